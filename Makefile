@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: optimize test test-all docs fuzz mutants lint clean
+.PHONY: optimize test test-all docs compat fuzz mutants lint clean
 
 optimize: $(VENV)/.run
 	$(BIN)/python -m rootsopt.optimize configs/cic.yaml -o results/cic
@@ -17,6 +17,12 @@ test-all: $(VENV)/.dev
 # The site, in build/site; notebooks run if they or the code have changed. A warning is an error.
 docs: $(VENV)/.dev
 	$(BIN)/python -m sphinx -E -W --keep-going -b html -d build/trees docs build/site
+
+# Oldest and newest supported versions of all dependencies, on each Python that is found (about ten
+# minutes a job); PYTHONS='python3.12 /path/to/python3.13' chooses the interpreters.
+PYTHONS ?= python3.11 python3.12 python3.13
+compat: $(VENV)/.dev
+	$(BIN)/python -m tests.compat --pythons $(PYTHONS)
 
 # Random configs, outline files and kills against the commands (about an hour).
 fuzz: $(VENV)/.dev

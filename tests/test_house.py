@@ -26,7 +26,7 @@ OPTIONAL = {
 OPTIONAL |= {"netCDF4", "shtab", "xarray", "zarr"}
 SLOW = {"rich", "scipy"}
 COMMANDS = {f"commands/{name}.py" for name in (
-    "attractors", "optimize", "pareto", "profile", "simulate", "sweep",
+    "attractors", "explore", "optimize", "pareto", "profile", "simulate", "sweep",
 )}  # fmt: skip
 LATE = {
     # The work of a command is loaded once its help or its config has asked for it.
@@ -41,6 +41,7 @@ LATE = {
     "commands/work/sweep.py": {"rootsopt.commands.work"},
     "optimize/__init__.py": {"rootsopt.commands.optimize"},
     # Modules that import optional or slow libraries.
+    "commands/work/explore.py": {"rootsopt.explore.engine", "rootsopt.explore.server"},
     "export/command.py": {"rootsopt.export.solid"},
     "measured/reading.py": {"rootsopt.measured.dxf"},
     "response/evaluation.py": {"rootsopt.response.dataset"},

@@ -12,7 +12,7 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, NoReturn
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 from rootsopt import report
 from rootsopt.commands import door
@@ -58,10 +58,11 @@ class _Parser(argparse.ArgumentParser):
         self.exit(BAD_INPUT, f"{self.prog}: {message}; see {self.prog} --help\n")
 
 
-def parser(command: str, purpose: str) -> argparse.ArgumentParser:
+def parser(command: str, purpose: str, writes: bool = True) -> argparse.ArgumentParser:
     """Return a parser with the arguments that every command takes.
 
-    `command`: name of the command; `purpose`: description of the command in its help."""
+    `command`: name of the command; `purpose`: description of the command in its help; `writes`:
+    whether the command writes a result folder, and takes the arguments for it."""
     result = _Parser(
         prog=f"rootsopt {command}",
         description=purpose,
@@ -74,6 +75,28 @@ def parser(command: str, purpose: str) -> argparse.ArgumentParser:
         type=Path,
         help=f"YAML file, or the name of a shipped config ({', '.join(shipped())})",
     )
+    if writes:
+        _add_folder(result, command)
+    result.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        dest="overrides",
+        help="override a config key, for example --set scene.speed_rpm=1500; repeatable",
+    )
+    _add_import(result)
+    result.add_argument(
+        "--no-cache",
+        action="store_true",
+        help="compile again, and keep no compiled programs in the user's cache folder "
+        "(ROOTSOPT_CACHE=DIR names another folder, ROOTSOPT_CACHE=off does the same)",
+    )
+    return result
+
+
+def _add_folder(result: argparse.ArgumentParser, command: str) -> None:
+    """Add the arguments for the result folder of a `command`."""
     result.add_argument(
         "-o",
         "--output",
@@ -86,15 +109,6 @@ def parser(command: str, purpose: str) -> argparse.ArgumentParser:
         action="store_true",
         help="replace an earlier run in the result folder instead of moving it",
     )
-    result.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        dest="overrides",
-        help="override a config key, for example --set scene.speed_rpm=1500; repeatable",
-    )
-    _add_import(result)
     result.add_argument("--no-figures", action="store_true", help="write no figures")
     result.add_argument(
         "--report",
@@ -102,13 +116,6 @@ def parser(command: str, purpose: str) -> argparse.ArgumentParser:
         help=f"write {REPORT}: summary, tables, charts and an animation in one file that opens "
         "without a network (needs the [pages] extra)",
     )
-    result.add_argument(
-        "--no-cache",
-        action="store_true",
-        help="compile again, and keep no compiled programs in the user's cache folder "
-        "(ROOTSOPT_CACHE=DIR names another folder, ROOTSOPT_CACHE=off does the same)",
-    )
-    return result
 
 
 def _add_import(arguments: argparse.ArgumentParser) -> None:
@@ -140,31 +147,35 @@ def run(
     purpose: str,
     argv: Sequence[str] | None,
     add_options: Callable[[argparse.ArgumentParser], None] = lambda _: None,
+    writes: bool = True,
 ) -> int:
     """Run a command and return its exit code.
 
     `command`: name of the command; `purpose`: description in its help; `argv`: arguments (`None`:
     those of the process); `add_options`: function that adds the command's own arguments to the
-    parser.
+    parser; `writes`: whether the command writes a result folder.
 
     Parse the arguments, load the config and select double precision. Then call the function `body`
     of the module `rootsopt.commands.work.COMMAND` with a new result folder, move the folder to its
-    final path and print the result. `InputError` and `OSError` give exit code 2."""
+    final path and print the result. A command that writes nothing has a `body` without the folder,
+    which returns the exit code. `InputError` and `OSError` give exit code 2."""
     environment.own_process()
     try:
         _import_extensions(command, argv)
-        arguments = parser(command, purpose)
+        arguments = parser(command, purpose, writes)
         add_options(arguments)
         options = arguments.parse_args(argv)
         options.given = [*(sys.argv[1:] if argv is None else argv)]
         for name in options.imports:  # Only the whole parser knows abbreviated options.
             import_named(name)
-        if options.output is None:
+        if writes and options.output is None:
             options.output = os.path.join("results", f"{options.config.stem}-{command}")
         config = load(options.config, options.overrides)
         use_float64()
         use_cache(wanted=not options.no_cache)
         with environment.explained():
+            if not writes:
+                return _work(command)(config, options)
             return _in_folder(command, config, options)
     except InputError as error:
         message = " ".join(str(error).split())
@@ -179,12 +190,17 @@ def run(
         return NO_RESULT
 
 
+def _work(command: str) -> Callable[..., Any]:
+    """Return the function `body` of the module with a command's work."""
+    return importlib.import_module(f"rootsopt.commands.work.{command}").body
+
+
 def _in_folder(command: str, config: Config, options: argparse.Namespace) -> int:
     from rootsopt.output.runs import RunFolder
 
     if options.report:
         report.require()
-    body: Body = importlib.import_module(f"rootsopt.commands.work.{command}").body
+    body: Body = _work(command)
     with (
         RunFolder(options.output, command, options.overwrite) as folder,
         door.leaving(folder.abandon),

@@ -56,7 +56,7 @@ def command_parser(name: str) -> argparse.ArgumentParser:
     from rootsopt.commands import cli
 
     module: Any = importlib.import_module(f"rootsopt.commands.{name}")
-    found = cli.parser(name, module.PURPOSE)
+    found = cli.parser(name, module.PURPOSE, getattr(module, "WRITES", True))
     getattr(module, "options", lambda parser: None)(found)
     return found
 

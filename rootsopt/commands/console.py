@@ -14,6 +14,7 @@ COMMANDS = {
     "sweep": "simulate one design at many speeds, or at values of any keys",
     "attractors": "find the coexisting motions of one scene",
     "profile": "compute the geometry of one design",
+    "explore": "move design and scene with sliders on a local page",
 }
 
 _COMPLETION = """

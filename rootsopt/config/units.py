@@ -39,6 +39,11 @@ def unit_of(key: str) -> str:
     return next((unit for end, (unit, _) in _UNITS.items() if key.endswith(end)), "")
 
 
+def without_unit(key: str) -> str:
+    """Return a key without the unit at the end of its name."""
+    return key.removesuffix(next((end for end in _UNITS if key.endswith(end)), ""))
+
+
 def si_unit(key: str) -> float:
     """Return the SI value of one unit of a design parameter's key (mm, ° or no unit)."""
     if key.endswith("_deg"):

@@ -1,5 +1,6 @@
 """The main task in one function: optimise a design and compare it with the baseline."""
 
+import threading
 from collections.abc import Callable
 
 from rootsopt.config import Config
@@ -14,13 +15,15 @@ def optimize_design(
     config: Config,
     progress: Callable[[int, int, float], None] | None = None,
     *,
+    stop: threading.Event | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
 ) -> Optimization:
     """Find the design that minimises the objective of a `config`, and compare it with the baseline.
 
     `progress`: function called after each evaluation with (evaluations done, evaluations expected,
-    best objective so far). `workers`, `scheduler`: where the designs are simulated, as in
+    best objective so far). `stop`: event that another thread can set to end the search early, with
+    the best design found until then. `workers`, `scheduler`: where the designs are simulated, as in
     `sweep_scenes`; by default in this process, on all cores.
 
     Return an `Optimization`. Its main fields are `baseline`, `optimized` (`None` if no better
@@ -33,4 +36,4 @@ def optimize_design(
     >>> found.optimized.design, found.improvement["mean_force_N"]"""
     check_geometry(config)
     with evaluating(workers, scheduler) as runs:
-        return search_of(resolve(config)[0], progress, runs=runs).run()
+        return search_of(resolve(config)[0], progress, stop, runs=runs).run()

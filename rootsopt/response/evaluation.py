@@ -129,7 +129,9 @@ class Evaluator:
     `reference`: response by which forces are divided when coexisting motions are compared;
     `fitted`: whether the contact map has been fitted to a motion; `map_error`: error of the contact
     map, relative to the static penetration, NaN if unknown; `maxima`: whether to compute all local
-    maxima of the force, with their gradients; `neighbours`: see `from_neighbours`; `orbits`: orbits
+    maxima of the force, with their gradients; `neighbours`: see `from_neighbours`; `confirm`:
+    whether an orbit that is reported with its series is closed anew and confirmed, even if it is
+    near a known one; `orbits`: orbits
     known from former evaluations, which all evaluators made from this one share.
     """
 
@@ -141,6 +143,7 @@ class Evaluator:
     map_error: float = float("nan")
     maxima: bool = False
     neighbours: bool = False
+    confirm: bool = True
     orbits: OrbitStore = dataclasses.field(default_factory=OrbitStore, compare=False, repr=False)
 
     @classmethod
@@ -203,6 +206,13 @@ class Evaluator:
         time, and another program that takes as long to compile as a hundred evaluations."""
         return dataclasses.replace(self, neighbours=True)
 
+    def following(self, orbits: OrbitStore) -> "Evaluator":
+        """Return another evaluator that knows the `orbits` of other scenes.
+
+        It closes orbits from those of neighbours, and reports the series of such an orbit without
+        confirming it by an integration."""
+        return dataclasses.replace(self, neighbours=True, confirm=False, orbits=orbits)
+
     def without_gradient(self) -> "Evaluator":
         """Return this evaluator unchanged, since its gradient takes little time.
 
@@ -245,11 +255,9 @@ class Evaluator:
             pair, tangents, shape = _build(now.scene, design)
             dtype = pair.angle_scale.dtype
             state = np.zeros(pair.states, dtype) if start is None else np.asarray(start, dtype)
-            # An orbit that is reported with its series is closed anew, and confirmed.
             built = Built(pair, tangents, now.scene.pitch_radius, now.scene.solver)
-            # An orbit that is reported with its series is closed anew, and confirmed.
             continues, found = now._continues(built), None
-            if continues and not series:
+            if continues and not (series and self.confirm):
                 found = self.orbits.near(built, start)
             if found is None:
                 found = jax.device_get(now.motion(pair, tangents, state))

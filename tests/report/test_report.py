@@ -4,13 +4,13 @@ import dataclasses
 import html as entities
 import json
 import re
-import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from browser import FLAGS, chromium
 
 from rootsopt import report
 from rootsopt.commands import pareto, profile
@@ -392,20 +392,16 @@ def test_nothing_is_loaded_without_the_option():
     assert done.stdout.strip() == "[]"
 
 
-_BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chromium-headless-shell")
-
-
 @pytest.fixture(scope="module")
-def browser():
+def browser(tmp_path_factory):
     """Return a function (page, options) → (standard output, console messages) of Chromium.
 
     It runs headless with scripts, without a network and without a display."""
-    found = next(filter(None, map(shutil.which, _BROWSERS)), None)
-    if found is None:
-        pytest.skip(f"no headless browser is installed: none of {', '.join(_BROWSERS)}")
+    found = chromium()
 
     def run(file, *options):
-        flags = ["--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr"]
+        profile = tmp_path_factory.mktemp("browser")
+        flags = [*FLAGS, f"--user-data-dir={profile}", "--enable-logging=stderr"]
         flags += ["--virtual-time-budget=8000", "--window-size=1280,900", *options]
         command = [found, *flags, file.as_uri()]
         done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)

@@ -15,7 +15,7 @@ STUDIES = sorted(path.name for path in EXPERIMENTS.glob("[!_.]*") if path.is_dir
 FILES = {"study.py", "figures.py", "__main__.py"}
 LONGEST = 400
 """Number of lines of study.py and its further modules up to which they are one file."""
-FROM_COMMANDS = {"basins", "drawing", "force", "pareto", "report", "sweep"}
+FROM_COMMANDS = {"basins", "drawing", "explore", "force", "pareto", "report", "sweep"}
 """Figures of the docs pages that commands make, not studies."""
 
 

@@ -1,0 +1,48 @@
+"""The work of `rootsopt explore`."""
+
+import argparse
+import sys
+import threading
+import webbrowser
+
+from rootsopt import explore
+from rootsopt.commands import door
+from rootsopt.config import Config
+from rootsopt.runtime import environment
+from rootsopt.scene import check_geometry
+
+
+def body(config: Config, options: argparse.Namespace) -> int:
+    """Run `rootsopt explore`: serve the page until the user stops it. Return the exit code.
+
+    Raises `InputError` if the config or an option is invalid, or if a library is missing."""
+    explore.require()
+    check_geometry(config)
+    from rootsopt.explore.engine import Engine
+    from rootsopt.explore.server import PageServer
+
+    engine = Engine(config)
+    server = PageServer(engine, str(options.config), options.port)
+
+    def prepare() -> None:
+        try:
+            engine.prepare()
+        except Exception as error:
+            engine.ready.set()  # Pages compute the same, and show the error.
+            environment.say(f"the programs could not be prepared: {error}")
+
+    def started(url: str) -> None:
+        print(f"rootsopt explore: {url}\nCtrl-C ends it.", flush=True)
+        if not options.no_browser:
+            threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
+
+    threading.Thread(target=prepare, daemon=True).start()
+    with door.patience("the page closes") as stop:
+        try:
+            server.run(stop, started)
+        except KeyboardInterrupt:  # if Python's own handler of Ctrl-C is in place
+            print("rootsopt explore: the page closes", file=sys.stderr)
+    return door.OK
+
+
+__all__ = ["body"]

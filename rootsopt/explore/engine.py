@@ -1,0 +1,158 @@
+"""Computes what the explorer shows: the geometry of a config, and its motion near a known one."""
+
+import dataclasses
+import threading
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rootsopt.config import Config
+from rootsopt.config.units import MM
+from rootsopt.export.animation import Contacts, frames_of, rolling_contacts, rolling_frames
+from rootsopt.profiles import Geometry, Profile, geometry, outline
+from rootsopt.response.choice import resolve
+from rootsopt.response.evaluation import Evaluation, Evaluator
+from rootsopt.response.orbits import OrbitStore
+from rootsopt.response.records import geometry_record
+from rootsopt.response.series import Series
+from rootsopt.response.speeds import alone
+from rootsopt.runtime.programs import Program
+from rootsopt.scene import Scene, check_geometry, design_vector
+
+_POINTS = 240
+"""Number of points of a drawn outline, as in the CSV files of the other commands."""
+_TURNS = 4
+"""Greatest number of revolutions shown of a motion."""
+_AGREES = 1e-3
+"""Relative difference of mean, peak and RMS force below which two motions count as the same."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Poses:
+    """Rotations φ (n,) of rotor 1 (rad) at which the pair is drawn, with the contacts.
+
+    `time` (n,): time (ms) since the start of the motion; `relative` (n,): ε (rad); `drive`,
+    `coast`: contacts of these flanks; `forces`: largest force (N) on drive and coast flank around
+    each rotation, (n,) each; `None` in perfect rolling."""
+
+    time: NDArray[np.float64]
+    rotation: NDArray[np.float64]
+    relative: NDArray[np.float64]
+    drive: Contacts
+    coast: Contacts
+    forces: tuple[NDArray[np.float64], NDArray[np.float64]] | None
+
+
+class Shape(NamedTuple):
+    """Geometry of a config.
+
+    `outline` (n, 2): closed outline (mm); `record`: the entry `geometry` of the result file;
+    `poses`: the pair in perfect rolling; `profile`: the profile itself."""
+
+    outline: NDArray[np.float64]
+    record: dict[str, float]
+    poses: Poses
+    profile: Profile
+
+
+class Engine:
+    """Evaluates configs that differ little from a first one, `given`.
+
+    Several sessions in several threads can share an engine. `ready` is set once the first config
+    has been evaluated, so that its programs are compiled."""
+
+    def __init__(self, given: Config):
+        self.given = given
+        self.orbits = OrbitStore()
+        self.ready = threading.Event()
+        self._base: Config | None = None
+        self._lock = threading.Lock()
+
+    @property
+    def base(self) -> Config:
+        """The config that the sliders change: `given` with the settings that suit an explorer.
+
+        `solver.fidelity: auto` is replaced by measured settings. Only the scene's own speed is
+        simulated."""
+        with self._lock:
+            if self._base is None:
+                check_geometry(self.given)
+                self._base = alone(resolve(self.given)[0])
+            return self._base
+
+    def shape(self, config: Config) -> Shape:
+        """Return the geometry of a `config`.
+
+        Raises `InputError` if its profile is not sound."""
+        check_geometry(config)
+        scene = Scene.from_config(config)
+        profile, record = _shape(scene, design_vector(config))
+        shown = np.asarray(outline(profile, points=_POINTS)) / MM
+        rotation, (drive, coast) = rolling_frames(profile)
+        zeros = np.zeros_like(rotation)
+        poses = Poses(zeros, rotation, zeros, drive, coast, None)
+        return Shape(shown, geometry_record(scene, record), poses, profile)
+
+    def near(self, config: Config, start: NDArray[np.float64] | None) -> Evaluation:
+        """Return the evaluation of a `config` from the state `start` of a similar one.
+
+        It is quick: the motion is not confirmed by an integration, and a motion that does not
+        settle is given up after a quarter of the allowed transient."""
+        return Evaluator.of(config).surveying().following(self.orbits)(start=start)
+
+    def from_rest(self, config: Config) -> Evaluation:
+        """Return the evaluation of a `config` from rest, as `rootsopt simulate` computes it."""
+        evaluator = Evaluator.of(config).from_neighbours()
+        return dataclasses.replace(evaluator, orbits=self.orbits)()
+
+    def prepare(self) -> None:
+        """Compile the programs in this thread, and set `ready`."""
+        config = self.base
+        evaluator = Evaluator.of(config).following(self.orbits).prepare()
+        self.shape(config)
+        found = evaluator()
+        if found.usable:
+            self.near(config, found.state)
+        self.ready.set()
+
+
+@Program
+def _shape(scene: Scene, design) -> tuple[Profile, Geometry]:
+    """Return profile and geometry of a design (d,) in config units."""
+    profile = scene.profile(design)
+    return profile, geometry(profile)
+
+
+def poses_of(profile: Profile, evaluation: Evaluation) -> Poses | None:
+    """Return the poses of the motion of an `evaluation`; `None` if it has no series."""
+    series = evaluation.series
+    if series is None:
+        return None
+    periods = int(evaluation.steady_state.get("period") or profile.lobes)
+    frames = frames_of(series, profile.lobes, periods)
+    drive, coast = (rolling_contacts(profile, frames.rotation, one) for one in (False, True))
+    time = 1e3 * (frames.time - series.time[0])
+    return Poses(time, frames.rotation, frames.relative, drive, coast, frames.forces)
+
+
+def cut(series: Series) -> Series:
+    """Return the first revolutions of a long motion."""
+    turns = (series.rotation - series.rotation[0]) / (2 * np.pi)
+    kept = turns < _TURNS
+    values: dict[str, Any] = {
+        field.name: None if (one := getattr(series, field.name)) is None else one[kept]
+        for field in dataclasses.fields(series)
+    }
+    return Series(**values)
+
+
+def same_motion(one: Evaluation, other: Evaluation) -> bool:
+    """Return whether two evaluations of a config describe the same motion, by their forces."""
+    if one.status is not other.status or one.response.keys() != other.response.keys():
+        return False
+    pairs = ((value, other.response[name]) for name, value in one.response.items())
+    return all(abs(a - b) <= _AGREES * max(abs(a), abs(b), 1e-12) for a, b in pairs)
+
+
+__all__ = ["Engine", "Poses", "Shape", "cut", "poses_of", "same_motion"]

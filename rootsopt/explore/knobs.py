@@ -1,0 +1,175 @@
+"""The numbers of a config that sliders move: names, units, spans and allowed ranges."""
+
+import math
+from typing import NamedTuple
+
+from rootsopt.config import Config
+from rootsopt.config.explain import all_keys, field_of, limits_of
+from rootsopt.config.families import family_of
+from rootsopt.config.units import unit_of, without_unit
+from rootsopt.design.bounds import bounds_of
+
+_SECTIONS = ("profile", "rotor", "contact", "scene")
+"""Sections of the config that hold the design and its scene."""
+_GROUPS = {
+    "profile": "Profile",
+    "rotor": "Rotor",
+    "contact": "Contact",
+    "contact.friction": "Friction",
+    "contact.wear": "Wear",
+    "scene": "Speed and mounting",
+    "scene.load": "Load",
+    "scene.motor": "Motor",
+    "scene.timing_gear": "Timing gear",
+    "scene.supports": "Elastic bearings",
+    "scene.bearings": "Bearing loads",
+    "scene.heat": "Heat",
+}
+_DESIGN = "Design"
+_ORDER = (_DESIGN, "Speed and mounting", "Load", "Motor", "Timing gear", "Contact")
+"""Groups at the top of the page; the others follow in the order of the config."""
+_FOLLOWS = ("contact.smoothing_mm",)
+"""Keys whose default follows other keys. They have a slider only if the config sets them."""
+_AROUND = 0.2, 2.0
+"""Span of a slider as multiples of the config's own value."""
+_ZERO = {"mm": 0.2, "mrad": 1.0, "°": 60.0, "K": 60.0}
+"""Half of the span of a slider, by unit, for a value of 0; `_ELSE` for other units."""
+_ELSE = 1.0
+_SIGNED = (
+    "rotor.helix_deg",
+    "contact.wear.offset_mm",
+    "scene.center_distance_error_mm",
+    "scene.phase_error_mrad",
+    "scene.heat.rotor_warming_K",
+    "scene.heat.housing_warming_K",
+    "scene.bearings.port_deg",
+)
+"""Keys whose slider reaches as far below 0 as above."""
+_STEPS = 200
+"""Least number of steps of a slider that is not whole."""
+
+
+class Knob(NamedTuple):
+    """A number of the config with its slider.
+
+    `key`: dotted config key; an entry of a list has its number, as in `profile.coefficients_3`.
+    `name`, `unit`, `help`, `group`: texts of the page. `value`: number in the config. `low`,
+    `high`, `step`: span and step of the slider. `least`, `most`: allowed range, perhaps infinite.
+    `whole`: whether only whole numbers are allowed."""
+
+    key: str
+    name: str
+    unit: str
+    help: str
+    group: str
+    value: float
+    low: float
+    high: float
+    step: float
+    least: float
+    most: float
+    whole: bool
+
+    def with_value(self, value: float) -> "Knob":
+        """Return the knob with another `value`, which lies in its span."""
+        return self._replace(value=value, low=min(self.low, value), high=max(self.high, value))
+
+
+def knobs_of(config: Config) -> list[Knob]:
+    """Return the knobs of all design parameters and scene parameters that a `config` has.
+
+    Design parameters span their bounds in an optimisation. Parts that the scene does not have, and
+    keys that are not set, have no knobs."""
+    found = _design(config)
+    parameters = set(config.profile.parameters)
+    for section in _SECTIONS:
+        for key in all_keys(Config):
+            if key.partition(".")[0] != section or "." not in key:
+                continue
+            name = key.rpartition(".")[2]
+            if section == "profile" and name in parameters:
+                continue
+            if key in _FOLLOWS and name not in config.contact.model_fields_set:
+                continue
+            value = _value(config, key)
+            if isinstance(value, int | float) and not isinstance(value, bool):
+                found.append(_scene(config, key, value))
+    order = [*_ORDER, *dict.fromkeys(knob.group for knob in found)]
+    return sorted(found, key=lambda knob: order.index(knob.group))
+
+
+def _design(config: Config) -> list[Knob]:
+    """Return the knobs of the design parameters."""
+    found = []
+    values = zip(config.design_keys, config.design, bounds_of(config), strict=True)
+    owners = [
+        parameter
+        for parameter in family_of(config.profile.family).parameters
+        for _ in range(_count(getattr(config.profile, parameter.key)))
+    ]
+    for (key, value, (low, high)), owner in zip(values, owners, strict=True):
+        sized = owner.limits(config.profile.pitch_radius_mm) or (owner.lowest, owner.highest)
+        least, most = max(owner.lowest, sized[0]), min(owner.highest, sized[1])
+        if not math.isfinite(high):
+            high = _AROUND[1] * float(value)
+        low, high = max(low, least), min(high, most)
+        name = without_unit(owner.key).replace("_", " ")
+        if key != owner.key:
+            name = f"{name.removesuffix('s')} {key.rpartition('_')[2]}"
+        found.append(
+            Knob(
+                f"profile.{key}", name, unit_of(owner.key), owner.help, _DESIGN, float(value),
+                low, high, _step(high - low), least, most, False,
+            ).with_value(float(value))
+        )  # fmt: skip
+    return found
+
+
+def _count(value: object) -> int:
+    return len(value) if isinstance(value, tuple) else 1
+
+
+def _scene(config: Config, key: str, value: float) -> Knob:
+    """Return the knob of any other number of the config."""
+    field = field_of(Config, key.split("."))
+    assert field is not None
+    least, most = limits_of(field.annotation, field.metadata).ends
+    whole = isinstance(value, int) and "float" not in str(field.annotation)
+    low, high = _span(key, float(value))
+    if whole:
+        low, high = least, most
+    low, high = max(low, least), min(high, most)
+    section, _, name = key.rpartition(".")
+    return Knob(
+        key, without_unit(name).replace("_", " "), unit_of(name), field.description or "",
+        _GROUPS.get(section, section), float(value), low, high,
+        1.0 if whole else _step(high - low), least, most, whole,
+    ).with_value(float(value))  # fmt: skip
+
+
+def _span(key: str, value: float) -> tuple[float, float]:
+    """Return the span of a slider around a `value`, before the key's limits are applied."""
+    reach = max(2 * abs(value), _ZERO.get(unit_of(key), _ELSE) * (key in _SIGNED or not value))
+    if key in _SIGNED:
+        return -reach, reach
+    if not value:
+        return 0.0, reach
+    return _AROUND[0] * value, _AROUND[1] * value
+
+
+def _step(width: float) -> float:
+    """Return the greatest step 1, 2 or 5 × 10^k of which at least `_STEPS` fit into `width`."""
+    if width <= 0:
+        return 1.0
+    power = 10.0 ** math.floor(math.log10(width / _STEPS))
+    return max(one * power for one in (1, 2, 5) if one * power * _STEPS <= width * (1 + 1e-9))
+
+
+def _value(config: Config, key: str) -> object:
+    inner: object = config
+    for part in key.split("."):
+        inner = getattr(inner, part, None)
+    return inner
+
+
+__all__ = ["Knob", "knobs_of"]

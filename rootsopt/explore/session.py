@@ -1,0 +1,277 @@
+"""The state of one page of the explorer: values, what is computed for them, and a search.
+
+A session knows nothing of the page. It tells it what is new by messages, from several threads."""
+
+import dataclasses
+import functools
+import sys
+import threading
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from rootsopt.config import Config
+from rootsopt.errors import InputError
+from rootsopt.explore.engine import Engine, Poses, Shape, poses_of, same_motion
+from rootsopt.explore.latest import Latest
+from rootsopt.optimize.design import optimize_design
+from rootsopt.optimize.search import Optimization
+from rootsopt.response.evaluation import Evaluation
+
+_IDLE = 0.4
+"""Time (s) without a new value after which the motion is computed from rest."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Message:
+    """What is new for the values with this `number`; the first values have the number 0."""
+
+    number: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Problem(Message):
+    """The values are refused, or nothing can be computed for them. `words`: why, what to do."""
+
+    words: str
+
+
+@dataclasses.dataclass(frozen=True)
+class NewShape(Message):
+    """The `shape` of the rotor."""
+
+    shape: Shape
+
+
+@dataclasses.dataclass(frozen=True)
+class NewMotion(Message):
+    """The `evaluation`, and the `poses` of its motion.
+
+    `near`: whether the motion was reached from that of other values, and not from rest; `final`:
+    whether the status is final. If not, a computation from rest follows."""
+
+    evaluation: Evaluation
+    poses: Poses | None
+    near: bool
+    final: bool = True
+
+
+@dataclasses.dataclass(frozen=True)
+class FromRest(Message):
+    """The motion from rest is known. `same`: whether it is the one shown; `evaluation`: its own."""
+
+    same: bool
+    evaluation: Evaluation
+
+
+@dataclasses.dataclass(frozen=True)
+class Progress(Message):
+    """A search has simulated `done` of about `expected` designs; `best`: best objective so far."""
+
+    done: int
+    expected: int
+    best: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Searched(Message):
+    """A search has ended. `found`: its outcome; `None`: an error, which `words` explains.
+
+    `values`: design parameters of the optimum by key; empty if there is none."""
+
+    found: Optimization | None
+    values: Mapping[str, float]
+    words: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Saved(Message):
+    """The config of the values as YAML `text`. `evaluation`: its motion from rest."""
+
+    text: str
+    evaluation: Evaluation
+
+
+class Session:
+    """One page of the explorer.
+
+    `engine`: computes everything; sessions share it. `show`: function that takes messages; it is
+    called from several threads. `idle`: time (s) without a new value after which the motion is
+    computed from rest."""
+
+    def __init__(self, engine: Engine, show: Callable[[Message], None], idle: float = _IDLE):
+        self.engine = engine
+        self.show = show
+        self.idle = idle
+        self.number = 0
+        self.values: dict[str, float] = {}
+        self.searching = threading.Event()
+        self._lock = threading.Lock()
+        self._state: Any = None
+        self._shown: NewMotion | None = None
+        self._rest: FromRest | None = None
+        self._stop = threading.Event()
+        self._shapes, self._motions, self._rests = (Latest(self._failed) for _ in range(3))
+        self._ask(0)
+
+    def move(self, values: Mapping[str, float]) -> int:
+        """Set new `values`, numbers by dotted config key; return their number."""
+        with self._lock:
+            self.values |= values
+            self.number += 1
+            number = self.number
+        self._ask(number)
+        return number
+
+    def show_from_rest(self) -> None:
+        """Show the motion that starts at rest, even if another one is known."""
+        number = self.number
+        self._rests.submit(lambda: self._refusing(number, lambda: self._from_rest(number, True)))
+
+    def save(self) -> None:
+        """Make the YAML of the values, and compute their motion from rest, as `simulate` does."""
+        number = self.number
+        self._rests.submit(lambda: self._refusing(number, lambda: self._save(number)))
+
+    def optimize(self) -> None:
+        """Search for the optimum from the present values, in a thread of its own."""
+        if self.searching.is_set():
+            return
+        self.searching.set()
+        self._stop = threading.Event()
+        threading.Thread(target=self._optimize, args=(self.number, self._stop), daemon=True).start()
+
+    def cancel(self) -> None:
+        """End the search with the best design found so far."""
+        self._stop.set()
+
+    def close(self) -> None:
+        """End all threads of the session."""
+        self.cancel()
+        for lane in (self._shapes, self._motions, self._rests):
+            lane.close()
+
+    @property
+    def seconds(self) -> float:
+        """Time (s) that the present computation of the motion has taken; 0 if none is running."""
+        return max(self._shapes.seconds, self._motions.seconds)
+
+    def config(self) -> Config:
+        """Return the config with the present values.
+
+        Raises `InputError` if the values do not fit each other."""
+        with self._lock:
+            values: dict[str, Any] = dict(self.values)
+        whole = ("profile.lobes",)
+        values |= {key: int(values[key]) for key in whole if key in values}
+        return self.engine.base.replaced(values) if values else self.engine.base
+
+    def _ask(self, number: int) -> None:
+        """Compute shape and motion of the values with this `number`."""
+        self._motions.clear()
+        self._rests.clear()
+        self._shapes.submit(lambda: self._refusing(number, lambda: self._compute_shape(number)))
+
+    def _compute_shape(self, number: int) -> None:
+        config = self.config()
+        shape = self.engine.shape(config)
+        self.show(NewShape(number, shape))
+        work = functools.partial(self._compute_motion, number, config, shape)
+        self._motions.submit(lambda: self._refusing(number, work))
+
+    def _compute_motion(self, number: int, config: Config, shape: Shape) -> None:
+        self.engine.ready.wait()
+        start = self._state
+        near = start is not None
+        found = self.engine.near(config, start) if near else self.engine.from_rest(config)
+        if found.usable:
+            self._state = found.state
+        final = found.usable or not near
+        self._present(NewMotion(number, found, poses_of(shape.profile, found), near, final))
+        if near:
+            delay = self.idle if found.usable else 0.0
+            work = functools.partial(self._from_rest, number, False)
+            self._rests.submit(lambda: self._refusing(number, work), delay)
+
+    def _present(self, motion: NewMotion) -> None:
+        self._shown = motion
+        self.show(motion)
+
+    def _from_rest(self, number: int, forced: bool) -> Evaluation | None:
+        """Compute the motion from rest of the values with this `number`, and compare it.
+
+        `forced`: whether to show it even if it is not the one that is shown. It is shown in any
+        case if the one that is shown has no steady state."""
+        if number != self.number:
+            return None
+        shown, known = self._shown, self._rest
+        config = self.config()
+        shape = self.engine.shape(config)  # refuses a profile that is not sound
+        if known is not None and known.number == number:
+            found = known.evaluation
+        else:
+            found = self.engine.from_rest(config)
+        if number != self.number:
+            return found
+        same = shown is not None and shown.number == number and same_motion(shown.evaluation, found)
+        self._rest = FromRest(number, same, found)
+        useless = shown is None or shown.number != number or not shown.final
+        if useless or (forced and not same):
+            if found.usable:
+                self._state = found.state
+            poses = poses_of(shape.profile, found)
+            self._present(NewMotion(number, found, poses, False))
+        else:
+            self.show(self._rest)
+        return found
+
+    def _save(self, number: int) -> None:
+        found = self._from_rest(number, True)
+        if found is not None:
+            self.show(Saved(number, self.config().to_yaml(), found))
+
+    def _refusing(self, number: int, work: Callable[[], object]) -> None:
+        """Do `work`; if the values are refused, say so."""
+        try:
+            work()
+        except InputError as error:
+            self.show(Problem(number, str(error)))
+
+    def _optimize(self, number: int, stop: threading.Event) -> None:
+        def progress(done: int, expected: int, best: float) -> None:
+            self.show(Progress(number, done, expected, best))
+
+        found, values, words = None, {}, ""
+        try:
+            self.engine.ready.wait()
+            found = optimize_design(self.config(), progress, stop=stop)
+            if found.optimized is not None:
+                values = {f"profile.{key}": x for key, x in found.optimized.design.items()}
+        except InputError as error:
+            words = str(error)
+        except Exception as error:
+            words = _unexpected(error)
+        self.searching.clear()
+        self.show(Searched(number, found, values, words))
+
+    def _failed(self, error: Exception) -> None:
+        self.show(Problem(self.number, _unexpected(error)))
+
+
+def _unexpected(error: Exception) -> str:
+    """Return the words for an error that should not occur, and print one line about it."""
+    words = f"{type(error).__name__}: {error}".splitlines()[0]
+    print(f"rootsopt explore: {words}", file=sys.stderr)
+    return f"The computation failed ({words}). Move the slider back, or choose other values."
+
+
+__all__ = [
+    "FromRest",
+    "Message",
+    "NewMotion",
+    "NewShape",
+    "Problem",
+    "Progress",
+    "Saved",
+    "Searched",
+    "Session",
+]

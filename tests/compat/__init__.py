@@ -1,0 +1,1 @@
+"""Tries the oldest and the newest supported versions of all dependencies: `make compat`."""

@@ -1,0 +1,148 @@
+"""The explorer's server: its address, who may use it, how it ends, and what it needs."""
+
+import http.client
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+import pytest
+
+from rootsopt import explore
+from rootsopt.commands import explore as command
+
+pytest.importorskip("bokeh")
+ROOT = Path(__file__).parents[2]
+CIC = str(ROOT / "configs" / "cic.yaml")
+
+
+@pytest.fixture(scope="module")
+def address():
+    """Return the address of a running server."""
+    from rootsopt.config import load
+    from rootsopt.errors import InputError
+    from rootsopt.explore.engine import Engine
+    from rootsopt.explore.server import PageServer
+
+    class Idle(Engine):
+        """An engine that never gets ready: the server is tested, not what it shows."""
+
+        def shape(self, config):
+            raise InputError("no shape")
+
+    found, up, stop = [], threading.Event(), threading.Event()
+
+    def serve():
+        server = PageServer(Idle(load(CIC)), "cic")
+        server.run(stop, lambda url: (found.append(url), up.set()))
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    assert up.wait(60)
+    yield found[0]
+    stop.set()
+    thread.join(30)
+    assert not thread.is_alive()
+
+
+def get(url, **headers):
+    """Return (status, text) of a request."""
+    request = urllib.request.Request(url, headers=headers)
+    try:
+        with urllib.request.urlopen(request, timeout=30) as answer:
+            return answer.status, answer.read().decode()
+    except urllib.error.HTTPError as error:
+        return error.code, error.read().decode()
+
+
+def test_page_is_served_to_those_who_know_the_token(address):
+    assert re.fullmatch(r"http://127\.0\.0\.1:\d+/[\w-]{32}/", address)
+    status, page = get(address)
+    assert status == 200
+    assert "rootsopt explore cic" in page
+    scripts = re.findall(r'(?:src|href)="([^"]+)"', page)
+    assert scripts
+    assert all(one.startswith(("static/", address, "data:", "/")) for one in scripts)
+    assert "//cdn" not in page
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["", "ws", "static/js/bokeh.min.js", "autoload.js", "x" * 32 + "/", "?token=1", "metadata"],
+)
+def test_requests_without_the_token_are_refused(address, path):
+    base = address.split("/", 3)
+    status, text = get(f"{base[0]}//{base[2]}/{path}")
+    assert status == 403
+    assert "token" in text
+
+
+def test_scripts_lie_behind_the_token_too(address):
+    assert get(f"{address}static/js/bokeh.min.js")[0] == 200
+
+
+@pytest.mark.parametrize(("origin", "status"), [("http://example.org", 403), (None, 101)])
+def test_foreign_pages_may_not_connect(address, origin, status):
+    """A web page of another origin that knows the address cannot open the connection."""
+    _, _, host, path = address.split("/", 3)
+    connection = http.client.HTTPConnection(host, timeout=30)
+    headers = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Version": "13",
+               "Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==",
+               "Origin": origin or f"http://{host}"}  # fmt: skip
+    connection.request("GET", f"/{path}ws", headers=headers)
+    assert connection.getresponse().status == status
+    connection.close()
+
+
+def test_server_listens_on_the_loopback_address_only(address):
+    port = int(address.split(":")[2].split("/")[0])
+    for family, one in ((socket.AF_INET, "127.0.0.2"), (socket.AF_INET6, "::1")):
+        with socket.socket(family) as probe:
+            probe.settimeout(5)
+            assert probe.connect_ex((one, port)) != 0
+
+
+def test_library_is_named_if_it_is_missing(monkeypatch, capsys):
+    monkeypatch.setattr(explore.importlib.util, "find_spec", lambda name: None)
+    assert command.main([CIC]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "pip install 'rootsopt[explore]'" in line
+
+
+def test_port_in_use_is_named(capsys):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        assert command.main([CIC, "--no-browser", "--port", str(port)]) == 2
+    assert f"{port} cannot be used" in capsys.readouterr().err
+
+
+def test_ctrl_c_ends_with_success():
+    """The address is printed on standard output; Ctrl-C ends with exit code 0 and one line."""
+    run = [sys.executable, "-m", "rootsopt", "explore", CIC, "--no-browser"]
+    process = subprocess.Popen(run, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    first = process.stdout.readline()
+    assert get(first.split()[-1])[0] == 200
+    process.send_signal(signal.SIGINT)
+    rest, errors = process.communicate(timeout=60)
+    assert process.returncode == 0
+    assert errors.strip() == (
+        "rootsopt explore: Ctrl-C: the page closes (once more to stop at once)"
+    )
+    assert "Traceback" not in rest
+
+
+def test_nothing_is_loaded_for_other_commands():
+    code = (
+        "import sys; from rootsopt.commands import cli, explore; cli.parser('profile', '');"
+        "import rootsopt.commands.work.profile; print([name for name in sys.modules"
+        " if name.split('.')[0] in ('bokeh', 'tornado') or name.startswith('rootsopt.explore')])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
