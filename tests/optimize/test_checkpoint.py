@@ -125,11 +125,17 @@ def test_a_line_cut_off_is_ignored(tmp_path):
     assert path.read_bytes() == data
 
 
-def test_a_resumed_search_equals_one_that_was_not_interrupted(tmp_path):
+SPEEDS = "objective: {speeds_rpm: [2700.0, 3300.0]}\n"
+"""Over several speeds, orbits are closed from those of neighbours, which the file does not hold."""
+
+
+@pytest.mark.parametrize("more", ["", pytest.param(SPEEDS, marks=pytest.mark.long)])
+def test_a_resumed_search_equals_one_that_was_not_interrupted(tmp_path, more):
     """The file is cut at random bytes, as after a kill."""
-    settings, path = parse(SCENE), tmp_path / "c"
+    settings, path = parse(SCENE + more), tmp_path / "c"
     full = Checkpoint(path, HEADER)
     expected = outcome(Search(settings, checkpoint=full).run())
+    assert (b"from_neighbour" in path.read_bytes()) == bool(more)
     full.close(remove=False)
     data = path.read_bytes()
     head = data.index(b"\n") + 1
