@@ -1,10 +1,11 @@
 """The options `--workers` and `--scheduler`, which `sweep`, `optimize` and `pareto` share."""
 
-import argparse
-from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    import argparse
+    from contextlib import AbstractContextManager
+
     from rootsopt.response.runs import Runs
 
 
@@ -25,7 +26,7 @@ def add_options(parser: "argparse.ArgumentParser | argparse._ArgumentGroup") -> 
     )
 
 
-def chosen(options: argparse.Namespace) -> "AbstractContextManager[Runs]":
+def chosen(options: "argparse.Namespace") -> "AbstractContextManager[Runs]":
     """Return a context manager for what runs the evaluations of a search with these `options`."""
     from rootsopt.sweeps.evaluations import evaluating
 

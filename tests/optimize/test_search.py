@@ -13,6 +13,7 @@ from rootsopt.optimize import noise
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.search import Search, Trial, _history
 from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.runs import HERE
 from rootsopt.status import Status
 from tests.standins import evaluation_of
 
@@ -27,7 +28,7 @@ def searching(truth=lambda point: 1.0, **settings) -> Search:
     """Return a search over points of the unit box whose verification finds the `truth`."""
     search = object.__new__(Search)
     search.stop, search._refuted, search._trials = threading.Event(), [], []
-    search._found, search.checkpoint, search.noisy = {}, None, True
+    search._found, search.checkpoint, search.noisy, search.runs = {}, None, True, HERE
     search.method = settings.get("method")
     search.settings = types.SimpleNamespace(screening=0, seed=0, starts=2)
     vars(search.settings).update(settings)
