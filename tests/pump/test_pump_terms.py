@@ -23,6 +23,7 @@ PUMP = (
 )
 
 
+@pytest.mark.long
 def test_terms_are_the_rows_of_the_sheet_and_have_gradients():
     config = load_config("cic", PUMP)
     scene, design = Scene.from_config(config), jnp.asarray(config.design)
