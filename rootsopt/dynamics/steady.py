@@ -19,7 +19,6 @@ from rootsopt.dynamics.collocation.closing import supported
 from rootsopt.dynamics.collocation.known import Known
 from rootsopt.dynamics.collocation.mesh import sizes
 from rootsopt.dynamics.collocation.motion import Collocated, collocated, near_orbit
-from rootsopt.dynamics.collocation.seed import from_steps
 from rootsopt.dynamics.flow import Flow
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.measures import Measures
@@ -533,16 +532,3 @@ def near_motion(
     """
     radius = jnp.asarray(radius, pair.angle_scale.dtype)
     return _Attempts(pair, tangents, solver, radius).near(*start)
-
-
-def seed(
-    pair: RotorPair,
-    state: Float[Array, " n"],
-    taken: tuple[Float[Array, " steps"], Float[Array, "steps n"]],
-    period: Int[Array, ""],
-    longest: int,
-) -> Known:
-    """Return an orbit of `pair` that was closed by shooting, as a start for `near_motion`.
-
-    Arguments: see `collocation.seed.from_steps`."""
-    return Known.unaligned(from_steps(pair, state, taken, period, longest))

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from rootsopt.dynamics.collocation.known import Known, trimmed
 from rootsopt.dynamics.collocation.mesh import sizes
+from rootsopt.dynamics.collocation.seed import from_steps
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.steady import Solver, Steady, continues, near_motion, seed
+from rootsopt.dynamics.steady import Solver, Steady, continues, near_motion
 from rootsopt.runtime.programs import Program
 from rootsopt.status import Status
 
@@ -255,6 +256,6 @@ def _key(state) -> bytes:
 
 
 _near = Program(near_motion)
-_seed = Program(seed)
+_seed = Program(from_steps)
 
 __all__ = ["Built", "OrbitStore", "prepare_near"]

@@ -1,12 +1,15 @@
 """Tests of local maxima of the contact force along an orbit, with their derivatives."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from rootsopt import load_config
 from rootsopt.dynamics import maxima
+from rootsopt.dynamics.flow import Flow
 from rootsopt.dynamics.maxima import candidates, shoulders
-from rootsopt.dynamics.orbit import SAMPLES
+from rootsopt.dynamics.measures import Measures
+from rootsopt.dynamics.orbit import SAMPLES, Orbit
 from rootsopt.response import evaluation
 from rootsopt.response.evaluation import Evaluator
 
@@ -73,6 +76,21 @@ def test_prepared_programs_are_those_that_are_called(evaluator, found):
     called = [set(program._made) for program in programs]
     maxima.prepare_maxima(pair, tangents, orbit, scene.solver.orbit)
     assert [set(program._made) for program in programs] == called
+
+
+@pytest.mark.parametrize(("used", "room", "cut"), [(10, 64, 1024), (1500, 4096, 2048)])
+def test_steps_of_an_orbit_have_few_sizes(used, room, cut):
+    flow = Flow.empty(2, 1, 8, room, Measures(), jnp.dtype(float))
+    grid = np.where(np.arange(room) < used, np.arange(room), np.inf)
+    corners = np.arange(2.0 * room).reshape(room, 2)
+    orbit = Orbit.empty(jnp.zeros(2), 1, flow)._replace(
+        flow=flow._replace(grid=jnp.asarray(grid), corners=jnp.asarray(corners))
+    )
+    found = maxima._cut(orbit).flow
+    assert found.grid.shape == (cut,)
+    np.testing.assert_array_equal(found.grid[:used], grid[:used])
+    assert np.all(np.isinf(found.grid[used:]))
+    np.testing.assert_array_equal(found.corners[:used], corners[:used])
 
 
 def test_candidates_are_told_apart():

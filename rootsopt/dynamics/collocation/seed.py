@@ -11,6 +11,7 @@ from rootsopt.dynamics.collocation.blocks import BLOCK, in_blocks
 from rootsopt.dynamics.collocation.closing import first_elements
 from rootsopt.dynamics.collocation.elements import Elements, Mesh
 from rootsopt.dynamics.collocation.gauss import GAUSS
+from rootsopt.dynamics.collocation.known import Known
 from rootsopt.dynamics.collocation.mesh import sizes
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.pair import RotorPair
@@ -65,8 +66,8 @@ def from_steps(
     taken: tuple[Float[Array, " steps"], Float[Array, "steps n"]],
     period: Int[Array, ""],
     longest: int,
-) -> Elements:
-    """Return the motion of an orbit that was closed by shooting, as `seeded` does.
+) -> Known:
+    """Return an orbit that was closed by shooting, as a start for closing it by collocation.
 
     `state`: scaled, at φ1 = 0; `taken`: `Flow.grid` and `Flow.corners` of the integration over the
     `period` (mesh periods); `longest`: longest period for which the arrays have room."""
@@ -77,7 +78,8 @@ def from_steps(
     slope = jax.vmap(lambda tau, y: pair.derivative(tau, y)[0])
     slopes = in_blocks(slope, steps + 1, *_padded(times, states))[: times.shape[0]]
     every, length = (times, states, slopes), period.astype(state.dtype)
-    return _on_steps(pair, every, steps, length, first_elements(period), sizes(longest))
+    room = sizes(longest)
+    return Known.unaligned(_on_steps(pair, every, steps, length, first_elements(period), room))
 
 
 def _padded(times: Float[Array, " m"], states: Float[Array, "m n"]) -> tuple[Array, Array]:

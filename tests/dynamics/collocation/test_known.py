@@ -156,6 +156,7 @@ def test_orbit_from_a_neighbour_is_that_by_shooting(name):
         assert near.status is usual.status is Status.PERIODIC
         if factor > 1:
             assert near.statistics["from_neighbour"] == 1
+            assert near.statistics["newton_steps"] <= 3  # The first one along the tangent.
         for force, value in usual.response.items():
             np.testing.assert_allclose(near.response[force], value, rtol=2e-6)
             slopes = np.array([list(one.gradient[force].values()) for one in (near, usual)])
