@@ -27,6 +27,7 @@ from experiments._common.simulation import evaluate, objective, profile_of
 from experiments.families.reach import Reach, changed, in_housing, of_family, problem_of, reach
 from rootsopt.config import Config, load, parse
 from rootsopt.config.units import MM
+from rootsopt.errors import InputError
 from rootsopt.optimize.search import Search
 from rootsopt.profiles import Profile
 from rootsopt.profiles.departure import departure
@@ -196,18 +197,36 @@ def one_family(path: str, family: str, quick: bool) -> dict[str, Any] | None:
     }
 
 
-def free_form(path: str, best: dict[str, Any], quick: bool) -> dict[str, Any]:
-    """Optimise a free form, starting from the row `best` of the best family. Return its row."""
+def free_start(rows: list[Row]) -> tuple[Row, Config, Config]:
+    """Return the best of the `rows` that a free form can follow, its config, and the free form's.
+
+    A flank that meshes all at once, such as the arc of `circle_epicycloid`, has no sound free form.
+    """
+    refusal: InputError | None = None
+    for row in sorted(rows, key=lambda row: row["objective"]):
+        config = parse(row["config"])
+        profile, _ = free_form_of(config.profile, COEFFICIENTS)
+        try:
+            free = changed(config, profile=profile.model_dump())
+            check_geometry(free)
+        except InputError as error:
+            refusal = error
+        else:
+            return row, config, free
+    assert refusal is not None
+    raise refusal
+
+
+def free_form(path: str, rows: list[Row], quick: bool) -> Row:
+    """Optimise a free form, starting from the best family of the `rows`. Return its row."""
     began = time.perf_counter()
     _, base = reference_of(path, quick)
-    config = parse(best["config"])
-    start = profile_of(config)
-    profile, _ = free_form_of(config.profile, COEFFICIENTS)
-    settings: dict[str, Any] = {"bounds": {"tip_arc_angle_deg": (0.0, 45 / config.profile.lobes)}}
+    best, given, config = free_start(rows)
+    start = profile_of(given)
+    settings: dict[str, Any] = {"bounds": {"tip_arc_angle_deg": (0.0, 45 / given.profile.lobes)}}
     settings |= SEARCH_FREE | ({"iterations": 2} if quick else {})
     config = changed(
         config,
-        profile=profile.model_dump(),
         optimizer=settings,
         solver={"gradient": "reverse"} | (COARSE if quick else {}),
     )
@@ -256,8 +275,7 @@ def run(
             own = [row for row in rows if row["study"] == Path(path).stem and row["reached"]]
             own = [row for row in own if np.isfinite(row["objective"])]
             if own:
-                best = min(own, key=lambda row: row["objective"])
-                free.append(pool.submit(free_form, path, best, quick))
+                free.append(pool.submit(free_form, path, own, quick))
         for future in free:
             row = future.result()
             say(f"{row['study']:8s} free_form {row['objective']:.4f} from {row['begun_at']}")
