@@ -9,7 +9,8 @@ import pytest
 
 import rootsopt
 from rootsopt.dynamics.collocation.elements import Elements, Mesh
-from rootsopt.dynamics.collocation.forces import OrbitForces, Peak
+from rootsopt.dynamics.collocation.equation import CollocatedEquation
+from rootsopt.dynamics.collocation.forces import OrbitForces, Peak, located_peak
 from rootsopt.dynamics.collocation.gauss import GAUSS, POINTS
 from rootsopt.dynamics.collocation.known import Known, trimmed
 from rootsopt.dynamics.collocation.mesh import roughness, sizes
@@ -137,6 +138,68 @@ def test_orbits_of_a_former_process_are_computed_when_asked_for():
         memory.recall([state], again(number), start)
     assert memory._recalled(_key(states[1500])) is not None
     assert made == list(range(1501))
+
+
+class _Bump(CollocatedEquation):
+    """An equation whose force is known in closed form.
+
+    A force depends on the roots as that of `NearContact` does: its error, and that of the improved
+    roots, is of second order in the roots' distance from the truth."""
+
+    place: float
+    corner: float
+
+    def __init__(self, place, corner):
+        self.pair = self.measures = self.top = None  # pyright: ignore[reportAttributeAccessIssue]
+        self.place, self.corner = place, corner
+
+    def true(self, tau):
+        away = tau - self.place
+        smooth = 200.0 - 3e4 * away**2 + 5e3 * away**3
+        return jnp.where(away > 0, smooth - 400.0 * self.corner * away, smooth)
+
+    def force(self, tau, state, roots):
+        del state
+        error = roots - jnp.sin(5.0 * tau)
+        return self.true(tau) + 1e3 * jnp.max(error**2), roots - error + error**2
+
+
+@pytest.mark.parametrize(
+    ("place", "corner"),
+    [(0.8, 0.0), (0.8004, 0.0), (0.78571, 0.0), (0.3 + 1.7 * 3 / 7, 1.0), (0.6501, 0.0), (1.03, 0.0)],
+)
+def test_peak_is_located(place, corner):
+    """The peak lies beside or at an element's end, or in its middle, or is a corner at an end."""
+    elements = _known().elements
+    tau, _ = elements.places
+    bump = _Bump(place, corner)
+    roots = jnp.broadcast_to(jnp.sin(5.0 * tau)[..., None, None], elements.roots.shape)
+    elements = elements._replace(roots=roots + 1e-3)
+    found = located_peak(bump, elements, bump.true(tau[:, :POINTS]))
+    begin, length = elements.mesh.ends[0][found.element], elements.mesh.lengths[found.element]
+    where = float(begin + length * found.share)
+    np.testing.assert_allclose(where, place, atol=2e-7)
+    np.testing.assert_allclose(float(found.force), 200.0, rtol=1e-12)
+
+
+@pytest.mark.long
+def test_free_form_from_a_neighbour_is_that_by_shooting():
+    """Elements end at its knots too, and gradients with respect to its coefficients are exact."""
+    config = rootsopt.load_config("configs/free.yaml")
+    evaluator = Evaluator.of(config).from_neighbours()
+    base = evaluator(series=False)
+    wave = 1 + 2e-3 * np.cos(3.0 * np.arange(len(base.design)))
+    design = np.array(list(base.design.values())) * wave
+    near = evaluator(design, start=base.state, series=False)
+    assert near.statistics["from_neighbour"] == 1
+    exact = config.replaced({"solver.orbit": "shooting", "solver.rtol": 1e-10})
+    usual = Evaluator.of(exact)(design, series=False)
+    for force, value in usual.response.items():
+        np.testing.assert_allclose(near.response[force], value, rtol=1e-6)
+        slopes = np.array([list(one.gradient[force].values()) for one in (near, usual)])
+        np.testing.assert_allclose(
+            slopes[0], slopes[1], rtol=0, atol=3e-4 * np.max(np.abs(slopes))
+        )
 
 
 @pytest.mark.parametrize("name", ["cic", pytest.param("ee", marks=pytest.mark.long)])
