@@ -1,15 +1,16 @@
 """Compares orbits closed by collocation with orbits closed by shooting, on random pairs.
 
 The study draws designs and scenes (speed, load, backlash, gear, contact) of several kinds: CIC with
-two to four lobes, EE, arc and involute, with gas and friction, with a motor, and lively scenes. For
-each pair of design and scene that settles, both solvers start from rest. Forces, their derivatives
-with respect to design, speed and load, period, multipliers and status are compared. The times are
-those of a second call in the same process.
+two to four lobes, EE, arc and involute, five arcs, a free form, with gas and friction, with a
+motor, and lively scenes. For each pair of design and scene that settles, both solvers start from
+rest. Forces, their derivatives with respect to design, speed and load, period, multipliers and
+status are compared. The times are those of a second call in the same process.
 """
 
 import csv
 import dataclasses
 import functools
+import json
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -23,7 +24,10 @@ import numpy as np
 from experiments._common.scenes import CIC
 from rootsopt import steady_response
 from rootsopt.config import Config, load
-from rootsopt.scene import Scene, design_vector
+from rootsopt.config.scene import ProfileConfig
+from rootsopt.errors import InputError
+from rootsopt.scene import Scene, check_geometry, design_vector
+from rootsopt.scene.families import free_form_of
 from rootsopt.status import Status
 
 Row = dict[str, Any]
@@ -31,6 +35,8 @@ METHODS = "collocation", "shooting"
 FORCES = "mean", "peak", "rms"
 PATIENCE = 12
 """Number of scenes drawn for each pair wanted, above which a kind ends early."""
+COEFFICIENTS = 12
+"""Number of coefficients of the free form."""
 QUICK_COUNT = 2
 """Number of pairs of a reduced run."""
 GAS = [
@@ -49,6 +55,8 @@ KINDS: dict[str, tuple[str, int, list[str]]] = {
     "cic, gas and friction": ("cic", 3, GAS),
     "cic, 2 lobes": ("cic", 2, []),
     "ee, 2 lobes": ("ee", 2, []),
+    "five arcs": ("five_arcs", 3, []),
+    "free form": ("free_form", 3, []),
 }
 """Family, lobes and further overrides of each kind."""
 
@@ -62,12 +70,24 @@ def pairs(seed: int, kind: str) -> Iterator[list[str]]:
         angle, tip = draw.uniform(29, 42), draw.uniform(0.5, 4.0)
         longest = 33.0 * np.sin(np.radians(angle)) * (np.pi / 2 / lobes - np.radians(tip))
         length = draw.uniform(0.3, 0.95) * longest
-        keys = f"pressure_angle_deg: {angle:.2f}, involute_length_mm: {length:.3f}"
-        profile = f"family: {family}, lobes: {lobes}, pitch_radius_mm: 33.0"
+        profile: Row = {"family": family, "lobes": lobes, "pitch_radius_mm": 33.0}
         if family != "ee":
-            profile += f", {keys}"
-        if family == "cic":
-            profile += f", tip_arc_angle_deg: {tip:.2f}"
+            profile |= {
+                "pressure_angle_deg": round(angle, 2),
+                "involute_length_mm": round(length, 3),
+            }
+        if family in ("cic", "free_form"):
+            profile["tip_arc_angle_deg"] = round(tip, 2)
+        if family == "free_form":  # It follows a CIC profile.
+            near = ProfileConfig.model_validate(profile | {"family": "cic"})
+            profile = free_form_of(near, COEFFICIENTS)[0].model_dump(exclude_none=True)
+        if family == "five_arcs":
+            profile = {key: profile[key] for key in ("family", "lobes", "pitch_radius_mm")} | {
+                "tip_arc_angle_deg": round(tip, 2),
+                "outer_radius_mm": round(draw.uniform(43.5, 45.5), 2),
+                "tip_arc_radius_mm": round(draw.uniform(11.5, 13.5), 2),
+                "tip_arc_turn_deg": round(draw.uniform(45, 65), 1),
+            }
         speed = draw.uniform(1000, 3000) if lively else 10 ** draw.uniform(2.8, 3.7)
         torque = draw.uniform(0.8, 5.0) if lively else 10 ** draw.uniform(-0.2, 1.2)
         play = draw.uniform(0.15, 0.4) if lively else draw.uniform(0.02, 0.3)
@@ -82,7 +102,7 @@ def pairs(seed: int, kind: str) -> Iterator[list[str]]:
         }
         if "scene.load" in "".join(fixed):
             values.pop("scene.load.torque_N_m")
-        yield [f"profile={{{profile}}}", *(f"{k}={v}" for k, v in values.items()), *fixed]
+        yield [f"profile={json.dumps(profile)}", *(f"{k}={v}" for k, v in values.items()), *fixed]
 
 
 @functools.lru_cache(maxsize=4)
@@ -125,6 +145,7 @@ def solved(config: Config, kind: str, method: str) -> tuple[np.ndarray, Any, flo
 def row_of(kind: str, overrides: list[str]) -> Row:
     """Compare both solvers on one pair of design and scene."""
     config = load(CIC, overrides)
+    check_geometry(config)
     row: Row = {"kind": kind, "scene": " ".join(overrides)}
     found = {}
     for method in METHODS:
@@ -166,7 +187,10 @@ def run(
         for number, overrides in enumerate(pairs(seed, kind)):
             if done >= each or number >= PATIENCE * each:
                 break
-            row = row_of(kind, overrides)
+            try:
+                row = row_of(kind, overrides)
+            except InputError:  # The drawn profile is not sound.
+                continue
             if row["shooting_status"] == "periodic" or row["collocation_status"] == "periodic":
                 done += row["shooting_status"] == "periodic"
                 rows.append(row)

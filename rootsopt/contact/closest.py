@@ -55,7 +55,7 @@ _DONE = 16
 # On a wavy flank: maximum number of minima of the gap that are compared, and number of jumps
 # between neighbouring minima that have a flag of their own.
 _MINIMA = 8
-_FLAGS = 3
+RANKS = 3
 # Distance of ν2 (rad) before the cusp at the pitch crossing below which a contact counts as the
 # minimum beyond the cusp. The two minima of the gap are several |ε| apart, and this limit lies
 # between them.
@@ -224,25 +224,40 @@ class FlankPair(eqx.Module):
             # The second minimum lies beyond the cusp or close before it.
             pieces.append(found.normal2 > self.frozen.pitch_normal - _NEAR_CUSP)
         if self.frozen.wavy:
-            pieces += [found.rank > 0.5 + number for number in range(_FLAGS)]
+            pieces += [found.rank > 0.5 + number for number in range(RANKS)]
         return jnp.concatenate([jnp.stack(pieces), beyond])
+
+    @property
+    def edges(self) -> Float[Array, " k"]:
+        """Normal angles (rad) at which one smooth piece of the flank ends: those of `margins`.
+
+        Inner pieces are segments. On a wavy flank they are the spans between knots, whose higher
+        derivatives differ, and the pitch crossing, beyond which rotor 2 is its own addendum, counts
+        as well."""
+        pieces = self.profile.stretches() if self.frozen.wavy else self.profile.segments()[:-1]
+        return jnp.stack([piece.stop for piece in pieces] or [jnp.zeros(())])
 
     def margins(
-        self, roll: Float[Array, ""], found: ClosestApproach, rival: Float[Array, ""]
+        self, roll: Float[Array, ""], found: ClosestApproach, rival: Float[Array, ""] | None = None
     ) -> Float[Array, " s"]:
-        """Return numbers (s,) that are positive where the flags of `switches` are set.
+        """Return numbers (s,) that change their signs where the closest approach changes its piece.
 
-        `roll`, `found`: as in `switches`; `rival`: gap (m) of the other minimum next to a cusp. The
-        flag for a common normal gets 1 or -1, because it changes only where the flanks are apart.
-        """
-        ends = jnp.stack([segment.stop for segment in self.profile.segments()[:-1]] or [0.0])
+        They are positive where the flags of `switches` are set; there is one for each of `edges`
+        and each rotor. The number for a common normal is 1 or -1, because it changes only where the
+        flanks are apart.
+
+        `roll`, `found`: as in `switches`; `rival`: gap (m) of the other minimum next to a cusp, if
+        known. The number for this minimum then passes smoothly through zero."""
         normals = jnp.stack([found.normal1, found.normal2])
-        beyond = (normals[:, None] - ends).ravel()
+        beyond = (normals[:, None] - self.edges).ravel()
         half = self.profile.half_pitch
-        pieces = [jnp.where(found.found, 1.0, -1.0), jnp.sin(jnp.pi / 2 * (roll - half) / half)]
+        numbers = [jnp.where(found.found, 1.0, -1.0), jnp.sin(jnp.pi / 2 * (roll - half) / half)]
         if self.profile.cusp:
-            pieces.append(rival - found.gap)
-        return jnp.concatenate([jnp.stack(pieces), beyond])
+            other = found.normal2 - (self.frozen.pitch_normal - _NEAR_CUSP)
+            numbers.append(other if rival is None else rival - found.gap)
+        if self.frozen.wavy:
+            numbers += [found.rank - 0.5 - number for number in range(RANKS)]
+        return jnp.concatenate([jnp.stack(numbers), beyond])
 
     @eqx.filter_jit  # so that all its calls in one program are traced once
     def _closest(self, roll, relative) -> ClosestApproach:

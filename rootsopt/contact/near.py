@@ -76,8 +76,7 @@ class NearContact(Contact):
 
     def margins(self, roll, approach: Approach) -> Float[Array, " s"]:
         found, rival = approach.place
-        other = found.gap if rival is None else rival.gap
-        return self.pair.margins(roll, found, other)
+        return self.pair.margins(roll, found, None if rival is None else rival.gap)
 
     def _moved(self, which: int, roll, relative) -> ClosestApproach:
         """Return the closest approach after one Newton step from the root with index `which`.

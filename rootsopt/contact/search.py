@@ -64,3 +64,6 @@ class SearchContact(Contact):
 
     def switches(self, roll, approach: Approach):
         return self.pair.switches(roll, approach.place)
+
+    def margins(self, roll, approach: Approach):
+        return self.pair.margins(roll, approach.place)

@@ -116,7 +116,7 @@ def supported(pair: RotorPair) -> bool:
         for margin, flag in names
         if hasattr(owner, flag)
     )
-    searched = isinstance(pair.contact, SearchContact) and not pair.contact.pair.profile.wavy
+    searched = isinstance(pair.contact, SearchContact)
     return known and searched
 
 

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from rootsopt.contact.closest import RANKS
 from rootsopt.contact.search import SearchContact
 from rootsopt.dynamics.collocation.blocks import in_blocks
 from rootsopt.dynamics.collocation.elements import Elements
@@ -92,7 +93,9 @@ def ranks(pair: RotorPair) -> list[int]:
     tau, state = nothing, jnp.zeros(pair.states)
     total = jax.eval_shape(lambda: pair.margins(tau, state).values).shape[0]
     profile = pair.contact.pair.profile
-    pieces = 2 + profile.cusp + 2 * max(len(profile.segments()) - 1, 1)
+    minima = RANKS if profile.wavy else 0
+    edges = jax.eval_shape(lambda: pair.contact.pair.edges).shape[0]
+    pieces = 2 + profile.cusp + minima + 2 * edges
     drags = jax.eval_shape(
         lambda: jnp.concatenate(
             [jnp.zeros(0), *(part.drag_margins(nothing) for part in pair.all_parts if part.rubs)]
@@ -103,6 +106,9 @@ def ranks(pair: RotorPair) -> list[int]:
     order[law] = -1
     if profile.cusp:
         order[law + 2] = 1
+    if profile.wavy:  # These flags also change where the contact moves on without a jump.
+        between = range(law + 2, law + 2 + profile.cusp + RANKS)
+        order = [-1 if k in between else rank for k, rank in enumerate(order)]
     both = order * (1 + pair.two_sided)
     return both + [0] * (total - len(both))
 

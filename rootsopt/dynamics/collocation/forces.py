@@ -30,13 +30,13 @@ from rootsopt.dynamics.collocation.system import (
 _RIVALS, _PLACES = 4, 9
 """Number of elements in which the peak is searched for, and number of instants per element at which
 the force is evaluated in each round."""
-_ROUNDS, _CLOSER = 8, 0.25
+_ROUNDS, _CLOSER = 4, 0.25
 """Number of rounds of the search for the peak, and factor by which the searched range shrinks from
-one round to the next. Next to a smooth peak, the force falls with the square of the distance."""
-_MENDED, _POOR = 3, 2
-"""Number of evaluations at each instant in the first rounds of the search for the peak, and number
-of these rounds. Each evaluation improves the `NearContact.roots` from which the next one starts. In
-later rounds, one evaluation is enough."""
+one round to the next. The vertex of a parabola through the best three instants follows."""
+_MENDED = 3
+"""Number of evaluations at each instant. Each improves the `NearContact.roots` from which the next
+one starts. After a single one, errors of the roots would decide between two instants near the
+peak, where the force hardly changes."""
 
 
 class Peak(NamedTuple):
@@ -110,30 +110,57 @@ def located_peak(
 
     each = jax.vmap(jax.vmap(at, (None, 0, 0)))
 
-    def round_(number, carry):
-        share, roots, _ = carry
-        reach = 0.5 * _CLOSER ** number.astype(force.dtype)
-        tried = jnp.clip(share[:, None] + reach * spread, 0.0, 1.0)
-        first = jax.vmap(lambda k, places: jax.vmap(lambda x: _inside(elements, k, x)[2])(places))
-        poor = number < _POOR
-        begun = jnp.where(poor, first(rivals, tried), roots[:, None])
-        # The polynomial through the roots is inaccurate near the element's ends. The first
-        # evaluations of an instant therefore only improve its roots.
-        forces, new = lax.fori_loop(
-            0,
-            jnp.where(poor, _MENDED, 1),
-            lambda _, found: each(rivals, tried, found[1]),
-            (jnp.zeros_like(tried), begun),
+    def mended(places, roots):
+        """Return the forces (N) at `places` of the rivals, and the improved `roots`."""
+        nothing = jnp.zeros_like(places)
+        return lax.fori_loop(
+            0, _MENDED, lambda _, found: each(rivals, places, found[1]), (nothing, roots)
         )
+
+    pick = jax.vmap(lambda x, i: x[i])
+
+    def round_(number, carry):
+        share, roots, *_ = carry
+        reach = 0.5 * _CLOSER ** number.astype(force.dtype)
+        tried = jnp.clip(share, reach, 1.0 - reach)[:, None] + reach * spread
+        first = jax.vmap(lambda k, places: jax.vmap(lambda x: _inside(elements, k, x)[2])(places))
+        # The polynomial through the roots is inaccurate near the element's ends.
+        begun = jnp.where(number == 0, first(rivals, tried), roots[:, None])
+        forces, new = mended(tried, begun)
         top = jnp.argmax(forces, axis=1)
-        pick = jax.vmap(lambda x, i: x[i])
-        return pick(tried, top), pick(new, top), pick(forces, top)
+        middle = jnp.clip(top, 1, _PLACES - 2)[:, None] + jnp.arange(-1, 2)
+        around = jnp.take_along_axis(tried, middle, 1), jnp.take_along_axis(forces, middle, 1)
+        return pick(tried, top), pick(new, top), pick(forces, top), around
 
     half = jnp.full(_RIVALS, 0.5, force.dtype)
     begun = jnp.zeros((_RIVALS, *elements.roots.shape[2:]), force.dtype)
-    share, roots, best = lax.fori_loop(0, _ROUNDS, round_, (half, begun, half))
+    three = jnp.zeros((_RIVALS, 3), force.dtype)
+    start = half, begun, half, (three, three)
+    share, roots, best, around = lax.fori_loop(0, _ROUNDS, round_, start)
+    vertex = jax.vmap(_vertex)(*around)
+    last, moved = mended(vertex[:, None], roots[:, None])
+    better = last[:, 0] > best
+    best = jnp.where(better, last[:, 0], best)
+    share = jnp.where(better, vertex, share)
+    roots = jnp.where(better[:, None, None], moved[:, 0], roots)
     top = jnp.argmax(best)
     return Peak(rivals[top], share[top], roots[top], best[top])
+
+
+def _vertex(places: Float[Array, " 3"], values: Float[Array, " 3"]) -> Float[Array, ""]:
+    """Return the place of the vertex of the parabola through three points.
+
+    It is between the outer `places`; if the parabola has no maximum there, it is the middle one."""
+    middle = places[1]
+    left, right = places[1] - places[0], places[2] - places[1]
+    known = (left > 0) & (right > 0)
+    fall = jnp.where(known, (values[1] - values[0]) / jnp.where(known, left, 1.0), 0.0)
+    rise = jnp.where(known, (values[2] - values[1]) / jnp.where(known, right, 1.0), 0.0)
+    bend = (rise - fall) / jnp.where(known, (left + right) / 2, 1.0)
+    slope = (fall * right + rise * left) / jnp.where(known, left + right, 1.0)
+    bends = known & (bend < 0)
+    step = jnp.where(bends, -slope / jnp.where(bends, bend, -1.0), 0.0)
+    return jnp.clip(middle + step, places[0], places[2])
 
 
 @eqx.filter_jit

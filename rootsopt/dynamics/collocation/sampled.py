@@ -7,9 +7,15 @@ from rootsopt.dynamics.collocation.elements import Elements
 from rootsopt.dynamics.collocation.forces import OrbitForces, origin
 from rootsopt.dynamics.flow import Flow
 
-PARTS = 4
-"""Number of steps into which an element is divided. A step of an explicit method of the order of
-the elements is then at least as accurate as the element."""
+_CUTS = (1e-6, 0.25, 0.5, 0.75, 1 - 1e-6, 1.0)
+"""Ends of the steps into which an element is divided, as fractions of its length.
+
+A step of an explicit method of the order of the elements is then at least as accurate as the
+element. An element may end at an event, where the derivatives of the equation jump. The steps
+beside the ends are short, since one of their stages lies exactly there and gets the derivatives of
+the other side."""
+PARTS = len(_CUTS)
+"""Number of steps into which an element is divided."""
 
 
 def as_flow(found: OrbitForces, samples: int, steps: int) -> Flow:
@@ -48,12 +54,12 @@ def _steps(elements: Elements, room: int) -> tuple[Float[Array, " steps"], Float
     `room`: size of the returned arrays; unused ends are inf."""
     mesh = elements.mesh
     number = jnp.arange(min(room, PARTS * mesh.left.shape[0]))
-    place, part = number // PARTS, number % PARTS + 1
+    place, part = number // PARTS, jnp.asarray(_CUTS, mesh.left.dtype)[number % PARTS]
     first = origin(elements)
     used = jnp.maximum(mesh.used, 1)
     k = jnp.mod(first + place, used)
     begin, length = mesh.ends[0], mesh.lengths
-    tau = begin[k] + length[k] * part / PARTS
+    tau = begin[k] + length[k] * part
     # Elements before φ1 = 0 come last. The last step ends after exactly one period.
     turns = jnp.where(first + place >= used, mesh.period, 0.0)
     last = PARTS * mesh.used - 1

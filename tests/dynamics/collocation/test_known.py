@@ -9,11 +9,12 @@ import pytest
 
 import rootsopt
 from rootsopt.dynamics.collocation.elements import Elements, Mesh
-from rootsopt.dynamics.collocation.forces import OrbitForces, Peak
+from rootsopt.dynamics.collocation.equation import CollocatedEquation
+from rootsopt.dynamics.collocation.forces import OrbitForces, Peak, located_peak
 from rootsopt.dynamics.collocation.gauss import GAUSS, POINTS
 from rootsopt.dynamics.collocation.known import Known, trimmed
 from rootsopt.dynamics.collocation.mesh import roughness, sizes
-from rootsopt.dynamics.collocation.sampled import as_flow
+from rootsopt.dynamics.collocation.sampled import PARTS, as_flow
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.orbits import Built, OrbitStore, _Closed, _key
 from rootsopt.status import Status
@@ -66,16 +67,19 @@ def test_orbit_sampled_as_steps_is_the_motion_over_one_period():
         peak=Peak(jnp.asarray(8), jnp.asarray(0.5), jnp.zeros((1, 2)), nothing),
         correction=nothing,
     )
-    flow = as_flow(found, samples=16, steps=64)
+    flow = as_flow(found, samples=16, steps=64 + PARTS * USED)
     assert bool(flow.solved)
-    ends = np.asarray(flow.grid)[: 4 * USED]
+    ends = np.asarray(flow.grid)[: PARTS * USED]
     assert np.all(np.diff(ends) > 0)
     np.testing.assert_allclose(ends[-1], PERIOD, rtol=1e-15)
-    assert np.all(np.isinf(flow.grid[40:]))
-    np.testing.assert_allclose(flow.corners[:40, 0], np.sin(TURN * ends), atol=1e-5)
+    # Beside an element's ends, which may be events, steps are short: see `sampled`.
+    beside = np.diff(ends, prepend=0.0).reshape(USED, PARTS)[:, [0, -1]]
+    assert np.all(beside < 1e-6)
+    assert np.all(np.isinf(flow.grid[PARTS * USED :]))
+    np.testing.assert_allclose(flow.corners[: PARTS * USED, 0], np.sin(TURN * ends), atol=1e-5)
     np.testing.assert_allclose(flow.states[:, 0], np.sin(TURN * np.arange(16) / 8), atol=1e-5)
     np.testing.assert_allclose(float(flow.peak_time), 0.15)
-    assert not bool(as_flow(found, samples=16, steps=39).solved)
+    assert not bool(as_flow(found, samples=16, steps=PARTS * USED - 1).solved)
 
 
 def test_known_orbit_is_cut_to_the_size_of_its_period():
@@ -139,6 +143,73 @@ def test_orbits_of_a_former_process_are_computed_when_asked_for():
     assert made == list(range(1501))
 
 
+class _Bump(CollocatedEquation):
+    """An equation whose force is known in closed form.
+
+    A force depends on the roots as that of `NearContact` does: its error, and that of the improved
+    roots, is of second order in the roots' distance from the truth."""
+
+    place: float
+    corner: float
+
+    def __init__(self, place, corner):
+        self.pair = self.measures = self.top = None  # pyright: ignore[reportAttributeAccessIssue]
+        self.place, self.corner = place, corner
+
+    def true(self, tau):
+        away = tau - self.place
+        smooth = 200.0 - 3e4 * away**2 + 5e3 * away**3
+        return jnp.where(away > 0, smooth - 400.0 * self.corner * away, smooth)
+
+    def force(self, tau, state, roots):
+        del state
+        error = roots - jnp.sin(5.0 * tau)
+        return self.true(tau) + 1e3 * jnp.max(error**2), roots - error + error**2
+
+
+@pytest.mark.parametrize(
+    ("place", "corner"),
+    [
+        (0.8, 0.0),
+        (0.8004, 0.0),
+        (0.78571, 0.0),
+        (0.3 + 1.7 * 3 / 7, 1.0),
+        (0.6501, 0.0),
+        (1.03, 0.0),
+    ],
+)
+def test_peak_is_located(place, corner):
+    """The peak lies beside or at an element's end, or in its middle, or is a corner at an end."""
+    elements = _known().elements
+    tau, _ = elements.places
+    bump = _Bump(place, corner)
+    roots = jnp.broadcast_to(jnp.sin(5.0 * tau)[..., None, None], elements.roots.shape)
+    elements = elements._replace(roots=roots + 1e-3)
+    found = located_peak(bump, elements, bump.true(tau[:, :POINTS]))
+    begin, length = elements.mesh.ends[0][found.element], elements.mesh.lengths[found.element]
+    where = float(begin + length * found.share)
+    np.testing.assert_allclose(where, place, atol=2e-7)
+    np.testing.assert_allclose(float(found.force), 200.0, rtol=1e-12)
+
+
+@pytest.mark.long
+def test_free_form_from_a_neighbour_is_that_by_shooting():
+    """Elements end at its knots too, and gradients with respect to its coefficients are exact."""
+    config = rootsopt.load_config("configs/free.yaml")
+    evaluator = Evaluator.of(config).from_neighbours()
+    base = evaluator(series=False)
+    wave = 1 + 2e-3 * np.cos(3.0 * np.arange(len(base.design)))
+    design = np.array(list(base.design.values())) * wave
+    near = evaluator(design, start=base.state, series=False)
+    assert near.statistics["from_neighbour"] == 1
+    exact = config.replaced({"solver.orbit": "shooting", "solver.rtol": 1e-10})
+    usual = Evaluator.of(exact)(design, series=False)
+    for force, value in usual.response.items():
+        np.testing.assert_allclose(near.response[force], value, rtol=1e-6)
+        slopes = np.array([list(one.gradient[force].values()) for one in (near, usual)])
+        np.testing.assert_allclose(slopes[0], slopes[1], rtol=0, atol=3e-4 * np.max(np.abs(slopes)))
+
+
 @pytest.mark.parametrize("name", ["cic", pytest.param("ee", marks=pytest.mark.long)])
 def test_orbit_from_a_neighbour_is_that_by_shooting(name):
     """The neighbour was closed by shooting, too. At half the speed, other events occur."""
@@ -166,3 +237,24 @@ def test_orbit_from_a_neighbour_is_that_by_shooting(name):
     again = evaluator.at_speed(config.scene.speed_rpm * 1.006)
     near = evaluator.at_speed(config.scene.speed_rpm * 1.003)(start=base.state, series=False)
     assert again(start=near.state, series=False).statistics["from_neighbour"] == 1
+
+
+def test_maxima_near_a_neighbour_are_those_by_shooting():
+    """At this speed, some of the local maxima follow events."""
+    config = rootsopt.load_config("configs/cic.yaml", ["scene.speed_rpm=1000"])
+    evaluator = Evaluator.of(config).from_neighbours().with_maxima()
+    fresh = dataclasses.replace(evaluator, orbits=OrbitStore())
+    base = evaluator(series=False)
+    for factor in (0.998, 0.999, 1.003):
+        design = factor * np.array(list(base.design.values()))
+        near = evaluator(design, start=base.state, series=False)
+        usual = fresh(design, start=base.state, series=False)
+        assert near.statistics["from_neighbour"] == 1
+        assert "from_neighbour" not in usual.statistics
+        one, other = near.maxima, usual.maxima
+        assert one is not None
+        assert other is not None
+        assert len(one.forces) == len(other.forces) == 5
+        np.testing.assert_allclose(one.forces, other.forces, rtol=1e-6)
+        size = np.max(np.abs(other.slopes), axis=1, keepdims=True)
+        np.testing.assert_allclose(one.slopes / size, other.slopes / size, rtol=0, atol=1e-2)
