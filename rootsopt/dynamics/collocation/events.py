@@ -92,9 +92,10 @@ def ranks(pair: RotorPair) -> list[int]:
     law = jax.eval_shape(pair.law.margins, nothing, nothing).shape[0]
     tau, state = nothing, jnp.zeros(pair.states)
     total = jax.eval_shape(lambda: pair.margins(tau, state).values).shape[0]
-    profile = pair.contact.pair.profile
+    flanks = pair.contact.pair
+    profile = flanks.profile
     minima = RANKS if profile.wavy else 0
-    edges = jax.eval_shape(lambda: pair.contact.pair.edges).shape[0]
+    edges = jax.eval_shape(lambda: flanks.edges).shape[0]
     pieces = 2 + profile.cusp + minima + 2 * edges
     drags = jax.eval_shape(
         lambda: jnp.concatenate(
