@@ -106,8 +106,8 @@ class _Loop(NamedTuple):
 def supported(pair: RotorPair) -> bool:
     """Return whether collocation can close orbits of `pair`.
 
-    The contact must be a `SearchContact` of flanks that are not wavy (`Profile.wavy`). Every flag
-    of contact law and parts needs a margin (see `Margins`)."""
+    The contact must be a `SearchContact`. Every flag of contact law and parts needs a margin (see
+    `Margins`)."""
     owners = [pair.law, *pair.all_parts]
     names = [("margins", "switches"), ("drag_margins", "drag_switches")]
     known = all(

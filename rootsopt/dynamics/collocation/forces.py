@@ -148,19 +148,16 @@ def located_peak(
 
 
 def _vertex(places: Float[Array, " 3"], values: Float[Array, " 3"]) -> Float[Array, ""]:
-    """Return the place of the vertex of the parabola through three points.
+    """Return the place of the vertex of the parabola through three points, in ascending order.
 
-    It is between the outer `places`; if the parabola has no maximum there, it is the middle one."""
-    middle = places[1]
+    It is limited to the span of `places`. If the parabola has no maximum, it is the middle one."""
     left, right = places[1] - places[0], places[2] - places[1]
-    known = (left > 0) & (right > 0)
-    fall = jnp.where(known, (values[1] - values[0]) / jnp.where(known, left, 1.0), 0.0)
-    rise = jnp.where(known, (values[2] - values[1]) / jnp.where(known, right, 1.0), 0.0)
-    bend = (rise - fall) / jnp.where(known, (left + right) / 2, 1.0)
-    slope = (fall * right + rise * left) / jnp.where(known, left + right, 1.0)
-    bends = known & (bend < 0)
+    before, after = (values[1] - values[0]) / left, (values[2] - values[1]) / right
+    bend = 2 * (after - before) / (left + right)
+    slope = (before * right + after * left) / (left + right)
+    bends = bend < 0
     step = jnp.where(bends, -slope / jnp.where(bends, bend, -1.0), 0.0)
-    return jnp.clip(middle + step, places[0], places[2])
+    return jnp.clip(places[1] + step, places[0], places[2])
 
 
 @eqx.filter_jit
