@@ -229,11 +229,11 @@ class FlankPair(eqx.Module):
 
     @property
     def edges(self) -> Float[Array, " k"]:
-        """Normal angles (rad) at which one smooth piece of the flank ends: those of `margins`.
+        """Normal angles (rad) at which a smooth piece of the flank ends (see `margins`).
 
-        Inner pieces are segments. On a wavy flank they are the spans between knots, whose higher
-        derivatives differ, and the pitch crossing, beyond which rotor 2 is its own addendum, counts
-        as well."""
+        These are the ends of the segments, without the pitch crossing. On a wavy flank they are the
+        knots, where higher derivatives jump, and the pitch crossing, where rotor 2's dedendum
+        ends."""
         pieces = self.profile.stretches() if self.frozen.wavy else self.profile.segments()[:-1]
         return jnp.stack([piece.stop for piece in pieces] or [jnp.zeros(())])
 
