@@ -12,7 +12,7 @@ PURE = ("turning", "rolling", "order")
 """Names of the margins that are angles or ratios. All other margins are lengths, or lengths per
 angle."""
 _POINTS = 400
-"""Number of points per segment at which margins are evaluated."""
+"""Number of points per smooth part of a flank at which margins are evaluated."""
 
 
 class ProfileMargins(NamedTuple):
@@ -49,11 +49,13 @@ class ProfileMargins(NamedTuple):
 def margins(profile: Profile) -> ProfileMargins:
     """Return the margins of a profile.
 
-    Least values along the flank are taken over `_POINTS` points per segment. Both sides of a joint
-    are evaluated. Between the points, a minimum is that of the parabola through three points."""
-    segments = profile.segments()
-    start = jnp.stack([s.start for s in segments])[:, None]
-    length = jnp.stack([s.stop for s in segments])[:, None] - start
+    Least values along the flank are taken over `_POINTS` points per smooth part: a segment, or a
+    knot span of a wavy flank. Both sides of a joint are evaluated. Between the points, a minimum is
+    that of the parabola through three points. No parabola crosses a joint or a knot, where it might
+    fall below all values of the flank."""
+    parts = profile.stretches() if profile.wavy else profile.segments()
+    start = jnp.stack([s.start for s in parts])[:, None]
+    length = jnp.stack([s.stop for s in parts])[:, None] - start
     nu = start + length * jnp.linspace(1e-9, 1 - 1e-9, _POINTS)
     point, addendum, dedendum = profile.speeds(nu)
     r = profile.pitch_radius
@@ -71,7 +73,7 @@ def margins(profile: Profile) -> ProfileMargins:
         return jnp.min(jnp.where(present, values, jnp.inf))
 
     return ProfileMargins(
-        turning=jnp.min(length),
+        turning=jnp.min(jnp.stack([s.stop - s.start for s in profile.segments()])),
         convexity=least(addendum),
         reach=least(r - jnp.abs(lever)),
         fall=least(lever),

@@ -212,6 +212,19 @@ def test_profile_that_does_not_mesh_is_refused():
             check(free(f"profile.coefficients={shares}").profile)
 
 
+@pytest.mark.parametrize("last", [0.7, 0.9, 0.95])
+def test_coefficients_may_reach_their_bound(last):
+    """A flank that begins as an arc centred on the pitch circle (τ = 1) is sound.
+
+    The roll angle rises from its constant value at a knot. No value is below those at the points:
+    a parabola across the knot would claim so. Just above the bound, the roll angle turns back."""
+    shares = np.array([1, 1, 1, 1, 1, last, 0.2, 0.4, 0.15, 0.15, 0, 0])
+    config = free("profile.tip_arc_angle_deg=0", f"profile.coefficients={shares.tolist()}").profile
+    check(config)
+    with pytest.raises(InputError, match="two points of a flank would mesh at once"):
+        check(with_design(config, [0.0, *(shares + 1e-6 * (shares == 1))]))
+
+
 def test_profile_command_projects(tmp_path, capsys):
     """`--project` writes a config of the same pair, within the distance that it prints."""
     from rootsopt.commands import profile as command
