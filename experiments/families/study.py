@@ -4,8 +4,8 @@ Every given config is a reference, which sets pitch radius, outer radius (the bo
 and area efficiency. Each classical family gets the pitch radius and the outer radius of the
 reference. Its area efficiency must be at least that of the reference, or the family's maximum if
 that is less. The other parameters are optimised in the config's scene. The objective is the average
-of mean and peak force, each relative to the reference's. The free form starts from the best family.
-The optimised designs are then simulated in further scenes.
+of mean and peak force, each relative to the reference's. The free form starts from the best two
+families. The optimised designs are then simulated in further scenes.
 """
 
 import functools
@@ -44,6 +44,8 @@ TRIED = 6
 search."""
 COEFFICIENTS = 12
 """Number of coefficients of the free form."""
+STARTS = 2
+"""Number of families from which a free form is optimised. The best result is kept."""
 SCENES: dict[str, dict[str, Any]] = {
     "1000 rpm": {"speed_rpm": 1000.0},
     "6000 rpm": {"speed_rpm": 6000.0},
@@ -197,11 +199,13 @@ def one_family(path: str, family: str, quick: bool) -> dict[str, Any] | None:
     }
 
 
-def free_start(rows: list[Row]) -> tuple[Row, Config, Config]:
-    """Return the best of the `rows` that a free form can follow, its config, and the free form's.
+def free_starts(rows: list[Row], count: int) -> list[tuple[Row, Config, Config]]:
+    """Return the best `count` of the `rows` that a free form can follow, each with its config and
+    the free form's.
 
     A flank that meshes all at once, such as the arc of `circle_epicycloid`, has no sound free form.
     """
+    found: list[tuple[Row, Config, Config]] = []
     refusal: InputError | None = None
     for row in sorted(rows, key=lambda row: row["objective"]):
         config = parse(row["config"])
@@ -212,16 +216,19 @@ def free_start(rows: list[Row]) -> tuple[Row, Config, Config]:
         except InputError as error:
             refusal = error
         else:
-            return row, config, free
-    assert refusal is not None
-    raise refusal
+            found.append((row, config, free))
+        if len(found) == count:
+            break
+    if not found and refusal is not None:
+        raise refusal
+    return found
 
 
-def free_form(path: str, rows: list[Row], quick: bool) -> Row:
-    """Optimise a free form, starting from the best family of the `rows`. Return its row."""
+def free_form(path: str, begun: tuple[Row, Config, Config], quick: bool) -> Row:
+    """Optimise a free form from `begun`, one of the `free_starts`. Return its row."""
     began = time.perf_counter()
     _, base = reference_of(path, quick)
-    best, given, config = free_start(rows)
+    best, given, config = begun
     start = profile_of(given)
     settings: dict[str, Any] = {"bounds": {"tip_arc_angle_deg": (0.0, 45 / given.profile.lobes)}}
     settings |= SEARCH_FREE | ({"iterations": 2} if quick else {})
@@ -274,10 +281,11 @@ def run(
         for path in paths:
             own = [row for row in rows if row["study"] == Path(path).stem and row["reached"]]
             own = [row for row in own if np.isfinite(row["objective"])]
-            if own:
-                free.append(pool.submit(free_form, path, own, quick))
-        for future in free:
-            row = future.result()
-            say(f"{row['study']:8s} free_form {row['objective']:.4f} from {row['begun_at']}")
-            rows.append(row)
+            begun = free_starts(own, 1 if quick else STARTS) if own else []
+            free.append([pool.submit(free_form, path, one, quick) for one in begun])
+        for futures in free:
+            found = [future.result() for future in futures]
+            for row in found:
+                say(f"{row['study']:8s} free_form {row['objective']:.4f} from {row['begun_at']}")
+            rows += sorted(found, key=lambda row: np.nan_to_num(row["objective"], nan=np.inf))[:1]
     return {"references": references, "rows": rows}
