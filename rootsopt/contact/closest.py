@@ -35,10 +35,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.custom_batching import sequential_vmap
+from jax.custom_batching import custom_vmap, sequential_vmap
 from jaxtyping import Array, Bool, Float
 
+from rootsopt.profiles import trigonometry as trig
 from rootsopt.profiles.base import Profile
+from rootsopt.runtime.kept import kept
 
 # Maximum number of Newton steps from the point of perfect rolling; two or three are usual.
 _NEWTON_STEPS = 5
@@ -50,6 +52,8 @@ _CONVERGED = {8: 1e-8, 4: 1e-3}
 _FINISHED = {8: 1e-11, 4: 1e-5}
 # Maximum number of steps inside a bracket; bisection alone needs about fifty.
 _GUARDED_STEPS = 60
+# Number of poses from which, and in groups of which, they may be searched together.
+_MANY = 32
 # Marks a finished search: this is added to the number of attempts.
 _DONE = 16
 # On a wavy flank: maximum number of minima of the gap that are compared, and number of jumps
@@ -121,7 +125,8 @@ class FlankPair(eqx.Module):
 
     `profile`: both rotors' profile; `frozen`: the same profile without derivatives, for the search;
     `nodes`: see `FlankNodes`; `center_distance`: E (m); `rolling`: whether the flanks are conjugate
-    and E is the distance of perfect rolling.
+    and E is the distance of perfect rolling; `together`: whether many poses are searched in groups,
+    which is faster, but takes longer to compile.
     """
 
     profile: Profile
@@ -129,6 +134,7 @@ class FlankPair(eqx.Module):
     nodes: FlankNodes
     center_distance: Float[Array, ""]
     rolling: bool = eqx.field(static=True)
+    together: bool = eqx.field(static=True, default=False)
 
     @classmethod
     def of(
@@ -181,7 +187,8 @@ class FlankPair(eqx.Module):
         )
         distance = 2 * profile.pitch_radius if center_distance is None else center_distance
         dynamic, static = eqx.partition(frozen, eqx.is_inexact_array)
-        dynamic, nodes = _materialized((dynamic, nodes), nodes.normal[-1] > -jnp.inf)
+        # Otherwise, XLA would compute the sines of the nodes again at every pose.
+        dynamic, nodes = kept((dynamic, nodes))
         rolling = center_distance is None and profile.conjugate
         return cls(profile, eqx.combine(dynamic, static), nodes, distance, rolling)
 
@@ -218,7 +225,7 @@ class FlankPair(eqx.Module):
         normals = jnp.stack([found.normal1, found.normal2])
         beyond = (normals[:, None] > ends).ravel()
         half = self.profile.half_pitch
-        mirrored = jnp.sin(jnp.pi / 2 * (roll - half) / half) > 0
+        mirrored = trig.sin(jnp.pi / 2 * (roll - half) / half) > 0
         pieces = [found.found, mirrored]
         if self.profile.cusp:
             # The second minimum lies beyond the cusp or close before it.
@@ -251,7 +258,7 @@ class FlankPair(eqx.Module):
         normals = jnp.stack([found.normal1, found.normal2])
         beyond = (normals[:, None] - self.edges).ravel()
         half = self.profile.half_pitch
-        numbers = [jnp.where(found.found, 1.0, -1.0), jnp.sin(jnp.pi / 2 * (roll - half) / half)]
+        numbers = [jnp.where(found.found, 1.0, -1.0), trig.sin(jnp.pi / 2 * (roll - half) / half)]
         if self.profile.cusp:
             other = found.normal2 - (self.frozen.pitch_normal - _NEAR_CUSP)
             numbers.append(other if rival is None else rival - found.gap)
@@ -272,7 +279,7 @@ class FlankPair(eqx.Module):
 
         @jax.custom_jvp
         def closest(dynamic, roll, relative):
-            return _search_one_by_one(eqx.combine(dynamic, static), roll, relative)
+            return _searched(eqx.combine(dynamic, static), roll, relative)
 
         @closest.defjvp
         def _(primals, tangents):
@@ -312,7 +319,7 @@ class FlankPair(eqx.Module):
         `normal2`: ν1 and ν2 (rad); `roll`: x (rad) from `folded`; `relative`: ε (rad)."""
         mate = self.profile.mate(normal2)
         direction = mate.facing + roll - relative / 2
-        return self.profile.support(normal1), mate.support, jnp.cos(direction)
+        return self.profile.support(normal1), mate.support, trig.cos(direction)
 
     def _mesh(self, normal2, roll, relative):
         """Return (T, G, ν1, q1, q2) at ν2 = `normal2`, as defined in the module's docstring.
@@ -324,8 +331,8 @@ class FlankPair(eqx.Module):
         direction = mate.facing + roll - relative / 2
         lever1 = profile.lever(normal1)
         support = profile.support(normal1) + mate.support
-        gap = self.center_distance * jnp.cos(direction) - support
-        offset = self.center_distance * jnp.sin(direction) - lever1 - mate.lever
+        gap = self.center_distance * trig.cos(direction) - support
+        offset = self.center_distance * trig.sin(direction) - lever1 - mate.lever
         return offset, gap, normal1, lever1, mate.lever
 
     def _search(self, roll, relative, attempt=0):
@@ -341,22 +348,8 @@ class FlankPair(eqx.Module):
         `_MINIMA` then search all intervals, one each. All attempts share one loop, which is
         compiled once.
         """
-        nothing = jnp.zeros_like(roll)
-        none = ClosestApproach(
-            gap=jnp.full_like(roll, self.profile.pitch_radius),
-            lever1=nothing,
-            lever2=nothing,
-            normal1=nothing,
-            normal2=nothing,
-            found=jnp.zeros(roll.shape, bool),
-            rank=nothing,
-        )
-        low, high = self.nodes.normal[0], self.nodes.normal[-1]
-        absent = roll < contact_begins(relative)
-        rolling = (low, high), jnp.clip(self.profile.normal_at(roll), low, high), ~absent, ~absent
-        usual = (relative <= 0) & (relative >= -self.profile.single_turn)
-        if self.profile.cusp:
-            usual &= roll < (1 - 5 * jnp.sqrt(jnp.abs(relative))) * self.profile.half_pitch
+        none, nothing = self._missing(roll), jnp.zeros_like(roll)
+        rolling, usual, absent = self._direct(roll, relative)
 
         def look(carry):
             attempt, best = carry
@@ -377,11 +370,71 @@ class FlankPair(eqx.Module):
             best = jax.tree.map(lambda x, y: jnp.where(direct & ~done, x, y), none, best)
             return jnp.where(done, _DONE, 0) + attempt + 1, best
 
-        trusted = self.rolling and not self.frozen.wavy
-        start = jnp.asarray(attempt if trusted else max(attempt, 1)), none
+        start = jnp.asarray(attempt if self._trusted else max(attempt, 1)), none
         limit = 1 + _MINIMA if self.frozen.wavy else 3
         attempts, best = lax.while_loop(lambda carry: carry[0] < limit, look, start)
         return attempts % _DONE, best
+
+    @property
+    def _trusted(self) -> bool:
+        """Whether a single minimum of the gap between two nodes is the closest approach."""
+        return self.rolling and not self.frozen.wavy
+
+    def _missing(self, roll) -> ClosestApproach:
+        """Return the closest approach of flanks without a common normal, at a `roll` (rad)."""
+        nothing = jnp.zeros_like(roll)
+        return ClosestApproach(
+            gap=jnp.full_like(roll, self.profile.pitch_radius),
+            lever1=nothing,
+            lever2=nothing,
+            normal1=nothing,
+            normal2=nothing,
+            found=jnp.zeros(roll.shape, bool),
+            rank=nothing,
+        )
+
+    def _direct(self, roll, relative):
+        """Return the start of Newton's method at perfect rolling, whether its result may be
+        trusted, and whether the flanks cannot touch yet.
+
+        `roll`, `relative`: as in `_mesh`. The start has the form of the result of `_bracket`."""
+        low, high = self.nodes.normal[0], self.nodes.normal[-1]
+        absent = roll < contact_begins(relative)
+        start = (low, high), jnp.clip(self.profile.normal_at(roll), low, high), ~absent, ~absent
+        usual = (relative <= 0) & (relative >= -self.profile.single_turn)
+        if self.profile.cusp:
+            usual &= roll < (1 - 5 * jnp.sqrt(jnp.abs(relative))) * self.profile.half_pitch
+        return start, usual, absent
+
+    def _search_all(self, roll: Float[Array, " n"], relative: Float[Array, " n"]):
+        """Return the closest approaches at many poses, as `_search` would find them.
+
+        Attempt 1 is made for groups of poses, and `_search` only where attempt 1 does not find
+        exactly one minimum. `roll`, `relative` (n,): as in `_mesh`."""
+        count = roll.size
+
+        def attempt(roll, relative):
+            """Return the closest approach of attempt 1, and whether it is certain."""
+            bracket, guess, present, single = self._bracket(1, roll, relative)
+            found, _ = self._root(bracket, guess, jnp.ones((), bool), roll, relative)
+            gap, normal1, lever1, lever2, normal2 = found
+            _, usual, absent = self._direct(roll, relative)
+            absent &= usual
+            present &= ~absent
+            new = ClosestApproach(gap, lever1, lever2, normal1, normal2, present, 0.0 * gap)
+            new = jax.tree.map(lambda x, y: jnp.where(present, x, y), new, self._missing(roll))
+            return new, single & present | absent
+
+        def one(k, found):
+            place = rest[k]
+            new = self._search(roll[place], relative[place])[1]
+            return jax.tree.map(lambda x, y: x.at[place].set(y), found, new)
+
+        poses = roll, relative
+        with trig.computed_once():
+            found, certain = lax.map(lambda pose: attempt(*pose), poses, batch_size=_MANY)
+        (rest,) = jnp.nonzero(~certain, size=count, fill_value=0)
+        return lax.fori_loop(0, jnp.sum(~certain), one, found)
 
     def _bracket(self, attempt, roll, relative):
         """Return an interval between two nodes where T falls through zero.
@@ -455,7 +508,10 @@ class FlankPair(eqx.Module):
             low, high = jnp.where(left, normal2, low), jnp.where(guarded & ~left, normal2, high)
             new = normal2 - step
             slow = (slope >= 0) | (jnp.abs(step) > 0.5 * jnp.abs(before))
-            halve = guarded & (slow | (new < low) | (new > high))
+            # The root may lie on an end of the bracket. A compiled program may round the step
+            # differently for each result. All results must agree on whether to halve.
+            slack = _FINISHED[size]
+            halve = guarded & (slow | (new < low - slack) | (new > high + slack))
             new = jnp.where(halve, (low + high) / 2, jnp.clip(new, low, high))
             step = jnp.where(halve, (high - low) / 2, step)
             # The gap is stationary at the root: its mean slope is half of that before the step.
@@ -471,22 +527,45 @@ class FlankPair(eqx.Module):
         return found, inside & (jnp.abs(step) < _CONVERGED[size])
 
 
-def _search_one_by_one(pair: FlankPair, roll, relative):
+def _searched(pair: FlankPair, roll, relative):
     """Return the closest approach, without derivatives, for a `roll` from `FlankPair.folded`.
 
-    `relative`: ε (rad). On a CPU, the poses of a batch are searched one at a time. If the flanks
-    are `rolling`, one pose rarely needs the bracketing on all nodes (`FlankPair._bracket`). A batch
-    searched as a whole would do it for every pose."""
+    `relative`: ε (rad). On a CPU, the poses of a batch are searched one at a time, unless the pair
+    is to search them `together`. If the flanks are `rolling`, one pose rarely needs the bracketing
+    on all nodes (`FlankPair._bracket`). A batch searched as a whole would do it for every pose.
+    Batches of pairs are always searched one pair at a time."""
     dynamic, static = eqx.partition(pair, eqx.is_inexact_array)
 
     def search(dynamic, roll, relative):
         pair = eqx.combine(dynamic, static)
         searcher = eqx.tree_at(lambda pair: pair.profile, pair, pair.frozen)
-        return searcher._search(roll, relative)[1]
+        if roll.ndim == 0:
+            return searcher._search(roll, relative)[1]
+        poses = roll.ravel(), relative.ravel()
+        if pair.together and searcher._trusted and roll.size >= _MANY:
+            found = searcher._search_all(*poses)
+        else:
+            found = lax.map(lambda pose: searcher._search(*pose)[1], poses)
+        return jax.tree.map(lambda x: x.reshape(roll.shape), found)
 
-    if jax.default_backend() == "cpu":
-        search = sequential_vmap(search)
-    return search(dynamic, roll, relative)
+    if jax.default_backend() != "cpu":
+        return search(dynamic, roll, relative)
+    poses = custom_vmap(search)
+
+    @poses.def_vmap
+    def _(size, batched, dynamic, *pose):
+        if any(jax.tree.leaves(batched[0])):
+            axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, tuple(batched))
+            found = jax.vmap(sequential_vmap(poses), axes)(dynamic, *pose)
+        else:
+            pose = (
+                x if is_batched else jnp.broadcast_to(x, (size, *x.shape))
+                for x, is_batched in zip(pose, batched[1:], strict=True)
+            )
+            found = poses(dynamic, *pose)
+        return found, jax.tree.map(lambda _: True, found)
+
+    return poses(dynamic, roll, relative)
 
 
 def contact_begins(relative: Float[Array, ""]) -> Float[Array, ""]:
@@ -494,20 +573,6 @@ def contact_begins(relative: Float[Array, ""]) -> Float[Array, ""]:
 
     Contact starts about √|ε| (rad) before the tip passes the line of centres."""
     return -(2 * jnp.sqrt(jnp.maximum(-relative, 0.0)) + 0.02)
-
-
-def _materialized(tree, true):
-    """Return `tree` unchanged, and keep XLA from fusing its arrays with the code that uses them.
-
-    Otherwise, XLA would recompute the sines of the nodes at every pose. A loop of unknown length
-    prevents this, whereas XLA drops optimisation barriers on CPUs. `true`: a traced value that is
-    always true, unknown to the compiler."""
-
-    def copy(carry):
-        return carry[0] + 1, tree
-
-    start = jnp.zeros((), int), jax.tree.map(jnp.zeros_like, tree)
-    return lax.while_loop(lambda carry: carry[0] < true.astype(int), copy, start)[1]
 
 
 def _circle(angle):
@@ -527,5 +592,5 @@ def _rotate(directions, angle):
     """Return the cosines and sines (2, n) of angles, after adding `angle` (rad) to each of them.
 
     `directions` (2, n): cosines and sines of the original angles."""
-    cos, sin = jnp.cos(angle), jnp.sin(angle)
+    cos, sin = trig.cos(angle), trig.sin(angle)
     return cos * directions[0] - sin * directions[1], cos * directions[1] + sin * directions[0]

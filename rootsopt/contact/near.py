@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 from rootsopt.contact.closest import ClosestApproach, FlankPair, contact_begins
 from rootsopt.contact.gap import Approach, Contact
 from rootsopt.contact.point import ContactPoint, contact_point
+from rootsopt.profiles import trigonometry as trig
 
 _FARTHEST = 0.06
 """Magnitude of the Newton step (rad) above which the flanks count as having no common normal."""
@@ -85,9 +86,10 @@ class NearContact(Contact):
         pair = self.pair
         root = lax.stop_gradient(self.roots[0, which]) + _ASIDE
         folded, mirrored = pair.folded(roll)
-        here, turned = jax.jvp(
-            lambda normal: pair._mesh(normal, folded, relative), (root,), (jnp.ones_like(root),)
-        )
+        with trig.computed_once():
+            here, turned = jax.jvp(
+                lambda normal: pair._mesh(normal, folded, relative), (root,), (jnp.ones_like(root),)
+            )
         turned = lax.stop_gradient(turned)
         offset, gap, normal1, lever1, lever2 = here
         falls = turned[0] < 0

@@ -8,6 +8,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from rootsopt.profiles import trigonometry as trig
 from rootsopt.profiles.base import Profile, Segment
 
 
@@ -97,7 +98,7 @@ class Arcs(Profile):
         return jnp.sum(nu[..., None] > self.joints[1:-1], axis=-1)
 
     def lever(self, nu):
-        return self.lever_from(nu, jnp.cos(nu), jnp.sin(nu))
+        return self.lever_from(nu, trig.cos(nu), trig.sin(nu))
 
     def lever_from(self, nu, cos, sin):
         x, y = jnp.moveaxis(self.center[self._arc(nu)], -1, 0)
@@ -106,7 +107,7 @@ class Arcs(Profile):
     def support(self, nu):
         arc = self._arc(nu)
         x, y = jnp.moveaxis(self.center[arc], -1, 0)
-        return x * jnp.cos(nu) + y * jnp.sin(nu) + self.radius[arc]
+        return x * trig.cos(nu) + y * trig.sin(nu) + self.radius[arc]
 
     def roll_angle(self, nu):
         return nu - jnp.arcsin(self.lever(nu) / self.pitch_radius)

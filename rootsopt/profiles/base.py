@@ -33,6 +33,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from rootsopt.profiles import trigonometry as trig
+
 _BRACKETS = 16
 """Number of equal intervals into which a segment is divided. The search for the normal angle at a
 given roll angle starts in one of these intervals."""
@@ -168,13 +170,13 @@ class Profile(eqx.Module):
         """Return the moment arm r cos ψ (m) of the contact normal about the rotor's axis.
 
         `nu`: normal angle (rad)."""
-        return self.pitch_radius * jnp.sin(nu - self.roll_angle(nu))
+        return self.pitch_radius * trig.sin(nu - self.roll_angle(nu))
 
     def support(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """Return the support function P·n = r sin ψ + s (m) of the addendum at `nu` (rad).
 
         Its derivative with respect to ν is -lever."""
-        arm = self.pitch_radius * jnp.cos(nu - self.roll_angle(nu))
+        arm = self.pitch_radius * trig.cos(nu - self.roll_angle(nu))
         return arm + self.contact_distance(nu)
 
     def mate(self, nu: Float[Array, "*n"], support: bool = True) -> Mate:

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from rootsopt.profiles import trigonometry as trig
 from rootsopt.profiles.base import Profile, Segment
 
 
@@ -94,7 +95,7 @@ class CIC(Profile):
 
         `turn`: normal angle (rad) measured from the arc's start."""
         c, r = self.arc_center_radius, self.pitch_radius
-        return c * jnp.cos(turn) - jnp.sqrt(r**2 - (c * jnp.sin(turn)) ** 2)
+        return c * trig.cos(turn) - jnp.sqrt(r**2 - (c * trig.sin(turn)) ** 2)
 
     def _arc_turn(self, nu):
         """Return the angle (rad) from the arc's start to the normal angle `nu` (rad), clamped to
@@ -105,7 +106,7 @@ class CIC(Profile):
         turn = self._arc_turn(nu)
         slide = self._arc_slide(turn)
         arc = self.tip_arc_angle + jnp.arctan2(
-            -slide * jnp.sin(turn), self.arc_center_radius - slide * jnp.cos(turn)
+            -slide * trig.sin(turn), self.arc_center_radius - slide * trig.cos(turn)
         )
         involute = nu - jnp.pi / 2 + self.pressure_angle
         beyond_land = jnp.where(nu > self.arc_end, involute, arc)
@@ -119,7 +120,7 @@ class CIC(Profile):
         # Off the arc, use any turn that keeps the pitch point away from the centre.
         turn = jnp.where(on_arc, roll_angle - self.tip_arc_angle, jnp.pi / 2)
         r, c = self.pitch_radius, self.arc_center_radius
-        arc = self.tip_arc_angle + jnp.arctan2(r * jnp.sin(turn), r * jnp.cos(turn) - c)
+        arc = self.tip_arc_angle + jnp.arctan2(r * trig.sin(turn), r * trig.cos(turn) - c)
         before_involute = jnp.where(on_arc, arc, roll_angle)
         return jnp.where(involute, roll_angle + jnp.pi / 2 - self.pressure_angle, before_involute)
 
@@ -132,14 +133,14 @@ class CIC(Profile):
     def lever(self, nu):
         # Normals of the land pass through the axis, those of the arc through its centre, and
         # those of the involute touch the base circle. No roll angle is needed.
-        arc = self.arc_center_radius * jnp.sin(self._arc_turn(nu))
+        arc = self.arc_center_radius * trig.sin(self._arc_turn(nu))
         return jnp.where(nu > self.arc_end, self.base_radius, arc)
 
     def support(self, nu):
         turn = self._arc_turn(nu)
-        arc = self.arc_center_radius * jnp.cos(turn) + self.arc_radius
+        arc = self.arc_center_radius * trig.cos(turn) + self.arc_radius
         beta = nu - jnp.pi / 2 + self.pressure_angle
-        reach = self.pitch_radius * jnp.sin(self.pressure_angle)
+        reach = self.pitch_radius * trig.sin(self.pressure_angle)
         involute = reach + self.base_radius * (self.half_pitch - beta)
         return jnp.where(nu > self.arc_end, involute, arc)
 

@@ -12,6 +12,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from rootsopt.profiles import trigonometry as trig
 from rootsopt.profiles.base import Profile, Quadrature, Segment
 
 INTERVALS = 48
@@ -171,13 +172,13 @@ class Curve(Profile):
         return self._support(*self._place(self._mirrored(nu)[0]))
 
     def lever(self, nu):
-        return self.pitch_radius * jnp.cos(self._pressure_angle(nu))
+        return self.pitch_radius * trig.cos(self._pressure_angle(nu))
 
     def roll_angle(self, nu):
         return nu - jnp.pi / 2 + self._pressure_angle(nu)
 
     def contact_distance(self, nu):
-        return self.support(nu) - self.pitch_radius * jnp.sin(self._pressure_angle(nu))
+        return self.support(nu) - self.pitch_radius * trig.sin(self._pressure_angle(nu))
 
     def normal_at(self, roll_angle):
         begins = self.node - jnp.pi / 2 + self.series[:, 0]

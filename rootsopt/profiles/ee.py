@@ -4,6 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from rootsopt.profiles import trigonometry as trig
 from rootsopt.profiles.base import Profile, Segment
 
 
@@ -36,7 +37,7 @@ class EE(Profile):
 
     def contact_distance(self, nu):
         beyond_pitch = self.lobes * (self.half_pitch - self.roll_angle(nu))
-        return self.pitch_radius / self.lobes * jnp.sin(beyond_pitch)
+        return self.pitch_radius / self.lobes * trig.sin(beyond_pitch)
 
     @property
     def single_turn(self) -> float:

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from rootsopt.profiles import trigonometry as trig
 from rootsopt.profiles.base import Profile, Segment
 
 
@@ -70,10 +71,10 @@ class TippedEpicycloid(Profile):
         return (self._stop - nu) * r / (r + 2 * rolling)
 
     def _lever(self, nu):
-        return self.pitch_radius * jnp.cos(self._psi(nu))
+        return self.pitch_radius * trig.cos(self._psi(nu))
 
     def _support(self, nu):
-        return (self.pitch_radius + 2 * self.rolling_radius) * jnp.sin(self._psi(nu))
+        return (self.pitch_radius + 2 * self.rolling_radius) * trig.sin(self._psi(nu))
 
     def _on_arc(self, nu):
         """Return (whether the normal angle `nu` is on the arc, `nu` on the arc and 0 elsewhere)."""
@@ -82,7 +83,7 @@ class TippedEpicycloid(Profile):
 
     def _tilt(self, nu):
         """Return ν - β (rad) on the tip arc at the normal angle `nu` (rad)."""
-        return jnp.arcsin(self.arc_center_radius * jnp.sin(nu) / self.pitch_radius)
+        return jnp.arcsin(self.arc_center_radius * trig.sin(nu) / self.pitch_radius)
 
     def roll_angle(self, nu):
         on_arc, here = self._on_arc(nu)
@@ -92,15 +93,15 @@ class TippedEpicycloid(Profile):
     def contact_distance(self, nu):
         on_arc, here = self._on_arc(nu)
         c, r = self.arc_center_radius, self.pitch_radius
-        arc = self.arc_radius + c * jnp.cos(here) - r * jnp.cos(self._tilt(here))
-        return jnp.where(on_arc, arc, 2 * self.rolling_radius * jnp.sin(self._psi(nu)))
+        arc = self.arc_radius + c * trig.cos(here) - r * trig.cos(self._tilt(here))
+        return jnp.where(on_arc, arc, 2 * self.rolling_radius * trig.sin(self._psi(nu)))
 
     def lever(self, nu):
-        arc = self.arc_center_radius * jnp.sin(nu)
+        arc = self.arc_center_radius * trig.sin(nu)
         return jnp.where(nu < self.joint, arc, self._lever(nu))
 
     def support(self, nu):
-        arc = self.arc_radius + self.arc_center_radius * jnp.cos(nu)
+        arc = self.arc_radius + self.arc_center_radius * trig.cos(nu)
         return jnp.where(nu < self.joint, arc, self._support(nu))
 
     def normal_at(self, roll_angle):

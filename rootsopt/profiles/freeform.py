@@ -10,6 +10,7 @@ from jax import lax
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
+from rootsopt.profiles import trigonometry as trig
 from rootsopt.profiles.base import Profile, Quadrature, Segment
 from rootsopt.runtime.programs import Program
 
@@ -146,7 +147,7 @@ class FreeForm(Profile):
         nodes, weights = (jnp.asarray(x, self.width.dtype) for x in (_NODES, _WEIGHTS))
         rest = (1 - share)[..., None]
         at = share[..., None] + rest * (1 + nodes) / 2
-        lever = self.pitch_radius * jnp.cos(self._psi(span[..., None], at))
+        lever = self.pitch_radius * trig.cos(self._psi(span[..., None], at))
         return self.width / 2 * jnp.sum(lever * rest * weights, axis=-1)
 
     def _pressure(self, nu):
@@ -157,7 +158,7 @@ class FreeForm(Profile):
         return nu + (self._pressure(nu) - jnp.pi / 2)
 
     def lever(self, nu):
-        free = self.pitch_radius * jnp.cos(self._psi(*self._place(nu)))
+        free = self.pitch_radius * trig.cos(self._psi(*self._place(nu)))
         return jnp.where(nu < self.tip_arc_angle, 0.0, free)
 
     def support(self, nu):
@@ -165,7 +166,7 @@ class FreeForm(Profile):
         return self.beyond[span] + self._within(span, share)
 
     def contact_distance(self, nu):
-        return self.support(nu) - self.pitch_radius * jnp.sin(self._pressure(nu))
+        return self.support(nu) - self.pitch_radius * trig.sin(self._pressure(nu))
 
     def normal_at(self, roll_angle):
         width, tip = self.width, self.tip_arc_angle

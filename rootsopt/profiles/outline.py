@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from rootsopt.profiles import trigonometry as trig
 from rootsopt.profiles.base import Mate, Profile, RollPoint, Segment
 
 
@@ -76,7 +77,7 @@ class Outline(Profile):
         support, lever = self.crown(inside)
         # Distance of the centre of curvature from the axis, along the normal.
         along = jnp.where(beyond > 0, self.crown.slope[-1, 1], self.crown.slope[0, 1])
-        cos, sin = jnp.cos(beyond), jnp.sin(beyond)
+        cos, sin = trig.cos(beyond), trig.sin(beyond)
         support = support + along * (cos - 1) - lever * sin
         return support, jnp.where(nu < 0, -1.0, 1.0) * (along * sin + lever * cos)
 
@@ -119,7 +120,7 @@ class Outline(Profile):
         function of the point (`facing` is not used). If the normal misses the pitch circle, the
         point of the normal nearest to the circle replaces the pitch point."""
         psi = jnp.arccos(jnp.clip(mate.lever / self.pitch_radius, -1.0, 1.0))
-        s = mate.support - self.pitch_radius * jnp.sin(psi)
+        s = mate.support - self.pitch_radius * trig.sin(psi)
         return RollPoint(direction + psi - jnp.pi / 2, psi, s)
 
     def addendum(self, nu):

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Int
 
-BLOCK = 16
+BLOCK = 48
 """Number of elements evaluated together. The arrays of a mesh have room for a multiple of this
 number."""
 

@@ -12,6 +12,7 @@ An orbit whose flags agree is solved again on a finer mesh, graded according to 
 coarser mesh. The difference between the two solutions is the error estimate.
 """
 
+import functools
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -108,16 +109,15 @@ def supported(pair: RotorPair) -> bool:
 
     The contact must be a `SearchContact`. Every flag of contact law and parts needs a margin (see
     `Margins`)."""
-    owners = [pair.law, *pair.all_parts]
-    names = [("margins", "switches"), ("drag_margins", "drag_switches")]
-    known = all(
-        _newer(type(owner), margin, flag)
-        for owner in owners
-        for margin, flag in names
-        if hasattr(owner, flag)
-    )
     searched = isinstance(pair.contact, SearchContact)
-    return known and searched
+    return searched and all(_has_margins(type(owner)) for owner in (pair.law, *pair.all_parts))
+
+
+@functools.cache
+def _has_margins(kind: type) -> bool:
+    """Return whether a contact law or part of the class `kind` has a margin for each flag."""
+    names = [("margins", "switches"), ("drag_margins", "drag_switches")]
+    return all(_newer(kind, margin, flag) for margin, flag in names if hasattr(kind, flag))
 
 
 def _newer(kind: type, margin: str, flag: str) -> bool:

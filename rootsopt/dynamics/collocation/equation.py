@@ -11,6 +11,7 @@ from rootsopt.contact.near import NearContact
 from rootsopt.contact.search import SearchContact
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.pair import RotorPair
+from rootsopt.runtime.kept import kept
 
 
 class Point(NamedTuple):
@@ -60,7 +61,7 @@ class CollocatedEquation(eqx.Module):
         return eqx.tree_at(lambda p: p.contact, pair, NearContact(pair.contact.pair, roots))
 
     def evaluated(self, dynamic, static, tau, state, roots, which):
-        """Return `Point.values`, and the tuple (roots, force, depth) of other `Point` fields.
+        """Return the list of `Point.values`, and the tuple (roots, force, depth) of other fields.
 
         `dynamic`, `static`: the pair's floating-point arrays, and the rest of the pair. For the
         other arguments, see `point`."""
@@ -71,7 +72,7 @@ class CollocatedEquation(eqx.Module):
         rates = self.measures.rates(tau, contact.total / unit, top)
         if near.free:
             rates = near.lapse(state) * jnp.append(rates, jnp.ones_like(unit))
-        values = jnp.concatenate([slope, rates, found.values[which][None]])
+        values = [*slope, *rates, found.values[which]]
         return values, (_roots(found.places), contact.total, contact.depth)
 
     def force(
@@ -103,8 +104,8 @@ class CollocatedEquation(eqx.Module):
 
         place = jnp.append(tau, state)
         values, linear, rest = jax.linearize(value, place, has_aux=True)
-        slopes = jax.vmap(linear)(jnp.eye(place.shape[0], dtype=place.dtype))
-        return Point(values, slopes.T, *rest)
+        slopes = jax.vmap(kept(linear))(jnp.eye(place.shape[0], dtype=place.dtype))
+        return Point(jnp.stack(values), jnp.stack(kept(slopes)), *rest)
 
     def along(
         self,
@@ -130,8 +131,8 @@ class CollocatedEquation(eqx.Module):
         # All directions at once: first those of time and state, then those of the pair.
         moved = jax.tree.map(lambda x: jnp.pad(x, [(size, 0)] + [(0, 0)] * (x.ndim - 1)), moved)
         unit = jnp.eye(size + count, size, dtype=place.dtype)
-        slopes = jax.vmap(linear)(moved, unit).T
-        return Point(values, slopes[:, :size], *rest), slopes[:, size:]
+        slopes = jnp.stack(kept(jax.vmap(kept(linear))(moved, unit)))
+        return Point(jnp.stack(values), slopes[:, :size], *rest), slopes[:, size:]
 
 
 def _roots(places: list[Any]) -> Float[Array, "sides 2"]:

@@ -6,6 +6,7 @@ instants, the contact is found by a search (`SearchContact`), not from a closest
 known (`NearContact`). Events inside elements are located by bisection.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
@@ -117,6 +118,9 @@ def ranks(pair: RotorPair) -> list[int]:
 @eqx.filter_jit
 def look(pair: RotorPair, elements: Elements) -> FlagScan:
     """Evaluate the flags at the Gauss points and on both sides of the end of each element."""
+    assert isinstance(pair.contact, SearchContact)
+    flanks = dataclasses.replace(pair.contact.pair, together=True)
+    pair = eqx.tree_at(lambda p: p.contact.pair, pair, flanks)
     mesh = elements.mesh
     tau, state = elements.places
     number = jnp.arange(mesh.left.shape[0])

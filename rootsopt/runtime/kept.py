@@ -1,0 +1,48 @@
+"""Values that XLA computes once, however many results use them.
+
+On a CPU, XLA fuses an operation with every operation that uses its result, and repeats it there.
+It even counts cosine and sine as cheap. In a program with many results and derivatives, most of the
+time may be spent on repetitions. XLA drops optimisation barriers on CPUs, but it does not merge the
+code before and after a branch whose condition it does not know.
+"""
+
+from typing import TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.custom_batching import custom_vmap
+
+T = TypeVar("T")
+_MANY = 32
+"""Number of values from which they are kept. It costs more to keep fewer than to repeat them."""
+
+
+def kept(tree: T) -> T:
+    """Return `tree` unchanged, and have the values of its floating-point arrays computed once.
+
+    The result cannot be differentiated. On a GPU, this function does nothing."""
+    values, rest = eqx.partition(tree, eqx.is_inexact_array)
+    leaves, shape = jax.tree.flatten(values)
+    if not leaves or jax.default_backend() != "cpu":
+        return tree
+    return eqx.combine(jax.tree.unflatten(shape, _kept(leaves)), rest)
+
+
+@custom_vmap
+def _kept(leaves):
+    if sum(leaf.size for leaf in leaves) < _MANY:
+        return leaves
+    # The compiler cannot know that both branches return the same (for all but infinite values).
+    endless = jnp.ravel(max(leaves, key=jnp.size))[0] == jnp.inf
+    return lax.cond(endless, lambda x: [1.0 * leaf for leaf in x], lambda x: x, leaves)
+
+
+@_kept.def_vmap
+def _(size, batched, leaves):
+    del size
+    return _kept(leaves), batched[0]
+
+
+__all__ = ["kept"]

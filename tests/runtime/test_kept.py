@@ -1,0 +1,56 @@
+"""Values that XLA computes once."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rootsopt.profiles import trigonometry as trig
+from rootsopt.runtime.kept import kept
+
+ANGLES = jnp.linspace(-3.0, 3.0, 64)
+
+
+def results(cos, sin):
+    """Return a function with several results and derivatives that use the same two values."""
+
+    def one(angle):
+        near = jnp.arctan2(2 + sin(angle), 3 + cos(angle))
+        return near * cos(angle), near / (2 + sin(angle)), cos(near) - sin(angle)
+
+    def both(angle):
+        values, linear = jax.linearize(one, angle)
+        return values, linear(1.0), jax.jacfwd(jax.jacfwd(one))(angle)
+
+    return jax.jit(jax.vmap(both))
+
+
+def waves(function, *arguments):
+    """Return the number of cosines and sines that the compiled `function` contains."""
+    text = function.lower(*arguments).compile().as_text()
+    return sum(text.count(f" {name}(") for name in ("cosine", "sine"))
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="only CPUs repeat operations")
+def test_cosines_of_many_angles_are_computed_once():
+    """The values and derivatives of all orders are the same. XLA alone repeats cosine and sine."""
+    repeated, once = results(jnp.cos, jnp.sin), results(trig.cos, trig.sin)
+    with trig.computed_once():
+        once.lower(ANGLES)  # traced here, and then remembered
+    pairs = zip(jax.tree.leaves(repeated(ANGLES)), jax.tree.leaves(once(ANGLES)), strict=True)
+    for value, other in pairs:
+        np.testing.assert_allclose(value, other, rtol=1e-13, atol=1e-13)
+    assert waves(once, ANGLES) < waves(repeated, ANGLES) / 2
+
+
+def test_what_is_kept_does_not_change():
+    """Integers, single numbers, infinite values and arrays of any nested batch pass unchanged."""
+    tree = {"number": 3.0 * ANGLES[0], "count": jnp.arange(3), "far": jnp.full(40, jnp.inf)}
+    for found, given in zip(jax.tree.leaves(kept(tree)), jax.tree.leaves(tree), strict=True):
+        np.testing.assert_array_equal(found, given)
+    square = ANGLES.reshape(8, 8)
+    fixed = jnp.arange(4.0)
+    row = jax.vmap(jax.vmap(lambda x: kept((x, fixed))))(square)
+    np.testing.assert_array_equal(row[0], square)
+    assert row[1].shape == (8, 8, 4)
+    assert float(jax.grad(lambda x: trig.sin(x) ** 2)(0.3)) == pytest.approx(np.sin(0.6))
