@@ -96,6 +96,7 @@ _OF = {
     "profiles/geometry": "profiles families",
     "profiles/involute": "profiles families optimize",
     "profiles/outline": "outline",
+    "profiles/trigonometry": "families profiles",
     "profiles/trochoid": "families conjugacy",
     "profiles/validity": "families",
     "pump/bearings": "bearings",
