@@ -224,12 +224,12 @@ def free_starts(rows: list[Row], count: int) -> list[tuple[Row, Config, Config]]
     return found
 
 
-def free_form(path: str, begun: tuple[Row, Config, Config], quick: bool) -> Row:
-    """Optimise a free form from `begun`, one of the `free_starts`. Return its row."""
+def free_form(path: str, start: tuple[Row, Config, Config], quick: bool) -> Row:
+    """Optimise a free form from one of the `free_starts`. Return its row."""
     began = time.perf_counter()
     _, base = reference_of(path, quick)
-    best, given, config = begun
-    start = profile_of(given)
+    best, given, config = start
+    followed = profile_of(given)
     settings: dict[str, Any] = {"bounds": {"tip_arc_angle_deg": (0.0, 45 / given.profile.lobes)}}
     settings |= SEARCH_FREE | ({"iterations": 2} if quick else {})
     config = changed(
@@ -243,7 +243,7 @@ def free_form(path: str, begun: tuple[Row, Config, Config], quick: bool) -> Row:
         **row_of(Path(path).stem, config, base.response),
         "reached": best["reached"],
         "begun_at": best["family"],
-        "departure_um": departure(made, start) / 1e-6,
+        "departure_um": departure(made, followed) / 1e-6,
         "evaluations": count,
         "seconds": time.perf_counter() - began,
         "config": config.to_yaml(),
@@ -281,8 +281,8 @@ def run(
         for path in paths:
             own = [row for row in rows if row["study"] == Path(path).stem and row["reached"]]
             own = [row for row in own if np.isfinite(row["objective"])]
-            begun = free_starts(own, 1 if quick else STARTS) if own else []
-            free.append([pool.submit(free_form, path, one, quick) for one in begun])
+            starts = free_starts(own, 1 if quick else STARTS) if own else []
+            free.append([pool.submit(free_form, path, start, quick) for start in starts])
         for futures in free:
             found = [future.result() for future in futures]
             for row in found:

@@ -52,7 +52,7 @@ _CONVERGED = {8: 1e-8, 4: 1e-3}
 _FINISHED = {8: 1e-11, 4: 1e-5}
 # Maximum number of steps inside a bracket; bisection alone needs about fifty.
 _GUARDED_STEPS = 60
-# Number of poses from which, and in groups of which, they may be searched together.
+# Least number of poses that are searched in groups (see `FlankPair.together`), and size of a group.
 _MANY = 32
 # Marks a finished search: this is added to the number of attempts.
 _DONE = 16
