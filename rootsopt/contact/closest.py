@@ -60,10 +60,11 @@ _DONE = 16
 # between neighbouring minima that have a flag of their own.
 _MINIMA = 8
 RANKS = 3
-# Distance of ν2 (rad) before the cusp at the pitch crossing below which a contact counts as the
-# minimum beyond the cusp. The two minima of the gap are several |ε| apart, and this limit lies
-# between them.
-_NEAR_CUSP = 1e-3
+# Distance of ν2 (rad) before the cusp at the pitch crossing, in penetrations (pitch radii), below
+# which a contact counts as the minimum beyond the cusp. Both minima of the gap move in proportion
+# to |ε|: on epicycloids, this one lies at most 0.6 |ε| before the cusp, the other one at least
+# 5 |ε| where they are equally deep.
+_NEAR_CUSP = 1.8
 # Penetration (pitch radii) above which a pair of points on flanks that are not conjugate is
 # ignored.
 _DEEPEST = 0.1
@@ -228,11 +229,17 @@ class FlankPair(eqx.Module):
         mirrored = trig.sin(jnp.pi / 2 * (roll - half) / half) > 0
         pieces = [found.found, mirrored]
         if self.profile.cusp:
-            # The second minimum lies beyond the cusp or close before it.
-            pieces.append(found.normal2 > self.frozen.pitch_normal - _NEAR_CUSP)
+            pieces.append(self._beyond_cusp(found) > 0)
         if self.frozen.wavy:
             pieces += [found.rank > 0.5 + number for number in range(RANKS)]
         return jnp.concatenate([jnp.stack(pieces), beyond])
+
+    def _beyond_cusp(self, found: ClosestApproach) -> Float[Array, ""]:
+        """Return a number that is positive if `found` is the minimum of the gap beyond the cusp.
+
+        That minimum lies beyond the cusp, or close before it (`_NEAR_CUSP`)."""
+        depth = jnp.maximum(-found.gap, 0.0) / self.frozen.pitch_radius
+        return found.normal2 - self.frozen.pitch_normal + _NEAR_CUSP * depth
 
     @property
     def edges(self) -> Float[Array, " k"]:
@@ -260,8 +267,7 @@ class FlankPair(eqx.Module):
         half = self.profile.half_pitch
         numbers = [jnp.where(found.found, 1.0, -1.0), trig.sin(jnp.pi / 2 * (roll - half) / half)]
         if self.profile.cusp:
-            other = found.normal2 - (self.frozen.pitch_normal - _NEAR_CUSP)
-            numbers.append(other if rival is None else rival - found.gap)
+            numbers.append(self._beyond_cusp(found) if rival is None else rival - found.gap)
         if self.frozen.wavy:
             numbers += [found.rank - 0.5 - number for number in range(RANKS)]
         return jnp.concatenate([jnp.stack(numbers), beyond])

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from rootsopt.dynamics.collocation.closing import supported
+from rootsopt.dynamics.collocation.closing import CORRECTED, supported
 from rootsopt.dynamics.collocation.known import Known
 from rootsopt.dynamics.collocation.mesh import sizes
 from rootsopt.dynamics.collocation.motion import Collocated, collocated, near_orbit
@@ -160,11 +160,14 @@ class _Collocation(NamedTuple):
     """State of the loop over attempts to close an orbit by collocation.
 
     `found`: result of the last attempt. The next one continues the transient from `state`, at the
-    tolerance `coarse`, until the states repeat to within the scaled distance `within`. `tries`:
-    number of attempts; `over`: whether the loop has ended.
+    tolerance `coarse`, until the states repeat to within the scaled distance `within`. If `shorter`
+    is not 0, the last orbit repeated after `shorter` mesh periods. The next attempt then closes an
+    orbit of this period, without a further transient. `tries`: number of attempts; `over`: whether
+    the loop has ended.
     """
 
     found: Steady
+    shorter: Int[Array, ""]
     state: Float[Array, " n"]
     coarse: Float[Array, ""]
     within: Float[Array, ""]
@@ -249,7 +252,9 @@ class _Attempts(eqx.Module):
         orbit, window = orbit_or_window(
             self.pair, self.tangents, start, period, shots, now.windowed, solver.windows
         )
-        judged, status = self._judged(orbit, start, now.fine, within)
+        open_by = solver.closed * solver.orbit.rtol
+        open_by = jnp.maximum(open_by, RESIDUAL[solver.precision])
+        judged, status = self._judged(orbit, start, now.fine, within, open_by)
         # An orbit of a shorter period is the motion even if its derivatives are uncertain.
         holds = among(status, (Status.PERIODIC, Status.INACCURATE))
         taken = jnp.where(shorter, holds, ~lost) & ~now.windowed
@@ -302,14 +307,14 @@ class _Attempts(eqx.Module):
             over=~(again | windowed | (shorter > 0)),
         )
 
-    def _judged(self, orbit: Orbit, start, fine, within) -> tuple[Verdict, Int[Array, ""]]:
+    def _judged(self, orbit: Orbit, start, fine, within, open_by) -> tuple[Verdict, Int[Array, ""]]:
         """Return the `Verdict` on an orbit integrated at the tolerance `fine`, and a status code.
 
+        `open_by`: residual (scaled) above which the orbit does not count as closed.
         The accuracy of the forces is checked later, by `final`."""
         pair, solver, dtype = self.pair, self.solver, start.dtype
         closing = dataclasses.replace(solver.orbit, rtol=fine)
         rtols = solver.transient.tolerance(dtype), closing.tolerance(dtype)
-        open_by = jnp.maximum(solver.closed * solver.orbit.rtol, RESIDUAL[solver.precision])
         scales = pair.law.exponent, self.radius, pair.force_scale
         found = verdict(orbit, start, within, rtols, open_by.astype(dtype), scales)
         numbers = jnp.concatenate([orbit.response, orbit.state])
@@ -361,7 +366,7 @@ class _Attempts(eqx.Module):
         (`_COLLOCATIONS`). If the last attempt fails, the status is NOT_SETTLED."""
         begun, no = self.start(state), jnp.zeros((), bool)
         zero = jnp.zeros((), int)
-        start = _Collocation(begun.found, state, begun.coarse, begun.within, zero, no)
+        start = _Collocation(begun.found, zero, state, begun.coarse, begun.within, zero, no)
         loop = lax.while_loop(lambda now: ~now.over, lambda now: self._collocate(now), start)
         return self.final(loop.found)
 
@@ -371,7 +376,12 @@ class _Attempts(eqx.Module):
         room = solver.max_periods - used
         room = jnp.where(now.tries > 0, jnp.minimum(room, _LONGER), room).astype(int)
         transient = dataclasses.replace(solver.transient, rtol=now.coarse)
-        settled = settle(self.pair, now.state, transient, now.within, room, solver.max_orbit)
+        known = now.shorter > 0
+        settled = lax.cond(
+            known,
+            lambda: now.found.settled._replace(period=now.shorter, periods=0 * used, steps=0 * used),
+            lambda: settle(self.pair, now.state, transient, now.within, room, solver.max_orbit),
+        )
         failure = transient_status(self.pair, settled)
         lost = now.found._replace(
             status=failure,
@@ -380,7 +390,7 @@ class _Attempts(eqx.Module):
             steps=now.found.steps + settled.steps,
         )
 
-        def close() -> Steady:
+        def close() -> tuple[Steady, Int[Array, ""]]:
             period = jnp.maximum(settled.period, 1)
             made = collocated(
                 self.pair,
@@ -390,13 +400,17 @@ class _Attempts(eqx.Module):
                 solver.measures,
                 (solver.samples, solver.max_orbit),
             )
-            return self._taken(lost, made, settled.state, period, now.within)
+            return self._taken(lost, made, settled.state, period, now.within), made.shorter
 
-        found = lax.cond(failure < 0, close, lambda: lost)
+        nothing = jnp.zeros_like(now.shorter)
+        found, shorter = lax.cond(failure < 0, close, lambda: (lost, nothing))
         again = (failure < 0) & (found.status == Status.NOT_SETTLED.code)
-        again &= (now.tries + 1 < _COLLOCATIONS) & (found.used < solver.max_periods)
-        coarse = jnp.maximum(now.coarse / 10, solver.orbit.rtol)
-        return _Collocation(found, settled.state, coarse, now.within / 10, now.tries + 1, ~again)
+        again &= now.tries + 1 < _COLLOCATIONS
+        again &= (shorter > 0) | (found.used < solver.max_periods)
+        finer = jnp.where(shorter > 0, 1.0, 0.1)
+        coarse = jnp.maximum(now.coarse * finer, solver.orbit.rtol)
+        within, tries = now.within * finer, now.tries + 1
+        return _Collocation(found, shorter, settled.state, coarse, within, tries, ~again)
 
     def near(self, known: Known, neighbour: RotorPair) -> Steady:
         """Return the motion whose orbit is near the `known` one of the similar pair `neighbour`.
@@ -419,7 +433,8 @@ class _Attempts(eqx.Module):
 
         `start`: scaled state near which the orbit has to be; `period` of the orbit (mesh periods);
         `within`: scaled distance to which the transient's states repeated."""
-        judged, status = self._judged(made.orbit, start, self.solver.orbit.rtol, within)
+        fine, rounding = self.solver.orbit.rtol, jnp.asarray(CORRECTED)
+        judged, status = self._judged(made.orbit, start, fine, within, rounding)
         unknown = among(status, (Status.PERIODIC, Status.INACCURATE)) & ~made.verified
         status = jnp.where(unknown | ~made.sound, Status.NOT_SETTLED.code, status)
         return found._replace(

@@ -46,7 +46,7 @@ _FINER = 1.4
 """Factor by which the number of elements grows when the mesh is refined."""
 _TURNS = 24
 """Maximum number of iterations of the loop."""
-_CORRECTED = 1e-6
+CORRECTED = 1e-6
 """Last correction of the states (scaled) above which an orbit is rejected."""
 _FAILURES = 4
 """Number of failures of Newton's method above which the search for the orbit fails."""
@@ -203,7 +203,7 @@ class _Closer(eqx.Module):
         begun = now.elements._replace(roots=jnp.where(now.trusted, now.elements.roots, given))
         limit = jnp.where(now.trusted, *_SMALL)
         got = newton(self.equation, begun, limit, self.neighbour, now.trusted)
-        good = got.size <= 10 * limit
+        good = got.stalled | (got.size <= 10 * limit)
         closed = now.closed._replace(steps=now.closed.steps + got.turns)
         # After a failure, the loop finds the events of the last motion and tries again.
         failures = now.failures + ~good
@@ -236,7 +236,7 @@ class _Closer(eqx.Module):
         full = now.elements.mesh.used >= now.elements.state.shape[0] - 1
         # Newton's method has converged, so the correction must be small. It is large or NaN where
         # the time derivative of a margin vanishes at its event.
-        good = found.correction < _CORRECTED
+        good = found.correction < CORRECTED
         size = jnp.where(first, jnp.maximum(size, self.known.roughness), size)
         kept = now.closed
         closed = kept._replace(
@@ -306,4 +306,4 @@ def _nothing(equation: CollocatedEquation, tangents: Any, elements: Elements) ->
     return Closed(empty, jnp.ones(()), infinite, infinite, no, zero, zero)
 
 
-__all__ = ["Closed", "close", "first_elements", "supported"]
+__all__ = ["CORRECTED", "Closed", "close", "first_elements", "supported"]

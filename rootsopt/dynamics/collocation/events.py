@@ -30,8 +30,9 @@ _HALVINGS = 30
 """Number of bisections that locate an event."""
 _SAME = 3e-9
 """Time (mesh periods) between two events below which they are merged into one."""
-_CHANGES = 384
-"""Number of new flag changes along a motion above which the search for its orbit fails."""
+_CHANGES = 2
+"""Number of flag changes per event for which there is room. Several flags may change at one event.
+If more change, the search for the orbit fails."""
 
 
 class FlagScan(NamedTuple):
@@ -215,7 +216,8 @@ def found_events(pair: RotorPair, elements: Elements, seen: FlagScan, room: int)
     `room`: size m of the returned arrays."""
     mesh, rank = elements.mesh, jnp.asarray(ranks(pair))
     fresh, later, ends_at, declared, kept = _compared(pair, elements, seen)
-    place, flag = jnp.nonzero(fresh, size=_CHANGES, fill_value=0)
+    most = _CHANGES * room
+    place, flag = jnp.nonzero(fresh, size=most, fill_value=0)
     new = jnp.sum(fresh)
     value = seen.flags[place, flag]
 
@@ -231,7 +233,7 @@ def found_events(pair: RotorPair, elements: Elements, seen: FlagScan, room: int)
         return found.at[k].set((low + high) / 2)
 
     located = lax.fori_loop(
-        0, jnp.minimum(new, _CHANGES), locate, jnp.full(_CHANGES, jnp.inf, seen.tau.dtype)
+        0, jnp.minimum(new, most), locate, jnp.full(most, jnp.inf, seen.tau.dtype)
     )
     held = jnp.full(mesh.times.shape, False).at[jnp.where(kept, ends_at, 0)].set(True)
     held = held.at[0].set(False)
@@ -239,7 +241,7 @@ def found_events(pair: RotorPair, elements: Elements, seen: FlagScan, room: int)
     which = jnp.concatenate([flag, mesh.which])
     times, which, count = _merged(times, which, rank)
     gone = jnp.sum(declared & ~kept)
-    fits = (new <= _CHANGES) & (count <= room - 3)
+    fits = (new <= most) & (count <= room - 3)
     return Events(times[:room], which[:room], count, new, gone, fits)
 
 

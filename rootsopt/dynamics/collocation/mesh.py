@@ -15,7 +15,7 @@ length of elements."""
 
 _MOST = 96
 """Maximum number of elements per mesh period."""
-_TIMES = 48
+_TIMES = 64
 """Number of events per mesh period, on average over the orbit, above which the search for the orbit
 fails."""
 

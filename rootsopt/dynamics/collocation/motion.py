@@ -30,9 +30,10 @@ _ACCURACY = 10.0
 _UNREFINED = 10.0
 """Estimated error of the forces above which an orbit is rejected, in multiples of the requested
 error. The estimate exceeds the request if the mesh has no room for refinement."""
-_REPEATS = 1e-6
-"""Scaled difference between the states at φ1 = 0 and after a fraction of the period, below which an
-orbit is rejected. Its true period is then shorter."""
+_REPEATS = 1e3, 1e-5
+"""Scaled difference between the states at φ1 = 0 and after a fraction of the period, below which
+this fraction is the orbit's true period. The limit is the first number (tolerances), but at least
+the second."""
 _MISS = 1e4, 1e-4
 """Scaled difference between the start and the end of an integration from the orbit's state, above
 which the orbit is rejected. The limit is the first number (tolerances), but at least the second.
@@ -49,12 +50,14 @@ class Collocated(NamedTuple):
     `orbit`: its `flow` is an integration over one period, with the forces from collocation; its
     `residual` is the last correction, inf if the orbit is not sound. `sound`: whether Newton's
     method has converged on a mesh that ends at the orbit's events; otherwise the orbit has no
-    meaning. `verified`: whether the orbit is sound and accurate, and the integration confirms it.
-    `known`: the orbit in the form from which orbits of similar pairs can be closed.
+    meaning. `shorter`: true period (mesh periods) if the orbit repeats after a fraction of its
+    period, otherwise 0. `verified`: whether the orbit is sound and accurate, does not repeat, and
+    the integration confirms it. `known`: the orbit in the form from which orbits of similar pairs can be closed.
     """
 
     orbit: Orbit
     sound: Bool[Array, ""]
+    shorter: Int[Array, ""]
     verified: Bool[Array, ""]
     known: Known
 
@@ -95,26 +98,34 @@ def collocated(
     miss = jnp.max(jnp.abs(out.end - found.state))
     size = jnp.maximum(1.0, jnp.max(jnp.abs(found.state)))
     gain = jnp.maximum(1.0, jnp.max(jnp.abs(found.monodromy)))
-    scale = jnp.maximum(jnp.abs(found.response[:3]), 1e-30)
-    apart = jnp.max(jnp.abs(out.response[:3] - found.response[:3]) / scale)
     far, unequal = (jnp.maximum(factor * tolerance, least) for factor, least in (_MISS, _APART))
-    verified = closed.sound & out.solved & (miss <= far * size * gain) & (apart <= unequal)
+    least = _FAINT * tolerance * pair.force_scale
+    allowed = unequal * jnp.abs(found.response[:3]) + jnp.stack([least, least**2, least])
+    equal = jnp.all(jnp.abs(out.response[:3] - found.response[:3]) <= allowed)
+    verified = closed.sound & out.solved & (miss <= far * size * gain) & equal
     verified &= closed.error <= _UNREFINED * _ACCURACY * tolerance
     # The transient may have mistaken several periods of the orbit for one.
-    verified &= ~_repeats(found, period, longest)
+    shorter = _repeats(found, period, longest, tolerance) * closed.sound
+    verified &= shorter == 0
     residual = jnp.where(closed.sound, found.correction, jnp.inf)
     orbit = _as_orbit(found, _with_forces(out, found), residual, closed.drift, closed.steps)
-    return Collocated(orbit, closed.sound, verified, _known(closed, verified))
+    return Collocated(orbit, closed.sound, shorter, verified, _known(closed, verified))
 
 
-def _repeats(found: OrbitForces, period: Int[Array, ""], longest: int) -> Bool[Array, ""]:
-    """Return whether the orbit repeats after a fraction of its `period` (mesh periods).
+def _repeats(
+    found: OrbitForces, period: Int[Array, ""], longest: int, tolerance: Float[Array, ""]
+) -> Int[Array, ""]:
+    """Return the least fraction of the orbit's `period` (mesh periods) after which it repeats, or
+    0.
 
-    `longest`: longest period of an orbit (mesh periods)."""
+    `longest`: longest period of an orbit (mesh periods); `tolerance`: that of the orbit's
+    integrator."""
     shorter = jnp.arange(1, max(longest // 2, 1) + 1)
     states = found.elements.motion(shorter.astype(found.state.dtype))
-    same = jnp.max(jnp.abs(states - found.state), axis=1) < _REPEATS
-    return jnp.any(same & (shorter < period) & (period % shorter == 0))
+    limit = jnp.maximum(_REPEATS[0] * tolerance, _REPEATS[1])
+    same = jnp.max(jnp.abs(states - found.state), axis=1) < limit
+    same &= (shorter < period) & (period % shorter == 0)
+    return jnp.where(jnp.any(same), shorter[jnp.argmax(same)], 0)
 
 
 def near_orbit(
@@ -136,12 +147,12 @@ def near_orbit(
     found, sound = closed.found, closed.sound & known.sound
     verified = sound & (closed.error <= _UNREFINED * _ACCURACY * tolerance)
     period = jnp.round(found.elements.mesh.period).astype(int)
-    verified &= ~_repeats(found, period, sizes_of[1])
-    # Newton's method converges quadratically: what is left is far below the last correction.
-    residual = jnp.where(sound, found.correction**2, jnp.inf)
+    shorter = _repeats(found, period, sizes_of[1], tolerance)
+    verified &= shorter == 0
+    residual = jnp.where(sound, found.correction, jnp.inf)
     out = as_flow(found, sizes_of[0], PARTS * known.elements.state.shape[0])
     orbit = _as_orbit(found, out, residual, closed.drift, closed.steps)
-    return Collocated(orbit, sound, verified & out.solved, _known(closed, verified))
+    return Collocated(orbit, sound, shorter, verified & out.solved, _known(closed, verified))
 
 
 def _known(closed: Closed, verified: Bool[Array, ""]) -> Known:

@@ -30,6 +30,9 @@ _LONGEST = 1.0
 """Change of a state (scaled) above which a Newton step is shortened."""
 _WAY = 1e-3
 """Fraction of the way to the new pair over which the predictor takes its difference."""
+_STALLED = 1e-7, 0.5
+"""Step (scaled) below which Newton's method also stops if the step exceeds the second number times
+the step before. The steps then only follow rounding."""
 _TURNED = 0.1
 """Change of a root (rad) above which it is limited to this value."""
 
@@ -38,12 +41,14 @@ class Converged(NamedTuple):
     """Result of Newton's method.
 
     `elements`: the orbit; `size`: greatest change in the last step, of the states (scaled) and of
-    the event times (mesh periods); `turns`: number of steps; `force` (e, s): contact force (N) at
-    the Gauss points.
+    the event times (mesh periods); `stalled`: whether steps no longer shrink because they only
+    follow rounding; `turns`: number of steps; `force` (e, s): contact force (N) at the Gauss
+    points.
     """
 
     elements: Elements
     size: Float[Array, ""]
+    stalled: Bool[Array, ""]
     turns: Int[Array, ""]
     force: Float[Array, "e s"]
 
@@ -85,6 +90,7 @@ def newton(
 ) -> Converged:
     """Solve for the orbit near `elements`, until the last step is at most `tolerance` (scaled).
 
+    Where rounding keeps steps above the tolerance, the method ends when they no longer shrink.
     `predict`: whether `elements` is an orbit of the similar pair `neighbour`. The first step is
     then along the tangent of the family of orbits that leads to the equation's pair (predictor).
     Newton's first step would be evaluated at penetrations of the wrong size, since the flanks have
@@ -92,7 +98,8 @@ def newton(
     divided by this way."""
 
     def go_on(now):
-        return (now.turns < _TURNS) & (now.size > tolerance)  # A size of NaN also ends the loop.
+        # A size of NaN also ends the loop.
+        return (now.turns < _TURNS) & (now.size > tolerance) & ~now.stalled
 
     def turn(now):
         at = now.elements
@@ -102,11 +109,13 @@ def newton(
         own = jax.tree.map(lambda x: x / way, own_column(at, found))
         roots = at.roots + jnp.clip((points.roots - at.roots) / way, -_TURNED, _TURNED)
         moved, size = advanced(at, solved_step(at, found, own), roots)
-        return Converged(moved, size, now.turns + 1, points.force[:, : len(GAUSS.nodes)])
+        stalled = (size < _STALLED[0]) & (size > _STALLED[1] * now.size)
+        return Converged(moved, size, stalled, now.turns + 1, points.force[:, : len(GAUSS.nodes)])
 
     force = jnp.zeros(elements.slopes.shape[:2], elements.state.dtype)
     infinite = jnp.full_like(elements.state[0, 0], jnp.inf)
-    start = Converged(elements, infinite, jnp.zeros((), int), force)
+    no = jnp.zeros((), bool)
+    start = Converged(elements, infinite, no, jnp.zeros((), int), force)
     return lax.while_loop(go_on, turn, start)
 
 
