@@ -41,7 +41,11 @@ It is multiplied by the greatest entries of the state and of the monodromy matri
 1."""
 _APART = 1e4, 1e-4
 """Relative difference between the forces of the orbit and of an integration from its state, above
-which the orbit is rejected. The limit is the first number (tolerances), but at least the second."""
+which the orbit is rejected. The limit is the first number (tolerances), but at least the second.
+Forces that differ by less than `_FAINT` agree."""
+_FAINT = 10.0
+"""Difference between forces that is not an error, in tolerances of the unit of force. So small a
+force cannot be integrated to its own digits."""
 
 
 class Collocated(NamedTuple):
@@ -52,7 +56,8 @@ class Collocated(NamedTuple):
     method has converged on a mesh that ends at the orbit's events; otherwise the orbit has no
     meaning. `shorter`: true period (mesh periods) if the orbit repeats after a fraction of its
     period, otherwise 0. `verified`: whether the orbit is sound and accurate, does not repeat, and
-    the integration confirms it. `known`: the orbit in the form from which orbits of similar pairs can be closed.
+    the integration confirms it. `known`: the orbit in the form from which orbits of similar pairs
+    can be closed.
     """
 
     orbit: Orbit
