@@ -83,13 +83,15 @@ class Linearization(NamedTuple):
     `residual` (n,) and `jacobian` (n, n + 1) of the equations; `memory`: pass this to the
     `SolutionCurve` to repeat the same computation, such as the same solver steps; `data`: further
     results. With a repeated computation, the residual is a smooth function. `memory` is None if the
-    residual is always smooth.
+    residual is always smooth. `turned` (n + 1,): a direction along the curve on whose side tangents
+    have a positive orientation (`_orientation`); by default, it follows from `jacobian`.
     """
 
     residual: NDArray[np.float64]
     jacobian: NDArray[np.float64]
     memory: Any = None
     data: Any = None
+    turned: NDArray[np.float64] | None = None
 
 
 SolutionCurve = Callable[[NDArray[np.float64], Any, bool], Linearization]
@@ -163,13 +165,28 @@ def corrected(
     guess: NDArray[np.float64],
     across: NDArray[np.float64],
     along: NDArray[np.float64],
+    near: Spot | None = None,
 ) -> Spot:
     """Return the point at which the curve meets the plane through `guess` normal to `across`.
 
     `guess` and `across` have the shape (n + 1,). The tangent at the point has the orientation of
-    `along` (n + 1,). Raises `StoppedError` if Newton's method does not converge, or if the curve
-    has no result.
+    `along` (n + 1,). `near`: a point of the curve from which a curve with its own method
+    `corrected` may start. Raises `StoppedError` if Newton's method does not converge, or if the
+    curve has no result.
     """
+    own = getattr(curve, "corrected", None)
+    if own is None:
+        return by_newton(curve, guess, across, along)
+    return own(guess, across, along, near)
+
+
+def by_newton(
+    curve: SolutionCurve,
+    guess: NDArray[np.float64],
+    across: NDArray[np.float64],
+    along: NDArray[np.float64],
+) -> Spot:
+    """Return the result of `corrected` by Newton's method for the equations of `curve`."""
     place, memory, careful = guess, None, False
     last, grown = math.inf, 0
     for looks in range(1, _MOST + 1):
@@ -266,14 +283,14 @@ def _next(curve: SolutionCurve, old: Spot, step: float, steps: StepSizes) -> Spo
     new = None
     guess = old.place + step * old.tangent
     if steps.low <= guess[-1] <= steps.high:
-        new = corrected(curve, guess, old.tangent, old.tangent)
+        new = corrected(curve, guess, old.tangent, old.tangent, old)
     beyond = guess if new is None else new.place
     if not steps.low <= beyond[-1] <= steps.high:
         bound = float(np.clip(beyond[-1], steps.low, steps.high))
         share = (bound - old.place[-1]) / (beyond[-1] - old.place[-1])
         guess = old.place + share * (beyond - old.place)
         guess[-1] = bound
-        new = corrected(curve, guess, np.eye(len(guess))[-1], old.tangent)
+        new = corrected(curve, guess, np.eye(len(guess))[-1], old.tangent, old)
         new.place[-1] = bound
     assert new is not None
     far = np.linalg.norm(new.place - guess) > _ASTRAY * step
@@ -292,7 +309,7 @@ def _around_corner(curve: SolutionCurve, old: Spot, steps: StepSizes) -> Spot | 
     for size in _CORNER:
         for across in np.vstack([np.eye(len(old.place)), -np.eye(len(old.place))]):
             try:
-                new = corrected(curve, old.place + size * across, across, old.tangent)
+                new = corrected(curve, old.place + size * across, across, old.tangent, old)
             except StoppedError:
                 continue
             if _orientation(new) != _orientation(old):
@@ -306,6 +323,8 @@ def _around_corner(curve: SolutionCurve, old: Spot, steps: StepSizes) -> Spot | 
 
 
 def _orientation(spot: Spot) -> float:
+    if spot.look.turned is not None:
+        return float(np.sign(spot.look.turned @ spot.tangent))
     return float(np.sign(np.linalg.det(np.vstack([spot.look.jacobian, spot.tangent]))))
 
 
@@ -319,7 +338,7 @@ def _back_at_first(curve: SolutionCurve, spots: list[Spot]) -> bool:
     if len(spots) <= _CLOSING or not 0 < share <= 1 or far or new.tangent @ first.tangent < 0.5:
         return False
     try:
-        again = corrected(curve, between, chord / np.linalg.norm(chord), new.tangent)
+        again = corrected(curve, between, chord / np.linalg.norm(chord), new.tangent, new)
     except StoppedError:
         return False
     return bool(np.linalg.norm(again.place - first.place) < _SAME)
@@ -339,7 +358,8 @@ def _located(curve: SolutionCurve, old: Spot, new: Spot, test: Callable[[Spot], 
     for _ in range(40):
         share = (low * at_high - high * at_low) / (at_high - at_low)
         try:
-            spot = corrected(curve, old.place + share * chord, across, old.tangent)
+            near = old if share < 0.5 else new
+            spot = corrected(curve, old.place + share * chord, across, old.tangent, near)
         except StoppedError:
             break
         value = test(spot)

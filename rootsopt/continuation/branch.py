@@ -23,6 +23,7 @@ from rootsopt.continuation.arclength import (
     corrected,
     follow_curve,
 )
+from rootsopt.continuation.collocated import CollocatedFamily, can_follow
 from rootsopt.continuation.orbits import (
     LONGEST,
     PLACES,
@@ -145,7 +146,7 @@ def follow(
         )
     for bound in (limits.low, limits.high):
         with_value(config, parameter, bound)
-    orbits = OrbitFamily(config, parameter, period, limits)
+    orbits = _family(config, parameter, period, limits)
     place = orbits.place(state, value)
     fixed = np.eye(len(place))[-1]
     try:
@@ -184,13 +185,13 @@ def follow_doubled(
         return None
     limits = limits or branch.limits
     simple = OrbitFamily(branch.config, branch.parameter, branch.period, limits)
-    orbits = OrbitFamily(branch.config, branch.parameter, 2 * branch.period, limits)
+    orbits = _family(branch.config, branch.parameter, 2 * branch.period, limits)
     place = simple.place(bifurcation.point.state, bifurcation.value)
     fixed = np.eye(len(place))[-1]
     try:
-        monodromy = corrected(simple, place, fixed, fixed).look.data.monodromy
-        multipliers, vectors = np.linalg.eig(monodromy)
-        flipped = np.real(vectors[:, np.argmin(np.abs(multipliers + 1))])
+        known = corrected(simple, place, fixed, fixed).look.data
+        multipliers, vectors = np.linalg.eig(known.monodromy)
+        flipped = known.to_state @ np.real(vectors[:, np.argmin(np.abs(multipliers + 1))])
         across = np.append(flipped / np.linalg.norm(flipped), 0.0)
     except StoppedError:
         return None
@@ -205,6 +206,14 @@ def follow_doubled(
         if start.look.data.half_way > 0.2 * size:
             return _branch(orbits, follow_curve(orbits, start, orbits.steps, _TESTS))
     return None
+
+
+def _family(config: Config, parameter: str, period: int, limits: StepSizes) -> OrbitFamily:
+    """Return the equations of orbits, closed by collocation if the config allows it."""
+    by_shooting = OrbitFamily(config, parameter, period, limits)
+    if not can_follow(by_shooting.scene, by_shooting.pair):
+        return by_shooting
+    return CollocatedFamily(config, parameter, period, limits)
 
 
 def _branch(orbits: OrbitFamily, path: Path) -> Branch:

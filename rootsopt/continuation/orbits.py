@@ -57,13 +57,13 @@ _GEAR = ("backlash_mm", "damping_ratio")
 SPAN = 20.0
 """Change of the scaled state that has the same length as the whole range of the parameter, when
 step lengths are measured."""
-_LOOKS = 504
+LOOKS = 504
 """Number of uniform instants on an orbit at which contact of flanks and gear is checked."""
 LONGEST = 8
 """Longest orbit that can be followed (mesh periods)."""
 _STEP = 1 / 256
 """Length (mesh periods) above which solver steps are divided. Slightly longer steps may remain."""
-_SAME = 1e-5
+HALF_ALIKE = 1e-5
 """Distance (unit of `StepSizes`) between the states at the start and the middle of an orbit below
 which the orbit has half the period. States between steps are interpolated, so the limit is not 0.
 """
@@ -165,7 +165,7 @@ class _Shot(NamedTuple):
 
     `out`: the flow; `grid`: step ends for repeating the integration (see `_shoot`); `lost`: whether
     |ε| has reached its limit at a sample, or `RotorPair.lost` holds at the end; `touching`: whether
-    flanks or gear touch, at `_LOOKS` uniform times; `scale` (rad): unit of ε in the config at this
+    flanks or gear touch, at `LOOKS` uniform times; `scale` (rad): unit of ε in the config at this
     value of the parameter.
     """
 
@@ -176,14 +176,17 @@ class _Shot(NamedTuple):
     scale: Float[Array, ""]
 
 
-class _OrbitData(NamedTuple):
+class OrbitData(NamedTuple):
     """Data of an orbit in `Linearization.data`, in addition to residual and Jacobian.
 
-    `statistics`: mean, peak and RMS force (N); `half_way`: distance (unit of `StepSizes`) between
+    `monodromy` (n, n): monodromy matrix of the scaled state at some instant; `to_state` (n, n):
+    derivative of the state at φ1 = 0 with respect to that at this instant; `statistics`: mean, peak
+    and RMS force (N); `half_way`: distance (unit of `StepSizes`) between
     the states at the start and the middle of the orbit. For the other fields, see `BranchPoint`.
     """
 
     monodromy: NDArray[np.float64]
+    to_state: NDArray[np.float64]
     state: NDArray[np.float64]
     statistics: NDArray[np.float64]
     half_way: float
@@ -220,6 +223,11 @@ class OrbitFamily:
         self.steps = dataclasses.replace(limits, low=0.0, high=1.0)
         # Keep the unit of ε of the first config while the parameter changes.
         self.unit = float(_unit(self.scene, self.names, self.values))
+
+    @property
+    def pair(self) -> RotorPair:
+        """The pair of the first orbit."""
+        return _pair(self.scene, self.names, self.values)
 
     def value(self, place: NDArray[np.float64]) -> float:
         """Return the value of the parameter (config's unit) at a `place`.
@@ -272,17 +280,18 @@ class OrbitFamily:
         miss = np.asarray(out.end) - state
         monodromy = np.asarray(out.slope)[:count, :count]
         by_share = out.slope[:count, count] * self.width / SPAN
-        seen = _OrbitData(
+        seen = OrbitData(
             monodromy=monodromy,
+            to_state=np.eye(count),
             state=state * (self.unit / shot.scale),
             statistics=np.array([out.mean, out.peak, np.sqrt(out.mean_square)]),
             half_way=float(np.max(np.abs(out.states[len(out.states) // 2] - state))) / SPAN,
             residual=float(np.max(np.abs(miss)) / max(1.0, np.max(np.abs(state)))),
             depth=float(out.depth),
             reach=reach,
-            gap_time=_longest_gap(np.asarray(shot.touching)) * self.period,
+            gap_time=longest_gap(np.asarray(shot.touching)) * self.period,
         )
-        if self.period % 2 == 0 and seen.half_way < _SAME and seen.residual < RESIDUAL["float64"]:
+        if self.period % 2 == 0 and seen.half_way < HALF_ALIKE and seen.residual < RESIDUAL["float64"]:
             raise StoppedError(End.HALVED)
         jacobian = np.column_stack([monodromy - np.eye(count), by_share])
         return Linearization(miss / SPAN, jacobian, shot.grid, seen)
@@ -314,7 +323,7 @@ class OrbitFamily:
 
     def point(self, spot: Spot) -> BranchPoint:
         """Return the orbit at a `spot` of the curve."""
-        seen: _OrbitData = spot.look.data
+        seen: OrbitData = spot.look.data
         mean, peak, rms = map(float, seen.statistics)
         return BranchPoint(
             value=self.value(spot.place),
@@ -333,7 +342,7 @@ class OrbitFamily:
         )
 
 
-def _longest_gap(touching: NDArray[np.bool_]) -> float:
+def longest_gap(touching: NDArray[np.bool_]) -> float:
     """Return the longest run of False around a cycle, as a fraction of the cycle."""
     if not touching.any():
         return 1.0
@@ -342,7 +351,7 @@ def _longest_gap(touching: NDArray[np.bool_]) -> float:
     return float(np.max(gaps)) / len(touching)
 
 
-def _build(
+def pair_at(
     scene: Scene, names: tuple[str, ...], values: Float[Array, " p"]
 ) -> tuple[RotorPair, Float[Array, ""]]:
     """Return the pair with these parameter `values` (config's units), and its unit of ε (rad).
@@ -367,8 +376,13 @@ def _build(
 
 
 @Program
+def _pair(scene, names, values):
+    return pair_at(scene, names, values)[0]
+
+
+@Program
 def _unit(scene, names, values):
-    return _build(scene, names, values)[1]
+    return pair_at(scene, names, values)[1]
 
 
 @Program
@@ -395,7 +409,7 @@ def _shoot(  # Eleven parameters, since a compiled program takes its arrays one 
     """
 
     def build(values):
-        pair, scale = _build(scene, names, values)
+        pair, scale = pair_at(scene, names, values)
         return eqx.tree_at(lambda p: p.angle_scale, pair, unit), scale
 
     def arrays(values):
@@ -411,8 +425,8 @@ def _shoot(  # Eleven parameters, since a compiled program takes its arrays one 
         lambda: _without_long(with_switches(pair, out, period, tolerance), period),
         lambda: grid,
     )
-    stride = SAMPLES // _LOOKS
-    times = period * jnp.arange(_LOOKS) / _LOOKS
+    stride = SAMPLES // LOOKS
+    times = period * jnp.arange(LOOKS) / LOOKS
 
     def touches(tau, state):
         held = pair.gear is not None and jnp.any(pair.gear.switches(pair.motion(tau, state), None))

@@ -34,8 +34,8 @@ from rootsopt.dynamics.collocation.events import (
 )
 from rootsopt.dynamics.collocation.forces import OrbitForces, response
 from rootsopt.dynamics.collocation.known import Known
-from rootsopt.dynamics.collocation.mesh import aligned, counted, needed, roughness
-from rootsopt.dynamics.collocation.newton import newton
+from rootsopt.dynamics.collocation.mesh import aligned, counted, needed, ordered, roughness
+from rootsopt.dynamics.collocation.newton import Converged, newton
 from rootsopt.dynamics.orbit import choose
 from rootsopt.dynamics.pair import RotorPair
 
@@ -50,7 +50,7 @@ CORRECTED = 1e-6
 """Last correction of the states (scaled) above which an orbit is rejected."""
 _FAILURES = 4
 """Number of failures of Newton's method above which the search for the orbit fails."""
-_SMALL = 1e-5, 3e-9
+SMALL = 1e-5, 3e-9
 """Newton step (scaled) below which Newton's method stops: from a similar pair's orbit on the same
 mesh, and otherwise. The step after it would be smaller by orders of magnitude, since convergence is
 quadratic. It is made together with the derivatives."""
@@ -82,7 +82,7 @@ class Closed(NamedTuple):
     steps: Int[Array, ""]
 
 
-class _Loop(NamedTuple):
+class Loop(NamedTuple):
     """State of the loop.
 
     `closed`: result so far; `elements`: motion for the next iteration; `force` (e, s): contact
@@ -90,7 +90,7 @@ class _Loop(NamedTuple):
     whose flags need not be evaluated; `fits`: whether the elements end at events; `solved`: whether
     Newton's method has converged on these elements; `failures`: number of times that it has not
     converged; `meshes`: number of meshes on which the orbit has been solved; `over`: whether the
-    loop ends.
+    loop ends; `line`: what else the solution of the equations determines (see `bordered`).
     """
 
     closed: Closed
@@ -102,6 +102,7 @@ class _Loop(NamedTuple):
     failures: Int[Array, ""]
     meshes: Int[Array, ""]
     over: Bool[Array, ""]
+    line: Any = ()
 
 
 def supported(pair: RotorPair) -> bool:
@@ -137,7 +138,7 @@ def first_elements(period: Int[Array, ""]) -> Int[Array, ""]:
     return jnp.asarray(2 * _FIRST * period)
 
 
-class _Closer(eqx.Module):
+class Closer(eqx.Module):
     """The loop of `close`: `start` returns its initial state, `turn` makes one iteration.
 
     `frozen`: the pair of `equation`, treated as constant by JAX. The other fields are arguments of
@@ -150,23 +151,41 @@ class _Closer(eqx.Module):
     neighbour: RotorPair
     tolerance: Float[Array, ""]
 
-    def start(self) -> _Loop:
+    def start(self) -> Loop:
         """Return the initial state of the loop."""
         known, elements = self.known, self.known.elements
         nothing = _nothing(self.equation, self.tangents, elements)
         no, zero = jnp.zeros((), bool), jnp.zeros((), int)
         begun = known.aligned, known.aligned, no, zero, zero, no
-        return _Loop(nothing, elements, elements.slopes[..., 0], *begun)
+        return Loop(nothing, elements, elements.slopes[..., 0], *begun)
 
-    def turn(self, now: _Loop) -> _Loop:
+    def frozen_at(self, now: Loop) -> RotorPair:
+        """Return the pair whose flags are evaluated, treated as constant by JAX."""
+        del now
+        return self.frozen
+
+    def converged(
+        self, now: Loop, elements: Elements, limit: Float[Array, ""]
+    ) -> tuple[Converged, Any]:
+        """Return the result of Newton's method from `elements`, and the new `Loop.line`.
+
+        `limit`: step (scaled) at which the method stops."""
+        return newton(self.equation, elements, limit, self.neighbour, now.trusted), now.line
+
+    def forces(self, now: Loop) -> OrbitForces:
+        """Return the forces of the present orbit."""
+        return response(self.equation, now.elements, now.force, self.tangents)
+
+    def turn(self, now: Loop) -> Loop:
         """Evaluate the flags along the motion, and return the loop's state after one iteration.
 
         Depending on the flags, the iteration solves for the orbit, stores its forces or changes the
         mesh."""
-        shape = jax.eval_shape(lambda: look(self.frozen, now.elements))
+        frozen = self.frozen_at(now)
+        shape = jax.eval_shape(lambda: look(frozen, now.elements))
         empty: FlagScan = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shape)
-        seen = lax.cond(now.trusted, lambda: empty, lambda: look(self.frozen, now.elements))
-        agree = now.trusted | (now.fits & agrees(self.frozen, now.elements, seen))
+        seen = lax.cond(now.trusted, lambda: empty, lambda: look(frozen, now.elements))
+        agree = now.trusted | (now.fits & agrees(frozen, now.elements, seen))
         done = agree & now.solved & (apart(now.elements, seen) <= _FAR)
         new = lax.cond(
             agree,
@@ -179,12 +198,21 @@ class _Closer(eqx.Module):
         closed = new.closed._replace(turns=now.closed.turns + 1)
         return new._replace(closed=closed, trusted=jnp.zeros((), bool))
 
-    def align(self, now: _Loop, seen: FlagScan, finer) -> _Loop:
+    def run(self) -> Loop:
+        """Return the final state of the loop."""
+
+        def go_on(now: Loop) -> Bool[Array, ""]:
+            return ~now.over & (now.closed.turns < _TURNS)
+
+        return lax.while_loop(go_on, lambda now: self.turn(now), self.start())
+
+    def align(self, now: Loop, seen: FlagScan, finer) -> Loop:
         """Return the loop's state with the motion on a mesh that ends at its events.
 
         `seen`: flags along the motion; `finer`: whether the new mesh has more elements than the old
         one."""
-        events = found_events(self.frozen, now.elements, seen, now.elements.mesh.times.shape[0])
+        room = now.elements.mesh.times.shape[0]
+        events = found_events(self.frozen_at(now), now.elements, seen, room)
         taken = now.elements.mesh.used
         first = taken // 2 + _EVENT * events.count
         used = jnp.where(now.fits, jnp.where(finer, (_FINER * taken).astype(int), taken), first)
@@ -195,32 +223,35 @@ class _Closer(eqx.Module):
         yes = jnp.ones((), bool)
         return now._replace(elements=new, fits=yes, solved=~yes, over=~events.fits)
 
-    def solve(self, now: _Loop, seen: FlagScan) -> _Loop:
+    def solve(self, now: Loop, seen: FlagScan) -> Loop:
         """Return the loop's state after Newton's method on the present mesh.
 
         `seen`: flags along the motion."""
         given = rooted(now.elements, seen).roots
         begun = now.elements._replace(roots=jnp.where(now.trusted, now.elements.roots, given))
-        limit = jnp.where(now.trusted, *_SMALL)
-        got = newton(self.equation, begun, limit, self.neighbour, now.trusted)
-        good = got.stalled | (got.size <= 10 * limit)
+        limit = jnp.where(now.trusted, *SMALL)
+        got, line = self.converged(now, begun, limit)
+        # Where events have passed each other, the elements between them have a negative length.
+        mesh, rising = ordered(got.elements.mesh)
+        good = rising & (got.stalled | (got.size <= 10 * limit))
         closed = now.closed._replace(steps=now.closed.steps + got.turns)
         # After a failure, the loop finds the events of the last motion and tries again.
         failures = now.failures + ~good
         return now._replace(
             closed=closed,
-            elements=got.elements,
+            elements=got.elements._replace(mesh=mesh),
             force=got.force,
             solved=good,
             failures=failures,
+            line=line,
             over=~jnp.isfinite(got.size) | (failures > _FAILURES),
         )
 
-    def keep(self, now: _Loop) -> _Loop:
+    def keep(self, now: Loop) -> Loop:
         """Return the loop's state with the forces, derivatives and errors of the present orbit.
 
         The flags along the orbit must change exactly at the events of its mesh."""
-        found = response(self.equation, now.elements, now.force, self.tangents)
+        found = self.forces(now)
         size = roughness(found.elements)
         # On the first mesh, the errors are estimated from those of the known orbit.
         growth = jnp.maximum(size / self.known.roughness, 1.0) ** 2
@@ -269,14 +300,8 @@ def close(
     it, and its error follows from the known one. Otherwise, and if the events are others or the
     error is too large, the mesh is changed until flags and events agree and the error is small
     enough."""
-    closer = _Closer(
-        equation, lax.stop_gradient(equation.pair), tangents, known, neighbour, tolerance
-    )
-
-    def go_on(now: _Loop) -> Bool[Array, ""]:
-        return ~now.over & (now.closed.turns < _TURNS)
-
-    return lax.while_loop(go_on, lambda now: closer.turn(now), closer.start()).closed
+    frozen = lax.stop_gradient(equation.pair)
+    return Closer(equation, frozen, tangents, known, neighbour, tolerance).run().closed
 
 
 def _differences(before: OrbitForces, after: OrbitForces):
@@ -306,4 +331,4 @@ def _nothing(equation: CollocatedEquation, tangents: Any, elements: Elements) ->
     return Closed(empty, jnp.ones(()), infinite, infinite, no, zero, zero)
 
 
-__all__ = ["CORRECTED", "Closed", "close", "first_elements", "supported"]
+__all__ = ["CORRECTED", "SMALL", "Closed", "Closer", "Loop", "close", "first_elements", "supported"]

@@ -5,6 +5,7 @@ right-hand sides are the derivatives of the equation and of the margins. Events 
 parameters, and elements move with the events. Therefore no kink or jump crosses a Gauss point.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -20,6 +21,8 @@ from rootsopt.dynamics.collocation.gauss import GAUSS
 from rootsopt.dynamics.collocation.newton import lines
 from rootsopt.dynamics.collocation.system import (
     Columns,
+    Condensed,
+    Lines,
     Step,
     chained,
     condensed,
@@ -162,12 +165,17 @@ def _vertex(places: Float[Array, " 3"], values: Float[Array, " 3"]) -> Float[Arr
 
 @eqx.filter_jit
 def response(
-    equation: CollocatedEquation, elements: Elements, force: Any, tangents: Any
+    equation: CollocatedEquation,
+    elements: Elements,
+    force: Any,
+    tangents: Any,
+    solve: Callable[[Elements, Lines, Columns, Condensed], Step] = chained,
 ) -> OrbitForces:
     """Return the forces of the closed orbit `elements` and their derivatives.
 
     `force` (e, s): contact force (N) at the Gauss points; `tangents`: d directions of the pair's
-    parameters, stacked along a leading axis. The arrays of the mesh must have room for one more
+    parameters, stacked along a leading axis; `solve`: solver of the condensed equations, by default
+    for a last correction at constant parameters. The arrays of the mesh must have room for one more
     element."""
     mesh = elements.mesh
     count, inside = elements.state.shape[1], len(GAUSS.nodes)
@@ -193,7 +201,7 @@ def response(
         gap=jnp.pad(own.gap, ((0, 0), (0, 0), (0, width))),
         margin=jnp.concatenate([own.margin, along[:, inside, -1]], axis=-1),
     )
-    step = chained(elements, found, columns, condensed(elements, found, columns))
+    step = solve(elements, found, columns, condensed(elements, found, columns))
     raw, changes = _averages(equation, elements, points, along, step)
     unit = lax.stop_gradient(equation.pair.force_scale)
     top = lax.stop_gradient(equation.top) / unit

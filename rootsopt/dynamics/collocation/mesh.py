@@ -1,7 +1,8 @@
 """Meshes: distribution of elements over the intervals between events."""
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.dynamics.collocation.blocks import BLOCK
 from rootsopt.dynamics.collocation.elements import Elements, Mesh
@@ -101,6 +102,18 @@ def _highest(elements: Elements) -> Float[Array, " e"]:
     highest = jnp.sum(jnp.asarray(GAUSS.powers[-1])[:, None] * elements.slopes, axis=1)
     size = jnp.max(jnp.abs(highest), axis=1) * mesh.lengths
     return jnp.where(jnp.arange(size.shape[0]) < mesh.used, size, 0.0)
+
+
+def ordered(mesh: Mesh) -> tuple[Mesh, Bool[Array, ""]]:
+    """Return `mesh` with its times in ascending order, and whether they were so before.
+
+    Events that have passed each other, or a fixed time, meet halfway or at the fixed time."""
+    fixed = (mesh.which < 0) | (mesh.times == mesh.times[-1])
+    least = lax.cummax(jnp.where(fixed, mesh.times, -jnp.inf))
+    most = lax.cummin(jnp.where(fixed, mesh.times, jnp.inf), reverse=True)
+    between = jnp.clip(mesh.times, least, most)
+    times = (lax.cummax(between) + lax.cummin(between, reverse=True)) / 2
+    return mesh._replace(times=times), jnp.all(jnp.diff(mesh.times) >= 0)
 
 
 def moved(elements: Elements, mesh: Mesh) -> Elements:

@@ -108,8 +108,8 @@ def newton(
         found = lines(at, points)
         own = jax.tree.map(lambda x: x / way, own_column(at, found))
         roots = at.roots + jnp.clip((points.roots - at.roots) / way, -_TURNED, _TURNED)
-        moved, size = advanced(at, solved_step(at, found, own), roots)
-        stalled = (size < _STALLED[0]) & (size > _STALLED[1] * now.size)
+        moved, size, _ = advanced(at, solved_step(at, found, own), roots)
+        stalled = has_stalled(size, now.size)
         return Converged(moved, size, stalled, now.turns + 1, points.force[:, : len(GAUSS.nodes)])
 
     force = jnp.zeros(elements.slopes.shape[:2], elements.state.dtype)
@@ -129,10 +129,17 @@ def between(
     return eqx.tree_at(lambda e: e.pair, equation, eqx.combine(here, static))
 
 
+def has_stalled(size: Float[Array, ""], before: Float[Array, ""]) -> Bool[Array, ""]:
+    """Return whether Newton's steps only follow rounding.
+
+    `size`, `before`: size of the last step and of the one before (scaled)."""
+    return (size < _STALLED[0]) & (size > _STALLED[1] * before)
+
+
 def advanced(
     elements: Elements, step: Step, roots: Float[Array, "e p sides 2"]
-) -> tuple[Elements, Float[Array, ""]]:
-    """Return the elements after a Newton step, and the size of the step before any shortening.
+) -> tuple[Elements, Float[Array, ""], Float[Array, ""]]:
+    """Return the elements after a Newton step, the size of the step, and the share taken of it.
 
     `roots`: new `Elements.roots`. The step is shortened if it would shrink an interval too much. It
     is also shortened if it is too long for the linearised equation."""
@@ -150,4 +157,4 @@ def advanced(
         elements.slopes + share * slopes,
         roots,
     )
-    return moved, jnp.maximum(largest, jnp.max(jnp.abs(times)))
+    return moved, jnp.maximum(largest, jnp.max(jnp.abs(times))), share

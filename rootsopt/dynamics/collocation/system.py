@@ -158,11 +158,42 @@ def _eliminated(system: Float[Array, "e m c"]) -> Float[Array, "e m k"]:
     return lax.fori_loop(0, size, eliminate, system)[..., size:]
 
 
+class Chain(NamedTuple):
+    """The condensed equations, solved from element to element for an open motion (n states).
+
+    All rows are linear in the change of the first state (n) and in the k right-hand sides: `end`
+    (n, n + k): state at the end of the last element; `state` (e, n, n + k): state at the start of
+    each element, if the end of its interval stays; `by_end` (e, n): its derivative with respect to
+    the shift of that end; `shift` (e, n + k): shift of the end of the interval, 0 unless the
+    element is the last one of its interval.
+    """
+
+    end: Float[Array, "n c"]
+    state: Float[Array, "e n c"]
+    by_end: Float[Array, "e n"]
+    shift: Float[Array, "e c"]
+
+    @property
+    def monodromy(self) -> Float[Array, "n n"]:
+        """Monodromy matrix at the start of the mesh."""
+        return self.end[:, : self.end.shape[0]]
+
+
 def chained(elements: Elements, lines: Lines, columns: Columns, parts: Condensed) -> Step:
     """Return the changes of states, slopes and event times that solve the linear equations.
 
     `elements`: motion along which the equation is linearised; `lines`, `columns`: linearised
     equation and right-hand sides; `parts`: result of `condensed` for them."""
+    chain = opened(elements, lines, columns, parts)
+    states = elements.state.shape[1]
+    unit = jnp.eye(states, dtype=elements.state.dtype)
+    return spread(elements, parts, chain, solved(unit - chain.monodromy, chain.end[:, states:]))
+
+
+def opened(elements: Elements, lines: Lines, columns: Columns, parts: Condensed) -> Chain:
+    """Return the solution of the linear equations for any change of the first state.
+
+    For the arguments, see `chained`."""
     mesh = elements.mesh
     states, width = elements.state.shape[1], columns.gap.shape[-1]
     last, fixed = mesh.last, mesh.which[mesh.interval + 1] < 0
@@ -205,24 +236,45 @@ def chained(elements: Elements, lines: Lines, columns: Columns, parts: Condensed
         jnp.zeros((count, states), dtype),
         jnp.zeros((count, wide), dtype),
     )
-    (end, *_), (now, by_end, shift) = lax.fori_loop(0, mesh.used, step, (start, kept))
-    monodromy = end[:, :states]
-    first = solved(jnp.eye(states, dtype=dtype) - monodromy, end[:, states:])
+    (end, *_), rows = lax.fori_loop(0, mesh.used, step, (start, kept))
+    return Chain(end, *rows)
+
+
+def spread(
+    elements: Elements,
+    parts: Condensed,
+    chain: Chain,
+    first: Float[Array, "n c"],
+    mix: Float[Array, "k c"] | None = None,
+) -> Step:
+    """Return the changes of the whole motion for c changes `first` of its first state.
+
+    `mix`: factors of the right-hand sides in each of the c columns; by default, there is one column
+    for each right-hand side. For the other arguments, see `chained`."""
+    mesh = elements.mesh
+    (states, width), count = first.shape, elements.state.shape[0]
+    dtype = elements.state.dtype
+
+    def mixed(constants):
+        if mix is None:
+            return constants
+        return jnp.sum(constants[..., None] * mix, axis=-2)
 
     def closed(rows):
-        return jnp.sum(rows[..., :states, None] * first, axis=-2) + rows[..., states:]
+        return jnp.sum(rows[..., :states, None] * first, axis=-2) + mixed(rows[..., states:])
 
     used = jnp.arange(count) < mesh.used
-    place = jnp.where(last & used, mesh.interval + 1, mesh.times.shape[0])
-    times = jnp.zeros((mesh.times.shape[0], width), dtype).at[place].set(closed(shift), mode="drop")
+    place = jnp.where(mesh.last & used, mesh.interval + 1, mesh.times.shape[0])
+    times = jnp.zeros((mesh.times.shape[0], width), dtype)
+    times = times.at[place].set(closed(chain.shift), mode="drop")
     left, right = times[mesh.interval], times[mesh.interval + 1]
-    state = closed(now) + by_end[..., None] * right[:, None]
-    answer = parts.slopes[..., states + 2 :] + (
+    state = closed(chain.state) + chain.by_end[..., None] * right[:, None]
+    answer = mixed(parts.slopes[..., states + 2 :]) + (
         parts.slopes[..., states, None] * left[:, None, None]
         + parts.slopes[..., states + 1, None] * right[:, None, None]
         + jnp.sum(parts.slopes[..., :states, None] * state[:, None, None], axis=-2)
     )
-    return Step(state, answer, times, monodromy)
+    return Step(state, answer, times, chain.monodromy)
 
 
 def moved_places(elements: Elements, step: Step) -> tuple[Array, Array]:

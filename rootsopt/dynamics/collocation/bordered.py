@@ -1,0 +1,300 @@
+"""Periodic orbits along a curve: Newton's method for the orbit and for a parameter.
+
+The collocation equations and the times of the events have one unknown more here: a parameter of the
+pair. One more equation closes the system: the orbit's place (the state at φ1 = 0 and the parameter)
+lies in a plane. The matrix with this border is regular at folds too, where that for a fixed
+parameter is singular (Keller 1977). Mesh and events are found as for single orbits (`closing`).
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from rootsopt.dynamics.collocation.blocks import in_blocks
+from rootsopt.dynamics.collocation.closing import Closer, Loop
+from rootsopt.dynamics.collocation.elements import Elements
+from rootsopt.dynamics.collocation.equation import CollocatedEquation
+from rootsopt.dynamics.collocation.events import FlagScan, look, rooted
+from rootsopt.dynamics.collocation.forces import OrbitForces, origin, response
+from rootsopt.dynamics.collocation.gauss import GAUSS
+from rootsopt.dynamics.collocation.known import Known
+from rootsopt.dynamics.collocation.mesh import ordered
+from rootsopt.dynamics.collocation.newton import Converged, advanced, has_stalled, lines
+from rootsopt.dynamics.collocation.system import (
+    Chain,
+    Columns,
+    Condensed,
+    Lines,
+    Step,
+    condensed,
+    opened,
+    own_column,
+    spread,
+)
+from rootsopt.dynamics.linear import solved
+from rootsopt.dynamics.measures import Measures
+from rootsopt.dynamics.pair import RotorPair
+
+_TURNS = 12
+"""Maximum number of Newton steps."""
+_SMALL = 1e-10
+"""Newton step (scaled) below which Newton's method stops."""
+
+Family = Callable[[Float[Array, ""]], tuple[RotorPair, RotorPair]]
+"""Type of a function that maps a parameter to the pair, and to the pair's derivative with respect
+to this parameter, with a leading axis of length 1."""
+
+
+class Plane(NamedTuple):
+    """The plane in which an orbit's place must lie.
+
+    A place (n + 1,) consists of the scaled state at φ1 = 0, divided by `span`, and the parameter.
+    `through` (n + 1,): a place in the plane; `normal` (n + 1,): direction normal to the plane.
+    """
+
+    through: Float[Array, " m"]
+    normal: Float[Array, " m"]
+    span: Float[Array, ""]
+
+
+class Line(NamedTuple):
+    """The solution curve at an orbit, linearised.
+
+    `share`: the parameter; `residual`: greatest difference between the start and the end of the
+    open motion (scaled); `monodromy` (n, n) and `by_share` (n,): derivatives of the end of the
+    motion with respect to the state at the start of the mesh, and to the parameter; `to_state` (n,
+    n): derivative of the state at φ1 = 0 with respect to that at the start of the mesh; `inner` (n
+    + 1,): direction of the curve, as a change of the state at the start of the mesh and of the
+    parameter; `tangent` (n + 1,): the same direction as a unit vector of places; `motion`: change
+    of the whole motion along it.
+    """
+
+    share: Float[Array, ""]
+    residual: Float[Array, ""]
+    monodromy: Float[Array, "n n"]
+    by_share: Float[Array, " n"]
+    to_state: Float[Array, "n n"]
+    inner: Float[Array, " m"]
+    tangent: Float[Array, " m"]
+    motion: Step
+
+    @classmethod
+    def empty(cls, elements: Elements, share: Float[Array, ""]) -> "Line":
+        """Return a line with zeros, for motions like `elements`."""
+        count = elements.state.shape[1]
+        zeros = jnp.zeros
+        motion = Step(
+            zeros((*elements.state.shape, 1)),
+            zeros((*elements.slopes.shape, 1)),
+            zeros((*elements.mesh.times.shape, 1)),
+            zeros((count, count)),
+        )
+        square, row, place = zeros((count, count)), zeros(count), zeros(count + 1)
+        return cls(share, jnp.asarray(jnp.inf), square, row, square, place, place, motion)
+
+
+class Followed(NamedTuple):
+    """An orbit on a curve.
+
+    `found`: its forces, without derivatives; `line`: the curve there; `known`: the orbit, from
+    which the next one can be computed. It is `sound` if Newton's method has converged on a mesh
+    that ends at the orbit's events.
+    """
+
+    found: OrbitForces
+    line: Line
+    known: Known
+
+
+def moved_along(
+    known: Known, motion: Step, distance: Float[Array, ""]
+) -> tuple[Known, Bool[Array, ""]]:
+    """Return the orbit `known`, moved by a `distance` along the curve; `motion`: `Line.motion`.
+
+    Its `Elements.roots` are not valid any more. Also return whether all events keep their order."""
+    old = known.elements
+    times = old.mesh.times + distance * motion.times[:, 0]
+    mesh, rising = ordered(old.mesh._replace(times=times))
+    elements = Elements(
+        mesh,
+        old.state + distance * motion.state[..., 0],
+        old.slopes + distance * motion.slopes[..., 0],
+        old.roots,
+    )
+    return known._replace(elements=elements), rising
+
+
+class _Follower(Closer):
+    """The loop of `followed`.
+
+    `family`: pairs of the curve; `measures`: averages of the force; `plane`: see `Plane`; `rising`:
+    whether all events of the known orbit have kept their order (`moved_along`). The other fields are those of `Closer`, for the parameter at the start."""
+
+    family: Family = eqx.field(kw_only=True)
+    measures: Measures = eqx.field(kw_only=True)
+    plane: Plane = eqx.field(kw_only=True)
+    rising: Bool[Array, ""] = eqx.field(kw_only=True)
+
+    def start(self) -> Loop:
+        begun = super().start()
+        line = Line.empty(begun.elements, self.plane.through[-1])
+        return begun._replace(trusted=begun.trusted & self.rising, line=line)
+
+    def frozen_at(self, now: Loop) -> RotorPair:
+        return lax.stop_gradient(self.family(now.line.share)[0])
+
+    def equation_at(self, share: Float[Array, ""]) -> tuple[CollocatedEquation, RotorPair]:
+        """Return the equation, and the derivative of its pair with respect to the parameter."""
+        pair, tangent = self.family(share)
+        return CollocatedEquation(pair, self.measures, pair.force_scale), tangent
+
+    def forces(self, now: Loop) -> OrbitForces:
+        equation, _ = self.equation_at(now.line.share)
+        return response(equation, now.elements, now.force, self.tangents, _uncorrected)
+
+    def converged(self, now: Loop, elements: Elements, limit) -> tuple[Converged, Line]:
+        del limit
+
+        def go_on(carry):
+            got, _ = carry
+            return (got.turns < _TURNS) & (got.size > _SMALL) & ~got.stalled
+
+        def turn(carry):
+            got, line = carry
+            moved, size, force, line = self._step(got.elements, line)
+            stalled = has_stalled(size, got.size)
+            return Converged(moved, size, stalled, got.turns + 1, force), line
+
+        force = jnp.zeros(elements.slopes.shape[:2], elements.state.dtype)
+        infinite, no = jnp.full_like(elements.state[0, 0], jnp.inf), jnp.zeros((), bool)
+        start = Converged(elements, infinite, no, jnp.zeros((), int), force)
+        return lax.while_loop(go_on, turn, (start, now.line))
+
+    def solve(self, now: Loop, seen: FlagScan) -> Loop:
+        """Return the loop's state after Newton's method on the present mesh.
+
+        If events of the known orbit are missing on the new one, their equations have no solution.
+        The flags along the motion at the start then show the events."""
+        new = super().solve(now, seen)
+        lost = now.trusted & ~new.solved
+        again = now._replace(failures=now.failures + 1, closed=new.closed)
+        return jax.tree.map(lambda x, y: jnp.where(lost, x, y), again, new)
+
+    def _step(self, elements: Elements, line: Line):
+        """Return the motion after a Newton step, the size of the step, the force (N) at the Gauss
+        points, and the new `line`."""
+        equation, tangent = self.equation_at(line.share)
+        count, inside = elements.state.shape[1], len(GAUSS.nodes)
+        mesh = elements.mesh
+        tau, state = elements.places
+        which = jnp.maximum(mesh.which[mesh.interval + 1], 0)
+
+        def both(tau, state, roots, which):
+            return equation.along(tau, state, roots, which, tangent)
+
+        each = jax.vmap(jax.vmap(both, (0, 0, 0, None)))
+        points, along = in_blocks(each, mesh.used, tau, state, elements.roots, which)
+        found = lines(elements, points)
+        own = own_column(elements, found)
+        columns = Columns(
+            slope=jnp.concatenate([own.slope, along[:, :inside, :count]], axis=-1),
+            gap=jnp.pad(own.gap, ((0, 0), (0, 0), (0, 1))),
+            margin=jnp.concatenate([own.margin, along[:, inside, -1]], axis=-1),
+        )
+        parts = condensed(elements, found, columns)
+        chain = opened(elements, found, columns, parts)
+        change, inner, to_state, tangent = self._bordered(elements, chain, line.share)
+        step = spread(elements, parts, chain, change[:count, None], _mixed(1.0, change[-1]))
+        moved, size, share = advanced(elements, step, points.roots)
+        motion = spread(elements, parts, chain, inner[:count, None], _mixed(0.0, inner[-1]))
+        miss = chain.end[:, count]
+        new = Line(
+            share=line.share + share * change[-1],
+            residual=jnp.max(jnp.abs(miss)),
+            monodromy=chain.monodromy,
+            by_share=chain.end[:, count + 1],
+            to_state=to_state,
+            inner=inner,
+            tangent=tangent,
+            motion=motion,
+        )
+        size = jnp.maximum(size, jnp.abs(change[-1]))
+        return moved, size, points.force[:, :inside], new
+
+    def _bordered(self, elements: Elements, chain: Chain, share: Float[Array, ""]):
+        """Solve the closing equations together with that of the plane.
+
+        `chain`: solution of the open equations, with one column for Newton's step and one for the
+        parameter. Return the change of the state at the start of the mesh and of the parameter (n +
+        1,), and `Line.inner`, `Line.to_state`, `Line.tangent`."""
+        count = elements.state.shape[1]
+        through, normal, span = self.plane
+        at = origin(elements)
+        rows, state = chain.state[at] / span, elements.state[at] / span
+        border = normal[:count] @ rows
+        last = jnp.append(border[:count], border[count + 1] + normal[-1])
+        first = jnp.column_stack([jnp.eye(count) - chain.monodromy, -chain.end[:, count + 1]])
+        miss = normal @ (jnp.append(state, share) - through) + border[count]
+        right = jnp.stack([jnp.append(chain.end[:, count], -miss), jnp.eye(count + 1)[-1]], axis=1)
+        change, inner = solved(jnp.concatenate([first, last[None]]), right).T
+        place = jnp.append(rows[:, :count] @ inner[:count] + rows[:, count + 1] * inner[-1], inner[-1])
+        length = jnp.linalg.norm(place)
+        return change, inner / length, chain.state[at][:, :count], place / length
+
+
+def _mixed(own: float, by_share: Float[Array, ""]) -> Float[Array, "2 1"]:
+    """Return factors of the two right-hand sides: that of Newton's step, and the parameter's."""
+    return jnp.stack([jnp.full_like(by_share, own), by_share])[:, None]
+
+
+def _uncorrected(elements: Elements, found: Lines, columns: Columns, parts: Condensed) -> Step:
+    """Return no change of the motion `elements`; for the other arguments, see `system.chained`."""
+    chain = opened(elements, found, columns, parts)
+    width = columns.gap.shape[-1]
+    return Step(
+        jnp.zeros((*elements.state.shape, width)),
+        jnp.zeros((*elements.slopes.shape, width)),
+        jnp.zeros((*elements.mesh.times.shape, width)),
+        chain.monodromy,
+    )
+
+
+def followed(
+    family: Family,
+    measures: Measures,
+    start: tuple[Known, Step, Float[Array, ""]],
+    plane: Plane,
+    tolerance: Float[Array, ""],
+) -> Followed:
+    """Return the orbit near a known motion whose place lies in a `plane`.
+
+    `family`: pairs along the curve; `measures`: averages of the force; `start`: arguments of
+    `moved_along`, which returns the known motion; `tolerance`: relative error of the forces to
+    reach. The first parameter is that of `Plane.through`."""
+    known, rising = moved_along(*start)
+    pair, _ = family(plane.through[-1])
+    frozen = lax.stop_gradient(pair)
+    equation = CollocatedEquation(pair, measures, pair.force_scale)
+    nothing = jax.tree.map(
+        lambda x: jnp.zeros((0, *x.shape)), eqx.filter(pair, eqx.is_inexact_array)
+    )
+    searched = rooted(known.elements, look(frozen, known.elements))
+    known = known._replace(elements=searched)
+    loop = _Follower(
+        equation, frozen, nothing, known, frozen, tolerance,
+        family=family, measures=measures, plane=plane, rising=rising,
+    ).run()  # fmt: skip
+    closed = loop.closed
+    yes = jnp.ones((), bool)
+    errors = closed.roughness, closed.error, closed.drift
+    return Followed(
+        closed.found, loop.line, Known(closed.found.elements, *errors, closed.sound, yes)
+    )
+
+
+__all__ = ["Family", "Followed", "Line", "Plane", "followed"]
