@@ -32,7 +32,7 @@ period that its orbits can hardly be followed."""
 QUIET = 4.0
 """Peak force (units of the static force that carries the load at the pitch radius) above which an
 orbit counts as noisy: the flanks hammer."""
-POINTS, FEWEST = 100, 25
+POINTS, FEWEST = 200, 25
 """Sum of the periods (mesh periods) of all points above which a branch ends. The second number is
 the number of points that every branch may have."""
 LONGEST, DOUBLED = 4, 2

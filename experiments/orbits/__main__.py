@@ -4,10 +4,11 @@ Writes orbits.csv (updated after each pair) and orbits.png. The exit code is 3 i
 another period or its forces differ by more than 1e-4.
 
 With `--speed`, times value and gradient from a neighbour's orbit instead, against the other ways,
-SciPy and Numba. Writes speed.csv.
+SciPy and Numba, on one core. Writes speed.csv.
 """
 
 import argparse
+import os
 import sys
 from typing import TYPE_CHECKING
 
@@ -43,7 +44,9 @@ def body(run: Run) -> int:
 
 
 def _timed(run: Run) -> int:
-    """Time the scenes named, and print the table."""
+    """Time the scenes named on one core, and print the table."""
+    if hasattr(os, "sched_setaffinity"):  # before JAX starts its threads
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     from experiments.orbits import speed
 
     rows: list[speed.Row] = []

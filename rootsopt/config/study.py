@@ -81,7 +81,7 @@ class SolverConfig(Section):
         "auto",
         description="how periodic orbits are closed: by shooting, by collocation aligned with "
         "contact events, or auto: by collocation from the orbit of a neighbour where hundreds of "
-        "evaluations follow, otherwise by shooting",
+        "evaluations follow and along branches, otherwise by shooting",
     )
     gradient: Literal["forward", "reverse"] = Field(
         "forward", description="differentiation mode; both give the same gradient"

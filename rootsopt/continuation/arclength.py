@@ -266,6 +266,20 @@ def follow_curve(
             step = min(1.5 * step, steps.greatest)
 
 
+def _surely(
+    curve: SolutionCurve,
+    guess: NDArray[np.float64],
+    across: NDArray[np.float64],
+    along: NDArray[np.float64],
+    near: Spot,
+) -> Spot:
+    """Return the result of `corrected`, by Newton's method if the curve's own method fails."""
+    try:
+        return corrected(curve, guess, across, along, near)
+    except StoppedError:
+        return by_newton(curve, guess, across, along)
+
+
 def _leaves(spot: Spot, steps: StepSizes) -> bool:
     """Return whether the curve leaves the parameter's range at `spot`.
 
@@ -357,9 +371,9 @@ def _located(curve: SolutionCurve, old: Spot, new: Spot, test: Callable[[Spot], 
     side = 0
     for _ in range(40):
         share = (low * at_high - high * at_low) / (at_high - at_low)
+        guess, near = old.place + share * chord, old if share < 0.5 else new
         try:
-            near = old if share < 0.5 else new
-            spot = corrected(curve, old.place + share * chord, across, old.tangent, near)
+            spot = _surely(curve, guess, across, old.tangent, near)
         except StoppedError:
             break
         value = test(spot)

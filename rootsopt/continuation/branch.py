@@ -46,6 +46,11 @@ _SIZES = 3e-4, 1e-3, 3e-3, 1e-4, 1e-2
 tried, in this order."""
 
 
+_FEW = 8
+"""Number of points below which a doubled branch that falls back to the single period is tried
+again, from another distance."""
+
+
 class Kind(enum.Enum):
     """Kinds of bifurcation. Each value says what happens to the orbit."""
 
@@ -197,15 +202,20 @@ def follow_doubled(
         return None
     # Both directions lead to the same orbit, shifted by `branch.period`. Near a grazing contact one
     # of them may fail.
+    fallen = None
     for size, way in itertools.product(_SIZES, (1, -1)):
         aside = way * across
         try:
             start = corrected(orbits, place + size * aside, aside, aside)
         except StoppedError:
             continue
-        if start.look.data.half_way > 0.2 * size:
-            return _branch(orbits, follow_curve(orbits, start, orbits.steps, _TESTS))
-    return None
+        if start.look.data.half_way <= 0.2 * size:
+            continue
+        found = _branch(orbits, follow_curve(orbits, start, orbits.steps, _TESTS))
+        if found.ends[1] is not End.HALVED or len(found.points) >= _FEW:
+            return found
+        fallen = found
+    return fallen
 
 
 def _family(config: Config, parameter: str, period: int, limits: StepSizes) -> OrbitFamily:

@@ -29,6 +29,7 @@ from rootsopt.dynamics.collocation.bordered import Followed, Line, Plane, follow
 from rootsopt.dynamics.collocation.closing import supported
 from rootsopt.dynamics.collocation.known import Known
 from rootsopt.dynamics.collocation.seed import from_steps
+from rootsopt.dynamics.collocation.system import Step
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.pair import RotorPair
@@ -50,11 +51,12 @@ which collocation is not used."""
 class _Memory(NamedTuple):
     """An orbit from which the next one on the curve can be closed (`Linearization.memory`).
 
-    `known`: the orbit; `line`: the curve there; `tangent` (n + 1,): tangent for which `line` holds.
+    `known`: the orbit; `tangent` (n + 1,) of the curve; `motion`: change of the whole motion along
+    it.
     """
 
     known: Known
-    line: Line
+    motion: Step
     tangent: NDArray[np.float64]
 
 
@@ -116,7 +118,7 @@ class CollocatedFamily(OrbitFamily):
             return spot.look.memory
         # It was closed by integration.
         shot = self._shot(spot.place, spot.look.memory, refine=False)
-        known, line = _seeded(
+        known, motion = _seeded(
             self.scene,
             self.names,
             self._values(self.value(spot.place)),
@@ -125,7 +127,7 @@ class CollocatedFamily(OrbitFamily):
             (shot.out.grid, shot.out.corners),
             np.zeros(self.period),
         )
-        return _Memory(known, line, np.zeros(len(spot.place)))
+        return _Memory(known, motion, np.zeros(len(spot.place)))
 
     def _followed(
         self,
@@ -137,18 +139,19 @@ class CollocatedFamily(OrbitFamily):
     ) -> Spot:
         """Return the orbit at which the curve meets a plane, from that of `memory` at `place`."""
         self._check_design(self.value(guess))
-        low = self.limits.low
+        low, width = np.asarray(float(self.limits.low)), np.asarray(float(self.width))
         made, seen = jax.device_get(
             _follow(
                 self.scene,
                 self.names,
-                (self.values * (np.arange(len(self.values)) != self.index), low, self.width),
+                (self.values * (np.arange(len(self.values)) != self.index), low, width),
                 np.eye(len(self.names))[self.index],
                 np.asarray(self.unit),
                 memory.known,
-                memory.line.motion,
+                memory.motion,
                 np.asarray((guess - place) @ memory.tangent),
-                Plane(guess, across, np.asarray(SPAN)),
+                guess,
+                across,
                 self.scene.solver.measures,
                 self.integrator,
             )
@@ -166,10 +169,11 @@ class CollocatedFamily(OrbitFamily):
             raise StoppedError(End.LOST_MESH)
         if made.found.depth > TOO_DEEP * float(self.scene.pitch_radius):
             raise StoppedError(End.TOO_DEEP)
+        monodromy = np.asarray(line.monodromy)
         mean, square, peak = made.found.response[:3]
         data = OrbitData(
-            monodromy=line.monodromy,
-            to_state=line.to_state,
+            monodromy=monodromy,
+            to_state=np.asarray(line.to_state),
             state=np.asarray(seen.state) * (self.unit / seen.scale),
             statistics=np.array([mean, peak, np.sqrt(square)]),
             half_way=float(np.max(np.abs(seen.half_way - seen.state))) / SPAN,
@@ -181,11 +185,15 @@ class CollocatedFamily(OrbitFamily):
         if self.period % 2 == 0 and data.half_way < HALF_ALIKE:
             raise StoppedError(End.HALVED)
         count = len(new) - 1
-        jacobian = np.column_stack([line.monodromy - np.eye(count), line.by_share])
+        jacobian = np.column_stack([monodromy - np.eye(count), line.by_share])
         tangent, inner = np.asarray(line.tangent), np.asarray(line.inner)
         turned = np.sign(np.linalg.det(np.vstack([jacobian, inner]))) * tangent
         look = Linearization(
-            np.atleast_1d(line.residual), jacobian, _Memory(made.known, line, tangent), data, turned
+            np.atleast_1d(line.residual),
+            jacobian,
+            _Memory(made.known, line.motion, tangent),
+            data,
+            turned,
         )
         return Spot(new, tangent if tangent @ along >= 0 else -tangent, look, 1)
 
@@ -204,14 +212,14 @@ def _seeded(
     state: Float[Array, " n"],
     taken: Any,
     periods: Float[Array, " k"],
-) -> tuple[Known, Line]:
-    """Return an orbit closed by integration as a start for collocation.
+) -> tuple[Known, Step]:
+    """Return an orbit closed by integration as a start for collocation, and a motion of zeros.
 
     `state` (n,): scaled; `taken`: as for `from_steps`; `periods`: its shape tells the period."""
     pair, _ = _with_unit(scene, names, values, unit)
     longest = periods.shape[0]
     known = from_steps(pair, state, taken, jnp.asarray(longest), longest)
-    return known, Line.empty(known.elements, jnp.zeros(()))
+    return known, Line.empty(known.elements, jnp.zeros(())).motion
 
 
 def _with_unit(scene: Scene, names: tuple[str, ...], values, unit):
@@ -230,16 +238,17 @@ def _follow(
     known: Known,
     motion: Any,
     distance: Float[Array, ""],
-    plane: Plane,
+    guess: Float[Array, " m"],
+    across: Float[Array, " m"],
     measures: Measures,
     integrator: Integrator,
 ) -> tuple[Followed, _Seen]:
-    """Return the orbit whose place lies in a `plane`, starting from a `known` one.
+    """Return the orbit whose place lies in the plane through `guess` (m,) normal to `across` (m,).
 
     `values`: those of the parameters `names`, with 0 for the followed one; the latter's least value
     and range; `direction` (p,): unit vector of the followed parameter; `unit`: fixed unit of ε
-    (rad); `motion`, `distance`: direction of the curve at the known orbit, and distance to go along
-    it."""
+    (rad); `known`: orbit to start from; `motion`, `distance`: direction of the curve there, and
+    distance to go along it."""
     others, low, width = values
 
     def at(share):
@@ -252,6 +261,7 @@ def _follow(
         _, tangent = jax.jvp(arrays, (share,), (jnp.ones_like(share),))
         return at(share)[0], jax.tree.map(lambda x: x[None], tangent)
 
+    plane = Plane(guess, across, jnp.asarray(SPAN))
     tolerance = _ACCURACY * integrator.tolerance(known.elements.state.dtype)
     made = followed(family, measures, (known, motion, distance), plane, tolerance)
     pair, scale = at(made.line.share)

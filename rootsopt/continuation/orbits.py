@@ -291,7 +291,11 @@ class OrbitFamily:
             reach=reach,
             gap_time=longest_gap(np.asarray(shot.touching)) * self.period,
         )
-        if self.period % 2 == 0 and seen.half_way < HALF_ALIKE and seen.residual < RESIDUAL["float64"]:
+        if (
+            self.period % 2 == 0
+            and seen.half_way < HALF_ALIKE
+            and seen.residual < RESIDUAL["float64"]
+        ):
             raise StoppedError(End.HALVED)
         jacobian = np.column_stack([monodromy - np.eye(count), by_share])
         return Linearization(miss / SPAN, jacobian, shot.grid, seen)

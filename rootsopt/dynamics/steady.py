@@ -376,10 +376,11 @@ class _Attempts(eqx.Module):
         room = solver.max_periods - used
         room = jnp.where(now.tries > 0, jnp.minimum(room, _LONGER), room).astype(int)
         transient = dataclasses.replace(solver.transient, rtol=now.coarse)
-        known = now.shorter > 0
+        nothing = jnp.zeros_like(used)
+        last = now.found.settled._replace(period=now.shorter, periods=nothing, steps=nothing)
         settled = lax.cond(
-            known,
-            lambda: now.found.settled._replace(period=now.shorter, periods=0 * used, steps=0 * used),
+            now.shorter > 0,
+            lambda: last,
             lambda: settle(self.pair, now.state, transient, now.within, room, solver.max_orbit),
         )
         failure = transient_status(self.pair, settled)
@@ -402,7 +403,6 @@ class _Attempts(eqx.Module):
             )
             return self._taken(lost, made, settled.state, period, now.within), made.shorter
 
-        nothing = jnp.zeros_like(now.shorter)
         found, shorter = lax.cond(failure < 0, close, lambda: (lost, nothing))
         again = (failure < 0) & (found.status == Status.NOT_SETTLED.code)
         again &= now.tries + 1 < _COLLOCATIONS

@@ -30,7 +30,7 @@ from rootsopt.continuation.branch import (
     value_of,
     with_value,
 )
-from rootsopt.continuation.orbits import OrbitFamily, _longest_gap
+from rootsopt.continuation.orbits import OrbitFamily, longest_gap
 from rootsopt.errors import InputError
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.status import Status
@@ -326,11 +326,11 @@ def test_a_design_ends_where_no_profile_can_be_made(branch):
     assert path.points[-1].value == pytest.approx(9.071, abs=2e-3)
 
 
-def test_longest_gap_goes_around():
-    assert _longest_gap(np.array([0, 1, 0, 0, 1, 0], bool)) == 2 / 6
-    assert _longest_gap(np.array([0, 0, 1, 0, 0, 1, 0], bool)) == 3 / 7
-    assert _longest_gap(np.zeros(4, bool)) == 1
-    assert _longest_gap(np.ones(4, bool)) == 0
+def testlongest_gap_goes_around():
+    assert longest_gap(np.array([0, 1, 0, 0, 1, 0], bool)) == 2 / 6
+    assert longest_gap(np.array([0, 0, 1, 0, 0, 1, 0], bool)) == 3 / 7
+    assert longest_gap(np.zeros(4, bool)) == 1
+    assert longest_gap(np.ones(4, bool)) == 0
 
 
 @pytest.mark.long

@@ -213,21 +213,24 @@ def test_jump_in_both_modes():
     assert np.max(np.delete(errors, 2)) < 1e-9
 
 
-def test_jump_is_a_switch():
-    """A switch changes where the levers jump beside a cusp, twice in a mesh period.
+@pytest.mark.parametrize("lobes", [2, 3, 4])
+@pytest.mark.parametrize("depth", [1e-4, 1.2e-3, 4e-3])
+def test_jump_is_a_switch(lobes, depth):
+    """A switch changes where the contact jumps beside a cusp, twice in a mesh period.
 
-    A step short enough for the derivative therefore encloses the jump at any tolerance."""
-    pair = FlankPair.of(EE(3, 0.033))
-    rolls = pair.profile.half_pitch + jnp.linspace(-0.02, 0.02, 801)
+    A step short enough for the derivative therefore encloses the jump at any tolerance. The switch
+    that tells the minima apart changes nowhere else while the contact passes the cusp."""
+    pair = FlankPair.of(EE(lobes, 0.033))
+    rolls = pair.profile.half_pitch + depth * jnp.linspace(-12, 12, 1201)
 
     @jax.jit
     def look(roll):
-        found = pair(roll, jnp.asarray(-1.2e-3))
-        return found.lever1, pair.switches(roll, found)
+        found = pair(roll, jnp.asarray(-depth))
+        return found.normal2, pair.switches(roll, found)
 
-    levers, switches = (np.asarray(x) for x in jax.lax.map(look, rolls))
-    steps = np.abs(np.diff(levers))
-    jumps = np.flatnonzero(steps > 20 * np.median(steps))
+    normals, switches = (np.asarray(x) for x in jax.lax.map(look, rolls))
+    jumps = np.flatnonzero(np.abs(np.diff(normals)) > 3 * depth)
     changes = np.any(switches[1:] != switches[:-1], axis=1)
     assert len(jumps) == 2
     assert np.all(changes[jumps])
+    np.testing.assert_array_equal(np.flatnonzero(switches[1:, 2] != switches[:-1, 2]), jumps)

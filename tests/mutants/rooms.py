@@ -6,6 +6,7 @@ _TESTS = Path(__file__).parents[1]
 _OF = {
     "continuation/arclength": "orbits continuation",
     "continuation/branch": "continuation",
+    "continuation/collocated": "collocated continuation",
     "continuation/orbits": "orbits continuation",
     "contact/closest": "closed_forms contact accuracy conjugacy families gradients",
     "contact/gap": "conformance",
@@ -23,6 +24,7 @@ _OF = {
     "contact/worn": "worn",
     "contact/wrapped": "worn twisted",
     "dynamics/collocation/blocks": "system mesh",
+    "dynamics/collocation/bordered": "collocated continuation",
     "dynamics/collocation/closing": "motion known",
     "dynamics/collocation/elements": "mesh system",
     "dynamics/collocation/equation": "system motion",

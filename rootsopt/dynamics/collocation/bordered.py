@@ -7,7 +7,7 @@ parameter is singular (Keller 1977). Mesh and events are found as for single orb
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -133,7 +133,8 @@ class _Follower(Closer):
     """The loop of `followed`.
 
     `family`: pairs of the curve; `measures`: averages of the force; `plane`: see `Plane`; `rising`:
-    whether all events of the known orbit have kept their order (`moved_along`). The other fields are those of `Closer`, for the parameter at the start."""
+    whether all events of the known orbit have kept their order (`moved_along`). The other fields
+    are those of `Closer`, for the parameter at the start."""
 
     family: Family = eqx.field(kw_only=True)
     measures: Measures = eqx.field(kw_only=True)
@@ -242,7 +243,8 @@ class _Follower(Closer):
         miss = normal @ (jnp.append(state, share) - through) + border[count]
         right = jnp.stack([jnp.append(chain.end[:, count], -miss), jnp.eye(count + 1)[-1]], axis=1)
         change, inner = solved(jnp.concatenate([first, last[None]]), right).T
-        place = jnp.append(rows[:, :count] @ inner[:count] + rows[:, count + 1] * inner[-1], inner[-1])
+        moved = rows[:, :count] @ inner[:count] + rows[:, count + 1] * inner[-1]
+        place = jnp.append(moved, inner[-1])
         length = jnp.linalg.norm(place)
         return change, inner / length, chain.state[at][:, :count], place / length
 

@@ -36,10 +36,11 @@ the force is evaluated in each round."""
 _ROUNDS, _CLOSER = 4, 0.25
 """Number of rounds of the search for the peak, and factor by which the searched range shrinks from
 one round to the next. The vertex of a parabola through the best three instants follows."""
-_MENDED = 3
-"""Number of evaluations at each instant. Each improves the `NearContact.roots` from which the next
-one starts. After a single one, errors of the roots would decide between two instants near the
-peak, where the force hardly changes."""
+_MENDED, _SETTLED = 8, 1e-11
+"""Maximum number of evaluations at each instant, and change of a force (relative to the greatest)
+below which they end. Each improves the `NearContact.roots` from which the next one starts. After a
+single one, errors of the roots would decide between two instants near the peak, where the force
+hardly changes. Where the contact passes a cusp, more are needed than elsewhere."""
 
 
 class Peak(NamedTuple):
@@ -115,10 +116,19 @@ def located_peak(
 
     def mended(places, roots):
         """Return the forces (N) at `places` of the rivals, and the improved `roots`."""
+
+        def go_on(carry):
+            times, before, forces, _ = carry
+            moved = jnp.max(jnp.abs(forces - before)) > _SETTLED * jnp.max(jnp.abs(forces))
+            return (times < 2) | (moved & (times < _MENDED))
+
+        def again(carry):
+            times, _, forces, roots = carry
+            return times + 1, forces, *each(rivals, places, roots)
+
         nothing = jnp.zeros_like(places)
-        return lax.fori_loop(
-            0, _MENDED, lambda _, found: each(rivals, places, found[1]), (nothing, roots)
-        )
+        start = jnp.zeros((), int), nothing, nothing, roots
+        return lax.while_loop(go_on, again, start)[2:]
 
     pick = jax.vmap(lambda x, i: x[i])
 

@@ -103,10 +103,8 @@ def collocated(
     miss = jnp.max(jnp.abs(out.end - found.state))
     size = jnp.maximum(1.0, jnp.max(jnp.abs(found.state)))
     gain = jnp.maximum(1.0, jnp.max(jnp.abs(found.monodromy)))
-    far, unequal = (jnp.maximum(factor * tolerance, least) for factor, least in (_MISS, _APART))
-    least = _FAINT * tolerance * pair.force_scale
-    allowed = unequal * jnp.abs(found.response[:3]) + jnp.stack([least, least**2, least])
-    equal = jnp.all(jnp.abs(out.response[:3] - found.response[:3]) <= allowed)
+    far = jnp.maximum(_MISS[0] * tolerance, _MISS[1])
+    equal = _equal(out.response[:3], found.response[:3], tolerance, pair.force_scale)
     verified = closed.sound & out.solved & (miss <= far * size * gain) & equal
     verified &= closed.error <= _UNREFINED * _ACCURACY * tolerance
     # The transient may have mistaken several periods of the orbit for one.
@@ -115,6 +113,21 @@ def collocated(
     residual = jnp.where(closed.sound, found.correction, jnp.inf)
     orbit = _as_orbit(found, _with_forces(out, found), residual, closed.drift, closed.steps)
     return Collocated(orbit, closed.sound, shorter, verified, _known(closed, verified))
+
+
+def _equal(
+    one: Float[Array, " 3"],
+    other: Float[Array, " 3"],
+    tolerance: Float[Array, ""],
+    unit: Float[Array, ""],
+) -> Bool[Array, ""]:
+    """Return whether two results for mean (N), mean square (N²) and peak force (N) agree.
+
+    `tolerance`: that of the orbit's integrator; `unit` of force (N)."""
+    least = _FAINT * tolerance * unit
+    share = jnp.maximum(_APART[0] * tolerance, _APART[1])
+    allowed = share * jnp.abs(other) + jnp.stack([least, least**2, least])
+    return jnp.all(jnp.abs(one - other) <= allowed)
 
 
 def _repeats(

@@ -2,10 +2,12 @@
 
 import jax.numpy as jnp
 import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
 
 from rootsopt.dynamics.collocation.elements import Elements, Mesh
 from rootsopt.dynamics.collocation.gauss import GAUSS, POINTS
-from rootsopt.dynamics.collocation.mesh import aligned, counted, moved, needed, shared
+from rootsopt.dynamics.collocation.mesh import aligned, counted, moved, needed, ordered, shared
 
 ROOM = 32
 
@@ -76,6 +78,33 @@ def test_motion_moves_to_another_mesh():
         np.testing.assert_allclose(new.motion(jnp.asarray(tau)), expected, atol=2e-6)
     back = moved(new, elements.mesh)
     np.testing.assert_allclose(back.state[:16], elements.state[:16], atol=2e-6)
+
+
+def _times(times, which):
+    mesh = _wave(np.linspace(0, 1, 5)).mesh
+    count = mesh.times.shape[0] - len(times)
+    times = jnp.asarray([*times, *[times[-1]] * count])
+    return mesh._replace(times=times, which=jnp.asarray([*which, *[-1] * count]))
+
+
+def test_events_that_passed_each_other_meet():
+    """Fixed times stay; ascending times are left alone."""
+    mesh, rising = ordered(_times([0.0, 0.4, 0.3, 0.5, 0.62, 0.6, 1.0], [-1, 3, 2, 1, 5, -1, -1]))
+    assert not rising
+    np.testing.assert_allclose(mesh.times[:7], [0.0, 0.35, 0.35, 0.5, 0.6, 0.6, 1.0])
+    same, rising = ordered(_times([0.0, 0.3, 0.4, 0.6, 1.0], [-1, 3, 2, -1, -1]))
+    assert rising
+    np.testing.assert_array_equal(same.times[:5], [0.0, 0.3, 0.4, 0.6, 1.0])
+
+
+@given(st.lists(st.floats(0, 1), min_size=1, max_size=6))
+def test_order_of_events_is_mended(events):
+    times = _times([0.0, *events, 1.0], [-1, *[2] * len(events), -1])
+    mesh, rising = ordered(times)
+    assert np.all(np.diff(mesh.times) >= 0)
+    assert bool(rising) == (sorted(events) == events)
+    if rising:
+        np.testing.assert_array_equal(mesh.times, times.times)
 
 
 def test_elements_crowd_where_they_are_needed():

@@ -10,8 +10,11 @@ import pytest
 
 import rootsopt
 from rootsopt.contact.law import ContactLaw
+from rootsopt.dynamics import steady
 from rootsopt.dynamics.collocation.closing import supported
+from rootsopt.dynamics.collocation.motion import _equal
 from rootsopt.dynamics.parts.base import Part
+from rootsopt.dynamics.settle import settle
 from rootsopt.scene import Scene
 from rootsopt.status import Status
 
@@ -24,6 +27,11 @@ LIVELY = [
     "profile.pressure_angle_deg=30.7",
     "profile.involute_length_mm=4",
     "profile.tip_arc_angle_deg=1.5",
+]
+STIFF = [
+    "scene.speed_rpm=657.2",
+    "scene.load.torque_N_m=2.069",
+    "scene.timing_gear={stiffness_N_m_per_rad: 42986, damping_ratio: 0.276, backlash_mm: 0.104}",
 ]
 FOUR = [
     "profile={family: cic, lobes: 4, pitch_radius_mm: 33.0, pressure_angle_deg: 33, "
@@ -59,8 +67,15 @@ def _both(name, overrides):
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "overrides", "period"),
-    [("cic", [], 1), ("ee", [], 1), ("cic", FOUR, 1), ("cic", LIVELY, 2), ("pump", [], 1)],
-    ids=["cic", "ee", "four lobes", "lively", "pump"],
+    [
+        ("cic", [], 1),
+        ("ee", [], 1),
+        ("ee", STIFF, 1),
+        ("cic", FOUR, 1),
+        ("cic", LIVELY, 2),
+        ("pump", [], 1),
+    ],
+    ids=["cic", "ee", "ee, steps down to rounding", "four lobes", "lively", "pump"],
 )
 def test_collocation_agrees_with_shooting(name, overrides, period):
     (by_one, one), (by_other, other) = _both(name, overrides)
@@ -73,6 +88,42 @@ def test_collocation_agrees_with_shooting(name, overrides, period):
     first, second = (np.sort(np.abs(response.multipliers)) for response in (one, other))
     np.testing.assert_allclose(first, second, atol=1e-5)
     np.testing.assert_allclose(one.state, other.state, rtol=1e-5, atol=1e-9)
+
+
+def test_faint_forces_agree():
+    """Forces agree to 1e-4; what is far below the unit of force does not count."""
+    unit, tolerance = jnp.asarray(100.0), jnp.asarray(1e-8)
+    forces = jnp.asarray([2.0, 9.0, 40.0])
+    assert _equal(1.00009 * forces, forces, tolerance, unit)
+    for place in range(3):
+        assert not _equal(forces.at[place].multiply(1.0002), forces, tolerance, unit)
+    faint = jnp.asarray([6e-8, 2e-13, 3e-5])
+    assert _equal(faint.at[0].multiply(2), faint, tolerance, unit)
+    assert not _equal(faint.at[2].multiply(2), faint, tolerance, unit)
+
+
+@pytest.mark.long
+def test_orbit_closed_over_too_many_periods_is_closed_again(monkeypatch):
+    """Where the transient takes twice the period for the period, the result has the true one."""
+    taken = []
+
+    def twice(*args):
+        found = settle(*args)
+        taken.append(1)
+        return found._replace(period=2 * found.period)
+
+    config = rootsopt.load_config("configs/cic.yaml")
+    scene = Scene.from_config(config)
+    solver = dataclasses.replace(scene.solver, closing="collocation")
+    pair, tangents, _ = scene.pair_and_tangents(jnp.asarray(config.design, float))
+    monkeypatch.setattr(steady, "settle", twice)
+    start = jnp.zeros(pair.states)
+    found = eqx.filter_jit(steady.steady_motion)(pair, tangents, start, scene.pitch_radius, solver)
+    assert taken
+    assert Status.of(int(found.status)) is Status.PERIODIC
+    assert int(found.period) == 1
+    alone = rootsopt.evaluate(config)
+    np.testing.assert_allclose(found.forces[0], alone.response["mean_force_N"], rtol=1e-6)
 
 
 def test_program_has_the_shapes_of_shooting():
