@@ -1,7 +1,8 @@
 """Times value and gradient from a neighbour's orbit against other methods for the same numbers.
 
 All tools run in one process, in turns, on one core. Times are processor times, which other
-processes on the machine hardly change. The neighbour is a design whose parameters differ by a small fraction."""
+processes on the machine hardly change. The neighbour is a design whose parameters differ by a small
+fraction."""
 
 import dataclasses
 import time

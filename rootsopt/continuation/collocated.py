@@ -156,11 +156,16 @@ class CollocatedFamily(OrbitFamily):
                 self.integrator,
             )
         )
-        made: Followed
-        line = made.line
         limit = _ACCURACY * _UNREFINED * self.integrator.rtol
         if not (made.known.sound and made.known.error <= limit):
             raise StoppedError(End.STEP_TOO_SMALL)
+        return self._spot(made, seen, along)
+
+    def _spot(self, made: Followed, seen: _Seen, along: NDArray[np.float64]) -> Spot:
+        """Return the orbit `made` as a point of the curve.
+
+        Raises `StoppedError` if the orbit has no meaning. For `along`, see `corrected`."""
+        line = made.line
         new = np.append(seen.state / SPAN, line.share)
         self._check_design(self.value(new))
         if not np.all(np.isfinite(np.append(new, line.tangent))):
@@ -229,7 +234,7 @@ def _with_unit(scene: Scene, names: tuple[str, ...], values, unit):
 
 
 @Program
-def _follow(
+def _follow(  # Twelve parameters, since a compiled program takes its arrays one by one.
     scene: Scene,
     names: tuple[str, ...],
     values: tuple[Float[Array, " p"], Float[Array, ""], Float[Array, ""]],
