@@ -44,8 +44,6 @@ count as equal. A branch whose steps have become too small there ends at an orbi
 _SIZES = 3e-4, 1e-3, 3e-3, 1e-4, 1e-2
 """Distances (unit of `StepSizes`) from a period doubling at which the orbit of twice the period is
 tried, in this order."""
-
-
 _FEW = 8
 """Number of points below which a doubled branch that falls back to the single period is tried
 again, from another distance."""

@@ -181,8 +181,8 @@ class OrbitData(NamedTuple):
 
     `monodromy` (n, n): monodromy matrix of the scaled state at some instant; `to_state` (n, n):
     derivative of the state at φ1 = 0 with respect to that at this instant; `statistics`: mean, peak
-    and RMS force (N); `half_way`: distance (unit of `StepSizes`) between
-    the states at the start and the middle of the orbit. For the other fields, see `BranchPoint`.
+    and RMS force (N); `half_way`: distance (unit of `StepSizes`) between the states at the start
+    and the middle of the orbit. For the other fields, see `BranchPoint`.
     """
 
     monodromy: NDArray[np.float64]

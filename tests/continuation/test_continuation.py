@@ -326,7 +326,7 @@ def test_a_design_ends_where_no_profile_can_be_made(branch):
     assert path.points[-1].value == pytest.approx(9.071, abs=2e-3)
 
 
-def testlongest_gap_goes_around():
+def test_longest_gap_goes_around():
     assert longest_gap(np.array([0, 1, 0, 0, 1, 0], bool)) == 2 / 6
     assert longest_gap(np.array([0, 0, 1, 0, 0, 1, 0], bool)) == 3 / 7
     assert longest_gap(np.zeros(4, bool)) == 1

@@ -32,7 +32,7 @@ def test_long_steps_of_an_orbit_are_divided():
 
 
 @pytest.mark.parametrize("period", [1, 3])
-def testlongest_gap_of_an_orbit_is_in_mesh_periods(monkeypatch, period):
+def test_longest_gap_of_an_orbit_is_in_mesh_periods(monkeypatch, period):
     """A quarter of an orbit of k mesh periods without a touch lasts k/4 mesh periods."""
     touching = np.ones(504, bool)
     touching[100:226] = False

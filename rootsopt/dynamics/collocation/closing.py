@@ -50,7 +50,7 @@ CORRECTED = 1e-6
 """Last correction of the states (scaled) above which an orbit is rejected."""
 _FAILURES = 4
 """Number of failures of Newton's method above which the search for the orbit fails."""
-SMALL = 1e-5, 3e-9
+_SMALL = 1e-5, 3e-9
 """Newton step (scaled) below which Newton's method stops: from a similar pair's orbit on the same
 mesh, and otherwise. The step after it would be smaller by orders of magnitude, since convergence is
 quadratic. It is made together with the derivatives."""
@@ -229,7 +229,7 @@ class Closer(eqx.Module):
         `seen`: flags along the motion."""
         given = rooted(now.elements, seen).roots
         begun = now.elements._replace(roots=jnp.where(now.trusted, now.elements.roots, given))
-        limit = jnp.where(now.trusted, *SMALL)
+        limit = jnp.where(now.trusted, *_SMALL)
         got, line = self.converged(now, begun, limit)
         # Where events have passed each other, the elements between them have a negative length.
         mesh, rising = ordered(got.elements.mesh)
@@ -331,4 +331,4 @@ def _nothing(equation: CollocatedEquation, tangents: Any, elements: Elements) ->
     return Closed(empty, jnp.ones(()), infinite, infinite, no, zero, zero)
 
 
-__all__ = ["CORRECTED", "SMALL", "Closed", "Closer", "Loop", "close", "first_elements", "supported"]
+__all__ = ["CORRECTED", "Closed", "Closer", "Loop", "close", "first_elements", "supported"]
