@@ -28,6 +28,7 @@ from rootsopt.continuation.orbits import (
 from rootsopt.dynamics.collocation.bordered import Followed, Line, Plane, followed
 from rootsopt.dynamics.collocation.closing import supported
 from rootsopt.dynamics.collocation.known import Known
+from rootsopt.dynamics.collocation.motion import ACCURACY, UNREFINED
 from rootsopt.dynamics.collocation.seed import from_steps
 from rootsopt.dynamics.collocation.system import Step
 from rootsopt.dynamics.integrator import Integrator
@@ -40,9 +41,6 @@ from rootsopt.scene import Scene
 _SHORT = 2e-3
 """Distance from the previous orbit (unit of `StepSizes`) below which an orbit that collocation does
 not find is closed by integration. Above it, the search tries a shorter step first."""
-_ACCURACY, _UNREFINED = 10.0, 10.0
-"""Requested relative error of the forces, in tolerances of the orbit's integrator, and estimated
-error above which an orbit is rejected, in multiples of the requested one."""
 _AGREE = 1e-4
 """Relative difference between the forces of the first orbit by collocation and by integration above
 which collocation is not used."""
@@ -156,7 +154,7 @@ class CollocatedFamily(OrbitFamily):
                 self.integrator,
             )
         )
-        limit = _ACCURACY * _UNREFINED * self.integrator.rtol
+        limit = ACCURACY * UNREFINED * self.integrator.rtol
         if not (made.known.sound and made.known.error <= limit):
             raise StoppedError(End.STEP_TOO_SMALL)
         return self._spot(made, seen, along)
@@ -267,7 +265,7 @@ def _follow(  # Twelve parameters, since a compiled program takes its arrays one
         return at(share)[0], jax.tree.map(lambda x: x[None], tangent)
 
     plane = Plane(guess, across, jnp.asarray(SPAN))
-    tolerance = _ACCURACY * integrator.tolerance(known.elements.state.dtype)
+    tolerance = ACCURACY * integrator.tolerance(known.elements.state.dtype)
     made = followed(family, measures, (known, motion, distance), plane, tolerance)
     pair, scale = at(made.line.share)
     elements = made.found.elements

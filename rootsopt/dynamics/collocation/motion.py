@@ -25,9 +25,9 @@ from rootsopt.dynamics.pair import RotorPair
 _STEPS = 1024
 """Maximum number of solver steps, per mesh period of the longest orbit, of the integration that
 provides the first elements."""
-_ACCURACY = 10.0
+ACCURACY = 10.0
 """Requested relative error of the forces, in tolerances of the orbit's integrator."""
-_UNREFINED = 10.0
+UNREFINED = 10.0
 """Estimated error of the forces above which an orbit is rejected, in multiples of the requested
 error. The estimate exceeds the request if the mesh has no room for refinement."""
 _REPEATS = 1e3, 1e-5
@@ -95,7 +95,7 @@ def collocated(
     tolerance = integrator.tolerance(state.dtype)
     equation = CollocatedEquation(pair, measures, pair.force_scale)
     begun = Known.unaligned(elements)
-    closed = close(equation, tangents, begun, pair, _ACCURACY * tolerance)
+    closed = close(equation, tangents, begun, pair, ACCURACY * tolerance)
     found = closed.found
     length, peak = period.astype(state.dtype), found.response[2]
     top = jnp.where(peak > 0, peak, pair.force_scale)
@@ -106,7 +106,7 @@ def collocated(
     far = jnp.maximum(_MISS[0] * tolerance, _MISS[1])
     equal = _equal(out.response[:3], found.response[:3], tolerance, pair.force_scale)
     verified = closed.sound & out.solved & (miss <= far * size * gain) & equal
-    verified &= closed.error <= _UNREFINED * _ACCURACY * tolerance
+    verified &= closed.error <= UNREFINED * ACCURACY * tolerance
     # The transient may have mistaken several periods of the orbit for one.
     shorter = _repeats(found, period, longest, tolerance) * closed.sound
     verified &= shorter == 0
@@ -161,9 +161,9 @@ def near_orbit(
     known, neighbour = start
     tolerance = integrator.tolerance(pair.angle_scale.dtype)
     equation = CollocatedEquation(pair, measures, lax.stop_gradient(pair.force_scale))
-    closed = close(equation, tangents, known, neighbour, _ACCURACY * tolerance)
+    closed = close(equation, tangents, known, neighbour, ACCURACY * tolerance)
     found, sound = closed.found, closed.sound & known.sound
-    verified = sound & (closed.error <= _UNREFINED * _ACCURACY * tolerance)
+    verified = sound & (closed.error <= UNREFINED * ACCURACY * tolerance)
     period = jnp.round(found.elements.mesh.period).astype(int)
     shorter = _repeats(found, period, sizes_of[1], tolerance)
     verified &= shorter == 0
