@@ -51,6 +51,13 @@ class Mesh(NamedTuple):
         return (self.interval != following) | (number >= self.used - 1)
 
     @property
+    def finals(self) -> Int[Array, " i"]:
+        """Index of the last element of each of the m - 1 intervals."""
+        number = jnp.arange(self.times.shape[0] - 1)
+        after = jnp.searchsorted(self.interval, number, side="right")
+        return jnp.minimum(after, self.used) - 1
+
+    @property
     def period(self) -> Float[Array, ""]:
         """Length of the period (mesh periods)."""
         return self.times[-1] - self.times[0]
@@ -79,8 +86,7 @@ class Elements(NamedTuple):
         begin, end = self.mesh.ends
         length = self.mesh.lengths
         tau = jnp.append(begin[:, None] + length[:, None] * GAUSS.nodes, end[:, None], axis=1)
-        rise = jnp.sum(GAUSS.integral[:, :, None] * self.slopes[:, None], axis=2)
-        inside = self.state[:, None] + length[:, None, None] * rise
+        inside = self.state[:, None] + length[:, None, None] * GAUSS.inside(self.slopes)
         return tau, jnp.concatenate([inside, self.following[:, None]], axis=1)
 
     @property

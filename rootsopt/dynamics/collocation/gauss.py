@@ -7,6 +7,9 @@ The error is of order 2s at the end of the element, and of order s + 1 inside th
 Boor and Swartz, SIAM J. Numer. Anal. 10 (1973) 582-606.
 """
 
+import functools
+import operator
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -43,13 +46,39 @@ class Gauss(NamedTuple):
 
     def lagrange(self, share: Float[Array, "*m"]) -> Float[Array, "*m s"]:
         """Return the s Lagrange polynomials at σ = `share`."""
-        order = np.arange(len(self.nodes))
-        return share[..., None] ** order @ jnp.asarray(self.powers)
+        return _polynomials(self.powers, share)
 
     def integrated(self, share: Float[Array, "*m"]) -> Float[Array, "*m s"]:
         """Return the integrals a_j of the s Lagrange polynomials from 0 to σ = `share`."""
         order = np.arange(1, len(self.nodes) + 1)
-        return (share[..., None] ** order / order) @ jnp.asarray(self.powers)
+        return share[..., None] * _polynomials(self.powers / order[:, None], share)
+
+    def inside(self, slopes: Float[Array, "e s *c"]) -> Float[Array, "e s *c"]:
+        """Return the integrals of `slopes` (values at the s points) from 0 to each of the points.
+
+        The integrals are those over elements of length 1."""
+        rows = self.integral.T.reshape(*self.integral.shape, *(1,) * (slopes.ndim - 2))
+        return summed(row * slopes[:, j, None] for j, row in enumerate(rows))
+
+    def whole(self, slopes: Float[Array, "e s *c"]) -> Float[Array, "e ..."]:
+        """Return the integrals of `slopes` (values at the s points) over elements of length 1."""
+        return summed(weight * slopes[:, j] for j, weight in enumerate(self.weights))
+
+
+def _polynomials(powers: NDArray[np.float64], share: Float[Array, "*m"]) -> Float[Array, "*m s"]:
+    """Return s polynomials at σ = `share`; `powers` (p, s): coefficients, constants first."""
+    share = share[..., None]
+    found = jnp.broadcast_to(jnp.asarray(powers[-1]), (*share.shape[:-1], powers.shape[1]))
+    for row in powers[-2::-1]:
+        found = found * share + row
+    return found
+
+
+def summed(terms: Iterable[Array]) -> Array:
+    """Return the sum of a few arrays of equal shape.
+
+    XLA computes this in one loop over their entries. A reduction over a short axis is slower."""
+    return functools.reduce(operator.add, terms)
 
 
 GAUSS = Gauss.of(POINTS)

@@ -16,14 +16,13 @@ last element must equal that at the start of the first.
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.dynamics.collocation.blocks import in_blocks
 from rootsopt.dynamics.collocation.elements import Elements, Mesh
-from rootsopt.dynamics.collocation.gauss import GAUSS
+from rootsopt.dynamics.collocation.gauss import GAUSS, summed
 from rootsopt.dynamics.linear import solved
 
 
@@ -84,7 +83,7 @@ class Condensed(NamedTuple):
 
 def own_column(elements: Elements, lines: Lines) -> Columns:
     """Return the right-hand side of Newton's step for the motion `elements`, as a single column."""
-    rise = jnp.sum(GAUSS.weights[:, None] * elements.slopes, axis=1)
+    rise = GAUSS.whole(elements.slopes)
     reached = elements.state + elements.mesh.lengths[:, None] * rise
     gap = reached - elements.following
     return Columns(lines.miss[..., None], gap[..., None], lines.margin[:, None])
@@ -112,7 +111,7 @@ def _condensed(
     left, right_end, lengths = shares.T
     length = lengths[:, None, None, None]
     share = right_end - left
-    rise = jnp.sum(GAUSS.integral[:, :, None] * own[:, None], axis=2)
+    rise = GAUSS.inside(own)
     by_time, by_state = lines.slopes[..., :1], lines.slopes[..., 1:]
     matrix = jnp.eye(points * states).reshape(points, states, points, states) - (
         length[..., None] * by_state[:, :, :, None] * GAUSS.integral[:, None, :, None]
@@ -132,8 +131,8 @@ def _condensed(
         axis=-1,
     )
     slopes = _eliminated(system).reshape(count, points, states, -1)
-    end = jnp.sum(GAUSS.weights[:, None, None] * slopes, axis=1) * length[:, 0]
-    longer = share[:, None] * jnp.sum(GAUSS.weights[:, None] * own, axis=1)
+    end = GAUSS.whole(slopes) * length[:, 0]
+    longer = share[:, None] * GAUSS.whole(own)
     still = jnp.broadcast_to(jnp.eye(states), (count, states, states))
     added = [still, -longer[..., None], longer[..., None], columns.gap]
     return Condensed(slopes, end + jnp.concatenate(added, axis=-1))
@@ -164,14 +163,13 @@ class Chain(NamedTuple):
     All rows are linear in the change of the first state (n) and in the k right-hand sides: `end`
     (n, n + k): state at the end of the last element; `state` (e, n, n + k): state at the start of
     each element, if the end of its interval stays; `by_end` (e, n): its derivative with respect to
-    the shift of that end; `shift` (e, n + k): shift of the end of the interval, 0 unless the
-    element is the last one of its interval.
+    the shift of that end; `shift` (m - 1, n + k): shift of the end of each interval.
     """
 
     end: Float[Array, "n c"]
     state: Float[Array, "e n c"]
     by_end: Float[Array, "e n"]
-    shift: Float[Array, "e c"]
+    shift: Float[Array, "i c"]
 
     @property
     def monodromy(self) -> Float[Array, "n n"]:
@@ -193,51 +191,63 @@ def chained(elements: Elements, lines: Lines, columns: Columns, parts: Condensed
 def opened(elements: Elements, lines: Lines, columns: Columns, parts: Condensed) -> Chain:
     """Return the solution of the linear equations for any change of the first state.
 
-    For the arguments, see `chained`."""
+    For the arguments, see `chained`. The maps from element to element are multiplied within each
+    interval. The event at the end of an interval then determines the shift of this end, and the
+    maps from interval to interval are multiplied."""
     mesh = elements.mesh
-    states, width = elements.state.shape[1], columns.gap.shape[-1]
-    last, fixed = mesh.last, mesh.which[mesh.interval + 1] < 0
-    rise, bend = parts.rise, lines.bend
-    wide = states + width
-    pushed = jnp.pad(columns.margin, ((0, 0), (states, 0)))
-
-    def along(carry, k):
-        """Return `carry` for the next element, and three results for element k.
-
-        These are the first two entries of `carry` and the shift of the interval's end, which is 0
-        unless the element is the last of its interval.
-
-        `carry`: change of the state at the start of element k if the interval's end stays;
-        derivative of this change with respect to the shift of that end; shift of the interval's
-        start. Changes and shifts are linear in the change of the first state and in the right-hand
-        sides, with one column for each."""
-        now, by_end, begun = carry
-        part = rise[k]
-        after = jnp.sum(part[:, :states, None] * now, axis=1)
-        after += part[:, states, None] * begun
-        after = after.at[:, states:].add(part[:, states + 2 :])
-        moved = jnp.sum(part[:, :states] * by_end, axis=1) + part[:, states + 1]
-        by_state, by_time = bend[k, 1:], bend[k, 0]
-        shift = -(pushed[k] + by_state @ after) / (by_time + by_state @ moved)
-        shift = jnp.where(fixed[k], 0.0, shift)
-        over = jnp.where(last[k], after + moved[:, None] * shift, after)
-        following = over, jnp.where(last[k], 0.0, moved), jnp.where(last[k], shift, begun)
-        return following, (now, by_end, jnp.where(last[k], shift, 0.0))
-
-    def step(k, loop):
-        carry, kept = loop
-        carry, new = along(carry, k)
-        return carry, jax.tree.map(lambda all_, one: all_.at[k].set(one), kept, new)
-
-    count, dtype = elements.state.shape[0], elements.state.dtype
-    start = jnp.eye(states, wide, dtype=dtype), jnp.zeros(states, dtype), jnp.zeros(wide, dtype)
-    kept = (
-        jnp.zeros((count, states, wide), dtype),
-        jnp.zeros((count, states), dtype),
-        jnp.zeros((count, wide), dtype),
+    count, states = elements.state.shape
+    used, ends = jnp.arange(count) < mesh.used, mesh.finals
+    first = jnp.append(True, mesh.last[:-1])
+    # From the start of the interval to the end of each element. The columns are the change of the
+    # state, the shifts of the interval's start and end, and the right-hand sides.
+    after = _composed(parts.rise, first, mesh.used)
+    begin, end = slice(0, states + 1), states + 1
+    reached, bend, fixed = after[ends], lines.bend[ends], mesh.which[1:] < 0
+    pull = summed(bend[:, 1 + k, None] * reached[:, k] for k in range(states))
+    pull = pull.at[:, end + 1 :].add(columns.margin[ends])
+    slope = bend[:, 0] + pull[:, end]
+    free = jnp.where(fixed, 0.0, -1 / jnp.where(fixed, 1.0, slope))
+    row = free[:, None] * jnp.concatenate([pull[:, begin], pull[:, end + 1 :]], axis=1)
+    # From the start of the period to the end of each interval, for the state and the shift.
+    over = jnp.concatenate([reached[:, :, begin], reached[:, :, end + 1 :]], axis=-1)
+    over += reached[:, :, end, None] * row[:, None]
+    over = jnp.concatenate([over, row[:, None]], axis=1)
+    intervals = mesh.interval[mesh.used - 1] + 1
+    over = _composed(over, jnp.arange(over.shape[0]) == 0, intervals)
+    # The start of the period stays where it is.
+    over = jnp.concatenate([over[..., :states], over[..., states + 1 :]], axis=-1)
+    still = jnp.eye(states + 1, over.shape[-1], dtype=over.dtype).at[states].set(0.0)
+    begun = jnp.concatenate([still[None], over[:-1]])[mesh.interval]
+    same = jnp.eye(states, after.shape[-1], dtype=after.dtype)
+    inside = jnp.concatenate([same[None], after[:-1]])
+    inside = jnp.where(first[:, None, None], same, inside)
+    state = summed(inside[:, :, k, None] * begun[:, k, None] for k in range(states + 1))
+    state = state.at[..., states:].add(inside[..., states + 2 :])
+    return Chain(
+        end=over[intervals - 1, :states],
+        state=jnp.where(used[:, None, None], state, 0.0),
+        by_end=jnp.where(used[:, None], inside[..., states + 1], 0.0),
+        shift=over[:, states],
     )
-    (end, *_), rows = lax.fori_loop(0, mesh.used, step, (start, kept))
-    return Chain(end, *rows)
+
+
+def _composed(
+    maps: Float[Array, "m n c"], starts: Bool[Array, " m"], count: Int[Array, ""]
+) -> Float[Array, "m n c"]:
+    """Return the products of affine `maps`, from the last of the `starts` up to each of them.
+
+    The first n columns of a map multiply a vector, the others are constants. Only the first `count`
+    products are valid. The first map must be a start."""
+    size = maps.shape[1]
+
+    def step(k, carry):
+        before, products = carry
+        own = maps[k]
+        after = summed(own[:, j, None] * before[j] for j in range(size))
+        after = jnp.where(starts[k], own, after.at[:, size:].add(own[:, size:]))
+        return after, products.at[k].set(after)
+
+    return lax.fori_loop(0, count, step, (jnp.zeros_like(maps[0]), jnp.zeros_like(maps)))[1]
 
 
 def spread(
@@ -252,7 +262,7 @@ def spread(
     `mix`: factors of the right-hand sides in each of the c columns; by default, there is one column
     for each right-hand side. For the other arguments, see `chained`."""
     mesh = elements.mesh
-    (states, width), count = first.shape, elements.state.shape[0]
+    states, width = first.shape
     dtype = elements.state.dtype
 
     def mixed(constants):
@@ -261,18 +271,18 @@ def spread(
         return jnp.sum(constants[..., None] * mix, axis=-2)
 
     def closed(rows):
-        return jnp.sum(rows[..., :states, None] * first, axis=-2) + mixed(rows[..., states:])
+        moved = summed(rows[..., k, None] * first[k] for k in range(states))
+        return moved + mixed(rows[..., states:])
 
-    used = jnp.arange(count) < mesh.used
-    place = jnp.where(mesh.last & used, mesh.interval + 1, mesh.times.shape[0])
-    times = jnp.zeros((mesh.times.shape[0], width), dtype)
-    times = times.at[place].set(closed(chain.shift), mode="drop")
+    # All times after the last interval in use are the end of the period.
+    real = jnp.arange(1, mesh.times.shape[0]) <= mesh.interval[mesh.used - 1]
+    shift = jnp.where(real[:, None], closed(chain.shift), 0.0)
+    times = jnp.concatenate([jnp.zeros((1, width), dtype), shift])
     left, right = times[mesh.interval], times[mesh.interval + 1]
     state = closed(chain.state) + chain.by_end[..., None] * right[:, None]
-    answer = mixed(parts.slopes[..., states + 2 :]) + (
-        parts.slopes[..., states, None] * left[:, None, None]
-        + parts.slopes[..., states + 1, None] * right[:, None, None]
-        + jnp.sum(parts.slopes[..., :states, None] * state[:, None, None], axis=-2)
+    moves = [*jnp.moveaxis(state, 1, 0), left, right]
+    answer = mixed(parts.slopes[..., states + 2 :]) + summed(
+        parts.slopes[..., k, None] * move[:, None, None] for k, move in enumerate(moves)
     )
     return Step(state, answer, times, chain.monodromy)
 
@@ -284,8 +294,8 @@ def moved_places(elements: Elements, step: Step) -> tuple[Array, Array]:
     share = mesh.right - mesh.left
     place = (mesh.left[:, None] + share[:, None] * GAUSS.nodes)[..., None]
     times = left[:, None] * (1 - place) + right[:, None] * place
-    rise = jnp.sum(GAUSS.integral[:, :, None] * elements.slopes[:, None], axis=2)
+    rise = GAUSS.inside(elements.slopes)
     longer = share[:, None] * (right - left)
-    within = jnp.sum(GAUSS.integral[:, :, None, None] * step.slopes[:, None], axis=2)
+    within = GAUSS.inside(step.slopes)
     states = step.state[:, None] + mesh.lengths[:, None, None, None] * within
     return times, states + rise[..., None] * longer[:, None, None]

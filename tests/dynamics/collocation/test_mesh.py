@@ -50,6 +50,14 @@ def test_rule_integrates_polynomials():
         np.testing.assert_allclose(GAUSS.weights @ GAUSS.nodes**degree, 1 / (degree + 1))
 
 
+def test_integrals_of_arrays_are_those_of_the_matrices():
+    slopes = jnp.asarray(np.random.default_rng(0).normal(size=(5, POINTS, 3, 2)))
+    inside = np.einsum("ij,ej...->ei...", GAUSS.integral, slopes)
+    np.testing.assert_allclose(GAUSS.inside(slopes), inside, atol=1e-15)
+    whole = np.einsum("j,ej...->e...", GAUSS.weights, slopes)
+    np.testing.assert_allclose(GAUSS.whole(slopes), whole, atol=1e-15)
+
+
 def test_motion_is_that_of_the_polynomials():
     elements = _wave(np.linspace(0, 1, 13))
     for tau in (0.0, 0.111, 0.5, 0.99, 1.3):
