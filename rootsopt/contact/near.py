@@ -10,6 +10,7 @@ from rootsopt.contact.closest import ClosestApproach, FlankPair, contact_begins
 from rootsopt.contact.gap import Approach, Contact
 from rootsopt.contact.point import ContactPoint, contact_point
 from rootsopt.profiles import trigonometry as trig
+from rootsopt.runtime.kept import kept_along
 
 _FARTHEST = 0.06
 """Magnitude of the Newton step (rad) above which the flanks count as having no common normal."""
@@ -106,11 +107,11 @@ class NearContact(Contact):
             jnp.where(mirrored, lever1, lever2),
         )
         away = lax.stop_gradient(pair.profile.pitch_radius)
-        return ClosestApproach(
-            gap=jnp.where(present, gap, away),
-            lever1=jnp.where(present, first, 0.0),
-            lever2=jnp.where(present, second, 0.0),
-            normal1=normal1 + turned[2] * step,
-            normal2=root + step,
-            found=present,
+        numbers = (
+            jnp.where(present, gap, away),
+            jnp.where(present, first, 0.0),
+            jnp.where(present, second, 0.0),
+            normal1 + turned[2] * step,
+            root + step,
         )
+        return ClosestApproach(*kept_along(numbers), found=present)

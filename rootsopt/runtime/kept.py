@@ -30,6 +30,24 @@ def kept(tree: T) -> T:
     return eqx.combine(jax.tree.unflatten(shape, _kept(leaves)), rest)
 
 
+def kept_along(tree: T) -> T:
+    """Return `tree` unchanged, like `kept`, and have its derivatives along directions computed
+    once, too.
+
+    All leaves must be floating-point arrays. Reverse-mode differentiation is not possible."""
+    return _kept_along(tree)  # pyright: ignore[reportReturnType]
+
+
+@jax.custom_jvp
+def _kept_along(tree):
+    return kept(tree)
+
+
+@_kept_along.defjvp
+def _(primals, tangents):
+    return kept(*primals), kept(*tangents)
+
+
 @custom_vmap
 def _kept(leaves):
     if sum(leaf.size for leaf in leaves) < _MANY:
@@ -45,4 +63,4 @@ def _(size, batched, leaves):
     return _kept(leaves), batched[0]
 
 
-__all__ = ["kept"]
+__all__ = ["kept", "kept_along"]

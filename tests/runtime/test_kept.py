@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rootsopt.profiles import trigonometry as trig
-from rootsopt.runtime.kept import kept
+from rootsopt.runtime.kept import kept, kept_along
 
 ANGLES = jnp.linspace(-3.0, 3.0, 64)
 
@@ -53,3 +53,28 @@ def test_what_is_kept_does_not_change():
     np.testing.assert_array_equal(row[0], square)
     assert row[1].shape == (8, 8, 4)
     assert float(jax.grad(lambda x: trig.sin(x) ** 2)(0.3)) == pytest.approx(np.sin(0.6))
+
+
+def derivatives(through):
+    """Return a function whose derivatives all pass `through` the same intermediate value."""
+
+    def one(angle):
+        inner = through(jnp.sin(2.0 * jnp.sin(angle)))
+        return jnp.arctan2(inner, 3.0), jnp.exp(inner) / (2.0 + inner), inner**3
+
+    def all_(angles):
+        values, linear = jax.linearize(jax.vmap(one), angles)
+        slopes = jax.vmap(linear)(jnp.eye(2)[:, :1] + jnp.zeros_like(angles))
+        return values, [jnp.cumsum(x, axis=1) for x in slopes]
+
+    return jax.jit(all_)
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="only CPUs repeat operations")
+def test_derivatives_along_directions_are_computed_once():
+    """Values and derivatives are the same. XLA alone repeats the inner derivative in each."""
+    repeated, once = derivatives(lambda x: x), derivatives(kept_along)
+    pairs = zip(jax.tree.leaves(repeated(ANGLES)), jax.tree.leaves(once(ANGLES)), strict=True)
+    for value, other in pairs:
+        np.testing.assert_allclose(value, other, rtol=1e-13, atol=1e-13)
+    assert waves(once, ANGLES) < waves(repeated, ANGLES)

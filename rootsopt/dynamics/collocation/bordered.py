@@ -198,8 +198,7 @@ class _Follower(Closer):
         def both(tau, state, roots, which):
             return equation.along(tau, state, roots, which, tangent)
 
-        each = jax.vmap(jax.vmap(both, (0, 0, 0, None)))
-        points, along = in_blocks(each, mesh.used, tau, state, elements.roots, which)
+        points, along = in_blocks(both, mesh.used, tau, state, elements.roots, which)
         found = lines(elements, points)
         own = own_column(elements, found)
         columns = Columns(

@@ -14,20 +14,20 @@ from rootsopt.dynamics.pair import RotorPair
 from rootsopt.runtime.kept import kept
 
 
-class Point(NamedTuple):
-    """The equation of motion at one instant, as r = n + q + 1 values.
+class Points(NamedTuple):
+    """The equation of motion at p instants on each of e elements, as r = n + q + 1 values.
 
-    `values` (r,): derivatives of the n scaled states with respect to time (mesh periods), q
-    integrands (see `CollocatedEquation`), and one margin (see `Margins`); `slopes` (r, 1 + n):
-    derivatives of `values` with respect to time and state; `roots` (sides, 2): improved
-    `NearContact.roots`; `force`: contact force (N); `depth`: penetration (m).
+    `values` (e, p, r): derivatives of the n scaled states with respect to time (mesh periods), q
+    integrands (see `CollocatedEquation`), and one margin (see `Margins`); `slopes` (e, p, r, 1 +
+    n): derivatives of `values` with respect to time and state; `roots` (e, p, sides, 2): improved
+    `NearContact.roots`; `force` (e, p): contact force (N); `depth` (e, p): penetration (m).
     """
 
-    values: Float[Array, " r"]
-    slopes: Float[Array, "r c"]
-    roots: Float[Array, "sides 2"]
-    force: Float[Array, ""]
-    depth: Float[Array, ""]
+    values: Float[Array, "e p r"]
+    slopes: Float[Array, "e p r c"]
+    roots: Float[Array, "e p sides 2"]
+    force: Float[Array, "e p"]
+    depth: Float[Array, "e p"]
 
 
 class CollocatedEquation(eqx.Module):
@@ -61,10 +61,12 @@ class CollocatedEquation(eqx.Module):
         return eqx.tree_at(lambda p: p.contact, pair, NearContact(pair.contact.pair, roots))
 
     def evaluated(self, dynamic, static, tau, state, roots, which):
-        """Return the list of `Point.values`, and the tuple (roots, force, depth) of other fields.
+        """Return the equation at one instant: a list of values, and the tuple (roots, force,
+        depth).
 
-        `dynamic`, `static`: the pair's floating-point arrays, and the rest of the pair. For the
-        other arguments, see `point`."""
+        `dynamic`, `static`: the pair's floating-point arrays, and the rest of the pair; `tau`: time
+        (mesh periods); `state` (n,): scaled; `roots` (sides, 2): `NearContact.roots`; `which`:
+        index of the margin to evaluate. For the results, see `Points`."""
         near = self.near(dynamic, static, roots)
         slope, contact, found = near.derivative_and_margins(tau, state)
         unit = jax.lax.stop_gradient(self.pair.force_scale)
@@ -86,53 +88,72 @@ class CollocatedEquation(eqx.Module):
         contact, margins = near.contact_and_margins(tau, state)
         return contact.total, _roots(margins.places)
 
-    def point(
+    def points(
         self,
-        tau: Float[Array, ""],
-        state: Float[Array, " n"],
-        roots: Float[Array, "sides 2"],
-        which: Int[Array, ""],
-    ) -> Point:
-        """Return the equation and its derivatives at one instant.
+        tau: Float[Array, "e p"],
+        state: Float[Array, "e p n"],
+        roots: Float[Array, "e p sides 2"],
+        which: Int[Array, " e"],
+    ) -> Points:
+        """Return the equation and its derivatives at p instants on each of e elements.
 
-        `tau`: time (mesh periods); `state` (n,): scaled; `roots` (sides, 2): `NearContact.roots`;
-        `which`: index of the margin to evaluate."""
-        dynamic, static = eqx.partition(self.pair, eqx.is_inexact_array)
-
-        def value(place):
-            return self.evaluated(dynamic, static, place[0], place[1:], roots, which)
-
-        place = jnp.append(tau, state)
-        values, linear, rest = jax.linearize(value, place, has_aux=True)
-        slopes = jax.vmap(kept(linear))(jnp.eye(place.shape[0], dtype=place.dtype))
-        return Point(jnp.stack(values), jnp.stack(kept(slopes)), *rest)
+        `tau`: times (mesh periods); `state`: scaled; `roots`: `NearContact.roots`; `which`: index
+        of the margin to evaluate on each element."""
+        return self._linear(tau, state, roots, which, None)[0]
 
     def along(
         self,
-        tau: Float[Array, ""],
-        state: Float[Array, " n"],
-        roots: Float[Array, "sides 2"],
-        which: Int[Array, ""],
+        tau: Float[Array, "e p"],
+        state: Float[Array, "e p n"],
+        roots: Float[Array, "e p sides 2"],
+        which: Int[Array, " e"],
         tangents: Any,
-    ) -> tuple[Point, Float[Array, "r d"]]:
-        """Return the result of `point`, and derivatives of `Point.values` along d directions.
+    ) -> tuple[Points, Float[Array, "e p r d"]]:
+        """Return the result of `points`, and derivatives of its values along d directions.
 
         `tangents`: directions of the pair's parameters, stacked along a leading axis. For the other
-        arguments, see `point`."""
+        arguments, see `points`."""
+        return self._linear(tau, state, roots, which, eqx.filter(tangents, eqx.is_inexact_array))
+
+    def _linear(self, tau, state, roots, which, moved) -> tuple[Points, Float[Array, "e p r d"]]:
+        """Return the result of `along`, for the floating-point arrays of its directions.
+
+        Without directions (`None`), d is 0. The instants are the last axis of all intermediate
+        arrays, so that the compiler makes vector instructions for them."""
+        shape, size = tau.shape, 1 + state.shape[-1]
         dynamic, static = eqx.partition(self.pair, eqx.is_inexact_array)
-        moved = eqx.filter(tangents, eqx.is_inexact_array)
+        place = jnp.concatenate([tau.reshape(1, -1), state.reshape(-1, size - 1).T])
+        rest = roots.reshape(-1, *roots.shape[2:]), jnp.repeat(which, shape[1])
 
         def value(dynamic, place):
-            return self.evaluated(dynamic, static, place[0], place[1:], roots, which)
+            def one(place, roots, which):
+                return self.evaluated(dynamic, static, place[0], place[1:], roots, which)
 
-        place = jnp.append(tau, state)
-        size, count = place.shape[0], jax.tree.leaves(moved)[0].shape[0]
-        values, linear, rest = jax.linearize(value, dynamic, place, has_aux=True)
-        # All directions at once: first those of time and state, then those of the pair.
-        moved = jax.tree.map(lambda x: jnp.pad(x, [(size, 0)] + [(0, 0)] * (x.ndim - 1)), moved)
-        unit = jnp.eye(size + count, size, dtype=place.dtype)
-        slopes = jnp.stack(kept(jax.vmap(kept(linear))(moved, unit)))
-        return Point(jnp.stack(values), slopes[:, :size], *rest), slopes[:, size:]
+            return jax.vmap(one, (1, 0, 0))(place, *rest)
+
+        unit = jnp.eye(size, dtype=place.dtype)
+        if moved is None:
+            values, linear, others = jax.linearize(
+                lambda place: value(dynamic, place), place, has_aux=True
+            )
+            moved = ()
+        else:
+            values, linear, others = jax.linearize(value, dynamic, place, has_aux=True)
+            # All directions at once: first those of time and state, then those of the pair.
+            count = jax.tree.leaves(moved)[0].shape[0]
+            pads = [(size, 0)]
+            moved = (jax.tree.map(lambda x: jnp.pad(x, pads + [(0, 0)] * (x.ndim - 1)), moved),)
+            unit = jnp.eye(size + count, size, dtype=place.dtype)
+        units = jnp.broadcast_to(unit[..., None], (*unit.shape, place.shape[1]))
+        slopes = jnp.stack(kept(jax.vmap(kept(linear))(*moved, units)))
+
+        def back(x):
+            """Move the last axis, that of the instants, to the front and split it."""
+            return jnp.moveaxis(x, -1, 0).reshape(*shape, *x.shape[:-1])
+
+        others = jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), others)
+        points = Points(back(jnp.stack(values)), back(slopes[:, :size]), *others)
+        return points, back(slopes[:, size:])
 
 
 def _roots(places: list[Any]) -> Float[Array, "sides 2"]:

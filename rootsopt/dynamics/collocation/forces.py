@@ -16,8 +16,8 @@ from jaxtyping import Array, Float, Int
 
 from rootsopt.dynamics.collocation.blocks import in_blocks
 from rootsopt.dynamics.collocation.elements import Elements
-from rootsopt.dynamics.collocation.equation import CollocatedEquation, Point
-from rootsopt.dynamics.collocation.gauss import GAUSS
+from rootsopt.dynamics.collocation.equation import CollocatedEquation, Points
+from rootsopt.dynamics.collocation.gauss import GAUSS, summed
 from rootsopt.dynamics.collocation.newton import lines
 from rootsopt.dynamics.collocation.system import (
     Columns,
@@ -201,8 +201,7 @@ def response(
     def both(tau, state, roots, which):
         return equation.along(tau, state, roots, which, tangents)
 
-    each = jax.vmap(jax.vmap(both, (0, 0, 0, None)))
-    points, along = in_blocks(each, extra + 1, tau, state, roots, which)
+    points, along = in_blocks(both, extra + 1, tau, state, roots, which)
     found = lines(elements, points)
     own = own_column(elements, found)
     width = along.shape[-1]
@@ -242,7 +241,7 @@ def response(
     )
 
 
-def _averages(equation: CollocatedEquation, elements: Elements, points: Point, along, step: Step):
+def _averages(equation: CollocatedEquation, elements: Elements, points: Points, along, step: Step):
     """Return the averages of the integrands over the orbit, and their changes (averages, columns).
 
     `points`, `along`: results of `CollocatedEquation.along` at the Gauss points; `step`: solution
@@ -252,14 +251,12 @@ def _averages(equation: CollocatedEquation, elements: Elements, points: Point, a
     rates = slice(count, count + equation.rates)
     times, states = moved_places(elements, step)
     value, bend = points.values[:, :inside, rates], points.slopes[:, :inside, rates]
-    change = bend[..., :1] * times[:, :, None]
-    change += jnp.sum(bend[..., 1:, None] * states[:, :, None], axis=-2)
+    moves = [times, *jnp.moveaxis(states, 2, 0)]
+    change = summed(bend[..., k, None] * move[:, :, None] for k, move in enumerate(moves))
     change = change.at[..., 1:].add(along[:, :inside, rates])
     left, right = step.times[mesh.interval], step.times[mesh.interval + 1]
     longer = (mesh.right - mesh.left)[:, None] * (right - left)
-    weights = GAUSS.weights[:, None]
-    part = jnp.sum(weights * value, axis=1)
-    by_part = jnp.sum(weights[..., None] * change, axis=1)
+    part, by_part = GAUSS.whole(value), GAUSS.whole(change)
     used = (jnp.arange(part.shape[0]) < mesh.used)[:, None]
     total = jnp.sum(jnp.where(used, mesh.lengths[:, None] * part, 0.0), axis=0)
     moved = mesh.lengths[:, None, None] * by_part + part[..., None] * longer[:, None]

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.dynamics.collocation.blocks import in_blocks
 from rootsopt.dynamics.collocation.elements import Elements
-from rootsopt.dynamics.collocation.equation import CollocatedEquation, Point
+from rootsopt.dynamics.collocation.equation import CollocatedEquation, Points
 from rootsopt.dynamics.collocation.gauss import GAUSS
 from rootsopt.dynamics.collocation.system import (
     Columns,
@@ -53,18 +53,19 @@ class Converged(NamedTuple):
     force: Float[Array, "e s"]
 
 
-def evaluated(equation: CollocatedEquation, elements: Elements) -> Point:
-    """Return the equation at the Gauss points and the end of each element.
-
-    All fields of the result have the leading axes (e, s + 1)."""
+def evaluated(equation: CollocatedEquation, elements: Elements) -> Points:
+    """Return the equation at the s Gauss points and the end of each element (p = s + 1)."""
     mesh = elements.mesh
     tau, state = elements.places
     which = jnp.maximum(mesh.which[mesh.interval + 1], 0)
-    each = jax.vmap(jax.vmap(equation.point, (0, 0, 0, None)))
-    return in_blocks(each, mesh.used, tau, state, elements.roots, which)
+
+    def points(*places):
+        return equation.points(*places)
+
+    return in_blocks(points, mesh.used, tau, state, elements.roots, which)
 
 
-def lines(elements: Elements, points: Point) -> Lines:
+def lines(elements: Elements, points: Points) -> Lines:
     """Return the linearised equation of `elements`; `points`: result of `evaluated`."""
     count = elements.state.shape[1]
     inside = len(GAUSS.nodes)
