@@ -189,7 +189,7 @@ class Closer(eqx.Module):
         done = agree & now.solved & (apart(now.elements, seen) <= _FAR)
         new = lax.cond(
             agree,
-            lambda: lax.cond(done, lambda: self.keep(now), lambda: self.solve(now, seen)),
+            lambda: lax.cond(done, lambda: self.keep(now, seen), lambda: self.solve(now, seen)),
             lambda: now,
         )
         new = lax.cond(
@@ -247,11 +247,12 @@ class Closer(eqx.Module):
             over=~jnp.isfinite(got.size) | (failures > _FAILURES),
         )
 
-    def keep(self, now: Loop) -> Loop:
+    def keep(self, now: Loop, seen: FlagScan) -> Loop:
         """Return the loop's state with the forces, derivatives and errors of the present orbit.
 
-        The flags along the orbit must change exactly at the events of its mesh."""
-        found = self.forces(now)
+        The flags along the orbit must change exactly at the events of its mesh. `seen`: these
+        flags. The roots come from the search, since those of Newton's method lag behind."""
+        found = self.forces(now._replace(elements=rooted(now.elements, seen)))
         size = roughness(found.elements)
         # On the first mesh, the errors are estimated from those of the known orbit.
         growth = jnp.maximum(size / self.known.roughness, 1.0) ** 2
