@@ -9,8 +9,6 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from experiments._common.engines import FD_STEPS
@@ -18,7 +16,7 @@ from experiments._common.engines import Scene as PlainScene
 from experiments._common.engines.scipy_nodes import NODES_1E3, ScipyNodes
 from experiments._common.scenes import CIC, SHAKY
 from rootsopt.config import load
-from rootsopt.response.evaluation import Evaluator, _build
+from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.orbits import OrbitStore, _near
 
 Row = dict[str, Any]
@@ -82,11 +80,10 @@ def rows_of(scene: str, repeats: int, say: Callable[[str], None] = lambda text: 
     truth = _numbers(exact)
     alone = dataclasses.replace(own, orbits=OrbitStore())
     known = own.orbits.begin(neighbour.state)
-    pair, tangents, _ = _build(own.scene, jnp.asarray(design))
-    settings = own.scene.pitch_radius, own.scene.solver
+    assert known is not None
 
     def program():
-        return jax.block_until_ready(_near(pair, tangents, known, *settings))
+        return _near(own.scene, design, known[0], known[1].pair)
 
     def afresh(tool: Evaluator, start: Any):
         return lambda: dataclasses.replace(tool, orbits=OrbitStore())(design, start, series=False)

@@ -415,11 +415,11 @@ class _Attempts(eqx.Module):
     def near(self, known: Known, neighbour: RotorPair) -> Steady:
         """Return the motion whose orbit is near the `known` one of the similar pair `neighbour`.
 
-        The status is NOT_SETTLED if the orbit is not accepted."""
+        Its orbit has no samples of the state and no steps (see `collocation.sampled`). The status
+        is NOT_SETTLED if the orbit is not accepted."""
         solver = self.solver
-        sizes_of = solver.samples, solver.max_orbit
-        start = known, neighbour
-        made = near_orbit(self.pair, self.tangents, start, solver.orbit, solver.measures, sizes_of)
+        settings = solver.orbit, solver.measures, solver.max_orbit
+        made = near_orbit(self.pair, self.tangents, (known, neighbour), *settings)
         period = jnp.round(known.elements.mesh.period).astype(int)
         state, within = made.orbit.state, settled_within(solver.transient.rtol)
         empty = self.start(state).found
@@ -541,9 +541,10 @@ def near_motion(
 
     `start`: this orbit, and its pair.
 
-    The result continues the motion of the similar pair without a transient, and must be stable. The
-    status is NOT_SETTLED if the orbit is not accepted; call `steady_motion` in that case.
-    Collocation must support the pair. For the other arguments, see `steady_motion`.
+    The result continues the motion of the similar pair without a transient, and must be stable. Its
+    orbit has no samples of the state and no steps (see `collocation.sampled`). The status is
+    NOT_SETTLED if the orbit is not accepted; call `steady_motion` in that case. Collocation must
+    support the pair. For the other arguments, see `steady_motion`.
     """
     radius = jnp.asarray(radius, pair.angle_scale.dtype)
     return _Attempts(pair, tangents, solver, radius).near(*start)

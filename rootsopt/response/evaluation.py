@@ -29,7 +29,7 @@ from rootsopt.dynamics.steady import (
 from rootsopt.dynamics.window import lyapunov
 from rootsopt.profiles import Geometry
 from rootsopt.pump.loads import OrbitLoads, orbit_loads
-from rootsopt.response.orbits import Built, OrbitStore, prepare_near
+from rootsopt.response.orbits import Built, OrbitStore, prepare_near, with_samples
 from rootsopt.response.records import (
     RESPONSES,
     bearing_record,
@@ -202,8 +202,8 @@ class Evaluator:
     def from_neighbours(self) -> "Evaluator":
         """Return another evaluator, for hundreds of evaluations that begin on neighbours' orbits.
 
-        With `solver.orbit` `auto`, it closes these orbits by collocation. That takes a tenth of the
-        time, and another program that takes as long to compile as a hundred evaluations."""
+        With `solver.orbit` `auto`, it closes these orbits by collocation. That takes a twentieth of
+        the time, and another program that takes as long to compile as a hundred evaluations."""
         return dataclasses.replace(self, neighbours=True)
 
     def following(self, orbits: OrbitStore) -> "Evaluator":
@@ -252,33 +252,38 @@ class Evaluator:
         now = other = self._sized(design)
         for _ in range(_MAPS):
             now = other
-            pair, tangents, shape = _build(now.scene, design)
-            dtype = pair.angle_scale.dtype
-            state = np.zeros(pair.states, dtype) if start is None else np.asarray(start, dtype)
-            built = Built(pair, tangents, now.scene.pitch_radius, now.scene.solver)
-            continues, found = now._continues(built), None
-            if continues and not (series and self.confirm):
-                found = self.orbits.near(built, start)
-            if found is None:
+            near = None
+            if now._follows and not (series and self.confirm):
+                near = self.orbits.near(now.scene, design, start)
+            if near is None:
+                pair, tangents, shape = _build(now.scene, design)
+                dtype = pair.angle_scale.dtype
+                state = np.zeros(pair.states, dtype) if start is None else np.asarray(start, dtype)
                 found = jax.device_get(now.motion(pair, tangents, state))
+            else:
+                pair, shape, found = near
+                if series or self.maxima or now.scene.bearings is not None:
+                    found = with_samples(found, now.scene.solver.samples)
             other = now._refitted(pair, found)
             if other is None:
                 break
             if float(other.scene.deepest) < float(now.scene.deepest):
                 other = other._sized(design)
-        if continues:
+        built = Built(now.scene, design, pair)
+        if now._follows and built.continues:
             self.orbits.keep(found, built)
         report = now._report(design, (pair, shape), found, began, series)
         if self.maxima and report.usable:
             integrator = now.scene.solver.orbit
+            _, tangents, _ = _build(now.scene, design)
             maxima = local_maxima(pair, tangents, found.orbit, int(found.period), integrator)
             report = dataclasses.replace(report, maxima=maxima)
         return now, report
 
-    def _continues(self, built: Built) -> bool:
-        """Return whether to close orbits of `built` by collocation from those of neighbours."""
-        wanted = self.neighbours or self.scene.solver.closing == "collocation"
-        return wanted and built.continues
+    @property
+    def _follows(self) -> bool:
+        """Whether to close orbits by collocation from those of neighbours where possible."""
+        return self.neighbours or self.scene.solver.closing == "collocation"
 
     def recall(
         self, evaluation: Evaluation, again: Callable[[], Any], start: NDArray[np.float64] | None
@@ -321,8 +326,8 @@ class Evaluator:
         # The slowest compilation starts first.
         _motion.prepare(pair, tangents, state, now.scene.pitch_radius, solver, then=then)
         _build.prepare(now.scene, design)
-        built = Built(pair, tangents, now.scene.pitch_radius, solver)
-        if now._continues(built):
+        built = Built(now.scene, design, pair)
+        if now._follows and built.continues:
             prepare_near(built)
         if series:
             count = pair.lobes * solver.samples
@@ -375,6 +380,8 @@ class Evaluator:
         A map must cover the motion. If the motion uses only a small part of the map, resolution is
         wasted, and the map is replaced. This is done only once, so that neighbouring designs share
         a map."""
+        if self.scene.fidelity != "map":
+            return None
         status, reached = Status.of(found.status), _reached(pair, found)
         return self.reaching(reached, status is Status.PERIODIC, pair.angle_limit)
 
@@ -398,7 +405,7 @@ class Evaluator:
 
         `built`: rotor pair and geometry; `began`: time at the start of the evaluation (s,
         `perf_counter`); `series`: whether to compute the series."""
-        seconds = time.perf_counter() - began
+        seconds, design = time.perf_counter() - began, np.asarray(design, np.float64)
         (pair, shape), status, orbit = built, Status.of(found.status), found.orbit
         period = int(found.period)
         statistics: dict[str, int | float] = {

@@ -11,10 +11,13 @@ from numpy.typing import NDArray
 
 from rootsopt.dynamics.collocation.known import Known, trimmed
 from rootsopt.dynamics.collocation.mesh import sizes
+from rootsopt.dynamics.collocation.sampled import sampled
 from rootsopt.dynamics.collocation.seed import from_steps
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.steady import Solver, Steady, continues, near_motion
+from rootsopt.dynamics.steady import Steady, continues, near_motion
+from rootsopt.profiles.geometry import Geometry
 from rootsopt.runtime.programs import Program
+from rootsopt.scene import Scene
 from rootsopt.status import Status
 
 _MOST = 4096
@@ -27,21 +30,26 @@ closed by collocation, above which the latter is not used."""
 
 
 class Built(NamedTuple):
-    """A rotor pair and everything on which its motion depends.
+    """A `design` (config units) in a `scene`, and their rotor pair."""
 
-    `pair`; `tangents`: directions along which to differentiate; `radius`: pitch radius (m);
-    `solver`: settings.
-    """
-
+    scene: Scene
+    design: Any
     pair: RotorPair
-    tangents: RotorPair
-    radius: Any
-    solver: Solver
 
     @property
     def continues(self) -> bool:
-        """Whether its orbit can be closed from that of a similar pair."""
-        return continues(self.pair, self.solver)
+        """Whether the orbit of the pair can be closed from that of a similar pair."""
+        return continues(self.pair, self.scene.solver)
+
+
+class Near(NamedTuple):
+    """A pair, and its motion near the orbit of a similar pair.
+
+    `pair`; `shape`: geometry of its rotors; `found`: the motion."""
+
+    pair: RotorPair
+    shape: Geometry
+    found: Steady
 
 
 class _Closed(NamedTuple):
@@ -131,19 +139,20 @@ class OrbitStore:
                     self._keep(key, entry)
             self._known |= {key: one for key, one in known.items() if key in self._found}
 
-    def near(self, built: Built, state: NDArray[np.float64] | None) -> Steady | None:
-        """Return the motion of `built` near the known orbit with this scaled `state` at φ1 = 0.
+    def near(self, scene: Scene, design: Any, state: NDArray[np.float64] | None) -> Near | None:
+        """Return the pair of a design (config units), and its motion near a known orbit.
 
-        `built` must be such that `Built.continues`. The result is `None` if there is no such orbit,
-        or if the motion is not accepted."""
-        found = self.begin(state)
-        if found is None or jax.tree.structure(found[1]) != jax.tree.structure(built.pair):
+        `state`: scaled state of this orbit at φ1 = 0. The result is `None` if there is no such
+        orbit, or if the motion is not accepted. The orbit of the motion lacks what `with_samples`
+        adds."""
+        known = self.begin(state)
+        if known is None or jax.tree.structure(known[1].scene) != jax.tree.structure(scene):
             return None
-        motion = _closed(built, *found)
-        return motion if Status.of(motion.status) is Status.PERIODIC else None
+        got = Near(*_near(scene, design, known[0], known[1].pair))
+        return got if Status.of(got.found.status) is Status.PERIODIC else None
 
-    def begin(self, state: NDArray[np.float64] | None) -> tuple[Known, RotorPair] | None:
-        """Return the orbit with this scaled `state` at φ1 = 0, and its pair.
+    def begin(self, state: NDArray[np.float64] | None) -> tuple[Known, Built] | None:
+        """Return the orbit with this scaled `state` at φ1 = 0, and its design, scene and pair.
 
         The result is `None` if no such orbit is known, or if collocation cannot close it."""
         if state is None:
@@ -152,7 +161,7 @@ class OrbitStore:
         with self._lock:
             found = self._recalled(key)
             known = None if found is None else self._adopted(key, *found)
-        return None if found is None or known is None else (known, found[1].pair)
+        return None if found is None or known is None else (known, found[1])
 
     def keep(self, found: Steady, built: Built) -> None:
         """Remember the orbit of the motion `found` of `built`, if it is periodic.
@@ -219,8 +228,8 @@ def _adopted(found: _Closed, built: Built) -> Known | None:
     if found.steps is None:
         return found.known
     period = np.asarray(found.period)
-    start = jax.device_get(_seed(built.pair, found.state, found.steps, period, found.period))
-    motion = _closed(built, start, built.pair)
+    start = _seed(built.pair, found.state, found.steps, period, found.period)
+    motion = _near(built.scene, built.design, start, built.pair)[-1]
     if motion.known is None or Status.of(motion.status) is not Status.PERIODIC:
         return None
     forces = np.asarray(motion.orbit.response[:3])
@@ -228,10 +237,22 @@ def _adopted(found: _Closed, built: Built) -> Known | None:
     return trimmed(motion.known, found.period) if np.all(same) else None
 
 
-def _closed(built: Built, known: Known, neighbour: RotorPair) -> Steady:
-    """Return the motion of `built` near the `known` orbit of the pair `neighbour`."""
-    start = known, neighbour
-    return jax.device_get(_near(built.pair, built.tangents, start, built.radius, built.solver))
+def with_samples(found: Steady, samples: int) -> Steady:
+    """Return the motion `found`, and add to its orbit what a motion near a known orbit lacks.
+
+    These are the steps, and a number of `samples` of the state."""
+    assert found.known is not None
+    flow = _sampled(found.orbit.flow, found.known.elements, samples)
+    return found._replace(orbit=found.orbit._replace(flow=flow))
+
+
+def _motion_near(scene: Scene, design: Any, known: Known, neighbour: RotorPair):
+    """Return the pair of a design, the geometry of its rotors, and its motion.
+
+    The motion is that near the `known` orbit of the pair `neighbour`."""
+    pair, tangents, shape = scene.pair_and_tangents(design)
+    start, radius = (known, neighbour), scene.pitch_radius
+    return pair, shape, near_motion(pair, tangents, start, radius, scene.solver)
 
 
 def prepare_near(built: Built) -> None:
@@ -239,7 +260,7 @@ def prepare_near(built: Built) -> None:
 
     In `built`, `jax.ShapeDtypeStruct` may replace arrays."""
     known = Known.empty(sizes(1), built.pair.states, 1 + built.pair.two_sided)
-    _near.prepare(built.pair, built.tangents, (known, built.pair), built.radius, built.solver)
+    _near.prepare(built.scene, built.design, known, built.pair)
 
 
 def _rows(start: NDArray[np.float64]) -> list[NDArray[np.float64]]:
@@ -255,7 +276,8 @@ def _key(state) -> bytes:
     return np.ascontiguousarray(state, np.float64).tobytes()
 
 
-_near = Program(near_motion)
-_seed = Program(from_steps)
+_near = Program(_motion_near, gathered=1)
+_sampled = Program(sampled, gathered=0)
+_seed = Program(from_steps, gathered=0)
 
-__all__ = ["Built", "OrbitStore", "prepare_near"]
+__all__ = ["Built", "Near", "OrbitStore", "prepare_near", "with_samples"]

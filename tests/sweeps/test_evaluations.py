@@ -131,7 +131,7 @@ def test_a_scheduler_without_workers_is_given_up(monkeypatch):
 def test_orbits_travel_with_the_states_that_name_them():
     config = load("cic")
     pair, *_ = _build.result_shape(Scene.from_config(config), design_vector(config))
-    built = Built(pair, pair, None, None)  # pyright: ignore[reportArgumentType]
+    built = Built(None, None, pair)  # pyright: ignore[reportArgumentType]
     store, state, far = OrbitStore(), np.array([0.1, 1 / 3]), np.array([0.2, 0.0])
     for number, place in enumerate((state, far), 1):
         known = Known.empty((number, 2), 2, 2)

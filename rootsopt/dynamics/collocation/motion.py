@@ -13,7 +13,7 @@ from rootsopt.dynamics.collocation.equation import CollocatedEquation
 from rootsopt.dynamics.collocation.forces import OrbitForces
 from rootsopt.dynamics.collocation.known import Known
 from rootsopt.dynamics.collocation.mesh import sizes
-from rootsopt.dynamics.collocation.sampled import PARTS, as_flow
+from rootsopt.dynamics.collocation.sampled import as_flow
 from rootsopt.dynamics.collocation.seed import seeded
 from rootsopt.dynamics.flow import Flow, flow
 from rootsopt.dynamics.integrator import Integrator
@@ -152,12 +152,13 @@ def near_orbit(
     start: tuple[Known, RotorPair],
     integrator: Integrator,
     measures: Measures,
-    sizes_of: tuple[int, int],
+    longest: int,
 ) -> Collocated:
     """Close the orbit near that of a similar pair, without a transient or integration.
 
-    `start`: the known orbit, and its pair; `integrator`: sets the accuracy; for the other
-    arguments, see `collocated`."""
+    `start`: the known orbit, and its pair; `integrator`: sets the accuracy; `longest`: longest
+    period (mesh periods); for the other arguments, see `collocated`. The result's `flow` has no
+    samples."""
     known, neighbour = start
     tolerance = integrator.tolerance(pair.angle_scale.dtype)
     equation = CollocatedEquation(pair, measures, lax.stop_gradient(pair.force_scale))
@@ -165,12 +166,11 @@ def near_orbit(
     found, sound = closed.found, closed.sound & known.sound
     verified = sound & (closed.error <= UNREFINED * ACCURACY * tolerance)
     period = jnp.round(found.elements.mesh.period).astype(int)
-    shorter = _repeats(found, period, sizes_of[1], tolerance)
+    shorter = _repeats(found, period, longest, tolerance)
     verified &= shorter == 0
     residual = jnp.where(sound, found.correction, jnp.inf)
-    out = as_flow(found, sizes_of[0], PARTS * known.elements.state.shape[0])
-    orbit = _as_orbit(found, out, residual, closed.drift, closed.steps)
-    return Collocated(orbit, sound, shorter, verified & out.solved, _known(closed, verified))
+    orbit = _as_orbit(found, as_flow(found), residual, closed.drift, closed.steps)
+    return Collocated(orbit, sound, shorter, verified, _known(closed, verified))
 
 
 def _known(closed: Closed, verified: Bool[Array, ""]) -> Known:

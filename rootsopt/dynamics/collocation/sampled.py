@@ -18,18 +18,14 @@ PARTS = len(_CUTS)
 """Number of steps into which an element is divided."""
 
 
-def as_flow(found: OrbitForces, samples: int, steps: int) -> Flow:
+def as_flow(found: OrbitForces) -> Flow:
     """Return the orbit `found` as a `Flow` over its period, with zeros for the derivatives.
 
-    `samples`: number of uniform samples of the state; `steps`: room for steps. Each element is
-    divided into `PARTS` steps. `Flow.solved` is False if there is no room for them."""
-    elements, response = found.elements, found.response
-    mesh, dtype = elements.mesh, found.state.dtype
-    grid, corners = _steps(elements, steps)
-    uniform = mesh.period * jnp.arange(samples) / samples
+    It has neither samples of the state nor steps: see `sampled`."""
+    response, count = found.response, found.state.shape[0]
+    mesh, dtype = found.elements.mesh, found.state.dtype
     begin, length = mesh.ends[0][found.peak.element], mesh.lengths[found.peak.element]
-    rows = found.state.shape[0] + response.shape[0]
-    columns = found.state.shape[0] + found.moved.shape[1]
+    rows, columns = count + response.shape[0], count + found.moved.shape[1]
     return Flow(
         end=found.state,
         mean=response[0],
@@ -37,15 +33,25 @@ def as_flow(found: OrbitForces, samples: int, steps: int) -> Flow:
         peak=response[2],
         peak_time=jnp.mod(begin + found.peak.share * length, mesh.period),
         depth=found.depth,
-        states=elements.motion(uniform),
-        grid=grid,
-        corners=corners,
+        states=jnp.zeros((0, count), dtype),
+        grid=jnp.zeros(0, dtype),
+        corners=jnp.zeros((0, count), dtype),
         steps=jnp.zeros((), int),
-        solved=PARTS * mesh.used <= steps,
+        solved=jnp.ones((), bool),
         strain=jnp.zeros((), dtype),
         others=response[3:],
         slope=jnp.zeros((rows, columns), dtype),
     )
+
+
+def sampled(flow: Flow, elements: Elements, samples: int) -> Flow:
+    """Return `flow` with uniform samples of the state, and with steps.
+
+    `elements`: the orbit; `samples`: number of samples. Each element is divided into `PARTS` steps.
+    """
+    grid, corners = _steps(elements, PARTS * elements.state.shape[0])
+    uniform = elements.mesh.period * jnp.arange(samples) / samples
+    return flow._replace(states=elements.motion(uniform), grid=grid, corners=corners)
 
 
 def _steps(elements: Elements, room: int) -> tuple[Float[Array, " steps"], Float[Array, "steps n"]]:
@@ -53,7 +59,7 @@ def _steps(elements: Elements, room: int) -> tuple[Float[Array, " steps"], Float
 
     `room`: size of the returned arrays; unused ends are inf."""
     mesh = elements.mesh
-    number = jnp.arange(min(room, PARTS * mesh.left.shape[0]))
+    number = jnp.arange(room)
     place, part = number // PARTS, jnp.asarray(_CUTS, mesh.left.dtype)[number % PARTS]
     first = origin(elements)
     used = jnp.maximum(mesh.used, 1)
@@ -66,8 +72,7 @@ def _steps(elements: Elements, room: int) -> tuple[Float[Array, " steps"], Float
     ends = jnp.where(number == last, mesh.period, tau + turns - begin[first])
     ends = jnp.where(number <= last, ends, jnp.inf)
     states = jnp.where((number <= last)[:, None], elements.inside(k, tau), 0.0)
-    spare = (0, room - number.size)
-    return jnp.pad(ends, spare, constant_values=jnp.inf), jnp.pad(states, (spare, (0, 0)))
+    return ends, states
 
 
-__all__ = ["PARTS", "as_flow"]
+__all__ = ["PARTS", "as_flow", "sampled"]
