@@ -193,9 +193,13 @@ def _solve(scene: Scene, design, start, numbers: tuple[int, ...]) -> tuple[Respo
 
 
 def _on_map(scene: Scene, pair: RotorPair, found: Steady) -> Steady:
-    """Return the motion `found`, with the status OFF_MAP if the motion has left the contact map."""
-    reached = pair.angle_scale * jnp.max(jnp.abs(found.orbit.flow.states[:, 0]))
-    left = among(found.status, CLOSED) & (reached > -scene.deepest)
+    """Return the motion `found`, with the status OFF_MAP if the motion has left the contact map.
+
+    Beyond the map, its extrapolated forces may also make the solver fail."""
+    orbit = jnp.max(jnp.abs(found.orbit.flow.states[:, 0]))
+    failed = found.status == Status.SOLVER_FAILED.code
+    reached = pair.angle_scale * jnp.where(failed, jnp.abs(found.settled.state[0]), orbit)
+    left = (failed | among(found.status, CLOSED)) & (reached > -scene.deepest)
     return found._replace(status=jnp.where(left, Status.OFF_MAP.code, found.status))
 
 
