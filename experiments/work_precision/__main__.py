@@ -1,13 +1,17 @@
 """What does accuracy cost in run time?
 
-Writes work_precision.csv, work_precision.json and work_precision.png.
+Writes work_precision.csv, work_precision.json, work_precision.png (contacts and solvers) and
+work_precision_orbits.png (ways to close orbits).
 """
 
 import sys
 
 from experiments._common.driver import OK, Run, drive
 
-FIGURES = {"work_precision.png": "work_precision.png"}
+FIGURES = {
+    "work_precision.png": "work_precision.png",
+    "work_precision_orbits.png": "work_precision_orbits.png",
+}
 
 
 def body(run: Run) -> int:
@@ -26,7 +30,9 @@ def body(run: Run) -> int:
         "quick": run.quick,
     }
     run.json("work_precision.json", summary)
-    run.figure("work_precision.png", figures.errors(results))
+    for name, titles in zip(FIGURES, (figures.TITLES, figures.CLOSED), strict=True):
+        if figures.panels_of(results, titles):
+            run.figure(name, figures.errors(results, titles))
     show("Work and precision", results.rows)
     left_out = [row for row in results.rows if row["status"] != "periodic"]
     total = len(results.rows)

@@ -12,12 +12,24 @@ TITLES = {
     "ee": "EE: contact (tsit5)",
     "lively": "lively CIC: contact (tsit5)",
 }
+CLOSED = {
+    "closing cic": "CIC: how orbits are closed",
+    "closing ee": "EE: how orbits are closed",
+    "closing lively": "lively CIC: how orbits are closed",
+}
 
 
-def errors(results: Results) -> Figure:
-    """Draw the error of mean (above) and peak (below) over run time, a column for each panel."""
+def panels_of(results: Results, titles: dict[str, str]) -> list[str]:
+    """Return those panels in `titles` for which there are curves."""
+    return [p for p in titles if any(p in curve.panels for curve, _ in results.measured)]
+
+
+def errors(results: Results, titles: dict[str, str]) -> Figure:
+    """Draw the error of mean (above) and peak (below) over run time, a column for each panel.
+
+    `titles`: of the panels to draw, `TITLES` or `CLOSED`. Panels without curves are left out."""
     measured, references = results.measured, results.references
-    panels = [p for p in TITLES if any(p in curve.panels for curve, _ in measured)]
+    panels = panels_of(results, titles)
     width, columns = 4.2 * len(panels) + 0.4, len(panels)
     figure, axes = sheet(width, 9.6, 2, columns, sharex="col", sharey="row")
     for column, panel in enumerate(panels):
@@ -26,7 +38,7 @@ def errors(results: Results) -> Figure:
         for row, name in enumerate(FORCES):
             ax: Axes = axes[row, column]
             for number, (curve, rows) in enumerate(drawn):
-                style = number if panel == "solver" else style_of(curve)
+                style = style_of(curve) if panel in ("contact", "ee", "lively") else number
                 draw_curve(ax, style, curve.label(panel), rows, name)
             ax.axhspan(FLOOR / 3, max(own[name], FLOOR), color="0.88", lw=0)
             ax.axhline(1e-3, color="0.5", lw=0.8, ls=":")
@@ -35,7 +47,7 @@ def errors(results: Results) -> Figure:
             plain_ticks(ax.xaxis)
             grid_below(ax, which="major", color="0.9")
             if row == 0:
-                ax.set_title(TITLES[panel], fontsize=11)
+                ax.set_title(titles[panel], fontsize=11)
             else:
                 ax.set_xlabel("one evaluation with gradient, warm (ms)")
                 below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.14)}

@@ -57,6 +57,13 @@ SINGLE = (1e-3, 1e-4, 1e-5, 2e-6)
 REFERENCE_RTOL = 1e-11
 FLOOR = 1e-12
 """Relative error below which an error is drawn at this value."""
+AWAY = 2e-3
+"""Relative difference between the parameters of the design and those of its neighbour."""
+CLOSINGS = {
+    "shooting": "shooting, from rest",
+    "collocation": "collocation, from rest",
+    "neighbour": "collocation, from a neighbour's orbit",
+}
 OTHER_ORBIT = 0.3
 """Scaled distance from the reference's orbit at φ1 = 0 above which a result is on another orbit."""
 
@@ -78,8 +85,9 @@ class Curve:
     """One choice of contact, solver and precision in a scene, over its tolerances.
 
     `panels`: names of the panels in which the curve is drawn; `transient`: tolerance of the
-    transient, if it differs from the orbit's. Curves with the same `compiled` share a compiled
-    program.
+    transient, if it differs from the orbit's; `closing`: how orbits are closed, by `shooting` or
+    `collocation` after a transient, or from the orbit of a `neighbour` (`AWAY`). Curves with the
+    same `compiled` share a compiled program.
     """
 
     scene: str
@@ -89,14 +97,18 @@ class Curve:
     precision: str = "float64"
     transient: float | None = None
     tolerances: tuple[float, ...] = FINE
+    closing: str = "shooting"
 
     @property
-    def compiled(self) -> tuple[str, str, str, bool]:
+    def compiled(self) -> tuple[str, str, str, str, bool]:
         """Everything that determines the compiled program."""
-        return self.contact, self.method, self.precision, self.scene == "ee"
+        closing = "shooting" if self.closing == "shooting" else "collocation"
+        return self.contact, self.method, self.precision, closing, self.scene == "ee"
 
     def label(self, panel: str) -> str:
         """Return the name of the curve in the legend of a `panel`."""
+        if panel.startswith("closing"):
+            return CLOSINGS[self.closing]
         parts = [self.contact]
         if panel == "solver" or self.method != "tsit5":
             parts.append(self.method)
@@ -109,6 +121,8 @@ class Curve:
     def evaluator(self) -> Evaluator:
         """Make the evaluator of the curve, at the config's tolerances."""
         choice = (f"solver.method={self.method}", f"solver.precision={self.precision}")
+        orbit = "shooting" if self.closing == "shooting" else "collocation"
+        choice += (f"solver.orbit={orbit}",)
         return evaluator(self.scene, *contact(self.contact), *choice)
 
 
@@ -125,21 +139,26 @@ FULL = (
     Curve("cic", ("contact",), "linear", tolerances=ROUGH),
     Curve("cic", ("contact",), "nodes 100", tolerances=NODES),
     Curve("cic", ("contact",), "nodes 400", tolerances=NODES),
-    Curve("cic", ("contact", "solver"), "search"),
+    Curve("cic", ("contact", "solver", "closing cic"), "search"),
     Curve("cic", ("contact", "solver"), "map 384x16"),
     Curve("cic", ("solver",), "search", "dopri5"),
     Curve("cic", ("solver",), "search", "dopri8"),
     Curve("cic", ("solver",), "search", "kvaerno5", tolerances=FINE[:5]),
     Curve("cic", ("solver",), "search", transient=1e-6),
     Curve("cic", ("solver",), "map 384x16", precision="float32", tolerances=SINGLE),
+    Curve("cic", ("closing cic",), "search", closing="collocation"),
+    Curve("cic", ("closing cic",), "search", closing="neighbour"),
     Curve("ee", ("ee",), "search", "dopri8"),
-    Curve("ee", ("ee",), "search"),
+    Curve("ee", ("ee", "closing ee"), "search"),
     Curve("ee", ("ee",), "map 384x16"),
+    Curve("ee", ("closing ee",), "search", closing="collocation"),
     Curve("ee", ("ee",), "linear", tolerances=ROUGH),
     Curve("ee", ("ee",), "nodes 400", tolerances=NODES),
     Curve("lively", ("lively",), "search", "dopri8"),
-    Curve("lively", ("lively",), "search"),
+    Curve("lively", ("lively", "closing lively"), "search"),
     Curve("lively", ("lively",), "map 384x16"),
+    Curve("lively", ("closing lively",), "search", closing="collocation"),
+    Curve("lively", ("closing lively",), "search", closing="neighbour"),
     Curve("lively", ("lively",), "map 192x12"),
     Curve("lively", ("lively",), "linear", tolerances=ROUGH),
     Curve("lively", ("lively",), "nodes 400", tolerances=NODES),
@@ -214,6 +233,11 @@ def measure(curve: Curve, truth: Evaluation, repeats: int) -> list[dict[str, Any
         # Fits the map to the motion.
         tool, found = at(tool, rtol, curve.transient).fit(series=False)
         call = functools.partial(tool, series=False)
+        if curve.closing == "neighbour":
+            design = np.asarray(tool.config.design, float)
+            beside = tool(design * (1 + AWAY), series=False)
+            call = functools.partial(tool, design, start=beside.state, series=False)
+            call()  # It may have a program to compile.
         seconds, found = median_time(call, repeats if found.usable else 1, PATIENCE)
         status = verdict(found, truth)
         off = errors(found, truth) if status == "periodic" else dict.fromkeys(FORCES, math.nan)
@@ -223,6 +247,7 @@ def measure(curve: Curve, truth: Evaluation, repeats: int) -> list[dict[str, Any
                 "contact": curve.contact,
                 "method": curve.method,
                 "precision": curve.precision,
+                "closing": curve.closing,
                 "rtol": rtol,
                 "transient_rtol": curve.transient or rtol,
                 "status": status,
