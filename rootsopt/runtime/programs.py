@@ -269,9 +269,8 @@ class Program:
         sources = _sources({self.function.__module__, *_modules(kind), *outside})
         if sources is None:
             return None
-        name = f"{self.function.__module__}.{self.function.__qualname__}"
-        kinds = [str(self.gathered), *map(repr, kind)]
-        words = [name, *kinds, *sources, *_machine(), *_versions(), *_settings()]
+        name = f"{self.function.__module__}.{self.function.__qualname__} {self.gathered}"
+        words = [name, *map(repr, kind), *sources, *_machine(), *_versions(), *_settings()]
         if any(" at 0x" in word for word in words):
             return None  # The text contains a memory address, which differs in the next process.
         purpose = hashlib.sha256("\0".join(words).encode()).hexdigest()
