@@ -119,7 +119,7 @@ class CollocatedEquation(eqx.Module):
         """Return the result of `along`, for the floating-point arrays of its directions.
 
         Without directions (`None`), d is 0. The instants are the last axis of all intermediate
-        arrays, so that the compiler makes vector instructions for them."""
+        arrays, so that inner loops are long."""
         shape, size = tau.shape, 1 + state.shape[-1]
         dynamic, static = eqx.partition(self.pair, eqx.is_inexact_array)
         place = jnp.concatenate([tau.reshape(1, -1), state.reshape(-1, size - 1).T])
