@@ -18,7 +18,7 @@ from rootsopt import report
 from rootsopt.commands import door
 from rootsopt.commands.door import BAD_INPUT, NO_RESULT
 from rootsopt.commands.door import OK as OK
-from rootsopt.config import Config, describe_families, describe_keys, load, sources
+from rootsopt.config import Config, describe_families, describe_keys, load, notes, sources
 from rootsopt.config.families import import_named
 from rootsopt.config.shipped import shipped
 from rootsopt.errors import InputError
@@ -171,6 +171,8 @@ def run(
         if writes and options.output is None:
             options.output = os.path.join("results", f"{options.config.stem}-{command}")
         config = load(options.config, options.overrides)
+        for note in notes(config):
+            environment.say(note)
         use_float64()
         use_cache(wanted=not options.no_cache)
         with environment.explained():
@@ -205,16 +207,17 @@ def _in_folder(command: str, config: Config, options: argparse.Namespace) -> int
         RunFolder(options.output, command, options.overwrite) as folder,
         door.leaving(folder.abandon),
     ):
+        folder.add_notes(notes(config))
         outcome = body(config, options, folder)
         if options.report:
             _report(folder, options, outcome)
-        notes = folder.put_in_place()
+        moved = folder.put_in_place()
         # Write files first: importing the console takes half of the time, and stdout may fail.
         from rich.console import Console
 
         out = Console()
         outcome.show(out)
-        for note in notes:
+        for note in moved:
             out.print(note, soft_wrap=True, markup=False, highlight=False)
         out.print(f"results in {folder.path}", soft_wrap=True, markup=False, highlight=False)
     return outcome.code

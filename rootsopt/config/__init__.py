@@ -5,6 +5,7 @@ converts to SI. A wrong file, key or value raises `InputError`. Its message name
 value, and says what is allowed."""
 
 from rootsopt.config.families import FAMILY_KEYS
+from rootsopt.config.plausible import notes
 from rootsopt.config.reading import Config, describe_families, describe_keys, load, parse
 from rootsopt.config.scene import ProfileConfig
 from rootsopt.config.study import EnsembleConfig, SolverConfig
@@ -27,5 +28,6 @@ __all__ = [
     "hint",
     "load",
     "load_config",
+    "notes",
     "parse",
 ]

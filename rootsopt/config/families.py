@@ -42,6 +42,8 @@ ENTRY_POINTS = "rootsopt.families"
 """Name of the entry-point group in which installed packages offer families.
 
 The name of each entry point is that of its family."""
+EXAMPLE_RADIUS = 33.0
+"""Pitch radius (mm) of the rotors in `Family.example`."""
 _ANY_LENGTH, _ANY_ANGLE, _ANY_NUMBER = (0.01, 1.5), (0.0, 90.0), (0.0, 2.0)
 """Usual range of a length (pitch radii), of an angle (°) and of a plain number.
 

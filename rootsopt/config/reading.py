@@ -231,15 +231,19 @@ class Config(Section):
 
     @property
     def load_torque(self) -> float:
-        """Load torque on rotor 2 (N·m); for a gas load, an estimate of its mean.
-
-        The estimate is only used to choose scales. It assumes an outer radius of 1.4 pitch radii
-        and an area efficiency of 0.45."""
+        """Load torque on rotor 2 (N·m); for a gas load, an estimate of its mean."""
         load = self.scene.load
         if load.torque_N_m is not None:
             return load.torque_N_m
         assert load.pressure_difference_Pa is not None
-        across = load.pressure_difference_Pa * self.rotor.length_mm * 1e-3
+        return self.gas_torque(load.pressure_difference_Pa)
+
+    def gas_torque(self, pressure: float) -> float:
+        """Return an estimate of the mean torque (N·m) on rotor 2 under a gas `pressure` (Pa).
+
+        It is only used to choose scales. It assumes an outer radius of 1.4 pitch radii and an area
+        efficiency of 0.45."""
+        across = pressure * self.rotor.length_mm * 1e-3
         return across * (1.4 * self.profile.pitch_radius_mm * 1e-3) ** 2 * 0.45 / 2
 
     @model_validator(mode="after")

@@ -1,5 +1,6 @@
 """Config sections that define what is simulated: profile, rotor, contact, scene."""
 
+import shlex
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
@@ -9,6 +10,7 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from rootsopt.config import catalogue as _catalogue  # noqa: F401  (fills the table)
 from rootsopt.config.families import (
+    EXAMPLE_RADIUS,
     families,
     family_of,
     on_change,
@@ -142,31 +144,40 @@ class ProfileConfig(Section):
                 "`profile.outline_file` must be the path of a file, but is "
                 f"{shown(self.outline_file)}, which has characters that cannot be printed"
             )
-        if self.from_file:
-            if self.outline_file is None:
-                raise ValueError(f"`profile.outline_file` is required for family {self.family}")
-            return self
-        readers = [name for name, family in families().items() if family.maker is None]
-        for key in (key for key in _FIELDS if key.startswith("outline_")):
-            if getattr(self, key) is not None:
-                raise ValueError(
-                    f"`profile.{key}` does not belong to family {self.family}; remove it, or set "
-                    f"`profile.family` to {' or '.join(readers)}"
-                )
         return self
 
     @model_validator(mode="after")
     def _family_keys(self):
-        own = family_of(self.family).keys
-        for key in parameters():
-            given = getattr(self, key) is not None
-            if key in own and not given:
-                raise ValueError(f"`profile.{key}` is required for family {self.family}")
-            if key not in own and given:
-                raise ValueError(
-                    f"`profile.{key}` does not belong to family {self.family}; remove it"
-                )
+        outline = [key for key in _FIELDS if key.startswith("outline_")]
+        keys = family_of(self.family).keys
+        own, required = (outline, ("outline_file",)) if self.from_file else (keys, keys)
+        given = [key for key in (*parameters(), *outline) if getattr(self, key) is not None]
+        foreign = [key for key in given if key not in own]
+        missing = [key for key in required if key not in given]
+        if foreign or missing:
+            raise ValueError(_completed(self, foreign, missing))
         return self
+
+
+def _completed(profile: ProfileConfig, foreign: Sequence[str], missing: Sequence[str]) -> str:
+    """Return the message on keys that are `foreign` to the family of a `profile`, or `missing`.
+
+    It lists the overrides that make the profile complete. Missing keys get the values of the
+    family's example at this pitch radius, and so do keys that another family shares: its values may
+    not fit."""
+    family, scale = family_of(profile.family), profile.pitch_radius_mm / EXAMPLE_RADIUS
+    values = dict.fromkeys(foreign, "null")
+    for key in family.keys if foreign and missing and family.keys else missing:
+        value = family.example.get(key, "FILE")
+        value = f"{value * scale:.4g}" if key.endswith("_mm") else value
+        values[key] = [*value] if isinstance(value, tuple) else value
+    first = f"`profile.{[*foreign, *missing][0]}` " + (
+        f"does not belong to family {profile.family}; for this family, add"
+        if foreign
+        else f"is required for family {profile.family}; add, for example,"
+    )
+    sets = [shlex.quote(f"profile.{key}={value}") for key, value in values.items()]
+    return " --set ".join((first, *sets))
 
 
 _FIELDS = dict(ProfileConfig.model_fields)
@@ -216,6 +227,11 @@ class FrictionConfig(Section):
 
     @model_validator(mode="after")
     def _ordered(self):
+        if self.static < self.kinetic:
+            raise ValueError(
+                "`contact.friction.static` must be at least `contact.friction.kinetic` = "
+                f"{self.kinetic:g}, but is {self.static:g}; raise it, or lower the other"
+            )
         if self.friction_speed_mm_s <= self.stiction_speed_mm_s:
             raise ValueError(
                 "`contact.friction.friction_speed_mm_s` must be greater than "
@@ -374,7 +390,10 @@ class TimingGearConfig(Section):
         description="torsional stiffness"
     )
     damping_ratio: Annotated[float, between(0, 100)] = Field(
-        0.0, description="damping ratio ζ, with the two rotors' inertia"
+        0.0,
+        description="damping coefficient over 2 √(k I): k the stiffness, I = I1 I2 / (I1 + I2) "
+        "the rotors' reduced inertia; with drive: prescribed, where only rotor 2 swings, the ratio "
+        "to critical damping is 0.71 times this",
     )
     backlash_mm: Annotated[float, between(0, 50)] = Field(
         description="total backlash at the pitch radius"

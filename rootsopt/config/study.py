@@ -1,5 +1,7 @@
 """Config sections that define the solver, objective, reports, sweep, constraints and optimiser."""
 
+import math
+import re
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
@@ -318,6 +320,35 @@ _Outer = Annotated[float, between(1, 1e4)]
 _Finite = Annotated[float, between(-1e12, 1e12)]
 
 
+_LINE = re.compile(r"line_.+_force_N")
+_CHAINS = (
+    ("mean_force_N", "rms_force_N", "peak_norm_force_N", "peak_force_N"),
+    ("bearing_load_equivalent_N", "bearing_load_max_N"),
+    ("static_bearing_load_equivalent_N", "static_bearing_load_max_N"),
+    ("flank_gap_min_um", "flank_gap_mean_um"),
+    ("root_radius_mm", "outer_radius_mm"),
+)
+"""Quantities that are never above the next one of their row."""
+_LINE_SHARES = {
+    "mean_force_N": 2.0,
+    "rms_force_N": 2 / math.sqrt(3),
+    "peak_force_N": 2 / math.pi,
+}
+"""Amplitude of a spectral line above which no force without a negative value comes, as multiples of
+these. The first is that of short pulses, the last that of a square wave. The second follows from
+the first: mean² + amplitude² / 2 ≤ RMS²."""
+_SIZES = {*_CHAINS[0], *_CHAINS[1], *_CHAINS[2], "axial_force_max_N", "tilting_moment_max_N_m"}
+"""Quantities that are magnitudes of forces, and never negative, like spectral lines."""
+
+
+def _above(name: str) -> list[tuple[str, float]]:
+    """Return (other quantity, factor) for all upper bounds of a quantity by another one."""
+    if _LINE.fullmatch(name):
+        return [*_LINE_SHARES.items()]
+    row = next((row for row in _CHAINS if name in row), (name,))
+    return [(other, 1.0) for other in row[row.index(name) + 1 :]]
+
+
 class ConstraintsConfig(Section):
     """Constraints that an optimised design must satisfy."""
 
@@ -356,6 +387,24 @@ class ConstraintsConfig(Section):
                     f"`constraints.terms.{named(name)}.max` must be greater than its `min` = "
                     f"{sides['min']:g}, but is {sides['max']:g}"
                 )
+        return self
+
+    @model_validator(mode="after")
+    def _reachable(self):
+        for name, sides in self.terms.items():
+            if sides.get("max", 0) < 0 and (name in _SIZES or _LINE.fullmatch(name)):
+                raise ValueError(
+                    f"`constraints.terms.{name}.max` must be at least 0, but is {sides['max']:g}: "
+                    "the quantity is never negative; raise or remove the limit"
+                )
+            for other, factor in _above(name):
+                floor, ceiling = sides.get("min"), self.terms.get(other, {}).get("max")
+                if floor is not None and ceiling is not None and floor > factor * ceiling:
+                    raise ValueError(
+                        f"`constraints.terms.{name}.min` must be at most {factor * ceiling:.4g}, "
+                        f"but is {floor:g}: `constraints.terms.{other}.max` is {ceiling:g}, and "
+                        f"{name} is never above {factor:.3g} times {other}; change one of the two"
+                    )
         return self
 
 

@@ -12,25 +12,28 @@ RPM = 2 * math.pi / 60
 # Ending of a key: (unit, {unit often written by mistake: factor to the right unit}). The first
 # ending that fits counts, so the longest endings come first.
 _UNITS: dict[str, tuple[str, dict[str, float]]] = {
-    "_N_s_per_mm": ("N·s/mm", {"N·s/m": 1e-3}),
+    "_N_s_per_mm": ("N·s/mm", {"N·s/m": 1e-3, "kN·s/mm": 1e3}),
     "_N_per_mm_e": ("N/mm^e", {}),
-    "_N_per_mm": ("N/mm", {"N/m": 1e-3}),
+    "_N_per_mm": ("N/mm", {"N/m": 1e-3, "kN/mm": 1e3}),
     "_N_m_s_per_rad": ("N·m·s/rad", {"N·mm·s/rad": 1e-3}),
-    "_N_m_per_rad": ("N·m/rad", {"N·mm/rad": 1e-3}),
+    "_N_m_per_rad": ("N·m/rad", {"N·mm/rad": 1e-3, "kN·m/rad": 1e3}),
     "_mPa_s": ("mPa·s", {"Pa·s": 1e3, "µPa·s": 1e-3}),
     "_J_per_kg_K": ("J/(kg·K)", {"kJ/(kg·K)": 1e3}),
     "_kg_m3": ("kg/m³", {"g/cm³": 1e3, "kg/mm³": 1e9, "t/mm³": 1e12}),
     "_kg_m2": ("kg·m²", {"kg·mm²": 1e-6}),
-    "_mm_s": ("mm/s", {"m/s": 1e3}),
+    "_mm_s": ("mm/s", {"m/s": 1e3, "µm/s": 1e-3}),
     "_rad_s": ("rad/s", {}),
-    "_mrad": ("mrad", {"rad": 1e3}),
-    "_N_m": ("N·m", {"N·mm": 1e-3}),
-    "_rpm": ("rpm", {}),
-    "_mm": ("mm", {"metres": 1e3, "micrometres": 1e-3}),
+    "_mrad": ("mrad", {"rad": 1e3, "µrad": 1e-3}),
+    "_N_m": ("N·m", {"N·mm": 1e-3, "kN·m": 1e3}),
+    "_rpm": ("rpm", {"Hz": 60.0, "thousands of rpm": 1e3}),
+    "_mm": ("mm", {"metres": 1e3, "micrometres": 1e-3, "centimetres": 10.0}),
     "_deg": ("°", {"radians": 180 / math.pi}),
-    "_Pa": ("Pa", {}),
-    "_per_K": ("1/K", {}),
+    "_Pa": ("Pa", {"bar": 1e5, "kPa": 1e3, "MPa": 1e6, "mbar": 100.0}),
+    "_per_K": ("1/K", {"1e-6/K": 1e-6}),
     "_K": ("K", {}),
+    "_force_N": ("N", {"kN": 1e3}),
+    "_cm3": ("cm³", {"litres": 1e3, "mm³": 1e-3}),
+    "_mm2": ("mm²", {"m²": 1e6, "cm²": 100.0}),
 }
 
 

@@ -26,7 +26,7 @@ import os
 import re
 import secrets
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
@@ -73,6 +73,7 @@ class RunFolder(ResultFolder):
         self._written: set[str] = set()
         self._spent: list[Path] = []
         self._result: Mapping[str, Any] | None = None
+        self._notes: list[str] = []
         self._made: list[Path] = []
         self._lock: Lock | None = None
         self._busy = threading.RLock()
@@ -222,7 +223,15 @@ class RunFolder(ResultFolder):
     @property
     def result(self) -> dict[str, Any]:
         """Content of the file `result.json` as it will be written, without the list of files."""
-        return plain({**(self._result or {}), "run": {"command": self.command}})
+        return plain({**self._entries, "run": {"command": self.command}})
+
+    @property
+    def _entries(self) -> dict[str, Any]:
+        return {**(self._result or {}), **({"notes": self._notes} if self._notes else {})}
+
+    def add_notes(self, notes: Sequence[str]) -> None:
+        """Add `notes` on the input to `result.json`. Without any, it has no entry `notes`."""
+        self._notes += notes
 
     def remove_afterwards(self, file: Path) -> None:
         """Remove `file`, which is not part of the run, as soon as the run is in place.
@@ -238,7 +247,7 @@ class RunFolder(ResultFolder):
         with self._busy:
             files = sorted(self._written | {RESULT})
             run = {"run": {"command": self.command, "files": files}}
-            super().write_json(RESULT, {**(self._result or {}), **run})
+            super().write_json(RESULT, {**self._entries, **run})
             with self._failing():
                 for folder in {(self.stage / name).parent for name in files} | {self.stage}:
                     disk.sync_folder(folder)

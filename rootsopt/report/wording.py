@@ -50,6 +50,7 @@ def asked(run: Run) -> list[str]:
         if keys:
             shown = _joined(keys) if len(keys) <= _FEW else f"{len(keys)} numbers"
             sentences.append(f"The design should be best while these scatter: {shown}.")
+    sentences += [f"{note}." for note in run.result.get("notes", ())]
     if run.rows:
         sentences.append(_over(run.rows))
     aims = run.result.get("terms")

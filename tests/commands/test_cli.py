@@ -127,9 +127,13 @@ def test_simulate_ee_and_profile(tmp_path):
     assert record["design"] == {}
     assert record["gradient"] == {}
     assert record["response"]["peak_force_N"] > record["response"]["mean_force_N"] > 0
-    done = command("profile", EE, "-o", tmp_path / "p", "--set", "profile.lobes=2")
+    odd = "--set", "scene.load.torque_N_m=4775"
+    done = command("profile", EE, "-o", tmp_path / "p", "--set", "profile.lobes=2", *odd)
     assert done.returncode == 0, done.stderr
     record = json.loads((tmp_path / "p" / "result.json").read_text())
+    (note,) = record["notes"]  # A value that looks like another unit is told, not refused.
+    assert done.stderr == f"rootsopt: {note}\n"
+    assert "N·mm? write 4.775" in note
     assert record["geometry"]["area_efficiency"] == pytest.approx(0.5, abs=1e-12)
     assert record["response"] == {}
     assert record["margins"]["root_mm"] == pytest.approx(record["geometry"]["root_radius_mm"])

@@ -1,6 +1,8 @@
 """Tests of config files: which are accepted, which are rejected, and that each message names a
 key."""
 
+import itertools
+import shlex
 from pathlib import Path
 from typing import Literal, get_args, get_origin
 
@@ -8,6 +10,7 @@ import pytest
 import yaml
 
 from rootsopt.config import Config, describe_keys, load, parse
+from rootsopt.config.families import families, family_of
 from rootsopt.config.section import Section
 from rootsopt.config.units import unit_of
 from rootsopt.errors import InputError
@@ -217,6 +220,40 @@ def test_keys_must_belong_to_the_family(key):
     message = refusal(EE_PROFILE, f"profile.{key}=5.0")
     assert f"`profile.{key}`" in message
     assert "ee" in message
+
+
+PAIRS = [
+    pair for pair in itertools.permutations(families(), 2) if family_of(pair[0]).maker is not None
+]
+
+
+@pytest.mark.parametrize(("old", "new"), PAIRS)
+def test_change_of_family_is_answered_by_the_overrides_that_it_needs(old, new):
+    """The message lists them all, in words that a shell takes."""
+    data = yaml.safe_load(MINIMAL)
+    example = {k: [*v] if isinstance(v, tuple) else v for k, v in family_of(old).example.items()}
+    data["profile"] = {"family": old, "lobes": 3, "pitch_radius_mm": 33.0, **example}
+    text, change = yaml.safe_dump(data), f"profile.family={new}"
+    if {*family_of(old).keys} == {*family_of(new).keys} and family_of(new).maker is not None:
+        return
+    message = refusal(text, change)
+    assert len(message) < 400
+    words = shlex.split(message[message.index("--set") :])
+    overrides = [word.replace("FILE", "rotor.csv") for word in words if word != "--set"]
+    foreign = {*family_of(old).keys} - {*family_of(new).keys}
+    assert {f"profile.{key}=null" for key in foreign} <= {*overrides}
+    config = parse(text, [change, *overrides])
+    assert config.profile.family == new
+    assert config.profile.parameters.keys() == {*family_of(new).keys}
+
+
+def test_overrides_of_a_family_suit_the_size_of_the_rotor():
+    """`arc` instead of CIC needs three keys less, and one more of the rotor's own size."""
+    less = [f"--set profile.{key}=null" for key in family_of("cic").keys]
+    message = refusal(MINIMAL, "profile.family=arc", "profile.arc_center_mm=29.7")
+    assert message.endswith(f"for this family, add {' '.join(less)}")
+    sized = refusal(MINIMAL, "profile.family=arc", "profile.pitch_radius_mm=66")
+    assert sized.endswith(f"{' '.join(less)} --set profile.arc_center_mm=59.4")
 
 
 # Wrong values

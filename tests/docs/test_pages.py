@@ -1,11 +1,15 @@
 """The pages teach what works: the code of tutorial and notebooks runs."""
 
+import itertools
 import json
 import re
+import shlex
 
 import pytest
 
 import rootsopt
+from rootsopt.config import load
+from rootsopt.scene import check_geometry
 from tests.docs.blocks import DOCS, blocks_of, in_python, in_shell
 
 PAGES = ["index", "tutorial", "howto", "theory", "fidelity", "gallery", "limits"]
@@ -95,3 +99,13 @@ def test_notebook(page, tmp_path):
     assert f"rootsopt {rootsopt.__version__}\n" in done.stdout
     assert "nan" not in done.stdout.split()
     assert "Warning" not in done.stderr
+
+
+def test_commands_of_the_howto_page_have_valid_overrides():
+    """Each row's command is accepted as printed, with `cic` for `CONFIG`."""
+    found = re.findall(r"`(rootsopt [^`]*--set[^`]*)`", (DOCS / "howto.md").read_text())
+    assert any("profile.family=arc" in one for one in found)
+    for one in found:
+        name, *words = shlex.split(one)[2:]
+        sets = [value for flag, value in itertools.pairwise(words) if flag == "--set"]
+        check_geometry(load("cic" if name == "CONFIG" else name, sets))

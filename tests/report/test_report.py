@@ -29,6 +29,7 @@ pytest.importorskip("plotly")
 ROOT = Path(__file__).parents[2]
 CIC = str(ROOT / "configs" / "cic.yaml")
 HOSTILE = '</script><script>document.title = "taken"</script><b>&amp;'
+NOTE = "`rotor.helix_deg` is 1 °, which is unusual"
 SAMPLES, PITCHES = 240, 3
 
 
@@ -72,7 +73,8 @@ def simulated(tmp_path_factory):
     figures = place / "figures"
     figures.mkdir()
     (figures / "force.png").write_bytes(b"\x89PNG")
-    return run_of(place, result_of(message=HOSTILE), motion(), source=HOSTILE)
+    result = result_of(message=HOSTILE, notes=[NOTE])
+    return run_of(place, result, motion(), source=HOSTILE)
 
 
 @pytest.fixture(scope="module")
@@ -121,6 +123,10 @@ def test_page_says_what_came_out_and_what_every_status_means(page):
     for status in Status:
         assert status.label.replace("_", " ") in text
         assert re.sub("[`]", "", status.value) in text
+
+
+def test_notes_on_odd_values_are_in_the_summary(page):
+    assert NOTE.replace("`", "") + "." in words_of(page)
 
 
 def test_spectrum_has_the_lines_of_the_motion(page):

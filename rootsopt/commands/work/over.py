@@ -10,6 +10,7 @@ from rich.console import Console
 from rootsopt.commands import cli, door
 from rootsopt.commands.work.searching import progress_bar
 from rootsopt.config import Config
+from rootsopt.config.plausible import notes_on_swept
 from rootsopt.errors import InputError
 from rootsopt.figures.sweep import sweep_figure
 from rootsopt.optimize.checkpoint import aside, set_aside
@@ -37,6 +38,11 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     datasets.check_name(name)
     config, plan = _points(config, options)
     plan = checked(config, plan)
+    columns = {key: values for one in plan.dimensions for key, values in one.columns.items()}
+    found = notes_on_swept(config, columns)
+    for note in found:
+        say(note)
+    folder.add_notes(found)
     run = runner(options.workers, options.scheduler, options.imports, not options.no_cache)
     with (
         closing(_journal(config, plan, options, folder)) as journal,

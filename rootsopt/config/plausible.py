@@ -1,0 +1,248 @@
+"""Notes on values that are allowed, but that usual machines do not have.
+
+A value far outside the usual range is often one in another unit. The ranges are wide: they hold for
+micro pumps and for boosters of a metre. Many follow the size of the rotor, whose torque, speed and
+mass a unit changes by a factor of a thousand, where machines differ by a factor of ten."""
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from rootsopt.config.families import parameters
+from rootsopt.config.units import MM, hint, unit_of
+
+if TYPE_CHECKING:
+    from rootsopt.config.reading import Config
+
+_BAR = 1e5
+"""One bar (Pa)."""
+
+
+def _one(_: "Config") -> float:
+    return 1.0
+
+
+def _radius(config: "Config") -> float:
+    """Return the pitch radius (mm)."""
+    return config.profile.pitch_radius_mm
+
+
+def _disc(config: "Config") -> float:
+    """Return the area (mm²) of the pitch circle."""
+    return math.pi * _radius(config) ** 2
+
+
+def _volume(config: "Config") -> float:
+    """Return the volume (cm³) of a cylinder on the pitch circle."""
+    return _disc(config) * config.rotor.length_mm * 1e-3
+
+
+def _mass(config: "Config") -> float:
+    """Return the mass (kg) of a solid cylinder on the pitch circle."""
+    return _volume(config) * 1e-6 * config.rotor.density_kg_m3
+
+
+def _inertia(config: "Config") -> float:
+    """Return the moment of inertia (kg·m²) of this cylinder."""
+    return _mass(config) * (_radius(config) * MM) ** 2 / 2
+
+
+def _rolling(config: "Config") -> float:
+    """Return the speed (rpm) at which the pitch circles roll at 1 m/s."""
+    return 60 / (2 * math.pi * _radius(config) * MM)
+
+
+def _bar(config: "Config") -> float:
+    """Return the load torque (N·m) of 1 bar. A load of the config may be 0 or wrong itself."""
+    return config.gas_torque(_BAR)
+
+
+def _slope(config: "Config") -> float:
+    """Return the torque of 1 bar per speed of the scene (N·m·s/rad)."""
+    return _bar(config) / (config.scene.speed_rpm * 2 * math.pi / 60)
+
+
+def _critical(config: "Config") -> float:
+    """Return the critical damping (N·s/mm) of a rotor on its bearings."""
+    supports = config.scene.supports
+    stiffness = 0.0 if supports is None else supports.stiffness_N_per_mm / MM
+    return 2 * math.sqrt(stiffness * _mass(config)) * MM
+
+
+def _force(config: "Config") -> float:
+    """Return the force (N) at the pitch circle that carries the load."""
+    return config.load_torque / (_radius(config) * MM)
+
+
+class Usual(NamedTuple):
+    """Usual range of a quantity: `low` to `high`, times its `size` in a config.
+
+    `size`: function of the config that returns the unit of `low` and `high`, in the unit of the
+    key."""
+
+    low: float
+    high: float
+    size: Callable[["Config"], float] = _one
+
+    def ends(self, config: "Config") -> tuple[float, float]:
+        """Return the range in the unit of the key."""
+        size = self.size(config)
+        return self.low * size, self.high * size
+
+
+_PRESSURE = Usual(300, 5e6)
+_TORQUE = Usual(1e-3, 50, _bar)
+_SPEED = Usual(0.2, 120, _rolling)
+_GAP = Usual(1e-5, 0.035, _radius)
+_LENGTH = Usual(5e-3, 2, _radius)
+_MARGIN = Usual(1e-3, 1, _radius)
+_ANGLE = Usual(0.2, 180)
+_TWIST = Usual(4, 360)
+_WARMING = Usual(0.5, 250)
+_EXPANSION = Usual(5e-7, 5e-5)
+_RADIUS = Usual(1, 2, _radius)
+USUAL: dict[str, Usual] = {
+    "profile.pitch_radius_mm": Usual(8, 1000),
+    "profile.outline_smoothing_mm": Usual(1e-5, 0.2),
+    "rotor.length_mm": Usual(0.1, 20, _radius),
+    "rotor.density_kg_m3": Usual(500, 2.2e4),
+    "rotor.bore_mm": Usual(0.02, 2, _radius),
+    "rotor.helix_deg": _TWIST,
+    "contact.stiffness_N_per_mm_e": Usual(1e3, 1e9),
+    "contact.max_damping_N_s_per_mm": Usual(1e-3, 50),
+    "contact.full_damping_depth_mm": Usual(1e-4, 0.5),
+    "contact.clearance_mm": _GAP,
+    "contact.smoothing_mm": Usual(5e-7, 0.02),
+    "contact.friction.stiction_speed_mm_s": Usual(0.5, 5e3),
+    "contact.friction.friction_speed_mm_s": Usual(2, 5e4),
+    "contact.wear.offset_mm": _GAP,
+    "contact.wear.depth_mm": _GAP,
+    "scene.speed_rpm": _SPEED,
+    "scene.motor.torque_N_m": _TORQUE,
+    "scene.motor.slope_N_m_s_per_rad": Usual(1e-3, 1e3, _slope),
+    "scene.motor.inertia_kg_m2": Usual(1e-3, 1e3, _inertia),
+    "scene.load.torque_N_m": _TORQUE,
+    "scene.load.pressure_difference_Pa": _PRESSURE,
+    "scene.timing_gear.stiffness_N_m_per_rad": Usual(50, 1e6, _bar),
+    "scene.timing_gear.damping_ratio": Usual(1e-3, 1),
+    "scene.timing_gear.backlash_mm": _GAP,
+    "scene.supports.stiffness_N_per_mm": Usual(50, 2e5, _radius),
+    "scene.supports.damping_N_s_per_mm": Usual(1e-3, 5, _critical),
+    "scene.bearings.gear_pressure_angle_deg": Usual(5, 45),
+    "scene.bearings.port_deg": Usual(1, 90),
+    "scene.bearings.bearing_distance_mm": Usual(0.02, 10, _radius),
+    "scene.bearings.gear_distance_mm": Usual(0.02, 20, _radius),
+    "scene.heat.rotor_warming_K": _WARMING,
+    "scene.heat.housing_warming_K": _WARMING,
+    "scene.heat.rotor_expansion_per_K": _EXPANSION,
+    "scene.heat.housing_expansion_per_K": _EXPANSION,
+    "scene.center_distance_error_mm": _GAP,
+    "scene.phase_error_mrad": Usual(2e-3, 40),
+    "objective.speeds_rpm": _SPEED,
+    "constraints.undercut_margin_min_mm": _MARGIN,
+    "constraints.seal_width_min_mm": _MARGIN,
+    "constraints.outer_radius_min_mm": _RADIUS,
+    "constraints.outer_radius_max_mm": _RADIUS,
+    "attractors.relative_range_mrad": Usual(1e-2, 300),
+    "attractors.rate_range_rad_s": Usual(1e-3, 1e4),
+    "sweep.speed_rpm": _SPEED,
+    "optimizer.bounds.helix_deg": _TWIST,
+    "pump.viscosity_mPa_s": Usual(5e-3, 2e5),
+    "pump.pressure_difference_Pa": _PRESSURE,
+    "pump.tip_clearance_mm": _GAP,
+    "pump.end_clearance_mm": _GAP,
+    "pump.radial_allowance_mm": _GAP,
+    "pump.gas.inlet_pressure_Pa": Usual(20, 5e6),
+    "pump.gas.temperature_K": Usual(200, 800),
+    "pump.gas.gas_constant_J_per_kg_K": Usual(30, 4500),
+    "drawing.tolerance_mm": _GAP,
+}
+"""Usual range of each key with a unit, other than design parameters."""
+_DESIGN = {"pressure_angle_deg": Usual(5, 85), "tip_arc_turn_deg": Usual(3, 180)}
+"""Usual ranges of design parameters that differ from those of their unit."""
+_UNITS = {"mm": _LENGTH, "°": _ANGLE}
+"""Usual range of a design parameter, by unit."""
+_TERMS = {
+    "_force_N": Usual(1e-2, 1e3, _force),
+    "_radius_mm": Usual(0.02, 2, _radius),
+    "area_mm2": Usual(0.2, 4, _disc),
+    "displaced_volume_cm3": Usual(0.2, 5, _volume),
+    "polar_inertia_kg_m2": Usual(0.1, 5, _inertia),
+}
+"""Usual ranges of limited quantities, by the ends of their names."""
+
+
+def usual_of(key: str) -> Usual | None:
+    """Return the usual range of a dotted key; `None` for a key without a unit."""
+    section, _, name = key.rpartition(".")
+    if section in ("profile", "optimizer.bounds") and name in parameters():
+        return _DESIGN.get(name) or _UNITS.get(unit_of(name))
+    if key.startswith("constraints.terms."):
+        return next((usual for end, usual in _TERMS.items() if name.endswith(end)), None)
+    return USUAL.get(key)
+
+
+def notes(config: "Config") -> tuple[str, ...]:
+    """Return one sentence on each value of a config that is not usual, in the order of the config.
+
+    Defaults have no note, and neither has 0, which is the same in every unit."""
+    given = dict(_numbers(config))
+    found = [_note(config, key, key, value) for key, value in given.items()]
+    return tuple(filter(None, (*found, *_listed(config, given))))
+
+
+def notes_on_swept(config: "Config", values: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return notes on the `values` of a sweep, by dotted key. The greatest one of each counts."""
+    found = (_note(config, key, f"--over {key}", _greatest(many)) for key, many in values.items())
+    return tuple(filter(None, found))
+
+
+def _listed(config: "Config", given: Mapping[str, float]) -> Iterator[str]:
+    """Yield notes on values in `tolerances.conditions` other than those `given`, by key.
+
+    Distributions are about the config's own value, and hardly reach another unit."""
+    conditions = {} if config.tolerances is None else config.tolerances.conditions
+    for name, values in conditions.items():
+        for key, value in values.items():
+            if value != given.get(key):
+                yield _note(config, key, f"tolerances.conditions.{name}.{key}", value)
+
+
+def _note(config: "Config", key: str, shown: str, value: float) -> str:
+    """Return the note on the `value` of a `key`, or "" if it is usual. `shown`: key in the note."""
+    usual = usual_of(key)
+    low, high = (0.0, math.inf) if usual is None else usual.ends(config)
+    if not value or not high or low <= abs(value) <= high:
+        return ""
+    unit = unit_of(key)
+    return (
+        f"`{shown}` is {value:g}{unit and f' {unit}'}, which is allowed, but unusual for this "
+        f"rotor (usually {float(f'{low:.2g}'):g} to {float(f'{high:.2g}'):g})"
+        + (hint(key, abs(value), low, high) or "; check its unit")
+    )
+
+
+def _numbers(section: Any, prefix: str = "") -> Iterator[tuple[str, float]]:
+    """Yield (dotted key, number) of all keys in a `section` whose value is not the default.
+
+    Of several numbers, such as bounds, the one with the greatest magnitude counts."""
+    for name, field in type(section).model_fields.items():
+        value, key = getattr(section, name), prefix + name
+        if hasattr(type(value), "model_fields"):
+            yield from _numbers(value, f"{key}.")
+        elif key == "constraints.terms":
+            yield from ((f"{key}.{term}", _greatest(sides)) for term, sides in value.items())
+        elif value != field.default and (number := _greatest(value)):
+            yield key, number
+
+
+def _greatest(value: Any) -> float:
+    """Return the number of the greatest magnitude in a value, 0 without a number."""
+    if isinstance(value, dict):  # The number of points of a range has no unit.
+        value = [one for key, one in value.items() if key != "points"]
+    many = value if isinstance(value, list | tuple) else [value]
+    numbers = [one for one in many if isinstance(one, int | float) and not isinstance(one, bool)]
+    return max(numbers, key=abs, default=0.0)
+
+
+__all__ = ["USUAL", "Usual", "notes", "notes_on_swept", "usual_of"]

@@ -1,0 +1,153 @@
+"""Notes on values that look as if given in another unit."""
+
+import functools
+import itertools
+import re
+from pathlib import Path
+
+import pytest
+
+from rootsopt.config import Config, load, notes, parse
+from rootsopt.config.explain import keys_of
+from rootsopt.config.plausible import USUAL, notes_on_swept, usual_of
+from rootsopt.config.shipped import shipped
+from rootsopt.config.units import _UNITS, unit_of
+from rootsopt.errors import InputError
+
+DOCS = Path(__file__).parents[2] / "docs"
+FULL = [
+    "contact.clearance_mm=0.05",
+    "contact.friction={}",
+    "contact.wear={offset_mm: 0.02, depth_mm: 0.03}",
+    "rotor.helix_deg=60",
+    "rotor.bore_mm=12",
+    "scene.motor.torque_N_m=4",
+    "scene.bearings={port_deg: 10, bearing_distance_mm: 30}",
+    "scene.heat={rotor_warming_K: 60, rotor_expansion_per_K: 2.3e-5}",
+    "pump={viscosity_mPa_s: 1.0, pressure_difference_Pa: 2.0e5, tip_clearance_mm: 0.1}",
+    "constraints={seal_width_min_mm: 2, outer_radius_max_mm: 45, terms: {peak_force_N: {max: 90}}}",
+    "optimizer.bounds={pressure_angle_deg: [25, 45], helix_deg: [0, 90]}",
+    "objective.speeds_rpm=[1500, 3000]",
+]
+"""Overrides that give a pump most of the quantities with a unit."""
+
+
+def test_every_quantity_has_a_usual_range():
+    """No key with a unit is forgotten, and no range is left for a key that is gone."""
+    keys = [key.name for key in keys_of(Config)]
+    assert [key for key in keys if unit_of(key) and usual_of(key) is None] == []
+    assert set(USUAL) <= set(keys)
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_shipped_configs_are_usual(name):
+    config = load(name)
+    assert notes(config) == ()
+    assert notes(parse(config.to_yaml())) == ()
+
+
+def test_values_of_the_pages_are_usual():
+    """`--set KEY=NUMBER` in the pages gives no note on the config of the paper's rotor."""
+    seen = 0
+    for page in sorted(DOCS.glob("*.md")):
+        for key, text in re.findall(r"--set '?([a-z_.]+)=([-\d.e]+)\b", page.read_text("utf-8")):
+            if usual_of(key) is not None and "outline" not in key:
+                seen += 1
+                assert notes_on_swept(load("cic"), {key: [float(text)]}) == (), (page, key)
+    assert seen > 10
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("scene.load={pressure_difference_Pa: 8.0}", "bar? write 8e+05"),
+        ("scene.load.torque_N_m=4775.0", "N·mm? write 4.775"),
+        ("scene.timing_gear.backlash_mm=5.0", "usually 0.00033 to 1.2"),
+        ("scene.timing_gear.stiffness_N_m_per_rad=20.0", "kN·m/rad? write 2e+04"),
+        ("scene.timing_gear.damping_ratio=50.0", "percentage? write 0.5"),
+        ("scene.speed_rpm=50.0", "Hz? write 3000"),
+        ("pump={viscosity_mPa_s: 0.001, pressure_difference_Pa: 1.0e5}", "Pa·s? write 1"),
+        ("rotor.helix_deg=1.05", "radians? write 60.16"),
+        ("contact.clearance_mm=0.0001", "metres? write 0.1"),
+        ("sweep.speed_rpm={from: 5, to: 50, points: 9999}", "Hz? write 3000"),
+        ("constraints.terms={peak_force_N: {max: 0.2}}", "kN? write 200"),
+        ("tolerances.conditions={a: {}, b: {scene.speed_rpm: 50.0}}", "conditions.b.scene.speed"),
+    ],
+)
+def test_odd_value_has_a_note(override, words):
+    (note,) = notes(load("cic", [override]))
+    assert words in note
+    assert note.startswith("`")
+    assert "unusual" in note
+
+
+def test_values_in_another_unit_do_not_pass_in_silence():
+    """Each quantity of a pump, given in a unit that differs by a thousand, is told.
+
+    Viscosity is left out: water in µPa·s has the number of an oil in mPa·s."""
+    config = load("pump", ["scene.load={torque_N_m: 4.0, pressure_difference_Pa: null}", *FULL])
+    assert notes(config) == ()
+    told = 0
+    for key in USUAL.keys() - {"pump.viscosity_mPa_s"}:
+        value = functools.reduce(lambda at, part: getattr(at, part, None), key.split("."), config)
+        others = [others for end, (_, others) in _UNITS.items() if key.endswith(end)]
+        if not isinstance(value, float) or not value or not others:
+            continue
+        for factor in (one for one in others[0].values() if not 0.01 <= one <= 100):
+            try:
+                found = notes(config.replaced({key: value / factor}))
+            except InputError as error:
+                found = (str(error),)
+            assert any(f"`{key}" in note for note in found), (key, value / factor)
+            told += 1
+    assert told > 40
+
+
+def test_zero_and_defaults_have_no_note():
+    values = ("contact.clearance_mm=0", "rotor.helix_deg=0", "scene.load.torque_N_m=0")
+    assert notes(load("cic", values)) == ()
+    large = load("cic", ["profile.pitch_radius_mm=900", "rotor.length_mm=2000",
+                         "profile.involute_length_mm=200", "scene.bearings={}"])  # fmt: skip
+    assert not [note for note in notes(large) if "distance" in note]
+
+
+def test_notes_on_swept_values_name_the_option():
+    values = {"scene.speed_rpm": (1000.0, 3000.0), "scene.timing_gear.backlash_mm": (0.1, 9.0)}
+    (note,) = notes_on_swept(load("cic"), values)
+    assert note.startswith("`--over scene.timing_gear.backlash_mm` is 9 mm")
+
+
+@pytest.mark.parametrize(
+    ("terms", "words"),
+    [
+        ("{peak_force_N: {max: -1}}", r"peak_force_N\.max` must be at least 0"),
+        ("{line_0.5_force_N: {max: -1}}", r"line_0\.5_force_N\.max` must be at least 0"),
+        ("{tilting_moment_max_N_m: {max: -1}}", "must be at least 0"),
+        ("{mean_force_N: {min: 21}, peak_force_N: {max: 20}}", r"mean_force_N\.min` .* at most 20"),
+        ("{rms_force_N: {min: 21, max: 30}, peak_force_N: {max: 20}}", r"rms_force_N\.min`"),
+        ("{line_1_force_N: {min: 21}, mean_force_N: {max: 10}}", "at most 20"),
+        ("{line_1_force_N: {min: 21}, peak_force_N: {max: 30}}", r"at most 19\.1"),
+        ("{line_1_force_N: {min: 21}, rms_force_N: {max: 18}}", r"at most 20\.78"),
+        ("{bearing_load_equivalent_N: {min: 9}, bearing_load_max_N: {max: 8}}", "at most 8"),
+    ],
+)
+def test_limits_that_no_force_can_meet_are_refused(terms, words):
+    with pytest.raises(InputError, match=words):
+        load("cic", [f"constraints.terms={terms}"])
+
+
+def test_limits_that_some_force_meets_are_accepted():
+    """A constant force has equal mean and peak; pulses have lines of twice their mean."""
+    for one in itertools.pairwise(("mean_force_N", "rms_force_N", "peak_force_N")):
+        load("cic", [f"constraints.terms={{{one[0]}: {{min: 20}}, {one[1]}: {{max: 20}}}}"])
+    load("cic", ["constraints.terms={line_1_force_N: {min: 20}, mean_force_N: {max: 10}}"])
+    load("cic", ["constraints.terms={peak_force_N: {max: 0}}"])
+
+
+@pytest.mark.parametrize(
+    "friction", ["{kinetic: 0.3}", "{static: 0.05}", "{static: 0, kinetic: 1}"]
+)
+def test_static_friction_is_not_below_kinetic_friction(friction):
+    with pytest.raises(InputError, match=r"`contact\.friction\.static` must be at least `contact"):
+        load("pump", [f"contact.friction={friction}"])
+    assert load("pump", ["contact.friction={static: 0.1, kinetic: 0.1}"]).contact.friction
