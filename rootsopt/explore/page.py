@@ -102,6 +102,7 @@ class Page:
 
     def _build(self) -> None:
         self.status = text(name="status_text")
+        self.notes = text(name="notes_text")
         self.search = text(name="search_text", visible=False)
         self.latency = text(name="latency_text", syncable=False)
         self.mark = Div(text="", visible=False, name="mark")
@@ -114,7 +115,7 @@ class Page:
         self.gradient = text(name="gradient_text")
         stretch: dict[str, Any] = {"sizing_mode": "stretch_width", "margin": 0}
         roots: dict[str, LayoutDOM] = {
-            "status": Column(self.status, self.search, self.latency, **stretch),
+            "status": Column(self.status, self.notes, self.search, self.latency, **stretch),
             "buttons": self._buttons(),
             "controls": self._controls(),
             "profile": self.profile.root,
@@ -275,6 +276,7 @@ class Page:
         if not drawn:
             self.profile.dim(True)
             self.pair.dim(True)
+        self.notes.text = ""
         self.force.clear("no motion")
         self._show_numbers(drawn)
         self._fresh(True)
@@ -283,6 +285,7 @@ class Page:
 
     def _take_shape(self, message: NewShape) -> None:
         self.shape, self.problem = message, None
+        self.notes.text = texts.notes_lines(message.notes)
         radius = self._radius()
         if not self.first[0]:
             self.first = message.shape.record, None

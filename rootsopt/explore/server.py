@@ -5,20 +5,26 @@
 
 import logging
 import secrets
-import socket
 import threading
 from collections.abc import Callable
 
 from bokeh.application import Application
 from bokeh.application.handlers.function import FunctionHandler
 from bokeh.document import Document
-from bokeh.server.server import Server
+from bokeh.server.server import BaseServer
+from bokeh.server.tornado import BokehTornado
+from tornado.httpserver import HTTPServer
+from tornado.httputil import HTTPServerRequest
 from tornado.ioloop import IOLoop, PeriodicCallback
+from tornado.netutil import bind_sockets
+from tornado.routing import AnyMatches, Matcher, Rule, RuleRouter
+from tornado.web import Application as Handlers
 from tornado.web import RequestHandler
 
 from rootsopt.errors import InputError
 from rootsopt.explore.engine import Engine
 from rootsopt.explore.page import Page
+from rootsopt.runtime.environment import say, shortened
 
 ADDRESS = "127.0.0.1"
 """The only address on which the page is served."""
@@ -28,18 +34,55 @@ _POLL = 100
 """Interval (ms) at which the server looks whether it is to end."""
 _LIFETIME = 30_000
 """Time (ms) for which a session is kept whose tab is closed or out of reach."""
+_NAMES = ADDRESS, "localhost", "[::1]"
+"""Names of this machine under which a browser may ask for the page.
+
+A web page elsewhere can let its own name lead to this machine (DNS rebinding). It is refused."""
 _REFUSED = (
-    "This address lacks the secret token. Open the address that `rootsopt explore` has printed.\n"
+    "This address lacks the secret token, or its name is not that of this machine. Open the "
+    "address that `rootsopt explore` has printed.\n"
 )
 
 
+class _Own(Matcher):
+    """Matches requests to one of `hosts`, name and port, whose path lies below `prefix`."""
+
+    def __init__(self, hosts: set[str], prefix: str):
+        self.hosts, self.prefix = hosts, prefix
+
+    def match(self, request: HTTPServerRequest) -> dict[str, str] | None:
+        names = request.headers.get_list("Host")
+        own = len(names) == 1 and names[0].lower() in self.hosts
+        return {} if own and request.path.startswith(self.prefix + "/") else None
+
+
 class _Refusal(RequestHandler):
-    """Answers all requests whose address does not begin with the token."""
+    """Answers all requests that are not for the page."""
 
     def prepare(self) -> None:
         self.set_status(403)
         self.set_header("Content-Type", "text/plain; charset=utf-8")
         self.finish(_REFUSED)
+
+
+class _OneLine(logging.Handler):
+    """Prints an error of the libraries as one line: a malformed request is no reason for more."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        error = record.exc_info[1] if record.exc_info else None
+        words = record.getMessage() if error is None else f"{type(error).__name__}: {error}"
+        say(f"explore: a request failed: {shortened(words)}")
+
+
+def _keep_quiet() -> None:
+    """Let the libraries report errors alone, in one line each, and no requests.
+
+    Their own messages hold tracebacks and the secret address."""
+    for name in ("asyncio", "bokeh", "tornado"):
+        logger = logging.getLogger(name)
+        logger.handlers, logger.propagate = [_OneLine()], False
+        logger.setLevel(logging.ERROR)
+    logging.getLogger("tornado.access").setLevel(logging.CRITICAL)
 
 
 class PageServer:
@@ -53,31 +96,35 @@ class PageServer:
 
     def __init__(self, engine: Engine, source: str, port: int = 0):
         self.engine, self.source = engine, source
-        token = secrets.token_urlsafe(_TOKEN)
-        # A refused request is no event worth a line on stderr.
-        logging.getLogger("tornado.access").setLevel(logging.ERROR)
-        application = Application(FunctionHandler(self._open))
+        _keep_quiet()
+        prefix = f"/{secrets.token_urlsafe(_TOKEN)}"
+        loop = IOLoop()
         try:
-            self.port = port or _free_port()
-            self.server = Server(
-                {"/": application},
-                io_loop=IOLoop(),
-                address=ADDRESS,
-                port=self.port,
-                prefix=f"/{token}",
-                # Only the page's own scripts may connect.
-                allow_websocket_origin=[f"{ADDRESS}:{self.port}"],
-                ico_path="none",
-                default_handler_class=_Refusal,
-                unused_session_lifetime_milliseconds=_LIFETIME,
-                check_unused_sessions_milliseconds=_LIFETIME // 3,
-            )
+            sockets = bind_sockets(port, ADDRESS)
         except OSError as error:
             raise InputError(
                 f"`--port` must be a free port, but {port} cannot be used "
                 f"({error.strerror or error}); choose another one, or leave `--port` out"
             ) from error
-        self.url = f"http://{ADDRESS}:{self.port}/{token}/"
+        self.port = sockets[0].getsockname()[1]
+        # Browsers leave out the standard port.
+        ports = (f":{self.port}", "") if self.port == 80 else (f":{self.port}",)
+        hosts = {name + end for name in _NAMES for end in ports}
+        pages = BokehTornado(
+            {"/": Application(FunctionHandler(self._open))},
+            prefix=prefix,
+            # Only the page's own scripts may connect.
+            extra_websocket_origins=[*hosts],
+            ico_path="none",
+            unused_session_lifetime_milliseconds=_LIFETIME,
+            check_unused_sessions_milliseconds=_LIFETIME // 3,
+        )
+        refusals = Handlers([], default_handler_class=_Refusal)
+        router = RuleRouter([Rule(_Own(hosts, prefix), pages), Rule(AnyMatches(), refusals)])
+        web = HTTPServer(router)
+        web.add_sockets(sockets)
+        self.server = BaseServer(loop, pages, web)
+        self.url = f"http://{ADDRESS}:{self.port}{prefix}/"
 
     def _open(self, document: Document) -> None:
         page = Page(document, self.engine, self.source)
@@ -95,12 +142,6 @@ class PageServer:
         finally:
             watch.stop()
             self.server.stop()
-
-
-def _free_port() -> int:
-    with socket.socket() as one:
-        one.bind((ADDRESS, 0))
-        return one.getsockname()[1]
 
 
 __all__ = ["ADDRESS", "PageServer"]

@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from rootsopt.config import Config
+from rootsopt.config import Config, notes
 from rootsopt.errors import InputError
 from rootsopt.explore.engine import Engine, Poses, Shape, poses_of, same_motion
 from rootsopt.explore.latest import Latest
@@ -37,9 +37,10 @@ class Problem(Message):
 
 @dataclasses.dataclass(frozen=True)
 class NewShape(Message):
-    """The `shape` of the rotor."""
+    """The `shape` of the rotor, and `notes` on values that are not usual."""
 
     shape: Shape
+    notes: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -174,7 +175,7 @@ class Session:
     def _compute_shape(self, number: int) -> None:
         config = self.config()
         shape = self.engine.shape(config)
-        self.show(NewShape(number, shape))
+        self.show(NewShape(number, shape, notes(config)))
         work = functools.partial(self._compute_motion, number, config, shape)
         self._motions.submit(lambda: self._refusing(number, work))
 

@@ -90,6 +90,11 @@ def status_line(word: str, kind: str, words: str, note: str = "") -> str:
     return f'<div class="status">{text}</div>'
 
 
+def notes_lines(notes: Iterable[str]) -> str:
+    """Return the `notes` on values that are not usual, one to a line."""
+    return "".join(f'<div class="note">{html.escape(note)}</div>' for note in notes)
+
+
 def motion_line(motion: NewMotion, rest: FromRest | None) -> str:
     """Return the status of a motion, with whether it is the one that starts at rest.
 
@@ -185,6 +190,7 @@ __all__ = [
     "gradient_table",
     "knob_label",
     "motion_line",
+    "notes_lines",
     "progress_line",
     "searched_line",
     "status_line",

@@ -8,7 +8,9 @@ import subprocess
 import sys
 import threading
 import urllib.error
+import urllib.parse
 import urllib.request
+import webbrowser
 from pathlib import Path
 
 import pytest
@@ -19,6 +21,10 @@ from rootsopt.commands import explore as command
 pytest.importorskip("bokeh")
 ROOT = Path(__file__).parents[2]
 CIC = str(ROOT / "configs" / "cic.yaml")
+REFUSED = (
+    "This address lacks the secret token, or its name is not that of this machine. Open the "
+    "address that `rootsopt explore` has printed.\n"
+)
 
 
 @pytest.fixture(scope="module")
@@ -50,6 +56,14 @@ def address():
     assert not thread.is_alive()
 
 
+def raw(address, text):
+    """Return the first line of the answer to a request that no HTTP library would send."""
+    host, port = address.split("/")[2].split(":")
+    with socket.create_connection((host, int(port)), timeout=30) as connection:
+        connection.sendall(text.encode("latin1"))
+        return connection.makefile("rb").readline().decode("latin1")
+
+
 def get(url, **headers):
     """Return (status, text) of a request."""
     request = urllib.request.Request(url, headers=headers)
@@ -73,7 +87,16 @@ def test_page_is_served_to_those_who_know_the_token(address):
 
 @pytest.mark.parametrize(
     "path",
-    ["", "ws", "static/js/bokeh.min.js", "autoload.js", "x" * 32 + "/", "?token=1", "metadata"],
+    [
+        "",
+        "ws",
+        "static/js/bokeh.min.js",
+        "autoload.js",
+        "x" * 32 + "/",
+        "?token=1",
+        "metadata",
+        "favicon.ico",
+    ],
 )
 def test_requests_without_the_token_are_refused(address, path):
     base = address.split("/", 3)
@@ -97,6 +120,77 @@ def test_foreign_pages_may_not_connect(address, origin, status):
     connection.request("GET", f"/{path}ws", headers=headers)
     assert connection.getresponse().status == status
     connection.close()
+
+
+@pytest.mark.parametrize("path", ["", "ws", "static/js/bokeh.min.js"])
+@pytest.mark.parametrize("name", ["example.org:{}", "127.0.0.1.example.org:{}", "127.0.0.1",
+                                  "127.0.0.1:1", "localhost", "{}", ""])  # fmt: skip
+def test_other_names_of_this_machine_are_refused(address, name, path):
+    """A page elsewhere whose name leads here (DNS rebinding) gets nothing, even with the token."""
+    host = name.format(address.split(":")[2].split("/")[0])
+    assert get(address + path, Host=host) == (403, REFUSED)
+
+
+def test_page_has_the_names_of_the_loopback_address(address):
+    port = address.split(":")[2].split("/")[0]
+    for name in ("127.0.0.1", "localhost", "LOCALHOST", "[::1]"):
+        assert get(f"{address}static/js/bokeh.min.js", Host=f"{name}:{port}")[0] == 200
+
+
+def test_malformed_requests_leave_no_traceback(address, capfd):
+    """They are answered or dropped; stderr has at most one line for each, without the token."""
+    page, host = "/" + address.split("/", 3)[3], address.split("/")[2]
+    end = f" HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n"
+    upgrade = (
+        "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+        f"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nOrigin: http://{host}\r\n"
+    )
+    socket_of = f"GET {page}ws HTTP/1.1\r\nHost: {host}\r\n{upgrade}"
+    requests = [
+        "GET / HTTP/9.9\r\n\r\n", "\x16\x03\x01\xff\r\n\r\n", "GET /\r\n\r\n", f"FOO {page}{end}",
+        f"GET /\xff{end}", f"GET http://[{end}", "GET / HTTP/1.1\r\nHost: \x00\r\n\r\n",
+        f"POST /{end.replace('close', 'close' + chr(13) + chr(10) + 'Content-Length: -1')}",
+        f"GET {page}static/%00{end}", f"GET {page}static/%ff{end}",
+        f"GET {page}?bokeh-token=zz{end}",
+        f"GET {page}autoload.js?bokeh-autoload-element=1&bokeh-session-id=%00{end}",
+        f"{socket_of}\r\n", f"{socket_of}Sec-WebSocket-Protocol: bokeh, zz\r\n\r\n",
+        f"{socket_of}Sec-WebSocket-Protocol: bokeh\r\n\r\n{chr(255) * 30}",
+    ]  # fmt: skip
+    for text in requests:
+        raw(address, text)
+    assert get(f"{address}static/js/bokeh.min.js")[0] == 200
+    lines = capfd.readouterr().err.splitlines()
+    assert lines
+    assert all(line.startswith("rootsopt: explore: a request failed: ") for line in lines)
+    assert page.strip("/") not in "".join(lines)
+
+
+def test_browser_is_given_no_secret(monkeypatch):
+    """Its arguments, which all users can list, name a file that only this user can read."""
+    opened, ready = [], threading.Event()
+
+    class Serving:
+        def __init__(self, *_):
+            pass
+
+        def run(self, stop, started):
+            started("http://127.0.0.1:1/secret/")
+            assert ready.wait(60)
+
+    def browse(address):
+        file = Path(urllib.request.url2pathname(urllib.parse.urlparse(address).path))
+        opened.extend((address, file, file.read_text(), file.parent.stat().st_mode & 0o777))
+        ready.set()
+
+    monkeypatch.setattr("rootsopt.explore.server.PageServer", Serving)
+    monkeypatch.setattr("rootsopt.explore.engine.Engine.prepare", lambda self: None)
+    monkeypatch.setattr(webbrowser, "open", browse)
+    assert command.main([CIC]) == 0
+    address, file, text, mode = opened
+    assert "secret" not in address
+    assert 'url=http://127.0.0.1:1/secret/"' in text
+    assert mode == 0o700
+    assert not file.exists()
 
 
 def test_server_listens_on_the_loopback_address_only(address):

@@ -1,9 +1,12 @@
 """The work of `rootsopt explore`."""
 
 import argparse
+import html
 import sys
+import tempfile
 import threading
 import webbrowser
+from pathlib import Path
 
 from rootsopt import explore
 from rootsopt.commands import door
@@ -34,15 +37,27 @@ def body(config: Config, options: argparse.Namespace) -> int:
     def started(url: str) -> None:
         print(f"rootsopt explore: {url}\nCtrl-C ends it.", flush=True)
         if not options.no_browser:
-            threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
+            file = _redirection(Path(private), url)
+            threading.Thread(target=webbrowser.open, args=(file,), daemon=True).start()
 
     threading.Thread(target=prepare, daemon=True).start()
-    with door.patience("the page closes") as stop:
+    with tempfile.TemporaryDirectory() as private, door.patience("the page closes") as stop:
         try:
             server.run(stop, started)
         except KeyboardInterrupt:  # if Python's own handler of Ctrl-C is in place
             print("rootsopt explore: the page closes", file=sys.stderr)
     return door.OK
+
+
+def _redirection(folder: Path, url: str) -> str:
+    """Write a file that leads a browser to `url`, and return the file's address.
+
+    Every user of this machine can list the arguments of a browser, so that they must not contain
+    the secret of the page. The `folder` is the user's own."""
+    file = folder / "explore.html"
+    target = html.escape(url)
+    file.write_text(f'<meta http-equiv="refresh" content="0; url={target}"><a href="{target}">')
+    return file.as_uri()
 
 
 __all__ = ["body"]
