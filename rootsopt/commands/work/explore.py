@@ -11,6 +11,7 @@ from pathlib import Path
 from rootsopt import explore
 from rootsopt.commands import door
 from rootsopt.config import Config
+from rootsopt.output import disk
 from rootsopt.runtime import environment
 from rootsopt.scene import check_geometry
 
@@ -56,7 +57,8 @@ def _redirection(folder: Path, url: str) -> str:
     the secret of the page. The `folder` is the user's own."""
     file = folder / "explore.html"
     target = html.escape(url)
-    file.write_text(f'<meta http-equiv="refresh" content="0; url={target}"><a href="{target}">')
+    text = f'<meta http-equiv="refresh" content="0; url={target}"><a href="{target}">{target}</a>'
+    disk.create(file, text.encode())
     return file.as_uri()
 
 
