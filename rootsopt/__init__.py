@@ -3,6 +3,10 @@
 Public names are imported on first use. Importing the package is therefore fast, loads no solver,
 and changes no global setting. The first use of a name makes XLA compile loops as
 `rootsopt.runtime.environment.use_compiled_loops` says, if JAX has not computed anything yet.
+
+>>> import rootsopt
+>>> rootsopt.__version__.count(".")
+2
 """
 
 from importlib import import_module

@@ -6,7 +6,12 @@ from typing import SupportsIndex
 
 
 class Status(enum.Enum):
-    """Outcome of a simulation or a search. Each value explains the status and advises the user."""
+    """Outcome of a simulation or a search. Each value explains the status and advises the user.
+
+    >>> import rootsopt
+    >>> rootsopt.Status.CHAOTIC.label, rootsopt.Status.CHAOTIC.usable
+    ('chaotic', False)
+    """
 
     PERIODIC = "The pair settled on a stable periodic orbit."
     AVERAGED = (

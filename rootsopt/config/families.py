@@ -74,6 +74,11 @@ class Parameter:
     `count`: least and greatest number of entries, if the key holds a list. `None`: a single number.
     `floor`: default lower bound of a parameter in `Family.ranges`, as a fraction of the upper end
     of its range. Bounds in the config replace it.
+
+    >>> import rootsopt
+    >>> angle = rootsopt.Parameter("crossing_angle_deg", "pressure angle at the crossing", 0, 80)
+    >>> angle.argument, round(angle.unit, 5)
+    ('crossing_angle', 0.01745)
     """
 
     key: str
@@ -194,7 +199,16 @@ class Family:
     high) by key for parameters whose range depends on the others: all values of sound profiles. The
     optimiser searches such a parameter as a fraction of this range, within its bounds.
 
-    A subclass may override `make`, `check` and `dependent` instead of providing functions."""
+    A subclass may override `make`, `check` and `dependent` instead of providing functions.
+
+    >>> import jax
+    >>> import rootsopt
+    >>> jax.config.update("jax_enable_x64", True)
+    >>> from rootsopt.profiles import EE
+    >>> family = rootsopt.Family(name="plain", help="epicycloid and hypocycloid", maker=EE)
+    >>> family.make(3, 0.033).lobes
+    3
+    """
 
     name: str
     help: str
@@ -266,7 +280,17 @@ def register_family(family: Family) -> Family:
     """Add a family to the table of profile families, and return it.
 
     Configs, commands and the optimiser use this table. Raises `ValueError` if the family is
-    incomplete, its name is taken, or one of its keys has another meaning in another family."""
+    incomplete, its name is taken, or one of its keys has another meaning in another family.
+
+    >>> import jax
+    >>> import rootsopt
+    >>> jax.config.update("jax_enable_x64", True)
+    >>> from rootsopt.profiles import EE
+    >>> family = rootsopt.Family(name="plain_ee", help="epicycloid and hypocycloid", maker=EE)
+    >>> _ = rootsopt.register_family(family)
+    >>> rootsopt.load_config("ee", ["profile.family=plain_ee"]).profile.family
+    'plain_ee'
+    """
     _check(family)
     _families[family.name] = family
     _origins[family.name] = sys._getframe(1).f_globals.get("__name__", "")

@@ -57,7 +57,13 @@ TWIST = "helix_deg"
 
 
 class Config(Section):
-    """The settings of a run: all sections of a config."""
+    """The settings of a run: all sections of a config.
+
+    >>> import rootsopt
+    >>> config = rootsopt.load_config("cic")
+    >>> dict(zip(config.design_keys, config.design.tolist()))
+    {'pressure_angle_deg': 36.43, 'involute_length_mm': 9.0, 'tip_arc_angle_deg': 4.0}
+    """
 
     profile: ProfileConfig
     rotor: RotorConfig
@@ -403,7 +409,12 @@ def load(path: str | Path, overrides: list[str] | tuple[str, ...] = ()) -> Confi
 
     `path`: a YAML file, or the name of a shipped config, such as "cic"; `overrides`: texts of the
     form `dotted.key=value`, as for `--set`. Raises `InputError` if the file, a key or a value is
-    wrong."""
+    wrong.
+
+    >>> import rootsopt
+    >>> rootsopt.load_config("cic", ["scene.speed_rpm=2500"]).scene.speed_rpm
+    2500.0
+    """
     path = located(Path(path))
     return parse(_read(path), overrides, source=str(path), folder=path.parent)
 

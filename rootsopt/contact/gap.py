@@ -59,6 +59,18 @@ class Contact(eqx.Module):
 
     A scene may also need the point of contact or another centre distance. By default, a contact
     does not support these and raises `InputError`.
+
+    >>> import jax
+    >>> import rootsopt
+    >>> jax.config.update("jax_enable_x64", True)
+    >>> class Wedge(rootsopt.Contact):
+    ...     lever: jax.Array
+    ...
+    ...     def __call__(self, roll, relative):
+    ...         return self.lever * relative, self.lever, self.lever
+    >>> gap, _, _ = Wedge(jax.numpy.asarray(0.03))(0.0, -1e-3)
+    >>> print(f"{1e6 * float(gap):.0f} µm")
+    -30 µm
     """
 
     @abc.abstractmethod

@@ -15,6 +15,22 @@ class ContactLaw(eqx.Module):
     of its derivatives jumps, an entry of `switches` must change. All numbers of a law are arrays,
     and responses are differentiable with respect to them. `exponent`: exact or approximate exponent
     of the penetration in the static force.
+
+    >>> import jax
+    >>> import rootsopt
+    >>> jax.config.update("jax_enable_x64", True)
+    >>> class Spring(rootsopt.ContactLaw):
+    ...     stiffness: jax.Array
+    ...     exponent: jax.Array
+    ...
+    ...     def __call__(self, depth, rate):
+    ...         return self.stiffness * jax.numpy.maximum(depth, 0.0)
+    ...
+    ...     def depth_at(self, force):
+    ...         return force / self.stiffness
+    >>> spring = Spring(jax.numpy.asarray(1e8), jax.numpy.asarray(1.0))
+    >>> print(f"{float(spring(2e-6, 0.0)):.0f} N")
+    200 N
     """
 
     exponent: eqx.AbstractVar[Float[Array, ""]]

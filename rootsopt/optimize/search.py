@@ -133,7 +133,16 @@ class Optimization:
     `infeasible`: why no design satisfies all constraints, `None` if a design does. `robustness`:
     the nominal optimum and the comparison with it, if scene or design scatter (`tolerances`).
     `beginning`: the fitted design that began the search; `None` unless the baseline's profile is
-    from a file."""
+    from a file.
+
+    >>> import jax
+    >>> import rootsopt
+    >>> jax.config.update("jax_enable_x64", True)
+    >>> quick = ["optimizer.starts=1", "optimizer.screening=0", "optimizer.iterations=2"]
+    >>> found = rootsopt.optimize_design(rootsopt.load_config("cic", quick))
+    >>> sorted(found.improvement)
+    ['mean_force_N', 'objective', 'peak_force_N', 'rms_force_N']
+    """
 
     problem: Problem | None
     baseline: Evaluation

@@ -70,6 +70,15 @@ class Segment(NamedTuple):
     `name`: name in figures and messages; `start`, `stop`: normal angles (rad) at its ends; `land`:
     whether the segment is an arc centred on the rotor's axis (ψ = π/2). A land transmits no torque,
     so the search for flank contact usually skips it.
+
+    >>> import jax
+    >>> import rootsopt
+    >>> jax.config.update("jax_enable_x64", True)
+    >>> config = rootsopt.load_config("cic")
+    >>> design = jax.numpy.asarray(config.design)
+    >>> profile = rootsopt.Scene.from_config(config).profile(design)
+    >>> [(one.name, one.land) for one in profile.segments()]
+    [('tip land', True), ('tip arc', False), ('involute', False)]
     """
 
     name: str
@@ -109,7 +118,17 @@ class Profile(eqx.Module):
     functions analytically beyond the pitch crossing. Unless the first segment is a land, it also
     continues them over the tip (β odd and s even in ν). This class derives everything else. A
     subclass may override `normal_at`, `lever` and `support` with a closed form, which is faster and
-    more exact."""
+    more exact.
+
+    >>> import jax
+    >>> import rootsopt
+    >>> jax.config.update("jax_enable_x64", True)
+    >>> config = rootsopt.load_config("cic")
+    >>> design = jax.numpy.asarray(config.design)
+    >>> profile = rootsopt.Scene.from_config(config).profile(design)
+    >>> print(f"{1e3 * float(profile.contact_distance(0.0)):.2f} mm from pitch point to tip")
+    12.10 mm from pitch point to tip
+    """
 
     lobes: eqx.AbstractVar[int]
     pitch_radius: eqx.AbstractVar[Float[Array, ""]]

@@ -65,6 +65,15 @@ class Evaluation:
     None if not known. For one motion it is the scaled state of the orbit at φ1 = 0 (n,). `maxima`:
     local maxima of the force over the orbit, slopes in N per config unit; None unless requested and
     periodic. `rivals`: evaluations of the other motions, if the worst of several motions counts.
+
+    >>> import jax
+    >>> import rootsopt
+    >>> jax.config.update("jax_enable_x64", True)
+    >>> config = rootsopt.load_config("cic")
+    >>> found = rootsopt.evaluate(config)
+    >>> slope = found.gradient["peak_force_N"]["pressure_angle_deg"]
+    >>> print(f"{found.status.label}, {slope:.2f} N per degree")
+    periodic, -6.90 N per degree
     """
 
     design: dict[str, float]
@@ -599,8 +608,13 @@ def evaluate(config: Config, design: ArrayLike | Sequence[float] | None = None) 
     Raises `InputError` for a scene that cannot be simulated; `RuntimeError` if JAX is not set to
     the precision of the config.
 
-    >>> config = rootsopt.load_config("configs/cic.yaml")
-    >>> rootsopt.evaluate(config).response["mean_force_N"]
+    >>> import jax
+    >>> import rootsopt
+    >>> jax.config.update("jax_enable_x64", True)
+    >>> config = rootsopt.load_config("cic")
+    >>> found = rootsopt.evaluate(config)
+    >>> print(f"{found.response['mean_force_N']:.1f} N")
+    76.2 N
     """
     return Evaluator.of(config)(None if design is None else jnp.asarray(design, float))
 

@@ -50,7 +50,17 @@ class Term(eqx.Module):
     static. The objective divides a term by its value for the baseline, which must be positive.
 
     `sense`: whether less of the quantity is better (`min`) or more (`max`). Only terms to be
-    minimised may have a weight in the objective."""
+    minimised may have a weight in the objective.
+
+    >>> import jax
+    >>> import rootsopt
+    >>> jax.config.update("jax_enable_x64", True)
+    >>> class Mass(rootsopt.Term):
+    ...     def value(self, scene, profile, shape, forces):
+    ...         return scene.density * scene.length * shape.area  # kg
+    >>> Mass().sense
+    'min'
+    """
 
     sense: ClassVar[Literal["min", "max"]] = "min"
 
@@ -237,7 +247,17 @@ _terms: dict[str, Term] = {}
 def register_term(name: str, term: Term) -> None:
     """Register a `term` under a `name` for use in `objective.terms`.
 
-    Raises ValueError if the name is not an identifier or is already taken."""
+    Raises ValueError if the name is not an identifier or is already taken.
+
+    >>> import jax
+    >>> import rootsopt
+    >>> jax.config.update("jax_enable_x64", True)
+    >>> class Mass(rootsopt.Term):
+    ...     def value(self, scene, profile, shape, forces):
+    ...         return scene.density * scene.length * shape.area  # kg
+    >>> rootsopt.register_term("rotor_mass_kg", Mass())
+    >>> config = rootsopt.load_config("cic", ["objective.terms.rotor_mass_kg=0.5"])
+    """
     if not name.isidentifier():
         raise ValueError(
             f"Argument `name` must be a word of letters, digits and _, but is {name!r}"

@@ -61,7 +61,14 @@ COMPILER_OPTIONS: dict[str, str | bool] = {
 
 The first option selects the older code generator for fused operations. The second turns off three
 passes over loops. XLA repeats these passes many times, because one pass moves an operation out of
-only one of several nested loops."""
+only one of several nested loops.
+
+>>> import jax
+>>> import rootsopt
+>>> half = jax.jit(lambda x: x / 2, compiler_options=rootsopt.COMPILER_OPTIONS)
+>>> float(half(3.0))
+1.5
+"""
 _PACKAGE = Path(__file__).parents[1]
 _store: Store | None = None
 _chosen = False

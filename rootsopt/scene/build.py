@@ -75,6 +75,13 @@ class Scene(eqx.Module):
     `center_distance_error`: centre distance minus twice the pitch radius (m), or `None`. `outline`:
     profile read from a file, or `None`; `medium`: fluid and clearances for leakage, or `None`;
     `bearings`: what loads the bearings, or `None`; `extra`: further parts.
+
+    >>> import jax
+    >>> import rootsopt
+    >>> jax.config.update("jax_enable_x64", True)
+    >>> scene = rootsopt.Scene.from_config(rootsopt.load_config("cic"))
+    >>> print(f"{scene.speed:.1f} rad/s, {scene.load_torque:.3f} N·m")
+    314.2 rad/s, 4.775 N·m
     """
 
     family: str = eqx.field(static=True)

@@ -74,7 +74,13 @@ def sweep_scenes(  # Keywords of the public interface, each independent of the o
     and if there are no axes or an axis has no values. Raises RuntimeError if JAX is not set to the
     precision of the config.
 
-    >>> rootsopt.sweep_scenes(config, {"scene.speed_rpm": [1000.0, 2000.0, 3000.0]}).mean_force_N
+    >>> import jax
+    >>> import rootsopt
+    >>> jax.config.update("jax_enable_x64", True)
+    >>> config = rootsopt.load_config("cic")
+    >>> data = rootsopt.sweep_scenes(config, {"scene.speed_rpm": [2900.0, 3000.0]})
+    >>> data.mean_force_N.dims, data.mean_force_N.round(1).values.tolist()
+    (('scene.speed_rpm',), [76.4, 76.2])
     """
     check_precision(config.solver.precision)
     plan = checked(config, plan_of(axes, zip, sample, sobol, seed))

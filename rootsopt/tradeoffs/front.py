@@ -150,7 +150,17 @@ class Front:
     `floor_dropped`: whether the default floor of the area efficiency (the baseline's value) was
     dropped because area efficiency is a term. `searches`, `evaluations`: effort. `interrupted`:
     whether the search was stopped. `infeasible`: why no design satisfies all constraints, `None` if
-    one does."""
+    one does.
+
+    >>> import jax
+    >>> import rootsopt
+    >>> jax.config.update("jax_enable_x64", True)
+    >>> terms = "pareto.terms=[outer_radius_mm, area_efficiency]"
+    >>> quick = [terms, "pareto.points=3", "pareto.refinements=0"]
+    >>> front = rootsopt.pareto_front(rootsopt.load_config("cic", quick))
+    >>> front.status.label, len(front.points)
+    ('geometry_only', 3)
+    """
 
     config: Config
     aims: tuple[Aim, ...]

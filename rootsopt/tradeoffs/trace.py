@@ -587,8 +587,15 @@ def pareto_front(
     Raises `InputError` if the config cannot be optimised, or for unknown terms. Raises
     `RuntimeError` if JAX is not set to the precision of the config.
 
-    >>> front = rootsopt.pareto_front(rootsopt.load_config("configs/cic.yaml"))
-    >>> [(point.terms, point.design) for point in front.points]"""
+    >>> import jax
+    >>> import rootsopt
+    >>> jax.config.update("jax_enable_x64", True)
+    >>> terms = "pareto.terms=[outer_radius_mm, area_efficiency]"
+    >>> quick = [terms, "pareto.points=3", "pareto.refinements=0"]
+    >>> front = rootsopt.pareto_front(rootsopt.load_config("cic", quick))
+    >>> [round(point.terms["outer_radius_mm"], 1) for point in front.points]
+    [39.0, 43.1, 47.8]
+    """
     check_geometry(config)
     with evaluating(workers, scheduler) as runs:
         return Tracer(resolve(config)[0], progress, runs=runs).run()

@@ -1,5 +1,7 @@
 """`steady_response`: a pure function that JAX transforms, differentiable in design and scene."""
 
+import doctest
+import inspect
 import re
 import subprocess
 import sys
@@ -14,6 +16,8 @@ import pytest
 
 import rootsopt
 from rootsopt import Scene, Status, steady_response
+from rootsopt.config.families import for_a_time
+from rootsopt.response import terms
 
 TIGHT = "solver.rtol=1e-11", "solver.transient_rtol=1e-8"
 QUANTITIES = {
@@ -361,9 +365,48 @@ def test_import_loads_no_solver():
     assert (found.stdout.strip(), found.stderr) == ("[]", "")
 
 
+def example_of(name):
+    """Return the example in the docstring of a public name.
+
+    The docstring of a constant stands below it; the version is shown in that of the package."""
+    value, place = getattr(rootsopt, name), rootsopt._PUBLIC.get(name, "rootsopt").partition(":")[0]
+    text = rootsopt.__doc__ if name == "__version__" else inspect.getdoc(value)
+    if isinstance(value, dict):
+        source = inspect.getsource(sys.modules[place])
+        (text,) = re.findall(rf'^{name}.*?^"""(.*?)"""', source, re.M | re.S)
+    found = doctest.DocTestParser().get_doctest(text, {}, name, None, 0)
+    assert "rootsopt" in "".join(one.source for one in found.examples), "no example"
+    return found
+
+
+@pytest.mark.parametrize("name", rootsopt.__all__)
+def test_example_in_the_docstring_runs(name, monkeypatch):
+    """It prints what it says, and sets double precision itself where it needs it."""
+    monkeypatch.setattr(terms, "_terms", dict(terms._terms))
+    example, told = example_of(name), []
+    jax.config.update("jax_enable_x64", False)
+    try:
+        with for_a_time():
+            result = doctest.DocTestRunner(verbose=False).run(example, out=told.append)
+    finally:
+        jax.config.update("jax_enable_x64", True)
+    assert result.failed == 0, "".join(told)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", rootsopt.__all__)
+def test_example_in_the_docstring_runs_in_a_fresh_process(name):
+    code = "; ".join((
+        "import doctest, sys", "parser = doctest.DocTestParser()",
+        "test = parser.get_doctest(sys.argv[1], {}, 'example', None, 0)",
+        "sys.exit(doctest.DocTestRunner().run(test).failed)",
+    ))  # fmt: skip
+    text = example_of(name).docstring
+    done = subprocess.run([sys.executable, "-c", code, text], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
 def test_every_public_name_is_there():
-    for name in rootsopt.__all__:
-        assert getattr(rootsopt, name).__doc__ or name == "__version__"
     with pytest.raises(AttributeError, match="no attribute 'Rotor'"):
         rootsopt.Rotor  # noqa: B018
     assert set(rootsopt.__all__) <= set(dir(rootsopt))

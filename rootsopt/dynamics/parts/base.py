@@ -76,6 +76,19 @@ class Part(eqx.Module):
 
     Arguments of several methods: `motion`: position and velocity of the pair; `own` (m,): the
     part's own states; `loads`: sums of all loads on the pair.
+
+    >>> import jax
+    >>> import rootsopt
+    >>> jax.config.update("jax_enable_x64", True)
+    >>> class Brake(rootsopt.Part):
+    ...     torque: jax.Array
+    ...
+    ...     def torque_on_2(self, motion, own):
+    ...         return -self.torque
+    >>> scene = rootsopt.Scene.from_config(rootsopt.load_config("cic"))
+    >>> braked = scene.with_parts(Brake(jax.numpy.asarray(0.5)))  # N·m
+    >>> float(braked.extra[0].torque)
+    0.5
     """
 
     # Properties of the part.
