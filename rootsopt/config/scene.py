@@ -166,7 +166,7 @@ def _completed(profile: ProfileConfig, foreign: Sequence[str], missing: Sequence
     family's example at this pitch radius, and so do keys that another family shares: its values may
     not fit."""
     family, scale = family_of(profile.family), profile.pitch_radius_mm / EXAMPLE_RADIUS
-    values = dict.fromkeys(foreign, "null")
+    values: dict[str, Any] = dict.fromkeys(foreign, "null")
     for key in family.keys if foreign and missing and family.keys else missing:
         value = family.example.get(key, "FILE")
         value = f"{value * scale:.4g}" if key.endswith("_mm") else value
