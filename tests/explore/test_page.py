@@ -14,6 +14,7 @@ from browser import Browser
 
 from rootsopt.config import load, parse
 from rootsopt.explore import session as sessions
+from rootsopt.explore import texts
 from rootsopt.explore.engine import Engine
 from rootsopt.explore.session import (
     FromRest,
@@ -104,6 +105,9 @@ def test_refused_values_are_not_saved_or_simulated(session):
 def test_motion_without_a_result_is_final_only_after_rest(session):
     """Under a load that no flank can hold, the status is that of a simulation from rest."""
     number = session.move({LOAD: 1e5})
+    (note,) = session.next(NewShape, number).notes
+    assert "is that N·mm? write 100" in texts.notes_lines((note,))
+    assert texts.notes_lines(("<b>",)) == '<div class="note">&lt;b&gt;</div>'
     first = session.next(NewMotion, number)
     assert not first.final
     last = session.next(NewMotion, number)
