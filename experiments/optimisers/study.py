@@ -18,11 +18,12 @@ import optax
 from numpy.typing import NDArray
 from scipy.optimize import BFGS, NonlinearConstraint, minimize
 
+from experiments.optimisers.epigraph import SCALE, Epigraph
 from rootsopt.config import load
 from rootsopt.optimize.certificate import certify
 from rootsopt.optimize.local import Local, Look
 from rootsopt.optimize.problem import FEASIBLE, Problem
-from rootsopt.optimize.sqp import SCALE, EndError, Epigraph, Stops, descend
+from rootsopt.optimize.sqp import EndError, Stops, descend
 from rootsopt.response.evaluators import evaluator_for
 
 REACHED = 1e-6
@@ -73,9 +74,9 @@ QUICK_TASKS = 2
 """Number of problems in a reduced run."""
 
 
-def slsqp(look: Look, start: NDArray[np.float64], stops: Stops) -> None:
+def sqp(look: "Recorder", start: NDArray[np.float64], stops: Stops) -> None:
     """Run the package's own local search: sequential quadratic programming."""
-    descend(look, start, stops)
+    descend(look, start, stops, look.problem.limits_at)
 
 
 def _problem(look: Look, start: NDArray[np.float64], stops: Stops) -> Epigraph | None:
@@ -225,7 +226,7 @@ def moving_asymptotes(look: Look, start: NDArray[np.float64], stops: Stops) -> N
 
 
 METHODS: dict[str, Method] = {
-    "slsqp": slsqp,
+    "slsqp": sqp,
     "augmented_lagrangian": augmented_lagrangian,
     "interior_point": interior_point,
     "mma": moving_asymptotes,
@@ -314,7 +315,7 @@ def _met(row: dict[str, Any]) -> bool:
 
 def _stops(evaluations: int) -> Stops:
     """Return stops so tight that a method ends at its own criterion, or at `evaluations`."""
-    return Stops(residual=1e-9, enough=1e-9, feasibility=FEASIBLE, evaluations=evaluations)
+    return Stops(feasibility=FEASIBLE, evaluations=evaluations)
 
 
 def run(

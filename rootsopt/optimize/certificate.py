@@ -50,9 +50,9 @@ class Certificate(NamedTuple):
     walls: tuple[NDArray[np.float64], ...] = ()
 
     @property
-    def greatest(self) -> float:
-        """Greatest multiplier of a constraint, or of a wall over all its branches."""
-        return float(np.max([0.0, *self.multipliers, *map(np.sum, self.walls)]))
+    def total(self) -> float:
+        """Sum of the multipliers of all constraints and walls."""
+        return float(np.sum(self.multipliers) + sum(map(np.sum, self.walls)))
 
     def holds(self, tolerance: float, feasibility: float) -> bool:
         """Return whether the conditions hold within tolerances.

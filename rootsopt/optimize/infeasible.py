@@ -16,8 +16,8 @@ from rootsopt.optimize.local import Group, Local, Look
 from rootsopt.optimize.problem import FEASIBLE, Problem
 from rootsopt.optimize.sqp import Found, Stops, descend
 
-_STOPS = Stops(residual=1e-7, feasibility=1e-9, evaluations=300)
-_SIMULATED = Stops(residual=1e-5, feasibility=FEASIBLE, evaluations=60)
+_STOPS = Stops(feasibility=1e-9, evaluations=300)
+_SIMULATED = Stops(feasibility=FEASIBLE, evaluations=60)
 """Criteria for the end of each local search if every point must be simulated."""
 _GOLDEN = 0.6180339887
 """Difference between the phases that `_groups` gives the branches at successive speeds."""

@@ -88,20 +88,22 @@ class Optimality:
     """What is known about the optimum of a search.
 
     `method`: method of the local searches. `certificate`: first-order conditions at the verified
-    design. `reason`: "converged", or a word for why these conditions do not hold. `holders`:
+    design. `reason`: "converged", or a word for why the search had not. `promised`: relative
+    decrease of the objective that the search still expected nearby, NaN if not known. `holders`:
     branches of the objective that are active there. `starts`: outcomes of the local searches.
     `sensitivities`: one row per quantity of the scene, with its effect on the forces."""
 
     method: str
     certificate: Certificate
     reason: str
+    promised: float
     holders: Sequence[Holder]
     starts: Sequence[StartOutcome]
     sensitivities: Sequence[dict[str, Any]] = ()
 
     @property
     def converged(self) -> bool:
-        """Whether the design satisfies the first-order conditions of an optimum."""
+        """Whether the first-order conditions hold and no design nearby is better."""
         return self.reason == "converged"
 
     @property
@@ -125,6 +127,7 @@ class Optimality:
             "residual": self.certificate.residual,
             "required_residual": RESIDUAL,
             "violation": self.certificate.violation,
+            "promised_decrease": None if math.isnan(self.promised) else self.promised,
             "held_by": [one.record() for one in self.holders],
             "starts": [
                 {
@@ -165,7 +168,8 @@ def unseen(searches: int, optima: int) -> dict[str, float | None]:
     """Return Bayesian estimates of the optima that the local searches have not found.
 
     `searches`: number N of local searches that ended at an optimum; `optima`: number W of distinct
-    optima. The result repeats both, and has two estimates. Each is `None` if N is too small:
+    optima. The result repeats both, and has two estimates. Each is `None` where the rule knows
+    nothing: if N is too small, or if the probability would be 1 or more:
 
     - `expected_optima`: posterior mean W (N - 1) / (N - W - 2) of the number of optima;
     - `share_of_starts`: posterior mean W (W + 1) / (N (N - 1)) of the probability that one more
@@ -176,7 +180,8 @@ def unseen(searches: int, optima: int) -> dict[str, float | None]:
     optimization methods, Mathematical Programming 37 (1987) 59-80."""
     count, n = optima, searches
     expected = count * (n - 1) / (n - count - 2) if n > count + 2 else None
-    share = min(1.0, count * (count + 1) / (n * (n - 1))) if n > 1 else None
+    share = count * (count + 1) / (n * (n - 1)) if n > 1 else 1.0
+    share = share if share < 1.0 else None
     return {"searches": n, "optima": count, "expected_optima": expected, "share_of_starts": share}
 
 

@@ -166,6 +166,10 @@ class Problem:
         slacks belong to the m constraints. A slack is negative if its constraint is violated."""
         return self._look_at(tuple(np.asarray(point, dtype=np.float64)))
 
+    def limits_at(self, point) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return (slacks (m,), their Jacobian (m, d)) at a `point` (d,), as in `look`."""
+        return self.look(point)[2:]  # type: ignore[return-value]
+
     @functools.cached_property
     def _look_at(self):
         def look(point):
@@ -269,12 +273,20 @@ class Problem:
         """Whether an evaluation needs all local maxima of the force."""
         return needs_maxima(self.config, self.limits)
 
-    def keeps_limits(self, evaluation: Evaluation) -> bool:
-        """Return whether an evaluated design satisfies all of `constraints.terms`."""
-        if self.excess(evaluation) > FEASIBLE:
-            return False
-        terms = (c for c in self.space.constraints if isinstance(c, TermConstraint))
-        return all(float(c.scaled(evaluation.response[c.quantity])) >= -FEASIBLE for c in terms)
+    def broken(self, evaluation: Evaluation) -> list[str]:
+        """Return the names of all limits that an evaluated design violates.
+
+        They are those of the geometry, of its soundness, and of `constraints.terms`. For a rotor
+        from a file, limits that need design parameters are left out."""
+        found = [
+            one.name
+            for k, one in enumerate(self.space.constraints)
+            if self._slack(evaluation, k) < -FEASIBLE
+        ]
+        for one in self.limits:
+            if evaluation.usable and one.excess(self.worst(evaluation, one)) > FEASIBLE:
+                found.append(one.name)
+        return found
 
     def _limited(self, evaluation: Evaluation) -> list[tuple[int, Evaluation]]:
         """Return (kind, evaluation) of each scene, speed and motion in which `limits` must hold."""
@@ -430,26 +442,13 @@ class Problem:
         the others have rows too. With a `certificate`, each row has a `multiplier`: the change of
         the objective per unit of the limit. Active bounds of the search then have rows as well."""
         rows = []
-        keys = {
-            "area_efficiency": "area_efficiency",
-            "undercut_margin": "undercut_margin_mm",
-            "seal_width": "seal_width_mm",
-            "root_radius": "root_radius_mm",
-            "outer_radius": "outer_radius_mm",
-        }
         always = self._always(optimized)
         for k, c in enumerate(self.space.constraints):
             limit = float(c.limit) / c.factor
-            if c.margin or isinstance(c, RangeConstraint):
-                before, after = (self._margin(one, k) for one in (self.baseline, optimized))
-            elif isinstance(c, TermConstraint):
-                before, after = (one.response[c.quantity] for one in (self.baseline, optimized))
-            else:
-                before = self.baseline.geometry[keys[c.quantity]]
-                after = optimized.geometry[keys[c.quantity]]
-            slack = c.sign * (after - limit) * c.factor / c.scale
+            before, after = (self._limited_value(one, k) for one in (self.baseline, optimized))
+            slacks = [self._slack(one, k) for one in (self.baseline, optimized)]
             sense = "<=" if c.ceiling else ">="
-            row = _row(c.name, before, after, limit, c.unit, slack, sense)
+            row = _row(c.name, before, after, limit, c.unit, slacks, sense)
             if always[k]:
                 row |= {"active": False, "always": True}
             if certificate is not None:
@@ -466,21 +465,32 @@ class Problem:
         rows = []
         for k, one in enumerate(self.limits):
             before, after = (self.worst(every, one) for every in (self.baseline, optimized))
-            slack = -float(one.excess(after))
-            row = _row(one.name, before, after, one.limit, one.unit, slack, one.sense)
+            slacks = [-float(one.excess(value)) for value in (before, after)]
+            row = _row(one.name, before, after, one.limit, one.unit, slacks, one.sense)
             if certificate is not None:
                 per_unit = float(np.sum(certificate.walls[k])) / one.scale
                 row |= self._multiplier(row, per_unit, optimized)
             rows.append(row)
         return rows
 
-    def _margin(self, evaluation: Evaluation, k: int) -> float:
+    def _slack(self, evaluation: Evaluation, k: int) -> float:
+        """Return the scaled slack of constraint `k` for an evaluated design, NaN if not known."""
+        one = self.space.constraints[k]
+        beyond = self._limited_value(evaluation, k) - float(one.limit) / one.factor
+        return one.sign * beyond * one.factor / one.scale
+
+    def _limited_value(self, evaluation: Evaluation, k: int) -> float:
         """Return the value that constraint `k` limits, in its unit, for an evaluated design.
 
-        Return NaN for a rotor from a file, which has no design parameters."""
+        Return NaN for a rotor from a file if the value needs design parameters."""
+        one = self.space.constraints[k]
+        if isinstance(one, TermConstraint):
+            return evaluation.response[one.quantity]
+        if not (one.margin or isinstance(one, RangeConstraint)):
+            key = f"{one.quantity}_{one.unit}" if one.unit else one.quantity
+            return evaluation.geometry.get(key, math.nan)
         if not evaluation.design:
             return math.nan
-        one = self.space.constraints[k]
         slack = float(self._slacks(evaluation)[k])
         return (float(one.limit) + one.sign * slack * one.scale) / one.factor
 
@@ -529,7 +539,10 @@ class Problem:
         for key, (end, least, most) in ranges.items():
             place = names.index(key)
             before, after, limit = self.baseline.design.get(key), optimized.design[key], float(end)
-            row = _row(words(key), before, after, limit, unit_of(key), limit - after, "<=")
+            own = self._upper_end(key)
+            slacks = [own - (math.nan if before is None else before), limit - after]
+            row = _row(words(key), before, after, limit, unit_of(key), slacks, "<=")
+            row["baseline_limit"] = None if math.isnan(own) else own
             limited[key] = limit <= high[place]
             low[place], high[place] = float(least), float(most)
             if certificate is not None:
@@ -548,14 +561,23 @@ class Problem:
             for sense, limit, multiplier, side in sides:
                 if multiplier <= _HELD or (side == "upper" and limited[key]):
                     continue
-                slack = (design[place] - limit) / width * (1 if sense == ">=" else -1)
                 before, after = self.baseline.design.get(key), float(design[place])
+                known = before is not None and key not in ranges
+                pair = np.array([before if known else math.nan, after])
+                slacks = (pair - limit) / width * (1 if sense == ">=" else -1)
                 name, unit = f"{side} bound of {words(key)}", unit_of(key)
                 if side == "lower" and self.space.floors[place]:
                     name += f" ({100 * self.space.floors[place]:g} %)"
-                row = _row(name, before, after, float(limit), unit, slack, sense)
+                row = _row(name, before, after, float(limit), unit, slacks, sense)
                 rows.append(row | self._multiplier(row, multiplier / width, optimized))
         return rows
+
+    def _upper_end(self, key: str) -> float:
+        """Return the upper end of a parameter's range for the baseline, NaN for one from a file."""
+        if key not in self.baseline.design:
+            return math.nan
+        design = np.asarray([*self.baseline.design.values()], dtype=np.float64)
+        return float(_ranges(self.space, design)[key][0])
 
     def held_by(self, evaluation: Evaluation, certificate: Certificate) -> list[Holder]:
         """Return the branches of the objective that are active at an evaluated optimum.
@@ -607,7 +629,9 @@ def _step(unit: str, limit: float) -> float:
     return 10.0 ** (round(math.log10(abs(limit))) - 2)
 
 
-def _row(name, before, after, limit, unit, slack, sense) -> dict:
+def _row(name, before, after, limit, unit, slacks, sense) -> dict:
+    """Return a row of the report; `slacks`: those of baseline (NaN: not known) and optimum."""
+    first, slack = slacks
     return {
         "name": name,
         "baseline": before,
@@ -616,6 +640,7 @@ def _row(name, before, after, limit, unit, slack, sense) -> dict:
         "unit": unit,
         "sense": sense,
         "satisfied": bool(slack >= -1e-6),
+        "baseline_satisfied": None if math.isnan(first) else bool(first >= -1e-6),
         "active": bool(abs(slack) < NEAR),
     }
 

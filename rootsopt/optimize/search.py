@@ -14,7 +14,7 @@ import dataclasses
 import operator
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -30,7 +30,7 @@ from rootsopt.optimize.certificate import Certificate, certify
 from rootsopt.optimize.checkpoint import Checkpoint
 from rootsopt.optimize.infeasible import Infeasible, explain
 from rootsopt.optimize.limits import force_limits, limited
-from rootsopt.optimize.local import Local, Look
+from rootsopt.optimize.local import Local
 from rootsopt.optimize.optimality import RESIDUAL, Optimality, StartOutcome
 from rootsopt.optimize.problem import FEASIBLE, Problem, needs_maxima
 from rootsopt.optimize.sqp import Found, Stops, descend
@@ -65,6 +65,8 @@ design is rejected."""
 _SHARPER = 0.01
 """Factor on `solver.rtol` for a second evaluation, if the first-order conditions do not hold.
 """
+_BESIDE = 1e-6, 1e-5, 3e-5, 1e-4
+"""Distances (unit box, per coordinate) from a design at which its verification is repeated."""
 _MEETS = 1e-4
 """Scaled excess over a force limit above which the verification rejects a design."""
 _EXPLAINED = 8
@@ -185,6 +187,20 @@ class Optimization:
         return gains
 
     @property
+    def cost(self) -> str:
+        """Sentence for a design that is worse than the baseline, because this violates limits.
+
+        It is empty for a better design, and without an optimised one."""
+        gain = self.improvement.get("objective", 0.0)
+        if self.problem is None or gain >= 0:
+            return ""
+        names = ", ".join(self.problem.broken(self.baseline))
+        return (
+            f"The baseline violates: {names}. The reported design is the best that was found to "
+            f"meet all limits. Its objective is {-100 * gain:.3g} % above that of the baseline."
+        )
+
+    @property
     def constraints(self) -> list[dict[str, Any]]:
         """Constraints at the optimum, one row each; empty without an optimised design."""
         if self.problem is None or self.optimized is None:
@@ -290,7 +306,7 @@ class Search:
         # Screening and descent need a ranking of designs and gradients, but only a few digits.
         self.fast = exact.at_tolerance(max(1e-6, self.config.solver.rtol)).surveying()
         self.problem = self._problem(exact.scene, baseline)
-        self._bar = 1.0 if self.problem.keeps_limits(baseline) else np.inf
+        self._bar = np.inf if self.problem.broken(baseline) else 1.0
         if self.problem.with_maxima:
             self.exact = exact.with_maxima()
         # Sequential quadratic programming needs more accurate gradients than a descent.
@@ -464,29 +480,10 @@ class Search:
 
         stops = Stops(evaluations=self.settings.iterations + 1, asked=self.stop.is_set)
         if not self.stop.is_set():
-            found = self._repaired(descend(look, point, stops), trials, look)
+            found = descend(look, point, stops, self.problem.limits_at)
             with self._lock:
                 self._found[number] = found
         return trials
-
-    def _repaired(self, found: Found, trials: list[Trial], look: Look) -> Found:
-        """Return the outcome of a local search, improved if its best trial was infeasible.
-
-        If the search has not converged, its best trial is moved onto the feasible set. The moved
-        design replaces the outcome `found` if it is better. `trials`: trials of the search; `look`:
-        function that evaluates the problem at a point."""
-        usable = [trial for trial in trials if trial.local is not None]
-        best = min(usable, key=_objective, default=trials[0])
-        if found.converged or best.feasible or found.local is None or self.stop.is_set():
-            return found
-        point = self.problem.toward(best.point, found.point)
-        local = look(point)
-        if local is None or local.violation > FEASIBLE:
-            return found
-        if found.local.violation <= FEASIBLE and local.objective >= found.local.objective:
-            return found
-        outcome = point, local, certify(local, point), found.reason, found.evaluations + 1
-        return Found(*outcome)
 
     def _descend(self, number: int, point: NDArray[np.float64]) -> list[Trial]:
         """Descend from `point` (d,) by an update rule, and return the trials.
@@ -572,7 +569,21 @@ class Search:
             if _near(candidate.point, tried):
                 continue
             tried.append(candidate.point)
-            evaluation = self.exact(self.problem.design(candidate.point))
+            evaluation, record = self._again(candidate)
+            if record["holds_up"] and record["verified_objective"] < self._bar:
+                return evaluation, record | {"rejected": failures}
+            failures.append(record | {"design": evaluation.design})
+            self._refuted.append(candidate.point)
+        return None, {"holds_up": False, "rejected": failures}
+
+    def _again(self, candidate: Trial) -> tuple[Evaluation, dict[str, Any]]:
+        """Simulate a candidate from rest, more tightly and beside it, until its objective holds up.
+
+        Return (evaluation that holds up, or else the first one; record for the result file). The
+        record has the statuses of all attempts."""
+        attempts: list[tuple[Evaluation, dict[str, Any]]] = []
+        for evaluator, point in self._attempts(candidate.point):
+            evaluation = evaluator(self.problem.design(point))
             objective = self.problem.objective(evaluation)
             change = abs(objective / candidate.objective - 1)
             record = {
@@ -581,11 +592,20 @@ class Search:
                 "status": evaluation.status.label,
                 "holds_up": bool(change <= _HOLDS_UP and self.problem.excess(evaluation) <= _MEETS),
             }
-            if record["holds_up"] and objective < self._bar:
-                return evaluation, record | {"rejected": failures}
-            failures.append(record | {"design": evaluation.design})
-            self._refuted.append(candidate.point)
-        return None, {"holds_up": False, "rejected": failures}
+            attempts.append((evaluation, record))
+            if record["holds_up"] or self.stop.is_set():
+                break
+        found, record = attempts[-1 if attempts[-1][1]["holds_up"] else 0]
+        return found, record | {"attempts": [one["status"] for _, one in attempts]}
+
+    def _attempts(self, point: NDArray[np.float64]) -> Iterator[tuple[Evaluates, NDArray]]:
+        """Yield (evaluator, point) of each attempt to confirm the design at a `point` (d,).
+
+        An orbit can fail a check of accuracy at a design although all its neighbours pass."""
+        yield self.exact, point
+        yield self.exact.at_tolerance(_SHARPER * self.config.solver.rtol), point
+        for size in _BESIDE:
+            yield self.exact, self.problem.toward(point + size * np.sign(0.5 - point), point)
 
     def _optimality(self, optimized: Evaluation, trials: list[Trial]) -> Optimality | None:
         """Return the first-order conditions at a verified design, and the outcomes of the starts.
@@ -603,17 +623,19 @@ class Search:
             found = self.problem.local(again, point)
             if found is not None and (other := certify(found, point)).residual < RESIDUAL:
                 certificate, optimized = other, again
-        reason = "converged"
         ends = sorted(self._found.items())
-        if not certificate.holds(RESIDUAL, FEASIBLE):
-            reasons = [found.reason for _, found in ends if _near(found.point, [point])]
-            reason = reasons[0] if reasons else "descent"
-            reason = "verification" if reason == "converged" else reason
+        reason, promised = "verification" if ends else "descent", float("nan")
+        near = [found for _, found in ends if _near(found.point, [point])]
+        if near:
+            found = min(near, key=lambda one: float(np.linalg.norm(one.point - point)))
+            holds = certificate.holds(RESIDUAL, FEASIBLE)
+            reason = found.reason if holds or not found.converged else "verification"
+            promised = found.promised
         held = self.problem.held_by(optimized, certificate)
         starts = [self._outcome(number, found) for number, found in ends]
         starts = starts or self._ends(trials)
         rows = self._sensitivities(optimized, certificate)
-        return Optimality(self.method, certificate, reason, held, starts, rows)
+        return Optimality(self.method, certificate, reason, promised, held, starts, rows)
 
     def _sensitivities(self, optimized: Evaluation, certificate: Certificate) -> list[dict]:
         """Return one row per scene quantity, with its effect on forces and objective.
@@ -635,8 +657,6 @@ class Search:
         `number`: index of the search; `found`: what it found."""
         certificate, local = found.certificate, found.local
         reason = found.reason
-        if certificate is not None and certificate.holds(RESIDUAL, FEASIBLE):
-            reason = "converged"
         met = local is not None and local.violation <= FEASIBLE
         if local is not None and not met and reason != "interrupted":
             reason = "infeasible"

@@ -113,6 +113,7 @@ def optimality_table(
         "first-order conditions",
         [
             ("residual (of the unit box)", _number(optimality["residual"]), word),
+            ("better nearby, promised (relative)", _number(optimality["promised_decrease"]), ""),
             ("violation (scaled)", _number(optimality["violation"]), ""),
         ],
     )
@@ -182,6 +183,21 @@ def conflict_table(rows: list[dict[str, Any]]) -> RenderableType:
     return table
 
 
+def rejected_table(rows: list[dict[str, Any]]) -> RenderableType:
+    """Return a table of the designs that did not hold up when simulated again from rest.
+
+    `rows`: entry `rejected` of `verification` in the result file."""
+    table = _table("Rejected designs", "in the search", "from rest", "reason")
+    for row in rows:
+        design = ", ".join(f"{_label(key)} {_number(x)}" for key, x in row["design"].items())
+        same = row["verified_objective"] is not None
+        reason = "another motion" if same else row["status"].replace("_", " ")
+        reason += f" ({len(row['attempts'])} attempts)"
+        numbers = (_number(row[f"{word}_objective"]) for word in ("searched", "verified"))
+        table.add_row(design, *numbers, Text(reason, style="bold red"))
+    return table
+
+
 def _price(row: Mapping[str, Any]) -> tuple[str, ...]:
     step = f"{row['relaxed_by']:+g} {row['unit']}".strip()
     name = f"{_words(row['name'])} {row['sense']} {_number(row['limit'])} {row['unit']}".strip()
@@ -209,11 +225,11 @@ def _optima(optimality: Mapping[str, Any]) -> list[tuple[str, ...]]:
         times = f"{one['found']} of {len(optimality['starts'])} starts"
         rows.append((f"optimum {number}", times, _number(one["objective"])))
     share = optimality["unseen"]["share_of_starts"]
-    if rows and share is not None:
+    if rows:
         name = "chance that a further start finds a new one"
-        if share > _UNSURE:
+        if share is None or share > _UNSURE:
             name += " (few starts: raise optimizer.starts)"
-        rows.append((name, f"{100 * share:.3g} %", ""))
+        rows.append((name, "unknown" if share is None else f"{100 * share:.3g} %", ""))
     return rows
 
 
@@ -443,7 +459,11 @@ def _constraint(row: Mapping[str, Any]) -> tuple[str | Text, ...]:
     else:
         word = "active" if row.get("active") else "satisfied"
         verdict = Text("met by all" if row.get("always") else word, style="green")
-    return label, _number(row["baseline"]), _number(row["optimized"]), verdict
+    before = Text(_number(row["baseline"]))
+    if row.get("baseline_satisfied") is False:
+        own = row.get("baseline_limit")
+        before.append(" violated" if own is None else f" > {_number(own)}", style="bold red")
+    return label, before, _number(row["optimized"]), verdict
 
 
 def _status(evaluation: Evaluation) -> Text:

@@ -99,7 +99,7 @@ def _held(one: Mapping[str, Any]) -> list[str]:
 def _unseen(found: Mapping[str, Any]) -> str:
     share = (found.get("unseen") or {}).get("share_of_starts")
     if share is None:
-        return ""
+        return "So few starts do not tell how many optima are left to find (optimizer.starts)."
     return (
         f"About {brief(100 * share, 2)} % of further starts would find an optimum that no start "
         "has found yet (optimizer.starts)."

@@ -389,7 +389,8 @@ class Tracer:
         limit = self.config.optimizer.iterations + 1
         if self.study.sharp is None:
             limit = max(limit, _CHEAP_EVALUATIONS)
-        found = descend(look, start, Stops(evaluations=limit, asked=self.stop.is_set))
+        stops = Stops(evaluations=limit, asked=self.stop.is_set)
+        found = descend(look, start, stops, self.study.problem.limits_at)
         self._count(searches=1)
         if found.local is None or found.certificate is None:
             return best

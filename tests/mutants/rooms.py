@@ -78,7 +78,7 @@ _OF = {
     "optimize/noise": "search noise ensemble",
     "optimize/problem": "search optimize speeds families freeform",
     "optimize/optimality": "optimality",
-    "optimize/refine": "sqp",
+    "optimize/models": "sqp",
     "optimize/risk": "risk robust",
     "optimize/robust": "robust",
     "optimize/robust_problem": "robust",

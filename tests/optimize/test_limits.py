@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -15,6 +16,7 @@ from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.search import Search
 from rootsopt.profiles import geometry
 from rootsopt.pump import flow
+from rootsopt.response.records import geometry_record
 from rootsopt.response.speeds import AtSpeed, SpeedsEvaluation
 from rootsopt.response.terms import Term, _terms, register_term
 from rootsopt.scene import Scene
@@ -111,9 +113,40 @@ def test_forces_are_limited_at_every_speed_that_counts():
     assert problem.excess(whole) == pytest.approx(0.25)
     ceiling, floor = force_limits(settings, problem.space.scene)
     assert (problem.worst(whole, ceiling), problem.worst(whole, floor)) == (200.0, 30.0)
-    assert not problem.keeps_limits(whole)
-    assert problem.keeps_limits(evaluation(45.0, 170.0))
+    assert problem.broken(whole) == ["peak force", "mean force"]
+    assert problem.broken(evaluation(45.0, 170.0)) == []
     assert problem_of().excess(whole) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("key", "name"),
+    [
+        ("area_efficiency_min=0.48", "area efficiency"),
+        ("terms.area_efficiency.min=0.48", "area efficiency"),
+        ("undercut_margin_min_mm=30", "undercut margin"),
+        ("seal_width_min_mm=7", "seal width"),
+        ("outer_radius_max_mm=44", "outer radius"),
+        ("outer_radius_min_mm=47", "outer radius"),
+        ("terms.displaced_volume_cm3.min=900", "displaced volume"),
+    ],
+)
+def test_the_baseline_breaks_limits_of_any_key(key, name):
+    """All keys are told alike, and each column of the report has its own verdict."""
+    settings = limited(config(f"constraints.{key}"))
+    scene = Scene.from_config(settings)
+    shape = geometry(scene.profile(jnp.asarray(settings.design)))
+    volume = 1e6 * float(flow.displaced_volume(shape, scene.length))
+    terms = {"area_efficiency": float(shape.area_efficiency), "displaced_volume_cm3": volume}
+    one = dataclasses.replace(
+        evaluation(),
+        geometry=geometry_record(scene, shape),
+        response=evaluation().response | terms,
+    )
+    problem = Problem.of(settings, scene, one)
+    assert problem.broken(one) == [name]
+    rows = {row["name"]: row for row in problem.constraint_rows(one)}
+    assert not rows[name]["baseline_satisfied"]
+    assert sum(row["baseline_satisfied"] is False for row in rows.values()) == 1
 
 
 def test_absent_limits_add_nothing():

@@ -1,17 +1,20 @@
 """Tests of the search on made-up objectives, without simulations."""
 
 import dataclasses
+import io
 import threading
 import types
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from rootsopt.config import load
 from rootsopt.design.space import sobol
 from rootsopt.optimize import noise
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.search import Search, Trial, _history
+from rootsopt.output.tables import rejected_table
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.runs import HERE
 from rootsopt.status import Status
@@ -24,8 +27,10 @@ def trial_of(point, objective, feasible=True) -> Trial:
     return Trial(np.asarray(point, float), 0, 0, evaluation, objective, feasible)
 
 
-def searching(truth=lambda point: 1.0, **settings) -> Search:
-    """Return a search over points of the unit box whose verification finds the `truth`."""
+def searching(truth=lambda point: 1.0, tight=None, **settings) -> Search:
+    """Return a search over points of the unit box whose verification finds the `truth`.
+
+    `tight`: what it finds at a tighter tolerance, by default the same."""
     search = object.__new__(Search)
     search.stop, search._refuted, search._trials = threading.Event(), [], []
     search._found, search.checkpoint, search.noisy, search.runs = {}, None, True, HERE
@@ -42,12 +47,17 @@ def searching(truth=lambda point: 1.0, **settings) -> Search:
     )
     search._bar = 1.0
 
-    def exact(point):
-        found = truth(tuple(point))
-        status = Status.PERIODIC if np.isfinite(found) else Status.NOT_SETTLED
-        return evaluation_of(found, status, point)
+    def told(truth):
+        def exact(point):
+            found = truth(tuple(point))
+            status = Status.PERIODIC if np.isfinite(found) else Status.INACCURATE
+            return evaluation_of(found, status, point)
 
-    search.exact = exact
+        return exact
+
+    search.exact = told(truth)
+    search.exact.at_tolerance = lambda rtol: told(tight or truth)
+    search.config = types.SimpleNamespace(solver=types.SimpleNamespace(rtol=1e-8))
     return search
 
 
@@ -83,7 +93,7 @@ def test_the_best_feasible_trial_that_holds_up_is_taken():
     Neighbours of a failed trial are not tried."""
     truth = {(0.9, 0.9): 0.3, (0.1, 0.1): 0.95, (0.11, 0.1): 0.5, (0.5, 0.5): 0.602,
              (0.7, 0.2): 0.65}  # fmt: skip
-    search = searching(lambda point: truth[point])
+    search = searching(lambda point: truth[tuple(np.round(point, 3))])
     trials = [
         trial_of([0.7, 0.2], 0.65),
         trial_of([0.9, 0.9], 0.3, feasible=False),
@@ -106,6 +116,44 @@ def test_the_best_feasible_trial_that_holds_up_is_taken():
     assert search._verify([only_infeasible])[0] is None
     assert np.isnan(_history([only_infeasible])[0]["best_objective"])
     assert searching()._starts([only_infeasible]) == []
+
+
+SPECK = (0.3, 0.7)
+"""A design whose orbit fails a check of accuracy, in the tests below."""
+
+
+@pytest.mark.parametrize(
+    ("truth", "tight", "attempts"),
+    [
+        (lambda point: 0.8, None, 1),
+        (lambda point: 0.8 if point != SPECK else np.nan, lambda point: 0.8, 2),
+        (lambda point: 0.8 if point != SPECK else np.nan, None, 3),
+        (lambda point: 0.8 if point != SPECK else 0.9, None, 3),
+        (lambda point: 0.8 if abs(point[0] - 0.3) > 5e-5 else np.nan, None, 6),
+        (lambda point: 0.95 if point[0] > 0.5 else np.nan, None, 0),
+    ],
+)
+def test_a_verification_is_repeated_more_tightly_and_beside_the_design(truth, tight, attempts):
+    """A single design that cannot be judged does not cost the best start; a region does.
+
+    0 attempts: none succeeds, and the record of the rejected design says so."""
+    search = searching(truth, tight)
+    trials = [trial_of(SPECK, 0.8), trial_of([0.8, 0.2], 0.95)]
+    found, record = search._verify(trials)
+    assert found is not None
+    if attempts:
+        assert len(record["attempts"]) == attempts
+        assert record["rejected"] == []
+        np.testing.assert_allclose([*found.design.values()], SPECK, atol=2e-4)
+    else:
+        (rejected,) = record["rejected"]
+        assert (rejected["status"], rejected["verified_objective"]) == ("inaccurate", None)
+        assert len(rejected["attempts"]) == 6
+        assert record["searched_objective"] == 0.95
+        shown = Console(record=True, width=80, file=io.StringIO())
+        shown.print(rejected_table(record["rejected"]))
+        text = shown.export_text()
+        assert "inaccurate (6 attempts)" in " ".join(text.split())
 
 
 def test_an_ensemble_takes_no_infeasible_candidate():

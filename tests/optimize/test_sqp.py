@@ -5,8 +5,8 @@ import pytest
 
 from rootsopt.optimize.certificate import certify
 from rootsopt.optimize.local import Group, Local
-from rootsopt.optimize.refine import Models, refine
-from rootsopt.optimize.sqp import EndError, Epigraph, Stops, descend
+from rootsopt.optimize.models import Models
+from rootsopt.optimize.sqp import Stops, descend
 
 
 def group(values, slopes):
@@ -203,21 +203,94 @@ def test_models_of_quadratic_functions_are_exact(seed):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_refining_with_exact_models_takes_a_few_steps(seed):
-    """SLSQP needs several times as many points for the same optimum."""
+def test_exact_models_take_a_few_steps(seed):
+    """Quadratic functions are known after one measurement, in 6 designs, wherever it is made."""
     look, _ = curved(seed)
-    start = np.full(6, 0.5)
-    problem = Epigraph(look, start, look(start), Stops())
-    with pytest.raises(EndError):
-        refine(problem.at, start, look(start), 1.0)
-    assert problem.certificate.residual < 1e-6
-    assert problem.evaluations <= 1 + 6 + 12
-    found = descend(look, start)
+    first, other = (descend(look, np.full(6, at)) for at in (0.5, 0.3))
+    assert first.converged
+    assert other.converged
+    assert max(first.evaluations, other.evaluations) <= 30
+    assert first.certificate.residual < 1e-5
+    assert first.local.objective == pytest.approx(other.local.objective, abs=1e-8)
+
+
+def sampled(look, point, limit, reach=0.05, count=1000):
+    """Return the least objective of random feasible points about `point`, from near to far."""
+    rng = np.random.default_rng(1)
+    scales = reach * 10 ** rng.uniform(-4, 0, (count, 1))
+    points = np.clip(point + scales * rng.uniform(-1, 1, (count, len(point))), 0, 1)
+    found = [one for one in map(look, points) if one is not None and one.violation <= limit]
+    return min(one.objective for one in found)
+
+
+def valley(x):
+    """Return a curved valley (Rosenbrock) whose floor falls by 3e-4 per unit box, with a wall of
+    force and a curved limit of the geometry across it."""
+    u, v = 2 * x[0] - 1, 2 * x[1] - 1
+    value = 1 + 3 * (v - u**2) ** 2 + 3e-4 * (1 - u) ** 2
+    slope = 2 * np.array([-12 * u * (v - u**2) - 6e-4 * (1 - u), 6 * (v - u**2)])
+    bound = np.array([1.2 - x[0] ** 2 - x[1] ** 2])
+    return Local(value, slope, (), bound, -2 * x[None])
+
+
+def saddle(x):
+    """Return a function whose gradient vanishes at (0.5, 0.5), a saddle."""
+    away = x - 0.5
+    value = 1 + away[0] ** 2 - 0.1 * away[1] ** 2
+    return Local(value, np.array([2, -0.2]) * away, (), np.zeros(0), np.zeros((0, 2)))
+
+
+def waves(seed):
+    """Return a function with corners between waves, and curved limits of the geometry."""
+    rng = np.random.default_rng(seed)
+    turns, shifts = rng.normal(size=(4, 4)) * 3, rng.uniform(0, 6, 4)
+    bends, centre = rng.uniform(0.5, 2, (2, 4)), rng.uniform(0.2, 0.8, (2, 4))
+
+    def look(x):
+        phase = turns @ x + shifts
+        values, slopes = 1 + 0.2 * np.sin(phase), 0.2 * np.cos(phase)[:, None] * turns
+        away = x - centre
+        slack, normals = 0.3 - np.sum(bends * away**2, axis=1), -2 * bends * away
+        return Local(0.0, np.zeros(4), (group(values, slopes),), slack, normals)
+
+    return look
+
+
+@pytest.mark.parametrize(
+    ("look", "start"),
+    [(valley, [0.9, 0.1]), (saddle, [0.9, 0.5]), (saddle, [0.5, 0.5]),
+     *((waves(seed), [0.4, 0.5, 0.6, 0.5]) for seed in range(6))],
+)  # fmt: skip
+@pytest.mark.parametrize("known", [False, True])
+def test_a_converged_search_has_the_value(look, start, known):
+    """No point in the neighbourhood is lower by more than 1e-5, whatever the first-order residual.
+
+    In a flat valley and at a saddle, the residual is small far from the minimum."""
+    limits = (lambda x: (look(x).slack, look(x).normals)) if known else None
+    found = descend(look, np.array(start), Stops(evaluations=100), limits)
     assert found.converged
-    assert found.local.objective == pytest.approx(problem.best[1].objective, abs=1e-9)
+    assert found.promised <= 3e-6
+    assert found.local.violation <= 1e-6
+    assert found.local.objective <= sampled(look, found.point, 0.0) + 1e-5
 
 
-def test_refining_follows_branches_of_higher_order():
+def test_constraints_of_the_geometry_are_met_exactly():
+    """All steps stay feasible along a curved edge, which models of the constraint leave.
+
+    Only the designs beside the optimum that measure the Hessians may violate it."""
+    seen, truth = [], waves(1)
+
+    def look(x):
+        seen.append(truth(x))
+        return seen[-1]
+
+    found = descend(look, np.array([0.4, 0.5, 0.6, 0.5]), None, lambda x: truth(x)[3:5])
+    assert found.converged
+    assert max(found.certificate.multipliers) > 0
+    assert sum(one.violation > 1e-9 for one in seen) <= 4
+
+
+def test_branches_of_higher_order_are_followed():
     """Rank-one updates correct the models where the curvature changes along the way."""
 
     def look(x):
@@ -226,12 +299,9 @@ def test_refining_follows_branches_of_higher_order():
                   [-3 * np.exp(-3 * (x[0] - 0.5)), -2 * (1 - x[1])]]  # fmt: skip
         return Local(0.0, np.zeros(2), (group(values, slopes),), np.zeros(0), np.zeros((0, 2)))
 
-    start = np.array([0.9, 0.1])
-    problem = Epigraph(look, start, look(start), Stops())
-    with pytest.raises(EndError):
-        refine(problem.at, start, look(start), 0.0)
-    found = descend(look, np.array([0.2, 0.9]))
-    np.testing.assert_allclose(problem.best[0], found.point, atol=1e-4)
+    one, other = (descend(look, np.array(start)) for start in ([0.9, 0.1], [0.2, 0.9]))
+    assert one.converged
+    np.testing.assert_allclose(one.point, other.point, atol=1e-4)
 
 
 def walled(x, limit=0.35, lift=0.0):

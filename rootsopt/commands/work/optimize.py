@@ -98,11 +98,15 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
                 designs = {"baseline": result.baseline, "robust": result.optimized}
                 shown = {name: one.design for name, one in designs.items()}
                 out.print(tables.robustness_table(record, shown))
+            if result.cost:
+                out.print(result.cost, soft_wrap=True)
             if alike:
                 out.print(tables.likeness_table(alike["resembles"]))
         if result.beginning is not None:
             outline_report.say(config, out)
             out.print(tables.beginning_table(result.beginning.record()))
+        if rejected := result.verification.get("rejected"):
+            out.print(tables.rejected_table(rejected))
         if result.interrupted or result.optimized is None:
             out.print(_message(result))
         out.print(
@@ -206,6 +210,11 @@ def _message(result) -> str:
 
 
 def _advice(result) -> str:
+    """Return the message of a result, preceded by what limits cost that the baseline violates."""
+    return f"{result.cost} {_said(result)}".strip()
+
+
+def _said(result) -> str:
 
     if result.interrupted:
         return _interrupted(result)
