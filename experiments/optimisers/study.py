@@ -31,7 +31,7 @@ REACHED = 1e-6
 EVALUATIONS, QUICK = 150, 15
 """Number of designs that each method may simulate: in a full run, and in a reduced run."""
 _PEAK = "objective.mean_weight=0"
-Method = Callable[[Look, NDArray[np.float64], Stops], None]
+Method = Callable[[Any, NDArray[np.float64], Stops], None]
 _OUTER, _INNER = 30, 25
 """Number of rounds of the augmented Lagrangian, and of iterations of L-BFGS in each round."""
 _PENALTY, _GROWTH, _MOST = 10.0, 4.0, 1e6

@@ -1,5 +1,6 @@
 """The options `--workers` and `--scheduler`, which `sweep`, `optimize` and `pareto` share."""
 
+import os
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -28,8 +29,15 @@ def add_options(parser: "argparse.ArgumentParser | argparse._ArgumentGroup") -> 
 
 def chosen(options: "argparse.Namespace") -> "AbstractContextManager[Runs]":
     """Return a context manager for what runs the evaluations of a search with these `options`."""
+    from rootsopt.runtime.environment import say
     from rootsopt.sweeps.evaluations import evaluating
 
+    if options.workers is not None:
+        say(
+            f"`--workers {options.workers}` starts processes that load everything again, some 10 s "
+            f"each, while one process already uses all {os.cpu_count() or 1} cores; it pays only "
+            "if a search takes many minutes"
+        )
     cache = not options.no_cache
     return evaluating(options.workers, options.scheduler, options.imports, cache)
 

@@ -1,6 +1,7 @@
 """Tests of `pareto` from outside: files, exit codes, messages, and a whole run with forces."""
 
 import csv
+import io
 import json
 import re
 import subprocess
@@ -8,9 +9,12 @@ import sys
 from pathlib import Path
 
 import pytest
+from rich.console import Console
+from rich.text import Text
 
 import rootsopt
 from rootsopt.commands.pareto import main
+from rootsopt.commands.work.searching import progress_bar
 from rootsopt.config import load
 from rootsopt.figures import page
 from rootsopt.output.fronts import design_file
@@ -105,6 +109,20 @@ def test_contradicting_constraints_end_with_advice(tmp_path, capsys):
     result = json.loads((tmp_path / "run" / "result.json").read_text())
     assert result["points"] == []
     assert {row["name"] for row in result["infeasible"]["conflicts"]} >= {"seal width"}
+
+
+def test_the_bar_has_words_while_compiling_and_ends_full():
+    """No count stands beside an unknown total, and no search ends at part of the expected number."""
+    out = io.StringIO()
+    console = Console(file=out, force_terminal=True, width=120)
+    with progress_bar(console, "compiling", "optimising", "designs", field="best") as update:
+        update(3, 100, 0.9)
+        update(62, 100, 0.8)
+    lines = Text.from_ansi(out.getvalue().replace("\r", "\n")).plain.splitlines()
+    assert "compiling" in lines[0]
+    assert "None" not in out.getvalue()
+    assert "ended after 62 designs" in lines[-1]
+    assert "62/100" not in lines[-1]
 
 
 _STOPPED = """

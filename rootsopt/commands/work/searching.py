@@ -79,7 +79,8 @@ def progress_bar(
 
     Yield `None` if the console is not a terminal, where no progress bar is shown. `first`: text
     until the first update, `then`: text from there on; `counted`: what the bar counts; `field`:
-    name of the number that is the function's third argument ("": the function has none)."""
+    name of the number that is the function's third argument ("": the function has none). At the end,
+    the bar is full and states the number counted."""
     if not console.is_terminal:
         yield None
         return
@@ -87,15 +88,21 @@ def progress_bar(
     columns = [
         TextColumn("{task.description}"),
         BarColumn(),
-        TextColumn(f"{{task.completed}}/{{task.total}} {counted}"),
+        TextColumn("{task.fields[count]}"),
         *([TextColumn(field + " {task.fields[shown]}")] if field else []),
         TimeElapsedColumn(),
     ]
     with Progress(*columns, console=console) as bar:
-        task = bar.add_task(first, total=None, shown="-")
+        task = bar.add_task(first, total=None, shown="-", count="")
 
         def update(done: int, expected: int, *shown: float) -> None:
-            text = f"{shown[0]:.4f}" if shown else "-"
-            bar.update(task, description=then, completed=done, total=expected, shown=text)
+            text, count = f"{shown[0]:.4f}" if shown else "-", f"{done}/{expected} {counted}"
+            bar.update(
+                task, description=then, completed=done, total=expected, shown=text, count=count
+            )
 
         yield update
+        row = bar.tasks[0]
+        if row.total is not None:  # Most searches need less than the expected number.
+            count = f"ended after {row.completed:g} {counted}"
+            bar.update(task, total=row.completed, count=count)
