@@ -79,8 +79,9 @@ def progress_bar(
 
     Yield `None` if the console is not a terminal, where no progress bar is shown. `first`: text
     until the first update, `then`: text from there on; `counted`: what the bar counts; `field`:
-    name of the number that is the function's third argument ("": the function has none). At the end,
-    the bar is full and states the number counted."""
+    name of the number that is the function's third argument ("": the function has none).
+
+    At the end, the bar is full and states the number counted."""
     if not console.is_terminal:
         yield None
         return
