@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from rootsopt.contact.closest import FlankPair, contact_begins
 from rootsopt.contact.gap import Contact
 from rootsopt.profiles.base import Profile
+from rootsopt.runtime.threads import one_thread
 
 # Grid cells beyond ε = 0, and beyond the middle of the flank. With them, no contact is close to an
 # end of the spline.
@@ -46,6 +47,7 @@ def continued_gap(
 
 
 @functools.lru_cache(maxsize=32)
+@one_thread
 def _interpolation_matrix(count: int) -> NDArray[np.float64]:
     """Return the matrix (count + 2, count) that computes the coefficients of a cubic B-spline.
 

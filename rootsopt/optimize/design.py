@@ -7,10 +7,12 @@ from rootsopt.config import Config
 from rootsopt.optimize.robust import search_of
 from rootsopt.optimize.search import Optimization
 from rootsopt.response.choice import resolve
+from rootsopt.runtime.threads import one_thread
 from rootsopt.scene import check_geometry
 from rootsopt.sweeps.evaluations import evaluating
 
 
+@one_thread
 def optimize_design(
     config: Config,
     progress: Callable[[int, int, float], None] | None = None,

@@ -15,6 +15,8 @@ import sys
 import warnings
 from collections.abc import Iterator
 
+from threadpoolctl import threadpool_limits
+
 from rootsopt.errors import InputError
 
 _RESPECTED = (
@@ -86,6 +88,16 @@ of JAX."""
 _TRIAL_SECONDS = 60.0
 _LOG_PREFIX = re.compile(r"^[IWEF]\d{4} \S+\s+\d+ \S+\] ")
 
+_ALGEBRA = (
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "BLIS_NUM_THREADS",
+    "VECLIB_MAXIMUM_THREADS",
+    "OMP_NUM_THREADS",
+)
+"""Names of the variables with the number of threads of libraries for dense algebra (BLAS, LAPACK).
+"""
+
 _NARROWEST = 40
 """Terminal width (characters) in the variable COLUMNS below which the variable is ignored. Narrower
 tables would lose their numbers."""
@@ -115,7 +127,8 @@ def own_process() -> None:
     """Override environment settings that would disturb a command. Call this before anything else.
 
     Afterwards, warnings do not become errors, tables are wide enough to read, and figures need no
-    display. The runtime checks of equinox are off. `use_float64` handles the variables of JAX."""
+    display. The runtime checks of equinox are off, and dense algebra uses one thread. `use_float64`
+    handles the variables of JAX."""
     if any(option.lower().startswith("e") for option in sys.warnoptions):
         for entry in [entry for entry in warnings.filters if entry[0] == "error"]:
             warnings.filters.remove(entry)  # type: ignore[attr-defined]
@@ -134,6 +147,16 @@ def own_process() -> None:
             _set_aside([f"EQX_ON_ERROR={shortened(chosen)}"])
         for name in [name for name in os.environ if name.startswith(("EQX_GETKEY", "JAXTYPING_"))]:
             del os.environ[name]
+    use_one_thread()
+
+
+def use_one_thread() -> None:
+    """Make dense algebra use one thread, from now on and in processes that this one starts.
+
+    Otherwise rounding, and with it the course of a search, depends on the number of cores. XLA's
+    own threads do not matter: they divide arrays, never a sum."""
+    os.environ.update(dict.fromkeys(_ALGEBRA, "1"))  # read by libraries that are loaded later
+    threadpool_limits(1)
 
 
 def use_float64() -> None:

@@ -1,25 +1,55 @@
-"""Divides work among the cores of the machine."""
+"""Divides work among the cores of the machine, with results that do not depend on their number."""
 
+import contextlib
 import os
+import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
+from threadpoolctl import threadpool_limits
+
+
+class _OneThread(contextlib.ContextDecorator):
+    """Context in which dense algebra (BLAS, LAPACK) uses one thread.
+
+    The number of threads belongs to the process, so that overlapping contexts share it. It is
+    restored when the last one ends, provided that this is in the thread that began the first one:
+    threadpoolctl lets no other thread change it."""
+
+    def __init__(self) -> None:
+        self._lock, self._users = threading.Lock(), 0
+        self._limits: Any = None
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if not self._users:
+                self._limits = threadpool_limits(1)
+            self._users += 1
+
+    def __exit__(self, *error: object) -> None:
+        with self._lock:
+            self._users -= 1
+            if not self._users:
+                self._limits.restore_original_limits()
+
+
+one_thread = _OneThread()
+"""Decorator and context for dense algebra on one thread. With more threads, rounding depends on
+their number. Commands choose one thread for the whole process instead (`use_one_thread`)."""
 
 
 def on_all_cores(work: Callable[..., Any], *arrays: Any) -> Any:
-    """Return `work(*arrays)`, computed in parts along the leading axis (n,), one thread per core.
+    """Return `work(*arrays)`, computed row by row along the leading axis (n,), one thread per core.
 
-    All arrays, and all arrays of the result, must have this leading axis. The parts are equal in
-    size, so that they share a compiled program."""
-    count = arrays[0].shape[0]
-    workers = max(1, min(os.cpu_count() or 1, count))
-    size = -(-count // workers)
-    # The last part is padded with copies of the last entry.
-    index = np.minimum(np.arange(workers * size), count - 1).reshape(workers, size)
-    with ThreadPoolExecutor(workers) as pool:
-        parts = list(pool.map(lambda rows: work(*(x[rows] for x in arrays)), index))
-    return jax.tree.map(lambda *x: jnp.concatenate(x)[:count], *parts)
+    All arrays, and all arrays of the result, must have this leading axis. Rows are not grouped: the
+    size of a group would depend on the number of cores, and rounding on the size."""
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        rows = range(arrays[0].shape[0])
+        parts = list(pool.map(lambda k: work(*(x[k : k + 1] for x in arrays)), rows))
+    return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
+
+
+__all__ = ["on_all_cores", "one_thread"]

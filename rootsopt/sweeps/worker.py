@@ -86,7 +86,7 @@ def dask_setup(worker: Any) -> None:
 
 @functools.cache
 def _prepare(settings: Settings) -> None:
-    """Choose double precision and the cache, and import extensions, once per process."""
+    """Choose precision, threads and cache, and import extensions, once per process."""
     here = dict(versions())
     odd = [name for name, version in settings.versions if here.get(name) != version]
     if odd:
@@ -96,6 +96,7 @@ def _prepare(settings: Settings) -> None:
             f"a worker has other versions than this process: {told}; install the same ones on all "
             "machines"
         )
+    environment.use_one_thread()
     environment.use_float64()
     refused = programs.keep_by_default() if settings.cache else programs.keep_in(None)
     if refused:

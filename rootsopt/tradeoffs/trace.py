@@ -36,6 +36,7 @@ from rootsopt.optimize.problem import FEASIBLE
 from rootsopt.optimize.sqp import Stops, descend
 from rootsopt.response.choice import resolve
 from rootsopt.response.runs import HERE, Runs
+from rootsopt.runtime.threads import one_thread
 from rootsopt.scene import check_geometry
 from rootsopt.sweeps.evaluations import evaluating
 from rootsopt.tradeoffs.assembly import Node, gaps_of, points_of, selected, spacing_of
@@ -569,6 +570,7 @@ def _better(best: Node | None, other: Node | None) -> Node | None:
     return best
 
 
+@one_thread
 def pareto_front(
     config: Config,
     progress: Progress | None = None,

@@ -1,18 +1,177 @@
-"""Work divided among threads."""
+"""Work divided among threads: results do not depend on the number of cores."""
+
+import json
+import os
+import subprocess
+import sys
+import threading
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
+from scipy.optimize import minimize
+from threadpoolctl import threadpool_info, threadpool_limits
 
-from rootsopt.runtime.threads import on_all_cores
+import rootsopt
+from rootsopt.config import load
+from rootsopt.contact.map import _interpolation_matrix
+from rootsopt.errors import InputError
+from rootsopt.optimize import design
+from rootsopt.runtime.environment import own_process
+from rootsopt.runtime.programs import Program
+from rootsopt.runtime.threads import on_all_cores, one_thread
+from rootsopt.tradeoffs import trace
+
+ROOT = Path(__file__).parents[2]
 
 
-def test_work_is_divided_among_the_cores():
-    """Every row is computed once and is returned in its place, whatever its shape."""
+def counts():
+    """Return the numbers of threads of all libraries for dense algebra that are loaded."""
+    return {one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"}
+
+
+@Program
+def mixed(rows, shift):
+    return jnp.exp(rows) * 2, jnp.sum(jnp.sin(rows), axis=-1) + shift
+
+
+def test_work_is_divided_among_the_cores(monkeypatch):
+    """Every row is computed once and returned in its place, with the same bits on 1 to 16 cores."""
     rng = np.random.default_rng(0)
     for count in (1, 2, 5, 8):
-        designs, states = jnp.asarray(rng.normal(size=(count, 3))), jnp.arange(float(count))
-        doubled, summed = on_all_cores(
-            lambda a, b: (2 * a, jnp.sum(a, axis=-1) + b), designs, states
+        rows, shift = jnp.asarray(rng.normal(size=(count, 300))), jnp.arange(float(count))
+        found = []
+        for cores in (1, 2, 16):
+            monkeypatch.setattr(os, "cpu_count", lambda cores=cores: cores)
+            found.append(on_all_cores(mixed, rows, shift))
+        np.testing.assert_allclose(found[0][0], 2 * np.exp(rows))
+        np.testing.assert_allclose(found[0][1], np.sum(np.sin(rows), axis=1) + np.arange(count))
+        for one in found[1:]:
+            assert [x.tobytes() for x in map(np.asarray, one)] == [
+                x.tobytes() for x in map(np.asarray, found[0])
+            ]
+
+
+def wandering():
+    """Return the end of a search with SciPy, whose rounding depends on the number of threads."""
+    aim = np.random.default_rng(1).normal(size=9)
+    inside = {"type": "ineq", "fun": lambda x: 1 - np.sum(x**2)}
+    start = np.zeros(9)
+    found = minimize(lambda x: np.sum((x - aim) ** 4), start, method="SLSQP", constraints=[inside])
+    return found.x.tobytes()
+
+
+@pytest.mark.parametrize("work", [wandering, lambda: _interpolation_matrix(150).tobytes()])
+def test_dense_algebra_rounds_alike_on_any_number_of_threads(work):
+    found = set()
+    for threads in (1, 2, 16):
+        _interpolation_matrix.cache_clear()
+        with threadpool_limits(threads):
+            found.add(one_thread(work)() if work is wandering else work())
+    assert len(found) == 1
+
+
+def test_overlapping_contexts_keep_one_thread_to_the_end():
+    """A context that ends early does not return the threads that another one has set aside."""
+    inside, ending, seen = threading.Event(), threading.Event(), []
+
+    @one_thread
+    def other():
+        inside.set()
+        ending.wait(10)
+        seen.append(counts())
+
+    with threadpool_limits(2):
+        thread = threading.Thread(target=other)
+        with one_thread:
+            thread.start()
+            inside.wait(10)
+        assert counts() == {1}
+        ending.set()
+        thread.join(10)
+        assert seen == [{1}]
+    with threadpool_limits(2):
+        with one_thread, one_thread:
+            assert counts() == {1}
+        assert counts() == {2}
+
+
+@pytest.mark.parametrize(
+    ("room", "search", "run"),
+    [
+        (design, "search_of", rootsopt.optimize_design),
+        (trace, "Tracer", rootsopt.pareto_front),
+    ],
+)
+def test_searches_from_python_use_one_thread_and_restore_the_others(monkeypatch, room, search, run):
+    seen = []
+
+    def made(*_, **__):
+        seen.append(counts())
+        raise InputError("enough")
+
+    monkeypatch.setattr(room, search, made)
+    with threadpool_limits(2):
+        with pytest.raises(InputError, match="enough"):
+            run(load("cic"))
+        assert [*seen, counts()] == [{1}, {2}]
+
+
+def test_commands_use_one_thread_whatever_the_user_has_set(monkeypatch):
+    """In libraries that are loaded already, and in those that are loaded later."""
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "16")
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    with threadpool_limits(2):
+        own_process()
+        assert counts() == {1}
+    script = "import scipy.linalg, threadpoolctl as t\n"
+    script += "print({x['num_threads'] for x in t.threadpool_info()})"
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "{1}\n"
+
+
+FAKED = """
+import os, sys
+cores = int(sys.argv.pop(1))
+os.cpu_count = lambda: cores
+from rootsopt.commands.console import main
+sys.exit(main())
+"""
+"""A console command on a machine that seems to have as many cores as the first argument says."""
+RUNS = {
+    "optimize": ["optimizer.screening=4", "optimizer.starts=2", "optimizer.iterations=12"],
+    "pareto": ["optimizer.screening=4", "pareto.points=3", "optimizer.iterations=6"],
+    "attractors": ["scene.timing_gear.backlash_mm=0.2"],
+    "simulate": ["solver.fidelity=map"],
+}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("command", RUNS)
+def test_a_run_has_the_same_bits_on_1_2_and_16_cores(tmp_path, command):
+    """Compiled on each of them, with as many threads of XLA and of dense algebra."""
+    files = []
+    for cores in ("1", "2", "16"):
+        out = tmp_path / cores
+        arguments = [command, "cic", "-o", str(out), "--no-figures", "--no-cache"]
+        arguments += [part for text in RUNS[command] for part in ("--set", text)]
+        own = {"NPROC": cores, "OPENBLAS_NUM_THREADS": cores, "OMP_NUM_THREADS": cores}
+        faked = [sys.executable, "-c", FAKED, cores, *arguments]
+        done = subprocess.run(
+            faked, cwd=ROOT, env=os.environ | own, capture_output=True, check=False
         )
-        np.testing.assert_array_equal(doubled, 2 * designs)
-        np.testing.assert_allclose(summed, np.sum(designs, axis=1) + np.arange(count))
+        assert done.returncode in (0, 3), done.stderr
+        found = {file.name: file.read_bytes() for file in out.glob("*.csv")}
+        result = json.loads((out / "result.json").read_bytes())
+        files.append((found, without_times(result)))
+    assert files[0][0]
+    assert files[0] == files[1] == files[2]
+
+
+def without_times(tree):
+    if isinstance(tree, dict):
+        return {k: without_times(v) for k, v in tree.items() if "seconds" not in k}
+    return [*map(without_times, tree)] if isinstance(tree, list) else tree
