@@ -12,6 +12,7 @@ import math
 import os
 import pickle
 import platform
+import re
 import sys
 import threading
 import zlib
@@ -70,6 +71,17 @@ only one of several nested loops.
 1.5
 """
 _PACKAGE = Path(__file__).parents[1]
+_WORDS = re.compile(
+    rb"""^[ \t]*[rR]?\"{3}(?:\\.|(?!\"{3})[^\\])*\"{3}[ \t]*$"""
+    rb"""|(\"{3}(?:\\.|[^\\])*?\"{3}|'{3}(?:\\.|[^\\])*?'{3})"""
+    rb"""|("(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*')|[ \t]*#[^\n]*""",
+    re.DOTALL | re.MULTILINE,
+)
+"""Texts for people: docstrings and comments. Groups: other texts, which stay."""
+_MENTIONED = re.compile(
+    rb"from (rootsopt(?:\.\w+)*) import (\([^)]*\)|[^\n]*)|(rootsopt(?:\.\w+)+)"
+)
+"""Names of modules of this package: in imports, with what is imported, and elsewhere."""
 _store: Store | None = None
 _chosen = False
 """Whether the cache's folder has been chosen, or the cache turned off. If not, the first program
@@ -425,31 +437,50 @@ def _modules(kind: _Kind) -> set[str]:
 def _sources(modules: set[str]) -> list[str] | None:
     """Return digests of the source files on which a program depends.
 
-    These are all files of this package, and the files of those `modules` that may change unnoticed.
-    Modules of Python, and of packages with a known version, are left out. Return `None` if a file
-    is missing."""
-    digests = [_package_digest()]
-    for name in sorted(modules):
+    These are the files of `modules` and of this one, and all files of this package that they
+    import, directly or not. Modules of Python, and of packages with a known version, are left out.
+    Return `None` if a file is missing."""
+    waiting = [__name__, *modules]
+    found: dict[str, str] = {}
+    while waiting:
+        name = waiting.pop()
         top = name.partition(".")[0]
-        if top in (_PACKAGE.name, *_PACKAGES) or top in sys.stdlib_module_names:
+        if name in found or top in _PACKAGES or top in sys.stdlib_module_names:
             continue
-        file = getattr(sys.modules.get(name), "__file__", None)
+        file = _file(name) or Path(getattr(sys.modules.get(name), "__file__", None) or "")
         try:
-            digests.append(hashlib.sha256(Path(file or "").read_bytes()).hexdigest())
+            now = file.stat()
+            found[name], imported = _source(file, now.st_mtime_ns, now.st_size)
         except OSError:
             return None
-    return digests if digests[0] else None
+        waiting += filter(_file, imported)
+    return [f"{name} {found[name]}" for name in sorted(found)]
+
+
+@functools.lru_cache(maxsize=4096)
+def _source(file: Path, *state: int) -> tuple[str, list[str]]:
+    """Return a digest of a source file without comments and docstrings, and what it imports.
+
+    `state`: numbers that differ after a change of the file. What it imports are names of this
+    package, of modules or in them, also those in texts, such as the maker of a family."""
+    del state
+    text = _WORDS.sub(lambda match: match[1] or match[2] or b"", file.read_bytes())
+    text = re.sub(rb"\n(?:[ \t]*\n)+", b"\n", text).strip()
+    names = set()
+    for room, members, alone in _MENTIONED.findall(text):
+        names |= {room, alone, *(room + b"." + one for one in re.findall(rb"\w+", members))}
+    return hashlib.sha256(text).hexdigest(), sorted(name.decode() for name in names if name)
 
 
 @functools.cache
-def _package_digest() -> str:
-    """Return a digest of all source files of this package, or "" if there are none."""
-    digest, files = hashlib.sha256(), sorted(_PACKAGE.rglob("*.py"))
-    for file in files:
-        data = file.read_bytes()
-        digest.update(f"{file.relative_to(_PACKAGE).as_posix()} {len(data)}\n".encode())
-        digest.update(data)
-    return digest.hexdigest() if files else ""
+def _file(name: str) -> Path | None:
+    """Return the source file of a module of this package, or `None` if `name` is not one."""
+    top, *parts = name.split(".")
+    if top != __name__.partition(".")[0]:
+        return None
+    place = _PACKAGE.joinpath(*parts)
+    files = place.with_suffix(".py"), place / "__init__.py"
+    return next((file for file in files if file.is_file()), None)
 
 
 @functools.cache
