@@ -1,9 +1,10 @@
 """The values that a sweep gives to one key, as a user writes them: lists, ranges and intervals."""
 
 import dataclasses
+import itertools
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,8 +20,8 @@ _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _RANGE = re.compile(rf"({_NUMBER}):({_NUMBER})(?::(\d+))?(:log)?")
 _MEANT = re.compile(r"[-+\d.][-+\d.eE]*:[-+\d.eE:]*[-+\d.eE:](?:log)?")
 """Texts that are meant to be a range."""
-_MOST = 1_000_000
-"""Number of values above which a range is rejected."""
+MOST = 1_000_000
+"""Number of values above which an axis is rejected, and of points above which a sweep is."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,21 +78,15 @@ class Axis:
 def axis_of(key: str, given: Any) -> Axis:
     """Return the axis of a `key`.
 
-    `given`: a sequence of values, or a text as after `--over KEY=`: values separated by commas,
-    and ranges `from:to:count`, with `:log` at the end for a logarithmic scale. A text `from:to` is
-    an interval to draw samples from.
+    `given`: a sequence, an array or an iterator of values, or a text as after `--over KEY=`: values
+    separated by commas, and ranges `from:to:count`, with `:log` at the end for a logarithmic scale.
+    A text `from:to` is an interval to draw samples from.
 
-    Raises `InputError` if there are no values, or if a range is not valid."""
-    if isinstance(given, Interval):
-        return Axis(key, given if given.points is None else tuple(given.range()))
+    Raises `InputError` if there are no values or more than `MOST`, or if a range is not valid."""
+    if isinstance(given, Interval) and given.points is None:
+        return Axis(key, given)
     if not isinstance(given, str):
-        values = given.tolist() if hasattr(given, "tolist") else given
-        if not isinstance(values, Sequence) or not len(values):
-            raise InputError(
-                f"`{key}` must have at least one value, as a list or as text such as "
-                f"'300:6000:39', but is {shown(given)}"
-            )
-        return Axis(key, tuple(x.item() if hasattr(x, "item") else x for x in values))
+        return Axis(key, _values(key, given))
     items = _items(key, given)
     spans = [item for item in items if isinstance(item, Interval) and item.points is None]
     if spans and len(items) == 1:
@@ -101,10 +96,40 @@ def axis_of(key: str, given: Any) -> Axis:
             f"`{key}`: an interval from:to cannot be mixed with other values, but the values are "
             f"{shown(given)}; write from:to:count for a range"
         )
-    values: list[Any] = []
-    for item in items:
-        values += item.range() if isinstance(item, Interval) else [item]
-    return Axis(key, tuple(values))
+    parts = (item.range() if isinstance(item, Interval) else [item] for item in items)
+    return Axis(key, _taken(key, itertools.chain.from_iterable(parts)))
+
+
+def _values(key: str, given: Any) -> tuple[Any, ...]:
+    """Return the values of a `key` that are `given` as a range, a sequence, an array or an
+    iterator."""
+    count = given.points if isinstance(given, Interval) else getattr(given, "size", None)
+    if (count or 0) > MOST:
+        raise _too_many(key)
+    values: Any = given.range() if isinstance(given, Interval) else given
+    values = values.tolist() if hasattr(values, "tolist") else values
+    found = _taken(key, values) if isinstance(values, Sequence | Iterator) else ()
+    if not found:
+        raise InputError(
+            f"`{key}` must have at least one value, as a list or as text such as "
+            f"'300:6000:39', but is {shown(given)}"
+        )
+    return tuple(x.item() if hasattr(x, "item") else x for x in found)
+
+
+def _taken(key: str, values: Iterable[Any]) -> tuple[Any, ...]:
+    """Return the `values`, but take no more of them than an axis may have."""
+    found = tuple(itertools.islice(values, MOST + 1))
+    if len(found) > MOST:
+        raise _too_many(key)
+    return found
+
+
+def _too_many(key: str) -> InputError:
+    return InputError(
+        f"`{key}` must have at most {MOST} values, but has more; give fewer, or draw samples with "
+        "`--sobol N`"
+    )
 
 
 def parse_over(text: str) -> tuple[str, Axis]:
@@ -145,9 +170,9 @@ def _interval(key: str, item: str) -> Any:
     points, log = None if match[3] is None else int(match[3]), match[4] is not None
     if not (math.isfinite(low) and math.isfinite(high)) or low == high:
         raise InputError(f"`{key}`: a range must have two different finite ends, but is {item}")
-    if points is not None and not 2 <= points <= _MOST:
+    if points is not None and not 2 <= points <= MOST:
         raise InputError(
-            f"`{key}`: a range must have 2 to {_MOST} values, but is {item}; write "
+            f"`{key}`: a range must have 2 to {MOST} values, but is {item}; write "
             "from:to:count, as in 300:6000:39"
         )
     if log and min(low, high) <= 0:
@@ -162,4 +187,4 @@ def _whole(key: str) -> bool:
     return "int" in kind and "float" not in kind
 
 
-__all__ = ["Axis", "Interval", "axis_of", "parse_over"]
+__all__ = ["MOST", "Axis", "Interval", "axis_of", "parse_over"]

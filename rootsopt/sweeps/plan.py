@@ -9,14 +9,11 @@ import numpy as np
 
 from rootsopt.config import Config
 from rootsopt.config.explain import all_keys
-from rootsopt.config.words import near
+from rootsopt.config.words import near, shown
 from rootsopt.design.space import sobol as sobol_points
 from rootsopt.errors import InputError
 from rootsopt.response.scatter import draw
-from rootsopt.sweeps.axes import Axis, Interval, axis_of
-
-MOST = 1_000_000
-"""Number of points above which a sweep is rejected."""
+from rootsopt.sweeps.axes import MOST, Axis, Interval, axis_of
 
 
 @dataclasses.dataclass(frozen=True)
@@ -236,8 +233,22 @@ def _dimensions(
         if len({*sizes.values()}) > 1:
             counts = ", ".join(f"`{one}` has {size}" for one, size in sizes.items())
             raise InputError(f"zipped keys must have equally many values, but {counts}")
+        _refuse_repetitions(columns)
         found.append(Dimension(key if number is None else names[number], columns))
     return tuple(found)
+
+
+def _refuse_repetitions(columns: Mapping[str, Sequence[Any]]) -> None:
+    """Raise `InputError` if two points along a dimension have the same values of all its keys."""
+    seen: set[str] = set()
+    for values in zip(*columns.values(), strict=True):
+        # As text, because a value may be a section; 1 and 1.0 are the same to a config.
+        text = repr([float(x) if type(x) is int and abs(x) < 2**53 else x for x in values])
+        if text in seen:
+            keys = " and ".join(f"`{key}`" for key in columns)
+            twice = ", ".join(map(shown, values))
+            raise InputError(f"{keys}: values must differ, but {twice} is given twice; remove one")
+        seen.add(text)
 
 
 __all__ = ["Dimension", "Plan", "check_values", "plan_of", "scattered"]

@@ -1,9 +1,13 @@
 """Values of one key as a user writes them."""
 
+import itertools
+import tracemalloc
+
 import numpy as np
 import pytest
 
 from rootsopt.errors import InputError
+from rootsopt.sweeps import axes
 from rootsopt.sweeps.axes import Interval, axis_of, parse_over
 
 SPEED, BACKLASH = "scene.speed_rpm", "scene.timing_gear.backlash_mm"
@@ -58,6 +62,42 @@ def test_python_values():
 def test_wrong_texts(text, words):
     with pytest.raises(InputError, match=words):
         axis_of(SPEED, text)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        range(10**9),
+        range(10**30),
+        itertools.count(1),
+        (x for x in itertools.repeat(1.0)),
+        np.broadcast_to(1.0, 10**9),
+        Interval(1.0, 2.0, 10**9),
+        "1:2:600,3:4:600",
+    ],
+    ids=["range", "long range", "count", "generator", "array", "interval", "text"],
+)
+def test_too_many_values_are_refused_before_they_are_made(given, monkeypatch):
+    monkeypatch.setattr(axes, "MOST", 1000)
+    tracemalloc.start()
+    with pytest.raises(InputError, match=rf"`{SPEED}` must have at most 1000 values"):
+        axis_of(SPEED, given)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 1e6
+
+
+@pytest.mark.parametrize(
+    "given", [[], (), iter(()), np.array([]), 3.0, {1.0: 2.0}, None, np.ones(())]
+)
+def test_axes_without_values_are_refused(given):
+    with pytest.raises(InputError, match=rf"`{SPEED}` must have at least one value"):
+        axis_of(SPEED, given)
+
+
+def test_iterators_are_taken_as_they_are():
+    assert axis_of(SPEED, (100.0 * x for x in range(1, 3))).values == (100.0, 200.0)
+    assert axis_of("profile.lobes", range(2, 5)).values == (2, 3, 4)
 
 
 @pytest.mark.parametrize("text", ["scene.speed_rpm", "=3", "scene..x=1", ".=1"])

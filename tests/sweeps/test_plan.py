@@ -35,6 +35,12 @@ def test_zipped_keys_advance_together():
     assert [one.name for one in pairs.dimensions] == ["point_1", "point_2"]
 
 
+def test_values_of_zipped_and_drawn_keys_may_repeat():
+    assert plan_of({SPEED: "1,1,2", LOAD: "3,4,3"}, zipped=True).count == 3
+    assert plan_of({"profile.lobes": "2:3"}, sobol=8).count == 8
+    assert plan_of({"profile.lobes": [True, 1, 10**400]}).count == 3  # for the config to refuse
+
+
 def test_samples_follow_from_their_seed():
     axes = {SPEED: "300:6000", "profile.family": "cic,ee"}
     for method in ({"sample": 64}, {"sobol": 64}):
@@ -69,6 +75,11 @@ def test_sobol_fills_every_part():
         ({SPEED: "1,2"}, {"zipped": [[SPEED], [SPEED]]}, "two groups"),
         ({"scene": [{}], SPEED: "1"}, {}, "is inside `scene`"),
         ({SPEED: "1:2:2000", LOAD: "1:2:2000"}, {}, "at most 1000000 points"),
+        ({SPEED: [1, 2, 1.0]}, {}, "`scene.speed_rpm`: values must differ, but 1.0 is given twice"),
+        ({"profile.family": "cic,ee,cic"}, {}, "`profile.family`: values must differ, but 'cic'"),
+        ({"scene.timing_gear": [None, {"a": 1}, {"a": 1}]}, {}, "`scene.timing_gear`: values"),
+        ({SPEED: "1:2:3,1.5"}, {}, "1.5 is given twice"),
+        ({SPEED: "1,1", LOAD: "2,2"}, {"zipped": True}, "`scene.load.torque_N_m`: values must"),
     ],
 )
 def test_wrong_plans(axes, options, words):
