@@ -17,11 +17,10 @@ from typing import Any
 
 from experiments._common.scenes import CIC
 from rootsopt.config import Config, load
-from rootsopt.sweeps.journal import Journal
 from rootsopt.sweeps.local import divided
 from rootsopt.sweeps.plan import Plan, plan_of
 from rootsopt.sweeps.points import simulated_together
-from rootsopt.sweeps.scenes import Run, complete, header, runner
+from rootsopt.sweeps.scenes import Points, Run, complete, runner
 
 Row = dict[str, Any]
 ROUNDS = 2
@@ -95,7 +94,7 @@ def _timed(config: Config, plan: Plan, workers: int | None, run: Run | None = No
         arrivals.append((time.perf_counter() - began, time.process_time(), done))
 
     with tempfile.TemporaryDirectory() as folder:
-        journal = Journal(Path(folder) / "points", header(config, plan))
+        journal = Points(config, plan, (), Path(folder) / "points")
         way = run or runner(workers)
         rows = complete(config, plan, way, journal, progress, threading.Event())
         journal.close()

@@ -23,12 +23,6 @@ def options(parser: "argparse.ArgumentParser") -> None:
     from rootsopt import export
 
     export.add_option(parser, "none")
-    parser.add_argument(
-        "--resume",
-        action="store_true",
-        help="go on with a run into the same folder that was stopped or killed, from its "
-        "checkpoint; the result is that of an uninterrupted run",
-    )
     parallel.add_options(parser)
 
 

@@ -1,4 +1,4 @@
-"""The options `--workers` and `--scheduler`, which `sweep`, `optimize` and `pareto` share."""
+"""The options `--workers`, `--scheduler` and `--resume` of `sweep`, `optimize` and `pareto`."""
 
 import os
 from typing import TYPE_CHECKING
@@ -24,6 +24,12 @@ def add_options(parser: "argparse.ArgumentParser | argparse._ArgumentGroup") -> 
         metavar="ADDRESS",
         help="use the workers of a running Dask scheduler, for example tcp://10.0.0.1:8786 (needs "
         "rootsopt[cluster])",
+    )
+    parser.add_argument(
+        "--resume",
+        action="store_true",
+        help="go on with a run into the same folder that was stopped or killed, from its "
+        "checkpoint; the result is that of an uninterrupted run",
     )
 
 

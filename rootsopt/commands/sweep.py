@@ -66,11 +66,6 @@ def options(parser: argparse.ArgumentParser) -> None:
         "(netCDF) or .zarr (Zarr, needs rootsopt[zarr]); default: sweep.nc",
     )
     parallel.add_options(group)
-    group.add_argument(
-        "--resume",
-        action="store_true",
-        help="go on with a sweep into the same folder that was stopped or killed",
-    )
 
 
 def _run(argv: Sequence[str] | None) -> int:

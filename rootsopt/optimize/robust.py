@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from rootsopt.config import Config
 from rootsopt.errors import InputError
 from rootsopt.optimize.certificate import Certificate
-from rootsopt.optimize.checkpoint import Checkpoint
 from rootsopt.optimize.local import Local
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.risk import combine
 from rootsopt.optimize.robust_problem import RobustProblem
 from rootsopt.optimize.search import Optimization, Progress, Search, sensitivity_rows
+from rootsopt.response.checkpoint import Checkpoint
 from rootsopt.response.evaluation import RESPONSES, Evaluation, Evaluator
 from rootsopt.response.runs import HERE, Runs
 from rootsopt.response.scatter import Shift, draw, shifts

@@ -27,13 +27,13 @@ from rootsopt.design.space import Space, sobol
 from rootsopt.errors import InputError
 from rootsopt.optimize.beginning import Beginning, beginning
 from rootsopt.optimize.certificate import Certificate, certify
-from rootsopt.optimize.checkpoint import Checkpoint
 from rootsopt.optimize.infeasible import Infeasible, explain
 from rootsopt.optimize.limits import force_limits, limited
 from rootsopt.optimize.local import Local
 from rootsopt.optimize.optimality import RESIDUAL, Optimality, StartOutcome
 from rootsopt.optimize.problem import FEASIBLE, Problem, needs_maxima
 from rootsopt.optimize.sqp import Found, Stops, descend
+from rootsopt.response.checkpoint import Checkpoint
 from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.response.evaluators import evaluator_for
 from rootsopt.response.runs import HERE, Runs
@@ -532,7 +532,7 @@ class Search:
         if kept is None:
             evaluation = self._simulated(evaluator, self.problem.design(point), orbit)
             if self.checkpoint is not None:
-                self.checkpoint.add(key, point, evaluation)
+                self.checkpoint.keep(key, point, evaluation)
         else:
             evaluation, design = kept, self.problem.design(point)
             evaluator.recall(kept, lambda: evaluator(design, start=orbit, series=False), orbit)

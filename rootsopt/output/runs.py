@@ -36,6 +36,7 @@ from rootsopt.errors import InputError
 from rootsopt.output import disk
 from rootsopt.output.files import ResultFolder, plain
 from rootsopt.output.lock import Lock, TakenError
+from rootsopt.runtime.journal import aside
 
 RESULT = "result.json"
 """Name of the file that lists all files of a run and is written last."""
@@ -236,8 +237,8 @@ class RunFolder(ResultFolder):
     def remove_afterwards(self, file: Path) -> None:
         """Remove `file`, which is not part of the run, as soon as the run is in place.
 
-        If the run ends before that, the file stays."""
-        self._spent.append(file)
+        So is an older one that was set aside. If the run ends before that, the files stay."""
+        self._spent += [file, aside(file)]
 
     def put_in_place(self) -> list[str]:
         """Write `result.json` and move the finished folder to its final path.

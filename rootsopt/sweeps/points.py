@@ -4,6 +4,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from pydantic import BaseModel
+
 from rootsopt.config import Config
 from rootsopt.config.families import families, family_of, find_installed, parameters
 from rootsopt.config.section import bare
@@ -115,6 +117,24 @@ def row_of(evaluation: Evaluation) -> Row:
     }
 
 
+class _Record(BaseModel, strict=True, extra="forbid"):
+    status: str
+    message: str
+    response: dict[str, float | None]
+    gradient: dict[str, dict[str, float | None]]
+    steady_state: dict[str, Any]
+    geometry: dict[str, float | None]
+
+
+def check_row(row: Any) -> Row:
+    """Return a record that was read from a file.
+
+    Raises `ValueError` or `LookupError` if it is not valid."""
+    _Record.model_validate(row)
+    Status[row["status"].upper()]
+    return row
+
+
 def lost(status: Status, why: str = "") -> Row:
     """Return the record of a point without an evaluation, with its `status`; `why`: what happened
     there."""
@@ -123,4 +143,13 @@ def lost(status: Status, why: str = "") -> Row:
     return {"status": status.label, "message": message, **none}
 
 
-__all__ = ["Row", "configured", "lost", "prepared", "row_of", "simulated", "simulated_together"]
+__all__ = [
+    "Row",
+    "check_row",
+    "configured",
+    "lost",
+    "prepared",
+    "row_of",
+    "simulated",
+    "simulated_together",
+]

@@ -1,7 +1,7 @@
 """Simulate a config over values of any of its keys, as a labelled dataset."""
 
-import hashlib
 import threading
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -10,14 +10,11 @@ from typing import Any
 import xarray
 
 from rootsopt.config import Config
-from rootsopt.config.sources import reason, regular_file
-from rootsopt.errors import InputError
+from rootsopt.runtime.journal import Journal, header_of
 from rootsopt.runtime.precision import check_precision
-from rootsopt.runtime.versions import versions
-from rootsopt.sweeps.journal import Journal
 from rootsopt.sweeps.local import in_process
 from rootsopt.sweeps.plan import Plan, check_values, plan_of
-from rootsopt.sweeps.points import Row, prepared
+from rootsopt.sweeps.points import Row, check_row, prepared
 from rootsopt.sweeps.table import dataset_of
 
 Run = Callable[[Config, Plan, Sequence[int], threading.Event], Any]
@@ -55,7 +52,8 @@ def sweep_scenes(  # Keywords of the public interface, each independent of the o
       starts processes must do so below `if __name__ == "__main__":`. By default, the points run in
       this process, on all cores.
     - `checkpoint`: file in which the points are kept as they are done; `resume`: whether to go on
-      with that file after a run that was stopped.
+      with that file after a run that was stopped. Damaged lines of the file are dropped with a
+      warning, and their points are simulated again.
 
     The result has these variables over the dimensions:
 
@@ -71,7 +69,8 @@ def sweep_scenes(  # Keywords of the public interface, each independent of the o
       without a gradient, and for parameters that the family of the point does not have).
 
     Raises `InputError` for a key or value that a config cannot have, before anything is simulated,
-    and if there are no axes or an axis has no values. Raises RuntimeError if JAX is not set to the
+    if there are no axes, if an axis has no values, too many or one of them twice, and if `resume`
+    finds no file or that of another sweep. Raises RuntimeError if JAX is not set to the
     precision of the config.
 
     >>> import jax
@@ -85,7 +84,10 @@ def sweep_scenes(  # Keywords of the public interface, each independent of the o
     check_precision(config.solver.precision)
     plan = checked(config, plan_of(axes, zip, sample, sobol, seed))
     done: dict[int, Row] = {}
-    with closing(_journal(config, plan, checkpoint, resume)) as journal:
+    path = None if checkpoint is None else Path(checkpoint)
+    with closing(Points(config, plan, (), path, resume)) as journal:
+        if journal.damage:
+            warnings.warn(journal.damage, stacklevel=2)
         run = runner(workers, scheduler)
         done = complete(config, plan, run, journal, progress)
     return dataset_of(config, plan, done)
@@ -104,7 +106,7 @@ def complete(
     config: Config,
     plan: Plan,
     run: Run,
-    journal: "Journal | Memory",
+    journal: "Points",
     progress: Callable[[int, int], None] = lambda done, expected: None,
     stop: threading.Event | None = None,
 ) -> dict[int, Row]:
@@ -138,50 +140,30 @@ def runner(
     return Cluster(workers, scheduler, tuple(imports), cache).run
 
 
-def header(config: Config, plan: Plan, imports: Sequence[str] = ()) -> dict[str, Any]:
-    """Return everything on which the records of a sweep depend, as plain values.
+class Points(Journal):
+    """The journal of a sweep: the record of each point by its number.
 
-    `imports`: names of the files and modules that were imported first. Raises `InputError` if an
-    outline file of the sweep cannot be read."""
-    outlines = [config.profile.outline_file]
-    for one in plan.dimensions:
-        outlines += one.columns.get("profile.outline_file", ())
-    found = {
-        "config": config.model_dump(mode="json"),
-        "sweep": plan.record(),
-        "versions": versions(),
-        "imports": [*imports],
-    }
-    return found | {"outlines": {path: _digest(path) for path in outlines if path is not None}}
+    `config`, `plan`: those of the sweep; `imports`: names of the files and modules that were
+    imported first; `path`, `resume`: see `Journal`."""
 
+    def __init__(
+        self,
+        config: Config,
+        plan: Plan,
+        imports: Sequence[str] = (),
+        path: Path | None = None,
+        resume: bool = False,
+    ):
+        self._count = plan.count
+        columns = (one.columns.get("profile.outline_file", ()) for one in plan.dimensions)
+        outlines = [path for column in columns for path in column]
+        header = header_of("sweep", config, imports, outlines, sweep=plan.record())
+        super().__init__(header, path, resume)
 
-def _digest(path: str) -> str:
-    """Return a digest of an outline file."""
-    try:
-        return hashlib.sha256(regular_file(path, "an outline").read_bytes()).hexdigest()
-    except OSError as error:
-        raise InputError(f"{path!r}: cannot be read: {reason(error)}") from None
-
-
-class Memory:
-    """Keeps the records of a sweep in memory, with the methods of a `Journal`, if no file is
-    wanted."""
-
-    def __init__(self) -> None:
-        self.rows: dict[int, Row] = {}
-
-    def add(self, found: Sequence[tuple[int, Row]]) -> None:
-        """Keep points (number, record)."""
-        self.rows |= dict(found)
-
-    def close(self) -> None:
-        """Do nothing."""
+    def read(self, key: Any, value: Any) -> Row:
+        if type(key) is not int or not 0 <= key < self._count:
+            raise ValueError(f"{key} is not the number of a point")
+        return check_row(value)
 
 
-def _journal(config: Config, plan: Plan, path: Any, resume: bool) -> "Journal | Memory":
-    if path is None:
-        return Memory()
-    return Journal(Path(path), header(config, plan), resume)
-
-
-__all__ = ["Memory", "checked", "complete", "header", "runner", "sweep_scenes"]
+__all__ = ["Points", "checked", "complete", "runner", "sweep_scenes"]

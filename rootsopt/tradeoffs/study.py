@@ -13,6 +13,7 @@ from rootsopt.optimize.limits import force_limits, term_constraints
 from rootsopt.optimize.local import Group
 from rootsopt.optimize.problem import FEASIBLE, Problem
 from rootsopt.profiles import geometry
+from rootsopt.response.checkpoint import Checkpoint
 from rootsopt.response.evaluation import Evaluation, Evaluator, geometry_record
 from rootsopt.response.runs import HERE, Runs
 from rootsopt.response.terms import terms_of, values_of
@@ -61,7 +62,8 @@ class Study:
 
     `config`: config of the study; `aims`: its k terms; `problem`: unit box and constraints, with
     the evaluated baseline; `fast`, `sharp`, `exact`: evaluators for screening, search and report.
-    All three are `None` if no term depends on forces. `runs`: where they run."""
+    All three are `None` if no term depends on forces. `runs`: where they run; `checkpoint`: file
+    that stores every evaluation and supplies those of an interrupted search."""
 
     config: Config
     aims: tuple[Aim, ...]
@@ -70,12 +72,13 @@ class Study:
     sharp: Evaluator | None
     exact: Evaluator | None
     runs: Runs = HERE
+    checkpoint: Checkpoint | None = None
 
     @classmethod
-    def of(cls, config: Config, runs: Runs = HERE) -> "Study":
+    def of(cls, config: Config, runs: Runs = HERE, checkpoint: Checkpoint | None = None) -> "Study":
         """Return the study of a `config`; evaluate its own design as the baseline.
 
-        `runs`: where other designs are evaluated.
+        `runs`: where other designs are evaluated; `checkpoint`: see `Study`.
 
         Raises `InputError` for unknown terms, or for a scene that cannot be simulated."""
         aims = aims_of(config)
@@ -97,7 +100,7 @@ class Study:
         floor = baseline.geometry["area_efficiency"]
         space = Space.of(config, exact.scene, floor, term_constraints(config, exact.scene))
         problem = Problem(config, baseline, space, limits)
-        return cls(config, aims, problem, fast, exact.surveying(), exact, runs)
+        return cls(config, aims, problem, fast, exact.surveying(), exact, runs, checkpoint)
 
     @property
     def usable(self) -> bool:
@@ -122,7 +125,7 @@ class Study:
         if self.fast is None:
             sample = self._still(point)
             return None if sample is None else sample.evaluation
-        found = self.runs.evaluated(self.fast.without_gradient(), self.problem.design(point))
+        found = self._simulated("screening", self.fast.without_gradient(), point)
         return found if found.usable else None
 
     def sample(self, point: NDArray[np.float64], orbit: NDArray | None = None) -> Sample | None:
@@ -131,7 +134,7 @@ class Study:
         `orbit`: first guess of the orbit. Return `None` without a usable steady state."""
         if self.sharp is None:
             return self._still(point)
-        return self._moving(point, self._simulated(self.sharp, point, orbit))
+        return self._moving(point, self._simulated("search", self.sharp, point, orbit))
 
     def verified(self, point: NDArray[np.float64]) -> Sample | None:
         """Return the terms at a `point` (d,), simulated from rest at the tight tolerance.
@@ -139,12 +142,20 @@ class Study:
         Return `None` without a usable steady state."""
         if self.exact is None:
             return self._still(point)
-        return self._moving(point, self._simulated(self.exact, point))
+        return self._moving(point, self._simulated("verification", self.exact, point))
 
     def _simulated(
-        self, evaluator: Evaluator, point: NDArray[np.float64], orbit: NDArray | None = None
+        self,
+        stage: str,
+        evaluator: Evaluator,
+        point: NDArray[np.float64],
+        orbit: NDArray | None = None,
     ) -> Evaluation:
-        return self.runs.evaluated(evaluator, self.problem.design(point), orbit)
+        design = self.problem.design(point)
+        if self.checkpoint is None:
+            return self.runs.evaluated(evaluator, design, orbit)
+        given = stage, evaluator, point, design, orbit
+        return self.checkpoint.evaluated(self.runs.evaluated, *given)
 
     def _moving(self, point: NDArray[np.float64], evaluation: Evaluation) -> Sample | None:
         if not evaluation.usable:

@@ -34,6 +34,7 @@ from rootsopt.optimize.local import Local
 from rootsopt.optimize.optimality import RESIDUAL
 from rootsopt.optimize.problem import FEASIBLE
 from rootsopt.optimize.sqp import Stops, descend
+from rootsopt.response.checkpoint import Checkpoint
 from rootsopt.response.choice import resolve
 from rootsopt.response.runs import HERE, Runs
 from rootsopt.runtime.threads import one_thread
@@ -78,7 +79,8 @@ class Tracer:
 
     `progress`: function called after each local search with (searches done, searches expected);
     `stop`: event that another thread can set to end the tracing early; `runs`: where designs are
-    evaluated.
+    evaluated; `checkpoint`: file that stores every evaluation and supplies those of an interrupted
+    search.
 
     Raises `InputError` if there is no design parameter."""
 
@@ -88,6 +90,7 @@ class Tracer:
         progress: Progress | None = None,
         stop: threading.Event | None = None,
         runs: Runs = HERE,
+        checkpoint: Checkpoint | None = None,
     ):
         if not config.design_keys:
             valid = ", ".join(family for family, found in FAMILY_KEYS.items() if found)
@@ -96,7 +99,7 @@ class Tracer:
                 f"{config.profile.family}: it has no design parameter; use `simulate` for it, "
                 "or make the twist one with `optimizer.bounds.helix_deg`"
             )
-        self.config, self.runs = config, runs
+        self.config, self.runs, self.checkpoint = config, runs, checkpoint
         self.progress = progress or (lambda done, expected: None)
         self.stop = threading.Event() if stop is None else stop
         self._study: Study | None = None
@@ -128,7 +131,7 @@ class Tracer:
         Return the front. If `stop` is set, the front has the points found so far.
 
         Raises `InputError` for unknown terms, or for a scene that cannot be simulated."""
-        study = self._study = Study.of(self.config, self.runs)
+        study = self._study = Study.of(self.config, self.runs, self.checkpoint)
         if not study.usable or self.stop.is_set():
             return self._front([])
         points = self._feasible()

@@ -47,7 +47,7 @@ TESTS = (
     "tests/scene/test_scene.py",
     "tests/sweeps/test_axes.py",
     "tests/sweeps/test_plan.py",
-    "tests/sweeps/test_journal.py",
+    "tests/runtime/test_journal.py",
 )
 """A few test files per package that take seconds, apart from compiling."""
 LEFT = (

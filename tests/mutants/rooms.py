@@ -70,7 +70,6 @@ _OF = {
     "design/space": "search optimize freeform",
     "optimize/beginning": "beginning",
     "optimize/certificate": "sqp robust tradeoffs",
-    "optimize/checkpoint": "checkpoint",
     "optimize/design": "optimize pareto",
     "optimize/infeasible": "optimize limits",
     "optimize/limits": "limits",
@@ -111,6 +110,7 @@ _OF = {
     "pump/play": "play",
     "pump/section": "play leakage",
     "pump/sheet": "pump_flow play leakage",
+    "response/checkpoint": "checkpoint journal",
     "response/batch": "threads accuracy",
     "response/ensemble": "members ensemble",
     "response/members": "members ensemble",
@@ -158,6 +158,7 @@ _FOLDERS = (
 )
 _RESPONSE = (
     "batch",
+    "checkpoint",
     "ensemble",
     "members",
     "orbits",

@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from rootsopt.commands import optimize
-from rootsopt.commands.work import optimize as work
+from rootsopt.commands.work.searching import checkpoint_of
 from rootsopt.config import load, parse
 from rootsopt.design.bounds import bounds_of, widened
 from rootsopt.design.resemblance import Likeness
@@ -19,6 +19,7 @@ from rootsopt.optimize.beginning import beginning
 from rootsopt.optimize.search import Search
 from rootsopt.output.runs import RunFolder
 from rootsopt.scene import outline_mm
+from tests.standins import evaluation_of
 
 CIC = "configs/cic.yaml"
 BASE = load(CIC)
@@ -111,14 +112,16 @@ def test_a_search_is_not_resumed_with_other_points(tmp_path):
     """The checkpoint knows the content of the file, and not only its name."""
     config = load(measured(tmp_path, 0.0))
     folder = RunFolder(tmp_path / "run", "optimize", overwrite=False)
-    options = argparse.Namespace(resume=False)
-    work._checkpoint(config, options, folder).close(remove=False)
+    options = argparse.Namespace(resume=False, imports=[])
+    first = checkpoint_of("optimize", config, options, folder)
+    first.keep((0, 0), np.zeros(1), evaluation_of())
+    first.close()
     options.resume = True
-    work._checkpoint(config, options, folder).close(remove=False)
+    checkpoint_of("optimize", config, options, folder).close()
     rotor = tmp_path / "rotor.csv"
     rotor.write_text(rotor.read_text().replace("0", "1", 1))
-    with pytest.raises(InputError, match=r"outline \(then .*, now "):
-        work._checkpoint(config, options, folder)
+    with pytest.raises(InputError, match=r"files: .*rotor\.csv \(then .*, now "):
+        checkpoint_of("optimize", config, options, folder)
 
 
 @pytest.mark.long

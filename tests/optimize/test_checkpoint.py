@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from rootsopt.commands import optimize as command
+from rootsopt.commands import pareto
 from rootsopt.commands.work import optimize as work
 from rootsopt.config import parse
 from rootsopt.errors import InputError
-from rootsopt.optimize.checkpoint import Checkpoint, set_aside
 from rootsopt.optimize.search import Search
 from rootsopt.output.runs import RunFolder
+from rootsopt.response.checkpoint import Checkpoint
 from rootsopt.response.evaluation import Evaluation
 from rootsopt.status import Status
 
@@ -47,41 +48,13 @@ def outcome(result):
     return json.dumps([rows, record, result.optimality.record(), result.constraints])
 
 
-def test_floats_come_back_to_the_last_bit(tmp_path):
-    path, point = tmp_path / "c", np.array([0.1, 1 / 3])
-    first = Checkpoint(path, HEADER)
-    assert first.empty
-    first.add((0, 3), point, evaluation(0.1))
-    first.close(remove=False)
-    again = Checkpoint(path, HEADER, resume=True)
-    found = again.known((0, 3), point)
-    assert found.state.tobytes() == evaluation(0.1).state.tobytes()
-    assert found.response == evaluation(0.1).response
-    assert found.status is Status.PERIODIC
-    assert again.known((0, 3), point + 1e-16) is None or np.all(point + 1e-16 == point)
-    assert again.known((0, 4), point) is None
-    again.close()
-    assert not path.exists()
-
-
-def test_a_run_that_does_not_resume_keeps_the_older_checkpoint(tmp_path):
-    path = tmp_path / "c"
-    assert set_aside(path) is None
-    Checkpoint(path, HEADER).close(remove=False)
-    older = set_aside(path)
-    assert older == tmp_path / "c.old"
-    assert not path.exists()
-    older.rename(path)
-    Checkpoint(path, HEADER, resume=True).close()
-
-
 def test_the_command_keeps_its_checkpoint_until_the_run_is_in_place(tmp_path, monkeypatch):
     """A kill while files are written does not lose the search, nor does an abandoned run."""
     kept, older = (tmp_path / f".run.checkpoint{end}" for end in ("", ".old"))
     kept.write_text("of an earlier run")
 
     def searched(config, progress, stop, checkpoint, runs):
-        checkpoint.add((0, 0), np.zeros(1), evaluation(0.1))
+        checkpoint.keep((0, 0), np.zeros(1), evaluation(0.1))
         return config, {}, None
 
     def given_up(self):
@@ -99,51 +72,63 @@ def test_the_command_keeps_its_checkpoint_until_the_run_is_in_place(tmp_path, mo
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
-def test_other_configs_and_missing_files_are_refused(tmp_path):
-    path = tmp_path / "c"
-    with pytest.raises(InputError, match="no '"):
-        Checkpoint(path, HEADER, resume=True)
-    Checkpoint(path, HEADER).close(remove=False)
-    other = {"config": {"a": 2}, "versions": {"jax": "1"}}
-    with pytest.raises(InputError, match=r"config\.a \(then 1, now 2\)"):
-        Checkpoint(path, other, resume=True)
-
-
-def test_a_line_cut_off_is_ignored(tmp_path):
-    path, point = tmp_path / "c", np.array([0.5])
-    first = Checkpoint(path, HEADER)
-    for k in range(3):
-        first.add((0, k), point, evaluation(float(k)))
-    first.close(remove=False)
-    data = path.read_bytes()
-    path.write_bytes(data[:-5])
-    again = Checkpoint(path, HEADER, resume=True)
-    assert again.known((0, 1), point) is not None
-    assert again.known((0, 2), point) is None
-    again.add((0, 2), point, evaluation(2.0))
-    again.close(remove=False)
-    assert path.read_bytes() == data
-
-
 SPEEDS = "objective: {speeds_rpm: [2700.0, 3300.0]}\n"
 """Over several speeds, orbits are closed from those of neighbours, which the file does not hold."""
 
 
 @pytest.mark.parametrize("more", ["", pytest.param(SPEEDS, marks=pytest.mark.long)])
 def test_a_resumed_search_equals_one_that_was_not_interrupted(tmp_path, more):
-    """The file is cut at random bytes, as after a kill."""
+    """The file is cut at a random byte, as after a kill, and its lines are damaged at random."""
     settings, path = parse(SCENE + more), tmp_path / "c"
-    full = Checkpoint(path, HEADER)
+    full = Checkpoint(HEADER, path)
     expected = outcome(Search(settings, checkpoint=full).run())
     assert (b"from_neighbour" in path.read_bytes()) == bool(more)
-    full.close(remove=False)
+    full.close()
     data = path.read_bytes()
     head = data.index(b"\n") + 1
     rng = np.random.default_rng(0)
-    for cut in rng.integers(head + (len(data) - head) // 2, len(data), 2):
-        path.write_bytes(data[:cut])
-        resumed = Checkpoint(path, HEADER, resume=True)
+    cut = data[: rng.integers(head + (len(data) - head) // 2, len(data))]
+    flipped = bytearray(data)
+    flipped[rng.integers(head)] ^= 1
+    for place in rng.integers(head, len(data), 3):
+        flipped[place] ^= 1 << rng.integers(8)
+    for content in (cut, bytes(flipped)):
+        path.write_bytes(content)
+        resumed = Checkpoint(HEADER, path, resume=True)
         found = outcome(Search(settings, checkpoint=resumed).run())
         assert resumed.reused > 0
-        resumed.close(remove=False)
+        assert resumed.damage
+        resumed.close()
         assert found == expected
+
+
+@pytest.mark.long
+def test_a_resumed_front_equals_one_that_was_not_interrupted(tmp_path, monkeypatch, capfd):
+    """The run is stopped by an error, and lines of its checkpoint are damaged."""
+    few = ["pareto.points=4", "optimizer.screening=4", "optimizer.iterations=6"]
+    arguments = ["cic", "--no-figures", *(part for text in few for part in ("--set", text))]
+    whole, run, kept = tmp_path / "whole", tmp_path / "run", tmp_path / ".run.checkpoint"
+    code = pareto.main([*arguments, "-o", str(whole)])
+    ended, keep = [], Checkpoint.keep
+
+    def stopping(self, *given):
+        keep(self, *given)
+        ended.append(given)
+        if len(ended) > 30:
+            raise InputError("enough")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Checkpoint, "keep", stopping)
+        assert pareto.main([*arguments, "-o", str(run)]) == 2
+    data = bytearray(kept.read_bytes())
+    for place in np.random.default_rng(1).integers(len(data), size=3):
+        data[place] ^= 1
+    kept.write_bytes(data)
+    capfd.readouterr()
+    assert pareto.main([*arguments, "-o", str(run), "--resume"]) == code
+    assert "damaged or of another run, and dropped" in capfd.readouterr().err
+    assert (run / "front.csv").read_bytes() == (whole / "front.csv").read_bytes()
+    found = [json.loads((one / "result.json").read_bytes())["points"] for one in (whole, run)]
+    assert found[0]
+    assert found[0] == found[1]
+    assert not kept.exists()

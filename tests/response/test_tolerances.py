@@ -11,7 +11,7 @@ import scipy.stats
 from rootsopt.config import load, parse
 from rootsopt.config.tolerances import scatterable
 from rootsopt.errors import InputError
-from rootsopt.optimize.checkpoint import _evaluation, _plain
+from rootsopt.response.checkpoint import plain_evaluation, read_evaluation
 from rootsopt.response.evaluation import Evaluator, _build, _motion
 from rootsopt.response.scatter import draw, quantiles, shifts
 from rootsopt.response.speeds import SpeedsEvaluator, alone
@@ -211,7 +211,7 @@ def test_scenes_begin_on_their_own_orbits(spread, monkeypatch):
     known = {part.evaluation.state.tobytes() for part in found.parts}
     assert {np.asarray(start).tobytes() for start in seen} == known
     assert again.response["mean_force_N"] == pytest.approx(found.response["mean_force_N"], 1e-8)
-    same = _evaluation(_plain(found))
+    same = read_evaluation(plain_evaluation(found))
     assert [part.values for part in same.parts] == [part.values for part in found.parts]
     np.testing.assert_array_equal(same.state, found.state)
 
@@ -265,7 +265,7 @@ def test_scatter_over_several_speeds():
         assert [p.speed_rpm for p in part.evaluation.parts] == [2000, 3000]
         for one in part.evaluation.parts:
             assert one.evaluation.response["mean_force_N"] == pytest.approx(force, rel=1e-12)
-    again = _evaluation(_plain(found))
+    again = read_evaluation(plain_evaluation(found))
     assert again.samples[1].evaluation.parts[0].speed_rpm == 2000
     for other in (
         evaluator.surveying(),

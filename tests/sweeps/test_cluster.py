@@ -13,9 +13,8 @@ import rootsopt
 from rootsopt.config import load
 from rootsopt.errors import InputError
 from rootsopt.sweeps.cluster import Cluster
-from rootsopt.sweeps.journal import Journal, read
 from rootsopt.sweeps.plan import plan_of
-from rootsopt.sweeps.scenes import complete, header
+from rootsopt.sweeps.scenes import Points, complete
 from tests.sweeps.workers import DEADLY
 
 IMPORT = str(Path(__file__).with_name("workers.py"))
@@ -39,12 +38,12 @@ def swept(path, plan, after=0, cluster=None):
             killed.append(done)
             kill_a_worker()
 
-    journal = Journal(path, header(config, plan))
+    journal = Points(config, plan, (), path)
     cluster = cluster or Cluster(2, imports=(IMPORT,))
     complete(config, plan, cluster.run, journal, progress)
     journal.close()
     assert bool(killed) == bool(after)
-    return read(path)[1]
+    return Points(config, plan, (), path, resume=True).rows
 
 
 def test_a_killed_worker_loses_and_duplicates_nothing(tmp_path, monkeypatch):

@@ -1,18 +1,17 @@
 """The work of `rootsopt optimize`."""
 
 import argparse
-import hashlib
 import threading
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, closing
 
 import jax.numpy as jnp
 from rich.console import Console
 
 from rootsopt.commands import cli, door, parallel
-from rootsopt.commands.work.searching import nothing_known, progress_bar, searched
-from rootsopt.config import Config, sources
+from rootsopt.commands.work.searching import checkpoint_of, nothing_known, progress_bar, searched
+from rootsopt.config import Config
 from rootsopt.config.families import family_of
 from rootsopt.design.resemblance import likenesses
 from rootsopt.export import chosen
@@ -22,14 +21,12 @@ from rootsopt.figures.speeds import speed_figure
 from rootsopt.figures.tolerances import distributions
 from rootsopt.measured import report as outline_report
 from rootsopt.optimize import noise
-from rootsopt.optimize.checkpoint import Checkpoint, aside, set_aside
 from rootsopt.optimize.robust import search_of
 from rootsopt.output import files, tables
 from rootsopt.output.runs import RunFolder
 from rootsopt.pump.sheet import check_clearances, record_of, warnings
 from rootsopt.response.speeds import at_speeds
 from rootsopt.response.tolerances import nominal_of
-from rootsopt.runtime.environment import say
 from rootsopt.runtime.timing import CompileClock
 from rootsopt.scene import Scene, check_geometry, outline_mm
 
@@ -49,17 +46,11 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
         door.patience(promise) as stop,
         parallel.chosen(options) as runs,
         _progress(Console(stderr=True)) as progress,
+        closing(checkpoint_of("optimize", config, options, folder)) as checkpoint,
     ):
-        checkpoint = _checkpoint(config, options, folder)
-        try:
-            config, choice, result = _searched(config, progress, stop, checkpoint, runs)
-        except BaseException:
-            checkpoint.close(remove=checkpoint.empty)
-            raise
-    checkpoint.close(remove=checkpoint.empty)
+        config, choice, result = _searched(config, progress, stop, checkpoint, runs)
     if not stop.is_set():  # A stopped search can go on later.
-        for file in (checkpoint.path, aside(checkpoint.path)):
-            folder.remove_afterwards(file)
+        folder.remove_afterwards(folder.checkpoint)
     if result is None:
         empty = {"baseline": None, "optimized": None}
         return nothing_known(config, folder, "simulated", empty)
@@ -117,26 +108,6 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
 
     found = result.optimized is not None and not result.interrupted
     return cli.Outcome(cli.OK if found else cli.NO_RESULT, show)
-
-
-def _checkpoint(config: Config, options: argparse.Namespace, folder: RunFolder):
-    """Return the checkpoint file of this run, beside the result folder.
-
-    With the option `--resume`, it contains the evaluations of the interrupted run. Without it, an
-    existing checkpoint is moved aside until a run has ended."""
-    path = folder.checkpoint
-    older = None if options.resume else set_aside(path)
-    if older is not None:
-        say(
-            f"an interrupted run has left a checkpoint, which is now {str(older)!r} and is deleted "
-            f"when this run ends; to go on with the interrupted run, stop this one, move the file "
-            f"back to {path.name!r}, and add `--resume`"
-        )
-    header = {"config": config.model_dump(mode="json"), "versions": files.versions()}
-    if config.profile.from_file:
-        source = sources.regular_file(config.profile.outline_file or "", "an outline")
-        header["outline"] = hashlib.sha256(source.read_bytes()).hexdigest()
-    return Checkpoint(path, header, options.resume)
 
 
 def _searched(config: Config, progress, stop: threading.Event, checkpoint, runs):

@@ -3,25 +3,23 @@
 import argparse
 import time
 from contextlib import closing
+from functools import partial
 from typing import Any
 
 from rich.console import Console
 
 from rootsopt.commands import cli, door
-from rootsopt.commands.work.searching import progress_bar
+from rootsopt.commands.work.searching import opened, progress_bar
 from rootsopt.config import Config
 from rootsopt.config.plausible import notes_on_swept
 from rootsopt.errors import InputError
 from rootsopt.figures.sweep import sweep_figure
-from rootsopt.optimize.checkpoint import aside, set_aside
 from rootsopt.output import datasets, files, sweeps
 from rootsopt.output.runs import RunFolder
-from rootsopt.runtime.environment import say
 from rootsopt.status import Status
 from rootsopt.sweeps.axes import parse_over
-from rootsopt.sweeps.journal import Journal
 from rootsopt.sweeps.plan import Plan, plan_of, scattered
-from rootsopt.sweeps.scenes import checked, complete, header, runner
+from rootsopt.sweeps.scenes import Points, checked, complete, runner
 from rootsopt.sweeps.table import dataset_of
 
 _DATA = "sweep.nc"
@@ -45,11 +43,11 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     folder.add_notes(found)
     run = runner(options.workers, options.scheduler, options.imports, not options.no_cache)
     with (
-        closing(_journal(config, plan, options, folder)) as journal,
+        closing(opened(partial(Points, config, plan, options.imports), options, folder)) as journal,
         door.patience(_PROMISE) as stop,
         progress_bar(Console(stderr=True), _FIRST, "simulating", "points") as progress,
     ):
-        known = len(journal.rows)
+        known = len(journal.resumed)
         records = complete(config, plan, run, journal, progress or _silent, stop)
     done = len(records) == plan.count
     seconds = time.perf_counter() - began
@@ -64,8 +62,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     if not options.no_figures:
         sweep_figure(folder, plan, dataset)
     if done:
-        for spent in (folder.checkpoint, aside(folder.checkpoint)):
-            folder.remove_afterwards(spent)
+        folder.remove_afterwards(folder.checkpoint)
     else:
         folder.overwrite = False  # An earlier result is more valuable than this one.
 
@@ -107,21 +104,6 @@ def _plan(options: argparse.Namespace) -> Plan:
         raise InputError("`--seed` is for samples; add `--sample N` or `--sobol N`, or remove it")
     seed = 0 if options.seed is None else options.seed
     return plan_of(axes, options.zip or groups, options.sample, options.sobol, seed)
-
-
-def _journal(config: Config, plan: Plan, options: argparse.Namespace, folder: RunFolder) -> Journal:
-    """Return the journal of this run, beside the result folder.
-
-    Without `--resume`, the journal of an interrupted run is moved aside until a run has ended."""
-    path = folder.checkpoint
-    older = None if options.resume else set_aside(path)
-    if older is not None:
-        say(
-            f"an interrupted run has left its points, which are now in {str(older)!r} until this "
-            "run has ended; to go on with that run, stop this one, move the file back to "
-            f"{path.name!r}, and add `--resume`"
-        )
-    return Journal(path, header(config, plan, options.imports), options.resume)
 
 
 def _silent(done: int, expected: int) -> None:

@@ -3,13 +3,13 @@
 import argparse
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, closing
 from typing import Any
 
 from rich.console import Console
 
 from rootsopt.commands import cli, door, parallel
-from rootsopt.commands.work.searching import nothing_known, progress_bar, searched
+from rootsopt.commands.work.searching import checkpoint_of, nothing_known, progress_bar, searched
 from rootsopt.config import Config
 from rootsopt.figures import page
 from rootsopt.figures.front import front_figure
@@ -36,8 +36,11 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
         door.patience(promise) as stop,
         parallel.chosen(options) as runs,
         _progress(Console(stderr=True)) as progress,
+        closing(checkpoint_of("pareto", config, options, folder)) as checkpoint,
     ):
-        config, choice, front = _traced(config, progress, stop, runs)
+        config, choice, front = _traced(config, progress, stop, runs, checkpoint)
+    if not stop.is_set():  # A stopped search can go on later.
+        folder.remove_afterwards(folder.checkpoint)
     if front is None:
         return nothing_known(config, folder, "evaluated", {"points": []})
     ran = time.perf_counter() - began
@@ -72,12 +75,13 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     return cli.Outcome(cli.OK if found else cli.NO_RESULT, show)
 
 
-def _traced(config: Config, progress, stop, runs) -> "tuple[Config, dict[str, Any], Front | None]":
+def _traced(config: Config, *how) -> "tuple[Config, dict[str, Any], Front | None]":
     """Trace the front; return (config, settings chosen for `auto`, front).
 
-    In the returned config, the chosen settings replace `auto`. The front is `None` if the search
-    was stopped before the baseline was evaluated."""
-    return searched(config, lambda given: Tracer(given, progress, stop, runs), stop)
+    `how`: further arguments of `Tracer`, the event that stops it second. In the returned config,
+    the chosen settings replace `auto`. The front is `None` if the search was stopped before the
+    baseline was evaluated."""
+    return searched(config, lambda given: Tracer(given, *how), how[1])
 
 
 def _progress(console) -> "AbstractContextManager[Callable[..., None] | None]":

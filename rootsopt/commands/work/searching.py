@@ -1,8 +1,11 @@
-"""Shared parts of the commands that search: `optimize` and `pareto`."""
+"""Shared parts of the commands that search or sweep: `optimize`, `pareto` and `sweep --over`."""
 
+import argparse
 import contextlib
 import threading
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from rich.console import Console
@@ -13,7 +16,10 @@ from rootsopt.config import Config
 from rootsopt.optimize.search import until_stopped
 from rootsopt.output import files
 from rootsopt.output.runs import RunFolder
+from rootsopt.response.checkpoint import Checkpoint
 from rootsopt.response.choice import resolve
+from rootsopt.runtime.environment import say
+from rootsopt.runtime.journal import Journal, header_of, set_aside
 from rootsopt.status import Status
 
 Found = TypeVar("Found", covariant=True)
@@ -31,6 +37,37 @@ class Searches(Protocol[Found]):
     def run(self) -> Found: ...
 
     def so_far(self) -> Found | None: ...
+
+
+J = TypeVar("J", bound=Journal)
+
+
+def checkpoint_of(
+    command: str, config: Config, options: argparse.Namespace, folder: RunFolder
+) -> Checkpoint:
+    """Return the checkpoint of a search, beside the result folder. Arguments: see `opened`."""
+    header = header_of(command, config, options.imports)
+    return opened(partial(Checkpoint, header), options, folder)
+
+
+def opened(make: Callable[[Path, bool], J], options: argparse.Namespace, folder: RunFolder) -> J:
+    """Return the journal of this run, beside the result folder.
+
+    `make`: function that opens it, given its path and whether to resume. With the option
+    `--resume`, it begins with the results of the interrupted run. Without it, an existing journal
+    is moved aside until a run has ended."""
+    path = folder.checkpoint
+    older = None if options.resume else set_aside(path)
+    if older is not None:
+        say(
+            f"an interrupted run has left a checkpoint, which is now {str(older)!r} and is deleted "
+            f"when this run ends; to go on with the interrupted run, stop this one, move the file "
+            f"back to {path.name!r}, and add `--resume`"
+        )
+    found = make(path, options.resume)
+    if found.damage:
+        say(found.damage)
+    return found
 
 
 def searched(

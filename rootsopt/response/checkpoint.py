@@ -1,0 +1,136 @@
+"""Keeps the evaluations of a search in a journal, so that a killed search can be resumed.
+
+A search is deterministic: the same evaluations lead to the same points. A resumed search starts
+from the beginning, but takes stored evaluations from the file instead of simulating them. It then
+continues with the same numbers, to the last bit, as an uninterrupted search."""
+
+import dataclasses
+import hashlib
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import TypeAdapter
+
+from rootsopt.dynamics.maxima import Maxima
+from rootsopt.response.evaluation import Evaluation
+from rootsopt.response.speeds import AtSpeed, SpeedsEvaluation
+from rootsopt.response.tolerances import AtSample, ToleranceEvaluation
+from rootsopt.response.wrapper import Evaluates
+from rootsopt.runtime.journal import Journal
+from rootsopt.status import Status
+
+_POINT = TypeAdapter(list[float])
+_NUMBERS = TypeAdapter(dict[str, float])
+_KINDS = {
+    "design": _NUMBERS,
+    "geometry": _NUMBERS,
+    "response": _NUMBERS,
+    "gradient": TypeAdapter(dict[str, dict[str, float]]),
+    "steady_state": TypeAdapter(dict[str, Any]),
+    "statistics": TypeAdapter(dict[str, Any]),
+    "message": TypeAdapter(str),
+}
+"""Types of the fields of an evaluation that are plain values."""
+
+
+class Checkpoint(Journal):
+    """A journal whose results are (point (d,) in the unit box as a list, evaluation).
+
+    `reused`: number of evaluations that were taken from a resumed file."""
+
+    reused = 0
+
+    def evaluated(
+        self,
+        run: Callable[..., Evaluation],
+        stage: str,
+        evaluator: Evaluates,
+        point: NDArray[np.float64],
+        design: ArrayLike,
+        start: NDArray[np.float64] | None,
+    ) -> Evaluation:
+        """Return `run(evaluator, design, start)`, or the evaluation stored for the same arguments.
+
+        `stage`: name of the evaluator; `point` (d,): the `design` (d,) in the unit box."""
+        begun = b"" if start is None else np.ascontiguousarray(start).tobytes()
+        key = stage, hashlib.sha256(point.tobytes() + begun).hexdigest()[:16]
+        known = self.known(key, point)
+        if known is not None:
+            evaluator.recall(known, lambda: evaluator(design, start=start, series=False), start)
+            return known
+        found = run(evaluator, design, start)
+        self.keep(key, point, found)
+        return found
+
+    def known(self, key: Any, point: NDArray[np.float64]) -> Evaluation | None:
+        """Return the evaluation stored under `key`, or `None` unless it belongs to `point` (d,).
+
+        Only evaluations that were read from a resumed file are found."""
+        with self._lock:
+            if key not in self.resumed or self.rows[key][0] != point.tolist():
+                return None
+            self.reused += 1
+            return self.rows[key][1]
+
+    def keep(self, key: Any, point: NDArray[np.float64], evaluation: Evaluation) -> None:
+        """Add the `evaluation` of a `point` (d,)."""
+        self.add([(key, (point.tolist(), evaluation))])
+
+    def read(self, key: Any, value: Any) -> tuple[list[float], Evaluation]:
+        point, evaluation = value
+        if not isinstance(key, tuple):
+            raise TypeError("an evaluation has a key of several parts")
+        return _POINT.validate_python(point, strict=True), read_evaluation(evaluation)
+
+    def plain(self, result: tuple[list[float], Evaluation]) -> Any:
+        return result[0], plain_evaluation(result[1])
+
+
+def plain_evaluation(evaluation: Evaluation) -> dict[str, Any]:
+    """Return an evaluation as plain values for JSON, without its time series."""
+    names = (field.name for field in dataclasses.fields(Evaluation))
+    found = {name: getattr(evaluation, name) for name in names}
+    maxima, state = evaluation.maxima, evaluation.state
+    found |= {
+        "series": None,
+        "status": evaluation.status.name,
+        "state": None if state is None else np.asarray(state).tolist(),
+        "maxima": None if maxima is None else [part.tolist() for part in maxima],
+        "rivals": [plain_evaluation(one) for one in evaluation.rivals],
+    }
+    if isinstance(evaluation, SpeedsEvaluation):
+        parts = evaluation.parts
+        found["parts"] = [[p.speed_rpm, p.share, plain_evaluation(p.evaluation)] for p in parts]
+    if isinstance(evaluation, ToleranceEvaluation):
+        scenes = evaluation.parts
+        found["scenes"] = [[part.values, plain_evaluation(part.evaluation)] for part in scenes]
+    return found
+
+
+def read_evaluation(found: Mapping[str, Any]) -> Evaluation:
+    """Return the evaluation from the plain values that `plain_evaluation` returned.
+
+    Raises `ValueError`, `LookupError` or `TypeError` if they are none."""
+    values = dict(found)
+    parts, scenes = values.pop("parts", None), values.pop("scenes", None)
+    for name, kind in _KINDS.items():
+        kind.validate_python(values[name], strict=True)
+    if values["state"] is not None:
+        values["state"] = np.asarray(values["state"], np.float64)
+    if values["maxima"] is not None:
+        times, forces, slopes = (np.asarray(part, np.float64) for part in values["maxima"])
+        values["maxima"] = Maxima(times, forces, slopes.reshape(len(times), len(values["design"])))
+    values["status"] = Status[values["status"]]
+    values["rivals"] = tuple(read_evaluation(one) for one in values["rivals"])
+    if scenes is not None:
+        samples = tuple(AtSample(numbers, read_evaluation(one)) for numbers, one in scenes)
+        return ToleranceEvaluation(**values, parts=samples)
+    if parts is None:
+        return Evaluation(**values)
+    every = tuple(AtSpeed(speed, share, read_evaluation(one)) for speed, share, one in parts)
+    return SpeedsEvaluation(**values, parts=every)
+
+
+__all__ = ["Checkpoint", "plain_evaluation", "read_evaluation"]

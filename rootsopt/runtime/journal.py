@@ -1,0 +1,232 @@
+"""Keeps the results of a run in a file as they are computed, so that a killed run can be resumed.
+
+The first line of the file, the header, states everything on which the results depend. Each further
+line holds one result under its key. A line is a checksum and JSON, which preserves every float
+exactly. The checksum of a result covers the header too, so that a damaged line and a line of
+another run are both recognised. Such lines are dropped, and their results are computed again."""
+
+import contextlib
+import hashlib
+import json
+import os
+import threading
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rootsopt.config import Config
+from rootsopt.config.sources import reason, regular_file
+from rootsopt.config.words import shown
+from rootsopt.errors import InputError
+from rootsopt.runtime.versions import versions
+
+_SHOWN = 5
+"""Maximum number of differences that an error message lists."""
+_ABSENT = "absent"
+
+
+class Journal:
+    """Results of one run by their key, `rows`, and the file in which they are kept.
+
+    A key is a number, or a tuple of numbers and texts.
+
+    `header`: everything on which the results depend, as nested mappings of plain values; `path`:
+    path of the file, `None` to keep the results in memory only; `resume`: whether to begin with the
+    results in the file. Threads can share an instance, but only one process may use the file.
+    `resumed`: keys of the results that were in the file; `dropped`: number of its lines that were
+    damaged or not valid.
+
+    With `resume`, raises `InputError` if the file does not exist or has another header. Raises
+    `OSError` if the file cannot be opened for writing."""
+
+    def __init__(self, header: Mapping[str, Any], path: Path | None, resume: bool = False):
+        self.path, self.dropped = path, 0
+        self.rows: dict[Any, Any] = {}
+        self.resumed: frozenset[Any] = frozenset()
+        self._lock, self._file = threading.Lock(), None
+        if path is None:
+            if resume:
+                raise InputError(
+                    "`resume` needs `checkpoint`, the file of the interrupted run, but there is "
+                    "none; give its path, or leave out `resume`"
+                )
+            return
+        head = _line(header, b"")
+        self._seal = head.split(b" ")[0]
+        lines = self._kept(path, head) if resume else []
+        self.resumed = frozenset(self.rows)
+        fresh = path.with_name(path.name + ".new")
+        fresh.write_bytes(b"".join([head, *lines]))
+        fresh.replace(path)
+        self._file = open(path, "ab")  # noqa: SIM115
+
+    def read(self, key: Any, value: Any) -> Any:
+        """Return the result whose plain value is `value`.
+
+        Raises `ValueError`, `LookupError` or `TypeError` if it is not valid."""
+        del key
+        return value
+
+    def plain(self, result: Any) -> Any:
+        """Return a result as a plain value for JSON, the inverse of `read`."""
+        return result
+
+    def add(self, results: Iterable[tuple[Any, Any]]) -> None:
+        """Add results (key, result) and flush them to the disk; known keys are ignored.
+
+        An `OSError`, such as a full disk, is ignored: the run continues without the file."""
+        with self._lock:
+            new = {key: result for key, result in results if key not in self.rows}
+            self.rows |= new
+            # A search that was stopped may still finish an evaluation.
+            if self._file is None or self._file.closed:
+                return
+            lines = (_line([key, self.plain(one)], self._seal) for key, one in new.items())
+            with contextlib.suppress(OSError):
+                self._file.write(b"".join(lines))
+                self._file.flush()
+                os.fsync(self._file.fileno())
+
+    def close(self) -> None:
+        """Close the file, and remove it if it holds no results; a second call does nothing."""
+        with self._lock:
+            if self._file is None or self._file.closed:
+                return
+            with contextlib.suppress(OSError):
+                self._file.close()
+            if self.path is not None and not self.rows:
+                self.path.unlink(missing_ok=True)
+
+    @property
+    def damage(self) -> str:
+        """Message about dropped lines; empty if there are none."""
+        if not self.dropped:
+            return ""
+        lines = "1 line is" if self.dropped == 1 else f"{self.dropped} lines are"
+        kept = f"{len(self.rows)} results are kept" if len(self.rows) != 1 else "1 result is kept"
+        return (
+            f"{str(self.path)!r}: {lines} damaged or of another run, and dropped; {kept}, and the "
+            "others are computed again"
+        )
+
+    def _kept(self, path: Path, head: bytes) -> list[bytes]:
+        """Read the results, and return their lines.
+
+        `head`: first line of the file if it is of this run. Raises `InputError` if the file cannot
+        be read, or if its header is a different one."""
+        try:
+            first, *others = path.read_bytes().split(b"\n")
+        except OSError:
+            raise InputError(
+                f"`--resume` needs the checkpoint of an interrupted run, but there is no "
+                f"{str(path)!r}; leave out `--resume`, or name that run's folder with --output"
+            ) from None
+        try:
+            found = _content(first, b"")
+        except ValueError:
+            self.dropped += bool(first)
+        else:
+            _compare(found, _content(head[:-1], b""))
+        kept = []
+        for line in filter(None, others):
+            try:
+                key, value = _content(line, self._seal)
+                key = tuple(key) if isinstance(key, list) else key
+                if key not in self.rows:
+                    self.rows[key] = self.read(key, value)
+                    kept.append(line + b"\n")
+            except (ValueError, LookupError, TypeError):
+                self.dropped += 1
+        return kept
+
+
+def header_of(
+    command: str,
+    config: Config,
+    imports: Sequence[str] = (),
+    outlines: Sequence[str | None] = (),
+    **more: Any,
+) -> dict[str, Any]:
+    """Return everything on which the results of a `command` depend, as plain values.
+
+    `imports`: names of the files and modules that were imported first; `outlines`: paths of outline
+    files beside the config's own; `more`: further entries. Raises `InputError` if a file cannot be
+    read."""
+    files = {path for path in (config.profile.outline_file, *outlines) if path is not None}
+    files |= {name for name in imports if os.path.isfile(name)}
+    return {
+        "command": command,
+        "config": config.model_dump(mode="json"),
+        "versions": versions(),
+        "imports": [*imports],
+        "files": {path: _file_digest(path) for path in sorted(files)},
+        **more,
+    }
+
+
+def aside(path: Path) -> Path:
+    """Return the path to which `set_aside` moves the file `path`."""
+    return path.with_name(path.name + ".old")
+
+
+def set_aside(path: Path) -> Path | None:
+    """Move the file `path` of an interrupted run to `aside(path)`, and return that path.
+
+    An older file of that name is replaced. Return `None` if there is no file. Raises `OSError` if
+    the file cannot be moved."""
+    return path.replace(aside(path)) if path.is_file() else None
+
+
+def _digest(*parts: bytes) -> bytes:
+    return hashlib.blake2b(b" ".join(parts), digest_size=8).hexdigest().encode()
+
+
+def _line(content: Any, seal: bytes) -> bytes:
+    """Return a line of the file; `seal`: checksum of the header, empty for the header itself."""
+    text = json.dumps(content, default=lambda value: value.tolist()).encode()
+    return b"%s %s\n" % (_digest(seal, text), text)
+
+
+def _content(line: bytes, seal: bytes) -> Any:
+    """Return the content of a line without its end. Raises `ValueError` if it is damaged."""
+    checksum, _, text = line.partition(b" ")
+    if checksum != _digest(seal, text):
+        raise ValueError("damaged")
+    return json.loads(text)
+
+
+def _compare(found: Any, header: Any) -> None:
+    """Raise `InputError` if the header `found` in the file differs from `header`."""
+    old, new = _flat(found), _flat(header)
+    keys = [key for key in dict.fromkeys((*new, *old)) if old.get(key) != new.get(key)]
+    if not keys:
+        return
+    changes = [
+        f"{key} (then {shown(old.get(key, _ABSENT))}, now {shown(new.get(key, _ABSENT))})"
+        for key in keys[:_SHOWN]
+    ]
+    more = f" and {len(keys) - _SHOWN} more" if len(keys) > _SHOWN else ""
+    raise InputError(
+        f"`--resume` needs the config, the files and the versions of the interrupted run, but "
+        f"these differ: {', '.join(changes)}{more}; restore them, or leave out `--resume`"
+    )
+
+
+def _flat(tree: Any, name: str = "") -> dict[str, Any]:
+    """Return the values in nested mappings as one mapping with names joined by `: `."""
+    if not isinstance(tree, dict):
+        return {name: tree}
+    found: dict[str, Any] = {}
+    for key, value in tree.items():
+        found |= _flat(value, f"{name}: {key}" if name else key)
+    return found
+
+
+def _file_digest(path: str) -> str:
+    try:
+        return hashlib.sha256(regular_file(path, "an outline").read_bytes()).hexdigest()
+    except OSError as error:
+        raise InputError(f"{path!r}: cannot be read: {reason(error)}") from None
+
+
+__all__ = ["Journal", "aside", "header_of", "set_aside"]

@@ -1,0 +1,331 @@
+"""The file with the results of a run: what is kept, dropped and refused."""
+
+import dataclasses
+import json
+import random
+
+import numpy as np
+import pytest
+
+import rootsopt
+from rootsopt.config import load
+from rootsopt.dynamics.maxima import Maxima
+from rootsopt.errors import InputError
+from rootsopt.response.checkpoint import Checkpoint, plain_evaluation
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.speeds import AtSpeed, SpeedsEvaluation
+from rootsopt.runtime.journal import Journal, _content, _line, header_of, set_aside
+from rootsopt.status import Status
+from rootsopt.sweeps import points
+from rootsopt.sweeps.plan import plan_of
+from rootsopt.sweeps.points import lost
+from rootsopt.sweeps.scenes import Points
+from tests.optimize.test_checkpoint import evaluation
+
+ROW = lost(Status.INVALID) | {"response": {"mean_force_N": 0.1 + 0.2, "peak_force_N": float("nan")}}
+SPEED = "scene.speed_rpm"
+PLAN = plan_of({SPEED: "1,2,3,4,5,6,7,8"})
+CIC = load("cic")
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "points"
+
+
+def sweep(path, resume=False, plan=PLAN):
+    return Points(CIC, plan, (), path, resume)
+
+
+def search(path, resume=False):
+    return Checkpoint({"a": 1}, path, resume)
+
+
+def rows_of(kind):
+    """Return results as a run would add them."""
+    if kind is sweep:
+        return [(k, ROW | {"message": f"row {k}"}) for k in (3, 1, 0, 7, 5, 6)]
+    parts = tuple(AtSpeed(rpm, 0.5, evaluation(rpm / 7)) for rpm in (1000.0, 2000.0))
+    several = SpeedsEvaluation(
+        **{
+            f.name: getattr(parts[0].evaluation, f.name)
+            for f in dataclasses.fields(parts[0].evaluation)
+        },
+        parts=parts,
+    )
+    maxima = Maxima(np.array([0.1]), np.array([1 / 3]), np.array([[2 / 3]]))
+    corner = dataclasses.replace(evaluation(0.5), maxima=maxima, rivals=(evaluation(0.25),))
+    every = [evaluation(0.1), several, corner, evaluation(float("nan"))]
+    keys = [(0, 3), (-1, 2), ("search", "0123"), (1, 0)]
+    return [(key, ([0.1 * k], one)) for k, (key, one) in enumerate(zip(keys, every, strict=True))]
+
+
+def texts(journal):
+    """Return all results as text, which preserves every bit."""
+    return {key: json.dumps(journal.plain(one)) for key, one in journal.rows.items()}
+
+
+def filled(path, kind=sweep):
+    journal = kind(path)
+    for row in rows_of(kind):
+        journal.add([row])
+    journal.close()
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize("kind", [sweep, search])
+def test_results_come_back_exactly(path, kind):
+    data, rows = filled(path, kind), rows_of(kind)
+    journal = kind(path, resume=True)
+    assert [*journal.rows] == [key for key, _ in rows] == [*texts(journal)]
+    assert journal.dropped == 0
+    assert not journal.damage
+    same = {key: json.dumps(journal.plain(one)) for key, one in rows}
+    assert texts(journal) == same
+    journal.add([(rows[0][0], rows[1][1])])  # The first result of a key counts.
+    journal.close()
+    assert path.read_bytes() == data
+
+
+def test_floats_and_types_come_back(path):
+    filled(path, search)
+    found = search(path, resume=True)
+    one = found.known((0, 3), np.array([0.0]))
+    assert one.state.tobytes() == evaluation(0.1).state.tobytes()
+    assert one.status is Status.PERIODIC
+    assert found.known((0, 3), np.array([1e-300])) is None
+    assert found.known((0, 4), np.array([0.0])) is None
+    several = found.known((-1, 2), np.array([0.1]))
+    assert type(several) is SpeedsEvaluation
+    assert several.parts[1].evaluation.response == evaluation(2000 / 7).response
+    assert found.rows["search", "0123"][1].maxima.slopes.shape == (1, 1)
+    assert found.reused == 2
+
+
+def test_every_cut_leaves_a_file_to_go_on_with(path):
+    """As a kill at any byte would."""
+    data = filled(path)
+    ends = [k + 1 for k, byte in enumerate(data) if byte == ord("\n")]
+    for size in (0, 3, *(end + d for end in ends for d in (-1, 0, 1) if end + d <= len(data))):
+        path.write_bytes(data[:size])
+        journal = sweep(path, resume=True)
+        # A line without its end is whole if nothing else is missing.
+        assert len(journal.rows) == max(0, sum(end - 1 <= size for end in ends) - 1)
+        journal.add([(2, ROW)])
+        journal.close()
+        assert 2 in sweep(path, resume=True).rows
+
+
+def damaged(data, chance):
+    """Return the content of a file after one to three damages, as any of them may happen."""
+    for _ in range(chance.randint(1, 3)):
+        lines = data.split(b"\n")
+        place = chance.randrange(max(1, len(data)))
+        one, other = (chance.randrange(len(lines)) for _ in range(2))
+        kind = chance.choice(["bit", "bits", "cut", "hole", "swap", "twice", "lost", "text", "key"])
+        if kind.startswith("bit"):
+            many = bytearray(data)
+            for k in [place] if kind == "bit" else range(place, min(place + 9, len(many))):
+                many[k] ^= 1 << chance.randrange(8)
+            data = bytes(many)
+            continue
+        if kind in ("cut", "hole"):
+            data = data[:place] + (b"" if kind == "cut" else data[place + chance.randint(1, 90) :])
+            continue
+        if kind == "swap":
+            lines[one], lines[other] = lines[other], lines[one]
+        elif kind == "twice":
+            lines.insert(other, lines[one])
+        elif kind == "lost":
+            del lines[one]
+        elif kind == "text":
+            lines[one] = chance.choice(
+                [b"{}", b"[1]", b"null", b"\xff", b"NaN", b"[" * 9999, b"1 2"]
+            )
+        else:
+            lines[one] = lines[one].replace(b"[3, ", b"[99, ").replace(b"0.3", b"NaN")
+        data = b"\n".join(lines)
+    return data
+
+
+@pytest.mark.parametrize("kind", [sweep, search])
+def test_damage_costs_results_but_never_changes_them(path, kind):
+    """No error, no changed result; the same file as without damage once the rest is added again."""
+    data, chance = filled(path, kind), random.Random(5)
+    whole, known = sorted(data.splitlines()), texts(kind(path, resume=True))
+    counts = []
+    for _ in range(100):
+        path.write_bytes(damaged(data, chance))
+        journal = kind(path, resume=True)
+        found = texts(journal)
+        assert found.items() <= known.items()
+        assert bool(journal.dropped) == bool(journal.damage)
+        counts.append((len(found), journal.dropped))
+        journal.add(rows_of(kind))
+        journal.close()
+        assert sorted(path.read_bytes().splitlines()) == whole
+    assert sum(dropped > 0 for _, dropped in counts) > 50
+    assert np.mean([rows for rows, _ in counts]) > 0.5 * len(known)
+
+
+def test_results_of_the_wrong_type_are_dropped(path):
+    """Although their checksum is right, as after a mistake of the program that wrote them."""
+    plain = plain_evaluation(evaluation(0.5))
+    wrong = [
+        (99, ROW), (-1, ROW), ("1", ROW), (None, ROW), ([], ROW), ({}, ROW),
+        (2, None), (2, []), (2, {}), (2, ROW | {"status": "well"}), (2, ROW | {"more": 1}),
+        (2, ROW | {"response": {"mean_force_N": "1"}}), (2, ROW | {"gradient": {"a": 1.0}}),
+    ]  # fmt: skip
+    filled(path)
+    seal = path.read_bytes().split(b" ")[0]
+    path.write_bytes(path.read_bytes() + b"".join(_line([*row], seal) for row in wrong))
+    journal = sweep(path, resume=True)
+    assert (len(journal.rows), journal.dropped) == (len(rows_of(sweep)), len(wrong))
+    assert f"{len(wrong)} lines are damaged" in journal.damage
+
+    other = path.with_name("search")
+    filled(other, search)
+    seal = other.read_bytes().split(b" ")[0]
+    wrong = [
+        plain | {"status": "WELL"}, plain | {"state": "a"}, plain | {"state": [[1.0], [1.0, 2.0]]},
+        plain | {"maxima": [[1.0], [2.0]]}, plain | {"maxima": [[1.0], [2.0], [1.0, 2.0, 3.0]]},
+        plain | {"response": {"a": None}}, plain | {"design": []}, plain | {"more": 1},
+        plain | {"rivals": [1]}, plain | {"parts": [[1.0]]}, {}, None, plain | {"message": 1},
+    ]  # fmt: skip
+    lines = [_line([[5, k], [[0.5], one]], seal) for k, one in enumerate(wrong)]
+    lines += [_line([[5, 98], [["a"], plain]], seal), _line([5, [[0.5], plain]], seal)]
+    other.write_bytes(other.read_bytes() + b"".join(lines))
+    found = search(other, resume=True)
+    assert (len(found.rows), found.dropped) == (len(rows_of(search)), len(lines))
+
+
+def test_an_evaluation_is_known_by_its_stage_point_and_start(path, monkeypatch):
+    """What is read is remembered by the evaluator, so that neighbours can begin there."""
+    asked, told, one = [], [], Evaluator.of(CIC)
+    monkeypatch.setattr(Evaluator, "__call__", lambda self, design, start, series: (start, series))
+    monkeypatch.setattr(Evaluator, "recall", lambda self, *given: told.append(given))
+
+    def run(evaluator, design, start):
+        asked.append((design[0], start))
+        return evaluation(design[0] if start is None else start[0])
+
+    point, start = np.array([0.5]), np.array([0.25, 1.0])
+    tasks = [("search", None), ("search", start), ("search", 2 * start), ("verification", None)]
+    numbers = []
+    for resume in (False, True):
+        journal = search(path, resume)
+        given = [(run, stage, one, point, 2 * point, begun) for stage, begun in tasks]
+        numbers.append([journal.evaluated(*task).response["mean_force_N"] for task in given])
+        journal.close()
+        assert len(asked) == 4
+    assert numbers[0] == numbers[1] == [1 / 3, 0.25 / 3, 0.5 / 3, 1 / 3]
+    assert len(told) == 4
+    found, again, begun = told[1]
+    assert found.response["mean_force_N"] == 0.25 / 3
+    assert begun is start
+    assert again() == (start, False)
+    other = search(path, resume=True)
+    other.evaluated(run, "search", one, point + 0.25, point, None)
+    assert len(asked) == 5
+
+
+def test_a_line_of_another_run_is_dropped(path):
+    """A row of another plan could have the same number."""
+    other = path.with_name("other")
+    sweep(other, plan=plan_of({SPEED: "1,2,3,4,5,6,7,9"})).add([(2, ROW)])
+    path.write_bytes(filled(path) + other.read_bytes().splitlines(keepends=True)[1])
+    journal = sweep(path, resume=True)
+    assert 2 not in journal.rows
+    assert "1 line is damaged or of another run, and dropped; 6 results are kept" in journal.damage
+
+
+def test_a_run_that_does_not_resume_keeps_the_older_file(path):
+    assert set_aside(path) is None
+    filled(path)
+    older = set_aside(path)
+    assert older == path.with_name("points.old")
+    older.rename(path)
+    assert len(sweep(path, resume=True).rows) == len(rows_of(sweep))
+
+
+def test_a_file_without_results_is_not_left_behind(path):
+    sweep(path).close()
+    assert not path.exists()
+    assert not [*path.parent.iterdir()]
+
+
+def test_a_full_disk_does_not_end_the_run(path, monkeypatch):
+    journal = sweep(path)
+
+    def full(_):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("os.fsync", full)
+        journal.add([(1, ROW)])
+    journal.add([(2, ROW)])
+    assert [*journal.rows] == [1, 2]
+    journal.close()
+    journal.add([(3, ROW)])  # A search that was stopped may still finish an evaluation.
+    assert [*sweep(path, resume=True).rows] == [1, 2]
+
+
+def test_what_differs_is_named(path, tmp_path):
+    plan = plan_of({SPEED: "1,2"})
+    rotor = tmp_path / "rotor.csv"
+    rotor.write_text("1,2")
+    files = {"imports": [], "outlines": [str(rotor), None]}
+    head = header_of("sweep", CIC, **files, sweep=plan.record())
+    journal = Journal(head, path)
+    journal.add([(0, ROW)])
+    journal.close()
+    before = path.read_bytes()
+    slower = CIC.replaced({"scene.load.torque_N_m": 9.0})
+    others = {
+        "config: scene: load: torque_N_m": header_of("sweep", slower, **files, sweep=plan.record()),
+        "scene.speed_rpm .then .1, 2., now .1.0, 3.0.": header_of(
+            "sweep", CIC, **files, sweep=plan_of({SPEED: [1.0, 3.0]}).record()
+        ),
+        r"command \(then 'sweep', now 'pareto'": header_of("pareto", CIC, **files),
+        r"versions: jax \(then": head | {"versions": head["versions"] | {"jax": "0.0.1"}},
+    }
+    rotor.write_text("1,3")
+    others[r"files: .*rotor\.csv \(then '"] = header_of("sweep", CIC, **files, sweep=plan.record())
+    for words, changed in others.items():
+        with pytest.raises(InputError, match=words):
+            Journal(changed, path, resume=True)
+    assert path.read_bytes() == before
+    with pytest.raises(InputError, match="there is no"):
+        Journal({}, path.with_name("absent"), resume=True)
+    with pytest.raises(InputError, match="cannot be read"):
+        header_of("sweep", CIC, outlines=[str(tmp_path / "absent.csv")])
+
+
+def test_sweep_goes_on_where_it_stopped(path, monkeypatch):
+    """Each point is simulated once, except for a damaged one, which is named in a warning.
+
+    The dataset is that of an uninterrupted sweep."""
+    asked = []
+
+    def check(config):
+        asked.append(config.scene.speed_rpm)
+        if len(asked) == 4:
+            raise KeyboardInterrupt
+        raise InputError("no")
+
+    monkeypatch.setattr(points, "check_geometry", check)
+    monkeypatch.setattr("os.cpu_count", lambda: 1)
+    axes = {SPEED: "1,2,3,4,5"}
+    with pytest.raises(KeyboardInterrupt):
+        rootsopt.sweep_scenes(CIC, axes, checkpoint=path)
+    head, first, *lines = path.read_bytes().splitlines(keepends=True)
+    assert 1 <= len(lines) <= 3
+    path.write_bytes(b"".join([head, first.replace(b"no", b"on"), *lines]))
+    with pytest.warns(UserWarning, match="1 line is damaged"):
+        found = rootsopt.sweep_scenes(CIC, axes, checkpoint=path, resume=True)
+    assert found.identical(rootsopt.sweep_scenes(CIC, axes))
+    head, *lines = path.read_bytes().split(b"\n")[:-1]
+    numbers = [_content(line, head.split(b" ")[0])[0] for line in lines]
+    assert sorted(numbers) == [0, 1, 2, 3, 4]
+    with pytest.raises(InputError, match="`resume` needs `checkpoint`"):
+        rootsopt.sweep_scenes(CIC, axes, resume=True)
