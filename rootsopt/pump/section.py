@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Complex, Float
 
 from rootsopt.profiles import Profile
@@ -51,7 +52,9 @@ def half_valley(flank: Flank, lobes: int, radius: Float[Array, "*n"]) -> Float[A
 
     `lobes`: N. Beyond the tip there is no lobe: the result is infinite. Below the root it is
     negative."""
-    away, across = jnp.abs(flank.point[::-1]), jnp.angle(flank.point[::-1])
+    # A measured root or land is not quite round: its first point that rises to the radius counts.
+    away = lax.cummax(jnp.abs(flank.point[::-1]))
+    across = jnp.angle(flank.point[::-1])
     free = jnp.pi / lobes - jnp.interp(radius, away, across)
     free = jnp.where(radius > away[-1], jnp.inf, free)
     return jnp.where(radius < away[0], (radius - away[0]) / away[0], free)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rootsopt.config import Config
-from rootsopt.config.units import MM
+from rootsopt.config.units import DEG, MM
 from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry, Profile, geometry
 from rootsopt.pump import flow
@@ -28,7 +28,7 @@ MRAD = 1e-3
 UM = 1e-6
 """One micrometre (m)."""
 _ROUNDING = 1e-8
-"""Overlap (m) of the flanks below which it counts as rounding of a measured outline."""
+"""Overlap (m) of the flanks up to which it counts as rounding of an outline."""
 LINES = 4
 """Number of lines of the flow in the sheet."""
 NOTE = (
@@ -52,7 +52,8 @@ def sheet(scene: Scene, design: Float[Array, " d"]) -> dict[str, Any]:
     With a clearance, a centre distance error or a measured outline, there is also the play.
     `angular_play_…_mrad`: least and greatest play of rotor 2 over the rotation.
     `gear_backlash_max_mm`: greatest backlash of a timing gear that keeps the flanks apart, negative
-    where the rotors overlap.
+    where they overlap. `flank_interference_…`: greatest overlap in perfect rolling (µm), and angle
+    of rotor 1 there, from a tip on the line of centres (°); absent without overlap.
 
     With a section `scene.bearings`, there are the greatest load of a bearing and the greatest
     equivalent load. For both, the timing gear carries the load instead of the flanks, and nothing
@@ -68,6 +69,8 @@ def sheet(scene: Scene, design: Float[Array, " d"]) -> dict[str, Any]:
         found["static_bearing_load_equivalent_N"] = float(jnp.max(equivalent))
     if _has_play(scene):
         found |= {key: value.tolist() for key, value in _play(scene, design).items()}
+        if found["flank_interference_um"] * UM <= _ROUNDING:
+            del found["flank_interference_um"], found["flank_interference_at_deg"]
     if scene.medium is not None:
         found |= _leaking(scene, scene.medium, design)
     return {key: found[key] for key in KEYS if key in found}
@@ -78,6 +81,13 @@ def warnings(rows: Mapping[str, Any]) -> list[str]:
 
     `rows`: the sheet."""
     found = []
+    if "flank_interference_um" in rows:
+        overlap = rows["flank_interference_um"]
+        found.append(
+            f"The flanks overlap by {overlap:.3g} um in perfect rolling, most with rotor 1 at "
+            f"{rows['flank_interference_at_deg']:.3g} deg: raise `contact.clearance_mm` by "
+            f"{overlap / 1e3:.2g} to separate them, unless this is the scatter of measured points."
+        )
     if rows.get("volumetric_efficiency", 1.0) <= 0:
         found.append(
             "More fluid leaks back than the rotors displace: the pump delivers nothing. Reduce the "
@@ -143,6 +153,8 @@ KEYS = (
     "angular_play_min_mrad",
     "angular_play_max_mrad",
     "gear_backlash_max_mm",
+    "flank_interference_um",
+    "flank_interference_at_deg",
     "static_bearing_load_max_N",
     "static_bearing_load_equivalent_N",
     "flank_gap_min_um",
@@ -193,6 +205,8 @@ def _play(scene: Scene, design: Float[Array, " d"]) -> dict[str, Array]:
         "angular_play_min_mrad": jnp.min(found.total) / MRAD,
         "angular_play_max_mrad": jnp.max(found.total) / MRAD,
         "gear_backlash_max_mm": found.gear_backlash / MM,
+        "flank_interference_um": found.overlap / UM,
+        "flank_interference_at_deg": found.overlap_at / DEG,
     }
 
 

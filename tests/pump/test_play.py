@@ -9,6 +9,7 @@ import pytest
 from matplotlib.path import Path
 
 from rootsopt.contact.nodes import pair_gap, place_pair
+from rootsopt.measured.conjugacy import conjugacy
 from rootsopt.profiles import CIC, EE
 from rootsopt.pump.gap import Allowances, mesh_gap
 from rootsopt.pump.play import play
@@ -86,9 +87,48 @@ def intersect(first, second, distance):
 
 
 def test_overlap_is_negative():
-    """A centre distance that is too small."""
+    """A centre distance that is too small: tips overlap by all of it, flanks by less."""
     found = of("cic", -2e-4)
-    assert float(found.gear_backlash) < 0
+    assert float(found.overlap) == pytest.approx(2e-4 - C, rel=2e-2)
+    lever = R * np.cos(np.radians(36.43))
+    assert float(found.gear_backlash) == pytest.approx(-2 * R * 1.5e-4 / lever, rel=2e-2)
+    assert float(of("cic").overlap) == 0
+
+
+def at_clearances(profile, clearances):
+    """Return backlash, overlap (µm) and least play (mrad) at several clearances (µm)."""
+    found = [played(profile, jnp.asarray(1e-6 * c), jnp.asarray(2 * R)) for c in clearances]
+    rows = [(1e6 * x.gear_backlash, 1e6 * x.overlap, 1e3 * jnp.min(x.total)) for x in found]
+    return np.array(rows, float).T
+
+
+@pytest.mark.parametrize("family", ["ee", "cic"])
+def test_play_is_continuous_in_the_overlap(family):
+    """Points with 2 µm of scatter: from overlap to clearance, the backlash changes by twice the
+    clearance over the cosine of the least pressure angle, and the overlap is that of the gap."""
+    profile = {"ee": EE(LOBES, R), "cic": CIC(LOBES, R, np.deg2rad(36.43), 8.5e-3, 0.07)}[family]
+    points = points_of(profile, 240)
+    points = points + 2e-3 * np.random.default_rng(0).normal(size=(len(points), 2)) @ [1, 1j]
+    scattered = profile_of(points, 2e-3)[0]
+    clearance = np.array([-5.0, -0.5, 0.0, 0.5, 5.0])
+    backlash, overlap, play = at_clearances(scattered, clearance)
+    least = 1e6 * conjugacy(scattered).least
+    assert -4 < least < -0.5
+    assert overlap == pytest.approx(np.maximum(0, -least - clearance), abs=0.2)
+    slope = np.diff(backlash) / np.diff(clearance)
+    steepest = 2 / (1 if family == "ee" else np.cos(np.radians(36.43)))
+    assert np.all((slope > 0.4 * steepest) & (slope < 1.3 * steepest))
+    assert -2.5 * steepest < backlash[2] < 0
+    assert np.all(np.abs(np.diff(play)) < 5)
+
+
+def test_play_does_not_depend_on_the_number_of_points():
+    """120 points interpolate EE to 8 µm, 12,000 to 1 nm: the backlash differs by no more."""
+    found = [profile_of(points_of(EE(LOBES, R), count))[0] for count in (10, 1000)]
+    (coarse, *_), (fine, overlap, _) = (at_clearances(one, [0.0])[:, 0] for one in found)
+    assert abs(fine) < 0.05
+    assert overlap < 0.02
+    assert -16 < coarse < 0
 
 
 def test_smaller_rotors_have_the_play_of_their_gap():
