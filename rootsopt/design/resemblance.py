@@ -7,6 +7,10 @@ The distance is that of the closed outlines (Hausdorff): the greatest distance o
 outline from the other outline. A search minimises it by linear programs. Let d be the distance from
 a point to the nearest point of an outline. By the envelope theorem, the derivative of d does not
 depend on how the nearest point moves along the outline.
+
+Rotors are often cut smaller than conjugate ones, to leave a clearance. If an outline's own mesh
+shows such an *inset*, a constant distance along the normal, the search fits it as one more
+parameter. Signed distances from an outline that is inset differ from those without by the inset.
 """
 
 import functools
@@ -25,6 +29,7 @@ from rootsopt.config.families import FREE_FORM, Parameter, family_of
 from rootsopt.config.units import DEG, MM
 from rootsopt.design.space import sobol
 from rootsopt.errors import InputError
+from rootsopt.measured.conjugacy import conjugacy
 from rootsopt.profiles import Outline, Profile, project
 from rootsopt.profiles.departure import beyond, departures, feet, flank_points
 from rootsopt.profiles.validity import PURE, margins
@@ -52,17 +57,24 @@ _UNSOUND = 1e-6
 """Magnitude of a negative margin (relative to its scale) above which a member counts as unsound."""
 
 
+_INSET, _INSET_USUAL = 0.05, 0.01
+"""Greatest inset and range of usual insets (pitch radii)."""
+
+
 class Likeness(NamedTuple):
     """The member of a family that is nearest to a profile.
 
     `family`: name of the family; `design`: the member's parameters by key, in config units;
     `departure`: Hausdorff distance (m) between the outlines of the member and the profile; `rms`:
-    root mean square of the distances (m) of the profile's points from the member."""
+    root mean square of the distances (m) of the profile's points from the member; `inset`: distance
+    (m) by which the member is made smaller along its normals before, 0 unless an outline shows an
+    inset."""
 
     family: str
     design: dict[str, float]
     departure: float
     rms: float
+    inset: float = 0.0
 
     def record(self) -> dict[str, Any]:
         """Return the fields as a dictionary for the result file, with the distances in µm."""
@@ -71,6 +83,7 @@ class Likeness(NamedTuple):
             "design": self.design,
             "departure_um": self.departure * 1e6,
             "departure_rms_um": self.rms * 1e6,
+            "inset_um": self.inset * 1e6,
         }
 
     def config(self, profile: ProfileConfig) -> ProfileConfig:
@@ -102,17 +115,18 @@ def likeness(profile: Profile, family: str) -> Likeness | None:
     parameters, keys = family_of(family).parameters, family_of(family).keys
     look = _Look(profile, family)
     if not keys:
-        return _best(look, profile, [np.zeros(0)])
+        return _best(look, profile, [_fitted(look, np.zeros(0), np.zeros(0))])
     size = float(profile.pitch_radius) / MM, profile.lobes
     low, high = np.array([parameter.usually(*size) for parameter in parameters]).T
     sample = low + (high - low) * sobol(_SAMPLE, 0, len(keys))
-    faults = np.array([look(one).fault for one in sample])
+    faults = np.array([look(look.start(one)).fault for one in sample])
     found = [_fitted(look, sample[k], high - low) for k in np.argsort(faults)[:_STARTS]]
     if not family_of(family).by_limits:
         return _best(look, profile, found)
     # The closed-form limits also allow profiles with slightly negative margins.
     free = _Look(profile, family, limited=False)
-    return _best(free, profile, [*found, *(_fitted(free, one, high - low) for one in found)])
+    again = (_fitted(free, one[:-1], high - low, one[-1]) for one in found)
+    return _best(free, profile, [*found, *again])
 
 
 def free_likeness(profile: Profile, *near: Likeness) -> Likeness | None:
@@ -140,7 +154,7 @@ def free_likeness(profile: Profile, *near: Likeness) -> Likeness | None:
 
 
 def _best(look: "_Look", profile: Profile, designs) -> Likeness | None:
-    """Return the nearest sound member among those with the given `designs`.
+    """Return the nearest sound member among those with the given `designs`, each with its inset.
 
     Return `None` if all of them are unsound."""
     keys = family_of(look.family).keys
@@ -149,6 +163,7 @@ def _best(look: "_Look", profile: Profile, designs) -> Likeness | None:
     for design in sorted(designs, key=lambda one: look(one).away):
         if not look(design).sound:
             break
+        design, inset = design[:-1], float(design[-1] * profile.pitch_radius)
         names = list(keys) if len(keys) == len(design) else _numbered(keys, len(design))
         named = dict(zip(names, map(float, design), strict=True))
         try:
@@ -156,8 +171,8 @@ def _best(look: "_Look", profile: Profile, designs) -> Likeness | None:
         except (InputError, ValueError):
             continue
         member = profile_of(look.family, profile.lobes, profile.pitch_radius, jnp.asarray(design))
-        found = departures(profile, member)
-        return Likeness(look.family, named, found.greatest, found.rms)
+        found = departures(profile, member, inset=inset)
+        return Likeness(look.family, named, found.greatest, found.rms, inset)
     return None
 
 
@@ -210,21 +225,29 @@ class _Comparison(NamedTuple):
 class _Look:
     """Compares members of a `family` with a `profile`, and caches the results.
 
-    Call an instance with the member's design (d,) in config units. `limited`: whether margins are
-    considered; otherwise, all count as zero."""
+    Call an instance with the member's design (d,) in config units, followed by its inset (pitch
+    radii). `limited`: whether margins are considered; otherwise, all count as zero. `inset`: first
+    guess of the inset; 0 if there is none."""
 
     def __init__(self, profile: Profile, family: str, limited: bool = True):
         self.limited = limited
         self.family, self.lobes, self.radius = family, profile.lobes, profile.pitch_radius
         self.target = flank_points(profile, _NODES) / float(self.radius)
         self.around = beyond(self.target, profile.lobes)
+        measured = isinstance(profile, Outline)
+        self.inset = conjugacy(profile).inset / float(self.radius) if measured else 0.0
+
+    def start(self, design, inset: float | None = None) -> NDArray[np.float64]:
+        """Return a design with its `inset`, by default the first guess."""
+        return np.append(design, self.inset if inset is None else inset)
 
     def limits(self, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the least and the greatest value (d,) of each of `count` design parameters."""
+        """Return the least and greatest value of `count` design parameters and of the inset."""
         radius = float(self.radius) / MM
         pairs = [_limits(one, radius) for one in family_of(self.family).parameters]
         pairs += pairs[-1:] * (count - len(pairs))
-        low, high = np.array(pairs).T
+        free = _INSET if self.inset else 0.0
+        low, high = np.array([*pairs, (-free, free)]).T
         return low, high
 
     @functools.lru_cache(maxsize=1024)  # noqa: B019
@@ -250,7 +273,14 @@ class _Look:
         return _Comparison(distance, margin, np.concatenate([slope, back_slope]), margin_slope)
 
     def __call__(self, design) -> _Comparison:
-        return self._at(tuple(map(float, design)))
+        *own, inset = map(float, design)
+        seen = self._at(tuple(own))
+        # Outside the member cut by the inset, all points lie farther out by it.
+        slopes = (
+            np.insert(slope, len(own), by, axis=1)
+            for slope, by in ((seen.distance_slope, 1.0), (seen.margin_slope, 0.0))
+        )
+        return _Comparison(seen.distance + inset, seen.margin, *slopes)
 
 
 def _limits(parameter: Parameter, radius_mm: float) -> tuple[float, float]:
@@ -262,14 +292,18 @@ def _limits(parameter: Parameter, radius_mm: float) -> tuple[float, float]:
     return low, high - 1e-9 * (high - low) if parameter.below else high
 
 
-def _fitted(look: _Look, start, width) -> NDArray[np.float64]:
-    """Return a design near `start` that locally minimises `_Comparison.fault`.
+def _fitted(look: _Look, start, width, inset: float | None = None) -> NDArray[np.float64]:
+    """Return a design near `start`, with its inset, that locally minimises `_Comparison.fault`.
 
     The search is a sequence of linear programs. Each finds the step that is best to first order
-    within a trust region. `width` (d,): widths of the parameters' usual ranges.
+    within a trust region. `width` (d,): widths of the parameters' usual ranges; `inset`: first
+    guess (pitch radii), by default that of the outline's mesh.
     """
     low, high = look.limits(len(start))
-    design, size = np.clip(start, low, high), _LONGEST
+    if not np.any(high > low):
+        return look.start(start)
+    width = np.append(width, _INSET_USUAL)
+    design, size = np.clip(look.start(start, inset), low, high), _LONGEST
     for _ in range(_PROGRAMS):
         seen = look(design)
         if not seen.finite or size < _SHORTEST:

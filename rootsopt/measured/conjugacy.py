@@ -14,6 +14,12 @@ from rootsopt.profiles import Profile
 from rootsopt.runtime.programs import Program
 
 _MICRON = 1e-6
+_CERTAIN = 1e-6, 1.5
+"""Limits above which flanks count as cut by an inset; both must be exceeded. First: the inset (m).
+Second: its ratio to the standard deviation of the gap over the mesh, a robust estimate."""
+_SPREAD = 1.4826
+"""Ratio of the standard deviation to the median of the absolute values, for a normal distribution.
+"""
 _POSES = 361
 """Number of roll angles at which the gap is measured."""
 
@@ -42,14 +48,28 @@ class Conjugacy:
         """Greatest gap (m) over all roll angles."""
         return float(np.nanmax(self.gap))
 
+    @property
+    def inset(self) -> float:
+        """Distance (m) along the normal by which both rotors are smaller than conjugate ones.
+
+        Half the median gap: rotors are often cut with their clearance. Negative for oversize; 0 if
+        the gap varies too much over the mesh to tell."""
+        median = np.nanmedian(self.gap)
+        spread = _SPREAD * np.nanmedian(np.abs(self.gap - median))
+        least, ratio = _CERTAIN
+        return float(median / 2) if abs(median / 2) > max(least, ratio * spread) else 0.0
+
     def record(self) -> dict[str, float]:
         """Return the gap's statistics for the result file.
+
+        `inset_um`: see `inset` (µm).
 
         `mesh_gap_min_um`, `mesh_gap_max_um`: least and greatest gap (µm). `mesh_gap_min_at_deg`,
         `mesh_gap_max_at_deg`: roll angles (°) of these gaps. `interference_um`: greatest overlap
         (µm), 0 without overlap. `backlash_um`: twice the least gap (µm), 0 with overlap. It is the
         play, along the normal, of a lobe between the partner's two lobes."""
         return {
+            "inset_um": self.inset / _MICRON,
             "mesh_gap_min_um": self.least / _MICRON,
             "mesh_gap_min_at_deg": float(np.degrees(self.roll[np.nanargmin(self.gap)])),
             "mesh_gap_max_um": self.most / _MICRON,
@@ -57,6 +77,22 @@ class Conjugacy:
             "interference_um": max(0.0, -self.least) / _MICRON,
             "backlash_um": max(0.0, 2 * self.least) / _MICRON,
         }
+
+
+def inset_note(inset: float, clearance_mm: float) -> str:
+    """Return a sentence on an `inset` (m) and the config's clearance; "" without an inset."""
+    if not inset:
+        return ""
+    size, gap = f"inset {inset * 1e3:.4g} mm", clearance_mm + 2e3 * inset
+    if gap < 0:
+        return (
+            f"outline: {size} (oversize): both rotors are larger than conjugate ones by this "
+            f"distance, and their flanks overlap; raise `contact.clearance_mm` by {-gap:.4g}"
+        )
+    return (
+        f"outline: {size}: both rotors are cut smaller than conjugate ones by this distance; "
+        f"conjugate flanks have the same gap with `--set contact.clearance_mm={gap:.4g}`"
+    )
 
 
 def conjugacy(profile: Profile) -> Conjugacy:

@@ -34,10 +34,12 @@ wrong side by more than this distance (pitch radii)."""
 _OFF = 0.02
 """Deviation between flanks (pitch radii) above which an outline is rejected. This is also the value
 (pitch radii) above which `profile.outline_smoothing_mm` is rejected."""
-_LAND = 1e-3, 0.5 * np.pi / 180
-"""Two limits for the tip land, an arc about the rotor's axis. First: moment arm of the normal about
-the axis (pitch radii) above which the land ends. Second: range of normal angles on one flank (rad)
-below which the land is ignored."""
+_LAND = 0.5 * np.pi / 180
+"""Angle (rad) of half a tip land below which the land is ignored."""
+_DROP, _SCATTERED, _WIDE = 1e-4, 8.0, 8.0
+"""Radii beside a tip land from which its end is extrapolated. They lie below the greatest radius by
+`_DROP` (pitch radii) or `_SCATTERED` times the scatter, whichever is more, and by up to `_WIDE`
+times as much."""
 _CORNER = 1e-2
 """Change of the normal's direction (rad) at a joint below which both sides get the mean direction.
 A joint with a larger change is a corner."""
@@ -397,7 +399,7 @@ def _outline(
         polar_area_moment=jnp.asarray(moment * _MM**4),
         outer_radius=jnp.asarray(np.max(np.abs(z)) * _MM),
         root_radius=jnp.asarray(np.min(np.abs(z)) * _MM),
-        seal_width=jnp.asarray(_land(nu, lever[:NODES], curvature_radius, radius) * _MM),
+        seal_width=jnp.asarray(_land(z[:NODES], radius, np.fmax(smoothing, seen.scatter)) * _MM),
     )
     return outline, star, float(np.min(curvature_radius))
 
@@ -422,17 +424,20 @@ def _table(node: NDArray, value: NDArray, slope: NDArray) -> Table:
     return Table(*(jnp.asarray(np.ascontiguousarray(x)) for x in (node, value, slope)))
 
 
-def _land(nu, lever, curvature_radius, radius) -> float:
+def _land(z, radius: float, scatter: float) -> float:
     """Return the arc length (mm) of the tip land on both sides of the tip; 0 without a land.
 
-    `nu`: normal angles (rad) of the addendum's nodes; `lever`, `curvature_radius`: values (mm) at
-    the nodes; `radius`: pitch radius (mm)."""
-    miss, turn = _LAND
-    beyond = np.flatnonzero(np.abs(lever) > miss * radius)
-    end = beyond[0] if len(beyond) else len(nu) - 1
-    if nu[end] - nu[0] < turn:
-        return 0.0
-    return float(2 * np.trapezoid(curvature_radius[:end], nu[:end]))
+    `z`: nodes of the addendum (mm), from the tip; `radius`: pitch radius (mm); `scatter`: of the
+    points (mm). The normals of scattered points do not show where a land ends. Beside a land, the
+    root of the drop in radius grows in proportion to the angle; this line is extrapolated to 0."""
+    away, angle = np.abs(z), np.angle(z)
+    top = np.median(away[away > np.max(away) - 2 * scatter - 1e-6 * radius])
+    drop, least = top - away, max(_SCATTERED * scatter, _DROP * radius)
+    beside = (drop > least) & (drop < _WIDE * least)
+    root = np.sqrt(drop[beside])
+    rows = np.stack([np.ones_like(root), root, root**3], axis=1)
+    end = np.linalg.lstsq(rows, angle[beside])[0][0] if len(root) > 3 else 0.0
+    return float(2 * top * end) if end > _LAND else 0.0
 
 
 def _integrals(flank: _Flank, lobes: int) -> tuple[float, float]:

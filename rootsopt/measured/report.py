@@ -3,8 +3,8 @@
 from typing import TYPE_CHECKING, Any
 
 from rootsopt.config import Config
-from rootsopt.measured.conjugacy import conjugacy
-from rootsopt.measured.source import advice, note, outline_of
+from rootsopt.measured.conjugacy import conjugacy, inset_note
+from rootsopt.measured.source import advice, estimates_of, note, outline_of
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -24,10 +24,13 @@ def say(config: Config, out: "Console") -> None:
     """Print notes to `out` on an imported outline.
 
     They say whether its flanks differ by 1 µm or more, whether its points scatter, and whether its
-    centre is not the rotor's axis."""
+    centre is not the rotor's axis. They also say whether a clearance was drawn into it."""
     if not config.profile.from_file:
         return
-    checks = outline_of(config.profile)[1]
-    for message in (note(checks), *advice(config.profile, checks)):
+    profile, checks = outline_of(config.profile)
+    inset = ""
+    if not estimates_of(config.profile, checks).off_center:
+        inset = inset_note(conjugacy(profile).inset, config.contact.clearance_mm)
+    for message in (note(checks), *advice(config.profile, checks), inset):
         if message:
             out.print(message, soft_wrap=True, markup=False, highlight=False)

@@ -4,6 +4,7 @@ import functools
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rootsopt.errors import InputError
 from rootsopt.measured.checks import Checks
 from rootsopt.measured.estimates import Estimates, written
 from rootsopt.measured.fit import imported
@@ -15,6 +16,9 @@ if TYPE_CHECKING:
 
 _NOTABLE = 1.0
 """Deviation between flanks (µm) at or above which the user gets a note."""
+_ECCENTRIC = 1e-3
+"""Distance of the lobes' centre of symmetry from the origin (pitch radii) above which simulations
+are refused."""
 _ROUGH = 0.5
 """Scatter (µm) of points that are not smoothed above which the user gets a note."""
 
@@ -42,25 +46,47 @@ def _kept(path: Path, stamp, lobes: int, radius: float, smoothing: float, place)
     return imported(read(path, unit, radius), lobes, radius, smoothing, center)
 
 
+def check_center(config: "ProfileConfig") -> None:
+    """Raise `InputError` if lobes lie so far from the axis that no simulation is worth its time.
+
+    A config that gives `outline_center` is taken at its word. Such a rotor has flanks that overlap
+    or differ by about this distance; its motion takes minutes and means nothing."""
+    if not config.from_file or config.outline_center is not None:
+        return
+    checks = outline_of(config)[1]
+    seen = estimates_of(config, checks)
+    if (there := seen.centering()) and abs(seen.center) > _ECCENTRIC * config.pitch_radius_mm:
+        raise InputError(
+            "`profile.outline_file` must hold an outline around the rotor's axis, the origin, but "
+            f"{there}, or `profile.outline_center` = [0, 0] to keep the origin"
+        )
+
+
+def estimates_of(config: "ProfileConfig", checks: Checks) -> Estimates:
+    """Return the estimates of an outline about the axis of its `config`."""
+    center = complex(checks.center_x_mm, checks.center_y_mm)
+    given = config.outline_center
+    axis = center if given == "fit" else complex(*(given or (0.0, 0.0)))
+    scatter, error = checks.scatter_um * 1e-3, checks.center_error_um * 1e-3
+    return Estimates(scatter, center - axis, error, config.pitch_radius_mm)
+
+
 def advice(config: "ProfileConfig", checks: Checks) -> list[str]:
     """Return notes on a file's scatter and centre, for a config that ignores them.
 
     `config`: the profile's config; `checks`: those of its outline."""
     found = []
-    center = complex(checks.center_x_mm, checks.center_y_mm)
-    given = config.outline_center
-    axis = center if given == "fit" else complex(*(given or (0.0, 0.0)))
-    error, scatter = checks.center_error_um, checks.scatter_um
-    if given == "fit":
+    if config.outline_center == "fit":
+        center = complex(checks.center_x_mm, checks.center_y_mm)
         found.append(
             f"outline: the axis is the fitted centre of symmetry, {written(center)} mm in the "
-            f"file, to about {max(error, 1e-3):.1g} um"
+            f"file, to about {max(checks.center_error_um, 1e-3):.1g} um"
         )
-    seen = Estimates(scatter * 1e-3, center - axis, error * 1e-3, config.pitch_radius_mm)
+    seen = estimates_of(config, checks)
     if seen.centering():
         found.append(f"outline: {seen.centering()}")
     smoothing = config.outline_smoothing_mm or 0.0
-    if seen.rough(smoothing) and scatter > _ROUGH:
+    if seen.rough(smoothing) and checks.scatter_um > _ROUGH:
         found.append(f"outline: {seen.remedy(smoothing)}")
     return found
 

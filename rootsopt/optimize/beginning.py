@@ -10,11 +10,13 @@ from typing import Any
 from rootsopt.config import Config
 from rootsopt.config.families import FREE_FORM, families, family_of
 from rootsopt.config.study import NEAREST
+from rootsopt.config.units import MM
 from rootsopt.design.bounds import widened
 from rootsopt.design.resemblance import Likeness, free_likeness, likeness
 from rootsopt.errors import InputError
 from rootsopt.profiles import Outline
 from rootsopt.response.evaluation import Evaluation
+from rootsopt.scene.check import shape_of
 from rootsopt.scene.families import classical, profile_from_file
 
 _FAR = 20e-6
@@ -29,7 +31,8 @@ class Beginning:
     `likeness`: the fitted profile, and its distances from the outline. `considered`: the nearest
     members of all families that were compared, nearest first. `widened`: keys of the parameters
     whose default bounds were widened. `file`: name of the outline's file. `evaluation`: simulation
-    of the fitted profile, `None` before it has been simulated."""
+    of the fitted profile, `None` before it has been simulated. `oversize`: flank gap (mm) by which
+    the members exceed that of an outline whose flanks overlap, otherwise 0."""
 
     config: Config
     likeness: Likeness
@@ -37,6 +40,7 @@ class Beginning:
     widened: tuple[str, ...]
     file: str
     evaluation: Evaluation | None = None
+    oversize: float = 0.0
 
     @property
     def message(self) -> str:
@@ -47,6 +51,8 @@ class Beginning:
             f"{one.family} profile, at most {one.departure * 1e6:.3g} um (RMS "
             f"{one.rms * 1e6:.3g} um) from it."
         )
+        if one.inset:
+            text += f" Its {self._inset}."
         if self.widened:
             bounds = family_of(one.family).parameters
             pairs = {p.key: getattr(self.config.optimizer.bounds, p.key) for p in bounds}
@@ -56,16 +62,20 @@ class Beginning:
             text += " `--set optimizer.family=free_form` begins closer to the outline."
         return text
 
+    @property
+    def _inset(self) -> str:
+        """Say how the members get the gap that the outline has by its inset."""
+        size, gap = f"inset is {self.likeness.inset * 1e3:.4g} mm", self.config.contact.clearance_mm
+        given = f"`--set contact.clearance_mm={gap:.6g}`"
+        text = f"{size}: to have the same flank gap, its members were simulated with {given}"
+        if self.oversize:
+            text += f", {self.oversize:.4g} mm more than that of the overlapping outline"
+        return text
+
     def record(self) -> dict[str, Any]:
         """Return the entry `beginning` of the result file."""
-        found = self.likeness.record() | {"widened_bounds": [*self.widened]}
-        if self.evaluation is not None:
-            found |= {
-                "response": self.evaluation.response,
-                "geometry": self.evaluation.geometry,
-                "status": self.evaluation.status.label,
-            }
-        return found | {
+        return self.likeness.record() | {
+            "widened_bounds": [*self.widened],
             "considered": [one.record() for one in self.considered],
             "message": self.message,
         }
@@ -86,15 +96,32 @@ def beginning(config: Config) -> Beginning | None:
             profile = one.config(config.profile)
         except (InputError, ValueError):
             continue
-        other = config.model_copy(update={"profile": profile})
+        other, oversize = _cut(config.model_copy(update={"profile": profile}), one.inset)
         other, keys = widened(other)
         file = Path(config.profile.outline_file or "").name
-        return Beginning(other, one, found, keys, file)
+        return Beginning(other, one, found, keys, file, oversize=oversize)
     valid = ", ".join([NEAREST, *(name for name, one in families().items() if one.fitted)])
     raise InputError(
         f"`optimizer.family` must be a family with a sound profile near the outline, but is "
         f"{wanted}, for which none was found; choose another one of {valid}"
     )
+
+
+def _cut(config: Config, inset: float) -> tuple[Config, float]:
+    """Return (config of a member with the flank gap of an outline, gap in mm that is too much).
+
+    An `inset` (m) of both rotors widens the gap by twice as much. The outline's area efficiency
+    includes the inset, which no member has: the limit `baseline` is that of the member."""
+    if not inset:
+        return config, 0.0
+    gap = round(config.contact.clearance_mm + 2 * inset / MM, 6)
+    contact = config.contact.model_copy(update={"clearance_mm": max(0.0, gap)})
+    config = config.model_copy(update={"contact": contact})
+    if config.constraints.area_efficiency_min == "baseline":
+        floor = float(shape_of(config).area_efficiency)
+        limits = config.constraints.model_copy(update={"area_efficiency_min": floor})
+        config = config.model_copy(update={"constraints": limits})
+    return config, max(0.0, -gap)
 
 
 def _fits(given: Outline, family: str) -> list[Likeness]:

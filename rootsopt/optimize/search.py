@@ -178,11 +178,32 @@ class Optimization:
 
         Each is a fraction of the baseline's value. The mapping is empty without an optimised
         design."""
+        return self._gains(self.baseline, 1.0)
+
+    @property
+    def nominal(self) -> Evaluation | None:
+        """Evaluation of the family member fitted to a baseline from a file.
+
+        `None` without such a baseline, or if the member has no usable steady state."""
+        found = None if self.beginning is None else self.beginning.evaluation
+        return found if found is not None and found.usable else None
+
+    @property
+    def improvement_over_nominal(self) -> dict[str, float]:
+        """The same reductions as fractions of the values of `nominal`; empty without it.
+
+        The difference from `improvement` is the share of the measured rotor's own deviations."""
+        if self.problem is None or self.nominal is None:
+            return {}
+        return self._gains(self.nominal, self.problem.objective(self.nominal))
+
+    def _gains(self, first: Evaluation, objective: float) -> dict[str, float]:
+        """Return the reductions with respect to the evaluation `first` with this objective."""
         if self.problem is None or self.optimized is None:
             return {}
-        gains = {"objective": 1 - self.problem.objective(self.optimized)}
+        gains = {"objective": 1 - self.problem.objective(self.optimized) / objective}
         for key in ("mean_force_N", "peak_force_N", "rms_force_N"):
-            before, after = self.baseline.response[key], self.optimized.response[key]
+            before, after = first.response[key], self.optimized.response[key]
             gains[key] = 1 - after / before if before > 0 else 0.0
         return gains
 

@@ -82,6 +82,32 @@ def comparison_table(
     return Group(table, *(Text(f"{name}: {message}") for name, message in notes))
 
 
+def nominal_table(
+    baseline: Mapping[str, Any],
+    nominal: Mapping[str, Any],
+    optimized: Mapping[str, Any],
+    improvement: Mapping[str, float],
+    over_nominal: Mapping[str, float],
+) -> RenderableType:
+    """Return a table of a measured baseline, its nominal member and the optimised design.
+
+    `baseline`, `nominal`, `optimized`: records in the result file; `improvement`, `over_nominal`:
+    reductions with respect to baseline and nominal member. Changes are in % of each."""
+    columns = "baseline", "nominal", "optimised", "change", "from nominal"
+    table = _table("Measured rotor, nominal member of the family, and optimum", *columns)
+    first, least = (1 - one.get("objective", math.nan) for one in (improvement, over_nominal))
+    rows = [("objective (baseline = 1)", 1.0, first / least, first)]
+    records = baseline, nominal, optimized
+    places = [("response", key) for key in _SHEET_FORCES[:2]]
+    places += [("geometry", key) for key in ("seal_width_mm", "area_efficiency")]
+    for group, key in places:
+        rows.append((_label(key), *(one.get(group, {}).get(key) for one in records)))
+    for name, *cells in rows:
+        changes = _change(cells[0], cells[2]), _change(cells[1], cells[2])
+        table.add_row(name, *map(_number, cells), *changes)
+    return table
+
+
 def pump_table(records: Mapping[str, Mapping[str, Any]]) -> RenderableType:
     """Return the pump sheet of several designs side by side.
 
@@ -398,7 +424,10 @@ def likeness_table(
     distances = "largest distance, um", "RMS distance, um"
     table = _table(title, *distances, "nearest member")
     for row in rows:
-        design = ", ".join(f"{key} {_number(value)}" for key, value in row["design"].items())
+        cells = [f"{key} {_number(value)}" for key, value in row["design"].items()]
+        if row["inset_um"]:
+            cells.insert(0, f"inset {row['inset_um'] / 1e3:.4g} mm")
+        design = ", ".join(cells)
         away = _number(row["departure_um"]), _number(row["departure_rms_um"])
         table.add_row(row["family"], *away, design)
     return table

@@ -57,14 +57,17 @@ def departure(profile: Profile, other: Profile, nodes: int = _NODES) -> float:
     return departures(profile, other, nodes).greatest
 
 
-def departures(profile: Profile, other: Profile, nodes: int = _NODES) -> Departure:
+def departures(
+    profile: Profile, other: Profile, nodes: int = _NODES, inset: float = 0.0
+) -> Departure:
     """Return the distances between the closed outlines of two profiles with equal lobes.
 
-    `nodes`: least number of points on each side of the pitch circle of a flank."""
+    `nodes`: least number of points on each side of the pitch circle of a flank; `inset`: distance
+    (m) by which `other` is made smaller along its normals before."""
     first, second = (flank_points(one, nodes) for one in (profile, other))
     there, back = (
-        np.abs(feet(points, beyond(line, profile.lobes), smooth=True).away)
-        for points, line in ((first, second), (second, first))
+        np.abs(feet(points, beyond(line, profile.lobes), smooth=True).away + shift)
+        for points, line, shift in ((first, second, inset), (second, first, -inset))
     )
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(first, axis=0), axis=1))])
     rms = np.sqrt(np.trapezoid(there**2, arc) / arc[-1])

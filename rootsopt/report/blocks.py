@@ -69,9 +69,9 @@ def result_block(run: Run) -> Block | None:
     cases = [case for case in run.cases if case.record]
     if not cases or len(cases) > _WIDEST or run.result.get("points"):
         return None
-    compared = len(cases) == 2 and cases[0].name == "baseline"
+    compared = len(cases) > 1 and cases[0].name == "baseline"
     heads = ["", *([case.name for case in cases] if len(cases) > 1 else ["value"])]
-    heads += ["change"] if compared else []
+    heads += ["change", *(f"from {case.name}" for case in cases[1:-1])] if compared else []
 
     def rows(given: Sequence[Mapping[str, Any]], changes: bool = True) -> list[list[str | Cell]]:
         found = []
@@ -80,7 +80,7 @@ def result_block(run: Run) -> Block | None:
             numbers = [one.get(key) for one in kept]
             row: list[str | Cell] = [label(key), *map(value, numbers)]
             if compared:
-                row.append(percent(*numbers) if changes else "")
+                row += [percent(x, numbers[-1]) if changes else "" for x in numbers[:-1]]
             found.append(row)
         return found
 
@@ -96,7 +96,7 @@ def result_block(run: Run) -> Block | None:
         ("steady state", rows(of("steady_state"), changes=False)),
     ]
     state = ["status", *(status_cell(str(case.record.get("status", ""))) for case in cases)]
-    groups[-1][1].append([*state, ""] if compared else state)
+    groups[-1][1].append([*state, *[""] * (len(cases) - 1)] if compared else state)
     return block("Design, force and geometry", heads, groups)
 
 
@@ -207,13 +207,19 @@ def likeness_block(run: Run) -> Block | None:
     found = found or (run.result.get("beginning") or {}).get("considered")
     rows = [
         [row["family"], value(row["departure_um"]), value(row["departure_rms_um"]),
-         ", ".join(f"{label(key)} {value(x)}" for key, x in row["design"].items())]
+         ", ".join(f"{label(key)} {value(x)}" for key, x in _with_inset(row).items())]
         for row in found or ()
     ]  # fmt: skip
     if not rows:
         return None
     heads = "family", "largest distance (µm)", "RMS distance (µm)", "nearest member"
     return block("Nearest profiles of the families", heads, [("", rows)])
+
+
+def _with_inset(row: Mapping[str, Any]) -> dict[str, float]:
+    """Return the design of a family member, with its inset (mm) if it has one."""
+    inset = row.get("inset_um")
+    return row["design"] | ({"inset_mm": inset / 1e3} if inset else {})
 
 
 def attractor_block(run: Run) -> Block | None:

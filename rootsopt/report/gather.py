@@ -103,12 +103,13 @@ def _cases(place: Path, config: Config, result: Mapping[str, Any]) -> Iterator[C
 
 def _listed(place: Path, config: Config, result: Mapping[str, Any]) -> Iterator[Case]:
     """Yield the designs or motions that a result lists by name or number."""
-    names = {"baseline": "baseline", "optimized": "optimised"}
+    names = {"baseline": "baseline", "nominal": "nominal member", "optimized": "optimised"}
     for key, name in names.items():
         record = result.get(key)
         if not isinstance(record, Mapping) or not isinstance(record.get("design"), Mapping):
             continue
-        file = place / f"{key}.yaml"
+        # The nominal member of a measured baseline has the family of the optimum.
+        file = place / ("optimized.yaml" if key == "nominal" else f"{key}.yaml")
         own = load(file) if file.exists() else config
         yield Case(name, own, dict(record["design"]), record, _series(place, key))
     for number, record in enumerate(result.get("attractors") or (), start=1):

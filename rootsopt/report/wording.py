@@ -222,6 +222,10 @@ def _optimised(run: Run) -> list[str]:
     gain = (run.result.get("improvement") or {}).get("objective")
     if gain is not None and math.isfinite(gain):
         sentences.append(f"The objective is {_percent(100 * -gain)} the baseline's.")
+    gain = (run.result.get("improvement_over_nominal") or {}).get("objective")
+    if gain is not None and math.isfinite(gain):
+        member = "that of the nominal member of the family, fitted to the measured baseline"
+        sentences.append(f"It is {_percent(100 * -gain)} {member}.")
     for key in ("mean_force_N", "peak_force_N"):
         a, b = (one.get("response", {}).get(key) for one in (before, after))
         if a and b is not None:

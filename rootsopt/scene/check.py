@@ -7,25 +7,37 @@ from numpy.typing import ArrayLike, NDArray
 from rootsopt.config import Config
 from rootsopt.config.units import MM
 from rootsopt.errors import InputError
-from rootsopt.profiles import geometry, outline
+from rootsopt.profiles import Geometry, geometry, outline
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import families
 from rootsopt.scene.build import Scene
 from rootsopt.scene.reading import design_vector
 
 
-def check_geometry(config: Config) -> None:
-    """Raise `InputError` unless the config's profile is sound and leaves room for the bore."""
+def check_geometry(config: Config, simulated: bool = True) -> None:
+    """Raise `InputError` unless the config's profile is sound and leaves room for the bore.
+
+    `simulated`: whether the rotor is to be simulated. An outline from a file must then lie around
+    its axis, which is checked before anything is compiled."""
+    if simulated and config.profile.from_file:
+        from rootsopt.measured.source import check_center  # For outlines only: it takes 0.5 s.
+
+        check_center(config.profile)
     families.check(config.profile)
     bore = config.rotor.bore_mm
     if bore is None:
         return
-    root = float(_shape(Scene.from_config(config), design_vector(config)).root_radius) / MM
+    root = float(shape_of(config).root_radius) / MM
     if bore >= 2 * root:
         raise InputError(
             f"`rotor.bore_mm` must be less than {2 * root:.6g} (the root circle), but is "
             f"{bore:g}; make it smaller"
         )
+
+
+def shape_of(config: Config) -> Geometry:
+    """Return the geometry of a config's own design."""
+    return _shape(Scene.from_config(config), design_vector(config))
 
 
 @Program

@@ -73,8 +73,11 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
         else:
             numbers = result.constraints, result.improvement
             out.print(tables.comparison_table(result.baseline, result.optimized, *numbers))
-            named = zip(("baseline", "optimised"), sheets.values(), strict=True)
-            out.print(tables.pump_table(dict(named)))
+            if result.nominal is not None:
+                gains = result.improvement, result.improvement_over_nominal
+                out.print(tables.nominal_table(*(one for one in sheets.values()), *gains))
+            named = {"baseline": sheets["baseline"], "optimised": sheets["optimized"]}
+            out.print(tables.pump_table(named))
             for note in warnings(sheets["optimized"]["pump"]):
                 out.print(f"optimised: {note}", soft_wrap=True, highlight=False)
             if baseline:
@@ -158,8 +161,12 @@ def _alike(config: Config, result) -> dict:
 
 
 def _sheets(config: Config, result) -> dict[str, dict]:
-    """Return the records of baseline and optimised design, with their pump sheets under `pump`."""
+    """Return the records of baseline and optimised design, with their pump sheets under `pump`.
+
+    Those of the nominal member of a measured baseline stand between them."""
     designs = {"baseline": (config, result.baseline)}
+    if result.nominal is not None:
+        designs["nominal"] = _searching(config, result), result.nominal
     if result.optimized is not None:
         designs["optimized"] = _searching(config, result), result.optimized
     return {
@@ -224,8 +231,10 @@ def _interrupted(result) -> str:
 def _write(folder, config, options, result, choice, sheets, compiled, ran) -> None:
 
     records = {"baseline": result.baseline, "optimized": result.optimized}
+    if result.nominal is not None:
+        records["nominal"] = result.nominal
     searching = _searching(config, result)
-    configs = {"baseline": config, "optimized": searching}
+    configs = dict.fromkeys(records, searching) | {"baseline": config}
     files.write_config(folder, config)
     if result.optimized is not None:
         folder.write_text("optimized.yaml", _designed(searching, result.optimized).to_yaml())
@@ -248,6 +257,8 @@ def _write(folder, config, options, result, choice, sheets, compiled, ran) -> No
         data["beginning"] = result.beginning.record()
         data |= outline_report.record(config)
     data["improvement"] = result.improvement
+    if result.nominal is not None:
+        data["improvement_over_nominal"] = result.improvement_over_nominal
     data["constraints"] = result.constraints
     if config.objective.speeds_rpm and result.optimized is not None:
         data["objective_by_speed"] = result.objective_by_speed

@@ -28,7 +28,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
 
     Return the `Outcome`. Raises `InputError` if the config or an option is invalid."""
     formats = chosen(options.export)
-    check_geometry(config)
+    check_geometry(config, simulated=False)
     coefficients = _coefficients(options.project)
     scene, design = Scene.from_config(config), design_vector(config)
     shape = geometry(scene.profile(design))
