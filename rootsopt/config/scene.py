@@ -64,7 +64,12 @@ class ProfileConfig(Section):
     outline_unit: Literal["mm", "cm", "m", "um", "inch"] | None = Field(
         None,
         description="outline: unit of the numbers in the file; absent: mm, or the unit that a "
-        "drawing states",
+        "drawing or a header states",
+    )
+    outline_join_mm: Annotated[float, between(1e-6, 1)] | None = Field(
+        None,
+        description="outline: distance (mm) between ends of a drawing's entities up to which they "
+        "are joined; absent: 0.001",
     )
 
     @property

@@ -11,7 +11,6 @@ from rootsopt.errors import InputError
 from rootsopt.measured.entities import Entity, chain
 from rootsopt.measured.estimates import UNITS
 from rootsopt.measured.guard import each, guarded, short, silenced
-from rootsopt.measured.joining import joined
 from rootsopt.measured.loop import Loop
 
 with silenced():  # Importing ezdxf writes to its log.
@@ -68,12 +67,12 @@ _UNITS = {
 astronomical units (17 to 20), are rejected."""
 
 
-def from_dxf(data: bytes, name: str, unit: str | None = None) -> Loop:
-    """Return the closed loop of the largest area in a drawing, in mm.
+def from_dxf(data: bytes, name: str, unit: str | None = None) -> list[Loop]:
+    """Return the points (mm) on each entity that may belong to the outline, as open chains.
 
     `data`: content of the file; `name`: name of the file in messages; `unit`: name of the unit of
     its numbers, instead of the unit that the drawing states. Raises `InputError` if the
-    drawing cannot be read, is too large or contains no closed loop."""
+    drawing cannot be read, is too large or contains no such entity."""
     binary = data.startswith(_BINARY)
     counted = _check_tags(data, binary, name)
     with guarded(name, _NOT, _AGAIN):
@@ -123,8 +122,7 @@ def from_dxf(data: bytes, name: str, unit: str | None = None) -> Loop:
             f"{name}: must hold an outline of at most {_POINTS} points, but its entities need "
             f"{count}; draw the outline alone on a layer {_LAYER}"
         )
-    found = joined([chain(part, spacing) for part in parts], _LAYER, name)
-    return dataclasses.replace(found, unit=scale)
+    return [dataclasses.replace(chain(part, spacing), unit=scale) for part in parts]
 
 
 def _check_tags(data: bytes, binary: bool, name: str) -> Counter[str]:

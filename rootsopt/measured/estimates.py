@@ -3,7 +3,9 @@
 Messages and results state the estimates. No estimate is used unless the config asks for it."""
 
 import dataclasses
+import itertools
 import math
+from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Complex128
@@ -17,8 +19,13 @@ _NEIGHBOURS = 2, 3, 4
 """Numbers of neighbours on each side from which the scatter is estimated (see `scatter`). The least
 of the three estimates counts. The others may be larger, because the error of a polynomial through
 few points depends on its degree."""
-_AGREED = 1.5
-"""Ratio of the greatest to the least of these estimates above which the scatter is unknown."""
+_GROWTH = 4.0
+"""Ratio of the estimates from neighbours twice as far apart and from next neighbours above which
+the scatter is unknown. Scatter does not depend on the distance. The error of a polynomial through
+points on a smooth curve grows at least with its square; for exact points of EE (2 to 6 lobes) and
+CIC it was found to grow by 6 or more."""
+_GROWN = 9.0
+"""Typical growth of the error of coarse points, with which it is separated from the scatter."""
 _CLEAR = 8.0
 """Ratio of the distance between neighbours to the scatter below which farther neighbours are used.
 Points that are closer together do not lie in order along the curve."""
@@ -35,10 +42,10 @@ _HARMONICS = 48
 _PASSES, _STILL = 12, 1e-12
 """Maximum number of Gauss-Newton steps in the search for the centre, and step (fraction of the
 outline's greatest radius) below which the search ends."""
-_SUM = 0.06
+SIZED = 0.06
 """Relative difference between the pitch radius and the mean of outer and root radius above which an
 outline counts as the wrong size. Both are equal for conjugate rotors."""
-_SEEN = 1e-4
+SEEN = 1e-4
 """Scatter (mm) below which messages do not mention it."""
 _ENOUGH = 0.7
 """Ratio of the smoothing to the scatter below which the points count as not smoothed enough."""
@@ -47,6 +54,14 @@ _APART = 6.0
 length along the points is then scatter."""
 _MORE = 1.25
 """Factor by which a message raises a smoothing that did not suffice."""
+_FACTORS = 2.0, 1.6, 1.25, 1.0
+"""Values of the smoothing (multiples of the scatter) that are tried for a message."""
+_STEPS = 2e-3, 1e-3, 5e-4, 2e-4, 1e-4, 5e-5, 2e-5, 1e-5
+"""Values of the smoothing (mm) that are tried for points without scatter, for example ends of arcs
+or lines that are rounded, or on the wrong side of the pitch circle."""
+_PER_FLANK = 8
+"""Number of points per flank below which the scatter is unknown: the error of a polynomial through
+them no longer grows with their distance."""
 _SURE, _LEAST = 5.0, 1e-3
 """Distances of the centre from the origin (standard errors; mm) above which a message proposes to
 move it there. Both must be exceeded."""
@@ -59,12 +74,16 @@ class Estimates:
     `scatter`: standard deviation (mm) of the points across the outline. `center`: centre of the
     lobes' rotational symmetry, as x + iy (mm). `center_error`: standard error (mm) of each of its
     coordinates. `middle`: mean (mm) of greatest and least radius about the centre, which is the
-    pitch radius of conjugate rotors. Numbers that cannot be estimated are NaN."""
+    pitch radius of conjugate rotors. `interpolation`: error (mm) of a polynomial between the
+    points; both it and the scatter if the latter is unknown. Numbers that cannot be estimated are
+    NaN. `reads`: whether the outline is read with a smoothing (mm)."""
 
     scatter: float
     center: complex
     center_error: float
     middle: float
+    interpolation: float = math.nan
+    reads: Callable[[float], bool] = lambda _: False
 
     @property
     def off_center(self) -> bool:
@@ -93,29 +112,37 @@ class Estimates:
 
     def rough(self, smoothing: float) -> bool:
         """Return whether the points scatter by more than a `smoothing` (mm) can remove."""
-        return self.scatter > _SEEN and smoothing < _ENOUGH * self.scatter
+        return self.scatter > SEEN and smoothing < _ENOUGH * self.scatter
 
     def remedy(self, smoothing: float) -> str:
         """Return what to change in the config if the outline is not smooth.
 
-        `smoothing`: smoothing (mm) of the config."""
-        seen = f"{_two(self.scatter)} um"
+        `smoothing`: smoothing (mm) of the config. Any other value that the text states has been
+        tried, unless none of those tried can be read."""
+        known, key = self.scatter > SEEN, "`profile.outline_smoothing_mm`"
+        steps = [self.scatter * more for more in _FACTORS] if known else _STEPS
+        tried = (float(f"{step:.2g}") for step in steps)
+        # From the greatest down, so that an outline that smoothing does not help costs one trial.
+        fitting = itertools.takewhile(lambda x: x > smoothing and self.reads(x), tried)
+        value = min(fitting, default=None)
+        offer = f"set {key} = {value:g}, with which it is read" if value else ""
+        seen = f"the points are scattered by about {_two(self.scatter)} um (RMS): "
         if self.rough(smoothing):
-            return (
-                f"the points are scattered by about {seen} (RMS): set "
-                f"`profile.outline_smoothing_mm` = {self.scatter:.2g}"
-            )
-        if smoothing > 0 and self.scatter > _SEEN:
-            return (
-                f"the points are scattered by about {seen} (RMS): raise "
-                f"`profile.outline_smoothing_mm` from {smoothing:.3g} to "
-                f"{_MORE * max(smoothing, self.scatter):.2g}, or correct the outline"
-            )
+            return seen + (offer or f"set {key} = {self.scatter:.2g}")
+        if known and smoothing > 0:
+            value = value or _MORE * max(smoothing, self.scatter)
+            return seen + f"raise {key} from {smoothing:.3g} to {value:.2g}, or correct the outline"
         if math.isnan(self.scatter):
-            return "the points are too few to tell scatter from shape: add points"
+            return f"{self.few}: add points" + (f", or {offer}" if offer else "")
+        hardly = f"the points are hardly scattered (by about {self.scatter * 1e3:.1g} um): "
+        return hardly + (offer or "correct the outline")
+
+    @property
+    def few(self) -> str:
+        """Say that the scatter is unknown."""
         return (
-            f"the points are hardly scattered (by about {self.scatter * 1e3:.1g} um): correct the "
-            "outline"
+            "the points are too few to tell scatter from shape (between them, the curve is known "
+            f"to about {_two(self.interpolation)} um)"
         )
 
     def centering(self) -> str:
@@ -132,7 +159,7 @@ class Estimates:
         """Return advice on units or pitch radius; "" if the size fits the `pitch_radius` (mm).
 
         `unit`: length (mm) of the unit in which the file was read."""
-        if not math.isfinite(self.middle) or abs(self.middle / pitch_radius - 1) < _SUM:
+        if not math.isfinite(self.middle) or abs(self.middle / pitch_radius - 1) < SIZED:
             return ""
         if fitting := unit_of_size(self.middle / unit, pitch_radius):
             read = next((name for name, mm in UNITS.items() if mm == unit), f"{unit:.4g} mm")
@@ -161,44 +188,56 @@ def unit_of_size(middle: float, pitch_radius: float) -> str | None:
 
     `middle`: mean of an outline's outer and root radius, in the file's unknown unit. Return `None`
     if there is no such unit."""
-    return next((u for u, mm in UNITS.items() if abs(middle * mm / pitch_radius - 1) < _SUM), None)
+    return next((u for u, mm in UNITS.items() if abs(middle * mm / pitch_radius - 1) < SIZED), None)
 
 
 def estimates(points: Complex128[np.ndarray, " n"], lobes: int) -> Estimates:
     """Return estimates from the `points` (mm) of a closed outline with this number of `lobes`."""
     with np.errstate(all="ignore"):
         try:
-            spread = scatter(points)
+            spread, between = scatter(points)
+            if len(points) < _PER_FLANK * 2 * lobes:
+                spread = math.nan
             middle, error = center(points, lobes)
         except np.linalg.LinAlgError:
-            spread, middle, error = math.nan, complex(math.nan), math.nan
+            spread, between = math.nan, math.nan
+            middle, error = complex(math.nan), math.nan
         radius = np.abs(points - middle)
-        return Estimates(spread, middle, error, float(np.max(radius) + np.min(radius)) / 2)
+        size = float(np.max(radius) + np.min(radius)) / 2
+        return Estimates(spread, middle, error, size, between)
 
 
-def scatter(points: Complex128[np.ndarray, " n"]) -> float:
-    """Return the standard deviation of the `points` of a closed outline across its curve.
+def scatter(points: Complex128[np.ndarray, " n"]) -> tuple[float, float]:
+    """Return (standard deviation across the curve, error of interpolation) of a closed outline.
 
     The unit is that of the points. Each point is predicted by the polynomial through some
     neighbours on both sides. Its deviation across the curve is divided by the standard deviation
     that unit scatter of all these points would cause. Corners and joints of the curve disturb few
     deviations, so the median is used. If the scatter is large compared with the distance between
-    neighbours, neighbours farther apart are used."""
+    neighbours, neighbours farther apart are used.
+
+    The deviations hold both scatter and the error of the polynomial. Only the latter grows with the
+    distance of the neighbours. The scatter is NaN if the deviations grow by `_GROWTH`; all of them
+    is then the error of interpolation. Otherwise, this error is what the growth leaves for it."""
     spacing = float(np.median(np.abs(np.diff(points))))
     stride, found = 1, _least(points, 1)
     while found > stride * spacing / _CLEAR and len(points) / (2 * stride) >= _FEWEST:
         stride *= 2
         found = _least(points, stride)
-    return found
+    wider = _least(points, 2 * stride)
+    if found < SEEN:
+        return found, found
+    if not wider < _GROWTH * found:
+        return math.nan, found
+    error = math.sqrt(max(wider**2 - found**2, 0.0) / (_GROWN**2 - 1))
+    return math.sqrt(found**2 - error**2), error
 
 
 def _least(points: NDArray[np.complex128], stride: int) -> float:
     """Return the scatter of `points` as in `scatter`, with neighbours `stride` points apart.
 
-    The result is NaN if it depends on the number of neighbours: the points are then too few."""
-    found = [_across(points, half, stride) for half in _NEIGHBOURS]
-    least, most = min(found), max(found)
-    return math.nan if most > _AGREED * least and least > _SEEN else least
+    It includes the error of the polynomial. NaN if there are too few points."""
+    return min(_across(points, half, stride) for half in _NEIGHBOURS)
 
 
 def _across(points: NDArray[np.complex128], half: int, stride: int) -> float:

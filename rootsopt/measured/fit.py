@@ -43,7 +43,7 @@ times as much."""
 _CORNER = 1e-2
 """Change of the normal's direction (rad) at a joint below which both sides get the mean direction.
 A joint with a larger change is a corner."""
-_AT = 1e-6
+_AT = 1e-4
 """Distance (pitch radii) from the pitch circle below which a joint is taken as the point where the
 flank crosses the circle."""
 _FAR = 1e3
@@ -55,7 +55,10 @@ rejected, in addition to `_FOLD`."""
 _MANY = 20.0
 """Ratio of the flanks' deviation to the scatter below which a message names scatter as the cause.
 """
-_ESTIMATED = "scatter_um", "center_x_mm", "center_y_mm", "center_error_um"
+_TRIED = 100_000
+"""Number of points above which no values of the smoothing are tried for a message. A trial takes
+20 µs per point."""
+_ESTIMATED = ("scatter_um", "interpolation_um", "center_x_mm", "center_y_mm", "center_error_um")
 """Names of the fields of `Checks` that may be NaN."""
 _GAUSS = np.polynomial.legendre.leggauss(12)
 
@@ -119,7 +122,16 @@ def imported(
             )
         loop = dataclasses.replace(loop, points=loop.points - axis)
         seen = dataclasses.replace(seen, center=seen.center - axis)
-        outline, checks = _imported(loop, lobes, pitch_radius_mm, smoothing_mm, seen)
+
+        def reads(smoothing: float) -> bool:
+            try:
+                _imported(loop, lobes, pitch_radius_mm, smoothing, seen)
+            except InputError:
+                return False
+            return True
+
+        advising = seen if len(loop.points) > _TRIED else dataclasses.replace(seen, reads=reads)
+        outline, checks = _imported(loop, lobes, pitch_radius_mm, smoothing_mm, advising)
         there = seen.center + axis
         checks = dataclasses.replace(checks, center_x_mm=there.real, center_y_mm=there.imag)
     known = (value for name, value in checks.record().items() if name not in _ESTIMATED)
@@ -176,6 +188,7 @@ def _imported(
         reversed=bool(backwards),
         axis_offset_um=float(abs(centroid)) / _MM,
         scatter_um=seen.scatter / _MM,
+        interpolation_um=seen.interpolation / _MM,
         center_x_mm=seen.center.real,
         center_y_mm=seen.center.imag,
         center_error_um=seen.center_error / _MM,

@@ -13,73 +13,77 @@ from scipy.spatial import KDTree
 from rootsopt.errors import InputError
 from rootsopt.measured.loop import Loop, place, signed_area
 
-TOGETHER = 1e-3
-"""Distance (mm) below which two ends of entities share a vertex."""
+JOIN = 1e-3
+"""Default distance (mm) below which two ends of entities share a vertex."""
+_ALONE = "draw the outline alone on a layer OUTLINE"
 _CROWDED = 50
-"""Number of other points within `TOGETHER` of a point, on average, above which a drawing is
-rejected. The points are the ends of all chains, or those of `_quarters`. Points at the same place
-count once."""
+"""Number of other points within the joining distance of a point, on average, above which a drawing
+is rejected. The points are the ends of all chains, or those of `_quarters`. Points at the same
+place count once."""
 
 
-def joined(chains: list[Loop], layer: str, name: str) -> Loop:
-    """Join `chains` of points at their ends; return the closed loop of the largest area.
+def joined(
+    chains: list[Loop], name: str, join: float = JOIN
+) -> tuple[list[Loop], InputError | None]:
+    """Join `chains` of points at their ends; return (closed loops, fault of the drawing).
 
     A chain may run in either direction. A chain given twice counts once. Chains that lead to a dead
-    end, such as centre lines, belong to no loop. `layer`: layer that messages recommend for the
-    outline; `name`: name of the drawing in messages.
+    end, such as centre lines, belong to no loop. `name`: name of the drawing in messages; `join`:
+    distance (mm) below which ends meet.
 
-    Raises `InputError` in four cases: there is no closed loop; open chains, if closed, would
-    enclose a larger area than any loop; more than two ends meet at a vertex of a possible outline;
-    too many ends are close together.
-    """
-    remedy = f"join them in the drawing, on a layer {layer}"
+    The fault applies if none of the loops is the rotor. It is not `None` in three cases: there is
+    no closed loop; open chains, if closed, would enclose a larger area than any loop; more than two
+    ends meet at a vertex of a possible outline. Raises `InputError` if too many ends are close
+    together."""
     ends = np.array([chain.points[[0, -1]] for chain in chains]).reshape(-1, 2)
-    vertex = _clusters(ends.ravel(), name).reshape(-1, 2)
+    vertex = _clusters(ends.ravel(), name, join).reshape(-1, 2)
     lengths = np.array([np.sum(np.abs(np.diff(chain.points))) for chain in chains])
-    alone = (vertex[:, 0] == vertex[:, 1]) & (lengths > 2 * TOGETHER)
+    alone = (vertex[:, 0] == vertex[:, 1]) & (lengths > 2 * join)
     alone &= np.array([len(chain.points) > 2 for chain in chains], bool)
-    loops = [Loop(c.points[:-1], _closing(c.joints)) for c in _where(chains, alone)]
+    loops = [_connected([c], closed=True) for c in _where(chains, alone)]
     links = np.flatnonzero(vertex[:, 0] != vertex[:, 1])
-    links = links[_first_of_each(_where(chains, links), vertex[links], name)]
+    links = links[_first_of_each(_where(chains, links), vertex[links], name, join)]
     inner = links[_in_loops(vertex[links])]
-    clear, tangled = [], []
+    branched: list[tuple[NDArray, int]] = []
     for group in _groups(vertex[inner]):
         members = inner[group]
         branches = np.flatnonzero(np.bincount(vertex[members].ravel()) > 2)
-        (tangled if len(branches) else clear).append((members, branches))
-    for members, _ in clear:
-        points, joints = _walked(chains, members, vertex)
-        loops.append(Loop(points[:-1], _closing(joints)))
+        if len(branches):
+            branched.append((members, int(branches[0])))
+        else:
+            loops.append(_walked(chains, members, vertex))
     best = max(loops, key=lambda loop: abs(signed_area(loop.points)), default=None)
-    size = _extent(best.points) if best else 0.0
-    for members, branches in tangled:
-        if _extent(np.concatenate([c.points for c in _where(chains, members)])) >= size:
-            at = ends.ravel()[np.flatnonzero(vertex.ravel() == branches[0])[0]]
-            meeting = np.count_nonzero(vertex[members] == branches[0])
-            raise InputError(
-                f"{name}: an outline must not branch, but {meeting} ends meet at "
-                f"{place(complex(at))}; remove the entities that do not belong to it, or draw it "
-                f"on a layer {layer}"
+    for members, branch in branched:
+        whole = np.concatenate([c.points for c in _where(chains, members)])
+        if best is None or _extent(whole) >= _extent(best.points):
+            at = complex(ends.ravel()[np.flatnonzero(vertex.ravel() == branch)[0]])
+            return loops, InputError(
+                f"{name}: an outline must not branch, but "
+                f"{np.count_nonzero(vertex[members] == branch)} ends meet at {place(at)}; remove "
+                f"the entities that do not belong to it, or {_ALONE}"
             )
     dead = np.setdiff1d(links, inner)
     if best is None:
         gap, at = _widest_gap(ends, vertex, links if len(links) else np.arange(len(chains)))
-        raise InputError(
-            f"{name}: the outline must be closed within {TOGETHER:g} mm, but the entities form no "
-            f"closed loop (widest gap {gap:.4g} mm, at {place(at)}); {remedy}"
+        return loops, InputError(
+            f"{name}: the outline must be closed within {join:g} mm (`profile.outline_join_mm`), "
+            f"but the entities form no closed loop (widest gap {gap:.4g} mm, at {place(at)}); join "
+            f"them in the drawing, or {_ALONE}"
         )
     for group in _groups(vertex[dead]):
         members = dead[group]
         if len(members) < 3 or np.max(np.bincount(vertex[members].ravel())) > 2:
             continue
-        if abs(signed_area(_walked(chains, members, vertex)[0])) > abs(signed_area(best.points)):
+        around = _walked(chains, members, vertex).points
+        if abs(signed_area(around)) > abs(signed_area(best.points)):
             gap, at = _widest_gap(ends, vertex, members)
-            raise InputError(
-                f"{name}: the outline must be closed within {TOGETHER:g} mm, but {len(members)} "
-                f"entities that enclose more than any closed loop have a gap of {gap:.4g} mm at "
-                f"{place(complex(at))}; {remedy}"
+            return loops, InputError(
+                f"{name}: the outline must be closed within {join:g} mm "
+                f"(`profile.outline_join_mm`), but {len(members)} entities that enclose more than "
+                f"any closed loop have a gap of {gap:.4g} mm at {place(at)}; join them in the "
+                f"drawing, or {_ALONE}"
             )
-    return best
+    return loops, None
 
 
 def _where(chains: list[Loop], which: NDArray) -> list[Loop]:
@@ -87,32 +91,23 @@ def _where(chains: list[Loop], which: NDArray) -> list[Loop]:
     return [chains[k] for k in which]
 
 
-def _closing(joints: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the mask of a closed chain's joints without its last point, which repeats the first.
-
-    The first point becomes a joint if it or the last point is one."""
-    joints = joints.copy()
-    joints[0] |= joints[-1]
-    return joints[:-1]
-
-
 def _extent(points: NDArray[np.complex128]) -> float:
     return float(np.hypot(np.ptp(points.real), np.ptp(points.imag)))
 
 
-def _clusters(points: NDArray[np.complex128], name: str) -> NDArray[np.intp]:
-    """Return the index of the cluster of each point. Points closer than `TOGETHER` share a cluster.
+def _clusters(points: NDArray[np.complex128], name: str, join: float) -> NDArray[np.intp]:
+    """Return the index of the cluster of each point. Points closer than `join` share a cluster.
 
     Raises `InputError` if too many points are close together."""
     unique, which = np.unique(points, return_inverse=True)
     tree = KDTree(np.stack([unique.real, unique.imag], axis=1))
     # Count the pairs before listing them: there may be n².
-    if tree.count_neighbors(tree, TOGETHER) > (1 + _CROWDED) * len(unique):
+    if tree.count_neighbors(tree, join) > (1 + _CROWDED) * len(unique):
         raise InputError(
-            f"{name}: ends of entities must be farther apart than {TOGETHER:g} mm, but many are "
+            f"{name}: ends of entities must be farther apart than {join:g} mm, but many are "
             "closer; check the drawing's units, or draw longer entities"
         )
-    pairs = tree.query_pairs(TOGETHER, output_type="ndarray")
+    pairs = tree.query_pairs(join, output_type="ndarray")
     return _components(pairs, len(unique))[which]
 
 
@@ -121,11 +116,13 @@ def _components(pairs: NDArray[np.intp], count: int) -> NDArray[np.intp]:
     return connected_components(graph, directed=False)[1].astype(np.intp)
 
 
-def _first_of_each(chains: list[Loop], vertex: NDArray[np.intp], name: str) -> NDArray[np.intp]:
+def _first_of_each(
+    chains: list[Loop], vertex: NDArray[np.intp], name: str, join: float
+) -> NDArray[np.intp]:
     """Return the indices of the chains that do not repeat an earlier chain.
 
-    `vertex` (n, 2): indices of the vertices at each chain's ends; `name`: name of the drawing in
-    messages. A chain repeats another if the ends and the points of `_quarters` of both coincide."""
+    `vertex` (n, 2): indices of the vertices at each chain's ends; `name`, `join`: as in `joined`. A
+    chain repeats another if the ends and the points of `_quarters` of both coincide."""
     if not chains:
         return np.zeros(0, np.intp)
     quarters = np.array(
@@ -134,7 +131,7 @@ def _first_of_each(chains: list[Loop], vertex: NDArray[np.intp], name: str) -> N
             for chain, (a, b) in zip(chains, vertex.tolist(), strict=True)
         ]
     )
-    between = _clusters(quarters.ravel(), name).reshape(len(chains), -1)
+    between = _clusters(quarters.ravel(), name, join).reshape(len(chains), -1)
     rows = np.concatenate([np.sort(vertex, axis=1), between], axis=1)
     return np.sort(np.unique(rows, axis=0, return_index=True)[1])
 
@@ -186,10 +183,8 @@ def _groups(vertex: NDArray[np.intp]) -> list[NDArray[np.intp]]:
     return sorted(groups, key=lambda group: group[0])
 
 
-def _walked(
-    chains: list[Loop], members: NDArray[np.intp], vertex: NDArray[np.intp]
-) -> tuple[NDArray[np.complex128], NDArray[np.bool_]]:
-    """Return (points, mask of joints) along the links of one loop or one open path in `chains`.
+def _walked(chains: list[Loop], members: NDArray[np.intp], vertex: NDArray[np.intp]) -> Loop:
+    """Return the loop or the open path along some links in `chains`.
 
     `members`: indices of the links, in any order; `vertex` (n, 2): indices of the vertices at each
     chain's ends."""
@@ -200,20 +195,47 @@ def _walked(
     open_ends = [v for v, links in at.items() if len(links) == 1]
     link = at[open_ends[0]][0] if open_ends else int(members[0])
     start = open_ends[0] if open_ends else int(vertex[link, 0])
-    points, joints = [], []
+    parts = []
     for _ in range(len(members)):
         a, b = vertex[link].tolist()
         way = slice(None) if a == start else slice(None, None, -1)
         start = b if a == start else a
-        own, marks = chains[link].points[way], chains[link].joints[way]
-        # Keep the point that two links share once, as a joint if either link has it as a joint.
-        if joints:
-            joints[-1][-1] |= marks[0]
-            own, marks = own[1:], marks[1:]
-        points.append(own)
-        joints.append(marks.copy())
+        own = chains[link]
+        parts.append(Loop(own.points[way], own.joints[way], own.unit))
         link = next((k for k in at[start] if k != link), -1)
-    return np.concatenate(points), np.concatenate(joints)
+    return _connected(parts, closed=not open_ends)
+
+
+def _connected(parts: list[Loop], closed: bool) -> Loop:
+    """Return successive chains as one; `closed`: whether the last one ends where the first begins.
+
+    Each gap between ends is closed from both sides in equal shares. Both chains are shifted by an
+    amount that varies linearly along their length, as surveyors do, because moving the end points
+    alone would bend the curve there. The point that two chains share is kept once, as a joint if
+    either chain has it as a joint."""
+    starts = np.array([part.points[0] for part in parts])
+    stops = np.array([part.points[-1] for part in parts])
+    gaps = np.roll(starts, -1) - stops
+    if not closed:
+        gaps[-1] = 0
+    points, joints = [], []
+    for k, part in enumerate(parts):
+        joints.append(part.joints.copy())
+        joints[-1][0] |= parts[k - 1].joints[-1] and (closed or k > 0)
+        points.append(_shifted(part.points, -gaps[k - 1] / 2, gaps[k] / 2))
+    last = slice(None) if closed else slice(len(parts) - 1)
+    points[last], joints[last] = ([x[:-1] for x in each[last]] for each in (points, joints))
+    widest = int(np.argmax(np.abs(gaps)))
+    gap = float(abs(gaps[widest])), complex(stops[widest])
+    return Loop(np.concatenate(points), np.concatenate(joints), parts[0].unit, gap)
+
+
+def _shifted(points: NDArray[np.complex128], first: complex, last: complex) -> NDArray:
+    """Return points along a chain, shifted by `first` at its start and by `last` at its end."""
+    if first == last == 0:
+        return points
+    way = np.append(0.0, np.cumsum(np.abs(np.diff(points))))
+    return points + first + (last - first) * way / way[-1]
 
 
 def _widest_gap(

@@ -1,9 +1,19 @@
 """The points of a closed outline."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 from jaxtyping import Bool, Complex128
+from numpy.typing import NDArray
+
+_CUSP = 2.0
+"""Turn (rad) at a point above which the outline runs back there."""
+_STRAIGHT = 0.8
+"""Distance between the two cusps of a tail (length of the path between them) below which they do
+not belong together."""
+_BESIDE = 1000
+"""Number of points on each side of a tail that are searched for its crossing."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -11,13 +21,17 @@ class Loop:
     """The points of a closed outline in order; the first point is not repeated at the end.
 
     `points` (n,): points (mm) as x + iy; `joints` (n,): mask of the points at the ends of arcs and
-    splines, where curvature may jump; `unit`: length (mm) of the file's unit. The readers also use
-    this class for open chains of points.
+    splines, where curvature may jump; `unit`: length (mm) of the file's unit; `gap`: width (mm) of
+    the widest gap between entities that was closed, and its place; `notes`: sentences for the user
+    on what the reader converted, chose or changed. The readers also use this class for open chains
+    of points.
     """
 
     points: Complex128[np.ndarray, " n"]
     joints: Bool[np.ndarray, " n"]
     unit: float = 1.0
+    gap: tuple[float, complex] = (0.0, 0j)
+    notes: tuple[str, ...] = ()
 
 
 def signed_area(points: Complex128[np.ndarray, " n"]) -> float:
@@ -25,6 +39,86 @@ def signed_area(points: Complex128[np.ndarray, " n"]) -> float:
 
     The area is positive if the polygon runs counter-clockwise."""
     return float(np.sum(np.imag(np.conj(points) * np.roll(points, -1)))) / 2
+
+
+@dataclasses.dataclass(frozen=True)
+class Tail:
+    """A swallow-tail: the outline runs forth, back and forth again between two cusps.
+
+    `inner`: indices of the points that trimming removes; `at`: crossing of the two forward runs
+    (mm, as x + iy); `size`: distance (mm) between the cusps."""
+
+    inner: NDArray[np.intp]
+    at: complex
+    size: float
+
+
+def tails(points: Complex128[np.ndarray, " n"], most: int) -> list[Tail]:
+    """Return the swallow-tails of a closed outline.
+
+    There are none if more than `most` points are cusps: these are scattered."""
+    steps, count = np.roll(points, -1) - points, len(points)
+    cusps = np.flatnonzero(np.abs(np.angle(steps / np.roll(steps, 1))) > _CUSP)
+    if not 2 <= len(cusps) <= most:
+        return []
+    # Begin after the widest stretch without cusps, so that the two cusps of a tail are neighbours.
+    gaps = np.diff(cusps, append=cusps[0] + count)
+    begin = cusps[np.argmax(gaps)] + np.max(gaps) // 2
+    order = np.sort((cusps - begin) % count).tolist()
+    reach = min(_BESIDE, count // 4)
+    found: list[Tail] = []
+    free = 0  # First index that belongs to no tail yet.
+    for i, j in itertools.pairwise(order):
+        around = (begin + np.arange(i - reach, j + reach + 1)) % count
+        if (
+            i >= free
+            and j - i < reach
+            and _runs_back(points[around][reach - 1 : reach + j - i + 1])
+        ):
+            found.append(_tail(points[around], around, reach, reach + j - i))
+            free = j + 1
+    return found
+
+
+def _runs_back(z: NDArray[np.complex128]) -> bool:
+    """Return whether the points after the second run back along the first step, without turns."""
+    steps = np.diff(z)
+    ahead = np.real(steps[1:] * np.conj(steps[0]))
+    way = np.sum(np.abs(steps[1:]))
+    return bool(np.all(ahead < 0) and abs(z[-1] - z[1]) > _STRAIGHT * way)
+
+
+def _tail(z: NDArray[np.complex128], index: NDArray[np.intp], i: int, j: int) -> Tail:
+    """Return the swallow-tail between the cusps `i` and `j` of the points `z`.
+
+    `index`: indices of these points in the outline."""
+    ahead = np.real((z - z[i]) * np.conj(z[i] - z[i - 1]))
+    # The last point before the stretch that is passed three times, and the first point after it.
+    p = i - 1 - int(np.argmax(np.append(ahead[i - 1 :: -1] < np.min(ahead[i : j + 1]), True)))
+    q = j + int(np.argmax(np.append(ahead[j:-1] > np.max(ahead[i : j + 1]), True)))
+    p, size = max(p, 0), float(np.max(np.abs(z[i : j + 1] - z[i])))
+    one, other = np.arange(p, i)[:, None], np.arange(j, q)[None, :]
+    along, across, apart = z[one + 1] - z[one], z[other + 1] - z[other], z[other] - z[one]
+    with np.errstate(all="ignore"):
+        area = np.imag(np.conj(along) * across)
+        first = np.imag(np.conj(apart) * across) / area
+        second = np.imag(np.conj(apart) * along) / area
+    hits = np.argwhere((first >= 0) & (first < 1) & (second >= 0) & (second < 1))
+    if len(hits) == 0:  # Too thin for a crossing: the runs lie on one another.
+        return Tail(index[p + 1 : q], complex(z[i] + z[j]) / 2, size)
+    k, m = hits[0]
+    at = complex(z[p + k] + first[k, m] * along[k, 0])
+    return Tail(index[p + k + 1 : j + m + 1], at, size)
+
+
+def trimmed(loop: Loop, cut: list[Tail]) -> Loop:
+    """Return the `loop` without some of its `tails`: the crossings replace them, as joints."""
+    points, joints = loop.points.copy(), loop.joints.copy()
+    kept = np.ones(len(points), bool)
+    for tail in cut:
+        kept[tail.inner[1:]] = False
+        points[tail.inner[0]], joints[tail.inner[0]] = tail.at, True
+    return dataclasses.replace(loop, points=points[kept], joints=joints[kept])
 
 
 def place(z: complex) -> str:

@@ -1,18 +1,41 @@
 """Reads a CSV or DXF file as one closed loop of points (mm, as x + iy)."""
 
+import contextlib
+import dataclasses
+import math
 import os
 import stat
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
 from rootsopt.errors import InputError
-from rootsopt.measured.estimates import UNITS, unit_of_size
+from rootsopt.measured.estimates import SEEN, SIZED, unit_of_size, written
 from rootsopt.measured.guard import short
-from rootsopt.measured.loop import Loop, signed_area
+from rootsopt.measured.joining import JOIN, joined
+from rootsopt.measured.loop import Loop, place, signed_area, tails, trimmed
 from rootsopt.measured.table import from_csv
 
-__all__ = ["Loop", "read", "signed_area"]
+__all__ = ["JOIN", "Loop", "Sought", "read", "signed_area"]
+
+_JOINS = 2e-3, 5e-3, 1e-2, 2e-2, 5e-2, 0.1, 0.2, 0.5, 1.0
+"""Distances (mm) up to which ends are joined to find the value of the key that closes an outline.
+The last one is the greatest value of the key."""
+_LOOPS, _NAMED = 500, 4
+"""Number of loops, the largest first, among which the rotor is looked for; number of rotors that a
+message names."""
+_THIN, _CONVEX = 1e-2, 0.98
+"""Area (squared extents) below which a loop is a sliver, and area (areas of the convex hull) above
+which it counts as convex."""
+_CUSPS, _TAIL = 16, 0.02
+"""Number of cusps per lobe above which they are scatter, and size (pitch radii) above which a
+swallow-tail is not cut off."""
+_RAYS, _UNLIKE = 720, 0.25
+"""Number of polar angles at which the radius of a loop is compared with the lobes' symmetry, and
+norm of the harmonics that break the symmetry (harmonics of the lobes) above which it has none."""
 
 _WIDEST = 5.0
 """Distance between the last and the first point above which a loop is rejected as open. The unit is
@@ -36,20 +59,49 @@ _NOT_FILES = (
 )
 
 
-def read(path: Path, unit: str | None = None, pitch_radius_mm: float | None = None) -> Loop:
+@dataclasses.dataclass(frozen=True)
+class Sought:
+    """The rotor that a file should contain.
+
+    `lobes`: number of lobes; `pitch_radius_mm`: pitch radius; `center`: its axis in the file, as in
+    `profile.outline_center`."""
+
+    lobes: int
+    pitch_radius_mm: float
+    center: Literal["fit"] | tuple[float, float] | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class _Shape:
+    """Centroid (mm, as x + iy) of a loop with lobes, and its least and greatest radius (mm)."""
+
+    center: complex
+    least: float
+    most: float
+
+    @property
+    def middle(self) -> float:
+        return (self.least + self.most) / 2
+
+
+def read(
+    path: Path, unit: str | None = None, sought: Sought | None = None, join: float = JOIN
+) -> Loop:
     """Return the outline in the CSV (.csv, .txt) or DXF file `path` as a closed loop (mm).
 
     CSV: x and y in mm, separated by commas, semicolons, tabs or blanks, with or without a header.
-    The columns are those that the header calls x and y (or `x_mm`, `y_mm`), or else the first two.
+    The columns are those that the header calls x and y, or r and theta; without these names, the
+    first two are x and y. A header may also state the units.
 
-    DXF, text or binary: the closed loop of the largest area formed by LINE, ARC, ELLIPSE, SPLINE,
-    LWPOLYLINE and POLYLINE. Only entities on the layer OUTLINE are used. If that layer is empty,
-    entities drawn directly are used, and otherwise those in blocks. Lengths are in the unit that
-    the file states, or in mm if it states none. The ends of a LINE and the corners of a polyline
-    are read as points on a smooth curve, not as corners of the outline.
+    DXF, text or binary: a closed loop formed by LINE, ARC, ELLIPSE, SPLINE, LWPOLYLINE and
+    POLYLINE. Only entities on the layer OUTLINE are used. If that layer is empty, entities drawn
+    directly are used, and otherwise those in blocks. Lengths are in the unit that the file states,
+    or in mm if it states none. The ends of a LINE and the corners of a polyline are read as points
+    on a smooth curve, not as corners of the outline.
 
     `unit`: name (from `UNITS`) of the unit of the file's numbers, instead of these rules.
-    `pitch_radius_mm`: pitch radius, by which a message may name the right unit.
+    `sought`: the rotor that is chosen if there are several loops. `None`: the largest loop.
+    `join`: distance (mm) up to which ends of entities are joined.
 
     Raises `InputError` if the file cannot be read or contains no closed outline.
     """
@@ -63,11 +115,142 @@ def read(path: Path, unit: str | None = None, pitch_radius_mm: float | None = No
     if kind == ".dxf":
         from rootsopt.measured.dxf import from_dxf  # Imported for drawings only: it takes 0.25 s.
 
-        return _closed(from_dxf(data, name, unit), name, unit, pitch_radius_mm)
-    loop = from_csv(data, name)
-    if unit is not None:
-        loop = Loop(loop.points * UNITS[unit], loop.joints, UNITS[unit])
-    return _closed(loop, name, unit, pitch_radius_mm)
+        loop = _joined(from_dxf(data, name, unit), sought, name, join)
+    else:
+        loops = from_csv(data, name, unit)
+        loop = (
+            loops[0] if len(loops) == 1 else _rotor(loops, sought, name) or _likely(loops, sought)
+        )
+    return _closed(loop, name, unit, sought)
+
+
+def _joined(chains: list[Loop], sought: Sought | None, name: str, join: float) -> Loop:
+    """Return the rotor's loop among those formed by the `chains` of a drawing.
+
+    `sought`, `join`: as in `read`. Raises `InputError` if the chains form no loop, or form the
+    rotor only if wider gaps are joined; the message states the value of the key."""
+    loops, fault = joined(chains, name, join)
+    if found := _rotor(loops, sought, name):
+        return found
+    if opened := _wider(chains, sought, name, join):
+        gap, at = opened.gap
+        raise InputError(
+            f"{name}: the outline must be closed within {join:g} mm (`profile.outline_join_mm`), "
+            f"but its widest gap is {gap:.4g} mm, at {place(at)}; set `profile.outline_join_mm` = "
+            f"{_above(gap):.2g}, or join the ends in the drawing"
+        )
+    if fault is not None:
+        raise fault
+    return _likely(loops, sought)
+
+
+def _wider(chains: list[Loop], sought: Sought | None, name: str, join: float) -> Loop | None:
+    """Return the rotor's loop that forms if gaps wider than `join` (mm) are closed, or `None`."""
+    if sought is None or len(chains) < 2:
+        return None
+    for wider in (step for step in _JOINS if step > join):
+        with contextlib.suppress(InputError):  # Too many ends meet, or there are several rotors.
+            if found := _rotor(joined(chains, name, wider)[0], sought, name):
+                return found
+    return None
+
+
+def _rotor(loops: list[Loop], sought: Sought | None, name: str) -> Loop | None:
+    """Return the loop that has lobes, symmetry and size of the rotor; `None` if none has.
+
+    Raises `InputError` if there are several such loops and none or more than one is at the axis."""
+    if sought is None:
+        return None
+    radius, found = sought.pitch_radius_mm, []
+    for loop in _largest(loops):
+        shape = _shape(loop.points, sought.lobes)
+        if shape and abs(shape.middle / radius - 1) < SIZED:
+            found.append((loop, shape))
+    given = sought.center
+    axis = 0j if given is None or given == "fit" else complex(*given)
+    near = [one for one in found if abs(one[1].center - axis) < radius / 2]
+    if len(found) > 1 and len(near) != 1:
+        raise InputError(_several([shape for _, shape in near or found], bool(near), name))
+    if not found:
+        return None
+    loop, shape = (near or found)[0]
+    return _noted(loop, len(loops), f"the {sought.lobes}-lobed one at {written(shape.center)} mm")
+
+
+def _several(shapes: list[_Shape], near: bool, name: str) -> str:
+    """Return the message for several rotors; `near`: whether all of them are at the axis."""
+    if near:
+        radii = " and ".join(f"{shape.most:.5g}" for shape in shapes[:_NAMED])
+        return (
+            f"{name}: must hold one outline of the rotor, but holds {len(shapes)} at the axis, "
+            f"with outer radii of {radii} mm; keep one of them (in a drawing, on a layer OUTLINE)"
+        )
+    centers = " and ".join(written(shape.center) for shape in shapes[:_NAMED])
+    choice = written(shapes[0].center).replace("(", "[").replace(")", "]")
+    return (
+        f"{name}: must hold one rotor at the axis, but holds {len(shapes)} elsewhere, at {centers} "
+        f"mm; choose one by its centre, for example `profile.outline_center` = {choice}"
+    )
+
+
+def _noted(loop: Loop, count: int, which: str) -> Loop:
+    """Return the loop with notes on its choice among `count` loops and on gaps that were closed."""
+    gap, at = loop.gap
+    notes = [f"of {count} closed loops in the file, {which} is read"] * (count > 1)
+    if gap > SEEN:
+        notes.append(f"ends of entities up to {gap * 1e3:.3g} um apart were joined, at {place(at)}")
+    return dataclasses.replace(loop, notes=(*loop.notes, *notes))
+
+
+def _likely(loops: list[Loop], sought: Sought | None) -> Loop:
+    """Return the loop that the messages should be about if none fits the rotor.
+
+    It is the largest with the rotor's lobes and with its size in another unit, or the largest with
+    its lobes, or the largest of all."""
+    ordered = _largest(loops)
+    if sought is None or len(loops) == 1:
+        return _noted(ordered[0], len(loops), "the largest")
+    lobed = [(one, shape) for one in ordered if (shape := _shape(one.points, sought.lobes))]
+    sized = [one for one, s in lobed if unit_of_size(s.middle / one.unit, sought.pitch_radius_mm)]
+    return [*sized, *(one for one, _ in lobed), *ordered][0]
+
+
+def _largest(loops: list[Loop]) -> list[Loop]:
+    return sorted(loops, key=lambda loop: -abs(signed_area(loop.points)))[:_LOOPS]
+
+
+def _shape(points: NDArray[np.complex128], lobes: int) -> _Shape | None:
+    """Return the shape of a loop with the rotational symmetry of `lobes` lobes, otherwise `None`.
+
+    Circles, rectangles and other convex loops have no lobes. The radius over the polar angle must
+    have its strongest harmonic at the number of lobes, and only multiples of this harmonic."""
+    points = points[np.append(True, np.diff(points) != 0)]
+    z = points - np.mean(points)
+    area, extent = signed_area(z), max(np.ptp(z.real), np.ptp(z.imag))
+    if len(z) < 4 * lobes or not abs(area) > _THIN * extent**2:
+        return None
+    # A rotor is narrower between its tips: its hull is larger.
+    if abs(area) > _CONVEX * ConvexHull(np.stack([z.real, z.imag], axis=1)).volume:
+        return None
+    after = np.roll(z, -1)
+    center = np.sum((z + after) * np.imag(np.conj(z) * after)) / (6 * area)
+    angle, radius = np.angle(z - center), np.abs(z - center)
+    order = np.argsort(angle)
+    grid = np.arange(_RAYS) * 2 * np.pi / _RAYS
+    around = np.interp(grid, angle[order], radius[order], period=2 * np.pi)
+    harmonics = np.abs(np.fft.rfft(around))[1:]
+    own = harmonics[lobes - 1]
+    others = np.delete(harmonics, slice(lobes - 1, None, lobes))
+    if own < np.max(harmonics) or np.linalg.norm(others) > _UNLIKE * own:
+        return None
+    middle = complex(np.mean(points) + center)
+    return _Shape(middle, float(np.min(radius)), float(np.max(radius)))
+
+
+def _above(length: float) -> float:
+    """Round a `length` up to two significant digits."""
+    digit = 10.0 ** (math.floor(math.log10(length)) - 1)
+    return math.ceil(length / digit * (1 + 1e-9)) * digit
 
 
 def _bytes(path: Path, name: str) -> bytes:
@@ -106,10 +289,10 @@ def _bytes(path: Path, name: str) -> bytes:
     return data
 
 
-def _closed(loop: Loop, name: str, unit: str | None, pitch_radius_mm: float | None) -> Loop:
+def _closed(loop: Loop, name: str, unit: str | None, sought: Sought | None) -> Loop:
     """Return the loop without repeated points.
 
-    `name`: name of the file in messages; `unit`, `pitch_radius_mm`: as in `read`.
+    `name`: name of the file in messages; `unit`, `sought`: as in `read`.
 
     Raises `InputError` if the loop is open, or if its size or number of points is out of range."""
     points = loop.points
@@ -131,7 +314,7 @@ def _closed(loop: Loop, name: str, unit: str | None, pitch_radius_mm: float | No
             f"{name}: must hold an outline of {low:g} to {high:g} mm, but "
             + ("all its points are in one place" if size == 0 else f"it measures {size:.4g} mm")
             + "; "
-            + (_unit(points, unit, pitch_radius_mm) or "check its units (CSV: mm; DXF: $INSUNITS)")
+            + (_unit(points, unit, sought) or "check its units (CSV: mm; DXF: $INSUNITS)")
         )
     steps = np.abs(np.diff(points))
     gap = abs(points[-1] - points[0])
@@ -145,17 +328,42 @@ def _closed(loop: Loop, name: str, unit: str | None, pitch_radius_mm: float | No
     owner = np.searchsorted(kept, np.flatnonzero(loop.joints)) % len(kept)
     joints = np.zeros(len(kept), bool)
     joints[owner] = True
-    return Loop(points[kept], joints, loop.unit)
+    return dataclasses.replace(loop, points=points[kept], joints=joints)
 
 
-def _unit(points, unit: str | None, pitch_radius_mm: float | None) -> str | None:
+def untangled(loop: Loop, lobes: int, pitch_radius_mm: float) -> Loop:
+    """Return the loop without small swallow-tails.
+
+    An offset curve has them where the offset exceeds the radius of curvature, as at the pitch
+    circle of EE. A cutter that follows the curve cuts them off, so that the trimmed loop is the
+    rotor as cut. Raises `InputError` for swallow-tails that are not small."""
+    found = tails(loop.points, _CUSPS * lobes)
+    if not found:
+        return loop
+    some = [
+        f"{place(tail.at)} ({np.degrees(np.angle(tail.at)):.5g} deg, {tail.size * 1e3:.3g} um long)"
+        for tail in found[:_NAMED]
+    ]
+    more = f" and {len(found) - _NAMED} more" if len(found) > _NAMED else ""
+    where = f"{len(found)} small loops (swallow-tails of an offset) at {', '.join(some)}{more}"
+    if max(tail.size for tail in found) > _TAIL * pitch_radius_mm:
+        raise InputError(
+            f"`profile.outline_file` must hold an outline that does not cross itself, but it has "
+            f"{where}; cut them off in the drawing, or remove their points"
+        )
+    return dataclasses.replace(
+        trimmed(loop, found), notes=(*loop.notes, f"{where} are cut off where they cross")
+    )
+
+
+def _unit(points, unit: str | None, sought: Sought | None) -> str | None:
     """Return advice on the unit in which the `points` would fit the pitch radius, or `None`.
 
-    `unit`, `pitch_radius_mm`: as in `read`."""
+    `unit`, `sought`: as in `read`."""
     with np.errstate(all="ignore"):
         radius = np.abs(points - np.mean(points))
         middle = float(np.max(radius) + np.min(radius)) / 2
-    fitting = None if pitch_radius_mm is None else unit_of_size(middle, pitch_radius_mm)
+    fitting = None if sought is None else unit_of_size(middle, sought.pitch_radius_mm)
     if unit is not None or fitting is None:
         return None
     return f"in {fitting} it would fit the pitch radius: set `profile.outline_unit` = {fitting}"

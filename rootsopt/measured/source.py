@@ -1,6 +1,8 @@
 """Makes a profile from the outline file that a config names, and keeps recent results."""
 
+import dataclasses
 import functools
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -8,7 +10,7 @@ from rootsopt.errors import InputError
 from rootsopt.measured.checks import Checks
 from rootsopt.measured.estimates import Estimates, written
 from rootsopt.measured.fit import imported
-from rootsopt.measured.reading import read
+from rootsopt.measured.reading import JOIN, Sought, read, untangled
 from rootsopt.profiles.outline import Outline
 
 if TYPE_CHECKING:
@@ -35,15 +37,25 @@ def outline_of(config: "ProfileConfig") -> tuple[Outline, Checks]:
     except (OSError, ValueError):
         stamp = ()  # Ignore the error here: `read` reports it.
     smoothing = config.outline_smoothing_mm or 0.0
-    place = config.outline_unit, config.outline_center
-    return _kept(path, stamp, config.lobes, config.pitch_radius_mm, smoothing, place)
+    sought = Sought(config.lobes, config.pitch_radius_mm, config.outline_center)
+    how = config.outline_unit, sought, config.outline_join_mm or JOIN
+    return _kept(path, stamp, how, smoothing)
 
 
 @functools.lru_cache(maxsize=16)
-def _kept(path: Path, stamp, lobes: int, radius: float, smoothing: float, place):
+def _kept(path: Path, stamp, how: tuple[str | None, Sought, float], smoothing: float):
     del stamp
-    unit, center = place
-    return imported(read(path, unit, radius), lobes, radius, smoothing, center)
+    loop, sought = read(path, *how), how[1]
+    loop = untangled(loop, sought.lobes, sought.pitch_radius_mm)
+    try:
+        outline, checks = imported(
+            loop, sought.lobes, sought.pitch_radius_mm, smoothing, sought.center
+        )
+    except InputError as error:
+        if not loop.notes:
+            raise
+        raise InputError(f"{error} (how it was read: {'; '.join(loop.notes)})") from None
+    return outline, dataclasses.replace(checks, notes=loop.notes)
 
 
 def check_center(config: "ProfileConfig") -> None:
@@ -68,14 +80,15 @@ def estimates_of(config: "ProfileConfig", checks: Checks) -> Estimates:
     given = config.outline_center
     axis = center if given == "fit" else complex(*(given or (0.0, 0.0)))
     scatter, error = checks.scatter_um * 1e-3, checks.center_error_um * 1e-3
-    return Estimates(scatter, center - axis, error, config.pitch_radius_mm)
+    between = checks.interpolation_um * 1e-3
+    return Estimates(scatter, center - axis, error, config.pitch_radius_mm, between)
 
 
 def advice(config: "ProfileConfig", checks: Checks) -> list[str]:
-    """Return notes on a file's scatter and centre, for a config that ignores them.
+    """Return notes on how a file was read, and on scatter and centre that the config ignores.
 
     `config`: the profile's config; `checks`: those of its outline."""
-    found = []
+    found = [f"outline: {text}" for text in checks.notes]
     if config.outline_center == "fit":
         center = complex(checks.center_x_mm, checks.center_y_mm)
         found.append(
@@ -88,6 +101,8 @@ def advice(config: "ProfileConfig", checks: Checks) -> list[str]:
     smoothing = config.outline_smoothing_mm or 0.0
     if seen.rough(smoothing) and checks.scatter_um > _ROUGH:
         found.append(f"outline: {seen.remedy(smoothing)}")
+    elif math.isnan(checks.scatter_um) and checks.interpolation_um > _ROUGH:
+        found.append(f"outline: {seen.few}; add points if the forces must be more exact")
     return found
 
 

@@ -2,32 +2,86 @@
 
 import codecs
 import csv
+import dataclasses
 import io
+import itertools
 import math
 import re
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rootsopt.errors import InputError
+from rootsopt.measured.estimates import UNITS
 from rootsopt.measured.guard import guarded, short
 from rootsopt.measured.loop import Loop
 
 _LONGEST = 100_000
 """Number of characters in a line above which a table is rejected."""
+_TRIED = 100
+"""Number of lines from which the character that separates the columns is found."""
 _REMEDY = "save the points as x,y in mm, one pair per line, as UTF-8 text"
-_HEADER = r"[\s_/]*(?:\(mm\)|\[mm\]|mm)?"
-_NAMES = tuple(re.compile(f"{axis}{_HEADER}", re.IGNORECASE) for axis in "xy")
 _WIDE = {codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
+_LACKING = re.compile(
+    r"#(?:n/?a|nv|div/0!|value!|wert!|ref!|bezug!|name\?|num!|zahl!|null!)|n/?a|nan|null|none|-+",
+    re.IGNORECASE,
+)
+"""Cells in which a spreadsheet or an instrument says that there is no number."""
+_AXES = {
+    "x": "x",
+    "y": "y",
+    "r": "r|rho|ρ|radius",
+    "theta": r"theta|θ|ϑ|phi|φ|ϕ|angle|winkel|polar[\s_]?angle",
+}
+"""Names of a column by axis, as regular expressions."""
+_LENGTHS = {
+    "mm": r"mm|millimet(?:er|re)s?",
+    "cm": r"cm|centimet(?:er|re)s?",
+    "m": r"m|met(?:er|re)s?",
+    "um": r"um|µm|μm|microns?|micromet(?:er|re)s?",
+    "inch": r"in|inch(?:es)?|zoll",
+}
+_ANGLES = {"deg": "deg|degrees?|°", "rad": "rad|radians?"}
+_OTHERS = r"ft|foot|feet|yd|yards?|mils?|thou|nm|dm|km|px|pixels?|grad|gon"
+"""Units that a header may state but that are not supported."""
+_UNIT = "|".join([*_LENGTHS.values(), *_ANGLES.values(), _OTHERS])
+_TURN = {"deg": 360.0, "rad": 2 * math.pi}
+_WHOLE = 0.8, 1.01
+"""Range of the angles in a column (turns) in which its unit can be told from the numbers."""
+_APART, _FEWEST = 5.0, 8
+"""Step between successive points (median of all steps) above which another outline may begin, and
+least number of points of an outline in a table that holds several."""
 
 
-def from_csv(data: bytes, name: str) -> Loop:
-    """Return the points (mm) of a table in the order of its lines, as a `Loop` without joints.
+@dataclasses.dataclass(frozen=True)
+class _Columns:
+    """The two columns that count.
 
-    `data`: content of the file; `name`: name of the file in messages. Raises `InputError` if the
-    table cannot be read or a line is not a point."""
+    `places`: their indices; `unit`: unit of lengths that the header states, or `None`; `angle`:
+    unit of the polar angle ("deg", "rad", or "" if it must be told from the numbers), `None` for
+    Cartesian coordinates."""
+
+    places: tuple[int, int] = (0, 1)
+    unit: str | None = None
+    angle: str | None = None
+
+    @property
+    def what(self) -> str:
+        """What a line of the table must hold, for messages."""
+        axes = "x and y" if self.angle is None else "r and theta, r"
+        return f"{axes} in {self.unit or 'mm'}"
+
+
+def from_csv(data: bytes, name: str, unit: str | None = None) -> list[Loop]:
+    """Return the outlines (mm) in a table, in the order of its lines, as loops without joints.
+
+    `data`: content of the file; `name`: name of the file in messages; `unit`: name of the unit of
+    its lengths, instead of the one that the header states. Raises `InputError` if the table cannot
+    be read or a line is not a point."""
     text = _text(data, name)
-    lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip()]
-    lines = [(n, line) for n, line in lines if not line.lstrip().startswith("#")]
+    lines = [one for one in enumerate(text.splitlines(), 1) if one[1].strip(" \t,;\r")]
+    comments = [line.lstrip("# \t") for _, line in lines if _comment(line)]
+    lines = [(n, line) for n, line in lines if not _comment(line)]
     if not lines:
         raise InputError(f"{name}: must hold points, but has none; {_REMEDY}")
     for number, line in lines:
@@ -36,22 +90,151 @@ def from_csv(data: bytes, name: str) -> Loop:
                 f"{name}, line {number}: must have at most {_LONGEST} characters, but has "
                 f"{len(line)}; {_REMEDY}"
             )
-    split = next((c for c in ";\t," if c in lines[0][1]), None)
     with guarded(name, "is not a table that can be read", _REMEDY):
+        split = _separator([line for _, line in lines[:_TRIED]])
         rows = [(number, _cells(line, split)) for number, line in lines]
-    columns = 0, 1
-    if any(_number(cell, split) is None for cell in rows[0][1][:2]):
-        columns = _columns(rows.pop(0)[1])
-    points = np.empty(len(rows), complex)
-    for k, (number, row) in enumerate(rows):
-        x, y = (_number(row[c], split) if c < len(row) else None for c in columns)
-        if x is None or y is None or not (math.isfinite(x) and math.isfinite(y)):
+        heads = [_cells(line, split) for line in comments]
+    if split == "," and len(rows) > 1 and not any("." in line for _, line in lines[1:]):
+        _check_commas(rows[1:], name)
+    titles = []
+    while rows and _counted(rows[0][1]) < (1 if titles else 2):
+        titles.append(rows.pop(0)[1])
+    columns = _columns(_headers(titles, heads), name)
+    values = np.array([_values(row, columns, name, number) for number, row in rows]).reshape(-1, 2)
+    points, notes = values @ [1, 1j], []
+    if columns.angle is not None:
+        angle = columns.angle or _angle(values[:, 1], name)
+        points = values[:, 0] * np.exp(2j * np.pi * values[:, 1] / _TURN[angle])
+        notes.append(f"the columns are read as polar coordinates r, theta ({angle})")
+    if unit is None and columns.unit not in (None, "mm"):
+        notes.append(f"lengths are read in {columns.unit}, as the header of the file says")
+    length = UNITS[unit or columns.unit or "mm"]
+    return [
+        Loop(part * length, np.zeros(len(part), bool), length, notes=tuple(notes))
+        for part in _parts(points)
+    ]
+
+
+def _comment(line: str) -> bool:
+    cell = re.split(r"[\s;,]", line.strip(), maxsplit=1)[0]
+    return cell.startswith("#") and not _LACKING.fullmatch(cell)
+
+
+def _separator(lines: list[str]) -> str | None:
+    """Return the character that splits most lines into two numbers or more, `None` for blanks."""
+
+    def score(split: str | None) -> int:
+        cells = (_cells(line, split) for line in lines)
+        return sum(sum(_number(x) is not None for x in row[:2]) == 2 for row in cells)
+
+    known = next((c for c in ";\t," if c in lines[0]), None)
+    return max((known, ";", "\t", None, ","), key=score)
+
+
+def _check_commas(rows: list[tuple[int, list[str]]], name: str) -> None:
+    """Raise `InputError` if commas may be decimal commas and separate the columns, too."""
+    number, row = max(rows, key=lambda one: len(one[1]))
+    if 2 < len(row) <= 4 and all(re.fullmatch(r"\s*[+-]?\d+\s*", cell) for cell in row):
+        raise InputError(
+            f"{name}, line {number}: must separate columns by another character than decimals, "
+            f"but {short(','.join(row))!r} has commas only; save the table with semicolons, or "
+            "with decimal points"
+        )
+
+
+def _headers(titles: list[list[str]], comments: list[list[str]]) -> list[list[str]]:
+    """Return the lines that may name the columns, likely ones first.
+
+    `titles`, `comments`: cells of the lines above the points, and of the lines that begin with #.
+    If units stand below the names, both lines form one header."""
+    joint = [" ".join(cells).strip() for cells in itertools.zip_longest(*titles, fillvalue="")]
+    return [joint, *titles[::-1], *comments[::-1]]
+
+
+def _columns(headers: list[list[str]], name: str) -> _Columns:
+    """Return the columns that the first of the `headers` names that names x and y, or r and theta.
+
+    Without such a header, these are the first two columns, x and y. Raises `InputError` if a header
+    states units that are not known or differ."""
+    for header, axes in itertools.product(headers, (("x", "y"), ("r", "theta"))):
+        found = [_named(axis, header) for axis in axes]
+        if None in found:
+            continue
+        (first, one), (second, two) = (one for one in found if one)
+        polar = axes[0] == "r"
+        if one not in (None, *_LENGTHS) or two not in ((None, *_ANGLES) if polar else (one,)):
+            stated = short(f"{header[first]}, {header[second]}")
             raise InputError(
-                f"{name}, line {number}: must hold x and y in mm, but is "
-                f"{short(', '.join(row))!r}; correct or remove the line"
+                f"{name}: the header must state no unit of length or one of {', '.join(_LENGTHS)}"
+                f"{' and of angle deg or rad' if polar else ''}, but is {stated!r}; correct it, or "
+                "remove the units and set `profile.outline_unit`"
             )
-        points[k] = complex(x, y)
-    return Loop(points, np.zeros(len(points), bool))
+        return _Columns((first, second), one, (two or "") if polar else None)
+    return _Columns()
+
+
+def _named(axis: str, header: list[str]) -> tuple[int, str | None] | None:
+    """Return (index, unit) of the cell that names an `axis`; `None` if there is not exactly one.
+
+    The unit is "?" if it is not supported, and `None` if there is none. Of several cells with this
+    name, the one in mm counts."""
+    stated = rf"[\s_/]*(?:[(\[]\s*(?P<inside>.*?)\s*[)\]]|(?P<bare>{_UNIT}))|[\s_]+\w+"
+    test = re.compile(f"(?:{_AXES[axis]})(?:{stated})?", re.IGNORECASE)
+    cells = [(k, match) for k, cell in enumerate(header) if (match := test.fullmatch(cell.strip()))]
+    found = [(k, _unit(match["inside"] or match["bare"])) for k, match in cells]
+    if len(found) > 1:
+        found = [one for one in found if one[1] == "mm"]
+    return found[0] if len(found) == 1 else None
+
+
+def _unit(text: str | None) -> str | None:
+    """Return the unit that a header states as `text`: `None` for no text, "?" if not supported."""
+    units = (_LENGTHS | _ANGLES).items()
+    known = (unit for unit, test in units if re.fullmatch(test, text or "", re.IGNORECASE))
+    return next(known, "?") if text else None
+
+
+def _counted(cells: list[str]) -> int:
+    """Return how many of the first two cells are numbers or say that a number is lacking."""
+    return sum(_number(x) is not None or bool(_LACKING.fullmatch(x.strip())) for x in cells[:2])
+
+
+def _values(row: list[str], columns: _Columns, name: str, number: int) -> list[float]:
+    """Return the two numbers of a line. `name`, `number`: file and line in messages."""
+    cells = [row[k] if k < len(row) else "" for k in columns.places]
+    found = [value for cell in cells if (value := _number(cell)) is not None]
+    if len(found) < 2 or not all(map(math.isfinite, found)):
+        raise InputError(
+            f"{name}, line {number}: must hold {columns.what}, but is {short(', '.join(row))!r}; "
+            "correct or remove the line"
+        )
+    return found
+
+
+def _angle(angles: NDArray[np.float64], name: str) -> str:
+    """Return the unit in which the `angles` go round once. Raises `InputError` if there is none."""
+    span = float(np.ptp(angles)) if len(angles) else 0.0
+    for unit, turn in _TURN.items():
+        if _WHOLE[0] * turn <= span <= _WHOLE[1] * turn:
+            return unit
+    raise InputError(
+        f"{name}: the polar angles must go round once, in degrees or rad, but range over "
+        f"{span:.4g}; state their unit in the header, as in r_mm,theta_deg"
+    )
+
+
+def _parts(points: NDArray[np.complex128]) -> list[NDArray[np.complex128]]:
+    """Return the outlines in a table, one after the other: all `points` unless each is closed."""
+    with np.errstate(all="ignore"):
+        steps = np.abs(np.diff(points))
+        cuts = np.flatnonzero(steps > _APART * np.median(steps)) + 1 if len(steps) else []
+        parts = np.split(points, cuts)
+        closed = all(
+            len(part) >= _FEWEST
+            and abs(part[-1] - part[0]) <= _APART * np.max(np.abs(np.diff(part)))
+            for part in parts
+        )
+    return parts if closed else [points]
 
 
 def _text(data: bytes, name: str) -> str:
@@ -72,33 +255,18 @@ def _text(data: bytes, name: str) -> str:
 
 def _cells(line: str, split: str | None) -> list[str]:
     if split is None:
-        return line.split()
+        return re.sub(r"\s+(?=[(\[])", "", line).split()  # "x (mm)" is one cell.
     return next(csv.reader(io.StringIO(line), delimiter=split), [])
 
 
-def _number(cell: str, split: str | None) -> float | None:
+def _number(cell: str) -> float | None:
     """Convert a cell to float; return `None` for text that is not a number.
 
-    `split`: character that separates cells, `None` for blanks. A decimal comma is accepted unless
-    commas separate the cells."""
+    A decimal comma is accepted: a cell with a comma that separates columns is in quotes."""
     cell = cell.strip()
-    if split != "," and cell.count(",") == 1 and "." not in cell:
+    if cell.count(",") == 1 and "." not in cell:
         cell = cell.replace(",", ".")
     try:
         return None if "_" in cell else float(cell)
     except ValueError:
         return None
-
-
-def _columns(header: list[str]) -> tuple[int, int]:
-    """Return the indices of the x and y columns, found by their names in the `header`.
-
-    If the names do not identify both columns, return 0 and 1."""
-    names = [cell.strip() for cell in header]
-    found = [[k for k, cell in enumerate(names) if test.fullmatch(cell)] for test in _NAMES]
-    if all(len(places) == 1 for places in found):
-        return found[0][0], found[1][0]
-    lower = [cell.lower() for cell in names]
-    if "x_mm" in lower and "y_mm" in lower:
-        return lower.index("x_mm"), lower.index("y_mm")
-    return 0, 1

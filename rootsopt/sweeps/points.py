@@ -51,7 +51,7 @@ def configured(config: Config, values: Mapping[str, Any]) -> Config:
         family = family_of(word)
         foreign = [key for key in parameters() if key not in family.keys]
         if family.maker is not None:
-            foreign += ["outline_file", "outline_smoothing_mm", "outline_center", "outline_unit"]
+            foreign += [key for key in type(config.profile).model_fields if "outline_" in key]
         given |= {f"profile.{key}": None for key in foreign}
     return config.replaced(given)
 

@@ -79,6 +79,21 @@ def points(family: str, count: int = 30) -> np.ndarray:
     return np.asarray(outline(rotor, count))[:-1] @ [1, 1j] * 1e3
 
 
+def epicycloid(lobes: int, radius: float, count: int, inset: float = 0.0) -> np.ndarray:
+    """Return EE (mm, x + iy) by its formula, tip on +x, even in the rolling angle.
+
+    `inset`: distance (mm) by which the curve is moved inwards, loops included."""
+    t = (np.arange(count) + 0.5) * 2 * np.pi / count
+    small, out = radius / (2 * lobes), np.floor(t * lobes / np.pi) % 2 == 0
+    side = np.where(out, 1.0, -1.0)
+    ratio = 2 * lobes * side + 1
+    turning = small * np.exp(1j * ratio * t)
+    z = (radius + side * small) * np.exp(1j * t) - side * turning
+    along = 1j * ((radius + side * small) * np.exp(1j * t) - side * ratio * turning)
+    z = z + 1j * along / np.abs(along) * inset
+    return z * np.exp(-0.5j * np.pi / lobes)
+
+
 def table(z: np.ndarray, split: str = ",", comma: bool = False, header: str = "x_mm,y_mm") -> bytes:
     """Return a CSV file of points."""
     rows = [split.join(f"{v:.10g}" for v in (p.real, p.imag)) for p in [*z, *z[:1]]]

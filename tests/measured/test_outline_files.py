@@ -1,8 +1,10 @@
 """Tests of outline files: one-line messages for malformed files, joining, conventions of CAD."""
 
+import dataclasses
 import io
 import os
 import random
+import re
 import signal
 
 import ezdxf
@@ -15,19 +17,19 @@ from rootsopt.measured import joining
 from rootsopt.measured.conjugacy import conjugacy
 from rootsopt.measured.fit import imported
 from rootsopt.measured.loop import Loop, signed_area
-from rootsopt.measured.reading import read
+from rootsopt.measured.reading import Sought, read, untangled
 from tests.fuzz import outlines
 
 T = np.linspace(0, 2 * np.pi, 60, endpoint=False)
 ROTOR = (40 + 8 * np.cos(3 * T)) * np.exp(1j * T)
 
 
-def drawn(path, draw, version="R2010", units=units.MM, fmt="asc"):
+def drawn(path, draw, version="R2010", units=units.MM, fmt="asc", **how):
     """Return the outline in a drawing with what `draw` adds to the model space."""
     document = ezdxf.new(version, units=units)
     draw(document.modelspace())
     document.saveas(path, fmt=fmt)
-    return read(path)
+    return read(path, **how)
 
 
 def line(space, start, stop, **attributes):
@@ -101,7 +103,7 @@ def test_good_files_of_the_campaign_are_read(tmp_path):
 )
 def test_malformed_tables(tmp_path, data, message):
     text = fault(tmp_path / "points.csv", data)
-    assert __import__("re").search(message, text), text
+    assert re.search(message, text), text
 
 
 @pytest.mark.parametrize(
@@ -307,7 +309,8 @@ def test_many_loose_lines_are_joined_in_order(tmp_path, monkeypatch):
     trees = []
     tree = joining.KDTree
     monkeypatch.setattr(joining, "KDTree", lambda data: trees.append(len(data)) or tree(data))
-    loop = joining.joined(chains, "OUTLINE", "lines.dxf")
+    (loop,), fault = joining.joined(chains, "lines.dxf")
+    assert fault is None
     assert trees == [len(z), 3 * len(z)]
     assert sorted(loop.points, key=np.angle) == pytest.approx(sorted(z, key=np.angle))
     assert abs(signed_area(loop.points)) == pytest.approx(abs(signed_area(z)))
@@ -436,3 +439,209 @@ def test_wrong_outlines(tmp_path, name, capfd):
     z = WRONG[name](outlines.points("cic", 60))
     fault(tmp_path / "points.csv", outlines.table(z))
     assert capfd.readouterr().err == ""
+
+
+SOUGHT = Sought(3, 33.0)
+EE = outlines.epicycloid(3, 33.0, 480)
+
+
+def rectangle(space, width, height):
+    corners = [(x * width / 2, y * height / 2) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    space.add_lwpolyline(corners, close=True)
+
+
+def title_block(space):
+    """Draw a frame and a table of loose lines that meet three and four at a point."""
+    for x in (-90, 40, 65, 90):
+        lines(space, np.array([x - 70j, x - 60j, x - 50j]), range(2))
+    for y in (-70, -60, -50):
+        lines(space, np.array([-90, 40, 65, 90]) + 1j * y, range(3))
+    lines(space, np.array([-90 - 50j, -90 + 70j, 90 + 70j, 90 - 50j]), range(3))
+
+
+SURROUNDINGS = {
+    "frame": lambda s: rectangle(s, 130, 90),
+    "square": lambda s: rectangle(s, 140, 140),
+    "circle of arcs": lambda s: [s.add_arc((0, 0), 60, a, a + 180) for a in (0, 180)],
+    "housing": lambda s: [s.add_arc((0, 0), 44.2, 42, 318), s.add_arc((66, 0), 44.2, 222, 138)],
+    "closed housing": lambda s: s.add_lwpolyline(
+        [(33, 29.4, 3.0), (33, -29.4, 3.0)], format="xyb", close=True
+    ),
+    "title block": title_block,
+    "second rotor": lambda s: polyline(66 - EE)(s),
+    "dimension and text": lambda s: [
+        s.add_text("ROTOR"),
+        s.add_linear_dim((0, 60), (-44, 0), (44, 0)).render(),
+        s.add_lwpolyline([(-50, 60), (50, 60), (50, 75), (-50, 75)], close=True),
+    ],
+    "open square": lambda s: lines(s, 70 * np.array([1 + 1j, -1 + 1j, -1 - 1j, 1 - 1j]), range(3)),
+}
+
+
+@pytest.mark.parametrize("name", SURROUNDINGS)
+def test_the_rotor_is_told_from_what_is_drawn_around_it(tmp_path, name):
+    """The larger loops have no lobes, or another place or size; the choice is reported."""
+
+    def draw(space):
+        SURROUNDINGS[name](space)
+        polyline(EE)(space)
+
+    loop = drawn(tmp_path / "drawing.dxf", draw, sought=SOUGHT)
+    assert loop.points == pytest.approx(EE, abs=1e-9)
+    assert all("the 3-lobed one at (0, 0) mm is read" in note for note in loop.notes)
+
+
+def test_one_of_several_rotors_is_chosen_by_its_centre(tmp_path):
+    def pair(space):
+        for turned in (EE - 33, 33 - EE):
+            polyline(turned)(space)
+
+    path = tmp_path / "pair.dxf"
+    with pytest.raises(InputError, match=r"holds 2 elsewhere, at .*`profile.outline_center` = \["):
+        drawn(path, pair, sought=SOUGHT)
+    for center, points in ((-33.0, EE - 33), (33.0, 33 - EE)):
+        chosen = dataclasses.replace(SOUGHT, center=(center, 0.0))
+        assert read(path, sought=chosen).points == pytest.approx(points, abs=1e-9)
+    with pytest.raises(InputError, match=r"holds 2 at the axis, with outer radii of 43.996 and 43"):
+        drawn(path, lambda s: [polyline(EE * k)(s) for k in (1, 0.98)], sought=SOUGHT)
+    rows = [f"{z.real:.9f},{z.imag:.9f}" for z in [*EE, EE[0], *(66 - EE), 66 - EE[0]]]
+    (tmp_path / "pair.csv").write_text("\n".join(["x_mm,y_mm", *rows]))
+    both = {c: read(tmp_path / "pair.csv", sought=Sought(3, 33.0, c)) for c in (None, (66.0, 0.0))}
+    assert both[None].points == pytest.approx(EE, abs=1e-8)
+    assert both[66.0, 0.0].points == pytest.approx(66 - EE, abs=1e-8)
+
+
+@pytest.mark.parametrize("gap", [1e-5, 3e-4, 1.8e-3, 1e-2])
+@pytest.mark.parametrize("framed", [False, True])
+def test_ends_that_miss_are_joined_or_the_key_is_named(tmp_path, gap, framed):
+    """The value in the message reads the file; gaps are closed without a bend at their ends."""
+
+    def draw(space):
+        shift = np.exp(1j * np.arange(12)) * gap / 2
+        for k in range(12):  # A polyline per half flank, each shifted by half the gap.
+            part = np.append(EE, EE[0])[40 * k : 40 * k + 41] + shift[k]
+            space.add_lwpolyline([(z.real, z.imag) for z in part])
+        if framed:
+            rectangle(space, 130, 90)
+
+    path, join = tmp_path / "gap.dxf", 1e-3
+    if gap > join:
+        with pytest.raises(InputError, match="widest gap is") as refused:
+            drawn(path, draw, sought=SOUGHT)
+        said = re.search(
+            r"gap is ([\d.e-]+) mm, at \(.*`profile.outline_join_mm` = ([\d.e-]+),",
+            f"{refused.value}",
+        )
+        assert said
+        assert float(said[1]) < float(said[2]) < 1.1 * float(said[1])
+        join = float(said[2])
+    loop = drawn(path, draw, sought=SOUGHT, join=join)
+    assert loop.gap[0] <= gap
+    assert any("apart were joined" in note for note in loop.notes) == (gap > 1e-4)
+    points = loop.points if signed_area(loop.points) > 0 else loop.points[::-1]
+    off = np.roll(points, -int(np.argmin(np.abs(points - EE[0])))) - EE
+    assert np.max(np.abs(off)) < gap
+    assert np.max(np.abs(np.diff(off, append=off[0]))) < gap / 8
+
+
+HEADERS = {
+    "x_in,y_in": (25.4, "lengths are read in inch"),
+    "X (inch);Y (inch)": (25.4, "lengths are read in inch"),
+    "x [cm]\ty [cm]": (10.0, "lengths are read in cm"),
+    "# x_in,y_in": (25.4, "lengths are read in inch"),
+    "x;y\nmm;mm": (1.0, None),
+    "r, theta": (1.0, "polar coordinates r, theta (deg)"),
+    "r_in;phi (rad)": (25.4, "polar coordinates r, theta (rad)"),
+    "theta_deg radius_mm": (1.0, "polar coordinates r, theta (deg)"),
+}
+
+
+@pytest.mark.parametrize("header", HEADERS)
+@pytest.mark.parametrize("comma", [False, True])
+def test_headers_that_state_units_or_polar_coordinates(tmp_path, header, comma):
+    length, note = HEADERS[header]
+    split = next((c for c in ";\t," if c in header), " ")
+    split = ";" if comma and split == "," else split
+    columns = np.stack([EE.real, EE.imag]) / length
+    if note and "polar" in note:
+        turn = 1.0 if "rad)" in note else 180 / np.pi
+        columns = np.stack([np.abs(EE) / length, np.angle(EE) * turn])
+        columns = columns[::-1] if header.startswith("theta") else columns
+    rows = [split.join(f"{v:.12g}" for v in row) for row in columns.T]
+    rows = [row.replace(".", ",") for row in rows] if comma else rows
+    (tmp_path / "points.csv").write_text("\n".join([header.replace(",", split), *rows]))
+    loop = read(tmp_path / "points.csv")
+    assert loop.points == pytest.approx(EE, abs=1e-8)
+    assert bool(loop.notes) == bool(note)
+    assert note is None or note in " ".join(loop.notes)
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        ("x,y\n1,2\n#N/A,3\n", "line 3: must hold x and y in mm, but is '#N/A, 3'"),
+        ("x_in;y_in\n1;2\n1,5;\n", "line 3: must hold x and y in inch, but is '1,5, '"),
+        ("x,y\n1,2\n1,#DIV/0!\n", "line 3: must hold x and y"),
+        ("x,y\n1,2\n,\n3,NaN\n", "line 4: must hold x and y"),
+        ("12,5,33,0\n12,7,32,5\n11,33,1\n", "must separate columns by another character"),
+        ("x_mm,y_in\n1,2\n", "must state no unit of length or one of mm, .* 'x_mm, y_in'"),
+        ("x [ft],y [ft]\n1,2\n", r"but is 'x \[ft\], y \[ft\]'"),
+        ("r,theta\n1,2\n3,90\n", "polar angles must go round once, .* but range over 88"),
+    ],
+)
+def test_tables_that_cannot_be_understood(tmp_path, data, message):
+    assert re.search(message, fault(tmp_path / "points.csv", data))
+
+
+@pytest.mark.parametrize("split", [";", "\t", " "])
+def test_decimal_commas_without_a_header(tmp_path, split):
+    rows = [f"{z.real:.8f}{split}{z.imag:.8f}".replace(".", ",") for z in ROTOR]
+    (tmp_path / "points.txt").write_text("\n".join([*rows, split * 2]))
+    assert read(tmp_path / "points.txt").points == pytest.approx(ROTOR, abs=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("lobes", "inset", "count"), [(2, 0.3, 2000), (3, 0.2, 1000), (4, 0.5, 4000)]
+)
+def test_swallow_tails_of_an_offset_are_named_and_cut_off(tmp_path, lobes, inset, count):
+    """The loops are at the crossings of the pitch circle; without them, the offset is read.
+
+    The message about what is left names the loops and a smoothing, which reads the file."""
+    z = outlines.epicycloid(lobes, 33.0, count, inset)
+    path = tmp_path / "points.csv"
+    path.write_bytes(outlines.table(z))
+    loop = untangled(read(path), lobes, 33.0)
+    assert np.max(np.abs(np.angle(np.diff(loop.points)[1:] / np.diff(loop.points)[:-1]))) < 2
+    (note,) = loop.notes
+    assert "small loops (swallow-tails of an offset) at (" in note
+    places = [float(x) for x in re.findall(r"\(([-\d.]+) deg, [\d.]+ um long\)", note)]
+    off = (np.array(places) * lobes / 180) % 1 - 0.5  # Flanks cross in the middle of a half lobe.
+    assert off == pytest.approx(0, abs=0.03)
+    assert abs(signed_area(loop.points)) == pytest.approx(abs(signed_area(z)), rel=1e-6)
+    with pytest.raises(InputError) as refused:
+        imported(loop, lobes, 33.0, 0.0)
+    said = re.search(r"`profile.outline_smoothing_mm` = ([\d.e-]+), with which", f"{refused.value}")
+    assert said
+    found, _ = imported(loop, lobes, 33.0, float(said[1]))
+    assert float(found.outer_radius) == pytest.approx(33e-3 * (1 + 1 / lobes) - 1e-3 * inset)
+
+
+def test_outlines_that_cross_themselves_widely_are_refused():
+    z = outlines.epicycloid(3, 33.0, 1500, 6.0)
+    with pytest.raises(InputError, match=r"does not cross itself, .* loops .* at \(.* deg, .* um"):
+        untangled(Loop(z, np.zeros(len(z), bool)), 3, 33.0)
+
+
+def test_exact_lines_and_arcs_are_read_with_the_smoothing_offered(tmp_path):
+    """Ends of lines that miss by 0.1 µm, and arcs on the wrong side of the pitch circle."""
+    shift = np.random.default_rng(0).uniform(-0.5e-4, 0.5e-4, (2, 2, len(EE)))
+    ends = np.stack([EE, np.roll(EE, -1)]) + shift[0] + 1j * shift[1]
+    loop = drawn(
+        tmp_path / "gaps.dxf", lambda s: [line(s, *pair) for pair in ends.T], sought=SOUGHT
+    )
+    with pytest.raises(InputError, match=r"outline_smoothing_mm` = .*, with which") as refused:
+        imported(loop, 3, 33.0, 0.0)
+    value = re.search(r"outline_smoothing_mm` = ([\d.e-]+)", str(refused.value))
+    assert value
+    assert float(value[1]) < 1e-3
+    imported(loop, 3, 33.0, float(value[1]))
