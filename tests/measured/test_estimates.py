@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from rootsopt.config import parse
 from rootsopt.errors import InputError
-from rootsopt.measured.estimates import center, estimates, scatter, unit_of_size
+from rootsopt.measured.estimates import Estimates, center, estimates, scatter, unit_of_size
 from rootsopt.measured.source import advice, outline_of
 from rootsopt.profiles import CIC, EE, outline
 from tests.fuzz import outlines
@@ -233,3 +233,11 @@ def test_scatter_that_cannot_be_told_from_shape_is_bounded():
     found, between = scatter(scattered(outlines.epicycloid(3, 33.0, 200), 1e-3))
     assert np.isnan(found)
     assert between == pytest.approx(1e-3, rel=0.5)
+
+
+def test_a_smoothing_is_offered_only_if_it_reads():
+    """The least value from which on all greater ones that are tried read the outline."""
+    for scatter_mm, least, offered in ((1e-6, 3e-4, "0.0005"), (5e-3, 6e-3, "0.0063")):
+        seen = Estimates(scatter_mm, 0j, 0.0, 33.0, 0.0, lambda s, least=least: s >= least)
+        assert f"= {offered}, with which it is read" in seen.remedy(0.0)
+    assert Estimates(1e-6, 0j, 0.0, 33.0).remedy(0.0).endswith("correct the outline")
