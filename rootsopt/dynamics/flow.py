@@ -7,6 +7,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
@@ -196,6 +197,30 @@ class Equation(eqx.Module):
         last = y.shape[0]
         force = force / slope[last - 1] if pair.free else force
         return jnp.concatenate([after, slope[last : last + pair.jumps], force[None]])
+
+    def with_rate(
+        self, tau: Float[Array, ""], found: Float[Array, " values"], dynamic: Any
+    ) -> Float[Array, " values-n+1"]:
+        """Return the entries of `found` after the state, followed by the rate of the force.
+
+        `found`: the state at the time `tau` (mesh periods), the first of the `marks` if the contact
+        may jump, and the contact force in `force_unit`. The rate is per mesh period, along the
+        motion, exact to rounding."""
+        pair, state = self.pair(dynamic), found[: self.states]
+        slope = pair.derivative(tau, state)[0]
+        along = jnp.ones_like(tau), slope
+        _, rate = jax.jvp(lambda *at: pair.contact_at(*at).total, (tau, state), along)
+        return jnp.append(found[self.states :], rate / self.force_unit)
+
+    def peak(
+        self, times: Float[Array, " 7"], found: Float[Array, "7 values"], noise, dynamic: Any
+    ) -> tuple[Float[Array, ""], Float[Array, "7 weighted"]]:
+        """Return the peak force (in `force_unit`), and weights of its derivative (`one_sided`).
+
+        `times` around the peak (mesh periods); `found`: as in `with_rate`, at these times; `noise`:
+        relative rounding error of the force."""
+        values = jax.vmap(self.with_rate, (0, 0, None))(times, found, dynamic)
+        return one_sided(values, noise)
 
 
 class _Recorded(NamedTuple):
@@ -491,12 +516,22 @@ def _peak_force(
     there = equation.with_force(begin, peak.time, y, dynamic)[:size]
 
     def beside(side):
-        return equation.with_force(peak.time, peak.time + side, there, dynamic)[size:]
+        return equation.with_force(peak.time, peak.time + side, there, dynamic)
 
     found = jax.vmap(beside)(peak.beside)
-    frozen = lax.stop_gradient(found)
-    value, weights = one_sided(frozen, peak.noise)
-    return value + jnp.sum(weights * (found - frozen))
+    frozen, fixed = lax.stop_gradient((found, dynamic))
+    value, weights = _weighted(equation, frozen, size, peak, fixed)
+    return value + jnp.sum(weights * (found - frozen)[:, size:])
+
+
+def _weighted(
+    equation: Equation, beside: Float[Array, "sides rows"], size: int, peak: _Peak, dynamic: Any
+) -> tuple[Float[Array, ""], Float[Array, "sides weighted"]]:
+    """Return the peak force (in `force_unit`), and the weights of its derivative.
+
+    `beside`: results of `Equation.with_force` beside the peak; `size`: number of entries of y."""
+    rows = np.append(np.arange(equation.states), np.arange(size, beside.shape[1]))
+    return equation.peak(peak.time + peak.beside, beside[:, rows], peak.noise, dynamic)
 
 
 def _linearized(
@@ -525,5 +560,5 @@ def _linearized(
     unit = jnp.eye(size, columns, dtype=taken.end.dtype).at[count:].set(0.0)
     along, there, beside = propagated(linear_step, unit, taken.last, peak.holds, sides)
     slopes = jax.vmap(Linear.after, (0, None))(beside, there)[:, size:]
-    value, weights = one_sided(beside.value[:, size:], peak.noise)
+    value, weights = _weighted(equation, beside.value, size, peak, dynamic)
     return along, value, jnp.tensordot(weights, slopes)

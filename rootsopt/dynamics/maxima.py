@@ -27,7 +27,7 @@ from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.orbit import Orbit
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.peak import BESIDE, BESIDE_UNIT, Steps, blended, one_sided
+from rootsopt.dynamics.peak import BESIDE, BESIDE_UNIT, Steps, blended
 from rootsopt.dynamics.tangent import linearized
 from rootsopt.runtime.programs import Program
 
@@ -50,7 +50,7 @@ _SHOULDER = 0.02
 """Difference from the greatest force, as a fraction of that force, above which a shoulder is not
 listed. A shoulder is an instant at which the force almost has a maximum (see the module's
 docstring)."""
-_STEPS = 1024
+_STEPS = 2048
 """Number of solver steps for which there is room, times a power of 2 if the orbit needs more."""
 _SHORTEST = 1e-9
 """Minimum time (mesh periods) from the start of a step to a maximum inside it. An earlier maximum
@@ -339,9 +339,10 @@ def _differentiated(
     along = _along(kept, orbit.moved, taken)[holds]
     there = _after(reached, along)[:, :count]
     every = jnp.repeat(there, sides.shape[0], axis=0)
-    shape = times.shape[0], sides.shape[0], near.value.shape[1] - count
-    slopes = _after(near, every)[:, count:].reshape(*shape, -1)
-    values, weights = jax.vmap(one_sided, (0, None))(near.value[:, count:].reshape(shape), noise)
+    at = times[:, None] + sides
+    slopes = _after(near, every)[:, count:].reshape(*at.shape, near.value.shape[1] - count, -1)
+    found = near.value.reshape(*at.shape, -1)
+    values, weights = lax.map(lambda at: equation.peak(*at, noise, dynamic), (at, found))
     return unit * values, unit * jnp.einsum("ksf,ksfd->kd", weights, slopes)
 
 

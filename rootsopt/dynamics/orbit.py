@@ -54,6 +54,12 @@ _AGREE = 10.0, 1e-3, 3e-2
 """Relative difference between the derivatives on a grid and on halved steps above which no
 derivatives are reported. The limit is the first number times the square root of the tolerance, at
 least the second number and at most the third."""
+_INEXACT = 1e-11
+"""Least tolerance to which kinks count as known before the orbit is closed. Otherwise, at tight
+tolerances, the check would have as long steps around kinks as the orbit."""
+_SAME = 1e-3
+"""Time (mesh periods) between the peaks on two grids above which they are two maxima of almost
+equal height. The derivative of each is right, so they are not compared."""
 _SMALL = 1e-9, 1e-3
 """Least and greatest value (scaled) of the Newton step below which the solver steps are kept. In
 between, this limit is a thousand tolerances."""
@@ -206,7 +212,7 @@ class _Shooting(eqx.Module):
         checking = ~self.is_open(now) & ~self.windowed
         start = jnp.where(checking, now.orbit.state, now.state)
         start = jnp.where(self.windowed, now.window.end, start)
-        grid = lax.cond(checking, lambda: halved(now.orbit.flow.grid), lambda: now.grid)
+        grid = lax.cond(checking, lambda: halved(now.grid), lambda: now.grid)
         length = jnp.where(self.windowed, 1, self.period).astype(start.dtype)
         frozen = lax.stop_gradient(self.pair)
         peak = now.orbit.flow.peak
@@ -258,31 +264,32 @@ class _Shooting(eqx.Module):
             newton_steps=done,
             drift=jnp.max(jnp.abs(start - now.looked)),
         )
-        apart = disagreement(now.orbit.flow.slope, out.slope, count)
-        # The comparison needs room to halve all steps.
-        apart = jnp.where(has_room(now.orbit.flow.grid), apart, jnp.inf)
-        compared = now.orbit._replace(defect=residual, disagreement=apart)
+        compared, apart = _compared(now, out, residual, count)
         finer = checking & (apart > agreement(self.tolerance)) & (apart < jnp.inf)
         finer &= now.refined < 1
         renewed = jnp.where(checking, finer, look)
-        base, grid = self._steps(now, out, renewed, finer)
         # Residuals are comparable only on the same steps.
         best = jnp.where(renewed | ~now.repeat, jnp.inf, jnp.minimum(now.best, residual))
-        return _Closing(
+        after = _Closing(
             orbit=choose(checking, compared, found),
             window=now.window,
             state=new,
             repeat=following | checking,
             held=jnp.where(checking, ~finer, now.repeat & ~again),
             improving=improving | renewed,
-            base=base,
-            grid=grid,
+            base=now.base,
+            grid=now.grid,
             best=best,
             looks=now.looks + renewed,
             looked=jnp.where(renewed, start, now.looked),
             refined=now.refined + finer,
             checked=checking & ~finer,
         )
+        # On a closed orbit, kinks are located exactly: the check has the shortest steps around
+        # them. Otherwise, both grids would have the same error, and the check would not notice it.
+        closed = ~self.is_open(after) & ~checking & self.check
+        base, grid = self._steps(now, out, renewed | closed, finer, closed)
+        return after._replace(base=base, grid=grid)
 
     def _kept(self, now: _Closing, start, out: Flow, size, residual, improving):
         """Return three decisions about the solver steps after the flow `out`.
@@ -294,7 +301,10 @@ class _Shooting(eqx.Module):
         done, smooth = now.orbit.newton_steps + 1, self.pair.smooth
         known = size < jnp.clip(1000 * self.tolerance, *_SMALL)
         following = now.repeat | known | (done >= jnp.minimum(self.shots // 3, _KEPT))
-        # Search for kinks again where the motion has moved them out of their steps.
+        # The first search interpolates within long steps, and leaves some kinks up to 1e-5 mesh
+        # periods outside their short steps, at any tolerance. The second one encloses them.
+        rough = now.repeat & (now.looks == 1) & (residual > self.closed) & smooth
+        # Search again where the motion has moved kinks out of their steps.
         few = now.looks < _LOOKS
         stalled = now.repeat & ~improving & (residual > self.closed) & few
         again = now.repeat & (residual <= self.closed) & few & (done + _AFTER <= self.shots)
@@ -304,20 +314,22 @@ class _Shooting(eqx.Module):
         strained = again & ~(out.strain <= _STRAIN)
         # Do not repeat the steps of a solver that failed.
         following &= ~strained & (out.solved | now.repeat | ~jnp.all(jnp.isfinite(start)))
-        look = following & (~now.repeat | stalled | strayed)
+        look = following & (~now.repeat | rough | stalled | strayed)
         return following, look, strayed | strained
 
-    def _steps(self, now: _Closing, out: Flow, renewed, finer):
+    def _steps(self, now: _Closing, out: Flow, renewed, finer, closed):
         """Return the grid without step ends for kinks, and the grid of the next integration.
 
-        `renewed`: whether to search for kinks along `out`; `finer`: whether to halve the steps."""
+        `renewed`: whether to search for kinks along `out`; `finer`: whether to halve the steps;
+        `closed`: whether `out` is the orbit, so that its kinks are known exactly."""
         base = jnp.where(now.repeat, now.base, out.grid)
         base = lax.cond(finer, lambda: halved(base), lambda: base)
         length = self.period.astype(out.end.dtype)
         frozen = lax.stop_gradient(self.pair)
+        tolerance = jnp.where(closed, 0.0, jnp.maximum(self.tolerance, _INEXACT))
         grid = lax.cond(
             renewed,
-            lambda: with_switches(frozen, out, length, self.tolerance, base),
+            lambda: with_switches(frozen, out, length, tolerance, base),
             lambda: jnp.where(now.repeat, now.grid, out.grid),
         )
         return base, grid
@@ -430,6 +442,26 @@ def choose(condition: Bool[Array, ""], new: Any, old: Any) -> Any:
     return jax.tree.map(lambda x, y: jnp.where(condition, x, y), new, old)
 
 
+def _compared(now: _Closing, out: Flow, residual: Float[Array, ""], count: int):
+    """Return the orbit of `now` with the derivatives of the flow `out`, and their disagreement.
+
+    `out`: flow from the start of the orbit on the grid of the check, whose derivatives are the more
+    accurate ones; `residual`: its residual (scaled); `count`: number of states. The orbit gets its
+    steps, too: further derivatives are computed on them. Its forces and states remain."""
+    flow = now.orbit.flow
+    # The derivatives belong to the peak that is reported.
+    same = jnp.abs(flow.peak_time - out.peak_time) < _SAME
+    row = count + 2
+    slope = out.slope.at[row].set(jnp.where(same, out.slope[row], flow.slope[row]))
+    # The comparison needs room to halve all steps.
+    apart = jnp.where(has_room(now.grid), disagreement(flow.slope, slope, count), jnp.inf)
+    finer = flow._replace(slope=slope, grid=out.grid, corners=out.corners)
+    kept = choose(jnp.all(jnp.isfinite(slope)), finer, flow)
+    monodromy = kept.slope[:count, :count]
+    orbit = now.orbit._replace(flow=kept, monodromy=monodromy, defect=residual)
+    return orbit._replace(disagreement=apart), apart
+
+
 def agreement(tolerance: Float[Array, ""]) -> Float[Array, ""]:
     """Return the `disagreement` above which an orbit's derivatives are not reported.
 
@@ -445,15 +477,15 @@ def disagreement(
 
     `first` and `second`: `Flow.slope` on two grids; `count`: number of states. Two kinds of
     derivative are compared: (I - M)⁻¹, where M is the monodromy matrix; and the derivatives of
-    state, mean force and mean square force with respect to the design. Differences are relative to
-    the greatest entry of the same quantity in `first`.
+    state, mean force, mean square force and peak force with respect to the design. Differences are
+    relative to the greatest entry of the same quantity in `first`.
     """
 
     def derivatives(slope):
         unit = jnp.eye(count, dtype=slope.dtype)
         right = jnp.concatenate([unit, slope[:count, count:]], axis=1)
         moved = solved(unit - slope[:count, :count], right)
-        forces = slope[count : count + 2]
+        forces = slope[count : count + 3]
         along = forces[:, count:] + forces[:, :count] @ moved[:, count:]
         return [moved[:, :count], moved[:, count:], *along]
 

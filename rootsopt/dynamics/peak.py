@@ -23,19 +23,13 @@ BESIDE = (0.0, -1.0, -2.0, 1.0, 2.0, -_WIDE, _WIDE)
 BESIDE_UNIT = {8: 2e-8, 4: 1e-3}
 """Unit of `BESIDE` (mesh periods), keyed by bytes per number."""
 _FARTHEST = {8: 32.0, 4: 1 / 16}
-"""Distance (units of `_WIDE`) from a located peak to the vertex of the parabola through the forces
-around it, above which the vertex is rejected. Keyed by bytes per number. It is large for 8 bytes,
-because peaks are located only to about 1e-5 mesh periods where the states bend between samples."""
-_ROUNDINGS = 1e5
-"""Second difference of the force over `_WIDE` (rounding errors of the force) above which it counts
-as curvature, not as rounding."""
+"""Distance (units of `_WIDE`) from a located peak to the instant at which the force stops rising,
+above which this instant is rejected. Keyed by bytes per number. It is large for 8 bytes, because
+peaks are located only to about 1e-5 mesh periods where the states bend between samples."""
 _NOISES = 10.0
-"""Second difference of the force over `_WIDE` (multiples of the force's noise) above which it
-counts as curvature, not as noise. The forces next to a smooth peak may also scatter by this much.
-"""
-_LEAST = 1e-9
-"""Fall of the force on both sides of a peak together, relative to the peak, below which the peak
-does not count as a corner. The fall may then be rounding."""
+"""Step of the force above which it counts as a jump, in multiples of the force's noise."""
+_NEAR, _FAR = (2, 4), (5, 6)
+"""Indices in `BESIDE` of the two pairs of times, one time on each side of the peak."""
 _KINK = 1e-3
 """Relative change of a mark's rate at a jump below which the mark does not show the jump."""
 
@@ -220,57 +214,47 @@ def locate_peak(
 
 def one_sided(
     found: Float[Array, "7 values"], noise: Float[Array, ""] | float = 0.0
-) -> tuple[Float[Array, ""], Float[Array, "7 values"]]:
-    """Return the peak force, and the weights (7, values) of its derivative.
+) -> tuple[Float[Array, ""], Float[Array, "7 weighted"]]:
+    """Return the peak force, and the weights (7, values - 1) of its derivative.
 
-    The derivative of the peak is the weighted sum of the derivatives of `found`.
+    The derivative of the peak is the weighted sum of the derivatives of `found`, without its last
+    column.
 
-    `found`: at the times `BESIDE` around the located peak, the contact force in any unit (last
-    column). If the contact may jump, the first of its `rootsopt.dynamics.saltation.marks` stands
-    before it. `noise`: relative error of the forces in addition to rounding. There are three cases:
+    `found`: at the times `BESIDE` around the located peak, the contact force in any unit, followed
+    by its rate (per mesh period). If the contact may jump, the first of its
+    `rootsopt.dynamics.saltation.marks` stands before them. `noise`: relative error of the forces in
+    addition to rounding.
 
-    Smooth peak: the derivative of the peak is the derivative of the force at a fixed instant
-    (envelope theorem). This instant is the vertex of the parabola through the forces, because
-    rounding hides the exact maximum.
+    The derivative is a weighted mean of those at two times, such that the same mean of the rates is
+    zero. Where the force has a corner, this accounts for the motion of the corner: the times are on
+    both sides of it, close by. At a smooth peak it is the derivative at the instant at which the
+    force stops rising (envelope theorem), from times farther apart. Rates from differences of the
+    force would not do: rounding of the gap would leave an error of up to 1e-3 in the weights.
 
-    Corner: the peak moves with the corner. Its derivative is a weighted mean of the derivatives on
-    both sides. The weights are such that the same mean of the time derivatives is zero.
-
-    Jump (such as with the `linear` contact): rounding decides on which side of the jump the located
-    instant lies. The side with the greater force is used. The peak moves with the jump.
+    At a jump (such as with the `linear` contact), rounding decides on which side of the jump the
+    located instant lies. The side with the greater force is used. The peak moves with the jump.
     """
-    forces = found[:, -1]
-    here, before, earlier, after, later, left, right = forces
-    none, one = jnp.zeros_like(here), jnp.ones_like(here)
-    # Compute each slope on one side only: the instant of the corner is not known well enough.
-    rise, fall = before - earlier, after - later
-    drop = rise + fall
-    # Next to a corner the force falls as fast as farther away; on a parabola, a third as fast.
-    sharp = (2 * here - before - after > 0.6 * drop) & (drop > _LEAST * here)
-    continuous = jnp.abs(before - after) <= 2 * drop
-    corner = (rise > 0) & (fall > 0) & sharp & continuous
-    share = rise / jnp.where(corner, drop, 1.0)
-    at_corner = jnp.stack([none, 1 - share, none, share, none, none, none])
-    bend = 2 * here - left - right
-    rounding = float(jnp.finfo(forces.dtype).eps) * here
-    noise = _NOISES * noise * here
-    # A jump stands out from the straight line through the forces at the wide distance.
-    line = here + (right - left) / (2 * _WIDE) * jnp.asarray(BESIDE[:5], forces.dtype)
-    smooth = jnp.max(jnp.abs(forces[:5] - line)) < bend / (8 * _WIDE) + 100 * rounding + noise
-    bent = bend > jnp.maximum(_ROUNDINGS * rounding, noise)
-    vertex = (right - left) / (2 * jnp.where(bent, bend, jnp.inf))
-    near = jnp.abs(vertex) < _FARTHEST[forces.dtype.itemsize]
-    vertex = jnp.where(smooth & near, vertex, 0.0)
-    at_vertex = jnp.stack([one, none, none, none, none, -vertex / 2, vertex / 2])
-    highest = jnp.where(corner | smooth, 0, jnp.argmax(forces[:5]))
-    single = (jnp.arange(len(BESIDE)) == highest).astype(forces.dtype)
-    weights = jnp.where(corner, at_corner, jnp.where(highest == 0, at_vertex, single))
-    above = jnp.where(corner, 0.0, bend / 2 * vertex**2)
-    weights = weights[:, None]
-    if found.shape[1] > 1:
-        moved = jnp.where(corner | smooth, 0.0, _with_jump(forces, found[:, 0]))
+    forces, rates = found[:, -2], found[:, -1]
+    dtype = forces.dtype
+    here, before, _, after, *_ = forces
+    # Between the nearest times, a corner changes the force by no more than its rates allow.
+    rise, fall = BESIDE_UNIT[dtype.itemsize] * jnp.stack([rates[1], rates[3]])
+    rounding = (100 * float(jnp.finfo(dtype).eps) + _NOISES * noise) * here
+    jumps = jnp.abs(after - before - rise - fall) > 2 * jnp.abs(rise - fall) + rounding
+    turns = (rates[_NEAR[0]] > 0) & (rates[_NEAR[1]] < 0)
+    first, last = (jnp.where(turns, *sides) for sides in zip(_NEAR, _FAR, strict=True))
+    drop = rates[first] - rates[last]
+    share = rates[first] / jnp.where(drop > 0, drop, jnp.inf)
+    place = jnp.where(turns, 0.0, _WIDE * (2 * share - 1))
+    stops = (drop > 0) & (jnp.abs(place) < _WIDE * _FARTHEST[dtype.itemsize]) & ~jumps
+    single = jnp.zeros_like(forces).at[jnp.argmax(forces[:5])].set(1.0)
+    double = jnp.zeros_like(single).at[first].set(1 - share).at[last].set(share)
+    weights = jnp.where(stops, double, single)[:, None]
+    above = jnp.maximum(BESIDE_UNIT[dtype.itemsize] * rates[0] * place / 2, 0.0)
+    if found.shape[1] > 2:
+        moved = jnp.where(jumps, _with_jump(forces, found[:, 0]), 0.0)
         weights = jnp.concatenate([moved[:, None], weights], axis=1)
-    return forces[highest] + above, weights
+    return jnp.where(stops, here + above, jnp.max(forces[:5])), weights
 
 
 def _with_jump(forces: Float[Array, "7"], marks: Float[Array, "7"]) -> Float[Array, "7"]:

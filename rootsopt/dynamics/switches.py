@@ -25,14 +25,17 @@ _FEW, _FEW_CHANGES = 2048, 128
 """Numbers of steps and of switches above which whole arrays are sorted, unused entries included."""
 _LANES = 16
 """Number of times at which flags are evaluated together, as arrays."""
-_HALVINGS = 26
-"""Number of bisections that locate a switch."""
+_FOURTH = 2
+"""Number of bisections that locate a switch, beyond those that reduce the interval between two
+looks to half the length of the short step around the switch."""
 _BRIEF, _PARTS = 0.05, 8
 """Distance (mesh periods) between two switches below which the interval between them is divided,
 and the number of steps into which it is divided."""
-_ASIDE = 1e-9, 1e-6
-"""Lower and upper limits (mesh periods) of half the length of the short step around a switch. The
-error of the gradients is proportional to this length."""
+_ASIDE, _CLOSE = (1e-10, 1e-6), 1e-9
+"""Lower and upper limits (mesh periods) of half the length of the short step around a switch, and
+the lower limit next to another switch, unless the length is smaller anyway. The error of the
+gradients is proportional to this length. Where the contact passes a joint of the flanks quickly,
+derivatives jump by 10⁴ of their size per mesh period."""
 _LOOSE = 1e3
 """Ratio of half the length (mesh periods) of the short step around a switch to the tolerance. The
 limits `_ASIDE` have precedence."""
@@ -50,7 +53,7 @@ short step."""
 _HOLDS = 2.5
 """Length of a step below which the step is never halved, in multiples of the greatest half length
 of a short step around a switch. The step may be such a short step."""
-_APART = 1e-10
+_APART = 1e-11
 """Distance (mesh periods) below which two step ends are merged."""
 
 
@@ -63,8 +66,9 @@ def with_switches(
 ) -> Float[Array, " steps"]:
     """Return the grid `base` with step ends added around the switches along the motion `out`.
 
-    `out` was integrated over `periods` mesh periods at the relative `tolerance`. `base`: ends of
-    steps (mesh periods), by default the grid of `out`."""
+    `out` was integrated over `periods` mesh periods. Its switches are known to about the relative
+    `tolerance`, which sets the lengths of the short steps around them. `base`: ends of steps (mesh
+    periods), by default the grid of `out`."""
     width = periods / out.states.shape[0]
     before = jnp.concatenate([out.states[:1], out.corners[:-1]])
     begins = jnp.concatenate([jnp.zeros_like(out.grid[:1]), out.grid[:-1]])
@@ -87,16 +91,18 @@ def with_switches(
         return pair.switches(tau, blended(pair, out.states, steps, tau, width))
 
     width_of = jax.eval_shape(flags, width)[0].shape[0]
+    aside = jnp.clip(_LOOSE * tolerance, *_ASIDE)
+    halvings = _FOURTH + jnp.ceil(-jnp.log2(_LOOKS * aside)).astype(int)
 
     # Scan and bisect in one loop, so that the flags are compiled once.
     def go_on(carry):
         turn, number, *_ = carry
-        return (turn < blocks) | (turn < blocks + _HALVINGS * -(-number // _LANES))
+        return (turn < blocks) | (turn < blocks + halvings * -(-number // _LANES))
 
     def look(carry):
         turn, number, listed, (low, high), last = carry
         looking = turn < blocks
-        place = jnp.where(looking, turn, (turn - blocks) // _HALVINGS) * _LANES + lanes
+        place = jnp.where(looking, turn, (turn - blocks) // halvings) * _LANES + lanes
         at = jnp.minimum(place, jnp.where(looking, known, _CHANGES) - 1)
         middle = (low[at % _CHANGES] + high[at % _CHANGES]) / 2
         found, counted = jax.vmap(flags)(jnp.where(looking, places[at], middle))
@@ -130,7 +136,7 @@ def with_switches(
     rooms = (_FEW, _FEW_CHANGES), (grid.shape[0], _CHANGES)
     return _if_few(
         few,
-        lambda room: _surrounded(grid[: room[0]], switches[: room[1]], periods, tolerance),
+        lambda room: _surrounded(grid[: room[0]], switches[: room[1]], periods, aside),
         rooms,
         grid.shape[0],
     )
@@ -156,9 +162,12 @@ def _surrounded(
     grid: Float[Array, " steps"],
     switches: Float[Array, " changes"],
     periods: Float[Array, ""],
-    tolerance: Float[Array, ""],
+    usual: Float[Array, ""],
 ) -> Float[Array, " more"]:
-    """Return `grid` with step ends added around the `switches`, padded with inf."""
+    """Return `grid` with step ends added around the `switches`, padded with inf.
+
+    `usual`: half the length (mesh periods) of the short step around a switch that has no other
+    switch close by."""
     found = jnp.sort(switches)
     # Between two close switches the contact crosses a whole flank segment: make short steps there.
     brief = jnp.diff(found, append=jnp.inf)
@@ -167,10 +176,10 @@ def _surrounded(
     # Each switch lies inside a step too short to matter. No stage is evaluated right at the switch,
     # where rounding would decide the side.
     apart = jnp.minimum(brief, jnp.diff(found, prepend=-jnp.inf))
-    aside = jnp.minimum(jnp.clip(_LOOSE * tolerance, *_ASIDE), _SHARE * apart)
     # A minimum length: two switches at almost the same instant would give steps of zero length.
-    least = jnp.maximum(_ASIDE[0], _ROUNDINGS * float(jnp.finfo(found.dtype).eps) * periods)
-    aside = jnp.maximum(aside, least)
+    rounding = _ROUNDINGS * float(jnp.finfo(found.dtype).eps) * periods
+    least = jnp.maximum(jnp.minimum(usual, _CLOSE), rounding)
+    aside = jnp.maximum(jnp.minimum(usual, _SHARE * apart), least)
     beside = [sign * grade * aside for grade in (1.0, *_GRADES) for sign in (-1, 1)]
     added = [*(found + apart for apart in beside), inside.ravel()]
     merged = jnp.sort(jnp.concatenate([grid, *added]))
