@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from experiments._common.scenes import FORCES
 from experiments._common.style import COLORS, sheet
-from experiments.gradients.study import TOLERANCES, Row
+from experiments.gradients.study import MEASURES, TOLERANCES, Row
 
 
 def errors_of(rows: Sequence[Row]) -> Figure:
@@ -16,10 +16,10 @@ def errors_of(rows: Sequence[Row]) -> Figure:
     left, right = axes[0]
     for rtol, color, marker in zip(TOLERANCES, COLORS[:3], "os^", strict=True):
         good = [r for r in rows if float(r["rtol"]) == rtol and r["status"] == "periodic"]
-        off = np.array([float(r["mean_force_N_error"]) for r in good])
-        said = np.array([float(r["gradient_disagreement"]) for r in good])
+        off = np.array([[float(r[f"{name}_error"]) for name in MEASURES] for r in good]).ravel()
+        said = np.repeat([float(r["gradient_disagreement"]) for r in good], len(MEASURES))
         kept = np.isfinite(off)
-        left.loglog(said[kept], off[kept], marker, color=color, ms=4, alpha=0.7, label=f"{rtol:g}")
+        left.loglog(said[kept], off[kept], marker, color=color, ms=3, alpha=0.5, label=f"{rtol:g}")
         for name, style in zip(FORCES, ("-", "--"), strict=True):
             errors = np.sort([float(r[f"{name}_error"]) for r in good])
             errors = errors[np.isfinite(errors)]
@@ -29,7 +29,7 @@ def errors_of(rows: Sequence[Row]) -> Figure:
     left.plot([1e-9, 1e-2], [1e-9, 1e-2], "k:", lw=1, label="equal")
     left.set(
         xlabel="disagreement on halved steps (relative)",
-        ylabel="error of the gradient of the mean\nagainst differences (relative)",
+        ylabel="error of the gradients of mean, peak, RMS\nagainst differences (relative)",
         title="Check against error",
     )
     left.legend(title="solver.rtol")

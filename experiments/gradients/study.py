@@ -1,10 +1,11 @@
 """Compares reported gradients of random designs and scenes with differences of orbits.
 
 A *pair* here is a random design (CIC with two and three lobes, arc, involute) in a random scene
-(speed, load, backlash, gear, with gas and friction or a motor). The study keeps pairs that settle
-on a periodic orbit, most of them with periods above one and some above four. It evaluates each pair
-at rtol 1e-8, 1e-9 and 1e-10. The derivatives of the mean and peak force are compared with central
-differences of the forces of orbits closed with another method (dopri8) at 1e-12.
+(speed, load, backlash, gear; half of the scenes with friction, motor and gas). The study keeps
+pairs that settle on a periodic orbit, most of them with periods above one and some above four. It
+evaluates each pair at rtol 1e-8, 1e-9 and 1e-10. The derivatives of mean, peak and RMS force along
+one direction of the design are compared with central differences of the forces of orbits closed
+with another method (dopri8) at 1e-12.
 """
 
 import csv
@@ -19,7 +20,7 @@ import numpy as np
 
 from experiments._common.scenes import CIC, FORCES
 from experiments._common.simulation import evaluator_of
-from rootsopt.config import Config, load
+from rootsopt.config import load
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.orbit import Shots, agreement, close_orbit
 from rootsopt.dynamics.window import no_tangents
@@ -28,13 +29,16 @@ from rootsopt.scene import Scene
 
 Row = dict[str, Any]
 TOLERANCES = (1e-8, 1e-9, 1e-10)
-STEP = 2e-5
-"""Relative step of the central differences. Orbits are accurate to 1e-12, so differences are
-accurate to 1e-7."""
-CLOSER = 1e-4
-"""Relative difference between gradient and central differences above which the differences are
-repeated with a quarter of the step and extrapolated to step 0. Forces are strongly curved close to
-a bifurcation."""
+MEASURES = (*FORCES, "rms_force_N")
+"""Names of the forces whose gradients are compared."""
+STEPS = 2e-5, 1e-5
+"""Relative steps of the central differences, which are extrapolated to step 0. Orbits are accurate
+to 1e-12, so differences are accurate to 1e-7, and their difference shows it."""
+WAY = np.array([1.0, -0.7, 0.8])
+"""Changes of the design parameters, relative to their values, along the direction of the
+differences."""
+BEYOND = 0.01
+"""Share of gradients that may err by more than their check states."""
 SHARE = 0.6
 """Share of pairs with a period above one below which pairs of period one are discarded."""
 QUICK_COUNT = 4
@@ -42,14 +46,7 @@ QUICK_COUNT = 4
 KINDS: dict[str, tuple[str, list[str]]] = {
     "cic, 3 lobes": ("cic", []),
     "cic, 2 lobes": ("cic", ["profile.lobes=2"]),
-    "cic, gas and friction": (
-        "cic",
-        [
-            "scene.load={pressure_difference_Pa: 2.0e4}",
-            "contact.friction={static: 0.2, kinetic: 0.1, stiction_speed_mm_s: 100, "
-            "friction_speed_mm_s: 1000}",
-        ],
-    ),
+    "cic, friction, motor and gas": ("cic", []),
     "cic, motor": (
         "cic",
         [
@@ -60,6 +57,8 @@ KINDS: dict[str, tuple[str, list[str]]] = {
     "arc and involute": ("arc_involute", []),
     "cic, long periods": ("cic", []),
 }
+FULL = "cic, friction, motor and gas"
+"""Kind of pairs with random friction, motor and gas. Half of all pairs are of this kind."""
 LONG = "cic, long periods"
 """Kind of pairs of which only orbits of five mesh periods or more are kept. About one scene in
 twenty of this kind has such an orbit."""
@@ -95,69 +94,81 @@ def pairs(seed: int, kind: str) -> Iterator[list[str]]:
             }
         if family == "arc_involute":
             values["profile.tip_arc_angle_deg"] = "null"
-        if "scene.load" in "".join(fixed):
+        if kind == FULL:
             values.pop("scene.load.torque_N_m")
+            values |= full(draw)
         yield [*(f"{key}={value}" for key, value in values.items()), *fixed]
+
+
+def full(draw: np.random.Generator) -> dict[str, Any]:
+    """Return random friction, motor and gas, as overrides."""
+    pressure, static = 10 ** draw.uniform(3.7, 4.8), draw.uniform(0.02, 0.25)
+    kinetic, creep = static * draw.uniform(0.3, 1.0), 10 ** draw.uniform(0.7, 2.3)
+    slide = creep * 10 ** draw.uniform(0.3, 1.3)
+    slope, inertia = 10 ** draw.uniform(-2.0, 0.0), 10 ** draw.uniform(-4.0, -2.3)
+    return {
+        "scene.load": f"{{pressure_difference_Pa: {pressure:.0f}}}",
+        "contact.friction": f"{{static: {static:.3f}, kinetic: {kinetic:.3f}, "
+        f"stiction_speed_mm_s: {creep:.1f}, friction_speed_mm_s: {slide:.1f}}}",
+        "scene.drive": "torque",
+        "scene.motor": f"{{slope_N_m_s_per_rad: {slope:.3f}, inertia_kg_m2: {inertia:.5f}}}",
+    }
 
 
 @eqx.filter_jit
 def forces(model: Scene, design, state, period, how: Integrator):
-    """Close an orbit. Return (mean, peak) force (N), the residual, and whether the solver
+    """Close an orbit. Return (mean, peak, RMS) force (N), the residual, and whether the solver
     succeeded.
     """
     pair = model.pair(design)
     orbit = close_orbit(pair, no_tangents(pair), state, period, Shots(how, check=False))
-    return jnp.stack([orbit.response[0], orbit.response[2]]), orbit.residual, orbit.flow.solved
+    mean, square, peak = orbit.response
+    return jnp.stack([mean, peak, jnp.sqrt(square)]), orbit.residual, orbit.flow.solved
 
 
-def differences(evaluator: Evaluator, found: Evaluation, step: float = STEP) -> np.ndarray:
-    """Differentiate mean and peak force by central differences of a relative `step`.
+def differences(evaluator: Evaluator, found: Evaluation) -> tuple[np.ndarray, np.ndarray]:
+    """Differentiate the forces along `WAY` by central differences, extrapolated to step 0.
 
-    Returns derivatives (2, d) in N per config unit, NaN where an orbit does not close.
-    """
+    Returns the derivatives (3,) in N per unit of relative change, and their estimated errors (3,).
+    Both are NaN where an orbit does not close."""
     how = Integrator("dopri8", jnp.asarray(1e-12), evaluator.scene.solver.orbit.max_steps)
     design = np.array(list(found.design.values()))
-    period = jnp.asarray(found.steady_state["period"])
-    columns = []
-    for k, value in enumerate(design):
-        sides = []
-        for sign in (1, -1):
-            moved = design.copy()
-            moved[k] += sign * step * value
-            state = jnp.asarray(found.state)
-            force, residual, solved = forces(
-                evaluator.scene, jnp.asarray(moved), state, period, how
-            )
-            closed = bool(solved) and float(residual) < 1e-10
-            sides.append(np.asarray(force) if closed else np.full(2, np.nan))
-        columns.append((sides[0] - sides[1]) / (2 * step * value))
-    return np.stack(columns, axis=1)
+    period, state = jnp.asarray(found.steady_state["period"]), jnp.asarray(found.state)
+
+    def at(change: float) -> np.ndarray:
+        moved = jnp.asarray(design * (1 + change * WAY))
+        force, residual, solved = forces(evaluator.scene, moved, state, period, how)
+        closed = bool(solved) and float(residual) < 1e-10
+        return np.asarray(force) if closed else np.full(len(MEASURES), np.nan)
+
+    wide, close = ((at(step) - at(-step)) / (2 * step) for step in STEPS)
+    return (4 * close - wide) / 3, np.abs(close - wide)
 
 
-def evaluated(config: Config) -> Iterator[tuple[float, Evaluation]]:
-    """Yield (rtol, evaluation) of the config's design from rest, the loosest tolerance first."""
-    evaluator = evaluator_of(config, give_up_early=True)
-    for rtol in TOLERANCES:
-        yield rtol, evaluator.at_tolerance(rtol)(series=False)
+def evaluated(evaluator: Evaluator) -> Iterator[tuple[float, Evaluation]]:
+    """Yield (rtol, evaluation) of the config's design: the loosest tolerance from rest, the others
+    from the state that it found.
+    """
+    first = evaluator.at_tolerance(TOLERANCES[0])(series=False)
+    yield TOLERANCES[0], first
+    for rtol in TOLERANCES[1:]:
+        yield rtol, evaluator.at_tolerance(rtol)(start=first.state, series=False)
 
 
-def errors(found: Evaluation, truth: np.ndarray) -> list[float]:
-    """Return the largest error of the gradients of mean and peak force, relative to the largest
-    entry of each gradient.
-
-    `truth` (2, d): gradients by central differences."""
-    slopes = [np.array(list(found.gradient[measure].values())) for measure in FORCES]
-    return [
-        float(np.max(np.abs(slope - row)) / np.max(np.abs(row)))
-        for slope, row in zip(slopes, truth, strict=True)
-    ]
+def slopes_of(found: Evaluation) -> np.ndarray:
+    """Return the terms (3, d) of the reported derivatives of the forces along `WAY`, in N."""
+    rows = np.array([list(found.gradient[measure].values()) for measure in MEASURES])
+    return rows * np.array(list(found.design.values())) * WAY
 
 
 def rows_of(
-    config: Config, kind: str, overrides: list[str], found: dict[float, Evaluation]
+    evaluator: Evaluator, kind: str, overrides: list[str], found: dict[float, Evaluation]
 ) -> list[dict[str, Any]]:
-    """Return the evaluations and their errors, one row per tolerance."""
-    truth = None
+    """Return the evaluations and their errors, one row per tolerance.
+
+    Errors are relative to the greatest term of the derivative."""
+    usable = [one for one in found.values() if one.usable]
+    truth, noise = differences(evaluator, usable[-1])
     rows = []
     for rtol, one in found.items():
         row: dict[str, Any] = {"kind": kind, "rtol": rtol, "status": one.status.label}
@@ -167,13 +178,12 @@ def rows_of(
         for name in ("gradient_disagreement", "orbit_defect", "orbit_steps", "seconds"):
             row[name] = one.statistics.get(name)
         if one.usable:
-            if truth is None:
-                evaluator = evaluator_of(config, give_up_early=True)
-                truth = differences(evaluator, one)
-                if max(errors(one, truth)) > CLOSER:
-                    truth = (16 * differences(evaluator, one, STEP / 4) - truth) / 15
-            for measure, error in zip(FORCES, errors(one, truth), strict=True):
-                row[measure], row[f"{measure}_error"] = one.response[measure], error
+            terms = slopes_of(one)
+            size = np.max(np.abs(terms), axis=1)
+            errors = np.abs(np.sum(terms, axis=1) - truth) / size
+            for k, measure in enumerate(MEASURES):
+                row[measure], row[f"{measure}_error"] = one.response[measure], errors[k]
+                row[f"{measure}_noise"] = noise[k] / size[k]
         rows.append(row)
     return rows
 
@@ -191,15 +201,14 @@ class Draw:
 
 
 def wanted_of(quick: bool, count: int) -> dict[str, int]:
-    """Return the number of pairs of each kind. The first kind gets most pairs.
+    """Return the number of pairs of each kind. Half of the pairs are of the kind `FULL`.
 
     `count`: number of pairs of all kinds except `LONG`, which a reduced run omits."""
-    kinds = [kind for kind in KINDS if kind != LONG][: 1 if quick else None]
-    wanted = {
-        kind: count * (2 if k == 0 else 1) // (len(kinds) + 1) for k, kind in enumerate(kinds)
-    }
-    wanted[kinds[0]] += count - sum(wanted.values())
-    return wanted if quick else wanted | {LONG: count // 20}
+    if quick:
+        return {FULL: count}
+    kinds = [kind for kind in KINDS if kind not in (FULL, LONG)]
+    share = count // 2 // len(kinds)
+    return {FULL: count - share * len(kinds)} | dict.fromkeys(kinds, share) | {LONG: count // 20}
 
 
 def run(
@@ -234,17 +243,17 @@ def pairs_of_kind(
             break
         # Wait for rare longer periods, but only for a limited number of scenes.
         patient = number < 6 * wanted
-        config = load(CIC, overrides)
-        series = evaluated(config)
+        evaluator = evaluator_of(load(CIC, overrides), give_up_early=True)
+        series = evaluated(evaluator)
         first = next(series)
         scout = int(first[1].steady_state.get("period", 0)) if first[1].usable else 0
         if (
             not scout
             or (kind == LONG and scout < 5)
-            or (scout == 1 and patient and plain >= (1 - SHARE) * wanted)
+            or (scout == 1 and patient and kind != FULL and plain >= (1 - SHARE) * wanted)
         ):
             continue
-        new = rows_of(config, kind, overrides, dict([first, *series]))
+        new = rows_of(evaluator, kind, overrides, dict([first, *series]))
         lively, plain = lively + (scout > 1), plain + (scout == 1)
         found = {row["rtol"]: (row["status"], row.get("mean_force_N_error")) for row in new}
         say(f"{kind} {lively} {plain} period {new[0]['period']} {found}")
@@ -265,13 +274,17 @@ class Judgement:
     """Summary of all pairs: counts by period, quantiles of the errors, broken promises.
 
     `errors`: rtol → (periodic pairs, all pairs, force → (median, 95 % quantile, maximum, number of
-    gradients compared)). `broken`: a line for each gradient whose error exceeds what its check
-    promises, and for each pair that has a result at one tolerance but none at a finer tolerance.
+    gradients compared)). `ratios`: median, 95 % and 99 % quantile and maximum of the errors
+    relative to the `gradient_disagreement`; noise of the differences is no error. `broken`: a line
+    for each gradient whose error exceeds the limit of its check, for each pair that has a result at
+    one tolerance but none at a finer tolerance, and if too many errors exceed the
+    `gradient_disagreement`.
     """
 
     pairs: int
     periods: dict[int, int]
     errors: dict[float, tuple[int, int, dict[str, tuple[float, float, float, int]]]]
+    ratios: tuple[float, ...]
     broken: list[str]
 
     def lines(self) -> Iterator[str]:
@@ -286,6 +299,8 @@ class Judgement:
                     f" ({compared} compared)"
                 )
             yield "; ".join(parts)
+        quantiles = ", ".join(f"{ratio:.1e}" for ratio in self.ratios)
+        yield f"error / disagreement: median, 95 %, 99 %, maximum {quantiles}"
         yield from self.broken
         yield f"{len(self.broken)} promises broken"
 
@@ -301,7 +316,7 @@ def judge(rows: Sequence[Row]) -> Judgement:
         mine = [found[rtol] for found in scenes.values()]
         good = [row for row in mine if row["status"] == "periodic"]
         quantiles = {}
-        for name in FORCES:
+        for name in MEASURES:
             off = np.array([float(row[f"{name}_error"]) for row in good])
             off = off[np.isfinite(off)]
             shares = np.quantile(off, [0.5, 0.95, 1.0]).tolist() if off.size else [np.nan] * 3
@@ -309,12 +324,30 @@ def judge(rows: Sequence[Row]) -> Judgement:
         errors[rtol] = len(good), len(mine), quantiles
         limit = float(agreement(jnp.asarray(rtol)))
         for row in good:
-            worst = np.nanmax([0.0, *(float(row[f"{name}_error"]) for name in FORCES)])
+            worst = np.nanmax([0.0, *(float(row[f"{name}_error"]) for name in MEASURES)])
             if worst > limit:
                 broken.append(f"OFF {rtol} {worst} {row['scene']}")
     for scene, found in scenes.items():
         usable = [found[rtol]["status"] == "periodic" for rtol in TOLERANCES]
         if usable[0] and not all(usable):
             broken.append(f"WORSE {[found[rtol]['status'] for rtol in TOLERANCES]} {scene}")
+    ratios = ratios_of(rows)
+    if ratios.size and np.mean(ratios > 1) > BEYOND:
+        broken.append(f"UNBOUNDED {100 * np.mean(ratios > 1):.1f} % of {ratios.size} gradients")
+    shares = np.quantile(ratios, [0.5, 0.95, 0.99, 1.0]) if ratios.size else np.full(4, np.nan)
     counts = {k: periods.count(k) for k in dict.fromkeys(periods)}
-    return Judgement(len(scenes), counts, errors, broken)
+    return Judgement(len(scenes), counts, errors, tuple(shares.tolist()), broken)
+
+
+def ratios_of(rows: Sequence[Row]) -> np.ndarray:
+    """Return the errors of all gradients, less the noise of the differences, relative to the
+    `gradient_disagreement`."""
+    found = [
+        (float(row[f"{name}_error"]), float(row[f"{name}_noise"]), row["gradient_disagreement"])
+        for row in rows
+        if row["status"] == "periodic"
+        for name in MEASURES
+    ]
+    off, noise, said = np.array(found, dtype=float).reshape(-1, 3).T
+    ratios = np.maximum(off - noise, 0.0) / said
+    return ratios[np.isfinite(ratios)]

@@ -34,8 +34,7 @@ and the number of steps into which it is divided."""
 _ASIDE, _CLOSE = (1e-10, 1e-6), 1e-9
 """Lower and upper limits (mesh periods) of half the length of the short step around a switch, and
 the lower limit next to another switch, unless the length is smaller anyway. The error of the
-gradients is proportional to this length. Where the contact passes a joint of the flanks quickly,
-derivatives jump by 10⁴ of their size per mesh period."""
+gradients is proportional to this length."""
 _LOOSE = 1e3
 """Ratio of half the length (mesh periods) of the short step around a switch to the tolerance. The
 limits `_ASIDE` have precedence."""
@@ -172,7 +171,6 @@ def _surrounded(
     # Between two close switches the contact crosses a whole flank segment: make short steps there.
     brief = jnp.diff(found, append=jnp.inf)
     share = jnp.arange(1, _PARTS, dtype=found.dtype) / _PARTS
-    inside = found[:, None] + jnp.where(brief < _BRIEF, brief, jnp.inf)[:, None] * share
     # Each switch lies inside a step too short to matter. No stage is evaluated right at the switch,
     # where rounding would decide the side.
     apart = jnp.minimum(brief, jnp.diff(found, prepend=-jnp.inf))
@@ -180,6 +178,10 @@ def _surrounded(
     rounding = _ROUNDINGS * float(jnp.finfo(found.dtype).eps) * periods
     least = jnp.maximum(jnp.minimum(usual, _CLOSE), rounding)
     aside = jnp.maximum(jnp.minimum(usual, _SHARE * apart), least)
+    # Two switches may be at the same instant, as where seal and contact pass the same joint. A step
+    # end between them would be right at the switch, where derivatives may be wrong by 10⁴.
+    divided = (brief < _BRIEF) & (brief > 2 * _PARTS * least)
+    inside = found[:, None] + jnp.where(divided, brief, jnp.inf)[:, None] * share
     beside = [sign * grade * aside for grade in (1.0, *_GRADES) for sign in (-1, 1)]
     added = [*(found + apart for apart in beside), inside.ravel()]
     merged = jnp.sort(jnp.concatenate([grid, *added]))

@@ -235,6 +235,57 @@ def test_two_changes_at_one_instant():
     assert row @ way == pytest.approx(slope, abs=1e-4 * np.max(np.abs(row)))
 
 
+JOINT = (
+    "scene.speed_rpm=1015.7",
+    "scene.load.torque_N_m=3",
+    "scene.timing_gear.backlash_mm=0.055",
+    "scene.timing_gear.damping_ratio=0.515",
+    "scene.timing_gear.stiffness_N_m_per_rad=11307",
+)
+CORNER = ("scene.load.torque_N_m=4.775",)
+
+
+@pytest.mark.parametrize(
+    ("scene", "design"), [(JOINT, (39.33, 8.83, 1.32)), (CORNER, (34.0, 7.0, 3.0))]
+)
+def test_the_check_bounds_the_error(scene, design):
+    """The disagreement bounds the errors of all gradients, at any tolerance.
+
+    In the first scene, the contact passes a joint within 1e-4 mesh periods, where derivatives jump.
+    With steps around the joint of the same length on both grids, the mean was 1e-5 off at any
+    tolerance, and the disagreement 1e-8. In the second scene, the peak is on a corner of the force.
+    With rates from differences of the force, its gradient was 2e-5 off."""
+    design, way, names = (
+        np.array(design),
+        np.array([1.0, -0.7, 0.8]),
+        ("mean_force_N", "peak_force_N", "rms_force_N"),
+    )
+    evaluator = Evaluator.of(load("configs/cic.yaml", scene), survey=True)
+    sharp = evaluator.at_tolerance(1e-11)
+
+    def terms(found):
+        rows = np.array([list(found.gradient[name].values()) for name in names])
+        return rows * design * way
+
+    found = {rtol: evaluator.at_tolerance(rtol)(design, series=False) for rtol in (1e-8, 1e-10)}
+    state = found[1e-10].state
+
+    def forces(change):
+        moved = sharp(jnp.asarray(design * (1 + change * way)), start=state, series=False)
+        return np.array([moved.response[name] for name in names])
+
+    wide, close = ((forces(h) - forces(-h)) / (2 * h) for h in (4e-5, 2e-5))
+    truth, noise = (4 * close - wide) / 3, np.abs(close - wide)
+    for rtol, one in found.items():
+        slopes = terms(one)
+        size = np.max(np.abs(slopes), axis=1)
+        error = np.maximum(np.abs(np.sum(slopes, axis=1) - truth) - noise, 0.0) / size
+        said = one.statistics["gradient_disagreement"]
+        assert np.max(noise / size) < 1e-6
+        assert np.max(error) < said < 1e-4, rtol
+        assert np.max(error) < 2e-6, rtol
+
+
 def test_a_check_without_room_is_none():
     """If a grid has no room for all halved steps, nothing is compared."""
     grid = jnp.asarray([0.1, 0.1 + 2e-6, 0.5, jnp.inf, jnp.inf])

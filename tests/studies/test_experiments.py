@@ -90,12 +90,14 @@ def test_gradients(tmp_path, programs):
 def test_gradients_that_are_off_are_told():
     """A gradient with too great an error fails, and so does a tighter tolerance that errs more."""
     good = {"scene": "one", "period": 1, "status": "periodic", "gradient_disagreement": 1e-6}
-    good |= {"mean_force_N_error": 1e-6, "peak_force_N_error": 1e-6}
+    good |= {f"{name}_error": 9e-7 for name in gradients.MEASURES}
+    good |= {f"{name}_noise": 1e-8 for name in gradients.MEASURES}
     rows = [good | {"rtol": rtol} for rtol in gradients.TOLERANCES]
     assert gradients.judge(rows).broken == []
-    for name in FORCES:
-        (said,) = gradients.judge([*rows[:2], rows[2] | {f"{name}_error": 1e-2}]).broken
+    for name in gradients.MEASURES:
+        said, more = gradients.judge([*rows[:2], rows[2] | {f"{name}_error": 1e-2}]).broken
         assert said.startswith("OFF 1e-10")
+        assert more == "UNBOUNDED 11.1 % of 9 gradients"
     (said,) = gradients.judge([*rows[:2], rows[2] | {"status": "not_settled"}]).broken
     assert said.startswith("WORSE")
 
