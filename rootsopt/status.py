@@ -33,8 +33,8 @@ class Status(enum.Enum):
         "damping."
     )
     PASSED_THROUGH = (
-        "The lobes passed through each other: the flanks alone cannot hold this load. Add a "
-        "scene.timing_gear, or lower the load or the backlash."
+        "The lobes passed through each other: nothing holds them against this load. Add a "
+        "scene.timing_gear or raise its stiffness, or lower the load or the backlash."
     )
     STALLED = (
         "The motor has stalled: it cannot carry the load. Raise scene.motor.torque_N_m or "
@@ -42,10 +42,11 @@ class Status(enum.Enum):
     )
     TOO_DEEP = (
         "The flanks penetrate too deep for a contact law to be valid (2 % of the pitch radius). "
-        "Raise contact.stiffness_N_per_mm_e or lower the load."
+        "Raise contact.stiffness_N_per_mm_e or lower the load. If the axes are too close, raise "
+        "scene.center_distance_error_mm."
     )
     UNRESOLVED = (
-        "The force is not resolved. Either the flanks penetrate so little that rounding of the gap "
+        "The force is not resolved: either the flanks penetrate so little that rounding of the gap "
         "changes its greatest value by more than 1 %, or the steps are too coarse for its impacts "
         "(mean, RMS and peak contradict each other). Set solver.precision to float64, or tighten "
         "solver.rtol."
@@ -94,6 +95,10 @@ class Status(enum.Enum):
         "The sweep was stopped before this point. Run it again with --resume for the missing "
         "points."
     )
+    UNSOUND = (
+        "The profile is not sound, so nothing was simulated: a margin of its geometry is negative. "
+        "Change the design until all margins are positive."
+    )
 
     @property
     def code(self) -> int:
@@ -111,6 +116,11 @@ class Status(enum.Enum):
                 f"Argument `code` must be a status code from 0 to {len(cls) - 1}, but is {number}"
             )
         return list(cls)[number]
+
+    @property
+    def meaning(self) -> str:
+        """What the status means: its first sentence, before the advice."""
+        return self.value.partition(". ")[0].removesuffix(".") + "."
 
     @property
     def usable(self) -> bool:

@@ -105,6 +105,8 @@ COEFFICIENTS = Parameter(
     count=(3, 64),
 )
 
+_OVERLONG = frozenset({"rolling", "order"})
+"""Margins that are negative with the longest involutes that `limits` tolerates."""
 _OWN = (
     Family(
         name="cic",
@@ -112,6 +114,7 @@ _OWN = (
         maker="rootsopt.profiles.cic:CIC",
         parameters=(PRESSURE_ANGLE, INVOLUTE_LENGTH, TIP_ARC_ANGLE),
         example={"pressure_angle_deg": 36.43, "involute_length_mm": 8.0, "tip_arc_angle_deg": 4.0},
+        inherent=_OVERLONG,
         limits="rootsopt.profiles.involute:check",
         by_limits=True,
         ranges="rootsopt.profiles.involute:ranges",
@@ -148,6 +151,7 @@ _OWN = (
         maker="rootsopt.profiles.cic:arc_involute",
         parameters=(PRESSURE_ANGLE, INVOLUTE_LENGTH),
         example={"pressure_angle_deg": 36.0, "involute_length_mm": 6.0},
+        inherent=_OVERLONG,
         limits="rootsopt.profiles.involute:check",
         by_limits=True,
         ranges="rootsopt.profiles.involute:ranges",

@@ -175,7 +175,7 @@ class _Shooting(eqx.Module):
         no, zero = jnp.zeros((), bool), jnp.zeros((), int)
         return _Closing(
             orbit=Orbit.empty(state, directions, none),
-            window=Window.empty(state, self.periods),
+            window=Window.empty(state, self.periods, self.tolerance),
             state=state,
             repeat=no,
             held=no,
@@ -211,7 +211,7 @@ class _Shooting(eqx.Module):
         mesh period of the window."""
         checking = ~self.is_open(now) & ~self.windowed
         start = jnp.where(checking, now.orbit.state, now.state)
-        start = jnp.where(self.windowed, now.window.end, start)
+        start = jnp.where(self.windowed, now.window.start, start)
         grid = lax.cond(checking, lambda: halved(now.grid), lambda: now.grid)
         length = jnp.where(self.windowed, 1, self.period).astype(start.dtype)
         frozen = lax.stop_gradient(self.pair)

@@ -43,6 +43,7 @@ from rootsopt.dynamics.parts import (
 )
 from rootsopt.dynamics.timescales import Timescales
 from rootsopt.errors import InputError
+from rootsopt.profiles.validity import Soundness
 
 STALLED = 0.05
 """Speed of rotor 1, as a fraction of the drive's speed, below which the motor counts as stalled."""
@@ -56,8 +57,8 @@ class RotorPair(eqx.Module):
     `gear`, `friction`, `supports`: parts that the scene names; `angle_scale` (rad) and
     `force_scale` (N): the solver's units; `timescales` of oscillation and free flight, None if
     unknown; `two_sided`: whether drive and coast flanks can touch at once (at the nominal centre
-    distance, only with negative clearance); `parts`: all other parts. An absent part is None and
-    costs nothing.
+    distance, only with negative clearance); `parts`: all other parts; `soundness`: margins of the
+    design, None if it was not checked. An absent part is None and costs nothing.
 
     Raises InputError if two parts let the axes move; if one part does but `two_sided` is False; if
     the pair is two-sided but the contact is not (see `Contact.two_sided`).
@@ -78,6 +79,7 @@ class RotorPair(eqx.Module):
     timescales: Timescales | None = None
     two_sided: bool = eqx.field(static=True, default=False)
     parts: tuple[Part, ...] = ()
+    soundness: Soundness | None = None
 
     def __check_init__(self):
         displacing = [type(part).__name__ for part in self.all_parts if part.displaces]
@@ -133,6 +135,11 @@ class RotorPair(eqx.Module):
         It is a quarter of the angle from a lobe's axis to its flank at the pitch circle.
         """
         return jnp.pi / (8 * self.lobes)
+
+    @property
+    def sound(self) -> Bool[Array, ""]:
+        """Whether the design is sound, as far as it was checked."""
+        return jnp.ones((), bool) if self.soundness is None else self.soundness.sound
 
     @property
     def smooth(self) -> bool:

@@ -195,13 +195,14 @@ class _Attempts(eqx.Module):
         flow = Flow.empty(count, directions, solver.samples, steps, solver.measures, dtype)
         infinite, no = jnp.full((), jnp.inf, dtype), jnp.zeros((), bool)
         one, zero = jnp.ones((), int), jnp.zeros((), int)
+        unsound = ~self.pair.sound
         found = Steady(
-            status=jnp.asarray(Status.NOT_SETTLED.code),
+            status=jnp.where(unsound, Status.UNSOUND.code, Status.NOT_SETTLED.code),
             orbit=Orbit.empty(state, directions, flow),
             period=one,
             rtol=solver.orbit.rtol,
             verdict=Verdict(no, no, jnp.zeros((), dtype), no, no),
-            window=Window.empty(state, solver.windows),
+            window=Window.empty(state, solver.windows, solver.transient.tolerance(dtype)),
             settled=Transient(state, zero, one, infinite, zero, no, ~no, zero),
             used=zero,
             steps=zero,
@@ -210,7 +211,7 @@ class _Attempts(eqx.Module):
         )
         coarse, fine = solver.transient.rtol, solver.orbit.rtol
         within = settled_within(coarse).astype(dtype)
-        return _Search(found, state, coarse, fine, within, zero, no, zero, no)
+        return _Search(found, state, coarse, fine, within, zero, no, zero, unsound)
 
     def step(self, now: _Search) -> _Search:
         """Make one iteration and return the new state of the loop.
@@ -364,9 +365,9 @@ class _Attempts(eqx.Module):
         An orbit is rejected if it is not stable, is not near the end of the transient, or is not
         confirmed by an integration. The transient then continues, followed by another attempt
         (`_COLLOCATIONS`). If the last attempt fails, the status is NOT_SETTLED."""
-        begun, no = self.start(state), jnp.zeros((), bool)
-        zero = jnp.zeros((), int)
-        start = _Collocation(begun.found, zero, state, begun.coarse, begun.within, zero, no)
+        begun, zero = self.start(state), jnp.zeros((), int)
+        coarse, within = begun.coarse, begun.within
+        start = _Collocation(begun.found, zero, state, coarse, within, zero, begun.over)
         loop = lax.while_loop(lambda now: ~now.over, lambda now: self._collocate(now), start)
         return self.final(loop.found)
 
@@ -422,10 +423,11 @@ class _Attempts(eqx.Module):
         made = near_orbit(self.pair, self.tangents, (known, neighbour), *settings)
         period = jnp.round(known.elements.mesh.period).astype(int)
         state, within = made.orbit.state, settled_within(solver.transient.rtol)
+        fine = solver.transient.tolerance(state.dtype)
         empty = self.start(state).found
         settled = empty.settled._replace(period=period, nearest=period)
         # Use an empty window: a full one would be copied, but never used.
-        empty = empty._replace(settled=settled, window=Window.empty(state, 0))
+        empty = empty._replace(settled=settled, window=Window.empty(state, 0, fine))
         return self.final(self._taken(empty, made, state, period, within))
 
     def _taken(self, found: Steady, made: Collocated, start, period, within) -> Steady:
@@ -450,19 +452,21 @@ class _Attempts(eqx.Module):
     def final(self, found: Steady) -> Steady:
         """Return `found`, with a different status if the forces of its orbit are not valid.
 
-        The status is then TOO_DEEP (the flanks penetrate too deep) or UNRESOLVED (the numerical
-        errors of the forces are too large)."""
+        The status is then UNSOUND (no such rotors), TOO_DEEP (the flanks penetrate too deep) or
+        UNRESOLVED (the numerical errors of the forces are too large)."""
         orbit, judged = found.orbit, found.verdict
         closed = among(found.status, (Status.PERIODIC, Status.INACCURATE))
         deep = orbit.flow.depth > TOO_DEEP * self.radius
         vague = (judged.rounding > UNRESOLVED) | ~judged.consistent
         status = jnp.where(closed & vague, Status.UNRESOLVED.code, found.status)
-        return found._replace(status=jnp.where(closed & deep, Status.TOO_DEEP.code, status))
+        status = jnp.where(closed & deep, Status.TOO_DEEP.code, status)
+        return found._replace(status=jnp.where(self.pair.sound, status, Status.UNSOUND.code))
 
 
 def transient_status(pair: RotorPair, settled: Transient) -> Int[Array, ""]:
     """Return the status code of a transient that has not settled, or -1 if it has settled."""
     return _first(
+        (~pair.sound, Status.UNSOUND),
         (~settled.solved, Status.SOLVER_FAILED),
         (~jnp.all(jnp.isfinite(settled.state)), Status.NON_FINITE),
         (settled.lost & pair.stalled(settled.state), Status.STALLED),
@@ -483,7 +487,7 @@ def window_status(pair: RotorPair, window: Window) -> Int[Array, ""]:
         (~finite, Status.NON_FINITE),
         (~window.solved, Status.SOLVER_FAILED),
         (jnp.max(window.response[:, 2]) <= least, Status.IDLE),
-        (jnp.asarray(window.exponent > 3 * window.error), Status.CHAOTIC),
+        (jnp.asarray(window.chaotic), Status.CHAOTIC),
         default=Status.NOT_SETTLED.code,
     )
 

@@ -9,6 +9,14 @@ from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from rootsopt.profiles.arcs import Arcs
+from rootsopt.profiles.edge import SHARPEST
+
+
+class EdgedArcs(Arcs):
+    """Arcs of which the second is an edge that must not be too sharp."""
+
+    def limit_margin(self):
+        return self.radius[1] / self.pitch_radius - SHARPEST
 
 
 def arc(lobes: int, pitch_radius: Float[ArrayLike, ""], arc_center: Float[ArrayLike, ""]) -> Arcs:
@@ -65,7 +73,7 @@ def arcs_epicycloid(
     arc_center: Float[ArrayLike, ""],
     tip_arc_angle: Float[ArrayLike, ""],
     edge_radius: Float[ArrayLike, ""],
-) -> Arcs:
+) -> EdgedArcs:
     """Return a lobe of a single arc, cut off by a tip land with rounded edges.
 
     `lobes`: number of lobes N; `pitch_radius`: r (m). The single arc is that of `arc`: its centre
@@ -99,7 +107,7 @@ def arcs_epicycloid(
     reach = b * jnp.cos(theta) + side * jnp.sqrt((radius - e) ** 2 - (b * jnp.sin(theta)) ** 2)
     edge = reach * jnp.stack([jnp.cos(theta), jnp.sin(theta)])
     turn = jnp.arctan2(side * edge[1], side * (edge[0] - b))
-    return Arcs(
+    return EdgedArcs(
         lobes=lobes,
         names=("tip land", "edge", "arc"),
         land=True,

@@ -219,6 +219,12 @@ class Profile(eqx.Module):
         reach = self.support(nu)
         return Mate(facing, lever, jnp.where(beyond, reach, reach - 2 * s))
 
+    def limit_margin(self) -> Float[Array, ""] | float:
+        """Return the least distance of a ratio of the family from its limits in closed form.
+
+        It is negative beyond a limit, and inf (the default) without such limits."""
+        return float("inf")
+
     @property
     def conjugate(self) -> bool:
         """Whether the flanks are designed to touch throughout the mesh in perfect rolling."""

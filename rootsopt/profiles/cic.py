@@ -7,6 +7,7 @@ from jaxtyping import Array, Float
 
 from rootsopt.profiles import trigonometry as trig
 from rootsopt.profiles.base import Profile, Segment
+from rootsopt.profiles.involute import LEAST, OVERLENGTH
 
 
 def arc_involute(
@@ -143,6 +144,10 @@ class CIC(Profile):
         reach = self.pitch_radius * trig.sin(self.pressure_angle)
         involute = reach + self.base_radius * (self.half_pitch - beta)
         return jnp.where(nu > self.arc_end, involute, arc)
+
+    def limit_margin(self):
+        share = self.involute_length / self.longest_involute
+        return jnp.minimum(share - LEAST, 1 + OVERLENGTH - share)
 
     @property
     def single_turn(self) -> float:

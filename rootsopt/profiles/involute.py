@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from rootsopt.config.scene import ProfileConfig
 
 _ANGLE, _LENGTH, _TIP = "pressure_angle_deg", "involute_length_mm", "tip_arc_angle_deg"
-_OVERLENGTH = 0.02
+OVERLENGTH = 0.02
 """Excess of the involute length u over u_max = `CIC.longest_involute` (fraction of u_max) above
 which a config is rejected. Beyond u_max the roll angle turns back and two points of a flank mesh at
 once. A node search finds no interference (< 1 nm) up to 5 % excess; the paper's printed Table 1 has
@@ -23,9 +23,11 @@ _CLEAR = 1e-6
 rejected. At this limit, the centre of the tip arc lies on the pitch circle, and one of the arc's
 normals is tangent to the circle. With a shorter involute, some of these normals miss the circle:
 their points touch nothing on the other rotor."""
-_LEAST_INVOLUTE = 0.002
+LEAST = 0.002
 """Involute length (fraction of the longest) below which a config is rejected. A shorter involute
 has no effect, and its length was probably given in metres."""
+_TOUCHING = 1e-6
+"""Undercut (mm) up to which a config is accepted: a search may end at such a design."""
 _INSIDE = 1 + 1e-6
 """Factor by which a search stays away from the lower limits of a config."""
 
@@ -48,7 +50,7 @@ def ranges(
     base = pitch_radius_mm * jnp.sin(pressure_angle_deg * DEG)
     longest = base * (half - tip_arc_angle_deg * DEG)
     touching = longest - base * 2 * pressure_angle_deg * DEG + _CLEAR * pitch_radius_mm
-    shortest = _INSIDE * jnp.maximum(_LEAST_INVOLUTE * longest, touching)
+    shortest = _INSIDE * jnp.maximum(LEAST * longest, touching)
     return {_LENGTH: (shortest, longest)}
 
 
@@ -68,12 +70,12 @@ def check(profile: "ProfileConfig") -> None:
             f"pitch) for {profile.lobes} lobes, but is {tip:g}"
         )
     longest = radius * sine * (half - tip) * DEG
-    limit = longest * (1 + _OVERLENGTH)
-    if length < _LEAST_INVOLUTE * longest:
+    limit = longest * (1 + OVERLENGTH)
+    if length < LEAST * longest:
         raise InputError(
-            f"`profile.involute_length_mm` must be at least {_LEAST_INVOLUTE * longest:.4g} "
-            f"({_LEAST_INVOLUTE:g} of the longest, {longest:.4g}), but is {length:g}"
-            + hint("involute_length_mm", length, _LEAST_INVOLUTE * longest, limit)
+            f"`profile.involute_length_mm` must be at least {LEAST * longest:.4g} "
+            f"({LEAST:g} of the longest, {longest:.4g}), but is {length:g}"
+            + hint("involute_length_mm", length, LEAST * longest, limit)
         )
     if length > limit:
         raise InputError(
@@ -104,7 +106,7 @@ def check(profile: "ProfileConfig") -> None:
         )
     # On the dedendum, undercut starts at the conjugate of the involute's end.
     uncut = radius * sine * math.tan(alpha * DEG)
-    if length > uncut * (1 + 1e-9):
+    if (uncut - length) / math.tan(alpha * DEG) < -_TOUCHING:
         raise InputError(
             f"`profile.involute_length_mm` must be at most {uncut:.4g} at "
             f"`profile.pressure_angle_deg` = {alpha:g}, but is {length:g}: the dedendum is "

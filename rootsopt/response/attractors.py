@@ -23,6 +23,7 @@ from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.settle import BLOCK, Transient, settle, settled_within
 from rootsopt.dynamics.steady import transient_status
 from rootsopt.response.evaluation import Evaluation, Evaluator, objective_weights
+from rootsopt.response.records import message_of
 from rootsopt.response.wrapper import Wrapper
 from rootsopt.runtime.programs import Program
 from rootsopt.runtime.threads import on_all_cores
@@ -37,9 +38,12 @@ _TRIES = 24
 """Maximum number of motions that are evaluated, in addition to the motion from rest."""
 _DEPTHS = 3.0
 """Penetration of the flanks (multiples of the static penetration) up to which the grid extends."""
-_LOST = (Status.PASSED_THROUGH, Status.STALLED, Status.SOLVER_FAILED, Status.NON_FINITE)
-"""Statuses of motions that do not count as attractors: the mesh was lost, or the simulation failed.
-"""
+_LOST = (
+    *(Status.UNSOUND, Status.PASSED_THROUGH, Status.STALLED),
+    *(Status.SOLVER_FAILED, Status.NON_FINITE),
+)
+"""Statuses of motions that do not count as attractors: there is no such pair, the mesh was lost, or
+the simulation failed."""
 _GONE = tuple(status.code for status in _LOST)
 
 
@@ -316,8 +320,9 @@ def _settled(evaluator: Evaluator, pair: RotorPair, starts) -> tuple[Transient, 
     return jax.device_get(ends)
 
 
-def _end(pair, state, *settings):
-    end = settle(pair, state, *settings)
+def _end(pair, state, integrator, tolerance, limit, most):
+    limit = jnp.where(pair.sound, limit, 0)
+    end = settle(pair, state, integrator, tolerance, limit, most)
     return end, transient_status(pair, end)
 
 
@@ -382,7 +387,7 @@ class AttractorEvaluator(Wrapper):
             gradient=chosen.gradient if status.usable else {},
             steady_state=chosen.steady_state | {"attractors": basins.summary()},
             status=status,
-            message=status.value,
+            message=message_of(self.config, status),
             state=np.stack([np.asarray(a.evaluation.state) for a in orbits]),
         )
 

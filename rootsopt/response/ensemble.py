@@ -38,6 +38,7 @@ from rootsopt.response.evaluation import (
     geometry_record,
     idle_hint,
     lyapunov_program,
+    message_of,
     unsettled,
     unsettled_status,
 )
@@ -235,7 +236,7 @@ class EnsembleEvaluator(Wrapper):
             gradient=gradient,
             steady_state=steady,
             status=status,
-            message=status.value + hint,
+            message=message_of(self.config, status) + hint,
             statistics={
                 "settle_mesh_periods": settings.settle_periods,
                 "neighbours": settings.designs // 2 * 2 if gradient else 0,
@@ -315,6 +316,8 @@ class _Outcome:
     @property
     def status(self) -> Status:
         """Status of the first design that has failed, or AVERAGED."""
+        if not bool(self.pair.sound):
+            return Status.UNSOUND
         statuses = (run.status for run in self.runs)
         return next((s for s in statuses if s is not Status.AVERAGED), Status.AVERAGED)
 

@@ -27,14 +27,17 @@ from rootsopt.dynamics.steady import (
     window_status,
 )
 from rootsopt.dynamics.window import lyapunov
+from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry
 from rootsopt.pump.loads import OrbitLoads, orbit_loads
 from rootsopt.response.orbits import Built, OrbitStore, prepare_near, with_samples
 from rootsopt.response.records import (
     RESPONSES,
     bearing_record,
+    fading_note,
     geometry_record,
     idle_hint,
+    message_of,
     orbit_record,
     orbit_statistics,
     unsettled,
@@ -42,8 +45,9 @@ from rootsopt.response.records import (
 )
 from rootsopt.response.series import Series, contact_series, orbit_series, window_series
 from rootsopt.response.terms import BEARING, terms_of, values_of
+from rootsopt.runtime.precision import check_precision
 from rootsopt.runtime.programs import Program
-from rootsopt.scene import Scene, design_keys, design_vector
+from rootsopt.scene import Scene, check_geometry, design_keys, design_vector, fault_of
 from rootsopt.status import Status
 
 if TYPE_CHECKING:
@@ -447,6 +451,8 @@ class Evaluator:
             response |= terms
             gradient |= slopes if gradient else {}
             hint = "" if pair.smooth else _NO_GRADIENT
+            if status is Status.PERIODIC:
+                hint += fading_note(float(orbit.multiplier), period)
         elif status is Status.IDLE:
             steady = {"kind": "idle"}
             names = self.scene.solver.measures.named(np.zeros((len(orbit.response), 1)), 1)
@@ -462,6 +468,8 @@ class Evaluator:
                     steady |= orbit_record(orbit, period)
                     state = np.asarray(orbit.state, np.float64)
                     motion = orbit_series(pair, orbit, period) if series else None
+        elif status is Status.UNSOUND and pair.soundness is not None:
+            hint = f" Here, {fault_of(pair.soundness)}."
         elif int(found.window.done):
             steady, response, motion = unsettled(pair, status, found.window, series)
         elif status is Status.SOLVER_FAILED and pair.timescales is not None:
@@ -474,7 +482,7 @@ class Evaluator:
             gradient=gradient,
             steady_state=steady,
             status=status,
-            message=status.value + hint,
+            message=message_of(self.config, status) + hint,
             statistics=statistics | {"seconds": seconds},
             series=motion,
             state=state,
@@ -605,8 +613,8 @@ def evaluate(config: Config, design: ArrayLike | Sequence[float] | None = None) 
 
     `design` (d,): in config units; by default the config's own.
 
-    Raises `InputError` for a scene that cannot be simulated; `RuntimeError` if JAX is not set to
-    the precision of the config.
+    Raises `InputError` for a scene that cannot be simulated or a profile that is not sound;
+    `RuntimeError` if JAX is not set to the precision of the config.
 
     >>> import jax
     >>> import rootsopt
@@ -616,7 +624,12 @@ def evaluate(config: Config, design: ArrayLike | Sequence[float] | None = None) 
     >>> print(f"{found.response['mean_force_N']:.1f} N")
     76.2 N
     """
-    return Evaluator.of(config)(None if design is None else jnp.asarray(design, float))
+    check_precision(config.solver.precision)
+    check_geometry(config, design)
+    found = Evaluator.of(config)(None if design is None else jnp.asarray(design, float))
+    if found.status is Status.UNSOUND:
+        raise InputError(found.message)
+    return found
 
 
 __all__ = ["RESPONSES", "Evaluation", "Evaluator", "Series", "evaluate"]

@@ -1,4 +1,4 @@
-"""Entries of the result file for one evaluation, and advice on flanks that never touch."""
+"""Entries of the result file for one evaluation, and advice that fits its scene."""
 
 from typing import Any
 
@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from rootsopt.config import Config
 from rootsopt.config.units import MM
+from rootsopt.dynamics.integrator import IMPLICIT
 from rootsopt.dynamics.orbit import Orbit
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import Steady
@@ -20,6 +21,10 @@ from rootsopt.status import Status
 
 RESPONSES = ("mean_force_N", "peak_force_N", "rms_force_N")
 """Keys of the mean, peak and RMS force in a response."""
+_SLOW = 0.999
+"""Floquet multiplier above which a message says how slowly disturbances fade."""
+_FADED = 0.01
+"""Fraction of itself to which a disturbance is said to fade."""
 _KINDS = {Status.CHAOTIC: "chaotic", Status.IDLE: "idle"}
 """Kinds of motions without an orbit, by status; all others are transient."""
 
@@ -119,6 +124,152 @@ def unsettled(
     values = map(float, (mean, peak, np.sqrt(square)))
     response: dict[str, float] = dict(zip(RESPONSES, values, strict=True))
     return steady, response, window_series(pair, window) if series else None
+
+
+def message_of(config: Config, status: Status) -> str:
+    """Return what a `status` means, and advice that fits the scene of a `config`.
+
+    The advice names only what the scene has or lacks: no timing gear where there is one, and no
+    value to lower that is 0."""
+    if status not in _WAYS:
+        return status.value
+    first, *others = _WAYS[status](config)
+    return f"{status.meaning} {', or '.join([first[0].upper() + first[1:], *others])}."
+
+
+def fading_note(multiplier: float, period: int) -> str:
+    """Return a note on an orbit whose disturbances fade slowly, else "".
+
+    `multiplier`: greatest modulus of its Floquet multipliers; `period`: mesh periods."""
+    if not _SLOW < abs(multiplier) < 1:
+        return ""
+    count = period * np.log(_FADED) / np.log(abs(multiplier))
+    return (
+        f" But a disturbance fades to {100 * _FADED:g} % only within {count:.3g} mesh periods "
+        f"(Floquet multiplier {multiplier:.7f}): a pump that is disturbed more often does not keep "
+        "this motion."
+    )
+
+
+def _way(verb: str, key: str, value: float | None) -> list[str]:
+    """Return the advice to change a key; empty if there is no `value`, or 0, to change."""
+    return [f"{verb} {key} ({value:g})"] if value else []
+
+
+def _load(config: Config, verb: str = "lower") -> list[str]:
+    """Return the advice to change the load."""
+    load = config.scene.load
+    for key in ("torque_N_m", "pressure_difference_Pa"):
+        if (value := getattr(load, key)) is not None:
+            if verb == "raise" and not value:
+                return [f"raise scene.load.{key} above 0"]
+            return _way(verb, f"scene.load.{key}", value)
+    return []
+
+
+def _backlash(config: Config, verb: str = "lower") -> list[str]:
+    """Return the advice to change the backlash of the timing gear, if there is one."""
+    gear = config.scene.timing_gear
+    if gear is not None and verb == "raise":
+        return [f"raise scene.timing_gear.backlash_mm ({gear.backlash_mm:g})"]
+    return [] if gear is None else _way(verb, "scene.timing_gear.backlash_mm", gear.backlash_mm)
+
+
+def _damping(config: Config) -> list[str]:
+    """Return the advice to add damping where the scene has it."""
+    gear, most = config.scene.timing_gear, config.contact.max_damping_N_s_per_mm
+    if gear is not None:
+        return [f"raise scene.timing_gear.damping_ratio ({gear.damping_ratio:g})"]
+    return [f"raise contact.max_damping_N_s_per_mm ({most:g})"]
+
+
+def _precision(config: Config) -> list[str]:
+    """Return the advice to use double precision, unless it is used."""
+    single = config.solver.precision == "float32"
+    return ["set solver.precision to float64"] if single else []
+
+
+def _passed_through(config: Config) -> list[str]:
+    gear, phase = config.scene.timing_gear, config.scene.phase_error_mrad
+    held = ["add a scene.timing_gear"]
+    if gear is not None:
+        stiffness = gear.stiffness_N_m_per_rad
+        held = _way("raise", "scene.timing_gear.stiffness_N_m_per_rad", stiffness)
+    phased = _way("bring closer to 0", "scene.phase_error_mrad", phase)
+    return [*held, *_load(config), *_backlash(config), *phased]
+
+
+def _too_deep(config: Config) -> list[str]:
+    """Return advice: what presses the rotors into each other comes first."""
+    error, wear = config.scene.center_distance_error_mm or 0.0, config.contact.wear
+    close = _way("raise", "scene.center_distance_error_mm", min(error, 0.0))
+    coated = _way("raise", "contact.wear.offset_mm", min(wear.offset_mm, 0.0) if wear else None)
+    tight = ["raise contact.clearance_mm"] if close or coated else []
+    stiffness = config.contact.stiffness_N_per_mm_e
+    stiffer = _way("raise", "contact.stiffness_N_per_mm_e", stiffness)
+    return [*close, *coated, *tight, *stiffer, *_load(config)]
+
+
+def _idle(config: Config) -> list[str]:
+    error = max(config.scene.center_distance_error_mm or 0.0, 0.0)
+    return [
+        *_load(config, "raise"),
+        *_way("lower", "contact.clearance_mm", config.contact.clearance_mm),
+        *_way("lower", "scene.center_distance_error_mm", error),
+        *_backlash(config, "raise"),
+    ]
+
+
+def _stalled(config: Config) -> list[str]:
+    motor = config.scene.motor
+    torque = None if motor is None else motor.torque_N_m
+    given = _way("raise", "scene.motor.torque_N_m", torque) or ["set scene.motor.torque_N_m"]
+    return [*given, "raise scene.motor.slope_N_m_s_per_rad", *_load(config)]
+
+
+def _chaotic(config: Config) -> list[str]:
+    averaged = "set objective.motion to ensemble to optimise averages over an ensemble of motions"
+    slower = _way("lower", "scene.speed_rpm", config.scene.speed_rpm)
+    return [averaged, *slower, *_load(config), *_backlash(config), *_damping(config)]
+
+
+def _not_settled(config: Config) -> list[str]:
+    longer = _way("raise", "solver.max_mesh_periods", config.solver.max_mesh_periods)
+    return [*_precision(config), *longer, *_damping(config)]
+
+
+def _unresolved(config: Config) -> list[str]:
+    return [*_precision(config), *_way("tighten", "solver.rtol", config.solver.rtol)]
+
+
+def _inaccurate(config: Config) -> list[str]:
+    most = config.solver.max_steps_per_period
+    steps = _way("raise", "solver.max_steps_per_period", most)
+    return [*_unresolved(config), "raise contact.smoothing_mm", *steps]
+
+
+def _solver_failed(config: Config) -> list[str]:
+    solver = config.solver
+    explicit = solver.method not in IMPLICIT
+    need = "; an explicit method needs ten for each of statistics.swings_per_mesh_period"
+    most = f"{solver.max_steps_per_period:g}{need if explicit else ''}"
+    implicit = ["set solver.method to kvaerno5, which is implicit"] if explicit else []
+    looser = _way("loosen", "solver.rtol", solver.rtol)
+    return [f"raise solver.max_steps_per_period ({most})", *looser, *implicit]
+
+
+_WAYS = {
+    Status.PASSED_THROUGH: _passed_through,
+    Status.TOO_DEEP: _too_deep,
+    Status.IDLE: _idle,
+    Status.STALLED: _stalled,
+    Status.CHAOTIC: _chaotic,
+    Status.NOT_SETTLED: _not_settled,
+    Status.UNRESOLVED: _unresolved,
+    Status.INACCURATE: _inaccurate,
+    Status.SOLVER_FAILED: _solver_failed,
+}
+"""Statuses whose advice depends on the scene, each with a function that returns it."""
 
 
 def idle_hint(config: Config, depth: float) -> str:

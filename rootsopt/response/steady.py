@@ -21,6 +21,7 @@ from rootsopt.dynamics.linear import eigenvalues
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import CLOSED, Steady, among, steady_motion
+from rootsopt.profiles.validity import Soundness
 from rootsopt.runtime.precision import check_precision
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene, along
@@ -37,11 +38,14 @@ class Response(NamedTuple):
     `multipliers` (n,): Floquet multipliers, greatest modulus first; `residual`: scaled distance
     between the start and the end of the orbit; `status`: code of a `Status` (`Status.of(code)`);
     `state` (n,) at φ1 = 0 in SI units: ε (rad), dε/dt (rad/s), then the states of parts, such as
-    the excess of a motor's speed over the scene's (rad/s).
+    the excess of a motor's speed over the scene's (rad/s); `margins`: margins of all checks of the
+    design (m, rad or ratios, see `Soundness`). The status is unsound if one of them is negative;
+    `Response.margins.failed` names it.
 
     The forces are those of the orbit, or 0 without contact. If the motion does not settle, the
     forces are those of a window of 128 mesh periods. In all other cases, the forces are NaN. If the
-    motion is not periodic, `period` is 0, and `multipliers` and `residual` are NaN.
+    motion is not periodic, `period` is 0, and `multipliers` and `residual` are NaN. If the design
+    is unsound, `state` is NaN, too.
 
     >>> import jax
     >>> import rootsopt
@@ -63,6 +67,7 @@ class Response(NamedTuple):
     residual: Float[Array, ""]
     status: Int[Array, ""]
     state: Float[Array, " n"]
+    margins: Soundness
 
 
 def steady_response(scene: Scene, design: ArrayLike, start: ArrayLike | None = None) -> Response:
@@ -74,8 +79,9 @@ def steady_response(scene: Scene, design: ArrayLike, start: ArrayLike | None = N
     This is a pure function. It works under `jit`, `vmap`, `grad`, `jvp`, `jacfwd` and `jacrev`,
     with respect to the design and to every physical quantity of the scene. The derivatives of
     forces and `state` are those of the orbit, by the implicit function theorem. They are NaN unless
-    the status is periodic. `multipliers` and `residual` are constants to JAX, with derivative 0.
-    Only first derivatives are available. On a CPU, `vmap` computes one motion after the other.
+    the status is periodic. `multipliers`, `residual` and `margins` are constants to JAX, with
+    derivative 0. Only first derivatives are available. On a CPU, `vmap` computes one motion after
+    the other.
 
     `jax.jit` of a function that calls this one compiles twice as fast with the option
     `compiler_options=rootsopt.COMPILER_OPTIONS`.
@@ -125,7 +131,8 @@ def _response_jvp(primals, tangents):
     values = _change(slopes, [tangent for _, tangent in moved], without)
     mean, peak, rms, lines, norm, state = _split(values, response)
     constant: Any = None
-    change = Response(mean, peak, rms, lines, norm, constant, constant, constant, constant, state)
+    same = *[constant] * 4, state, jax.tree.map(lambda _: constant, response.margins)
+    change = Response._make([mean, peak, rms, lines, norm, *same])
     return response, change
 
 
@@ -234,6 +241,7 @@ def _state(pair: RotorPair, tangents: RotorPair, found: Steady):
 
     closed = among(found.status, (*CLOSED, Status.IDLE))
     state = jnp.where(closed, found.orbit.state, found.settled.state)
+    state = jnp.where(pair.sound, state, jnp.nan)
     directions = eqx.filter(tangents, eqx.is_inexact_array)
     return pair.in_si(state), jax.vmap(along)(directions, found.orbit.moved.T).T
 
@@ -267,6 +275,7 @@ def _named(measures: Measures, pair: RotorPair, tangents: RotorPair, found: Stea
     periodic = found.status == Status.PERIODIC.code
     rows = jnp.concatenate([jnp.stack(rows), by_state])
     monodromy = jnp.where(closed, orbit.monodromy, jnp.nan)
+    assert pair.soundness is not None
     response = Response(
         mean=mean,
         peak=peak,
@@ -278,6 +287,7 @@ def _named(measures: Measures, pair: RotorPair, tangents: RotorPair, found: Stea
         residual=jnp.where(closed, orbit.residual, jnp.nan),
         status=found.status,
         state=state,
+        margins=pair.soundness,
     )
     wide = jnp.result_type(float)
     response, rows = jax.tree.map(

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rootsopt.config import Config
+from rootsopt.config.families import family_of
 from rootsopt.config.units import DEG
 from rootsopt.contact.gap import Contact
 from rootsopt.contact.law import ContactLaw
@@ -46,6 +47,7 @@ from rootsopt.dynamics.steady import Solver
 from rootsopt.dynamics.timescales import Timescales
 from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry, Outline, Profile, geometry
+from rootsopt.profiles.validity import Soundness, soundness
 from rootsopt.runtime.precision import check_precision
 from rootsopt.scene import families, reading
 from rootsopt.scene.bearings import GRAVITY, Bearings, bearings_of
@@ -192,6 +194,10 @@ class Scene(eqx.Module):
         if not self.twist_free:
             return self
         return dataclasses.replace(self, helix=design[-1] * DEG)
+
+    def soundness(self, profile: Profile) -> Soundness:
+        """Return the margins of all checks of a design with this `profile`."""
+        return soundness(profile, self.bore_radius, family_of(self.family).inherent)
 
     @property
     def straight(self) -> bool:
@@ -393,6 +399,7 @@ class Scene(eqx.Module):
             supports=supports,
             two_sided=self.two_sided,
             parts=extra,
+            soundness=self.soundness(profile),
         )
         timescales = Timescales.of(
             self.law, pair.all_parts, inertia, force, self.pitch_radius, self.clearance

@@ -13,12 +13,21 @@ from rootsopt.scene import families
 from rootsopt.scene.build import Scene
 from rootsopt.scene.reading import design_vector
 
+_TOUCHING = 1e-6
+"""Distance (mm) by which a bore may be wider than the root circle of a design: a search may end
+there."""
 
-def check_geometry(config: Config, simulated: bool = True) -> None:
+
+def check_geometry(
+    config: Config, design: ArrayLike | None = None, simulated: bool = True
+) -> None:
     """Raise `InputError` unless the config's profile is sound and leaves room for the bore.
 
-    `simulated`: whether the rotor is to be simulated. An outline from a file must then lie around
-    its axis, which is checked before anything is compiled."""
+    `design` (d,): in config units, by default the config's own; `simulated`: whether the rotor is
+    to be simulated. An outline from a file must then lie around its axis, which is checked before
+    anything is compiled."""
+    if design is not None:
+        config = config.with_design(np.asarray(design, float))
     if simulated and config.profile.from_file:
         from rootsopt.measured.source import check_center  # For outlines only: it takes 0.5 s.
 
@@ -28,7 +37,7 @@ def check_geometry(config: Config, simulated: bool = True) -> None:
     if bore is None:
         return
     root = float(shape_of(config).root_radius) / MM
-    if bore >= 2 * root:
+    if bore >= 2 * root + (0.0 if design is None else 2 * _TOUCHING):
         raise InputError(
             f"`rotor.bore_mm` must be less than {2 * root:.6g} (the root circle), but is "
             f"{bore:g}; make it smaller"

@@ -13,11 +13,11 @@ from rootsopt.errors import InputError
 from rootsopt.measured.conjugacy import conjugacy
 from rootsopt.profiles import Outline, Profile, project
 from rootsopt.profiles.departure import departure
-from rootsopt.profiles.validity import PURE, margins
+from rootsopt.profiles.validity import Soundness, margins, soundness
 from rootsopt.runtime.programs import Program
 
-_ROUNDING = 1e-9
-"""Magnitude (relative to its scale) above which a negative margin makes a profile unsound."""
+_UNITS = {"turning": ("deg", DEG), "order": ("deg", DEG), "rolling": ("", 1.0), "limits": ("", 1.0)}
+"""Units of margins that are not lengths: name of the unit, and its SI value."""
 
 
 def classical() -> tuple[str, ...]:
@@ -107,22 +107,27 @@ def check(config: ProfileConfig) -> None:
         return
     family = family_of(config.family)
     family.check(config)
-    if family.by_limits:
-        return
     radius = jnp.asarray(config.pitch_radius_mm * MM)
-    found = _margins(config.family, config.lobes, radius, design_of(config))
-    for name, value in found._asdict().items():
-        if name in family.inherent:
-            continue
-        scale = 1.0 if name in PURE else config.pitch_radius_mm * MM
-        if not float(value) >= -_ROUNDING * scale:
-            given = ", ".join(
-                f"`profile.{key}` = {_written(value)}" for key, value in config.parameters.items()
-            )
-            raise InputError(
-                f"the profile of family {config.family} must be sound, but with {given} "
-                f"{_FAULTS[name]}; {family.remedy}"
-            )
+    found = _soundness(config.family, config.lobes, radius, design_of(config))
+    if fault := fault_of(found):
+        given = ", ".join(
+            f"`profile.{key}` = {_written(value)}" for key, value in config.parameters.items()
+        )
+        raise InputError(
+            f"the profile of family {config.family} must be sound, but with {given} {fault}; "
+            f"{family.remedy or 'change these parameters'}"
+        )
+
+
+def fault_of(found: Soundness) -> str:
+    """Return the first check of a design that fails, with its margin, or "" if it is sound."""
+    name = found.failed
+    if not name:
+        return ""
+    unit, size = _UNITS.get(name, ("mm", MM))
+    value = float(getattr(found, name)) / size
+    margin = f"margin {value:.3g} {unit}".rstrip() if np.isfinite(value) else "no such curve"
+    return f"{_FAULTS[name]} ({margin})"
 
 
 def margins_of(config: ProfileConfig) -> dict[str, float]:
@@ -134,11 +139,10 @@ def margins_of(config: ProfileConfig) -> dict[str, float]:
         return {}
     radius = jnp.asarray(config.pitch_radius_mm * MM)
     found = _margins(config.family, config.lobes, radius, design_of(config))._asdict()
-    units = {"turning": ("_deg", DEG), "order": ("_deg", DEG), "rolling": ("", 1.0)}
     record = {}
     for name, value in found.items():
-        suffix, unit = units.get(name, ("_mm", MM))
-        record[name + suffix] = float(value) / unit
+        unit, size = _UNITS.get(name, ("mm", MM))
+        record["_".join(filter(None, (name, unit)))] = float(value) / size
     return record
 
 
@@ -146,6 +150,13 @@ def margins_of(config: ProfileConfig) -> dict[str, float]:
 def _margins(family, lobes, pitch_radius, design):
     """Return the margins (SI units) of the profile of a design in config units."""
     return margins(profile_of(family, lobes, pitch_radius, design))
+
+
+@Program
+def _soundness(family, lobes, pitch_radius, design):
+    """Return the margins of all checks of a profile's design, in config units."""
+    profile = profile_of(family, lobes, pitch_radius, design)
+    return soundness(profile, None, family_of(family).inherent)
 
 
 def _written(value: float | tuple[float, ...]) -> str:
@@ -164,4 +175,6 @@ _FAULTS = {
     "undercut": "the dedendum is undercut",
     "star": "the outline folds back, seen from the axis",
     "root": "the root lies beyond the axis",
+    "limits": "a limit of the family in closed form is exceeded",
+    "bore": "the bore is wider than the root circle",
 }

@@ -19,7 +19,7 @@ from rootsopt.optimize.problem import Problem
 from rootsopt.profiles import geometry
 from rootsopt.response.attractors import Attractor, AttractorEvaluator, Basins, _averaged
 from rootsopt.response.evaluation import Evaluation, Evaluator
-from rootsopt.response.records import idle_hint, unsettled
+from rootsopt.response.records import fading_note, idle_hint, message_of, unsettled
 from rootsopt.response.speeds import AtSpeed, SpeedsEvaluation, overall
 from rootsopt.scene import Scene, design_vector
 from rootsopt.status import Status
@@ -102,7 +102,7 @@ def window(peak, exponent):
     """Return a window of 16 mesh periods with these peaks (N) and this exponent, known to about
     0.01."""
     growth = exponent + 0.04 * (-1.0) ** np.arange(16) * np.arange(16) / 16
-    empty = Window.empty(jnp.zeros(2), 16)
+    empty = Window.empty(jnp.zeros(2), 16, jnp.asarray(1e-6))
     return empty._replace(
         growth=jnp.asarray(growth - np.mean(growth) + exponent),
         response=jnp.asarray(np.column_stack([peak, peak**2, peak])),
@@ -127,6 +127,45 @@ def test_a_motion_without_contact_that_does_not_repeat_is_idle(exponent):
     steady, response, _ = unsettled(pair, status, jax.device_get(touching), False)
     assert steady["kind"] == ("chaotic" if exponent else "transient")
     assert response["peak_force_N"] == 1
+
+
+@pytest.mark.parametrize(
+    ("status", "overrides", "has", "lacks"),
+    [
+        (Status.PASSED_THROUGH, ["scene.timing_gear=null"], "dd a scene.timing_gear", "backlash"),
+        (
+            Status.PASSED_THROUGH,
+            ["scene.timing_gear.backlash_mm=0", "scene.timing_gear.stiffness_N_m_per_rad=2000"],
+            "Raise scene.timing_gear.stiffness_N_m_per_rad (2000), or lower scene.load.torque_N_m",
+            "backlash|[Aa]dd",
+        ),
+        (Status.PASSED_THROUGH, ["scene.phase_error_mrad=9"], "scene.phase_error_mrad (9)", "add"),
+        (
+            Status.TOO_DEEP,
+            ["scene.center_distance_error_mm=-0.5"],
+            "Raise scene.center_distance_error_mm (-0.5)",
+            "backlash",
+        ),
+        (Status.TOO_DEEP, [], "Raise contact.stiffness_N_per_mm_e", "center_distance|wear"),
+        (Status.IDLE, ["scene.timing_gear=null"], "scene.load", "clearance|gear"),
+        (Status.CHAOTIC, ["scene.timing_gear=null"], "contact.max_damping", "gear|backlash"),
+        (Status.NOT_SETTLED, ["solver.precision=float32"], "to float64", "contact.max"),
+        (Status.UNRESOLVED, [], "solver.rtol", "precision"),
+        (Status.SOLVER_FAILED, ["solver.method=kvaerno5"], "loosen", "implicit"),
+    ],
+)
+def test_advice_names_what_the_scene_has(status, overrides, has, lacks):
+    """The message advises nothing that the scene has already, and lowers nothing that is 0."""
+    said = message_of(config_of(*overrides), status)
+    assert has in said
+    assert not re.search(lacks, said)
+
+
+def test_slowly_fading_disturbances_are_named():
+    """At a multiplier of 0.9999957 every four mesh periods, 1 % is left after 4.28e6 of them."""
+    assert "4.28e+06 mesh periods" in fading_note(0.9999957, 4)
+    assert 0.0099 < 0.9999957 ** (4.284e6 / 4) < 0.0101
+    assert fading_note(0.998, 4) == fading_note(1.1, 1) == fading_note(math.inf, 1) == ""
 
 
 def test_advice_depends_on_what_holds_the_flanks_apart():

@@ -236,23 +236,32 @@ def test_forward_and_reverse_agree(known):
 def test_composes_with_jit_and_vmap(scene, known):
     """`jit(vmap(value_and_grad))` works over scenes and designs, one of which passes through.
 
-    That one has NaN forces and gradient, and leaves the others as they are."""
+    That one has NaN forces and gradient, and leaves the others as they are. So have designs that
+    are not sound; their margins tell why."""
     response, *_, jacobian = known
-    loads = jnp.array([1.0, 3000.0]) * scene.load_torque
+    unsound = {"undercut": (20, 9, 4), "limits": (36.43, 9.2, 4), "turning": (np.nan, 9, 4)}
+    count = 2 + len(unsound)
+    loads = jnp.array([1.0, 3000.0, *[1.0] * len(unsound)]) * scene.load_torque
     scenes = eqx.tree_at(lambda s: s.load_torque, scene, loads)
-    axes = jax.tree.map(lambda x: 0 if jnp.shape(x) == (2,) else None, scenes)
+    axes = jax.tree.map(lambda x: 0 if jnp.shape(x) == (count,) else None, scenes)
 
     def mean(design, scene):
         found = steady_response(scene, design)
         return found.mean, found
 
     both = jax.vmap(jax.value_and_grad(mean, has_aux=True), (0, axes))
-    (values, found), slopes = jax.jit(both)(jnp.stack([DESIGN] * 2), scenes)
-    assert [Status.of(code) for code in found.status] == [Status.PERIODIC, Status.PASSED_THROUGH]
+    designs = jnp.asarray([DESIGN, DESIGN, *unsound.values()])
+    (values, found), slopes = jax.jit(both)(designs, scenes)
+    expected = [Status.PERIODIC, Status.PASSED_THROUGH, *[Status.UNSOUND] * len(unsound)]
+    assert [Status.of(code) for code in found.status] == expected
+    rows = [jax.tree.map(lambda x, k=k: x[k], found.margins) for k in range(count)]
+    assert [row.failed for row in rows] == ["", "", *unsound]
+    assert np.all(np.isnan(found.state[2:]))
+    assert np.all(np.isnan(found.peak[1:]))
     assert float(values[0]) == pytest.approx(float(response.mean), rel=1e-9)
     np.testing.assert_allclose(slopes[0], jacobian[0][0], rtol=1e-6)
-    assert np.all(np.isnan(slopes[1]))
-    assert np.isnan(values[1])
+    assert np.all(np.isnan(slopes[1:]))
+    assert np.all(np.isnan(values[1:]))
 
 
 def test_batch_is_computed_one_by_one(scene):

@@ -13,6 +13,7 @@ from rootsopt.output.runs import RunFolder
 from rootsopt.response.attractors import find
 from rootsopt.response.choice import resolve
 from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.records import message_of
 from rootsopt.scene import check_geometry
 
 
@@ -29,7 +30,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
         "attractors": found.records(),
         "lost": found.lost,
         "status": found.status.label,
-        "message": found.status.value,
+        "message": message_of(config, found.status),
         "versions": files.versions(),
     }
     folder.write_json("result.json", choice | data)
@@ -53,7 +54,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     def show(out: Console) -> None:
         out.print(tables.attractor_table(rows, found.lost))
         if not found.status.usable:
-            out.print(f"{found.status.label}: {found.status.value}", soft_wrap=True)
+            out.print(f"{found.status.label}: {data['message']}", soft_wrap=True)
 
     usable = any(one.evaluation.usable for one in found.attractors)
     return cli.Outcome(cli.OK if usable else cli.NO_RESULT, show)
