@@ -15,7 +15,7 @@ from browser import Browser
 from rootsopt.config import load, parse
 from rootsopt.explore import session as sessions
 from rootsopt.explore import texts
-from rootsopt.explore.engine import Engine
+from rootsopt.explore.engine import Engine, Shape, same_motion
 from rootsopt.explore.session import (
     FromRest,
     NewMotion,
@@ -26,8 +26,10 @@ from rootsopt.explore.session import (
     Session,
 )
 from rootsopt.optimize.search import Optimization
+from rootsopt.profiles import EE
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.status import Status
+from tests.standins import evaluation_of
 
 pytest.importorskip("bokeh")
 ROOT = Path(__file__).parents[2]
@@ -65,6 +67,104 @@ def session(engine):
     made.close()
 
 
+class Stub(Engine):
+    """An engine that computes nothing: a motion near another one has the given `status`.
+
+    Its force is 1 N, that of a motion from rest 2 N. `calls`: names and times (s) of both."""
+
+    def __init__(self):
+        super().__init__(load(CIC))
+        self.status, self.calls = Status.PERIODIC, []
+        self._base = self.given
+        self.ready.set()
+
+    def shape(self, config):
+        return Shape(np.zeros((1, 2)), {}, None, EE(3, 33e-3))
+
+    def near(self, config, start):
+        self.calls.append(("near", time.monotonic()))
+        return evaluation_of(1.0, self.status)
+
+    def from_rest(self, config):
+        self.calls.append(("rest", time.monotonic()))
+        return evaluation_of(2.0)
+
+
+@pytest.fixture
+def stub():
+    return Stub()
+
+
+@pytest.fixture
+def told(stub):
+    """Return a session in which nothing is computed, after its first motion."""
+    made = Told(stub, idle=0.3)
+    made.next(NewMotion, 0)
+    yield made
+    made.close()
+
+
+def test_rest_waits_until_the_slider_rests(stub, told):
+    """A motion that is known near the last one is compared with that from rest only later.
+
+    One that is not known near the last one is simulated from rest at once."""
+    for _ in range(3):
+        number = told.move({SPEED: 3100.0})
+        told.next(NewMotion, number)
+    told.next(FromRest, number)
+    names, times = zip(*stub.calls, strict=True)
+    assert names[:2] == ("rest", "near")
+    assert names[-1] == "rest"
+    assert times[-1] - times[-2] >= 0.3
+    told.idle, stub.status = 600.0, Status.NOT_SETTLED
+    number = told.move({SPEED: 3200.0})
+    assert [told.next(NewMotion, number).near for _ in range(2)] == [True, False]
+
+
+def test_motion_from_rest_is_shown_when_asked(told):
+    """On its own it only says that there is another motion; asked for, it is shown, once."""
+    number = told.move({SPEED: 3100.0})
+    assert told.next(NewMotion, number).near
+    assert not told.next(FromRest, number).same
+    told.show_from_rest()
+    shown = told.next(NewMotion, number)
+    assert not shown.near
+    assert shown.evaluation.response["mean_force_N"] == 2
+    told.show_from_rest()
+    assert told.next(FromRest, number).same
+
+
+def test_sliders_of_whole_numbers_give_whole_numbers(told):
+    told.move({"profile.lobes": 4.0})
+    assert type(told.config().profile.lobes) is int
+
+
+def test_motions_are_the_same_if_all_their_forces_agree():
+    one, other = evaluation_of(100.0), evaluation_of(100.05)
+    assert same_motion(one, other)
+    apart = dataclasses.replace(other, response=other.response | {"peak_force_N": 101.0})
+    assert not same_motion(one, apart)
+    assert not same_motion(one, dataclasses.replace(other, status=Status.CHAOTIC))
+
+
+class Better(Optimization):
+    """An outcome whose objective is a fifth lower, and whose peak force is a tenth higher."""
+
+    @property
+    def improvement(self):
+        return {"objective": 0.2, "peak_force_N": -0.1}
+
+
+def test_changes_have_the_sign_of_what_they_change():
+    """Now against the start in the tables; the optimum against the start of its search."""
+    table = texts.force_table(evaluation_of(90.0), evaluation_of(100.0))
+    assert "−10.00 %" in table
+    start = evaluation_of(100.0)
+    found = Better(None, start, start, [], {})
+    line = texts.searched_line(Searched(0, found, {}))
+    assert "objective −20.0 %, peak +10.0 %" in line
+
+
 def test_forces_near_a_motion_are_those_from_rest(session, engine):
     """The motion that follows a slider has the forces of a simulation from rest, and says so."""
     number = session.move({SPEED: 3050.0, TIP: 4.2})
@@ -72,6 +172,10 @@ def test_forces_near_a_motion_are_those_from_rest(session, engine):
     motion = session.next(NewMotion, number)
     assert motion.near
     assert motion.evaluation.series is not None
+    turned = np.degrees(motion.poses.rotation - motion.poses.rotation[0])
+    # 3050 revolutions per minute are 18.3 degrees per millisecond.
+    taken = motion.poses.time - motion.poses.time[0]
+    np.testing.assert_allclose(taken, turned / 18.3, rtol=1e-6, atol=1e-9)
     assert session.next(FromRest, number).same
     config = load(CIC, [f"{SPEED}=3050", f"{TIP}=4.2"])
     alone = Evaluator.of(config)()

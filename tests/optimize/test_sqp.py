@@ -107,6 +107,24 @@ def test_steps_into_unusable_designs_are_shortened():
     assert descend(lambda x: None, np.array([0.1, 0.9])).reason == "unusable"
 
 
+def test_a_stationary_point_that_is_worse_is_not_the_result():
+    """The first step lands on a shelf: the gradient vanishes there, but the start was better.
+
+    The minimum, -2.5 at x = 0.35, lies between the start and the shelf."""
+    seen = []
+
+    def look(x):
+        away = x[0] - 0.35
+        value, slope = (3.0, 0.0) if x[0] > 0.5 else (1000 * away**2 - 2.5, 2000 * away)
+        seen.append(value)
+        return Local(value, np.array([slope, 0.0]), (), np.zeros(0), np.zeros((0, 2)))
+
+    found = descend(look, np.array([0.3, 0.5]))
+    assert 3.0 in seen
+    assert found.local.objective == min(seen)
+    np.testing.assert_allclose(found.point[0], 0.35, atol=1e-6)
+
+
 def test_reasons_of_an_early_end():
     """Three reasons are tested: too few evaluations, a request to stop, and a wrong gradient."""
     start = np.array([0.1, 0.9])
@@ -139,6 +157,40 @@ def test_certificate_is_zero_only_at_an_optimum():
     assert certify(smooth(beside), beside).residual == pytest.approx(
         np.linalg.norm([0.2 + 0.4, -0.2 - 0.4]) / 2, rel=1e-9
     )
+
+
+def beside(kind, gap):
+    """Return a linear problem and a point at a distance `gap` from the limit that stops it.
+
+    The objective falls by 2 per unit of the way to the limit."""
+    point, slope, limits, walls = np.array([0.4, 0.5]), np.array([2.0, 0.0]), (), ()
+    slack, normals = np.zeros(0), np.zeros((0, 2))
+    far = group([-0.5], [[-1.0, 0.0]])
+    if kind == "lower bound":
+        point[0] = gap
+    elif kind == "upper bound":
+        point[0], slope = 1 - gap, -slope
+    elif kind == "constraint":
+        slack, normals = np.array([gap]), np.array([[1.0, 0.0]])
+    elif kind == "wall":
+        walls = group([-gap], [[-1.0, 0.0]]), far
+    else:  # The other branch of a maximum: each rises by 4 where the other falls.
+        slope, limits = np.zeros(2), (group([1.0, 1.0 - 4 * gap], [[2.0, 0], [-2.0, 0]]),)
+    return Local(0.0, slope, limits, slack, normals, walls), point
+
+
+@pytest.mark.parametrize("kind", ["lower bound", "upper bound", "constraint", "wall", "branch"])
+def test_residual_counts_what_a_step_onto_the_limit_would_gain(kind):
+    """A multiplier makes the gradient vanish beside a limit, too: only on it is the optimum.
+
+    For linear functions, multiplier times distance is what is left to gain."""
+    gap = 2e-5
+    found = certify(*beside(kind, gap))
+    assert found.residual == pytest.approx(2 * gap, rel=1e-3)
+    assert certify(*beside(kind, 0.0)).residual < 1e-10
+    # A limit that is far away stops nothing: the whole gradient is left.
+    away, point = beside(kind, 0.1)
+    assert certify(away, point).residual == pytest.approx(2, rel=1e-9)
 
 
 def test_constraint_that_cannot_move_has_no_multiplier():

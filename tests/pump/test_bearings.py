@@ -74,6 +74,10 @@ def test_gear_and_equivalent_load():
     assert abs(force) == pytest.approx(3.3 / R / np.cos(np.radians(20)))
     # Its moment about rotor 2, in its own sense (clockwise), from the pitch point at (-r, 0).
     assert -(np.conj(-R) * force).imag == pytest.approx(3.3)
+    # A torque the other way turns the push round; the teeth part the rotors all the same.
+    back = complex(bearings.gear_force(*map(jnp.asarray, (-3.3, R, np.radians(20)))))
+    assert back == pytest.approx(force.conjugate())
+    assert back.real > 0
     loads = jnp.asarray([[10.0 + 0j, 10.0j], [20.0, 0.0]])
     found = bearings.equivalent_load(loads, bearings.BALL)
     np.testing.assert_allclose(found, [10.0, 20 * 0.5 ** (1 / 3)])

@@ -20,7 +20,10 @@ from rootsopt.report import charts
 from rootsopt.report.blocks import pump_block
 from rootsopt.report.gather import Run
 from rootsopt.report.html import report_text
+from rootsopt.report.meshing import animations
 from rootsopt.report.names import label
+from rootsopt.report.optimum import certificate_blocks
+from rootsopt.report.wording import came_out, what_next
 from rootsopt.response.series import Series
 from rootsopt.status import Status
 
@@ -138,6 +141,14 @@ def test_spectrum_has_the_lines_of_the_motion(page):
     assert lines[5] == pytest.approx(20, rel=1e-5)
     assert sum(lines.values()) == pytest.approx(50, rel=1e-4)
     assert marks["customdata"][marks["x"].index(2)] == "300"
+
+
+def test_force_is_drawn_over_milliseconds(page):
+    """Three periods of a mesh frequency of 150 Hz take 20 ms."""
+    drive = data_of(page)["charts"][0]["data"][0]
+    assert drive["x"][0] == 0
+    assert drive["x"][-1] == pytest.approx(20 * (1 - 1 / SAMPLES), rel=1e-5)
+    assert drive["y"][0] == pytest.approx(100)
 
 
 def test_animation_shows_forces_and_turns_one_period(page):
@@ -294,10 +305,56 @@ def test_optimum_is_reported_in_the_users_words(tmp_path):
         "flow lines, 2 of 2 0.010000",
     ):
         assert words in text
+    # Of two limits, the one whose relaxation lowers the objective more.
+    other = {"name": "seal_width", "unit": "mm", "relaxed_by": -0.1, "multiplier": 0.1}
+    given["constraints"] = [limit, limit | other | {"relaxed_objective_percent": -0.4}]
+    (dear,) = [line for line in what_next(run_of(tmp_path, given)) if "highest price" in line]
+    assert "area efficiency" in dear
     optimality |= {"converged": False, "reason": "evaluations", "message": "Raise iterations."}
     text = words_of(report_text(run_of(tmp_path, given)))
     assert "The dearest limit" not in text
     assert "The design is no optimum, so prices are rough." in text
+
+
+@pytest.mark.parametrize("command", ["optimize", "simulate", "profile"])
+def test_advice_names_the_config_of_the_result(command, tmp_path):
+    """Each file in an advised command can be read and holds the design that the page is about."""
+    design = dict(zip(load(CIC).design_keys, (37.0, 8.0, 4.5), strict=True))
+    after = load(CIC).with_design([*design.values()])
+    given = result_of(command)
+    if command == "optimize":
+        optimized = result_of() | {"design": design}
+        given = {"baseline": given, "optimized": optimized, "run": {"command": command}}
+        given |= {"status": "periodic", "message": "Found."}
+    run = run_of(tmp_path, given)
+    (tmp_path / "optimized.yaml").write_text(after.to_yaml())
+    named = re.findall(r"rootsopt \w+ (\S+\.yaml)", " ".join(what_next(run)))
+    assert len(named) >= 2
+    expected = after if command == "optimize" else load(CIC)
+    for file in named:
+        np.testing.assert_array_equal(load(file).design, expected.design)
+
+
+def test_shares_of_motions_are_percentages(tmp_path):
+    """The basins of all motions fill the initial states that settle."""
+    motions = [result_of(share=share, reached=share > 0.5) for share in (0.75, 0.25)]
+    given = result_of("attractors", attractors=motions)
+    text = " ".join(came_out(run_of(tmp_path, given)))
+    shares = [float(x) for x in re.findall(r"(\S+) % of the initial states", text)]
+    assert shares == [75, 25]
+
+
+def test_steps_of_the_scene_have_their_own_unit(tmp_path):
+    """A clearance moves by a micrometre, another length by a hundredth of itself."""
+    row = {"unit": "mm", "mean_force_N": 0.1, "peak_force_N": -0.2}
+    rows = [row | {"quantity": "clearance", "step": 1e-3, "value": 0.1},
+            row | {"quantity": "rotor length", "step": 1.0, "value": 100.0}]  # fmt: skip
+    optimality = {"converged": True, "reason": "converged", "message": "", "residual": 0.0,
+                  "required_residual": 1e-4, "violation": 0.0, "method": "slsqp",
+                  "sensitivities": rows}  # fmt: skip
+    run = run_of(tmp_path, result_of("optimize", optimality=optimality))
+    shown = certificate_blocks(run)[-1].groups[0][1]
+    assert [cells[0].text for cells in shown] == ["clearance +1 µm", "rotor length +1 %"]
 
 
 def test_robust_optimum_is_compared_in_fresh_scenes(tmp_path):
@@ -326,11 +383,14 @@ def test_sweep_over_two_quantities(tmp_path):
         for play in (0.1, 0.2) for speed in (1000.0, 3000.0, 2000.0)
     ]  # fmt: skip
     rows[0] |= {"mean_force_N": None, "peak_force_N": None, "status": "passed_through"}
+    rows[2] |= {"status": "averaged", "rms_force_N": float("nan")}
+    keys = [*rows[0], "rms_force_N"]
     ResultFolder(tmp_path).write_csv(
-        "sweep.csv", {key: np.array([row[key] for row in rows], object) for key in rows[0]}
+        "sweep.csv", {key: np.array([row.get(key) for row in rows], object) for key in keys}
     )
     run = run_of(tmp_path, result_of("sweep", status="chaotic"))
     page = report_text(run)
+    assert {row["rms_force_N"] for row in run.rows} == {None}
     traces = data_of(page)["charts"][0]["data"]
     assert [len(trace["x"]) for trace in traces] == [2, 2, 3, 3]
     assert traces[3]["x"] == [1000, 2000, 3000]
@@ -501,11 +561,16 @@ def test_page_prints(browser, page, tmp_path):
 
 def test_cases_share_a_rotor(simulated):
     """Two motions of one design are drawn with one outline."""
-    from rootsopt.report.meshing import animations
-
     other = dataclasses.replace(simulated.cases[0], name="motion 2", series=None)
     found = animations([simulated.cases[0], other])
     assert found is not None
     assert len(found["rotors"]) == 1
     assert [case["rotor"] for case in found["cases"]] == [0, 0]
     assert found["cases"][1]["forces"] is None
+
+
+def test_axes_are_drawn_where_they_are(simulated):
+    """Two pitch radii of 33 mm and the error of the scene apart."""
+    config = load(CIC, ["scene.center_distance_error_mm=0.25"])
+    found = animations([dataclasses.replace(simulated.cases[0], config=config, series=None)])
+    assert found["rotors"][0]["center"] == 66.25

@@ -1,5 +1,7 @@
 """Sweeps from Python: what the dataset holds, also where a point fails."""
 
+import threading
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -8,11 +10,12 @@ import xarray
 import rootsopt
 from rootsopt import InputError, Status
 from rootsopt.sweeps import points
+from rootsopt.sweeps.local import in_process
 from rootsopt.sweeps.plan import plan_of
 from rootsopt.sweeps.points import configured, lost, simulated
 from rootsopt.sweeps.table import dataset_of
 
-LOAD, CLEARANCE = "scene.load.torque_N_m", "contact.clearance_mm"
+SPEED, LOAD, CLEARANCE = "scene.speed_rpm", "scene.load.torque_N_m", "contact.clearance_mm"
 ANGLE, FAMILY = "profile.pressure_angle_deg", "profile.family"
 
 
@@ -82,6 +85,87 @@ def test_family_takes_its_own_parameters(config):
         configured(config, {FAMILY: "arc"})
 
 
+def from_file(path, more="") -> rootsopt.Config:
+    """Return a config whose rotor is read from the file `path`, which need not exist."""
+    profile = f"{{family: outline, lobes: 3, pitch_radius_mm: 33, outline_file: '{path}'{more}}}"
+    return rootsopt.load_config("cic", [f"profile={profile}"])
+
+
+def test_family_leaves_the_file_of_an_outline():
+    """A point with another family has nothing of the file, and a point without keeps it."""
+    more = ", outline_smoothing_mm: 0.002, outline_center: fit, outline_unit: inch"
+    config = from_file("rotor.csv", more)
+    names = [name for name in type(config.profile).model_fields if name.startswith("outline_")]
+    own = {ANGLE: 36.0, "profile.involute_length_mm": 8.0, "profile.tip_arc_angle_deg": 4.0}
+    found = configured(config, {FAMILY: "cic", **own}).profile
+    assert not found.from_file
+    assert [*found.parameters.values()] == [36.0, 8.0, 4.0]
+    assert {getattr(found, name) for name in names} == {None}
+    for values in ({LOAD: 1.0}, {FAMILY: "outline"}):
+        kept = configured(config, values).profile
+        assert (kept.outline_smoothing_mm, kept.outline_unit) == (0.002, "inch")
+        assert kept.outline_file == config.profile.outline_file
+
+
+@pytest.mark.parametrize("place", ["config", "axis"])
+def test_points_of_another_outline_are_not_used_again(tmp_path, monkeypatch, place):
+    """After the file of an outline has changed, a sweep begins anew, or is refused.
+
+    After the same interruption, it goes on if the file is the same."""
+    files = [tmp_path / f"{number}.csv" for number in range(5)]
+    for file in files:
+        file.write_text("x_mm,y_mm\n1,0\n")
+    axes = {SPEED: "1,2,3,4,5"}
+    if place == "axis":
+        axes = {"profile.outline_file": [*map(str, files)]}
+    asked, ends = [], [3]
+
+    def check(config):
+        asked.append(config)
+        if len(asked) in ends:
+            raise KeyboardInterrupt
+        raise InputError("not simulated")
+
+    monkeypatch.setattr(points, "check_geometry", check)
+    monkeypatch.setattr("os.cpu_count", lambda: 1)
+    config = from_file(files[0])
+    for changed in (False, True):
+        kept = tmp_path / f"points {changed}"
+        ends[:], asked[:] = [3], []
+        with pytest.raises(KeyboardInterrupt):
+            rootsopt.sweep_scenes(config, axes, checkpoint=kept)
+        ends[:], asked[:] = [], []
+        if not changed:
+            rootsopt.sweep_scenes(config, axes, checkpoint=kept, resume=True)
+            assert len(asked) < 5
+            continue
+        files[0].write_text("x_mm,y_mm\n2,0\n")
+        try:
+            rootsopt.sweep_scenes(config, axes, checkpoint=kept, resume=True)
+        except InputError:
+            assert asked == []
+        else:
+            assert len(asked) == 5
+
+
+def test_stopped_sweep_keeps_what_has_begun(config, monkeypatch):
+    """Points that wait are dropped without an error, those that have begun are reported."""
+    stop, begun = threading.Event(), []
+
+    def check(config):
+        begun.append(config.scene.speed_rpm)
+        if len(begun) == 2:
+            stop.set()
+        raise InputError("not simulated")
+
+    monkeypatch.setattr(points, "check_geometry", check)
+    monkeypatch.setattr("os.cpu_count", lambda: 1)
+    plan = plan_of({SPEED: "1,2,3,4,5,6"})
+    found = dict(one for some in in_process(config, plan, range(6), stop) for one in some)
+    assert 2 <= len(begun) < 6
+    assert sorted(found) == [*range(len(begun))]
+
+
 def test_part_can_be_null(config):
     assert configured(config, {"scene.timing_gear": None}).scene.timing_gear is None
 
@@ -104,12 +188,16 @@ def test_points_of_two_families_have_all_parameters():
         number: lost(Status.PERIODIC) | {"response": {"mean_force_N": 3.0}, "gradient": slope}
         for number, slope in zip((0, 2), slopes, strict=True)
     }
+    # The number of mesh periods belongs to a periodic motion, not to one that is given up.
+    rows[0] |= {"steady_state": {"period": 3}}
+    rows[2] |= {"steady_state": {"period": 4}, "status": Status.CHAOTIC.label}
     found = dataset_of(rootsopt.load_config("cic"), plan, rows)
     slope = found.gradient_mean_force_N
     assert slope.design_key.values.tolist() == ["pressure_angle_deg", "arc_center_mm"]
     np.testing.assert_array_equal(slope.values[:, 0], [[1.0, np.nan], [np.nan, 2.0]])
     assert found["rotor.bore_mm"].values.tolist() == ["null", "10"]
     assert found.status.values[:, 1].tolist() == ["not_simulated"] * 2
+    assert found.period.values.tolist() == [[3, 0], [0, 0]]
 
 
 def test_single_precision_of_jax_is_refused(config, monkeypatch):
