@@ -18,9 +18,7 @@ _TOUCHING = 1e-6
 there."""
 
 
-def check_geometry(
-    config: Config, design: ArrayLike | None = None, simulated: bool = True
-) -> None:
+def check_geometry(config: Config, design: ArrayLike | None = None, simulated: bool = True) -> None:
     """Raise `InputError` unless the config's profile is sound and leaves room for the bore.
 
     `design` (d,): in config units, by default the config's own; `simulated`: whether the rotor is

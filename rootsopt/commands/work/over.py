@@ -16,6 +16,7 @@ from rootsopt.errors import InputError
 from rootsopt.figures.sweep import sweep_figure
 from rootsopt.output import datasets, files, sweeps
 from rootsopt.output.runs import RunFolder
+from rootsopt.runtime.environment import say
 from rootsopt.status import Status
 from rootsopt.sweeps.axes import parse_over
 from rootsopt.sweeps.plan import Plan, plan_of, scattered
