@@ -342,7 +342,7 @@ def _differentiated(
     at = times[:, None] + sides
     slopes = _after(near, every)[:, count:].reshape(*at.shape, near.value.shape[1] - count, -1)
     found = near.value.reshape(*at.shape, -1)
-    values, weights = lax.map(lambda at: equation.peak(*at, noise, dynamic), (at, found))
+    values, weights = lax.map(lambda x: equation.peak(x[0], x[1], noise, dynamic), (at, found))
     return unit * values, unit * jnp.einsum("ksf,ksfd->kd", weights, slopes)
 
 

@@ -75,7 +75,8 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
             out.print(tables.comparison_table(result.baseline, result.optimized, *numbers))
             if result.nominal is not None:
                 gains = result.improvement, result.improvement_over_nominal
-                out.print(tables.nominal_table(*(one for one in sheets.values()), *gains))
+                measured, nominal, found = sheets.values()
+                out.print(tables.nominal_table(measured, nominal, found, *gains))
             named = {"baseline": sheets["baseline"], "optimised": sheets["optimized"]}
             out.print(tables.pump_table(named))
             for note in warnings(sheets["optimized"]["pump"]):
