@@ -83,7 +83,7 @@ def inset_note(inset: float, clearance_mm: float) -> str:
     """Return a sentence on an `inset` (m) and the config's clearance; "" without an inset."""
     if not inset:
         return ""
-    size, gap = f"inset {inset * 1e3:.4g} mm", clearance_mm + 2e3 * inset
+    size, gap = f"inset {inset * 1e3:.3g} mm", clearance_mm + 2e3 * inset
     if gap < 0:
         return (
             f"outline: {size} (oversize): both rotors are larger than conjugate ones by this "

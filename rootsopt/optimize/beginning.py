@@ -52,7 +52,7 @@ class Beginning:
             f"{one.rms * 1e6:.3g} um) from it."
         )
         if one.inset:
-            text += f" Its {self._inset}."
+            text += f" {self._inset}."
         if self.widened:
             bounds = family_of(one.family).parameters
             pairs = {p.key: getattr(self.config.optimizer.bounds, p.key) for p in bounds}
@@ -65,11 +65,12 @@ class Beginning:
     @property
     def _inset(self) -> str:
         """Say how the members get the gap that the outline has by its inset."""
-        size, gap = f"inset is {self.likeness.inset * 1e3:.4g} mm", self.config.contact.clearance_mm
-        given = f"`--set contact.clearance_mm={gap:.6g}`"
-        text = f"{size}: to have the same flank gap, its members were simulated with {given}"
+        size, gap = self.likeness.inset * 1e3, self.config.contact.clearance_mm
+        text = f"The outline is cut, inset {size:.3g} mm: the members of the family have the same "
+        text += f"flank gap with `--set contact.clearance_mm={gap:.6g}`"
         if self.oversize:
-            text += f", {self.oversize:.4g} mm more than that of the overlapping outline"
+            text = f"The outline is oversize, inset {size:.3g} mm: its flanks overlap by "
+            text += f"{self.oversize:.3g} mm more than those of the members, whose clearance is 0"
         return text
 
     def record(self) -> dict[str, Any]:

@@ -426,7 +426,7 @@ def likeness_table(
     for row in rows:
         cells = [f"{key} {_number(value)}" for key, value in row["design"].items()]
         if row["inset_um"]:
-            cells.insert(0, f"inset {row['inset_um'] / 1e3:.4g} mm")
+            cells.insert(0, f"inset {row['inset_um'] / 1e3:.3g} mm")
         design = ", ".join(cells)
         away = _number(row["departure_um"]), _number(row["departure_rms_um"])
         table.add_row(row["family"], *away, design)

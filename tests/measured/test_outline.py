@@ -15,14 +15,16 @@ from rootsopt.config import load, parse
 from rootsopt.contact.closest import FlankPair
 from rootsopt.contact.nodes import pair_gap
 from rootsopt.errors import InputError
-from rootsopt.measured.conjugacy import conjugacy
+from rootsopt.measured.conjugacy import conjugacy, inset_note
 from rootsopt.measured.curves import _jumps
 from rootsopt.measured.fit import imported
 from rootsopt.measured.reading import Loop, read, signed_area
 from rootsopt.measured.source import note, outline_of
+from rootsopt.optimize.design import optimize_design
 from rootsopt.profiles import CIC, EE, geometry, outline
 from rootsopt.scene import Scene, check_geometry, design_vector
 from rootsopt.scene.families import free_form_of
+from rootsopt.tradeoffs.trace import pareto_front
 
 R = 0.033
 CIC3 = CIC(3, R, np.deg2rad(36.43), 8.5e-3, np.deg2rad(4.0))
@@ -58,6 +60,12 @@ def bulged(points, by):
     along = np.roll(points, -1) - np.roll(points, 1)
     above = np.clip((np.abs(points) - 33) / (np.max(np.abs(points)) - 33), 0, 1)
     return points - 1j * along / np.abs(along) * by * np.sin(np.pi * above) ** 2
+
+
+def cut(points, by):
+    """Return points of an outline that is `by` mm smaller along its normals."""
+    along = np.roll(points, -1) - np.roll(points, 1)
+    return points + 1j * along / np.abs(along) * by
 
 
 def write(path, points, header="x_mm,y_mm", separator=","):
@@ -121,6 +129,59 @@ def test_a_wrong_outline_leaves_the_gap_that_its_points_leave(profile, by):
     for x, e, gap in zip(rolls, relatives, approaches(pair, rolls, relatives).gap, strict=True):
         seen = pair_gap(closed(points), 3, 2e3 * R, -x - e / 2, -x + e / 2) * 1e-3
         assert float(gap) == pytest.approx(seen, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("by", "scatter"), [(0.5, 0.0), (0.02, 0.0), (-0.05, 0.0), (0.0, 0.0), (0.1, 2e-3), (0.0, 2e-3)]
+)
+def test_an_inset_is_seen_in_the_mesh(by, scatter):
+    """Half the gap in rolling, with its sign; within the scatter, there is none."""
+    points = cut(points_of(CIC3, 240), by)
+    points = points + scatter * np.random.default_rng(0).normal(size=(2892, 2)) @ [1, 1j]
+    found = conjugacy(profile_of(points, scatter)[0])
+    assert found.inset == pytest.approx(by * 1e-3, abs=1e-9 + 0.2e-3 * scatter)
+    assert found.record()["inset_um"] == found.inset * 1e6
+    said = inset_note(found.inset, 0.05)
+    if scatter == 0 and by > 0:
+        assert f"inset {by:g} mm" in said
+        assert f"--set contact.clearance_mm={0.05 + 2 * by:.4g}`" in said
+    assert ("oversize" in said) == (by < 0)
+
+
+def test_addenda_that_differ_are_no_inset():
+    assert conjugacy(profile_of(bulged(points_of(CIC3, 240), -0.02))[0]).inset == 0
+
+
+def test_seal_width_within_the_scatter():
+    """Points with 2 µm of scatter: a land of 6.26 mm is found to 5 %; a rounded tip has none."""
+    scatter = 2e-3
+    off = np.random.default_rng(2).normal(size=(3000, 2)) @ [1, 1j]
+    for one in PROFILES.values():
+        points = points_of(one, 240)
+        found, _ = profile_of(points + scatter * off[: len(points)], scatter)
+        true = float(geometry(one).seal_width)
+        assert float(geometry(found).seal_width) == pytest.approx(true, rel=0.05)
+
+
+def test_lobes_off_the_axis_are_refused_before_anything_is_compiled(tmp_path, monkeypatch, capsys):
+    """Every command that simulates says what `profile` says, unless the config gives the axis."""
+    path = write(tmp_path / "points.csv", points_of(CIC3, 240) + 0.4)
+    (tmp_path / "scene.yaml").write_text(CONFIG.format(path))
+    looked = []
+    monkeypatch.setattr("rootsopt.scene.families.check", looked.append)
+    assert simulate.main([str(tmp_path / "scene.yaml"), "-o", str(tmp_path / "out")]) == 2
+    assert "set `profile.outline_center` = fit" in capsys.readouterr().err
+    config = load(tmp_path / "scene.yaml")
+    for work in (optimize_design, pareto_front):
+        with pytest.raises(InputError, match=r"outline_center` = fit .*\[0, 0\]"):
+            work(config)
+    assert not looked
+    for center, simulated in (([0, 0], True), ("fit", True), (None, False)):
+        given = config.model_copy(
+            update={"profile": config.profile.model_copy(update={"outline_center": center})}
+        )
+        check_geometry(given, simulated)
+    assert len(looked) == 3
 
 
 def test_levers_are_the_derivatives_of_the_gap():

@@ -1,12 +1,15 @@
 """A rotor from a file as baseline: where the search begins, what it finds, what is said of it."""
 
 import argparse
+import dataclasses
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import yaml
+from rich.console import Console
 
 from rootsopt.commands import optimize
 from rootsopt.commands.work.searching import checkpoint_of
@@ -16,19 +19,22 @@ from rootsopt.design.resemblance import Likeness
 from rootsopt.errors import InputError
 from rootsopt.optimize import beginning as module
 from rootsopt.optimize.beginning import beginning
-from rootsopt.optimize.search import Search
+from rootsopt.optimize.search import Optimization, Search
+from rootsopt.output import tables
 from rootsopt.output.runs import RunFolder
 from rootsopt.scene import outline_mm
+from rootsopt.scene.check import shape_of
+from tests.measured.test_outline import cut
 from tests.standins import evaluation_of
 
 CIC = "configs/cic.yaml"
 BASE = load(CIC)
 
 
-def measured(folder: Path, scatter: float, **optimizer) -> Path:
+def measured(folder: Path, scatter: float, inset: float = 0.0, **optimizer) -> Path:
     """A config in `folder` whose baseline is the rotor of `CIC`, with `scatter` (mm) of its points,
-    clockwise, turned and from another first point."""
-    points = outline_mm(BASE)[:-1] @ [1, 1j]
+    clockwise, turned and from another first point; `inset` (mm) smaller along its normals."""
+    points = cut(outline_mm(BASE)[:-1] @ [1, 1j], inset)
     chance = np.random.default_rng(5)
     off = chance.normal(size=(len(points), 2)) @ [1, 1j]
     points = np.roll((points + scatter * off)[::-1] * np.exp(0.3j), 321)
@@ -58,6 +64,53 @@ def test_fit_finds_the_design_that_was_drawn(tmp_path):
     assert f"{found.likeness.departure * 1e6:.3g} um" in found.message
     assert found.record()["departure_rms_um"] == found.likeness.rms * 1e6
     assert found.widened == ()
+
+
+def test_members_get_the_gap_of_an_inset(tmp_path):
+    """The inset is fitted with the parameters; both sides of the comparison have its gap, and the
+    floor of the area efficiency is that of the member."""
+    config = load(measured(tmp_path, 1e-3, 0.1, family="cic"), ["contact.clearance_mm=0.03"])
+    found = beginning(config)
+    assert found is not None
+    assert found.likeness.inset == pytest.approx(1e-4, abs=0.5e-6)
+    assert found.likeness.departure < 2e-6
+    for key, value in BASE.profile.parameters.items():
+        assert getattr(found.config.profile, key) == pytest.approx(value, rel=0.01)
+    gap = found.config.contact.clearance_mm
+    assert gap == pytest.approx(0.03 + 2e3 * found.likeness.inset, abs=1e-6)
+    assert f"--set contact.clearance_mm={gap:.6g}`" in found.message
+    assert "inset 0.1 mm" in found.message
+    floor = found.config.constraints.area_efficiency_min
+    assert floor == pytest.approx(shape_of(BASE).area_efficiency, rel=1e-3)
+    assert found.record()["inset_um"] == found.likeness.inset * 1e6
+    # An outline that overlaps has members that just touch.
+    other, more = module._cut(config, -5e-5)
+    assert (other.contact.clearance_mm, more) == (0.0, pytest.approx(0.07))
+    assert module._cut(config, 0.0) == (config, 0.0)
+
+
+def test_improvement_over_the_nominal_member():
+    """A third less than the nominal member, which is a quarter quieter than the measured rotor."""
+
+    forces = dict.fromkeys(("mean_force_N", "peak_force_N", "rms_force_N"), 1.0)
+    blank = evaluation_of()
+    measured, member, best = (
+        dataclasses.replace(blank, response={key: force * x for key, x in forces.items()})
+        for force in (100.0, 75.0, 50.0)
+    )
+    problem = SimpleNamespace(objective=lambda found: found.response["mean_force_N"] / 100)
+    found = SimpleNamespace(problem=problem, optimized=best)
+    gain = Optimization._gains(found, measured, 1.0)  # type: ignore[arg-type]
+    over = Optimization._gains(found, member, 0.75)  # type: ignore[arg-type]
+    assert gain == pytest.approx({"objective": 0.5} | dict.fromkeys(forces, 0.5))
+    assert over == pytest.approx({"objective": 1 / 3} | dict.fromkeys(forces, 1 / 3))
+    console = Console(width=80, record=True)
+    records = [{"response": one.response} for one in (measured, member, best)]
+    console.print(tables.nominal_table(*records, gain, over))
+    row = next(x for x in console.export_text().splitlines() if "objective" in x)
+    cells = [x.strip() for x in row.split("|")[2:7]]
+    assert cells[1:3] == ["0.75000", "0.50000"]
+    assert [float(x.split()[0]) for x in cells[3:]] == pytest.approx([-50, -33.3], abs=0.1)
 
 
 def test_a_config_without_a_file_has_no_beginning():
@@ -135,6 +188,13 @@ def test_a_measured_rotor_leads_to_the_optimum_of_its_family(tmp_path, capsys):
     assert "rotor.csv as it is" in said
     assert result["beginning"]["message"] in " ".join(said.split())
     assert result["baseline"]["design"] == {}
+    nominal, seal = result["nominal"], "seal_width_mm"
+    assert nominal["design"] == pytest.approx(result["beginning"]["design"])
+    assert nominal["geometry"][seal] == pytest.approx(result["baseline"]["geometry"][seal], rel=0.1)
+    ratio = result["optimized"]["response"]["peak_force_N"] / nominal["response"]["peak_force_N"]
+    over = result["improvement_over_nominal"]
+    assert over["peak_force_N"] == pytest.approx(1 - ratio, rel=1e-9)
+    assert "from nominal" in said
     assert result["optimality"]["residual"] < 1e-4
     before, after = (result[name]["response"] for name in ("baseline", "optimized"))
     expected = 0.5 * sum(after[k] / before[k] for k in ("mean_force_N", "peak_force_N"))
