@@ -3,6 +3,8 @@
 import os
 from typing import TYPE_CHECKING
 
+from rootsopt.runtime.environment import say
+
 if TYPE_CHECKING:
     import argparse
     from contextlib import AbstractContextManager
@@ -35,7 +37,6 @@ def add_options(parser: "argparse.ArgumentParser | argparse._ArgumentGroup") -> 
 
 def chosen(options: "argparse.Namespace") -> "AbstractContextManager[Runs]":
     """Return a context manager for what runs the evaluations of a search with these `options`."""
-    from rootsopt.runtime.environment import say
     from rootsopt.sweeps.evaluations import evaluating
 
     if options.workers is not None:
