@@ -200,7 +200,7 @@ class Equation(eqx.Module):
 
     def with_rate(
         self, tau: Float[Array, ""], found: Float[Array, " values"], dynamic: Any
-    ) -> Float[Array, " values-n+1"]:
+    ) -> Float[Array, " sided"]:
         """Return the entries of `found` after the state, followed by the rate of the force.
 
         `found`: the state at the time `tau` (mesh periods), the first of the `marks` if the contact

@@ -25,9 +25,8 @@ _FEW, _FEW_CHANGES = 2048, 128
 """Numbers of steps and of switches above which whole arrays are sorted, unused entries included."""
 _LANES = 16
 """Number of times at which flags are evaluated together, as arrays."""
-_FOURTH = 2
-"""Number of bisections that locate a switch, beyond those that reduce the interval between two
-looks to half the length of the short step around the switch."""
+_HALVINGS = 26
+"""Number of bisections that locate a switch."""
 _BRIEF, _PARTS = 0.05, 8
 """Distance (mesh periods) between two switches below which the interval between them is divided,
 and the number of steps into which it is divided."""
@@ -90,18 +89,16 @@ def with_switches(
         return pair.switches(tau, blended(pair, out.states, steps, tau, width))
 
     width_of = jax.eval_shape(flags, width)[0].shape[0]
-    aside = jnp.clip(_LOOSE * tolerance, *_ASIDE)
-    halvings = _FOURTH + jnp.ceil(-jnp.log2(_LOOKS * aside)).astype(int)
 
     # Scan and bisect in one loop, so that the flags are compiled once.
     def go_on(carry):
         turn, number, *_ = carry
-        return (turn < blocks) | (turn < blocks + halvings * -(-number // _LANES))
+        return (turn < blocks) | (turn < blocks + _HALVINGS * -(-number // _LANES))
 
     def look(carry):
         turn, number, listed, (low, high), last = carry
         looking = turn < blocks
-        place = jnp.where(looking, turn, (turn - blocks) // halvings) * _LANES + lanes
+        place = jnp.where(looking, turn, (turn - blocks) // _HALVINGS) * _LANES + lanes
         at = jnp.minimum(place, jnp.where(looking, known, _CHANGES) - 1)
         middle = (low[at % _CHANGES] + high[at % _CHANGES]) / 2
         found, counted = jax.vmap(flags)(jnp.where(looking, places[at], middle))
@@ -135,7 +132,7 @@ def with_switches(
     rooms = (_FEW, _FEW_CHANGES), (grid.shape[0], _CHANGES)
     return _if_few(
         few,
-        lambda room: _surrounded(grid[: room[0]], switches[: room[1]], periods, aside),
+        lambda room: _surrounded(grid[: room[0]], switches[: room[1]], periods, tolerance),
         rooms,
         grid.shape[0],
     )
@@ -161,12 +158,9 @@ def _surrounded(
     grid: Float[Array, " steps"],
     switches: Float[Array, " changes"],
     periods: Float[Array, ""],
-    usual: Float[Array, ""],
+    tolerance: Float[Array, ""],
 ) -> Float[Array, " more"]:
-    """Return `grid` with step ends added around the `switches`, padded with inf.
-
-    `usual`: half the length (mesh periods) of the short step around a switch that has no other
-    switch close by."""
+    """Return `grid` with step ends added around the `switches`, padded with inf."""
     found = jnp.sort(switches)
     # Between two close switches the contact crosses a whole flank segment: make short steps there.
     brief = jnp.diff(found, append=jnp.inf)
@@ -174,6 +168,7 @@ def _surrounded(
     # Each switch lies inside a step too short to matter. No stage is evaluated right at the switch,
     # where rounding would decide the side.
     apart = jnp.minimum(brief, jnp.diff(found, prepend=-jnp.inf))
+    usual = jnp.clip(_LOOSE * tolerance, *_ASIDE)
     # A minimum length: two switches at almost the same instant would give steps of zero length.
     rounding = _ROUNDINGS * float(jnp.finfo(found.dtype).eps) * periods
     least = jnp.maximum(jnp.minimum(usual, _CLOSE), rounding)
