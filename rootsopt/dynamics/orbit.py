@@ -74,8 +74,9 @@ class Orbit(NamedTuple):
     further measures; `sensitivity` (r, d): derivatives of `response` with respect to the design,
     along the family of orbits; `moved` (n, d): likewise, derivatives of `state`; `newton_steps`:
     number of integrations for Newton's method; `drift`: change of `state` since the last search for
-    kinks (scaled); `defect`: residual (scaled) on a grid with halved steps; `disagreement`:
-    relative difference between the derivatives on both grids. `defect` and `disagreement` are 0 if
+    kinks (scaled); `defect`: residual (scaled) on a grid with halved steps, on which the
+    derivatives are computed; `disagreement`: relative difference between the derivatives on both
+    grids, plus that from the distance between their orbits. `defect` and `disagreement` are 0 if
     there was no check.
     """
 
@@ -453,8 +454,13 @@ def _compared(now: _Closing, out: Flow, residual: Float[Array, ""], count: int):
     same = jnp.abs(flow.peak_time - out.peak_time) < _SAME
     row = count + 2
     slope = out.slope.at[row].set(jnp.where(same, out.slope[row], flow.slope[row]))
+    # Both flows begin at the same state. The orbit on the finer grid is displaced by (I - M)⁻¹
+    # times the residual (scaled), and its derivatives differ by about as much.
+    unit = jnp.eye(count, dtype=slope.dtype)
+    gain = jnp.max(jnp.sum(jnp.abs(solved(unit - slope[:count, :count], unit)), axis=1))
+    apart = disagreement(flow.slope, slope, count) + gain * residual
     # The comparison needs room to halve all steps.
-    apart = jnp.where(has_room(now.grid), disagreement(flow.slope, slope, count), jnp.inf)
+    apart = jnp.where(has_room(now.grid), apart, jnp.inf)
     finer = flow._replace(slope=slope, grid=out.grid, corners=out.corners)
     kept = choose(jnp.all(jnp.isfinite(slope)), finer, flow)
     monodromy = kept.slope[:count, :count]
