@@ -84,17 +84,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
             if baseline:
                 optimized = result.optimized.record()["speeds"]
                 out.print(tables.speeds_table(baseline, optimized, result.objective_by_speed))
-            if result.optimality is not None:
-                out.print(tables.optimality_table(result.optimality.record(), numbers[0]))
-                if result.optimality.sensitivities:
-                    out.print(tables.sensitivity_table([*result.optimality.sensitivities]))
-            if result.robustness is not None and result.robustness.fresh:
-                record = result.robustness.record()
-                designs = {"baseline": result.baseline, "robust": result.optimized}
-                shown = {name: one.design for name, one in designs.items()}
-                out.print(tables.robustness_table(record, shown))
-            if result.cost:
-                out.print(result.cost, soft_wrap=True)
+            _show_optimum(out, result, numbers[0])
             if alike:
                 out.print(tables.likeness_table(alike["resembles"]))
         if result.beginning is not None:
@@ -112,6 +102,21 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
 
     found = result.optimized is not None and not result.interrupted
     return cli.Outcome(cli.OK if found else cli.NO_RESULT, show)
+
+
+def _show_optimum(out: Console, result, constraints) -> None:
+    """Print what is known about the optimum, with the rows of its `constraints`."""
+    if result.optimality is not None:
+        out.print(tables.optimality_table(result.optimality.record(), constraints))
+        if result.optimality.sensitivities:
+            out.print(tables.sensitivity_table([*result.optimality.sensitivities]))
+    if result.robustness is not None and result.robustness.fresh:
+        record = result.robustness.record()
+        designs = {"baseline": result.baseline, "robust": result.optimized}
+        shown = {name: one.design for name, one in designs.items()}
+        out.print(tables.robustness_table(record, shown))
+    if result.cost:
+        out.print(result.cost, soft_wrap=True)
 
 
 def _searched(config: Config, progress, stop: threading.Event, checkpoint, runs):
