@@ -1,7 +1,7 @@
 """`python -m tests.mutants`: make mistakes in a copy of the package and see which tests notice.
 
-First come mistakes that tests once missed (tests/mutants/by_hand.py). Then comes a seeded choice of
-all mistakes that the operators can make in the numerical modules. The exit code is 1 if one of the
+First come mistakes made by hand (tests/mutants/by_hand.py). Then comes a seeded choice of all
+mistakes that the operators can make in the numerical modules. The exit code is 1 if one of the
 first is missed, or if fewer than 95 % of the others are noticed. The tree itself is not changed.
 With --resume, a run continues from the recorded outcomes of an earlier one."""
 

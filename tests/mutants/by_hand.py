@@ -1,4 +1,4 @@
-"""Mistakes that the tests once missed, from `by_hand.yaml`."""
+"""Mistakes made by hand, from `by_hand.yaml`."""
 
 import dataclasses
 from pathlib import Path

@@ -9,6 +9,7 @@ import pytest
 from rootsopt.config import parse
 from rootsopt.dynamics.maxima import Maxima
 from rootsopt.errors import InputError
+from rootsopt.optimize.certificate import Certificate
 from rootsopt.optimize.infeasible import explain
 from rootsopt.optimize.limits import TermConstraint, force_limits, limited, term_constraints
 from rootsopt.optimize.local import Local
@@ -24,6 +25,11 @@ from rootsopt.status import Status
 from tests.optimize.test_optimize import SCENE, baseline
 
 PEAK = "constraints.terms.peak_force_N.max="
+LIMITED = (
+    "constraints.terms.displaced_volume_cm3.min=400",
+    "constraints.terms.width.max=452",
+    "constraints.terms.ratio.max=3",
+)
 
 
 def config(*overrides):
@@ -74,10 +80,7 @@ def registered():
 
 def test_terms_without_forces_are_constraints_of_the_geometry(registered):
     """Their slacks are those of the formulas, and projection moves designs onto them."""
-    problem = problem_of(
-        "constraints.terms.displaced_volume_cm3.min=400", "constraints.terms.width.max=452",
-        "constraints.terms.ratio.max=3",
-    )  # fmt: skip
+    problem = problem_of(*LIMITED)
     assert [one.key for one in problem.limits] == ["ratio"]
     terms = [c for c in problem.space.constraints if isinstance(c, TermConstraint)]
     assert [(c.name, c.unit, c.ceiling) for c in terms] == [
@@ -92,6 +95,34 @@ def test_terms_without_forces_are_constraints_of_the_geometry(registered):
     assert not problem.feasible(outside)
     moved = problem.project(outside)
     assert problem.feasible(moved)
+
+
+def test_prices_are_per_unit_of_the_limits(registered):
+    """A multiplier of a scaled slack, (V - 400) / 400 or 1 - F / 150, becomes a price per unit.
+
+    A limit is relaxed by 1 % of it, to the nearest power of ten."""
+    problem = problem_of(*LIMITED, "constraints.terms.mean_force_N.max=150")
+    values = {"displaced_volume_cm3": 450.0, "width": 440.0, "ratio": 2.0}
+    sizes = {"undercut_margin_mm": 5.0, "seal_width_mm": 5.0}
+    base, found = (
+        dataclasses.replace(
+            one, response=one.response | values, geometry=one.geometry | sizes
+        )
+        for one in (problem.baseline, evaluation(40.0, 160.0))
+    )  # fmt: skip
+    problem = dataclasses.replace(problem, baseline=base)
+    held = np.full(len(problem.space.constraints), 2.0)
+    walls = np.zeros(1), np.array([0.25, 0.5])
+    proof = Certificate(0.0, 0.0, held, np.zeros(3), np.zeros(3), (), walls)
+    rows = {row["name"]: row for row in problem.constraint_rows(found, proof)}
+    volume, force = rows["displaced volume"], rows["mean force"]
+    # The objective, 0.8, rises with the least volume and falls with the greatest force.
+    assert volume["multiplier"] == pytest.approx(2 / 400)
+    assert force["multiplier"] == pytest.approx(-0.75 / 150)
+    assert (volume["relaxed_by"], force["relaxed_by"]) == (-10.0, 1.0)
+    for row in (volume, force):
+        change = row["multiplier"] * row["relaxed_by"]
+        assert row["relaxed_objective_percent"] == pytest.approx(100 * change / 0.8)
 
 
 def test_forces_are_limited_at_every_speed_that_counts():

@@ -55,6 +55,15 @@ def test_a_lucky_trial_is_no_candidate_on_its_own(problem):
     assert noise.candidates(problem, [trial([0.5, 0.5, 0.5], 1.2)]) == []
 
 
+def test_many_trials_are_surer_than_one(problem):
+    """Four trials of 0.8 with an error of 0.08 each have a mean with an error of 0.04.
+
+    With it, they rank before one trial of 0.79 with an error of 0.08."""
+    many = [trial([0.2, 0.2, 0.2 + 0.01 * k], 0.8, 0.08) for k in range(4)]
+    found = noise.candidates(problem, [trial([0.8, 0.8, 0.8], 0.79, 0.08), *many])
+    assert [objective for objective, _ in found] == pytest.approx([0.8, 0.79])
+
+
 @dataclasses.dataclass(frozen=True)
 class Judge(EnsembleEvaluator):
     """An evaluator that knows the true objective of every design; the baseline's is 1."""

@@ -9,8 +9,9 @@ from rootsopt.optimize.optimality import StartOutcome, distinct, unseen
 from rootsopt.optimize.search import method_of
 
 
-def outcome(number, objective, point):
-    return StartOutcome(number, objective, 1e-9, "converged", 10, {"a": point}, np.array([point]))
+def outcome(number, objective, *point):
+    design = {"a": point[0]}
+    return StartOutcome(number, objective, 1e-9, "converged", 10, design, np.array(point))
 
 
 def test_optima_are_told_apart_by_objective_and_point():
@@ -18,6 +19,8 @@ def test_optima_are_told_apart_by_objective_and_point():
     starts.append(outcome(3, 0.8, 0.9))
     found = distinct(starts)
     assert [(one.objective, one.found) for one in found] == [(0.8, 2), (0.8, 1), (0.9, 1)]
+    # Two designs that agree in one parameter only are two.
+    assert len(distinct([outcome(0, 0.8, 0.2, 0.1), outcome(1, 0.8, 0.2, 0.9)])) == 2
 
 
 def test_unseen_optima_by_simulation():

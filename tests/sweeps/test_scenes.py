@@ -1,6 +1,7 @@
 """Sweeps from Python: what the dataset holds, also where a point fails."""
 
 import threading
+import time
 
 import jax.numpy as jnp
 import numpy as np
@@ -112,12 +113,12 @@ def test_points_of_another_outline_are_not_used_again(tmp_path, monkeypatch, pla
     """After the file of an outline has changed, a sweep begins anew, or is refused.
 
     After the same interruption, it goes on if the file is the same."""
-    files = [tmp_path / f"{number}.csv" for number in range(5)]
+    files = [tmp_path / f"{number}.csv" for number in range(6)]
     for file in files:
         file.write_text("x_mm,y_mm\n1,0\n")
     axes = {SPEED: "1,2,3,4,5"}
     if place == "axis":
-        axes = {"profile.outline_file": [*map(str, files)]}
+        axes = {"profile.outline_file": [*map(str, files[1:])]}
     asked, ends = [], [3]
 
     def check(config):
@@ -139,7 +140,7 @@ def test_points_of_another_outline_are_not_used_again(tmp_path, monkeypatch, pla
             rootsopt.sweep_scenes(config, axes, checkpoint=kept, resume=True)
             assert len(asked) < 5
             continue
-        files[0].write_text("x_mm,y_mm\n2,0\n")
+        files[place == "axis"].write_text("x_mm,y_mm\n2,0\n")
         try:
             rootsopt.sweep_scenes(config, axes, checkpoint=kept, resume=True)
         except InputError:
@@ -156,6 +157,7 @@ def test_stopped_sweep_keeps_what_has_begun(config, monkeypatch):
         begun.append(config.scene.speed_rpm)
         if len(begun) == 2:
             stop.set()
+        time.sleep(0.1)
         raise InputError("not simulated")
 
     monkeypatch.setattr(points, "check_geometry", check)

@@ -5,6 +5,7 @@ They are compared with independent searches; domination, gaps, rates and files a
 import functools
 import itertools
 import threading
+import types
 
 import equinox as eqx
 import jax
@@ -17,6 +18,7 @@ from standins import evaluation_of
 import rootsopt
 from rootsopt import register_term
 from rootsopt.config import parse
+from rootsopt.config.units import words
 from rootsopt.errors import InputError
 from rootsopt.optimize.certificate import certify
 from rootsopt.optimize.local import Group
@@ -26,11 +28,12 @@ from rootsopt.response import terms
 from rootsopt.response.terms import needs_forces
 from rootsopt.scene import Scene
 from rootsopt.status import Status
-from rootsopt.tradeoffs import gaps, trace
-from rootsopt.tradeoffs.aims import aims_of, freed
+from rootsopt.tradeoffs import gaps, lattice, trace
+from rootsopt.tradeoffs.aims import Aim, aims_of, freed
+from rootsopt.tradeoffs.assembly import Node, points_of, selected
 from rootsopt.tradeoffs.front import Standing, dominated
 from rootsopt.tradeoffs.scalar import RHO, Scalar, Scale
-from rootsopt.tradeoffs.study import Sample
+from rootsopt.tradeoffs.study import Sample, Study
 from rootsopt.tradeoffs.trace import Tracer, pareto_front
 
 SCENE = """
@@ -431,6 +434,93 @@ def test_peaks_are_branches_of_one_group():
     assert len(local.groups) == 2
     weights = scalar.weights(sample, certify(local, point))
     assert weights == pytest.approx([2 / 3, 1 / 3], abs=2 * RHO)
+
+
+def test_rates_have_the_signs_of_the_terms_themselves():
+    """On the plane a = b/2 - 2c, a rises by 1/2 per unit of b and falls by 2 per unit of c.
+
+    Of a and c more is better, of b less: a greater a costs more b, and less of c."""
+    slopes = {("a", "max"): [0.5, -2.0], ("b", "min"): [1.0, 0.0], ("c", "max"): [0.0, 1.0]}
+    aims = [Aim(*one) for one in slopes]
+    point = np.array([0.5, 0.5])
+    groups = [
+        Group(np.array([[float(k), 0.0]]), np.zeros(1), aim.sign * np.array([slope]))
+        for k, (aim, slope) in enumerate(zip(aims, slopes.values(), strict=True))
+    ]
+    scale = Scale(np.zeros(3), np.array([4.0, 2.0, 1.0]))
+    sample = Sample(point, evaluation_of(), tuple(groups), (False,) * 3, np.zeros(0),
+                    np.zeros((0, 2)))  # fmt: skip
+    scalar = Scalar(scale, np.zeros(3), (0, 1, 2))
+    node = Node(scalar, sample, certify(scalar.local(sample), point), "converged")
+    study = object.__new__(Study)
+    free = types.SimpleNamespace(space=types.SimpleNamespace(constraints=()))
+    vars(study).update(config=types.SimpleNamespace(design_keys=("b", "c")), aims=tuple(aims),
+                       problem=free, term_values=lambda found: {},
+                       completed=lambda found: found)  # fmt: skip
+    ((found,), dropped) = points_of(study, [node], selected([node], scale), scale)
+    assert dropped == []
+    assert found.rates == pytest.approx({"b": 0.5, "c": -2.0}, rel=0.02)
+
+
+def test_neighbours_on_the_grid_differ_by_one_step():
+    """One step from one term to another, in every pair of terms; found by comparing all points."""
+    for count, divisions in ((2, 5), (3, 4)):
+        grid = lattice.keys(count, divisions)
+        apart = np.sum(np.abs(np.array(grid)[:, None] - np.array(grid)), axis=2)
+        expected = {(i, j) for i, j in np.argwhere(apart == 2).tolist() if i < j}
+        found = lattice.links(grid)
+        assert len(found) == len(expected)
+        assert {(min(pair), max(pair)) for pair in found} == expected
+
+
+def test_halves_of_divided_neighbours_know_how_often_they_were_tried():
+    """A gap states how many searches looked for a point between its sides, also before a half."""
+    search = gaps.Bisections([(0, 3), (3, 4)], {(0, 3): 2})
+    search.divided((0, 3), 5)
+    assert sorted(search.pairs) == [(0, 5), (3, 4), (3, 5)]
+    assert [search.tried[pair] for pair in ((0, 5), (3, 5))] == [2, 2]
+
+
+def test_limits_of_a_point_are_those_on_which_it_lies(front):
+    """A point that a lower bound holds lies at 0 in the unit box, one that an upper holds at 1."""
+    keys, held = front.config.design_keys, []
+    for point in front.points:
+        for name, multiplier in point.limits.items():
+            side, bound, key = name.partition(" bound of ")
+            if bound:
+                place = [words(one) for one in keys].index(key)
+                held.append(side)
+                assert multiplier > 0
+                assert point.point[place] == pytest.approx(float(side == "upper"), abs=1e-6)
+    assert {*held} == {"lower", "upper"}
+
+
+@pytest.mark.parametrize(("off", "standing"), [(0.005, "certified"), (0.02, "not_held_up")])
+def test_a_point_holds_up_only_if_all_its_terms_do(off, standing):
+    """After the simulation from rest, one term that is more than 1 % off is enough to drop it.
+
+    Otherwise the conditions count that hold with the new terms: here, both lead by as much."""
+    point = np.array([0.5, 0.0])
+
+    def sample(second):
+        groups = [
+            Group(np.array([[float(k), 0.0]]), np.array([value]), np.array([[slope, 1.0]]))
+            for k, (value, slope) in enumerate(((4.0, 1.0), (second, -1.0)))
+        ]
+        return Sample(point, evaluation_of(), tuple(groups), (False, False), np.zeros(0),
+                      np.zeros((0, 2)))  # fmt: skip
+
+    scale = Scale(np.array([3.0, 1.0]), np.ones(2))
+    scalar = Scalar(scale, np.array([0.0, 2.0 * off]), (0, 1))
+    searched = sample(2.0)
+    node = Node(scalar, searched, certify(scalar.local(searched), point), "converged")
+    tracer = Tracer(config(RADIUS))
+    tracer._scale = scale
+    tracer._study = study = object.__new__(Study)
+    vars(study)["verified"] = lambda point: sample(2.0 * (1 + off))
+    assert tracer._checked(node).standing.label == standing
+    vars(study)["verified"] = lambda point: None
+    assert tracer._checked(node).standing is Standing.NOT_HELD_UP
 
 
 def test_a_point_divides_neighbours_if_it_lies_between_them():
