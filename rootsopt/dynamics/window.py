@@ -156,12 +156,16 @@ class Window(NamedTuple):
 
     @property
     def chaotic(self) -> Bool[_Arrays, ""]:
-        """Whether motions diverge, beyond the error of the exponent, at both distances alike."""
+        """Whether motions diverge at both distances alike.
+
+        The exponent must exceed three standard errors, and the rate at each distance two of its
+        own, which are √2 times greater."""
         xp = _numpy_of(self.growth)
         far, near = xp.mean(self._rates, axis=1)
         alike = xp.abs(near - far) < _ALIKE
         sure = self.exponent > 3 * self.error
-        return xp.asarray(sure & (xp.minimum(far, near) > 0) & alike)
+        each = xp.minimum(far, near) > 2 * 2**0.5 * self.error
+        return xp.asarray(sure & each & alike)
 
     @property
     def forces(self) -> Float[_Arrays, " 3"]:

@@ -16,6 +16,7 @@ from rootsopt.dynamics.linear import spectral_radius
 from rootsopt.dynamics.peak import BESIDE, BESIDE_UNIT, one_sided
 from rootsopt.dynamics.window import no_tangents
 from rootsopt.response.evaluation import RESPONSES, Evaluator, evaluate
+from rootsopt.response.records import message_of
 from rootsopt.status import Status
 
 # A scene like that of the shipped configs, for which the figures below were measured.
@@ -495,7 +496,7 @@ def test_status_names_the_outcome(settled, name):
     """Each scene ends with the correct status."""
     evaluation = settled[name]
     assert evaluation.status in OUTCOMES[name]
-    assert evaluation.message == evaluation.status.value
+    assert evaluation.message == message_of(SCENES[name], evaluation.status)
     assert evaluation.usable == (evaluation.status is Status.PERIODIC)
 
 

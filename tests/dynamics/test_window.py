@@ -4,8 +4,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from rootsopt.config import load
 from rootsopt.dynamics import window
+from rootsopt.dynamics.flow import strobe
 from rootsopt.dynamics.integrator import Integrator
+from rootsopt.response.evaluation import Evaluator, lyapunov_program
+from rootsopt.runtime.programs import Program
 from tests.standins import oscillator, told_flow
 
 PERIODS = 1024
@@ -50,3 +54,47 @@ def test_noise_of_steps_is_no_chaos(monkeypatch, noise):
     found = window_of(monkeypatch, np.full(PERIODS, -2.0), noise)
     assert not bool(found.chaotic)
     assert bool(window_of(monkeypatch, np.full(PERIODS, 0.7), min(noise, 1e-3)).chaotic)
+
+
+_KEYS = (
+    *("profile.involute_length_mm", "contact.exponent"),
+    *("scene.timing_gear.stiffness_N_m_per_rad", "scene.timing_gear.backlash_mm"),
+    *("scene.timing_gear.damping_ratio", "scene.speed_rpm", "scene.load.torque_N_m"),
+)
+SINGLE = "solver.precision=float32", "solver.rtol=1e-5", "solver.transient_rtol=1e-4"
+STABLE = (
+    (8.5, 1.53, 7.925e5, 0.24175, 0.5, 3000, 4.775),
+    (8.361, 1.319, 2.124e5, 0.02046, 0.352, 2634, 1.673),
+    (6.781, 1.540, 2.543e5, 0.2763, 0.442, 2748.1, 1.754),
+    (4.126, 1.456, 6.502e5, 0.07077, 0.287, 4793.3, 1.333),
+    (5.219, 1.999, 9.823e5, 0.3611, 0.499, 2196.8, 4.379),
+)
+WILD = (
+    (9.0, 2.2, 2.0e4, 0.4, 0.1, 3000, 1.0),
+    (6.025, 1.373, 4.715e5, 0.3349, 0.170, 3013.8, 1.923),
+    (6.459, 1.853, 8798, 0.3485, 0.239, 2677.9, 1.156),
+    (6.925, 1.388, 1.964e5, 0.218, 0.361, 3896.5, 1.217),
+)
+
+
+@Program
+def _later(pair, state, integrator):
+    return strobe(pair, state, 64, integrator).states[-1]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("precision", [(), SINGLE], ids=["double", "single"])
+def test_chaos_is_told_from_stable_orbits(precision):
+    """In both precisions, only the chaotic scenes count as chaotic.
+
+    The stable scenes have Floquet multipliers from 1e-8 to 0.7. A tangent vector grows along them
+    in single precision, by up to a factor of 70 per mesh period."""
+    found = []
+    for values in STABLE + WILD:
+        pairs = zip(_KEYS, values, strict=True)
+        config = load("configs/cic.yaml", [*precision, *(f"{key}={x}" for key, x in pairs)])
+        evaluator = Evaluator.of(config)
+        pair, how = evaluator.pair(config.design), evaluator.scene.solver.transient
+        state = _later(pair, np.zeros(2, pair.angle_scale.dtype), how)
+        found.append(bool(lyapunov_program(pair, state, 128, how).chaotic))
+    assert found == [False] * len(STABLE) + [True] * len(WILD)

@@ -252,7 +252,7 @@ def test_no_number_without_its_status():
     free = "scene.timing_gear=null", "scene.load.torque_N_m=4.775"
     evaluation = averaged(*free, *PERIODIC, gradient=True)
     assert evaluation.status is Status.PASSED_THROUGH
-    assert evaluation.message == evaluation.status.value
+    assert evaluation.message.startswith(evaluation.status.meaning + " Add a scene.timing_gear, or")
     assert (evaluation.response, evaluation.gradient) == ({}, {})
     assert evaluation.steady_state == {"kind": "transient"}
     assert evaluation.series is None
