@@ -104,6 +104,7 @@ _RADIUS = Usual(1, 2, _radius)
 USUAL: dict[str, Usual] = {
     "profile.pitch_radius_mm": Usual(8, 1000),
     "profile.outline_smoothing_mm": Usual(1e-5, 0.2),
+    "profile.outline_join_mm": Usual(1e-6, 0.2),
     "rotor.length_mm": Usual(0.1, 20, _radius),
     "rotor.density_kg_m3": Usual(500, 2.2e4),
     "rotor.bore_mm": Usual(0.02, 2, _radius),

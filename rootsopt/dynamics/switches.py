@@ -55,7 +55,7 @@ _APART = 1e-11
 """Distance (mesh periods) below which two step ends are merged."""
 
 
-def with_switches(
+def with_switches(  # 81 lines: its inner functions share the steps.
     pair: RotorPair,
     out: Flow,
     periods: Float[Array, ""],

@@ -391,7 +391,8 @@ class Problem:
                 break
             # Aim slightly inside, so that the constraint holds despite rounding. Coordinates held
             # by their bound do not move.
-            rows, want = jacobian[violated], 1e-7 - slack[violated]
+            # Where no profile exists, a margin may have no derivative, and does not move the point.
+            rows, want = np.nan_to_num(jacobian[violated]), 1e-7 - slack[violated]
             push = rows.T @ want
             held = ((point <= 0) & (push < 0)) | ((point >= 1) & (push > 0))
             move = np.linalg.lstsq(np.where(held, 0.0, rows), want, rcond=1e-8)[0]

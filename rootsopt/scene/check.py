@@ -26,10 +26,8 @@ def check_geometry(config: Config, design: ArrayLike | None = None, simulated: b
     anything is compiled."""
     if design is not None:
         config = config.with_design(np.asarray(design, float))
-    if simulated and config.profile.from_file:
-        from rootsopt.measured.source import check_center  # For outlines only: it takes 0.5 s.
-
-        check_center(config.profile)
+    if simulated:
+        families.check_axis(config.profile)
     families.check(config.profile)
     bore = config.rotor.bore_mm
     if bore is None:

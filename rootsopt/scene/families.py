@@ -97,6 +97,14 @@ def profile_from_file(config: ProfileConfig) -> Outline | None:
     return outline_of(config)[0]
 
 
+def check_axis(config: ProfileConfig) -> None:
+    """Raise `InputError` if an outline from a file does not lie around its axis."""
+    if config.from_file:
+        from rootsopt.measured.source import check_center  # As in `profile_from_file`.
+
+        check_center(config)
+
+
 def check(config: ProfileConfig) -> None:
     """Raise `InputError` unless the profile is sound.
 

@@ -450,7 +450,10 @@ def test_a_tip_arc_that_misses_the_pitch_circle_is_refused():
     keys = {"profile__pressure_angle_deg": 12, "profile__tip_arc_angle_deg": 4}
     short = config_of(**keys, profile__involute_length_mm=0.2)
     assert "`profile.involute_length_mm` must be at least 0.2395" in refused(short)
-    assert not refused(config_of(**keys, profile__involute_length_mm=0.24))
+    # A longer involute meets the pitch circle; its arc still undercuts the other rotor.
+    longer = refused(config_of(**keys, profile__involute_length_mm=0.24))
+    assert "must be at least" not in longer.partition(";")[0]
+    assert "undercut" in longer
 
 
 @pytest.mark.parametrize("angle", [1.0, 10.0, 20.0, 45.0, 89.0])

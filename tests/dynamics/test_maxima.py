@@ -78,7 +78,7 @@ def test_prepared_programs_are_those_that_are_called(evaluator, found):
     assert [set(program._made) for program in programs] == called
 
 
-@pytest.mark.parametrize(("used", "room", "cut"), [(10, 64, 1024), (1500, 4096, 2048)])
+@pytest.mark.parametrize(("used", "room", "cut"), [(10, 64, 2048), (3000, 8192, 4096)])
 def test_steps_of_an_orbit_have_few_sizes(used, room, cut):
     flow = Flow.empty(2, 1, 8, room, Measures(), jnp.dtype(float))
     grid = np.where(np.arange(room) < used, np.arange(room), np.inf)

@@ -180,7 +180,7 @@ def test_lobes_off_the_axis_are_refused_before_anything_is_compiled(tmp_path, mo
         given = config.model_copy(
             update={"profile": config.profile.model_copy(update={"outline_center": center})}
         )
-        check_geometry(given, simulated)
+        check_geometry(given, simulated=simulated)
     assert len(looked) == 3
 
 

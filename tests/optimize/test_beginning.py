@@ -81,7 +81,7 @@ def test_members_get_the_gap_of_an_inset(tmp_path):
     assert f"--set contact.clearance_mm={gap:.6g}`" in found.message
     assert "inset 0.1 mm" in found.message
     floor = found.config.constraints.area_efficiency_min
-    assert floor == pytest.approx(shape_of(BASE).area_efficiency, rel=1e-3)
+    assert floor == pytest.approx(float(shape_of(BASE).area_efficiency), rel=1e-3)
     assert found.record()["inset_um"] == found.likeness.inset * 1e6
     # An outline that overlaps has members that just touch.
     other, more = module._cut(config, -5e-5)

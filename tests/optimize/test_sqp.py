@@ -108,21 +108,17 @@ def test_steps_into_unusable_designs_are_shortened():
 
 
 def test_a_stationary_point_that_is_worse_is_not_the_result():
-    """The first step lands on a shelf: the gradient vanishes there, but the start was better.
-
-    The minimum, -2.5 at x = 0.35, lies between the start and the shelf."""
+    """Beyond x = 0.33 lies a shelf at 3, where the gradient vanishes, but the start was better."""
     seen = []
 
     def look(x):
-        away = x[0] - 0.35
-        value, slope = (3.0, 0.0) if x[0] > 0.5 else (1000 * away**2 - 2.5, 2000 * away)
+        value, slope = (3.0, 0.0) if x[0] > 0.33 else (-100 * (x[0] - 0.3), -100.0)
         seen.append(value)
         return Local(value, np.array([slope, 0.0]), (), np.zeros(0), np.zeros((0, 2)))
 
     found = descend(look, np.array([0.3, 0.5]))
     assert 3.0 in seen
-    assert found.local.objective == min(seen)
-    np.testing.assert_allclose(found.point[0], 0.35, atol=1e-6)
+    assert found.local.objective == min(seen) < 0
 
 
 def test_reasons_of_an_early_end():

@@ -29,7 +29,7 @@ from rootsopt.response.evaluators import evaluator_for
 from rootsopt.response.members import Members
 from rootsopt.status import Status
 
-PERIODIC = ("ensemble.members=8", "ensemble.settle_periods=24", "ensemble.periods=8")
+PERIODIC = ("ensemble.members=8", "ensemble.settle_periods=48", "ensemble.periods=8")
 GEAR = "scene.timing_gear={stiffness_N_m_per_rad: 2.0e4, damping_ratio: 0.1, backlash_mm: 0.4}"
 CHAOTIC = (GEAR, "scene.load.torque_N_m=1", "objective.motion=ensemble")
 INSIDE = (30.0, 4.0, 3.0)
