@@ -169,12 +169,12 @@ def test_lobes_off_the_axis_are_refused_before_anything_is_compiled(tmp_path, mo
     (tmp_path / "scene.yaml").write_text(CONFIG.format(path))
     looked = []
     monkeypatch.setattr("rootsopt.scene.families.check", looked.append)
-    assert simulate.main([str(tmp_path / "scene.yaml"), "-o", str(tmp_path / "out")]) == 2
-    assert "set `profile.outline_center` = fit" in capsys.readouterr().err
     config = load(tmp_path / "scene.yaml")
-    for work in (optimize_design, pareto_front):
+    for work in (check_geometry, optimize_design, pareto_front):
         with pytest.raises(InputError, match=r"outline_center` = fit .*\[0, 0\]"):
             work(config)
+    assert simulate.main([str(tmp_path / "scene.yaml"), "-o", str(tmp_path / "out")]) == 2
+    assert "set `profile.outline_center` = fit" in capsys.readouterr().err
     assert not looked
     for center, simulated in (([0, 0], True), ("fit", True), (None, False)):
         given = config.model_copy(
