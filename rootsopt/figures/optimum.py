@@ -18,14 +18,15 @@ _RANGE = 0.01
 
 
 def plot_residual(ax: Axes, history: Sequence[Mapping[str, Any]], required: float) -> Axes:
-    """Draw the first-order residual over the iterations of each local search.
+    """Draw the first-order residual at the best design of each local search so far.
 
-    `history`: rows with `start`, `iteration` and `residual`; `required`: residual up to which a
-    design counts as an optimum. Trials of the screening, and trials without a residual, are left
-    out. Return `ax`."""
+    `history`: rows with `start`, `iteration`, `objective`, `feasible` and `residual`; `required`:
+    residual up to which a design counts as an optimum. Trials of the screening, and trials without
+    a residual, are left out. Return `ax`."""
     starts = sorted({int(row["start"]) for row in history if int(row["start"]) >= 0})
     for start in starts:
-        rows = [row for row in history if int(row["start"]) == start]
+        # The last trials measure second derivatives beside the optimum, where the residual is large.
+        rows = _best([row for row in history if int(row["start"]) == start])
         x = np.array([row["iteration"] for row in rows], dtype=float)
         y = np.array([row["residual"] for row in rows], dtype=float)
         known = np.isfinite(y)
@@ -40,6 +41,18 @@ def plot_residual(ax: Axes, history: Sequence[Mapping[str, Any]], required: floa
     ax.grid(visible=True, alpha=0.3)
     ax.legend(frameon=False)
     return ax
+
+
+def _best(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Return the rows of a search that were the best until then: feasible, then by objective."""
+    found: list[Mapping[str, Any]] = []
+    for row in rows:
+        if not np.isfinite(row["objective"]):
+            continue
+        rank = not row["feasible"], row["objective"]
+        if not found or rank <= (not found[-1]["feasible"], found[-1]["objective"]):
+            found.append(row)
+    return found
 
 
 def plot_prices(ax: Axes, constraints: Sequence[Mapping[str, Any]], converged: bool = True) -> Axes:

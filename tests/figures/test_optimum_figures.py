@@ -5,7 +5,7 @@ import pytest
 
 from rootsopt.config import load
 from rootsopt.figures.comparison import plot_departure, plot_forces_together
-from rootsopt.figures.optimum import plot_prices, plot_starts
+from rootsopt.figures.optimum import plot_prices, plot_residual, plot_starts
 from rootsopt.figures.style import figure
 from rootsopt.response.series import Series
 from rootsopt.scene import outline_mm
@@ -76,3 +76,22 @@ def test_ends_of_searches_are_drawn_with_their_optima():
     assert [drawn(ax, k)[0, 1] for k in (0, 1, 2)] == [0.8, 0.8, 0.9]
     assert ax.lines[2].get_markerfacecolor() == "none"
     assert "found 1" in ax.get_legend().get_texts()[0].get_text()
+
+
+def test_residuals_are_those_of_the_best_design_so_far():
+    """Trials beside the optimum, infeasible ones and those without a motion are left out."""
+    nan = float("nan")
+    trials = [
+        (0.9, True, 0.1),
+        (nan, True, nan),
+        (0.8, True, 1e-9),
+        (0.7, False, 0.3),
+        (0.85, True, 2),
+    ]
+    names = "objective", "feasible", "residual"
+    rows = [
+        {"start": 0, "iteration": k} | dict(zip(names, trial, strict=True))
+        for k, trial in enumerate(trials)
+    ]
+    ax = plot_residual(figure(4, 4)[1][0, 0], rows, 1e-4)
+    np.testing.assert_array_equal(ax.lines[0].get_xydata(), [[0, 0.1], [2, 1e-9]])
