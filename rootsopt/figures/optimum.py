@@ -25,7 +25,7 @@ def plot_residual(ax: Axes, history: Sequence[Mapping[str, Any]], required: floa
     a residual, are left out. Return `ax`."""
     starts = sorted({int(row["start"]) for row in history if int(row["start"]) >= 0})
     for start in starts:
-        # The last trials measure second derivatives beside the optimum, where the residual is large.
+        # The last trials measure second derivatives beside the optimum: their residual is large.
         rows = _best([row for row in history if int(row["start"]) == start])
         x = np.array([row["iteration"] for row in rows], dtype=float)
         y = np.array([row["residual"] for row in rows], dtype=float)
