@@ -28,8 +28,11 @@ above which this instant is rejected. Keyed by bytes per number. It is large for
 peaks are located only to about 1e-5 mesh periods where the states bend between samples."""
 _NOISES = 10.0
 """Step of the force above which it counts as a jump, in multiples of the force's noise."""
-_NEAR, _FAR = (2, 4), (5, 6)
-"""Indices in `BESIDE` of the two pairs of times, one time on each side of the peak."""
+_NEAREST, _NEAR, _FAR = (1, 3), (2, 4), (5, 6)
+"""Indices in `BESIDE` of three pairs of times, one time on each side of the peak."""
+_SHARP = 0.75
+"""Fall of the force's rate between the times `_NEAREST`, as a fraction of that between the times
+`_NEAR`, above which the peak is a corner. At a smooth peak it is a half."""
 _KINK = 1e-3
 """Relative change of a mark's rate at a jump below which the mark does not show the jump."""
 
@@ -226,10 +229,11 @@ def one_sided(
     addition to rounding.
 
     The derivative is a weighted mean of those at two times, such that the same mean of the rates is
-    zero. Where the force has a corner, this accounts for the motion of the corner: the times are on
-    both sides of it, close by. At a smooth peak it is the derivative at the instant at which the
-    force stops rising (envelope theorem), from times farther apart. Rates from differences of the
-    force would not do: rounding of the gap would leave an error of up to 1e-3 in the weights.
+    zero. Where the force has a corner, this accounts for the motion of the corner: the values on
+    both sides are extrapolated to it (`_at_corner`). At a smooth peak it is the derivative at the
+    instant at which the force stops rising (envelope theorem), from times farther apart. Rates from
+    differences of the force would not do: rounding of the gap would leave an error of up to 1e-3 in
+    the weights.
 
     At a jump (such as with the `linear` contact), rounding decides on which side of the jump the
     located instant lies. The side with the greater force is used. The peak moves with the jump.
@@ -242,19 +246,39 @@ def one_sided(
     rounding = (100 * float(jnp.finfo(dtype).eps) + _NOISES * noise) * here
     jumps = jnp.abs(after - before - rise - fall) > 2 * jnp.abs(rise - fall) + rounding
     turns = (rates[_NEAR[0]] > 0) & (rates[_NEAR[1]] < 0)
-    first, last = (jnp.where(turns, *sides) for sides in zip(_NEAR, _FAR, strict=True))
-    drop = rates[first] - rates[last]
-    share = rates[first] / jnp.where(drop > 0, drop, jnp.inf)
+    corner = (after - before - rise - fall) / jnp.where(rise > fall, rise - fall, jnp.inf)
+    unit = jnp.eye(len(BESIDE), dtype=dtype)
+    sides = jnp.where(turns, _at_corner(unit, rates, corner), unit[jnp.asarray(_FAR)])
+    first, last = sides @ rates
+    drop = first - last
+    share = first / jnp.where(drop > 0, drop, jnp.inf)
     place = jnp.where(turns, 0.0, _WIDE * (2 * share - 1))
+    share = jnp.where(turns, jnp.clip(share, 0.0, 1.0), share)
     stops = (drop > 0) & (jnp.abs(place) < _WIDE * _FARTHEST[dtype.itemsize]) & ~jumps
     single = jnp.zeros_like(forces).at[jnp.argmax(forces[:5])].set(1.0)
-    double = jnp.zeros_like(single).at[first].set(1 - share).at[last].set(share)
-    weights = jnp.where(stops, double, single)[:, None]
+    weights = jnp.where(stops, jnp.stack([1 - share, share]) @ sides, single)[:, None]
     above = jnp.maximum(BESIDE_UNIT[dtype.itemsize] * rates[0] * place / 2, 0.0)
     if found.shape[1] > 2:
         moved = jnp.where(jumps, _with_jump(forces, found[:, 0]), 0.0)
         weights = jnp.concatenate([moved[:, None], weights], axis=1)
     return jnp.where(stops, here + above, jnp.max(forces[:5])), weights
+
+
+def _at_corner(
+    unit: Float[Array, "7 7"], rates: Float[Array, "7"], corner: Float[Array, ""]
+) -> Float[Array, "2 7"]:
+    """Return weights (2, 7) that extrapolate values at `BESIDE` to both sides of a corner.
+
+    `unit`: identity matrix; `rates` of the force; `corner`: time of the corner (in `BESIDE_UNIT`).
+    Each row extrapolates linearly from the two times on one side. Values beside the corner would do
+    only to first order: with 4e-8 mesh periods, derivatives of the peak were off by 2e-6. If the
+    corner is not between the nearest times, or the rates change as much beyond them (a smooth
+    peak), the values at the times `_NEAR` are used."""
+    nearest, near = unit[jnp.asarray(_NEAREST)], unit[jnp.asarray(_NEAR)]
+    steep, wide = (rates[first] - rates[last] for first, last in (_NEAREST, _NEAR))
+    sharp = (jnp.abs(corner) < 1) & (steep > _SHARP * wide)
+    beyond = jnp.where(sharp, jnp.stack([1 + corner, 1 - corner]), -1.0)
+    return nearest + beyond[:, None] * (nearest - near)
 
 
 def _with_jump(forces: Float[Array, "7"], marks: Float[Array, "7"]) -> Float[Array, "7"]:

@@ -255,8 +255,9 @@ def test_the_check_bounds_the_error(scene, design):
 
     In the first scene, the contact passes a joint within 1e-4 mesh periods, where derivatives jump.
     With steps around the joint of the same length on both grids, the mean was 1e-5 off at any
-    tolerance, and the disagreement 1e-8. In the second scene, the peak is on a corner of the force.
-    With rates from differences of the force, its gradient was 2e-5 off."""
+    tolerance, and the disagreement 1e-8. In both scenes, the peak is on a corner of the force. In
+    the second, with rates from differences of the force, its gradient was 2e-5 off. With values
+    4e-8 mesh periods beside the corner, it was 2e-7 off in both."""
     design, way, names = (
         np.array(design),
         np.array([1.0, -0.7, 0.8]),
@@ -285,7 +286,7 @@ def test_the_check_bounds_the_error(scene, design):
         said = one.statistics["gradient_disagreement"]
         assert np.max(noise / size) < 1e-6
         assert np.max(error) < said < 1e-4, rtol
-        assert np.max(error) < 2e-6, rtol
+        assert np.max(error) < 1e-7, rtol
 
 
 def test_a_check_without_room_is_none():

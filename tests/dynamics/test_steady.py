@@ -392,8 +392,8 @@ def test_weights_of_a_peak():
     """The weights are correct for a smooth peak, a corner and a jump.
 
     For a smooth peak, they give the instant at which the force stops rising. For a corner, they
-    give the mean for which the force is stationary, although the instant is slightly beside it. For
-    a jump, they give its higher side."""
+    give the mean of both sides, at the corner, for which the force is stationary. The located
+    instant is slightly beside it. For a jump, they give its higher side."""
     times = np.array(BESIDE)
     unit = BESIDE_UNIT[8]
 
@@ -429,7 +429,22 @@ def test_weights_of_a_peak():
             lambda t, size=size: 5 + size * jnp.minimum(2 * (t - 0.1), -6 * (t - 0.1)), noise
         )
         assert value == pytest.approx(5 - 0.2 * size - 3e-7 * noise)
-        np.testing.assert_allclose(found, [0, 0, 0.75, 0, 0.25, 0, 0], rtol=1e-9)
+        shares = [found[0], found[1] + found[2], found[3] + found[4], *found[5:]]
+        np.testing.assert_allclose(shares, [0, 0.75, 0.25, 0, 0], rtol=1e-9)
+    # Values and rates that change beside the corner at `top` are extrapolated to it. Those beside
+    # it would be off by 0.002 and more.
+    for top in (-0.9, 0.0, 0.4):
+        slide = times - top
+        value, found = weights(
+            lambda t, top=top: (
+                5 + jnp.minimum(2 * (t - top), -6 * (t - top)) + 1e-4 * (t - top) ** 2
+            )
+        )
+        sides = np.where(slide < 0, 5 + 1e-3 * slide, 9 + 3e-3 * slide)
+        assert found @ sides == pytest.approx(0.75 * 5 + 0.25 * 9, abs=2e-5)
+    # If the corner is not between the nearest times, nothing is extrapolated across it.
+    _, found = weights(lambda t: 5 + jnp.minimum(2 * (t - 1.5), -6 * (t - 1.5)))
+    np.testing.assert_allclose(found, [0, 0, 0.75, 0, 0.25, 0, 0], rtol=1e-9)
     for side in (1, -1):
         value, found = weights(lambda t, side=side: jnp.where(side * t > 0, 4 + t / 9, 1 + t / 9))
         chosen = times[np.argmax(found)]
