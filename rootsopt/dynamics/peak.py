@@ -246,9 +246,12 @@ def one_sided(
     rounding = (100 * float(jnp.finfo(dtype).eps) + _NOISES * noise) * here
     jumps = jnp.abs(after - before - rise - fall) > 2 * jnp.abs(rise - fall) + rounding
     turns = (rates[_NEAR[0]] > 0) & (rates[_NEAR[1]] < 0)
-    corner = (after - before - rise - fall) / jnp.where(rise > fall, rise - fall, jnp.inf)
+    known = rise - fall > rounding
+    corner = jnp.where(known, after - before - rise - fall, jnp.inf)
+    corner = corner / jnp.where(known, rise - fall, 1.0)
     unit = jnp.eye(len(BESIDE), dtype=dtype)
-    sides = jnp.where(turns, _at_corner(unit, rates, corner), unit[jnp.asarray(_FAR)])
+    near, sharp = _at_corner(unit, rates, corner)
+    sides = jnp.where(turns, near, unit[jnp.asarray(_FAR)])
     first, last = sides @ rates
     drop = first - last
     share = first / jnp.where(drop > 0, drop, jnp.inf)
@@ -256,29 +259,32 @@ def one_sided(
     share = jnp.where(turns, jnp.clip(share, 0.0, 1.0), share)
     stops = (drop > 0) & (jnp.abs(place) < _WIDE * _FARTHEST[dtype.itemsize]) & ~jumps
     single = jnp.zeros_like(forces).at[jnp.argmax(forces[:5])].set(1.0)
-    weights = jnp.where(stops, jnp.stack([1 - share, share]) @ sides, single)[:, None]
+    double = jnp.stack([1 - share, share]) @ sides
+    weights = jnp.where(stops, double, single)[:, None]
     above = jnp.maximum(BESIDE_UNIT[dtype.itemsize] * rates[0] * place / 2, 0.0)
     if found.shape[1] > 2:
         moved = jnp.where(jumps, _with_jump(forces, found[:, 0]), 0.0)
         weights = jnp.concatenate([moved[:, None], weights], axis=1)
-    return jnp.where(stops, here + above, jnp.max(forces[:5])), weights
+    top = jnp.where(turns & sharp, jnp.dot(double, forces), here + above)
+    return jnp.where(stops, top, jnp.max(forces[:5])), weights
 
 
 def _at_corner(
     unit: Float[Array, "7 7"], rates: Float[Array, "7"], corner: Float[Array, ""]
-) -> Float[Array, "2 7"]:
-    """Return weights (2, 7) that extrapolate values at `BESIDE` to both sides of a corner.
+) -> tuple[Float[Array, "2 7"], Bool[Array, ""]]:
+    """Return weights (2, 7) that extrapolate values at `BESIDE` to both sides of a corner, and
+    whether they do.
 
     `unit`: identity matrix; `rates` of the force; `corner`: time of the corner (in `BESIDE_UNIT`).
     Each row extrapolates linearly from the two times on one side. Values beside the corner would do
-    only to first order: with 4e-8 mesh periods, derivatives of the peak were off by 2e-6. If the
-    corner is not between the nearest times, or the rates change as much beyond them (a smooth
-    peak), the values at the times `_NEAR` are used."""
+    only to first order: 4e-8 mesh periods away, derivatives of the peak were off by 2e-6. The force
+    was off by 1e-8 only 1e-10 mesh periods away. If the corner is not between the nearest times, or
+    the rates change as much beyond them (a smooth peak), the values at `_NEAR` are used."""
     nearest, near = unit[jnp.asarray(_NEAREST)], unit[jnp.asarray(_NEAR)]
     steep, wide = (rates[first] - rates[last] for first, last in (_NEAREST, _NEAR))
     sharp = (jnp.abs(corner) < 1) & (steep > _SHARP * wide)
     beyond = jnp.where(sharp, jnp.stack([1 + corner, 1 - corner]), -1.0)
-    return nearest + beyond[:, None] * (nearest - near)
+    return nearest + beyond[:, None] * (nearest - near), sharp
 
 
 def _with_jump(forces: Float[Array, "7"], marks: Float[Array, "7"]) -> Float[Array, "7"]:
