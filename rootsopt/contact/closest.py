@@ -60,6 +60,9 @@ _DONE = 16
 # between neighbouring minima that have a flag of their own.
 _MINIMA = 8
 RANKS = 3
+# Distance of x (rad) from a joint's roll angle, in relative rotations |ε|, below which the gap of a
+# forked flank may have two minima. On sound five arcs that almost carry over, 6 were needed.
+_FORK = 30.0
 # Distance of ν2 (rad) before the cusp at the pitch crossing, in penetrations (pitch radii), below
 # which a contact counts as the minimum beyond the cusp. Both minima of the gap move in proportion
 # to |ε|: on epicycloids, this one lies at most 0.6 |ε| before the cusp, the other one at least
@@ -71,8 +74,8 @@ _DEEPEST = 0.1
 # Magnitude of T (pitch radii) below which T at a node counts as zero, because it may be a rounding
 # error. Keyed by bytes per number.
 _SLACK = {8: 1e-13, 4: 1e-6}
-# Number of extra nodes between the edge of a land and the next node. Their distances from the edge
-# double from one to the next.
+# Number of extra nodes between the edge of a land, or a joint of a forked flank, and the next node.
+# Their distances from the edge double from one to the next.
 _CROWD = 12
 
 
@@ -169,13 +172,13 @@ class FlankPair(eqx.Module):
         near = jnp.concatenate([fraction, 1 - crowd, jnp.ones(1), 1 + crowd[::-1]])
         beyond = 1 + jnp.arange(1, 1 + count // 2) / count
         pieces.append(start + (stop - start) * jnp.concatenate([near, beyond]))
-        tip = frozen.segments()[0]
-        if tip.land:
-            # Beside a land, contact starts on a part of the flank that grows from zero length. At
-            # the ends of this part, the point of rotor 1 or of rotor 2 is at the land's edge.
-            after = frozen.segments()[1]
+        # Beside a land, contact starts on a part of the flank that grows from zero length. At the
+        # ends of this part, the point of rotor 1 or of rotor 2 is at the land's edge. Beside a
+        # joint, T may rise over a part of this kind, between two minima of the gap.
+        tip, *others = frozen.segments()
+        for after in others if frozen.forked else others[: tip.land]:
             step = (after.stop - after.start) / count
-            pieces.append(tip.stop + step * 0.5 ** jnp.arange(_CROWD, 0, -1))
+            pieces.append(after.start + step * 0.5 ** jnp.arange(_CROWD, 0, -1))
         normal = jnp.sort(jnp.concatenate(pieces))
         mate = frozen.mate(normal)
         nodes = FlankNodes(
@@ -410,6 +413,10 @@ class FlankPair(eqx.Module):
         usual = (relative <= 0) & (relative >= -self.profile.single_turn)
         if self.profile.cusp:
             usual &= roll < (1 - 5 * jnp.sqrt(jnp.abs(relative))) * self.profile.half_pitch
+        if self.profile.forked:
+            joints = jnp.stack([one.stop for one in self.profile.segments()[:-1]])
+            beside = jnp.abs(roll - self.profile.roll_angle(joints)) < _FORK * jnp.abs(relative)
+            usual &= ~jnp.any(beside)
         return start, usual, absent
 
     def _search_all(self, roll: Float[Array, " n"], relative: Float[Array, " n"]):

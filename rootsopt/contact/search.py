@@ -35,7 +35,8 @@ class SearchContact(Contact):
     @property
     def jumps(self) -> bool:
         """Whether levers may jump where two minima of the gap are equally deep."""
-        return self.pair.profile.cusp or not self.pair.rolling
+        profile = self.pair.profile
+        return profile.cusp or profile.forked or not self.pair.rolling
 
     @property
     def two_sided(self) -> bool:

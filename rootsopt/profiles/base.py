@@ -253,12 +253,24 @@ class Profile(eqx.Module):
         return True
 
     @property
+    def forked(self) -> bool:
+        """Whether the gap may have two minima beside a joint of the flank.
+
+        Where the curvature jumps, one rotor passes the joint before the other does. In between, the
+        flanks may conform so closely that the contact jumps over this part. By default, any
+        conjugate flank of several segments beside its land is forked, unless it is `wavy`."""
+        if self.wavy or not self.conjugate:
+            return False
+        return sum(not one.land for one in self.segments()) > 1
+
+    @property
     def single_turn(self) -> float:
         """Relative rotation (rad) below which the gap is trusted to have no second, deeper minimum.
 
         Down to ε = -`single_turn`, and at the nominal centre distance, the contact search accepts
         the minimum near the point of perfect rolling, if Newton's method converges to it. A
-        fraction of the flank next to a cusp, about √|ε|, is excluded. Tests confirm the value."""
+        fraction of the flank next to a cusp, about √|ε|, is excluded, and one next to the joints of
+        a `forked` flank, about |ε|. Tests confirm the value."""
         return 1e-3
 
     @property

@@ -150,6 +150,10 @@ class CIC(Profile):
         return jnp.minimum(share - LEAST, 1 + OVERLENGTH - share)
 
     @property
+    def forked(self) -> bool:
+        return False
+
+    @property
     def single_turn(self) -> float:
         return 5e-3
 

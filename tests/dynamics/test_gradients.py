@@ -90,7 +90,7 @@ def errors(config):
     """Return the error of each response's derivatives, relative to the greatest of them, by
     name."""
     orbit, _, period = orbits_of(config)
-    ones = jnp.ones(3)
+    ones = jnp.ones(len(design_vector(config)) or 3)
 
     def responses(factors, state):
         rows = np.asarray(orbit(factors, state).response)[:, None]
@@ -179,6 +179,18 @@ def test_linear_contact_jumps(scene, design):
     found = errors(load("configs/cic.yaml", [*SHARP, fidelity, *SCENES[scene], *changes]))
     assert found.pop("peak_force_N") < 5e-3
     assert max(found.values()) < 3e-5, found
+
+
+@pytest.mark.long
+def test_contact_jumps_beside_a_joint():
+    """Derivatives follow the jump of the contact over the joint of two arcs.
+
+    Otherwise, that of the mean with respect to the outer radius would be wrong by a third."""
+    arcs = "family: five_arcs, lobes: 3, pitch_radius_mm: 33.0, outer_radius_mm: 45.19"
+    rest = "tip_arc_angle_deg: 1.9156, tip_arc_radius_mm: 15.912, tip_arc_turn_deg: 80"
+    changes = [f"profile={{{arcs}, {rest}}}", "optimizer.bounds={}"]
+    found = errors(load("configs/cic.yaml", [*SHARP, *changes]))
+    assert max(found.values()) < 1e-5, found
 
 
 def test_jump_in_both_modes():
