@@ -18,6 +18,8 @@ from scipy.optimize import nnls
 
 from rootsopt.optimize.local import Local
 
+RESIDUAL = 1e-4
+"""First-order residual above which a design does not count as converged."""
 NEAR = 1e-4
 """Distance above which a limit or a branch cannot be active.
 
@@ -120,4 +122,4 @@ def certify(local: Local, point: NDArray[np.float64], near: float = NEAR) -> Cer
     return Certificate(residual, local.violation, *held)
 
 
-__all__ = ["NEAR", "Certificate", "certify"]
+__all__ = ["NEAR", "RESIDUAL", "Certificate", "certify"]

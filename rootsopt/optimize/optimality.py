@@ -8,11 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.optimize.certificate import Certificate
+from rootsopt.optimize.certificate import RESIDUAL, Certificate
 from rootsopt.optimize.sqp import REASONS
 
-RESIDUAL = 1e-4
-"""First-order residual above which a design does not count as converged."""
 _SAME = 1e-4, 0.03
 """Differences above which the optima of two local searches count as distinct: relative difference
 between objectives, and difference in one coordinate of the unit box."""
@@ -146,6 +144,14 @@ class Optimality:
         }
 
 
+def judged(reason: str, holds: bool) -> str:
+    """Return why a search ended (`reason`), once its design has been simulated again from rest.
+
+    `holds`: whether the first-order conditions hold there. Only a search that has converged can
+    lose its verdict: conditions that hold say little about the value."""
+    return reason if holds or reason != "converged" else "verification"
+
+
 def distinct(starts: Sequence[StartOutcome]) -> list[Optimum]:
     """Return the distinct optima among the outcomes of local searches, the best first.
 
@@ -185,4 +191,12 @@ def unseen(searches: int, optima: int) -> dict[str, float | None]:
     return {"searches": n, "optima": count, "expected_optima": expected, "share_of_starts": share}
 
 
-__all__ = ["RESIDUAL", "Holder", "Optimality", "Optimum", "StartOutcome", "distinct", "unseen"]
+__all__ = [
+    "Holder",
+    "Optimality",
+    "Optimum",
+    "StartOutcome",
+    "distinct",
+    "judged",
+    "unseen",
+]

@@ -26,11 +26,11 @@ from rootsopt.config import FAMILY_KEYS, Config
 from rootsopt.design.space import Space, sobol
 from rootsopt.errors import InputError
 from rootsopt.optimize.beginning import Beginning, beginning
-from rootsopt.optimize.certificate import Certificate, certify
+from rootsopt.optimize.certificate import RESIDUAL, Certificate, certify
 from rootsopt.optimize.infeasible import Infeasible, explain
 from rootsopt.optimize.limits import force_limits, limited
 from rootsopt.optimize.local import Local
-from rootsopt.optimize.optimality import RESIDUAL, Optimality, StartOutcome
+from rootsopt.optimize.optimality import Optimality, StartOutcome, judged
 from rootsopt.optimize.problem import FEASIBLE, Problem, needs_maxima
 from rootsopt.optimize.sqp import Found, Stops, descend
 from rootsopt.response.checkpoint import Checkpoint
@@ -649,8 +649,7 @@ class Search:
         near = [found for _, found in ends if _near(found.point, [point])]
         if near:
             found = min(near, key=lambda one: float(np.linalg.norm(one.point - point)))
-            holds = certificate.holds(RESIDUAL, FEASIBLE)
-            reason = found.reason if holds or not found.converged else "verification"
+            reason = judged(found.reason, certificate.holds(RESIDUAL, FEASIBLE))
             promised = found.promised
         held = self.problem.held_by(optimized, certificate)
         starts = [self._outcome(number, found) for number, found in ends]

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.optimize.certificate import Certificate, certify
+from rootsopt.optimize.certificate import RESIDUAL, Certificate, certify
 from rootsopt.optimize.local import Local, Look
 from rootsopt.optimize.models import Limits, Models
 
@@ -32,6 +32,8 @@ _WIDE = 0.05
 _FRESH = 0.02
 """Distance (unit box) from the point where the Hessians were measured above which they are measured
 again before a search has converged."""
+_FLAT = RESIDUAL / 2
+"""First-order residual above which a search goes on, although its models promise no decrease."""
 _NOISE = 3e-8
 """Difference of two objectives below which the smaller residual decides which point is better.
 Evaluations of the same design differ by up to this amount if their first guesses of the orbit
@@ -46,7 +48,8 @@ value."""
 class Stops(NamedTuple):
     """Criteria for the end of a local search.
 
-    `gain`: promised relative decrease of the objective below which the search ends at once;
+    `gain`: promised relative decrease of the objective below which the search ends, once the
+    first-order conditions hold;
     `enough`: promised decrease below which it has converged if further steps fail; `feasibility`:
     scaled violation below which a point is feasible; `evaluations`: maximum number of evaluated
     points; `asked`: function that returns whether to end at once."""
@@ -151,7 +154,7 @@ class _Descent:
             return None
         if self.violated or self.promised > self.stops.enough:
             return "infeasible" if self.violated else "no_progress"
-        small = self.promised <= self.stops.gain
+        small = self.promised <= self.stops.gain and self.certificate.residual <= _FLAT
         return "converged" if small or not self._moves(step, decrease) else None
 
     def _step(self) -> tuple[NDArray[np.float64], float]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rootsopt.config import Config
 from rootsopt.optimize.infeasible import Infeasible
-from rootsopt.optimize.optimality import RESIDUAL
+from rootsopt.optimize.certificate import RESIDUAL
 from rootsopt.response.evaluation import Evaluation
 from rootsopt.status import Status
 from rootsopt.tradeoffs.aims import Aim
@@ -24,10 +24,14 @@ term counts as equal when designs are compared."""
 class Standing(enum.Enum):
     """Status of one point of a front. Each value explains it and advises the user."""
 
-    CERTIFIED = "The first-order conditions of a best compromise hold."
+    CERTIFIED = (
+        "No compromise nearby is better, and the first-order conditions hold. The search for the "
+        "point had converged."
+    )
     NOT_CERTIFIED = (
-        "The design is the best that was found for this compromise, but the first-order conditions "
-        "do not hold there. Raise optimizer.iterations or tighten solver.rtol."
+        "The design is the best that was found for this compromise, but its search had not "
+        "converged, or the first-order conditions do not hold. Raise optimizer.iterations or "
+        "tighten solver.rtol."
     )
     NOT_VERIFIED = (
         "The search was stopped before the design was simulated again from rest. Run it again."

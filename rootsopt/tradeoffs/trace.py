@@ -28,10 +28,10 @@ from numpy.typing import NDArray
 from rootsopt.config import FAMILY_KEYS, Config
 from rootsopt.design.space import sobol
 from rootsopt.errors import InputError
-from rootsopt.optimize.certificate import certify
+from rootsopt.optimize.certificate import RESIDUAL, certify
 from rootsopt.optimize.infeasible import Infeasible, explain
 from rootsopt.optimize.local import Local
-from rootsopt.optimize.optimality import RESIDUAL
+from rootsopt.optimize.optimality import judged
 from rootsopt.optimize.problem import FEASIBLE
 from rootsopt.optimize.sqp import Stops, descend
 from rootsopt.response.checkpoint import Checkpoint
@@ -59,6 +59,9 @@ _APART = 0.15
 _CHEAP_EVALUATIONS, _CHEAP_STARTS, _CHEAP_SCREENING = 300, 6, 64
 """Minimum effort where no term needs a simulation: number of evaluations per search, of starts per
 end, and of screened designs."""
+_EQUAL = 1e-7
+"""Difference between the objectives of two searches (fraction of a term's range) below which a
+search that has converged counts as the better one."""
 _SHARP = 0.01
 """Accuracy (fraction of the gap's width) with which the sides of a gap are located."""
 _EXPLAINED = 8
@@ -528,13 +531,9 @@ class Tracer:
             return node._replace(standing=Standing.NOT_HELD_UP)
         scalar = node.scalar._replace(scale=self.scale)
         certificate = certify(scalar.local(sample), sample.point)
-        holds = certificate.holds(RESIDUAL, FEASIBLE)
-        reason = node.reason
-        if holds:
-            reason = "converged"
-        elif reason == "converged":
-            reason = "verification"
-        standing = Standing.CERTIFIED if holds else Standing.NOT_CERTIFIED
+        reason = judged(node.reason, certificate.holds(RESIDUAL, FEASIBLE))
+        certified = reason == "converged"
+        standing = Standing.CERTIFIED if certified else Standing.NOT_CERTIFIED
         return Node(scalar, sample, certificate, reason, node.end, standing)
 
     def _front(self, nodes: Sequence[Node], infeasible: Infeasible | None = None) -> Front:
@@ -567,10 +566,14 @@ class Tracer:
 
 
 def _better(best: Node | None, other: Node | None) -> Node | None:
-    """Return the node with the lower objective; `best` if both are equally good."""
-    if best is None or (other is not None and other.objective < best.objective):
-        return other
-    return best
+    """Return the node with the lower objective.
+
+    Of two that are equally good (`_EQUAL`), return one whose search has converged, or `best`."""
+    if best is None or other is None:
+        return other if best is None else best
+    gain = best.objective - other.objective
+    sooner = other.reason == "converged" != best.reason
+    return other if gain > (-_EQUAL if sooner else _EQUAL) else best
 
 
 @one_thread

@@ -131,6 +131,21 @@ def test_reasons_of_an_early_end():
     assert not wrong.converged
 
 
+def test_steps_that_fail_do_not_count_as_convergence():
+    """The objective falls by 0.1 per unit box, but every step fails, as if by a wrong gradient.
+
+    The trust region shrinks until its own decrease is negligible. The decrease in the whole
+    neighbourhood is not."""
+
+    def look(x):
+        value = 1 + (10 * abs(x[0] - 0.5) if x[0] != 0.5 else 0)
+        return Local(value, np.array([-0.1, 0.0]), (), np.zeros(0), np.zeros((0, 2)))
+
+    found = descend(look, np.array([0.5, 0.5]))
+    assert found.reason == "no_progress"
+    assert found.promised > 1e-3
+
+
 def test_contradicting_constraints_are_infeasible():
     """For x ≥ 0.8 and x ≤ 0.2, no point counts as an optimum; one limit is violated by 0.3."""
 
@@ -281,6 +296,13 @@ def valley(x):
     return Local(value, slope, (), bound, -2 * x[None])
 
 
+def stiff(x):
+    """Return a steep function: 1e-9 above its minimum, the slope is still 1e-3 per unit box."""
+    away = 20 * (x - 0.4)
+    slope = 20 * np.sinh(away)
+    return Local(1 + np.sum(np.cosh(away) - 1), slope, (), np.zeros(0), np.zeros((0, 2)))
+
+
 def saddle(x):
     """Return a function whose gradient vanishes at (0.5, 0.5), a saddle."""
     away = x - 0.5
@@ -306,18 +328,21 @@ def waves(seed):
 
 @pytest.mark.parametrize(
     ("look", "start"),
-    [(valley, [0.9, 0.1]), (saddle, [0.9, 0.5]), (saddle, [0.5, 0.5]),
+    [(valley, [0.9, 0.1]), (stiff, [0.9, 0.1]), (stiff, [0.41, 0.37]),
+     (saddle, [0.9, 0.5]), (saddle, [0.5, 0.5]),
      *((waves(seed), [0.4, 0.5, 0.6, 0.5]) for seed in range(6))],
 )  # fmt: skip
 @pytest.mark.parametrize("known", [False, True])
 def test_a_converged_search_has_the_value(look, start, known):
-    """No point in the neighbourhood is lower by more than 1e-5, whatever the first-order residual.
+    """No point in the neighbourhood is lower by more than 1e-5, and the first-order conditions hold.
 
-    In a flat valley and at a saddle, the residual is small far from the minimum."""
+    These alone say little: in a flat valley and at a saddle, the residual is small far from the
+    minimum."""
     limits = (lambda x: (look(x).slack, look(x).normals)) if known else None
     found = descend(look, np.array(start), Stops(evaluations=150), limits)
     assert found.converged
     assert found.promised <= 3e-6
+    assert found.certificate.residual <= 1e-4
     assert found.local.violation <= 1e-6
     assert found.local.objective <= sampled(look, found.point, 0.0) + 1e-5
 

@@ -495,11 +495,19 @@ def test_limits_of_a_point_are_those_on_which_it_lies(front):
     assert {*held} == {"lower", "upper"}
 
 
-@pytest.mark.parametrize(("off", "standing"), [(0.005, "certified"), (0.02, "not_held_up")])
-def test_a_point_holds_up_only_if_all_its_terms_do(off, standing):
+@pytest.mark.parametrize(
+    ("off", "reason", "standing"),
+    [
+        (0.005, "converged", "certified"),
+        (0.005, "no_progress", "not_certified"),
+        (0.02, "converged", "not_held_up"),
+    ],
+)
+def test_a_point_holds_up_only_if_all_its_terms_do(off, reason, standing):
     """After the simulation from rest, one term that is more than 1 % off is enough to drop it.
 
-    Otherwise the conditions count that hold with the new terms: here, both lead by as much."""
+    Otherwise the conditions count that hold with the new terms: here, both lead by as much. They
+    certify nothing where the search promises a better compromise nearby."""
     point = np.array([0.5, 0.0])
 
     def sample(second):
@@ -513,12 +521,17 @@ def test_a_point_holds_up_only_if_all_its_terms_do(off, standing):
     scale = Scale(np.array([3.0, 1.0]), np.ones(2))
     scalar = Scalar(scale, np.array([0.0, 2.0 * off]), (0, 1))
     searched = sample(2.0)
-    node = Node(scalar, searched, certify(scalar.local(searched), point), "converged")
+    node = Node(scalar, searched, certify(scalar.local(searched), point), reason)
     tracer = Tracer(config(RADIUS))
     tracer._scale = scale
     tracer._study = study = object.__new__(Study)
     vars(study)["verified"] = lambda point: sample(2.0 * (1 + off))
-    assert tracer._checked(node).standing.label == standing
+    checked = tracer._checked(node)
+    assert (checked.standing.label, checked.reason) == (standing, reason)
+    # Of two equal designs, the one whose search has converged counts.
+    worse = node._replace(reason="evaluations")
+    assert trace._better(worse, node) is (node if reason == "converged" else worse)
+    assert trace._better(node, worse) is node
     vars(study)["verified"] = lambda point: None
     assert tracer._checked(node).standing is Standing.NOT_HELD_UP
 
