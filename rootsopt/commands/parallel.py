@@ -42,8 +42,8 @@ def chosen(options: "argparse.Namespace") -> "AbstractContextManager[Runs]":
     if options.workers is not None:
         say(
             f"`--workers {options.workers}` starts processes that load everything again, some 10 s "
-            f"each, while one process already uses all {os.cpu_count() or 1} cores; it pays only "
-            "if a search takes many minutes"
+            f"each, and then are no faster than this process, which uses all {os.cpu_count() or 1} "
+            "cores; leave it out unless a design may end its process"
         )
     cache = not options.no_cache
     return evaluating(options.workers, options.scheduler, options.imports, cache)

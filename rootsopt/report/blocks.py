@@ -7,6 +7,7 @@ from typing import Any
 from rootsopt.output.labels import fitting, in_words
 from rootsopt.report.gather import Case, Run
 from rootsopt.report.names import label, percent, value
+from rootsopt.response.records import message_of
 from rootsopt.status import Status
 from rootsopt.tradeoffs.front import Standing
 
@@ -280,9 +281,9 @@ def statistics_block(run: Run) -> Block | None:
 
 
 def status_block(run: Run) -> Block:
-    """Return the meaning of every status, those of this run first."""
+    """Return the meaning of every status, those of this run first, with advice for its scene."""
     met = statuses_in(run.result)
-    meanings = {status.label: status.value for status in Status}
+    meanings = {status.label: message_of(run.config, status) for status in Status}
     points = {one.label: one.value for one in Standing}
     here = meanings | points
     rows = [[status_cell(word), here[word]] for word in met if word in here]

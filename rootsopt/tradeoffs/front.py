@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rootsopt.config import Config
-from rootsopt.optimize.infeasible import Infeasible
 from rootsopt.optimize.certificate import RESIDUAL
+from rootsopt.optimize.infeasible import Infeasible
 from rootsopt.response.evaluation import Evaluation
 from rootsopt.status import Status
 from rootsopt.tradeoffs.aims import Aim

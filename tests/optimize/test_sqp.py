@@ -334,7 +334,7 @@ def waves(seed):
 )  # fmt: skip
 @pytest.mark.parametrize("known", [False, True])
 def test_a_converged_search_has_the_value(look, start, known):
-    """No point in the neighbourhood is lower by more than 1e-5, and the first-order conditions hold.
+    """No point nearby is lower by more than 1e-5, and the first-order conditions hold.
 
     These alone say little: in a flat valley and at a saddle, the residual is small far from the
     minimum."""

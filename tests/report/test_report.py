@@ -24,6 +24,7 @@ from rootsopt.report.meshing import animations
 from rootsopt.report.names import label
 from rootsopt.report.optimum import certificate_blocks
 from rootsopt.report.wording import came_out, what_next
+from rootsopt.response.records import message_of
 from rootsopt.response.series import Series
 from rootsopt.status import Status
 
@@ -125,7 +126,7 @@ def test_page_says_what_came_out_and_what_every_status_means(page):
         assert words in text
     for status in Status:
         assert status.label.replace("_", " ") in text
-        assert re.sub("[`]", "", status.value) in text
+        assert message_of(load(CIC), status).replace("`", "") in text
 
 
 def test_notes_on_odd_values_are_in_the_summary(page):
@@ -194,14 +195,19 @@ def test_long_motions_keep_their_peak():
 
 
 def test_run_without_a_result_says_why(tmp_path):
-    """A run with exit code 3 shows the reason and the advice, and no empty charts."""
+    """A run with exit code 3 shows the reason and the advice, and no empty charts.
+
+    The table of statuses gives the same advice, for the scene of the run: it has a timing gear."""
     status = Status.PASSED_THROUGH
     bare = {"response": {}, "gradient": {}, "steady_state": {"kind": "transient"}}
-    given = result_of(status=status.label, message=status.value, **bare)
+    message = message_of(load(CIC), status)
+    given = result_of(status=status.label, message=message, **bare)
     page = report_text(run_of(tmp_path, given, usable=False))
     text = words_of(page)
     assert "Passed through: The lobes passed through each other" in text
-    assert "What to do next Add a scene.timing_gear" in text
+    assert f"What to do next {message.partition('. ')[2]}" in text
+    assert message in text
+    assert "Add a scene.timing_gear" not in text
     assert "✗" not in text  # drawn by the style, not read out twice
     data = data_of(page)
     assert data["charts"] == []

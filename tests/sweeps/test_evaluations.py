@@ -5,12 +5,13 @@ import pickle
 import subprocess
 import sys
 import threading
+from argparse import Namespace
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 
-from rootsopt.commands import optimize, pareto
+from rootsopt.commands import optimize, parallel, pareto
 from rootsopt.config import load
 from rootsopt.dynamics.collocation.known import Known
 from rootsopt.errors import InputError
@@ -203,6 +204,12 @@ def test_classes_of_a_script_travel(tmp_path):
 def test_without_workers_evaluations_run_here():
     with evaluating() as runs:
         assert runs is HERE
+
+
+def test_the_price_of_workers_is_said_before_they_start(capsys):
+    """The context is not entered, so nothing has started yet."""
+    parallel.chosen(Namespace(workers=3, scheduler=None, imports=[], no_cache=False))
+    assert "are no faster than this process" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", [optimize, pareto])
