@@ -34,10 +34,12 @@ _FRESH = 0.02
 again before a search has converged."""
 _FLAT = RESIDUAL / 2
 """First-order residual above which a search goes on, although its models promise no decrease."""
-_NOISE = 3e-8
+_TRIES = 3
+"""Number of steps tried in order to lower this residual."""
+_NOISE = 1e-7
 """Difference of two objectives below which the smaller residual decides which point is better.
 Evaluations of the same design differ by up to this amount if their first guesses of the orbit
-differ."""
+differ (3e-8 on CIC rotors, 1e-7 on five arcs)."""
 _SMALL = 0.1
 """Least magnitude of the objective to which decreases are related."""
 _PRICE, _MOST = 2.0, 1e5
@@ -155,7 +157,18 @@ class _Descent:
         if self.violated or self.promised > self.stops.enough:
             return "infeasible" if self.violated else "no_progress"
         small = self.promised <= self.stops.gain and self.certificate.residual <= _FLAT
-        return "converged" if small or not self._moves(step, decrease) else None
+        return "converged" if small or not self._polished(step, decrease) else None
+
+    def _polished(self, step: NDArray[np.float64], decrease: float) -> bool:
+        """Return whether a step of negligible `decrease` leads to a point that is flatter.
+
+        `step`, `decrease`: as `_step` returns them. A step that fails corrects the models, so that
+        a few are tried while the first-order conditions do not hold."""
+        for _ in range(_TRIES if self.certificate.residual > _FLAT else 1):
+            if decrease <= 0 or self._moves(step, decrease):
+                return decrease > 0
+            step, decrease = self._step()
+        return False
 
     def _step(self) -> tuple[NDArray[np.float64], float]:
         """Return the next step (d,), and the decrease of the merit that the models promise for it.
