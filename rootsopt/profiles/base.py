@@ -270,7 +270,7 @@ class Profile(eqx.Module):
         Down to ε = -`single_turn`, and at the nominal centre distance, the contact search accepts
         the minimum near the point of perfect rolling, if Newton's method converges to it. A
         fraction of the flank next to a cusp, about √|ε|, is excluded, and one next to the joints of
-        a `forked` flank, about |ε|. Tests confirm the value."""
+        a `forked` flank, proportional to ε. Tests confirm the value."""
         return 1e-3
 
     @property
