@@ -51,10 +51,9 @@ class Stops(NamedTuple):
     """Criteria for the end of a local search.
 
     `gain`: promised relative decrease of the objective below which the search ends, once the
-    first-order conditions hold;
-    `enough`: promised decrease below which it has converged if further steps fail; `feasibility`:
-    scaled violation below which a point is feasible; `evaluations`: maximum number of evaluated
-    points; `asked`: function that returns whether to end at once."""
+    first-order conditions hold; `enough`: promised decrease below which it has converged if further
+    steps fail; `feasibility`: scaled violation below which a point is feasible; `evaluations`:
+    maximum number of evaluated points; `asked`: function that returns whether to end at once."""
 
     gain: float = 1e-9
     enough: float = 3e-6
