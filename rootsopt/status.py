@@ -100,6 +100,11 @@ class Status(enum.Enum):
         "Change the design until all margins are positive."
     )
 
+    NOT_CLOSED = (
+        "The motion repeats, but its orbit could not be closed by collocation, so that forces and "
+        "gradient are not known. Set solver.orbit to shooting, which takes ten times as long."
+    )
+
     @property
     def code(self) -> int:
         """Number that represents the status in arrays."""

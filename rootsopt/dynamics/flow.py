@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import NDArray
 
 from rootsopt.dynamics.flanks import FlankForce
 from rootsopt.dynamics.integrator import Integrator, StepGrid
@@ -17,7 +18,7 @@ from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.peak import BESIDE, BESIDE_UNIT, Steps, locate_peak, one_sided
 from rootsopt.dynamics.saltation import MARKS, marks, saltation
-from rootsopt.dynamics.stepping import integrated
+from rootsopt.dynamics.stepping import Integrated, integrated, interpolated
 from rootsopt.dynamics.tangent import Linear, linearized, one_step, propagated
 
 _SHORTEST = 1e-9
@@ -29,12 +30,13 @@ class Strobe(NamedTuple):
     """Scaled states at the ends of successive mesh periods.
 
     `states` (periods, n); `steps`: total number of solver steps; `solved`: whether the solver
-    succeeded in every mesh period.
+    succeeded in every mesh period; `pieces`: the motion, if it was requested.
     """
 
     states: Float[Array, "periods n"]
     steps: Int[Array, ""]
     solved: Bool[Array, ""]
+    pieces: "Pieces | None" = None
 
 
 class Flow(NamedTuple):
@@ -102,12 +104,31 @@ class Flow(NamedTuple):
         return jnp.append(jnp.stack([self.mean, self.mean_square, self.peak]), self.others)
 
 
+class Pieces(NamedTuple):
+    """A motion over p mesh periods, each divided into e pieces with the same number of steps.
+
+    `ends` (p, e): ends of the pieces, as fractions of the mesh period; `states` (p, e, n): scaled
+    states at their starts; `slopes` (p, e, s, n): derivatives of the states with respect to time
+    (mesh periods) at s instants inside each piece.
+    """
+
+    ends: Float[Array, "p e"]
+    states: Float[Array, "p e n"]
+    slopes: Float[Array, "p e s n"]
+
+
 def strobe(
-    pair: RotorPair, state: Float[Array, " n"], periods: int, integrator: Integrator
+    pair: RotorPair,
+    state: Float[Array, " n"],
+    periods: int,
+    integrator: Integrator,
+    pieces: tuple[int, NDArray[np.float64]] | None = None,
 ) -> Strobe:
     """Integrate the scaled `state` (n,) over `periods` mesh periods from φ1 = 0.
 
-    Unlike `flow`, this function computes no statistics of the contact force.
+    `pieces`: number of pieces of each mesh period and instants inside a piece (fractions of its
+    length) for `Strobe.pieces`; `None`: no pieces. Unlike `flow`, this function computes no
+    statistics of the contact force.
 
     A step ends exactly at the end of each mesh period. Interpolated states would have an error far
     above the tolerance, which could hide that the motion repeats.
@@ -117,11 +138,33 @@ def strobe(
     term = diffrax.ODETerm(lambda tau, y, pair: pair.derivative(tau, y)[0])
 
     def one_period(state, _):
-        out = integrated(term, solver, control, state, pair, integrator.max_steps, recorded=False)
-        return out.end, (out.end, out.steps, out.solved)
+        recorded = pieces is not None
+        out = integrated(term, solver, control, state, pair, integrator.max_steps, recorded)
+        made = None if pieces is None else _divided(out, solver, *pieces)
+        return out.end, (out.end, out.steps, out.solved, made)
 
-    _, (states, steps, solved) = lax.scan(one_period, state, length=periods)
-    return Strobe(states, jnp.sum(steps), jnp.all(solved))
+    _, (states, steps, solved, made) = lax.scan(one_period, state, length=periods)
+    return Strobe(states, jnp.sum(steps), jnp.all(solved), made)
+
+
+def _divided(
+    out: Integrated, solver: diffrax.AbstractSolver, count: int, inside: NDArray[np.float64]
+) -> Pieces:
+    """Return the mesh period `out` in `count` pieces with the same number of steps.
+
+    `inside`: instants inside a piece, as fractions of its length."""
+    assert out.records is not None
+    last = jnp.maximum(out.accepted - 1, 0)
+    edges = jnp.append(jnp.zeros_like(out.end[:1]), out.records.ends)
+    number = jnp.arange(count + 1) * (last + 1) / count
+    whole = jnp.minimum(number.astype(int), last)
+    part = number - whole
+    share = edges[whole] + part * (edges[whole + 1] - edges[whole])
+
+    begin, length = share[:-1, None], jnp.diff(share)[:, None]
+    each = jax.vmap(jax.vmap(lambda share: interpolated(out, solver, share)))
+    states, slopes = each(begin + length * np.append(0.0, inside))
+    return Pieces(share[1:], states[:, 0], slopes[:, 1:])
 
 
 class Equation(eqx.Module):
@@ -404,16 +447,10 @@ def _solved(
         _over_unit(equation, periods), solver, control, start, dynamic, max_steps, recorded=True
     )
     assert out.records is not None
-    ends, after, dense = out.records
+    ends, after, _ = out.records
     last = jnp.maximum(out.accepted - 1, 0)
-    begins = jnp.concatenate([jnp.zeros_like(ends[:1]), ends[:-1]])
-
-    def sample(share):
-        k = jnp.minimum(jnp.searchsorted(ends, share), last)
-        within = jax.tree.map(lambda x: x[k], dense)
-        return solver.interpolation_cls(t0=begins[k], t1=ends[k], **within).evaluate(share)
-
-    states = jax.vmap(sample)((jnp.arange(samples) / samples).astype(dtype))
+    shares = (jnp.arange(samples) / samples).astype(dtype)
+    states = jax.vmap(lambda share: interpolated(out, solver, share)[0])(shares)
     states, grid, strain = lax.stop_gradient((states, ends * periods, out.control[-1]))
     return _Recorded(
         grid=grid,

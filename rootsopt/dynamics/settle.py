@@ -9,10 +9,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import NDArray
 
-from rootsopt.dynamics.flow import strobe
+from rootsopt.dynamics.flow import Pieces, strobe
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.pair import RotorPair
 
@@ -34,7 +36,8 @@ class Transient(NamedTuple):
     not settled; `nearest`: the period with which the last states repeat most closely; `spread`:
     greatest scaled difference between states that are `nearest` periods apart; `periods`: mesh
     periods simulated; `lost`: see `RotorPair.lost`; `solved`: whether the solver succeeded;
-    `steps`: number of solver steps.
+    `steps`: number of solver steps; `pieces`: the motion over the last mesh periods, at least as
+    many as the longest orbit has, if it was requested.
     """
 
     state: Float[Array, " n"]
@@ -45,6 +48,7 @@ class Transient(NamedTuple):
     lost: Bool[Array, ""]
     solved: Bool[Array, ""]
     steps: Int[Array, ""]
+    pieces: Pieces | None = None
 
 
 def settled_within(rtol: Float[Array, ""]) -> Float[Array, ""]:
@@ -61,6 +65,7 @@ def settle(
     tolerance: Float[Array, ""],
     max_periods: Int[Array, ""],
     max_orbit: int,
+    pieces: tuple[int, NDArray[np.float64]] | None = None,
 ) -> Transient:
     """Integrate from the scaled `state` (n,) until the stroboscopic states repeat with a period k.
 
@@ -68,7 +73,7 @@ def settle(
     last k + 1 states differ from the states k periods earlier by less than `tolerance` (scaled).
     For large states, the noise of the steps replaces `tolerance` if it is greater. k is the
     smallest such period, at most `max_orbit` ≤ 8. Steps become finer after `_PATIENCE`. The
-    transient ends unsettled after `max_periods` mesh periods."""
+    transient ends unsettled after `max_periods` mesh periods. `pieces`: as for `strobe`."""
     orders = jnp.arange(1, max_orbit + 1)
     age = jnp.arange(_MEMORY)[::-1]
 
@@ -90,7 +95,7 @@ def settle(
         return period, orders[nearest], spreads[nearest]
 
     def go_on(loop):
-        carry, _ = loop
+        carry, *_ = loop
         alive = ~carry.lost & carry.solved & jnp.all(jnp.isfinite(carry.state))
         return (carry.period == 0) & alive & (carry.periods < max_periods)
 
@@ -100,7 +105,8 @@ def settle(
         rtol = jnp.where(
             carry.periods < longest, integrator.rtol, jnp.minimum(integrator.rtol, fine)
         )
-        part = strobe(pair, carry.state, BLOCK, dataclasses.replace(integrator, rtol=rtol))
+        how = dataclasses.replace(integrator, rtol=rtol)
+        part = strobe(pair, carry.state, BLOCK, how, pieces)
         memory = jnp.concatenate([memory[BLOCK:], part.states])
         end = part.states[-1]
         lost = pair.lost(end)
@@ -115,6 +121,9 @@ def settle(
             lost=lost,
             solved=part.solved,
             steps=carry.steps + part.steps,
+            pieces=jax.tree.map(
+                lambda old, x: jnp.concatenate([old[BLOCK:], x]), carry.pieces, part.pieces
+            ),
         )
         return new, memory
 
@@ -127,6 +136,20 @@ def settle(
         lost=jnp.zeros((), bool),
         solved=jnp.ones((), bool),
         steps=jnp.zeros((), int),
+        pieces=None if pieces is None else no_pieces(state, max_orbit, pieces),
     )
     memory = jnp.full((_MEMORY, *state.shape), jnp.inf, state.dtype)
     return lax.while_loop(go_on, advance, (start, memory))[0]
+
+
+def no_pieces(
+    state: Float[Array, " n"], longest: int, pieces: tuple[int, NDArray[np.float64]]
+) -> Pieces:
+    """Return the placeholder for `Transient.pieces` of a motion with states like `state` (n,).
+
+    `longest`: longest period of an orbit (mesh periods); `pieces`: as for `strobe`."""
+    count, inside = pieces
+    shape = -(-longest // BLOCK) * BLOCK, count
+    nothing = jnp.zeros(shape, state.dtype)
+    states = jnp.zeros((*shape, *state.shape), state.dtype)
+    return Pieces(nothing, states, jnp.zeros((*shape, len(inside), *state.shape), state.dtype))

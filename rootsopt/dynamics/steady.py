@@ -15,10 +15,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from rootsopt.dynamics.collocation.closing import CORRECTED, supported
+from rootsopt.dynamics.collocation.closing import supported
 from rootsopt.dynamics.collocation.known import Known
-from rootsopt.dynamics.collocation.mesh import sizes
-from rootsopt.dynamics.collocation.motion import Collocated, collocated, near_orbit
 from rootsopt.dynamics.flow import Flow
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.measures import Measures
@@ -29,7 +27,7 @@ from rootsopt.dynamics.verdict import RESIDUAL, TOO_DEEP, UNRESOLVED, Verdict, v
 from rootsopt.dynamics.window import PERIODS, Window
 from rootsopt.status import Status
 
-_NEARLY = 0.05
+NEARLY = 0.05
 """Scaled difference below which states nearly repeat. Newton's method then decides whether there is
 an orbit, possibly of a shorter period."""
 _CLOSEST = 1e-12
@@ -38,10 +36,6 @@ repeat to rounding."""
 _TRUSTED = 1e-8
 """Finest tolerance to which an orbit is refined, unless the config requests a finer tolerance. An
 orbit is refined if it does not close or its derivatives are uncertain."""
-_COLLOCATIONS, _LONGER = 3, 160.0
-"""Maximum number of attempts to close an orbit by collocation, and maximum number of mesh periods
-by which the transient continues before each further attempt. The states of the transient must then
-repeat ten times more closely."""
 
 
 class Solver(eqx.Module):
@@ -88,7 +82,7 @@ class Steady(NamedTuple):
     checks; `window` of a motion that did not settle; `settled`: end of the transient; `used`: mesh
     periods of all transients; `steps`: number of solver steps of transients and orbits;
     `collocated`: whether the orbit was closed by collocation; `known`: that orbit, from which
-    those of similar pairs can be closed (`near_motion`), `None` if orbits are closed by shooting
+    those of similar pairs can be closed, `None` if orbits are closed by shooting
     only.
     """
 
@@ -156,25 +150,6 @@ class _Search(NamedTuple):
     over: Bool[Array, ""]
 
 
-class _Collocation(NamedTuple):
-    """State of the loop over attempts to close an orbit by collocation.
-
-    `found`: result of the last attempt. The next one continues the transient from `state`, at the
-    tolerance `coarse`, until the states repeat to within the scaled distance `within`. If `shorter`
-    is not 0, the last orbit repeated after `shorter` mesh periods. The next attempt then closes an
-    orbit of this period, without a further transient. `tries`: number of attempts; `over`: whether
-    the loop has ended.
-    """
-
-    found: Steady
-    shorter: Int[Array, ""]
-    state: Float[Array, " n"]
-    coarse: Float[Array, ""]
-    within: Float[Array, ""]
-    tries: Int[Array, ""]
-    over: Bool[Array, ""]
-
-
 class _Attempts(eqx.Module):
     """The loop of `steady_motion`. Its fields hold the arguments of that function.
 
@@ -207,7 +182,7 @@ class _Attempts(eqx.Module):
             used=zero,
             steps=zero,
             collocated=no,
-            known=self._unknown(),
+            known=None,
         )
         coarse, fine = solver.transient.rtol, solver.orbit.rtol
         within = settled_within(coarse).astype(dtype)
@@ -235,7 +210,7 @@ class _Attempts(eqx.Module):
         failure = transient_status(self.pair, settled)
         # The transient has reached its limit, but the motion nearly repeats. The difference may be
         # noise of the coarse steps: let Newton's method decide.
-        nearly = (failure == Status.NOT_SETTLED.code) & (settled.spread < _NEARLY) & fresh
+        nearly = (failure == Status.NOT_SETTLED.code) & (settled.spread < NEARLY) & fresh
         within = jnp.where(nearly, settled.spread, now.within)
         settled = settled._replace(period=jnp.where(nearly, settled.nearest, settled.period))
         lost = fresh & (failure >= 0) & ~nearly
@@ -255,7 +230,8 @@ class _Attempts(eqx.Module):
         )
         open_by = solver.closed * solver.orbit.rtol
         open_by = jnp.maximum(open_by, RESIDUAL[solver.precision])
-        judged, status = self._judged(orbit, start, now.fine, within, open_by)
+        limits = now.fine, within, open_by
+        checks, status = judged(self.pair, solver, self.radius, orbit, start, limits)
         # An orbit of a shorter period is the motion even if its derivatives are uncertain.
         holds = among(status, (Status.PERIODIC, Status.INACCURATE))
         taken = jnp.where(shorter, holds, ~lost) & ~now.windowed
@@ -265,7 +241,7 @@ class _Attempts(eqx.Module):
             orbit=choose(taken, orbit, found.orbit),
             period=jnp.where(taken, period, found.period),
             rtol=jnp.where(taken, now.fine, found.rtol),
-            verdict=choose(taken, judged, found.verdict),
+            verdict=choose(taken, checks, found.verdict),
             window=choose(now.windowed, window, found.window),
             settled=settled,
             used=used,
@@ -308,31 +284,6 @@ class _Attempts(eqx.Module):
             over=~(again | windowed | (shorter > 0)),
         )
 
-    def _judged(self, orbit: Orbit, start, fine, within, open_by) -> tuple[Verdict, Int[Array, ""]]:
-        """Return the `Verdict` on an orbit integrated at the tolerance `fine`, and a status code.
-
-        `open_by`: residual (scaled) above which the orbit does not count as closed.
-        The accuracy of the forces is checked later, by `final`."""
-        pair, solver, dtype = self.pair, self.solver, start.dtype
-        closing = dataclasses.replace(solver.orbit, rtol=fine)
-        rtols = solver.transient.tolerance(dtype), closing.tolerance(dtype)
-        scales = pair.law.exponent, self.radius, pair.force_scale
-        found = verdict(orbit, start, within, rtols, open_by.astype(dtype), scales)
-        numbers = jnp.concatenate([orbit.response, orbit.state])
-        # A pair that is not smooth never has derivatives. Their absence is not a failure.
-        unknown = ~jnp.all(jnp.isfinite(orbit.sensitivity)) & pair.smooth
-        status = _first(
-            (~orbit.flow.solved, Status.SOLVER_FAILED),
-            (found.idle, Status.IDLE),
-            (~jnp.all(jnp.isfinite(numbers)), Status.NON_FINITE),
-            # Checked before the derivatives, which are unknown if the orbit amplifies errors.
-            (~found.steady, Status.NOT_SETTLED),
-            (unknown, Status.NON_FINITE),
-            (~found.certain, Status.INACCURATE),
-            default=Status.PERIODIC.code,
-        )
-        return found, status
-
     def _shorter(self, found: Steady, beyond) -> Int[Array, ""]:
         """Return a shorter period after which the orbit nearly repeats, or 0.
 
@@ -341,7 +292,7 @@ class _Attempts(eqx.Module):
         periods = jnp.arange(1, max(self.solver.max_orbit // 2, 1) + 1)
         place = periods * self.solver.samples // found.period
         states = found.orbit.flow.states[jnp.minimum(place, self.solver.samples - 1)]
-        near = jnp.max(jnp.abs(states - found.orbit.state), axis=1) < _NEARLY
+        near = jnp.max(jnp.abs(states - found.orbit.state), axis=1) < NEARLY
         divides = (found.period % periods == 0) & (periods < found.period)
         fits = near & divides & (periods > beyond)
         return jnp.where(jnp.any(fits), periods[jnp.argmax(fits)], 0)
@@ -353,114 +304,54 @@ class _Attempts(eqx.Module):
             return jnp.asarray(Status.NOT_SETTLED.code)
         return window_status(self.pair, window)
 
-    def _unknown(self) -> Known | None:
-        """Return the placeholder for `Steady.known`."""
-        if not collocates(self.pair, self.solver):
-            return None
-        return Known.empty(sizes(self.solver.max_orbit), self.pair.states, 1 + self.pair.two_sided)
 
-    def collocated(self, state: Float[Array, " n"]) -> Steady:
-        """Return the motion that the scaled `state` leads to, with an orbit closed by collocation.
+def judged(
+    pair: RotorPair,
+    solver: Solver,
+    radius: Float[Array, ""],
+    orbit: Orbit,
+    start: Float[Array, " n"],
+    limits: tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]],
+) -> tuple[Verdict, Int[Array, ""]]:
+    """Return the `Verdict` on an orbit of `pair`, and a status code.
 
-        An orbit is rejected if it is not stable, is not near the end of the transient, or is not
-        confirmed by an integration. The transient then continues, followed by another attempt
-        (`_COLLOCATIONS`). If the last attempt fails, the status is NOT_SETTLED."""
-        begun, zero = self.start(state), jnp.zeros((), int)
-        coarse, within = begun.coarse, begun.within
-        start = _Collocation(begun.found, zero, state, coarse, within, zero, begun.over)
-        loop = lax.while_loop(lambda now: ~now.over, lambda now: self._collocate(now), start)
-        return self.final(loop.found)
+    `radius`: pitch radius (m); `start`: scaled state near which the orbit has to be; `limits`:
+    tolerance of the orbit, scaled distance to which the transient's states repeated, and residual
+    (scaled) above which the orbit does not count as closed. The accuracy of the forces is checked
+    later, by `final`."""
+    dtype, (fine, within, open_by) = start.dtype, limits
+    closing = dataclasses.replace(solver.orbit, rtol=fine)
+    rtols = solver.transient.tolerance(dtype), closing.tolerance(dtype)
+    scales = pair.law.exponent, radius, pair.force_scale
+    found = verdict(orbit, start, within, rtols, open_by.astype(dtype), scales)
+    numbers = jnp.concatenate([orbit.response, orbit.state])
+    # A pair that is not smooth never has derivatives. Their absence is not a failure.
+    unknown = ~jnp.all(jnp.isfinite(orbit.sensitivity)) & pair.smooth
+    status = _first(
+        (~orbit.flow.solved, Status.SOLVER_FAILED),
+        (found.idle, Status.IDLE),
+        (~jnp.all(jnp.isfinite(numbers)), Status.NON_FINITE),
+        # Checked before the derivatives, which are unknown if the orbit amplifies errors.
+        (~found.steady, Status.NOT_SETTLED),
+        (unknown, Status.NON_FINITE),
+        (~found.certain, Status.INACCURATE),
+        default=Status.PERIODIC.code,
+    )
+    return found, status
 
-    def _collocate(self, now: _Collocation) -> _Collocation:
-        """Continue the transient, try to close its orbit, and return the new state of the loop."""
-        solver, used = self.solver, now.found.used
-        room = solver.max_periods - used
-        room = jnp.where(now.tries > 0, jnp.minimum(room, _LONGER), room).astype(int)
-        transient = dataclasses.replace(solver.transient, rtol=now.coarse)
-        nothing = jnp.zeros_like(used)
-        last = now.found.settled._replace(period=now.shorter, periods=nothing, steps=nothing)
-        settled = lax.cond(
-            now.shorter > 0,
-            lambda: last,
-            lambda: settle(self.pair, now.state, transient, now.within, room, solver.max_orbit),
-        )
-        failure = transient_status(self.pair, settled)
-        lost = now.found._replace(
-            status=failure,
-            settled=settled,
-            used=used + settled.periods,
-            steps=now.found.steps + settled.steps,
-        )
 
-        def close() -> tuple[Steady, Int[Array, ""]]:
-            period = jnp.maximum(settled.period, 1)
-            made = collocated(
-                self.pair,
-                self.tangents,
-                (settled.state, period),
-                (solver.transient, solver.orbit),
-                solver.measures,
-                (solver.samples, solver.max_orbit),
-            )
-            return self._taken(lost, made, settled.state, period, now.within), made.shorter
+def final(pair: RotorPair, found: Steady, radius: Float[Array, ""]) -> Steady:
+    """Return `found`, with a different status if the forces of its orbit are not valid.
 
-        found, shorter = lax.cond(failure < 0, close, lambda: (lost, nothing))
-        again = (failure < 0) & (found.status == Status.NOT_SETTLED.code)
-        again &= now.tries + 1 < _COLLOCATIONS
-        again &= (shorter > 0) | (found.used < solver.max_periods)
-        finer = jnp.where(shorter > 0, 1.0, 0.1)
-        coarse = jnp.maximum(now.coarse * finer, solver.orbit.rtol)
-        within, tries = now.within * finer, now.tries + 1
-        return _Collocation(found, shorter, settled.state, coarse, within, tries, ~again)
-
-    def near(self, known: Known, neighbour: RotorPair) -> Steady:
-        """Return the motion whose orbit is near the `known` one of the similar pair `neighbour`.
-
-        Its orbit has no samples of the state and no steps (see `collocation.sampled`). The status
-        is NOT_SETTLED if the orbit is not accepted."""
-        solver = self.solver
-        settings = solver.orbit, solver.measures, solver.max_orbit
-        made = near_orbit(self.pair, self.tangents, (known, neighbour), *settings)
-        period = jnp.round(known.elements.mesh.period).astype(int)
-        state, within = made.orbit.state, settled_within(solver.transient.rtol)
-        fine = solver.transient.tolerance(state.dtype)
-        empty = self.start(state).found
-        settled = empty.settled._replace(period=period, nearest=period)
-        # Use an empty window: a full one would be copied, but never used.
-        empty = empty._replace(settled=settled, window=Window.empty(state, 0, fine))
-        return self.final(self._taken(empty, made, state, period, within))
-
-    def _taken(self, found: Steady, made: Collocated, start, period, within) -> Steady:
-        """Return `found` with the orbit `made`, and with its status.
-
-        `start`: scaled state near which the orbit has to be; `period` of the orbit (mesh periods);
-        `within`: scaled distance to which the transient's states repeated."""
-        fine, rounding = self.solver.orbit.rtol, jnp.asarray(CORRECTED)
-        judged, status = self._judged(made.orbit, start, fine, within, rounding)
-        unknown = among(status, (Status.PERIODIC, Status.INACCURATE)) & ~made.verified
-        status = jnp.where(unknown | ~made.sound, Status.NOT_SETTLED.code, status)
-        return found._replace(
-            status=status,
-            orbit=made.orbit,
-            period=period,
-            verdict=judged,
-            steps=found.steps + made.orbit.flow.steps,
-            collocated=jnp.ones((), bool),
-            known=made.known,
-        )
-
-    def final(self, found: Steady) -> Steady:
-        """Return `found`, with a different status if the forces of its orbit are not valid.
-
-        The status is then UNSOUND (no such rotors), TOO_DEEP (the flanks penetrate too deep) or
-        UNRESOLVED (the numerical errors of the forces are too large)."""
-        orbit, judged = found.orbit, found.verdict
-        closed = among(found.status, (Status.PERIODIC, Status.INACCURATE))
-        deep = orbit.flow.depth > TOO_DEEP * self.radius
-        vague = (judged.rounding > UNRESOLVED) | ~judged.consistent
-        status = jnp.where(closed & vague, Status.UNRESOLVED.code, found.status)
-        status = jnp.where(closed & deep, Status.TOO_DEEP.code, status)
-        return found._replace(status=jnp.where(self.pair.sound, status, Status.UNSOUND.code))
+    The status is then UNSOUND (no such rotors), TOO_DEEP (the flanks penetrate too deep) or
+    UNRESOLVED (the numerical errors of the forces are too large). `radius`: pitch radius (m)."""
+    orbit, checks = found.orbit, found.verdict
+    closed = among(found.status, (Status.PERIODIC, Status.INACCURATE))
+    deep = orbit.flow.depth > TOO_DEEP * radius
+    vague = (checks.rounding > UNRESOLVED) | ~checks.consistent
+    status = jnp.where(closed & vague, Status.UNRESOLVED.code, found.status)
+    status = jnp.where(closed & deep, Status.TOO_DEEP.code, status)
+    return found._replace(status=jnp.where(pair.sound, status, Status.UNSOUND.code))
 
 
 def transient_status(pair: RotorPair, settled: Transient) -> Int[Array, ""]:
@@ -512,16 +403,10 @@ def steady_motion(
     """
     radius = jnp.asarray(radius, pair.angle_scale.dtype)
     attempts = _Attempts(pair, tangents, solver, radius)
-
-    def shooting() -> Steady:
-        search = lax.while_loop(
-            lambda now: ~now.over, lambda now: attempts.step(now), attempts.start(state)
-        )
-        return attempts.final(search.found)
-
-    if not collocates(pair, solver):
-        return shooting()
-    return attempts.collocated(state)
+    search = lax.while_loop(
+        lambda now: ~now.over, lambda now: attempts.step(now), attempts.start(state)
+    )
+    return final(pair, search.found, radius)
 
 
 def collocates(pair: RotorPair, solver: Solver) -> bool:
@@ -530,25 +415,5 @@ def collocates(pair: RotorPair, solver: Solver) -> bool:
 
 
 def continues(pair: RotorPair, solver: Solver) -> bool:
-    """Return whether orbits of `pair` can be closed from those of similar pairs (`near_motion`)."""
+    """Return whether orbits of `pair` can be closed by collocation."""
     return solver.closing != "shooting" and solver.precision == "float64" and supported(pair)
-
-
-def near_motion(
-    pair: RotorPair,
-    tangents: RotorPair,
-    start: tuple[Known, RotorPair],
-    radius: Float[Array, ""],
-    solver: Solver,
-) -> Steady:
-    """Find the steady motion of `pair` near the orbit of a similar pair.
-
-    `start`: this orbit, and its pair.
-
-    The result continues the motion of the similar pair without a transient, and must be stable. Its
-    orbit has no samples of the state and no steps (see `collocation.sampled`). The status is
-    NOT_SETTLED if the orbit is not accepted; call `steady_motion` in that case. Collocation must
-    support the pair. For the other arguments, see `steady_motion`.
-    """
-    radius = jnp.asarray(radius, pair.angle_scale.dtype)
-    return _Attempts(pair, tangents, solver, radius).near(*start)

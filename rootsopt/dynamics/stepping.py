@@ -46,6 +46,19 @@ class Integrated(NamedTuple):
     records: Records | None
 
 
+def interpolated(
+    out: Integrated, solver: diffrax.AbstractSolver, share: Float[Array, ""]
+) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """Return y and its derivative at `share` of the unit interval, inside the steps of `out`."""
+    assert out.records is not None
+    ends, _, dense = out.records
+    k = jnp.minimum(jnp.searchsorted(ends, share), jnp.maximum(out.accepted - 1, 0))
+    begin = jnp.where(k > 0, ends[jnp.maximum(k - 1, 0)], 0.0)
+    within = jax.tree.map(lambda x: x[k], dense)
+    step = solver.interpolation_cls(t0=begin, t1=ends[k], **within)
+    return jax.jvp(step.evaluate, (share,), (jnp.ones_like(share),))
+
+
 class _State(NamedTuple):
     """State of the loop over steps.
 

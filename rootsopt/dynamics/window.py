@@ -189,13 +189,17 @@ def lyapunov(
     `state`."""
     one = jnp.ones_like(state[0])
 
-    def step(_: Any, window: Window) -> Window:
+    def step(window: Window) -> Window:
         return window.after(
             flow(pair, window.start, one, integrator, _SAMPLES, measures=Measures())
         )
 
+    def goes_on(window: Window) -> Bool[Array, ""]:
+        alive = window.solved & jnp.all(jnp.isfinite(window.start))
+        return (window.done < periods) & alive
+
     begun = Window.empty(state, periods, integrator.tolerance(state.dtype))
-    return lax.fori_loop(0, 2 * periods, step, begun)
+    return lax.while_loop(goes_on, step, begun)
 
 
 def no_tangents(pair: RotorPair) -> RotorPair:

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from rootsopt.config import Config
 from rootsopt.config.units import RPM
 from rootsopt.contact.size import size_map
+from rootsopt.dynamics.closed import Start, closed_motion
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.maxima import Maxima, local_maxima, prepare_maxima
 from rootsopt.dynamics.measures import PEAK_NORM, Measures, line_name
@@ -23,6 +24,7 @@ from rootsopt.dynamics.settle import BLOCK
 from rootsopt.dynamics.steady import (
     CLOSED,
     Steady,
+    collocates,
     steady_motion,
     window_status,
 )
@@ -275,8 +277,8 @@ class Evaluator:
                 found = jax.device_get(now.motion(pair, tangents, state))
             else:
                 pair, shape, found = near
-                if series or self.maxima or now.scene.bearings is not None:
-                    found = with_samples(found, now.scene.solver.samples)
+            if bool(found.collocated) and (series or self.maxima or now.scene.bearings is not None):
+                found = with_samples(found, now.scene.solver.samples)
             other = now._refitted(pair, found)
             if other is None:
                 break
@@ -563,8 +565,18 @@ def _reached(pair: RotorPair, found: Steady) -> float:
     return scale * abs(float(found.settled.state[0]))
 
 
+def _steady(pair: RotorPair, tangents: RotorPair, state, radius, solver) -> Steady:
+    """Return the steady motion that the scaled `state` leads to.
+
+    The orbit is closed by the method of the `solver` (see `Solver.closing`)."""
+    if not collocates(pair, solver):
+        return steady_motion(pair, tangents, state, radius, solver)
+    start = Start.at(pair, pair.in_si(state), solver.max_orbit)
+    return closed_motion(pair, tangents, start, radius, solver)
+
+
 _build = Program(Scene.pair_and_tangents)
-_motion = Program(steady_motion)
+_motion = Program(_steady)
 lyapunov_program = Program(lyapunov)
 unsettled_status = Program(window_status)
 

@@ -5,16 +5,19 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from rootsopt.dynamics.closed import Start, closed_motion
 from rootsopt.dynamics.collocation.known import Known, trimmed
 from rootsopt.dynamics.collocation.mesh import sizes
 from rootsopt.dynamics.collocation.sampled import sampled
 from rootsopt.dynamics.collocation.seed import from_steps
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.steady import Steady, continues, near_motion
+from rootsopt.dynamics.steady import Steady, continues
 from rootsopt.profiles.geometry import Geometry
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene
@@ -251,8 +254,10 @@ def _motion_near(scene: Scene, design: Any, known: Known, neighbour: RotorPair):
 
     The motion is that near the `known` orbit of the pair `neighbour`."""
     pair, tangents, shape = scene.pair_and_tangents(design)
-    start, radius = (known, neighbour), scene.pitch_radius
-    return pair, shape, near_motion(pair, tangents, start, radius, scene.solver)
+    numbers = eqx.filter(neighbour, eqx.is_inexact_array)
+    start = Start(pair.in_si(jnp.zeros(pair.states)), known, numbers)
+    radius, solver = scene.pitch_radius, scene.solver
+    return pair, shape, closed_motion(pair, tangents, start, radius, solver, near_only=True)
 
 
 def prepare_near(built: Built) -> None:

@@ -6,6 +6,7 @@ the orbit. JAX transformations only multiply by this matrix. Therefore forward a
 agree to rounding. Derivatives that are not requested are not computed.
 """
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -17,10 +18,10 @@ from jax.custom_batching import sequential_vmap
 from jaxtyping import Array, Complex, Float, Int
 from numpy.typing import ArrayLike
 
+from rootsopt.dynamics.closed import Start, closed_motion, unknown
 from rootsopt.dynamics.linear import eigenvalues
-from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.steady import CLOSED, Steady, among, steady_motion
+from rootsopt.dynamics.steady import CLOSED, Solver, Steady, among, continues, steady_motion
 from rootsopt.profiles.validity import Soundness
 from rootsopt.runtime.precision import check_precision
 from rootsopt.runtime.programs import Program
@@ -40,7 +41,9 @@ class Response(NamedTuple):
     `state` (n,) at φ1 = 0 in SI units: ε (rad), dε/dt (rad/s), then the states of parts, such as
     the excess of a motor's speed over the scene's (rad/s); `margins`: margins of all checks of the
     design (m, rad or ratios, see `Soundness`). The status is unsound if one of them is negative;
-    `Response.margins.failed` names it.
+    `Response.margins.failed` names it. `start`: argument `start` for similar designs and scenes, a
+    pytree of arrays whose shapes depend only on the kind of scene. It can be mapped, carried by
+    `scan`, and pickled.
 
     The forces are those of the orbit, or 0 without contact. If the motion does not settle, the
     forces are those of a window of 128 mesh periods. In all other cases, the forces are NaN. If the
@@ -68,13 +71,18 @@ class Response(NamedTuple):
     status: Int[Array, ""]
     state: Float[Array, " n"]
     margins: Soundness
+    start: Start
 
 
-def steady_response(scene: Scene, design: ArrayLike, start: ArrayLike | None = None) -> Response:
+def steady_response(
+    scene: Scene, design: ArrayLike, start: Start | ArrayLike | None = None
+) -> Response:
     """Return the steady response of a `design` (d,) in config units, in a `scene`.
 
-    `start` (n,): state at φ1 = 0 from which the motion begins (SI units, as `Response.state`); by
-    default at rest. All values of `start` that lead to the same motion give the same response.
+    `start`: `Response.start` of a similar design or scene, near whose orbit this one is closed in a
+    few milliseconds; or a state (n,) at φ1 = 0 from which the motion begins (SI units, as
+    `Response.state`); by default at rest. An orbit that is of no use is not used: the motion then
+    begins at its state. All values of `start` that lead to the same motion give the same response.
 
     This is a pure function. It works under `jit`, `vmap`, `grad`, `jvp`, `jacfwd` and `jacrev`,
     with respect to the design and to every physical quantity of the scene. The derivatives of
@@ -86,7 +94,11 @@ def steady_response(scene: Scene, design: ArrayLike, start: ArrayLike | None = N
     `jax.jit` of a function that calls this one compiles twice as fast with the option
     `compiler_options=rootsopt.COMPILER_OPTIONS`.
 
-    Raises ValueError if the design has the wrong shape; RuntimeError if JAX is not set to the
+    A motion that repeats, but whose orbit cannot be closed by collocation, has the status
+    NOT_CLOSED under `jit` and `vmap`. Otherwise its orbit is closed by shooting.
+
+    Raises ValueError if the design has the wrong shape, or if `start` belongs to another kind of
+    scene; RuntimeError if JAX is not set to the
     precision of the scene; NotImplementedError if a second derivative is requested.
 
     >>> import jax
@@ -114,7 +126,8 @@ def steady_response(scene: Scene, design: ArrayLike, start: ArrayLike | None = N
             f"Argument `design` must have {expected} entries for this scene, but has "
             f"{design.shape[0]}; see `config.design_keys`"
         )
-    start = None if start is None else jnp.asarray(start, float)
+    if not (start is None or isinstance(start, Start)):
+        start = jnp.asarray(start, float)
     return _response(scene, design, start)
 
 
@@ -131,8 +144,8 @@ def _response_jvp(primals, tangents):
     values = _change(slopes, [tangent for _, tangent in moved], without)
     mean, peak, rms, lines, norm, state = _split(values, response)
     constant: Any = None
-    same = *[constant] * 4, state, jax.tree.map(lambda _: constant, response.margins)
-    change = Response._make([mean, peak, rms, lines, norm, *same])
+    same = [jax.tree.map(lambda _: None, part) for part in (response.margins, response.start)]
+    change = Response._make([mean, peak, rms, lines, norm, *[constant] * 4, state, *same])
     return response, change
 
 
@@ -193,7 +206,12 @@ def _solved(scene: Scene, design, start, along: tuple[int, ...]) -> tuple[Respon
     arguments = scene, design, start, along
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arguments)):
         return _inline(*arguments)
-    return _compiled(*arguments)
+    found = _compiled(*arguments)
+    if int(found[0].status) != Status.NOT_CLOSED.code:
+        return found
+    # Rare: shooting has a program of its own, which is compiled only now.
+    solver = dataclasses.replace(scene.solver, closing="shooting")
+    return _compiled(dataclasses.replace(scene, solver=solver), *arguments[1:])
 
 
 def _solve(scene: Scene, design, start, numbers: tuple[int, ...]) -> tuple[Response, Array]:
@@ -208,12 +226,41 @@ def _solve(scene: Scene, design, start, numbers: tuple[int, ...]) -> tuple[Respo
         return moved.pair_and_shape(parameters)
 
     pair, tangents, _ = along(build, chosen, _basis(chosen))
-    rest = jnp.zeros(pair.states, pair.angle_scale.dtype)
-    state = rest if start is None else pair.scaled(jnp.asarray(start))
-    found = steady_motion(pair, tangents, state, scene.pitch_radius, scene.solver)
+    start = _start_of(pair, start, scene.solver)
+    radius, solver = scene.pitch_radius, scene.solver
+    if continues(pair, solver):
+        found = closed_motion(pair, tangents, start, radius, solver)
+    else:
+        found = steady_motion(pair, tangents, pair.scaled(start.state), radius, solver)
     if scene.fidelity == "map":
         found = _on_map(scene, pair, found)
-    return _named(scene.solver.measures, pair, tangents, found)
+    return _named(scene.solver, pair, tangents, found)
+
+
+def _start_of(pair: RotorPair, start: Any, solver: Solver) -> Start:
+    """Return the argument `start` of `steady_response` as a `Start` for the motion of `pair`.
+
+    Raises ValueError if it belongs to another kind of scene."""
+    if not isinstance(start, Start):
+        rest = pair.in_si(jnp.zeros(pair.states, pair.angle_scale.dtype))
+        state = rest if start is None else jnp.asarray(start)
+        if state.shape != rest.shape:
+            raise ValueError(
+                f"Argument `start` must be a state ({pair.states},) of this scene, or the field "
+                f"`start` of a response, but has shape {state.shape}; see `Response.state`"
+            )
+        return Start.at(pair, state, solver.max_orbit)
+    usual = jax.eval_shape(lambda: Start.at(pair, start.state, solver.max_orbit))
+    kinds = [
+        (jax.tree.structure(one), [jnp.shape(leaf) for leaf in jax.tree.leaves(one)])
+        for one in (start, usual)
+    ]
+    if kinds[0] != kinds[1]:
+        raise ValueError(
+            "Argument `start` must come from a response of the same kind of scene (family, lobes, "
+            "parts, solver settings), but comes from another one; pass its `start.state`, or None"
+        )
+    return start
 
 
 def _on_map(scene: Scene, pair: RotorPair, found: Steady) -> Steady:
@@ -257,8 +304,19 @@ def _basis(leaves: list[Array]) -> list[Array]:
     return rows
 
 
-def _named(measures: Measures, pair: RotorPair, tangents: RotorPair, found: Steady):
+def _next_start(solver: Solver, pair: RotorPair, found: Steady, state: Float[Array, " n"]) -> Start:
+    """Return `Response.start`. After a motion that fails, the next one begins at rest."""
+    failed = (Status.UNSOUND, Status.PASSED_THROUGH, Status.STALLED, Status.NON_FINITE)
+    failed = among(found.status, (*failed, Status.SOLVER_FAILED))
+    rest = pair.in_si(jnp.zeros_like(state))
+    known = unknown(pair, solver.max_orbit) if found.known is None else found.known
+    numbers = eqx.filter(pair, eqx.is_inexact_array)
+    return Start(jnp.where(failed, rest, state), known, numbers)
+
+
+def _named(solver: Solver, pair: RotorPair, tangents: RotorPair, found: Steady):
     """Return the response of a motion, and the derivatives of its differentiated fields."""
+    measures = solver.measures
     orbit, period = found.orbit, found.period
     closed = among(found.status, CLOSED)
     mean, square, peak, *others = found.forces
@@ -288,6 +346,7 @@ def _named(measures: Measures, pair: RotorPair, tangents: RotorPair, found: Stea
         status=found.status,
         state=state,
         margins=pair.soundness,
+        start=_next_start(solver, pair, found, state),
     )
     wide = jnp.result_type(float)
     response, rows = jax.tree.map(

@@ -39,9 +39,9 @@ from rootsopt.dynamics.collocation.newton import Converged, newton
 from rootsopt.dynamics.orbit import choose
 from rootsopt.dynamics.pair import RotorPair
 
-_FIRST, _EVENT = 20, 1
-"""Number of elements of the first mesh that is aligned with events: per mesh period, plus per
-event."""
+FIRST, _EVENT = 40, 1
+"""Number of elements per mesh period before events are known. The first mesh that is aligned with
+events has half as many, and the second number per event."""
 _FINER = 1.4
 """Factor by which the number of elements grows when the mesh is refined."""
 _TURNS = 24
@@ -130,12 +130,6 @@ def _newer(kind: type, margin: str, flag: str) -> bool:
         next(k for k, base in enumerate(order) if name in vars(base)) for name in (margin, flag)
     ]
     return places[0] <= places[1]
-
-
-def first_elements(period: Int[Array, ""]) -> Int[Array, ""]:
-    """Return the number of elements before events are known, for an orbit of `period` mesh
-    periods."""
-    return jnp.asarray(2 * _FIRST * period)
 
 
 class Closer(eqx.Module):
@@ -332,4 +326,4 @@ def _nothing(equation: CollocatedEquation, tangents: Any, elements: Elements) ->
     return Closed(empty, jnp.ones(()), infinite, infinite, no, zero, zero)
 
 
-__all__ = ["CORRECTED", "Closed", "Closer", "Loop", "close", "first_elements", "supported"]
+__all__ = ["CORRECTED", "FIRST", "Closed", "Closer", "Loop", "close", "supported"]

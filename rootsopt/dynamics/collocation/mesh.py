@@ -14,19 +14,22 @@ _FLOOR = 0.15
 length of elements."""
 
 
-_MOST = 96
-"""Maximum number of elements per mesh period."""
-_TIMES = 64
-"""Number of events per mesh period, on average over the orbit, above which the search for the orbit
-fails."""
+_MOST = 96, 48
+"""Maximum number of elements per mesh period: in each of the first two mesh periods, and in each
+further one. Longer orbits with as many events as a free form are rare, and all orbits pay for the
+room: sorting events takes half of the time from rest with room for 64 events in each of eight mesh
+periods."""
+_TIMES = 64, 24
+"""Number of events above which the search for the orbit fails, counted like elements."""
 
 
 def sizes(periods: int) -> tuple[int, int]:
     """Return the sizes of the arrays of a mesh, for its elements and for its times.
 
     They are large enough for orbits of up to `periods` mesh periods."""
-    elements = -(-(periods * _MOST) // BLOCK) * BLOCK
-    return elements, periods * _TIMES + 3
+    first, further = min(periods, 2), max(periods - 2, 0)
+    elements, times = (first * x + further * y for x, y in (_MOST, _TIMES))
+    return -(-elements // BLOCK) * BLOCK, times + 3
 
 
 def shared(

@@ -1,63 +1,51 @@
 """Initial mesh and motion for closing an orbit by collocation.
 
-Both come from the steps of an integration over the orbit's period."""
+Both come from the steps of an integration over the orbit's period: the end of a transient, or the
+last shot of an orbit that was closed by shooting."""
 
-import diffrax
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from rootsopt.dynamics.collocation.blocks import BLOCK, in_blocks
-from rootsopt.dynamics.collocation.closing import first_elements
+from rootsopt.dynamics.collocation.closing import FIRST
 from rootsopt.dynamics.collocation.elements import Elements, Mesh
 from rootsopt.dynamics.collocation.gauss import GAUSS
 from rootsopt.dynamics.collocation.known import Known
 from rootsopt.dynamics.collocation.mesh import sizes
-from rootsopt.dynamics.integrator import Integrator
+from rootsopt.dynamics.flow import Pieces
 from rootsopt.dynamics.pair import RotorPair
 
 
-def seeded(
-    pair: RotorPair,
-    state: Float[Array, " n"],
-    period: Int[Array, ""],
-    integrator: Integrator,
-    used: Int[Array, ""],
-    room: tuple[int, int],
-) -> tuple[Elements, Bool[Array, ""]]:
-    """Return the motion from a scaled `state` over `period` mesh periods, and the solver's success.
+def from_pieces(pair: RotorPair, pieces: Pieces, period: Int[Array, ""], longest: int) -> Known:
+    """Return the end of a transient as a start for closing its orbit by collocation.
 
-    The motion starts at φ1 = 0. `used`: number of elements; `room`: sizes of the arrays for
-    elements and for times. All elements cover the same number of solver steps, so that they are
-    short where the integrator's steps are short. The mesh has no events, and `Elements.roots` are
-    0."""
-    dtype = state.dtype
-    length = period.astype(dtype)
-
-    def slope(tau, y, pair):
-        return pair.derivative(tau, y)[0]
-
-    solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(slope),
-        integrator.solver(dtype),
-        t0=jnp.zeros((), dtype),
-        t1=length,
-        dt0=None,
-        y0=state,
-        args=pair,
-        saveat=diffrax.SaveAt(
-            t0=True, steps=True, fn=lambda tau, y, pair: (tau, y, slope(tau, y, pair))
-        ),
-        stepsize_controller=integrator.controller(dtype, 1.0, pair),
-        adjoint=diffrax.ForwardMode(),
-        max_steps=integrator.max_steps,
-        throw=False,
+    `pieces`: the last mesh periods of the transient, which ends at φ1 = 0, in `PIECES`; `period` of
+    the orbit (mesh periods); `longest`: longest period for which the arrays have room."""
+    capacity, count = sizes(longest)
+    dtype, per = pieces.states.dtype, pieces.ends.shape[1]
+    number = jnp.arange(capacity)
+    used, length = period * per, period.astype(dtype)
+    real = number < used
+    which = pieces.ends.shape[0] - period + number // per
+    row, column = jnp.minimum(which, pieces.ends.shape[0] - 1), number % per
+    begins = jnp.pad(pieces.ends[:, :-1], ((0, 0), (1, 0)))
+    left, right = ((x[row, column] + number // per) / length for x in (begins, pieces.ends))
+    mesh = Mesh(
+        times=jnp.full(count, length, dtype).at[0].set(0.0),
+        which=jnp.full(count, -1),
+        interval=jnp.where(real, 0, count - 2),
+        left=jnp.where(real, left, 1.0),
+        right=jnp.where(real, right, 1.0),
+        used=used,
     )
-    assert solution.ys is not None
-    times, states, slopes = solution.ys
-    steps = jnp.minimum(solution.stats["num_accepted_steps"], times.shape[0] - 1)
-    found = _on_steps(pair, (times, states, slopes), steps, length, used, room)
-    return found, solution.result == diffrax.RESULTS.successful
+    roots = jnp.zeros((capacity, len(GAUSS.nodes) + 1, 1 + pair.two_sided, 2), dtype)
+    states, slopes = pieces.states[row, column], pieces.slopes[row, column]
+    return Known.unaligned(Elements(mesh, states, slopes, roots))
+
+
+PIECES = FIRST, GAUSS.nodes
+"""Argument `pieces` of the transient (`strobe`) for `from_pieces`."""
 
 
 def from_steps(
@@ -79,7 +67,7 @@ def from_steps(
     slopes = in_blocks(slope, steps + 1, *_padded(times, states))[: times.shape[0]]
     every, length = (times, states, slopes), period.astype(state.dtype)
     room = sizes(longest)
-    return Known.unaligned(_on_steps(pair, every, steps, length, first_elements(period), room))
+    return Known.unaligned(_on_steps(pair, every, steps, length, FIRST * period, room))
 
 
 def _padded(times: Float[Array, " m"], states: Float[Array, "m n"]) -> tuple[Array, Array]:
@@ -99,7 +87,8 @@ def _on_steps(
     """Return the motion through the ends of solver steps, on elements without events.
 
     `taken`: times (mesh periods), scaled states and slopes at the start and at the ends of the
-    steps; `steps`: number of them; `length`: period; for the others, see `seeded`."""
+    steps; `steps`: number of them; `length`: period; `used`: number of elements; `room`: sizes of
+    the arrays for elements and for times."""
     times, states, slopes = taken
     capacity, count = room
     dtype = states.dtype

@@ -1,0 +1,302 @@
+"""The steady motion near an orbit that is already known, or that a state leads to.
+
+The orbit is closed by collocation. If the orbit of a similar pair is known, the first attempt
+begins there. Otherwise, and if that attempt fails, a transient leads to the orbit. All attempts are
+iterations of one loop, so that each part is compiled only once.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from rootsopt.dynamics.collocation.closing import CORRECTED
+from rootsopt.dynamics.collocation.known import Known
+from rootsopt.dynamics.collocation.mesh import sizes
+from rootsopt.dynamics.collocation.motion import Collocated, apart, closed_orbit
+from rootsopt.dynamics.collocation.seed import PIECES, from_pieces
+from rootsopt.dynamics.flow import Flow
+from rootsopt.dynamics.orbit import Orbit, choose
+from rootsopt.dynamics.pair import RotorPair
+from rootsopt.dynamics.settle import Transient, no_pieces, settle, settled_within
+from rootsopt.dynamics.steady import (
+    NEARLY,
+    Solver,
+    Steady,
+    Verdict,
+    among,
+    final,
+    judged,
+    transient_status,
+    window_status,
+)
+from rootsopt.dynamics.window import Window, lyapunov
+from rootsopt.status import Status
+
+_COARSE = 1e-5
+"""Tolerance of the first transient, unless that of the solver is coarser: it only has to lead to
+the neighbourhood of the orbit. Each further attempt is ten times finer."""
+_ATTEMPTS, _LONGER = 3, 160.0
+"""Maximum number of attempts to close an orbit at the end of a transient, and maximum number of
+mesh periods by which the transient continues before each further attempt. The states of the
+transient must then repeat ten times more closely."""
+
+
+class Start(eqx.Module):
+    """Where the search for an orbit begins.
+
+    `state` (n,): at φ1 = 0, in SI units, where the transient begins if there is no known orbit or
+    it does not lead to another one; `known`: a closed orbit; `pair`: the numbers of its pair, with
+    `None` in place of all other leaves. The orbit is used if `known.sound`.
+    """
+
+    state: Float[Array, " n"]
+    known: Known
+    pair: RotorPair
+
+    @classmethod
+    def at(cls, pair: RotorPair, state: Float[Array, " n"], longest: int) -> "Start":
+        """Return a start at the `state` (n,), in SI units, of `pair`, without a known orbit.
+
+        `longest`: longest period of an orbit (mesh periods)."""
+        return cls(state, unknown(pair, longest), eqx.filter(pair, eqx.is_inexact_array))
+
+
+def unknown(pair: RotorPair, longest: int) -> Known:
+    """Return the placeholder for an orbit of `pair` of up to `longest` mesh periods."""
+    return Known.empty(sizes(longest), pair.states, 1 + pair.two_sided)
+
+
+class _Loop(NamedTuple):
+    """State of the loop over attempts.
+
+    `found`: result of the last attempt; `near`: whether the next attempt begins on the known orbit.
+    Otherwise, it continues the transient from the scaled `state`, at the tolerance `coarse`, until
+    the states repeat to within the scaled distance `within`. If `shorter` is not 0, the last orbit
+    repeated after `shorter` mesh periods; the next attempt then closes an orbit of this period,
+    without a further transient. `tries`: number of attempts from a transient; `over`: whether the
+    loop has ended.
+    """
+
+    found: Steady
+    near: Bool[Array, ""]
+    shorter: Int[Array, ""]
+    state: Float[Array, " n"]
+    coarse: Float[Array, ""]
+    within: Float[Array, ""]
+    tries: Int[Array, ""]
+    over: Bool[Array, ""]
+
+
+class _Attempts(eqx.Module):
+    """The loop of `closed_motion`. Its fields hold the arguments of that function.
+
+    `near_only`: whether the known orbit is the only attempt, so that transients are not compiled.
+    """
+
+    pair: RotorPair
+    tangents: RotorPair
+    start: Start
+    radius: Float[Array, ""]
+    solver: Solver
+    near_only: bool = eqx.field(static=True)
+
+    def run(self) -> Steady:
+        """Return the result of the search."""
+        if self.near_only:
+            return self.attempt(self.begin(), *self.settled(self.begin())).found
+        loop = lax.while_loop(lambda now: ~now.over, lambda now: self.step(now), self.begin())
+        return self.judged_by_window(loop)
+
+    def begin(self) -> _Loop:
+        """Return the initial state of the loop."""
+        solver, pair = self.solver, self.pair
+        state = pair.scaled(self.start.state)
+        dtype, count = state.dtype, state.shape[0]
+        directions = jax.tree.leaves(eqx.filter(self.tangents, eqx.is_inexact_array))[0].shape[0]
+        # The orbit has neither samples nor steps: see `collocation.sampled`.
+        flow = Flow.empty(count, directions, 0, 0, solver.measures, dtype)
+        no, zero = jnp.zeros((), bool), jnp.zeros((), int)
+        unsound = ~pair.sound
+        pieces = None if self.near_only else no_pieces(state, solver.max_orbit, PIECES)
+        found = Steady(
+            status=jnp.where(unsound, Status.UNSOUND.code, Status.NOT_SETTLED.code),
+            orbit=Orbit.empty(state, directions, flow),
+            period=jnp.ones((), int),
+            rtol=solver.orbit.rtol,
+            verdict=Verdict(no, no, jnp.zeros((), dtype), no, no),
+            window=self.no_window(state, 0),
+            settled=Transient(
+                state, zero, zero + 1, jnp.full((), jnp.inf, dtype), zero, no, ~no, zero, pieces
+            ),
+            used=zero,
+            steps=zero,
+            collocated=~no,
+            known=unknown(pair, solver.max_orbit),
+        )
+        coarse = jnp.maximum(solver.transient.rtol, _COARSE)
+        within = settled_within(coarse).astype(dtype)
+        near = self.start.known.sound
+        return _Loop(found, near, zero, state, coarse, within, zero, unsound)
+
+    def step(self, now: _Loop) -> _Loop:
+        """Make one attempt, and return the new state of the loop."""
+        settled, failure = lax.cond(
+            now.near | (now.shorter > 0), lambda: self.settled(now), lambda: self.transient(now)
+        )
+        return lax.cond(
+            failure < 0,
+            lambda: self.attempt(now, settled, failure),
+            lambda: self.lost(now, settled, failure),
+        )
+
+    def settled(self, now: _Loop) -> tuple[Transient, Int[Array, ""]]:
+        """Return the transient of an attempt that needs none, and -1."""
+        nothing = jnp.zeros_like(now.shorter)
+        known = jnp.round(self.start.known.elements.mesh.period).astype(int)
+        period = jnp.where(now.near, known, now.shorter)
+        settled = now.found.settled._replace(period=period, periods=nothing, steps=nothing)
+        return settled, nothing - 1
+
+    def transient(self, now: _Loop) -> tuple[Transient, Int[Array, ""]]:
+        """Return the transient of an attempt, and its status code, -1 if it has settled."""
+        solver = self.solver
+        room = solver.max_periods - now.found.used
+        room = jnp.where(now.tries > 0, jnp.minimum(room, _LONGER), room).astype(int)
+        integrator = dataclasses.replace(solver.transient, rtol=now.coarse)
+        found = settle(self.pair, now.state, integrator, now.within, room, solver.max_orbit, PIECES)
+        failure = transient_status(self.pair, found)
+        # The motion nearly repeats. The difference may be noise of the coarse steps: let Newton's
+        # method decide.
+        nearly = (failure == Status.NOT_SETTLED.code) & (found.spread < NEARLY)
+        period = jnp.where(nearly, found.nearest, found.period)
+        return found._replace(period=period), jnp.where(nearly, -1, failure)
+
+    def lost(self, now: _Loop, settled: Transient, failure: Int[Array, ""]) -> _Loop:
+        """Return the loop's state after a transient that has not settled."""
+        found = self.counted(now.found, settled)._replace(status=failure)
+        return now._replace(found=found, state=settled.state, over=jnp.ones((), bool))
+
+    def counted(self, found: Steady, settled: Transient) -> Steady:
+        """Return `found` after a further transient."""
+        used, steps = found.used + settled.periods, found.steps + settled.steps
+        return found._replace(settled=settled, used=used, steps=steps)
+
+    def attempt(self, now: _Loop, settled: Transient, failure: Int[Array, ""]) -> _Loop:
+        """Close an orbit, and return the loop's state."""
+        solver, pair = self.solver, self.pair
+        del failure
+        period = jnp.maximum(settled.period, 1)
+        known, neighbour = self.start.known, self.start.pair
+        if not self.near_only:
+            known = lax.cond(
+                now.near,
+                lambda: known,
+                lambda: from_pieces(pair, settled.pieces, period, solver.max_orbit),
+            )
+            own = eqx.filter(pair, eqx.is_inexact_array)
+            neighbour = choose(now.near, neighbour, lax.stop_gradient(own))
+        made = closed_orbit(pair, self.tangents, (known, neighbour), solver)
+        within = now.within
+        place = jnp.where(now.near, made.orbit.state, settled.state)
+        if not self.near_only:
+            # The orbit must be that of the transient everywhere, not only at φ1 = 0.
+            reach = 10 * within / jnp.maximum(1 - made.orbit.multiplier, 1e-3)
+            meets = now.near | (apart(made.known, settled.pieces) <= reach)
+            made = made._replace(verified=made.verified & meets)
+        found = self.taken(self.counted(now.found, settled), made, place, period, within)
+        failed = found.status == Status.NOT_SETTLED.code
+        refused = now.near & (found.status != Status.PERIODIC.code)
+        shorter = jnp.where(now.near, 0, made.shorter)
+        again = failed & ~now.near & (now.tries + 1 < _ATTEMPTS)
+        again &= (shorter > 0) | (found.used < solver.max_periods)
+        finer = jnp.where(now.near | (shorter > 0), 1.0, 0.1)
+        return _Loop(
+            found=found,
+            near=jnp.zeros((), bool),
+            shorter=shorter,
+            # A refused orbit does not change where the transient begins.
+            state=jnp.where(now.near, now.state, settled.state),
+            coarse=jnp.maximum(now.coarse * finer, jnp.minimum(solver.orbit.rtol, now.coarse)),
+            within=now.within * finer,
+            tries=now.tries + ~now.near,
+            over=~(again | refused),
+        )
+
+    def taken(self, found: Steady, made: Collocated, start, period, within) -> Steady:
+        """Return `found` with the orbit `made`, and with its status.
+
+        `start`: scaled state near which the orbit has to be; `period` of the orbit (mesh periods);
+        `within`: scaled distance to which the transient's states repeated."""
+        limits = self.solver.orbit.rtol, within, jnp.asarray(CORRECTED)
+        orbit = made.orbit
+        verdict, status = judged(self.pair, self.solver, self.radius, orbit, start, limits)
+        unsure = among(status, (Status.PERIODIC, Status.INACCURATE)) & ~made.verified
+        status = jnp.where(unsure | ~made.sound, Status.NOT_SETTLED.code, status)
+        found = found._replace(
+            status=status,
+            orbit=orbit,
+            period=period,
+            verdict=verdict,
+            steps=found.steps + orbit.flow.steps,
+            known=made.known,
+        )
+        return final(self.pair, found, self.radius)
+
+    def judged_by_window(self, loop: _Loop) -> Steady:
+        """Return the result, judged by a window of the motion if no orbit has been closed."""
+        solver, found = self.solver, loop.found
+        if not solver.windows:
+            return found
+        unsettled = found.status == Status.NOT_SETTLED.code
+
+        def window() -> tuple[Window, Int[Array, ""]]:
+            made = lyapunov(self.pair, loop.state, solver.windows, solver.transient)
+            return made, window_status(self.pair, made)
+
+        made, status = lax.cond(
+            unsettled & (solver.examine > 0),
+            window,
+            lambda: (self.no_window(loop.state, solver.windows), found.status),
+        )
+        repeats = unsettled & (status == Status.NOT_SETTLED.code) & (found.settled.period > 0)
+        status = jnp.where(repeats, Status.NOT_CLOSED.code, status)
+        return found._replace(window=made, status=status)
+
+    def no_window(self, state: Float[Array, " n"], periods: int) -> Window:
+        """Return a window from the scaled `state` (n,) before any integration."""
+        return Window.empty(state, periods, self.solver.transient.tolerance(state.dtype))
+
+
+def closed_motion(
+    pair: RotorPair,
+    tangents: RotorPair,
+    start: Start,
+    radius: Float[Array, ""],
+    solver: Solver,
+    near_only: bool = False,
+) -> Steady:
+    """Find the steady motion of `pair` near a known orbit, or the one to which a state leads.
+
+    `tangents`: directions of the pair's parameters, stacked along a leading axis, along which to
+    differentiate; `start`: see `Start`; `radius`: pitch radius (m), for judging penetrations;
+    `solver`: settings; `near_only`: whether to try nothing but the known orbit.
+
+    An orbit is rejected if it is not stable or not near the end of the transient. The transient
+    then continues, followed by another attempt (`_ATTEMPTS`). A window of the motion follows if the
+    last attempt fails. If it shows no chaos although the transient repeated, the status is
+    NOT_CLOSED. If an orbit near the known one is not accepted, the search begins at
+    `start.state`; with `near_only`, the status is NOT_SETTLED.
+
+    The orbit has no samples of the state and no steps (see `collocation.sampled`). Collocation must
+    support the pair (`collocation.closing.supported`)."""
+    radius = jnp.asarray(radius, pair.angle_scale.dtype)
+    start = lax.stop_gradient(start)
+    return _Attempts(pair, tangents, start, radius, solver, near_only).run()
+
+
+__all__ = ["Start", "closed_motion", "unknown"]
