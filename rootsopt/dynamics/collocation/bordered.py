@@ -15,29 +15,24 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from rootsopt.dynamics.collocation.blocks import in_blocks
 from rootsopt.dynamics.collocation.closing import Closer, Loop
 from rootsopt.dynamics.collocation.elements import Elements
-from rootsopt.dynamics.collocation.equation import CollocatedEquation
-from rootsopt.dynamics.collocation.events import FlagScan, look, rooted
-from rootsopt.dynamics.collocation.forces import OrbitForces, origin, response
-from rootsopt.dynamics.collocation.gauss import GAUSS
+from rootsopt.dynamics.collocation.equation import CollocatedEquation, Points
+from rootsopt.dynamics.collocation.events import look, rooted
+from rootsopt.dynamics.collocation.forces import OrbitForces, origin
 from rootsopt.dynamics.collocation.known import Known
 from rootsopt.dynamics.collocation.mesh import ordered
-from rootsopt.dynamics.collocation.newton import Converged, advanced, has_stalled, lines
+from rootsopt.dynamics.collocation.newton import advanced, columns_of, evaluated, lines
 from rootsopt.dynamics.collocation.system import (
     Chain,
-    Columns,
-    Condensed,
-    Lines,
     Step,
     condensed,
     opened,
-    own_column,
     spread,
 )
 from rootsopt.dynamics.linear import solved
 from rootsopt.dynamics.measures import Measures
+from rootsopt.dynamics.orbit import choose
 from rootsopt.dynamics.pair import RotorPair
 
 _TURNS = 12
@@ -144,78 +139,45 @@ class _Follower(Closer):
     def start(self) -> Loop:
         begun = super().start()
         line = Line.empty(begun.elements, self.plane.through[-1])
-        return begun._replace(trusted=begun.trusted & self.rising, line=line)
+        trusted = begun.trusted & self.rising
+        return begun._replace(looks=~trusted, trusted=trusted, line=line)
 
     def frozen_at(self, now: Loop) -> RotorPair:
         return lax.stop_gradient(self.family(now.line.share)[0])
 
-    def equation_at(self, share: Float[Array, ""]) -> tuple[CollocatedEquation, RotorPair]:
-        """Return the equation, and the derivative of its pair with respect to the parameter."""
-        pair, tangent = self.family(share)
-        return CollocatedEquation(pair, self.measures, pair.force_scale), tangent
+    def limit(self, now: Loop) -> Float[Array, ""]:
+        del now
+        return jnp.asarray(_SMALL)
 
-    def forces(self, now: Loop) -> OrbitForces:
-        equation, _ = self.equation_at(now.line.share)
-        return response(equation, now.elements, now.force, self.tangents, _uncorrected)
-
-    def converged(self, now: Loop, elements: Elements, limit) -> tuple[Converged, Line]:
-        del limit
-
-        def go_on(carry):
-            got, _ = carry
-            return (got.turns < _TURNS) & (got.size > _SMALL) & ~got.stalled
-
-        def turn(carry):
-            got, line = carry
-            moved, size, force, line = self._step(got.elements, line)
-            stalled = has_stalled(size, got.size)
-            return Converged(moved, size, stalled, got.turns + 1, force), line
-
-        force = jnp.zeros(elements.slopes.shape[:2], elements.state.dtype)
-        infinite, no = jnp.full_like(elements.state[0, 0], jnp.inf), jnp.zeros((), bool)
-        start = Converged(elements, infinite, no, jnp.zeros((), int), force)
-        return lax.while_loop(go_on, turn, (start, now.line))
-
-    def solve(self, now: Loop, seen: FlagScan) -> Loop:
-        """Return the loop's state after Newton's method on the present mesh.
+    def judged(self, now: Loop, after: Loop, size: Float[Array, ""]) -> Loop:
+        """Return the loop's state `after` a step of the given size.
 
         If events of the known orbit are missing on the new one, their equations have no solution.
         The flags along the motion at the start then show the events."""
-        new = super().solve(now, seen)
-        lost = now.trusted & ~new.solved
-        again = now._replace(failures=now.failures + 1, closed=new.closed)
-        return jax.tree.map(lambda x, y: jnp.where(lost, x, y), again, new)
+        size = jnp.maximum(size, jnp.abs(after.line.share - now.line.share))
+        new = super().judged(now, after, size)
+        lost = now.trusted & new.looks & ~new.solved
+        begun = self.start()._replace(looks=lost, trusted=~lost, closed=new.closed)
+        return choose(lost, begun._replace(failures=new.failures), new)
 
-    def _step(self, elements: Elements, line: Line):
-        """Return the motion after a Newton step, the size of the step, the force (N) at the Gauss
-        points, and the new `line`."""
-        equation, tangent = self.equation_at(line.share)
-        count, inside = elements.state.shape[1], len(GAUSS.nodes)
-        mesh = elements.mesh
-        tau, state = elements.places
-        which = jnp.maximum(mesh.which[mesh.interval + 1], 0)
-
-        def both(tau, state, roots, which):
-            return equation.along(tau, state, roots, which, tangent)
-
-        points, along = in_blocks(both, mesh.used, tau, state, elements.roots, which)
-        found = lines(elements, points)
-        own = own_column(elements, found)
-        columns = Columns(
-            slope=jnp.concatenate([own.slope, along[:, :inside, :count]], axis=-1),
-            gap=jnp.pad(own.gap, ((0, 0), (0, 0), (0, 1))),
-            margin=jnp.concatenate([own.margin, along[:, inside, -1]], axis=-1),
-        )
-        parts = condensed(elements, found, columns)
-        chain = opened(elements, found, columns, parts)
-        change, inner, to_state, tangent = self._bordered(elements, chain, line.share)
-        step = spread(elements, parts, chain, change[:count, None], _mixed(1.0, change[-1]))
-        moved, size, share = advanced(elements, step, points.roots)
-        motion = spread(elements, parts, chain, inner[:count, None], _mixed(0.0, inner[-1]))
-        miss = chain.end[:, count]
+    def step(self, now: Loop) -> tuple[CollocatedEquation, Points, Array, Step, Line]:
+        """Solve the linearised equation together with that of the plane, as `Closer.step`."""
+        at, line = now.elements, now.line
+        pair, tangent = self.family(line.share)
+        equation = CollocatedEquation(pair, self.measures, pair.force_scale)
+        count, yes = at.state.shape[1], jnp.ones((), bool)
+        points, along = evaluated(equation, at, now.rivals, tangent, yes)
+        found = lines(at, points)
+        columns = columns_of(at, found, along)
+        parts = condensed(at, found, columns)
+        chain = opened(at, found, columns, parts)
+        change, inner, to_state, tangent = self._bordered(at, chain, line.share)
+        step = spread(at, parts, chain, change[:count, None], _mixed(1.0, change[-1]))
+        motion = spread(at, parts, chain, inner[:count, None], _mixed(0.0, inner[-1]))
+        share = advanced(at, step, at.roots)[2]
         new = Line(
             share=line.share + share * change[-1],
-            residual=jnp.max(jnp.abs(miss)),
+            residual=jnp.max(jnp.abs(chain.end[:, count])),
             monodromy=chain.monodromy,
             by_share=chain.end[:, count + 1],
             to_state=to_state,
@@ -223,8 +185,7 @@ class _Follower(Closer):
             tangent=tangent,
             motion=motion,
         )
-        size = jnp.maximum(size, jnp.abs(change[-1]))
-        return moved, size, points.force[:, :inside], new
+        return equation, points, along * change[-1], step, new
 
     def _bordered(self, elements: Elements, chain: Chain, share: Float[Array, ""]):
         """Solve the closing equations together with that of the plane.
@@ -251,18 +212,6 @@ class _Follower(Closer):
 def _mixed(own: float, by_share: Float[Array, ""]) -> Float[Array, "2 1"]:
     """Return factors of the two right-hand sides: that of Newton's step, and the parameter's."""
     return jnp.stack([jnp.full_like(by_share, own), by_share])[:, None]
-
-
-def _uncorrected(elements: Elements, found: Lines, columns: Columns, parts: Condensed) -> Step:
-    """Return no change of the motion `elements`; for the other arguments, see `system.chained`."""
-    chain = opened(elements, found, columns, parts)
-    width = columns.gap.shape[-1]
-    return Step(
-        jnp.zeros((*elements.state.shape, width)),
-        jnp.zeros((*elements.slopes.shape, width)),
-        jnp.zeros((*elements.mesh.times.shape, width)),
-        chain.monodromy,
-    )
 
 
 def followed(

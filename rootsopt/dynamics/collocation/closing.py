@@ -3,10 +3,11 @@
 An *event* is an instant at which a flag of the equation (`RotorPair.switches`) changes. The *mesh*
 divides the orbit into elements that end at its events.
 
-One loop does everything, so that each program is compiled once. Each iteration evaluates the flags
-along the orbit. If the flags do not change exactly at the events of the mesh, the elements are
-aligned with the changes found. Otherwise, Newton's method solves for the orbit and the times of its
-events, and the flags are evaluated again.
+One loop does everything, so that each part is compiled once. An iteration evaluates the flags along
+the motion, or makes a step of Newton's method for the orbit and the times of its events. If the
+flags do not change exactly at the events of the mesh, the elements are aligned with the changes
+found. Steps follow until they are small, and the flags are evaluated again. If they agree, a last
+step yields the forces and their derivatives.
 
 An orbit whose flags agree is solved again on a finer mesh, graded according to the error on the
 coarser mesh. The difference between the two solutions is the error estimate.
@@ -23,7 +24,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.contact.search import SearchContact
 from rootsopt.dynamics.collocation.elements import Elements
-from rootsopt.dynamics.collocation.equation import CollocatedEquation
+from rootsopt.dynamics.collocation.equation import CollocatedEquation, Points
 from rootsopt.dynamics.collocation.events import (
     FlagScan,
     agrees,
@@ -32,10 +33,19 @@ from rootsopt.dynamics.collocation.events import (
     look,
     rooted,
 )
-from rootsopt.dynamics.collocation.forces import OrbitForces, response
+from rootsopt.dynamics.collocation.forces import OrbitForces, forces_of, no_forces
 from rootsopt.dynamics.collocation.known import Known
 from rootsopt.dynamics.collocation.mesh import aligned, counted, needed, ordered, roughness
-from rootsopt.dynamics.collocation.newton import Converged, newton
+from rootsopt.dynamics.collocation.newton import (
+    advanced,
+    between,
+    columns_of,
+    evaluated,
+    has_stalled,
+    lines,
+)
+from rootsopt.dynamics.collocation.peak import Rivals, forces_along, rivals_of
+from rootsopt.dynamics.collocation.system import Step, chained, condensed
 from rootsopt.dynamics.orbit import choose
 from rootsopt.dynamics.pair import RotorPair
 
@@ -44,8 +54,12 @@ FIRST, _EVENT = 40, 1
 events has half as many, and the second number per event."""
 _FINER = 1.4
 """Factor by which the number of elements grows when the mesh is refined."""
-_TURNS = 24
-"""Maximum number of iterations of the loop."""
+_TURNS, _STEPS = 24, 16
+"""Maximum number of evaluations of the flags, and of Newton steps after each of them."""
+_WAY = 1e-3
+"""Fraction of the way to the new pair over which the predictor takes its difference."""
+_TURNED = 0.1
+"""Change of a root (rad) above which it is limited to this value."""
 CORRECTED = 1e-6
 """Last correction of the states (scaled) above which an orbit is rejected."""
 _FAILURES = 4
@@ -69,8 +83,8 @@ class Closed(NamedTuple):
     which the errors hold; `error`: estimated relative error of the forces, the largest of mean, RMS
     and peak; `drift`: estimated error of their derivatives, relative to the largest derivative of
     the same force; `sound`: whether Newton's method has converged and the flags agree with the
-    events of the mesh; `turns`: number of iterations of the loop; `steps`: number of Newton steps.
-    `error` and `drift` are inf if they are not known.
+    events of the mesh; `turns`: number of evaluations of the flags; `steps`: number of Newton
+    steps. `error` and `drift` are inf if they are not known.
     """
 
     found: OrbitForces
@@ -85,20 +99,29 @@ class Closed(NamedTuple):
 class Loop(NamedTuple):
     """State of the loop.
 
-    `closed`: result so far; `elements`: motion for the next iteration; `force` (e, s): contact
-    force (N) at the Gauss points; `trusted`: whether the motion is the orbit of a similar pair,
-    whose flags need not be evaluated; `fits`: whether the elements end at events; `solved`: whether
-    Newton's method has converged on these elements; `failures`: number of times that it has not
-    converged; `meshes`: number of meshes on which the orbit has been solved; `over`: whether the
-    loop ends; `line`: what else the solution of the equations determines (see `bordered`).
+    `closed`: result so far; `elements`: motion for the next iteration; `rivals`: instants at which
+    its force may be greatest; `looks`: whether the next iteration evaluates the flags along the
+    motion. Otherwise it makes a step of Newton's method. `keeps`: whether the motion is a solution
+    with the right events, so that the step is the last one, which yields forces and derivatives;
+    `trusted`: whether the motion is the orbit of a similar pair, whose flags need not be evaluated;
+    `fits`: whether the elements end at events; `solved`: whether Newton's method has converged on
+    these elements; `size`: greatest change in the last step, of the states (scaled) and of the
+    event times (mesh periods); `tries`: number of steps since the last look; `failures`: number of
+    times that Newton's method has not converged; `meshes`: number of meshes on which the orbit has
+    been solved; `over`: whether the loop ends; `line`: what else the solution of the equations
+    determines (see `bordered`).
     """
 
     closed: Closed
     elements: Elements
-    force: Float[Array, "e s"]
+    rivals: Rivals
+    looks: Bool[Array, ""]
+    keeps: Bool[Array, ""]
     trusted: Bool[Array, ""]
     fits: Bool[Array, ""]
     solved: Bool[Array, ""]
+    size: Float[Array, ""]
+    tries: Int[Array, ""]
     failures: Int[Array, ""]
     meshes: Int[Array, ""]
     over: Bool[Array, ""]
@@ -148,49 +171,92 @@ class Closer(eqx.Module):
     def start(self) -> Loop:
         """Return the initial state of the loop."""
         known, elements = self.known, self.known.elements
-        nothing = _nothing(self.equation, self.tangents, elements)
-        no, zero = jnp.zeros((), bool), jnp.zeros((), int)
-        begun = known.aligned, known.aligned, no, zero, zero, no
-        return Loop(nothing, elements, elements.slopes[..., 0], *begun)
+        infinite, zero, no = jnp.asarray(jnp.inf), jnp.zeros((), int), jnp.zeros((), bool)
+        forces = no_forces(self.equation, elements, self.directions)
+        nothing = Closed(forces, jnp.ones(()), infinite, infinite, no, zero, zero)
+        return Loop(
+            closed=nothing,
+            elements=elements,
+            rivals=Rivals.anywhere(elements),
+            looks=~known.aligned,
+            keeps=no,
+            trusted=known.aligned,
+            fits=known.aligned,
+            solved=no,
+            size=infinite,
+            tries=zero,
+            failures=zero,
+            meshes=zero,
+            over=no,
+        )
+
+    @property
+    def directions(self) -> int:
+        """Number of directions along which forces are differentiated."""
+        return jax.tree.leaves(eqx.filter(self.tangents, eqx.is_inexact_array))[0].shape[0]
 
     def frozen_at(self, now: Loop) -> RotorPair:
         """Return the pair whose flags are evaluated, treated as constant by JAX."""
         del now
         return self.frozen
 
-    def converged(
-        self, now: Loop, elements: Elements, limit: Float[Array, ""]
-    ) -> tuple[Converged, Any]:
-        """Return the result of Newton's method from `elements`, and the new `Loop.line`.
+    def limit(self, now: Loop) -> Float[Array, ""]:
+        """Return the size of a step (scaled) at which Newton's method stops."""
+        return jnp.where(now.trusted, *_SMALL)
 
-        `limit`: step (scaled) at which the method stops."""
-        return newton(self.equation, elements, limit, self.neighbour, now.trusted), now.line
+    def step(self, now: Loop) -> tuple[CollocatedEquation, Points, Array, Step, Any]:
+        """Solve the linearised equation for Newton's step and the directions of the parameters.
 
-    def forces(self, now: Loop) -> OrbitForces:
-        """Return the forces of the present orbit."""
-        return response(self.equation, now.elements, now.force, self.tangents)
+        Return the equation, the equation along the motion, direct changes of its values in all
+        columns of the step (e, p, r, k), the step, and the new `Loop.line`.
+
+        If the motion is the orbit of a similar pair, the first step is along the tangent of the
+        family of orbits that leads to the equation's pair (predictor). Newton's first step would be
+        evaluated at penetrations of the wrong size, since the flanks have moved. The tangent is
+        Newton's step for a pair a small way (`_WAY`) towards the new one, divided by this way."""
+        at = now.elements
+        way = jnp.where(now.trusted & (now.tries == 0), _WAY, 1.0)
+        equation = between(self.equation, self.neighbour, way)
+        points, along = evaluated(equation, at, now.rivals, self.tangents, now.keeps)
+        found = lines(at, points)
+        columns = columns_of(at, found, along)
+        step = chained(at, found, columns, condensed(at, found, columns))
+        first = jnp.arange(columns.gap.shape[-1]) == 0
+        # All changes are proportional to the right-hand sides.
+        longer = jnp.where(first, 1 / way, 1.0)
+        step = Step(*(x * longer for x in step[:3]), step.monodromy)
+        turned = jnp.clip((points.roots - at.roots) / way, -_TURNED, _TURNED)
+        points = points._replace(roots=at.roots + turned)
+        direct = jnp.pad(along, ((0, 0), (0, 0), (0, 0), (1, 0)))
+        return equation, points, direct, step, now.line
 
     def turn(self, now: Loop) -> Loop:
-        """Evaluate the flags along the motion, and return the loop's state after one iteration.
-
-        Depending on the flags, the iteration solves for the orbit, stores its forces or changes the
-        mesh."""
+        """Evaluate the flags along the motion or make a step, then change the mesh if needed."""
         frozen = self.frozen_at(now)
-        shape = jax.eval_shape(lambda: look(frozen, now.elements))
-        empty: FlagScan = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shape)
-        seen = lax.cond(now.trusted, lambda: empty, lambda: look(frozen, now.elements))
-        agree = now.trusted | (now.fits & agrees(frozen, now.elements, seen))
-        done = agree & now.solved & (apart(now.elements, seen) <= _FAR)
-        new = lax.cond(
-            agree,
-            lambda: lax.cond(done, lambda: self.keep(now, seen), lambda: self.solve(now, seen)),
-            lambda: now,
+
+        def look_at():
+            seen = look(frozen, now.elements)
+            return seen, now.fits & agrees(frozen, now.elements, seen)
+
+        shape = jax.eval_shape(look_at)
+        empty: Any = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shape)
+        seen, agree = lax.cond(now.looks, look_at, lambda: empty)
+        new = lax.cond(now.looks, lambda: self.looked(now, seen, agree), lambda: self.stepped(now))
+        changes = jnp.where(now.looks, ~agree, now.keeps) & ~new.over
+        return lax.cond(changes, lambda: self.align(new, seen, now.keeps), lambda: new)
+
+    def looked(self, now: Loop, seen: FlagScan, agree: Bool[Array, ""]) -> Loop:
+        """Return the loop's state after the flags `seen` along the motion.
+
+        `agree`: whether they change exactly at the events of the mesh. The roots for the next step
+        come from the search, since those of Newton's method lag behind."""
+        keeps = agree & now.solved & (apart(now.elements, seen) <= _FAR)
+        motion = choose(agree, rooted(now.elements, seen), now.elements)
+        closed = now.closed._replace(turns=now.closed.turns + 1)
+        fresh = jnp.full_like(now.size, jnp.inf), jnp.zeros_like(now.tries)
+        return now._replace(
+            closed=closed, elements=motion, looks=~agree, keeps=keeps, size=fresh[0], tries=fresh[1]
         )
-        new = lax.cond(
-            (done | ~agree) & ~new.over, lambda: self.align(new, seen, done), lambda: new
-        )
-        closed = new.closed._replace(turns=now.closed.turns + 1)
-        return new._replace(closed=closed, trusted=jnp.zeros((), bool))
 
     def run(self) -> Loop:
         """Return the final state of the loop."""
@@ -200,13 +266,13 @@ class Closer(eqx.Module):
 
         return lax.while_loop(go_on, lambda now: self.turn(now), self.start())
 
-    def align(self, now: Loop, seen: FlagScan, finer) -> Loop:
+    def align(self, now: Loop, seen: FlagScan, finer: Bool[Array, ""]) -> Loop:
         """Return the loop's state with the motion on a mesh that ends at its events.
 
-        `seen`: flags along the motion; `finer`: whether the new mesh has more elements than the old
-        one."""
+        `seen`: flags along the motion; `finer`: whether the mesh already ends at all events, and
+        the new one has more elements."""
         room = now.elements.mesh.times.shape[0]
-        events = found_events(self.frozen_at(now), now.elements, seen, room)
+        events = found_events(self.frozen_at(now), now.elements, seen, room, finer)
         taken = now.elements.mesh.used
         first = taken // 2 + _EVENT * events.count
         used = jnp.where(now.fits, jnp.where(finer, (_FINER * taken).astype(int), taken), first)
@@ -215,38 +281,57 @@ class Closer(eqx.Module):
         density = jnp.where(now.fits, place, spot), jnp.where(now.fits, wanted, number)
         new = aligned(now.elements, (events.times, events.which), density, used)
         yes = jnp.ones((), bool)
-        return now._replace(elements=new, fits=yes, solved=~yes, over=~events.fits)
-
-    def solve(self, now: Loop, seen: FlagScan) -> Loop:
-        """Return the loop's state after Newton's method on the present mesh.
-
-        `seen`: flags along the motion."""
-        given = rooted(now.elements, seen).roots
-        begun = now.elements._replace(roots=jnp.where(now.trusted, now.elements.roots, given))
-        limit = jnp.where(now.trusted, *_SMALL)
-        got, line = self.converged(now, begun, limit)
-        # Where events have passed each other, the elements between them have a negative length.
-        mesh, rising = ordered(got.elements.mesh)
-        good = rising & (got.stalled | (got.size <= 10 * limit))
-        closed = now.closed._replace(steps=now.closed.steps + got.turns)
-        # After a failure, the loop finds the events of the last motion and tries again.
-        failures = now.failures + ~good
         return now._replace(
-            closed=closed,
-            elements=got.elements._replace(mesh=mesh),
-            force=got.force,
-            solved=good,
-            failures=failures,
-            line=line,
-            over=~jnp.isfinite(got.size) | (failures > _FAILURES),
+            elements=new, looks=yes, keeps=~yes, fits=yes, solved=~yes, over=~events.fits
         )
 
-    def keep(self, now: Loop, seen: FlagScan) -> Loop:
-        """Return the loop's state with the forces, derivatives and errors of the present orbit.
+    def stepped(self, now: Loop) -> Loop:
+        """Return the loop's state after a step of Newton's method."""
+        equation, points, direct, step, line = self.step(now)
+        at, extra = now.elements, now.elements.mesh.used
+        roots = points.roots.at[extra].set(at.roots[extra])
+        moved, size, _ = advanced(at, step, roots)
 
-        The flags along the orbit must change exactly at the events of its mesh. `seen`: these
-        flags. The roots come from the search, since those of Newton's method lag behind."""
-        found = self.forces(now._replace(elements=rooted(now.elements, seen)))
+        def kept() -> Loop:
+            found = forces_of(equation, at, now.rivals, (points, direct), step, moved)
+            return self.keep(now._replace(line=line), found)
+
+        def goes_on() -> Loop:
+            rivals = rivals_of(at, points, *forces_along(equation, points))
+            after = now._replace(elements=moved, rivals=rivals, line=line)
+            return self.judged(now, after, size)
+
+        new = lax.cond(now.keeps, kept, goes_on)
+        return new._replace(closed=new.closed._replace(steps=now.closed.steps + 1))
+
+    def judged(self, now: Loop, after: Loop, size: Float[Array, ""]) -> Loop:
+        """Return the loop's state `after` a step of the given size.
+
+        If the step is small enough, the motion is solved. Where rounding keeps steps above the
+        limit, the method ends when they no longer shrink."""
+        limit, tries = self.limit(now), now.tries + 1
+        stalled = has_stalled(size, now.size)
+        # A size of NaN also ends the method.
+        ends = ~(size > limit) | stalled | (tries >= _STEPS)
+        # Where events have passed each other, the elements between them have a negative length.
+        mesh, rising = ordered(after.elements.mesh)
+        good = rising & (stalled | (size <= 10 * limit))
+        mesh = choose(ends, mesh, after.elements.mesh)
+        # After a failure, the loop finds the events of the last motion and tries again.
+        failures = now.failures + (ends & ~good)
+        return after._replace(
+            elements=after.elements._replace(mesh=mesh),
+            looks=ends,
+            trusted=now.trusted & ~ends,
+            solved=ends & good,
+            size=size,
+            tries=tries,
+            failures=failures,
+            over=ends & (~jnp.isfinite(size) | (failures > _FAILURES)),
+        )
+
+    def keep(self, now: Loop, found: OrbitForces) -> Loop:
+        """Return the loop's state with the forces `found`, their derivatives and errors."""
         size = roughness(found.elements)
         # On the first mesh, the errors are estimated from those of the known orbit.
         growth = jnp.maximum(size / self.known.roughness, 1.0) ** 2
@@ -315,15 +400,6 @@ def _differences(before: OrbitForces, after: OrbitForces):
     largest = jnp.max(jnp.abs(after.sensitivity), axis=1, initial=0.0)
     drift = jnp.max((slopes / jnp.where(largest > 0, largest, 1.0))[:3])
     return error, drift
-
-
-def _nothing(equation: CollocatedEquation, tangents: Any, elements: Elements) -> Closed:
-    """Return the result before the first iteration: zeros, with infinite errors."""
-    shape = jax.eval_shape(lambda: response(equation, elements, elements.slopes[..., 0], tangents))
-    empty: OrbitForces = jax.tree.map(lambda x: jnp.full(x.shape, 0, x.dtype), shape)
-    infinite, zero = jnp.asarray(jnp.inf), jnp.zeros((), int)
-    no = jnp.zeros((), bool)
-    return Closed(empty, jnp.ones(()), infinite, infinite, no, zero, zero)
 
 
 __all__ = ["CORRECTED", "FIRST", "Closed", "Closer", "Loop", "close", "supported"]

@@ -5,7 +5,8 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.contact.near import NearContact
 from rootsopt.contact.search import SearchContact
@@ -77,30 +78,6 @@ class CollocatedEquation(eqx.Module):
         values = [*slope, *rates, found.values[which]]
         return values, (_roots(found.places), contact.total, contact.depth)
 
-    def force(
-        self, tau: Float[Array, ""], state: Float[Array, " n"], roots: Float[Array, "sides 2"]
-    ) -> tuple[Float[Array, ""], Float[Array, "sides 2"]]:
-        """Return the contact force (N), and the improved `roots`.
-
-        `tau`: time (mesh periods); `state` (n,): scaled; `roots` (sides, 2):
-        `NearContact.roots`."""
-        near = self.near(*eqx.partition(self.pair, eqx.is_inexact_array), roots)
-        contact, margins = near.contact_and_margins(tau, state)
-        return contact.total, _roots(margins.places)
-
-    def points(
-        self,
-        tau: Float[Array, "e p"],
-        state: Float[Array, "e p n"],
-        roots: Float[Array, "e p sides 2"],
-        which: Int[Array, " e"],
-    ) -> Points:
-        """Return the equation and its derivatives at p instants on each of e elements.
-
-        `tau`: times (mesh periods); `state`: scaled; `roots`: `NearContact.roots`; `which`: index
-        of the margin to evaluate on each element."""
-        return self._linear(tau, state, roots, which, None)[0]
-
     def along(
         self,
         tau: Float[Array, "e p"],
@@ -108,18 +85,16 @@ class CollocatedEquation(eqx.Module):
         roots: Float[Array, "e p sides 2"],
         which: Int[Array, " e"],
         tangents: Any,
+        whole: Bool[Array, ""],
     ) -> tuple[Points, Float[Array, "e p r d"]]:
-        """Return the result of `points`, and derivatives of its values along d directions.
+        """Return the equation at p instants on each of e elements, and derivatives of its values
+        along d directions.
 
-        `tangents`: directions of the pair's parameters, stacked along a leading axis. For the other
-        arguments, see `points`."""
-        return self._linear(tau, state, roots, which, eqx.filter(tangents, eqx.is_inexact_array))
-
-    def _linear(self, tau, state, roots, which, moved) -> tuple[Points, Float[Array, "e p r d"]]:
-        """Return the result of `along`, for the floating-point arrays of its directions.
-
-        Without directions (`None`), d is 0. The instants are the last axis of all intermediate
-        arrays, so that inner loops are long."""
+        `tau`: times (mesh periods); `state`: scaled; `roots`: `NearContact.roots`; `which`: index
+        of the margin to evaluate on each element; `tangents`: directions of the pair's parameters,
+        stacked along a leading axis; `whole`: whether derivatives along them are needed. Otherwise
+        they are 0. The instants are the last axis of all intermediate arrays, so that inner loops
+        are long."""
         shape, size = tau.shape, 1 + state.shape[-1]
         dynamic, static = eqx.partition(self.pair, eqx.is_inexact_array)
         place = jnp.concatenate([tau.reshape(1, -1), state.reshape(-1, size - 1).T])
@@ -131,21 +106,30 @@ class CollocatedEquation(eqx.Module):
 
             return jax.vmap(one, (1, 0, 0))(place, *rest)
 
+        values, linear, others = jax.linearize(value, dynamic, place, has_aux=True)
+        moved = eqx.filter(tangents, eqx.is_inexact_array)
+        count = jax.tree.leaves(moved)[0].shape[0]
+        # Derivatives along as many directions at once as time and state have. Those along the
+        # parameters come in further passes of the same code, since most steps do not need them.
+        passes = 1 - (-count // size)
+
+        def by_pass(rows):
+            more = [(size, (passes - 1) * size - count)]
+            rows = jnp.pad(rows, more + [(0, 0)] * (rows.ndim - 1))
+            return rows.reshape(passes, size, *rows.shape[1:])
+
+        moved = jax.tree.map(by_pass, moved)
         unit = jnp.eye(size, dtype=place.dtype)
-        if moved is None:
-            values, linear, others = jax.linearize(
-                lambda place: value(dynamic, place), place, has_aux=True
-            )
-            moved = ()
-        else:
-            values, linear, others = jax.linearize(value, dynamic, place, has_aux=True)
-            # All directions at once: first those of time and state, then those of the pair.
-            count = jax.tree.leaves(moved)[0].shape[0]
-            pads = [(size, 0)]
-            moved = (jax.tree.map(lambda x: jnp.pad(x, pads + [(0, 0)] * (x.ndim - 1)), moved),)
-            unit = jnp.eye(size + count, size, dtype=place.dtype)
+        unit = jnp.zeros((passes, *unit.shape), place.dtype).at[0].set(unit)
         units = jnp.broadcast_to(unit[..., None], (*unit.shape, place.shape[1]))
-        slopes = jnp.stack(kept(jax.vmap(kept(linear))(*moved, units)))
+
+        def derivatives(k, found):
+            own = jax.tree.map(lambda x: x[k], (moved, units))
+            return found.at[k].set(jnp.stack(kept(jax.vmap(kept(linear))(*own)), axis=1))
+
+        slopes = jnp.zeros((passes, size, len(values), place.shape[1]), place.dtype)
+        slopes = lax.fori_loop(0, jnp.where(whole, passes, 1), derivatives, slopes)
+        slopes = jnp.moveaxis(slopes.reshape(passes * size, *slopes.shape[2:]), 0, 1)
 
         def back(x):
             """Move the last axis, that of the instants, to the front and split it."""
@@ -153,7 +137,7 @@ class CollocatedEquation(eqx.Module):
 
         others = jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), others)
         points = Points(back(jnp.stack(values)), back(slopes[:, :size]), *others)
-        return points, back(slopes[:, size:])
+        return points, back(slopes[:, size : size + count])
 
 
 def _roots(places: list[Any]) -> Float[Array, "sides 2"]:

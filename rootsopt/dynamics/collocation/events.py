@@ -210,13 +210,16 @@ def agrees(pair: RotorPair, elements: Elements, seen: FlagScan) -> Bool[Array, "
     return ~jnp.any(found.fresh) & ~jnp.any(found.declared & ~found.kept)
 
 
-def found_events(pair: RotorPair, elements: Elements, seen: FlagScan, room: int) -> Events:
+def found_events(
+    pair: RotorPair, elements: Elements, seen: FlagScan, room: int, same: Bool[Array, ""]
+) -> Events:
     """Return the events of the motion `elements`, whose flags are `seen`.
 
-    `room`: size m of the returned arrays."""
+    `room`: size m of the returned arrays; `same`: whether they are known to be those of the mesh.
+    Then `seen` is not used."""
     mesh, rank = elements.mesh, jnp.asarray(ranks(pair))
     fresh, later, ends_at, declared, kept = _compared(pair, elements, seen)
-    most = _CHANGES * room
+    most, fresh = _CHANGES * room, fresh & ~same
     # Choose the instants first: to choose among all flags of all instants takes ten times as long.
     some = jnp.nonzero(jnp.any(fresh, axis=1), size=most, fill_value=fresh.shape[0])[0]
     changes = fresh.at[some].get(mode="fill", fill_value=False)
@@ -240,7 +243,9 @@ def found_events(pair: RotorPair, elements: Elements, seen: FlagScan, room: int)
         0, jnp.minimum(new, most), locate, jnp.full(most, jnp.inf, seen.tau.dtype)
     )
     held = jnp.full(mesh.times.shape, False).at[jnp.where(kept, ends_at, 0)].set(True)
-    held = held.at[0].set(False)
+    number = jnp.arange(mesh.times.shape[0])
+    real = number <= mesh.interval[mesh.used - 1]
+    held = jnp.where(same, real, held).at[0].set(False)
     times = jnp.concatenate([located, jnp.where(held, mesh.times, jnp.inf)])
     which = jnp.concatenate([flag, mesh.which])
     times, which, count = _merged(times, which, rank)

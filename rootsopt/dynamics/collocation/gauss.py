@@ -53,6 +53,11 @@ class Gauss(NamedTuple):
         order = np.arange(1, len(self.nodes) + 1)
         return share[..., None] * _polynomials(self.powers / order[:, None], share)
 
+    def derivative(self, share: Float[Array, "*m"]) -> Float[Array, "*m s"]:
+        """Return the derivatives of the s Lagrange polynomials at σ = `share`."""
+        order = np.arange(1, len(self.nodes))
+        return _polynomials(order[:, None] * self.powers[1:], share)
+
     def inside(self, slopes: Float[Array, "e s *c"]) -> Float[Array, "e s *c"]:
         """Return the integrals of `slopes` (values at the s points) from 0 to each of the points.
 

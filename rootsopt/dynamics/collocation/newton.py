@@ -1,68 +1,55 @@
-"""Newton's method for an orbit and the times of its events, whose sequence stays the same."""
+"""One step of Newton's method for an orbit and the times of its events.
 
-from typing import NamedTuple
+The sequence of the events stays the same."""
+
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from rootsopt.dynamics.collocation.blocks import in_blocks
 from rootsopt.dynamics.collocation.elements import Elements
 from rootsopt.dynamics.collocation.equation import CollocatedEquation, Points
 from rootsopt.dynamics.collocation.gauss import GAUSS
-from rootsopt.dynamics.collocation.system import (
-    Columns,
-    Lines,
-    Step,
-    chained,
-    condensed,
-    own_column,
-)
+from rootsopt.dynamics.collocation.peak import Rivals
+from rootsopt.dynamics.collocation.system import Columns, Lines, Step, own_column
 from rootsopt.dynamics.pair import RotorPair
 
-_TURNS = 16
-"""Maximum number of Newton steps."""
 _ROOM = 0.7
 """Greatest fraction of an interval's length by which one step may shorten the interval."""
 _LONGEST = 1.0
 """Change of a state (scaled) above which a Newton step is shortened."""
-_WAY = 1e-3
-"""Fraction of the way to the new pair over which the predictor takes its difference."""
 _STALLED = 1e-7, 0.5
 """Step (scaled) below which Newton's method also stops if the step exceeds the second number times
 the step before. The steps then only follow rounding."""
-_TURNED = 0.1
-"""Change of a root (rad) above which it is limited to this value."""
 
 
-class Converged(NamedTuple):
-    """Result of Newton's method.
+def evaluated(
+    equation: CollocatedEquation,
+    elements: Elements,
+    rivals: Rivals,
+    tangents: Any,
+    whole: Bool[Array, ""],
+) -> tuple[Points, Float[Array, "e p r d"]]:
+    """Return the equation along `elements`, and its derivatives along d directions.
 
-    `elements`: the orbit; `size`: greatest change in the last step, of the states (scaled) and of
-    the event times (mesh periods); `stalled`: whether steps no longer shrink because they only
-    follow rounding; `turns`: number of steps; `force` (e, s): contact force (N) at the Gauss
-    points.
-    """
-
-    elements: Elements
-    size: Float[Array, ""]
-    stalled: Bool[Array, ""]
-    turns: Int[Array, ""]
-    force: Float[Array, "e s"]
-
-
-def evaluated(equation: CollocatedEquation, elements: Elements) -> Points:
-    """Return the equation at the s Gauss points and the end of each element (p = s + 1)."""
-    mesh = elements.mesh
-    tau, state = elements.places
+    It is evaluated at the s Gauss points and the end of each element (p = s + 1), and at the
+    instants `rivals`, on the element after the last one in use. `tangents`: directions of the
+    pair's parameters, stacked along a leading axis; `whole`: whether derivatives along them are
+    needed. Otherwise they are 0. The arrays of the mesh must have room for one more element."""
+    mesh, extra = elements.mesh, elements.mesh.used
+    tau, state = (
+        x.at[extra].set(y) for x, y in zip(elements.places, rivals.places(elements), strict=True)
+    )
+    roots = elements.roots.at[extra].set(rivals.roots)
     which = jnp.maximum(mesh.which[mesh.interval + 1], 0)
 
-    def points(*places):
-        return equation.points(*places)
+    def points(tau, state, roots, which):
+        return equation.along(tau, state, roots, which, tangents, whole)
 
-    return in_blocks(points, mesh.used, tau, state, elements.roots, which)
+    return in_blocks(points, extra + 1, tau, state, roots, which)
 
 
 def lines(elements: Elements, points: Points) -> Lines:
@@ -77,47 +64,18 @@ def lines(elements: Elements, points: Points) -> Lines:
     )
 
 
-def solved_step(elements: Elements, found: Lines, columns: Columns) -> Step:
-    """Solve the linearised equation `found` for several right-hand sides (`columns`)."""
-    return chained(elements, found, columns, condensed(elements, found, columns))
+def columns_of(elements: Elements, found: Lines, direct: Float[Array, "e p r k"]) -> Columns:
+    """Return the right-hand sides of Newton's step, followed by those of k further directions.
 
-
-def newton(
-    equation: CollocatedEquation,
-    elements: Elements,
-    tolerance: Float[Array, ""],
-    neighbour: RotorPair,
-    predict: Bool[Array, ""],
-) -> Converged:
-    """Solve for the orbit near `elements`, until the last step is at most `tolerance` (scaled).
-
-    Where rounding keeps steps above the tolerance, the method ends when they no longer shrink.
-    `predict`: whether `elements` is an orbit of the similar pair `neighbour`. The first step is
-    then along the tangent of the family of orbits that leads to the equation's pair (predictor).
-    Newton's first step would be evaluated at penetrations of the wrong size, since the flanks have
-    moved. The tangent is Newton's step for a pair a small way (`_WAY`) towards the new one,
-    divided by this way."""
-
-    def go_on(now):
-        # A size of NaN also ends the loop.
-        return (now.turns < _TURNS) & (now.size > tolerance) & ~now.stalled
-
-    def turn(now):
-        at = now.elements
-        way = jnp.where(predict & (now.turns == 0), _WAY, 1.0)
-        points = evaluated(between(equation, neighbour, way), at)
-        found = lines(at, points)
-        own = jax.tree.map(lambda x: x / way, own_column(at, found))
-        roots = at.roots + jnp.clip((points.roots - at.roots) / way, -_TURNED, _TURNED)
-        moved, size, _ = advanced(at, solved_step(at, found, own), roots)
-        stalled = has_stalled(size, now.size)
-        return Converged(moved, size, stalled, now.turns + 1, points.force[:, : len(GAUSS.nodes)])
-
-    force = jnp.zeros(elements.slopes.shape[:2], elements.state.dtype)
-    infinite = jnp.full_like(elements.state[0, 0], jnp.inf)
-    no = jnp.zeros((), bool)
-    start = Converged(elements, infinite, no, jnp.zeros((), int), force)
-    return lax.while_loop(go_on, turn, start)
+    `found`: linearised equation; `direct`: derivatives of the equation's values along the
+    directions, at constant motion."""
+    count, inside = elements.state.shape[1], len(GAUSS.nodes)
+    own = own_column(elements, found)
+    return Columns(
+        slope=jnp.concatenate([own.slope, direct[:, :inside, :count]], axis=-1),
+        gap=jnp.pad(own.gap, ((0, 0), (0, 0), (0, direct.shape[-1]))),
+        margin=jnp.concatenate([own.margin, direct[:, inside, -1]], axis=-1),
+    )
 
 
 def between(

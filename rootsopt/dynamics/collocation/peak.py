@@ -1,0 +1,183 @@
+"""The greatest contact force of an orbit on elements.
+
+Inside an element the force is smooth. Its values and its slopes along the orbit at the Gauss points
+determine a polynomial of degree 2s - 1, whose maxima show where to evaluate the equation next. The
+peak follows from force and slope there. A peak at a corner of the force lies at the end of an
+element, which is an event, and moves with this event.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int
+from numpy.typing import NDArray
+
+from rootsopt.dynamics.collocation.elements import Elements
+from rootsopt.dynamics.collocation.equation import CollocatedEquation, Points
+from rootsopt.dynamics.collocation.gauss import GAUSS
+
+RIVALS = len(GAUSS.nodes) + 1
+"""Number of elements that may contain the peak: as many as an element has instants, so that the
+equation is evaluated in all of them on one additional element."""
+_PLACES = np.linspace(0.0, 1.0, 9)
+"""Places in each element at which the polynomials of the force are compared."""
+_STEPS = 4
+"""Number of Newton steps from the best of these places to the maximum of a polynomial."""
+_NEAREST = 0.1
+"""Greatest distance of the peak from the instant at which the equation is evaluated, as a fraction
+of the element's length. The latter lies at the maximum of a polynomial."""
+
+
+class Rivals(NamedTuple):
+    """The instants of an orbit at which the force may be greatest, in p elements.
+
+    `element` (p,): indices of elements; `share` (p,): positions in these elements, from 0 (start)
+    to 1 (end); `roots` (p, sides, 2): `NearContact.roots` there.
+    """
+
+    element: Int[Array, " p"]
+    share: Float[Array, " p"]
+    roots: Float[Array, "p sides 2"]
+
+    @classmethod
+    def anywhere(cls, elements: Elements) -> "Rivals":
+        """Return instants in the middle of the first element of `elements`."""
+        element = jnp.zeros(RIVALS, int)
+        share = jnp.full(RIVALS, 0.5, elements.state.dtype)
+        return cls(element, share, _roots(elements.roots, element, share))
+
+    def places(self, elements: Elements) -> tuple[Float[Array, " p"], Float[Array, "p n"]]:
+        """Return times (mesh periods) and scaled states of the instants, on the motion
+        `elements`."""
+        begin, length = elements.mesh.ends[0][self.element], elements.mesh.lengths[self.element]
+        rise = jnp.sum(GAUSS.integrated(self.share)[..., None] * elements.slopes[self.element], 1)
+        return begin + length * self.share, elements.state[self.element] + length[:, None] * rise
+
+
+class Peak(NamedTuple):
+    """The greatest contact force of an orbit.
+
+    `element`: index of the element that contains the peak; `share`: position in the element, from 0
+    (start) to 1 (end); `shift`: part of `share` that has been added to the instant at which the
+    equation was evaluated, the rival with the index `rival`; `force`: contact force (N).
+    """
+
+    element: Int[Array, ""]
+    share: Float[Array, ""]
+    shift: Float[Array, ""]
+    rival: Int[Array, ""]
+    force: Float[Array, ""]
+
+
+def forces_along(
+    equation: CollocatedEquation, points: Points
+) -> tuple[Float[Array, "e p"], Float[Array, "e p"]]:
+    """Return the contact force at all `points`, and its derivative with respect to time (mesh
+    periods) along the motion.
+
+    Both are in units of the pair's `force_scale`."""
+    count, last = points.slopes.shape[-1] - 1, points.values.shape[-1] - 2
+    states = points.values[..., :count]
+
+    def along(row):
+        slope = points.slopes[..., row, :]
+        return slope[..., 0] + jnp.sum(slope[..., 1:] * states, axis=-1)
+
+    force, rate = points.values[..., count], along(count)
+    if equation.pair.free:
+        lapse = points.values[..., last]
+        force = force / lapse
+        rate = (rate - force * along(last)) / lapse
+    return force, rate
+
+
+def rivals_of(
+    elements: Elements, points: Points, force: Float[Array, "e p"], rate: Float[Array, "e p"]
+) -> Rivals:
+    """Return the instants at which the force on the motion `elements` may be greatest.
+
+    `points`: equation along the motion; `force`, `rate`: results of `forces_along` for them."""
+    rows = _polynomials(elements, force, rate)
+    used = jnp.arange(rows.shape[0]) < elements.mesh.used
+    heights = rows @ _powers(_PLACES, rows.shape[1])
+    highest = jnp.where(used, jnp.max(heights, axis=1), -jnp.inf)
+    element = lax.top_k(highest, RIVALS)[1].astype(int)
+    rows, share = rows[element], jnp.asarray(_PLACES)[jnp.argmax(heights[element], axis=1)]
+    for _ in range(_STEPS):
+        share = jnp.clip(share + _to_vertex(*_derivatives(rows, share)), 0.0, 1.0)
+    return Rivals(element, share, _roots(points.roots, element, share))
+
+
+def peak_of(
+    elements: Elements, rivals: Rivals, force: Float[Array, "e p"], rate: Float[Array, "e p"]
+) -> Peak:
+    """Return the greatest force of the motion `elements`, in units of the pair's `force_scale`.
+
+    `force`, `rate`: results of `forces_along`, where the instants `rivals` follow the elements in
+    use."""
+    extra, element = elements.mesh.used, rivals.element
+    rows = _polynomials(elements, force, rate)[element]
+    slope = elements.mesh.lengths[element] * rate[extra]
+    bend = _derivatives(rows, rivals.share)[1]
+    step = _to_vertex(slope, bend)
+    share = jnp.clip(rivals.share + step, 0.0, 1.0)
+    shift = share - rivals.share
+    height = force[extra] + shift * (slope + bend * shift / 2)
+    # If fewer elements are in use than there are rivals, the others are not part of the orbit.
+    height = jnp.where(element < extra, height, -jnp.inf)
+    top = jnp.argmax(height)
+    return Peak(element[top], share[top], shift[top], top, height[top])
+
+
+def _roots(roots, element, share) -> Float[Array, "p sides 2"]:
+    """Return `NearContact.roots` in each `element` at `share`, by the polynomials through those at
+    the Gauss points; `roots`: `Elements.roots`."""
+    weights = GAUSS.lagrange(share)[..., None, None]
+    return jnp.sum(weights * roots[element, : len(GAUSS.nodes)], axis=1)
+
+
+def _to_vertex(slope: Float[Array, " p"], bend: Float[Array, " p"]) -> Float[Array, " p"]:
+    """Return the distance to the vertex of a parabola, or the greatest allowed one uphill."""
+    bends = bend < 0
+    step = -slope / jnp.where(bends, bend, -1.0)
+    step = jnp.where(bends, step, jnp.sign(slope) * _NEAREST)
+    return jnp.clip(step, -_NEAREST, _NEAREST)
+
+
+def _powers(share: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """Return the powers 0 to `count` - 1 of the distance from the middle of an element, as rows."""
+    return (share - 0.5) ** np.arange(count)[:, None]
+
+
+def _hermite() -> NDArray[np.float64]:
+    """Return the matrix that converts values and slopes at the Gauss points to coefficients of
+    powers of the distance from the middle of the element."""
+    count = 2 * len(GAUSS.nodes)
+    order = np.arange(count)
+    values = _powers(GAUSS.nodes, count).T
+    slopes = np.zeros_like(values)
+    slopes[:, 1:] = order[1:] * values[:, :-1]
+    return np.linalg.inv(np.concatenate([values, slopes]))
+
+
+_HERMITE = _hermite()
+
+
+def _polynomials(elements: Elements, force, rate) -> Float[Array, "e c"]:
+    """Return the coefficients of the force in each element (see `_hermite`)."""
+    inside = len(GAUSS.nodes)
+    slopes = elements.mesh.lengths[:, None] * rate[:, :inside]
+    return jnp.concatenate([force[:, :inside], slopes], axis=1) @ _HERMITE.T
+
+
+def _derivatives(rows: Float[Array, "p c"], share: Float[Array, " p"]):
+    """Return first and second derivative of the polynomials `rows` at `share`."""
+    place = share - 0.5
+    slope = bend = value = jnp.zeros_like(place)
+    for column in rows.T[::-1]:
+        bend = bend * place + 2 * slope
+        slope = slope * place + value
+        value = value * place + column
+    return slope, bend
