@@ -84,7 +84,7 @@ class Closed(NamedTuple):
     and peak; `drift`: estimated error of their derivatives, relative to the largest derivative of
     the same force; `sound`: whether Newton's method has converged and the flags agree with the
     events of the mesh; `turns`: number of evaluations of the flags; `steps`: number of Newton
-    steps. `error` and `drift` are inf if they are not known.
+    steps before the last, which yields the forces. `error` and `drift` are inf if not known.
     """
 
     found: OrbitForces
@@ -297,12 +297,12 @@ class Closer(eqx.Module):
             return self.keep(now._replace(line=line), found)
 
         def goes_on() -> Loop:
-            rivals = rivals_of(at, points, *forces_along(equation, points))
+            rivals = rivals_of(at, points, *forces_along(equation, points), now.rivals)
             after = now._replace(elements=moved, rivals=rivals, line=line)
             return self.judged(now, after, size)
 
         new = lax.cond(now.keeps, kept, goes_on)
-        return new._replace(closed=new.closed._replace(steps=now.closed.steps + 1))
+        return new._replace(closed=new.closed._replace(steps=now.closed.steps + ~now.keeps))
 
     def judged(self, now: Loop, after: Loop, size: Float[Array, ""]) -> Loop:
         """Return the loop's state `after` a step of the given size.

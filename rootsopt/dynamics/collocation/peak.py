@@ -94,19 +94,29 @@ def forces_along(
 
 
 def rivals_of(
-    elements: Elements, points: Points, force: Float[Array, "e p"], rate: Float[Array, "e p"]
+    elements: Elements,
+    points: Points,
+    force: Float[Array, "e p"],
+    rate: Float[Array, "e p"],
+    before: Rivals,
 ) -> Rivals:
-    """Return the instants at which the force on the motion `elements` may be greatest.
+    """Return the instants on the motion `elements` at which the force may be greatest.
 
-    `points`: equation along the motion; `force`, `rate`: results of `forces_along` for them."""
+    `points`: equation along the motion, where the instants `before` follow the elements in use;
+    `force`, `rate`: results of `forces_along` for it."""
     rows = _polynomials(elements, force, rate)
     used = jnp.arange(rows.shape[0]) < elements.mesh.used
     heights = rows @ _powers(_PLACES, rows.shape[1])
     highest = jnp.where(used, jnp.max(heights, axis=1), -jnp.inf)
     element = lax.top_k(highest, RIVALS)[1].astype(int)
+    # The slope at the instants before shows the error of the polynomials' slopes nearby.
+    known = elements.mesh.lengths[before.element] * rate[elements.mesh.used]
+    wrong = known - _derivatives(rows[before.element], before.share)[0]
+    wrong = jnp.zeros(rows.shape[0], rows.dtype).at[before.element].set(wrong)[element]
     rows, share = rows[element], jnp.asarray(_PLACES)[jnp.argmax(heights[element], axis=1)]
     for _ in range(_STEPS):
-        share = jnp.clip(share + _to_vertex(*_derivatives(rows, share)), 0.0, 1.0)
+        slope, bend = _derivatives(rows, share)
+        share = jnp.clip(share + _to_vertex(slope + wrong, bend), 0.0, 1.0)
     return Rivals(element, share, _roots(points.roots, element, share))
 
 
@@ -121,8 +131,7 @@ def peak_of(
     rows = _polynomials(elements, force, rate)[element]
     slope = elements.mesh.lengths[element] * rate[extra]
     bend = _derivatives(rows, rivals.share)[1]
-    step = _to_vertex(slope, bend)
-    share = jnp.clip(rivals.share + step, 0.0, 1.0)
+    share = jnp.clip(rivals.share + _to_vertex(slope, bend), 0.0, 1.0)
     shift = share - rivals.share
     height = force[extra] + shift * (slope + bend * shift / 2)
     # If fewer elements are in use than there are rivals, the others are not part of the orbit.

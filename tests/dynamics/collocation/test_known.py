@@ -9,11 +9,12 @@ import pytest
 
 import rootsopt
 from rootsopt.dynamics.collocation.elements import Elements, Mesh
-from rootsopt.dynamics.collocation.equation import CollocatedEquation
-from rootsopt.dynamics.collocation.forces import OrbitForces, Peak, located_peak
+from rootsopt.dynamics.collocation.equation import Points
+from rootsopt.dynamics.collocation.forces import OrbitForces
 from rootsopt.dynamics.collocation.gauss import GAUSS, POINTS
 from rootsopt.dynamics.collocation.known import Known, trimmed
 from rootsopt.dynamics.collocation.mesh import roughness, sizes
+from rootsopt.dynamics.collocation.peak import Peak, Rivals, peak_of, rivals_of
 from rootsopt.dynamics.collocation.sampled import PARTS, as_flow, sampled
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.orbits import Built, OrbitStore, _Closed, _key
@@ -64,7 +65,7 @@ def test_orbit_sampled_as_steps_is_the_motion_over_one_period():
         moved=jnp.zeros((1, 2)),
         monodromy=jnp.zeros((1, 1)),
         depth=nothing,
-        peak=Peak(jnp.asarray(8), jnp.asarray(0.5), jnp.zeros((1, 2)), nothing),
+        peak=Peak(jnp.asarray(8), jnp.asarray(0.5), nothing, jnp.asarray(0), nothing),
         correction=nothing,
     )
     flow = sampled(as_flow(found), elements, samples=16)
@@ -141,28 +142,13 @@ def test_orbits_of_a_former_process_are_computed_when_asked_for():
     assert made == list(range(1501))
 
 
-class _Bump(CollocatedEquation):
-    """An equation whose force is known in closed form.
-
-    A force depends on the roots as that of `NearContact` does: its error, and that of the improved
-    roots, is of second order in the roots' distance from the truth."""
-
-    place: float
-    corner: float
-
-    def __init__(self, place, corner):
-        self.pair = self.measures = self.top = None  # pyright: ignore[reportAttributeAccessIssue]
-        self.place, self.corner = place, corner
-
-    def true(self, tau):
-        away = tau - self.place
-        smooth = 200.0 - 3e4 * away**2 + 5e3 * away**3
-        return jnp.where(away > 0, smooth - 400.0 * self.corner * away, smooth)
-
-    def force(self, tau, state, roots):
-        del state
-        error = roots - jnp.sin(5.0 * tau)
-        return self.true(tau) + 1e3 * jnp.max(error**2), roots - error + error**2
+def _bump(tau, place, corner):
+    """Return a force and its derivative with respect to the time `tau`: 200 at `place`."""
+    away = tau - place
+    bell = 200.0 * np.exp(-20.0 * away**2 + 10.0 * away**3)
+    slope = bell * (-40.0 * away + 30.0 * away**2)
+    behind = away > 0
+    return bell - 400.0 * corner * away * behind, slope - 400.0 * corner * behind
 
 
 @pytest.mark.parametrize(
@@ -179,15 +165,21 @@ class _Bump(CollocatedEquation):
 def test_peak_is_located(place, corner):
     """The peak lies beside or at an element's end, or in its middle, or is a corner at an end."""
     elements = _known().elements
-    tau, _ = elements.places
-    bump = _Bump(place, corner)
-    roots = jnp.broadcast_to(jnp.sin(5.0 * tau)[..., None, None], elements.roots.shape)
-    elements = elements._replace(roots=roots + 1e-3)
-    found = located_peak(bump, elements, bump.true(tau[:, :POINTS]))
+    force, rate = (jnp.asarray(x) for x in _bump(np.asarray(elements.places[0]), place, corner))
+    # The corner is an event: the element before it has the slope of its own side at its end.
+    nothing = jnp.zeros((*force.shape, 1))
+    roots = jnp.zeros((*force.shape, 1, 2))
+    points = Points(nothing, nothing[..., None], roots, force, force)
+    rivals = Rivals.anywhere(elements)
+    for _ in range(2):
+        rivals = rivals_of(elements, points, force, rate, rivals)
+        there = np.asarray(rivals.places(elements)[0]) - 1e-12
+        new = _bump(there, place, corner)
+        force, rate = (x.at[USED].set(y) for x, y in zip((force, rate), new, strict=True))
+    found = peak_of(elements, rivals, force, rate)
     begin, length = elements.mesh.ends[0][found.element], elements.mesh.lengths[found.element]
-    where = float(begin + length * found.share)
-    np.testing.assert_allclose(where, place, atol=2e-7)
-    np.testing.assert_allclose(float(found.force), 200.0, rtol=1e-12)
+    np.testing.assert_allclose(float(begin + length * found.share), place, atol=2e-7)
+    np.testing.assert_allclose(float(found.force), 200.0, rtol=1e-11)
 
 
 @pytest.mark.long

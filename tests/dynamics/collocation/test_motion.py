@@ -10,9 +10,8 @@ import pytest
 
 import rootsopt
 from rootsopt.contact.law import ContactLaw
-from rootsopt.dynamics import steady
+from rootsopt.dynamics import closed
 from rootsopt.dynamics.collocation.closing import supported
-from rootsopt.dynamics.collocation.motion import _equal
 from rootsopt.dynamics.parts.base import Part
 from rootsopt.dynamics.settle import settle
 from rootsopt.scene import Scene
@@ -90,18 +89,6 @@ def test_collocation_agrees_with_shooting(name, overrides, period):
     np.testing.assert_allclose(one.state, other.state, rtol=1e-5, atol=1e-9)
 
 
-def test_faint_forces_agree():
-    """Forces agree to 1e-4; what is far below the unit of force does not count."""
-    unit, tolerance = jnp.asarray(100.0), jnp.asarray(1e-8)
-    forces = jnp.asarray([2.0, 9.0, 40.0])
-    assert _equal(1.00009 * forces, forces, tolerance, unit)
-    for place in range(3):
-        assert not _equal(forces.at[place].multiply(1.0002), forces, tolerance, unit)
-    faint = jnp.asarray([6e-8, 2e-13, 3e-5])
-    assert _equal(faint.at[0].multiply(2), faint, tolerance, unit)
-    assert not _equal(faint.at[2].multiply(2), faint, tolerance, unit)
-
-
 @pytest.mark.long
 def test_orbit_closed_over_too_many_periods_is_closed_again(monkeypatch):
     """Where the transient takes twice the period for the period, the result has the true one."""
@@ -116,9 +103,9 @@ def test_orbit_closed_over_too_many_periods_is_closed_again(monkeypatch):
     scene = Scene.from_config(config)
     solver = dataclasses.replace(scene.solver, closing="collocation")
     pair, tangents, _ = scene.pair_and_tangents(jnp.asarray(config.design, float))
-    monkeypatch.setattr(steady, "settle", twice)
-    start = jnp.zeros(pair.states)
-    found = eqx.filter_jit(steady.steady_motion)(pair, tangents, start, scene.pitch_radius, solver)
+    monkeypatch.setattr(closed, "settle", twice)
+    start = closed.Start.at(pair, pair.in_si(jnp.zeros(pair.states)), solver.max_orbit)
+    found = eqx.filter_jit(closed.closed_motion)(pair, tangents, start, scene.pitch_radius, solver)
     assert taken
     assert Status.of(int(found.status)) is Status.PERIODIC
     assert int(found.period) == 1
