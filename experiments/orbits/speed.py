@@ -5,19 +5,24 @@ processes on the machine hardly change. The neighbour is a design whose paramete
 fraction."""
 
 import dataclasses
+import functools
 import time
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from experiments._common.engines import FD_STEPS
 from experiments._common.engines import Scene as PlainScene
 from experiments._common.engines.scipy_nodes import NODES_1E3, ScipyNodes
 from experiments._common.scenes import CIC, SHAKY
+from rootsopt import COMPILER_OPTIONS, Scene, steady_response
 from rootsopt.config import load
 from rootsopt.response.evaluation import Evaluator
-from rootsopt.response.orbits import OrbitStore, _near
+from rootsopt.response.orbits import OrbitStore
 
 Row = dict[str, Any]
 AWAY = 2e-3
@@ -66,7 +71,7 @@ def _row(scene: str, tool: str, seconds: float, found: Any, truth: Any) -> Row:
 def rows_of(scene: str, repeats: int, say: Callable[[str], None] = lambda text: None) -> list[Row]:
     """Measure one of `SCENES`; return a row for each tool."""
     path, overrides = SCENES[scene]
-    config = load(path, [*overrides, "solver.orbit=collocation"])
+    config = load(path, overrides)
     own = Evaluator.of(config)
     shooting = Evaluator.of(load(path, [*overrides, "solver.orbit=shooting"]))
     base = np.asarray(config.design, float)
@@ -78,30 +83,20 @@ def rows_of(scene: str, repeats: int, say: Callable[[str], None] = lambda text: 
     if not (neighbour.usable and exact.usable):
         return [{"scene": scene, "tool": f"{neighbour.status.label}, {exact.status.label}"}]
     truth = _numbers(exact)
-    alone = dataclasses.replace(own, orbits=OrbitStore())
-    known = own.orbits.begin(neighbour.state)
-    assert known is not None
-
-    def program():
-        return _near(own.scene, design, known[0], known[1].pair)
 
     def afresh(tool: Evaluator, start: Any):
         return lambda: dataclasses.replace(tool, orbits=OrbitStore())(design, start, series=False)
 
     near = own(design, start=neighbour.state, series=False)
     used = near.statistics.get("from_neighbour", 0)
-    name = "neighbour" if used else "neighbour refused, usual way"
+    name = "evaluate, neighbour" if used else "evaluate, neighbour refused"
     calls = {
         name: lambda: own(design, start=neighbour.state, series=False),
-        "collocation from the neighbour's state": afresh(alone, neighbour.state),
-        "collocation from rest": afresh(alone, None),
+        "evaluate, from rest": afresh(own, None),
         "shooting from the neighbour's state": afresh(shooting, neighbour.state),
         "shooting from rest": afresh(shooting, None),
     }
-    rows = []
-    if used:
-        seconds, _ = processor_time(program, repeats)
-        rows.append(_row(scene, "neighbour, program alone", seconds, _numbers(near), truth))
+    rows = _public(scene, config, (base, design), truth, repeats)
     for tool, call in calls.items():
         say(f"{scene}: {tool}")
         seconds, found = processor_time(call, repeats)
@@ -111,6 +106,32 @@ def rows_of(scene: str, repeats: int, say: Callable[[str], None] = lambda text: 
         rows.append(_row(scene, tool, seconds, _numbers(found), truth))
     if scene == "cic":
         rows += _competitors(config, design, truth, repeats, say)
+    return rows
+
+
+def _public(scene: str, config: Any, designs: Any, truth: Any, repeats: int) -> list[Row]:
+    """Measure `steady_response` under `jax.jit`, from a neighbour's orbit and from rest."""
+    machine, (base, design) = Scene.from_config(config), designs
+
+    @functools.partial(jax.jit, compiler_options=dict(COMPILER_OPTIONS))
+    def solve(design, start):
+        def forces(design):
+            found = steady_response(machine, design, start)
+            values = jnp.stack([found.mean, found.peak])
+            return values, (values, found.start)
+
+        slopes, (values, begin) = jax.jacfwd(forces, has_aux=True)(design)
+        return values, slopes, begin
+
+    known = steady_response(machine, base).start
+    rest = eqx.tree_at(lambda start: start.known.sound, known, jnp.zeros((), bool))
+    rest = eqx.tree_at(lambda start: start.state, rest, jnp.zeros_like(known.state))
+    rows = []
+    for tool, start in (("neighbour", known), ("from rest", rest)):
+        seconds, found = processor_time(
+            lambda start=start: jax.block_until_ready(solve(design, start)), repeats
+        )
+        rows.append(_row(scene, tool, seconds, found[:2], truth))
     return rows
 
 

@@ -6,11 +6,12 @@ iterations of one loop, so that each part is compiled only once.
 """
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
@@ -29,8 +30,10 @@ from rootsopt.dynamics.steady import (
     Steady,
     Verdict,
     among,
+    continues,
     final,
     judged,
+    steady_motion,
     transient_status,
     window_status,
 )
@@ -54,9 +57,9 @@ class Start(eqx.Module):
     `None` in place of all other leaves. The orbit is used if `known.sound`.
     """
 
-    state: Float[Array, " n"]
+    state: Float[Array | np.ndarray, " n"]
     known: Known
-    pair: RotorPair
+    pair: Any
 
     @classmethod
     def at(cls, pair: RotorPair, state: Float[Array, " n"], longest: int) -> "Start":
@@ -64,6 +67,14 @@ class Start(eqx.Module):
 
         `longest`: longest period of an orbit (mesh periods)."""
         return cls(state, unknown(pair, longest), eqx.filter(pair, eqx.is_inexact_array))
+
+    def fits(self, other: "Start") -> bool:
+        """Return whether both starts belong to the same kind of pair and solver."""
+        one, two = (
+            (jax.tree.structure(start), [jnp.shape(leaf) for leaf in jax.tree.leaves(start)])
+            for start in (self, other)
+        )
+        return one == two
 
 
 def unknown(pair: RotorPair, longest: int) -> Known:
@@ -93,22 +104,16 @@ class _Loop(NamedTuple):
 
 
 class _Attempts(eqx.Module):
-    """The loop of `closed_motion`. Its fields hold the arguments of that function.
-
-    `near_only`: whether the known orbit is the only attempt, so that transients are not compiled.
-    """
+    """The loop of `closed_motion`. Its fields hold the arguments of that function."""
 
     pair: RotorPair
     tangents: RotorPair
     start: Start
     radius: Float[Array, ""]
     solver: Solver
-    near_only: bool = eqx.field(static=True)
 
     def run(self) -> Steady:
         """Return the result of the search."""
-        if self.near_only:
-            return self.attempt(self.begin(), *self.settled(self.begin())).found
         loop = lax.while_loop(lambda now: ~now.over, lambda now: self.step(now), self.begin())
         return self.judged_by_window(loop)
 
@@ -122,7 +127,7 @@ class _Attempts(eqx.Module):
         flow = Flow.empty(count, directions, 0, 0, solver.measures, dtype)
         no, zero = jnp.zeros((), bool), jnp.zeros((), int)
         unsound = ~pair.sound
-        pieces = None if self.near_only else no_pieces(state, solver.max_orbit, PIECES)
+        pieces = no_pieces(state, solver.max_orbit, PIECES)
         found = Steady(
             status=jnp.where(unsound, Status.UNSOUND.code, Status.NOT_SETTLED.code),
             orbit=Orbit.empty(state, directions, flow),
@@ -192,22 +197,20 @@ class _Attempts(eqx.Module):
         del failure
         period = jnp.maximum(settled.period, 1)
         known, neighbour = self.start.known, self.start.pair
-        if not self.near_only:
-            known = lax.cond(
-                now.near,
-                lambda: known,
-                lambda: from_pieces(pair, settled.pieces, period, solver.max_orbit),
-            )
-            own = eqx.filter(pair, eqx.is_inexact_array)
-            neighbour = choose(now.near, neighbour, lax.stop_gradient(own))
+        known = lax.cond(
+            now.near,
+            lambda: known,
+            lambda: from_pieces(pair, settled.pieces, period, solver.max_orbit),
+        )
+        own = eqx.filter(pair, eqx.is_inexact_array)
+        neighbour = choose(now.near, neighbour, lax.stop_gradient(own))
         made = closed_orbit(pair, self.tangents, (known, neighbour), solver)
         within = now.within
         place = jnp.where(now.near, made.orbit.state, settled.state)
-        if not self.near_only:
-            # The orbit must be that of the transient everywhere, not only at φ1 = 0.
-            reach = 10 * within / jnp.maximum(1 - made.orbit.multiplier, 1e-3)
-            meets = now.near | (apart(made.known, settled.pieces) <= reach)
-            made = made._replace(verified=made.verified & meets)
+        # The orbit must be that of the transient everywhere, not only at φ1 = 0.
+        reach = 10 * within / jnp.maximum(1 - made.orbit.multiplier, 1e-3)
+        meets = now.near | (apart(made.known, settled.pieces) <= reach)
+        made = made._replace(verified=made.verified & meets)
         found = self.taken(self.counted(now.found, settled), made, place, period, within)
         failed = found.status == Status.NOT_SETTLED.code
         refused = now.near & (found.status != Status.PERIODIC.code)
@@ -250,6 +253,7 @@ class _Attempts(eqx.Module):
     def judged_by_window(self, loop: _Loop) -> Steady:
         """Return the result, judged by a window of the motion if no orbit has been closed."""
         solver, found = self.solver, loop.found
+        found = found._replace(settled=found.settled._replace(pieces=None))
         if not solver.windows:
             return found
         unsettled = found.status == Status.NOT_SETTLED.code
@@ -272,31 +276,44 @@ class _Attempts(eqx.Module):
         return Window.empty(state, periods, self.solver.transient.tolerance(state.dtype))
 
 
+def motion(
+    pair: RotorPair,
+    tangents: RotorPair,
+    start: Start,
+    radius: Float[Array, ""],
+    solver: Solver,
+) -> Steady:
+    """Find the steady motion of `pair`, by `closed_motion` where collocation supports it.
+
+    Otherwise the orbit is closed by shooting. For the arguments, see `closed_motion`."""
+    if continues(pair, solver):
+        return closed_motion(pair, tangents, start, radius, solver)
+    return steady_motion(pair, tangents, pair.scaled(start.state), radius, solver)
+
+
 def closed_motion(
     pair: RotorPair,
     tangents: RotorPair,
     start: Start,
     radius: Float[Array, ""],
     solver: Solver,
-    near_only: bool = False,
 ) -> Steady:
     """Find the steady motion of `pair` near a known orbit, or the one to which a state leads.
 
     `tangents`: directions of the pair's parameters, stacked along a leading axis, along which to
     differentiate; `start`: see `Start`; `radius`: pitch radius (m), for judging penetrations;
-    `solver`: settings; `near_only`: whether to try nothing but the known orbit.
+    `solver`: settings.
 
     An orbit is rejected if it is not stable or not near the end of the transient. The transient
     then continues, followed by another attempt (`_ATTEMPTS`). A window of the motion follows if the
     last attempt fails. If it shows no chaos although the transient repeated, the status is
-    NOT_CLOSED. If an orbit near the known one is not accepted, the search begins at
-    `start.state`; with `near_only`, the status is NOT_SETTLED.
+    NOT_CLOSED. If an orbit near the known one is not accepted, the search begins at `start.state`.
 
     The orbit has no samples of the state and no steps (see `collocation.sampled`). Collocation must
     support the pair (`collocation.closing.supported`)."""
     radius = jnp.asarray(radius, pair.angle_scale.dtype)
     start = lax.stop_gradient(start)
-    return _Attempts(pair, tangents, start, radius, solver, near_only).run()
+    return _Attempts(pair, tangents, start, radius, solver).run()
 
 
-__all__ = ["Start", "closed_motion", "unknown"]
+__all__ = ["Start", "closed_motion", "motion", "unknown"]

@@ -409,11 +409,6 @@ def steady_motion(
     return final(pair, search.found, radius)
 
 
-def collocates(pair: RotorPair, solver: Solver) -> bool:
-    """Return whether the orbits of `pair` that a state leads to are closed by collocation."""
-    return solver.closing == "collocation" and continues(pair, solver)
-
-
 def continues(pair: RotorPair, solver: Solver) -> bool:
     """Return whether orbits of `pair` can be closed by collocation."""
     return solver.closing != "shooting" and solver.precision == "float64" and supported(pair)

@@ -43,6 +43,8 @@ _ALIKE = float(np.log(3.0))
 not the motion, sets them."""
 _KEPT = 105
 """Number of states stored per mesh period."""
+_FAINT = 1e-9
+"""Force (in units of the pair's `force_scale`) below which a relative difference has no meaning."""
 _SAMPLES = 630
 """Number of uniform samples per mesh period for locating the peak force; a multiple of `_KEPT`."""
 
@@ -103,7 +105,7 @@ class Window(NamedTuple):
         """Scaled state from which the next mesh period is integrated."""
         return jnp.where(self.second, self.beside, self.end)
 
-    def after(self, out: "Flow | _Period") -> "Window":
+    def after(self, out: "Flow | Period") -> "Window":
         """Return the window after one more integration over a mesh period; `out`: its flow.
 
         The two motions take turns: the second one is then put back beside the first."""
@@ -183,26 +185,26 @@ def _numpy_of(array: Any) -> Any:
     return np if isinstance(array, np.ndarray) else jnp
 
 
-class _Period(NamedTuple):
-    """A motion over one mesh period: the fields of `Flow` that `Window.after` needs."""
+class Period(NamedTuple):
+    """A motion over one mesh period: the fields of `Flow` that `Window.after` needs.
+
+    The peak in `response` (3,) is that of `_SAMPLES` uniform samples; `duration`: in usual mesh
+    periods, from which it differs if rotor 1 is free."""
 
     end: Float[Array, " n"]
     response: Float[Array, " 3"]
     states: Float[Array, "samples n"]
     depth: Float[Array, ""]
     solved: Bool[Array, ""]
+    duration: Float[Array, ""]
 
 
-def lyapunov(
-    pair: RotorPair, state: Float[Array, " n"], periods: int, integrator: Integrator
-) -> Window:
-    """Return a window of `periods` mesh periods (a multiple of 16), integrated from the scaled
-    `state`. The peak is that of `_SAMPLES` uniform samples of each mesh period.
+def one_period(pair: RotorPair, start: Float[Array, " n"], integrator: Integrator) -> Period:
+    """Integrate the scaled state `start` (n,) over one mesh period from φ1 = 0.
 
     `flow` would do the same, but compiles three times as many operations: it locates the peak."""
-    count, dtype = state.shape[0], state.dtype
+    count, dtype = start.shape[0], start.dtype
     control, solver = integrator.controller(dtype, pair=pair), integrator.solver(dtype)
-    shares = jnp.arange(_SAMPLES, dtype=dtype) / _SAMPLES
 
     def slope(tau, y, pair):
         moved, contact = pair.derivative(tau, y[:count])
@@ -210,28 +212,66 @@ def lyapunov(
         lapse = pair.lapse(y[:count]) if pair.free else jnp.ones_like(force)
         return jnp.append(moved, lapse * jnp.stack([force, force**2, force**0]))
 
-    def over(start: Float[Array, " n"]) -> _Period:
-        begun = jnp.append(start, jnp.zeros(3, dtype))
-        most, term = integrator.max_steps, diffrax.ODETerm(slope)
-        out = integrated(term, solver, control, begun, pair, most, recorded=True)
+    begun = jnp.append(start, jnp.zeros(3, dtype))
+    most, term = integrator.max_steps, diffrax.ODETerm(slope)
+    out = integrated(term, solver, control, begun, pair, most, recorded=True)
 
-        def sample(share):
-            swing = interpolated(out, solver, share)[0][:count]
-            contact = pair.contact_at(share, swing)
-            return swing, contact.total, contact.depth
+    def sample(share):
+        swing = interpolated(out, solver, share)[0][:count]
+        contact = pair.contact_at(share, swing)
+        return swing, contact.total, contact.depth
 
-        states, force, depth = lax.map(sample, shares)
-        mean, square = out.end[count : count + 2] / out.end[-1]
-        unit = pair.force_scale
-        response = jnp.stack([unit * mean, unit**2 * square, jnp.max(force)])
-        return _Period(out.end[:count], response, states, jnp.max(depth), out.solved)
+    states, force, depth = lax.map(sample, jnp.arange(_SAMPLES, dtype=dtype) / _SAMPLES)
+    mean, square = out.end[count : count + 2] / out.end[-1]
+    unit = pair.force_scale
+    response = jnp.stack([unit * mean, unit**2 * square, jnp.max(force)])
+    return Period(out.end[:count], response, states, jnp.max(depth), out.solved, out.end[-1])
+
+
+def lyapunov(
+    pair: RotorPair, state: Float[Array, " n"], periods: int, integrator: Integrator
+) -> Window:
+    """Return a window of `periods` mesh periods (a multiple of 16), integrated from the scaled
+    `state`."""
+
+    def step(window: Window) -> Window:
+        return window.after(one_period(pair, window.start, integrator))
 
     def goes_on(window: Window) -> Bool[Array, ""]:
         alive = window.solved & jnp.all(jnp.isfinite(window.start))
         return (window.done < periods) & alive
 
-    begun = Window.empty(state, periods, integrator.tolerance(dtype))
-    return lax.while_loop(goes_on, lambda window: window.after(over(window.start)), begun)
+    begun = Window.empty(state, periods, integrator.tolerance(state.dtype))
+    return lax.while_loop(goes_on, step, begun)
+
+
+def integrated_difference(
+    pair: RotorPair,
+    orbit: tuple[Float[Array, " n"], Float[Array, " r"]],
+    period: Int[Array, ""],
+    integrator: Integrator,
+) -> Float[Array, ""]:
+    """Return the difference between a closed orbit and an integration over its period.
+
+    `orbit`: its scaled state (n,) at φ1 = 0, and its forces (r,): mean (N), mean square (N²), and
+    others that do not count; `period` (mesh periods). The result is the greatest of the relative
+    differences in mean and RMS force, and the scaled distance between start and end. It is inf if
+    the solver fails."""
+    state, forces = orbit
+
+    def step(_: Any, carry):
+        here, total, solved = carry
+        made = one_period(pair, here, integrator)
+        rates = jnp.append(made.response[:2], jnp.ones_like(made.duration))
+        return made.end, total + made.duration * rates, solved & made.solved
+
+    begun = state, jnp.zeros(3, state.dtype), jnp.ones((), bool)
+    end, total, solved = lax.fori_loop(0, period, step, begun)
+    sizes = jnp.stack([total[:2] / total[2], forces[:2]])
+    found, given = sizes.at[:, 1].set(jnp.sqrt(sizes[:, 1]))
+    apart = jnp.abs(found - given) / jnp.maximum(given, _FAINT * pair.force_scale)
+    largest = jnp.maximum(jnp.max(apart), jnp.max(jnp.abs(end - state)))
+    return jnp.where(solved & jnp.isfinite(largest), largest, jnp.inf)
 
 
 def no_tangents(pair: RotorPair) -> RotorPair:

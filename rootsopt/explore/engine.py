@@ -103,7 +103,7 @@ class Engine:
 
     def from_rest(self, config: Config) -> Evaluation:
         """Return the evaluation of a `config` from rest, as `rootsopt simulate` computes it."""
-        evaluator = Evaluator.of(config).from_neighbours()
+        evaluator = Evaluator.of(config)
         return dataclasses.replace(evaluator, orbits=self.orbits)()
 
     def prepare(self) -> None:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from rootsopt.config import Config
 from rootsopt.config.units import RPM
 from rootsopt.contact.size import size_map
-from rootsopt.dynamics.closed import Start, closed_motion
+from rootsopt.dynamics.closed import Start, motion
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.maxima import Maxima, local_maxima, prepare_maxima
 from rootsopt.dynamics.measures import PEAK_NORM, Measures, line_name
@@ -24,15 +24,13 @@ from rootsopt.dynamics.settle import BLOCK
 from rootsopt.dynamics.steady import (
     CLOSED,
     Steady,
-    collocates,
-    steady_motion,
     window_status,
 )
-from rootsopt.dynamics.window import lyapunov
+from rootsopt.dynamics.window import integrated_difference, lyapunov
 from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry
 from rootsopt.pump.loads import OrbitLoads, orbit_loads
-from rootsopt.response.orbits import Built, OrbitStore, prepare_near, with_samples
+from rootsopt.response.orbits import OrbitStore, prepare_samples, with_samples
 from rootsopt.response.records import (
     RESPONSES,
     bearing_record,
@@ -57,6 +55,9 @@ if TYPE_CHECKING:
 
 _MAPS = 5
 """Maximum number of contact maps tried for one design."""
+_APART = 1e-4
+"""Difference between an orbit closed by collocation and an integration over its period (see
+`integrated_difference`) above which the orbit is closed by shooting."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -144,10 +145,9 @@ class Evaluator:
     `reference`: response by which forces are divided when coexisting motions are compared;
     `fitted`: whether the contact map has been fitted to a motion; `map_error`: error of the contact
     map, relative to the static penetration, NaN if unknown; `maxima`: whether to compute all local
-    maxima of the force, with their gradients; `neighbours`: see `from_neighbours`; `confirm`:
-    whether an orbit that is reported with its series is closed anew and confirmed, even if it is
-    near a known one; `orbits`: orbits
-    known from former evaluations, which all evaluators made from this one share.
+    maxima of the force, with their gradients; `confirm`: whether an orbit
+    that is reported with its series is confirmed by an integration over its period; `orbits`:
+    orbits known from former evaluations, which all evaluators made from this one share.
     """
 
     config: Config
@@ -157,7 +157,6 @@ class Evaluator:
     fitted: bool = False
     map_error: float = float("nan")
     maxima: bool = False
-    neighbours: bool = False
     confirm: bool = True
     orbits: OrbitStore = dataclasses.field(default_factory=OrbitStore, compare=False, repr=False)
 
@@ -214,19 +213,10 @@ class Evaluator:
         """Return another evaluator that adds all local maxima of the force to an evaluation."""
         return dataclasses.replace(self, maxima=True)
 
-    def from_neighbours(self) -> "Evaluator":
-        """Return another evaluator, for hundreds of evaluations that begin on neighbours' orbits.
-
-        With `solver.orbit` `auto`, it closes these orbits by collocation. That takes a twentieth of
-        the time, and another program that takes as long to compile as a hundred evaluations."""
-        return dataclasses.replace(self, neighbours=True)
-
     def following(self, orbits: OrbitStore) -> "Evaluator":
-        """Return another evaluator that knows the `orbits` of other scenes.
-
-        It closes orbits from those of neighbours, and reports the series of such an orbit without
-        confirming it by an integration."""
-        return dataclasses.replace(self, neighbours=True, confirm=False, orbits=orbits)
+        """Return another evaluator that knows the `orbits` of other scenes, and reports the series
+        of an orbit without confirming it by an integration."""
+        return dataclasses.replace(self, confirm=False, orbits=orbits)
 
     def without_gradient(self) -> "Evaluator":
         """Return this evaluator unchanged, since its gradient takes little time.
@@ -267,38 +257,26 @@ class Evaluator:
         now = other = self._sized(design)
         for _ in range(_MAPS):
             now = other
-            near = None
-            if now._follows and not (series and self.confirm):
-                near = self.orbits.near(now.scene, design, start)
-            if near is None:
-                pair, tangents, shape = _build(now.scene, design)
-                dtype = pair.angle_scale.dtype
-                state = np.zeros(pair.states, dtype) if start is None else np.asarray(start, dtype)
-                found = jax.device_get(now.motion(pair, tangents, state))
-            else:
-                pair, shape, found = near
+            pair, tangents, shape = _build(now.scene, design)
+            solver = now.scene.solver
+            begin = self.orbits.start(pair, start, solver.max_orbit)
+            found = now.motion(pair, tangents, begin)
+            if series and self.confirm:
+                found = now._confirmed(pair, tangents, begin, found)
             if bool(found.collocated) and (series or self.maxima or now.scene.bearings is not None):
-                found = with_samples(found, now.scene.solver.samples)
+                found = with_samples(found, solver.samples)
             other = now._refitted(pair, found)
             if other is None:
                 break
             if float(other.scene.deepest) < float(now.scene.deepest):
                 other = other._sized(design)
-        built = Built(now.scene, design, pair)
-        if now._follows and built.continues:
-            self.orbits.keep(found, built)
+        self.orbits.keep(found, pair)
         report = now._report(design, (pair, shape), found, began, series)
         if self.maxima and report.usable:
             integrator = now.scene.solver.orbit
-            _, tangents, _ = _build(now.scene, design)
             maxima = local_maxima(pair, tangents, found.orbit, int(found.period), integrator)
             report = dataclasses.replace(report, maxima=maxima)
         return now, report
-
-    @property
-    def _follows(self) -> bool:
-        """Whether to close orbits by collocation from those of neighbours where possible."""
-        return self.neighbours or self.scene.solver.closing == "collocation"
 
     def recall(
         self, evaluation: Evaluation, again: Callable[[], Any], start: NDArray[np.float64] | None
@@ -309,10 +287,34 @@ class Evaluator:
         evaluator made from this one; `start`: its argument `start`."""
         self.orbits.recall(evaluation.motions(), again, start)
 
-    def motion(self, pair: RotorPair, tangents: RotorPair, state) -> Steady:
-        """Return the steady motion of `pair` that the scaled `state` (n,) leads to, with its
-        derivatives along `tangents`."""
-        return _motion(pair, tangents, state, self.scene.pitch_radius, self.scene.solver)
+    def motion(self, pair: RotorPair, tangents: RotorPair, start: Start) -> Steady:
+        """Return the steady motion of `pair` that `start` leads to, with its derivatives along
+        `tangents`, in arrays of NumPy."""
+        radius, solver = self.scene.pitch_radius, self.scene.solver
+        found = _motion(pair, tangents, start, radius, solver)
+        if Status.of(found.status) is not Status.NOT_CLOSED:
+            return found
+        return self._by_shooting(pair, tangents, start)
+
+    def _by_shooting(self, pair: RotorPair, tangents: RotorPair, start: Start) -> Steady:
+        """Return the result of `motion`, with an orbit closed by shooting.
+
+        Shooting has a program of its own, which is compiled only for the rare motions that need
+        it."""
+        solver = dataclasses.replace(self.scene.solver, closing="shooting")
+        return _motion(pair, tangents, start, self.scene.pitch_radius, solver)
+
+    def _confirmed(
+        self, pair: RotorPair, tangents: RotorPair, start: Start, found: Steady
+    ) -> Steady:
+        """Return the motion `found` from `start`, if an integration over its period confirms it.
+
+        Otherwise, return the motion whose orbit is closed by shooting."""
+        if not bool(found.collocated) or Status.of(found.status) not in CLOSED:
+            return found
+        orbit, integrator = found.orbit, self.scene.solver.orbit
+        apart = _integrated(pair, (orbit.state, orbit.response), found.period, integrator)
+        return found if apart <= _APART else self._by_shooting(pair, tangents, start)
 
     def pair(self, design: ArrayLike) -> RotorPair:
         """Return the rotor pair of `design` (config units)."""
@@ -329,21 +331,21 @@ class Evaluator:
         design = design_vector(self.config) if design is None else jnp.asarray(design)
         now = self._sized(design)
         pair, tangents, _ = _build.result_shape(now.scene, design)
-        dtype = pair.angle_scale.dtype
-        state = jax.ShapeDtypeStruct((pair.states,), dtype)
-
-        solver = now.scene.solver
+        dtype, solver = pair.angle_scale.dtype, now.scene.solver
+        begin = eqx.filter_eval_shape(_at_rest, pair, solver.max_orbit)
 
         def then(found: Steady) -> None:
+            if found.known is not None and (series or maxima or self.maxima):
+                found = prepare_samples(found, solver.samples)
+            if series and self.confirm:
+                known = found.orbit.state, found.orbit.response
+                _integrated.prepare(pair, known, found.period, solver.orbit)
             if maxima or self.maxima:
                 prepare_maxima(pair, tangents, found.orbit, solver.orbit)
 
         # The slowest compilation starts first.
-        _motion.prepare(pair, tangents, state, now.scene.pitch_radius, solver, then=then)
+        _motion.prepare(pair, tangents, begin, now.scene.pitch_radius, solver, then=then)
         _build.prepare(now.scene, design)
-        built = Built(now.scene, design, pair)
-        if now._follows and built.continues:
-            prepare_near(built)
         if series:
             count = pair.lobes * solver.samples
             times = jax.ShapeDtypeStruct((count,), float)
@@ -565,18 +567,15 @@ def _reached(pair: RotorPair, found: Steady) -> float:
     return scale * abs(float(found.settled.state[0]))
 
 
-def _steady(pair: RotorPair, tangents: RotorPair, state, radius, solver) -> Steady:
-    """Return the steady motion that the scaled `state` leads to.
-
-    The orbit is closed by the method of the `solver` (see `Solver.closing`)."""
-    if not collocates(pair, solver):
-        return steady_motion(pair, tangents, state, radius, solver)
-    start = Start.at(pair, pair.in_si(state), solver.max_orbit)
-    return closed_motion(pair, tangents, start, radius, solver)
+def _at_rest(pair: RotorPair, longest: int) -> Start:
+    """Return a start at rest; `longest`: longest period of an orbit (mesh periods)."""
+    rest = jnp.zeros(pair.states, pair.angle_scale.dtype)
+    return Start.at(pair, pair.in_si(rest), longest)
 
 
 _build = Program(Scene.pair_and_tangents)
-_motion = Program(_steady)
+_motion = Program(motion, gathered=0)
+_integrated = Program(integrated_difference)
 lyapunov_program = Program(lyapunov)
 unsettled_status = Program(window_status)
 

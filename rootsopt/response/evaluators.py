@@ -16,7 +16,7 @@ def evaluator_for(config: Config) -> Evaluates:
     if config.objective.motion == "ensemble":
         found = EnsembleEvaluator(single)
     elif config.objective.motion in ("worst", "weighted"):
-        found = AttractorEvaluator(single.from_neighbours())
+        found = AttractorEvaluator(single)
     if config.objective.speeds_rpm:
-        found = SpeedsEvaluator(found.from_neighbours())
+        found = SpeedsEvaluator(found)
     return found

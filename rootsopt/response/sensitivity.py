@@ -16,6 +16,7 @@ import numpy as np
 from rootsopt.config import Config
 from rootsopt.dynamics.maxima import local_maxima
 from rootsopt.response.evaluation import Evaluation, Evaluator
+from rootsopt.response.orbits import with_samples
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene, along
 from rootsopt.status import Status
@@ -144,7 +145,8 @@ def by_scene(evaluator: Evaluator, evaluation: Evaluation) -> Evaluation | None:
         some = directions[begin : begin + size]
         stacked = jax.tree.map(lambda *x: np.stack(x), *some, *[blank] * (size - len(some)))
         pair, tangents = _along(evaluator.scene, design, stacked)
-        found = jax.device_get(evaluator.motion(pair, tangents, np.asarray(evaluation.state)))
+        start = evaluator.orbits.start(pair, evaluation.state, solver.max_orbit)
+        found = evaluator.motion(pair, tangents, start)
         if Status.of(found.status) is not Status.PERIODIC:
             return None
         rows = np.column_stack([found.orbit.response, found.orbit.sensitivity])
@@ -155,6 +157,8 @@ def by_scene(evaluator: Evaluator, evaluation: Evaluation) -> Evaluation | None:
             gradient[name] |= dict(zip(keys, map(float, values), strict=True))
         if maxima is not None:
             period = int(found.period)
+            if bool(found.collocated):
+                found = with_samples(found, solver.samples)
             again = local_maxima(pair, tangents, found.orbit, period, solver.orbit)
             if again.times.shape != maxima.times.shape:
                 return None

@@ -18,10 +18,10 @@ from jax.custom_batching import sequential_vmap
 from jaxtyping import Array, Complex, Float, Int
 from numpy.typing import ArrayLike
 
-from rootsopt.dynamics.closed import Start, closed_motion, unknown
+from rootsopt.dynamics.closed import Start, motion, unknown
 from rootsopt.dynamics.linear import eigenvalues
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.steady import CLOSED, Solver, Steady, among, continues, steady_motion
+from rootsopt.dynamics.steady import CLOSED, Solver, Steady, among
 from rootsopt.profiles.validity import Soundness
 from rootsopt.runtime.precision import check_precision
 from rootsopt.runtime.programs import Program
@@ -228,10 +228,7 @@ def _solve(scene: Scene, design, start, numbers: tuple[int, ...]) -> tuple[Respo
     pair, tangents, _ = along(build, chosen, _basis(chosen))
     start = _start_of(pair, start, scene.solver)
     radius, solver = scene.pitch_radius, scene.solver
-    if continues(pair, solver):
-        found = closed_motion(pair, tangents, start, radius, solver)
-    else:
-        found = steady_motion(pair, tangents, pair.scaled(start.state), radius, solver)
+    found = motion(pair, tangents, start, radius, solver)
     if scene.fidelity == "map":
         found = _on_map(scene, pair, found)
     return _named(scene.solver, pair, tangents, found)
@@ -251,11 +248,7 @@ def _start_of(pair: RotorPair, start: Any, solver: Solver) -> Start:
             )
         return Start.at(pair, state, solver.max_orbit)
     usual = jax.eval_shape(lambda: Start.at(pair, start.state, solver.max_orbit))
-    kinds = [
-        (jax.tree.structure(one), [jnp.shape(leaf) for leaf in jax.tree.leaves(one)])
-        for one in (start, usual)
-    ]
-    if kinds[0] != kinds[1]:
+    if not start.fits(usual):
         raise ValueError(
             "Argument `start` must come from a response of the same kind of scene (family, lobes, "
             "parts, solver settings), but comes from another one; pass its `start.state`, or None"

@@ -92,10 +92,6 @@ class Evaluates(Protocol):
         """Return another evaluator that adds all local maxima of the force to an evaluation."""
         ...
 
-    def from_neighbours(self) -> "Evaluates":
-        """Return another evaluator, for many evaluations that begin on neighbours' orbits."""
-        ...
-
     def without_gradient(self) -> "Evaluates":
         """Return an evaluator that skips the gradient, if computing it takes most of the time."""
         ...
@@ -174,10 +170,6 @@ class Wrapper:
     def with_maxima(self: W) -> W:
         """Return another evaluator that adds all local maxima of the force to an evaluation."""
         return self._around(self.single.with_maxima())
-
-    def from_neighbours(self: W) -> W:
-        """Return another evaluator, for many evaluations that begin on neighbours' orbits."""
-        return self._around(self.single.from_neighbours())
 
     def without_gradient(self: W) -> W:
         """Return an evaluator that skips the gradient, if computing it takes most of the time."""

@@ -92,7 +92,7 @@ class Study:
         limits = force_limits(config, scene)
         maxima = any(_is_cornered(aim) for aim in aims) or any(one.cornered for one in limits)
         # A front takes hundreds of evaluations.
-        exact = Evaluator.of(reported(config)).from_neighbours().prepare(maxima=maxima)
+        exact = Evaluator.of(reported(config)).prepare(maxima=maxima)
         exact, baseline = exact.fit()
         if maxima:
             exact = exact.with_maxima()

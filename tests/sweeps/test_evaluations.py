@@ -13,11 +13,12 @@ import pytest
 
 from rootsopt.commands import optimize, parallel, pareto
 from rootsopt.config import load
+from rootsopt.dynamics.closed import Start
 from rootsopt.dynamics.collocation.known import Known
 from rootsopt.errors import InputError
 from rootsopt.response.evaluation import Evaluator, _build
 from rootsopt.response.evaluators import evaluator_for
-from rootsopt.response.orbits import Built, OrbitStore, _Closed
+from rootsopt.response.orbits import OrbitStore
 from rootsopt.response.runs import HERE, Runs
 from rootsopt.scene import Scene, design_vector
 from rootsopt.sweeps import evaluations
@@ -132,11 +133,10 @@ def test_a_scheduler_without_workers_is_given_up(monkeypatch):
 def test_orbits_travel_with_the_states_that_name_them():
     config = load("cic")
     pair, *_ = _build.result_shape(Scene.from_config(config), design_vector(config))
-    built = Built(None, None, pair)  # pyright: ignore[reportArgumentType]
     store, state, far = OrbitStore(), np.array([0.1, 1 / 3]), np.array([0.2, 0.0])
     for number, place in enumerate((state, far), 1):
         known = Known.empty((number, 2), 2, 2)
-        store._keep(place.tobytes(), (_Closed(place, 1, np.ones(3), None, known), built))
+        store._keep(place.tobytes(), Start(place, known, pair))
     store.recall([np.array([0.3, 0.0])], lambda: None, None)
     for start in (
         state,
@@ -145,17 +145,17 @@ def test_orbits_travel_with_the_states_that_name_them():
     ):
         part = store.part(start)
         assert len(part) == 1
-        found = part.begin(state)
+        found = part._recalled(state.tobytes())
         assert found is not None
-        assert found[0].elements.state.shape[0] == 1
+        assert found.known.elements.state.shape[0] == 1
     assert len(store.part(None)) == len(store.part(np.array([7.0, 8.0]))) == 0
     again = pickle.loads(pickle.dumps(store.part(far)))
     back = OrbitStore()
     back.add(again)
-    found = back.begin(far)
+    found = back._recalled(far.tobytes())
     assert found is not None
-    assert found[0].elements.state.shape[0] == 2
-    assert back.begin(state) is None
+    assert found.known.elements.state.shape[0] == 2
+    assert back._recalled(state.tobytes()) is None
     assert len(pickle.loads(pickle.dumps(store))) == 2
 
 

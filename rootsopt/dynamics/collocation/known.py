@@ -9,7 +9,6 @@ from jaxtyping import Array, Bool, Float
 
 from rootsopt.dynamics.collocation.elements import Elements, Mesh
 from rootsopt.dynamics.collocation.gauss import GAUSS
-from rootsopt.dynamics.collocation.mesh import sizes
 
 
 class Known(NamedTuple):
@@ -61,20 +60,37 @@ class Known(NamedTuple):
         return cls(motion, nothing, nothing, nothing, no, no)
 
 
-def trimmed(known: Known, period: int) -> Known | None:
-    """Return the orbit `known` in arrays of the usual size for `period` mesh periods.
-
-    All orbits of this period then share one program. The result is `None` if the orbit needs more
-    room. The arrays are those of NumPy."""
-    room, times = sizes(period)
+def trimmed(known: Known) -> Known:
+    """Return the orbit `known` in arrays of NumPy without the unused elements and times, to store
+    it."""
     mesh, *parts = jax.tree.map(np.asarray, known.elements)
-    anchors, interval = mesh.times[:times], np.minimum(mesh.interval[:room], times - 2)
-    if mesh.used + 1 > room or np.any(mesh.times[times - 2 :] < mesh.times[-1]):
-        return None
-    shares = mesh.left[:room], mesh.right[:room], mesh.used
-    arrays: Any = anchors, mesh.which[:times], interval, *shares
+    count = int(mesh.used)
+    # The times that follow the last interval are all equal to the last of these.
+    times = int(np.max(mesh.interval[:count], initial=0)) + 2
+    shares = (x[:count] for x in (mesh.interval, mesh.left, mesh.right))
+    short = Mesh(mesh.times[:times], mesh.which[:times], *shares, mesh.used)
     rest: Any = map(np.asarray, known[1:])
-    return Known(Elements(Mesh(*arrays), *(part[:room] for part in parts)), *rest)
+    return Known(Elements(short, *(part[:count] for part in parts)), *rest)
 
 
-__all__ = ["Known", "trimmed"]
+def padded(known: Known, room: tuple[int, int]) -> Known:
+    """Return a `trimmed` orbit in arrays with `room` for elements and for times of the mesh."""
+    mesh, *parts = known.elements
+    elements, times = room[0] - len(mesh.left), room[1] - len(mesh.times)
+
+    def more(x, value):
+        return np.pad(x, (0, elements), constant_values=value)
+
+    full = Mesh(
+        times=np.pad(mesh.times, (0, times), mode="edge"),
+        which=np.pad(mesh.which, (0, times), constant_values=-1),
+        interval=more(mesh.interval, room[1] - 2),
+        left=more(mesh.left, 1.0),
+        right=more(mesh.right, 1.0),
+        used=mesh.used,
+    )
+    wide = (np.pad(x, ((0, elements), *((0, 0),) * (x.ndim - 1))) for x in parts)
+    return known._replace(elements=Elements(full, *wide))  # pyright: ignore[reportArgumentType]
+
+
+__all__ = ["Known", "padded", "trimmed"]

@@ -1,23 +1,22 @@
 """Tests of orbits closed from those of neighbouring pairs."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import rootsopt
+from rootsopt.dynamics.closed import Start
 from rootsopt.dynamics.collocation.elements import Elements, Mesh
 from rootsopt.dynamics.collocation.equation import Points
 from rootsopt.dynamics.collocation.forces import OrbitForces
 from rootsopt.dynamics.collocation.gauss import GAUSS, POINTS
-from rootsopt.dynamics.collocation.known import Known, trimmed
+from rootsopt.dynamics.collocation.known import Known, padded, trimmed
 from rootsopt.dynamics.collocation.mesh import roughness, sizes
 from rootsopt.dynamics.collocation.peak import Peak, Rivals, peak_of, rivals_of
 from rootsopt.dynamics.collocation.sampled import PARTS, as_flow, sampled
 from rootsopt.response.evaluation import Evaluator
-from rootsopt.response.orbits import Built, OrbitStore, _Closed, _key
+from rootsopt.response.orbits import OrbitStore, _key
 from rootsopt.status import Status
 
 PERIOD, BEGIN, USED = 2, 0.3, 10
@@ -81,30 +80,33 @@ def test_orbit_sampled_as_steps_is_the_motion_over_one_period():
     np.testing.assert_allclose(float(flow.peak_time), 0.15)
 
 
-def test_known_orbit_is_cut_to_the_size_of_its_period():
-    known = _known((sizes(8)[0], sizes(8)[1]))
-    cut = trimmed(known, PERIOD)
-    assert cut is not None
-    cut = jax.tree.map(jnp.asarray, cut)
-    assert (cut.elements.state.shape[0], cut.elements.mesh.times.shape[0]) == sizes(PERIOD)
-    for tau in (0.0, 0.7, 2.25):
-        np.testing.assert_array_equal(
-            cut.elements.motion(jnp.asarray(tau)), known.elements.motion(jnp.asarray(tau))
-        )
-    assert int(jnp.max(cut.elements.mesh.interval)) == sizes(PERIOD)[1] - 2
-    np.testing.assert_array_equal(
-        cut.elements.mesh.lengths[:USED], known.elements.mesh.lengths[:USED]
-    )
-    np.testing.assert_allclose(roughness(cut.elements), roughness(known.elements), rtol=0)
-    many = known._replace(elements=known.elements._replace(
-        mesh=known.elements.mesh._replace(used=jnp.asarray(sizes(1)[0]))))  # fmt: skip
-    assert trimmed(many, 1) is None
+def test_known_orbit_is_stored_without_unused_elements():
+    """It returns as it was, in arrays of any size that has room for it."""
+    known = _known(sizes(8))
+    cut = trimmed(known)
+    assert cut.elements.state.shape[0] == USED
+    again = padded(cut, sizes(8))
+    for one, other in zip(jax.tree.leaves(again), jax.tree.leaves(known), strict=True):
+        assert one.shape == other.shape
+    few = jax.tree.map(jnp.asarray, padded(cut, sizes(1)))
+    for found in (jax.tree.map(jnp.asarray, again), few):
+        for tau in (0.0, 0.7, 2.25):
+            np.testing.assert_array_equal(
+                found.elements.motion(jnp.asarray(tau)), known.elements.motion(jnp.asarray(tau))
+            )
+        np.testing.assert_allclose(roughness(found.elements), roughness(known.elements), rtol=0)
+        for name in ("times", "which", "interval", "left", "right"):
+            room = len(getattr(found.elements.mesh, name))
+            whole = padded(trimmed(_known(sizes(8))), sizes(8)).elements.mesh
+            if room == len(getattr(whole, name)):
+                np.testing.assert_array_equal(
+                    getattr(found.elements.mesh, name), getattr(known.elements.mesh, name)
+                )
 
 
 def _entry(state):
     """Return an entry of the memory for an orbit with this state."""
-    built = Built(None, None, None)  # pyright: ignore[reportArgumentType]
-    return _Closed(state, PERIOD, np.ones(3), None, _known(sizes(8))), built
+    return Start(state, trimmed(_known(sizes(8))), None)  # pyright: ignore[reportArgumentType]
 
 
 def test_memory_forgets_the_least_recently_used_orbit(monkeypatch):
@@ -186,7 +188,7 @@ def test_peak_is_located(place, corner):
 def test_free_form_from_a_neighbour_is_that_by_shooting():
     """Elements end at its knots too, and gradients with respect to its coefficients are exact."""
     config = rootsopt.load_config("configs/free.yaml")
-    evaluator = Evaluator.of(config).from_neighbours()
+    evaluator = Evaluator.of(config)
     base = evaluator(series=False)
     wave = 1 + 2e-3 * np.cos(3.0 * np.arange(len(base.design)))
     design = np.array(list(base.design.values())) * wave
@@ -202,11 +204,11 @@ def test_free_form_from_a_neighbour_is_that_by_shooting():
 
 @pytest.mark.parametrize("name", ["cic", pytest.param("ee", marks=pytest.mark.long)])
 def test_orbit_from_a_neighbour_is_that_by_shooting(name):
-    """The neighbour was closed by shooting, too. At half the speed, other events occur."""
+    """At half the speed, other events occur."""
     config = rootsopt.load_config(f"configs/{name}.yaml")
     assert config.solver.orbit == "auto"
-    evaluator = Evaluator.of(config).from_neighbours()
-    fresh = dataclasses.replace(evaluator, orbits=OrbitStore())
+    evaluator = Evaluator.of(config)
+    fresh = Evaluator.of(config.replaced({"solver.orbit": "shooting"}))
     base = evaluator(series=False)
     assert "from_neighbour" not in base.statistics
     for factor, slack in ((1.003, 5e-6), (0.5, 1e-2)):
@@ -237,8 +239,8 @@ def test_maxima_near_a_neighbour_are_those_by_shooting():
     # Collocation is refined for mean, RMS and peak; at 1e-8, lower maxima err by some 1e-6.
     overrides = ["scene.speed_rpm=1000", "solver.rtol=1e-9"]
     config = rootsopt.load_config("configs/cic.yaml", overrides)
-    evaluator = Evaluator.of(config).from_neighbours().with_maxima()
-    fresh = dataclasses.replace(evaluator, orbits=OrbitStore())
+    evaluator = Evaluator.of(config).with_maxima()
+    fresh = Evaluator.of(config.replaced({"solver.orbit": "shooting"})).with_maxima()
     base = evaluator(series=False)
     for factor in (0.998, 0.999, 1.003):
         design = factor * np.array(list(base.design.values()))
