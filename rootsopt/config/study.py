@@ -81,9 +81,8 @@ class SolverConfig(Section):
     )
     orbit: Literal["collocation", "shooting", "auto"] = Field(
         "auto",
-        description="how periodic orbits are closed: by shooting, by collocation aligned with "
-        "contact events, or auto: by collocation from the orbit of a neighbour where hundreds of "
-        "evaluations follow and along branches, otherwise by shooting",
+        description="how periodic orbits are closed: auto and collocation: by collocation aligned "
+        "with contact events where possible; shooting: by shooting, an independent reference",
     )
     gradient: Literal["forward", "reverse"] = Field(
         "forward", description="differentiation mode; both give the same gradient"

@@ -288,8 +288,9 @@ class Evaluator:
         self.orbits.recall(evaluation.motions(), again, start)
 
     def motion(self, pair: RotorPair, tangents: RotorPair, start: Start) -> Steady:
-        """Return the steady motion of `pair` that `start` leads to, with its derivatives along
-        `tangents`, in arrays of NumPy."""
+        """Return the steady motion of `pair` that `start` leads to, in arrays of NumPy.
+
+        It has derivatives along `tangents`; `start`: result of `OrbitStore.start`."""
         radius, solver = self.scene.pitch_radius, self.scene.solver
         found = _motion(pair, tangents, start, radius, solver)
         if Status.of(found.status) is not Status.NOT_CLOSED:
@@ -569,12 +570,17 @@ def _reached(pair: RotorPair, found: Steady) -> float:
 
 def _at_rest(pair: RotorPair, longest: int) -> Start:
     """Return a start at rest; `longest`: longest period of an orbit (mesh periods)."""
-    rest = jnp.zeros(pair.states, pair.angle_scale.dtype)
-    return Start.at(pair, pair.in_si(rest), longest)
+    return Start.at(pair, jnp.zeros(pair.states, pair.angle_scale.dtype), longest)
 
 
-_build = Program(Scene.pair_and_tangents)
-_motion = Program(motion, gathered=0)
+def _motion_from(pair: RotorPair, tangents: RotorPair, start: Start, radius, solver) -> Steady:
+    """Return the steady motion that a `start` with a scaled state leads to."""
+    start = eqx.tree_at(lambda start: start.state, start, pair.in_si(start.state))
+    return motion(pair, tangents, start, radius, solver)
+
+
+_build = Program(Scene.pair_and_tangents, gathered=0)
+_motion = Program(_motion_from, gathered=0)
 _integrated = Program(integrated_difference)
 lyapunov_program = Program(lyapunov)
 unsettled_status = Program(window_status)

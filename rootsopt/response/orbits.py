@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -80,11 +79,12 @@ class OrbitStore:
         """Return where the search for an orbit of `pair` begins, in arrays of NumPy.
 
         `state`: scaled, at φ1 = 0; `None`: at rest. If it is that of a known orbit, the search
-        begins on this orbit. `longest`: longest period of an orbit (mesh periods)."""
+        begins on this orbit. `longest`: longest period of an orbit (mesh periods). Unlike
+        elsewhere, the state of the result is scaled."""
         dtype, room = pair.angle_scale.dtype, sizes(longest)
         given = np.zeros(pair.states, dtype) if state is None else np.asarray(state, dtype)
         empty = _empty(room, pair.states, 1 + pair.two_sided)
-        nothing = Start(np.asarray(pair.in_si(jnp.asarray(given))), empty, _numbers(pair))
+        nothing = Start(given, empty, _numbers(pair))
         if state is None:
             return nothing
         with self._lock:
