@@ -579,7 +579,7 @@ def _motion_from(pair: RotorPair, tangents: RotorPair, start: Start, radius, sol
     return motion(pair, tangents, start, radius, solver)
 
 
-_build = Program(Scene.pair_and_tangents, gathered=0)
+_build = Program(Scene.pair_and_tangents)
 _motion = Program(_motion_from, gathered=0)
 _integrated = Program(integrated_difference)
 lyapunov_program = Program(lyapunov)

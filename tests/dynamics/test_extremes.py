@@ -18,7 +18,7 @@ from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.orbit import Orbit
 from rootsopt.dynamics.parts import TimingGear
 from rootsopt.dynamics.peak import Steps, locate_peak
-from rootsopt.dynamics.steady import _Attempts
+from rootsopt.dynamics.steady import final
 from rootsopt.dynamics.timescales import Timescales
 from rootsopt.dynamics.verdict import is_consistent, is_idle, judged
 from rootsopt.errors import InputError
@@ -371,9 +371,9 @@ def test_a_pair_with_a_motor_that_floats_is_idle():
 def test_a_force_lost_in_rounding_is_no_result(monkeypatch):
     """Beyond the limit of `force_rounding`, the forces have a status and no gradient."""
 
-    def stricter(pair, tangents, state, radius, solver):
-        found = _motion(pair, tangents, state, radius, solver)
-        return _Attempts(pair, tangents, solver, radius).final(found)
+    def stricter(pair, tangents, start, radius, solver):
+        found = _motion(pair, tangents, start, radius, solver)
+        return final(pair, jax.tree.map(jnp.asarray, found), radius)
 
     # The program has the usual limit; what it finds is judged by another one.
     monkeypatch.setattr("rootsopt.dynamics.steady.UNRESOLVED", 1e-14)
