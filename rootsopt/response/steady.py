@@ -303,6 +303,7 @@ def _next_start(solver: Solver, pair: RotorPair, found: Steady, state: Float[Arr
     failed = among(found.status, (*failed, Status.SOLVER_FAILED))
     rest = pair.in_si(jnp.zeros_like(state))
     known = unknown(pair, solver.max_orbit) if found.known is None else found.known
+    known = known._replace(sound=known.sound & among(found.status, CLOSED))
     numbers = eqx.filter(pair, eqx.is_inexact_array)
     return Start(jnp.where(failed, rest, state), known, numbers)
 

@@ -1,5 +1,6 @@
 """`Response.start`: an orbit that travels through pure functions to similar designs and scenes."""
 
+import dataclasses
 import pickle
 
 import equinox as eqx
@@ -10,6 +11,8 @@ import pytest
 
 import rootsopt
 from rootsopt import Scene, Status, steady_response
+from rootsopt.dynamics.window import integrated_difference
+from rootsopt.response.evaluation import Evaluator
 
 CONFIG = rootsopt.load_config("configs/cic.yaml")
 DESIGN = np.asarray(CONFIG.design, float)
@@ -113,3 +116,50 @@ def test_start_of_another_kind_is_refused(scene, first):
         steady_response(Scene.from_config(other), other.design, first.start)
     with pytest.raises(ValueError, match=r"state \(2,\) of this scene"):
         steady_response(scene, DESIGN, np.zeros(3))
+
+
+def test_orbit_that_is_not_closed_is_said_to_be(scene, monkeypatch):
+    """Inside `jit` it has a status; otherwise shooting closes it."""
+    monkeypatch.setattr("rootsopt.dynamics.closed.CORRECTED", 0.0)
+    # With a window of 16 mesh periods, which says that the motion is not chaotic.
+    brief = eqx.tree_at(lambda s: s.solver, scene, dataclasses.replace(scene.solver, windows=16))
+    found, slope = jax.jit(
+        lambda design: jax.value_and_grad(
+            lambda design: (lambda one: (one.mean, one))(steady_response(brief, design)),
+            has_aux=True,
+        )(design)
+    )(DESIGN)
+    assert Status.of(found[1].status) is Status.NOT_CLOSED
+    assert np.all(np.isnan(slope))
+    assert not bool(found[1].start.known.sound)
+    asked = []
+
+    def program(scene, *rest):
+        asked.append(scene.solver.closing)
+        return found[1]._replace(status=codes[len(asked) - 1]), slope
+
+    codes = Status.NOT_CLOSED.code, Status.PERIODIC.code
+    monkeypatch.setattr("rootsopt.response.steady._compiled", program)
+    assert Status.of(steady_response(scene, DESIGN).status) is Status.PERIODIC
+    assert asked == ["auto", "shooting"]
+
+
+def test_reported_orbit_is_integrated(scene, monkeypatch):
+    """An orbit that an integration over its period contradicts is closed by shooting."""
+    evaluator = Evaluator.of(CONFIG)
+    usual = evaluator()
+    assert usual.statistics["collocated"] == 1
+    pair, how = evaluator.pair(DESIGN), scene.solver.orbit
+    square = usual.response["rms_force_N"] ** 2
+    forces = jnp.asarray([usual.response["mean_force_N"], square])
+    state = jnp.asarray(usual.state)
+    apart = eqx.filter_jit(integrated_difference)
+    assert apart(pair, (state, forces), jnp.asarray(1), how) < 1e-6
+    assert apart(pair, (state, forces * 1.001), jnp.asarray(1), how) > 4e-4
+    assert apart(pair, (state * 1.01, forces), jnp.asarray(1), how) > 1e-4
+    monkeypatch.setattr("rootsopt.response.evaluation._APART", 0.0)
+    again = evaluator()
+    assert "collocated" not in again.statistics
+    assert again.response["peak_force_N"] == pytest.approx(usual.response["peak_force_N"], rel=1e-7)
+    # Without a series, nothing is integrated.
+    assert evaluator(series=False).statistics["collocated"] == 1
