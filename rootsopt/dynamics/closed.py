@@ -210,13 +210,21 @@ class _Attempts(eqx.Module):
         # The orbit must be that of the transient everywhere, not only at φ1 = 0.
         reach = 10 * within / jnp.maximum(1 - made.orbit.multiplier, 1e-3)
         meets = now.near | (apart(made.known, settled.pieces) <= reach)
+        # The orbit is that of the transient, but a finer mesh does not make it accurate: it has an
+        # event that the equation does not know. A further attempt would end the same way.
+        vague = ~now.near & meets & made.sound & ~made.verified & (made.shorter == 0)
         made = made._replace(verified=made.verified & meets)
         found = self.taken(self.counted(now.found, settled), made, place, period, within)
         failed = found.status == Status.NOT_SETTLED.code
         refused = now.near & (found.status != Status.PERIODIC.code)
         shorter = jnp.where(now.near, 0, made.shorter)
-        again = failed & ~now.near & (now.tries + 1 < _ATTEMPTS)
+        again = failed & ~now.near & ~vague & (now.tries + 1 < _ATTEMPTS)
         again &= (shorter > 0) | (found.used < solver.max_periods)
+        # Chaos does not repeat at two tolerances: no window is needed to exclude it.
+        repeats = (now.tries > 0) & (settled.spread < within) & ~again
+        missed = failed & ~now.near & (vague | repeats)
+        status = jnp.where(missed, Status.NOT_CLOSED.code, found.status)
+        found = found._replace(status=status)
         finer = jnp.where(now.near | (shorter > 0), 1.0, 0.1)
         return _Loop(
             found=found,
@@ -254,19 +262,16 @@ class _Attempts(eqx.Module):
         """Return the result, judged by a window of the motion if no orbit has been closed."""
         solver, found = self.solver, loop.found
         found = found._replace(settled=found.settled._replace(pieces=None))
-        if not solver.windows:
-            return found
         unsettled = found.status == Status.NOT_SETTLED.code
+        made, status = self.no_window(loop.state, solver.windows), found.status
 
         def window() -> tuple[Window, Int[Array, ""]]:
             made = lyapunov(self.pair, loop.state, solver.windows, solver.transient)
             return made, window_status(self.pair, made)
 
-        made, status = lax.cond(
-            unsettled & (solver.examine > 0),
-            window,
-            lambda: (self.no_window(loop.state, solver.windows), found.status),
-        )
+        if solver.windows:
+            examined = unsettled & (solver.examine > 0)
+            made, status = lax.cond(examined, window, lambda: (made, status))
         repeats = unsettled & (status == Status.NOT_SETTLED.code) & (found.settled.period > 0)
         status = jnp.where(repeats, Status.NOT_CLOSED.code, status)
         return found._replace(window=made, status=status)
@@ -306,8 +311,9 @@ def closed_motion(
 
     An orbit is rejected if it is not stable or not near the end of the transient. The transient
     then continues, followed by another attempt (`_ATTEMPTS`). A window of the motion follows if the
-    last attempt fails. If it shows no chaos although the transient repeated, the status is
-    NOT_CLOSED. If an orbit near the known one is not accepted, the search begins at `start.state`.
+    last attempt fails, unless the transient has repeated at two tolerances. If it shows no chaos
+    although the transient repeated, the status is NOT_CLOSED. If an orbit near the known one is not
+    accepted, the search begins at `start.state`.
 
     The orbit has no samples of the state and no steps (see `collocation.sampled`). Collocation must
     support the pair (`collocation.closing.supported`)."""

@@ -35,7 +35,14 @@ from rootsopt.dynamics.collocation.events import (
 )
 from rootsopt.dynamics.collocation.forces import OrbitForces, forces_of, no_forces
 from rootsopt.dynamics.collocation.known import Known
-from rootsopt.dynamics.collocation.mesh import aligned, counted, needed, ordered, roughness
+from rootsopt.dynamics.collocation.mesh import (
+    aligned,
+    counted,
+    most_elements,
+    needed,
+    ordered,
+    roughness,
+)
 from rootsopt.dynamics.collocation.newton import (
     advanced,
     between,
@@ -276,7 +283,8 @@ class Closer(eqx.Module):
         taken = now.elements.mesh.used
         first = taken // 2 + _EVENT * events.count
         used = jnp.where(now.fits, jnp.where(finer, (_FINER * taken).astype(int), taken), first)
-        used = jnp.clip(used, events.count + 2, now.elements.state.shape[0] - 1)
+        used = jnp.maximum(jnp.minimum(used, most_elements(now.elements.mesh)), events.count + 2)
+        used = jnp.minimum(used, now.elements.state.shape[0] - 1)
         (place, wanted), (spot, number) = needed(now.elements), counted(now.elements)
         density = jnp.where(now.fits, place, spot), jnp.where(now.fits, wanted, number)
         new = aligned(now.elements, (events.times, events.which), density, used)
@@ -344,7 +352,7 @@ class Closer(eqx.Module):
                 strict=True,
             )
         )
-        full = now.elements.mesh.used >= now.elements.state.shape[0] - 1
+        full = now.elements.mesh.used >= most_elements(now.elements.mesh)
         # Newton's method has converged, so the correction must be small. It is large or NaN where
         # the time derivative of a margin vanishes at its event.
         good = found.correction < CORRECTED

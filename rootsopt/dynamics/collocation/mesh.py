@@ -32,6 +32,17 @@ def sizes(periods: int) -> tuple[int, int]:
     return -(-elements // BLOCK) * BLOCK, times + 3
 
 
+def most_elements(mesh: Mesh) -> Int[Array, ""]:
+    """Return the number of elements above which the `mesh` is not refined.
+
+    The arrays have room for more if the period is shorter than the longest one. An orbit that needs
+    more elements has an event that the equation does not know, and each further element costs
+    time."""
+    first, further = jnp.minimum(mesh.period, 2.0), jnp.maximum(mesh.period - 2.0, 0.0)
+    wanted = jnp.round(first * _MOST[0] + further * _MOST[1]).astype(int)
+    return jnp.minimum(wanted, mesh.left.shape[0]) - 1
+
+
 def shared(
     times: Float[Array, " m"],
     which: Int[Array, " m"],
