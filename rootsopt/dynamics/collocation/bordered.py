@@ -7,7 +7,7 @@ parameter is singular (Keller 1977). Mesh and events are found as for single orb
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -149,13 +149,13 @@ class _Follower(Closer):
         del now
         return jnp.asarray(_SMALL)
 
-    def judged(self, now: Loop, after: Loop, size: Float[Array, ""]) -> Loop:
+    def judged(self, now: Loop, after: Loop, size: Float[Array, ""], found: Any) -> Loop:
         """Return the loop's state `after` a step of the given size.
 
         If events of the known orbit are missing on the new one, their equations have no solution.
         The flags along the motion at the start then show the events."""
         size = jnp.maximum(size, jnp.abs(after.line.share - now.line.share))
-        new = super().judged(now, after, size)
+        new = super().judged(now, after, size, found)
         lost = now.trusted & new.looks & ~new.solved
         begun = self.start()._replace(looks=lost, trusted=~lost, closed=new.closed)
         return choose(lost, begun._replace(failures=new.failures), new)

@@ -51,7 +51,7 @@ from rootsopt.dynamics.collocation.newton import (
     has_stalled,
     lines,
 )
-from rootsopt.dynamics.collocation.peak import Rivals, forces_along, rivals_of
+from rootsopt.dynamics.collocation.peak import Rivals, forces_along, is_settled, peak_of, rivals_of
 from rootsopt.dynamics.collocation.system import Step, chained, condensed
 from rootsopt.dynamics.orbit import choose
 from rootsopt.dynamics.pair import RotorPair
@@ -79,8 +79,12 @@ _FAR = 1e-6
 """Difference (rad) between the contact's normal angle in the solved orbit and that found by a
 search, above which the orbit is solved again from the latter."""
 _GAIN = 10.0
-"""Factor by which the difference between the results on two meshes is divided to estimate the error
-on the finer mesh. In theory the error falls by the larger factor 1.4⁸."""
+"""Factor by which the difference between the forces on two meshes is divided to estimate the error
+on the finer mesh. In theory the error falls by the larger factor 1.4⁸. The difference between their
+derivatives is not divided: it must bound the error, and falls less evenly."""
+_ROUGH = 3e-8
+"""Relative error of derivatives that does not show in this difference: both meshes have the same
+roots of the gap to 1e-6 rad, and the same rounding errors."""
 
 
 class Closed(NamedTuple):
@@ -305,22 +309,25 @@ class Closer(eqx.Module):
             return self.keep(now._replace(line=line), found)
 
         def goes_on() -> Loop:
-            rivals = rivals_of(at, points, *forces_along(equation, points), now.rivals)
+            along = forces_along(equation, points)
+            rivals = rivals_of(at, points, *along, now.rivals)
+            found = is_settled(now.rivals, rivals, peak_of(at, now.rivals, *along))
             after = now._replace(elements=moved, rivals=rivals, line=line)
-            return self.judged(now, after, size)
+            return self.judged(now, after, size, found)
 
         new = lax.cond(now.keeps, kept, goes_on)
         return new._replace(closed=new.closed._replace(steps=now.closed.steps + ~now.keeps))
 
-    def judged(self, now: Loop, after: Loop, size: Float[Array, ""]) -> Loop:
+    def judged(self, now: Loop, after: Loop, size: Float[Array, ""], found: Any) -> Loop:
         """Return the loop's state `after` a step of the given size.
 
-        If the step is small enough, the motion is solved. Where rounding keeps steps above the
-        limit, the method ends when they no longer shrink."""
+        If the step is small enough and the peak is `found`, the motion is solved. Where rounding
+        keeps steps above the limit, the method ends when they no longer shrink."""
         limit, tries = self.limit(now), now.tries + 1
         stalled = has_stalled(size, now.size)
         # A size of NaN also ends the method.
-        ends = ~(size > limit) | stalled | (tries >= _STEPS)
+        ends = ~(size > limit) | stalled
+        ends = (ends & (found | ~jnp.isfinite(size))) | (tries >= _STEPS)
         # Where events have passed each other, the elements between them have a negative length.
         mesh, rising = ordered(after.elements.mesh)
         good = rising & (stalled | (size <= 10 * limit))
@@ -344,14 +351,9 @@ class Closer(eqx.Module):
         # On the first mesh, the errors are estimated from those of the known orbit.
         growth = jnp.maximum(size / self.known.roughness, 1.0) ** 2
         first = now.meshes == 0
-        error, drift = (
-            jnp.where(first, known * growth, x / _GAIN)
-            for known, x in zip(
-                (self.known.error, self.known.drift),
-                _differences(now.closed.found, found),
-                strict=True,
-            )
-        )
+        apart, turned = _differences(now.closed.found, found)
+        error = jnp.where(first, self.known.error * growth, apart / _GAIN)
+        drift = jnp.where(first, self.known.drift * growth, turned + _ROUGH)
         full = now.elements.mesh.used >= most_elements(now.elements.mesh)
         # Newton's method has converged, so the correction must be small. It is large or NaN where
         # the time derivative of a margin vanishes at its event.

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import NDArray
 
 from rootsopt.dynamics.collocation.elements import Elements
@@ -25,6 +25,10 @@ _PLACES = np.linspace(0.0, 1.0, 9)
 """Places in each element at which the polynomials of the force are compared."""
 _STEPS = 4
 """Number of Newton steps from the best of these places to the maximum of a polynomial."""
+_CLOSE = 1e-4
+"""Distance of the peak from the instant at which the equation is evaluated (fraction of the
+element's length) below which force and derivative are extrapolated to it: both errors are then far
+below those of the orbit."""
 _NEAREST = 0.1
 """Greatest distance of the peak from the instant at which the equation is evaluated, as a fraction
 of the element's length. The latter lies at the maximum of a polynomial."""
@@ -138,6 +142,19 @@ def peak_of(
     height = jnp.where(element < extra, height, -jnp.inf)
     top = jnp.argmax(height)
     return Peak(element[top], share[top], shift[top], top, height[top])
+
+
+def is_settled(before: Rivals, after: Rivals, peak: Peak) -> Bool[Array, ""]:
+    """Return whether the peak lies so close to an instant that the extrapolation to it is exact.
+
+    `before`: instants at which the equation was evaluated; `peak`: result of `peak_of` for them;
+    `after`: result of `rivals_of` for them."""
+    highest = after.element[0]
+    return (
+        (peak.element == highest)
+        & (jnp.abs(peak.shift) < _CLOSE)
+        & jnp.any(before.element == highest)
+    )
 
 
 def _roots(roots, element, share) -> Float[Array, "p sides 2"]:
