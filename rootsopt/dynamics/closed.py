@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
@@ -57,7 +56,7 @@ class Start(eqx.Module):
     `None` in place of all other leaves. The orbit is used if `known.sound`.
     """
 
-    state: Float[Array | np.ndarray, " n"]
+    state: Any
     known: Known
     pair: Any
 
@@ -195,12 +194,13 @@ class _Attempts(eqx.Module):
         """Close an orbit, and return the loop's state."""
         solver, pair = self.solver, self.pair
         del failure
-        period = jnp.maximum(settled.period, 1)
+        period, pieces = jnp.maximum(settled.period, 1), settled.pieces
+        assert pieces is not None
         known, neighbour = self.start.known, self.start.pair
         known = lax.cond(
             now.near,
             lambda: known,
-            lambda: from_pieces(pair, settled.pieces, period, solver.max_orbit),
+            lambda: from_pieces(pair, pieces, period, solver.max_orbit),
         )
         own = eqx.filter(pair, eqx.is_inexact_array)
         neighbour = choose(now.near, neighbour, lax.stop_gradient(own))
@@ -209,7 +209,7 @@ class _Attempts(eqx.Module):
         place = jnp.where(now.near, made.orbit.state, settled.state)
         # The orbit must be that of the transient everywhere, not only at φ1 = 0.
         reach = 10 * within / jnp.maximum(1 - made.orbit.multiplier, 1e-3)
-        meets = now.near | (apart(made.known, settled.pieces) <= reach)
+        meets = now.near | (apart(made.known, pieces) <= reach)
         # The orbit is that of the transient, but a finer mesh does not make it accurate: it has an
         # event that the equation does not know. A further attempt would end the same way.
         vague = ~now.near & meets & made.sound & ~made.verified & (made.shorter == 0)

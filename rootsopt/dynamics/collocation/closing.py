@@ -80,8 +80,13 @@ _FAR = 1e-6
 search, above which the orbit is solved again from the latter."""
 _GAIN = 10.0
 """Factor by which the difference between the forces on two meshes is divided to estimate the error
-on the finer mesh. In theory the error falls by the larger factor 1.4⁸. The difference between their
-derivatives is not divided: it must bound the error, and falls less evenly."""
+on the finer mesh. In theory the error falls by the larger factor 1.4⁸."""
+_DOUBT = 3.0
+"""Factor by which the difference between derivatives on two meshes is multiplied, since it must
+bound the error of those on the finer mesh and falls less evenly than that of the forces."""
+_TURNING = 100.0, 1e-6
+"""Difference between derivatives on two meshes above which the mesh is refined: the first number
+times the error of the forces to reach, at least the second."""
 _ROUGH = 3e-8
 """Relative error of derivatives that does not show in this difference: both meshes have the same
 roots of the gap to 1e-6 rad, and the same rounding errors."""
@@ -235,7 +240,8 @@ class Closer(eqx.Module):
         first = jnp.arange(columns.gap.shape[-1]) == 0
         # All changes are proportional to the right-hand sides.
         longer = jnp.where(first, 1 / way, 1.0)
-        step = Step(*(x * longer for x in step[:3]), step.monodromy)
+        moves = step.state * longer, step.slopes * longer, step.times * longer
+        step = Step(*moves, step.monodromy)
         turned = jnp.clip((points.roots - at.roots) / way, -_TURNED, _TURNED)
         points = points._replace(roots=at.roots + turned)
         direct = jnp.pad(along, ((0, 0), (0, 0), (0, 0), (1, 0)))
@@ -353,7 +359,9 @@ class Closer(eqx.Module):
         first = now.meshes == 0
         apart, turned = _differences(now.closed.found, found)
         error = jnp.where(first, self.known.error * growth, apart / _GAIN)
-        drift = jnp.where(first, self.known.drift * growth, turned + _ROUGH)
+        drift = jnp.where(first, self.known.drift * growth, _DOUBT * turned + _ROUGH)
+        steep, least = _TURNING
+        certain = drift <= _DOUBT * jnp.maximum(steep * self.tolerance, least) + _ROUGH
         full = now.elements.mesh.used >= most_elements(now.elements.mesh)
         # Newton's method has converged, so the correction must be small. It is large or NaN where
         # the time derivative of a margin vanishes at its event.
@@ -371,7 +379,7 @@ class Closer(eqx.Module):
             closed=closed,
             elements=found.elements,
             meshes=now.meshes + 1,
-            over=(error <= self.tolerance) | full | ~good,
+            over=((error <= self.tolerance) & certain) | full | ~good,
         )
 
 

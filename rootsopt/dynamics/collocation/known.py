@@ -67,7 +67,7 @@ def trimmed(known: Known) -> Known:
     count = int(mesh.used)
     # The times that follow the last interval are all equal to the last of these.
     times = int(np.max(mesh.interval[:count], initial=0)) + 2
-    shares = (x[:count] for x in (mesh.interval, mesh.left, mesh.right))
+    shares = mesh.interval[:count], mesh.left[:count], mesh.right[:count]
     short = Mesh(mesh.times[:times], mesh.which[:times], *shares, mesh.used)
     rest: Any = map(np.asarray, known[1:])
     return Known(Elements(short, *(part[:count] for part in parts)), *rest)
@@ -78,12 +78,14 @@ def padded(known: Known, room: tuple[int, int]) -> Known:
     mesh, *parts = known.elements
     elements, times = room[0] - len(mesh.left), room[1] - len(mesh.times)
 
-    def more(x, value):
+    def more(x, value) -> Any:
         return np.pad(x, (0, elements), constant_values=value)
 
+    anchors: Any = np.pad(mesh.times, (0, times), mode="edge")
+    which: Any = np.pad(mesh.which, (0, times), constant_values=-1)
     full = Mesh(
-        times=np.pad(mesh.times, (0, times), mode="edge"),
-        which=np.pad(mesh.which, (0, times), constant_values=-1),
+        times=anchors,
+        which=which,
         interval=more(mesh.interval, room[1] - 2),
         left=more(mesh.left, 1.0),
         right=more(mesh.right, 1.0),

@@ -174,7 +174,7 @@ def _to_vertex(slope: Float[Array, " p"], bend: Float[Array, " p"]) -> Float[Arr
 
 def _powers(share: NDArray[np.float64], count: int) -> NDArray[np.float64]:
     """Return the powers 0 to `count` - 1 of the distance from the middle of an element, as rows."""
-    return (share - 0.5) ** np.arange(count)[:, None]
+    return np.asarray((share - 0.5) ** np.arange(count)[:, None], np.float64)
 
 
 def _hermite() -> NDArray[np.float64]:
@@ -185,7 +185,7 @@ def _hermite() -> NDArray[np.float64]:
     values = _powers(GAUSS.nodes, count).T
     slopes = np.zeros_like(values)
     slopes[:, 1:] = order[1:] * values[:, :-1]
-    return np.linalg.inv(np.concatenate([values, slopes]))
+    return np.asarray(np.linalg.inv(np.concatenate([values, slopes])), np.float64)
 
 
 _HERMITE = _hermite()
