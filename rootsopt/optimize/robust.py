@@ -143,8 +143,7 @@ class RobustSearch(Search):
         super().__init__(config, progress, stop, checkpoint, runs)
         self.nominal, self.first = nominal, self.settings.starts
         self.settings = self.settings.model_copy(update={"screening": 0})
-        single = self.exact
-        self.exact = ToleranceEvaluator.of(config, single, runs)
+        self.exact = ToleranceEvaluator.of(config, self.exact, runs)
         self._shares: dict[int, NDArray[np.float64]] = {}
 
     def _simulated(self, evaluator: Evaluates, design, orbit) -> Evaluation:

@@ -91,7 +91,6 @@ class Study:
             return cls(config, aims, Problem(config, baseline, space), None, None, None, runs)
         limits = force_limits(config, scene)
         maxima = any(_is_cornered(aim) for aim in aims) or any(one.cornered for one in limits)
-        # A front takes hundreds of evaluations.
         exact = Evaluator.of(reported(config)).prepare(maxima=maxima)
         exact, baseline = exact.fit()
         if maxima:

@@ -242,8 +242,9 @@ class Closer(eqx.Module):
         longer = jnp.where(first, 1 / way, 1.0)
         moves = step.state * longer, step.slopes * longer, step.times * longer
         step = Step(*moves, step.monodromy)
-        turned = jnp.clip((points.roots - at.roots) / way, -_TURNED, _TURNED)
-        points = points._replace(roots=at.roots + turned)
+        given = at.roots.at[at.mesh.used].set(now.rivals.roots)
+        turned = jnp.clip((points.roots - given) / way, -_TURNED, _TURNED)
+        points = points._replace(roots=given + turned)
         direct = jnp.pad(along, ((0, 0), (0, 0), (0, 0), (1, 0)))
         return equation, points, direct, step, now.line
 

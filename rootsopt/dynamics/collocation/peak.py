@@ -121,7 +121,10 @@ def rivals_of(
     for _ in range(_STEPS):
         slope, bend = _derivatives(rows, share)
         share = jnp.clip(share + _to_vertex(slope + wrong, bend), 0.0, 1.0)
-    return Rivals(element, share, _roots(points.roots, element, share))
+    # Likewise for the roots: derivatives of the force have an error proportional to theirs.
+    astray = points.roots[elements.mesh.used] - _roots(points.roots, before.element, before.share)
+    astray = jnp.zeros_like(points.roots[:, 0]).at[before.element].set(astray)[element]
+    return Rivals(element, share, _roots(points.roots, element, share) + astray)
 
 
 def peak_of(
@@ -149,12 +152,8 @@ def is_settled(before: Rivals, after: Rivals, peak: Peak) -> Bool[Array, ""]:
 
     `before`: instants at which the equation was evaluated; `peak`: result of `peak_of` for them;
     `after`: result of `rivals_of` for them."""
-    highest = after.element[0]
-    return (
-        (peak.element == highest)
-        & (jnp.abs(peak.shift) < _CLOSE)
-        & jnp.any(before.element == highest)
-    )
+    tried = jnp.any(before.element == after.element[0])
+    return tried & (jnp.abs(peak.shift) < _CLOSE)
 
 
 def _roots(roots, element, share) -> Float[Array, "p sides 2"]:
