@@ -58,7 +58,7 @@ def settled_within(rtol: Float[Array, ""]) -> Float[Array, ""]:
     return jnp.clip(1000 * rtol, 3e-3, 3e-2)
 
 
-def settle(
+def settle(  # 85 lines: its inner functions share the arguments.
     pair: RotorPair,
     state: Float[Array, " n"],
     integrator: Integrator,

@@ -12,6 +12,7 @@ from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.orbit import SAMPLES, Orbit
 from rootsopt.response import evaluation
 from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.orbits import prepare_samples
 
 _STEP = 2e-4
 """Step of the differences, in config units."""
@@ -70,8 +71,9 @@ def test_prepared_programs_are_those_that_are_called(evaluator, found):
     """Programs prepared from shapes alone, before there is an orbit, are the ones used later."""
     scene = evaluator.scene
     pair, tangents, _ = evaluator.assembled()
-    start = pair, tangents, found.state, scene.pitch_radius, scene.solver
-    orbit = evaluation._motion.result_shape(*start).orbit
+    begin = evaluator.orbits.start(pair, found.state, scene.solver.max_orbit)
+    start = pair, tangents, begin, scene.pitch_radius, scene.solver
+    orbit = prepare_samples(evaluation._motion.result_shape(*start), scene.solver.samples).orbit
     programs = maxima._forces, maxima._differentiated
     called = [set(program._made) for program in programs]
     maxima.prepare_maxima(pair, tangents, orbit, scene.solver.orbit)

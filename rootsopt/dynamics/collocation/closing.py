@@ -81,7 +81,7 @@ search, above which the orbit is solved again from the latter."""
 _GAIN = 10.0
 """Factor by which the difference between the forces on two meshes is divided to estimate the error
 on the finer mesh. In theory the error falls by the larger factor 1.4⁸."""
-_DOUBT = 3.0
+_DOUBT = 5.0
 """Factor by which the difference between derivatives on two meshes is multiplied, since it must
 bound the error of those on the finer mesh and falls less evenly than that of the forces."""
 _TURNING = 100.0, 1e-6
@@ -406,14 +406,15 @@ def close(
 def _differences(before: OrbitForces, after: OrbitForces):
     """Return two relative differences between the results on two meshes.
 
-    The first is the largest difference in mean, RMS and peak force, the second that in their
-    derivatives."""
+    The first is the largest difference in mean, RMS and peak force and in the further measures, the
+    second that in the derivatives of the first three. Spectral lines are relative to the mean."""
 
     def rms(values):
-        return values.at[1].set(jnp.sqrt(jnp.maximum(values[1], 0.0)))[:3]
+        return values.at[1].set(jnp.sqrt(jnp.maximum(values[1], 0.0)))
 
     one, other = rms(before.response), rms(after.response)
-    size = jnp.maximum(jnp.abs(other), 1e-30)
+    least = jnp.where(jnp.arange(other.shape[0]) < 3, 1e-30, jnp.abs(other[0]))
+    size = jnp.maximum(jnp.abs(other), jnp.maximum(least, 1e-30))
     error = jnp.max(jnp.abs(one - other) / size)
     slopes = jnp.max(jnp.abs(before.sensitivity - after.sensitivity), axis=1, initial=0.0)
     largest = jnp.max(jnp.abs(after.sensitivity), axis=1, initial=0.0)
