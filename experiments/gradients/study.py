@@ -187,7 +187,7 @@ def rows_of(
         row |= {"period": one.steady_state.get("period"), "scene": " ".join(overrides)}
         for name in ("residual", "floquet_multiplier"):
             row[name] = one.steady_state.get(name)
-        for name in ("gradient_disagreement", "orbit_defect", "orbit_steps", "seconds"):
+        for name in ("gradient_disagreement", "orbit_elements", "seconds"):
             row[name] = one.statistics.get(name)
         if one.usable:
             errors = np.abs(np.sum(slopes_of(one), axis=1) - truth) / size

@@ -139,7 +139,6 @@ class _Attempts(eqx.Module):
             ),
             used=zero,
             steps=zero,
-            collocated=~no,
             known=unknown(pair, solver.max_orbit),
         )
         coarse = jnp.maximum(solver.transient.rtol, _COARSE)

@@ -80,10 +80,9 @@ class Steady(NamedTuple):
     `status`: code of a `Status`; `orbit`: the orbit found, or the last one tried; `period` (mesh
     periods), `rtol` and `verdict`: length and tolerance of this orbit, and the results of its
     checks; `window` of a motion that did not settle; `settled`: end of the transient; `used`: mesh
-    periods of all transients; `steps`: number of solver steps of transients and orbits;
-    `collocated`: whether the orbit was closed by collocation; `known`: that orbit, from which
-    those of similar pairs can be closed, `None` if orbits are closed by shooting
-    only.
+    periods of all transients; `steps`: number of solver steps of transients and orbits; `known`: an
+    orbit closed by collocation, from which those of similar pairs can be closed, `None` after
+    shooting.
     """
 
     status: Int[Array, ""]
@@ -95,7 +94,6 @@ class Steady(NamedTuple):
     settled: Transient
     used: Int[Array, ""]
     steps: Int[Array, ""]
-    collocated: Bool[Array, ""]
     known: Known | None
 
     @property
@@ -181,7 +179,6 @@ class _Attempts(eqx.Module):
             settled=Transient(state, zero, one, infinite, zero, no, ~no, zero),
             used=zero,
             steps=zero,
-            collocated=no,
             known=None,
         )
         coarse, fine = solver.transient.rtol, solver.orbit.rtol
@@ -246,7 +243,6 @@ class _Attempts(eqx.Module):
             settled=settled,
             used=used,
             steps=steps + jnp.where(now.windowed, 0, orbit.flow.steps),
-            collocated=found.collocated,
             known=found.known,
         )
         return self._next(now, new, within, lost, taken & shorter)

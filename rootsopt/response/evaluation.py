@@ -263,7 +263,9 @@ class Evaluator:
             found = now.motion(pair, tangents, begin)
             if series and self.confirm:
                 found = now._confirmed(pair, tangents, begin, found)
-            if bool(found.collocated) and (series or self.maxima or now.scene.bearings is not None):
+            if found.known is not None and (
+                series or self.maxima or now.scene.bearings is not None
+            ):
                 found = with_samples(found, solver.samples)
             other = now._refitted(pair, found)
             if other is None:
@@ -311,7 +313,7 @@ class Evaluator:
         """Return the motion `found` from `start`, if an integration over its period confirms it.
 
         Otherwise, return the motion whose orbit is closed by shooting."""
-        if not bool(found.collocated) or Status.of(found.status) not in CLOSED:
+        if found.known is None or Status.of(found.status) not in CLOSED:
             return found
         orbit, integrator = found.orbit, self.scene.solver.orbit
         apart = _integrated(pair, (orbit.state, orbit.response), found.period, integrator)
@@ -538,7 +540,7 @@ class Evaluator:
         orbit, solver = found.orbit, self.scene.solver
         sensitivity = orbit.sensitivity
         # Collocation has computed them already, and records no steps for reverse mode.
-        if self.config.solver.gradient == "reverse" and not bool(found.collocated):
+        if self.config.solver.gradient == "reverse" and found.known is None:
             settings = np.asarray(found.period), solver.orbit, solver.measures
             sensitivity = _reverse(self.scene, design, orbit, *settings)
         rows = np.column_stack([orbit.response, sensitivity])

@@ -85,15 +85,15 @@ def orbit_statistics(found: Steady) -> dict[str, int | float]:
     orbit = found.orbit
     statistics: dict[str, int | float] = {
         "newton_steps": int(orbit.newton_steps),
-        "orbit_steps": int(orbit.flow.steps),
         "orbit_rtol": float(found.rtol),
-        "orbit_defect": float(orbit.defect),
         "force_rounding": float(found.verdict.rounding),
     }
-    if bool(found.collocated):
-        statistics["collocated"] = 1
+    if found.known is not None:
+        statistics |= {"collocated": 1, "orbit_elements": int(found.known.elements.mesh.used)}
         if not int(found.used):
             statistics["from_neighbour"] = 1
+    else:
+        statistics |= {"orbit_steps": int(orbit.flow.steps), "orbit_defect": float(orbit.defect)}
     if np.isfinite(orbit.disagreement):  # Infinite: there was no room for a comparison.
         statistics["gradient_disagreement"] = float(orbit.disagreement)
     return statistics

@@ -157,7 +157,7 @@ def by_scene(evaluator: Evaluator, evaluation: Evaluation) -> Evaluation | None:
             gradient[name] |= dict(zip(keys, map(float, values), strict=True))
         if maxima is not None:
             period = int(found.period)
-            if bool(found.collocated):
+            if found.known is not None:
                 found = with_samples(found, solver.samples)
             again = local_maxima(pair, tangents, found.orbit, period, solver.orbit)
             if again.times.shape != maxima.times.shape:

@@ -98,8 +98,8 @@ def steady_response(
     NOT_CLOSED under `jit` and `vmap`. Otherwise its orbit is closed by shooting.
 
     Raises ValueError if the design has the wrong shape, or if `start` belongs to another kind of
-    scene; RuntimeError if JAX is not set to the
-    precision of the scene; NotImplementedError if a second derivative is requested.
+    scene; RuntimeError if JAX is not set to the precision of the scene; NotImplementedError if a
+    second derivative is requested.
 
     >>> import jax
     >>> import rootsopt
