@@ -29,6 +29,12 @@ _CLOSE = 1e-4
 """Distance of the peak from the instant at which the equation is evaluated (fraction of the
 element's length) below which force and derivative are extrapolated to it: both errors are then far
 below those of the orbit."""
+_BESIDE = 1e-2
+"""Distance between two instants (fraction of the element's length) below which the errors of their
+interpolated roots count as equal."""
+_INSIDE = 1e-3
+"""Least distance of such an instant from the ends of its element, as a fraction of its length.
+Closer to an end, which may be an event, slope and roots may be those of the other side."""
 _NEAREST = 0.1
 """Greatest distance of the peak from the instant at which the equation is evaluated, as a fraction
 of the element's length. The latter lies at the maximum of a polynomial."""
@@ -115,15 +121,17 @@ def rivals_of(
     element = lax.top_k(highest, RIVALS)[1].astype(int)
     # The slope at the instants before shows the error of the polynomials' slopes nearby.
     known = elements.mesh.lengths[before.element] * rate[elements.mesh.used]
-    wrong = known - _derivatives(rows[before.element], before.share)[0]
+    wrong = known - _derivatives(rows[before.element], before.share)[1]
     wrong = jnp.zeros(rows.shape[0], rows.dtype).at[before.element].set(wrong)[element]
     rows, share = rows[element], jnp.asarray(_PLACES)[jnp.argmax(heights[element], axis=1)]
     for _ in range(_STEPS):
-        slope, bend = _derivatives(rows, share)
-        share = jnp.clip(share + _to_vertex(slope + wrong, bend), 0.0, 1.0)
+        _, slope, bend = _derivatives(rows, share)
+        share = jnp.clip(share + _to_vertex(slope + wrong, bend), _INSIDE, 1.0 - _INSIDE)
     # Likewise for the roots: derivatives of the force have an error proportional to theirs.
     astray = points.roots[elements.mesh.used] - _roots(points.roots, before.element, before.share)
     astray = jnp.zeros_like(points.roots[:, 0]).at[before.element].set(astray)[element]
+    place = jnp.full(used.shape, jnp.inf).at[before.element].set(before.share)[element]
+    astray = jnp.where((jnp.abs(share - place) < _BESIDE)[:, None, None], astray, 0.0)
     return Rivals(element, share, _roots(points.roots, element, share) + astray)
 
 
@@ -137,10 +145,11 @@ def peak_of(
     extra, element = elements.mesh.used, rivals.element
     rows = _polynomials(elements, force, rate)[element]
     slope = elements.mesh.lengths[element] * rate[extra]
-    bend = _derivatives(rows, rivals.share)[1]
+    value, leaning, bend = _derivatives(rows, rivals.share)
     share = jnp.clip(rivals.share + _to_vertex(slope, bend), 0.0, 1.0)
     shift = share - rivals.share
-    height = force[extra] + shift * (slope + bend * shift / 2)
+    rise = _derivatives(rows, share)[0] - value + (slope - leaning) * shift
+    height = force[extra] + rise
     # If fewer elements are in use than there are rivals, the others are not part of the orbit.
     height = jnp.where(element < extra, height, -jnp.inf)
     top = jnp.argmax(height)
@@ -153,7 +162,8 @@ def is_settled(before: Rivals, after: Rivals, peak: Peak) -> Bool[Array, ""]:
     `before`: instants at which the equation was evaluated; `peak`: result of `peak_of` for them;
     `after`: result of `rivals_of` for them."""
     tried = jnp.any(before.element == after.element[0])
-    return tried & (jnp.abs(peak.shift) < _CLOSE)
+    at_end = (jnp.abs(peak.share - 0.5) == 0.5) & (jnp.abs(peak.shift) <= 2 * _INSIDE)
+    return tried & (at_end | (jnp.abs(peak.shift) < _CLOSE))
 
 
 def _roots(roots, element, share) -> Float[Array, "p sides 2"]:
@@ -198,11 +208,11 @@ def _polynomials(elements: Elements, force, rate) -> Float[Array, "e c"]:
 
 
 def _derivatives(rows: Float[Array, "p c"], share: Float[Array, " p"]):
-    """Return first and second derivative of the polynomials `rows` at `share`."""
+    """Return value, first and second derivative of the polynomials `rows` at `share`."""
     place = share - 0.5
     slope = bend = value = jnp.zeros_like(place)
     for column in rows.T[::-1]:
         bend = bend * place + 2 * slope
         slope = slope * place + value
         value = value * place + column
-    return slope, bend
+    return value, slope, bend
