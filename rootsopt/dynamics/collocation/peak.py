@@ -32,7 +32,7 @@ below those of the orbit."""
 _BESIDE = 1e-2
 """Distance between two instants (fraction of the element's length) below which the errors of their
 interpolated roots count as equal."""
-_INSIDE = 1e-3
+_INSIDE = 1e-4
 """Least distance of such an instant from the ends of its element, as a fraction of its length.
 Closer to an end, which may be an event, slope and roots may be those of the other side."""
 _NEAREST = 0.1
