@@ -30,6 +30,8 @@ _HALVINGS = 30
 """Number of bisections that locate an event."""
 _SAME = 3e-9
 """Time (mesh periods) between two events below which they are merged into one."""
+_ENDS = (1.0, 0.0)
+"""End and start of an element, as fractions of its length."""
 _CHANGES = 2
 """Number of flag changes per event for which there is room. Several flags may change at one event.
 If more change, the search for the orbit fails."""
@@ -146,12 +148,22 @@ def rooted(elements: Elements, seen: FlagScan) -> Elements:
 
     At the end of an element, the first root belongs to the side of the end on which the flanks
     push. The second root, for the other minimum next to a cusp, belongs to the instant after the
-    end."""
+    end. Both are extrapolated to the end: otherwise derivatives of a peak at a corner of the force
+    would have a relative error of about 5e-6."""
     inside = len(GAUSS.nodes)
-    before = seen.pushes[:, inside] | ~seen.pushes[:, inside + 1]
-    own = jnp.where(before, seen.roots[:, inside], seen.roots[:, inside + 1])
-    ends = jnp.stack([own, seen.roots[:, inside + 1]], axis=-1)
-    points = jnp.repeat(seen.roots[:, :inside, :, None], 2, axis=-1)
+    mesh, number = elements.mesh, jnp.arange(elements.state.shape[0])
+    following = jnp.where(number + 1 < mesh.used, number + 1, 0)
+    nodes = seen.roots[:, :inside]
+    # Slopes at both ends of each element, with respect to the fraction of its length.
+    leaving, entering = jnp.einsum("ms,esk->mek", GAUSS.derivative(jnp.asarray(_ENDS)), nodes)
+    length = jnp.where(mesh.lengths > 0, mesh.lengths, 1.0)[:, None]
+    before, after = leaving / length, (entering / length)[following]
+    end = mesh.ends[1][:, None, None]
+    aside = seen.tau.reshape(*number.shape, -1)[:, inside:, None] - end
+    moved = seen.roots[:, inside:] - aside * jnp.stack([before, after], axis=1)
+    own = seen.pushes[:, inside] | ~seen.pushes[:, inside + 1]
+    ends = jnp.stack([jnp.where(own, moved[:, 0], moved[:, 1]), moved[:, 1]], axis=-1)
+    points = jnp.repeat(nodes[..., None], 2, axis=-1)
     return elements._replace(roots=jnp.concatenate([points, ends[:, None]], axis=1))
 
 

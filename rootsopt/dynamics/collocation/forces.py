@@ -17,6 +17,9 @@ from rootsopt.dynamics.collocation.gauss import GAUSS, summed
 from rootsopt.dynamics.collocation.peak import Peak, Rivals, forces_along, peak_of
 from rootsopt.dynamics.collocation.system import Step, moved_places
 
+_COINCIDE = 1e-6
+"""Distance (fraction of an element's length) between two instants below which they count as one."""
+
 
 class OrbitForces(NamedTuple):
     """Results of a closed orbit, with derivatives along d directions of the parameters.
@@ -62,7 +65,7 @@ def forces_of(
     averages, factors = equation.measures.values(raw, unit, top)
     by_averages = changes * factors[:, None]
     peak = peak_of(elements, rivals, *forces_along(equation, points))
-    by_height = unit * _by_height(equation, elements, rivals, peak, (points, direct, change), step)
+    by_height = unit * _by_height(equation, elements, peak, (points, direct, change), step)
     peak = peak._replace(force=unit * peak.force)
     values = jnp.concatenate([averages[:2], peak.force[None], averages[2:]])
     slopes = jnp.concatenate([by_averages[:2], by_height[None], by_averages[2:]])
@@ -84,7 +87,7 @@ def forces_of(
 def no_forces(equation: CollocatedEquation, elements: Elements, directions: int) -> OrbitForces:
     """Return zeros in place of the forces of a motion like `elements`."""
     rows, count = equation.measures.count + 1, elements.state.shape[1]
-    zeros, zero = jnp.zeros, jnp.zeros(())
+    zeros, zero, index = jnp.zeros, jnp.zeros(()), jnp.zeros((), int)
     return OrbitForces(
         elements=elements,
         response=zeros(rows),
@@ -93,7 +96,7 @@ def no_forces(equation: CollocatedEquation, elements: Elements, directions: int)
         moved=zeros((count, directions)),
         monodromy=zeros((count, count)),
         depth=zero,
-        peak=Peak(zeros((), int), zero, zero, zeros((), int), zero),
+        peak=Peak(index, zero, (index, index), zero, zero),
         correction=zero,
     )
 
@@ -130,18 +133,16 @@ def _averages(equation: CollocatedEquation, elements: Elements, points: Points, 
     return kept, (moved[:-1] - kept[:, None] * moved[-1]) / duration
 
 
-def _by_height(
-    equation: CollocatedEquation, elements: Elements, rivals: Rivals, peak: Peak, evaluated, step
-):
+def _by_height(equation: CollocatedEquation, elements: Elements, peak: Peak, evaluated, step):
     """Return the changes of the peak force in all columns of `step` (in units of `force_scale`).
 
     `evaluated`: equation along the orbit with the instants `rivals`, its direct changes, and its
     changes at the Gauss points."""
     points, direct, change = evaluated
-    mesh, extra, k = elements.mesh, elements.mesh.used, peak.element
-    count, share = elements.state.shape[1], rivals.share[peak.rival]
+    mesh, k, share = elements.mesh, peak.element, peak.share - peak.shift
+    count = elements.state.shape[1]
     first, last = count, count + equation.rates - 1
-    value, bend = points.values[extra, peak.rival], points.slopes[extra, peak.rival]
+    value, bend = points.values[peak.place], points.slopes[peak.place]
     begin, end = mesh.interval[k], mesh.interval[k] + 1
     place = mesh.left[k] + (mesh.right[k] - mesh.left[k]) * share
     time = step.times[begin] * (1 - place) + step.times[end] * place
@@ -149,9 +150,14 @@ def _by_height(
     longer = (mesh.right[k] - mesh.left[k]) * (step.times[end] - step.times[begin])
     state = step.state[k] + mesh.lengths[k] * jnp.sum(weights[..., None] * step.slopes[k], axis=0)
     state += jnp.sum(weights * elements.slopes[k], axis=0)[:, None] * longer
-    here = bend[:, :1] * time + bend[:, 1:] @ state + direct[extra, peak.rival]
-    # The peak is a little beside the instant of the evaluation.
-    beside = GAUSS.derivative(share) @ change[k].reshape(len(GAUSS.nodes), -1)
+    here = bend[:, :1] * time + bend[:, 1:] @ state + direct[peak.place]
+    # The peak may be a little beside the instant of the evaluation. The changes here and at the
+    # Gauss points lie on one polynomial.
+    rows = change[k].reshape(len(GAUSS.nodes), -1)
+    away = share - GAUSS.nodes
+    bends = jnp.sum(away / (away**2 + _COINCIDE**2))
+    beside = (here.ravel() - GAUSS.lagrange(share) @ rows) * bends
+    beside += GAUSS.derivative(share) @ rows
     here += peak.shift * beside.reshape(here.shape)
     if not equation.pair.free:
         return here[first]

@@ -4,6 +4,10 @@ Inside an element the force is smooth. Its values and its slopes along the orbit
 determine a polynomial of degree 2s - 1, whose maxima show where to evaluate the equation next. The
 peak follows from force and slope there. A peak at a corner of the force lies at the end of an
 element, which is an event, and moves with this event.
+
+At the event itself, rounding decides from which side of the corner the derivatives are. Both sides
+give the same change of the peak, since the force is continuous and the event moves with them. If
+the force jumps, the peak is extrapolated from inside the element.
 """
 
 from typing import NamedTuple
@@ -35,6 +39,9 @@ interpolated roots count as equal."""
 _INSIDE = 1e-4
 """Least distance of such an instant from the ends of its element, as a fraction of its length.
 Closer to an end, which may be an event, slope and roots may be those of the other side."""
+_JUMP = 1e-6
+"""Relative difference between the force at an element's end, and that extrapolated from inside the
+element, above which the force jumps there."""
 _NEAREST = 0.1
 """Greatest distance of the peak from the instant at which the equation is evaluated, as a fraction
 of the element's length. The latter lies at the maximum of a polynomial."""
@@ -70,14 +77,15 @@ class Peak(NamedTuple):
     """The greatest contact force of an orbit.
 
     `element`: index of the element that contains the peak; `share`: position in the element, from 0
-    (start) to 1 (end); `shift`: part of `share` that has been added to the instant at which the
-    equation was evaluated, the rival with the index `rival`; `force`: contact force (N).
+    (start) to 1 (end); `place`: row and column of the instant from which the derivatives of the
+    peak follow, in the arrays of `Points`; `shift`: part of `share` that has been added to this
+    instant; `force`: contact force (N).
     """
 
     element: Int[Array, ""]
     share: Float[Array, ""]
+    place: tuple[Int[Array, ""], Int[Array, ""]]
     shift: Float[Array, ""]
-    rival: Int[Array, ""]
     force: Float[Array, ""]
 
 
@@ -126,7 +134,9 @@ def rivals_of(
     rows, share = rows[element], jnp.asarray(_PLACES)[jnp.argmax(heights[element], axis=1)]
     for _ in range(_STEPS):
         _, slope, bend = _derivatives(rows, share)
-        share = jnp.clip(share + _to_vertex(slope + wrong, bend), _INSIDE, 1.0 - _INSIDE)
+        # A greater error than this is not that of a polynomial: the motion is not yet a solution.
+        error = jnp.where(jnp.abs(wrong) < _BESIDE * jnp.abs(bend), wrong, 0.0)
+        share = jnp.clip(share + _to_vertex(slope + error, bend), _INSIDE, 1.0 - _INSIDE)
     # Likewise for the roots: derivatives of the force have an error proportional to theirs.
     astray = points.roots[elements.mesh.used] - _roots(points.roots, before.element, before.share)
     astray = jnp.zeros_like(points.roots[:, 0]).at[before.element].set(astray)[element]
@@ -153,7 +163,20 @@ def peak_of(
     # If fewer elements are in use than there are rivals, the others are not part of the orbit.
     height = jnp.where(element < extra, height, -jnp.inf)
     top = jnp.argmax(height)
-    return Peak(element[top], share[top], shift[top], top, height[top])
+    element, share, shift, height = element[top], share[top], shift[top], height[top]
+    # Every end of an element is also an instant at which the equation is evaluated.
+    before = jnp.where(element > 0, element, extra) - 1
+    ending, inside = jnp.where(share > 0, element, before), len(GAUSS.nodes)
+    at_end, here = jnp.abs(share - 0.5) == 0.5, force[ending, inside]
+    joins = at_end & (jnp.abs(here - height) <= _JUMP * jnp.abs(height))
+    place = jnp.where(joins, ending, extra), jnp.where(joins, inside, top)
+    return Peak(
+        element=jnp.where(joins, ending, element),
+        share=jnp.where(joins, 1.0, share),
+        place=place,
+        shift=jnp.where(joins, 0.0, shift),
+        force=jnp.where(joins, here, height),
+    )
 
 
 def is_settled(before: Rivals, after: Rivals, peak: Peak) -> Bool[Array, ""]:
