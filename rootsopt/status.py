@@ -49,11 +49,11 @@ class Status(enum.Enum):
         "The force is not resolved: either the flanks penetrate so little that rounding of the gap "
         "changes its greatest value by more than 1 %, or the steps are too coarse for its impacts "
         "(mean, RMS and peak contradict each other). Set solver.precision to float64, or tighten "
-        "solver.rtol."
+        "solver.accuracy."
     )
     INACCURATE = (
         "The orbit is closed, but halving the solver's steps changes it or its derivatives: they "
-        "are not accurate enough to be reported. Tighten solver.rtol, or raise "
+        "are not accurate enough to be reported. Tighten solver.accuracy, or raise "
         "contact.smoothing_mm or solver.max_steps_per_period."
     )
     IDLE = (
@@ -70,11 +70,11 @@ class Status(enum.Enum):
     )
     SOLVER_FAILED = (
         "The solver ran out of steps. Raise solver.max_steps_per_period (an explicit method needs "
-        "at least ten for each of statistics.swings_per_mesh_period), loosen solver.rtol, or use "
-        "an implicit solver.method (kvaerno5)."
+        "at least ten for each of statistics.swings_per_mesh_period), loosen solver.accuracy, or "
+        "use an implicit solver.method (kvaerno5)."
     )
     NON_FINITE = (
-        "The simulation produced a number that is not finite. Loosen solver.rtol or check the "
+        "The simulation produced a number that is not finite. Loosen solver.accuracy or check the "
         "contact parameters."
     )
 

@@ -70,7 +70,7 @@ def measure(config: Config, overrides: list[str], family: str, wanted: float) ->
     error = difference(found, truth)
     return row | {
         "fidelity": choice.config.solver.fidelity,
-        "rtol": choice.config.solver.rtol,
+        "rtol": choice.config.solver.orbit_tolerance,
         "estimated": np.nan if choice.error is None else choice.error,
         "error": np.nan if error is None else error,
         "status": found.status.label,

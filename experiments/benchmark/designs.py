@@ -125,7 +125,7 @@ def part_single(job: Job) -> dict[str, Any]:
 
     solver = load(CIC).solver
     usual = "linear" if job.quick else "search"
-    default = evaluated("default", usual, solver.rtol, solver.transient_rtol)
+    default = evaluated("default", usual, solver.orbit_tolerance, solver.transient_tolerance)
     rows = [default, evaluated("cheapest", *choice)]
     design, state = jnp.asarray(BASELINE), jnp.zeros(2)
     compiled = eqx.filter_jit(respond)

@@ -166,7 +166,7 @@ def _simulate(model: Scene, design, tolerances, method: str):
 def _arguments(case: Case) -> tuple[Any, ...]:
     model = jax.tree.map(np.asarray, Scene.from_config(case.config))
     solver = case.config.solver
-    tolerances = np.array([solver.transient_rtol, solver.rtol])
+    tolerances = np.array([solver.transient_tolerance, solver.orbit_tolerance])
     return model, np.asarray(design_vector(case.config)), tolerances, case.kind.method
 
 
@@ -252,12 +252,12 @@ def refine(case: Case) -> None:
     names = ("mean_force_N", "peak_force_N", "rms_force_N")
     found = np.array([case.row[name] for name in names])
     off = np.abs(found - truth) / np.maximum(truth, case.row["static_force_N"])
-    allowed = ALLOWED * max(case.config.solver.rtol, CORNER)
+    allowed = ALLOWED * max(case.config.solver.orbit_tolerance, CORNER)
     if case.kind.precision == "float32":
         # Rounding of the reference's gap in double; single precision rounds 2^29 times as coarsely.
         depth, law = jnp.asarray(orbit.flow.depth), model.law
         rounding = 2**29 * float(force_rounding(depth, law.exponent, model.pitch_radius))
-        allowed = ALLOWED * max(case.config.solver.rtol, SINGLE) + 5 * rounding
+        allowed = ALLOWED * max(case.config.solver.orbit_tolerance, SINGLE) + 5 * rounding
     case.row |= {
         "reference": "closed" if closed else "not closed",
         "reference_mean_N": float(mean),

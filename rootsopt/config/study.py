@@ -13,8 +13,9 @@ from rootsopt.config.words import named, shown
 
 _Seed = Annotated[int, Field(ge=0, le=2**31 - 1)]
 _NODES_RTOL = 3e-5
-"""Default tolerance for fidelity `nodes`, whose force has a step at every node. These steps limit
-the accuracy of forces to about 1e-3, and a finer tolerance would need many solver steps."""
+"""Least tolerance by default for fidelity `nodes`, whose force has a step at every node. These
+steps limit the accuracy of forces to about 1e-3, and a finer tolerance would need many solver
+steps."""
 NEAREST = "nearest"
 """Word in `optimizer.family` for the named family that is nearest to an outline."""
 _LEAST_WEIGHT = 1e-6
@@ -32,8 +33,10 @@ class SolverConfig(Section):
         "linear in the relative rotation, the paper's nodes against segments, or auto: the "
         "cheapest of these that meets `accuracy`",
     )
-    accuracy: Annotated[float, Field(ge=1e-6, le=0.1)] = Field(
-        1e-3, description="relative error of mean and peak force that auto accepts"
+    accuracy: Annotated[float, Field(ge=1e-9, le=0.1)] = Field(
+        1e-5,
+        description="relative error of forces and of their gradient that is accepted: the greater, "
+        "the faster",
     )
     nodes: Annotated[int, Field(ge=16, le=20_000)] = Field(
         400, description="number of nodes per flank for fidelity nodes"
@@ -60,15 +63,13 @@ class SolverConfig(Section):
     method: Literal["tsit5", "dopri5", "dopri8", "kvaerno3", "kvaerno5"] = Field(
         "tsit5", description="explicit: tsit5, dopri5, dopri8; implicit: kvaerno3, kvaerno5"
     )
-    rtol: Annotated[float, Field(ge=1e-12, le=1e-2)] = Field(
-        1e-8,
-        description="tolerance on the orbit and its statistics; refined where the orbit does not "
-        f"close; {_NODES_RTOL:g} by default for fidelity nodes",
+    rtol: Annotated[float, Field(ge=1e-12, le=1e-2)] | None = Field(
+        None,
+        description="tolerance on the orbit and its statistics, refined where the orbit does not "
+        "close; absent: accuracy / 1000",
     )
-    transient_rtol: Annotated[float, Field(ge=1e-12, le=1e-2)] = Field(
-        1e-7,
-        description=f"tolerance during the transient; {_NODES_RTOL:g} by default for fidelity "
-        "nodes",
+    transient_rtol: Annotated[float, Field(ge=1e-12, le=1e-2)] | None = Field(
+        None, description="tolerance during the transient; absent: accuracy / 100"
     )
     max_steps_per_period: Annotated[int, Field(ge=64, le=10**6)] = Field(
         4096, description="solver steps allowed per mesh period"
@@ -92,12 +93,19 @@ class SolverConfig(Section):
         description="precision of the integration; float32 reaches tolerances down to 2e-6",
     )
 
-    @model_validator(mode="before")
-    @classmethod
-    def _coarse_nodes(cls, data):
-        if isinstance(data, dict) and data.get("fidelity") == "nodes":
-            return {"rtol": _NODES_RTOL, "transient_rtol": _NODES_RTOL} | data
-        return data
+    @property
+    def orbit_tolerance(self) -> float:
+        """Relative tolerance on the orbit and its statistics."""
+        return self.rtol or self._tolerance(1000)
+
+    @property
+    def transient_tolerance(self) -> float:
+        """Relative tolerance during the transient."""
+        return self.transient_rtol or self._tolerance(100)
+
+    def _tolerance(self, factor: float) -> float:
+        """Return the tolerance that is finer than `accuracy` by a `factor`."""
+        return max(self.accuracy / factor, _NODES_RTOL if self.fidelity == "nodes" else 0.0)
 
 
 class ObjectiveConfig(Section):

@@ -59,7 +59,7 @@ class End(enum.Enum):
     MAX_POINTS = "The branch has reached the maximum number of points. Raise `limits.points`."
     STEP_TOO_SMALL = (
         "Newton's method does not converge, even for the smallest allowed step: the orbits end "
-        "here or change too abruptly. Lower `limits.least`, or tighten solver.rtol."
+        "here or change too abruptly. Lower `limits.least`, or tighten solver.accuracy."
     )
     SOLVER_FAILED = "The solver ran out of steps. Raise solver.max_steps_per_period."
     NON_FINITE = "The motion, or its derivative, is not finite."

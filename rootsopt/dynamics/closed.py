@@ -14,10 +14,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from rootsopt.dynamics.collocation.closing import CORRECTED
+from rootsopt.dynamics.collocation.closing import corrected
 from rootsopt.dynamics.collocation.known import Known
 from rootsopt.dynamics.collocation.mesh import sizes
-from rootsopt.dynamics.collocation.motion import Collocated, apart, closed_orbit
+from rootsopt.dynamics.collocation.motion import ACCURACY, Collocated, apart, closed_orbit
 from rootsopt.dynamics.collocation.seed import PIECES, from_pieces
 from rootsopt.dynamics.flow import Flow
 from rootsopt.dynamics.orbit import Orbit, choose
@@ -242,7 +242,8 @@ class _Attempts(eqx.Module):
 
         `start`: scaled state near which the orbit has to be; `period` of the orbit (mesh periods);
         `within`: scaled distance to which the transient's states repeated."""
-        limits = self.solver.orbit.rtol, within, jnp.asarray(CORRECTED)
+        rtol = self.solver.orbit.rtol
+        limits = rtol, within, corrected(ACCURACY * rtol)
         orbit = made.orbit
         verdict, status = judged(self.pair, self.solver, self.radius, orbit, start, limits)
         unsure = among(status, (Status.PERIODIC, Status.INACCURATE)) & ~made.verified

@@ -22,9 +22,9 @@ BLOCK = 4
 """Number of mesh periods integrated between two checks of whether the motion repeats."""
 _MEMORY = 20
 """Number of stroboscopic states stored: more than twice the longest cycle that is recognised."""
-_PATIENCE = 32, 1e-5
-"""Number of mesh periods after which a transient continues with a finer tolerance, and the greatest
-value of that tolerance. The noise of coarser steps can hide that the motion repeats."""
+_PATIENCE = (32, 1e-5), (128, 1e-7)
+"""Numbers of mesh periods after which a transient continues with a finer tolerance, each with the
+greatest value of that tolerance. The noise of coarser steps can hide that the motion repeats."""
 NOISE = 100.0
 """Relative noise (tolerances) that adaptive steps cause in the stroboscopic states."""
 
@@ -101,10 +101,9 @@ def settle(  # 85 lines: its inner functions share the arguments.
 
     def advance(loop):
         carry, memory = loop
-        longest, fine = _PATIENCE
-        rtol = jnp.where(
-            carry.periods < longest, integrator.rtol, jnp.minimum(integrator.rtol, fine)
-        )
+        rtol = integrator.rtol
+        for longest, fine in _PATIENCE:
+            rtol = jnp.where(carry.periods < longest, rtol, jnp.minimum(rtol, fine))
         how = dataclasses.replace(integrator, rtol=rtol)
         part = strobe(pair, carry.state, BLOCK, how, pieces)
         memory = jnp.concatenate([memory[BLOCK:], part.states])

@@ -22,7 +22,7 @@ _REASONS = REASONS | {
     ),
     "verification": (
         "The first-order conditions held in the search, but not when the design was simulated "
-        "again from rest. Tighten solver.rtol."
+        "again from rest. Tighten solver.accuracy."
     ),
 }
 

@@ -63,8 +63,8 @@ _HOLDS_UP = 0.01
 """Relative difference between a design's objectives in search and verification above which the
 design is rejected."""
 _SHARPER = 0.01
-"""Factor on `solver.rtol` for a second evaluation, if the first-order conditions do not hold.
-"""
+"""Factor on the tolerance of orbits for a second evaluation, if the first-order conditions do not
+hold."""
 _BESIDE = 1e-6, 1e-5, 3e-5, 1e-4
 """Distances (unit box, per coordinate) from a design at which its verification is repeated."""
 _MEETS = 1e-4
@@ -325,7 +325,7 @@ class Search:
         # Forces of coexisting motions are compared relative to the baseline's.
         self.exact = exact = exact.relative_to(baseline)
         # Screening and descent need a ranking of designs and gradients, but only a few digits.
-        self.fast = exact.at_tolerance(max(1e-6, self.config.solver.rtol)).surveying()
+        self.fast = exact.at_tolerance(max(1e-6, self.config.solver.orbit_tolerance)).surveying()
         self.problem = self._problem(exact.scene, baseline)
         self._bar = np.inf if self.problem.broken(baseline) else 1.0
         if self.problem.with_maxima:
@@ -624,7 +624,7 @@ class Search:
 
         An orbit can fail a check of accuracy at a design although all its neighbours pass."""
         yield self.exact, point
-        yield self.exact.at_tolerance(_SHARPER * self.config.solver.rtol), point
+        yield self.exact.at_tolerance(_SHARPER * self.config.solver.orbit_tolerance), point
         for size in _BESIDE:
             yield self.exact, self.problem.toward(point + size * np.sign(0.5 - point), point)
 
@@ -639,7 +639,7 @@ class Search:
         certificate = certify(local, point)
         if not certificate.holds(RESIDUAL, FEASIBLE) and not self.stop.is_set():
             # The gradients may be less accurate than the residual requires.
-            sharper = self.exact.at_tolerance(_SHARPER * self.config.solver.rtol)
+            sharper = self.exact.at_tolerance(_SHARPER * self.config.solver.orbit_tolerance)
             again = sharper(self.problem.design(point), start=optimized.state, series=False)
             found = self.problem.local(again, point)
             if found is not None and (other := certify(found, point)).residual < RESIDUAL:

@@ -91,7 +91,7 @@ REASONS = {
     "no_progress": (
         "The models of the search promise a better design nearby, but no step finds one: the "
         "gradients are less accurate than needed, or the motion changes its kind beside the "
-        "design. Tighten solver.rtol, or raise optimizer.starts."
+        "design. Tighten solver.accuracy, or raise optimizer.starts."
     ),
     "infeasible": "No point near the start satisfies all constraints. Relax a constraint.",
     "unusable": "The start has no usable steady state. Choose another one.",

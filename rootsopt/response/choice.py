@@ -51,8 +51,8 @@ class Choice:
             "fidelity": solver.fidelity,
             "map_error": solver.map_error if solver.fidelity == "map" else None,
             "method": solver.method,
-            "rtol": solver.rtol,
-            "transient_rtol": solver.transient_rtol,
+            "rtol": solver.orbit_tolerance,
+            "transient_rtol": solver.transient_tolerance,
             "tried": self.tried,
         }
 
@@ -83,7 +83,7 @@ def choose(config: Config) -> Choice:
         error = max(known) if len(known) == len(errors) else None
         status = next((one.status for one in found if not one.usable), found[0].status)
         solver = candidate.solver
-        settings = {"fidelity": solver.fidelity, "rtol": solver.rtol}
+        settings = {"fidelity": solver.fidelity, "rtol": solver.orbit_tolerance}
         tried.append(settings | {"error": error, "status": status.label})
         if error is not None and error <= _MARGIN * wanted:
             # Add the error of the reference itself, about its tolerance.

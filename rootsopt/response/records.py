@@ -238,8 +238,16 @@ def _not_settled(config: Config) -> list[str]:
     return [*_precision(config), *longer, *_damping(config)]
 
 
+def _tolerance(config: Config) -> tuple[str, float]:
+    """Return the key that sets the tolerance of orbits, and its value."""
+    solver = config.solver
+    if solver.rtol is None:
+        return "solver.accuracy", solver.accuracy
+    return "solver.rtol", solver.rtol
+
+
 def _unresolved(config: Config) -> list[str]:
-    return [*_precision(config), *_way("tighten", "solver.rtol", config.solver.rtol)]
+    return [*_precision(config), *_way("tighten", *_tolerance(config))]
 
 
 def _inaccurate(config: Config) -> list[str]:
@@ -254,7 +262,7 @@ def _solver_failed(config: Config) -> list[str]:
     need = "; an explicit method needs ten for each of statistics.swings_per_mesh_period"
     most = f"{solver.max_steps_per_period:g}{need if explicit else ''}"
     implicit = ["set solver.method to kvaerno5, which is implicit"] if explicit else []
-    looser = _way("loosen", "solver.rtol", solver.rtol)
+    looser = _way("loosen", *_tolerance(config))
     return [f"raise solver.max_steps_per_period ({most})", *looser, *implicit]
 
 

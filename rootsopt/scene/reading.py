@@ -150,8 +150,8 @@ def integrators(config: Config) -> tuple[Integrator, Integrator]:
     solver = config.solver
     steps = solver.max_steps_per_period
     return (
-        Integrator(solver.method, jnp.asarray(solver.transient_rtol), steps),
-        Integrator(solver.method, jnp.asarray(solver.rtol), _ORBIT_STEPS * steps),
+        Integrator(solver.method, jnp.asarray(solver.transient_tolerance), steps),
+        Integrator(solver.method, jnp.asarray(solver.orbit_tolerance), _ORBIT_STEPS * steps),
     )
 
 

@@ -31,7 +31,7 @@ class Standing(enum.Enum):
     NOT_CERTIFIED = (
         "The design is the best that was found for this compromise, but its search had not "
         "converged, or the first-order conditions do not hold. Raise optimizer.iterations or "
-        "tighten solver.rtol."
+        "tighten solver.accuracy."
     )
     NOT_VERIFIED = (
         "The search was stopped before the design was simulated again from rest. Run it again."
@@ -40,7 +40,7 @@ class Standing(enum.Enum):
     REPEATED = "Another point is the same design."
     NOT_HELD_UP = (
         "Simulated from rest at the tight tolerance, the design has no usable steady state, or "
-        "forces other than in the search. Tighten solver.rtol."
+        "forces other than in the search. Tighten solver.accuracy."
     )
 
     @property
@@ -214,7 +214,7 @@ class Front:
         if not self.points:
             return (
                 "No point of the front held up when simulated from rest. Raise "
-                "optimizer.screening or optimizer.starts, or tighten solver.rtol."
+                "optimizer.screening or optimizer.starts, or tighten solver.accuracy."
             )
         if not self.certified:
             return f"No point of the front is certified. {Standing.NOT_CERTIFIED.value}"

@@ -95,7 +95,7 @@ class Study:
         exact, baseline = exact.fit()
         if maxima:
             exact = exact.with_maxima()
-        fast = exact.at_tolerance(max(1e-6, config.solver.rtol)).surveying()
+        fast = exact.at_tolerance(max(1e-6, config.solver.orbit_tolerance)).surveying()
         floor = baseline.geometry["area_efficiency"]
         space = Space.of(config, exact.scene, floor, term_constraints(config, exact.scene))
         problem = Problem(config, baseline, space, limits)

@@ -127,7 +127,7 @@ def test_resolved_yaml_round_trips():
         # A plain YAML reader must be able to read it too.
         assert Config.model_validate_json(config.model_dump_json()) == config
         assert yaml.safe_load(text)["solver"]["method"] == config.solver.method
-    assert config.solver.rtol == 1e-8
+    assert config.solver.orbit_tolerance == pytest.approx(1e-8)
 
 
 def test_load_reads_a_file_and_applies_overrides(tmp_path):

@@ -409,7 +409,7 @@ def test_auto_looks_more_closely_at_what_does_not_settle(monkeypatch, settles):
             return cls(config)
 
         def __call__(self, series):
-            asked.append(self.config.solver.rtol)
+            asked.append(self.config.solver.orbit_tolerance)
             fine = settles and asked[-1] < 1e-8
             found = outcome if fine else dataclasses.replace(outcome, status=Status.NOT_SETTLED)
             return dataclasses.replace(found, statistics={"transient_mesh_periods": 4})

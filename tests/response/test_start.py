@@ -126,7 +126,7 @@ def test_start_of_another_kind_is_refused(scene, first):
 @pytest.mark.long
 def test_orbit_that_is_not_closed_is_said_to_be(scene, monkeypatch):
     """Inside `jit` it has a status; otherwise shooting closes it."""
-    monkeypatch.setattr("rootsopt.dynamics.closed.CORRECTED", 0.0)
+    monkeypatch.setattr("rootsopt.dynamics.closed.corrected", jnp.zeros_like)
     # With a window of 16 mesh periods, which says that the motion is not chaotic.
     brief = eqx.tree_at(lambda s: s.solver, scene, dataclasses.replace(scene.solver, windows=16))
     found, slope = jax.jit(

@@ -121,9 +121,9 @@ def test_nodes_give_forces_without_a_gradient():
     A message says so. Derivatives in Python are NaN, and an optimisation is refused before it
     simulates anything."""
     config = config_of("float64", "nodes")
-    assert config.solver.rtol == config.solver.transient_rtol == 3e-5
+    assert config.solver.orbit_tolerance == config.solver.transient_tolerance == 3e-5
     given = config_of("float64", "nodes", "tsit5", "solver.rtol=1e-6")
-    assert (given.solver.rtol, given.solver.transient_rtol) == (1e-6, 3e-5)
+    assert (given.solver.orbit_tolerance, given.solver.transient_tolerance) == (1e-6, 3e-5)
     found = Evaluator.of(config)(series=False)
     truth = Evaluator.of(load(CIC))(series=False)
     assert found.status is Status.PERIODIC

@@ -213,7 +213,7 @@ def _said(result) -> str:
     if result.verification.get("rejected"):
         return (
             "No better design held up when simulated again from rest at the tight tolerance. "
-            "Raise optimizer.iterations or optimizer.screening, or tighten solver.rtol."
+            "Raise optimizer.iterations or optimizer.screening, or tighten solver.accuracy."
         )
     return result.status.value
 

@@ -14,11 +14,11 @@ _FLOOR = 0.15
 length of elements."""
 
 
-_MOST = 96, 48
+_MOST, _FINEST = (96, 48), 160
 """Maximum number of elements per mesh period: in each of the first two mesh periods, and in each
 further one. Longer orbits with as many events as a free form are rare, and all orbits pay for the
 room: sorting events takes half of the time from rest with room for 64 events in each of eight mesh
-periods."""
+periods. Shorter orbits can use the room of longer ones, up to the third number per mesh period."""
 _TIMES = 64, 24
 """Number of events above which the search for the orbit fails, counted like elements."""
 
@@ -38,8 +38,7 @@ def most_elements(mesh: Mesh) -> Int[Array, ""]:
     The arrays have room for more if the period is shorter than the longest one. An orbit that needs
     more elements has an event that the equation does not know, and each further element costs
     time."""
-    first, further = jnp.minimum(mesh.period, 2.0), jnp.maximum(mesh.period - 2.0, 0.0)
-    wanted = jnp.round(first * _MOST[0] + further * _MOST[1]).astype(int)
+    wanted = jnp.round(_FINEST * mesh.period).astype(int)
     return jnp.minimum(wanted, mesh.left.shape[0]) - 1
 
 
@@ -133,26 +132,31 @@ def ordered(mesh: Mesh) -> tuple[Mesh, Bool[Array, ""]]:
 def moved(elements: Elements, mesh: Mesh) -> Elements:
     """Return the motion `elements` on another `mesh`.
 
-    `Elements.roots` are copied without change. They are not valid on the new mesh, and must be
+    `Elements.roots` are only useful if both meshes have the same events; otherwise they must be
     renewed (see `events.rooted`)."""
     old_begin = elements.mesh.ends[0]
-    begin, _ = mesh.ends
+    begin, end = mesh.ends
     length, old_length = mesh.lengths, elements.mesh.lengths
     last = elements.mesh.used - 1
 
-    def at(tau, integrated: bool):
+    def at(tau):
         start = elements.mesh.times[0]
         tau = start + jnp.mod(tau - start, elements.mesh.period)
         k = jnp.clip(jnp.searchsorted(old_begin, tau, side="right") - 1, 0, last)
         size = jnp.where(old_length[k] > 0, old_length[k], 1.0)
-        share = (tau - old_begin[k]) / size
-        if integrated:
-            rise = jnp.sum(GAUSS.integrated(share)[..., None] * elements.slopes[k], axis=-2)
-            return elements.state[k] + old_length[k][..., None] * rise
-        return jnp.sum(GAUSS.lagrange(share)[..., None] * elements.slopes[k], axis=-2)
+        return k, (tau - old_begin[k]) / size
 
-    tau = begin[:, None] + length[:, None] * GAUSS.nodes
-    return Elements(mesh, at(begin, True), at(tau, False), elements.roots)
+    k, share = at(begin)
+    rise = jnp.sum(GAUSS.integrated(share)[..., None] * elements.slopes[k], axis=-2)
+    state = elements.state[k] + old_length[k][..., None] * rise
+    k, share = at(jnp.append(begin[:, None] + length[:, None] * GAUSS.nodes, end[:, None], axis=1))
+    weights = GAUSS.lagrange(share)
+    slopes = jnp.einsum("eps,epsn->epn", weights[:, :-1], elements.slopes[k[:, :-1]])
+    roots = jnp.einsum("eps,epsij->epij", weights, elements.roots[k][:, :, :-1])
+    # The root at an event belongs to one side of the event.
+    own = elements.roots[elements.mesh.finals[mesh.interval], -1]
+    roots = roots.at[:, -1].set(jnp.where(mesh.last[:, None, None], own, roots[:, -1]))
+    return Elements(mesh, state, slopes, roots)
 
 
 def aligned(
