@@ -1,0 +1,138 @@
+"""Measures error and time of random designs and scenes at several values of `solver.accuracy`.
+
+Profiles are EE, and CIC with random pressure angle, involute and tip land, with two to four lobes.
+Scenes vary speed, load, backlash and damping. The errors are those of mean, peak and RMS force, and
+of their derivatives with respect to the profile parameters, relative to the largest derivative of
+the same force. The reference is shooting with dopri8 at 1e-11. Scenes whose reference is not
+periodic are replaced by other random scenes.
+"""
+
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+
+from experiments._common.scenes import CIC, shipped
+from experiments._common.simulation import evaluator_of
+from rootsopt.config import load
+from rootsopt.errors import InputError
+from rootsopt.response.evaluation import Evaluation
+from rootsopt.status import Status
+
+Row = dict[str, Any]
+REQUESTS = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7)
+"""Values of `solver.accuracy`."""
+SHARP = ("solver.orbit=shooting", "solver.method=dopri8", "solver.rtol=1e-11")
+NAMES = ("mean_force_N", "peak_force_N", "rms_force_N")
+QUICK_COUNT, REPEATS = 1, 5
+"""Number of scenes of a reduced run, and number of timed evaluations."""
+
+
+def scenes(seed: int) -> Iterator[tuple[str, list[str]]]:
+    """Yield (name of a shipped config, random overrides) without end."""
+    draw = np.random.default_rng(seed)
+    while True:
+        family = "ee" if draw.uniform() < 0.25 else "cic"
+        lobes = int(draw.integers(2, 5))
+        values: dict[str, Any] = {
+            "profile.lobes": lobes,
+            "scene.speed_rpm": round(10 ** draw.uniform(2.5, 3.7), 1),
+            "scene.load.torque_N_m": round(10 ** draw.uniform(0.3, 1.5), 3),
+            "scene.timing_gear.backlash_mm": round(draw.uniform(0.02, 0.3), 3),
+            "scene.timing_gear.damping_ratio": round(draw.uniform(0.1, 0.8), 3),
+        }
+        if family == "cic":
+            radius = load(CIC).profile.pitch_radius_mm
+            angle, tip = draw.uniform(25, 42), draw.uniform(0.5, 5.0)
+            longest = radius * np.sin(np.radians(angle)) * (np.pi / 2 / lobes - np.radians(tip))
+            values |= {
+                "profile.pressure_angle_deg": round(angle, 2),
+                "profile.tip_arc_angle_deg": round(tip, 2),
+                "profile.involute_length_mm": round(draw.uniform(0.1, 0.9) * longest, 2),
+            }
+        yield family, [f"{key}={value}" for key, value in values.items()]
+
+
+def error(found: Evaluation, truth: Evaluation) -> float:
+    """Return the largest relative error of forces and derivatives, inf if there are none."""
+    if found.status is not Status.PERIODIC:
+        return np.inf
+    off = [abs(found.response[name] / truth.response[name] - 1) for name in NAMES]
+    for name in NAMES:
+        one, other = (np.array(list(x.gradient[name].values())) for x in (found, truth))
+        off.append(np.max(np.abs(one - other), initial=0) / np.max(np.abs(other), initial=1e-300))
+    return float(max(off))
+
+
+def measure(family: str, overrides: list[str]) -> list[Row]:
+    """Measure one scene. Return a row for each accuracy; none if the scene has no reference."""
+    finest = evaluator_of(shipped(family, *overrides, f"solver.accuracy={REQUESTS[-1]}"))
+    near = finest(series=False)
+    truth = evaluator_of(shipped(family, *overrides, *SHARP))(start=near.state, series=False)
+    if not (truth.status is near.status is Status.PERIODIC):
+        return []
+    rows = []
+    for wanted in REQUESTS:
+        tool = evaluator_of(shipped(family, *overrides, f"solver.accuracy={wanted}"))
+        found, spent = tool(series=False), []
+        for _ in range(REPEATS):
+            began = time.process_time()
+            tool(series=False)
+            spent.append(time.process_time() - began)
+        rows.append(
+            {
+                "family": family,
+                "scene": " ".join(overrides),
+                "accuracy": wanted,
+                "status": found.status.label,
+                "error": error(found, truth),
+                "seconds": float(np.median(spent)),
+                "elements": found.statistics.get("orbit_elements", 0),
+                "solver_steps": found.statistics["solver_steps"],
+                "newton_steps": found.statistics["newton_steps"],
+            }
+        )
+    return rows
+
+
+def run(
+    quick: bool, count: int = 60, seed: int = 0, say: Callable[[str], None] = lambda text: None
+) -> list[Row]:
+    """Measure random scenes until `count` of them have a reference; return all rows."""
+    count = QUICK_COUNT if quick else count
+    rows: list[Row] = []
+    done = 0
+    for family, overrides in scenes(seed):
+        try:
+            new = measure(family, overrides)
+        except InputError:
+            continue  # an impossible geometry
+        rows += new
+        done += bool(new)
+        say(f"{done}/{count} {family} " + " ".join(f"{row['error']:.0e}" for row in new))
+        if done >= count:
+            break
+    return rows
+
+
+def summary(rows: list[Row]) -> list[Row]:
+    """Return, for each accuracy: share of scenes within it, errors, and time."""
+    usual = np.array([row["seconds"] for row in rows if row["accuracy"] == 1e-5])
+    table = []
+    for wanted in REQUESTS:
+        mine = [row for row in rows if row["accuracy"] == wanted]
+        errors = np.array([row["error"] for row in mine])
+        seconds = np.array([row["seconds"] for row in mine])
+        table.append(
+            {
+                "accuracy": wanted,
+                "scenes": len(mine),
+                "within": float(np.mean(errors <= wanted)),
+                "median_error": float(np.median(errors)),
+                "error_of_95_percent": float(np.quantile(errors, 0.95, method="lower")),
+                "median_ms": 1e3 * float(np.median(seconds)),
+                "time_over_usual": float(np.median(seconds / usual)),
+            }
+        )
+    return table
