@@ -802,3 +802,14 @@ def test_entries_of_a_list_are_replaced_by_number():
         config.check_values({"profile.coefficients_3": 9e9})
     with pytest.raises(InputError, match="coefficients_99"):
         config.check_values({"profile.coefficients_99": 0.5})
+
+
+def test_tolerances_follow_from_accuracy():
+    """Explicit tolerances override what follows from `solver.accuracy`."""
+    coarse = parse(MINIMAL, ["solver.accuracy=1e-2"]).solver
+    assert coarse.orbit_tolerance == pytest.approx(1e-5)
+    assert coarse.transient_tolerance == pytest.approx(1e-4)
+    given = parse(MINIMAL, ["solver.accuracy=1e-2", "solver.rtol=1e-9"]).solver
+    assert (given.orbit_tolerance, given.transient_tolerance) == (1e-9, pytest.approx(1e-4))
+    with pytest.raises(InputError, match=r"solver\.accuracy"):
+        parse(MINIMAL, ["solver.accuracy=1e-10"])

@@ -338,12 +338,12 @@ def test_paper_search(tmp_path, programs):
 
 
 @pytest.mark.long
-def test_auto_accuracy(tmp_path, programs):
-    """What `auto` chooses is within the error asked for."""
-    run("auto_accuracy", tmp_path, programs)
-    record = json.loads((tmp_path / "auto.json").read_text())
-    assert record["judged"] == record["within_request"] == 1
-    assert is_picture(tmp_path / "auto.png")
+def test_accuracy(tmp_path, programs):
+    """Errors are within the accuracy asked for."""
+    run("accuracy", tmp_path, programs)
+    table = json.loads((tmp_path / "accuracy.json").read_text())["table"]
+    assert all(row["scenes"] == row["within"] == 1 for row in table)
+    assert is_picture(tmp_path / "accuracy.png")
 
 
 @pytest.mark.long

@@ -255,3 +255,21 @@ def test_maxima_near_a_neighbour_are_those_by_shooting():
         np.testing.assert_allclose(one.forces, other.forces, rtol=1e-6)
         size = np.max(np.abs(other.slopes), axis=1, keepdims=True)
         np.testing.assert_allclose(one.slopes / size, other.slopes / size, rtol=0, atol=1e-2)
+
+
+def test_a_coarser_accuracy_saves_work_and_bounds_the_error():
+    config = rootsopt.load_config("configs/cic.yaml")
+    sharp = config.replaced({"solver.orbit": "shooting", "solver.rtol": 1e-10})
+    truth = Evaluator.of(sharp)(series=False)
+    names, work = ("mean_force_N", "peak_force_N", "rms_force_N"), []
+    for accuracy in (1e-2, 1e-5, 1e-7):
+        found = Evaluator.of(config.replaced({"solver.accuracy": accuracy}))(series=False)
+        assert found.status is Status.PERIODIC
+        for name in names:
+            assert found.response[name] == pytest.approx(truth.response[name], rel=accuracy)
+            slopes = np.array([list(one.gradient[name].values()) for one in (found, truth)])
+            assert np.max(np.abs(slopes[0] - slopes[1])) < accuracy * np.max(np.abs(slopes))
+        effort = found.statistics
+        assert effort["gradient_disagreement"] <= accuracy
+        work.append(effort["solver_steps"] + effort["newton_steps"] * effort["orbit_elements"])
+    assert work[0] < 0.7 * work[1] < 0.7 * work[2]
