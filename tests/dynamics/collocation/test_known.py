@@ -55,7 +55,7 @@ def _known(room=(48, 51)):
 def test_orbit_sampled_as_steps_is_the_motion_over_one_period():
     """Steps begin at φ1 = 0 even if the mesh does not, and end after exactly one period."""
     elements = _known().elements
-    nothing = jnp.zeros(())
+    nothing, origin = jnp.zeros(()), jnp.asarray(0)
     found = OrbitForces(
         elements=elements,
         response=jnp.arange(3.0),
@@ -64,7 +64,7 @@ def test_orbit_sampled_as_steps_is_the_motion_over_one_period():
         moved=jnp.zeros((1, 2)),
         monodromy=jnp.zeros((1, 1)),
         depth=nothing,
-        peak=Peak(jnp.asarray(8), jnp.asarray(0.5), (jnp.asarray(0),) * 2, nothing, nothing),
+        peak=Peak(jnp.asarray(8), jnp.asarray(0.5), (origin, origin), nothing, nothing),
         correction=nothing,
     )
     flow = sampled(as_flow(found), elements, samples=16)
