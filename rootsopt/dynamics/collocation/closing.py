@@ -232,6 +232,11 @@ class Closer(eqx.Module):
         return jnp.maximum(self.tolerance / _USUAL, 1.0)
 
     @property
+    def denser(self) -> Float[Array, ""]:
+        """Factor by which meshes are denser than at the usual accuracy, at least 1."""
+        return jnp.maximum(_USUAL / self.tolerance, 1.0) ** (1 / _ORDER)
+
+    @property
     def directions(self) -> int:
         """Number of directions along which forces are differentiated."""
         return jax.tree.leaves(eqx.filter(self.tangents, eqx.is_inexact_array))[0].shape[0]
@@ -318,10 +323,10 @@ class Closer(eqx.Module):
         room = now.elements.mesh.times.shape[0]
         events = found_events(self.frozen_at(now), now.elements, seen, room, finer)
         taken = now.elements.mesh.used
-        share = _SHARE * jnp.maximum(_USUAL / self.tolerance, 1.0) ** (1 / _ORDER)
-        first = jnp.round(share * taken).astype(int) + _EVENT * events.count
+        first = jnp.round(_SHARE * self.denser * taken).astype(int) + _EVENT * events.count
         used = jnp.where(now.fits, jnp.where(finer, (_FINER * taken).astype(int), taken), first)
-        used = jnp.maximum(jnp.minimum(used, most_elements(now.elements.mesh)), events.count + 2)
+        most = most_elements(now.elements.mesh, self.denser)
+        used = jnp.maximum(jnp.minimum(used, most), events.count + 2)
         used = jnp.minimum(used, now.elements.state.shape[0] - 1)
         (place, wanted), (spot, number) = needed(now.elements), counted(now.elements)
         density = jnp.where(now.fits, place, spot), jnp.where(now.fits, wanted, number)
@@ -404,7 +409,7 @@ class Closer(eqx.Module):
         error, drift = choose(first, self.uncompared(size), compared)
         steep, least, most = _TURNING
         certain = drift <= jnp.clip(steep * self.tolerance, least, most)
-        full = now.elements.mesh.used >= most_elements(now.elements.mesh)
+        full = now.elements.mesh.used >= most_elements(now.elements.mesh, self.denser)
         # Newton's method has converged, so the correction must be small. It is large or NaN where
         # the time derivative of a margin vanishes at its event.
         good = found.correction < corrected(self.tolerance)

@@ -18,7 +18,8 @@ _MOST, _FINEST = (96, 48), 160
 """Maximum number of elements per mesh period: in each of the first two mesh periods, and in each
 further one. Longer orbits with as many events as a free form are rare, and all orbits pay for the
 room: sorting events takes half of the time from rest with room for 64 events in each of eight mesh
-periods. Shorter orbits can use the room of longer ones, up to the third number per mesh period."""
+periods. Shorter orbits can use the room of longer ones, up to the third number per mesh period at
+the usual accuracy."""
 _TIMES = 64, 24
 """Number of events above which the search for the orbit fails, counted like elements."""
 
@@ -32,13 +33,13 @@ def sizes(periods: int) -> tuple[int, int]:
     return -(-elements // BLOCK) * BLOCK, times + 3
 
 
-def most_elements(mesh: Mesh) -> Int[Array, ""]:
+def most_elements(mesh: Mesh, denser: Float[Array, ""]) -> Int[Array, ""]:
     """Return the number of elements above which the `mesh` is not refined.
 
-    The arrays have room for more if the period is shorter than the longest one. An orbit that needs
-    more elements has an event that the equation does not know, and each further element costs
-    time."""
-    wanted = jnp.round(_FINEST * mesh.period).astype(int)
+    `denser`: factor by which meshes are denser than at the usual accuracy. The arrays have room for
+    more if the period is shorter than the longest one. An orbit that needs more elements has an
+    event that the equation does not know, and each further element costs time."""
+    wanted = jnp.round(_FINEST * denser * mesh.period).astype(int)
     return jnp.minimum(wanted, mesh.left.shape[0]) - 1
 
 
