@@ -150,7 +150,7 @@ def test_a_motion_without_contact_that_does_not_repeat_is_idle(exponent):
         (Status.IDLE, ["scene.timing_gear=null"], "scene.load", "clearance|gear"),
         (Status.CHAOTIC, ["scene.timing_gear=null"], "contact.max_damping", "gear|backlash"),
         (Status.NOT_SETTLED, ["solver.precision=float32"], "to float64", "contact.max"),
-        (Status.UNRESOLVED, [], "solver.rtol", "precision"),
+        (Status.UNRESOLVED, [], "solver.accuracy", "precision"),
         (Status.SOLVER_FAILED, ["solver.method=kvaerno5"], "loosen", "implicit"),
     ],
 )

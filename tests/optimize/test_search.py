@@ -57,7 +57,7 @@ def searching(truth=lambda point: 1.0, tight=None, **settings) -> Search:
 
     search.exact = told(truth)
     search.exact.at_tolerance = lambda rtol: told(tight or truth)
-    search.config = types.SimpleNamespace(solver=types.SimpleNamespace(rtol=1e-8))
+    search.config = types.SimpleNamespace(solver=types.SimpleNamespace(orbit_tolerance=1e-8))
     return search
 
 
