@@ -283,20 +283,22 @@ def _zero(margin, low, high, positive):
         near = jnp.where(beyond <= jnp.abs(middle - chord), chord + inwards * beyond, middle)
         inside = jnp.abs(near - middle) <= spare
         place = jnp.where(inside, near, middle - inwards * spare)
+        # The first two iterations evaluate both ends, so that the margin is compiled once.
+        place = jnp.where(count == -2, low, jnp.where(count == -1, high, place))
         here = margin(place)
-        same = (here > 0) == positive
+        lower = jnp.where(count < 0, count == -2, (here > 0) == positive)
         return (
-            jnp.where(same, place, low),
-            jnp.where(same, high, place),
-            jnp.where(same, here, at_low),
-            jnp.where(same, at_high, here),
+            jnp.where(lower, place, low),
+            jnp.where(lower, high, place),
+            jnp.where(lower, here, at_low),
+            jnp.where(lower, at_high, here),
             count + 1,
         )
 
     def wide(ends):
         return (ends[1] - ends[0] > 2 * _LOCATED) & (ends[-1] <= most)
 
-    start = low, high, margin(low), margin(high), jnp.zeros_like(most)
+    start = low, high, jnp.zeros_like(low), jnp.zeros_like(low), jnp.full_like(most, -2)
     low, high, *_ = lax.while_loop(wide, closer, start)
     return (low + high) / 2
 
