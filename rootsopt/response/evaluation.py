@@ -55,9 +55,12 @@ if TYPE_CHECKING:
 
 _MAPS = 5
 """Maximum number of contact maps tried for one design."""
-_APART = 1e-4
+_APART = 1e-4, 1e3
 """Difference between an orbit closed by collocation and an integration over its period (see
-`integrated_difference`) above which the orbit is closed by shooting."""
+`integrated_difference`) above which the orbit is closed by shooting: the first number, at least the
+second times the tolerance of orbits."""
+_FINE = 1e-8
+"""Greatest tolerance of this integration."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -316,8 +319,12 @@ class Evaluator:
         if found.known is None or Status.of(found.status) not in CLOSED:
             return found
         orbit, integrator = found.orbit, self.scene.solver.orbit
-        apart = _integrated(pair, (orbit.state, orbit.response), found.period, integrator)
-        return found if apart <= _APART else self._by_shooting(pair, tangents, start)
+        # A coarse integration would say nothing about the orbit.
+        fine = dataclasses.replace(integrator, rtol=jnp.minimum(integrator.rtol, _FINE))
+        apart = _integrated(pair, (orbit.state, orbit.response), found.period, fine)
+        least, tolerances = _APART
+        close = apart <= max(least, tolerances * float(integrator.rtol))
+        return found if close else self._by_shooting(pair, tangents, start)
 
     def pair(self, design: ArrayLike) -> RotorPair:
         """Return the rotor pair of `design` (config units)."""
