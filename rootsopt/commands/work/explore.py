@@ -2,6 +2,7 @@
 
 import argparse
 import html
+import os
 import sys
 import tempfile
 import threading
@@ -47,6 +48,9 @@ def body(config: Config, options: argparse.Namespace) -> int:
             server.run(stop, started)
         except KeyboardInterrupt:  # if Python's own handler of Ctrl-C is in place
             print("rootsopt explore: the page closes", file=sys.stderr)
+    if stop.is_set():  # Python would wait for programs that are half compiled.
+        sys.stdout.flush()
+        os._exit(door.OK)
     return door.OK
 
 
