@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from rootsopt.dynamics.flow import Equation
 from rootsopt.dynamics.integrator import Integrator
@@ -199,13 +199,12 @@ class _Pieces(NamedTuple):
     """Pieces of an orbit's steps, in order of time.
 
     `begin`, `end`: of each piece (mesh periods; `end` is inf beyond the last); `step`: index of the
-    step that holds it; `first`: start of this step; `last`: whether the piece ends the step."""
+    step that holds it; `first`: start of this step."""
 
     begin: Float[Array, " pieces"]
     end: Float[Array, " pieces"]
     step: Int[Array, " pieces"]
     first: Float[Array, " pieces"]
-    last: Bool[Array, " pieces"]
 
 
 def _pieces(
@@ -228,8 +227,7 @@ def _pieces(
     step = jnp.clip(jnp.searchsorted(grid, end), 0, used - 1)
     # Rounding may put a corner beyond the last step.
     end = jnp.where(end > grid[used - 1], jnp.inf, end)
-    # An end may occur twice. The step ends only at the first one that has a positive length.
-    return _Pieces(begin, end, step, starts[step], (end == grid[step]) & (begin < end))
+    return _Pieces(begin, end, step, starts[step])
 
 
 def loads_corners(bearings: BearingSet) -> Float[Array, " k"]:
@@ -292,19 +290,14 @@ def orbit_loads(  # 90 lines: the functions of its two loops share the linearise
     taken, lanes = jnp.sum(pieces.end < jnp.inf), jnp.arange(_CHUNK)
 
     def linear_piece(k):
-        of = pieces.step[k]
-        times = jnp.stack([pieces.first[k], pieces.begin[k]])
-        times = times, jnp.append(times[1:], pieces.end[k])
+        begin, end = pieces.begin[k], pieces.end[k]
+        start = equation.start(before[pieces.step[k]], pair.free)
+        state = equation.advanced(pieces.first[k], begin, start, dynamic)[0][:count]
 
         def run(y, dynamic):
-            def part(y, between):
-                # The integrals start again from zero, so that only the second part counts.
-                start = equation.start(y[:count], pair.free)
-                return equation.advanced(between[0], between[1], start, dynamic)[0], None
+            return equation.advanced(begin, end, y, dynamic)[0]
 
-            return lax.scan(part, y, times)[0]
-
-        return linearized(run, equation.start(before[of], pair.free), dynamic, moved, count)
+        return linearized(run, equation.start(state, pair.free), dynamic, moved, count)
 
     openings = _openings(dynamic, static, moved) if scene.twist_free else None
 
@@ -321,7 +314,7 @@ def orbit_loads(  # 90 lines: the functions of its two loops share the linearise
 
     def advance(carry, job):
         moved, total, slopes, peaks = carry
-        wanted, last, end, found, jumps = job
+        wanted, end, found, jumps = job
         after = found.by_state @ moved + found.by_parameters
         new = total + found.value[count:], slopes + after[count:]
         total, slopes = jax.tree.map(lambda x, y: jnp.where(wanted, x, y), new, (total, slopes))
@@ -329,7 +322,7 @@ def orbit_loads(  # 90 lines: the functions of its two loops share the linearise
             slopes = slopes.at[:4].add(jnp.where(wanted, jumps, 0.0))
         here = wanted & (tau[latest] == end)
         peaks = jnp.where(here[:, None, None], after[:count], peaks)
-        return (jnp.where(wanted & last, after[:count], moved), total, slopes, peaks), None
+        return (jnp.where(wanted, after[:count], moved), total, slopes, peaks), None
 
     def chunk(carry):
         number, sums = carry
@@ -337,7 +330,7 @@ def orbit_loads(  # 90 lines: the functions of its two loops share the linearise
         at = jnp.minimum(place, taken - 1)
         found = jax.vmap(linear_piece)(at)
         jumps = None if openings is None else jax.vmap(opening)(at, found.value[:, :count])
-        jobs = place < taken, pieces.last[at], pieces.end[at], found, jumps
+        jobs = place < taken, pieces.end[at], found, jumps
         sums, _ = lax.scan(advance, sums, jobs)
         return number + 1, sums
 

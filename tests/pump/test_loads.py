@@ -205,7 +205,8 @@ def test_work_and_momentum_of_elastic_bearings():
     scene, design = scene_of(GAS, BEARINGS, SUPPORTS)
     evaluator = Evaluator(rootsopt.load_config("cic", [GAS, BEARINGS, SUPPORTS]), scene)
     pair, tangents, _ = scene.pair_and_tangents(design)
-    found = evaluator.motion(pair, tangents, np.zeros(pair.states))
+    start = evaluator.orbits.start(pair, None, scene.solver.max_orbit)
+    found = evaluator.motion(pair, tangents, start)
     assert Status.of(found.status) is Status.PERIODIC
     loads = orbit_loads(
         scene, design, found.orbit, jnp.asarray(int(found.period)), scene.solver.orbit
