@@ -143,7 +143,7 @@ def differences(
     period, state = jnp.asarray(found.steady_state["period"]), jnp.asarray(found.state)
 
     def at(change: float) -> np.ndarray:
-        moved = jnp.asarray(design * (1 + change * WAY))
+        moved = jnp.asarray(design * (1 + change * WAY[: len(design)]))
         force, residual, solved = forces(evaluator.scene, moved, state, period, how)
         closed = bool(solved) and float(residual) < 1e-10
         return np.asarray(force) if closed else np.full(len(MEASURES), np.nan)
@@ -165,7 +165,8 @@ def evaluated(evaluator: Evaluator) -> Iterator[tuple[float, Evaluation]]:
 def slopes_of(found: Evaluation) -> np.ndarray:
     """Return the terms (3, d) of the reported derivatives of the forces along `WAY`, in N."""
     rows = np.array([list(found.gradient[measure].values()) for measure in MEASURES])
-    return rows * np.array(list(found.design.values())) * WAY
+    design = np.array(list(found.design.values()))
+    return rows * design * WAY[: len(design)]
 
 
 def rows_of(
