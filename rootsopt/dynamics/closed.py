@@ -153,7 +153,7 @@ class _Attempts(eqx.Module):
         )
         return lax.cond(
             failure < 0,
-            lambda: self.attempt(now, settled, failure),
+            lambda: self.attempt(now, settled),
             lambda: self.lost(now, settled, failure),
         )
 
@@ -189,10 +189,9 @@ class _Attempts(eqx.Module):
         used, steps = found.used + settled.periods, found.steps + settled.steps
         return found._replace(settled=settled, used=used, steps=steps)
 
-    def attempt(self, now: _Loop, settled: Transient, failure: Int[Array, ""]) -> _Loop:
+    def attempt(self, now: _Loop, settled: Transient) -> _Loop:
         """Close an orbit, and return the loop's state."""
         solver, pair = self.solver, self.pair
-        del failure
         period, pieces = jnp.maximum(settled.period, 1), settled.pieces
         assert pieces is not None
         known, neighbour = self.start.known, self.start.pair

@@ -245,7 +245,7 @@ def found_events(
         def margin(tau):
             return pair.margins(tau, elements.motion(tau)).values[flag[k]]
 
-        return found.at[k].set(_zero(margin, seen.tau[place[k]], later[place[k]], value[k]))
+        return found.at[k].set(zero_of(margin, seen.tau[place[k]], later[place[k]], value[k]))
 
     located = lax.fori_loop(
         0, jnp.minimum(new, most), locate, jnp.full(most, jnp.inf, seen.tau.dtype)
@@ -262,12 +262,12 @@ def found_events(
     return Events(times[:room], which[:room], count, new, gone, fits)
 
 
-def _zero(margin, low, high, positive):
+def zero_of(margin, low, high, positive):
     """Return the instant between `low` and `high` at which the sign of `margin` changes.
 
-    `positive`: whether the margin is positive at `low`. Chord and bisection are combined by the ITP
-    method (Oliveira and Takahashi, ACM Trans. Math. Softw. 47 (2021) 5): a smooth margin takes
-    about eight evaluations, one that jumps only one more than bisection."""
+    `margin`: function of time (mesh periods); `positive`: whether it is positive at `low`. Chord
+    and bisection are combined by the ITP method (Oliveira and Takahashi, ACM Trans. Math. Softw. 47
+    (2021) 5): a smooth margin takes about ten evaluations, any other hardly more than bisection."""
     width = high - low
     most = jnp.ceil(jnp.log2(jnp.maximum(width / (2 * _LOCATED), 1.0))) + 1
 

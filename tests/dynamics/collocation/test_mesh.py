@@ -3,14 +3,17 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from rootsopt.dynamics.collocation.elements import Elements, Mesh
+from rootsopt.dynamics.collocation.events import zero_of
 from rootsopt.dynamics.collocation.gauss import GAUSS, POINTS
 from rootsopt.dynamics.collocation.mesh import aligned, counted, moved, needed, ordered, shared
 
 ROOM = 32
+EVENT = 0.3071
 
 
 def _elements(function, slope, edges, start=0.0):
@@ -156,3 +159,29 @@ def test_elements_crowd_where_they_are_needed():
     begin = np.asarray(mesh.ends[0])[:24]
     assert np.sum((begin > 0.4) & (begin < 0.5)) >= 10
     assert np.max(np.diff(begin)) < 0.4
+
+
+@pytest.mark.parametrize(
+    ("margin", "most"),
+    [
+        (lambda tau: jnp.sin(tau - EVENT), 12),
+        (lambda tau: jnp.exp(50 * tau) - jnp.exp(50 * EVENT), 12),
+        (lambda tau: jnp.where(tau > EVENT, -1.0, 1.0), 30),
+        (lambda tau: 1e3 * (EVENT - tau) ** 3, 30),
+    ],
+)
+def test_event_is_located(margin, most):
+    """A smooth margin takes about ten evaluations, one that jumps no more than bisection."""
+    places = []
+
+    def seen(tau):
+        places.append(float(tau))
+        return margin(tau)
+
+    low, high = jnp.asarray(0.3), jnp.asarray(0.32)
+    with jax.disable_jit():
+        found = zero_of(seen, low, high, margin(low) > 0)
+    assert abs(float(found) - EVENT) < 4e-10
+    assert len(places) <= most
+    assert min(places) >= 0.3
+    assert max(places) <= 0.32
