@@ -19,10 +19,6 @@ class Status(enum.Enum):
         "is that of the average over a neighbourhood of the design."
     )
     GEOMETRY_ONLY = "The profile is valid; nothing was simulated."
-    OFF_MAP = (
-        "The motion left the contact map, so its forces are not known. Set solver.fidelity to "
-        "search, or make the scene with a lower `deepest`."
-    )
     CHAOTIC = (
         "The motion is chaotic: mean and peak are those of a finite window and have no usable "
         "gradient. Set objective.motion to ensemble to optimise averages over an ensemble of "
@@ -48,8 +44,7 @@ class Status(enum.Enum):
     UNRESOLVED = (
         "The force is not resolved: either the flanks penetrate so little that rounding of the gap "
         "changes its greatest value by more than 1 %, or the steps are too coarse for its impacts "
-        "(mean, RMS and peak contradict each other). Set solver.precision to float64, or tighten "
-        "solver.accuracy."
+        "(mean, RMS and peak contradict each other). Tighten solver.accuracy."
     )
     INACCURATE = (
         "The orbit is closed, but halving the solver's steps changes it or its derivatives: they "
@@ -69,9 +64,8 @@ class Status(enum.Enum):
         "the search again for the optimum."
     )
     SOLVER_FAILED = (
-        "The solver ran out of steps. Raise solver.max_steps_per_period (an explicit method needs "
-        "at least ten for each of statistics.swings_per_mesh_period), loosen solver.accuracy, or "
-        "use an implicit solver.method (kvaerno5)."
+        "The solver ran out of steps. Raise solver.max_steps_per_period (it needs at least "
+        "ten for each of statistics.swings_per_mesh_period), or loosen solver.accuracy."
     )
     NON_FINITE = (
         "The simulation produced a number that is not finite. Loosen solver.accuracy or check the "

@@ -41,8 +41,8 @@ def part_table(job: Job) -> dict[str, Any]:
     start_process()
     import jax
     import jax.numpy as jnp
-
     from rootsopt.contact.map import MapContact
+
     from rootsopt.scene import Scene
 
     config = load(CIC)

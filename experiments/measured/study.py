@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from experiments._common.polygons import signed_distance
 from experiments._common.scenes import CIC
 from experiments._common.simulation import evaluate, profile_of
 from rootsopt.config import Config, load
-from rootsopt.contact.nodes import signed_distance
 from rootsopt.measured.conjugacy import Conjugacy, conjugacy
 from rootsopt.measured.source import outline_of
 from rootsopt.output.files import ResultFolder

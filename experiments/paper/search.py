@@ -17,13 +17,13 @@ import jax
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from rootsopt.contact.map import MapContact
 from scipy.optimize import differential_evolution
 
 from experiments._common.engines import Motion, Rotor, Scene, motion_of
 from experiments._common.engines.numba_pair import Search, Table, integrate
 from experiments._common.simulation import profile_of
 from experiments.paper.scene import FAMILIES, PAPER, QUANTITIES, Quantity, config_of
-from rootsopt.contact.map import MapContact
 from rootsopt.profiles import geometry
 
 _DEEPEST = -0.035

@@ -215,27 +215,6 @@ class Config(Section):
         return data
 
     @property
-    def needs_search(self) -> tuple[str, ...]:
-        """Keys set in this config that require `solver.fidelity: search`.
-
-        Friction, supports and bearings need the point of contact. An outline file or a centre
-        distance error needs the gap between flanks that do not roll perfectly. Only this fidelity
-        provides them. Twisted rotors are checked with this one.
-        """
-        parts = {
-            "contact.friction": self.contact.friction,
-            "scene.supports": self.scene.supports,
-            "scene.bearings": self.scene.bearings,
-            "scene.heat": self.scene.heat,
-            "contact.wear": self.contact.wear,
-            "rotor.helix_deg": self.rotor.helix_deg or None,
-            "optimizer.bounds.helix_deg": self.optimizer.bounds.helix_deg,
-            "scene.center_distance_error_mm": self.scene.center_distance_error_mm,
-            "profile.outline_file": self.profile.outline_file,
-        }
-        return tuple(key for key, part in parts.items() if part is not None)
-
-    @property
     def load_torque(self) -> float:
         """Load torque on rotor 2 (N·m); for a gas load, an estimate of its mean."""
         load = self.scene.load
@@ -263,7 +242,6 @@ class Config(Section):
             self.profile.pitch_radius_mm,
             None if gear is None else gear.stiffness_N_m_per_rad,
             law,
-            self.solver.precision,
         )
         return self.model_copy(update={"contact": _followed(contact, "smoothing_mm", length)})
 
@@ -279,16 +257,6 @@ class Config(Section):
             across = load.pressure_difference_Pa
             filled = _followed(pump, "pressure_difference_Pa", across)
             return self.model_copy(update={"pump": filled})
-        return self
-
-    @model_validator(mode="after")
-    def _searched(self):
-        fidelity = self.solver.fidelity
-        if self.needs_search and fidelity not in ("search", "auto"):
-            raise ValueError(
-                f"`solver.fidelity` must be search (or auto) with `{self.needs_search[0]}`, which "
-                f"no other fidelity supports, but is {fidelity}"
-            )
         return self
 
     @model_validator(mode="after")

@@ -11,11 +11,10 @@ _SHARES = {"twist": 0.05, "depth": 0.02, "damping": 0.1}
 smoothing length, the gear would work in the rounded edge of its backlash, where its stiffness
 differs. `depth`: penetration of the flanks under the full load. `damping`: penetration at which the
 damping is full."""
-_LEAST = {"float64": 1e-6, "float32": 1e-5}
-"""Minimum default smoothing length (mm) for each precision.
+_LEAST = 1e-6
+"""Minimum default smoothing length (mm).
 
-A shorter length would need more solver steps and make the gradient less accurate. In single
-precision, the gap has a rounding error of about 4e-6 mm."""
+A shorter length would need more solver steps and make the gradient less accurate."""
 _LEAST_LOAD = 1e-3
 """Load torque (N·m) below which the smoothing length does not depend on the load."""
 
@@ -25,13 +24,12 @@ def following_mm(
     pitch_radius_mm: float,
     gear_stiffness: float | None,
     contact: tuple[float, float, float],
-    precision: str,
 ) -> float:
     """Return the default smoothing length (mm) of a scene, with two significant digits.
 
     `load_torque`: torque on rotor 2 (N·m). `pitch_radius_mm`: pitch radius (mm). `gear_stiffness`:
     stiffness of the timing gear (N·m/rad), `None` without a gear. `contact`: stiffness (N/mm^e),
-    exponent e and depth of full damping (mm) of the flanks. `precision`: `float64` or `float32`.
+    exponent e and depth of full damping (mm) of the flanks.
 
     This smoothing changes the forces by less than 1e-4 of their values. The command `python -m
     experiments.smoothing` measures this."""
@@ -45,6 +43,6 @@ def following_mm(
     ]
     if gear_stiffness is not None:
         lengths.append(_SHARES["twist"] * torque / gear_stiffness * pitch_radius_mm)
-    shortest = max(min(lengths), _LEAST[precision])
+    shortest = max(min(lengths), _LEAST)
     # Two digits keep the written config readable.
     return float(f"{shortest:.1e}") if math.isfinite(shortest) else _LONGEST

@@ -2,20 +2,16 @@
 
 import math
 import re
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
 from rootsopt.config.families import families, on_change, parameters, replace_fields
-from rootsopt.config.section import Order, Section, Speed, Weight, between, number, tuples
+from rootsopt.config.section import Order, Section, Speed, Weight, bare, between, number, tuples
 from rootsopt.config.units import hint
 from rootsopt.config.words import named, shown
 
 _Seed = Annotated[int, Field(ge=0, le=2**31 - 1)]
-_NODES_RTOL = 3e-5
-"""Least tolerance by default for fidelity `nodes`, whose force has a step at every node. These
-steps limit the accuracy of forces to about 1e-3, and a finer tolerance would need many solver
-steps."""
 NEAREST = "nearest"
 """Word in `optimizer.family` for the named family that is nearest to an outline."""
 _LEAST_WEIGHT = 1e-6
@@ -24,32 +20,28 @@ _MOST_LINES = 32
 """Number of spectral lines above which an objective is rejected."""
 
 
-class SolverConfig(Section):
-    """Settings of the simulation: fidelity, integration method, tolerances and limits."""
+_SEARCHED = "contact is found by a search, which no other model beat in time at its error"
+_REMOVED: dict[str, tuple[Any, str]] = {
+    "fidelity": ("search", _SEARCHED),
+    "nodes": (400, _SEARCHED),
+    "map_error": (1e-4, _SEARCHED),
+    "map_rolls": (None, _SEARCHED),
+    "map_relatives": (None, _SEARCHED),
+    "gradient": ("forward", "both modes of differentiation gave the same gradient"),
+    "precision": ("float64", "motions are integrated in double precision"),
+}
+"""Keys of former versions: (value that is accepted, since nothing else is done; reason)."""
+_REMOVED_METHODS = ("dopri5", "kvaerno3", "kvaerno5")
+"""Values of `solver.method` of former versions."""
 
-    fidelity: Literal["search", "map", "linear", "nodes", "auto"] = Field(
-        "search",
-        description="contact model: search at every call (reference), C² map of the gap, gap "
-        "linear in the relative rotation, the paper's nodes against segments, or auto: the "
-        "cheapest of these that meets `accuracy`",
-    )
+
+class SolverConfig(Section):
+    """Settings of the simulation: accuracy, integration method, tolerances and limits."""
+
     accuracy: Annotated[float, Field(ge=1e-9, le=0.1)] = Field(
         1e-5,
         description="relative error of forces and of their gradient that is accepted: the greater, "
         "the faster",
-    )
-    nodes: Annotated[int, Field(ge=16, le=20_000)] = Field(
-        400, description="number of nodes per flank for fidelity nodes"
-    )
-    map_error: Annotated[float, Field(ge=1e-6, le=0.1)] = Field(
-        1e-4, description="error of the map's penetration, relative to the static penetration"
-    )
-    map_rolls: Annotated[int, Field(ge=16, le=4096)] | None = Field(
-        None, description="map points over the roll angle; absent: as many as map_error needs"
-    )
-    map_relatives: Annotated[int, Field(ge=12, le=1024)] | None = Field(
-        None,
-        description="map points over the relative rotation; absent: as many as map_error needs",
     )
     slices: Annotated[int, Field(ge=1, le=64)] | None = Field(
         None,
@@ -60,8 +52,8 @@ class SolverConfig(Section):
         1e-2,
         description="mean error of the contact torque of twisted rotors, relative to its maximum",
     )
-    method: Literal["tsit5", "dopri5", "dopri8", "kvaerno3", "kvaerno5"] = Field(
-        "tsit5", description="explicit: tsit5, dopri5, dopri8; implicit: kvaerno3, kvaerno5"
+    method: Literal["tsit5", "dopri8"] = Field(
+        "tsit5", description="Runge-Kutta method, of order 5 or 8 (cheaper below an rtol of 1e-10)"
     )
     rtol: Annotated[float, Field(ge=1e-12, le=1e-2)] | None = Field(
         None,
@@ -85,27 +77,37 @@ class SolverConfig(Section):
         description="how periodic orbits are closed: auto and collocation: by collocation aligned "
         "with contact events where possible; shooting: by shooting, an independent reference",
     )
-    gradient: Literal["forward", "reverse"] = Field(
-        "forward", description="differentiation mode; both give the same gradient"
-    )
-    precision: Literal["float64", "float32"] = Field(
-        "float64",
-        description="precision of the integration; float32 reaches tolerances down to 2e-6",
-    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _former(cls, data):
+        """Drop keys of former versions. Reject values that would now have no effect."""
+        if not isinstance(data, dict):
+            return data
+        for key, (accepted, reason) in _REMOVED.items():
+            value = data.get(key, accepted)
+            if value != accepted and bare(str(value)) != accepted:
+                raise ValueError(
+                    f"`solver.{key}` must be left out, but is {shown(value)}: {reason}; remove it, "
+                    "and set `solver.accuracy` to trade accuracy for time"
+                )
+        method = data.get("method")
+        if isinstance(method, str) and bare(method) in _REMOVED_METHODS:
+            raise ValueError(
+                f"`solver.method` must be tsit5 or dopri8, but is {shown(method)}, which was "
+                "removed: it was not faster at any accuracy; remove it"
+            )
+        return {key: value for key, value in data.items() if key not in _REMOVED}
 
     @property
     def orbit_tolerance(self) -> float:
         """Relative tolerance on the orbit and its statistics."""
-        return self.rtol or self._tolerance(1000)
+        return self.rtol or self.accuracy / 1000
 
     @property
     def transient_tolerance(self) -> float:
         """Relative tolerance during the transient."""
-        return self.transient_rtol or self._tolerance(100)
-
-    def _tolerance(self, factor: float) -> float:
-        """Return the tolerance that is finer than `accuracy` by a `factor`."""
-        return max(self.accuracy / factor, _NODES_RTOL if self.fidelity == "nodes" else 0.0)
+        return self.transient_rtol or self.accuracy / 100
 
 
 class ObjectiveConfig(Section):

@@ -44,12 +44,12 @@ from rootsopt.runtime.kept import kept
 
 # Maximum number of Newton steps from the point of perfect rolling; two or three are usual.
 _NEWTON_STEPS = 5
-# Length (rad) of the last step below which Newton's method has converged, keyed by bytes per
-# number. The next step would then be smaller than the rounding error, even across a kink of T.
-_CONVERGED = {8: 1e-8, 4: 1e-3}
-# Length (rad) of a step below which no further step is tried, keyed by bytes per number. Beside a
-# kink of T, the normal angles of the result err by this length.
-_FINISHED = {8: 1e-11, 4: 1e-5}
+# Length (rad) of the last step below which Newton's method has converged. The next step would then
+# be smaller than the rounding error, even across a kink of T.
+_CONVERGED = 1e-8
+# Length (rad) of a step below which no further step is tried. Beside a kink of T, the normal angles
+# of the result err by this length.
+_FINISHED = 1e-11
 # Maximum number of steps inside a bracket; bisection alone needs about fifty.
 _GUARDED_STEPS = 60
 # Least number of poses that are searched in groups (see `FlankPair.together`), and size of a group.
@@ -72,8 +72,8 @@ _NEAR_CUSP = 1.8
 # ignored.
 _DEEPEST = 0.1
 # Magnitude of T (pitch radii) below which T at a node counts as zero, because it may be a rounding
-# error. Keyed by bytes per number.
-_SLACK = {8: 1e-13, 4: 1e-6}
+# error.
+_SLACK = 1e-13
 # Number of extra nodes between the edge of a land, or a joint of a forked flank, and the next node.
 # Their distances from the edge double from one to the next.
 _CROWD = 12
@@ -465,7 +465,7 @@ class FlankPair(eqx.Module):
         offset = self.center_distance * sin - lever1 - nodes.lever
         # The tolerance keeps a root on a node. A compiled program may round T[i] differently as the
         # end of one interval and as the start of the next.
-        slack = _SLACK[offset.dtype.itemsize] * profile.pitch_radius
+        slack = _SLACK * profile.pitch_radius
         falling = (offset[:-1] >= -slack) & (offset[1:] < slack)
         if profile.wavy:
             number = jnp.cumsum(falling)
@@ -503,12 +503,11 @@ class FlankPair(eqx.Module):
         T has a kink where ν1 crosses a segment's end. G, ν1 and the levers follow from values and
         slopes before the last step; the error is of second order in this step.
         """
-        size = guess.dtype.itemsize
         limit = jnp.where(guarded, _GUARDED_STEPS, _NEWTON_STEPS)
 
         def go_on(carry):
             count, step = carry[:2]
-            return (count < limit) & (jnp.abs(step) >= _FINISHED[size])
+            return (count < limit) & (jnp.abs(step) >= _FINISHED)
 
         def newton(carry):
             count, before, _, (low, high), found = carry
@@ -523,7 +522,7 @@ class FlankPair(eqx.Module):
             slow = (slope >= 0) | (jnp.abs(step) > 0.5 * jnp.abs(before))
             # The root may lie on an end of the bracket. A compiled program may round the step
             # differently for each result. All results must agree on whether to halve.
-            slack = _FINISHED[size]
+            slack = _FINISHED
             halve = guarded & (slow | (new < low - slack) | (new > high + slack))
             new = jnp.where(halve, (low + high) / 2, jnp.clip(new, low, high))
             step = jnp.where(halve, (high - low) / 2, step)
@@ -537,7 +536,7 @@ class FlankPair(eqx.Module):
         start = 0, jnp.full_like(guess, jnp.inf), nothing, bracket, found
         _, step, slope, (low, high), found = lax.while_loop(go_on, newton, start)
         inside = (found[-1] > low) & (found[-1] < high) & (slope < 0)
-        return found, inside & (jnp.abs(step) < _CONVERGED[size])
+        return found, inside & (jnp.abs(step) < _CONVERGED)
 
 
 def _searched(pair: FlankPair, roll, relative):

@@ -11,28 +11,17 @@ from rootsopt.contact.point import ContactPoint
 from rootsopt.errors import InputError
 
 
-class Edges(NamedTuple):
-    """Distance of a pose from the roll coordinates at which a gap jumps.
-
-    `distance` (rad): continuous function of x, with a kink at every jump of the gap, for example
-    the sum of the distances from all jumps; `by_roll`: its derivative with respect to x."""
-
-    distance: Float[Array, ""]
-    by_roll: Float[Array, ""]
-
-
 class Approach(NamedTuple):
     """Gap and levers of two flanks at a pose.
 
     `gap`: gap (m), negative when the flanks penetrate; `lever1`, `lever2`: levers (m) of rotor 1
     and rotor 2; `place`: further result of the contact that its `point` and `switches` use, or
-    `None`; `edges`: see `Edges`, for a contact whose gap jumps, or `None`."""
+    `None`."""
 
     gap: Float[Array, ""]
     lever1: Float[Array, ""]
     lever2: Float[Array, ""]
     place: Any = None
-    edges: Edges | None = None
 
 
 class Slices(NamedTuple):
@@ -92,8 +81,7 @@ class Contact(eqx.Module):
     def jumps(self) -> bool:
         """Whether levers may jump where a flag of `switches` changes.
 
-        A contact with jumps needs a `lever_scale`. If the gap itself jumps as well, `approach`
-        must also return `Edges`."""
+        A contact with jumps needs a `lever_scale`. The gap itself must be continuous."""
         return False
 
     @property
@@ -177,5 +165,5 @@ class Contact(eqx.Module):
     def _lacks(self, what: str, why: str) -> InputError:
         return InputError(
             f"the contact `{type(self).__name__}` does not give {what}, which {why}; use "
-            f"`SearchContact` (`solver.fidelity` = search), or override the method that raises this"
+            "`SearchContact`, the scene's own contact, or override the method that raises this"
         )

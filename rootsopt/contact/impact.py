@@ -120,8 +120,7 @@ class ImpactLaw(ContactLaw):
 
         `depth`: penetration (m); `rate`: its rate (m/s). The total force is the sum of elastic
         force and damping force. The width is the fraction of the elastic force over which the
-        release is rounded. Only the release uses the quotient of the two forces. At the onset, both
-        are so small that its derivative would overflow in single precision. The release is not
+        release is rounded. Only the release uses the quotient of the two forces. The release is not
         rounded where the square of the elastic force is out of range.
         """
         delta = ramp(depth, self.smoothing)

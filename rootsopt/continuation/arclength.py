@@ -65,7 +65,6 @@ class End(enum.Enum):
     NON_FINITE = "The motion, or its derivative, is not finite."
     LOST_MESH = "The lobes pass through each other beyond this point."
     TOO_DEEP = "Beyond this point, the flanks penetrate too deep for a contact law to be valid."
-    OFF_THE_MAP = "The motion leaves the contact map. Set solver.fidelity to search."
     NO_GEOMETRY = "No valid profile lies beyond this point."
 
 

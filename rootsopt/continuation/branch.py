@@ -132,7 +132,7 @@ def follow(
     step sizes. A step of length 1 spans the range, or changes the scaled state by `SPAN`. `ways`:
     directions to follow, -1 for falling and 1 for rising values of the parameter.
 
-    Raises `InputError` for an unknown parameter, single precision, or an invalid `period` or
+    Raises `InputError` for an unknown parameter, or an invalid `period` or
     `ways`; for limits that exclude the config's value, or that the config cannot have; and if there
     is no orbit to start from.
     """

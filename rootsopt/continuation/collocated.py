@@ -265,7 +265,7 @@ def _follow(  # Twelve parameters, since a compiled program takes its arrays one
         return at(share)[0], jax.tree.map(lambda x: x[None], tangent)
 
     plane = Plane(guess, across, jnp.asarray(SPAN))
-    tolerance = ACCURACY * integrator.tolerance(known.elements.state.dtype)
+    tolerance = ACCURACY * integrator.tolerance
     made = followed(family, measures, (known, motion, distance), plane, tolerance)
     pair, scale = at(made.line.share)
     elements = made.found.elements

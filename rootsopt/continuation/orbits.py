@@ -203,15 +203,10 @@ class OrbitFamily:
     parameter as a fraction of its range. `config` of the first orbit; `parameter`: name of the
     parameter; `period`: k; `limits`: range of the parameter (config's unit) and step sizes.
 
-    Raises `InputError` for an unknown parameter or single precision.
+    Raises `InputError` for an unknown parameter.
     """
 
     def __init__(self, config: Config, parameter: str, period: int, limits: StepSizes):
-        if config.solver.precision != "float64":
-            raise InputError(
-                "`solver.precision` must be float64 to follow a branch, but is "
-                f"{config.solver.precision}"
-            )
         _check(config, parameter)
         self.config, self.parameter, self.period, self.limits = config, parameter, period, limits
         self.names = parameters(config)
@@ -264,7 +259,6 @@ class OrbitFamily:
             # Integrate again, on steps short enough to see contacts that the chosen steps skip.
             shot = self._shot(place, shot.grid, refine=True)
         out: Flow = shot.out
-        reach = self.unit * float(np.max(np.abs(out.states[:, 0])))
         count = len(place) - 1
         if not out.solved:
             raise StoppedError(End.SOLVER_FAILED)
@@ -274,8 +268,6 @@ class OrbitFamily:
             raise StoppedError(End.LOST_MESH)
         if out.depth > TOO_DEEP * float(self.scene.pitch_radius):
             raise StoppedError(End.TOO_DEEP)
-        if self.scene.fidelity == "map" and reach > -float(self.scene.deepest):
-            raise StoppedError(End.OFF_THE_MAP)
         state = SPAN * place[:-1]
         miss = np.asarray(out.end) - state
         monodromy = np.asarray(out.slope)[:count, :count]
@@ -288,14 +280,10 @@ class OrbitFamily:
             half_way=float(np.max(np.abs(out.states[len(out.states) // 2] - state))) / SPAN,
             residual=float(np.max(np.abs(miss)) / max(1.0, np.max(np.abs(state)))),
             depth=float(out.depth),
-            reach=reach,
+            reach=self.unit * float(np.max(np.abs(out.states[:, 0]))),
             gap_time=longest_gap(np.asarray(shot.touching)) * self.period,
         )
-        if (
-            self.period % 2 == 0
-            and seen.half_way < HALF_ALIKE
-            and seen.residual < RESIDUAL["float64"]
-        ):
+        if self.period % 2 == 0 and seen.half_way < HALF_ALIKE and seen.residual < RESIDUAL:
             raise StoppedError(End.HALVED)
         jacobian = np.column_stack([monodromy - np.eye(count), by_share])
         return Linearization(miss / SPAN, jacobian, shot.grid, seen)
@@ -423,7 +411,7 @@ def _shoot(  # Eleven parameters, since a compiled program takes its arrays one 
     _, tangent = jax.jvp(arrays, (values,), (direction,))
     tangents = jax.tree.map(lambda x: x[None], tangent)
     out = flow(pair, state, period, integrator, SAMPLES, tangents, grid, repeat)
-    tolerance = integrator.tolerance(state.dtype)
+    tolerance = integrator.tolerance
     finer = lax.cond(
         refine,
         lambda: _without_long(with_switches(pair, out, period, tolerance), period),

@@ -277,7 +277,7 @@ class _Attempts(eqx.Module):
 
     def no_window(self, state: Float[Array, " n"], periods: int) -> Window:
         """Return a window from the scaled `state` (n,) before any integration."""
-        return Window.empty(state, periods, self.solver.transient.tolerance(state.dtype))
+        return Window.empty(state, periods, self.solver.transient.tolerance)
 
 
 def motion(

@@ -27,12 +27,11 @@ class FlankForce(NamedTuple):
     gap); `closing`: rate of `depth` (m/s); `lever1`, `lever2`: levers (m) of the deeper flank;
     `torque1`, `torque2`: contact torques (N·m) on the rotors, each positive in its rotor's sense of
     rotation; `push`: contact force (N) on rotor 2 in x and y, None if no part lets the axes move.
-    The force on rotor 1 is equal and opposite. `edges`: distance (rad) of the pose from the jumps
-    of the gap (see `Edges`) and its rate (rad/s), None for a contact whose gap is continuous.
+    The force on rotor 1 is equal and opposite.
 
     For twisted rotors, forces, torques and `push` are sums over the slices, and the levers are
-    means. `edges` then holds the mean of the slices' edges, or of their penetrations (m) and rates
-    (m/s). A jump in one slice is a kink of this mean."""
+    means. `means` then holds the mean penetration (m) of the slices and its rate (m/s), if levers
+    may jump: a jump in one slice is a kink of this mean. Otherwise, `means` is None."""
 
     drive: Float[Array, "*n"]
     coast: Float[Array, "*n"]
@@ -43,7 +42,7 @@ class FlankForce(NamedTuple):
     torque1: Float[Array, "*n"]
     torque2: Float[Array, "*n"]
     push: Float[Array, "*n 2"] | None = None
-    edges: Float[Array, "*n 2"] | None = None
+    means: Float[Array, "*n 2"] | None = None
 
     @property
     def total(self) -> Float[Array, "*n"]:
@@ -139,8 +138,8 @@ def force_of(pair: "RotorPair", motion: Motion, touches: Any = None) -> FlankFor
         return _section_force(pair, motion, *touches)
     found = jax.vmap(functools.partial(_section_force, pair), (None, 0, 0))(motion, *touches)
     whole = jax.tree.map(lambda x: jnp.tensordot(slices.weights, x, 1), found)
-    if whole.edges is None and pair.jumps:
-        whole = whole._replace(edges=jnp.stack([whole.depth, whole.closing]))
+    if pair.jumps:
+        whole = whole._replace(means=jnp.stack([whole.depth, whole.closing]))
     deepest = jnp.argmax(found.depth)
     return whole._replace(depth=found.depth[deepest], closing=found.closing[deepest])
 
@@ -191,10 +190,6 @@ def _flank_force(
         torque2 += side * drag * sliding.point.support2
         if push is not None and sliding.tangent is not None:
             push += drag * sliding.tangent
-    edges = touch.approach.edges
-    if edges is not None:
-        turning = -side * (motion.speed + motion.rate / 2)
-        edges = jnp.stack([edges.distance, edges.by_roll * turning])
     return FlankForce(
         drive=force,
         coast=jnp.zeros_like(force),
@@ -205,7 +200,6 @@ def _flank_force(
         torque1=torque1,
         torque2=torque2,
         push=push,
-        edges=edges,
     )
 
 

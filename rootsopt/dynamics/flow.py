@@ -133,8 +133,8 @@ def strobe(
     A step ends exactly at the end of each mesh period. Interpolated states would have an error far
     above the tolerance, which could hide that the motion repeats.
     """
-    control = integrator.controller(state.dtype, pair=pair)
-    solver = integrator.solver(state.dtype)
+    control = integrator.controller(pair=pair)
+    solver = integrator.solver()
     term = diffrax.ODETerm(lambda tau, y, pair: pair.derivative(tau, y)[0])
 
     def one_period(state, _):
@@ -184,7 +184,7 @@ class Equation(eqx.Module):
     force_unit: Float[Array, ""]
     top: Float[Array, ""]
     states: int = eqx.field(static=True)
-    solver: diffrax.AbstractSolver
+    solver: diffrax.AbstractERK
 
     def pair(self, dynamic) -> RotorPair:
         """Return the pair whose floating-point arrays are `dynamic`."""
@@ -303,7 +303,7 @@ class _Peak(NamedTuple):
     noise: Float[Array, ""]
 
 
-def flow(  # Eleven parameters: adaptive steps, repeated steps and reverse mode need different ones.
+def flow(  # Ten parameters: adaptive steps and repeated steps need different ones.
     pair: RotorPair,
     state: Float[Array, " n"],
     periods: Float[Array, ""],
@@ -312,7 +312,6 @@ def flow(  # Eleven parameters: adaptive steps, repeated steps and reverse mode 
     tangents: RotorPair | None = None,
     grid: Float[Array, " steps"] | None = None,
     repeat: Bool[Array, ""] | bool = True,
-    adjoint: diffrax.AbstractAdjoint | None = None,
     measures: Measures | None = None,
     top: Float[Array, ""] | None = None,
 ) -> Flow:
@@ -327,9 +326,6 @@ def flow(  # Eleven parameters: adaptive steps, repeated steps and reverse mode 
     given, every step is linearised, and the result has `slope`. The derivatives account for the
     moving instants of contact jumps.
 
-    `adjoint`: diffrax adjoint that makes the flow differentiable in reverse mode. If the contact
-    may jump, reverse mode differentiates the recorded steps instead of using `adjoint`.
-
     `grid`: ends of steps (mesh periods) to repeat if `repeat` is true. Otherwise, or without a
     `grid`, the steps are chosen adaptively.
     """
@@ -338,17 +334,16 @@ def flow(  # Eleven parameters: adaptive steps, repeated steps and reverse mode 
     force_unit = lax.stop_gradient(pair.force_scale)
     top = jnp.ones_like(force_unit) if top is None else lax.stop_gradient(top) / force_unit
     dynamic, static = eqx.partition(pair, eqx.is_inexact_array)
-    solver = integrator.solver(dtype, "lax" if adjoint is None else "bounded")
+    solver = integrator.solver()
     equation = Equation(static, measures, force_unit, top, count, solver)
     start = equation.start(state, pair.free)
     ends = jnp.full(integrator.max_steps, jnp.inf, dtype) if grid is None else grid / periods
     control = StepGrid(  # pyright: ignore[reportCallIssue]
-        pid=integrator.controller(dtype, periods, lax.stop_gradient(pair)),
+        pid=integrator.controller(periods, lax.stop_gradient(pair)),
         ends=ends,
         repeat=jnp.asarray(False if grid is None else repeat),
     )
-    how = periods, control, integrator.max_steps, samples
-    taken = _taken(equation, dynamic, start, how, adjoint, pair.jumps)
+    taken = _solved(equation, dynamic, start, periods, control, integrator.max_steps, samples)
     steps, peak, depth = _located(pair, taken, periods, count)
     duration = taken.end[-1] if pair.free else periods
     raw = taken.end[count : count + measures.count] / duration
@@ -383,27 +378,6 @@ def flow(  # Eleven parameters: adaptive steps, repeated steps and reverse mode 
     )
 
 
-def _taken(
-    equation: Equation,
-    dynamic: Any,
-    start: Float[Array, " m"],
-    how: tuple[Float[Array, ""], StepGrid, int, int],
-    adjoint: diffrax.AbstractAdjoint | None,
-    jumps: bool,
-) -> _Recorded:
-    """Integrate from y = `start` and return all accepted steps.
-
-    `how`: arguments `periods`, `control`, `max_steps` and `samples` of `_solved`. With an
-    `adjoint`, the result is differentiable in reverse mode. An adjoint of diffrax ignores jumps of
-    the contact, so the steps are differentiated instead if there may be `jumps`."""
-    if adjoint is None:
-        return _solved(equation, dynamic, start, *how)
-    if not jumps:
-        return _solved_by_diffrax(equation, dynamic, start, *how, adjoint)
-    taken = _solved(equation, *lax.stop_gradient((dynamic, start)), *how)
-    return _retraced(equation, taken, start, dynamic)
-
-
 def _located(
     pair: RotorPair, taken: _Recorded, periods: Float[Array, ""], count: int
 ) -> tuple[Steps, _Peak, Float[Array, ""]]:
@@ -426,7 +400,7 @@ def _located(
     peak = _Peak(
         holds=holds,
         time=jnp.maximum(peak_time, taken.begins[holds] + _SHORTEST),
-        beside=BESIDE_UNIT[dtype.itemsize] * jnp.asarray(BESIDE, dtype),
+        beside=BESIDE_UNIT * jnp.asarray(BESIDE, dtype),
         noise=lax.stop_gradient(pair.rounding(depth)),
     )
     return steps, peak, depth
@@ -465,57 +439,6 @@ def _solved(
     )
 
 
-def _solved_by_diffrax(
-    equation: Equation,
-    dynamic: Any,
-    start: Float[Array, " m"],
-    periods: Float[Array, ""],
-    control: StepGrid,
-    max_steps: int,
-    samples: int,
-    adjoint: diffrax.AbstractAdjoint,
-) -> _Recorded:
-    """Return the results of `_solved`, differentiable in reverse mode by the diffrax `adjoint`."""
-    dtype = start.dtype
-    solution = diffrax.diffeqsolve(
-        _over_unit(equation, periods),
-        equation.solver,
-        t0=dtype.type(0.0),
-        t1=dtype.type(1.0),
-        dt0=None,
-        y0=start,
-        args=dynamic,
-        saveat=diffrax.SaveAt(
-            subs=[
-                diffrax.SubSaveAt(steps=True, fn=lambda share, y, args: (share, y)),
-                diffrax.SubSaveAt(t1=True),
-            ],
-            dense=True,
-            controller_state=True,
-        ),
-        stepsize_controller=control,
-        adjoint=adjoint,
-        max_steps=max_steps,
-        throw=False,
-    )
-    assert solution.ys is not None
-    assert solution.controller_state is not None
-    (ends, after), (end,) = solution.ys
-    states = jax.vmap(solution.evaluate)((jnp.arange(samples) / samples).astype(dtype))
-    states, grid = lax.stop_gradient((states[:, : equation.states], ends * periods))
-    return _Recorded(
-        grid=grid,
-        before=jnp.concatenate([start[None], after[:-1]]),
-        after=after,
-        end=end,
-        last=jnp.maximum(solution.stats["num_accepted_steps"] - 1, 0),
-        states=states,
-        strain=lax.stop_gradient(solution.controller_state[-1]),
-        steps=solution.stats["num_steps"],
-        solved=solution.result == diffrax.RESULTS.successful,
-    )
-
-
 def _over_unit(equation: Equation, periods: Float[Array, ""]) -> diffrax.ODETerm:
     """Return the equation with time in units of `periods` mesh periods, so that it ends at 1."""
 
@@ -525,29 +448,10 @@ def _over_unit(equation: Equation, periods: Float[Array, ""]) -> diffrax.ODETerm
     return diffrax.ODETerm(whole)
 
 
-def _retraced(
-    equation: Equation, taken: _Recorded, start: Float[Array, " m"], dynamic: Any
-) -> _Recorded:
-    """Repeat the steps in `taken` from y = `start`, in a form that JAX can differentiate.
-
-    The derivatives account for the moving instants of jumps."""
-
-    @jax.checkpoint
-    def again(y, step):
-        begin, end = step
-        return equation.advanced(begin, end, y, dynamic)[0]
-
-    def advance(y, step):
-        return lax.cond(step[1] < jnp.inf, again, lambda y, _: y, y, step), y
-
-    end, before = lax.scan(advance, start, (taken.begins, taken.grid))
-    return taken._replace(end=end, before=before)
-
-
 def _peak_force(
     equation: Equation, taken: _Recorded, peak: _Peak, dynamic: Any
 ) -> Float[Array, ""]:
-    """Return the peak force (in `force_unit`), differentiable in reverse mode."""
+    """Return the peak force (in `force_unit`)."""
     begin, y = taken.begins[peak.holds], taken.before[peak.holds]
     size = y.shape[0]
     there = equation.with_force(begin, peak.time, y, dynamic)[:size]
@@ -555,10 +459,7 @@ def _peak_force(
     def beside(side):
         return equation.with_force(peak.time, peak.time + side, there, dynamic)
 
-    found = jax.vmap(beside)(peak.beside)
-    frozen, fixed = lax.stop_gradient((found, dynamic))
-    value, weights = _weighted(equation, frozen, size, peak, fixed)
-    return value + jnp.sum(weights * (found - frozen)[:, size:])
+    return _weighted(equation, jax.vmap(beside)(peak.beside), size, peak, dynamic)[0]
 
 
 def _weighted(

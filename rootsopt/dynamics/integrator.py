@@ -1,33 +1,20 @@
 """Integration of the equation of motion: method, tolerance and steps."""
 
 from collections.abc import Callable
-from typing import Any
 
 import diffrax
 import equinox as eqx
 import jax.numpy as jnp
-import optimistix
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from rootsopt.dynamics.landing import LandingControl
 from rootsopt.dynamics.pair import RotorPair
 
-METHODS: dict[str, Callable[..., diffrax.AbstractSolver]] = {
+METHODS: dict[str, Callable[..., diffrax.AbstractERK]] = {
     "tsit5": diffrax.Tsit5,
-    "dopri5": diffrax.Dopri5,
     "dopri8": diffrax.Dopri8,
-    "kvaerno3": diffrax.Kvaerno3,
-    "kvaerno5": diffrax.Kvaerno5,
 }
-IMPLICIT = ("kvaerno3", "kvaerno5")
-
-
-_STAGES = 1e5
-"""Minimum tolerance (rounding errors) of Newton's method for the stages of an implicit step. The
-gap is a difference between lengths that are ten thousand times a penetration, so rounding errors
-are large. With a finer tolerance, the iterations would not end, and a repeated step cannot be
-shortened. The actual error is smaller, because every iteration is a full Newton step."""
 _LONGEST = 1 / 32, 1 / 8, 4.0
 """Upper limits on the step length: an absolute length (mesh periods), and a multiple of
 `Timescales.fall`. The smaller limit applies. In free flight, the error control alone would let a
@@ -39,52 +26,37 @@ mesh period."""
 class Integrator(eqx.Module):
     """Settings for integrating the equation of motion.
 
-    `method`: a key of `METHODS` (explicit: tsit5, dopri5, dopri8; implicit: kvaerno3, kvaerno5);
-    `rtol`: relative tolerance, also used as absolute tolerance, since states are scaled;
-    `max_steps`: maximum number of steps in one integration. The precision is that of the initial
-    state.
+    `method`: a key of `METHODS`; `rtol`: relative tolerance, also used as absolute tolerance, since
+    states are scaled; `max_steps`: maximum number of steps in one integration.
     """
 
     method: str = eqx.field(static=True)
     rtol: Float[Array, ""]
     max_steps: int = eqx.field(static=True)
 
-    def tolerance(self, dtype: Any) -> Float[Array, ""]:
-        """Return `rtol` or, if greater, 20 rounding errors of `dtype`, the type of the states."""
-        floor = 20 * float(jnp.finfo(dtype).eps)
-        return jnp.maximum(self.rtol, floor).astype(dtype)
+    @property
+    def tolerance(self) -> Float[Array, ""]:
+        """`rtol` or, if greater, 20 rounding errors."""
+        return jnp.maximum(self.rtol, 20 * float(jnp.finfo(float).eps))
 
-    def solver(self, dtype: Any, loops: str = "lax") -> diffrax.AbstractSolver:
-        """Return the diffrax solver for states of type `dtype`.
-
-        `loops`: kind of loop over the stages of a step, "lax" (forward mode only) or "bounded"
-        (forward and reverse mode)."""
-        method = METHODS[self.method]
-        if self.method not in IMPLICIT:
-            return method(scan_kind=loops)
-        least = _STAGES * float(jnp.finfo(dtype).eps)
-        rtol: Any = jnp.maximum(self.tolerance(dtype), least).astype(dtype)
-        # Compute a new Jacobian for every iteration. With the Jacobian from the start of the step,
-        # iterations do not converge across a kink, and a repeated step cannot be made shorter.
-        return method(scan_kind=loops, root_finder=optimistix.Newton(rtol=rtol, atol=rtol))
+    def solver(self) -> diffrax.AbstractERK:
+        """Return the diffrax solver."""
+        return METHODS[self.method](scan_kind="lax")
 
     def controller(
-        self,
-        dtype: Any,
-        periods: Float[Array, ""] | float = 1.0,
-        pair: RotorPair | None = None,
+        self, periods: Float[Array, ""] | float = 1.0, pair: RotorPair | None = None
     ) -> "diffrax.PIDController | LandingControl":
-        """Return the step size control for states of type `dtype`.
+        """Return the step size control.
 
         `periods`: mesh periods per unit of the independent variable; `pair`: rotor pair whose
         `timescales` limit the steps. The result is a `LandingControl` if the `timescales` are
         known. Otherwise it is a plain `diffrax.PIDController`."""
-        rtol = self.tolerance(dtype)
+        rtol = self.tolerance
         longest = _LONGEST[0]
         if pair is not None and pair.timescales is not None:
             fall = pair.timescales.fall / pair.mesh_period
             flying = jnp.maximum(_LONGEST[1] * fall, _LONGEST[2] / self.max_steps)
-            longest = jnp.minimum(longest, flying).astype(dtype)
+            longest = jnp.minimum(longest, flying)
         base = diffrax.PIDController(rtol=rtol, atol=rtol, dtmax=longest / periods)
         if pair is None or pair.timescales is None:
             return base

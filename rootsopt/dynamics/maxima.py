@@ -280,7 +280,7 @@ def _differentiated(
     dtype, count = orbit.state.dtype, orbit.state.shape[0]
     dynamic, static = eqx.partition(pair, eqx.is_inexact_array)
     moved = eqx.filter(tangents, eqx.is_inexact_array)
-    unit, solver = pair.force_scale, integrator.solver(dtype)
+    unit, solver = pair.force_scale, integrator.solver()
     equation = Equation(static, Measures(), unit, jnp.ones_like(unit), count, solver)
     grid = orbit.flow.grid
     begins = jnp.concatenate([jnp.zeros_like(grid[:1]), grid[:-1]])
@@ -288,7 +288,7 @@ def _differentiated(
     taken = jnp.sum(grid < jnp.inf)
     holds = jnp.clip(jnp.searchsorted(grid, times), 0, taken - 1)
     times = jnp.maximum(times, begins[holds] + _SHORTEST)
-    sides = BESIDE_UNIT[dtype.itemsize] * jnp.asarray(BESIDE, dtype)
+    sides = BESIDE_UNIT * jnp.asarray(BESIDE, dtype)
     lanes = jnp.arange(_CHUNK)
 
     def linear_step(begin, end, state):

@@ -9,10 +9,8 @@ The solver steps of an orbit are recorded as a *grid*, and repeated once Newton'
 *kink* is an instant at which the equation of motion is not smooth; grid steps end there.
 """
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -401,7 +399,7 @@ def orbit_or_window(
     then smooth and closes to rounding, and its derivative is as accurate as the motion.
     """
     count, dtype = state.shape[0], state.dtype
-    tolerance = shots.integrator.tolerance(dtype)
+    tolerance = shots.integrator.tolerance
     roundings, tolerances, most = _CLOSED
     enough = jnp.minimum(tolerances * tolerance, most)
     enough = jnp.maximum(roundings * float(jnp.finfo(dtype).eps), enough)
@@ -501,40 +499,3 @@ def disagreement(
 
     pairs = zip(derivatives(first), derivatives(second), strict=True)
     return jnp.max(jnp.stack([apart(one, other) for one, other in pairs]))
-
-
-def reverse_sensitivity(
-    build: Callable[[Float[Array, " d"]], RotorPair],
-    design: Float[Array, " d"],
-    state: Float[Array, " n"],
-    period: Int[Array, ""],
-    integrator: Integrator,
-    grid: Float[Array, " steps"],
-    measures: Measures | None = None,
-    top: Float[Array, ""] | None = None,
-) -> Float[Array, "r d"]:
-    """Return `Orbit.sensitivity` (r, d), computed in reverse mode.
-
-    `build`: function that returns the pair of a `design` (d,); `state` (n,), `period` and `grid`:
-    scaled start, mesh periods and steps of the closed orbit; `measures`: averages of the force;
-    `top`: peak force of the orbit (N).
-
-    The derivatives use diffrax's checkpointed adjoint. If the contact may jump, the recorded steps
-    are differentiated instead. Let R be the response, Φ the flow, M = dΦ/dz, v the cotangent of R
-    and w the cotangent of the end state. By the implicit function theorem, (I - M)ᵀ w = R_zᵀ v, and
-    dR/dp = R_pᵀ v + Φ_pᵀ w.
-    """
-    count = state.shape[0]
-    length = period.astype(state.dtype)
-    adjoint = diffrax.RecursiveCheckpointAdjoint()
-
-    def run(state, design):
-        kept = {"grid": grid, "adjoint": adjoint, "measures": measures, "top": top}
-        out = flow(build(design), state, length, integrator, SAMPLES, **kept)
-        return jnp.concatenate([out.end, out.response])
-
-    end, pull = jax.vjp(run, state, design)
-    by_state, by_design = jax.vmap(pull)(jnp.eye(end.shape[0], dtype=state.dtype))
-    monodromy, response = by_state[:count], by_state[count:]
-    weight = solved((jnp.eye(count, dtype=state.dtype) - monodromy).T, response.T)
-    return by_design[count:] + weight.T @ by_design[:count]

@@ -20,12 +20,12 @@ _WIDE = 64
 """Distance of the outermost times in `BESIDE` from the peak, in units of `BESIDE_UNIT`."""
 BESIDE = (0.0, -1.0, -2.0, 1.0, 2.0, -_WIDE, _WIDE)
 """Times relative to a located peak at which the force is evaluated, in units of `BESIDE_UNIT`."""
-BESIDE_UNIT = {8: 2e-8, 4: 1e-3}
-"""Unit of `BESIDE` (mesh periods), keyed by bytes per number."""
-_FARTHEST = {8: 32.0, 4: 1 / 16}
+BESIDE_UNIT = 2e-8
+"""Unit of `BESIDE` (mesh periods)."""
+_FARTHEST = 32.0
 """Distance (units of `_WIDE`) from a located peak to the instant at which the force stops rising,
-above which this instant is rejected. Keyed by bytes per number. It is large for 8 bytes, because
-peaks are located only to about 1e-5 mesh periods where the states bend between samples."""
+above which this instant is rejected. It is large, because peaks are located only to about 1e-5 mesh
+periods where the states bend between samples."""
 _NOISES = 10.0
 """Step of the force above which it counts as a jump, in multiples of the force's noise."""
 _NEAREST, _NEAR, _FAR = (1, 3), (2, 4), (5, 6)
@@ -242,7 +242,7 @@ def one_sided(
     dtype = forces.dtype
     here, before, _, after, *_ = forces
     # Between the nearest times, a corner changes the force by no more than its rates allow.
-    rise, fall = BESIDE_UNIT[dtype.itemsize] * jnp.stack([rates[1], rates[3]])
+    rise, fall = BESIDE_UNIT * jnp.stack([rates[1], rates[3]])
     rounding = (100 * float(jnp.finfo(dtype).eps) + _NOISES * noise) * here
     jumps = jnp.abs(after - before - rise - fall) > 2 * jnp.abs(rise - fall) + rounding
     turns = (rates[_NEAR[0]] > 0) & (rates[_NEAR[1]] < 0)
@@ -257,11 +257,11 @@ def one_sided(
     share = first / jnp.where(drop > 0, drop, jnp.inf)
     place = jnp.where(turns, 0.0, _WIDE * (2 * share - 1))
     share = jnp.where(turns, jnp.clip(share, 0.0, 1.0), share)
-    stops = (drop > 0) & (jnp.abs(place) < _WIDE * _FARTHEST[dtype.itemsize]) & ~jumps
+    stops = (drop > 0) & (jnp.abs(place) < _WIDE * _FARTHEST) & ~jumps
     single = jnp.zeros_like(forces).at[jnp.argmax(forces[:5])].set(1.0)
     double = jnp.stack([1 - share, share]) @ sides
     weights = jnp.where(stops, double, single)[:, None]
-    above = jnp.maximum(BESIDE_UNIT[dtype.itemsize] * rates[0] * place / 2, 0.0)
+    above = jnp.maximum(BESIDE_UNIT * rates[0] * place / 2, 0.0)
     if found.shape[1] > 2:
         moved = jnp.where(jumps, _with_jump(forces, found[:, 0]), 0.0)
         weights = jnp.concatenate([moved[:, None], weights], axis=1)
@@ -293,13 +293,11 @@ def _with_jump(forces: Float[Array, "7"], marks: Float[Array, "7"]) -> Float[Arr
     The weighted sum is the part of the derivative that comes from the motion of the jump:
     F dt*/dp. F is the time derivative of the force on the greater side, and t* the instant of the
     jump (see `rootsopt.dynamics.saltation`). `forces`, `marks`: contact force and first mark at the
-    times `BESIDE`. Time derivatives are difference quotients, each on one side of the jump. In
-    single precision, the outermost times are too far away for them."""
-    near = forces.dtype.itemsize < 8
+    times `BESIDE`. Time derivatives are difference quotients, each on one side of the jump."""
 
     def rates(values):
-        _, before, earlier, after, later, left, right = values
-        return (before - earlier, later - after) if near else (earlier - left, right - later)
+        _, _, earlier, _, later, left, right = values
+        return earlier - left, right - later
 
     before, after = rates(marks)
     closing = before - after

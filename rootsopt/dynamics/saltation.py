@@ -8,9 +8,7 @@ P. C. Müller, Chaos, Solitons & Fractals 5 (1995) 1671-1681):
     dy = (f₋ - f₊) dt*,        dt* = -d(δ₋ - δ₊) / (dδ₋/dτ - dδ₊/dτ).
 
 f is the right-hand side of the equation of motion and δ the penetration, before (₋) and after (₊)
-the jump. If the gap itself jumps at given poses, δ is the distance from these poses
-(`rootsopt.contact.gap.Edges`). This distance is continuous and has a kink at the jump. Besides the
-states, y also contains the integrals over the motion.
+the jump. Besides the states, y also contains the integrals over the motion.
 """
 
 import jax.numpy as jnp
@@ -20,12 +18,8 @@ from jaxtyping import Array, Float
 from rootsopt.dynamics.flanks import FlankForce
 
 LONGEST = 4e-6
-"""Length of a step (mesh periods) above which the step is not checked for a jump. In double
-precision, all short steps around switches (`rootsopt.dynamics.switches`) are shorter."""
-_LONGEST_ROUNDINGS = 320
-"""Length of a step (rounding errors of one mesh period) above which the step is not checked for a
-jump, if it exceeds `LONGEST`. That is so only in single precision. There, the short steps of an
-orbit of eight mesh periods have 256 rounding errors."""
+"""Length of a step (mesh periods) above which the step is not checked for a jump. All short steps
+around switches (`rootsopt.dynamics.switches`) are shorter."""
 _FASTER = 20.0
 """Rate of change of a lever (pitch radii per mesh period) above which the change counts as a jump.
 Along a flank of the EE family the rate is at most 2π, for any number of lobes."""
@@ -43,9 +37,8 @@ rate, both levers). A jump of the levers shows in them."""
 def marks(contact: FlankForce) -> Float[Array, "4"]:
     """Return penetration (m), its rate (m/s) and both levers (m), which together reveal a jump.
 
-    For a contact with `Edges`, the first two are the distance from the edges (rad) and its rate
-    (rad/s) instead."""
-    event = (contact.depth, contact.closing) if contact.edges is None else tuple(contact.edges)
+    For twisted rotors, the first two are means of the slices."""
+    event = (contact.depth, contact.closing) if contact.means is None else tuple(contact.means)
     return jnp.stack([*event, contact.lever1, contact.lever2])
 
 
@@ -76,7 +69,6 @@ def saltation(
     most = most * lax.stop_gradient(length)
     apart = jnp.abs(frozen[:, None, -2:] - frozen[jnp.array([0, -1]), -2:])
     between = jnp.max(jnp.min(jnp.max(apart, axis=-1), axis=-1))
-    longest = max(LONGEST, _LONGEST_ROUNDINGS * float(jnp.finfo(step.dtype).eps))
-    jumps = (jnp.abs(step) < longest) & (jump > most) & (between < _ALIKE * jump) & (closing != 0)
+    jumps = (jnp.abs(step) < LONGEST) & (jump > most) & (between < _ALIKE * jump) & (closing != 0)
     moved = (lax.stop_gradient(depth) - depth) / jnp.where(jumps, closing, jnp.inf)
     return fall * moved

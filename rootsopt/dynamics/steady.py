@@ -44,8 +44,8 @@ class Solver(eqx.Module):
     `transient`, `orbit`: integrators of the transient and of the orbit; `measures`: averages of the
     force to compute; `max_periods`: maximum length of the transient (mesh periods); `examine`: 1 to
     integrate a window of a motion that does not settle, 0 to skip the window; `max_orbit`: longest
-    period of an orbit to find (mesh periods), at most 8; `precision`: float64 or float32.
-    `max_periods` and `examine` are floats, as are all leaves.
+    period of an orbit to find (mesh periods), at most 8. `max_periods` and `examine` are floats, as
+    are all leaves.
 
     The other settings have defaults. Coarse surveys of many designs use other values. `shots`:
     maximum number of integrations to close an orbit; `closed`: residual (tolerances) at which an
@@ -64,7 +64,6 @@ class Solver(eqx.Module):
     max_periods: Float[Array, ""]
     examine: Float[Array, ""]
     max_orbit: int = eqx.field(static=True)
-    precision: str = eqx.field(static=True, default="float64")
     shots: int = eqx.field(static=True, default=24)
     closed: float = eqx.field(static=True, default=0.0)
     samples: int = eqx.field(static=True, default=SAMPLES)
@@ -175,7 +174,7 @@ class _Attempts(eqx.Module):
             period=one,
             rtol=solver.orbit.rtol,
             verdict=Verdict(no, no, jnp.zeros((), dtype), no, no),
-            window=Window.empty(state, solver.windows, solver.transient.tolerance(dtype)),
+            window=Window.empty(state, solver.windows, solver.transient.tolerance),
             settled=Transient(state, zero, one, infinite, zero, no, ~no, zero),
             used=zero,
             steps=zero,
@@ -226,7 +225,7 @@ class _Attempts(eqx.Module):
             self.pair, self.tangents, start, period, shots, now.windowed, solver.windows
         )
         open_by = solver.closed * solver.orbit.rtol
-        open_by = jnp.maximum(open_by, RESIDUAL[solver.precision])
+        open_by = jnp.maximum(open_by, RESIDUAL)
         limits = now.fine, within, open_by
         checks, status = judged(self.pair, solver, self.radius, orbit, start, limits)
         # An orbit of a shorter period is the motion even if its derivatives are uncertain.
@@ -317,7 +316,7 @@ def judged(
     later, by `final`."""
     dtype, (fine, within, open_by) = start.dtype, limits
     closing = dataclasses.replace(solver.orbit, rtol=fine)
-    rtols = solver.transient.tolerance(dtype), closing.tolerance(dtype)
+    rtols = solver.transient.tolerance, closing.tolerance
     scales = pair.law.exponent, radius, pair.force_scale
     found = verdict(orbit, start, within, rtols, open_by.astype(dtype), scales)
     numbers = jnp.concatenate([orbit.response, orbit.state])
@@ -407,4 +406,4 @@ def steady_motion(
 
 def continues(pair: RotorPair, solver: Solver) -> bool:
     """Return whether orbits of `pair` can be closed by collocation."""
-    return solver.closing != "shooting" and solver.precision == "float64" and supported(pair)
+    return solver.closing != "shooting" and supported(pair)

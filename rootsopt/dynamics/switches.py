@@ -38,8 +38,7 @@ _LOOSE = 1e3
 """Ratio of half the length (mesh periods) of the short step around a switch to the tolerance. The
 limits `_ASIDE` have precedence."""
 _ROUNDINGS = 16.0
-"""Minimum half length (rounding errors of the time) of the short step around a switch. It exceeds
-the limits `_ASIDE` only in single precision."""
+"""Minimum half length (rounding errors of the time) of the short step around a switch."""
 _SHARE = 1e-4
 """Maximum half length of the short step around a switch, as a fraction of the time to the nearest
 other switch. Where flags change at the ends of a rounded corner, the error of the gradients is

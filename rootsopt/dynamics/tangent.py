@@ -22,7 +22,7 @@ the chunk in which the motion ends."""
 
 
 def one_step(
-    solver: diffrax.AbstractSolver,
+    solver: diffrax.AbstractERK,
     term: diffrax.ODETerm,
     begin: Float[Array, ""],
     end: Float[Array, ""],
@@ -32,12 +32,7 @@ def one_step(
     """Take one step of `solver` from `begin` to `end`. Return y at `end`, and dy/dτ at the stages.
 
     `term`: diffrax term of the equation; `y` (m,): value at `begin`; `args`: arguments for `term`.
-    The first stage is at `begin`, the last at `end`. For an implicit solver, only these two slopes
-    are returned."""
-    if not isinstance(solver, diffrax.AbstractERK):
-        memory = solver.init(term, begin, end, y, args)
-        after = solver.step(term, begin, end, y, args, memory, made_jump=False)[0]
-        return after, jnp.stack([term.vf(begin, y, args), term.vf(end, after, args)])
+    The first stage is at `begin`, the last at `end`."""
     # The same sums as in the solver's own step, without error estimate and special cases: several
     # times cheaper to compile.
     tableau = solver.tableau

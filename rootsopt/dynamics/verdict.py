@@ -13,8 +13,8 @@ from rootsopt.dynamics.linear import solved
 from rootsopt.dynamics.orbit import Orbit, agreement
 from rootsopt.dynamics.settle import NOISE
 
-RESIDUAL = {"float64": 1e-9, "float32": 1e-3}
-"""Residual (scaled) above which an orbit does not count as closed, for each precision."""
+RESIDUAL = 1e-9
+"""Residual (scaled) above which an orbit does not count as closed."""
 TOO_DEEP = 0.02
 """Penetration (pitch radii) above which the forces of an orbit are not valid."""
 UNRESOLVED = 1e-2

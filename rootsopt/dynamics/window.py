@@ -204,7 +204,7 @@ def one_period(pair: RotorPair, start: Float[Array, " n"], integrator: Integrato
 
     `flow` would do the same, but compiles three times as many operations: it locates the peak."""
     count, dtype = start.shape[0], start.dtype
-    control, solver = integrator.controller(dtype, pair=pair), integrator.solver(dtype)
+    control, solver = integrator.controller(pair=pair), integrator.solver()
 
     def slope(tau, y, pair):
         moved, contact = pair.derivative(tau, y[:count])
@@ -241,7 +241,7 @@ def lyapunov(
         alive = window.solved & jnp.all(jnp.isfinite(window.start))
         return (window.done < periods) & alive
 
-    begun = Window.empty(state, periods, integrator.tolerance(state.dtype))
+    begun = Window.empty(state, periods, integrator.tolerance)
     return lax.while_loop(goes_on, step, begun)
 
 

@@ -11,7 +11,6 @@ from rootsopt.config import Config
 from rootsopt.config.units import MM
 from rootsopt.export.animation import Contacts, frames_of, rolling_contacts, rolling_frames
 from rootsopt.profiles import Geometry, Profile, geometry, outline
-from rootsopt.response.choice import resolve
 from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.response.orbits import OrbitStore
 from rootsopt.response.records import geometry_record
@@ -71,14 +70,11 @@ class Engine:
 
     @property
     def base(self) -> Config:
-        """The config that the sliders change: `given` with the settings that suit an explorer.
-
-        `solver.fidelity: auto` is replaced by measured settings. Only the scene's own speed is
-        simulated."""
+        """The config that the sliders change: `given` at the scene's own speed only."""
         with self._lock:
             if self._base is None:
                 check_geometry(self.given)
-                self._base = alone(resolve(self.given)[0])
+                self._base = alone(self.given)
             return self._base
 
     def shape(self, config: Config) -> Shape:

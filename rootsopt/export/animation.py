@@ -13,11 +13,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image
 
-from rootsopt.contact.nodes import place_pair
 from rootsopt.export.drawing import Drawing
 from rootsopt.export.pieces import polyline
 from rootsopt.figures.style import BLUE, GREY, ORANGE, SKY, VERMILION, figure
-from rootsopt.profiles import Profile
+from rootsopt.profiles import Profile, place_pair
 from rootsopt.response.series import Series
 from rootsopt.runtime.programs import Program
 

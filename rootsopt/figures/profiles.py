@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from numpy.typing import NDArray
 
-from rootsopt.contact.nodes import place_pair
 from rootsopt.figures.style import COLORS, DASHES, GREY, ORANGE, SKY, VERMILION
+from rootsopt.profiles import place_pair
 
 
 def plot_profiles(

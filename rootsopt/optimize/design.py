@@ -6,7 +6,6 @@ from collections.abc import Callable
 from rootsopt.config import Config
 from rootsopt.optimize.robust import search_of
 from rootsopt.optimize.search import Optimization
-from rootsopt.response.choice import resolve
 from rootsopt.runtime.threads import one_thread
 from rootsopt.scene import check_geometry
 from rootsopt.sweeps.evaluations import evaluating
@@ -32,7 +31,7 @@ def optimize_design(
     design was confirmed), `improvement`, `constraints`, `history` and `status`.
 
     Raises `InputError` if the config cannot be optimised. Raises `RuntimeError` if JAX is not set
-    to the precision of the config.
+    to double precision.
 
     >>> import jax
     >>> import rootsopt
@@ -44,4 +43,4 @@ def optimize_design(
     """
     check_geometry(config)
     with evaluating(workers, scheduler) as runs:
-        return search_of(resolve(config)[0], progress, stop, runs=runs).run()
+        return search_of(config, progress, stop, runs=runs).run()

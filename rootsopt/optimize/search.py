@@ -743,8 +743,6 @@ def method_of(config: Config) -> str:
     Raises `InputError` if the search needs exact gradients but there are none: the objective is an
     average over an ensemble, or the contact is not smooth."""
     method, noisy = config.optimizer.method, config.objective.motion == "ensemble"
-    if not noisy:
-        check_gradient(config)
     if method == "auto":
         return "adam" if noisy else "slsqp"
     if method == "slsqp" and noisy:
@@ -753,15 +751,6 @@ def method_of(config: Config) -> str:
             "is slsqp: gradients of averages have noise; set it to auto"
         )
     return method
-
-
-def check_gradient(config: Config) -> None:
-    """Raise `InputError` if the contact of `config` gives forces without a gradient."""
-    if config.solver.fidelity == "nodes":
-        raise InputError(
-            "`solver.fidelity` must be search, map, linear or auto for an optimisation, but is "
-            "nodes: polylines give forces without a gradient"
-        )
 
 
 def until_stopped(work: Callable[[], T], stop: threading.Event, patience: float) -> T | None:

@@ -15,6 +15,7 @@ from rootsopt.profiles.geometry import (
     flank_nodes,
     geometry,
     outline,
+    place_pair,
     quadrature_nodes,
 )
 from rootsopt.profiles.outline import Outline, Table
@@ -47,6 +48,7 @@ __all__ = [
     "geometry",
     "hypo_epicycloid",
     "outline",
+    "place_pair",
     "project",
     "quadrature_nodes",
 ]

@@ -189,3 +189,23 @@ def outline(profile: Profile, points: int = 120) -> Float[Array, "n 2"]:
     closed = np.concatenate([lobe @ matrix for matrix in rotation])
     closed = np.roll(closed, -start, axis=0)
     return jnp.asarray(np.concatenate([closed, closed[:1]]))
+
+
+def place_pair(
+    outline: NDArray[np.float64], lobes: int, center_distance: float, phi1: float, phi2: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return both outlines (n, 2) in the fixed frame: rotor 1 at the origin, rotor 2 at (E, 0).
+
+    `outline` (n, 2): closed outline of both rotors, with a lobe tip on +x. E is `center_distance`;
+    `lobes`: number of lobes; `phi1`, `phi2`: rotations φ1 and φ2 (rad). Rotations are positive in
+    each rotor's own direction of rotation, so that rotor 2 is the mirror image. At φ1 = φ2 = 0 a
+    lobe of rotor 1 points at a valley of rotor 2. All lengths have the unit of `outline`.
+    """
+    first = _rotate(outline, phi1)
+    second = _rotate(outline, phi2 + np.pi / lobes) * [-1.0, 1.0]
+    return first, second[::-1] + np.array([center_distance, 0.0])
+
+
+def _rotate(points: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
+    cos, sin = np.cos(angle), np.sin(angle)
+    return points @ np.array([[cos, sin], [-sin, cos]])

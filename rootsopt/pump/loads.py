@@ -252,10 +252,6 @@ def orbit_loads(  # 90 lines: the functions of its two loops share the linearise
     derivatives follow the family of orbits, with respect to the design. The steps of the orbit are
     linearised once more, with the loads as further integrals."""
 
-    # Orbits in single precision are evaluated in double, like the pair before it is converted.
-    scene = dataclasses.replace(scene, precision="float64")
-    orbit = jax.tree.map(lambda x: x.astype(float) if eqx.is_inexact_array(x) else x, orbit)
-
     def build(design):
         return BearingSet.of(scene, design), jnp.zeros(())
 
@@ -268,12 +264,10 @@ def orbit_loads(  # 90 lines: the functions of its two loops share the linearise
     # Reserve four integrals, one for each bearing: mean, mean square, and cosine and sine of one
     # line.
     room = Measures(orders=np.ones(1))
-    equation = _LoadEquation(
-        static, room, unit, jnp.ones_like(unit), count, integrator.solver(dtype)
-    )
+    equation = _LoadEquation(static, room, unit, jnp.ones_like(unit), count, integrator.solver())
     # The loads have corners that the motion does not have, as where the gear's torque changes sign.
     marked = dataclasses.replace(pair, parts=(*pair.parts, bearings.loads))
-    tolerance = integrator.tolerance(dtype)
+    tolerance = integrator.tolerance
     ends = with_switches(
         lax.stop_gradient(marked), orbit.flow, period.astype(dtype), tolerance, orbit.flow.grid
     )

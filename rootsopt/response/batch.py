@@ -31,9 +31,8 @@ class Batch(NamedTuple):
     `response` (n, 3): mean, peak and RMS force (N); `gradient` (n, 3, d): derivatives of `response`
     (N per config unit); `state` (n, s): scaled state of the orbit at φ1 = 0, a start for
     neighbouring designs; `period` (mesh periods); `multiplier`: greatest modulus of the Floquet
-    multipliers; `residual` of the closed orbit; `deepest`: most negative ε (rad) on the orbit;
-    `steps`: number of solver steps; `status`: codes of `Status`. `response` and `gradient` are NaN
-    where there is no periodic orbit.
+    multipliers; `residual` of the closed orbit; `steps`: number of solver steps; `status`: codes of
+    `Status`. `response` and `gradient` are NaN where there is no periodic orbit.
     """
 
     response: Float[Array, "*n 3"]
@@ -42,7 +41,6 @@ class Batch(NamedTuple):
     period: Int[Array, "*n"]
     multiplier: Float[Array, "*n"]
     residual: Float[Array, "*n"]
-    deepest: Float[Array, "*n"]
     steps: Int[Array, "*n"]
     status: Int[Array, "*n"]
 
@@ -70,7 +68,6 @@ def coarse(
         orbit=orbit,
         max_periods=jnp.asarray(float(max_periods)),
         max_orbit=max_orbit,
-        precision=scene.precision,
         shots=8,
         closed=0.1,
         samples=SAMPLES,
@@ -113,7 +110,6 @@ def respond(
         period=found.period,
         multiplier=orbit.multiplier,
         residual=orbit.residual,
-        deepest=pair.angle_scale * jnp.min(orbit.flow.states[:, 0]),
         steps=found.steps,
         status=found.status,
     )

@@ -14,7 +14,6 @@ import dataclasses
 import functools
 import os
 import time
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -60,8 +59,6 @@ ensemble are far larger than the error of such steps (docs/chaos.md)."""
 _AGAIN = 4
 """Divisor of `ensemble.settle_periods` for motions that start from the last states of a
 neighbouring design's motions."""
-_MAPS = 5
-"""Maximum number of contact maps tried for one ensemble."""
 VERIFYING = 4
 """Factor by which the number of members is increased to verify the best design of a search."""
 SIGNIFICANT = 3.0
@@ -130,17 +127,15 @@ class EnsembleEvaluator(Wrapper):
     def prepare(self, design=None, series=True, maxima=False) -> "EnsembleEvaluator":
         """Compile the programs for evaluating `design` (config units) in the background.
 
-        `series` and `maxima` have no effect. Return another evaluator, with a contact map sized
-        for the design."""
+        `series` and `maxima` have no effect. Return this evaluator."""
         design = design_vector(self.config) if design is None else jnp.asarray(design)
-        now = self._around(self.single._sized(design))
-        pair, _ = _pair.result_shape(now.scene, design)
+        pair, _ = _pair.result_shape(self.scene, design)
         prepare_members(pair, self.integrator)
         if not self.single.survey:
             state = jax.ShapeDtypeStruct((pair.states,), pair.angle_scale.dtype)
             lyapunov_program.prepare(pair, state, PERIODS, self.scene.solver.transient)
-        _pair.prepare(now.scene, design)
-        return now
+        _pair.prepare(self.scene, design)
+        return self
 
     def fit(self, design=None, start=None, series=True) -> tuple["EnsembleEvaluator", Evaluation]:
         """Evaluate a design. Return another evaluator for neighbouring designs, and the evaluation.
@@ -151,27 +146,9 @@ class EnsembleEvaluator(Wrapper):
         Raises ValueError if `start` has the wrong shape."""
         began = time.perf_counter()
         design = design_vector(self.config) if design is None else jnp.asarray(design)
-        now, outcome = self._fitted(design, lambda now: now._attempt(design, start))
-        return now, now._report(design, outcome, began, series)
+        return self, self._report(design, self._simulated(design, start), began, series)
 
-    def _fitted(
-        self, design, attempt: Callable[["EnsembleEvaluator"], "_Outcome"]
-    ) -> tuple["EnsembleEvaluator", "_Outcome"]:
-        """Repeat `attempt` until its contact map fits, at most `_MAPS` times.
-
-        `attempt` simulates with the evaluator that it is given. Return the last evaluator and
-        outcome."""
-        now, single = self, self.single._sized(design)
-        for _ in range(_MAPS):
-            now = self._around(single)
-            outcome = attempt(now)
-            other = single.reaching(outcome.reached, False, outcome.pair.angle_limit)
-            if other is None:
-                break
-            single = other._sized(design)
-        return now, outcome
-
-    def _attempt(self, design, start) -> "_Outcome":
+    def _simulated(self, design, start) -> "_Outcome":
         pair, shape = _pair(self.scene, design)
         settle = self.settings.settle_periods
         if start is None:
@@ -277,16 +254,11 @@ class EnsembleEvaluator(Wrapper):
         designs, jacobian = _around(space, design, points)
         settle = -(-self.settings.settle_periods // _AGAIN)
 
-        def attempt(now: EnsembleEvaluator) -> _Outcome:
-            with ThreadPoolExecutor(os.cpu_count()) as pool:
-                built = list(pool.map(functools.partial(_pair, now.scene), designs))
-            pairs, shapes = zip(*built, strict=True)
-            runs = run_members(
-                pairs, members.states, settle, self.settings.periods, self.integrator
-            )
-            return _Outcome(pairs[0], shapes[0], runs)
-
-        _, around = self._fitted(design, attempt)
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            built = list(pool.map(functools.partial(_pair, self.scene), designs))
+        pairs, shapes = zip(*built, strict=True)
+        runs = run_members(pairs, members.states, settle, self.settings.periods, self.integrator)
+        around = _Outcome(pairs[0], shapes[0], runs)
         if around.status is not Status.AVERAGED:
             return around.status, None
         values = np.stack([run.responses[:, 0] for run in around.runs])
@@ -320,11 +292,6 @@ class _Outcome:
             return Status.UNSOUND
         statuses = (run.status for run in self.runs)
         return next((s for s in statuses if s is not Status.AVERAGED), Status.AVERAGED)
-
-    @property
-    def reached(self) -> float:
-        """Largest |ε| (rad) in all motions."""
-        return max(float(np.max(run.max_relative)) for run in self.runs)
 
 
 def neighbours(

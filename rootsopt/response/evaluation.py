@@ -13,12 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from rootsopt.config import Config
 from rootsopt.config.units import RPM
-from rootsopt.contact.size import size_map
 from rootsopt.dynamics.closed import Start, motion
-from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.maxima import Maxima, local_maxima, prepare_maxima
-from rootsopt.dynamics.measures import PEAK_NORM, Measures, line_name
-from rootsopt.dynamics.orbit import Orbit, reverse_sensitivity
+from rootsopt.dynamics.measures import PEAK_NORM, line_name
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.settle import BLOCK
 from rootsopt.dynamics.steady import (
@@ -53,8 +50,6 @@ from rootsopt.status import Status
 if TYPE_CHECKING:
     import xarray
 
-_MAPS = 5
-"""Maximum number of contact maps tried for one design."""
 _APART = 1e-4, 1e3
 """Difference between an orbit closed by collocation and an integration over its period (see
 `integrated_difference`) above which the orbit is closed by shooting: the first number, at least the
@@ -146,19 +141,16 @@ class Evaluator:
 
     `survey`: whether the evaluator is for a search over many designs (see `surveying`);
     `reference`: response by which forces are divided when coexisting motions are compared;
-    `fitted`: whether the contact map has been fitted to a motion; `map_error`: error of the contact
-    map, relative to the static penetration, NaN if unknown; `maxima`: whether to compute all local
-    maxima of the force, with their gradients; `confirm`: whether an orbit
-    that is reported with its series is confirmed by an integration over its period; `orbits`:
-    orbits known from former evaluations, which all evaluators made from this one share.
+    `maxima`: whether to compute all local maxima of the force, with their gradients; `confirm`:
+    whether an orbit that is reported with its series is confirmed by an integration over its
+    period; `orbits`: orbits known from former evaluations, which all evaluators made from this one
+    share.
     """
 
     config: Config
     scene: Scene
     survey: bool = False
     reference: dict[str, float] | None = None
-    fitted: bool = False
-    map_error: float = float("nan")
     maxima: bool = False
     confirm: bool = True
     orbits: OrbitStore = dataclasses.field(default_factory=OrbitStore, compare=False, repr=False)
@@ -253,35 +245,23 @@ class Evaluator:
     ) -> tuple["Evaluator", Evaluation]:
         """Evaluate a design. Return another evaluator for neighbouring designs, and the evaluation.
 
-        Arguments: see `__call__`. The contact map of the returned evaluator has the size and the
-        range that the motion of this design needs."""
+        Arguments: see `__call__`."""
         began = time.perf_counter()
         design = design_vector(self.config) if design is None else jnp.asarray(design)
-        now = other = self._sized(design)
-        for _ in range(_MAPS):
-            now = other
-            pair, tangents, shape = _build(now.scene, design)
-            solver = now.scene.solver
-            begin = self.orbits.start(pair, start, solver.max_orbit)
-            found = now.motion(pair, tangents, begin)
-            if series and self.confirm:
-                found = now._confirmed(pair, tangents, begin, found)
-            if found.known is not None and (
-                series or self.maxima or now.scene.bearings is not None
-            ):
-                found = with_samples(found, solver.samples)
-            other = now._refitted(pair, found)
-            if other is None:
-                break
-            if float(other.scene.deepest) < float(now.scene.deepest):
-                other = other._sized(design)
+        pair, tangents, shape = _build(self.scene, design)
+        solver = self.scene.solver
+        begin = self.orbits.start(pair, start, solver.max_orbit)
+        found = self.motion(pair, tangents, begin)
+        if series and self.confirm:
+            found = self._confirmed(pair, tangents, begin, found)
+        if found.known is not None and (series or self.maxima or self.scene.bearings is not None):
+            found = with_samples(found, solver.samples)
         self.orbits.keep(found, pair)
-        report = now._report(design, (pair, shape), found, began, series)
+        report = self._report(design, (pair, shape), found, began, series)
         if self.maxima and report.usable:
-            integrator = now.scene.solver.orbit
-            maxima = local_maxima(pair, tangents, found.orbit, int(found.period), integrator)
+            maxima = local_maxima(pair, tangents, found.orbit, int(found.period), solver.orbit)
             report = dataclasses.replace(report, maxima=maxima)
-        return now, report
+        return self, report
 
     def recall(
         self, evaluation: Evaluation, again: Callable[[], Any], start: NDArray[np.float64] | None
@@ -336,12 +316,10 @@ class Evaluator:
         """Compile the programs for evaluating `design` (config units) in the background.
 
         `series`: whether the evaluations will compute the series; `maxima`: whether evaluators
-        `with_maxima` will follow. Return another evaluator, with a contact map sized for the
-        design."""
+        `with_maxima` will follow. Return this evaluator."""
         design = design_vector(self.config) if design is None else jnp.asarray(design)
-        now = self._sized(design)
-        pair, tangents, _ = _build.result_shape(now.scene, design)
-        dtype, solver = pair.angle_scale.dtype, now.scene.solver
+        pair, tangents, _ = _build.result_shape(self.scene, design)
+        dtype, solver = pair.angle_scale.dtype, self.scene.solver
         begin = eqx.filter_eval_shape(_at_rest, pair, solver.max_orbit)
 
         def then(found: Steady) -> None:
@@ -354,17 +332,13 @@ class Evaluator:
                 prepare_maxima(pair, tangents, found.orbit, solver.orbit)
 
         # The slowest compilation starts first.
-        _motion.prepare(pair, tangents, begin, now.scene.pitch_radius, solver, then=then)
-        _build.prepare(now.scene, design)
+        _motion.prepare(pair, tangents, begin, self.scene.pitch_radius, solver, then=then)
+        _build.prepare(self.scene, design)
         if series:
             count = pair.lobes * solver.samples
             times = jax.ShapeDtypeStruct((count,), float)
             contact_series.prepare(pair, times, jax.ShapeDtypeStruct((count, pair.states), dtype))
-        return now
-
-    def sized(self) -> "Evaluator":
-        """Return another evaluator, with a contact map sized for the config's own design."""
-        return self._sized(design_vector(self.config))
+        return self
 
     def assembled(self) -> tuple[RotorPair, RotorPair, Geometry]:
         """Return the pair of the config's own design, its derivatives along the design, and its
@@ -373,59 +347,12 @@ class Evaluator:
 
     def evaluation(
         self, built: tuple[RotorPair, Geometry], found: Steady, began: float
-    ) -> Evaluation | None:
+    ) -> Evaluation:
         """Return the evaluation, without series, of the config's own design with a known motion.
 
         `built`: its pair and geometry; `found`: its motion; `began`: time at the start (s,
-        `perf_counter`). The result is None if the contact map does not fit the motion."""
-        if self._refitted(built[0], found) is not None:
-            return None
+        `perf_counter`)."""
         return self._report(design_vector(self.config), built, found, began, False)
-
-    def _sized(self, design) -> "Evaluator":
-        """Return another evaluator whose contact map has enough nodes for `design`.
-
-        A size set in the config is kept. Any other size only grows, so that neighbouring designs
-        share a program. In a survey, the present size is kept.
-        """
-        solver, scene = self.config.solver, self.scene
-        given = solver.map_rolls, solver.map_relatives
-        if scene.fidelity != "map" or self.survey or None not in given:
-            return self
-        depth = scene.static_depth
-        wanted = size_map(scene.profile(design), float(scene.deepest), solver.map_error * depth)
-        known = (0, 0) if np.isnan(self.map_error) else scene.map_size
-        least = wanted.rolls, wanted.relatives
-        sizes = (size or max(pair) for size, *pair in zip(given, known, least, strict=True))
-        scene = dataclasses.replace(scene, map_size=tuple(sizes))
-        return dataclasses.replace(self, scene=scene, map_error=wanted.error / depth)
-
-    def _refitted(self, pair: RotorPair, found: Steady) -> "Evaluator | None":
-        """Return another evaluator whose contact map fits the motion `found`; None if the present
-        map fits.
-
-        A map must cover the motion. If the motion uses only a small part of the map, resolution is
-        wasted, and the map is replaced. This is done only once, so that neighbouring designs share
-        a map."""
-        if self.scene.fidelity != "map":
-            return None
-        status, reached = Status.of(found.status), _reached(pair, found)
-        return self.reaching(reached, status is Status.PERIODIC, pair.angle_limit)
-
-    def reaching(self, reached: float, steady: bool, most: Any) -> "Evaluator | None":
-        """Return another evaluator with a contact map for motions that reach |ε| = `reached` (rad).
-
-        The map covers at most `most` (rad). The result is None if the present map fits, or if there
-        is no map. `steady`: whether the motion is periodic; only then may the map shrink."""
-        covered = -float(self.scene.deepest)
-        if self.scene.fidelity != "map" or not np.isfinite(reached):
-            return None
-        wasteful = steady and not self.fitted and reached < 0.6 * covered
-        deepest = min(1.3 * reached, float(most))
-        if not (reached > covered or wasteful) or deepest == covered:
-            return None
-        scene = eqx.tree_at(lambda scene: scene.deepest, self.scene, jnp.asarray(-deepest))
-        return dataclasses.replace(self, scene=scene, fitted=True)
 
     def _report(self, design, built, found: Steady, began: float, series: bool) -> Evaluation:
         """Return the evaluation of the motion `found`.
@@ -438,11 +365,11 @@ class Evaluator:
         statistics: dict[str, int | float] = {
             "transient_mesh_periods": int(found.used),
             "solver_steps": int(found.steps),
-        } | self._map_statistics()
+        }
         steady: dict[str, Any] = {"kind": "transient"}
         response: dict[str, float] = {}
         known = status is Status.PERIODIC and pair.smooth
-        gradient = self._gradient(design, found) if known else {}
+        gradient = self._gradient(found) if known else {}
         hint, motion, state = "", None, None
         if status in CLOSED:
             named = self.scene.solver.measures.named(orbit.response[:, None], period)
@@ -532,26 +459,12 @@ class Evaluator:
             name: dict(zip(self.keys, map(float, row), strict=True)) for name, row in named
         }
 
-    def _map_statistics(self) -> dict[str, int | float]:
-        """Return size and error of the contact map; empty without a contact map."""
-        if self.scene.fidelity != "map":
-            return {}
-        rolls, relatives = self.scene.map_size
-        found: dict[str, int | float] = {"map_rolls": rolls, "map_relatives": relatives}
-        return found if np.isnan(self.map_error) else found | {"map_error": self.map_error}
-
-    def _gradient(self, design, found: Steady) -> dict[str, dict[str, float]]:
+    def _gradient(self, found: Steady) -> dict[str, dict[str, float]]:
         """Return the gradient of a closed orbit as a dict with the keys of the result file."""
         if not self.keys:
             return {}
-        orbit, solver = found.orbit, self.scene.solver
-        sensitivity = orbit.sensitivity
-        # Collocation has computed them already, and records no steps for reverse mode.
-        if self.config.solver.gradient == "reverse" and found.known is None:
-            settings = np.asarray(found.period), solver.orbit, solver.measures
-            sensitivity = _reverse(self.scene, design, orbit, *settings)
-        rows = np.column_stack([orbit.response, sensitivity])
-        named = solver.measures.named(rows, int(found.period))
+        rows = np.column_stack([found.orbit.response, found.orbit.sensitivity])
+        named = self.scene.solver.measures.named(rows, int(found.period))
         return {
             name: dict(zip(self.keys, map(float, slope), strict=True))
             for name, (_, slope) in named.items()
@@ -562,19 +475,6 @@ def at_speed(scene: Scene, speed_rpm: float) -> Scene:
     """Return the `scene` at the speed `speed_rpm`."""
     speed = jnp.asarray(speed_rpm * RPM)
     return eqx.tree_at(lambda scene: scene.speed, scene, speed)
-
-
-def _reached(pair: RotorPair, found: Steady) -> float:
-    """Return the largest |ε| (rad) of the motion `found`.
-
-    It is taken from the orbit if there is one, else from the window. Without a window, it is taken
-    from the last state of the transient alone."""
-    scale = float(pair.angle_scale)
-    if Status.of(found.status) in (*CLOSED, Status.IDLE):
-        return scale * float(np.max(np.abs(found.orbit.flow.states[:, 0])))
-    if int(found.window.done):
-        return scale * float(np.max(np.abs(found.window.states[..., 0])))
-    return scale * abs(float(found.settled.state[0]))
 
 
 def _at_rest(pair: RotorPair, longest: int) -> Start:
@@ -611,27 +511,7 @@ def objective_weights(config: Config) -> dict[str, float]:
     return {name: share / total for name, share in shares.items() if share}
 
 
-@Program
-def _reverse(
-    scene: Scene, design, orbit: Orbit, period, integrator: Integrator, measures: Measures
-):
-    grid, peak = orbit.flow.grid, orbit.flow.peak
-    return reverse_sensitivity(
-        scene.pair,
-        design,
-        orbit.state,
-        period,
-        integrator,
-        grid,
-        measures,
-        jnp.maximum(peak, 1e-30),
-    )
-
-
-_NO_GRADIENT = (
-    " The contact force jumps at many places, so that it has no gradient. For a gradient, set "
-    "solver.fidelity to search, map or linear."
-)
+_NO_GRADIENT = " The contact force jumps at many places, so that it has no gradient."
 
 
 def evaluate(config: Config, design: ArrayLike | Sequence[float] | None = None) -> Evaluation:
@@ -640,7 +520,7 @@ def evaluate(config: Config, design: ArrayLike | Sequence[float] | None = None) 
     `design` (d,): in config units; by default the config's own.
 
     Raises `InputError` for a scene that cannot be simulated or a profile that is not sound;
-    `RuntimeError` if JAX is not set to the precision of the config.
+    `RuntimeError` if JAX is not set to double precision.
 
     >>> import jax
     >>> import rootsopt
@@ -650,7 +530,7 @@ def evaluate(config: Config, design: ArrayLike | Sequence[float] | None = None) 
     >>> print(f"{found.response['mean_force_N']:.1f} N")
     76.2 N
     """
-    check_precision(config.solver.precision)
+    check_precision()
     check_geometry(config, design)
     found = Evaluator.of(config)(None if design is None else jnp.asarray(design, float))
     if found.status is Status.UNSOUND:

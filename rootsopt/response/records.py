@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from rootsopt.config import Config
 from rootsopt.config.units import MM
-from rootsopt.dynamics.integrator import IMPLICIT
 from rootsopt.dynamics.orbit import Orbit
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import Steady
@@ -183,12 +182,6 @@ def _damping(config: Config) -> list[str]:
     return [f"raise contact.max_damping_N_s_per_mm ({most:g})"]
 
 
-def _precision(config: Config) -> list[str]:
-    """Return the advice to use double precision, unless it is used."""
-    single = config.solver.precision == "float32"
-    return ["set solver.precision to float64"] if single else []
-
-
 def _passed_through(config: Config) -> list[str]:
     gear, phase = config.scene.timing_gear, config.scene.phase_error_mrad
     held = ["add a scene.timing_gear"]
@@ -235,7 +228,7 @@ def _chaotic(config: Config) -> list[str]:
 
 def _not_settled(config: Config) -> list[str]:
     longer = _way("raise", "solver.max_mesh_periods", config.solver.max_mesh_periods)
-    return [*_precision(config), *longer, *_damping(config)]
+    return [*longer, *_damping(config)]
 
 
 def _tolerance(config: Config) -> tuple[str, float]:
@@ -247,7 +240,7 @@ def _tolerance(config: Config) -> tuple[str, float]:
 
 
 def _unresolved(config: Config) -> list[str]:
-    return [*_precision(config), *_way("tighten", *_tolerance(config))]
+    return _way("tighten", *_tolerance(config))
 
 
 def _inaccurate(config: Config) -> list[str]:
@@ -257,13 +250,10 @@ def _inaccurate(config: Config) -> list[str]:
 
 
 def _solver_failed(config: Config) -> list[str]:
-    solver = config.solver
-    explicit = solver.method not in IMPLICIT
-    need = "; an explicit method needs ten for each of statistics.swings_per_mesh_period"
-    most = f"{solver.max_steps_per_period:g}{need if explicit else ''}"
-    implicit = ["set solver.method to kvaerno5, which is implicit"] if explicit else []
+    most = f"{config.solver.max_steps_per_period:g}"
+    need = "ten are needed for each of statistics.swings_per_mesh_period"
     looser = _way("loosen", *_tolerance(config))
-    return [f"raise solver.max_steps_per_period ({most})", *looser, *implicit]
+    return [f"raise solver.max_steps_per_period ({most}; {need})", *looser]
 
 
 _WAYS = {

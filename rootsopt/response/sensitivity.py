@@ -25,7 +25,7 @@ _STEP = 1e-6
 """Relative step of the difference quotients that approximate the derivatives of the scene with
 respect to a quantity. Their error is small, since the scene depends almost linearly on its
 quantities."""
-_SETTINGS = ("solver", "deepest")
+_SETTINGS = ("solver",)
 """Fields of a scene on which the response does not depend. Their derivatives are set to zero."""
 MICROMETRE = 1e-3
 """One micrometre (mm): change of clearance, backlash and centre distance error for which the table

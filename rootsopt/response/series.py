@@ -52,7 +52,7 @@ def contact_series(pair: RotorPair, tau, states):
 
 def series_of(pair: RotorPair, tau, states) -> Series:
     """Return the series of a motion with scaled `states` (t, n) at `tau` (t,) in mesh periods."""
-    # Reduce to one turn of the rotor, so that single precision resolves late times as well.
+    # Reduce to one turn of the rotor: the rounding error of a late time is greater.
     turn = np.mod(tau, pair.lobes)
     period, lapse, (relative, rate), contact = contact_series(pair, turn, states)
     time = period * tau

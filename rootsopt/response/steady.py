@@ -98,7 +98,7 @@ def steady_response(
     NOT_CLOSED under `jit` and `vmap`. Otherwise its orbit is closed by shooting.
 
     Raises ValueError if the design has the wrong shape, or if `start` belongs to another kind of
-    scene; RuntimeError if JAX is not set to the precision of the scene; NotImplementedError if a
+    scene; RuntimeError if JAX is not set to double precision; NotImplementedError if a
     second derivative is requested.
 
     >>> import jax
@@ -113,7 +113,7 @@ def steady_response(
     With `jax.grad(lambda design: rootsopt.steady_response(scene, design).mean)(config.design)` the
     gradient of the mean force follows, in N per unit of `config.design_keys`.
     """
-    check_precision(scene.precision)
+    check_precision()
     design = jnp.asarray(design, float)
     if design.ndim != 1:
         raise ValueError(
@@ -180,7 +180,7 @@ def _moved(scene: Any, design: Any) -> tuple[list[tuple[int, Array]], list[Array
     return numbers, leaves
 
 
-_SETTINGS = ("solver", "deepest")
+_SETTINGS = ("solver",)
 """Fields of a scene that are numerical settings, not physical quantities. Their tangents are
 ignored."""
 
@@ -229,8 +229,6 @@ def _solve(scene: Scene, design, start, numbers: tuple[int, ...]) -> tuple[Respo
     start = _start_of(pair, start, scene.solver)
     radius, solver = scene.pitch_radius, scene.solver
     found = motion(pair, tangents, start, radius, solver)
-    if scene.fidelity == "map":
-        found = _on_map(scene, pair, found)
     return _named(scene.solver, pair, tangents, found)
 
 
@@ -254,17 +252,6 @@ def _start_of(pair: RotorPair, start: Any, solver: Solver) -> Start:
             "parts, solver settings), but comes from another one; pass its `start.state`, or None"
         )
     return start
-
-
-def _on_map(scene: Scene, pair: RotorPair, found: Steady) -> Steady:
-    """Return the motion `found`, with the status OFF_MAP if the motion has left the contact map.
-
-    Beyond the map, its extrapolated forces may also make the solver fail."""
-    orbit = jnp.max(jnp.abs(found.orbit.flow.states[:, 0]))
-    failed = found.status == Status.SOLVER_FAILED.code
-    reached = pair.angle_scale * jnp.where(failed, jnp.abs(found.settled.state[0]), orbit)
-    left = (failed | among(found.status, CLOSED)) & (reached > -scene.deepest)
-    return found._replace(status=jnp.where(left, Status.OFF_MAP.code, found.status))
 
 
 def _state(pair: RotorPair, tangents: RotorPair, found: Steady):

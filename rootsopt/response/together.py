@@ -26,14 +26,12 @@ def pays() -> bool:
 def evaluate_together(evaluators: Sequence[Evaluator]) -> list[Evaluation]:
     """Evaluate the own design of each evaluator's config from rest, without series.
 
-    Scenes of the same structure (parts, number of lobes, solver) are stepped together. Where the
-    contact map does not fit the motion, the scene is evaluated again by itself."""
+    Scenes of the same structure (parts, number of lobes, solver) are stepped together."""
     began = time.perf_counter()
-    sized = [one.sized() for one in evaluators]
-    built = [one.assembled() for one in sized]
+    built = [one.assembled() for one in evaluators]
     groups: dict[Hashable, list[int]] = {}
     inputs = []
-    for number, (one, (pair, tangents, _)) in enumerate(zip(sized, built, strict=True)):
+    for number, (one, (pair, tangents, _)) in enumerate(zip(evaluators, built, strict=True)):
         state = np.zeros(pair.states, pair.angle_scale.dtype)
         arguments = pair, tangents, state, one.scene.pitch_radius, one.scene.solver
         arrays, others = eqx.partition(arguments, eqx.is_array)
@@ -46,8 +44,7 @@ def evaluate_together(evaluators: Sequence[Evaluator]) -> list[Evaluation]:
         for row, number in enumerate(members):
             pair, _, shape = built[number]
             motion = jax.tree.map(lambda x, row=row: x[row], motions)
-            report = sized[number].evaluation((pair, shape), motion, began)
-            found[number] = evaluators[number](series=False) if report is None else report
+            found[number] = evaluators[number].evaluation((pair, shape), motion, began)
     return [found[number] for number in range(len(evaluators))]
 
 

@@ -42,7 +42,7 @@ class Evaluates(Protocol):
     def fit(
         self, design: Any = None, start: NDArray | None = None, series: bool = True
     ) -> tuple["Evaluates", Evaluation]:
-        """Evaluate a design. Return another evaluator, fitted to its motion, and the evaluation.
+        """Evaluate a design. Return another evaluator for neighbouring designs, and the evaluation.
 
         Arguments: see `__call__`."""
         ...
@@ -51,8 +51,7 @@ class Evaluates(Protocol):
         """Compile the programs for evaluating `design` (d,), in config units, in the background.
 
         `series`: whether the evaluations will compute the series; `maxima`: whether evaluators
-        `with_maxima` will follow. Return another evaluator, with a contact map sized for
-        `design`."""
+        `with_maxima` will follow. Return another evaluator for these designs."""
         ...
 
     def recall(self, evaluation: Evaluation, again: Callable[[], Any], start: Any) -> None:

@@ -20,10 +20,7 @@ from rootsopt.config.families import family_of
 from rootsopt.config.units import DEG
 from rootsopt.contact.gap import Contact
 from rootsopt.contact.law import ContactLaw
-from rootsopt.contact.linear import LinearContact
-from rootsopt.contact.map import MapContact
 from rootsopt.contact.search import SearchContact
-from rootsopt.contact.segments import NodeContact
 from rootsopt.contact.twisted import TwistedContact, slices_of
 from rootsopt.contact.worn import WornContact, wear_series
 from rootsopt.dynamics.pair import RotorPair
@@ -45,7 +42,6 @@ from rootsopt.dynamics.parts import (
 )
 from rootsopt.dynamics.steady import Solver
 from rootsopt.dynamics.timescales import Timescales
-from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry, Outline, Profile, geometry
 from rootsopt.profiles.validity import Soundness, soundness
 from rootsopt.runtime.precision import check_precision
@@ -63,9 +59,8 @@ class Scene(eqx.Module):
 
     `family`, `lobes`, `pitch_radius` (m): profile; `design_size`: number d of design parameters.
     `twist_free`: whether the last one of them is the twist (°), which then replaces `helix`.
-    `fidelity`, `map_size`, `nodes`: contact model and its resolution.
-    `precision`: number type of the integration; `solver`: solver for the steady motion. `slices`:
-    number of slices of twisted rotors, 0 for straight ones.
+    `solver`: solver for the steady motion. `slices`: number of slices of twisted rotors, 0 for
+    straight ones.
     `length` (m), `density` (kg/m³), `bore_radius` (m, `None`: no bore): body of a rotor. `helix`:
     twist over the length (rad), `None` for straight rotors.
     `law`, `clearance` (m): contact law, and distance added to every flank gap. `wear` (m, `None`:
@@ -73,7 +68,6 @@ class Scene(eqx.Module):
     `speed` (rad/s), `load_torque` (N·m), `pressure` (Pa, `None`: constant torque): operation.
     `gear`, `motor`, `friction`, `supports`: optional parts. `gear_damping_ratio`: damping of the
     gear as a share of critical damping, which `Scene` adds to `gear.damping` (0 from a config).
-    `deepest`: relative rotation (rad, negative) down to which a contact map must extend.
     `center_distance_error`: centre distance minus twice the pitch radius (m), or `None`. `outline`:
     profile read from a file, or `None`; `medium`: fluid and clearances for leakage, or `None`;
     `bearings`: what loads the bearings, or `None`; `extra`: further parts.
@@ -88,10 +82,6 @@ class Scene(eqx.Module):
 
     family: str = eqx.field(static=True)
     lobes: int = eqx.field(static=True)
-    fidelity: str = eqx.field(static=True)
-    precision: str = eqx.field(static=True)
-    map_size: tuple[int, int] = eqx.field(static=True)
-    nodes: int = eqx.field(static=True)
     slices: int = eqx.field(static=True)
     design_size: int = eqx.field(static=True)
     twist_free: bool = eqx.field(static=True)
@@ -104,7 +94,6 @@ class Scene(eqx.Module):
     load_torque: Float[Array, ""]
     gear: TimingGear | None
     gear_damping_ratio: Float[Array, ""]
-    deepest: Float[Array, ""]
     solver: Solver
     bore_radius: Float[Array, ""] | None = None
     helix: Float[Array, ""] | None = None
@@ -120,29 +109,18 @@ class Scene(eqx.Module):
     extra: tuple[Part, ...] = ()
 
     @classmethod
-    def from_config(cls, config: Config, deepest: float | None = None) -> "Scene":
+    def from_config(cls, config: Config) -> "Scene":
         """Return the scene of a config.
 
-        `deepest`: relative rotation (rad, negative) down to which the contact map must extend; by
-        default, an estimate. If the config does not give the map's size, the map has a default
-        size. (`evaluate` chooses the size from `solver.map_error` instead.)
-
-        Raises `RuntimeError` if JAX is not set to the precision that the config needs, and
-        `InputError` if an outline file cannot be used."""
-        check_precision(config.solver.precision)
-        if deepest is None:
-            deepest = reading.expected_rotation(config)
+        Raises `RuntimeError` if JAX is not set to double precision, and `InputError` if an outline
+        file cannot be used."""
+        check_precision()
         found = cls(
             family=config.profile.family,
             lobes=config.profile.lobes,
-            fidelity=config.solver.fidelity,
-            precision=config.solver.precision,
-            map_size=reading.map_size(config),
-            nodes=config.solver.nodes,
             slices=config.solver.slices or 0,
             design_size=len(reading.design_keys(config)),
             twist_free=config.twist_free,
-            deepest=jnp.asarray(deepest),
             solver=reading.solver_of(config),
             outline=families.profile_from_file(config.profile),
             medium=medium_of(config),
@@ -167,8 +145,8 @@ class Scene(eqx.Module):
     def renewed(self, config: Config) -> "Scene":
         """Return this scene with the physical quantities of another `config`.
 
-        The config must have the same parts as that of this scene. Profile, solver and the range of
-        the contact map stay the same."""
+        The config must have the same parts as that of this scene. Profile and solver stay the
+        same."""
         return dataclasses.replace(
             self,
             medium=medium_of(config),
@@ -256,30 +234,10 @@ class Scene(eqx.Module):
         return dataclasses.replace(self, law=_as_arrays(law))
 
     def contact(self, profile: Profile) -> Contact:
-        """Return the contact of `profile` at this scene's fidelity.
-
-        Raises `InputError` if the fidelity is `auto`, which must first be replaced by another one,
-        or does not support twisted rotors.
-        """
+        """Return the contact of `profile` in this scene."""
         if self.helix is not None:
-            if self.fidelity not in ("search", "auto"):
-                raise InputError(
-                    "`solver.fidelity` must be search for twisted rotors (`rotor.helix_deg`), but "
-                    f"is {self.fidelity}; set it to search"
-                )
             straight = dataclasses.replace(self, helix=None)
             return TwistedContact(straight.contact(profile), self.helix, self.slices)
-        if self.fidelity == "map":
-            return MapContact.of(profile, self.deepest, *self.map_size)
-        if self.fidelity == "linear":
-            return LinearContact.of(profile)
-        if self.fidelity == "nodes":
-            return NodeContact.of(profile, self.nodes)
-        if self.fidelity == "auto":
-            raise InputError(
-                "`solver.fidelity` must be chosen before a pair is built, but is auto; call "
-                "rootsopt.response.choice.choose first"
-            )
         distance = None
         if self.two_sided:
             error = self.center_distance_error
@@ -404,11 +362,7 @@ class Scene(eqx.Module):
         timescales = Timescales.of(
             self.law, pair.all_parts, inertia, force, self.pitch_radius, self.clearance
         )
-        pair = dataclasses.replace(pair, timescales=timescales)
-        if self.precision == "float32":
-            # The pair is built in double precision, and integrated in single precision.
-            pair = jax.tree.map(_single, pair)
-        return pair, shape
+        return dataclasses.replace(pair, timescales=timescales), shape
 
 
 def along(
@@ -441,10 +395,6 @@ class _Static(eqx.Module):
     """Carries a value that is not an array through a JAX transformation."""
 
     value: Any = eqx.field(static=True)
-
-
-def _single(leaf):
-    return leaf.astype(jnp.float32) if eqx.is_inexact_array(leaf) else leaf
 
 
 def _as_arrays(tree):

@@ -1,6 +1,5 @@
 """Converts a config into the parts of a scene: SI quantities, contact law, parts, solver."""
 
-import math
 from typing import Any
 
 import jax.numpy as jnp
@@ -18,8 +17,6 @@ from rootsopt.dynamics.steady import Solver
 _ORBIT_STEPS = 4
 """Limit on the number of solver steps for a whole orbit, as a multiple of the number that the
 config allows per mesh period."""
-_ROLLS, _RELATIVES = 384, 16
-"""Default size of a contact map: number of points over roll and over relative rotation."""
 
 
 def design_vector(config: Config) -> Float[Array, " d"]:
@@ -120,28 +117,6 @@ def parts_of(config: Config) -> dict[str, Any]:
     return parts
 
 
-def map_size(config: Config) -> tuple[int, int]:
-    """Return (number of points over roll, over relative rotation) of a config's contact map."""
-    solver = config.solver
-    return solver.map_rolls or _ROLLS, solver.map_relatives or _RELATIVES
-
-
-def expected_rotation(config: Config) -> float:
-    """Return an estimate (rad, negative) of the most negative relative rotation in a scene.
-
-    Its magnitude is a length divided by the pitch radius, but at most a quarter of π/2N. The length
-    is 1.3 times the sum of clearance and half the backlash, plus 1.5 times the penetration under 20
-    times the static contact force."""
-    contact, scene = config.contact, config.scene
-    radius = config.profile.pitch_radius_mm
-    play = contact.clearance_mm
-    if scene.timing_gear is not None:
-        play += scene.timing_gear.backlash_mm / 2
-    force = 20 * max(config.load_torque, 0.01) / (radius * MM)
-    depth = (force / contact.stiffness_N_per_mm_e) ** (1 / contact.exponent)
-    return -min((1.3 * play + 1.5 * depth) / radius, math.pi / (8 * config.profile.lobes))
-
-
 def integrators(config: Config) -> tuple[Integrator, Integrator]:
     """Return (integrator of the transient, integrator of the orbit), with the config's settings.
 
@@ -166,7 +141,6 @@ def solver_of(config: Config) -> Solver:
         max_periods=jnp.asarray(float(settings.max_mesh_periods)),
         examine=jnp.asarray(1.0),
         max_orbit=settings.max_orbit_periods,
-        precision=settings.precision,
         closing=settings.orbit,
     )
 

@@ -11,7 +11,6 @@ from rootsopt.config.families import families, family_of, find_installed, parame
 from rootsopt.config.section import bare
 from rootsopt.config.words import sentence
 from rootsopt.errors import InputError
-from rootsopt.response.choice import resolve
 from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.response.evaluators import evaluator_for
 from rootsopt.response.together import evaluate_together
@@ -70,7 +69,7 @@ def _evaluator(config: Config, values: Mapping[str, Any]) -> Evaluates:
     """Return the evaluator of a point. Raises `InputError` if its config is not valid."""
     one = configured(config, values)
     check_geometry(one)
-    return evaluator_for(resolve(one)[0])
+    return evaluator_for(one)
 
 
 def _lost_by(error: Exception) -> Row:

@@ -81,7 +81,7 @@ def sweep_scenes(  # Keywords of the public interface, each independent of the o
     >>> data.mean_force_N.dims, data.mean_force_N.round(1).values.tolist()
     (('scene.speed_rpm',), [76.4, 76.2])
     """
-    check_precision(config.solver.precision)
+    check_precision()
     plan = checked(config, plan_of(axes, zip, sample, sobol, seed))
     done: dict[int, Row] = {}
     path = None if checkpoint is None else Path(checkpoint)

@@ -5,7 +5,6 @@ from typing import NamedTuple
 from rootsopt.config import Config
 from rootsopt.errors import InputError
 from rootsopt.optimize.limits import LIMITS, depends_on_forces, limited
-from rootsopt.optimize.search import check_gradient
 from rootsopt.response.reporting import in_words, is_force, reporting, unit_in
 from rootsopt.response.terms import terms_of
 from rootsopt.scene import Scene
@@ -83,7 +82,6 @@ def simulated(config: Config, scene: Scene) -> bool:
             f"`tolerances` must be absent for `pareto.terms` with forces ({forced[0]}): a front is "
             "that of the nominal scene; remove them"
         )
-    check_gradient(config)
     return True
 
 

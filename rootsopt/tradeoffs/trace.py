@@ -35,7 +35,6 @@ from rootsopt.optimize.optimality import judged
 from rootsopt.optimize.problem import FEASIBLE
 from rootsopt.optimize.sqp import Stops, descend
 from rootsopt.response.checkpoint import Checkpoint
-from rootsopt.response.choice import resolve
 from rootsopt.response.runs import HERE, Runs
 from rootsopt.runtime.threads import one_thread
 from rootsopt.scene import check_geometry
@@ -594,7 +593,7 @@ def pareto_front(
     `standing`), `gaps`, `dropped`, `baseline_terms` and `status`.
 
     Raises `InputError` if the config cannot be optimised, or for unknown terms. Raises
-    `RuntimeError` if JAX is not set to the precision of the config.
+    `RuntimeError` if JAX is not set to double precision.
 
     >>> import jax
     >>> import rootsopt
@@ -607,7 +606,7 @@ def pareto_front(
     """
     check_geometry(config)
     with evaluating(workers, scheduler) as runs:
-        return Tracer(resolve(config)[0], progress, runs=runs).run()
+        return Tracer(config, progress, runs=runs).run()
 
 
 __all__ = ["Tracer", "pareto_front"]

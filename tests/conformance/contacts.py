@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rootsopt.contact.nodes import pair_gap
+from experiments._common.polygons import pair_gap
 from rootsopt.errors import InputError
 from tests.conformance.kinks import along, unmarked
 

@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from experiments._common.polygons import pair_gap
 from rootsopt.config import describe_families, describe_keys, parse
 from rootsopt.config.families import families, family_of
 from rootsopt.contact.closest import FlankPair
-from rootsopt.contact.nodes import pair_gap
 from rootsopt.design.space import Space, sobol
 from rootsopt.errors import InputError
 from rootsopt.profiles import geometry

@@ -9,13 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
-from rootsopt.contact import ContactLaw, ImpactLaw
 from rootsopt.contact.linear import LinearContact
 from rootsopt.contact.map import MapContact
+from rootsopt.contact.segments import NodeContact
+
+from rootsopt.contact import ContactLaw, ImpactLaw
 from rootsopt.contact.point import ContactPoint
 from rootsopt.contact.search import SearchContact
-from rootsopt.contact.segments import NodeContact
 from rootsopt.dynamics.parts import (
     ConstantLoad,
     Friction,

@@ -140,8 +140,8 @@ def balance(pair, start, how):
         return jnp.concatenate([change, lapse * jnp.stack(powers)])
 
     solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(slope), how.solver(start.dtype), 0.0, 1.0, None, jnp.pad(start, (0, 4)),
-        stepsize_controller=how.controller(start.dtype), max_steps=how.max_steps,
+        diffrax.ODETerm(slope), how.solver(), 0.0, 1.0, None, jnp.pad(start, (0, 4)),
+        stepsize_controller=how.controller(), max_steps=how.max_steps,
         adjoint=diffrax.ForwardMode(),
     )  # fmt: skip
     end = solution.ys[-1]

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rootsopt.contact.map import MapContact
+from rootsopt.contact.size import RELATIVES, ROLLS, size_map
 
+from experiments._common.polygons import pair_gap
 from rootsopt.config import load, parse
 from rootsopt.contact.closest import FlankPair
-from rootsopt.contact.map import MapContact
-from rootsopt.contact.nodes import pair_gap
-from rootsopt.contact.size import RELATIVES, ROLLS, size_map
 from rootsopt.errors import InputError
 from rootsopt.profiles import CIC, EE, FreeForm
 from rootsopt.profiles.validity import margins

@@ -3,11 +3,11 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
 from rootsopt.contact.map import MARGIN
-from rootsopt.contact.nodes import signed_distance
-from rootsopt.contact.search import SearchContact
 from rootsopt.contact.size import _smallest
+
+from experiments._common.polygons import signed_distance
+from rootsopt.contact.search import SearchContact
 from rootsopt.profiles import CIC, five_arcs
 
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-from rootsopt.contact import FlankPair, ImpactLaw, ramp, smooth_step
 from rootsopt.contact.map import MapContact
-from rootsopt.contact.nodes import pair_gap
+
+from experiments._common.polygons import pair_gap
+from rootsopt.contact import FlankPair, ImpactLaw, ramp, smooth_step
 from rootsopt.dynamics.parts import TimingGear
 from rootsopt.profiles import CIC, EE
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-from rootsopt.contact import FlankPair
 from rootsopt.contact.linear import LinearContact
 from rootsopt.contact.segments import NodeContact
+
+from rootsopt.contact import FlankPair
 from rootsopt.profiles import CIC, EE
 
 R = 0.033

@@ -363,12 +363,12 @@ def powers(pair, state, how):
 
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(slope),
-        how.solver(state.dtype),
+        how.solver(),
         t0=0.0,
         t1=1.0,
         dt0=None,
         y0=jnp.concatenate([state, jnp.zeros(4)]),
-        stepsize_controller=how.controller(jnp.float64),
+        stepsize_controller=how.controller(),
         adjoint=ADJOINT,
         max_steps=how.max_steps,
     )

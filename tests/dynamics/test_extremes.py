@@ -147,7 +147,7 @@ def test_steps_follow_the_scene(speed, stiffness):
     swing, fall = (
         float(t / pair.mesh_period) for t in (pair.timescales.swing, pair.timescales.fall)
     )
-    control = how.controller(np.dtype(float), pair=pair)
+    control = how.controller(pair=pair)
     first, longest = float(control.first), float(control.base.dtmax)
     assert first == pytest.approx(min(1e-3, swing / 20))
     assert longest == pytest.approx(min(1 / 32, max(fall / 8, 4 / 4096)))

@@ -81,7 +81,7 @@ def control(**over) -> LandingControl:
     )
     pair = Scene.from_config(config).pair(design_vector(config))
     how = Integrator("tsit5", jnp.asarray(1e-8), 4096)
-    found = how.controller(jnp.dtype("float64"), 1.0, pair)
+    found = how.controller(1.0, pair)
     assert isinstance(found, LandingControl)
     return found
 

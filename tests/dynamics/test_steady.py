@@ -66,15 +66,13 @@ def force_at(pair, start, times, how):
     """Return the force at ascending `times` (mesh periods), each the end of a solver step."""
     states = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda tau, y, _: pair.derivative(tau, y)[0]),
-        how.solver(times.dtype),
+        how.solver(),
         t0=0.0,
         t1=times[-1],
         dt0=1e-4,
         y0=start,
         saveat=diffrax.SaveAt(ts=times),
-        stepsize_controller=diffrax.ClipStepSizeController(
-            how.controller(times.dtype), step_ts=times
-        ),
+        stepsize_controller=diffrax.ClipStepSizeController(how.controller(), step_ts=times),
         max_steps=200_000,
     ).ys
     return jax.vmap(lambda t, y: pair.contact_at(t, y).total)(times, states)

@@ -24,7 +24,7 @@ def swing(tau, y, gravity):
 def both(method, gravity=4000.0, max_steps=512):
     """Return the integration by this loop and by diffrax."""
     integrator = Integrator(method, jnp.asarray(1e-6), max_steps)
-    solver, control = integrator.solver(np.dtype(float)), integrator.controller(np.dtype(float))
+    solver, control = integrator.solver(), integrator.controller()
     term = diffrax.ODETerm(swing)
 
     @jax.jit

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from experiments._common.polygons import signed_distance
 from rootsopt.commands import profile, simulate
 from rootsopt.config import load
-from rootsopt.contact.nodes import place_pair, signed_distance
 from rootsopt.design.space import Space
 from rootsopt.errors import InputError
 from rootsopt.export import chosen, solid, svg
@@ -24,7 +24,7 @@ from rootsopt.export.animation import rolling_contacts, simulation_gif
 from rootsopt.export.drawing import Drawing
 from rootsopt.export.dxf import dxf_bytes
 from rootsopt.export.pieces import Arc, Spline, outline_pieces, polyline
-from rootsopt.profiles import CIC, EE, geometry, outline
+from rootsopt.profiles import CIC, EE, geometry, outline, place_pair
 from rootsopt.response.series import Series
 from rootsopt.scene import Scene, check_geometry, design_keys, design_vector
 from rootsopt.scene.families import profile_of

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from ezdxf import units
 
+from experiments._common.polygons import pair_gap
 from rootsopt.commands import profile, simulate
 from rootsopt.config import load, parse
 from rootsopt.contact.closest import FlankPair
-from rootsopt.contact.nodes import pair_gap
 from rootsopt.errors import InputError
 from rootsopt.measured.conjugacy import conjugacy, inset_note
 from rootsopt.measured.curves import _jumps

@@ -7,7 +7,7 @@ angles. Lengths in mm here, as the promise (|gap| below a nanometre) is.
 import numpy as np
 import pytest
 
-from rootsopt.contact.nodes import pair_gap, signed_distance
+from experiments._common.polygons import pair_gap, signed_distance
 from rootsopt.profiles import CIC, EE, outline
 
 R = 33.0

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.interpolate import BSpline
 
+from experiments._common.polygons import pair_gap
 from rootsopt.config import parse
-from rootsopt.contact.nodes import pair_gap
 from rootsopt.design.resemblance import likenesses
 from rootsopt.design.space import sobol
 from rootsopt.errors import InputError

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from rootsopt.contact.nodes import place_pair
 from rootsopt.dynamics.parts import GasLoad
-from rootsopt.profiles import geometry
+from rootsopt.profiles import geometry, place_pair
 from rootsopt.pump import bearings, flow
 from tests.conformance.families import LOBES, R, made, outline_of
 

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from scipy import integrate, optimize
 
+from experiments._common.polygons import pair_gap, signed_distance
 from rootsopt import load_config
-from rootsopt.contact.nodes import pair_gap, place_pair, signed_distance
 from rootsopt.errors import InputError
-from rootsopt.profiles import geometry
+from rootsopt.profiles import geometry, place_pair
 from rootsopt.profiles.epicycloid import circle_epicycloid
 from rootsopt.pump import gas
 from rootsopt.pump.gap import Allowances, mesh_gap, relative_curvature

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from matplotlib.path import Path
 
-from rootsopt.contact.nodes import pair_gap, place_pair
+from experiments._common.polygons import pair_gap
 from rootsopt.measured.conjugacy import conjugacy
-from rootsopt.profiles import CIC, EE
+from rootsopt.profiles import CIC, EE, place_pair
 from rootsopt.pump.gap import Allowances, mesh_gap
 from rootsopt.pump.play import play
 from tests.conformance.families import LOBES, R, made, outline_of

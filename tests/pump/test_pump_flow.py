@@ -12,8 +12,7 @@ from scipy.spatial import KDTree
 
 from rootsopt import load_config
 from rootsopt.config.families import families
-from rootsopt.contact.nodes import place_pair
-from rootsopt.profiles import CIC, EE, geometry
+from rootsopt.profiles import CIC, EE, geometry, place_pair
 from rootsopt.pump import flow
 from rootsopt.pump.sheet import sheet
 from rootsopt.scene import Scene, design_vector

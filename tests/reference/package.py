@@ -32,8 +32,9 @@ def evaluate(config: str, overrides: list[str], nudge: float = 0.0) -> dict[str,
     config: name of a shipped config. overrides: HERE in them is this folder. nudge: relative change
     of the speed, to see how far a result depends on rounding. Raises `rootsopt.errors.InputError`
     for a config that is refused."""
-    from rootsopt.config import load
     from rootsopt.response.choice import resolve
+
+    from rootsopt.config import load
     from rootsopt.response.evaluators import evaluator_for
 
     path = ROOT / "configs" / f"{config}.yaml"

@@ -3,9 +3,9 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from rootsopt.contact.size import MapSize
 
 from rootsopt.config import load
-from rootsopt.contact.size import MapSize
 from rootsopt.dynamics.flanks import FlankForce
 from rootsopt.output import files
 from rootsopt.response import evaluation, series

@@ -10,12 +10,12 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from rootsopt.contact.map import _interpolation_matrix
 from scipy.optimize import minimize
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import rootsopt
 from rootsopt.config import load
-from rootsopt.contact.map import _interpolation_matrix
 from rootsopt.errors import InputError
 from rootsopt.optimize import design
 from rootsopt.runtime.environment import own_process

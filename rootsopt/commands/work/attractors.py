@@ -11,7 +11,6 @@ from rootsopt.figures.basins import basin_figures
 from rootsopt.output import files, tables
 from rootsopt.output.runs import RunFolder
 from rootsopt.response.attractors import find
-from rootsopt.response.choice import resolve
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.records import message_of
 from rootsopt.scene import check_geometry
@@ -23,7 +22,6 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     Return the `Outcome`. Raises `InputError` if the config is invalid."""
     check_geometry(config)
     with cli.waiting(Console(stderr=True), "compiling and simulating"):
-        config, choice = resolve(config)
         found = find(Evaluator.of(config), series=True)
     files.write_config(folder, config)
     data = {
@@ -33,7 +31,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
         "message": message_of(config, found.status),
         "versions": files.versions(),
     }
-    folder.write_json("result.json", choice | data)
+    folder.write_json("result.json", data)
     rows = [{"attractor": number} | row for number, row in enumerate(found.summary(), 1)]
     folder.write_csv("attractors.csv", files.row_columns(rows))
     relative, rate = np.meshgrid(1e3 * found.relative, found.rate)

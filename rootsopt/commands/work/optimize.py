@@ -1,7 +1,6 @@
 """The work of `rootsopt optimize`."""
 
 import argparse
-import threading
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, closing
@@ -48,7 +47,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
         _progress(Console(stderr=True)) as progress,
         closing(checkpoint_of("optimize", config, options, folder)) as checkpoint,
     ):
-        config, choice, result = _searched(config, progress, stop, checkpoint, runs)
+        result = searched(lambda: search_of(config, progress, stop, checkpoint, runs), stop)
     if not stop.is_set():  # A stopped search can go on later.
         folder.remove_afterwards(folder.checkpoint)
     if result is None:
@@ -59,7 +58,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     ran = time.perf_counter() - began
     alike = {} if result.interrupted else _alike(config, result)
     sheets = _sheets(config, result)
-    _write(folder, config, options, result, choice | alike, sheets, clock.seconds, ran)
+    _write(folder, config, options, result, alike, sheets, clock.seconds, ran)
     if result.optimized is not None:
         write_simulated(folder, _searching(config, result), formats, result.optimized)
     total = time.perf_counter() - began
@@ -117,17 +116,6 @@ def _show_optimum(out: Console, result, constraints) -> None:
         out.print(tables.robustness_table(record, shown))
     if result.cost:
         out.print(result.cost, soft_wrap=True)
-
-
-def _searched(config: Config, progress, stop: threading.Event, checkpoint, runs):
-    """Run the search; return (config, settings chosen for `auto`, result).
-
-    In the returned config, the chosen settings replace `auto`. The result is `None` if the search
-    was stopped before the baseline was simulated. `progress`: function as from `_progress`, or
-    `None`; `stop`: event that stops the search; `checkpoint`: file for the evaluations; `runs`:
-    where they run."""
-    how = progress, stop, checkpoint, runs
-    return searched(config, lambda given: search_of(given, *how), stop)
 
 
 def _contradiction(config: Config, folder: RunFolder, result) -> cli.Outcome:
@@ -234,7 +222,7 @@ def _interrupted(result) -> str:
     )
 
 
-def _write(folder, config, options, result, choice, sheets, compiled, ran) -> None:
+def _write(folder, config, options, result, alike, sheets, compiled, ran) -> None:
 
     records = {"baseline": result.baseline, "optimized": result.optimized}
     if result.nominal is not None:
@@ -258,7 +246,7 @@ def _write(folder, config, options, result, choice, sheets, compiled, ran) -> No
     rows = result.history
     if rows:
         folder.write_csv("history.csv", {key: [row[key] for row in rows] for key in rows[0]})
-    data |= choice
+    data |= alike
     if result.beginning is not None:
         data["beginning"] = result.beginning.record()
         data |= outline_report.record(config)

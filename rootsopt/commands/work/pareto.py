@@ -4,7 +4,6 @@ import argparse
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, closing
-from typing import Any
 
 from rich.console import Console
 
@@ -18,7 +17,6 @@ from rootsopt.output.runs import RunFolder
 from rootsopt.runtime.environment import say
 from rootsopt.runtime.timing import CompileClock
 from rootsopt.scene import check_geometry
-from rootsopt.tradeoffs.front import Front
 from rootsopt.tradeoffs.trace import Tracer
 
 
@@ -38,7 +36,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
         _progress(Console(stderr=True)) as progress,
         closing(checkpoint_of("pareto", config, options, folder)) as checkpoint,
     ):
-        config, choice, front = _traced(config, progress, stop, runs, checkpoint)
+        front = searched(lambda: Tracer(config, progress, stop, runs, checkpoint), stop)
     if not stop.is_set():  # A stopped search can go on later.
         folder.remove_afterwards(folder.checkpoint)
     if front is None:
@@ -49,7 +47,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     record["statistics"] |= seconds
     files.write_config(folder, config)
     fronts.write_front(folder, front)
-    folder.write_json("result.json", choice | record | {"versions": files.versions()})
+    folder.write_json("result.json", record | {"versions": files.versions()})
     if front.points and not options.no_figures:
         front_figure(folder, front)
         if page.available():
@@ -73,15 +71,6 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
 
     found = front.certified > 0 and not front.interrupted
     return cli.Outcome(cli.OK if found else cli.NO_RESULT, show)
-
-
-def _traced(config: Config, *how) -> "tuple[Config, dict[str, Any], Front | None]":
-    """Trace the front; return (config, settings chosen for `auto`, front).
-
-    `how`: further arguments of `Tracer`, the event that stops it second. In the returned config,
-    the chosen settings replace `auto`. The front is `None` if the search was stopped before the
-    baseline was evaluated."""
-    return searched(config, lambda given: Tracer(given, *how), how[1])
 
 
 def _progress(console) -> "AbstractContextManager[Callable[..., None] | None]":

@@ -17,7 +17,6 @@ from rootsopt.optimize.search import until_stopped
 from rootsopt.output import files
 from rootsopt.output.runs import RunFolder
 from rootsopt.response.checkpoint import Checkpoint
-from rootsopt.response.choice import resolve
 from rootsopt.runtime.environment import say
 from rootsopt.runtime.journal import Journal, header_of, set_aside
 from rootsopt.status import Status
@@ -70,25 +69,18 @@ def opened(make: Callable[[Path, bool], J], options: argparse.Namespace, folder:
     return found
 
 
-def searched(
-    config: Config, make: "Callable[[Config], Searches[Found]]", stop: threading.Event
-) -> "tuple[Config, dict[str, Any], Found | None]":
-    """Run the search that `make` returns for a config; return (config, chosen settings, outcome).
+def searched(make: "Callable[[], Searches[Found]]", stop: threading.Event) -> "Found | None":
+    """Run the search that `make` returns, and return its outcome.
 
-    In the config that `make` gets and that is returned, the chosen settings replace `auto`. The
-    outcome is `None` if `stop`, an event that stops the search, came before the baseline was known.
-    """
-    state: dict[str, Any] = {"config": config, "choice": {}}
+    It is `None` if `stop`, an event that stops the search, came before the baseline was known."""
+    made: list[Searches[Found]] = []
 
     def work():
-        state["config"], state["choice"] = resolve(config)
-        state["search"] = make(state["config"])
-        return state["search"].run()
+        made.append(make())
+        return made[0].run()
 
     found = until_stopped(work, stop, PATIENCE)
-    if found is None and "search" in state:
-        found = state["search"].so_far()
-    return state["config"], state["choice"], found
+    return made[0].so_far() if found is None and made else found
 
 
 def nothing_known(

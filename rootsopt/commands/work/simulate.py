@@ -13,7 +13,6 @@ from rootsopt.measured import report as outline_report
 from rootsopt.output import files, tables
 from rootsopt.output.runs import RunFolder
 from rootsopt.pump.sheet import check_clearances, record_of, warnings
-from rootsopt.response.choice import resolve
 from rootsopt.response.evaluators import evaluator_for
 from rootsopt.response.speeds import alone
 from rootsopt.scene import check_geometry, outline_mm
@@ -27,13 +26,12 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     check_geometry(config)
     check_clearances(config)
     with cli.waiting(Console(stderr=True), "compiling and simulating"):
-        config, choice = resolve(config)
         evaluation = evaluator_for(alone(config))()
     files.write_config(folder, config)
     folder.write_csv("profile_design.csv", files.profile_columns(outline_mm(config)))
     if evaluation.series is not None:
         folder.write_csv("response_design.csv", files.response_columns(evaluation.series))
-    data = evaluation.record() | choice | outline_report.record(config)
+    data = evaluation.record() | outline_report.record(config)
     weighed = config.pump is not None or config.scene.bearings is not None
     if weighed:
         data["pump"] = record_of(config, [*evaluation.design.values()])

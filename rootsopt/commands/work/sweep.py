@@ -14,7 +14,6 @@ from rootsopt.figures.speeds import speed_figure
 from rootsopt.output import files, tables
 from rootsopt.output.runs import RunFolder
 from rootsopt.response import speeds
-from rootsopt.response.choice import resolve
 from rootsopt.response.evaluators import evaluator_for
 from rootsopt.scene import check_geometry, design_keys, design_vector
 
@@ -31,7 +30,6 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     refuse_options(options)
     check_geometry(config)
     with _progress(Console(stderr=True)) as progress:
-        config, choice = resolve(config)
         evaluator = evaluator_for(speeds.alone(config)).without_gradient()
         parts = speeds.sweep(evaluator, speeds.swept_speeds(config), progress=progress)
     rows = [part.row() for part in parts]
@@ -46,7 +44,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
         "message": message,
         "versions": files.versions(),
     }
-    folder.write_json("result.json", choice | data)
+    folder.write_json("result.json", data)
     if not options.no_figures:
         name = config.profile.family.upper()
         speed_figure(folder, {name: parts}, f"Contact force of the {name} pair over speed")

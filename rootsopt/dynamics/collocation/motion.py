@@ -63,7 +63,7 @@ def closed_orbit(
     `measures`, `max_orbit`. The result's `flow` has neither samples nor steps."""
     known, neighbour = start
     integrator, measures = settings.orbit, settings.measures
-    tolerance = integrator.tolerance(pair.angle_scale.dtype)
+    tolerance = integrator.tolerance
     equation = CollocatedEquation(pair, measures, lax.stop_gradient(pair.force_scale))
     closed = close(equation, tangents, known, neighbour, ACCURACY * tolerance)
     found, sound = closed.found, closed.sound & known.sound

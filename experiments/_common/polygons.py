@@ -1,35 +1,17 @@
 """Gap between the nodes of one outline and the segments of another: Eq. 9 of the paper.
 
-Tests use this method as the reference for the fast search. The method is slow, but assumes neither
-roll angles nor conjugacy: it needs only a closed outline and a pose. The module uses only NumPy and
-SciPy, and its results have no derivatives.
+Tests and studies use this method as the reference for the fast search. The method is slow, but
+assumes neither roll angles nor conjugacy: it needs only a closed outline and a pose. The module uses
+only NumPy and SciPy.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from rootsopt.profiles import place_pair
+
 Points = NDArray[np.float64]
-
-
-def _rotate(points: Points, angle: float) -> Points:
-    cos, sin = np.cos(angle), np.sin(angle)
-    return points @ np.array([[cos, sin], [-sin, cos]])
-
-
-def place_pair(
-    outline: Points, lobes: int, center_distance: float, phi1: float, phi2: float
-) -> tuple[Points, Points]:
-    """Return both outlines (n, 2) in the fixed frame: rotor 1 at the origin, rotor 2 at (E, 0).
-
-    `outline` (n, 2): closed outline of both rotors, with a lobe tip on +x. E is `center_distance`;
-    `lobes`: number of lobes; `phi1`, `phi2`: rotations φ1 and φ2 (rad). Rotations are positive in
-    each rotor's own direction of rotation, so that rotor 2 is the mirror image. At φ1 = φ2 = 0 a
-    lobe of rotor 1 points at a valley of rotor 2. All lengths have the unit of `outline`.
-    """
-    first = _rotate(outline, phi1)
-    second = _rotate(outline, phi2 + np.pi / lobes) * [-1.0, 1.0]
-    return first, second[::-1] + np.array([center_distance, 0.0])
 
 
 def signed_distance(nodes: Points, outline: Points, refine: bool = True) -> NDArray[np.float64]:
