@@ -1,8 +1,8 @@
 """Gap between the nodes of one outline and the segments of another: Eq. 9 of the paper.
 
 Tests and studies use this method as the reference for the fast search. The method is slow, but
-assumes neither roll angles nor conjugacy: it needs only a closed outline and a pose. The module uses
-only NumPy and SciPy.
+assumes neither roll angles nor conjugacy: it needs only a closed outline and a pose. The module
+uses only NumPy and SciPy.
 """
 
 import numpy as np

@@ -1,7 +1,6 @@
-"""Tests of the contact fidelities: exactness of the search, stated errors, the automatic choice."""
+"""Tests of the exactness of the search, and of batches."""
 
 import dataclasses
-import itertools
 
 import equinox as eqx
 import jax
@@ -10,8 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from rootsopt.contact.map import MapContact
-from rootsopt.contact.size import RELATIVES, ROLLS, size_map
 
 from experiments._common.polygons import pair_gap
 from rootsopt.config import load, parse
@@ -19,10 +16,8 @@ from rootsopt.contact.closest import FlankPair
 from rootsopt.errors import InputError
 from rootsopt.profiles import CIC, EE, FreeForm
 from rootsopt.profiles.validity import margins
-from rootsopt.response import choice
 from rootsopt.response.batch import coarse, respond_many
 from rootsopt.response.evaluation import Evaluator
-from rootsopt.scene import Scene, design_vector
 from rootsopt.scene.families import check, profile_of
 from rootsopt.status import Status
 
@@ -250,47 +245,7 @@ def test_second_derivatives_are_those_of_the_gap(name):
         )
 
 
-# The map
-
-
-@given(
-    angle=st.floats(26.0, 42.0),
-    share=st.floats(0.15, 0.95),
-    tip=st.floats(0.5, 5.0),
-    deepest=st.floats(-2e-3, -1e-4),
-)
-def test_map_keeps_its_stated_error(angle, share, tip, deepest):
-    """A map sized for an error meets it at poses other than the probed ones."""
-    longest = R * np.sin(angle * DEG) * (np.pi / 6 - tip * DEG)
-    profile = CIC(3, R, angle * DEG, share * longest, tip * DEG)
-    size = size_map(profile, deepest, 4e-7)
-    assert size.rolls in ROLLS
-    assert size.relatives in RELATIVES
-    assert size.enough == (size.error <= 4e-7)
-    rng = np.random.default_rng(2)
-    x = jnp.asarray(rng.uniform(0.0, float(profile.half_pitch), 3000))
-    relative = jnp.asarray(deepest * rng.uniform(0.0, 1.0, 3000))
-    table = tabulate(profile, jnp.asarray(deepest), size.rolls, size.relatives)
-    made = table_gap(table, x, relative)
-    true = closest(FlankPair.of(profile), x, relative)
-    # Cells next to the start of contact are not counted (see `size_map`).
-    inside = np.asarray(true.found) & (np.asarray(true.gap) < -0.05 * R * abs(deepest))
-    assert np.max(np.abs(made - true.gap), where=inside, initial=0.0) < 2 * max(size.error, 4e-7)
-
-
-tabulate = eqx.filter_jit(MapContact.of)
-table_gap = eqx.filter_jit(lambda table, x, e: jax.vmap(lambda a, b: table(a, b)[0])(x, e))
-
-
-def test_a_smaller_error_needs_no_smaller_map():
-    """The size grows as the error falls. An error that cannot be met is reported."""
-    sizes = [size_map(PAPER, -4e-4, error) for error in (1e-6, 1e-7, 1e-8, 1e-9, 1e-13)]
-    assert all(a.rolls <= b.rolls for a, b in itertools.pairwise(sizes[:-1]))
-    assert sizes[0].enough
-    assert not sizes[-1].enough
-
-
-# Precision, batches
+# Batches
 
 
 @pytest.fixture(scope="module")
@@ -298,26 +253,6 @@ def default():
     """Return evaluator and evaluation of the shipped scene."""
     evaluator = Evaluator.of(load("configs/cic.yaml"))
     return evaluator, evaluator(series=False)
-
-
-@pytest.mark.long
-def test_single_precision(default):
-    """float32 reaches forces to 1e-4 and the gradient of the mean to 1 %, and results are float32.
-
-    The contact is the map, which is tabulated in double precision. A gap searched for in single
-    precision is a difference of lengths ten thousand times as large."""
-    overrides = ["solver.precision=float32", "solver.fidelity=map"]
-    evaluator = Evaluator.of(load("configs/cic.yaml", overrides))
-    single, double = evaluator(series=False), default[1]
-    pair = evaluator.scene.pair(design_vector(evaluator.config))
-    leaves = jax.tree.leaves(eqx.filter(pair, eqx.is_inexact_array))
-    assert {leaf.dtype for leaf in leaves} == {np.dtype("float32")}
-    assert single.status is Status.PERIODIC
-    for key, value in double.response.items():
-        assert single.response[key] == pytest.approx(value, rel=1e-4)
-    for key, value in double.gradient["mean_force_N"].items():
-        largest = max(map(abs, double.gradient["mean_force_N"].values()))
-        assert single.gradient["mean_force_N"][key] == pytest.approx(value, abs=0.01 * largest)
 
 
 DESIGNS = jnp.array([[36.43, 9.0, 4.0], [28.0, 3.0, 1.5], [30.0, 4.0, 2.0]])
@@ -364,72 +299,3 @@ def test_batch_at_a_coarse_tolerance(default):
     np.testing.assert_allclose(loose.response, fine.response, rtol=1e-6)
     largest = np.max(np.abs(fine.gradient), axis=2, keepdims=True)
     assert np.max(np.abs(loose.gradient - fine.gradient) / largest) < 1e-3
-
-
-# The choice
-
-
-@pytest.mark.parametrize("wanted", [1e-2, 1e-4])
-def test_auto_meets_the_request(wanted):
-    """The chosen settings agree with search at 1e-10 within the request."""
-    overrides = [f"solver.accuracy={wanted}", "solver.fidelity=auto"]
-    config = load("configs/cic.yaml", overrides)
-    chosen = choice.choose(config)
-    record = chosen.record()
-    assert record["fidelity"] in ("linear", "map", "search")
-    assert record["estimated_error"] <= wanted
-    found = Evaluator.of(chosen.config)(series=False)
-    sharp = ["solver.fidelity=search", "solver.method=dopri8", "solver.rtol=1e-10"]
-    truth = Evaluator.of(load("configs/cic.yaml", sharp))(series=False)
-    error = choice.difference(found, truth)
-    assert error is not None
-    assert error <= wanted
-    assert error <= 2 * record["estimated_error"] + 1e-7
-
-
-def test_auto_must_be_resolved_before_use():
-    """The message for a pair of a config with `auto` names the function to call."""
-    config = load("configs/cic.yaml", ["solver.fidelity=auto"])
-    with pytest.raises(InputError, match=r"choice\.choose"):
-        Scene.from_config(config).pair(design_vector(config))
-
-
-@pytest.mark.parametrize("settles", [True, False])
-def test_auto_looks_more_closely_at_what_does_not_settle(monkeypatch, settles):
-    """A motion that does not settle in the reference is tried again at a hundredth of its
-    tolerance."""
-    asked = []
-
-    @dataclasses.dataclass
-    class Stub:
-        config: object
-
-        @classmethod
-        def of(cls, config):
-            return cls(config)
-
-        def __call__(self, series):
-            asked.append(self.config.solver.orbit_tolerance)
-            fine = settles and asked[-1] < 1e-8
-            found = outcome if fine else dataclasses.replace(outcome, status=Status.NOT_SETTLED)
-            return dataclasses.replace(found, statistics={"transient_mesh_periods": 4})
-
-    outcome = choice.Evaluation(
-        design={},
-        geometry={},
-        response={"mean_force_N": 1.0, "peak_force_N": 2.0},
-        gradient={},
-        steady_state={},
-        status=Status.PERIODIC,
-        message="",
-        statistics={},
-        series=None,
-    )
-    monkeypatch.setattr(choice, "Evaluator", Stub)
-    chosen = choice.choose(
-        load("configs/cic.yaml", ["solver.fidelity=auto", "solver.accuracy=1e-3"])
-    )
-    assert asked[:2] == pytest.approx([1e-7, 1e-9])
-    assert chosen.config.solver.rtol == pytest.approx(1e-9)
-    assert chosen.config.solver.fidelity == "search"
-    assert (chosen.error is None) == (not settles)

@@ -1,10 +1,8 @@
-"""Tests of small parts of the contact, against closed forms and an independent interpolation."""
+"""Tests of small parts of the contact, against closed forms."""
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from rootsopt.contact.map import MARGIN
-from rootsopt.contact.size import _smallest
 
 from experiments._common.polygons import signed_distance
 from rootsopt.contact.search import SearchContact
@@ -43,28 +41,3 @@ def test_distance_from_a_circle_of_few_nodes():
         errors.append(np.max(np.abs(cubic - (radii - 1))))
         assert errors[-1] < 0.02 * sagitta
     assert errors[0] / errors[1] == pytest.approx(16, rel=0.2)
-
-
-def test_error_of_a_map_is_what_its_spline_leaves():
-    """The stated error of a map is the greatest difference between a fine sampling and its spline.
-
-    The spline goes through the map's own points, where the flanks overlap. The interpolation here
-    is independent."""
-    from scipy.interpolate import make_interp_spline
-
-    points = np.linspace(0.0, 1.0, 3073)
-    lines = np.stack([-1 - 0.3 * np.cos(9 * points), -2 - 0.1 * np.sin(25 * points)])
-    exact = [lambda x: -1 - 0.3 * np.cos(9 * x), lambda x: -2 - 0.1 * np.sin(25 * x)]
-    for asked in (1e-4, 1e-5, 1e-6):
-        count, error = _smallest(
-            (12, 24, 48, 96, 192), 0.0, 1.0, (jnp.asarray(points), jnp.asarray(lines)), asked
-        )
-        assert error <= asked
-        # Some points of a map lie beyond the range; those within it are a uniform grid.
-        step = 1.0 / (count - 1 - MARGIN)
-        knots = step * np.arange(count - MARGIN)
-        left = [
-            np.max(np.abs(make_interp_spline(knots, f(knots), bc_type="not-a-knot")(points) - line))
-            for f, line in zip(exact, lines, strict=True)
-        ]
-        assert error == pytest.approx(max(left), rel=1e-3)

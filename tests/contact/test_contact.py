@@ -1,6 +1,4 @@
-"""Tests of closest approach, its map, the IMPACT law and the timing gear (SI units)."""
-
-import functools
+"""Tests of closest approach, the IMPACT law and the timing gear (SI units)."""
 
 import equinox as eqx
 import jax
@@ -9,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from rootsopt.contact.map import MapContact
 
 from experiments._common.polygons import pair_gap
 from rootsopt.contact import FlankPair, ImpactLaw, ramp, smooth_step
@@ -241,6 +238,21 @@ def test_design_derivatives_of_gap_and_levers(involute):
     np.testing.assert_allclose(backward, scaled, rtol=0, atol=1e-12 * R)
 
 
+@pytest.mark.parametrize("fraction", [0.7, 1.0, 1.012])
+def test_design_derivatives_are_finite_at_joints(fraction):
+    """At joints, at the ends of contact and beside them, derivatives are numbers in both modes.
+
+    The centre of the tip arc lies inside, on or outside the pitch circle."""
+    profile = cic(3, 0.62, fraction, 0.06)
+    half, start = profile.half_pitch, float(profile.involute_start)
+    joints = np.array([0.0, 0.06, start, half, 2 * half - start, 2 * half - 0.06, 2 * half, -half])
+    rolls = np.resize((joints[:, None] + [0.0, 1e-16, -1e-16, 1e-9, -1e-9]).ravel(), 41)
+    design = jnp.array([0.62, profile.involute_length, 0.06])
+    for relative in (0.0, -2e-4):
+        at = design, jnp.asarray(rolls), jnp.full(41, relative)
+        assert np.all(np.isfinite([forward(*at), reverse(*at)]))
+
+
 @every_profile
 def test_no_pose_gives_nan(profile):
     """Gap, levers and slopes are finite for any roll, however large, and for any ε."""
@@ -254,172 +266,6 @@ def test_no_pose_gives_nan(profile):
     missed = ~np.asarray(found.found)
     assert np.all(np.asarray(found.gap)[missed] > 0)
     assert np.all(np.asarray(found.lever1)[missed] == 0)
-
-
-# The map
-
-DEEPEST = -4e-3
-
-
-@eqx.filter_jit
-def _tabulate(profile, rolls, relatives):
-    return MapContact.of(profile, jnp.asarray(DEEPEST), rolls, relatives)
-
-
-@functools.cache
-def tabulate(name, rolls, relatives):
-    """Return the map of a profile, made once."""
-    return _tabulate(PROFILES[name], rolls, relatives)
-
-
-@eqx.filter_jit
-def _look_up(table, rolls, relatives):
-    return jax.vmap(table)(rolls, relatives)
-
-
-def look_up(table, rolls, relatives):
-    """Return gap and levers from a map at many poses."""
-    return over_poses(_look_up, table, rolls, relatives)
-
-
-@eqx.filter_jit
-def _map_slopes(table, rolls, relatives):
-    slopes = jax.grad(lambda x, e: table(x, e)[0], (0, 1))
-    bends = jax.jacfwd(slopes, (0, 1))
-    return jax.vmap(slopes)(rolls, relatives), jax.vmap(bends)(rolls, relatives)
-
-
-def map_slopes(table, rolls, relatives):
-    """Return first and second derivatives of the map's gap with respect to the pose."""
-    return over_poses(_map_slopes, table, rolls, relatives)
-
-
-def mesh_grid(lobes, deepest=DEEPEST):
-    """Return poses in contact over the mesh, away from the nodes of any map."""
-    rolls = np.linspace(-0.01, np.pi / lobes + 0.01, 156)
-    relatives = deepest * np.linspace(0.013, 0.987, 23)
-    return (a.ravel() for a in np.meshgrid(rolls, relatives))
-
-
-def torque_errors(name, sizes):
-    """Return the relative RMS error of the contact torque on rotor 2 for maps of several sizes."""
-    rolls, relatives = mesh_grid(PROFILES[name].lobes)
-    exact = approach(PROFILES[name], rolls, relatives)
-
-    def torque(gap, lever):
-        return np.maximum(0, -gap) ** 2.2 * lever
-
-    reference = torque(exact.gap, exact.lever2)
-    errors = []
-    for size in sizes:
-        gap, _, lever2 = look_up(tabulate(name, *size), rolls, relatives)
-        errors.append(np.sqrt(np.mean((torque(gap, lever2) - reference) ** 2)))
-    return np.array(errors) / np.sqrt(np.mean(reference**2))
-
-
-@pytest.mark.parametrize("name", ["paper", "short involute", "ee three"])
-def test_torque_from_the_default_map_is_accurate(name):
-    """With 128 × 24 points, the RMS error of the torque is below 5e-4 of the search's torque."""
-    assert torque_errors(name, [(128, 24)])[0] < 5e-4
-
-
-@pytest.mark.parametrize("name", ["paper", "short involute"])
-def test_map_approaches_the_search_when_refined(name):
-    """The torque error falls as the map grows."""
-    coarse, default, fine = torque_errors(name, [(64, 12), (128, 24), (256, 48)])
-    # Curvature jumps allow second order on average; the single steps scatter with where
-    # the jumps lie between the points.
-    assert coarse > default > fine
-    assert fine < coarse / 8
-
-
-few_maps = pytest.mark.parametrize("name", ["paper", "ee three"])
-
-
-@few_maps
-def test_levers_of_the_map_are_derivatives_of_its_gap(name):
-    """Levers and gap of the map agree to rounding, so that forces come from a potential."""
-    table = tabulate(name, 128, 24)
-    rolls, relatives = mesh_grid(PROFILES[name].lobes)
-    _, lever1, lever2 = look_up(table, rolls, relatives)
-    (by_roll, by_relative), _ = map_slopes(table, rolls, relatives)
-    np.testing.assert_allclose(lever1 - lever2, by_roll, rtol=0, atol=1e-12)
-    np.testing.assert_allclose((lever1 + lever2) / 2, by_relative, rtol=0, atol=1e-12)
-
-
-@few_maps
-def test_map_is_twice_continuously_differentiable(name):
-    """Gap, slopes and second derivatives do not jump at the nodes of the map."""
-    table = tabulate(name, 64, 12)
-    nodes = np.asarray(table.first_roll + table.roll_step * np.arange(1, 60))
-    depths = np.asarray(table.deepest + table.relative_step * np.arange(1, 8))
-    tiny = 1e-10
-    for x, e, dx, de in (
-        (nodes, np.full(59, 0.37 * DEEPEST), tiny, 0.0),
-        (np.full(7, 0.41), depths, 0.0, tiny),
-    ):
-        before = look_up(table, x - dx, e - de), *map_slopes(table, x - dx, e - de)
-        after = look_up(table, x + dx, e + de), *map_slopes(table, x + dx, e + de)
-        for left, right in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True):
-            scale = max(R, float(np.abs(left).max()))
-            # Third derivatives are up to 1e3 times the second, over 2e-10.
-            np.testing.assert_allclose(left, right, rtol=0, atol=1e-6 * scale)
-
-
-@few_maps
-def test_map_is_smooth_where_it_is_folded(name):
-    """In the middle of the flank, where the map is mirrored, the slope over roll vanishes."""
-    half = float(PROFILES[name].half_pitch)
-    table = tabulate(name, 128, 24)
-    relatives = DEEPEST * np.linspace(0.05, 1, 9)
-    (by_roll, _), _ = map_slopes(table, np.full(9, half - 1e-9), relatives)
-    # Relative to levers of order r: a trajectory there meets no kink above the map's error.
-    np.testing.assert_allclose(by_roll, 0, atol=1e-5 * R)
-
-
-@few_maps
-def test_map_has_the_symmetry_and_period_of_the_flank(name):
-    """x → π/N - x exchanges the levers; 2π/N is a period."""
-    table = tabulate(name, 64, 12)
-    rolls, relatives = (a[::7] for a in mesh_grid(PROFILES[name].lobes))
-    gap, lever1, lever2 = look_up(table, rolls, relatives)
-    whole = np.pi / PROFILES[name].lobes
-    swapped = look_up(table, whole - rolls, relatives)
-    later = look_up(table, rolls - 4 * whole, relatives)
-    for other in (swapped[0], later[0]):
-        np.testing.assert_allclose(other, gap, rtol=0, atol=1e-14)
-    np.testing.assert_allclose(swapped[2], lever1, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(later[2], lever2, rtol=0, atol=1e-12)
-
-
-@few_maps
-def test_map_goes_on_linearly_below_its_deepest(name):
-    """Below `deepest` the gap is continued along its tangent in ε."""
-    table = tabulate(name, 64, 12)
-    rolls = np.linspace(0.1, 0.9, 17)
-    gap, lever1, lever2 = look_up(table, rolls, np.full(17, DEEPEST))
-    tangent = (lever1 + lever2) / 2
-    for beyond in (1e-4, 1e-2, 0.3):
-        below, lower1, lower2 = look_up(table, rolls, np.full(17, DEEPEST - beyond))
-        np.testing.assert_allclose(below, gap - tangent * beyond, rtol=1e-10)
-        np.testing.assert_allclose((lower1 + lower2) / 2, tangent, rtol=1e-10)
-
-
-def test_design_derivative_of_the_map_is_that_of_the_search():
-    """The derivative of the table is the envelope derivative at its nodes."""
-    design = jnp.array([36.43 * DEG, 8.0e-3, 4.0 * DEG])
-    rolls, relatives = jnp.linspace(0.15, 0.9, 31), jnp.full(31, -1.3e-3)
-
-    def tabulated(design):
-        profile = CIC(3, R, design[0], design[1], design[2])
-        table = MapContact.of(profile, jnp.asarray(DEEPEST), 128, 12)
-        return jax.vmap(table)(rolls, relatives)[0]
-
-    by_map = jax.jit(jax.jacfwd(tabulated))(design) * design
-    by_search = forward(design, rolls, relatives)[:, 0] * design
-    error = np.abs(by_map - by_search).max()
-    # The derivative of a gap with curvature jumps has kinks: first order in the cell.
-    assert error < 2e-2 * np.abs(by_search).max()
 
 
 # Rounded corners

@@ -391,3 +391,40 @@ def test_geometry_maps_over_designs():
         single = measure(CIC(3, R, alpha[i], 8e-3, tip[i]))
         for many, one in zip(jax.tree.leaves(mapped), jax.tree.leaves(single), strict=True):
             np.testing.assert_allclose(many[i], one, rtol=1e-12)
+
+
+# The inverse of the roll angle
+
+
+@pytest.mark.parametrize("name", [n for n in profiles() if n not in ("paper", "longest involute")])
+def test_normal_at_inverts_the_roll_angle(name):
+    """ν(β(ν)) = ν from the tip to the pitch point."""
+    profile = profiles()[name]
+    nu = jnp.linspace(0, float(profile.pitch_normal), 301)
+    np.testing.assert_allclose(profile.normal_at(profile.roll_angle(nu)), nu, atol=1e-12)
+
+
+def test_involute_is_preferred_where_the_roll_angle_turns_back():
+    """For u > u_max, ψ = α from the start of the involute, which lies before the end of the arc."""
+    profile = paper()
+    start, tip = float(profile.involute_start), float(profile.tip_arc_angle)
+    assert start < tip
+    beta = jnp.linspace(start, tip, 21)
+    psi = beta + np.pi / 2 - profile.normal_at(beta)
+    np.testing.assert_allclose(psi, profile.pressure_angle, atol=1e-12)
+    land = jnp.linspace(0, start - 1e-9, 21)
+    np.testing.assert_array_equal(profile.normal_at(land), land)
+
+
+def test_arc_shrinks_to_an_instant_as_its_center_nears_the_pitch_circle():
+    """As c → r, the arc's normals mesh within a roll angle that tends to zero."""
+    for short in (1e-3, 1e-6, 1e-9):
+        profile = cic(3, 0.62, 1 - short, 0.06)
+        start, stop = float(profile.tip_arc_angle), float(profile.involute_start)
+        beta = start + (stop - start) * jnp.linspace(0, 1, 11)
+        normal = profile.normal_at(beta)
+        assert np.all(np.diff(normal) > 0)
+        # β has an absolute rounding of 1e-17, here shared out over the arc.
+        tolerance = 1e-12 + 1e-15 / short
+        np.testing.assert_allclose(profile.roll_angle(normal), beta, atol=1e-13)
+        np.testing.assert_allclose(normal[-1], profile.arc_end, atol=tolerance)
