@@ -26,8 +26,6 @@ SMALL = [
     "--set", "optimizer.screening=2",
     "--set", "optimizer.starts=1",
     "--set", "optimizer.iterations=2",
-    "--set", "solver.map_rolls=96",
-    "--set", "solver.map_relatives=16",
 ]  # fmt: skip
 
 

@@ -76,7 +76,7 @@ def test_minimal_config_loads_with_its_values_and_defaults():
     assert config.scene.load.torque_N_m == 1.0
     assert config.scene.timing_gear is None
     assert config.contact.clearance_mm == 0.0
-    assert config.solver.fidelity == "search"
+    assert config.solver.method == "tsit5"
 
 
 def test_whole_numbers_serve_as_numbers():
@@ -333,8 +333,8 @@ def test_nan_and_infinity_are_refused(key, value):
     ("key", "choices"),
     [
         ("profile.family", ("cic", "ee")),
-        ("solver.fidelity", ("search", "map")),
-        ("solver.method", ("tsit5", "dopri5")),
+        ("solver.method", ("tsit5", "dopri8")),
+        ("solver.orbit", ("collocation", "shooting")),
         ("scene.drive", ("prescribed",)),
         ("optimizer.method", ("adam",)),
     ],
@@ -481,9 +481,8 @@ def test_hint_is_given_only_where_it_fits(value):
 
 
 CHOICES = [
-    ("solver.fidelity", "search", ("SEARCH", "Search", " search ", "Sea-rch")),
-    ("solver.precision", "float32", ("Float32", "FLOAT-32", "float 32")),
-    ("solver.gradient", "reverse", ("Reverse",)),
+    ("solver.orbit", "shooting", ("SHOOTING", "Shooting", " shooting ", "Shoo-ting")),
+    ("solver.method", "dopri8", ("Dopri8", "DOPRI-8", "dopri 8")),
     ("optimizer.method", "rmsprop", ("RMSprop", "RMS prop", "rms-prop")),
     ("objective.motion", "worst", ("WORST",)),
     ("scene.drive", "prescribed", ("Prescribed",)),
@@ -648,6 +647,36 @@ def test_key_given_twice_is_refused(text, key):
     assert "twice" in message
 
 
+# Keys and values of former versions
+
+FORMER = {
+    "fidelity": ("search", "map"),
+    "nodes": ("400", "100"),
+    "map_error": ("1e-4", "1e-3"),
+    "map_rolls": ("null", "96"),
+    "map_relatives": ("null", "16"),
+    "gradient": ("forward", "reverse"),
+    "precision": ("Float64", "float32"),
+}
+
+
+def test_removed_keys_are_accepted_only_where_they_change_nothing():
+    """A resolved config of a former version loads. Any other value gets a sentence on its own."""
+    given = [f"solver.{key}={default}" for key, (default, _) in FORMER.items()]
+    config = parse(MINIMAL, given)
+    assert config == parse(MINIMAL)
+    assert not FORMER.keys() & config.model_dump()["solver"].keys()
+    for key, (_, other) in FORMER.items():
+        message = refusal(MINIMAL, f"solver.{key}={other}")
+        assert f"`solver.{key}` must be left out, but is" in message
+        assert "remove it, and set `solver.accuracy`" in message
+    for key, (_, other) in FORMER.items():
+        with pytest.raises(InputError, match=f"`solver.{key}` must be left out"):
+            config.replaced({f"solver.{key}": other})
+    for method in ("dopri5", "kvaerno3", "Kvaerno-5"):
+        assert "was removed" in refusal(MINIMAL, f"solver.method={method}")
+
+
 # Overrides
 
 
@@ -661,14 +690,14 @@ def test_overrides_replace_and_create_nested_keys():
             "scene.speed_rpm=1000",
             "scene.speed_rpm = 1500",
             "constraints.area_efficiency_min=0.4",
-            "solver.fidelity=search",
+            "solver.orbit=shooting",
         ],
     )
     assert config.scene.timing_gear is not None
     assert config.scene.timing_gear.stiffness_N_m_per_rad == 2e4
     assert config.scene.speed_rpm == 1500.0
     assert config.constraints.area_efficiency_min == 0.4
-    assert config.solver.fidelity == "search"
+    assert config.solver.orbit == "shooting"
 
 
 def test_override_can_take_a_part_away():

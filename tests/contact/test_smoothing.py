@@ -63,7 +63,6 @@ def test_smoothing_length_follows_the_scene():
     assert length_of(stiff) == pytest.approx(min(1e-4, 0.02 * depth), rel=0.05)
     assert length_of("contact.full_damping_depth_mm=2e-4") == pytest.approx(2e-5)
     assert length_of("scene.load.torque_N_m=0") == pytest.approx(1e-6)
-    assert length_of("scene.load.torque_N_m=0", "solver.precision=float32") == pytest.approx(1e-5)
     for given, found in (("auto", 1e-4), ("3e-5", 3e-5), ("0", 0.0)):
         assert length_of(f"contact.smoothing_mm={given}") == found
     assert f"smoothing_mm: {length_of(*STIFF)!r}" in load("configs/cic.yaml", STIFF).to_yaml()

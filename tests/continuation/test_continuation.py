@@ -312,9 +312,6 @@ def test_wrong_input_is_explained(branch):
     assert parameters(bare) == ("speed_rpm", "torque_N_m")
     with pytest.raises(InputError, match="no timing gear"):
         value_of(bare, "backlash_mm")
-    single = load("configs/cic.yaml", ["solver.precision=float32", "solver.rtol=1e-5"])
-    with pytest.raises(InputError, match="float64"):
-        follow(single, "speed_rpm", state, 1, StepSizes(300, 6000))
 
 
 def test_a_design_ends_where_no_profile_can_be_made(branch):

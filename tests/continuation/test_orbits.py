@@ -45,7 +45,7 @@ def test_longest_gap_of_an_orbit_is_in_mesh_periods(monkeypatch, period):
     subject = object.__new__(orbits.OrbitFamily)
     subject.period, subject.unit, subject.width = period, 1e-3, 200.0
     subject.limits = StepSizes(100.0, 300.0)
-    subject.scene = types.SimpleNamespace(fidelity="search", pitch_radius=0.033)
+    subject.scene = types.SimpleNamespace(pitch_radius=0.033)
     monkeypatch.setattr(orbits.OrbitFamily, "_check_design", lambda self, value: None)
     monkeypatch.setattr(orbits.OrbitFamily, "_shot", lambda self, *args, **options: shot)
     look = subject(np.array([0.4, -0.2, 0.5 * orbits.SPAN]) / orbits.SPAN, None, False)

@@ -17,7 +17,7 @@ from rootsopt.dynamics.flow import flow, strobe
 from rootsopt.dynamics.integrator import Integrator
 
 jax.config.update("jax_enable_x64", True)
-config = rootsopt.load_config("configs/ee.yaml", ["solver.fidelity=linear"])
+config = rootsopt.load_config("configs/ee.yaml")
 pair = rootsopt.Scene.from_config(config).pair(config.design)
 how = Integrator("tsit5", jnp.asarray(1e-8), 1024)
 state = jnp.zeros(2)

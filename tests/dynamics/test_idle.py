@@ -149,9 +149,9 @@ def test_a_motion_without_contact_that_does_not_repeat_is_idle(exponent):
         (Status.TOO_DEEP, [], "Raise contact.stiffness_N_per_mm_e", "center_distance|wear"),
         (Status.IDLE, ["scene.timing_gear=null"], "scene.load", "clearance|gear"),
         (Status.CHAOTIC, ["scene.timing_gear=null"], "contact.max_damping", "gear|backlash"),
-        (Status.NOT_SETTLED, ["solver.precision=float32"], "to float64", "contact.max"),
-        (Status.UNRESOLVED, [], "solver.accuracy", "precision"),
-        (Status.SOLVER_FAILED, ["solver.method=kvaerno5"], "loosen", "implicit"),
+        (Status.NOT_SETTLED, [], "solver.max_mesh_periods", "contact.max"),
+        (Status.UNRESOLVED, [], "solver.accuracy", "rtol"),
+        (Status.SOLVER_FAILED, ["solver.rtol=1e-7"], "loosen solver.rtol", "accuracy"),
     ],
 )
 def test_advice_names_what_the_scene_has(status, overrides, has, lacks):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import rootsopt
-from rootsopt import InputError, Scene, Status
+from rootsopt import Scene, Status
 from rootsopt.contact.search import SearchContact
 from rootsopt.contact.twisted import TwistedContact, slices_of
 from rootsopt.dynamics.parts import TwistedLoad
@@ -135,16 +135,6 @@ def test_number_of_slices_follows_the_error():
     assert slices_needed(*fixed, np.radians(10), 1e-2) <= counts[1]
     assert scene_of("ee", "rotor.helix_deg=60")[0].slices == counts[1]
     assert scene_of("ee", "rotor.helix_deg=60", "solver.slices=5")[0].slices == 5
-
-
-@pytest.mark.parametrize("fidelity", ["linear", "nodes", "map"])
-def test_other_contacts_are_refused_by_name(fidelity):
-    with pytest.raises(InputError, match=r"must be search \(or auto\) with `rotor.helix_deg`"):
-        scene_of("ee", "rotor.helix_deg=60", f"solver.fidelity={fidelity}")
-    scene, design = scene_of("ee", "rotor.helix_deg=60", "solver.slices=2")
-    other = dataclasses.replace(scene, fidelity=fidelity)
-    with pytest.raises(InputError, match=f"must be search for twisted .* but is {fidelity}"):
-        other.pair(jnp.asarray(design))
 
 
 @pytest.mark.long

@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 from experiments._common.polygons import signed_distance
-from rootsopt.commands import profile, simulate
+from rootsopt.commands import profile
 from rootsopt.config import load
 from rootsopt.design.space import Space
 from rootsopt.errors import InputError
@@ -415,16 +415,11 @@ def test_bore_takes_mass_and_inertia():
     assert "root radius" not in {c.name for c in Space.of(plain, one, 0.4).constraints}
 
 
-def test_bore_must_fit_and_twist_needs_a_contact_that_supports_it(tmp_path, capsys):
+def test_bore_must_fit():
     config = load(ROOT / "configs/ee.yaml", ["rotor.bore_mm=44.0"])
     with pytest.raises(InputError, match=r"`rotor.bore_mm` must be less than 44 .* but is 44"):
         check_geometry(config)
     check_geometry(load(ROOT / "configs/ee.yaml", ["rotor.bore_mm=43.9"]))
-    changes = "rotor.helix_deg=9", "solver.fidelity=linear", "solver.slices=2"
-    sets = [word for change in changes for word in ("--set", change)]
-    assert simulate.main([str(ROOT / "configs/cic.yaml"), "-o", str(tmp_path), *sets]) == 2
-    message = capsys.readouterr().err
-    assert "`solver.fidelity` must be search (or auto) with `rotor.helix_deg`" in message
 
 
 def test_notes_name_the_design():

@@ -397,7 +397,7 @@ DESIGNS: dict[str, dict[str, Any]] = {
 """A sound design of each family at 33 mm and three lobes."""
 UNDRAWN = ("profile.", "scene.", "sweep.", "pareto.", "tolerances.")
 """Sections whose choices are not drawn at random."""
-TIED = ("optimizer.family", "solver.fidelity", "objective.motion", "objective.over_speeds")
+TIED = ("optimizer.family", "objective.motion", "objective.over_speeds")
 """Choices that require certain other keys."""
 OPTIONAL = ("rotor.bore_mm", "contact.friction", "scene.timing_gear", "scene.supports")
 SCATTER = {"rotor.length_mm": {"relative_uniform": 0.01}}
@@ -483,7 +483,6 @@ def _valid(draw: random.Random) -> Case:
         constraints["outer_radius_max_mm"] = min(1e4, low * 1.1 + 1)
         constraints["outer_radius_min_mm"] = min(low, 9e3)
     if any(part not in gone for part in ("contact.friction", "scene.supports")):
-        _set(data, "solver.fidelity", draw.choice(("search", "Auto")))
         data["scene"].pop("center_distance_error_mm", None)
     for part in set(OPTIONAL[1:]) - set(gone):
         _set(data, part, data.get(part.split(".")[0], {}).get(part.split(".")[1], {}))

@@ -25,7 +25,7 @@ from tests.fuzz.report import Report
 ROOT = Path(__file__).parents[2]
 COMMANDS = {
     "profile": ["--export", "dxf,svg"],
-    "simulate": ["--no-figures", "--set", "solver.fidelity=linear"],
+    "simulate": ["--no-figures"],
 }
 _WHOLE = 60
 """Number of cases of which one is a whole command."""

@@ -337,9 +337,7 @@ def test_config_keys(tmp_path):
     (tmp_path / "scene.yaml").write_text(CONFIG.format("points.csv"))
     config = load(tmp_path / "scene.yaml")
     assert config.profile.outline_file == str(path)
-    assert config.solver.fidelity == "search"
     for change, message in (
-        ("solver.fidelity=map", r"search \(or auto\) with `profile.outline_file`"),
         ("profile.outline_file=null", r"`profile.outline_file` is required"),
         ("profile.family=ee", r"`profile.outline_file` does not belong to family ee"),
     ):

@@ -235,8 +235,6 @@ def test_search_improves_within_the_constraints():
         "optimizer.screening=4",
         "optimizer.starts=1",
         "optimizer.iterations=6",
-        "solver.map_rolls=96",
-        "solver.map_relatives=16",
     )
     seen = []
     result = Search(settings, lambda done, expected, best: seen.append((done, best))).run()
@@ -260,8 +258,6 @@ SMALL = (
     "optimizer.screening=4",
     "optimizer.starts=1",
     "optimizer.iterations=6",
-    "solver.map_rolls=96",
-    "solver.map_relatives=16",
 )
 
 

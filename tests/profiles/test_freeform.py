@@ -36,16 +36,15 @@ def made(family, *design):
 
 
 def scene(family, inside, *overrides):
-    """Return the scene of the optimiser's tests with another profile and the linear contact."""
+    """Return the scene of the optimiser's tests with another profile."""
     text = SCENE.replace("family: cic", f"family: {family}").replace(CIC_KEYS, inside)
-    return parse(text, ["solver.fidelity=linear", *overrides])
+    return parse(text, [*overrides])
 
 
 def free(*overrides):
     return scene(
         "free_form",
         f"tip_arc_angle_deg: 2.0, coefficients: {SHARES.tolist()}",
-        "solver.gradient=reverse",
         *overrides,
     )
 
@@ -250,7 +249,7 @@ def test_gradient_of_the_force_agrees_with_central_differences():
     """Reverse mode agrees with differences along a direction in all coefficients.
 
     With a step of 1e-4, differences of second order are good to some 1e-6 of the greatest slope."""
-    evaluator = Evaluator.of(free("solver.rtol=1e-10", "solver.fidelity=search"))
+    evaluator = Evaluator.of(free("solver.rtol=1e-10"))
     design = np.asarray(design_vector(evaluator.config))
     direction = np.random.default_rng(2).normal(size=len(design))
     here = evaluator(jnp.asarray(design), series=False)

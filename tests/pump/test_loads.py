@@ -178,8 +178,6 @@ def test_term_needs_bearings():
     with pytest.raises(InputError, match=r"needs the section `scene.bearings`"):
         term.value(scene, *values)
     assert needs_forces(scene_of(BEARINGS)[0], term, design)
-    with pytest.raises(InputError, match=r"must be search .* with `scene.bearings`"):
-        rootsopt.load_config("cic", [BEARINGS, "solver.fidelity=map"])
 
 
 @pytest.mark.long

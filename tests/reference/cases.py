@@ -28,7 +28,7 @@ def _tight(case: Case) -> Case:
     return case if loose else case._replace(overrides=[_TIGHT, *case.overrides])
 
 
-_AS_SHIPPED = ("as shipped", "single precision", "unresolved", "inaccurate", "ensemble", "nodes")
+_AS_SHIPPED = ("as shipped", "inaccurate", "ensemble")
 """Beginnings of the names of cases that use the config's own tolerance."""
 
 
@@ -46,10 +46,7 @@ _KEYS = {
     "clearance": "contact.clearance_mm",
     "stiffness": "contact.stiffness_N_per_mm_e",
     "rtol": "solver.rtol",
-    "precision": "solver.precision",
-    "contact": "solver.fidelity",
     "method": "solver.method",
-    "gradient": "solver.gradient",
 }
 
 
@@ -132,7 +129,6 @@ _EVERY = [
     Case("paper cic", "paper_cic", []),
     Case("paper ee", "paper_ee", []),
     Case("free form", "free", []),
-    Case("free form, forward", "free", _sections(gradient="forward")),
     Case("pump", "pump", []),
     Case("bore and short rotor", "cic", ["rotor.bore_mm=20", "rotor.length_mm=40"]),
     Case("clearance", "cic", _sections(clearance="0.01")),
@@ -162,17 +158,10 @@ _EVERY = [
                                           "objective.over_speeds=worst"]),
     Case("chaotic", "cic", _sections(damping="0", speed="6000")),
     Case("measures", "cic", _MEASURED),
-    Case("linear", "cic", _sections(contact="linear")),
-    Case("linear, doubled load", "cic", _sections(contact="linear", load="9.55")),
-    Case("passed through, linear", "cic", ["scene.timing_gear=null",
-                                           *_sections(load="30", contact="linear")]),
-    Case("linear of ee", "ee", _sections(contact="linear")),
     Case("passed through", "cic", ["scene.timing_gear=null", *_sections(load="30")]),
     *(Case(f"bare, {name}", "cic", [*_BARE, *more]) for name, more in _PARTS.items()),
     Case("stalled", "cic", ["scene.drive=torque",
                             "scene.motor={slope_N_m_s_per_rad: 0.001, torque_N_m: 0.5}"]),
-    Case("single precision", "cic", _sections(precision="float32")),
-    Case("unresolved", "cic", _sections(precision="float32", load="1e-4")),
     Case("inaccurate, no room for a check", "cic",
          [*_sections(damping="0.05", load="2", speed="6000"), "solver.max_steps_per_period=320"]),
     *(Case(name, "cic", [_profile(*rest)]) for name, rest in _FAMILIES.items()),
@@ -188,22 +177,8 @@ _EVERY = [
                                                  "ensemble.designs=12",
                                                  *_sections(damping="0.1", backlash="0.4",
                                                             load="1")], nudged=False),
-    Case("map", "cic", _sections(contact="map")),
-    Case("map of ee", "ee", _sections(contact="map")),
-    Case("single precision, map", "cic", _sections(precision="float32", contact="map")),
-    Case("nodes", "cic", _sections(contact="nodes")),
-    Case("reverse", "cic", [*_MEASURED, *_sections(gradient="reverse"),
-                            "objective.line_weights={1: 0.3, 2: 0.7}"]),
-    *(
-        Case(f"linear, {name}", "cic", _sections(contact="linear", method=name))
-        for name in ("dopri5", "kvaerno3", "kvaerno5")
-    ),
-    Case("as shipped, auto", "cic", _sections(contact="auto")),
-    Case("kvaerno5", "cic", _sections(method="kvaerno5")),
-    Case("map of given size", "cic", [*_sections(contact="map"), "solver.map_rolls=96",
-                                      "solver.map_relatives=24"]),
 ]  # fmt: skip
 """All cases; those that share compiled programs are adjacent."""
 CASES = [_tight(case) for case in _EVERY]
-SHORT = ("linear", "linear, doubled load", "passed through, linear", "linear of ee")
-"""Names of cases that compile within seconds."""
+SHORT = ("cic", "slow", "two mesh periods")
+"""Names of cases that share the program of most tests."""

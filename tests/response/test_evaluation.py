@@ -1,15 +1,10 @@
-"""Columns and map errors of an evaluation agree with numbers made up for the test."""
+"""Columns of an evaluation agree with numbers made up for the test."""
 
-import jax.numpy as jnp
 import numpy as np
-import pytest
-from rootsopt.contact.size import MapSize
 
-from rootsopt.config import load
 from rootsopt.dynamics.flanks import FlankForce
 from rootsopt.output import files
-from rootsopt.response import evaluation, series
-from rootsopt.response.evaluation import Evaluator
+from rootsopt.response import series
 from tests.standins import oscillator
 
 
@@ -39,23 +34,3 @@ def test_series_has_drive_and_coast_where_they_belong(monkeypatch):
     assert list(columns) == list(expected)
     for name, values in expected.items():
         np.testing.assert_allclose(columns[name], values, rtol=1e-14, err_msg=name)
-
-
-def test_stated_error_of_a_map_is_relative_to_the_static_depth(monkeypatch):
-    """`map_error` is the error of the penetration over the static depth: F = K δ^e."""
-    config = load("configs/cic.yaml", ["solver.fidelity=map", "solver.map_error=2e-3"])
-    evaluator = Evaluator.of(config)
-    depth = 1e-3 * (4.775 / 33e-3 / 2e5) ** (1 / 2.2)
-    asked = []
-
-    def size_map(profile, deepest, error):
-        asked.append(error)
-        return MapSize(256, 24, 0.7 * error, True)
-
-    monkeypatch.setattr(evaluation, "size_map", size_map)
-    sized = evaluator._sized(jnp.array([36.43, 8.0, 4.0]))
-    assert asked == pytest.approx([2e-3 * depth])
-    assert sized.map_error == pytest.approx(1.4e-3)
-    assert sized.scene.map_size == (256, 24)
-    # The evaluator that was asked stays as it was.
-    assert np.isnan(evaluator.map_error)

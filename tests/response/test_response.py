@@ -344,19 +344,6 @@ def test_second_derivatives_are_refused(scene):
         jax.hessian(lambda design: steady_response(scene, design).mean)(DESIGN)
 
 
-@pytest.mark.long
-def test_motion_that_leaves_the_contact_map(scene, known):
-    """A motion that leaves the contact map has NaN forces and a status that says so."""
-    config, _ = scene_of("solver.fidelity=map")
-    wide, narrow = (Scene.from_config(config, deepest) for deepest in (-3e-3, -1e-3))
-    found = steady_response(wide, DESIGN)
-    assert Status.of(found.status) is Status.PERIODIC
-    assert float(found.mean) == pytest.approx(float(known[0].mean), rel=1e-3)
-    found = steady_response(narrow, DESIGN)
-    assert Status.of(found.status) is Status.OFF_MAP
-    assert np.isnan(found.mean)
-
-
 @pytest.mark.parametrize(
     ("design", "message"),
     [([1.0, 2.0], "must have 3 entries.*but has 2"), ([[1.0]], r"array \(d,\), but has shape")],

@@ -12,7 +12,7 @@ from rootsopt.commands.console import main
 from rootsopt.config import load, parse
 from rootsopt.errors import InputError
 from rootsopt.optimize.problem import Problem
-from rootsopt.response import choice, speeds
+from rootsopt.response import speeds
 from rootsopt.response.attractors import AttractorEvaluator
 from rootsopt.response.evaluation import Evaluator, _build, _motion
 from rootsopt.response.evaluators import evaluator_for
@@ -321,20 +321,6 @@ def test_simulate_stays_at_the_scene(tmp_path, baseline):
     record = json.loads((tmp_path / "result.json").read_text())
     assert "speeds" not in record
     assert record["response"]["mean_force_N"] == baseline[1].response["mean_force_N"]
-
-
-def test_auto_agrees_at_every_speed():
-    """`solver.fidelity: auto` judges a candidate by the worst of all speeds simulated."""
-
-    def first(*overrides):
-        (tried, *_) = choice.choose(
-            config_of("solver.fidelity=auto", "solver.accuracy=0.1", *overrides)
-        ).tried
-        return tried["error"]
-
-    each = first("scene.speed_rpm=3000"), first("scene.speed_rpm=6000")
-    assert each[0] != pytest.approx(each[1], rel=0.1)
-    assert first("objective.speeds_rpm=[6000]") == max(each)
 
 
 def test_linearised_pair_has_the_closed_form_stiffness():

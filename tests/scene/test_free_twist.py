@@ -101,9 +101,7 @@ def test_impossible_bounds_are_refused(change, words):
         rootsopt.load_config("cic", [change])
 
 
-def test_other_fidelities_and_no_parameters_are_refused():
-    with pytest.raises(InputError, match=r"with `optimizer.bounds.helix_deg`"):
-        rootsopt.load_config("cic", [FREE[0], "solver.fidelity=map"])
+def test_no_parameters_are_refused():
     with pytest.raises(InputError, match=r"or make the twist one with `optimizer.bounds.helix_d"):
         Search(rootsopt.load_config("ee"))
 

@@ -279,9 +279,6 @@ def test_orbit_and_gradient_of_all_parts():
 @pytest.mark.parametrize(
     ("overrides", "words"),
     [
-        (["contact.friction={}", "solver.fidelity=map"], "`solver.fidelity` must be search"),
-        (["scene.supports={stiffness_N_per_mm: 1, damping_N_s_per_mm: 0}",
-          "solver.fidelity=linear"], "scene.supports"),
         (["scene.drive=torque"], "`scene.motor` is missing"),
         (["scene.motor={slope_N_m_s_per_rad: 1}"], "belongs to `scene.drive` = torque"),
         (["scene.load={}"], "neither"),

@@ -51,10 +51,9 @@ def test_results_are_kept_with_their_configs(results):
 
 
 def test_every_family_occurs():
-    """Every family and every contact occurs in the cases."""
+    """Every family occurs in the cases."""
     text = " ".join(" ".join(case.overrides) for case in CASES)
     assert {family for family in FAMILY_KEYS if f"family: {family}," not in text} <= OF_CONFIGS
-    assert all(f"solver.fidelity={one}" in text for one in ("map", "linear", "nodes", "auto"))
 
 
 OF_CONFIGS = {"cic", "ee", "free_form"}
@@ -80,7 +79,6 @@ STATUSES = {
     "passed_through",
     "stalled",
     "too_deep",
-    "unresolved",
     "inaccurate",
     "solver_failed",
 }
