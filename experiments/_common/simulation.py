@@ -48,16 +48,11 @@ def profile_of(config: Config, design: ArrayLike | None = None) -> Profile:
     return Scene.from_config(config).profile(chosen)
 
 
-def stacked(configs: Sequence[Config], precision: str) -> Scene:
+def stacked(configs: Sequence[Config]) -> Scene:
     """Return n scenes of one kind, their numbers stacked along a leading axis (n,).
 
-    All `configs` must lead to the same compiled program; `precision`: float64 or float32."""
-    models = [
-        jax.tree.map(
-            np.asarray, dataclasses.replace(Scene.from_config(config), precision=precision)
-        )
-        for config in configs
-    ]
+    All `configs` must lead to the same compiled program."""
+    models = [jax.tree.map(np.asarray, Scene.from_config(config)) for config in configs]
     return jax.tree.map(lambda *leaves: np.stack(leaves), *models)
 
 

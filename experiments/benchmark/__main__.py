@@ -91,7 +91,7 @@ def main() -> int:
         "benchmark",
         __doc__,
         body,
-        quick="coarse contact, small sizes",
+        quick="small sizes",
         published=FIGURES,
         add_options=add_options,
         precision=False,

@@ -15,7 +15,6 @@ from experiments.benchmark.job import (
     ACCURACY,
     BASELINE,
     BATCH_SECONDS,
-    CONTACTS,
     GRADIENT_ACCURACY,
     Job,
     Row,
@@ -46,7 +45,7 @@ def part_reference(job: Job) -> dict[str, Any]:
     from experiments._common.simulation import at, evaluator_of
 
     choice = ("solver.method=tsit5",) if job.quick else ("solver.method=dopri8",)
-    tool = evaluator_of(load(CIC, [*CONTACTS[job.contacts[-1]], *choice]))
+    tool = evaluator_of(load(CIC, choice))
     loose = at(tool, 1e-10, 1e-8)(series=False)
     tool = at(tool, REFERENCE_RTOL, 1e-8)
     designs = sample_designs(2 if job.quick else CHECKED)
@@ -93,51 +92,46 @@ def part_single(job: Job) -> dict[str, Any]:
 
     truth, slope = job.known["forces"][0], job.known["slopes"][0]
     repeats = 2 if job.quick else 9
-    tried, tools, compiling = [], {}, {}
-    for contact in job.contacts:
-        tool = evaluator_of(load(CIC, CONTACTS[contact]))
-        compiling[contact], _, _ = first_and_warm(functools.partial(tool, series=False), 1)
-        for rtol, transient in TOLERANCES[1:2] if job.quick else TOLERANCES:
-            # Fits the map to the motion.
-            tool, _ = at(tool, rtol, transient).fit(series=False)
-            seconds, found = median_time(functools.partial(tool, series=False), 3)
-            off = value_error(forces_of(found.response), truth) if found.usable else math.nan
-            by = gradient_error(slopes_of(found.gradient), slope)
-            tried.append([contact, rtol, transient, seconds, off, by, found.status.label])
-        tools[contact] = tool
-    good = [one for one in tried if one[4] <= ACCURACY] or tried
-    fine = [one for one in good if one[5] <= GRADIENT_ACCURACY] or good
-    value_only, choice = (min(x, key=lambda one: one[3])[:3] for x in (good, fine))
+    tried = []
+    usual = evaluator_of(load(CIC))
+    compiling, _, _ = first_and_warm(functools.partial(usual, series=False), 1)
+    for rtol, transient in TOLERANCES[1:2] if job.quick else TOLERANCES:
+        tool = at(usual, rtol, transient)
+        seconds, found = median_time(functools.partial(tool, series=False), 3)
+        off = value_error(forces_of(found.response), truth) if found.usable else math.nan
+        by = gradient_error(slopes_of(found.gradient), slope)
+        tried.append([rtol, transient, seconds, off, by, found.status.label])
+    good = [one for one in tried if one[3] <= ACCURACY] or tried
+    fine = [one for one in good if one[4] <= GRADIENT_ACCURACY] or good
+    value_only, choice = (min(x, key=lambda one: one[2])[:2] for x in (good, fine))
 
-    def evaluated(name: str, contact: str, rtol: float, transient: float) -> Row:
-        tool = at(tools[contact], rtol, transient)
+    def evaluated(name: str, rtol: float, transient: float) -> Row:
+        tool = at(usual, rtol, transient)
         seconds, found = median_time(lambda: tool(series=False), repeats)
         return row(
             f"rootsopt, {name}",
             "value+gradient",
             seconds,
-            compile_s=compiling[contact],
+            compile_s=compiling,
             value_error=value_error(forces_of(found.response), truth),
             gradient_error=gradient_error(slopes_of(found.gradient), slope),
-            settings=f"{contact}, rtol {rtol:g}, transient {transient:g}",
+            settings=f"rtol {rtol:g}, transient {transient:g}",
             note="Evaluator: checks settlement, closes the orbit, reports stability",
         )
 
     solver = load(CIC).solver
-    usual = "linear" if job.quick else "search"
-    default = evaluated("default", usual, solver.orbit_tolerance, solver.transient_tolerance)
+    default = evaluated("default", solver.orbit_tolerance, solver.transient_tolerance)
     rows = [default, evaluated("cheapest", *choice)]
     design, state = jnp.asarray(BASELINE), jnp.zeros(2)
     compiled = eqx.filter_jit(respond)
     for gradient in () if job.quick else (False, True):
-        contact, rtol, transient = choice if gradient else value_only
-        tool = tools[contact]
+        rtol, transient = choice if gradient else value_only
         settling, closing = (
             dataclasses.replace(one, rtol=jnp.asarray(value))
-            for one, value in zip(integrators(tool.config), (transient, rtol), strict=True)
+            for one, value in zip(integrators(usual.config), (transient, rtol), strict=True)
         )
-        solver = coarse(tool.scene, settling, closing)
-        call = functools.partial(compiled, tool.scene, design, state, solver, gradient=gradient)
+        solver = coarse(usual.scene, settling, closing)
+        call = functools.partial(compiled, usual.scene, design, state, solver, gradient=gradient)
         extra, seconds, out = first_and_warm(lambda call=call: ready(call()), repeats)
         off = gradient_error(out.gradient[:2], slope) if gradient else None
         rows.append(
@@ -148,13 +142,11 @@ def part_single(job: Job) -> dict[str, Any]:
                 compile_s=extra,
                 value_error=value_error(np.asarray(out.response)[[0, 1]], truth),
                 gradient_error=off,
-                settings=f"{contact}, rtol {rtol:g}, transient {transient:g}",
+                settings=f"rtol {rtol:g}, transient {transient:g}",
                 note="batch.respond: settlement checked, orbit closed, no second attempts",
             )
         )
-    # A little deeper, for designs with deeper contact than the baseline.
-    deepest = {name: 1.1 * float(tool.scene.deepest) for name, tool in tools.items()}
-    return {"rows": rows, "tried": tried, "choice": choice, "deepest": deepest}
+    return {"rows": rows, "tried": tried, "choice": choice}
 
 
 class _Batch:
@@ -172,20 +164,20 @@ class _Batch:
         )
         self.tried: list[list[Any]] = []
 
-    def run(self, contact: str, rtol: float, transient_rtol: float, gradient: bool) -> Any:
-        """Simulate all designs with one setting: contact and tolerances."""
+    def run(self, rtol: float, transient_rtol: float, gradient: bool) -> Any:
+        """Simulate all designs with these tolerances."""
         import jax.numpy as jnp
 
         from rootsopt.response.batch import coarse, respond_many
         from rootsopt.scene import Scene, integrators
 
-        config = load(CIC, CONTACTS[contact])
+        config = load(CIC)
         transient, orbit = integrators(config)
         how = (
             dataclasses.replace(transient, rtol=jnp.asarray(transient_rtol)),
             dataclasses.replace(orbit, rtol=jnp.asarray(rtol)),
         )
-        scene = Scene.from_config(config, self.job.known["deepest"][contact])
+        scene = Scene.from_config(config)
         solver = coarse(scene, *how)
         return ready(respond_many(scene, self.designs, self.states, solver, gradient))
 
@@ -201,42 +193,33 @@ class _Batch:
         pairs = zip(found, self.slope[usable], strict=True) if found.size else ()
         return int(out.usable.sum()), off, [gradient_error(*pair) for pair in pairs]
 
-    def choose(self) -> tuple[str, float, float]:
-        """Choose the cheapest contact and tolerances at which all designs are accurate enough.
+    def choose(self) -> tuple[float, float]:
+        """Choose the cheapest tolerances at which all designs are accurate enough.
 
-        If no setting is accurate enough, choose the finest. Returns (contact, orbit tolerance,
-        transient tolerance).
+        If none are, choose the finest. Returns (orbit tolerance, transient tolerance).
         """
         job = self.job
-        contacts = job.contacts[job.contacts.index(job.known["choice"][0]) :]
-        for contact in contacts:
-            self.run(contact, *TOLERANCES[1], True)
-            for pair in TOLERANCES[1:2] if job.quick else TOLERANCES[1:]:
-                call = functools.partial(self.run, contact, *pair, True)
-                seconds, out = median_time(call, 2)
-                self.tried.append([contact, *pair, seconds, *self.errors(out)])
-            good = [
-                one
-                for one in self.tried
-                if one[4] == job.size
-                and one[5] <= ACCURACY
-                and np.median(one[6]) <= GRADIENT_ACCURACY
-            ]
-            if good:
-                return tuple(min(good, key=lambda one: one[3])[:3])
-        return contacts[-1], *TOLERANCES[-1]
+        self.run(*TOLERANCES[1], True)
+        for pair in TOLERANCES[1:2] if job.quick else TOLERANCES[1:]:
+            seconds, out = median_time(functools.partial(self.run, *pair, True), 2)
+            self.tried.append([*pair, seconds, *self.errors(out)])
+        good = [
+            one
+            for one in self.tried
+            if one[3] == job.size and one[4] <= ACCURACY and np.median(one[5]) <= GRADIENT_ACCURACY
+        ]
+        return tuple(min(good, key=lambda one: one[2])[:2]) if good else TOLERANCES[-1]
 
-    def timed(self, setting: tuple[str, float, float], gradient: bool) -> Row:
+    def timed(self, setting: tuple[float, float], gradient: bool) -> Row:
         """Time the batch with a setting; the first call includes compilation."""
         from rootsopt.runtime.timing import CompileClock
 
-        job, (contact, rtol, coarse) = self.job, setting
+        job, (rtol, coarse) = self.job, setting
         call = functools.partial(self.run, *setting, gradient)
         with CompileClock() as clock:
             call()
         seconds, out = median_time(call, 1 if job.quick else 5, BATCH_SECONDS / 8)
         usable, off, by = self.errors(out)
-        outside = int(np.sum(np.asarray(out.deepest) < job.known["deepest"][contact]))
         return row(
             f"rootsopt, batch of {job.size}" + (" (GPU)" if job.part == "gpu" else ""),
             "value+gradient" if gradient else "value",
@@ -248,10 +231,9 @@ class _Batch:
             # Where the peak falls on a corner of the force, a gradient may fail. The median design
             # counts, and the note gives the worst.
             gradient_error=float(np.median(by)) if by else None,
-            settings=f"{contact}, rtol {rtol:g}, transient {coarse:g}",
+            settings=f"rtol {rtol:g}, transient {coarse:g}",
             note=f"{usable} of {job.size} periodic"
-            + (f", worst gradient error {max(by):.2g}" if by else "")
-            + (f", {outside} beyond the map" if "map" in contact and outside else ""),
+            + (f", worst gradient error {max(by):.2g}" if by else ""),
         )
 
 

@@ -16,12 +16,6 @@ GRADIENT_ACCURACY = 0.1
 central differences reach about 0.05 at settings with forces accurate to `ACCURACY`."""
 BATCH_SECONDS = 150.0
 """Expected time (s) of all runs of a batch above which the batch is skipped."""
-CONTACTS = {
-    "search": ("solver.fidelity=search",),
-    "map 384x16": ("solver.fidelity=map", "solver.map_rolls=384", "solver.map_relatives=16"),
-    "map 192x12": ("solver.fidelity=map", "solver.map_rolls=192", "solver.map_relatives=12"),
-    "linear": ("solver.fidelity=linear",),
-}
 Row = dict[str, Any]
 
 
@@ -33,11 +27,6 @@ class Job:
     quick: bool
     size: int
     known: dict[str, Any]
-
-    @property
-    def contacts(self) -> tuple[str, ...]:
-        """Contacts to choose from, from coarse to fine."""
-        return ("linear",) if self.quick else ("map 192x12", "map 384x16", "search")
 
 
 def forces_of(response: dict[str, float]) -> list[float]:

@@ -1,18 +1,15 @@
-"""Time the pieces of one evaluation: gap table, orbit, integration, reverse mode."""
+"""Time the pieces of one evaluation: orbit, integration."""
 
 import dataclasses
 import functools
 import os
 from typing import Any
 
-import numpy as np
-
 from experiments._common.driver import start_process
 from experiments._common.scenes import CIC
-from experiments._common.timing import first_and_warm, median_time, peak_memory, ready
+from experiments._common.timing import first_and_warm, median_time, ready
 from experiments.benchmark.job import (
     BASELINE,
-    CONTACTS,
     Job,
     Row,
     forces_of,
@@ -36,34 +33,6 @@ ORBIT_SCENES = {
 }
 
 
-def part_table(job: Job) -> dict[str, Any]:
-    """Time the gap table of one design and its Jacobian, compiled."""
-    start_process()
-    import jax
-    import jax.numpy as jnp
-    from rootsopt.contact.map import MapContact
-
-    from rootsopt.scene import Scene
-
-    config = load(CIC)
-    model = Scene.from_config(config, job.known["deepest"].get("map 384x16"))
-    rolls, relatives = (64, 12) if job.quick else model.map_size
-    size = f"{rolls}x{relatives}"
-
-    def table(design: Any) -> Any:
-        return MapContact.of(model.profile(design), model.deepest, rolls, relatives).coefficients
-
-    rows = []
-    for what, function in (("gap table", table), ("table and Jacobian", None)):
-        call = jax.jit(function or (lambda x: (table(x), jax.jacfwd(table)(x))))
-        design = jnp.asarray(BASELINE)
-        extra, seconds, _ = first_and_warm(
-            lambda call=call, design=design: ready(call(design)), 3 if job.quick else 21
-        )
-        rows.append(row("rootsopt", what, seconds, compile_s=extra, settings=size))
-    return {"rows": rows}
-
-
 def part_orbit(job: Job) -> dict[str, Any]:
     """Time forces with gradient by a closed orbit, and by averaging after a transient.
 
@@ -78,13 +47,12 @@ def part_orbit(job: Job) -> dict[str, Any]:
     from experiments._common.engines.transient import averaged
     from experiments._common.simulation import at, evaluator_of
 
-    contact = CONTACTS["linear" if job.quick else "search"]
     wanted = 1e-4 if job.quick else ORBIT_ACCURACY
     design = jnp.asarray(BASELINE)
     repeats = 3 if job.quick else 15
     rows = []
     for scene, changes in list(ORBIT_SCENES.items())[: 1 if job.quick else None]:
-        tool = evaluator_of(load(CIC, [*contact, *changes]))
+        tool = evaluator_of(load(CIC, list(changes)))
         truth = at(tool, 1e-11, 1e-9)(series=False)
         forces, slopes = forces_of(truth.response), slopes_of(truth.gradient)
         forgets = f"multiplier {truth.steady_state['floquet_multiplier']:.2g}"
@@ -130,9 +98,8 @@ def part_revolutions(job: Job) -> dict[str, Any]:
     from rootsopt.dynamics.flow import strobe
     from rootsopt.scene import Scene, integrators
 
-    contact = "linear" if job.quick else "search"
-    config = load(CIC, CONTACTS[contact])
-    model = Scene.from_config(config, job.known["deepest"].get(contact))
+    config = load(CIC)
+    model = Scene.from_config(config)
     pair = eqx.filter_jit(Scene.pair)(model, jnp.asarray(BASELINE))
     how = integrators(config)[0]
     compiled = eqx.filter_jit(strobe)
@@ -147,59 +114,8 @@ def part_revolutions(job: Job) -> dict[str, Any]:
                 seconds,
                 compile_s=extra,
                 revolutions=count,
-                settings=f"{contact}, rtol {float(how.rtol):g}",
+                settings=f"rtol {float(how.rtol):g}",
                 note=f"{int(out.steps)} steps, {'solved' if bool(out.solved) else 'failed'}",
             )
         )
     return {"rows": rows}
-
-
-def part_reverse(job: Job) -> dict[str, Any]:
-    """Time a reverse-mode gradient of the mean force over 200 revolutions, with checkpoints."""
-    start_process()
-    import diffrax
-    import equinox as eqx
-    import jax
-    import jax.numpy as jnp
-
-    from rootsopt.dynamics.flow import flow
-    from rootsopt.dynamics.integrator import Integrator
-    from rootsopt.scene import Scene
-
-    contact = "linear" if job.quick else "search"
-    config = load(CIC, CONTACTS[contact])
-    model = Scene.from_config(config, job.known["deepest"].get(contact))
-    count = 3 if job.quick else 200
-    periods = count * MESH_PERIODS
-    how = Integrator(config.solver.method, jnp.asarray(1e-6), 200 * periods)
-    before = peak_memory()
-
-    def mean(design: Any) -> Any:
-        adjoint = diffrax.RecursiveCheckpointAdjoint()
-        start = jnp.zeros(2)
-        out = flow(model.pair(design), start, jnp.asarray(float(periods)), how, 16, adjoint=adjoint)
-        return out.mean, (out.steps, out.solved)
-
-    compiled = eqx.filter_jit(jax.value_and_grad(mean, has_aux=True))
-    call = functools.partial(compiled, jnp.asarray(BASELINE))
-    extra, seconds, out = first_and_warm(lambda: ready(call()), 1)
-    (value, (steps, solved)), slope = out
-    memory = peak_memory()
-    near = gradient_error(np.asarray(slope), job.known["slopes"][0][0])
-    state = "solved" if bool(solved) else "failed"
-    return {
-        "rows": [
-            row(
-                "rootsopt",
-                f"reverse over {count} revolutions",
-                seconds,
-                compile_s=extra,
-                revolutions=count,
-                value_error=abs(float(value) / job.known["forces"][0][0] - 1),
-                gradient_error=near,
-                settings=f"{contact}, rtol 1e-06",
-                note=f"mean force from rest, {int(steps)} steps, {state}; "
-                f"{memory - before:.0f} MB above the imports; errors against the closed orbit",
-            )
-        ]
-    }

@@ -5,10 +5,9 @@ accurate to 1e-3:
 (a) SciPy with node-to-segment contact and central differences;
 (b) the pair compiled by Numba, with central differences;
 (c) rootsopt, one design and batches;
-(d) gap table and its Jacobian;
-(e) cost over revolutions and batch size, and memory of a long reverse-mode gradient;
-(f) the main job from a cold process, without and with cached programs;
-(g) large batches on a GPU.
+(d) cost over revolutions and batch size;
+(e) the main job from a cold process, without and with cached programs;
+(f) large batches on a GPU.
 
 Each part runs in its own process (`--part NAME`, which writes JSON), so that peak memory is
 measured for each part. No module here loads JAX before a part needs it. Build, compile and run are
@@ -31,12 +30,7 @@ from experiments._common.timing import MB
 from experiments.benchmark.competitors import part_numba, part_scipy
 from experiments.benchmark.designs import part_batch, part_reference, part_single
 from experiments.benchmark.job import BATCH_SECONDS, Job, Row, row
-from experiments.benchmark.pieces import (
-    part_orbit,
-    part_reverse,
-    part_revolutions,
-    part_table,
-)
+from experiments.benchmark.pieces import part_orbit, part_revolutions
 
 Say = Callable[[str], None]
 SIZES = (16, 256, 1024)
@@ -53,9 +47,7 @@ PARTS: dict[str, Callable[[Job], dict[str, Any]]] = {
     "single": part_single,
     "batch": part_batch,
     "orbit": part_orbit,
-    "table": part_table,
     "revolutions": part_revolutions,
-    "reverse": part_reverse,
     "gpu": part_batch,
 }
 
@@ -79,7 +71,7 @@ class Parts:
     def __init__(self, quick: bool, scratch: Path, say: Say):
         self.quick, self.scratch, self.say = quick, scratch, say
         self.rows: list[Row] = []
-        self.known: dict[str, Any] = {"deepest": {}}
+        self.known: dict[str, Any] = {}
         self.failed: dict[str, str] = {}
 
     def part(self, name: str, size: int = 0) -> bool:
@@ -138,7 +130,7 @@ class Parts:
 def run(quick: bool, gpu: bool = False, say: Say = lambda text: None) -> Parts:
     """Run all parts. Raises `NoResultError` if the reference cannot be computed.
 
-    A reduced run uses coarse contact and small sizes, and omits the longest parts.
+    A reduced run uses small sizes, and omits the longest parts.
     """
     with tempfile.TemporaryDirectory() as scratch:
         parts = Parts(quick, Path(scratch), say)
@@ -148,13 +140,11 @@ def run(quick: bool, gpu: bool = False, say: Say = lambda text: None) -> Parts:
             parts.part(name)
         if "choice" in parts.known:
             parts.batches("batch", (4,) if quick else SIZES)
-        for name in ("table", "revolutions"):
-            parts.part(name)
-        for name in ("orbit", "reverse"):
-            if quick:
-                parts.failed[name] = "omitted in a reduced run"
-            else:
-                parts.part(name)
+        parts.part("revolutions")
+        if quick:
+            parts.failed["orbit"] = "omitted in a reduced run"
+        else:
+            parts.part("orbit")
         parts.main_job()
         if gpu and "choice" in parts.known:
             parts.batches("gpu", GPU_SIZES)

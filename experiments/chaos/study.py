@@ -34,7 +34,6 @@ SCENE = (
     "objective.motion=ensemble",
 )
 FULL = (
-    "solver.fidelity=map",
     "ensemble.members=16",
     "ensemble.settle_periods=32",
     "ensemble.spread=0.1",
@@ -89,7 +88,7 @@ SIZES = {
 def resized(config: Config, model: Scene, **changes) -> EnsembleEvaluator:
     """Make an evaluator without gradients, with `changes` to the config's `ensemble` section."""
     ensemble = config.ensemble.model_copy(update=changes)
-    single = Evaluator(config.model_copy(update={"ensemble": ensemble}), model, fitted=True)
+    single = Evaluator(config.model_copy(update={"ensemble": ensemble}), model)
     return EnsembleEvaluator(single.surveying(), differentiate=False)
 
 

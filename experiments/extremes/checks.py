@@ -2,7 +2,6 @@
 functions."""
 
 import dataclasses
-import functools
 import math
 import time
 from typing import Any
@@ -17,7 +16,6 @@ from experiments._common.simulation import evaluator_of as make_evaluator
 from experiments._common.simulation import pair_of_model, stacked
 from experiments.extremes.scenes import Kind
 from rootsopt.config import Config
-from rootsopt.contact.impact import force_rounding
 from rootsopt.dynamics.flow import flow, strobe
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.orbit import Shots, close_orbit
@@ -34,12 +32,10 @@ STEPS = 1024
 """Maximum number of solver steps in a mesh period."""
 ALLOWED = 100.0
 """Deviation of a force (tolerances, relative to the larger of true and static force) above which a
-promise is broken. In single precision, five rounding errors of the gap are added to the limit."""
+promise is broken."""
 CORNER = 1e-9
 """Tolerance below which the limit on the deviation no longer falls. A peak on a corner of the force
 is known only to about 1e-8 (docs/accuracy.md)."""
-SINGLE = 2.4e-6
-"""Finest tolerance possible in single precision."""
 SHARP = "dopri8", 1e-12, 20_000
 """Method, tolerance and maximum number of steps of the reference."""
 FEW = 50
@@ -103,16 +99,12 @@ def law(cases: list[Case]) -> dict[str, Any]:
     """Count the values of the contact laws that are not finite or negative, over all scenes."""
     laws = [jax.tree.map(np.asarray, Scene.from_config(case.config).law) for case in cases]
     laws = jax.tree.map(lambda *leaves: np.stack(leaves), *laws)
-    found: dict[str, Any] = {}
-    for dtype in (np.float32, np.float64):
-        single = jax.tree.map(functools.partial(jnp.asarray, dtype=dtype), laws)
-        bad, negative = _law_values(single, jnp.asarray(DEPTHS, dtype), jnp.asarray(RATES, dtype))
-        found[np.dtype(dtype).name] = {
-            "values": len(cases) * DEPTHS.size * RATES.size,
-            "not_finite": int(np.sum(bad)),
-            "negative": int(np.sum(negative)),
-        }
-    return found
+    bad, negative = _law_values(laws, jnp.asarray(DEPTHS), jnp.asarray(RATES))
+    return {
+        "values": len(cases) * DEPTHS.size * RATES.size,
+        "not_finite": int(np.sum(bad)),
+        "negative": int(np.sum(negative)),
+    }
 
 
 def equation(cases: list[Case], seed: int) -> dict[str, Any]:
@@ -126,10 +118,9 @@ def equation(cases: list[Case], seed: int) -> dict[str, Any]:
     groups: dict[tuple, list[Case]] = {}
     for case in cases:
         kind = case.kind
-        shape = kind.family, kind.lobes, kind.scene, kind.fidelity
-        groups.setdefault(shape, []).append(case)
-    for (family, lobes, scene, fidelity), members in groups.items():
-        if fidelity == "map" or lobes in (4, 5):
+        groups.setdefault((kind.family, kind.lobes, kind.scene), []).append(case)
+    for (family, lobes, scene), members in groups.items():
+        if lobes in (4, 5):
             continue
         states = members[0].kind.states
         configs = [case.config for case in members]
@@ -139,11 +130,9 @@ def equation(cases: list[Case], seed: int) -> dict[str, Any]:
         signed[..., 1] *= 100
         times = draw.uniform(0, 1, (*size.shape[:2], 1))
         poses = np.concatenate([times, signed], axis=-1)
-        models = stacked(configs, "float64")
-        for precision in ("float32", "float64"):
-            bad = _equation_values(dataclasses.replace(models, precision=precision), designs, poses)
-            name = f"{family} {lobes}, {scene}, {precision}"
-            found[name] = {"scenes": len(members), "not_finite": int(np.sum(bad))}
+        bad = _equation_values(stacked(configs), designs, poses)
+        name = f"{family} {lobes}, {scene}"
+        found[name] = {"scenes": len(members), "not_finite": int(np.sum(bad))}
     return found
 
 
@@ -236,7 +225,7 @@ def _rates(pair, tau, state):
 def refine(case: Case) -> None:
     """Measure how far a periodic result deviates from the nearby orbit found with `SHARP`
     settings."""
-    model = dataclasses.replace(Scene.from_config(case.config), precision="float64")
+    model = Scene.from_config(case.config)
     design = np.asarray(design_vector(case.config))
     period = np.asarray(case.row["period"])
     orbit = jax.device_get(_sharp(model, design, case.state, period))
@@ -253,11 +242,6 @@ def refine(case: Case) -> None:
     found = np.array([case.row[name] for name in names])
     off = np.abs(found - truth) / np.maximum(truth, case.row["static_force_N"])
     allowed = ALLOWED * max(case.config.solver.orbit_tolerance, CORNER)
-    if case.kind.precision == "float32":
-        # Rounding of the reference's gap in double; single precision rounds 2^29 times as coarsely.
-        depth, law = jnp.asarray(orbit.flow.depth), model.law
-        rounding = 2**29 * float(force_rounding(depth, law.exponent, model.pitch_radius))
-        allowed = ALLOWED * max(case.config.solver.orbit_tolerance, SINGLE) + 5 * rounding
     case.row |= {
         "reference": "closed" if closed else "not closed",
         "reference_mean_N": float(mean),
@@ -276,7 +260,7 @@ def by_scipy(case: Case) -> None:
 
     Writes the distance between start and end, and the mean force, into the row.
     """
-    model = dataclasses.replace(Scene.from_config(case.config), precision="float64")
+    model = Scene.from_config(case.config)
     pair = pair_of_model(model, design_vector(case.config))
     period = case.row["period"]
     done = solve_ivp(

@@ -18,7 +18,7 @@ from experiments._common.style import (
     VERMILION,
     sheet,
 )
-from experiments.extremes.checks import ALLOWED, SINGLE
+from experiments.extremes.checks import ALLOWED
 
 Row = dict[str, Any]
 COLOURS = {
@@ -39,14 +39,9 @@ _EDGES = np.logspace(-2, 8, 11)
 MARKS = "os^vD<>"
 
 
-def solver_of(row: Row) -> tuple[str, str, str]:
-    """Return (contact, method, precision) of the scene in a `row`."""
-    return row["fidelity"], row["method"], row["precision"]
-
-
 def atlas(rows: list[Row]) -> Figure:
     """Draw the outcomes of each solver, and the deviations from the reference."""
-    counts = Counter(map(solver_of, rows))
+    counts = Counter(row["method"] for row in rows)
     groups = [name for name, _ in counts.most_common(MOST)]
     columns = min(3, len(groups) + 1)
     lines = -(-(len(groups) + 1) // columns)
@@ -54,7 +49,7 @@ def atlas(rows: list[Row]) -> Figure:
     axes = axes.ravel()
     present = [name for name in COLOURS if any(row["status"] == name for row in rows)]
     for ax, group in zip(axes, groups, strict=False):
-        outcomes(ax, group, [row for row in rows if solver_of(row) == group], present)
+        outcomes(ax, group, [row for row in rows if row["method"] == group], present)
     ax = axes[len(groups)]
     deviations(ax, groups, [row for row in rows if row.get("reference") == "closed"])
     # Put the legend into an empty panel, if there is one.
@@ -72,10 +67,10 @@ def atlas(rows: list[Row]) -> Figure:
     return figure
 
 
-def outcomes(ax: Axes, group: tuple[str, str, str], mine: list[Row], present: list[str]) -> None:
+def outcomes(ax: Axes, group: str, mine: list[Row], present: list[str]) -> None:
     """Draw the share of each outcome over the number of contact oscillations in a mesh period.
 
-    `group`: solver, as (contact, method, precision); `mine`: rows of this solver; `present`:
+    `group`: method of the solver; `mine`: rows of this solver; `present`:
     outcomes to draw."""
     bins = len(_EDGES) - 1
     swings = np.clip([row["swings"] for row in mine], _EDGES[0], _EDGES[-1] * 0.999)
@@ -94,27 +89,26 @@ def outcomes(ax: Axes, group: tuple[str, str, str], mine: list[Row], present: li
     ax.set_xscale("log")
     ax.set_xlim(_EDGES[0], _EDGES[-1])
     ax.set_ylim(0, 1)
-    ax.set_title(f"{group[1]}, {group[2]}, {group[0]} ({len(mine)} scenes)", fontsize=9)
+    ax.set_title(f"{group} ({len(mine)} scenes)", fontsize=9)
     ax.set_xlabel("oscillations of the contact in a mesh period", fontsize=8)
     ax.set_ylabel("share of scenes", fontsize=8)
 
 
-def deviations(ax: Axes, groups: list[tuple[str, str, str]], judged: list[Row]) -> None:
+def deviations(ax: Axes, groups: list[str], judged: list[Row]) -> None:
     """Draw the deviation from the reference over the tolerance by solver, with the allowed
     limit."""
-    finest = {"float64": 0.0, "float32": SINGLE}
     for mark, colour, group in zip(MARKS, COLORS, groups, strict=False):
-        mine = [row for row in judged if solver_of(row) == group]
+        mine = [row for row in judged if row["method"] == group]
         if mine:
             ax.loglog(
-                [max(row["solver.rtol"], finest[group[2]]) for row in mine],
+                [row["solver.rtol"] for row in mine],
                 [max(row["mean_off"], row["peak_off"], 1e-13) for row in mine],
                 mark, ms=4, mfc="none", color=colour,
-                label=", ".join((group[1], group[2], group[0])),
+                label=group,
             )  # fmt: skip
     line = np.array([1e-12, 1e-2])
     ax.loglog(line, ALLOWED * line, "k-", lw=1, label=f"{ALLOWED:g} × tolerance")
-    ax.set_xlabel("tolerance (single precision: the finest it holds)", fontsize=8)
+    ax.set_xlabel("tolerance", fontsize=8)
     ax.set_ylabel("relative deviation of mean or peak force", fontsize=8)
     ax.set_title(f"deviation from the reference ({len(judged)} scenes)", fontsize=9)
     ax.grid(alpha=0.3)

@@ -55,10 +55,7 @@ SCENES: dict[str, dict[str, Any]] = {
 SEARCH = {"screening": 24, "starts": 4, "iterations": 40, "learning_rate": 0.06}
 SEARCH_FREE = {"screening": 0, "starts": 1, "iterations": 100, "learning_rate": 0.005}
 QUICK = ("cic", "arc")
-"""Families of a reduced run, which uses linear contact."""
-COARSE = {"fidelity": "map", "map_rolls": 192, "map_relatives": 12}
-"""Settings for the contact of the free form in a reduced run. With `linear` contact, the motion of
-a free form does not settle."""
+"""Families of a reduced run."""
 
 
 def curvature(profile: Profile) -> dict[str, float]:
@@ -168,9 +165,9 @@ def row_of(study: str, config: Config, reference: dict[str, float]) -> dict[str,
 
 
 @functools.cache
-def reference_of(path: str, quick: bool) -> tuple[Config, Evaluation]:
+def reference_of(path: str) -> tuple[Config, Evaluation]:
     """Load and simulate a reference config. Return config and evaluation."""
-    config = load(path, ["solver.fidelity=linear"] if quick else [])
+    config = load(path)
     return config, evaluate(config)
 
 
@@ -179,7 +176,7 @@ def one_family(path: str, family: str, quick: bool) -> dict[str, Any] | None:
 
     The result is `None` if the family does not fit."""
     began = time.perf_counter()
-    reference, base = reference_of(path, quick)
+    reference, base = reference_of(path)
     config = in_housing(of_family(reference, family), base.geometry["outer_radius_mm"], 0.0)
     found = reach(config, 24) if quick else reach(config)
     if found is None:
@@ -235,7 +232,6 @@ def free_form(path: str, start: tuple[Row, Config, Config], quick: bool) -> Row:
     config = changed(
         config,
         optimizer=settings,
-        solver={"gradient": "reverse"} | (COARSE if quick else {}),
     )
     config, count = optimised(config, base.response)
     made = profile_of(config)

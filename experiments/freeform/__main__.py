@@ -43,7 +43,7 @@ def main() -> int:
         "freeform",
         __doc__,
         body,
-        quick="a few steps, coarse contact map",
+        quick="a few steps",
         published=FIGURES,
         add_options=add_options,
         cache=True,

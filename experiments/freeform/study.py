@@ -20,9 +20,6 @@ from rootsopt.profiles.departure import departure, flank_points
 from rootsopt.scene.families import with_design
 
 CONFIG = "configs/free.yaml"
-COARSE = ("solver.fidelity=map", "solver.map_rolls=192", "solver.map_relatives=12")
-"""Overrides for the contact of a reduced run. With `linear` contact, the motion of a free form does
-not settle."""
 MM, UM = 1e-3, 1e-6
 
 
@@ -66,8 +63,8 @@ def run(quick: bool, config: str = CONFIG) -> Results:
 
     Raises `NoResultError` if the search finds no better design.
     """
-    settings = load(config, [*COARSE, "optimizer.iterations=4"] if quick else [])
-    paper = evaluate(load(CIC, list(COARSE) if quick else []))
+    settings = load(config, ["optimizer.iterations=4"] if quick else [])
+    paper = evaluate(load(CIC))
     result = Search(settings).run()
     if result.optimized is None:
         raise NoResultError("the search found nothing better; raise optimizer.iterations")

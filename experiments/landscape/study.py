@@ -31,7 +31,6 @@ GRID = 6
 QUICK_GRID = 5
 """Number of points along each axis in a reduced run."""
 QUICK = (
-    "solver.fidelity=linear",
     "optimizer.screening=4",
     "optimizer.starts=1",
     "optimizer.iterations=15",

@@ -14,17 +14,18 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from rootsopt.contact.map import MapContact
 from scipy.optimize import differential_evolution
 
 from experiments._common.engines import Motion, Rotor, Scene, motion_of
-from experiments._common.engines.numba_pair import Search, Table, integrate
+from experiments._common.engines.numba_pair import MARGIN, Search, Table, integrate, spline_of
 from experiments._common.simulation import profile_of
 from experiments.paper.scene import FAMILIES, PAPER, QUANTITIES, Quantity, config_of
-from rootsopt.profiles import geometry
+from rootsopt.contact import FlankPair
+from rootsopt.profiles import Profile, geometry
 
 _DEEPEST = -0.035
 """Relative rotation (rad) below which the contact maps end. All plays lie inside, with a
@@ -83,14 +84,9 @@ class Samples(NamedTuple):
 
 def rotors_of(family: str) -> Rotors:
     """Return the data of a pair that all scenes share; `family`: its profile family."""
-    config = config_of(family, None, "solver.fidelity=map")
+    config = config_of(family)
     profile = profile_of(config)
-    contact = jax.jit(lambda p: MapContact.of(p, _DEEPEST, _ROLLS, _RELATIVES))(profile)  # pyright: ignore[reportArgumentType]
-    table = Table(
-        np.asarray(contact.coefficients),
-        *(float(x) for x in (contact.first_roll, contact.roll_step)),
-        *(float(x) for x in (contact.deepest, contact.relative_step)),
-    )
+    table = _table(profile)
     # With a map, the compiled motion needs only the rotor's pitch angle.
     radius, lobes = config.profile.pitch_radius_mm * 1e-3, config.profile.lobes
     rotor = Rotor(lobes, radius, 0.0, math.pi / (2 * lobes), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -115,6 +111,31 @@ def rotors_of(family: str) -> Rotors:
         gear_rounding=contact_config.rounding_mm * 1e-3 / radius,
     )
     return Rotors(float(geometry(profile).polar_area_moment), table, rotor, idle, unset)
+
+
+def _table(profile: Profile) -> Table:
+    """Return the contact map of a profile, from rootsopt's search for the closest approach."""
+    half = float(profile.half_pitch)
+    first = -min(0.9 * half, 2 * math.sqrt(-_DEEPEST) + 0.02)
+    step, fall = (half - first) / (_ROLLS - 1 - MARGIN), -_DEEPEST / (_RELATIVES - 1 - MARGIN)
+    poses = first + step * np.arange(_ROLLS), _DEEPEST + fall * np.arange(_RELATIVES)
+    return Table(spline_of(np.asarray(_gaps(profile, *poses))), first, step, _DEEPEST, fall)
+
+
+@jax.jit
+def _gaps(profile, rolls, relatives):
+    """Return the gap (m) at each pair of `rolls` and `relatives` (rad).
+
+    Where the tip land passes, it is continued from the land's end by a parabola."""
+    pair, land = FlankPair.of(profile), profile.segments()[0]
+    end = land.stop if land.land else 0.0
+
+    def gap(roll, relative):
+        found = pair(roll, relative)
+        beyond = profile.pitch_radius * (roll - end - relative / 2) ** 2
+        return jnp.where(found.found, found.gap, beyond)
+
+    return jax.vmap(lambda x: jax.vmap(lambda e: gap(x, e))(relatives))(rolls)
 
 
 def motion_at(rotors: Rotors, values: NDArray[np.float64]) -> Motion:

@@ -212,7 +212,7 @@ def measure(kind: str, size: Size, seed: int, say: Say) -> Measured:
     lengths.
     """
     configs = scenes(kind, size.counts[kind], seed)
-    models = stacked(configs, "float64")
+    models = stacked(configs)
     designs = np.stack([np.asarray(design_vector(config)) for config in configs])
     rest = np.zeros((len(configs), 11 if kind == "pump" else 2))
     began = time.perf_counter()

@@ -60,23 +60,6 @@ def is_picture(path: Path):
 
 
 @pytest.mark.long
-def test_work_precision(tmp_path, programs):
-    """Errors fall with the tolerance."""
-    run("work_precision", tmp_path, programs)
-    rows = rows_of(tmp_path / "work_precision.csv")
-    assert {row["status"] for row in rows} == {"periodic"}
-    for key in ("mean_error", "peak_error"):
-        first, *tighter = numbers(rows, key)
-        # The quick run's linear contact begins with a jump, which sets a floor to the error.
-        assert 0 < max(tighter) < first / 5
-        assert tighter[-1] < 1e-7 < first < 1e-2
-    assert numbers(rows, "orbit_steps") == sorted(numbers(rows, "orbit_steps"))
-    assert is_picture(tmp_path / "work_precision.png")
-    summary = json.loads((tmp_path / "work_precision.json").read_text())
-    assert summary["references"]["cic"]["error"]["mean"] < 1e-7
-
-
-@pytest.mark.long
 def test_gradients(tmp_path, programs):
     """Gradients of a few random pairs are those of differences, at every tolerance."""
     said = run("gradients", tmp_path, programs)
@@ -169,7 +152,7 @@ def test_extremes(tmp_path, programs):
     assert {"periodic", "solver_failed"} < {row["status"] for row in rows}
     summary = json.loads((tmp_path / "extremes.json").read_text())
     assert summary["not_finite"] == summary["unnamed"] == 0
-    assert summary["checks"]["law"]["float32"]["values"] > 10_000
+    assert summary["checks"]["law"]["values"] > 10_000
     assert summary["scipy"]["compared"] >= 1
     assert summary["scipy"]["worst_end"] < 1e-3
     assert is_picture(tmp_path / "extremes.png")
@@ -182,22 +165,17 @@ def test_benchmark(tmp_path, programs):
     rows = rows_of(tmp_path / "benchmark.csv")
     assert all(float(row["run_s"]) > 0 for row in rows)
     parts = {row["part"] for row in rows}
-    expected = {"scipy", "numba", "single", "batch 4", "table", "revolutions", "main job"}
+    expected = {"scipy", "numba", "single", "batch 4", "revolutions", "main job"}
     assert parts == expected
     for row in rows:
         if row["value_error"]:
-            # The quick run's reference is the linear contact, 6 % off the competitors'.
-            limit = 0.1 if row["tool"].startswith("(") else 1e-2
-            assert float(row["value_error"]) < limit
+            assert float(row["value_error"]) < 1e-2
     assert all(float(row["peak_memory_MB"]) > 10 for row in rows)
     result = json.loads((tmp_path / "benchmark.json").read_text())
-    assert set(result["not_measured"]) == {"orbit", "reverse"}
+    assert set(result["not_measured"]) == {"orbit"}
     goals = {goal["target"]: goal for goal in result["targets"]}
-    assert len(result["targets"]) == 14
+    assert len(result["targets"]) == 11
     assert all(name.split(",")[0] in out for name in goals)
-    for name in ("gap table (ms)", "gap table and Jacobian (ms)"):
-        assert goals[name]["figure"] > 0
-        assert isinstance(goals[name]["reached"], bool)
     assert 0.5 < goals["exponent of cost over revolutions"]["figure"] < 1.6
     assert is_picture(tmp_path / "benchmark.png")
 
@@ -294,10 +272,10 @@ def test_paper_scene_is_shared():
 def test_pair_of_quantities():
     """The pair differentiated with respect to the quantities is that of the config with them."""
     values = np.array([123.0, 4.5, 6.7e4, 0.21, 0.43, 0.065])
-    config = config_of("ee", values, "solver.fidelity=linear")
+    config = config_of("ee", values)
     design = design_vector(config)
     expected = jax.tree.leaves(Scene.from_config(config).pair(design))
-    shipped = Scene.from_config(config_of("ee", None, "solver.fidelity=linear"))
+    shipped = Scene.from_config(config_of("ee"))
     found = jax.tree.leaves(pair_of(shipped, design, jnp.asarray(values)))
     assert len(found) == len(expected)
     for one, other in zip(found, expected, strict=True):

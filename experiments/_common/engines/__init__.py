@@ -66,7 +66,9 @@ class Scene:
             raise ValueError(f"`profile.family` must be 'cic', but is {config.profile.family!r}")
         contact, scene, gear = config.contact, config.scene, config.scene.timing_gear
         torque = scene.load.torque_N_m
-        if config.needs_search or scene.motor or scene.phase_error_mrad or torque is None:
+        parts = contact.friction, contact.wear, scene.supports, scene.bearings, scene.heat
+        more = scene.motor, scene.phase_error_mrad, scene.center_distance_error_mm
+        if any((*parts, *more, config.rotor.helix_deg)) or torque is None:
             raise ValueError(
                 "`scene` must hold only a constant load and a timing gear; remove its other parts"
             )

@@ -288,7 +288,7 @@ class Table(NamedTuple):
     relative_step: float
 
 
-_MARGIN = 3
+MARGIN = 3
 NO_TABLE = Table(np.zeros((4, 4)), 0.0, 1.0, 0.0, 1.0)
 
 
@@ -317,12 +317,25 @@ def _spline(values, out):
 
 
 @_compiled
+def spline_of(values):
+    """Return the coefficients (m + 2, n + 2) of the bicubic B-spline through `values` (m, n)."""
+    rolls, relatives = values.shape
+    half_way = np.empty((rolls, relatives + 2))
+    for i in range(rolls):
+        _spline(values[i], half_way[i])
+    coefficients = np.empty((relatives + 2, rolls + 2))
+    for j in range(relatives + 2):
+        _spline(half_way[:, j].copy(), coefficients[j])
+    return coefficients.T.copy()
+
+
+@_compiled
 def tabulate(rotor, deepest, rolls, relatives):
     """Tabulate the gap down to ε = `deepest` < 0 on `rolls` × `relatives` points."""
     half = rotor.half_pitch
     first = -min(0.9 * half, 2 * math.sqrt(-deepest) + 0.02)
-    roll_step = (half - first) / (rolls - 1 - _MARGIN)
-    relative_step = -deepest / (relatives - 1 - _MARGIN)
+    roll_step = (half - first) / (rolls - 1 - MARGIN)
+    relative_step = -deepest / (relatives - 1 - MARGIN)
     values = np.empty((rolls, relatives))
     search = Search(*search_of(rotor))
     for i in range(rolls):
@@ -334,13 +347,7 @@ def tabulate(rotor, deepest, rolls, relatives):
                 # The land is passing: extend the gap at its end by a parabola.
                 gap = rotor.radius * (roll - rotor.land_end - relative / 2) ** 2
             values[i, j] = gap
-    half_way = np.empty((rolls, relatives + 2))
-    for i in range(rolls):
-        _spline(values[i], half_way[i])
-    coefficients = np.empty((relatives + 2, rolls + 2))
-    for j in range(relatives + 2):
-        _spline(half_way[:, j].copy(), coefficients[j])
-    return coefficients.T.copy(), first, roll_step, deepest, relative_step
+    return spline_of(values), first, roll_step, deepest, relative_step
 
 
 @_compiled
