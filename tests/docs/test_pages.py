@@ -12,7 +12,7 @@ from rootsopt.config import load
 from rootsopt.scene import check_geometry
 from tests.docs.blocks import DOCS, blocks_of, in_python, in_shell
 
-PAGES = ["index", "tutorial", "howto", "theory", "fidelity", "gallery", "limits"]
+PAGES = ["index", "tutorial", "howto", "theory", "accuracy", "gallery", "limits"]
 NOTEBOOKS = sorted((DOCS / "notebooks").glob("*.md"))
 CELL = "{code-cell}"
 
