@@ -20,7 +20,7 @@ _MOST_LINES = 32
 """Number of spectral lines above which an objective is rejected."""
 
 
-_SEARCHED = "contact is found by a search, which no other model beat in time at its error"
+_SEARCHED = "contact is always found by the search, the most accurate of the former models"
 _REMOVED: dict[str, tuple[Any, str]] = {
     "fidelity": ("search", _SEARCHED),
     "nodes": (400, _SEARCHED),
@@ -30,7 +30,7 @@ _REMOVED: dict[str, tuple[Any, str]] = {
     "gradient": ("forward", "both modes of differentiation gave the same gradient"),
     "precision": ("float64", "motions are integrated in double precision"),
 }
-"""Keys of former versions: (value that is accepted, since nothing else is done; reason)."""
+"""Keys of former versions: (former default, which a resolved config holds; why it was removed)."""
 _REMOVED_METHODS = ("dopri5", "kvaerno3", "kvaerno5")
 """Values of `solver.method` of former versions."""
 
@@ -95,7 +95,7 @@ class SolverConfig(Section):
         if isinstance(method, str) and bare(method) in _REMOVED_METHODS:
             raise ValueError(
                 f"`solver.method` must be tsit5 or dopri8, but is {shown(method)}, which was "
-                "removed: it was not faster at any accuracy; remove it"
+                "removed: it was rarely faster; leave the key out"
             )
         return {key: value for key, value in data.items() if key not in _REMOVED}
 

@@ -180,5 +180,5 @@ _EVERY = [
 ]  # fmt: skip
 """All cases; those that share compiled programs are adjacent."""
 CASES = [_tight(case) for case in _EVERY]
-SHORT = ("cic", "slow", "two mesh periods")
+SHORT = ("slow", "held apart", "no load", "too deep")
 """Names of cases that share the program of most tests."""
