@@ -34,15 +34,13 @@ class Members(NamedTuple):
 
     `means` (m, 3): mean force (N), mean square (N²) and mean of the peaks of all mesh periods (N);
     `drift`: mean force in the second half of the window minus that in the first (N); `greatest`:
-    greatest force (N); `max_relative`: greatest |ε| (rad); `depth`: greatest penetration (m;
-    negative: least gap); `states` (m, n): last scaled states; `repeats` (m, 8): whether the last
-    states repeat after 1 … 8 mesh periods; `lost`, `stalled`: see `RotorPair`; `solved`: whether
-    the solver succeeded."""
+    greatest force (N); `depth`: greatest penetration (m; negative: least gap); `states` (m, n): last
+    scaled states; `repeats` (m, 8): whether the last states repeat after 1 … 8 mesh periods;
+    `lost`, `stalled`: see `RotorPair`; `solved`: whether the solver succeeded."""
 
     means: Float[Array, "m 3"]
     drift: Float[Array, " m"]
     greatest: Float[Array, " m"]
-    max_relative: Float[Array, " m"]
     depth: Float[Array, " m"]
     states: Float[Array, "m n"]
     repeats: Bool[Array, "m 8"]
@@ -164,26 +162,22 @@ def member(
     half = periods // 2
 
     def count(index, carry):
-        state, solved, means, drift, greatest, reach, depth, memory = carry
+        state, solved, means, drift, greatest, depth, memory = carry
         out = flow(pair, state, one, integrator, _SAMPLES)
-        reach = jnp.maximum(reach, jnp.max(jnp.abs(out.states[:, 0])))
         return (
             out.end,
             solved & out.solved,
             means + jnp.stack([out.mean, out.mean_square, out.peak]),
             drift + jnp.sign(2 * index - (periods - 1)) * out.mean,
             jnp.maximum(greatest, out.peak),
-            reach,
             jnp.maximum(depth, out.depth),
             jnp.concatenate([memory[1:], out.end[None]]),
         )
 
     settled = lax.fori_loop(0, settle, pass_by, (state, jnp.ones((), bool)))
     memory = jnp.full((_MEMORY, *state.shape), jnp.inf, dtype)
-    start = *settled, jnp.zeros(3, dtype), none, none, none, low, memory
-    end, solved, means, drift, greatest, reach, depth, memory = lax.fori_loop(
-        0, periods, count, start
-    )
+    start = *settled, jnp.zeros(3, dtype), none, none, low, memory
+    end, solved, means, drift, greatest, depth, memory = lax.fori_loop(0, periods, count, start)
     apart = jnp.stack(
         [jnp.max(jnp.abs(memory[k:] - memory[:-k])[-k - 1 :]) for k in range(1, _MEMORY // 2 + 1)]
     )
@@ -191,7 +185,6 @@ def member(
         means=means / periods,
         drift=drift / jnp.maximum(half, 1),
         greatest=greatest,
-        max_relative=pair.angle_scale * reach,
         depth=depth,
         states=end,
         repeats=apart < _REPEATS,

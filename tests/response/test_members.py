@@ -74,7 +74,7 @@ def of_means(means) -> Members:
     count = len(means)
     zero, no = np.zeros(count), np.zeros(count, bool)
     return Members(
-        means, zero, zero, zero, zero, np.zeros((count, 2)), np.zeros((count, 8), bool), no, no, ~no
+        means, zero, zero, zero, np.zeros((count, 2)), np.zeros((count, 8), bool), no, no, ~no
     )
 
 
