@@ -34,8 +34,8 @@ class Members(NamedTuple):
 
     `means` (m, 3): mean force (N), mean square (N²) and mean of the peaks of all mesh periods (N);
     `drift`: mean force in the second half of the window minus that in the first (N); `greatest`:
-    greatest force (N); `depth`: greatest penetration (m; negative: least gap); `states` (m, n): last
-    scaled states; `repeats` (m, 8): whether the last states repeat after 1 … 8 mesh periods;
+    greatest force (N); `depth`: greatest penetration (m; negative: least gap); `states` (m, n):
+    last scaled states; `repeats` (m, 8): whether the last states repeat after 1 … 8 mesh periods;
     `lost`, `stalled`: see `RotorPair`; `solved`: whether the solver succeeded."""
 
     means: Float[Array, "m 3"]

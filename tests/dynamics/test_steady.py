@@ -319,7 +319,7 @@ def test_weights_of_a_peak():
     give the mean of both sides, at the corner, for which the force is stationary. The located
     instant is slightly beside it. For a jump, they give its higher side."""
     times = np.array(BESIDE)
-    unit = BESIDE_UNIT[8]
+    unit = BESIDE_UNIT
 
     def weights(force, noise=0.0):
         # Forces and exact rates. Rounding of the gap hides in the forces, not in their rates.

@@ -267,7 +267,7 @@ def sound(level=1.0):
     few = level * np.ones(4)
     means = np.column_stack([few, few**2, 2 * few + np.arange(4)])
     return Members(
-        means, 0 * few, 9 * few, 1e-3 * few, -1e-3 * few, np.ones((4, 2)), np.ones((4, 8), bool),
+        means, 0 * few, 9 * few, -1e-3 * few, np.ones((4, 2)), np.ones((4, 8), bool),
         NO, NO, YES,
     )  # fmt: skip
 
