@@ -152,5 +152,3 @@ def test_flags_without_margins_are_left_to_shooting():
     assert supported(make(scene, design))
     assert supported(make(scene.with_law(_Law(jnp.ones(()))), design))
     assert not supported(make(scene.with_parts(_Flagged()), design))
-    linear = dataclasses.replace(scene, fidelity="linear")
-    assert not supported(make(linear, design))
