@@ -74,7 +74,7 @@ class Near(Contact):
         return 0.03 * relative, 0.03 * jnp.ones_like(roll), 0.03 * jnp.ones_like(roll)
 
 
-def evaluation_of(force=1.0, status=Status.PERIODIC, design=(), state=None) -> Evaluation:
+def evaluation_of(force=1.0, status=Status.PERIODIC, design=(), start=None) -> Evaluation:
     """Return an evaluation whose forces are all `force`."""
     return Evaluation(
         design={f"x{k}": float(x) for k, x in enumerate(design)},
@@ -86,5 +86,5 @@ def evaluation_of(force=1.0, status=Status.PERIODIC, design=(), state=None) -> E
         message=status.value,
         statistics={"seconds": 1.0},
         series=None,
-        state=np.zeros(2) if state is None else state,
+        start=np.zeros(2) if start is None else start,
     )

@@ -59,7 +59,7 @@ def part_orbit(job: Job) -> dict[str, Any]:
         tried: list[Row] = []
         for rtol in ORBIT_TOLERANCES:
             here = at(tool, rtol, rtol)
-            neighbour = here(design * 1.002, series=False).state
+            neighbour = here(design * 1.002, series=False).start
             evaluate = functools.partial(here, design, neighbour, series=False)
             seconds, found = median_time(evaluate, repeats)
             off = value_error(forces_of(found.response), forces)

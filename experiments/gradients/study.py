@@ -159,7 +159,7 @@ def evaluated(evaluator: Evaluator) -> Iterator[tuple[float, Evaluation]]:
     first = evaluator.at_tolerance(TOLERANCES[0])(series=False)
     yield TOLERANCES[0], first
     for rtol in TOLERANCES[1:]:
-        yield rtol, evaluator.at_tolerance(rtol)(start=first.state, series=False)
+        yield rtol, evaluator.at_tolerance(rtol)(start=first.start, series=False)
 
 
 def slopes_of(found: Evaluation) -> np.ndarray:

@@ -250,15 +250,15 @@ class Recorder:
     def reset(self) -> None:
         """Forget all evaluations."""
         self.rows: list[dict[str, float]] = []
-        self.state, self.began = self.baseline.state, time.perf_counter()
+        self.start, self.began = self.baseline.start, time.perf_counter()
 
     def __call__(self, point: np.ndarray) -> Local | None:
         """Evaluate the problem at a point and record it."""
         design = self.problem.design(point)
-        evaluation = self.evaluator(design, start=self.state, series=False)
+        evaluation = self.evaluator(design, start=self.start, series=False)
         found = self.problem.local(evaluation, point)
         if found is not None:
-            self.state = evaluation.state
+            self.start = evaluation.start
         self.rows.append(
             {
                 "evaluation": len(self.rows) + 1,

@@ -4,7 +4,6 @@ All tools run in one process, in turns, on one core. Times are processor times, 
 processes on the machine hardly change. The neighbour is a design whose parameters differ by a small
 fraction."""
 
-import dataclasses
 import functools
 import time
 from collections.abc import Callable
@@ -22,7 +21,6 @@ from experiments._common.scenes import CIC, SHAKY
 from rootsopt import COMPILER_OPTIONS, Scene, steady_response
 from rootsopt.config import load
 from rootsopt.response.evaluation import Evaluator
-from rootsopt.response.orbits import OrbitStore
 
 Row = dict[str, Any]
 AWAY = 2e-3
@@ -79,22 +77,20 @@ def rows_of(scene: str, repeats: int, say: Callable[[str], None] = lambda text: 
     design = base * (1 + AWAY * draw.uniform(-1, 1, base.shape))
     say(f"{scene}: compiling")
     neighbour = own(base, series=False)
-    exact = shooting.at_tolerance(EXACT)(design, start=neighbour.state, series=False)
+    exact = shooting.at_tolerance(EXACT)(design, start=neighbour.start, series=False)
     if not (neighbour.usable and exact.usable):
         return [{"scene": scene, "tool": f"{neighbour.status.label}, {exact.status.label}"}]
     truth = _numbers(exact)
 
-    def afresh(tool: Evaluator, start: Any):
-        return lambda: dataclasses.replace(tool, orbits=OrbitStore())(design, start, series=False)
-
-    near = own(design, start=neighbour.state, series=False)
+    state = neighbour.state
+    near = own(design, start=neighbour.start, series=False)
     used = near.statistics.get("from_neighbour", 0)
     name = "evaluate, neighbour" if used else "evaluate, neighbour refused"
     calls = {
-        name: lambda: own(design, start=neighbour.state, series=False),
-        "evaluate, from rest": afresh(own, None),
-        "shooting from the neighbour's state": afresh(shooting, neighbour.state),
-        "shooting from rest": afresh(shooting, None),
+        name: lambda: own(design, start=neighbour.start, series=False),
+        "evaluate, from rest": lambda: own(design, series=False),
+        "shooting from the neighbour's state": lambda: shooting(design, state, series=False),
+        "shooting from rest": lambda: shooting(design, series=False),
     }
     rows = _public(scene, config, (base, design), truth, repeats)
     for tool, call in calls.items():

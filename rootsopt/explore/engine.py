@@ -12,10 +12,10 @@ from rootsopt.config.units import MM
 from rootsopt.export.animation import Contacts, frames_of, rolling_contacts, rolling_frames
 from rootsopt.profiles import Geometry, Profile, geometry, outline
 from rootsopt.response.evaluation import Evaluation, Evaluator
-from rootsopt.response.orbits import OrbitStore
 from rootsopt.response.records import geometry_record
 from rootsopt.response.series import Series
 from rootsopt.response.speeds import alone
+from rootsopt.response.starts import Seeds
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene, check_geometry, design_vector
 
@@ -63,7 +63,6 @@ class Engine:
 
     def __init__(self, given: Config):
         self.given = given
-        self.orbits = OrbitStore()
         self.ready = threading.Event()
         self._base: Config | None = None
         self._lock = threading.Lock()
@@ -90,26 +89,25 @@ class Engine:
         poses = Poses(zeros, rotation, zeros, drive, coast, None)
         return Shape(shown, geometry_record(scene, record), poses, profile)
 
-    def near(self, config: Config, start: NDArray[np.float64] | None) -> Evaluation:
-        """Return the evaluation of a `config` from the state `start` of a similar one.
+    def near(self, config: Config, start: Seeds) -> Evaluation:
+        """Return the evaluation of a `config` from the `start` of a similar one.
 
         It is quick: the motion is not confirmed by an integration, and a motion that does not
         settle is given up after a quarter of the allowed transient."""
-        return Evaluator.of(config).surveying().following(self.orbits)(start=start)
+        return Evaluator.of(config).surveying().unconfirmed()(start=start)
 
     def from_rest(self, config: Config) -> Evaluation:
         """Return the evaluation of a `config` from rest, as `rootsopt simulate` computes it."""
-        evaluator = Evaluator.of(config)
-        return dataclasses.replace(evaluator, orbits=self.orbits)()
+        return Evaluator.of(config)()
 
     def prepare(self) -> None:
         """Compile the programs in this thread, and set `ready`."""
         config = self.base
-        evaluator = Evaluator.of(config).following(self.orbits).prepare()
+        evaluator = Evaluator.of(config).unconfirmed().prepare()
         self.shape(config)
         found = evaluator()
         if found.usable:
-            self.near(config, found.state)
+            self.near(config, found.start)
         self.ready.set()
 
 

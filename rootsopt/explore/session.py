@@ -107,7 +107,7 @@ class Session:
         self.values: dict[str, float] = {}
         self.searching = threading.Event()
         self._lock = threading.Lock()
-        self._state: Any = None
+        self._start: Any = None
         self._shown: NewMotion | None = None
         self._rest: FromRest | None = None
         self._stop = threading.Event()
@@ -181,11 +181,11 @@ class Session:
 
     def _compute_motion(self, number: int, config: Config, shape: Shape) -> None:
         self.engine.ready.wait()
-        start = self._state
+        start = self._start
         near = start is not None
         found = self.engine.near(config, start) if near else self.engine.from_rest(config)
         if found.usable:
-            self._state = found.state
+            self._start = found.start
         final = found.usable or not near
         self._present(NewMotion(number, found, poses_of(shape.profile, found), near, final))
         if near:
@@ -218,7 +218,7 @@ class Session:
         useless = shown is None or shown.number != number or not shown.final
         if useless or (forced and not same):
             if found.usable:
-                self._state = found.state
+                self._start = found.start
             poses = poses_of(shape.profile, found)
             self._present(NewMotion(number, found, poses, False))
         else:

@@ -335,16 +335,11 @@ def _scattered(
 ) -> Scattered:
     """Simulate one design in many scenes. Arguments: see `compare`."""
     design = np.array(list(nominal.design.values()))
-    begun = nominal.state
-    if evaluator.config.solver.orbit != "shooting":
-        # The evaluator then remembers this orbit, and starts from it in every scene.
-        again = evaluator(design, nominal.state, series=False)
-        begun = again.state if again.usable else begun
 
     def at(shift: Shift) -> tuple[str, list[float]]:
         if tick():
             return "interrupted", [float("nan")] * len(COMPARED)
-        one = in_scene(evaluator, shift, design, begun, runs).evaluation
+        one = in_scene(evaluator, shift, design, nominal.start, runs).evaluation
         forces = [one.response.get(name, float("nan")) for name in RESPONSES]
         values = [problem.objective(one), *forces] if one.usable else [float("nan")] * len(COMPARED)
         return one.status.label, values

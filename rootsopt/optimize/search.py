@@ -38,6 +38,7 @@ from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.response.evaluators import evaluator_for
 from rootsopt.response.runs import HERE, Runs
 from rootsopt.response.sensitivity import by_scene, quantities
+from rootsopt.response.starts import Seeds
 from rootsopt.response.wrapper import Evaluates
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene, design_vector
@@ -469,20 +470,20 @@ class Search:
         """Return why no design satisfies the limits of forces.
 
         `points`: feasible points (d,), used if the local searches found none."""
-        orbits: list[NDArray[np.float64] | None] = [None]
+        starts: list[Seeds] = [None]
 
         def look(point: NDArray[np.float64]) -> Local | None:
             if self.stop.is_set():
                 return None
-            evaluation = self.sharp(self.problem.design(point), start=orbits[-1], series=False)
+            evaluation = self.sharp(self.problem.design(point), start=starts[-1], series=False)
             if evaluation.usable:
-                orbits.append(evaluation.state)
+                starts.append(evaluation.start)
             return self.problem.local(evaluation, point)
 
         usable = [found for found in self._found.values() if found.local is not None]
         usable.sort(key=lambda found: found.local.violation if found.local else np.inf)
-        starts = [found.point for found in usable[: _SIMULATED - 1]] + points[:1]
-        return explain(self.problem, starts, look)
+        begins = [found.point for found in usable[: _SIMULATED - 1]] + points[:1]
+        return explain(self.problem, begins, look)
 
     def _solve(self, number: int, point: NDArray[np.float64]) -> list[Trial]:
         """Search from `point` (d,) by sequential quadratic programming, and return the trials.
@@ -492,7 +493,7 @@ class Search:
         last: list[Trial] = []
 
         def look(point: NDArray[np.float64]) -> Local | None:
-            orbit = last[-1].evaluation.state if last else None
+            orbit = last[-1].evaluation.start if last else None
             trial = self._evaluate(self.sharp, point, number, len(trials), orbit)
             trials.append(trial)
             if trial.local is not None:
@@ -519,7 +520,7 @@ class Search:
         for iteration in range(settings.iterations + 1):
             if self.stop.is_set():
                 break
-            orbit = last.evaluation.state if last is not None and last is trials[-1] else None
+            orbit = last.evaluation.start if last is not None and last is trials[-1] else None
             trial = self._evaluate(self.fast, point, number, iteration, orbit)
             trials.append(trial)
             if np.isnan(trial.objective):
@@ -545,7 +546,7 @@ class Search:
     ) -> Trial:
         """Evaluate a `point` (d,), or use its stored evaluation, and return it as a new trial.
 
-        `start`, `iteration`: as in `Trial`; `orbit`: first guess of the orbit; `key`: key in the
+        `start`, `iteration`: as in `Trial`; `orbit`: where the motion begins; `key`: key in the
         checkpoint, by default (`start`, `iteration`)."""
         point = np.array(point, dtype=np.float64)
         key = (start, iteration) if key is None else key
@@ -555,8 +556,7 @@ class Search:
             if self.checkpoint is not None:
                 self.checkpoint.keep(key, point, evaluation)
         else:
-            evaluation, design = kept, self.problem.design(point)
-            evaluator.recall(kept, lambda: evaluator(design, start=orbit, series=False), orbit)
+            evaluation = kept
         objective = self.problem.objective(evaluation)
         feasible, excess = self.problem.feasible(point), self.problem.excess(evaluation)
         local = None
@@ -640,7 +640,7 @@ class Search:
         if not certificate.holds(RESIDUAL, FEASIBLE) and not self.stop.is_set():
             # The gradients may be less accurate than the residual requires.
             sharper = self.exact.at_tolerance(_SHARPER * self.config.solver.orbit_tolerance)
-            again = sharper(self.problem.design(point), start=optimized.state, series=False)
+            again = sharper(self.problem.design(point), start=optimized.start, series=False)
             found = self.problem.local(again, point)
             if found is not None and (other := certify(found, point)).residual < RESIDUAL:
                 certificate, optimized = other, again
@@ -721,7 +721,7 @@ def sensitivity_rows(
     objective (% per unit, by key), or {} if they are not known. Return an empty list without such
     gradients."""
     design = np.array(list(optimized.design.values()))
-    fitted = evaluator.fit(design, optimized.state, series=False)[0]
+    fitted = evaluator.fit(design, optimized.start, series=False)[0]
     moved = by_scene(fitted, optimized)
     if moved is None:
         return []

@@ -388,7 +388,7 @@ class AttractorEvaluator(Wrapper):
             steady_state=chosen.steady_state | {"attractors": basins.summary()},
             status=status,
             message=message_of(self.config, status),
-            state=np.stack([np.asarray(a.evaluation.state) for a in orbits]),
+            start=np.stack([np.asarray(a.evaluation.state) for a in orbits]),
         )
 
     def _badness(self, attractors: list[Attractor]) -> Callable[[Attractor], float]:

@@ -6,6 +6,7 @@ continues with the same numbers, to the last bit, as an uninterrupted search."""
 
 import dataclasses
 import hashlib
+import json
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -16,6 +17,7 @@ from pydantic import TypeAdapter
 from rootsopt.dynamics.maxima import Maxima
 from rootsopt.response.evaluation import Evaluation
 from rootsopt.response.speeds import AtSpeed, SpeedsEvaluation
+from rootsopt.response.starts import Seeds, plain, read
 from rootsopt.response.tolerances import AtSample, ToleranceEvaluation
 from rootsopt.response.wrapper import Evaluates
 from rootsopt.runtime.journal import Journal
@@ -49,16 +51,15 @@ class Checkpoint(Journal):
         evaluator: Evaluates,
         point: NDArray[np.float64],
         design: ArrayLike,
-        start: NDArray[np.float64] | None,
+        start: Seeds,
     ) -> Evaluation:
         """Return `run(evaluator, design, start)`, or the evaluation stored for the same arguments.
 
         `stage`: name of the evaluator; `point` (d,): the `design` (d,) in the unit box."""
-        begun = b"" if start is None else np.ascontiguousarray(start).tobytes()
+        begun = json.dumps(plain(start)).encode()
         key = stage, hashlib.sha256(point.tobytes() + begun).hexdigest()[:16]
         known = self.known(key, point)
         if known is not None:
-            evaluator.recall(known, lambda: evaluator(design, start=start, series=False), start)
             return known
         found = run(evaluator, design, start)
         self.keep(key, point, found)
@@ -92,11 +93,11 @@ def plain_evaluation(evaluation: Evaluation) -> dict[str, Any]:
     """Return an evaluation as plain values for JSON, without its time series."""
     names = (field.name for field in dataclasses.fields(Evaluation))
     found = {name: getattr(evaluation, name) for name in names}
-    maxima, state = evaluation.maxima, evaluation.state
+    maxima = evaluation.maxima
     found |= {
         "series": None,
         "status": evaluation.status.name,
-        "state": None if state is None else np.asarray(state).tolist(),
+        "start": plain(evaluation.start),
         "maxima": None if maxima is None else [part.tolist() for part in maxima],
         "rivals": [plain_evaluation(one) for one in evaluation.rivals],
     }
@@ -117,8 +118,7 @@ def read_evaluation(found: Mapping[str, Any]) -> Evaluation:
     parts, scenes = values.pop("parts", None), values.pop("scenes", None)
     for name, kind in _KINDS.items():
         kind.validate_python(values[name], strict=True)
-    if values["state"] is not None:
-        values["state"] = np.asarray(values["state"], np.float64)
+    values["start"] = read(values["start"])
     if values["maxima"] is not None:
         times, forces, slopes = (np.asarray(part, np.float64) for part in values["maxima"])
         values["maxima"] = Maxima(times, forces, slopes.reshape(len(times), len(values["design"])))

@@ -72,7 +72,7 @@ ERRORS = {name: name.replace("_N", "_standard_error_N") for name in RESPONSES}
 class EnsembleEvaluator(Wrapper):
     """Evaluates designs with an ensemble of motions in the scene of `single`.
 
-    A call has the argument `start` (members, n): scaled initial states, such as the `state` of a
+    A call has the argument `start` (members, n): scaled initial states, such as the `start` of a
     neighbouring design's evaluation. By default, the initial states are those of
     `members.initial_states`. `differentiate`: whether to compute the gradient, which takes most of
     the time.
@@ -88,7 +88,7 @@ class EnsembleEvaluator(Wrapper):
       `mean_force_drift_N` within the window, with its standard error. If this drift is far from
       zero, `ensemble.settle_periods` is too short, or members still move from one kind of
       coexisting motion to another.
-    - `state` (members, n): last scaled states, a `start` for a neighbouring design.
+    - `start` (members, n): last scaled states, for a neighbouring design.
     - `series` of one member.
 
     The orbit tolerance is not used, since averages need no closed orbit. The Lyapunov exponent is
@@ -171,7 +171,7 @@ class EnsembleEvaluator(Wrapper):
         steady: dict[str, Any] = {"kind": "transient"}
         response: dict[str, float] = {}
         gradient: dict[str, dict[str, float]] = {}
-        series, state, hint = None, None, ""
+        series, last, hint = None, None, ""
         if status is Status.AVERAGED:
             values = members.responses
             least = float(np.finfo(members.greatest.dtype).eps) * float(pair.force_scale)
@@ -190,7 +190,7 @@ class EnsembleEvaluator(Wrapper):
                 "mean_force_drift_standard_error_N": float(by_drift),
                 "greatest_force_N": greatest,
             }
-            state = np.asarray(members.states, np.float64)
+            last = np.asarray(members.states, np.float64)
             if float(np.max(members.depth)) > TOO_DEEP * float(self.scene.pitch_radius):
                 status = Status.TOO_DEEP
         if status is Status.AVERAGED and self.single.keys and self.differentiate:
@@ -205,7 +205,7 @@ class EnsembleEvaluator(Wrapper):
                 )
             else:
                 # A neighbour has failed: the results do not represent a neighbourhood.
-                response, steady, series, state = {}, {"kind": "transient"}, None, None
+                response, steady, series, last = {}, {"kind": "transient"}, None, None
         return Evaluation(
             design=dict(zip(self.single.keys, map(float, design), strict=True)),
             geometry=geometry_record(self.scene, outcome.shape),
@@ -220,7 +220,7 @@ class EnsembleEvaluator(Wrapper):
                 "seconds": time.perf_counter() - began,
             },
             series=series,
-            state=state,
+            start=last,
         )
 
     def _kind(self, pair, members: Members, with_series):

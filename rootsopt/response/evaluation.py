@@ -2,7 +2,7 @@
 
 import dataclasses
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -27,7 +27,6 @@ from rootsopt.dynamics.window import integrated_difference, lyapunov
 from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry
 from rootsopt.pump.loads import OrbitLoads, orbit_loads
-from rootsopt.response.orbits import OrbitStore, prepare_samples, with_samples
 from rootsopt.response.records import (
     RESPONSES,
     bearing_record,
@@ -40,7 +39,15 @@ from rootsopt.response.records import (
     unsettled,
     window_record,
 )
-from rootsopt.response.series import Series, contact_series, orbit_series, window_series
+from rootsopt.response.series import (
+    Series,
+    contact_series,
+    orbit_series,
+    prepare_samples,
+    window_series,
+    with_samples,
+)
+from rootsopt.response.starts import Seed, Seeds, begun
 from rootsopt.response.terms import BEARING, terms_of, values_of
 from rootsopt.runtime.precision import check_precision
 from rootsopt.runtime.programs import Program
@@ -66,10 +73,10 @@ class Evaluation:
     unit): dicts with the keys of the result file. `gradient` is empty unless it can be trusted.
     `steady_state`: kind of motion and its properties; `status` and `message`: outcome and advice;
     `statistics`: effort and accuracy; `series`: whole orbits over at least one revolution, or a
-    window of a motion that does not settle; `state`: argument `start` for a neighbouring design,
-    None if not known. For one motion it is the scaled state of the orbit at φ1 = 0 (n,). `maxima`:
-    local maxima of the force over the orbit, slopes in N per config unit; None unless requested and
-    periodic. `rivals`: evaluations of the other motions, if the worst of several motions counts.
+    window of a motion that does not settle; `start`: argument `start` for a neighbouring design,
+    None if not known; `maxima`: local maxima of the force over the orbit, slopes in N per config
+    unit; None unless requested and periodic. `rivals`: evaluations of the other motions, if the
+    worst of several motions counts.
 
     >>> import jax
     >>> import rootsopt
@@ -90,7 +97,7 @@ class Evaluation:
     message: str
     statistics: dict[str, int | float]
     series: Series | None
-    state: NDArray[np.float64] | None = None
+    start: Seeds = None
     maxima: Maxima | None = None
     rivals: "tuple[Evaluation, ...]" = ()
 
@@ -114,9 +121,11 @@ class Evaluation:
 
         return dataset(self)
 
-    def motions(self) -> list[NDArray[np.float64]]:
-        """Return the scaled states (n,) at φ1 = 0 of all known orbits of the evaluation."""
-        return [] if self.state is None else list(np.atleast_2d(self.state))
+    @property
+    def state(self) -> NDArray[np.float64] | None:
+        """Scaled state (n,) of the orbit at φ1 = 0; None without an orbit, or if there are several
+        motions."""
+        return self.start.state if isinstance(self.start, Seed) else None
 
     def record(self) -> dict[str, Any]:
         """Return the record for the result file."""
@@ -143,8 +152,8 @@ class Evaluator:
     `reference`: response by which forces are divided when coexisting motions are compared;
     `maxima`: whether to compute all local maxima of the force, with their gradients; `confirm`:
     whether an orbit that is reported with its series is confirmed by an integration over its
-    period; `orbits`: orbits known from former evaluations, which all evaluators made from this one
-    share.
+    period.
+
     """
 
     config: Config
@@ -153,7 +162,6 @@ class Evaluator:
     reference: dict[str, float] | None = None
     maxima: bool = False
     confirm: bool = True
-    orbits: OrbitStore = dataclasses.field(default_factory=OrbitStore, compare=False, repr=False)
 
     @classmethod
     def of(cls, config: Config, rtol: float | None = None, survey: bool = False) -> "Evaluator":
@@ -208,10 +216,10 @@ class Evaluator:
         """Return another evaluator that adds all local maxima of the force to an evaluation."""
         return dataclasses.replace(self, maxima=True)
 
-    def following(self, orbits: OrbitStore) -> "Evaluator":
-        """Return another evaluator that knows the `orbits` of other scenes, and reports the series
-        of an orbit without confirming it by an integration."""
-        return dataclasses.replace(self, confirm=False, orbits=orbits)
+    def unconfirmed(self) -> "Evaluator":
+        """Return another evaluator, which reports the series of an orbit without confirming it by
+        an integration."""
+        return dataclasses.replace(self, confirm=False)
 
     def without_gradient(self) -> "Evaluator":
         """Return this evaluator unchanged, since its gradient takes little time.
@@ -227,20 +235,21 @@ class Evaluator:
     def __call__(
         self,
         design: ArrayLike | None = None,
-        start: NDArray[np.float64] | None = None,
+        start: Seed | ArrayLike | None = None,
         series: bool = True,
     ) -> Evaluation:
         """Evaluate `design` (config units; default: the config's own).
 
-        `start` (n,): scaled state at φ1 = 0 to begin from, such as the `state` of a neighbouring
-        design; by default at rest (ε = 0, dε/dt = 0). `series`: whether to compute the series.
+        `start`: where to begin, the `start` of a neighbouring design's evaluation, or a scaled
+        state (n,) at φ1 = 0; by default at rest (ε = 0, dε/dt = 0). `series`: whether to compute
+        the series.
         """
         return self.fit(design, start, series)[1]
 
     def fit(
         self,
         design: ArrayLike | None = None,
-        start: NDArray[np.float64] | None = None,
+        start: Seed | ArrayLike | None = None,
         series: bool = True,
     ) -> tuple["Evaluator", Evaluation]:
         """Evaluate a design. Return another evaluator for neighbouring designs, and the evaluation.
@@ -250,32 +259,22 @@ class Evaluator:
         design = design_vector(self.config) if design is None else jnp.asarray(design)
         pair, tangents, shape = _build(self.scene, design)
         solver = self.scene.solver
-        begin = self.orbits.start(pair, start, solver.max_orbit)
+        begin = begun(pair, start, solver.max_orbit)
         found = self.motion(pair, tangents, begin)
         if series and self.confirm:
             found = self._confirmed(pair, tangents, begin, found)
         if found.known is not None and (series or self.maxima or self.scene.bearings is not None):
             found = with_samples(found, solver.samples)
-        self.orbits.keep(found, pair)
         report = self._report(design, (pair, shape), found, began, series)
         if self.maxima and report.usable:
             maxima = local_maxima(pair, tangents, found.orbit, int(found.period), solver.orbit)
             report = dataclasses.replace(report, maxima=maxima)
         return self, report
 
-    def recall(
-        self, evaluation: Evaluation, again: Callable[[], Any], start: NDArray[np.float64] | None
-    ) -> None:
-        """Remember how to compute an `evaluation` of a former process, with its orbits.
-
-        Neighbouring designs can then start on these orbits. `again` repeats the evaluation with an
-        evaluator made from this one; `start`: its argument `start`."""
-        self.orbits.recall(evaluation.motions(), again, start)
-
     def motion(self, pair: RotorPair, tangents: RotorPair, start: Start) -> Steady:
         """Return the steady motion of `pair` that `start` leads to, in arrays of NumPy.
 
-        It has derivatives along `tangents`; `start`: result of `OrbitStore.start`."""
+        It has derivatives along `tangents`; `start`: result of `starts.begun`."""
         radius, solver = self.scene.pitch_radius, self.scene.solver
         found = _motion(pair, tangents, start, radius, solver)
         if Status.of(found.status) is not Status.NOT_CLOSED:
@@ -370,14 +369,14 @@ class Evaluator:
         response: dict[str, float] = {}
         known = status is Status.PERIODIC and pair.smooth
         gradient = self._gradient(found) if known else {}
-        hint, motion, state = "", None, None
+        hint, motion, start = "", None, None
         if status in CLOSED:
             named = self.scene.solver.measures.named(orbit.response[:, None], period)
             response = {name: value for name, (value, _) in named.items()}
             steady = {"kind": "periodic"} | orbit_record(orbit, period)
             statistics |= orbit_statistics(found)
             motion = orbit_series(pair, orbit, period) if series else None
-            state = np.asarray(orbit.state, np.float64)
+            start = Seed.of(found, pair)
             if self.scene.bearings is not None and (series or {*BEARING} & {*self._names}):
                 loads = jax.device_get(self._bearing_loads(design, found))
                 for name, (value, slope) in bearing_record(loads).items():
@@ -407,7 +406,7 @@ class Evaluator:
                 if found.verdict.steady:
                     # The timing gear holds the pair. A pair that floats can rest anywhere.
                     steady |= orbit_record(orbit, period)
-                    state = np.asarray(orbit.state, np.float64)
+                    start = Seed.of(found, pair)
                     motion = orbit_series(pair, orbit, period) if series else None
         elif status is Status.UNSOUND and pair.soundness is not None:
             hint = f" Here, {fault_of(pair.soundness)}."
@@ -426,7 +425,7 @@ class Evaluator:
             message=message_of(self.config, status) + hint,
             statistics=statistics | {"seconds": seconds},
             series=motion,
-            state=state,
+            start=start,
         )
 
     @property

@@ -3,9 +3,8 @@
 import os
 from typing import Any, Protocol, runtime_checkable
 
-from numpy.typing import NDArray
-
 from rootsopt.response.evaluation import Evaluation
+from rootsopt.response.starts import Seeds
 from rootsopt.response.wrapper import Evaluates
 
 
@@ -20,9 +19,7 @@ class Runs(Protocol):
         """Number of evaluations that should be asked for at a time."""
         ...
 
-    def evaluated(
-        self, evaluator: Evaluates, design: Any, start: NDArray | None = None
-    ) -> Evaluation:
+    def evaluated(self, evaluator: Evaluates, design: Any, start: Seeds = None) -> Evaluation:
         """Return `evaluator(design, start, series=False)`."""
         ...
 
@@ -35,9 +32,7 @@ class Here:
         """Number of cores."""
         return os.cpu_count() or 1
 
-    def evaluated(
-        self, evaluator: Evaluates, design: Any, start: NDArray | None = None
-    ) -> Evaluation:
+    def evaluated(self, evaluator: Evaluates, design: Any, start: Seeds = None) -> Evaluation:
         """Return `evaluator(design, start, series=False)`."""
         return evaluator(design, start, series=False)
 

@@ -16,7 +16,8 @@ import numpy as np
 from rootsopt.config import Config
 from rootsopt.dynamics.maxima import local_maxima
 from rootsopt.response.evaluation import Evaluation, Evaluator
-from rootsopt.response.orbits import with_samples
+from rootsopt.response.series import with_samples
+from rootsopt.response.starts import begun
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene, along
 from rootsopt.status import Status
@@ -131,7 +132,7 @@ def by_scene(evaluator: Evaluator, evaluation: Evaluation) -> Evaluation | None:
 
     They replace the gradients with respect to the design: in `gradient` (N per config unit, keyed
     by config key), and in `maxima`. The result is None if the steady motion from the evaluation's
-    state is not periodic, or does not have the same number of maxima."""
+    start is not periodic, or does not have the same number of maxima."""
     config, solver = evaluator.config, evaluator.scene.solver
     design = jnp.asarray(list(evaluation.design.values()))
     wanted = quantities(config)
@@ -145,7 +146,7 @@ def by_scene(evaluator: Evaluator, evaluation: Evaluation) -> Evaluation | None:
         some = directions[begin : begin + size]
         stacked = jax.tree.map(lambda *x: np.stack(x), *some, *[blank] * (size - len(some)))
         pair, tangents = _along(evaluator.scene, design, stacked)
-        start = evaluator.orbits.start(pair, evaluation.state, solver.max_orbit)
+        start = begun(pair, evaluation.start, solver.max_orbit)
         found = evaluator.motion(pair, tangents, start)
         if Status.of(found.status) is not Status.PERIODIC:
             return None

@@ -8,8 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from rootsopt.dynamics.collocation.sampled import sampled
 from rootsopt.dynamics.orbit import Orbit
 from rootsopt.dynamics.pair import RotorPair
+from rootsopt.dynamics.steady import Steady
 from rootsopt.dynamics.window import Window
 from rootsopt.runtime.programs import Program
 
@@ -85,3 +87,25 @@ def window_series(pair: RotorPair, window: Window) -> Series:
     states = np.asarray(window.states)
     periods, samples, count = states.shape
     return series_of(pair, np.arange(periods * samples) / samples, states.reshape(-1, count))
+
+
+def with_samples(found: Steady, samples: int) -> Steady:
+    """Return the motion `found`, and add to its orbit what a motion near a known orbit lacks.
+
+    These are the steps, and a number of `samples` of the state."""
+    assert found.known is not None
+    flow = _sampled(found.orbit.flow, found.known.elements, samples)
+    return found._replace(orbit=found.orbit._replace(flow=flow))
+
+
+def prepare_samples(found: Steady, samples: int) -> Steady:
+    """Compile the program of `with_samples` in the background, and return the shape of its result.
+
+    In `found`, `jax.ShapeDtypeStruct` replaces arrays."""
+    assert found.known is not None
+    _sampled.prepare(found.orbit.flow, found.known.elements, samples)
+    flow = _sampled.result_shape(found.orbit.flow, found.known.elements, samples)
+    return found._replace(orbit=found.orbit._replace(flow=flow))
+
+
+_sampled = Program(sampled, gathered=0)

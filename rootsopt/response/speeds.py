@@ -11,7 +11,6 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rootsopt.config import Config
 from rootsopt.response.evaluation import RESPONSES, Evaluation
@@ -53,14 +52,11 @@ class SpeedsEvaluation(Evaluation):
     """An `Evaluation` at the scene's own speed, together with the evaluations at all speeds.
 
     `parts`: one for each speed; `status`: that of the first part that is not usable. In this case,
-    there is no gradient. If all parts are usable, it is the status of the first part. `state` (m, 1
-    + n): a row for each known motion, which holds the index of its part, then the scaled state.
+    there is no gradient. If all parts are usable, it is the status of the first part. `start`:
+    one entry for each part.
     """
 
     parts: tuple[AtSpeed, ...] = ()
-
-    def motions(self) -> list[NDArray[np.float64]]:
-        return [state for part in self.parts for state in part.evaluation.motions()]
 
     def record(self) -> dict[str, Any]:
         return super().record() | {
@@ -89,7 +85,7 @@ class SpeedsEvaluator(Wrapper):
     def fit(self, design=None, start=None, series=True) -> tuple["SpeedsEvaluator", Evaluation]:
         """Evaluate a design. Return another evaluator for neighbouring designs, and the evaluation.
 
-        `design` (d,): in config units, by default the config's own; `start`: the `state` of a
+        `design` (d,): in config units, by default the config's own; `start`: the `start` of a
         neighbouring design's evaluation; `series`: whether to compute the series at the scene's own
         speed."""
         config, now = self.config, self.single
@@ -99,7 +95,7 @@ class SpeedsEvaluator(Wrapper):
             now = now.at_speed(speed)
             if self.baseline:
                 now = now.relative_to(self.baseline[number].evaluation)
-            known = None if start is None else _rows(start, number)
+            known = None if start is None else start[number]
             now, found = now.fit(design, known, series and speed == own)
             parts.append(AtSpeed(speed, share, found))
         fitted = dataclasses.replace(self, single=now.at_speed(own))
@@ -121,21 +117,9 @@ def together(parts: Sequence["AtSpeed"], own: float) -> SpeedsEvaluation:
         message=message,
         statistics=head.statistics | {"speeds": len(parts), "seconds": seconds},
         series=head.series,
-        state=_states(parts) if status.usable else None,
+        start=tuple(part.evaluation.start for part in parts) if status.usable else None,
         parts=tuple(parts),
     )
-
-
-def _states(parts: Sequence[AtSpeed]) -> NDArray[np.float64]:
-    rows = [np.atleast_2d(np.asarray(part.evaluation.state)) for part in parts]
-    numbered = (np.insert(states, 0, number, axis=1) for number, states in enumerate(rows))
-    return np.concatenate(list(numbered))
-
-
-def _rows(start: NDArray[np.float64], number: int) -> NDArray[np.float64]:
-    start = np.atleast_2d(start)
-    states = start[start[:, 0] == number, 1:]
-    return states[0] if len(states) == 1 else states
 
 
 def alone(config: Config, speed_rpm: float | None = None) -> Config:

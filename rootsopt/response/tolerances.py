@@ -9,13 +9,12 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
-from numpy.typing import NDArray
 
 from rootsopt.config import Config
 from rootsopt.response.evaluation import RESPONSES, Evaluation
 from rootsopt.response.runs import HERE, Runs
 from rootsopt.response.scatter import Shift, draw, shifts
+from rootsopt.response.starts import Seeds
 from rootsopt.response.wrapper import Evaluates, Wrapper
 from rootsopt.scene import design_vector
 from rootsopt.status import Status
@@ -45,8 +44,7 @@ class ToleranceEvaluation(Evaluation):
 
     `parts`: that of the nominal scene, then one for each sample. `status`: that of the first part
     that is not usable. In this case, there is no gradient. If all parts are usable, it is the
-    status of the nominal scene. `state` (m, 1 + n): a row for each known motion, which holds the
-    index of its part, then the state of that part.
+    status of the nominal scene. `start`: one entry for each part.
     """
 
     parts: tuple[AtSample, ...] = ()
@@ -60,9 +58,6 @@ class ToleranceEvaluation(Evaluation):
     def samples(self) -> tuple[AtSample, ...]:
         """Evaluations in the scenes of the sample, without the nominal scene."""
         return self.parts[1:]
-
-    def motions(self) -> list[NDArray[np.float64]]:
-        return [state for part in self.parts for state in part.evaluation.motions()]
 
     def record(self) -> dict[str, Any]:
         own = {"status": self.status.label, "message": self.message}
@@ -98,18 +93,19 @@ class ToleranceEvaluator(Wrapper):
     def fit(self, design=None, start=None, series=True) -> tuple["ToleranceEvaluator", Evaluation]:
         """Evaluate a design. Return another evaluator for neighbouring designs, and the evaluation.
 
-        `design` (d,): in config units, by default the config's own; `start`: the `state` of a
+        `design` (d,): in config units, by default the config's own; `start`: the `start` of a
         neighbouring design's evaluation; `series`: whether to compute the series in the nominal
         scene. Without a usable motion in the nominal scene, no sample is simulated."""
         nominal = design_vector(self.config) if design is None else jnp.asarray(design)
-        now, head = self.single.fit(nominal, _rows(start, 0), series)
+        begin = (None,) * (1 + len(self.shifts)) if start is None else start
+        now, head = self.single.fit(nominal, begin[0], series)
         fitted = dataclasses.replace(self, single=now)
         if not head.usable:
             return fitted, together((AtSample({}, head),))
 
         def at(number: int) -> AtSample:
             shift = self.shifts[number - 1]
-            return in_scene(now, shift, nominal, _rows(start, number), self.runs)
+            return in_scene(now, shift, nominal, begin[number], self.runs)
 
         with ThreadPoolExecutor(self.runs.slots) as pool:
             parts = tuple(pool.map(at, range(1, 1 + len(self.shifts))))
@@ -120,7 +116,7 @@ def in_scene(
     evaluator: Evaluates,
     shift: Shift,
     design: Any,
-    start: NDArray[np.float64] | None,
+    start: Seeds,
     runs: Runs = HERE,
 ) -> AtSample:
     """Evaluate a `design` (d,) in a scene that differs from the nominal one by `shift`.
@@ -144,7 +140,7 @@ def together(parts: Sequence[AtSample]) -> ToleranceEvaluation:
         "status": status,
         "message": message,
         "statistics": head.statistics | {"samples": len(parts) - 1, "seconds": seconds},
-        "state": _states(parts) if status.usable else None,
+        "start": tuple(part.evaluation.start for part in parts) if status.usable else None,
     }
     return ToleranceEvaluation(**fields, parts=tuple(parts))
 
@@ -168,19 +164,6 @@ def nominal_of(evaluation: Evaluation) -> Evaluation:
 
     Return an evaluation without such parts unchanged."""
     return evaluation.nominal if isinstance(evaluation, ToleranceEvaluation) else evaluation
-
-
-def _states(parts: Sequence[AtSample]) -> NDArray[np.float64]:
-    rows = [np.atleast_2d(np.asarray(part.evaluation.state)) for part in parts]
-    return np.concatenate([np.insert(one, 0, k, axis=1) for k, one in enumerate(rows)])
-
-
-def _rows(start: NDArray[np.float64] | None, number: int) -> NDArray[np.float64] | None:
-    """Return the state of one part from the `state` of an evaluation, or None without a state."""
-    if start is None:
-        return None
-    states = start[start[:, 0] == number, 1:]
-    return states[0] if len(states) == 1 else states
 
 
 __all__ = [

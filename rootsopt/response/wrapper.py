@@ -1,14 +1,14 @@
 """The protocol of all evaluators, and the base class of evaluators that wrap another evaluator."""
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from rootsopt.config import Config
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.response.evaluation import Evaluation
+from rootsopt.response.starts import Seeds
 from rootsopt.scene import Scene
 
 W = TypeVar("W", bound="Wrapper")
@@ -30,17 +30,15 @@ class Evaluates(Protocol):
         """Scene in which designs are evaluated."""
         ...
 
-    def __call__(
-        self, design: Any = None, start: NDArray | None = None, series: bool = True
-    ) -> Evaluation:
+    def __call__(self, design: Any = None, start: Seeds = None, series: bool = True) -> Evaluation:
         """Evaluate `design` (d,), in config units; by default the config's own.
 
-        `start`: scaled states to begin from, such as the `state` of a neighbouring design's
-        evaluation; `series`: whether to compute the series."""
+        `start`: where to begin, such as the `start` of a neighbouring design's evaluation;
+        `series`: whether to compute the series."""
         ...
 
     def fit(
-        self, design: Any = None, start: NDArray | None = None, series: bool = True
+        self, design: Any = None, start: Seeds = None, series: bool = True
     ) -> tuple["Evaluates", Evaluation]:
         """Evaluate a design. Return another evaluator for neighbouring designs, and the evaluation.
 
@@ -52,10 +50,6 @@ class Evaluates(Protocol):
 
         `series`: whether the evaluations will compute the series; `maxima`: whether evaluators
         `with_maxima` will follow. Return another evaluator for these designs."""
-        ...
-
-    def recall(self, evaluation: Evaluation, again: Callable[[], Any], start: Any) -> None:
-        """Remember how to compute an `evaluation`. Arguments: see `Evaluator.recall`."""
         ...
 
     def pair(self, design: ArrayLike) -> RotorPair:
@@ -128,10 +122,6 @@ class Wrapper:
 
         Arguments: see `Evaluates.__call__`."""
         raise NotImplementedError
-
-    def recall(self, evaluation, again, start) -> None:
-        """Remember how to compute an `evaluation`. Arguments: see `Evaluator.recall`."""
-        self.single.recall(evaluation, again, start)
 
     def pair(self, design: ArrayLike) -> RotorPair:
         """Return the rotor pair of `design` (config units)."""

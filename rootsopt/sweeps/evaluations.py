@@ -1,9 +1,9 @@
 """Evaluations of a search on the workers of a cluster.
 
-The search stays in this process, with its steps, its checkpoint and its known orbits. A worker gets
-an evaluator, a design, and the orbit to begin from, all of which are small (6 kB, and some 50 kB
-for an orbit closed by collocation). It returns the evaluation, and the orbit that it found. If a
-worker dies, the scheduler gives its evaluation to another one, with the same result."""
+The search stays in this process, with its steps and its checkpoint. A worker gets an evaluator, a
+design, and the orbit to begin from, all of which are small (20 kB to 100 kB). It returns the
+evaluation, with the orbit that it found. If a worker dies, the scheduler gives its evaluation to
+another one, with the same result."""
 
 import contextlib
 import math
@@ -14,14 +14,13 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rootsopt.errors import InputError
 from rootsopt.response.evaluation import Evaluation
-from rootsopt.response.orbits import OrbitStore
 from rootsopt.response.runs import HERE, Runs
+from rootsopt.response.starts import Seeds
 from rootsopt.response.wrapper import Evaluates
-from rootsopt.sweeps.worker import Settings, evaluate, single_of, with_orbits
+from rootsopt.sweeps.worker import Settings, evaluate
 
 _POLL = 0.5
 """Time (s) after which a lost connection and the end of the search are noticed."""
@@ -49,16 +48,13 @@ class Elsewhere:
         """Twice the number of evaluations that the workers can run at a time."""
         return 2 * self._watch.count()
 
-    def evaluated(
-        self, evaluator: Evaluates, design: Any, start: NDArray | None = None
-    ) -> Evaluation:
+    def evaluated(self, evaluator: Evaluates, design: Any, start: Seeds = None) -> Evaluation:
         """Return `evaluator(design, start, series=False)`, computed by a worker.
 
         Raises `InputError` if the workers cannot be used; `ClosedError` after `close`."""
         import cloudpickle  # Comes with distributed; takes classes of a script or notebook along.
 
-        known = single_of(evaluator).orbits
-        task = with_orbits(evaluator, known.part(start)), np.asarray(design, float), start
+        task = evaluator, np.asarray(design, float), start
         future = self._submit(cloudpickle.dumps(task))
         done = threading.Event()
         future.add_done_callback(lambda _: done.set())
@@ -67,9 +63,7 @@ class Elsewhere:
                 future.cancel()
                 raise ClosedError
             self._watch.check()
-        found: tuple[Evaluation, OrbitStore] = pickle.loads(self._result(future))
-        known.add(found[1])
-        return found[0]
+        return pickle.loads(self._result(future))
 
     def _submit(self, task: bytes) -> Any:
         if self._closed.is_set():

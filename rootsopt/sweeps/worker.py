@@ -1,6 +1,5 @@
 """Simulates points of a sweep, and designs of a search, in a process that another one started."""
 
-import dataclasses
 import functools
 import pickle
 import signal
@@ -11,9 +10,6 @@ from typing import Any, NamedTuple
 from rootsopt.config import Config
 from rootsopt.config.families import import_named
 from rootsopt.errors import InputError
-from rootsopt.response.evaluation import Evaluator
-from rootsopt.response.orbits import OrbitStore
-from rootsopt.response.wrapper import Evaluates, Wrapper
 from rootsopt.runtime import environment, programs
 from rootsopt.runtime.versions import versions
 from rootsopt.sweeps.local import at_once
@@ -47,7 +43,7 @@ def work(
 
 
 def evaluate(settings: Settings, task: bytes) -> bytes:
-    """Evaluate a design; return the evaluation, and all orbits that are then known.
+    """Return the evaluation of a design.
 
     `task`: evaluator, design (d,) and start, as in `Evaluates.__call__`. It travels as bytes, as
     does the result: its arrays need double precision, and its types may need an import. Raises
@@ -55,24 +51,7 @@ def evaluate(settings: Settings, task: bytes) -> bytes:
     with _one:
         _prepare(settings)
     evaluator, design, start = pickle.loads(task)
-    found = evaluator(design, start, series=False)
-    return pickle.dumps((found, single_of(evaluator).orbits))
-
-
-def single_of(evaluator: Evaluates) -> Evaluator:
-    """Return the innermost of the evaluators that an evaluator wraps; without a wrapper, itself."""
-    while isinstance(evaluator, Wrapper):
-        evaluator = evaluator.single
-    assert isinstance(evaluator, Evaluator)
-    return evaluator
-
-
-def with_orbits(evaluator: Evaluates, orbits: OrbitStore) -> Evaluates:
-    """Return another evaluator that knows the given orbits only."""
-    if isinstance(evaluator, Wrapper):
-        return dataclasses.replace(evaluator, single=with_orbits(evaluator.single, orbits))
-    assert isinstance(evaluator, Evaluator)
-    return dataclasses.replace(evaluator, orbits=orbits)
+    return pickle.dumps(evaluator(design, start, series=False))
 
 
 def dask_setup(worker: Any) -> None:
@@ -105,4 +84,4 @@ def _prepare(settings: Settings) -> None:
         import_named(name)
 
 
-__all__ = ["Settings", "dask_setup", "evaluate", "single_of", "with_orbits", "work"]
+__all__ = ["Settings", "dask_setup", "evaluate", "work"]

@@ -6,13 +6,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rootsopt.response.starts import Seeds
+
 
 class Seen(NamedTuple):
-    """A feasible design evaluated earlier: `point` (d,), its terms `values` (k,), its `orbit`."""
+    """A feasible design evaluated earlier.
+
+    `point` (d,): the design in the unit box; `values` (k,): its terms; `orbit`: where the motions
+    of neighbouring designs begin."""
 
     point: NDArray[np.float64]
     values: NDArray[np.float64]
-    orbit: NDArray | None
+    orbit: Seeds
 
 
 class Course:

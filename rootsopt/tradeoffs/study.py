@@ -16,6 +16,7 @@ from rootsopt.profiles import geometry
 from rootsopt.response.checkpoint import Checkpoint
 from rootsopt.response.evaluation import Evaluation, Evaluator, geometry_record
 from rootsopt.response.runs import HERE, Runs
+from rootsopt.response.starts import Seeds
 from rootsopt.response.terms import terms_of, values_of
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene, design_vector
@@ -127,7 +128,7 @@ class Study:
         found = self._simulated("screening", self.fast.without_gradient(), point)
         return found if found.usable else None
 
-    def sample(self, point: NDArray[np.float64], orbit: NDArray | None = None) -> Sample | None:
+    def sample(self, point: NDArray[np.float64], orbit: Seeds = None) -> Sample | None:
         """Return the terms at a `point` (d,) during a search.
 
         `orbit`: first guess of the orbit. Return `None` without a usable steady state."""
@@ -148,7 +149,7 @@ class Study:
         stage: str,
         evaluator: Evaluator,
         point: NDArray[np.float64],
-        orbit: NDArray | None = None,
+        orbit: Seeds = None,
     ) -> Evaluation:
         design = self.problem.design(point)
         if self.checkpoint is None:

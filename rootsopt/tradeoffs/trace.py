@@ -36,6 +36,7 @@ from rootsopt.optimize.problem import FEASIBLE
 from rootsopt.optimize.sqp import Stops, descend
 from rootsopt.response.checkpoint import Checkpoint
 from rootsopt.response.runs import HERE, Runs
+from rootsopt.response.starts import Seeds
 from rootsopt.runtime.threads import one_thread
 from rootsopt.scene import check_geometry
 from rootsopt.sweeps.evaluations import evaluating
@@ -181,7 +182,7 @@ class Tracer:
         for point, evaluation in zip(points, found, strict=True):
             if evaluation is not None:
                 values = signs * [evaluation.response[name] for name in names]
-                seen = Seen(point, values, evaluation.state)
+                seen = Seen(point, values, evaluation.start)
                 kept = self.study.problem.excess(evaluation) <= FEASIBLE
                 (inside if kept else beyond).append(seen)
         self._course = Course(inside or beyond)
@@ -328,10 +329,10 @@ class Tracer:
             before = course.evaluations
             if far is not None and np.max(np.abs(near.point - far.point)) < 2 * _APART:
                 secant = np.clip(2 * near.point - far.point, 0.0, 1.0)
-                yield secant, near.sample.evaluation.state
+                yield secant, near.sample.evaluation.start
                 if course.evaluations > before + 1:  # The start had a steady state.
                     return
-            yield near.point, near.sample.evaluation.state
+            yield near.point, near.sample.evaluation.start
             return
 
     def _again(self, scalar: Scalar, best: Node | None, course: Course) -> Node | None:
@@ -367,7 +368,7 @@ class Tracer:
         self,
         scalar: Scalar,
         start: NDArray[np.float64],
-        orbit: NDArray | None,
+        orbit: Seeds,
         best: Node | None,
         course: Course,
     ) -> Node | None:
@@ -378,7 +379,7 @@ class Tracer:
         if self.stop.is_set():
             return best
         samples: dict[bytes, Sample] = {}
-        last = [orbit]
+        last: list[Seeds] = [orbit]
 
         def look(point: NDArray[np.float64]) -> Local | None:
             sample = self.study.sample(point, last[0])
@@ -386,10 +387,10 @@ class Tracer:
             self._count(evaluations=1)
             if sample is None:
                 return None
-            last[0] = sample.evaluation.state
+            last[0] = sample.evaluation.start
             samples[point.tobytes()] = sample
             if sample.feasible:
-                course.seen.append(Seen(sample.point, sample.values, sample.evaluation.state))
+                course.seen.append(Seen(sample.point, sample.values, sample.evaluation.start))
             return scalar.local(sample)
 
         limit = self.config.optimizer.iterations + 1
@@ -455,7 +456,7 @@ class Tracer:
         values = [self.scale.of(node.sample.values) for node in ends]
         middle = np.mean(values, axis=0)
         scalar = Scalar(self.scale, middle, tuple(range(len(middle))))
-        starts = [(node.sample.point, node.sample.evaluation.state) for node in ends]
+        starts = [(node.sample.point, node.sample.evaluation.start) for node in ends]
         starts.append((np.mean([point for point, _ in starts], axis=0), starts[0][1]))
         begins = [(0, Seen(point, np.zeros(0), orbit)) for point, orbit in starts]
         best = self._again(scalar, self._solved_from(begins, [scalar])[0], self._course)
@@ -487,7 +488,7 @@ class Tracer:
             reference = limit - np.where(np.arange(2) == lead, 0.0, _SHARP * apart)
             node = self._all()[moving]
             scalar = Scalar(self.scale, reference, (0, 1), direction)
-            orbit = node.sample.evaluation.state
+            orbit = node.sample.evaluation.start
             best = self._solved(scalar, node.point, orbit, None, self._course)
             if best is None or self.stop.is_set():
                 continue

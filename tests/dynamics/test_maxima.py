@@ -12,7 +12,8 @@ from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.orbit import SAMPLES, Orbit
 from rootsopt.response import evaluation
 from rootsopt.response.evaluation import Evaluator
-from rootsopt.response.orbits import prepare_samples
+from rootsopt.response.series import prepare_samples
+from rootsopt.response.starts import begun
 
 _STEP = 2e-4
 """Step of the differences, in config units."""
@@ -53,7 +54,7 @@ def test_gradients_are_those_of_differences(evaluator, found):
     peak = np.array(list(found.gradient["peak_force_N"].values()))
     np.testing.assert_allclose(maxima.slopes[0], peak, rtol=1e-4)
     for k, step in enumerate(_STEP * np.eye(len(design))):
-        sides = [evaluator(design + s * step, found.state, series=False).maxima for s in (1, -1)]
+        sides = [evaluator(design + s * step, found.start, series=False).maxima for s in (1, -1)]
         for time, slope in zip(maxima.times, maxima.slopes, strict=True):
             above, below = (one.forces[np.argmin(np.abs(one.times - time))] for one in sides)
             scale = np.abs(maxima.slopes).max()
@@ -71,7 +72,7 @@ def test_prepared_programs_are_those_that_are_called(evaluator, found):
     """Programs prepared from shapes alone, before there is an orbit, are the ones used later."""
     scene = evaluator.scene
     pair, tangents, _ = evaluator.assembled()
-    begin = evaluator.orbits.start(pair, found.state, scene.solver.max_orbit)
+    begin = begun(pair, found.start, scene.solver.max_orbit)
     start = pair, tangents, begin, scene.pitch_radius, scene.solver
     orbit = prepare_samples(evaluation._motion.result_shape(*start), scene.solver.samples).orbit
     programs = maxima._forces, maxima._differentiated

@@ -14,6 +14,7 @@ from rootsopt.optimize.search import Search
 from rootsopt.output.runs import RunFolder
 from rootsopt.response.checkpoint import Checkpoint
 from rootsopt.response.evaluation import Evaluation
+from rootsopt.response.starts import Seed
 from rootsopt.status import Status
 
 SCENE = """
@@ -33,10 +34,11 @@ HEADER = {"config": {"a": 1}, "versions": {"jax": "1"}}
 
 
 def evaluation(value):
+    start = Seed(np.array([value / 7, np.pi]), (np.array([[value]]), np.array(True)))
     return Evaluation(
         design={"a": value}, geometry={}, response={"mean_force_N": value / 3}, gradient={},
         steady_state={"period": 1}, status=Status.PERIODIC, message="", statistics={},
-        series=None, state=np.array([value / 7, np.pi]),
+        series=None, start=start,
     )  # fmt: skip
 
 

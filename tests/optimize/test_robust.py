@@ -50,7 +50,7 @@ def spread():
     evaluator = ToleranceEvaluator.of(config, Evaluator.of(config)).with_maxima()
     baseline = evaluator(series=False)
     problem = RobustProblem.of(config, evaluator.scene, baseline)
-    return evaluator, baseline, evaluator(problem.design(POINT), baseline.state, series=False)
+    return evaluator, baseline, evaluator(problem.design(POINT), baseline.start, series=False)
 
 
 def relative(one, base):
@@ -92,7 +92,7 @@ def test_gradient_agrees_with_central_differences(spread):
     step = 1e-4
     first = problem_of(evaluator, baseline)
     ends = [
-        evaluator(first.design(POINT + sign * step * direction), moved.state, series=False)
+        evaluator(first.design(POINT + sign * step * direction), moved.start, series=False)
         for sign in (1, -1)
     ]
     slopes = []
@@ -137,7 +137,7 @@ def test_small_scatter_is_the_nominal_objective_and_its_sensitivity():
     problem = RobustProblem.of(tiny, evaluator.scene, baseline)
     nominal = Problem.of(tiny, evaluator.scene, baseline.nominal)
     design = problem.design(POINT)
-    moved = evaluator(design, baseline.state, series=False)
+    moved = evaluator(design, baseline.start, series=False)
     assert problem.objective(moved) == pytest.approx(nominal.objective(moved.nominal), abs=1e-5)
     slopes = problem.slope(moved, POINT), nominal.slope(moved.nominal, POINT)
     np.testing.assert_allclose(*slopes, rtol=1e-3)

@@ -178,7 +178,7 @@ class Told(Evaluator):
         lost = len(self.asked) == 2
         force = 0.5 + float(np.sum((np.asarray(design) - 0.6) ** 2))
         status = Status.NOT_SETTLED if lost else Status.PERIODIC
-        return evaluation_of(force, status, design, state=np.asarray(design))
+        return evaluation_of(force, status, design, start=np.asarray(design))
 
 
 def test_a_descent_goes_half_way_back_from_where_there_is_no_steady_state():

@@ -256,7 +256,7 @@ def test_gradient_of_the_force_agrees_with_central_differences():
     assert here.usable
     step = 1e-4
     sides = [
-        evaluator(jnp.asarray(design + s * step * direction), here.state, series=False).response
+        evaluator(jnp.asarray(design + s * step * direction), here.start, series=False).response
         for s in (1, -1)
     ]
     for name, slope in here.gradient.items():

@@ -16,6 +16,7 @@ from rootsopt.profiles import geometry
 from rootsopt.pump import bearings as formulas
 from rootsopt.pump.loads import BearingSet, orbit_loads, static_loads
 from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.starts import begun
 from rootsopt.response.terms import Forces, needs_forces, terms_of
 from rootsopt.scene.bearings import GRAVITY
 from rootsopt.status import Status
@@ -203,7 +204,7 @@ def test_work_and_momentum_of_elastic_bearings():
     scene, design = scene_of(GAS, BEARINGS, SUPPORTS)
     evaluator = Evaluator(rootsopt.load_config("cic", [GAS, BEARINGS, SUPPORTS]), scene)
     pair, tangents, _ = scene.pair_and_tangents(design)
-    start = evaluator.orbits.start(pair, None, scene.solver.max_orbit)
+    start = begun(pair, None, scene.solver.max_orbit)
     found = evaluator.motion(pair, tangents, start)
     assert Status.of(found.status) is Status.PERIODIC
     loads = orbit_loads(

@@ -119,8 +119,8 @@ def test_worst_and_weighted(coexisting):
         for key, value in mean.gradient[name].items():
             assert value == pytest.approx(shares @ [g[key] for g in gradients], rel=1e-6)
     assert len(mean.steady_state["attractors"]) == len(shares)
-    assert mean.state is not None
-    assert mean.state.shape == (len(shares), 2)
+    assert isinstance(mean.start, np.ndarray)
+    assert mean.start.shape == (len(shares), 2)
 
 
 def test_the_reference_decides_which_is_worst(coexisting):

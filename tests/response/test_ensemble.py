@@ -231,7 +231,7 @@ def test_same_seed_same_numbers():
     size = "ensemble.members=4", "ensemble.settle_periods=8", "ensemble.periods=8"
     first, again, other = (averaged(*CHAOTIC, *size, f"ensemble.seed={seed}") for seed in (5, 5, 6))
     assert first.response == again.response
-    np.testing.assert_array_equal(first.state, again.state)
+    np.testing.assert_array_equal(first.start, again.start)
     assert first.response != other.response
 
 
@@ -240,7 +240,7 @@ def test_start_is_continued():
     settings = config_of(*CHAOTIC, "ensemble.members=4", "ensemble.periods=4")
     evaluator = EnsembleEvaluator(Evaluator.of(settings, survey=True)).without_gradient()
     first = evaluator(series=False)
-    on = evaluator(start=first.state, series=False)
+    on = evaluator(start=first.start, series=False)
     assert on.status is Status.AVERAGED
     assert on.response != first.response
     with pytest.raises(ValueError, match="start"):
@@ -327,7 +327,7 @@ def test_a_neighbour_that_fails_leaves_no_gradient(monkeypatch):
     runs = lambda number: failed if number == 7 else sound()  # noqa: E731
     evaluation = told(monkeypatch, runs, gradient=True)
     assert evaluation.status is Status.PASSED_THROUGH
-    assert (evaluation.response, evaluation.gradient, evaluation.state) == ({}, {}, None)
+    assert (evaluation.response, evaluation.gradient, evaluation.start) == ({}, {}, None)
     whole = told(monkeypatch, lambda number: sound(), gradient=True)
     assert whole.status is Status.AVERAGED
     assert rows(whole.gradient) == pytest.approx(0)

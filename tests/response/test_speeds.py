@@ -1,7 +1,6 @@
 """One design at several speeds: evaluator, objective, optimiser, sweep."""
 
 import csv
-import dataclasses
 import json
 
 import numpy as np
@@ -69,7 +68,7 @@ def singles(baseline, problem):
 
 @pytest.fixture(scope="module")
 def moved(baseline, problem):
-    return baseline[0](problem.design(POINT), start=baseline[1].state, series=False)
+    return baseline[0](problem.design(POINT), start=baseline[1].start, series=False)
 
 
 def relative(one, base):
@@ -122,7 +121,7 @@ def test_slope_agrees_with_central_differences(baseline, problem, moved):
     # Differences of second order: 1e-4 leaves some 1e-6 of curvature and 1e-6 of tolerance.
     step = 1e-4
     ends = [
-        evaluator(problem.design(POINT + sign * step * direction), moved.state, series=False)
+        evaluator(problem.design(POINT + sign * step * direction), moved.start, series=False)
         for sign in (1, -1)
     ]
     worst = Problem.of(config_of(SPEEDS, WORST), evaluator.scene, base)
@@ -145,21 +144,12 @@ def test_each_speed_begins_on_its_own_orbit(baseline, moved, monkeypatch):
         return single(self, design, start, series)
 
     monkeypatch.setattr(Evaluator, "fit", spy)
-    again = evaluator(start=found.state, series=False)
+    again = evaluator(start=found.start, series=False)
     for start, part in zip(seen, found.parts, strict=True):
-        np.testing.assert_array_equal(start, part.evaluation.state)
+        assert start is part.evaluation.start
     for new, old in zip(again.parts, found.parts, strict=True):
         periods = [part.evaluation.statistics["transient_mesh_periods"] for part in (new, old)]
         assert periods[0] <= periods[1]
-    # Several motions at a speed, and one at another.
-    states = [np.arange(6.0).reshape(3, 2), np.array([7.0, 8.0])]
-    parts = [
-        AtSpeed(1.0, 1.0, dataclasses.replace(found.parts[0].evaluation, state=state))
-        for state in states
-    ]
-    both = speeds._states(parts)
-    for number, state in enumerate(states):
-        np.testing.assert_array_equal(speeds._rows(both, number), state)
 
 
 def test_without_speeds_all_is_as_before(baseline):
@@ -195,7 +185,7 @@ def test_a_speed_without_steady_state_is_a_status():
     assert found.status is Status.NOT_SETTLED
     assert found.message.startswith("At 2700 rpm: ")
     assert found.gradient == {}
-    assert found.state is None
+    assert found.start is None
     assert [row["status"] for row in found.record()["speeds"]] == ["not_settled", "periodic"]
     problem = Problem.of(config_of(), evaluator.scene, found.parts[1].evaluation)
     assert np.isnan(problem.objective(found))
@@ -213,7 +203,7 @@ def test_motions_that_coexist_at_every_speed():
     assert found.status is Status.PERIODIC
     for part in found.parts:
         assert len(part.evaluation.steady_state["attractors"]) == 1
-    last, again = evaluator.relative_to(found).fit(start=found.state, series=False)
+    last, again = evaluator.relative_to(found).fit(start=found.start, series=False)
     assert last.single.single.reference == found.parts[2].evaluation.response
     assert again.response["peak_force_N"] == pytest.approx(found.response["peak_force_N"], rel=1e-7)
 
@@ -357,7 +347,7 @@ def test_every_speed_simulated_counts_in_the_status(monkeypatch, failing):
     assert [part.share for part in found.parts] == [0.5, 0.0, 0.5]
     assert found.status is Status.PASSED_THROUGH
     assert not found.usable
-    assert found.state is None
+    assert found.start is None
     assert found.message.startswith(f"At {failing:g} rpm: ")
     assert found.statistics["seconds"] == 3
     parts = [part._replace(evaluation=evaluation_of()) for part in found.parts]

@@ -267,7 +267,7 @@ def test_orbit_and_gradient_of_all_parts():
     # Along a direction in which all parameters count.
     design, step, way = np.asarray(design_vector(config)), 1e-3, np.array([1.0, -0.7, 0.8])
     ends = [
-        evaluator(jnp.asarray(design + s * step * way), start=found.state, series=False).response
+        evaluator(jnp.asarray(design + s * step * way), start=found.start, series=False).response
         for s in (-1, 1)
     ]
     for name in ("mean_force_N", "rms_force_N"):

@@ -13,18 +13,14 @@ import pytest
 
 from rootsopt.commands import optimize, parallel, pareto
 from rootsopt.config import load
-from rootsopt.dynamics.closed import Start
-from rootsopt.dynamics.collocation.known import Known
 from rootsopt.errors import InputError
-from rootsopt.response.evaluation import Evaluator, _build
+from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.evaluators import evaluator_for
-from rootsopt.response.orbits import OrbitStore
 from rootsopt.response.runs import HERE, Runs
-from rootsopt.scene import Scene, design_vector
 from rootsopt.sweeps import evaluations
 from rootsopt.sweeps.cluster import Cluster
 from rootsopt.sweeps.evaluations import ClosedError, Elsewhere, evaluating
-from rootsopt.sweeps.worker import Settings, single_of, with_orbits
+from rootsopt.sweeps.worker import Settings
 from tests.sweeps.test_cluster import IMPORT, kill_a_worker, no_workers
 from tests.sweeps.workers import DEADLY, force
 
@@ -54,7 +50,7 @@ def test_a_killed_worker_loses_and_duplicates_no_design(monkeypatch):
     assert sorted(ended) == [*range(40)]
     for design, one in zip(designs, found, strict=True):
         assert one.response["mean_force_N"] == force(design)
-        assert one.state.tobytes() == design.tobytes()
+        assert one.start.tobytes() == design.tobytes()
     assert no_workers()
 
 
@@ -130,41 +126,10 @@ def test_a_scheduler_without_workers_is_given_up(monkeypatch):
         Elsewhere(None, Client(), Settings(())).evaluated(Evaluator.of(load("cic")), np.ones(3))
 
 
-def test_orbits_travel_with_the_states_that_name_them():
-    config = load("cic")
-    pair, *_ = _build.result_shape(Scene.from_config(config), design_vector(config))
-    store, state, far = OrbitStore(), np.array([0.1, 1 / 3]), np.array([0.2, 0.0])
-    for number, place in enumerate((state, far), 1):
-        known = Known.empty((number, 2), 2, 2)
-        store._keep(place.tobytes(), Start(place, known, pair))
-    store.recall([np.array([0.3, 0.0])], lambda: None, None)
-    for start in (
-        state,
-        np.array([[0.0, *state], [1.0, 5.0, 6.0]]),
-        np.array([[2.0, 1.0, *state]]),
-    ):
-        part = store.part(start)
-        assert len(part) == 1
-        found = part._recalled(state.tobytes())
-        assert found is not None
-        assert found.known.elements.state.shape[0] == 1
-    assert len(store.part(None)) == len(store.part(np.array([7.0, 8.0]))) == 0
-    again = pickle.loads(pickle.dumps(store.part(far)))
-    back = OrbitStore()
-    back.add(again)
-    found = back._recalled(far.tobytes())
-    assert found is not None
-    assert found.known.elements.state.shape[0] == 2
-    assert back._recalled(state.tobytes()) is None
-    assert len(pickle.loads(pickle.dumps(store))) == 2
-
-
 @pytest.mark.parametrize("motion", ["reached", "worst", "ensemble"])
 def test_every_evaluator_travels(motion):
     config = load("cic", [f"objective.motion={motion}"])
-    store = OrbitStore()
-    sent = with_orbits(evaluator_for(config), store)
-    assert single_of(sent).orbits is store
+    sent = evaluator_for(config)
     found = pickle.loads(pickle.dumps(sent))
     assert type(found) is type(sent)
     assert found.config == config

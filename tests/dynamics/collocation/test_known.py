@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import rootsopt
-from rootsopt.dynamics.closed import Start
 from rootsopt.dynamics.collocation.elements import Elements, Mesh
 from rootsopt.dynamics.collocation.equation import Points
 from rootsopt.dynamics.collocation.forces import OrbitForces
@@ -16,7 +15,6 @@ from rootsopt.dynamics.collocation.mesh import roughness, sizes
 from rootsopt.dynamics.collocation.peak import Peak, Rivals, peak_of, rivals_of
 from rootsopt.dynamics.collocation.sampled import PARTS, as_flow, sampled
 from rootsopt.response.evaluation import Evaluator
-from rootsopt.response.orbits import OrbitStore, _key
 from rootsopt.status import Status
 
 PERIOD, BEGIN, USED = 2, 0.3, 10
@@ -104,46 +102,6 @@ def test_known_orbit_is_stored_without_unused_elements():
                 )
 
 
-def _entry(state):
-    """Return an entry of the memory for an orbit with this state."""
-    return Start(state, trimmed(_known(sizes(8))), None)  # pyright: ignore[reportArgumentType]
-
-
-def test_memory_forgets_the_least_recently_used_orbit(monkeypatch):
-    monkeypatch.setattr("rootsopt.response.orbits._MOST", 2)
-    memory = OrbitStore()
-    first, second, third = (np.array([x]) for x in (0.25, 0.5, 0.75))
-    memory._keep(_key(first), _entry(first))
-    memory._keep(_key(second), _entry(second))
-    assert memory._recalled(_key(np.array([0.26]))) is None
-    assert memory._recalled(_key(first)) is not None
-    memory._keep(_key(third), _entry(third))
-    assert len(memory) == 2
-    assert memory._recalled(_key(second)) is None
-    assert memory._recalled(_key(first)) is not None
-
-
-def test_orbits_of_a_former_process_are_computed_when_asked_for():
-    """Each orbit begins on the one before, of which there may be more than Python's stack has room
-    for; an orbit that nobody asks for is not computed."""
-    memory, made = OrbitStore(), []
-    states = [np.array([0.1, float(k)]) for k in range(2000)]
-
-    def again(number):
-        def compute():
-            made.append(number)
-            memory._keep(_key(states[number]), _entry(states[number]))
-
-        return compute
-
-    for number, state in enumerate(states):
-        # As the `state` of several motions has it: an index before each state.
-        start = None if number == 0 else np.array([[7.0, *states[number - 1]]])
-        memory.recall([state], again(number), start)
-    assert memory._recalled(_key(states[1500])) is not None
-    assert made == list(range(1501))
-
-
 def _bump(tau, place, corner):
     """Return a force and its derivative with respect to the time `tau`: 200 at `place`."""
     away = tau - place
@@ -192,7 +150,7 @@ def test_free_form_from_a_neighbour_is_that_by_shooting():
     base = evaluator(series=False)
     wave = 1 + 2e-3 * np.cos(3.0 * np.arange(len(base.design)))
     design = np.array(list(base.design.values())) * wave
-    near = evaluator(design, start=base.state, series=False)
+    near = evaluator(design, start=base.start, series=False)
     assert near.statistics["from_neighbour"] == 1
     exact = config.replaced({"solver.orbit": "shooting", "solver.rtol": 1e-10})
     usual = Evaluator.of(exact)(design, series=False)
@@ -213,9 +171,9 @@ def test_orbit_from_a_neighbour_is_that_by_shooting(name):
     assert "from_neighbour" not in base.statistics
     for factor, slack in ((1.003, 5e-6), (0.5, 1e-2)):
         moved = evaluator.at_speed(config.scene.speed_rpm * factor)
-        near = moved(start=base.state, series=False)
+        near = moved(start=base.start, series=False)
         exact = fresh.at_speed(config.scene.speed_rpm * factor).at_tolerance(1e-10)
-        usual = exact(start=base.state, series=False)
+        usual = exact(start=base.start, series=False)
         assert "from_neighbour" not in usual.statistics
         assert near.status is usual.status is Status.PERIODIC
         if factor > 1:
@@ -230,8 +188,8 @@ def test_orbit_from_a_neighbour_is_that_by_shooting(name):
             np.testing.assert_allclose(slopes[0], slopes[1], rtol=0, atol=slack * most)
     # A chain of neighbours begins on an orbit that was closed by collocation.
     again = evaluator.at_speed(config.scene.speed_rpm * 1.006)
-    near = evaluator.at_speed(config.scene.speed_rpm * 1.003)(start=base.state, series=False)
-    assert again(start=near.state, series=False).statistics["from_neighbour"] == 1
+    near = evaluator.at_speed(config.scene.speed_rpm * 1.003)(start=base.start, series=False)
+    assert again(start=near.start, series=False).statistics["from_neighbour"] == 1
 
 
 def test_maxima_near_a_neighbour_are_those_by_shooting():
@@ -244,8 +202,8 @@ def test_maxima_near_a_neighbour_are_those_by_shooting():
     base = evaluator(series=False)
     for factor in (0.998, 0.999, 1.003):
         design = factor * np.array(list(base.design.values()))
-        near = evaluator(design, start=base.state, series=False)
-        usual = fresh(design, start=base.state, series=False)
+        near = evaluator(design, start=base.start, series=False)
+        usual = fresh(design, start=base.start, series=False)
         assert near.statistics["from_neighbour"] == 1
         assert "from_neighbour" not in usual.statistics
         one, other = near.maxima, usual.maxima
