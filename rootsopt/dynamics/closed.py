@@ -36,7 +36,7 @@ from rootsopt.dynamics.steady import (
     transient_status,
     window_status,
 )
-from rootsopt.dynamics.window import Window, lyapunov
+from rootsopt.dynamics.window import PERIODS, Window, lyapunov
 from rootsopt.status import Status
 
 _COARSE = 1e-5
@@ -114,7 +114,7 @@ class _Attempts(eqx.Module):
     def run(self) -> Steady:
         """Return the result of the search."""
         loop = lax.while_loop(lambda now: ~now.over, lambda now: self.step(now), self.begin())
-        return self.judged_by_window(loop)
+        return loop.found._replace(settled=loop.found.settled._replace(pieces=None))
 
     def begin(self) -> _Loop:
         """Return the initial state of the loop."""
@@ -133,7 +133,7 @@ class _Attempts(eqx.Module):
             period=jnp.ones((), int),
             rtol=solver.orbit.rtol,
             verdict=Verdict(no, no, jnp.zeros((), dtype), no, no),
-            window=self.no_window(state, 0),
+            window=None,
             settled=Transient(
                 state, zero, zero + 1, jnp.full((), jnp.inf, dtype), zero, no, ~no, zero, pieces
             ),
@@ -257,28 +257,6 @@ class _Attempts(eqx.Module):
         )
         return final(self.pair, found, self.radius)
 
-    def judged_by_window(self, loop: _Loop) -> Steady:
-        """Return the result, judged by a window of the motion if no orbit has been closed."""
-        solver, found = self.solver, loop.found
-        found = found._replace(settled=found.settled._replace(pieces=None))
-        unsettled = found.status == Status.NOT_SETTLED.code
-        made, status = self.no_window(loop.state, solver.windows), found.status
-
-        def window() -> tuple[Window, Int[Array, ""]]:
-            made = lyapunov(self.pair, loop.state, solver.windows, solver.transient)
-            return made, window_status(self.pair, made)
-
-        if solver.windows:
-            examined = unsettled & (solver.examine > 0)
-            made, status = lax.cond(examined, window, lambda: (made, status))
-        repeats = unsettled & (status == Status.NOT_SETTLED.code) & (found.settled.period > 0)
-        status = jnp.where(repeats, Status.NOT_CLOSED.code, status)
-        return found._replace(window=made, status=status)
-
-    def no_window(self, state: Float[Array, " n"], periods: int) -> Window:
-        """Return a window from the scaled `state` (n,) before any integration."""
-        return Window.empty(state, periods, self.solver.transient.tolerance)
-
 
 def motion(
     pair: RotorPair,
@@ -289,7 +267,8 @@ def motion(
 ) -> Steady:
     """Find the steady motion of `pair`, by `closed_motion` where collocation supports it.
 
-    Otherwise the orbit is closed by shooting. For the arguments, see `closed_motion`."""
+    Otherwise the orbit is closed by shooting. For the arguments, see `closed_motion`. A motion that
+    does not settle is left to `examined`."""
     if continues(pair, solver):
         return closed_motion(pair, tangents, start, radius, solver)
     return steady_motion(pair, tangents, pair.scaled(start.state), radius, solver)
@@ -309,10 +288,9 @@ def closed_motion(
     `solver`: settings.
 
     An orbit is rejected if it is not stable or not near the end of the transient. The transient
-    then continues, followed by another attempt (`_ATTEMPTS`). A window of the motion follows if the
-    last attempt fails, unless the transient has repeated at two tolerances. If it shows no chaos
-    although the transient repeated, the status is NOT_CLOSED. If an orbit near the known one is not
-    accepted, the search begins at `start.state`.
+    then continues, followed by another attempt (`_ATTEMPTS`). If the last attempt fails although
+    the transient has repeated at two tolerances, the status is NOT_CLOSED. If an orbit near the
+    known one is not accepted, the search begins at `start.state`.
 
     The orbit has no samples of the state and no steps (see `collocation.sampled`). Collocation must
     support the pair (`collocation.closing.supported`)."""
@@ -321,4 +299,29 @@ def closed_motion(
     return _Attempts(pair, tangents, start, radius, solver).run()
 
 
-__all__ = ["Start", "closed_motion", "motion", "unknown"]
+def examined(pair: RotorPair, found: Steady, solver: Solver) -> Steady:
+    """Return the motion `found` of `pair`; one that has not settled is judged by a window of it.
+
+    The window begins at the end of the transient, and distinguishes chaos from a long transient."""
+    state, integrator = found.settled.state, solver.transient
+    unsettled = (found.status == Status.NOT_SETTLED.code) & (solver.examine > 0)
+    window = lax.cond(
+        unsettled,
+        lambda: lyapunov(pair, state, PERIODS, integrator),
+        lambda: Window.empty(state, PERIODS, integrator.tolerance),
+    )
+    status = jnp.where(unsettled, window_status(pair, window), found.status)
+    return not_closed(found._replace(window=window, status=status))
+
+
+def not_closed(found: Steady) -> Steady:
+    """Return the motion `found`, whose status is NOT_CLOSED if it repeats and shows no chaos.
+
+    The status of a motion after shooting stays."""
+    if found.known is None:
+        return found
+    repeats = (found.status == Status.NOT_SETTLED.code) & (found.settled.period > 0)
+    return found._replace(status=jnp.where(repeats, Status.NOT_CLOSED.code, found.status))
+
+
+__all__ = ["Start", "closed_motion", "examined", "motion", "not_closed", "unknown"]

@@ -2,8 +2,6 @@
 
 Newton's method on the k-fold stroboscopic map closes an orbit of k mesh periods. The monodromy
 matrix shows whether the orbit is stable, and the implicit function theorem gives its derivatives.
-Where there is no orbit, the same loop integrates a window of the motion
-(`rootsopt.dynamics.window`).
 
 The solver steps of an orbit are recorded as a *grid*, and repeated once Newton's method is close. A
 *kink* is an instant at which the equation of motion is not smooth; grid steps end there.
@@ -23,7 +21,6 @@ from rootsopt.dynamics.linear import solved, spectral_radius
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.switches import halved, has_room, with_switches
-from rootsopt.dynamics.window import Window
 
 SAMPLES = 2520
 """Number of uniform samples of an orbit. It is divisible by every period up to ten, so that a
@@ -115,9 +112,9 @@ class Orbit(NamedTuple):
 
 
 class _Closing(NamedTuple):
-    """State of the loop that closes an orbit or integrates a window.
+    """State of the loop that closes an orbit.
 
-    `orbit`, `window`: results so far; `state`, `grid`: initial state and step ends for the next
+    `orbit`: result so far; `state`, `grid`: initial state and step ends for the next
     integration; `repeat`: whether the next integration repeats the steps of `grid`; `held`: whether
     the last integration repeated steps that remain in use; `improving`: whether the last
     integration at least halved the residual, or the grid is new; `base`: the grid without the step
@@ -128,7 +125,6 @@ class _Closing(NamedTuple):
     """
 
     orbit: Orbit
-    window: Window
     state: Float[Array, " n"]
     repeat: Bool[Array, ""]
     held: Bool[Array, ""]
@@ -143,13 +139,13 @@ class _Closing(NamedTuple):
 
 
 class _Shooting(eqx.Module):
-    """The loop of `orbit_or_window`, with the settings of one call.
+    """The loop of `close_orbit`, with the settings of one call.
 
     `start` returns the initial state of the loop, `go_on` whether the loop continues, and `step`
     its next state. `shots`: maximum number of integrations; `closed`: residual (scaled) at which
     Newton's method stops; `tolerance`: relative tolerance of the integrator; `check`: whether to
     compare derivatives with those on halved steps. The other fields are arguments of
-    `orbit_or_window` or fields of `Shots`."""
+    `close_orbit` or fields of `Shots`."""
 
     pair: RotorPair
     tangents: RotorPair
@@ -159,10 +155,8 @@ class _Shooting(eqx.Module):
     shots: Int[Array, ""]
     closed: Float[Array, ""]
     tolerance: Float[Array, ""]
-    windowed: Bool[Array, ""]
     samples: int = eqx.field(static=True)
     check: bool = eqx.field(static=True)
-    periods: int = eqx.field(static=True)
 
     def start(self, state: Float[Array, " n"]) -> _Closing:
         """Return the initial state of the loop, for a motion that begins at the scaled `state`
@@ -174,7 +168,6 @@ class _Shooting(eqx.Module):
         no, zero = jnp.zeros((), bool), jnp.zeros((), int)
         return _Closing(
             orbit=Orbit.empty(state, directions, none),
-            window=Window.empty(state, self.periods, self.tolerance),
             state=state,
             repeat=no,
             held=no,
@@ -198,42 +191,30 @@ class _Shooting(eqx.Module):
     def go_on(self, now: _Closing) -> Bool[Array, ""]:
         """Return whether the loop continues: something is left to integrate."""
         sound = now.held & now.orbit.flow.solved & jnp.isfinite(now.orbit.residual)
-        closing = self.is_open(now) | (sound & ~now.checked & self.check)
-        alive = now.window.solved & jnp.all(jnp.isfinite(now.window.end))
-        window = (now.window.done < self.periods) & alive
-        return jnp.where(self.windowed, window, closing)
+        return self.is_open(now) | (sound & ~now.checked & self.check)
 
     def step(self, now: _Closing) -> _Closing:
         """Integrate once and return the new state of the loop.
 
-        The integration serves a Newton step, the check of the orbit on halved steps, or the next
-        mesh period of the window."""
-        checking = ~self.is_open(now) & ~self.windowed
+        The integration serves a Newton step, or the check of the orbit on halved steps."""
+        checking = ~self.is_open(now)
         start = jnp.where(checking, now.orbit.state, now.state)
-        start = jnp.where(self.windowed, now.window.start, start)
         grid = lax.cond(checking, lambda: halved(now.grid), lambda: now.grid)
-        length = jnp.where(self.windowed, 1, self.period).astype(start.dtype)
         frozen = lax.stop_gradient(self.pair)
         peak = now.orbit.flow.peak
         out = flow(
             self.pair,
             start,
-            length,
+            self.period.astype(start.dtype),
             self.integrator,
             self.samples,
             self.tangents,
             grid,
-            (now.repeat | checking) & ~self.windowed,
+            now.repeat | checking,
             measures=self.measures,
             top=jnp.where(peak > 0, peak, frozen.force_scale),
         )
-        if not self.periods:
-            return self._newton(now, start, checking, out)
-        return lax.cond(
-            self.windowed,
-            lambda: now._replace(window=now.window.after(out)),
-            lambda: self._newton(now, start, checking, out),
-        )
+        return self._newton(now, start, checking, out)
 
     def _newton(self, now: _Closing, start, checking, out: Flow) -> _Closing:
         """Return the loop's state after the flow `out` from the scaled state `start`.
@@ -271,7 +252,6 @@ class _Shooting(eqx.Module):
         best = jnp.where(renewed | ~now.repeat, jnp.inf, jnp.minimum(now.best, residual))
         after = _Closing(
             orbit=choose(checking, compared, found),
-            window=now.window,
             state=new,
             repeat=following | checking,
             held=jnp.where(checking, ~finer, now.repeat & ~again),
@@ -361,36 +341,16 @@ def close_orbit(
 ) -> Orbit:
     """Find the periodic orbit of `period` mesh periods near the scaled `state` (n,), by shooting.
 
-    The result includes the derivatives of the orbit. `tangents`: d pair / d design, stacked along a
-    leading axis; `shots`: integrator, measures of the force and limits of Newton's method. Nothing
-    is raised if Newton's method fails: the result is that of its last integration. `Orbit.residual`
-    and `Orbit.flow.solved` show whether it has failed. See `orbit_or_window`.
-    """
-    return orbit_or_window(pair, tangents, state, period, shots)[0]
-
-
-def orbit_or_window(
-    pair: RotorPair,
-    tangents: RotorPair,
-    state: Float[Array, " n"],
-    period: Int[Array, ""],
-    shots: Shots,
-    windowed: Bool[Array, ""] | bool = False,
-    periods: int = 0,
-) -> tuple[Orbit, Window]:
-    """Close and differentiate an orbit or, if `windowed`, integrate a window from `state`.
-
-    Return both; the one that was not computed is a placeholder. `periods`: length of the window
-    (mesh periods).
-
-    The orbit is the solution of Φ(z) = z near the scaled `state` (n,), where Φ is the flow over
-    `period` mesh periods. Newton shooting finds it, and the implicit function theorem gives its
-    derivatives. `tangents` holds d pair / d design, stacked along a leading axis.
+    The orbit is the solution of Φ(z) = z, where Φ is the flow over `period` mesh periods. Newton
+    shooting finds it, and the implicit function theorem gives its derivatives. `tangents`: d pair /
+    d design, stacked along a leading axis; `shots`: integrator, measures of the force and limits of
+    Newton's method.
 
     Newton's method stops if the residual is at most `shots.closed` or, if greater, the limit from
     `_CLOSED`. It also stops if the residual no longer halves, or after `shots.count` integrations
     (half as many more if the steps were halved). If the orbit is still open then, nothing is
-    raised: the result is that of the last integration.
+    raised: the result is that of the last integration. `Orbit.residual` and `Orbit.flow.solved`
+    show whether it has failed.
 
     If the pair is not `smooth`, the linearised steps miss how its jumps move, so that derivatives
     with respect to the design are NaN.
@@ -412,12 +372,10 @@ def orbit_or_window(
         shots=jnp.asarray(shots.count),
         closed=jnp.maximum(shots.closed, enough).astype(dtype),
         tolerance=tolerance,
-        windowed=jnp.asarray(windowed),
         samples=shots.samples,
         # No check for a pair that is not smooth: its derivatives are those of the steps, not of
         # the motion.
         check=shots.check and pair.smooth,
-        periods=periods,
     )
     # The integration occurs only once, inside the loop, so that it is compiled once.
     found = lax.while_loop(
@@ -433,7 +391,7 @@ def orbit_or_window(
         response=orbit.flow.response,
         sensitivity=slope[count:, count:] + slope[count:, :count] @ moved,
         moved=moved,
-    ), found.window
+    )
 
 
 def choose(condition: Bool[Array, ""], new: Any, old: Any) -> Any:

@@ -1,9 +1,8 @@
 """The steady motion that a state leads to, with its status and derivatives, as a pure function.
 
 The transient is simulated until the motion repeats (`settle`). The orbit near its end is closed and
-differentiated (`orbit_or_window`), then checked (`verdict`). If a check fails, the next attempt
-uses finer tolerances. Where there is no orbit, a window of the motion distinguishes chaos from a
-long transient. All attempts are iterations of one loop, so that each part is compiled only once.
+differentiated (`close_orbit`), then checked (`verdict`). If a check fails, the next attempt uses
+finer tolerances. All attempts are iterations of one loop, so that each part is compiled only once.
 """
 
 import dataclasses
@@ -20,11 +19,11 @@ from rootsopt.dynamics.collocation.known import Known
 from rootsopt.dynamics.flow import Flow
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.measures import Measures
-from rootsopt.dynamics.orbit import SAMPLES, Orbit, Shots, choose, orbit_or_window
+from rootsopt.dynamics.orbit import SAMPLES, Orbit, Shots, choose, close_orbit
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.settle import Transient, settle, settled_within
 from rootsopt.dynamics.verdict import RESIDUAL, TOO_DEEP, UNRESOLVED, Verdict, verdict
-from rootsopt.dynamics.window import PERIODS, Window
+from rootsopt.dynamics.window import Window
 from rootsopt.status import Status
 
 NEARLY = 0.05
@@ -43,15 +42,14 @@ class Solver(eqx.Module):
 
     `transient`, `orbit`: integrators of the transient and of the orbit; `measures`: averages of the
     force to compute; `max_periods`: maximum length of the transient (mesh periods); `examine`: 1 to
-    integrate a window of a motion that does not settle, 0 to skip the window; `max_orbit`: longest
-    period of an orbit to find (mesh periods), at most 8. `max_periods` and `examine` are floats, as
-    are all leaves.
+    integrate a window of a motion that does not settle (see `closed.examined`), 0 to skip it;
+    `max_orbit`: longest period of an orbit to find (mesh periods), at most 8. `max_periods` and
+    `examine` are floats, as are all leaves.
 
     The other settings have defaults. Coarse surveys of many designs use other values. `shots`:
     maximum number of integrations to close an orbit; `closed`: residual (tolerances) at which an
     orbit may count as closed; `samples`: number of uniform samples of an orbit; `check`: whether to
-    compare the derivatives with those on halved steps; `attempts`: maximum number of attempts;
-    `windows`: length of a window (mesh periods), a multiple of 16; 0: no window.
+    compare the derivatives with those on halved steps; `attempts`: maximum number of attempts.
 
     `closing`: how orbits are closed: by `shooting`, by `collocation`, or `auto` (by collocation
     from the orbit of a similar pair, otherwise by shooting). Only shooting closes orbits of pairs
@@ -69,7 +67,6 @@ class Solver(eqx.Module):
     samples: int = eqx.field(static=True, default=SAMPLES)
     check: bool = eqx.field(static=True, default=True)
     attempts: int = eqx.field(static=True, default=16)
-    windows: int = eqx.field(static=True, default=PERIODS)
     closing: str = eqx.field(static=True, default="shooting")
 
 
@@ -78,10 +75,10 @@ class Steady(NamedTuple):
 
     `status`: code of a `Status`; `orbit`: the orbit found, or the last one tried; `period` (mesh
     periods), `rtol` and `verdict`: length and tolerance of this orbit, and the results of its
-    checks; `window` of a motion that did not settle; `settled`: end of the transient; `used`: mesh
-    periods of all transients; `steps`: number of solver steps of transients and orbits; `known`: an
-    orbit closed by collocation, from which those of similar pairs can be closed, `None` after
-    shooting.
+    checks; `window` of a motion that did not settle, `None` if it was not examined; `settled`: end
+    of the transient; `used`: mesh periods of all transients; `steps`: number of solver steps of
+    transients and orbits; `known`: an orbit closed by collocation, from which those of similar
+    pairs can be closed, `None` after shooting.
     """
 
     status: Int[Array, ""]
@@ -89,7 +86,7 @@ class Steady(NamedTuple):
     period: Int[Array, ""]
     rtol: Float[Array, ""]
     verdict: Verdict
-    window: Window
+    window: Window | None
     settled: Transient
     used: Int[Array, ""]
     steps: Int[Array, ""]
@@ -105,7 +102,7 @@ class Steady(NamedTuple):
         closed = self.orbit.response
         unknown = jnp.full_like(closed, jnp.nan)
         found = jnp.where(among(self.status, CLOSED), closed, unknown)
-        if self.window.growth.shape[0]:
+        if self.window is not None:
             whole = self.window.done == self.window.growth.shape[0]
             window = among(self.status, (Status.CHAOTIC, Status.NOT_SETTLED)) & whole
             found = jnp.where(window, unknown.at[:3].set(self.window.forces), found)
@@ -130,8 +127,8 @@ class _Search(NamedTuple):
     """State of the loop over attempts: the result so far, and what to do in the next iteration.
 
     `found`: result so far; `shorter`: period (mesh periods) of a shorter orbit to try next, 0 for
-    none; `windowed`: whether to integrate a window next. Otherwise, the next iteration simulates a
-    transient and closes its orbit. It starts from `state`, at the tolerances `coarse` (transient)
+    none. Otherwise, the next iteration simulates a transient and closes its orbit. It starts from
+    `state`, at the tolerances `coarse` (transient)
     and `fine` (orbit), and the states must repeat to within the scaled distance `within`. `tries`:
     number of refinements so far; `over`: whether the loop has ended.
     """
@@ -142,7 +139,6 @@ class _Search(NamedTuple):
     fine: Float[Array, ""]
     within: Float[Array, ""]
     shorter: Int[Array, ""]
-    windowed: Bool[Array, ""]
     tries: Int[Array, ""]
     over: Bool[Array, ""]
 
@@ -174,7 +170,7 @@ class _Attempts(eqx.Module):
             period=one,
             rtol=solver.orbit.rtol,
             verdict=Verdict(no, no, jnp.zeros((), dtype), no, no),
-            window=Window.empty(state, solver.windows, solver.transient.tolerance),
+            window=None,
             settled=Transient(state, zero, one, infinite, zero, no, ~no, zero),
             used=zero,
             steps=zero,
@@ -182,16 +178,15 @@ class _Attempts(eqx.Module):
         )
         coarse, fine = solver.transient.rtol, solver.orbit.rtol
         within = settled_within(coarse).astype(dtype)
-        return _Search(found, state, coarse, fine, within, zero, no, zero, unsound)
+        return _Search(found, state, coarse, fine, within, zero, zero, unsound)
 
     def step(self, now: _Search) -> _Search:
         """Make one iteration and return the new state of the loop.
 
-        An iteration computes a transient and its orbit, an orbit of a shorter period, or a window.
-        """
+        An iteration computes a transient and its orbit, or an orbit of a shorter period."""
         solver, found = self.solver, now.found
         shorter = now.shorter > 0
-        fresh = ~shorter & ~now.windowed
+        fresh = ~shorter
         settled = settle(
             self.pair,
             now.state,
@@ -212,36 +207,33 @@ class _Attempts(eqx.Module):
         lost = fresh & (failure >= 0) & ~nearly
         period = jnp.maximum(jnp.where(shorter, now.shorter, settled.period), 1)
         start = jnp.where(shorter, found.orbit.state, settled.state)
-        rtol = jnp.where(now.windowed, solver.transient.rtol, now.fine)
         shots = Shots(
-            integrator=dataclasses.replace(solver.orbit, rtol=rtol),
+            integrator=dataclasses.replace(solver.orbit, rtol=now.fine),
             measures=solver.measures,
             count=jnp.where(lost, 0, solver.shots),
             closed=solver.closed * solver.orbit.rtol,
             samples=solver.samples,
             check=solver.check,
         )
-        orbit, window = orbit_or_window(
-            self.pair, self.tangents, start, period, shots, now.windowed, solver.windows
-        )
+        orbit = close_orbit(self.pair, self.tangents, start, period, shots)
         open_by = solver.closed * solver.orbit.rtol
         open_by = jnp.maximum(open_by, RESIDUAL)
         limits = now.fine, within, open_by
         checks, status = judged(self.pair, solver, self.radius, orbit, start, limits)
         # An orbit of a shorter period is the motion even if its derivatives are uncertain.
         holds = among(status, (Status.PERIODIC, Status.INACCURATE))
-        taken = jnp.where(shorter, holds, ~lost) & ~now.windowed
+        taken = jnp.where(shorter, holds, ~lost)
         status = jnp.where(lost, failure, jnp.where(taken, status, found.status))
         new = Steady(
-            status=jnp.where(now.windowed, self._unsettled(window), status),
+            status=status,
             orbit=choose(taken, orbit, found.orbit),
             period=jnp.where(taken, period, found.period),
             rtol=jnp.where(taken, now.fine, found.rtol),
             verdict=choose(taken, checks, found.verdict),
-            window=choose(now.windowed, window, found.window),
+            window=None,
             settled=settled,
             used=used,
-            steps=steps + jnp.where(now.windowed, 0, orbit.flow.steps),
+            steps=steps + orbit.flow.steps,
             known=found.known,
         )
         return self._next(now, new, within, lost, taken & shorter)
@@ -253,19 +245,17 @@ class _Attempts(eqx.Module):
         failed; `shortened`: whether an orbit of a shorter period was accepted."""
         solver = self.solver
         candidate = self._shorter(new, now.shorter)
-        looks = (new.status == Status.PERIODIC.code) & ~shortened & ~now.windowed & ~lost
+        looks = (new.status == Status.PERIODIC.code) & ~shortened & ~lost
         # Newton's method left the neighbourhood, or found an orbit that is unstable or has
         # uncertain derivatives. Either the motion was not steady yet, or the steps were too coarse:
         # continue the transient with finer tolerances.
         late = (new.used >= solver.max_periods) | (within < _CLOSEST)
         late |= now.tries + 1 >= solver.attempts
-        weak = among(new.status, (Status.NOT_SETTLED, Status.INACCURATE)) & ~now.windowed
+        weak = among(new.status, (Status.NOT_SETTLED, Status.INACCURATE))
         again = weak & ~late & ~lost
         least = jnp.minimum(solver.orbit.rtol, _TRUSTED)
         fine = jnp.where(again, jnp.maximum(now.fine / 100, least), now.fine)
         coarse = jnp.where(again, jnp.maximum(now.coarse / 10, fine), now.coarse)
-        unsettled = (new.status == Status.NOT_SETTLED.code) & ~again & ~now.windowed
-        windowed = unsettled & (solver.windows > 0) & (solver.examine > 0)
         shorter = jnp.where(looks, candidate, 0)
         return _Search(
             found=new,
@@ -274,9 +264,8 @@ class _Attempts(eqx.Module):
             fine=fine,
             within=jnp.where(again, within / 10, within),
             shorter=shorter,
-            windowed=windowed,
             tries=now.tries + again,
-            over=~(again | windowed | (shorter > 0)),
+            over=~(again | (shorter > 0)),
         )
 
     def _shorter(self, found: Steady, beyond) -> Int[Array, ""]:
@@ -291,13 +280,6 @@ class _Attempts(eqx.Module):
         divides = (found.period % periods == 0) & (periods < found.period)
         fits = near & divides & (periods > beyond)
         return jnp.where(jnp.any(fits), periods[jnp.argmax(fits)], 0)
-
-    def _unsettled(self, window: Window) -> Int[Array, ""]:
-        """Return the status code of the motion, judged by a `window` of it, as `window_status`
-        does."""
-        if not self.solver.windows:
-            return jnp.asarray(Status.NOT_SETTLED.code)
-        return window_status(self.pair, window)
 
 
 def judged(

@@ -73,7 +73,6 @@ def coarse(
         samples=SAMPLES,
         check=False,
         attempts=1,
-        windows=0,
     )
 
 

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rootsopt.config import Config
 from rootsopt.config.units import RPM
-from rootsopt.dynamics.closed import Start, motion
+from rootsopt.dynamics.closed import Start, motion, not_closed
 from rootsopt.dynamics.maxima import Maxima, local_maxima, prepare_maxima
 from rootsopt.dynamics.measures import PEAK_NORM, line_name
 from rootsopt.dynamics.pair import RotorPair
@@ -23,7 +23,7 @@ from rootsopt.dynamics.steady import (
     Steady,
     window_status,
 )
-from rootsopt.dynamics.window import integrated_difference, lyapunov
+from rootsopt.dynamics.window import PERIODS, integrated_difference, lyapunov
 from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry
 from rootsopt.pump.loads import OrbitLoads, orbit_loads
@@ -276,7 +276,7 @@ class Evaluator:
 
         It has derivatives along `tangents`; `start`: result of `starts.begun`."""
         radius, solver = self.scene.pitch_radius, self.scene.solver
-        found = _motion(pair, tangents, start, radius, solver)
+        found = self._examined(pair, _motion(pair, tangents, start, radius, solver))
         if Status.of(found.status) is not Status.NOT_CLOSED:
             return found
         return self._by_shooting(pair, tangents, start)
@@ -287,7 +287,20 @@ class Evaluator:
         Shooting has a program of its own, which is compiled only for the rare motions that need
         it."""
         solver = dataclasses.replace(self.scene.solver, closing="shooting")
-        return _motion(pair, tangents, start, self.scene.pitch_radius, solver)
+        found = _motion(pair, tangents, start, self.scene.pitch_radius, solver)
+        return self._examined(pair, found)
+
+    def _examined(self, pair: RotorPair, found: Steady) -> Steady:
+        """Return the motion `found`, with the status that `closed.examined` would give it.
+
+        The window has a program of its own, which few motions need."""
+        if Status.of(found.status) is not Status.NOT_SETTLED:
+            return found
+        if float(self.scene.solver.examine) > 0:
+            state, integrator = found.settled.state, self.scene.solver.transient
+            window = jax.device_get(lyapunov_program(pair, state, PERIODS, integrator))
+            found = found._replace(window=window, status=unsettled_status(pair, window))
+        return not_closed(found)
 
     def _confirmed(
         self, pair: RotorPair, tangents: RotorPair, start: Start, found: Steady
@@ -397,7 +410,7 @@ class Evaluator:
             steady = {"kind": "idle"}
             names = self.scene.solver.measures.named(np.zeros((len(orbit.response), 1)), 1)
             response = dict.fromkeys(names, 0.0)
-            if int(found.window.done):
+            if found.window is not None:
                 hint = idle_hint(self.config, float(found.window.depth))
                 steady |= window_record(found.window)
                 motion = window_series(pair, found.window) if series else None
@@ -410,7 +423,7 @@ class Evaluator:
                     motion = orbit_series(pair, orbit, period) if series else None
         elif status is Status.UNSOUND and pair.soundness is not None:
             hint = f" Here, {fault_of(pair.soundness)}."
-        elif int(found.window.done):
+        elif found.window is not None:
             steady, response, motion = unsettled(pair, status, found.window, series)
         elif status is Status.SOLVER_FAILED and pair.timescales is not None:
             swings = pair.mesh_period / (2 * np.pi * pair.timescales.swing)

@@ -18,7 +18,7 @@ from jax.custom_batching import sequential_vmap
 from jaxtyping import Array, Complex, Float, Int
 from numpy.typing import ArrayLike
 
-from rootsopt.dynamics.closed import Start, motion, unknown
+from rootsopt.dynamics.closed import Start, examined, motion, unknown
 from rootsopt.dynamics.linear import eigenvalues
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import CLOSED, Solver, Steady, among
@@ -206,15 +206,23 @@ def _solved(scene: Scene, design, start, along: tuple[int, ...]) -> tuple[Respon
     arguments = scene, design, start, along
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arguments)):
         return _inline(*arguments)
-    found = _compiled(*arguments)
+    found = _compiled(*arguments, False)
+    # Rare: a window and shooting have programs of their own, which are compiled only now.
+    if int(found[0].status) == Status.NOT_SETTLED.code:
+        found = _compiled(*arguments, True)
     if int(found[0].status) != Status.NOT_CLOSED.code:
         return found
-    # Rare: shooting has a program of its own, which is compiled only now.
     solver = dataclasses.replace(scene.solver, closing="shooting")
-    return _compiled(dataclasses.replace(scene, solver=solver), *arguments[1:])
+    return _compiled(dataclasses.replace(scene, solver=solver), *arguments[1:], True)
 
 
-def _solve(scene: Scene, design, start, numbers: tuple[int, ...]) -> tuple[Response, Array]:
+def _solve(
+    scene: Scene, design, start, numbers: tuple[int, ...], windowed: bool = True
+) -> tuple[Response, Array]:
+    """Return the results of `_solved`.
+
+    `numbers`: its argument `along`; `windowed`: whether to examine a motion that does not settle.
+    """
     leaves, tree = jax.tree.flatten((scene, design), is_leaf=lambda x: x is None)
     chosen = [leaves[k] for k in numbers]
 
@@ -229,6 +237,8 @@ def _solve(scene: Scene, design, start, numbers: tuple[int, ...]) -> tuple[Respo
     start = _start_of(pair, start, scene.solver)
     radius, solver = scene.pitch_radius, scene.solver
     found = motion(pair, tangents, start, radius, solver)
+    if windowed:
+        found = examined(pair, found, solver)
     return _named(scene.solver, pair, tangents, found)
 
 

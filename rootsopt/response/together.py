@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rootsopt.dynamics.closed import examined
 from rootsopt.dynamics.steady import Steady, steady_motion
 from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.runtime.programs import Program
@@ -44,6 +45,8 @@ def evaluate_together(evaluators: Sequence[Evaluator]) -> list[Evaluation]:
         for row, number in enumerate(members):
             pair, _, shape = built[number]
             motion = jax.tree.map(lambda x, row=row: x[row], motions)
+            if not int(motion.window.done):
+                motion = motion._replace(window=None)
             found[number] = evaluators[number].evaluation((pair, shape), motion, began)
     return [found[number] for number in range(len(evaluators))]
 
@@ -57,7 +60,12 @@ def _kind(arrays: Any, others: Any) -> Hashable:
 
 @Program
 def _motions(arrays, others) -> Steady:
-    return jax.vmap(lambda one: steady_motion(*eqx.combine(one, others)))(arrays)
+    def one(arrays):
+        pair, tangents, state, radius, solver = eqx.combine(arrays, others)
+        found = steady_motion(pair, tangents, state, radius, solver)
+        return examined(pair, found, solver)
+
+    return jax.vmap(one)(arrays)
 
 
 __all__ = ["evaluate_together", "pays"]

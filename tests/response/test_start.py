@@ -1,6 +1,5 @@
 """`Response.start`: an orbit that travels through pure functions to similar designs and scenes."""
 
-import dataclasses
 import pickle
 
 import equinox as eqx
@@ -128,10 +127,10 @@ def test_orbit_that_is_not_closed_is_said_to_be(scene, monkeypatch):
     """Inside `jit` it has a status; otherwise shooting closes it."""
     monkeypatch.setattr("rootsopt.dynamics.closed.corrected", jnp.zeros_like)
     # With a window of 16 mesh periods, which says that the motion is not chaotic.
-    brief = eqx.tree_at(lambda s: s.solver, scene, dataclasses.replace(scene.solver, windows=16))
+    monkeypatch.setattr("rootsopt.dynamics.closed.PERIODS", 16)
     found, slope = jax.jit(
         lambda design: jax.value_and_grad(
-            lambda design: (lambda one: (one.mean, one))(steady_response(brief, design)),
+            lambda design: (lambda one: (one.mean, one))(steady_response(scene, design)),
             has_aux=True,
         )(design)
     )(DESIGN)
@@ -141,13 +140,14 @@ def test_orbit_that_is_not_closed_is_said_to_be(scene, monkeypatch):
     asked = []
 
     def program(scene, *rest):
-        asked.append(scene.solver.closing)
+        asked.append((scene.solver.closing, rest[-1]))
         return found[1]._replace(status=codes[len(asked) - 1]), slope
 
-    codes = Status.NOT_CLOSED.code, Status.PERIODIC.code
+    # The window and shooting have programs of their own.
+    codes = Status.NOT_SETTLED.code, Status.NOT_CLOSED.code, Status.PERIODIC.code
     monkeypatch.setattr("rootsopt.response.steady._compiled", program)
     assert Status.of(steady_response(scene, DESIGN).status) is Status.PERIODIC
-    assert asked == ["auto", "shooting"]
+    assert asked == [("auto", False), ("auto", True), ("shooting", True)]
 
 
 def test_reported_orbit_is_integrated(scene, monkeypatch):

@@ -96,10 +96,10 @@ on the finer mesh. In theory the error falls by the larger factor 1.4⁸."""
 _DOUBT = 5.0
 """Factor by which the difference between derivatives on two meshes is multiplied, since it must
 bound the error of those on the finer mesh and falls less evenly than that of the forces."""
-_TURNING = 100.0, 1e-7, 1e-2
+_TURNING = 100.0, 2.5e-7, 1e-2
 """Error of derivatives above which the mesh is refined: the first number times the error of the
 forces to reach, at least the second and at most the third."""
-_ROUGH = 3e-8
+_ROUGH = 1e-7
 """Relative error of derivatives that does not show in their difference: both meshes have the same
 roots of the gap to 1e-6 rad, and the same rounding errors."""
 
