@@ -21,6 +21,7 @@ from rootsopt.response.attractors import Attractor, AttractorEvaluator, Basins, 
 from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.response.records import fading_note, idle_hint, message_of, unsettled
 from rootsopt.response.speeds import AtSpeed, SpeedsEvaluation, overall
+from rootsopt.response.starts import Seed
 from rootsopt.scene import Scene, design_vector
 from rootsopt.status import Status
 
@@ -49,7 +50,7 @@ def made_up(response, status=Status.PERIODIC, state=(0.1, 0.0)) -> Evaluation:
         message=status.value,
         statistics={"seconds": 0.0},
         series=None,
-        state=None if state is None else np.array(state),
+        start=None if state is None else Seed(np.array(state)),
     )
 
 
@@ -297,4 +298,4 @@ def test_a_motion_without_contact_beside_others_counts_as_zero(monkeypatch):
         found = AttractorEvaluator(Evaluator.of(config_of(f"objective.motion={motion}")))()
         assert found.status is Status.PERIODIC
         assert found.response["peak_force_N"] == pytest.approx(share * 200)
-        assert found.state.shape == (2, 2)
+        assert found.start.shape == (2, 2)
