@@ -239,7 +239,7 @@ class Recorder:
     def __init__(self, task: Task):
         self.config = load(task.config, list(task.overrides))
         evaluator = evaluator_for(self.config)
-        evaluator, baseline = evaluator.fit(series=False)
+        baseline = evaluator(series=False)
         self.problem = Problem.of(self.config, evaluator.scene, baseline)
         self.baseline = baseline
         self.evaluator = evaluator.relative_to(baseline).surveying().with_maxima()
@@ -250,15 +250,15 @@ class Recorder:
     def reset(self) -> None:
         """Forget all evaluations."""
         self.rows: list[dict[str, float]] = []
-        self.start, self.began = self.baseline.start, time.perf_counter()
+        self.near, self.began = self.baseline.start, time.perf_counter()
 
     def __call__(self, point: np.ndarray) -> Local | None:
         """Evaluate the problem at a point and record it."""
         design = self.problem.design(point)
-        evaluation = self.evaluator(design, start=self.start, series=False)
+        evaluation = self.evaluator(design, start=self.near, series=False)
         found = self.problem.local(evaluation, point)
         if found is not None:
-            self.start = evaluation.start
+            self.near = evaluation.start
         self.rows.append(
             {
                 "evaluation": len(self.rows) + 1,

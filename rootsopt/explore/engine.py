@@ -103,7 +103,8 @@ class Engine:
     def prepare(self) -> None:
         """Compile the programs in this thread, and set `ready`."""
         config = self.base
-        evaluator = Evaluator.of(config).unconfirmed().prepare()
+        evaluator = Evaluator.of(config).unconfirmed()
+        evaluator.prepare()
         self.shape(config)
         found = evaluator()
         if found.usable:

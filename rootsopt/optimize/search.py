@@ -41,7 +41,7 @@ from rootsopt.response.sensitivity import by_scene, quantities
 from rootsopt.response.starts import Seeds
 from rootsopt.response.wrapper import Evaluates
 from rootsopt.runtime.programs import Program
-from rootsopt.scene import Scene, design_vector
+from rootsopt.scene import Scene
 from rootsopt.status import Status
 
 if TYPE_CHECKING:
@@ -314,9 +314,10 @@ class Search:
 
     def _run(self) -> Optimization:
         maxima = needs_maxima(self.config, force_limits(self.config, self.exact.scene))
-        exact = self.exact.prepare(design_vector(self.config), maxima=maxima)
+        exact = self.exact
+        exact.prepare(maxima=maxima)
         Space.of(self.config, exact.scene, 0.0).prepare()
-        exact, first = exact.fit()
+        first = exact()
         baseline = first
         if self.beginning is not None:
             self.beginning = dataclasses.replace(self.beginning, evaluation=first)
@@ -720,9 +721,7 @@ def sensitivity_rows(
     evaluation with gradients with respect to the quantities, and returns the derivatives of the
     objective (% per unit, by key), or {} if they are not known. Return an empty list without such
     gradients."""
-    design = np.array(list(optimized.design.values()))
-    fitted = evaluator.fit(design, optimized.start, series=False)[0]
-    moved = by_scene(fitted, optimized)
+    moved = by_scene(evaluator, optimized)
     if moved is None:
         return []
     objective = percent(moved)

@@ -135,21 +135,9 @@ def find(
     on motions of a neighbouring design, whose basins the grid may miss. `evaluator` evaluates each
     attractor; `series`: whether to compute the series of each attractor.
     """
-    return find_fitted(evaluator, design, known, series)[1]
-
-
-def find_fitted(
-    evaluator: Evaluator,
-    design: Float[Array, " d"] | None = None,
-    known: Iterable[NDArray[np.float64]] = (),
-    series: bool = False,
-) -> tuple[Evaluator, Basins]:
-    """Return an evaluator fitted to the motion from rest, and the result of `find`.
-
-    Arguments: see `find`."""
     config = evaluator.config
     design = design_vector(config) if design is None else jnp.asarray(design)
-    evaluator, rest = evaluator.fit(design, None, series)
+    rest = evaluator(design, None, series)
     pair = evaluator.pair(design)
     scale, period = float(pair.angle_scale), float(pair.mesh_period)
     relative, rate = _axes(config, pair)
@@ -173,7 +161,7 @@ def find_fitted(
     kept = [i for i in order if found.evaluations[i].status not in _LOST]
     rank[kept] = np.arange(len(kept))
     lost = [label for label, number in zip(found.lost, numbers, strict=False) if number < 0]
-    return evaluator, Basins(
+    return Basins(
         relative=relative,
         rate=rate,
         leads_to=rank[numbers].reshape(len(rate), len(relative)),
@@ -361,14 +349,13 @@ class AttractorEvaluator(Wrapper):
 
     single: Evaluator
 
-    def fit(self, design=None, start=None, series=True) -> tuple["AttractorEvaluator", Evaluation]:
-        """Evaluate a design. Return another evaluator for neighbouring designs, and the evaluation.
+    def __call__(self, design=None, start=None, series=True) -> Evaluation:
+        """Evaluate a design.
 
         `design` (d,): in config units, by default the config's own; `start` (m, n): scaled states
         on motions of a neighbouring design; `series`: whether to compute the series."""
         known = () if start is None else tuple(np.atleast_2d(start))
-        single, basins = find_fitted(self.single, design, known, series)
-        return dataclasses.replace(self, single=single), self._of(basins)
+        return self._of(find(self.single, design, known, series))
 
     def _of(self, basins: Basins) -> Evaluation:
         """Return the evaluation that combines all motions as `objective.motion` specifies."""

@@ -124,10 +124,10 @@ class EnsembleEvaluator(Wrapper):
         config = self.config.model_copy(update={"ensemble": ensemble})
         return self._around(dataclasses.replace(self.single, config=config, survey=False))
 
-    def prepare(self, design=None, series=True, maxima=False) -> "EnsembleEvaluator":
+    def prepare(self, design=None, series=True, maxima=False) -> None:
         """Compile the programs for evaluating `design` (config units) in the background.
 
-        `series` and `maxima` have no effect. Return this evaluator."""
+        `series` and `maxima` have no effect."""
         design = design_vector(self.config) if design is None else jnp.asarray(design)
         pair, _ = _pair.result_shape(self.scene, design)
         prepare_members(pair, self.integrator)
@@ -135,10 +135,9 @@ class EnsembleEvaluator(Wrapper):
             state = jax.ShapeDtypeStruct((pair.states,), pair.angle_scale.dtype)
             lyapunov_program.prepare(pair, state, PERIODS, self.scene.solver.transient)
         _pair.prepare(self.scene, design)
-        return self
 
-    def fit(self, design=None, start=None, series=True) -> tuple["EnsembleEvaluator", Evaluation]:
-        """Evaluate a design. Return another evaluator for neighbouring designs, and the evaluation.
+    def __call__(self, design=None, start=None, series=True) -> Evaluation:
+        """Evaluate a design.
 
         `design` (d,): in config units, by default the config's own; `start` (members, n): scaled
         initial states; `series`: whether to compute the series of a member.
@@ -146,7 +145,7 @@ class EnsembleEvaluator(Wrapper):
         Raises ValueError if `start` has the wrong shape."""
         began = time.perf_counter()
         design = design_vector(self.config) if design is None else jnp.asarray(design)
-        return self, self._report(design, self._simulated(design, start), began, series)
+        return self._report(design, self._simulated(design, start), began, series)
 
     def _simulated(self, design, start) -> "_Outcome":
         pair, shape = _pair(self.scene, design)

@@ -244,17 +244,6 @@ class Evaluator:
         state (n,) at φ1 = 0; by default at rest (ε = 0, dε/dt = 0). `series`: whether to compute
         the series.
         """
-        return self.fit(design, start, series)[1]
-
-    def fit(
-        self,
-        design: ArrayLike | None = None,
-        start: Seed | ArrayLike | None = None,
-        series: bool = True,
-    ) -> tuple["Evaluator", Evaluation]:
-        """Evaluate a design. Return another evaluator for neighbouring designs, and the evaluation.
-
-        Arguments: see `__call__`."""
         began = time.perf_counter()
         design = design_vector(self.config) if design is None else jnp.asarray(design)
         pair, tangents, shape = _build(self.scene, design)
@@ -269,7 +258,7 @@ class Evaluator:
         if self.maxima and report.usable:
             maxima = local_maxima(pair, tangents, found.orbit, int(found.period), solver.orbit)
             report = dataclasses.replace(report, maxima=maxima)
-        return self, report
+        return report
 
     def motion(self, pair: RotorPair, tangents: RotorPair, start: Start) -> Steady:
         """Return the steady motion of `pair` that `start` leads to, in arrays of NumPy.
@@ -324,11 +313,11 @@ class Evaluator:
 
     def prepare(
         self, design: ArrayLike | None = None, series: bool = True, maxima: bool = False
-    ) -> "Evaluator":
+    ) -> None:
         """Compile the programs for evaluating `design` (config units) in the background.
 
         `series`: whether the evaluations will compute the series; `maxima`: whether evaluators
-        `with_maxima` will follow. Return this evaluator."""
+        `with_maxima` will follow."""
         design = design_vector(self.config) if design is None else jnp.asarray(design)
         pair, tangents, _ = _build.result_shape(self.scene, design)
         dtype, solver = pair.angle_scale.dtype, self.scene.solver
@@ -350,7 +339,6 @@ class Evaluator:
             count = pair.lobes * solver.samples
             times = jax.ShapeDtypeStruct((count,), float)
             contact_series.prepare(pair, times, jax.ShapeDtypeStruct((count, pair.states), dtype))
-        return self
 
     def assembled(self) -> tuple[RotorPair, RotorPair, Geometry]:
         """Return the pair of the config's own design, its derivatives along the design, and its

@@ -82,24 +82,22 @@ class SpeedsEvaluator(Wrapper):
         relative to those of the `baseline` at the same speed."""
         return dataclasses.replace(self, baseline=at_speeds(baseline))
 
-    def fit(self, design=None, start=None, series=True) -> tuple["SpeedsEvaluator", Evaluation]:
-        """Evaluate a design. Return another evaluator for neighbouring designs, and the evaluation.
+    def __call__(self, design=None, start=None, series=True) -> Evaluation:
+        """Evaluate a design.
 
         `design` (d,): in config units, by default the config's own; `start`: the `start` of a
         neighbouring design's evaluation; `series`: whether to compute the series at the scene's own
         speed."""
-        config, now = self.config, self.single
-        own = config.scene.speed_rpm
+        config, own = self.config, self.config.scene.speed_rpm
         parts = []
         for number, (speed, share) in enumerate(shares(config).items()):
-            now = now.at_speed(speed)
+            now = self.single.at_speed(speed)
             if self.baseline:
                 now = now.relative_to(self.baseline[number].evaluation)
             known = None if start is None else start[number]
-            now, found = now.fit(design, known, series and speed == own)
+            found = now(design, known, series and speed == own)
             parts.append(AtSpeed(speed, share, found))
-        fitted = dataclasses.replace(self, single=now.at_speed(own))
-        return fitted, together(parts, own)
+        return together(parts, own)
 
 
 def together(parts: Sequence["AtSpeed"], own: float) -> SpeedsEvaluation:

@@ -90,26 +90,25 @@ class ToleranceEvaluator(Wrapper):
         relative to those of the `baseline` in the nominal scene."""
         return self._around(self.single.relative_to(nominal_of(baseline)))
 
-    def fit(self, design=None, start=None, series=True) -> tuple["ToleranceEvaluator", Evaluation]:
-        """Evaluate a design. Return another evaluator for neighbouring designs, and the evaluation.
+    def __call__(self, design=None, start=None, series=True) -> Evaluation:
+        """Evaluate a design.
 
         `design` (d,): in config units, by default the config's own; `start`: the `start` of a
         neighbouring design's evaluation; `series`: whether to compute the series in the nominal
         scene. Without a usable motion in the nominal scene, no sample is simulated."""
         nominal = design_vector(self.config) if design is None else jnp.asarray(design)
         begin = (None,) * (1 + len(self.shifts)) if start is None else start
-        now, head = self.single.fit(nominal, begin[0], series)
-        fitted = dataclasses.replace(self, single=now)
+        head = self.single(nominal, begin[0], series)
         if not head.usable:
-            return fitted, together((AtSample({}, head),))
+            return together((AtSample({}, head),))
 
         def at(number: int) -> AtSample:
             shift = self.shifts[number - 1]
-            return in_scene(now, shift, nominal, begin[number], self.runs)
+            return in_scene(self.single, shift, nominal, begin[number], self.runs)
 
         with ThreadPoolExecutor(self.runs.slots) as pool:
             parts = tuple(pool.map(at, range(1, 1 + len(self.shifts))))
-        return fitted, together((AtSample({}, head), *parts))
+        return together((AtSample({}, head), *parts))
 
 
 def in_scene(

@@ -37,19 +37,11 @@ class Evaluates(Protocol):
         `series`: whether to compute the series."""
         ...
 
-    def fit(
-        self, design: Any = None, start: Seeds = None, series: bool = True
-    ) -> tuple["Evaluates", Evaluation]:
-        """Evaluate a design. Return another evaluator for neighbouring designs, and the evaluation.
-
-        Arguments: see `__call__`."""
-        ...
-
-    def prepare(self, design: Any = None, series: bool = True, maxima: bool = False) -> "Evaluates":
+    def prepare(self, design: Any = None, series: bool = True, maxima: bool = False) -> None:
         """Compile the programs for evaluating `design` (d,), in config units, in the background.
 
         `series`: whether the evaluations will compute the series; `maxima`: whether evaluators
-        `with_maxima` will follow. Return another evaluator for these designs."""
+        `with_maxima` will follow."""
         ...
 
     def pair(self, design: ArrayLike) -> RotorPair:
@@ -95,8 +87,8 @@ class Wrapper:
     """Base class of evaluators that combine several evaluations made by another evaluator,
     `single`.
 
-    A subclass defines `fit`, which combines evaluations of one design (see `Evaluates.fit`). A call
-    returns the evaluation from `fit`. The other methods delegate to `single`.
+    A subclass defines the call, which combines evaluations of one design. The other methods
+    delegate to `single`.
     """
 
     single: Evaluates
@@ -115,23 +107,17 @@ class Wrapper:
         """Evaluate `design` (config units; default: the config's own).
 
         Arguments: see `Evaluates.__call__`."""
-        return self.fit(design, start, series)[1]
-
-    def fit(self: W, design=None, start=None, series=True) -> tuple[W, Evaluation]:
-        """Evaluate a design. Return another evaluator, fitted to its motion, and the evaluation.
-
-        Arguments: see `Evaluates.__call__`."""
         raise NotImplementedError
 
     def pair(self, design: ArrayLike) -> RotorPair:
         """Return the rotor pair of `design` (config units)."""
         return self.single.pair(design)
 
-    def prepare(self: W, design=None, series=True, maxima=False) -> W:
+    def prepare(self, design=None, series=True, maxima=False) -> None:
         """Compile the programs for evaluating a design in the background.
 
-        Return another evaluator, sized for the design. Arguments: see `Evaluates.prepare`."""
-        return self._around(self.single.prepare(design, series, maxima))
+        Arguments: see `Evaluates.prepare`."""
+        self.single.prepare(design, series, maxima)
 
     def at_speed(self: W, speed_rpm: float) -> W:
         """Return another evaluator at the speed `speed_rpm`."""

@@ -92,8 +92,9 @@ class Study:
             return cls(config, aims, Problem(config, baseline, space), None, None, None, runs)
         limits = force_limits(config, scene)
         maxima = any(_is_cornered(aim) for aim in aims) or any(one.cornered for one in limits)
-        exact = Evaluator.of(reported(config)).prepare(maxima=maxima)
-        exact, baseline = exact.fit()
+        exact = Evaluator.of(reported(config))
+        exact.prepare(maxima=maxima)
+        baseline = exact()
         if maxima:
             exact = exact.with_maxima()
         fast = exact.at_tolerance(max(1e-6, config.solver.orbit_tolerance)).surveying()

@@ -291,8 +291,8 @@ def test_a_motion_without_contact_beside_others_counts_as_zero(monkeypatch):
     assert averaged.response == pytest.approx({k: v / 2 for k, v in FORCES.items()})
     assert averaged.gradient["mean_force_N"]["tip_arc_angle_deg"] == 0.5
     monkeypatch.setattr(
-        "rootsopt.response.attractors.find_fitted",
-        lambda single, *rest: (single, basins_of(quiet, noisy)),
+        "rootsopt.response.attractors.find",
+        lambda single, *rest: basins_of(quiet, noisy),
     )
     for motion, share in (("worst", 1.0), ("weighted", 0.5)):
         found = AttractorEvaluator(Evaluator.of(config_of(f"objective.motion={motion}")))()

@@ -78,7 +78,8 @@ def test_outside_term_is_in_results_and_objective(outside):
     Its value is that of its own formula."""
     only = [f"objective.terms.{OUTSIDE}=1", "objective.mean_weight=0", "objective.peak_weight=0"]
     config = load_config(CIC, only)
-    evaluator, found = Evaluator.of(config).fit(series=False)
+    evaluator = Evaluator.of(config)
+    found = evaluator(series=False)
     geometry = found.geometry
     area = np.pi * geometry["outer_radius_mm"] ** 2 - geometry["area_mm2"]
     litres = 2e-6 * config.rotor.length_mm * area

@@ -197,13 +197,13 @@ def test_parts_are_the_evaluations_of_moved_configs(spread):
 def test_scenes_begin_on_their_own_orbits(spread, monkeypatch):
     evaluator, found = spread
     seen = []
-    single = Evaluator.fit
+    single = Evaluator.__call__
 
     def spy(self, design=None, start=None, series=True):
         seen.append(start)
         return single(self, design, start, series)
 
-    monkeypatch.setattr(Evaluator, "fit", spy)
+    monkeypatch.setattr(Evaluator, "__call__", spy)
     again = evaluator(start=found.start, series=False)
     known = {id(part.evaluation.start) for part in found.parts}
     assert {id(start) for start in seen} == known
@@ -222,11 +222,11 @@ def test_scenes_begin_on_their_own_orbits(spread, monkeypatch):
 class Told(Evaluator):
     """Stand in for an evaluator: its force is the clearance in µm, and fails above 12 µm."""
 
-    def fit(self, design=None, start=None, series=True):
+    def __call__(self, design=None, start=None, series=True):
         clearance = 1e6 * float(self.scene.clearance)
         status = Status.PERIODIC if clearance < 12 else Status.NOT_SETTLED
         start = np.array([clearance, float(self.scene.speed)])
-        return self, evaluation_of(clearance, status, start=start)
+        return evaluation_of(clearance, status, start=start)
 
 
 def told(*overrides):
