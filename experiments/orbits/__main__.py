@@ -5,6 +5,9 @@ another period or its forces differ by more than 1e-4.
 
 With `--speed`, times value and gradient from a neighbour's orbit instead, against the other ways,
 SciPy and Numba, on one core. Writes speed.csv.
+
+With `--batches`, times value and gradient of batches of designs, on the device that JAX_PLATFORMS
+names ("cuda,cpu" for a GPU) or on the CPU. Writes batches.csv.
 """
 
 import argparse
@@ -32,6 +35,8 @@ def body(run: Run) -> int:
     options = run.options
     if options.speed:
         return _timed(run)
+    if options.batches is not None:
+        return _batches(run)
     if not options.draw:
         study.run(run.quick, options.count, options.seed, run.say, keep)
     rows = study.read(run.folder.path)
@@ -58,6 +63,20 @@ def _timed(run: Run) -> int:
     return verdict(all("ms" in row for row in rows))
 
 
+def _batches(run: Run) -> int:
+    """Time batches of designs, and print the table."""
+    from experiments.orbits import batches
+
+    rows: list[batches.Row] = []
+    for row in batches.rows_of(run.options.batches or [*batches.SIZES], run.say):
+        rows.append(row)
+        run.csv("batches.csv", rows)
+        run.say(batches.lines(rows[-1:])[1])
+    for line in batches.lines(rows):
+        print(line)
+    return verdict(all(row["force_difference"] <= _AGREE for row in rows))
+
+
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add options for size and seed of the draw, and for drawing alone."""
     parser.add_argument("--count", type=int, default=72, help="pairs (default: 72)")
@@ -67,6 +86,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         choices=("cic", "lively", "free form", "pump"),
         help="scenes in which to time orbits from a neighbour; no comparison of random pairs",
+    )
+    parser.add_argument(
+        "--batches",
+        nargs="*",
+        type=int,
+        metavar="SIZE",
+        help="numbers of designs in a batch to time (default: 256 to 65536); no comparison of "
+        "random pairs",
     )
     parser.add_argument(
         "--draw", action="store_true", help="measure nothing: table and figure of a former run"

@@ -4,12 +4,10 @@ All tools run in one process, in turns, on one core. Times are processor times, 
 processes on the machine hardly change. The neighbour is a design whose parameters differ by a small
 fraction."""
 
-import functools
 import time
 from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -105,23 +103,34 @@ def rows_of(scene: str, repeats: int, say: Callable[[str], None] = lambda text: 
     return rows
 
 
-def _public(scene: str, config: Any, designs: Any, truth: Any, repeats: int) -> list[Row]:
-    """Measure `steady_response` under `jax.jit`, from a neighbour's orbit and from rest."""
-    machine, (base, design) = Scene.from_config(config), designs
+def solver_of(machine: Scene) -> Callable[..., Any]:
+    """Return the function (design, start) -> mean and peak (N), their gradients, next start,
+    status."""
 
-    @functools.partial(jax.jit, compiler_options=dict(COMPILER_OPTIONS))
     def solve(design, start):
         def forces(design):
             found = steady_response(machine, design, start)
             values = jnp.stack([found.mean, found.peak])
-            return values, (values, found.start)
+            return values, (values, found.start, found.status)
 
-        slopes, (values, begin) = jax.jacfwd(forces, has_aux=True)(design)
-        return values, slopes, begin
+        slopes, (values, begin, status) = jax.jacfwd(forces, has_aux=True)(design)
+        return values, slopes, begin, status
 
-    known = steady_response(machine, base).start
-    rest = eqx.tree_at(lambda start: start.known.sound, known, jnp.zeros((), bool))
-    rest = eqx.tree_at(lambda start: start.state, rest, jnp.zeros_like(known.state))
+    return solve
+
+
+def rest_of(machine: Scene, design: Any) -> Any:
+    """Return a start at rest, in the form of `Response.start`."""
+    start = jax.eval_shape(lambda: steady_response(machine, design).start)
+    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), start)
+
+
+def _public(scene: str, config: Any, designs: Any, truth: Any, repeats: int) -> list[Row]:
+    """Measure `steady_response` under `jax.jit`, from a neighbour's orbit and from rest."""
+    machine, (base, design) = Scene.from_config(config), designs
+    solve = jax.jit(solver_of(machine), compiler_options=dict(COMPILER_OPTIONS))
+    rest = rest_of(machine, base)
+    known = solve(base, rest)[2]
     rows = []
     for tool, start in (("neighbour", known), ("from rest", rest)):
         seconds, found = processor_time(

@@ -20,7 +20,7 @@ from rootsopt.dynamics.collocation.mesh import sizes
 from rootsopt.dynamics.collocation.motion import ACCURACY, Collocated, apart, closed_orbit
 from rootsopt.dynamics.collocation.seed import PIECES, from_pieces
 from rootsopt.dynamics.flow import Flow
-from rootsopt.dynamics.orbit import Orbit, choose
+from rootsopt.dynamics.orbit import Orbit, branch, choose
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.settle import Transient, no_pieces, settle, settled_within
 from rootsopt.dynamics.steady import (
@@ -147,12 +147,16 @@ class _Attempts(eqx.Module):
         return _Loop(found, near, zero, state, coarse, within, zero, unsound)
 
     def step(self, now: _Loop) -> _Loop:
-        """Make one attempt, and return the new state of the loop."""
-        settled, failure = lax.cond(
-            now.near | (now.shorter > 0), lambda: self.settled(now), lambda: self.transient(now)
+        """Make one attempt, and return the new state of the loop.
+
+        In a batch, motions that are over take the branches that cost least."""
+        settled, failure = branch(
+            now.near | (now.shorter > 0) | now.over,
+            lambda: self.settled(now),
+            lambda: self.transient(now),
         )
-        return lax.cond(
-            failure < 0,
+        return branch(
+            (failure < 0) & ~now.over,
             lambda: self.attempt(now, settled),
             lambda: self.lost(now, settled, failure),
         )
@@ -195,7 +199,7 @@ class _Attempts(eqx.Module):
         period, pieces = jnp.maximum(settled.period, 1), settled.pieces
         assert pieces is not None
         known, neighbour = self.start.known, self.start.pair
-        known = lax.cond(
+        known = branch(
             now.near,
             lambda: known,
             lambda: from_pieces(pair, pieces, period, solver.max_orbit),
@@ -305,7 +309,7 @@ def examined(pair: RotorPair, found: Steady, solver: Solver) -> Steady:
     The window begins at the end of the transient, and distinguishes chaos from a long transient."""
     state, integrator = found.settled.state, solver.transient
     unsettled = (found.status == Status.NOT_SETTLED.code) & (solver.examine > 0)
-    window = lax.cond(
+    window = branch(
         unsettled,
         lambda: lyapunov(pair, state, PERIODS, integrator),
         lambda: Window.empty(state, PERIODS, integrator.tolerance),

@@ -13,6 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.dynamics.flow import Flow, flow
@@ -397,6 +398,52 @@ def close_orbit(
 def choose(condition: Bool[Array, ""], new: Any, old: Any) -> Any:
     """Return the tree `new` if the `condition` holds, else the tree `old`."""
     return jax.tree.map(lambda x, y: jnp.where(condition, x, y), new, old)
+
+
+def branch(taken: Bool[Array, ""], then: Callable[[], Any], otherwise: Callable[[], Any]) -> Any:
+    """Return `then()` if `taken` holds, else `otherwise()`, like `lax.cond`.
+
+    On a GPU, the motions of a batch are computed together, and `lax.cond` would compute both
+    branches for all of them. Here, a branch that no motion takes is left out. A motion that does
+    not take a branch repeats one that does, so that the loops of the branch do not last longer.
+    There, the result cannot be differentiated."""
+    if jax.default_backend() == "cpu":
+        return lax.cond(taken, then, otherwise)
+    both = eqx.filter_closure_convert(then), eqx.filter_closure_convert(otherwise)
+    dynamic, static = eqx.partition(both, eqx.is_array)
+
+    @custom_vmap
+    def chosen(taken, dynamic):
+        one, other = eqx.combine(dynamic, static)
+        return lax.cond(taken, lambda: one(), lambda: other())
+
+    @chosen.def_vmap
+    def _(size, batched, taken, dynamic):
+        taken = jnp.broadcast_to(taken, size)
+        axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, batched[1])
+
+        def computed(number, takes):
+            """Return the results (size, …) of a branch, zeros if no motion `takes` it."""
+            row = jnp.where(takes, jnp.arange(size), jnp.argmax(takes))
+
+            def every():
+                own = jax.tree.map(
+                    lambda x, is_batched: x[row] if is_batched else x,
+                    dynamic[number],
+                    batched[1][number],
+                )
+                call = jax.vmap(
+                    lambda x: eqx.combine(x, static[number])(), (axes[number],), axis_size=size
+                )
+                return call(own)
+
+            nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(every))
+            return lax.cond(jnp.any(takes), every, lambda: nothing)
+
+        found = jax.vmap(choose)(taken, computed(0, taken), computed(1, ~taken))
+        return found, jax.tree.map(lambda _: True, found)
+
+    return chosen(taken, dynamic)
 
 
 def _compared(now: _Closing, out: Flow, residual: Float[Array, ""], count: int):

@@ -283,6 +283,35 @@ def test_batch_is_computed_one_by_one(scene):
     assert batch < 1.05 * one
 
 
+@pytest.mark.long
+def test_batch_on_a_gpu_is_that_of_single_motions(scene, monkeypatch):
+    """Motions that are computed together are those computed one by one, whichever branch each of
+    them takes: from rest and from a neighbour, near and far, sound and unsound."""
+
+    def mean(design, start):
+        found = steady_response(scene, design, start)
+        return found.mean, found
+
+    start = steady_response(scene, DESIGN).start
+    rest = eqx.tree_at(lambda s: s.known.sound, start, jnp.zeros((), bool))
+    both = jax.value_and_grad(mean, has_aux=True)
+    moved = np.array([[1, 1, 1], [1.002, 0.999, 1.001], [0.93, 0.95, 1.3], [0.5, 1, 1]])
+    cases = [(design, start) for design in moved * DESIGN for start in (start, rest)]
+    single = [jax.jit(both)(*case) for case in cases]
+    jax.clear_caches()
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    designs, starts = (
+        jax.tree.map(lambda *x: jnp.stack(x), *part) for part in zip(*cases, strict=True)
+    )
+    (values, found), slopes = jax.jit(jax.vmap(both))(designs, starts)
+    jax.clear_caches()
+    for k, ((value, alone), slope) in enumerate(single):
+        assert int(found.status[k]) == int(alone.status)
+        np.testing.assert_allclose(values[k], value, rtol=1e-9)
+        np.testing.assert_allclose(slopes[k], slope, rtol=1e-6)
+    assert len(set(found.status.tolist())) > 1
+
+
 def test_design_without_parameters():
     """The derivative with respect to an empty design is empty; the one of the scene is not."""
     config = rootsopt.load_config("configs/ee.yaml")

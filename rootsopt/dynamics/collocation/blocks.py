@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Int
 
 BLOCK = 48
@@ -15,11 +16,28 @@ BLOCK = 48
 number."""
 
 
+@custom_vmap
+def greatest(count: Int[Array, ""]) -> Int[Array, ""]:
+    """Return `count` or, in a batch, the greatest of the batch.
+
+    A loop with one number of iterations for all motions of a batch only writes what is new. With a
+    number for each motion, every iteration would copy all arrays, to keep those of motions that are
+    done."""
+    return count
+
+
+@greatest.def_vmap
+def _(size, batched, count):
+    del size, batched
+    return jnp.max(count), False
+
+
 def in_blocks(function: Any, used: Int[Array, ""], *arrays: Any) -> Any:
     """Return `function(*arrays)`, evaluated block by block along the leading axis of elements.
 
     `function` maps arrays (e, …) of e elements to arrays (e, …); `used`: number of elements in use.
-    Blocks without such elements are not evaluated; their results are 0."""
+    Blocks without such elements are not evaluated, except in a batch, where another motion uses
+    them; their results have no meaning."""
     count = jax.tree.leaves(arrays)[0].shape[0]
     size = min(BLOCK, count)
     function = jax.jit(function)  # traced once, for shapes and values
@@ -37,4 +55,4 @@ def in_blocks(function: Any, used: Int[Array, ""], *arrays: Any) -> Any:
             lambda old, x: lax.dynamic_update_slice_in_dim(old, x, begin, 0), found, new
         )
 
-    return lax.fori_loop(0, (used + size - 1) // size, block, nothing)
+    return lax.fori_loop(0, greatest((used + size - 1) // size), block, nothing)

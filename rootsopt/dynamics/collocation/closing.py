@@ -54,7 +54,7 @@ from rootsopt.dynamics.collocation.newton import (
 )
 from rootsopt.dynamics.collocation.peak import Rivals, forces_along, is_settled, peak_of, rivals_of
 from rootsopt.dynamics.collocation.system import Step, chained, condensed
-from rootsopt.dynamics.orbit import choose
+from rootsopt.dynamics.orbit import branch, choose
 from rootsopt.dynamics.pair import RotorPair
 
 FIRST, _SHARE, _EVENT = 40, 0.5, 1
@@ -280,7 +280,9 @@ class Closer(eqx.Module):
         return equation, points, direct, step, now.line
 
     def turn(self, now: Loop) -> Loop:
-        """Evaluate the flags along the motion or make a step, then change the mesh if needed."""
+        """Evaluate the flags along the motion or make a step, then change the mesh if needed.
+
+        In a batch, motions that are over take the branches that cost least."""
         frozen = self.frozen_at(now)
 
         def look_at():
@@ -289,10 +291,14 @@ class Closer(eqx.Module):
 
         shape = jax.eval_shape(look_at)
         empty: Any = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shape)
-        seen, agree = lax.cond(now.looks, look_at, lambda: empty)
-        new = lax.cond(now.looks, lambda: self.looked(now, seen, agree), lambda: self.stepped(now))
+        seen, agree = branch(now.looks & ~now.over, look_at, lambda: empty)
+        new = branch(
+            now.looks | now.over,
+            lambda: self.looked(now, seen, agree),
+            lambda: self.stepped(now),
+        )
         changes = jnp.where(now.looks, ~agree, now.keeps) & ~new.over
-        return lax.cond(changes, lambda: self.align(new, seen, now.keeps), lambda: new)
+        return branch(changes, lambda: self.align(new, seen, now.keeps), lambda: new)
 
     def looked(self, now: Loop, seen: FlagScan, agree: Bool[Array, ""]) -> Loop:
         """Return the loop's state after the flags `seen` along the motion.
@@ -361,7 +367,7 @@ class Closer(eqx.Module):
             after = now._replace(elements=moved, rivals=rivals, line=line)
             return self.judged(now, after, size, found)
 
-        new = lax.cond(now.keeps, kept, goes_on)
+        new = branch(now.keeps, kept, goes_on)
         return new._replace(closed=new.closed._replace(steps=now.closed.steps + ~now.keeps))
 
     def judged(self, now: Loop, after: Loop, size: Float[Array, ""], found: Any) -> Loop:

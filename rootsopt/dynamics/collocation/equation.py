@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.contact.near import NearContact
 from rootsopt.contact.search import SearchContact
+from rootsopt.dynamics.collocation.blocks import greatest
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.runtime.kept import kept
@@ -93,8 +94,8 @@ class CollocatedEquation(eqx.Module):
         `tau`: times (mesh periods); `state`: scaled; `roots`: `NearContact.roots`; `which`: index
         of the margin to evaluate on each element; `tangents`: directions of the pair's parameters,
         stacked along a leading axis; `whole`: whether derivatives along them are needed. Otherwise
-        they are 0. The instants are the last axis of all intermediate arrays, so that inner loops
-        are long."""
+        they have no meaning. The instants are the last axis of all intermediate arrays, so that
+        inner loops are long."""
         shape, size = tau.shape, 1 + state.shape[-1]
         dynamic, static = eqx.partition(self.pair, eqx.is_inexact_array)
         place = jnp.concatenate([tau.reshape(1, -1), state.reshape(-1, size - 1).T])
@@ -128,7 +129,7 @@ class CollocatedEquation(eqx.Module):
             return found.at[k].set(jnp.stack(kept(jax.vmap(kept(linear))(*own)), axis=1))
 
         slopes = jnp.zeros((passes, size, len(values), place.shape[1]), place.dtype)
-        slopes = lax.fori_loop(0, jnp.where(whole, passes, 1), derivatives, slopes)
+        slopes = lax.fori_loop(0, greatest(jnp.where(whole, passes, 1)), derivatives, slopes)
         slopes = jnp.moveaxis(slopes.reshape(passes * size, *slopes.shape[2:]), 0, 1)
 
         def back(x):

@@ -38,7 +38,8 @@ def evaluated(
     It is evaluated at the s Gauss points and the end of each element (p = s + 1), and at the
     instants `rivals`, on the element after the last one in use. `tangents`: directions of the
     pair's parameters, stacked along a leading axis; `whole`: whether derivatives along them are
-    needed. Otherwise they are 0. The arrays of the mesh must have room for one more element."""
+    needed. Otherwise they have no meaning. The arrays of the mesh must have room for one more
+    element."""
     mesh, extra = elements.mesh, elements.mesh.used
     tau, state = (
         x.at[extra].set(y) for x, y in zip(elements.places, rivals.places(elements), strict=True)

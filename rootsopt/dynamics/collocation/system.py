@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from rootsopt.dynamics.collocation.blocks import in_blocks
+from rootsopt.dynamics.collocation.blocks import greatest, in_blocks
 from rootsopt.dynamics.collocation.elements import Elements, Mesh
 from rootsopt.dynamics.collocation.gauss import GAUSS, summed
 from rootsopt.dynamics.linear import solved
@@ -93,7 +93,7 @@ def condensed(elements: Elements, lines: Lines, columns: Columns) -> Condensed:
     """Return the linear equations of all `elements` after elimination of the slopes.
 
     `lines`: equation linearised along the motion `elements`; `columns`: right-hand sides. In unused
-    blocks of elements, the result is 0."""
+    blocks of elements, the result has no meaning."""
     mesh = elements.mesh
     shares = jnp.stack([mesh.left, mesh.right, mesh.lengths], axis=1)
     return in_blocks(_condensed, mesh.used, shares, elements.slopes, lines, columns)
@@ -247,7 +247,8 @@ def _composed(
         after = jnp.where(starts[k], own, after.at[:, size:].add(own[:, size:]))
         return after, products.at[k].set(after)
 
-    return lax.fori_loop(0, count, step, (jnp.zeros_like(maps[0]), jnp.zeros_like(maps)))[1]
+    begin = jnp.zeros_like(maps[0]), jnp.zeros_like(maps)
+    return lax.fori_loop(0, greatest(count), step, begin)[1]
 
 
 def spread(

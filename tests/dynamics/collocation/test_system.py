@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rootsopt.dynamics.collocation.blocks import BLOCK, in_blocks
 from rootsopt.dynamics.collocation.elements import Elements, Mesh
 from rootsopt.dynamics.collocation.gauss import GAUSS
 from rootsopt.dynamics.collocation.system import Columns, Lines, chained, condensed, own_column
@@ -97,3 +98,14 @@ def test_columns_are_independent():
         one = Columns(*(x[..., k : k + 1] for x in columns))
         alone = chained(elements, lines, one, condensed(elements, lines, one))
         np.testing.assert_allclose(step.state[..., k], alone.state[..., 0], rtol=1e-9, atol=1e-12)
+
+
+def test_blocks_of_a_batch():
+    """A batch with meshes of different sizes does not copy all its arrays for every block."""
+    used = jnp.asarray([5, BLOCK + 1, 3 * BLOCK])
+    values = jnp.arange(9.0 * BLOCK).reshape(3, -1)
+    made = jax.vmap(lambda used, values: in_blocks(lambda x: 2 * x, used, values))
+    for count, value, found in zip(used, values, made(used, values), strict=True):
+        np.testing.assert_array_equal(found[:count], 2 * value[:count])
+    # A loop with a condition for each mesh would choose between old and new arrays.
+    assert "bool[3] = lt" not in str(jax.make_jaxpr(made)(used, values))
