@@ -27,7 +27,7 @@ _CHECKED = 8
 """Number of designs that are compared with single evaluations."""
 _PART = 32
 """Number of designs that a thread of a CPU computes in one call."""
-_NEEDED = 3e6
+_NEEDED = 3.5e6
 """Memory (bytes) for each design that is computed on a GPU."""
 _REPEATS, _SECONDS = 5, 10.0
 """Maximum number of timed calls, and time (s) after which no further call is made."""

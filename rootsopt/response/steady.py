@@ -89,7 +89,7 @@ def steady_response(
     forces and `state` are those of the orbit, by the implicit function theorem. They are NaN unless
     the status is periodic. `multipliers`, `residual` and `margins` are constants to JAX, with
     derivative 0. Only first derivatives are available. On a CPU, `vmap` computes one motion after
-    the other.
+    the other; on a GPU, all together.
 
     `jax.jit` of a function that calls this one compiles twice as fast with the option
     `compiler_options=rootsopt.COMPILER_OPTIONS`.

@@ -296,7 +296,7 @@ def test_batch_on_a_gpu_is_that_of_single_motions(scene, monkeypatch):
     rest = eqx.tree_at(lambda s: s.known.sound, start, jnp.zeros((), bool))
     both = jax.value_and_grad(mean, has_aux=True)
     moved = np.array([[1, 1, 1], [1.002, 0.999, 1.001], [0.93, 0.95, 1.3], [0.5, 1, 1]])
-    cases = [(design, start) for design in moved * DESIGN for start in (start, rest)]
+    cases = [(design, begin) for design in moved * DESIGN for begin in (start, rest)]
     single = [jax.jit(both)(*case) for case in cases]
     jax.clear_caches()
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
