@@ -7,6 +7,7 @@ The solver steps of an orbit are recorded as a *grid*, and repeated once Newton'
 *kink* is an instant at which the equation of motion is not smooth; grid steps end there.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
