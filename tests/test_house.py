@@ -24,7 +24,7 @@ OPTIONAL = {
     "plotly",
 }
 OPTIONAL |= {"netCDF4", "shtab", "xarray", "zarr"}
-SLOW = {"rich", "scipy"}
+SLOW = {"PIL", "rich", "scipy"}
 COMMANDS = {f"commands/{name}.py" for name in (
     "attractors", "explore", "optimize", "pareto", "profile", "simulate", "sweep",
 )}  # fmt: skip

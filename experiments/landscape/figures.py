@@ -56,4 +56,4 @@ def _scene(figure: Figure, found: Results, axes, last: bool) -> None:
     axes[0].set_title(found.name, loc="left", fontsize=10)
     axes[0].legend(loc="best", fontsize=7)
     shades = ScalarMappable(Normalize(low, high), "viridis")
-    figure.colorbar(shades, ax=axes, label="objective")
+    figure.colorbar(shades, ax=axes[-1], label="objective")

@@ -4,17 +4,12 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import BoundaryNorm, ListedColormap, to_hex, to_rgb
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from rootsopt.config import Config
-from rootsopt.figures.style import (
-    COLORS,
-    GREY,
-)
+from rootsopt.figures.style import COLORS, GREY, figure
 from rootsopt.output.files import ResultFolder
 from rootsopt.response.attractors import Attractor, Basins
 
@@ -76,7 +71,8 @@ def plot_motions(axes: Sequence[Axes], attractors: Sequence[Attractor], colors, 
     axes[-1].set_xlabel("time (mesh periods)")
 
 
-def _legend(ax: Axes, basins: Basins) -> None:
+def _entries(basins: Basins) -> list[Patch | Line2D]:
+    """Return legend entries for the colours of a map, and for its marks."""
     entries: list[Patch | Line2D] = []
     for number, (one, color) in enumerate(zip(basins.attractors, _colors(basins), strict=True), 1):
         entries.append(Patch(facecolor=_pale(color), edgecolor=color, label=_label(number, one)))
@@ -87,12 +83,7 @@ def _legend(ax: Axes, basins: Basins) -> None:
     start.set_label("start at rest")
     point = Line2D([], [], marker="o", color=GREY, linestyle="", markeredgecolor="white")
     point.set_label("motion, once every mesh period")
-    ax.legend(
-        handles=[*entries, point, start],
-        loc="upper center",
-        bbox_to_anchor=(0.5, -0.14),
-        frameon=False,
-    )
+    return [*entries, point, start]
 
 
 def _label(number: int, one: Attractor) -> str:
@@ -121,14 +112,14 @@ def basin_figures(folder: ResultFolder, basins: Basins, config: Config) -> list[
     The contact force is shown only for the motions to which the most initial states lead."""
     pairs = list(zip(basins.attractors, _colors(basins), strict=True))
     shown = [(one, color) for one, color in pairs if one.evaluation.series is not None][:_PANELS]
-    made = Figure(figsize=(13, 6.6), layout="constrained")
-    FigureCanvasAgg(made)
-    grid = made.add_gridspec(1, 2, width_ratios=[1, 1.1])
-    left, right = made.add_subfigure(grid[0]), made.add_subfigure(grid[1])
-    ax = plot_basins(left.subplots(), basins)
-    _legend(ax, basins)
+    entries = _entries(basins)
+    made, (panels,) = figure(13, 5.6 + 0.12 * len(entries), 1, 2, width_ratios=[1, 1.1])
+    made.legend(handles=entries, loc="outside lower center", ncols=2, frameon=False)
+    plot_basins(panels[0], basins)
+    panels[1].remove()
     if shown:
-        axes = right.subplots(len(shown), 1, squeeze=False, sharex=True, sharey=True)[:, 0]
+        rows = panels[1].get_subplotspec().subgridspec(len(shown), 1)
+        axes = rows.subplots(squeeze=False, sharex=True, sharey=True)[:, 0]
         attractors, colors = zip(*shown, strict=True)
         plot_motions(list(axes), attractors, colors, config.profile.lobes)
         axes[0].set_ylim(0, None)

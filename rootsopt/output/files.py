@@ -118,11 +118,17 @@ class ResultFolder:
 
         `figure` has a canvas of the Agg backend, as those of `figures.style.figure` have; its
         resolution is changed. Raises `InputError` if the file cannot be written."""
-        image, canvas = io.BytesIO(), cast("FigureCanvasAgg", figure.canvas)
+        from PIL import Image  # As matplotlib, only for figures.
+
+        file, canvas = io.BytesIO(), cast("FigureCanvasAgg", figure.canvas)
         # `savefig` would lay out and draw everything twice.
         figure.set_dpi(DPI)
-        canvas.print_png(image)
-        return self.write_bytes(name, image.getvalue())
+        canvas.draw()
+        picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+        # Without the opaque alpha, the lowest level gives files as small as matplotlib's default,
+        # in half the time.
+        picture.save(file, "png", compress_level=1, dpi=(DPI, DPI))
+        return self.write_bytes(name, file.getvalue())
 
 
 def _temporary(name: str) -> str:

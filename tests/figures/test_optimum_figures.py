@@ -1,9 +1,16 @@
-"""Tests of figures of an optimum: departure, forces against the baseline, ends of the searches."""
+"""Tests of figures of an optimum: departure, forces against the baseline, ends of the searches.
+
+And of the room that the labels of all figures get."""
+
+import itertools
 
 import numpy as np
 import pytest
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 
 from rootsopt.config import load
+from rootsopt.figures import runs
 from rootsopt.figures.comparison import plot_departure, plot_forces_together
 from rootsopt.figures.optimum import plot_prices, plot_residual, plot_starts
 from rootsopt.figures.style import figure
@@ -95,3 +102,63 @@ def test_residuals_are_those_of_the_best_design_so_far():
     ]
     ax = plot_residual(figure(4, 4)[1][0, 0], rows, 1e-4)
     np.testing.assert_array_equal(ax.lines[0].get_xydata(), [[0, 0.1], [2, 1e-9]])
+
+
+def overlaps(figure):
+    """Return what leaves a figure, and what covers something else, as pairs of names.
+
+    Compared are its panels with their labels, its legends and its title."""
+    figure.draw_without_rendering()
+    boxes = {ax.get_label() or f"panel {k}": ax.get_tightbbox() for k, ax in enumerate(figure.axes)}
+    boxes |= {f"legend {k}": legend.get_tightbbox() for k, legend in enumerate(figure.legends)}
+    boxes |= {text.get_text(): text.get_tightbbox() for text in figure.texts}
+    width, height = figure.bbox.size + 0.5
+    left = [
+        (name, "edge")
+        for name, box in boxes.items()
+        if box.x0 < -0.5 or box.y0 < -0.5 or box.x1 > width or box.y1 > height
+    ]
+    pairs = itertools.combinations(boxes.items(), 2)
+    return left + [(a, b) for (a, one), (b, other) in pairs if one.overlaps(other)]
+
+
+def histories(keys):
+    """Return rows whose numbers have long tick labels."""
+    shared = {"start": 1, "feasible": True, "residual": 1e-9}
+    return [
+        shared | {"evaluation": k, "iteration": k, "objective": 1 - 1e-5 * k}
+        | {"best_objective": 1 - 1e-5 * k} | dict.fromkeys(keys, -123.45 + 0.12 * k)
+        for k in range(9)
+    ]  # fmt: skip
+
+
+def test_long_labels_have_room():
+    """Long names, small differences between large numbers, and many parameters all fit."""
+    names = "lower bound of involute length (10 %)", "angular_play_min_mrad", "an arc's radius" * 9
+    limits = [
+        {"name": name, "unit": "mm", "relaxed_by": -0.1, "multiplier": -1.0,
+         "relaxed_objective_percent": -1.0} for name in names
+    ]  # fmt: skip
+    starts = [{"start": k, "objective": 0.8, "reason": "converged"} for k in range(9)]
+    made, axes = figure(14, 4.4, 1, 3, gridspec_kw={"width_ratios": [1, 1, 0.8]})
+    plot_residual(axes[0, 0], histories(()), 1e-4)
+    plot_prices(axes[0, 1], limits, converged=False)
+    plot_starts(axes[0, 2], starts, [{"objective": 0.8, "found": 9}])
+    made.suptitle("title")
+    assert overlaps(made) == []
+    keys = [f"radius_of_arc_{k}_mm" for k in range(5)]
+    assert overlaps(runs._history(histories(keys), keys)) == []
+
+
+def test_legends_and_common_labels_have_room():
+    """A legend wider than its figure gets a smaller font."""
+    made, axes = figure(5, 4, 2, 2, sharex=True, sharey=True)
+    for ax in axes.ravel():
+        ax.plot([0, 1], [-1e6, 1e6], label="not settled, average of a window")
+        ax.set_title("a title")
+    made.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center")
+    made.legend(handles=[*axes[0, 0].lines] * 3, loc="outside upper center", ncols=3)
+    made.supxlabel("x (mm)")
+    made.supylabel("y (mm)")
+    made.colorbar(ScalarMappable(Normalize(0, 10), "viridis"), ax=axes[1, 1], label="force (N)")
+    assert overlaps(made) == []

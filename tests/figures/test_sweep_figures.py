@@ -11,6 +11,7 @@ from rootsopt.status import Status
 from rootsopt.sweeps.plan import plan_of
 from rootsopt.sweeps.points import lost
 from rootsopt.sweeps.table import dataset_of
+from tests.figures.test_optimum_figures import overlaps
 
 SPEED, PLAY = "scene.speed_rpm", "scene.timing_gear.backlash_mm"
 CYCLE = (Status.PERIODIC, Status.PERIODIC, Status.CHAOTIC, Status.INVALID, Status.PASSED_THROUGH)
@@ -48,6 +49,7 @@ def test_statuses_are_in_every_figure(axes, options, panels, tmp_path, monkeypat
     assert names == ["figures/sweep.png"]
     (figure,) = kept
     assert len(figure.axes) == panels
+    assert overlaps(figure) == []
     found = {str(label).replace("_", " ") for label in data.status.values.ravel()}
     entries = [text.get_text() for one in figure.legends for text in one.get_texts()]
     for label in found - ({"periodic"} if panels == 4 else set()):
