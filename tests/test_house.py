@@ -24,7 +24,7 @@ OPTIONAL = {
     "plotly",
 }
 OPTIONAL |= {"netCDF4", "shtab", "xarray", "zarr"}
-SLOW = {"PIL", "rich", "scipy"}
+SLOW = {"PIL", "optax", "rich", "scipy"}
 COMMANDS = {f"commands/{name}.py" for name in (
     "attractors", "explore", "optimize", "pareto", "profile", "simulate", "sweep",
 )}  # fmt: skip
@@ -38,12 +38,23 @@ LATE = {
     "commands/completion.py": {"rootsopt.commands"},
     "commands/console.py": {"rootsopt", "rootsopt.commands", "rootsopt.errors"},
     "commands/parallel.py": {"rootsopt.sweeps.evaluations"},
-    "commands/work/sweep.py": {"rootsopt.commands.work"},
+    # Figures are imported in the background; exports, only if they are asked for.
+    **{f"commands/work/{name}.py": {"rootsopt.figures", f"rootsopt.figures.{module}"}
+       for name, module in (("attractors", "basins"), ("over", "sweep"), ("pareto", "front"),
+                            ("profile", "runs"))},
+    "commands/work/optimize.py": {
+        "rootsopt.export.writing", "rootsopt.figures", "rootsopt.figures.tolerances",
+    },
+    "commands/work/simulate.py": {"rootsopt.export.writing", "rootsopt.figures"},
+    "commands/work/sweep.py": {"rootsopt.commands.work", "rootsopt.figures.speeds"},
+    "export/writing.py": {"rootsopt.export.animation"},
     "optimize/__init__.py": {"rootsopt.commands.optimize"},
     # Modules that import optional or slow libraries.
     "commands/work/explore.py": {"rootsopt.explore.engine", "rootsopt.explore.server"},
     "export/command.py": {"rootsopt.export.solid"},
+    "figures/runs.py": {"rootsopt.measured.source"},
     "measured/reading.py": {"rootsopt.measured.dxf"},
+    "measured/report.py": {"rootsopt.measured.source"},
     "response/evaluation.py": {"rootsopt.response.dataset"},
     "scene/families.py": {"rootsopt.measured.source"},
     "sweeps/evaluations.py": {"rootsopt.sweeps.cluster"},

@@ -7,7 +7,6 @@ uses only NumPy and SciPy.
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from rootsopt.profiles import place_pair
 
@@ -22,6 +21,8 @@ def signed_distance(nodes: Points, outline: Points, refine: bool = True) -> NDAr
     through the segment's two ends, with the outline's own tangents, replaces that segment. The
     error is then of fourth order in the node spacing, not second.
     """
+    from scipy.spatial import KDTree  # Slow import (0.2 s), not needed by figures.
+
     corners = outline[:-1] if np.allclose(outline[0], outline[-1], atol=0) else outline
     count = len(corners)
     nearest = KDTree(corners).query(nodes)[1]

@@ -10,6 +10,7 @@ import importlib
 import os
 import shlex
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
@@ -238,6 +239,16 @@ def _report(folder: "RunFolder", options: argparse.Namespace, outcome: Outcome) 
         environment.say(f"{REPORT} is not written, because it could not be made: {words}")
         return
     folder.write_text(REPORT, text)
+
+
+def load_figures(options: argparse.Namespace, module: str) -> None:
+    """Import a `module` of `rootsopt.figures` in the background, if the `options` want figures.
+
+    With matplotlib it takes 0.5 s. Meanwhile, programs are loaded or compiled, which does not hold
+    Python's lock."""
+    if not options.no_figures:
+        name = f"rootsopt.figures.{module}"
+        threading.Thread(target=importlib.import_module, args=(name,)).start()
 
 
 @contextlib.contextmanager

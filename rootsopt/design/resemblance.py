@@ -22,7 +22,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
-from scipy.optimize import linprog
 
 from rootsopt.config import ProfileConfig
 from rootsopt.config.families import FREE_FORM, Parameter, family_of
@@ -326,6 +325,8 @@ def _promising(seen: _Comparison, width, size: float, room) -> NDArray[np.float6
     No entry of the step exceeds `size` in magnitude, or leaves the range `room` (low, high), each
     (d,). The linear program minimises a bound on all distances plus a weighted bound on negative
     margins. Distances that cannot reach the bound within the step are left out."""
+    from scipy.optimize import linprog  # Slow import (0.3 s).
+
     slope = seen.distance_slope * width
     rows = np.concatenate([slope, -slope])
     value = np.concatenate([seen.distance, -seen.distance])

@@ -88,8 +88,7 @@ def local_maxima(
     if not times.size:
         return Maxima(times, forces, np.zeros((0, orbit.moved.shape[1])))
     padded = np.resize(times, MOST + _BESIDES)
-    rounding = pair.rounding(jnp.asarray(orbit.flow.depth))
-    values, slopes = _differentiated(pair, tangents, orbit, padded, rounding, integrator)
+    values, slopes = _differentiated(pair, tangents, orbit, padded, integrator)
     values, slopes = (np.asarray(x, np.float64)[: times.size] for x in (values, slopes))
     order = np.argsort(-values, kind="stable")
     return Maxima(times[order], values[order], slopes[order])
@@ -110,8 +109,7 @@ def prepare_maxima(
     orbit = orbit._replace(flow=flow._replace(grid=grid, corners=corners))
     steps: Any = Steps(grid, grid, corners, corners, like(dtype=int))
     times = like(_room(flow.states.shape[0], _STEPS))
-    padded, noise = like(MOST + _BESIDES), like(dtype=flow.depth.dtype)
-    _differentiated.prepare(pair, tangents, orbit, padded, noise, integrator)
+    _differentiated.prepare(pair, tangents, orbit, like(MOST + _BESIDES), integrator)
     _forces.prepare(pair, flow.states, steps, times, like(), like(dtype=int))
 
 
@@ -270,13 +268,11 @@ def _differentiated(
     tangents: RotorPair,
     orbit: Orbit,
     times: Float[Array, " k"],
-    noise: Float[Array, ""],
     integrator: Integrator,
 ) -> tuple[Float[Array, " k"], Float[Array, "k d"]]:
     """Return the force (N) at located maxima, and its derivatives along the family of orbits.
 
-    `times` (k,): instants of the maxima (mesh periods); `noise`: relative rounding error of the
-    force."""
+    `times` (k,): instants of the maxima (mesh periods)."""
     dtype, count = orbit.state.dtype, orbit.state.shape[0]
     dynamic, static = eqx.partition(pair, eqx.is_inexact_array)
     moved = eqx.filter(tangents, eqx.is_inexact_array)
@@ -342,6 +338,7 @@ def _differentiated(
     at = times[:, None] + sides
     slopes = _after(near, every)[:, count:].reshape(*at.shape, near.value.shape[1] - count, -1)
     found = near.value.reshape(*at.shape, -1)
+    noise = pair.rounding(orbit.flow.depth)
     values, weights = lax.map(lambda x: equation.peak(x[0], x[1], noise, dynamic), (at, found))
     return unit * values, unit * jnp.einsum("ksf,ksfd->kd", weights, slopes)
 

@@ -8,7 +8,6 @@ import numpy as np
 
 from rootsopt.config import Config
 from rootsopt.export import solid
-from rootsopt.export.animation import rolling_gif, simulation_gif
 from rootsopt.export.command import SOLID
 from rootsopt.export.coordinates import coordinates
 from rootsopt.export.drawing import Drawing
@@ -52,6 +51,8 @@ def write(
     if set(formats) & set(SOLID):
         files |= _solids(drawing, formats, folder.place)
     if "gif" in formats:
+        from rootsopt.export.animation import rolling_gif, simulation_gif
+
         if series is None:
             files["figures/meshing.gif"] = rolling_gif(drawing, profile)
         else:

@@ -4,7 +4,6 @@ from typing import TYPE_CHECKING, Any
 
 from rootsopt.config import Config
 from rootsopt.measured.conjugacy import conjugacy, inset_note
-from rootsopt.measured.source import advice, estimates_of, note, outline_of
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -16,6 +15,8 @@ def record(config: Config) -> dict[str, Any]:
     Return {} if the config names no outline file."""
     if not config.profile.from_file:
         return {}
+    from rootsopt.measured.source import outline_of  # For outlines only: it takes 0.5 s.
+
     profile, checks = outline_of(config.profile)
     return {"outline": checks.record() | conjugacy(profile).record()}
 
@@ -27,6 +28,8 @@ def say(config: Config, out: "Console") -> None:
     centre is not the rotor's axis. They also say whether a clearance was drawn into it."""
     if not config.profile.from_file:
         return
+    from rootsopt.measured.source import advice, estimates_of, note, outline_of
+
     profile, checks = outline_of(config.profile)
     inset = ""
     if not estimates_of(config.profile, checks).off_center:

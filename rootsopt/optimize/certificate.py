@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
 from rootsopt.optimize.local import Local
 
@@ -68,6 +67,8 @@ def certify(local: Local, point: NDArray[np.float64], near: float = NEAR) -> Cer
 
     `local`: objective and constraints at the point, with gradients. `near`: distance above which
     limits and branches cannot be active, as in `NEAR`."""
+    from scipy.optimize import nnls  # Slow import (0.3 s).
+
     size, rows = len(point), []
     gaps: list[NDArray[np.float64]] = []
     chosen: list[NDArray[np.bool_]] = []

@@ -14,7 +14,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment, minimize
 
 from rootsopt.optimize.local import Group, Local, Look
 
@@ -156,6 +155,8 @@ class Models:
             rows[above:, :size], rows[above:, -1] = limits, 1.0
             return rows
 
+        from scipy.optimize import minimize  # Slow import (0.3 s).
+
         start = np.clip(begin / reach, low, high)
         rises = (self.tops(self.values(reach * start)[0]) - self.tops(value)) / reach
         worst = max(0.0, -float(np.min(self.slacks(reach * start)[0], initial=0.0))) / reach
@@ -211,6 +212,8 @@ def _alike(group: Group, other: Group) -> NDArray[np.int64]:
     """Return the index (k,) in `other` of each branch of `group`; -1 if there is no such branch.
 
     Two branches are the same if their kinds are equal and their phases are close (`_SAME`)."""
+    from scipy.optimize import linear_sum_assignment  # Slow import (0.3 s).
+
     apart = np.abs(group.tags[:, None, 1] - other.tags[None, :, 1])
     apart = np.minimum(apart % 1.0, -apart % 1.0)
     differ = group.tags[:, None, 0] != other.tags[None, :, 0]

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
 from rootsopt.config import Config
 from rootsopt.config.units import unit_of, words
@@ -430,6 +429,8 @@ class Problem:
         walls += [-side for side, x in zip(sides, point, strict=True) if x >= 1 - FEASIBLE]
         if not walls:
             return np.asarray(slope, dtype=np.float64)
+        from scipy.optimize import nnls  # Slow import (0.3 s).
+
         normals = np.stack(walls)
         multipliers, _ = nnls(normals.T, slope)
         return np.asarray(slope - multipliers @ normals, dtype=np.float64)

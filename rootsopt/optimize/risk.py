@@ -19,7 +19,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import betainc
 
 from rootsopt.config.tolerances import TolerancesConfig
 
@@ -54,6 +53,8 @@ def order_weights(count: int, quantile: float) -> NDArray[np.float64]:
     """Return the weights (count,) of Harrell and Davis for `count` values in ascending order.
 
     `quantile`: the quantile q that the weighted mean estimates."""
+    from scipy.special import betainc  # Slow import (0.1 s).
+
     edges = np.arange(count + 1) / count
     cumulative = betainc((count + 1) * quantile, (count + 1) * (1 - quantile), edges)
     return np.diff(cumulative)

@@ -19,7 +19,6 @@ from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-import optax
 from numpy.typing import NDArray
 
 from rootsopt.config import FAMILY_KEYS, Config
@@ -48,11 +47,6 @@ if TYPE_CHECKING:
     from rootsopt.optimize.robust import Robustness
 
 T = TypeVar("T")
-RULES: dict[str, Callable[..., optax.GradientTransformation]] = {
-    "adam": optax.adam,
-    "rmsprop": optax.rmsprop,
-    "sgd": optax.sgd,
-}
 _PATIENCE = 4
 """Number of successive steps without a gain above which a descent ends."""
 _GAIN = 1e-4
@@ -706,7 +700,7 @@ class Search:
 
     def _named(self, point) -> dict[str, float]:
         """Return the design at a `point` (d,), in config units by key."""
-        values = map(float, self.problem.design(point))
+        values = self.problem.look(point)[0].tolist()
         return dict(zip(self.problem.config.design_keys, values, strict=True))
 
 
@@ -783,8 +777,11 @@ def until_stopped(work: Callable[[], T], stop: threading.Event, patience: float)
             return None
 
 
-def _rule(method: str, learning_rate: float, iterations: int) -> optax.GradientTransformation:
-    return RULES[method](optax.cosine_decay_schedule(learning_rate, iterations, 0.05))
+def _rule(method: str, learning_rate: float, iterations: int):
+    """Return the update rule of optax that `method` names."""
+    import optax
+
+    return getattr(optax, method)(optax.cosine_decay_schedule(learning_rate, iterations, 0.05))
 
 
 @Program

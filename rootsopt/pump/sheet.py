@@ -194,7 +194,8 @@ def ripple_of(scene: Scene, profile: Profile, shape: Geometry) -> Float[Array, "
 def _has_play(scene: Scene) -> bool:
     """Return whether rotor 2 has play between its flanks, or the rotors may overlap."""
     odd = scene.outline is not None or scene.center_distance_error is not None
-    return odd or float(scene.clearance) > 0 or float(radial_allowance(scene)) != 0
+    shrunk = scene.medium is not None and float(scene.medium.radial_allowance) != 0
+    return odd or shrunk or float(scene.clearance) > 0
 
 
 @Program

@@ -301,8 +301,10 @@ class Evaluator:
             return found
         orbit, integrator = found.orbit, self.scene.solver.orbit
         # A coarse integration would say nothing about the orbit.
-        fine = dataclasses.replace(integrator, rtol=jnp.minimum(integrator.rtol, _FINE))
-        apart = _integrated(pair, (orbit.state, orbit.response), found.period, fine)
+        # NumPy's minimum: that of JAX, outside of a program, would be compiled.
+        rtol = jax.device_put(np.minimum(integrator.rtol, _FINE))
+        fine = dataclasses.replace(integrator, rtol=rtol)
+        apart = float(_integrated(pair, (orbit.state, orbit.response), found.period, fine))
         least, tolerances = _APART
         close = apart <= max(least, tolerances * float(integrator.rtol))
         return found if close else self._by_shooting(pair, tangents, start)

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from rootsopt.config import Config
@@ -134,7 +133,7 @@ def by_scene(evaluator: Evaluator, evaluation: Evaluation) -> Evaluation | None:
     by config key), and in `maxima`. The result is None if the steady motion from the evaluation's
     start is not periodic, or does not have the same number of maxima."""
     config, solver = evaluator.config, evaluator.scene.solver
-    design = jnp.asarray(list(evaluation.design.values()))
+    design = np.array(list(evaluation.design.values()))
     wanted = quantities(config)
     size = max(1, len(evaluation.design))
     directions = [_direction(config, evaluator.scene, one) for one in wanted]

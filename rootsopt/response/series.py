@@ -57,6 +57,7 @@ def series_of(pair: RotorPair, tau, states) -> Series:
     # Reduce to one turn of the rotor: the rounding error of a late time is greater.
     turn = np.mod(tau, pair.lobes)
     period, lapse, (relative, rate), contact = contact_series(pair, turn, states)
+    period = np.asarray(period)
     time = period * tau
     if pair.free:
         from scipy.integrate import cumulative_simpson  # Slow import (0.5 s), only for motors.

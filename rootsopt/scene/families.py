@@ -115,7 +115,7 @@ def check(config: ProfileConfig) -> None:
         return
     family = family_of(config.family)
     family.check(config)
-    radius = jnp.asarray(config.pitch_radius_mm * MM)
+    radius = np.asarray(config.pitch_radius_mm * MM)
     found = _soundness(config.family, config.lobes, radius, design_of(config))
     if fault := fault_of(found):
         given = ", ".join(

@@ -21,10 +21,15 @@ import numpy as np
 import pytest
 
 from rootsopt.commands import cli
+from rootsopt.config import load
 from rootsopt.config.families import for_a_time, import_named
+from rootsopt.design import space
+from rootsopt.dynamics.collocation.known import Known
+from rootsopt.pump import sheet
 from rootsopt.runtime import environment, programs, store
 from rootsopt.runtime.programs import Program
 from rootsopt.runtime.timing import CompileClock
+from rootsopt.scene import Scene
 
 
 class Answer(NamedTuple):
@@ -533,6 +538,19 @@ def test_programs_follow_the_files_of_families_from_outside(folder, monkeypatch,
     assert place() == before
     for name in ("own_helper", "own_family"):
         del sys.modules[name]
+
+
+def test_host_arithmetic_compiles_nothing():
+    """Outside of programs, JAX would compile a small program for each operation on its arrays."""
+    config = load("cic")
+    scene = Scene.from_config(config)
+    jax.config.update("jax_no_execution", True)  # Any operation on arrays raises an error.
+    try:
+        assert not np.any(Known.empty((7, 9), 3, 2).elements.mesh.times)
+        assert not sheet._has_play(scene)
+        assert not [*space._reaching(config)]
+    finally:
+        jax.config.update("jax_no_execution", False)
 
 
 def grown(part, x):

@@ -7,7 +7,6 @@ from rich.console import Console
 
 from rootsopt.commands import cli
 from rootsopt.config import Config
-from rootsopt.figures.basins import basin_figures
 from rootsopt.output import files, tables
 from rootsopt.output.runs import RunFolder
 from rootsopt.response.attractors import find
@@ -21,6 +20,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
 
     Return the `Outcome`. Raises `InputError` if the config is invalid."""
     check_geometry(config)
+    cli.load_figures(options, "basins")
     with cli.waiting(Console(stderr=True), "compiling and simulating"):
         found = find(Evaluator.of(config), series=True)
     files.write_config(folder, config)
@@ -47,6 +47,8 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
             response = files.response_columns(one.evaluation.series)
             folder.write_csv(f"response_{number}.csv", response)
     if not options.no_figures:
+        from rootsopt.figures.basins import basin_figures
+
         basin_figures(folder, found, config)
 
     def show(out: Console) -> None:

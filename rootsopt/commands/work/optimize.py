@@ -14,10 +14,6 @@ from rootsopt.config import Config
 from rootsopt.config.families import family_of
 from rootsopt.design.resemblance import likenesses
 from rootsopt.export import chosen
-from rootsopt.export.writing import write_simulated
-from rootsopt.figures import runs
-from rootsopt.figures.speeds import speed_figure
-from rootsopt.figures.tolerances import distributions
 from rootsopt.measured import report as outline_report
 from rootsopt.optimize import noise
 from rootsopt.optimize.robust import search_of
@@ -36,6 +32,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     Return the `Outcome`. Raises `InputError` if the config or an option is invalid."""
     began = time.perf_counter()
     formats = chosen(options.export)
+    cli.load_figures(options, "runs")
     check_geometry(config)
     check_clearances(config)
     clock = CompileClock()
@@ -59,7 +56,9 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     alike = {} if result.interrupted else _alike(config, result)
     sheets = _sheets(config, result)
     _write(folder, config, options, result, alike, sheets, clock.seconds, ran)
-    if result.optimized is not None:
+    if result.optimized is not None and formats:
+        from rootsopt.export.writing import write_simulated
+
         write_simulated(folder, _searching(config, result), formats, result.optimized)
     total = time.perf_counter() - began
 
@@ -270,20 +269,26 @@ def _write(folder, config, options, result, alike, sheets, compiled, ran) -> Non
     data["versions"] = files.versions()
     folder.write_json("result.json", data)
     if not options.no_figures:
-        if result.optimized is not None:
-            pair = result.baseline, result.optimized
-            given = None if result.beginning is None else config
-            runs.optimization_figures(folder, *pair, rows, searching, given)
-            if result.optimality is not None:
-                limits = data["constraints"]
-                runs.certificate_figure(folder, rows, limits, data["optimality"])
-        else:
-            runs.simulation_figures(folder, result.baseline, config)
-        if config.objective.speeds_rpm:
-            names = {"baseline": result.baseline, "optimised": result.optimized}
-            known = {name: nominal_of(one) for name, one in names.items() if one is not None}
-            designs = {name: at_speeds(one) for name, one in known.items()}
-            speed_figure(folder, designs, "Contact force over the speeds of the objective")
+        _draw(folder, config, result, data)
+
+
+def _draw(folder, config: Config, result, data: dict) -> None:
+    """Write the figures of a search; `data`: content of the result file."""
+    from rootsopt.figures import runs, speeds
+
+    if result.optimized is not None:
+        pair, rows = (result.baseline, result.optimized), result.history
+        given = None if result.beginning is None else config
+        runs.optimization_figures(folder, *pair, rows, _searching(config, result), given)
+        if result.optimality is not None:
+            runs.certificate_figure(folder, rows, data["constraints"], data["optimality"])
+    else:
+        runs.simulation_figures(folder, result.baseline, config)
+    if config.objective.speeds_rpm:
+        names = {"baseline": result.baseline, "optimised": result.optimized}
+        known = {name: nominal_of(one) for name, one in names.items() if one is not None}
+        designs = {name: at_speeds(one) for name, one in known.items()}
+        speeds.speed_figure(folder, designs, "Contact force over the speeds of the objective")
 
 
 def _designed(config: Config, evaluation) -> Config:
@@ -303,6 +308,8 @@ def _write_robustness(folder, config, options, robustness) -> None:
         columns |= {f"{name}_{key}": values for key, values in one.values.items()}
     folder.write_csv("tolerances.csv", columns)
     if not options.no_figures:
+        from rootsopt.figures.tolerances import distributions
+
         designs = {name: one.values for name, one in robustness.fresh.items()}
         count = len(next(iter(robustness.scenes.values())))
         made = distributions(designs, f"Contact force in {count} fresh scenes")

@@ -13,7 +13,6 @@ from rootsopt.commands.work.searching import opened, progress_bar
 from rootsopt.config import Config
 from rootsopt.config.plausible import notes_on_swept
 from rootsopt.errors import InputError
-from rootsopt.figures.sweep import sweep_figure
 from rootsopt.output import datasets, files, sweeps
 from rootsopt.output.runs import RunFolder
 from rootsopt.runtime.environment import say
@@ -33,6 +32,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
 
     Return the `Outcome`. Raises `InputError` if a key, a value or an option is not valid."""
     began = time.perf_counter()
+    cli.load_figures(options, "sweep")
     name = _DATA if options.data is None else options.data
     datasets.check_name(name)
     config, plan = _points(config, options)
@@ -61,6 +61,8 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     record = sweeps.summary(plan, records) | {"data": name, "statistics": statistics}
     folder.write_json("result.json", record | {"versions": files.versions()})
     if not options.no_figures:
+        from rootsopt.figures.sweep import sweep_figure
+
         sweep_figure(folder, plan, dataset)
     if done:
         folder.remove_afterwards(folder.checkpoint)

@@ -10,8 +10,6 @@ from rich.console import Console
 from rootsopt.commands import cli, door, parallel
 from rootsopt.commands.work.searching import checkpoint_of, nothing_known, progress_bar, searched
 from rootsopt.config import Config
-from rootsopt.figures import page
-from rootsopt.figures.front import front_figure
 from rootsopt.output import files, fronts, tables
 from rootsopt.output.runs import RunFolder
 from rootsopt.runtime.environment import say
@@ -25,8 +23,8 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
 
     Return the `Outcome`. Raises `InputError` if the config is invalid."""
     began = time.perf_counter()
-
     check_geometry(config)
+    cli.load_figures(options, "front")
     clock = CompileClock()
     promise = "keeping the points found so far and writing the files"
     with (
@@ -49,6 +47,9 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     fronts.write_front(folder, front)
     folder.write_json("result.json", record | {"versions": files.versions()})
     if front.points and not options.no_figures:
+        from rootsopt.figures import page
+        from rootsopt.figures.front import front_figure
+
         front_figure(folder, front)
         if page.available():
             page.write_page(folder, front)

@@ -11,7 +11,6 @@ from rootsopt.design.resemblance import free_likeness, likenesses
 from rootsopt.errors import InputError
 from rootsopt.export import chosen
 from rootsopt.export.writing import write
-from rootsopt.figures import runs
 from rootsopt.measured import report as outline_report
 from rootsopt.output import files, tables
 from rootsopt.output.runs import RunFolder
@@ -28,6 +27,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
 
     Return the `Outcome`. Raises `InputError` if the config or an option is invalid."""
     formats = chosen(options.export)
+    cli.load_figures(options, "runs")
     check_geometry(config, simulated=False)
     coefficients = _coefficients(options.project)
     scene, design = Scene.from_config(config), design_vector(config)
@@ -50,6 +50,8 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     folder.write_csv("profile_design.csv", files.profile_columns(outline_mm(config)))
     write(folder, config, formats, record["design"])
     if not options.no_figures:
+        from rootsopt.figures import runs
+
         runs.profile_figures(folder, config, record)
     alike = resembles(scene.profile(design)) if options.resembles else []
     if alike:

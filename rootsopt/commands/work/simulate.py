@@ -7,8 +7,6 @@ from rich.console import Console
 from rootsopt.commands import cli
 from rootsopt.config import Config
 from rootsopt.export import chosen
-from rootsopt.export.writing import write_simulated
-from rootsopt.figures import runs
 from rootsopt.measured import report as outline_report
 from rootsopt.output import files, tables
 from rootsopt.output.runs import RunFolder
@@ -23,6 +21,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
 
     Return the `Outcome`. Raises `InputError` if the config or an option is invalid."""
     formats = chosen(options.export)
+    cli.load_figures(options, "runs")
     check_geometry(config)
     check_clearances(config)
     with cli.waiting(Console(stderr=True), "compiling and simulating"):
@@ -36,8 +35,13 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     if weighed:
         data["pump"] = record_of(config, [*evaluation.design.values()])
     folder.write_json("result.json", data | {"versions": files.versions()})
-    write_simulated(folder, config, formats, evaluation)
+    if formats:
+        from rootsopt.export.writing import write_simulated
+
+        write_simulated(folder, config, formats, evaluation)
     if not options.no_figures:
+        from rootsopt.figures import runs
+
         runs.simulation_figures(folder, evaluation, config)
 
     def show(out: Console) -> None:

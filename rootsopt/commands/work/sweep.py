@@ -10,7 +10,6 @@ from rich.progress import Progress
 from rootsopt.commands import cli
 from rootsopt.config import Config
 from rootsopt.errors import InputError
-from rootsopt.figures.speeds import speed_figure
 from rootsopt.output import files, tables
 from rootsopt.output.runs import RunFolder
 from rootsopt.response import speeds
@@ -29,6 +28,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
         return over.body(config, options, folder)
     refuse_options(options)
     check_geometry(config)
+    cli.load_figures(options, "speeds")
     with _progress(Console(stderr=True)) as progress:
         evaluator = evaluator_for(speeds.alone(config)).without_gradient()
         parts = speeds.sweep(evaluator, speeds.swept_speeds(config), progress=progress)
@@ -46,6 +46,8 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     }
     folder.write_json("result.json", data)
     if not options.no_figures:
+        from rootsopt.figures.speeds import speed_figure
+
         name = config.profile.family.upper()
         speed_figure(folder, {name: parts}, f"Contact force of the {name} pair over speed")
 

@@ -41,23 +41,27 @@ class Known(NamedTuple):
         number of flank sides that can touch at once."""
         elements, times = sizes
         points = len(GAUSS.nodes)
-        nothing, zero = jnp.zeros(()), jnp.zeros((), int)
+
+        # NumPy's zeros: outside of a program, JAX would compile one for each shape.
+        def zeros(*shape: int, dtype: Any = float) -> Any:
+            return np.zeros(shape, jax.dtypes.canonicalize_dtype(dtype))
+
         mesh = Mesh(
-            times=jnp.zeros(times),
-            which=jnp.zeros(times, int),
-            interval=jnp.zeros(elements, int),
-            left=jnp.zeros(elements),
-            right=jnp.zeros(elements),
-            used=zero,
+            times=zeros(times),
+            which=zeros(times, dtype=int),
+            interval=zeros(elements, dtype=int),
+            left=zeros(elements),
+            right=zeros(elements),
+            used=zeros(dtype=int),
         )
         motion = Elements(
             mesh,
-            jnp.zeros((elements, states)),
-            jnp.zeros((elements, points, states)),
-            jnp.zeros((elements, points + 1, sides, 2)),
+            zeros(elements, states),
+            zeros(elements, points, states),
+            zeros(elements, points + 1, sides, 2),
         )
-        no = jnp.zeros((), bool)
-        return cls(motion, nothing, nothing, nothing, no, no)
+        no = zeros(dtype=bool)
+        return cls(motion, zeros(), zeros(), zeros(), no, no)
 
 
 def trimmed(known: Known) -> Known:
