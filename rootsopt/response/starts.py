@@ -1,7 +1,6 @@
 """Where an evaluation begins: on the closed orbit of a similar design or scene, or at a state."""
 
 import base64
-import functools
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -58,7 +57,7 @@ def begun(pair: RotorPair, start: Seed | ArrayLike | None, longest: int) -> Star
     seed = start if isinstance(start, Seed) else None
     state = start if seed is None else seed.state
     given = np.zeros(pair.states, dtype) if state is None else np.asarray(state, dtype)
-    empty = _empty(room, pair.states, 1 + pair.two_sided)
+    empty = Known.empty(room, pair.states, 1 + pair.two_sided)
     nothing = Start(given, empty, _numbers(pair))
     leaves, kind = jax.tree.flatten((empty, nothing.pair))
     if seed is None or len(seed.orbit) != len(leaves):
@@ -105,12 +104,6 @@ def _read(kind: str, shape: list[int], data: str) -> NDArray[Any]:
 def _numbers(pair: RotorPair) -> RotorPair:
     """Return the numbers of `pair` in arrays of NumPy, with `None` in place of all other leaves."""
     return jax.tree.map(np.asarray, eqx.filter(pair, eqx.is_inexact_array))
-
-
-@functools.cache
-def _empty(room: tuple[int, int], states: int, sides: int) -> Known:
-    """Return the placeholder `Known.empty` in arrays of NumPy."""
-    return jax.tree.map(np.asarray, Known.empty(room, states, sides))
 
 
 __all__ = ["Seed", "Seeds", "begun", "plain", "read"]
