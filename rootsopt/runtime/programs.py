@@ -53,16 +53,17 @@ _SETTINGS = (
 """Names of the JAX settings that change what is traced or compiled."""
 _VARIABLES = ("XLA_FLAGS", "EQX_ON_ERROR")
 COMPILER_OPTIONS: dict[str, str | bool] = {
-    "xla_cpu_use_fusion_emitters": False,
     "xla_disable_hlo_passes": (
         "while-loop-invariant-code-motion,while-loop-constant-sinking,simplify-while-loops"
     ),
+    # JAX 0.11 refuses this option.
+    **({"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ < (0, 11) else {}),
 }
 """Compiler options on CPUs. They more than halve the compile time; programs run equally fast.
 
-The first option selects the older code generator for fused operations. The second turns off three
-passes over loops. XLA repeats these passes many times, because one pass moves an operation out of
-only one of several nested loops.
+The first option turns off three passes over loops. XLA repeats these passes many times, because one
+pass moves an operation out of only one of several nested loops. The second selects the older code
+generator for fused operations.
 
 >>> import jax
 >>> import rootsopt
