@@ -5,6 +5,7 @@ thread computes a part of the batch, one design after the other: on one thread, 
 per core. Some designs are compared with single evaluations on the CPU, by a program without
 batches."""
 
+import functools
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -57,7 +58,8 @@ def rows_of(sizes: list[int], say: Callable[[str], None] = lambda text: None) ->
             for name, start in starts.items():
                 say(f"{size} designs from {name}, {row['device']}")
                 call(start)
-                seconds, found = median_time(lambda start=start: call(start), _REPEATS, _SECONDS)  # noqa: B023
+                again = functools.partial(call, start)
+                seconds, found = median_time(again, _REPEATS, _SECONDS)
                 yield {
                     **row,
                     "start": name,

@@ -1,6 +1,7 @@
 """Tests of interrupted and resumed searches, which equal an uninterrupted one to the last bit."""
 
 import json
+import types
 
 import numpy as np
 import pytest
@@ -55,15 +56,15 @@ def test_the_command_keeps_its_checkpoint_until_the_run_is_in_place(tmp_path, mo
     kept, older = (tmp_path / f".run.checkpoint{end}" for end in ("", ".old"))
     kept.write_text("of an earlier run")
 
-    def searched(config, progress, stop, checkpoint, runs):
+    def search_of(config, progress, stop, checkpoint, runs):
         checkpoint.keep((0, 0), np.zeros(1), evaluation(0.1))
-        return config, {}, None
+        return types.SimpleNamespace(run=lambda: None, so_far=lambda: None)
 
     def given_up(self):
         raise InputError("no space")
 
     put = RunFolder.put_in_place
-    monkeypatch.setattr(work, "_searched", searched)
+    monkeypatch.setattr(work, "search_of", search_of)
     monkeypatch.setattr(RunFolder, "put_in_place", given_up)
     arguments = ["configs/cic.yaml", "-o", str(tmp_path / "run")]
     assert command.main(arguments) == 2

@@ -307,10 +307,10 @@ def test_a_stopped_search_without_time_to_verify():
 
 @dataclasses.dataclass(frozen=True)
 class _Slow(Evaluator):
-    """An evaluator that takes ten minutes for a design, except in a survey."""
+    """An evaluator that takes ten minutes to verify a design."""
 
     def __call__(self, design=None, start=None, series=True):
-        if not self.survey:
+        if self.reference is not None and not self.survey:
             time.sleep(600)
         return super().__call__(design, start, series)
 

@@ -453,7 +453,7 @@ def test_a_program_follows_the_code_that_it_imports(package):
     ):
         seen.append(replaced(name, old, new))
         assert seen.count(seen[-1]) == 1, name
-    (package / "contact" / "map.py").rename(package / "contact" / "maps.py")
+    (package / "contact" / "gap.py").rename(package / "contact" / "gaps.py")
     assert replaced("status.py", "a", "a") not in seen
 
 
