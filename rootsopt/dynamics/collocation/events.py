@@ -1,9 +1,10 @@
 """Find the events of a motion, and check the events that a mesh assumes.
 
 An event is an instant at which a flag of the equation (`RotorPair.switches`) changes. The flags are
-evaluated at all Gauss points and on both sides of the end of each element. At each of these
-instants, the contact is found by a search (`SearchContact`), not from a closest approach already
-known (`NearContact`). Events inside elements are located by the zeros of their margins.
+evaluated at all Gauss points, on both sides of the end of each element, and where a short touch may
+begin or end: beside a zero of ε, or where ε is extreme. At each of these instants, the contact is
+found by a search (`SearchContact`), not from a closest approach already known (`NearContact`).
+Events inside elements are located by the zeros of their margins.
 """
 
 import dataclasses
@@ -31,6 +32,9 @@ _LOCATED, _STEEP = 3e-10, 0.2
 chord's root the next instant is, so that both ends of the range approach the event."""
 _SAME = 3e-9
 """Time (mesh periods) between two events below which they are merged into one."""
+_WITHIN = 0.03, 0.97
+"""Range of an element (fraction of its length) for the instants of `extra`. Those at the element's
+ends are beside it."""
 _ENDS = (1.0, 0.0)
 """End and start of an element, as fractions of its length."""
 _CHANGES = 2
@@ -121,7 +125,8 @@ def ranks(pair: RotorPair) -> list[int]:
 
 @eqx.filter_jit
 def look(pair: RotorPair, elements: Elements) -> FlagScan:
-    """Evaluate the flags at the Gauss points and on both sides of the end of each element."""
+    """Evaluate the flags at the Gauss points of each element, on both sides of its end, and at its
+    `extra` instants."""
     assert isinstance(pair.contact, SearchContact)
     flanks = dataclasses.replace(pair.contact.pair, together=True)
     pair = eqx.tree_at(lambda p: p.contact.pair, pair, flanks)
@@ -129,19 +134,59 @@ def look(pair: RotorPair, elements: Elements) -> FlagScan:
     tau, state = elements.places
     number = jnp.arange(mesh.left.shape[0])
     length = mesh.lengths
+    more = mesh.ends[0][:, None] + length[:, None] * extra(elements)
     beside = jnp.minimum(length, length[jnp.where(number + 1 < mesh.used, number + 1, 0)])
     aside = jnp.minimum(_ASIDE[0], _ASIDE[1] * beside)
     end = tau[:, -1:] + aside[:, None] * jnp.asarray([-1.0, 1.0])
     slope = elements.slopes[:, -1:]
     ends = state[:, -1:] + slope * (end - tau[:, -1:])[..., None]
-    tau = jnp.concatenate([tau[:, :-1], end], axis=1)
-    state = jnp.concatenate([state[:, :-1], ends], axis=1)
+    inner = elements.inside(jnp.broadcast_to(number[:, None], more.shape), more)
+    tau = jnp.concatenate([tau[:, :-1], end, more], axis=1)
+    state = jnp.concatenate([state[:, :-1], ends, inner], axis=1)
     each = jax.vmap(jax.vmap(lambda t, z: flags_at(pair, t, z)))
     flags, counts, roots, pushes = in_blocks(each, mesh.used, tau, state)
     width = flags.shape[-1]
     total = mesh.used * tau.shape[1]
+    order = jnp.argsort(tau, axis=1)
+    flags, counts = (jnp.take_along_axis(x, order[..., None], 1) for x in (flags, counts))
     flags, counts = flags.reshape(-1, width), counts.reshape(-1, width)
-    return FlagScan(tau.ravel(), flags, counts, roots, pushes, total)
+    times = jnp.take_along_axis(tau, order, 1).ravel()
+    kept = slice(-more.shape[1])
+    return FlagScan(times, flags, counts, roots[:, kept], pushes[:, kept], total)
+
+
+def extra(elements: Elements) -> Float[Array, "e 2"]:
+    """Return two instants in each element, as fractions of its length, where a short touch shows.
+
+    They lie beside the zero of ε, or else where ε is extreme and in the middle of the element.
+    Without clearance, flanks that are about to part may touch for a moment after ε has changed its
+    sign, and flanks that are about to meet, before."""
+    begins, inside = elements.state[:, None, :2], elements.places[1][..., :2]
+    relative, rate = jnp.moveaxis(jnp.concatenate([begins, inside], axis=1), -1, 0)
+    (zero, crosses), (turn, turns) = (_zero(elements, x, k) for k, x in enumerate((relative, rate)))
+    aside = _ASIDE[0] / jnp.maximum(elements.mesh.lengths, _ASIDE[0])
+    beside = jnp.stack([zero - aside, zero + aside], axis=1)
+    other = jnp.stack([jnp.where(turns, turn, 0.4), jnp.full_like(turn, 0.5)], axis=1)
+    return jnp.clip(jnp.where(crosses[:, None], beside, other), *_WITHIN)
+
+
+def _zero(elements: Elements, values: Float[Array, "e q"], state: int):
+    """Return where a state is zero in each element, and whether it changes its sign there.
+
+    `values`: those of the state number `state` at the start, the Gauss points and the end of each
+    element. They are interpolated, and two steps of Newton's method follow."""
+    places = jnp.asarray([0.0, *GAUSS.nodes, 1.0])
+    crosses = values[:, :-1] * values[:, 1:] < 0
+    first = jnp.argmax(crosses, axis=1)
+    before, after = (jnp.take_along_axis(values, k[:, None], 1)[:, 0] for k in (first, first + 1))
+    low, high = places[first], places[first + 1]
+    share = low + (high - low) * before / jnp.where(before == after, 1.0, before - after)
+    slopes, length = elements.slopes[..., state], elements.mesh.lengths
+    for _ in range(2):
+        value = values[:, 0] + length * jnp.sum(GAUSS.integrated(share) * slopes, axis=1)
+        slope = length * jnp.sum(GAUSS.lagrange(share) * slopes, axis=1)
+        share = jnp.clip(share - value / jnp.where(slope == 0, jnp.inf, slope), low, high)
+    return share, jnp.any(crosses, axis=1)
 
 
 def rooted(elements: Elements, seen: FlagScan) -> Elements:
@@ -160,7 +205,7 @@ def rooted(elements: Elements, seen: FlagScan) -> Elements:
     length = jnp.where(mesh.lengths > 0, mesh.lengths, 1.0)[:, None]
     before, after = leaving / length, (entering / length)[following]
     end = mesh.ends[1][:, None, None]
-    aside = seen.tau.reshape(*number.shape, -1)[:, inside:, None] - end
+    aside = seen.tau.reshape(*number.shape, -1)[:, -2:, None] - end
     moved = seen.roots[:, inside:] - aside * jnp.stack([before, after], axis=1)
     own = seen.pushes[:, inside] | ~seen.pushes[:, inside + 1]
     ends = jnp.stack([jnp.where(own, moved[:, 0], moved[:, 1]), moved[:, 1]], axis=-1)
@@ -199,7 +244,7 @@ def _compared(pair: RotorPair, elements: Elements, seen: FlagScan) -> _Compared:
     """Compare the flags `seen` along the motion `elements` with the events of its mesh."""
     mesh = elements.mesh
     places = seen.tau.shape[0]
-    per = len(GAUSS.nodes) + 2
+    per = places // elements.state.shape[0]
     rank = jnp.asarray(ranks(pair))
     number = jnp.arange(places)
     after = jnp.where(number + 1 < seen.total, number + 1, 0)

@@ -8,6 +8,7 @@ import pytest
 import rootsopt
 from rootsopt.dynamics.collocation.elements import Elements, Mesh
 from rootsopt.dynamics.collocation.equation import Points
+from rootsopt.dynamics.collocation.events import extra
 from rootsopt.dynamics.collocation.forces import OrbitForces
 from rootsopt.dynamics.collocation.gauss import GAUSS, POINTS
 from rootsopt.dynamics.collocation.known import Known, padded, trimmed
@@ -140,6 +141,27 @@ def test_peak_is_located(place, corner):
     begin, length = elements.mesh.ends[0][found.element], elements.mesh.lengths[found.element]
     np.testing.assert_allclose(float(begin + length * found.share), place, atol=2e-7)
     np.testing.assert_allclose(float(found.force), 200.0, rtol=1e-10)
+
+
+def test_flags_are_evaluated_where_a_short_touch_shows():
+    """Beside zeros of the first state, and where it is extreme."""
+    elements = _known().elements
+    begin, length = elements.mesh.ends[0], elements.mesh.lengths
+    inside = begin[:, None] + length[:, None] * GAUSS.nodes
+    rate, bend = TURN * jnp.cos(TURN * inside), -(TURN**2) * jnp.sin(TURN * inside)
+    state = jnp.stack([jnp.sin(TURN * begin), TURN * jnp.cos(TURN * begin)], axis=1)
+    moving = elements._replace(state=state, slopes=jnp.stack([rate, bend], axis=-1))
+    found = np.asarray(begin[:, None] + length[:, None] * extra(moving))[:USED]
+    first, last = np.asarray(begin)[:USED], np.asarray(begin + length)[:USED]
+    for zero in (1.0, 2.0):
+        near = found[(first < zero - 1e-3) & (zero + 1e-3 < last)]
+        for pair in near:  # The elements are only near a sine.
+            np.testing.assert_allclose(pair, zero, rtol=0, atol=3e-6)
+            np.testing.assert_allclose(np.diff(pair), 4e-7, rtol=1e-6)
+    assert np.sum(np.abs(found - 1.0) < 3e-6) == 2
+    for turn in (0.5, 1.5):
+        assert np.min(np.abs(found - turn)) < 1e-5
+    assert np.all((found > first[:, None]) & (found < last[:, None]))
 
 
 @pytest.mark.long
