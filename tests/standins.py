@@ -1,4 +1,4 @@
-"""Stand-ins for a pair, its flow and an evaluation, with numbers made up for a test.
+"""Stand-ins for a pair and an evaluation, with numbers made up for a test.
 
 A pair whose flanks never touch is a damped oscillator."""
 
@@ -7,8 +7,6 @@ import numpy as np
 
 from rootsopt.contact.gap import Contact
 from rootsopt.contact.impact import ImpactLaw
-from rootsopt.dynamics.flow import Flow
-from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.parts import ConstantLoad, PrescribedDrive, TimingGear
 from rootsopt.response.evaluation import RESPONSES, Evaluation
@@ -41,30 +39,6 @@ def oscillator(**changes) -> RotorPair:
         "force_scale": jnp.asarray(100.0),
     }
     return RotorPair(**parts | changes)
-
-
-def told_flow(pair, state, means, growth=None):
-    """Return a mesh period whose force has the mean `means[k]`.
-
-    k is the first state, which grows by one in each period. `growth`: the derivative with respect
-    to the state, as a multiple of the unit matrix."""
-    at = jnp.round(state[0]).astype(int)
-    mean = jnp.asarray(means)[at]
-    blank = Flow.empty(state.shape[0], 0, 2, 1, Measures(), state.dtype)
-    slope = blank.slope
-    if growth is not None:
-        count = state.shape[0]
-        slope = slope.at[:count].set(jnp.exp(jnp.asarray(growth)[at]) * jnp.eye(count))
-    return blank._replace(
-        end=state.at[0].add(1.0).at[1].set(at % 3 + 0.001 * at),
-        mean=mean,
-        mean_square=2 * mean**2,
-        peak=3 * mean + at % 2,
-        depth=-mean,
-        states=jnp.stack([state, -2 * state]),
-        solved=jnp.asarray(True),
-        slope=slope,
-    )
 
 
 class Near(Contact):

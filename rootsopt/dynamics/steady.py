@@ -128,9 +128,9 @@ class _Search(NamedTuple):
 
     `found`: result so far; `shorter`: period (mesh periods) of a shorter orbit to try next, 0 for
     none. Otherwise, the next iteration simulates a transient and closes its orbit. It starts from
-    `state`, at the tolerances `coarse` (transient)
-    and `fine` (orbit), and the states must repeat to within the scaled distance `within`. `tries`:
-    number of refinements so far; `over`: whether the loop has ended.
+    `state`, at the tolerances `coarse` (transient) and `fine` (orbit), and the states must repeat
+    to within the scaled distance `within`. `tries`: number of refinements so far; `over`: whether
+    the loop has ended.
     """
 
     found: Steady

@@ -21,7 +21,6 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from rootsopt.dynamics.flow import Flow
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.stepping import integrated, interpolated
@@ -105,7 +104,7 @@ class Window(NamedTuple):
         """Scaled state from which the next mesh period is integrated."""
         return jnp.where(self.second, self.beside, self.end)
 
-    def after(self, out: "Flow | Period") -> "Window":
+    def after(self, out: "Period") -> "Window":
         """Return the window after one more integration over a mesh period; `out`: its flow.
 
         The two motions take turns: the second one is then put back beside the first."""
@@ -186,7 +185,7 @@ def _numpy_of(array: Any) -> Any:
 
 
 class Period(NamedTuple):
-    """A motion over one mesh period: the fields of `Flow` that `Window.after` needs.
+    """A motion over one mesh period, with what `Window.after` needs.
 
     The peak in `response` (3,) is that of `_SAMPLES` uniform samples; `duration`: in usual mesh
     periods, from which it differs if rotor 1 is free."""

@@ -339,11 +339,6 @@ def _named(solver: Solver, pair: RotorPair, tangents: RotorPair, found: Steady):
         margins=pair.soundness,
         start=_next_start(solver, pair, found, state),
     )
-    wide = jnp.result_type(float)
-    response, rows = jax.tree.map(
-        lambda x: x.astype(wide) if eqx.is_inexact_array(x) and jnp.isrealobj(x) else x,
-        (response, rows),
-    )
     return response, jnp.where(periodic, rows, jnp.nan)
 
 

@@ -56,7 +56,7 @@ COMPILER_OPTIONS: dict[str, str | bool] = {
     "xla_disable_hlo_passes": (
         "while-loop-invariant-code-motion,while-loop-constant-sinking,simplify-while-loops"
     ),
-    # JAX 0.11 refuses this option.
+    # JAX 0.11.2 refuses this option.
     **({"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ < (0, 11) else {}),
 }
 """Compiler options on CPUs. They more than halve the compile time; programs run equally fast.

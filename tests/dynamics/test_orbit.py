@@ -91,7 +91,10 @@ def test_loops_of_a_branch_end_with_the_motions_that_take_it(monkeypatch):
 
     def one(limit):
         count = jnp.zeros((), int)
-        loop = lambda: lax.while_loop(lambda k: k < limit, counted, count)  # noqa: E731
+
+        def loop():
+            return lax.while_loop(lambda k: k < limit, counted, count)
+
         return branch(limit < 10, loop, lambda: count)
 
     found = jax.jit(jax.vmap(one))(jnp.asarray([3, 500, 5]))

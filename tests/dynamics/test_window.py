@@ -10,7 +10,7 @@ from rootsopt.dynamics.flow import strobe
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.response.evaluation import Evaluator, lyapunov_program
 from rootsopt.runtime.programs import Program
-from tests.standins import oscillator, told_flow
+from tests.standins import oscillator
 
 PERIODS = 1024
 
@@ -19,12 +19,12 @@ def window_of(monkeypatch, growth, noise=0.0):
     """Return a window in which distances grow by told factors and steps add `noise`."""
 
     def one_period(pair, state, how):
-        out = told_flow(pair, state, np.ones(PERIODS))
-        at = jnp.round(state[0])
+        at, one = jnp.round(state[0]), jnp.ones(())
         aside = jnp.exp(jnp.asarray(growth)[at.astype(int)]) * (state[0] - at)
         aside = jnp.sign(aside) * jnp.hypot(aside, noise)
         end = jnp.stack([at + 1 + aside, 0.0 * at])
-        return out._replace(end=end, states=jnp.tile(state, (630, 1)))
+        states, yes = jnp.tile(state, (630, 1)), jnp.ones((), bool)
+        return window.Period(end, jnp.asarray([1.0, 2.0, 3.0]), states, -one, yes, one)
 
     monkeypatch.setattr(window, "one_period", one_period)
     how = Integrator("tsit5", jnp.asarray(1e-6), 64)
