@@ -339,6 +339,11 @@ def _named(solver: Solver, pair: RotorPair, tangents: RotorPair, found: Steady):
         margins=pair.soundness,
         start=_next_start(solver, pair, found, state),
     )
+    # Without weak types: a start that has them would be compiled for once more.
+    response, rows = jax.tree.map(
+        lambda x: x.astype(float) if eqx.is_inexact_array(x) and jnp.isrealobj(x) else x,
+        (response, rows),
+    )
     return response, jnp.where(periodic, rows, jnp.nan)
 
 
