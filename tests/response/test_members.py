@@ -7,10 +7,28 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from rootsopt.dynamics.flow import Flow
 from rootsopt.dynamics.integrator import Integrator
+from rootsopt.dynamics.measures import Measures
 from rootsopt.response import ensemble, members
 from rootsopt.response.members import Members
-from tests.standins import oscillator, told_flow
+from tests.standins import oscillator
+
+
+def told_flow(state, means):
+    """Return a mesh period whose force has the mean `means[k]`; k, the first state, grows by one."""
+    at = jnp.round(state[0]).astype(int)
+    mean = jnp.asarray(means)[at]
+    blank = Flow.empty(state.shape[0], 0, 2, 1, Measures(), state.dtype)
+    return blank._replace(
+        end=state.at[0].add(1.0).at[1].set(at % 3 + 0.001 * at),
+        mean=mean,
+        mean_square=2 * mean**2,
+        peak=3 * mean + at % 2,
+        depth=-mean,
+        states=jnp.stack([state, -2 * state]),
+        solved=jnp.asarray(True),
+    )
 
 
 def test_averages_of_a_member(monkeypatch):
@@ -20,7 +38,7 @@ def test_averages_of_a_member(monkeypatch):
     half."""
     settle = 3
     means = np.random.default_rng(0).uniform(1, 2, 20) + np.arange(20)
-    monkeypatch.setattr(members, "flow", lambda pair, state, *rest: told_flow(pair, state, means))
+    monkeypatch.setattr(members, "flow", lambda pair, state, *rest: told_flow(state, means))
     monkeypatch.setattr(
         members,
         "strobe",
@@ -61,7 +79,7 @@ def test_a_member_repeats_after_its_period(monkeypatch):
     def step(state):
         return jnp.array([0.5, 0.0]).at[1].set((jnp.round(state[1]) + 1) % 3)
 
-    blank = told_flow(None, jnp.zeros(2), [1.0])
+    blank = told_flow(jnp.zeros(2), [1.0])
     monkeypatch.setattr(members, "flow", lambda pair, state, *rest: blank._replace(end=step(state)))
     averages = averages_from(jnp.zeros(2))
     # A cycle of k counts once the last k + 1 states have been there k mesh periods before.
