@@ -25,7 +25,8 @@ from rootsopt.dynamics.pair import RotorPair
 from rootsopt.figures.speeds import LABELS
 from rootsopt.optimize.search import Search
 from rootsopt.response.evaluation import Evaluation, objective_weights
-from rootsopt.response.speeds import AtSpeed, sweep
+from rootsopt.response.result import Part
+from rootsopt.response.speeds import sweep
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import design_vector
 
@@ -140,7 +141,7 @@ def crossings(found: dict[str, float], lobes: int, speeds) -> list[Row]:
     return rows
 
 
-def maxima(parts: tuple[AtSpeed, ...], rows: list[Row]) -> list[Row]:
+def maxima(parts: tuple[Part, ...], rows: list[Row]) -> list[Row]:
     """Find the local maxima of mean and peak force over speed.
 
     `rows`: crossings. Returns a row per maximum, with the nearest crossing."""
@@ -189,13 +190,11 @@ class Study:
     config."""
 
     config: Config
-    designs: dict[str, tuple[AtSpeed, ...]]
+    designs: dict[str, tuple[Part, ...]]
     linear: dict[str, dict[str, float]]
     outcomes: list[Row]
 
-    def over(
-        self, parts: tuple[AtSpeed, ...], baseline: tuple[AtSpeed, ...] | None = None
-    ) -> np.ndarray:
+    def over(self, parts: tuple[Part, ...], baseline: tuple[Part, ...] | None = None) -> np.ndarray:
         """Return the objective (n,) along a sweep, relative to a `baseline` sweep.
 
         `parts`: the sweep; `baseline`: by default the sweep of CIC."""
@@ -295,7 +294,7 @@ def run(quick: bool, say: Callable[[str], None] = lambda text: None) -> Results:
         found = results.studies[scene] = study(scene, speeds, listed, quick)
         for name, parts in found.designs.items():
             here = {"scene": scene, "design": name}
-            results.rows += [here | part.row() for part in parts]
+            results.rows += [here | part.row(whole=True) for part in parts]
             across = crossings(found.linear[name], found.config.profile.lobes, speeds)
             results.resonances += [here | row for row in across]
             results.peaks += [here | row for row in maxima(parts, across)]

@@ -12,7 +12,7 @@ from rootsopt.figures.style import (
     figure,
 )
 from rootsopt.output.files import ResultFolder
-from rootsopt.response.speeds import AtSpeed
+from rootsopt.response.result import Part
 
 _MARKERS = {"periodic": "o", "averaged": "s", "chaotic": "x", "not_settled": "+"}
 _NO_FORCE = "v"
@@ -22,7 +22,7 @@ ones."""
 LABELS = {"mean_force_N": "mean force (N)", "peak_force_N": "peak force (N)"}
 
 
-def plot_speeds(ax: Axes, designs: Mapping[str, Sequence[AtSpeed]], force: str) -> Axes:
+def plot_speeds(ax: Axes, designs: Mapping[str, Sequence[Part]], force: str) -> Axes:
     """Draw a force over speed, one line per design.
 
     `designs`: evaluations of each design at all speeds, keyed by its name; `force`: key of the
@@ -53,7 +53,7 @@ def plot_speeds(ax: Axes, designs: Mapping[str, Sequence[AtSpeed]], force: str) 
     return ax
 
 
-def legend_entries(designs: Mapping[str, Sequence[AtSpeed]]) -> list[Line2D]:
+def legend_entries(designs: Mapping[str, Sequence[Part]]) -> list[Line2D]:
     """Return legend entries for the lines of the designs and for the markers of the statuses."""
     entries = []
     for name, color, dashes in zip(designs, COLORS, DASHES * 2, strict=False):
@@ -78,7 +78,7 @@ def legend_entries(designs: Mapping[str, Sequence[AtSpeed]]) -> list[Line2D]:
 
 
 def speed_figure(
-    folder: ResultFolder, designs: Mapping[str, Sequence[AtSpeed]], title: str
+    folder: ResultFolder, designs: Mapping[str, Sequence[Part]], title: str
 ) -> list[str]:
     """Write speeds.png, mean and peak force over speed; return the names of the files written.
 

@@ -27,7 +27,7 @@ from rootsopt.optimize.limits import (
 from rootsopt.optimize.local import Group, Local
 from rootsopt.optimize.optimality import Holder
 from rootsopt.response.evaluation import Evaluation, objective_weights
-from rootsopt.response.speeds import at_speeds, counted
+from rootsopt.response.speeds import counted
 from rootsopt.response.terms import sense_of
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene
@@ -109,7 +109,7 @@ class Problem:
         """
         check_senses(config)
         orders = {line_name(order): order for order in config.objective.line_weights}
-        counting = [part for part in at_speeds(baseline) if part.share > 0]
+        counting = [part for part in baseline.by_speed if part.share > 0]
         for name, part in itertools.product(objective_weights(config), counting):
             one = part.evaluation
             least = _NO_LINE * one.response["mean_force_N"] if name in orders else 0.0
@@ -147,7 +147,7 @@ class Problem:
         The keys of a row are `speed_rpm`, `share` (weight of the speed) and `objective`. The
         objective is NaN if a measure of the baseline is 0, which is possible only if the share is
         0. Without `objective.speeds_rpm`, the list is empty."""
-        parts = zip(at_speeds(evaluation), at_speeds(self.baseline), strict=True)
+        parts = zip(evaluation.by_speed, self.baseline.by_speed, strict=True)
         return [
             {
                 "speed_rpm": part.speed_rpm,
@@ -201,7 +201,7 @@ class Problem:
         worst = self.config.objective.over_speeds == "worst"
         # The same groups at every point, even if one of them has a single branch.
         cornered = self.cornered or self.config.objective.motion == "worst"
-        parts = zip(at_speeds(evaluation), at_speeds(self.baseline), strict=True)
+        parts = zip(evaluation.by_speed, self.baseline.by_speed, strict=True)
         smooth, slope = 0.0, np.zeros(len(self.space.lower))
         groups: list[Group] = []
         for number, (part, base) in enumerate(parts):
@@ -289,18 +289,15 @@ class Problem:
 
     def _limited(self, evaluation: Evaluation) -> list[tuple[int, Evaluation]]:
         """Return (kind, evaluation) of each scene, speed and motion in which `limits` must hold."""
+        scenes = [part.evaluation for part in evaluation.scenes] or [evaluation]
         found = []
-        for scene, whole in enumerate(self._scenes(evaluation)):
-            for number, part in enumerate(at_speeds(whole)):
+        for scene, whole in enumerate(scenes):
+            for number, part in enumerate(whole.by_speed):
                 if part.share <= 0:
                     continue
                 kind = SCENE_KINDS * scene + number
                 found += [(kind, one) for one in (part.evaluation, *part.evaluation.rivals)]
         return found
-
-    def _scenes(self, evaluation: Evaluation) -> list[Evaluation]:
-        """Return the evaluations in all scenes in which `limits` must hold."""
-        return [evaluation]
 
     def along_scene(self, moved: Evaluation, certificate: Certificate) -> dict[str, float]:
         """Return the derivatives of the optimal objective with respect to scene quantities, by key.
@@ -587,7 +584,7 @@ class Problem:
         `evaluation`, `certificate`: those of the optimum."""
         labels: list[list[Holder]] = []
         worst = self.config.objective.over_speeds == "worst"
-        parts = zip(at_speeds(evaluation), at_speeds(self.baseline), strict=True)
+        parts = zip(evaluation.by_speed, self.baseline.by_speed, strict=True)
         for part, base in parts:
             if part.share <= 0:
                 continue

@@ -27,10 +27,8 @@ from rootsopt.response.evaluation import RESPONSES, Evaluation, Evaluator
 from rootsopt.response.runs import HERE, Runs
 from rootsopt.response.scatter import Shift, draw, shifts
 from rootsopt.response.tolerances import (
-    ToleranceEvaluation,
     ToleranceEvaluator,
     in_scene,
-    nominal_of,
 )
 from rootsopt.response.wrapper import Evaluates
 from rootsopt.scene import Scene
@@ -186,12 +184,12 @@ class RobustSearch(Search):
         single = self.exact.single
         if not isinstance(single, Evaluator) or self.stop.is_set():
             return []
-        return sensitivity_rows(single, nominal_of(optimized), lambda moved: {})
+        return sensitivity_rows(single, optimized.nominal, lambda moved: {})
 
     def _local(self, start: int, evaluation: Evaluation, point) -> Local | None:
         problem = self.problem
         assert isinstance(problem, RobustProblem)
-        if not (isinstance(evaluation, ToleranceEvaluation) and evaluation.usable):
+        if not evaluation.usable:
             return None
         shares = self._shares.get(start)
         if shares is None:
@@ -271,7 +269,7 @@ class TolerantSearch:
             "nominal": self._nominal.optimized,
             "robust": found.optimized,
         }
-        designs = {name: nominal_of(one) for name, one in known.items() if one is not None}
+        designs = {name: one.nominal for name, one in known.items() if one is not None}
         drawn = draw(self.config, tolerances.check_samples, fresh=True)
         single = stage.fast.single if isinstance(stage.fast, ToleranceEvaluator) else stage.fast
         best = found.problem.objective(found.optimized) if found.optimized else float("nan")

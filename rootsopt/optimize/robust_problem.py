@@ -16,7 +16,6 @@ from rootsopt.optimize.optimality import Holder
 from rootsopt.optimize.problem import SCENE_KINDS, Problem
 from rootsopt.optimize.risk import Combined, combine
 from rootsopt.response.evaluation import Evaluation
-from rootsopt.response.tolerances import ToleranceEvaluation, nominal_of
 from rootsopt.scene import Scene
 
 _HELD = 1e-6
@@ -37,19 +36,18 @@ class RobustProblem(Problem):
     def of(cls, config: Config, scene: Scene, baseline: Evaluation) -> "RobustProblem":
         """Return the problem of a `config` with `tolerances`, as `Problem.of` does.
 
-        `baseline`: a usable `ToleranceEvaluation` of the config's own design."""
-        assert isinstance(baseline, ToleranceEvaluation)
+        `baseline`: a usable evaluation of the config's own design over the sample."""
         problem = Problem.of(config, scene, baseline.nominal)
         found = cls(config, problem.baseline, problem.space, problem.limits)
         return dataclasses.replace(found, reference=found.combined(baseline).value)
 
-    def values(self, evaluation: ToleranceEvaluation) -> NDArray[np.float64]:
+    def values(self, evaluation: Evaluation) -> NDArray[np.float64]:
         """Return the objective in each scene of the sample (n,), 1 for the nominal baseline."""
         return np.array(
-            [super(RobustProblem, self).objective(p.evaluation) for p in _of(evaluation)]
+            [super(RobustProblem, self).objective(p.evaluation) for p in evaluation.samples]
         )
 
-    def combined(self, evaluation: ToleranceEvaluation) -> Combined:
+    def combined(self, evaluation: Evaluation) -> Combined:
         """Return the combination of the objectives in all scenes, with its weights.
 
         It is not yet divided by that of the baseline."""
@@ -60,7 +58,7 @@ class RobustProblem(Problem):
         """Return the robust objective of an `evaluation`, which is 1 for the baseline.
 
         The result is NaN without a usable steady state in every scene."""
-        if not isinstance(evaluation, ToleranceEvaluation):
+        if not evaluation.scenes:
             return super().objective(evaluation)
         if not evaluation.usable:
             return float("nan")
@@ -68,10 +66,10 @@ class RobustProblem(Problem):
 
     def slope(self, evaluation: Evaluation, point) -> NDArray[np.float64]:
         """Return the gradient (d,) of the robust objective with respect to the `point` (d,)."""
-        if not isinstance(evaluation, ToleranceEvaluation):
+        if not evaluation.scenes:
             return super().slope(evaluation, point)
         weights = self.combined(evaluation).weights
-        rows = [super(RobustProblem, self).slope(p.evaluation, point) for p in _of(evaluation)]
+        rows = [super(RobustProblem, self).slope(p.evaluation, point) for p in evaluation.samples]
         return np.asarray(weights @ np.array(rows) / self.reference)
 
     def local(
@@ -85,12 +83,12 @@ class RobustProblem(Problem):
         the weights of the scenes at this point, with negative ones set to 0. The rest of the
         objective becomes its smooth part, with the gradient of the greatest branch in each
         scene."""
-        if not isinstance(evaluation, ToleranceEvaluation):
+        if not evaluation.scenes:
             return super().local(evaluation, point)
         if not evaluation.usable:
             return None
         assert self.config.tolerances is not None
-        every = [super(RobustProblem, self).local(p.evaluation, point) for p in _of(evaluation)]
+        every = [super(RobustProblem, self).local(p.evaluation, point) for p in evaluation.samples]
         parts = [part for part in every if part is not None]
         walls = self.walls(evaluation, self.look(point)[1]) if self.limits else ()
         if self.config.tolerances.combine == "worst":
@@ -111,16 +109,6 @@ class RobustProblem(Problem):
         limits = parts[0].slack, parts[0].normals, walls
         return Local(smooth / self.reference, slope / self.reference, scaled, *limits)
 
-    def _scenes(self, evaluation: Evaluation) -> list[Evaluation]:
-        """Return the evaluations in the nominal scene and in all scenes of the sample."""
-        if not isinstance(evaluation, ToleranceEvaluation):
-            return [evaluation]
-        return [part.evaluation for part in evaluation.parts]
-
-    def by_speed(self, evaluation: Evaluation) -> list[dict[str, float]]:
-        """Return one row per speed in the nominal scene, as `Problem.by_speed` does."""
-        return super().by_speed(nominal_of(evaluation))
-
     def shares(self, weights: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the shares (n,) with which the maxima of each scene become groups in `local`."""
         return np.maximum(weights, 0.0)
@@ -140,7 +128,7 @@ class RobustProblem(Problem):
 
         With any other rule, all scenes influence the optimum, and the list is empty. `evaluation`,
         `certificate`: those of the optimum."""
-        if not isinstance(evaluation, ToleranceEvaluation):
+        if not evaluation.scenes:
             return super().held_by(evaluation, certificate)
         assert self.config.tolerances is not None
         if self.config.tolerances.combine != "worst" or not certificate.shares:
@@ -157,10 +145,6 @@ class RobustProblem(Problem):
             nothing = float("nan")
             held.append(Holder(nothing, nothing, nothing, top, share, int(scene)))
         return held
-
-
-def _of(evaluation: ToleranceEvaluation):
-    return evaluation.samples
 
 
 def top_slope(local: Local) -> NDArray[np.float64]:

@@ -279,7 +279,7 @@ def evaluation_table(evaluation: Evaluation) -> RenderableType:
 def sweep_table(rows: list[dict[str, Any]]) -> RenderableType:
     """Return a table of one design at many speeds.
 
-    `rows`: one per speed, as `AtSpeed.row` returns them."""
+    `rows`: one per speed, as `Part.row` returns them."""
     columns = "mean, N", "peak, N", "period", "multiplier", "status"
     table = _table("Contact force over speed", *columns)
     table.columns[0].header = Text("speed, rpm")

@@ -15,10 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import TypeAdapter
 
 from rootsopt.dynamics.maxima import Maxima
-from rootsopt.response.evaluation import Evaluation
-from rootsopt.response.speeds import AtSpeed, SpeedsEvaluation
+from rootsopt.response.result import Evaluation, Part
 from rootsopt.response.starts import Seeds, plain, read
-from rootsopt.response.tolerances import AtSample, ToleranceEvaluation
 from rootsopt.response.wrapper import Evaluates
 from rootsopt.runtime.journal import Journal
 from rootsopt.status import Status
@@ -91,8 +89,10 @@ class Checkpoint(Journal):
 
 def plain_evaluation(evaluation: Evaluation) -> dict[str, Any]:
     """Return an evaluation as plain values for JSON, without its time series."""
-    names = (field.name for field in dataclasses.fields(Evaluation))
-    found = {name: getattr(evaluation, name) for name in names}
+    found = {
+        field.name: getattr(evaluation, field.name) for field in dataclasses.fields(Evaluation)
+    }
+    speeds, scenes = found.pop("speeds"), found.pop("scenes")
     maxima = evaluation.maxima
     found |= {
         "series": None,
@@ -101,12 +101,10 @@ def plain_evaluation(evaluation: Evaluation) -> dict[str, Any]:
         "maxima": None if maxima is None else [part.tolist() for part in maxima],
         "rivals": [plain_evaluation(one) for one in evaluation.rivals],
     }
-    if isinstance(evaluation, SpeedsEvaluation):
-        parts = evaluation.parts
-        found["parts"] = [[p.speed_rpm, p.share, plain_evaluation(p.evaluation)] for p in parts]
-    if isinstance(evaluation, ToleranceEvaluation):
-        scenes = evaluation.parts
+    if scenes:
         found["scenes"] = [[part.values, plain_evaluation(part.evaluation)] for part in scenes]
+    elif speeds:
+        found["parts"] = [[p.speed_rpm, p.share, plain_evaluation(p.evaluation)] for p in speeds]
     return found
 
 
@@ -115,7 +113,7 @@ def read_evaluation(found: Mapping[str, Any]) -> Evaluation:
 
     Raises `ValueError`, `LookupError` or `TypeError` if they are none."""
     values = dict(found)
-    parts, scenes = values.pop("parts", None), values.pop("scenes", None)
+    parts, scenes = values.pop("parts", ()), values.pop("scenes", ())
     for name, kind in _KINDS.items():
         kind.validate_python(values[name], strict=True)
     values["start"] = read(values["start"])
@@ -124,13 +122,10 @@ def read_evaluation(found: Mapping[str, Any]) -> Evaluation:
         values["maxima"] = Maxima(times, forces, slopes.reshape(len(times), len(values["design"])))
     values["status"] = Status[values["status"]]
     values["rivals"] = tuple(read_evaluation(one) for one in values["rivals"])
-    if scenes is not None:
-        samples = tuple(AtSample(numbers, read_evaluation(one)) for numbers, one in scenes)
-        return ToleranceEvaluation(**values, parts=samples)
-    if parts is None:
-        return Evaluation(**values)
-    every = tuple(AtSpeed(speed, share, read_evaluation(one)) for speed, share, one in parts)
-    return SpeedsEvaluation(**values, parts=every)
+    values["scenes"] = tuple(Part(numbers, read_evaluation(one)) for numbers, one in scenes)
+    speeds = (Part({"speed_rpm": rpm}, read_evaluation(one), share) for rpm, share, one in parts)
+    values["speeds"] = values["scenes"][0].evaluation.speeds if scenes else tuple(speeds)
+    return Evaluation(**values)
 
 
 __all__ = ["Checkpoint", "plain_evaluation", "read_evaluation"]

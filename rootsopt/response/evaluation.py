@@ -3,18 +3,18 @@
 import dataclasses
 import time
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from rootsopt.config import Config
 from rootsopt.config.units import RPM
 from rootsopt.dynamics.closed import Start, motion, not_closed
-from rootsopt.dynamics.maxima import Maxima, local_maxima, prepare_maxima
+from rootsopt.dynamics.maxima import local_maxima, prepare_maxima
 from rootsopt.dynamics.measures import PEAK_NORM, line_name
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.settle import BLOCK
@@ -39,6 +39,7 @@ from rootsopt.response.records import (
     unsettled,
     window_record,
 )
+from rootsopt.response.result import Evaluation
 from rootsopt.response.series import (
     Series,
     contact_series,
@@ -47,15 +48,12 @@ from rootsopt.response.series import (
     window_series,
     with_samples,
 )
-from rootsopt.response.starts import Seed, Seeds, begun
+from rootsopt.response.starts import Seed, begun
 from rootsopt.response.terms import BEARING, terms_of, values_of
 from rootsopt.runtime.precision import check_precision
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene, check_geometry, design_keys, design_vector, fault_of
 from rootsopt.status import Status
-
-if TYPE_CHECKING:
-    import xarray
 
 _APART = 1e-4, 1e3
 """Difference between an orbit closed by collocation and an integration over its period (see
@@ -63,82 +61,6 @@ _APART = 1e-4, 1e3
 second times the tolerance of orbits."""
 _FINE = 1e-8
 """Greatest tolerance of this integration."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Evaluation:
-    """Everything known about one design in one scene.
-
-    `design`: parameters in config units; `geometry`, `response` (N), `gradient` (N per config
-    unit): dicts with the keys of the result file. `gradient` is empty unless it can be trusted.
-    `steady_state`: kind of motion and its properties; `status` and `message`: outcome and advice;
-    `statistics`: effort and accuracy; `series`: whole orbits over at least one revolution, or a
-    window of a motion that does not settle; `start`: argument `start` for a neighbouring design,
-    None if not known; `maxima`: local maxima of the force over the orbit, slopes in N per config
-    unit; None unless requested and periodic. `rivals`: evaluations of the other motions, if the
-    worst of several motions counts.
-
-    >>> import jax
-    >>> import rootsopt
-    >>> jax.config.update("jax_enable_x64", True)
-    >>> config = rootsopt.load_config("cic")
-    >>> found = rootsopt.evaluate(config)
-    >>> slope = found.gradient["peak_force_N"]["pressure_angle_deg"]
-    >>> print(f"{found.status.label}, {slope:.2f} N per degree")
-    periodic, -6.90 N per degree
-    """
-
-    design: dict[str, float]
-    geometry: dict[str, float]
-    response: dict[str, float]
-    gradient: dict[str, dict[str, float]]
-    steady_state: dict[str, Any]
-    status: Status
-    message: str
-    statistics: dict[str, int | float]
-    series: Series | None
-    start: Seeds = None
-    maxima: Maxima | None = None
-    rivals: "tuple[Evaluation, ...]" = ()
-
-    @property
-    def usable(self) -> bool:
-        """Whether the numbers describe a steady state with a gradient."""
-        return self.status.usable
-
-    def to_dataset(self) -> "xarray.Dataset":
-        """Return the series as an `xarray.Dataset` over time, with units and long names.
-
-        Design, geometry, response and status are its attributes.
-
-        Raises ValueError if the evaluation has no series."""
-        if self.series is None:
-            raise ValueError(
-                f"An evaluation must have a series to become a dataset, but this one is "
-                f"{self.status.label} and has none; pass `series=True`, or choose another design"
-            )
-        from rootsopt.response.dataset import dataset
-
-        return dataset(self)
-
-    @property
-    def state(self) -> NDArray[np.float64] | None:
-        """Scaled state (n,) of the orbit at φ1 = 0; None without an orbit, or if there are several
-        motions."""
-        return self.start.state if isinstance(self.start, Seed) else None
-
-    def record(self) -> dict[str, Any]:
-        """Return the record for the result file."""
-        return {
-            "design": self.design,
-            "geometry": self.geometry,
-            "response": self.response,
-            "gradient": self.gradient,
-            "steady_state": self.steady_state,
-            "status": self.status.label,
-            "message": self.message,
-            "statistics": self.statistics,
-        }
 
 
 @dataclasses.dataclass(frozen=True)

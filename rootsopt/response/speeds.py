@@ -4,64 +4,17 @@ The speed is an array of the model, so all speeds share the same compiled progra
 """
 
 import dataclasses
-import math
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from rootsopt.config import Config
-from rootsopt.response.evaluation import RESPONSES, Evaluation
+from rootsopt.response.result import Evaluation, Part, together
 from rootsopt.response.wrapper import Evaluates, Wrapper
 from rootsopt.status import Status
-
-_STEADY = (
-    "kind",
-    "period",
-    "floquet_multiplier",
-    "lyapunov_exponent_per_mesh_period",
-    "lyapunov_standard_error",
-)
-
-
-class AtSpeed(NamedTuple):
-    """The evaluation at one speed.
-
-    `speed_rpm` of rotor 1; `share` of this speed in the objective; `evaluation` at this speed.
-    """
-
-    speed_rpm: float
-    share: float
-    evaluation: Evaluation
-
-    def row(self) -> dict[str, Any]:
-        """Return a table row: speed, forces, kind of motion and status, without the share."""
-        response, steady = self.evaluation.response, self.evaluation.steady_state
-        return {
-            "speed_rpm": self.speed_rpm,
-            **{name: response.get(name) for name in (*RESPONSES, *response)},
-            **{name: steady.get(name) for name in _STEADY},
-            "status": self.evaluation.status.label,
-        }
-
-
-@dataclasses.dataclass(frozen=True)
-class SpeedsEvaluation(Evaluation):
-    """An `Evaluation` at the scene's own speed, together with the evaluations at all speeds.
-
-    `parts`: one for each speed; `status`: that of the first part that is not usable. In this case,
-    there is no gradient. If all parts are usable, it is the status of the first part. `start`:
-    one entry for each part.
-    """
-
-    parts: tuple[AtSpeed, ...] = ()
-
-    def record(self) -> dict[str, Any]:
-        return super().record() | {
-            "speeds": [part.row() | {"share": part.share} for part in self.parts]
-        }
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,12 +28,12 @@ class SpeedsEvaluator(Wrapper):
     this speed, its share in the objective is 0, but its status counts.
     """
 
-    baseline: tuple["AtSpeed", ...] = ()
+    baseline: tuple[Part, ...] = ()
 
     def relative_to(self, baseline: Evaluation) -> "SpeedsEvaluator":
         """Return another evaluator that compares coexisting motions at each speed by their forces
         relative to those of the `baseline` at the same speed."""
-        return dataclasses.replace(self, baseline=at_speeds(baseline))
+        return dataclasses.replace(self, baseline=baseline.by_speed)
 
     def __call__(self, design=None, start=None, series=True) -> Evaluation:
         """Evaluate a design.
@@ -96,28 +49,17 @@ class SpeedsEvaluator(Wrapper):
                 now = now.relative_to(self.baseline[number].evaluation)
             known = None if start is None else start[number]
             found = now(design, known, series and speed == own)
-            parts.append(AtSpeed(speed, share, found))
-        return together(parts, own)
+            parts.append(Part({"speed_rpm": speed}, found, share))
+        return over_speeds(parts, own)
 
 
-def together(parts: Sequence["AtSpeed"], own: float) -> SpeedsEvaluation:
-    """Combine the evaluations at several speeds into one, reported at the speed `own` (rpm)."""
+def over_speeds(parts: Sequence[Part], own: float) -> Evaluation:
+    """Return the evaluation over several speeds, reported at the speed `own` (rpm).
+
+    Its status is that of the first part that is not usable, or of the first part if all are."""
     (head,) = (part.evaluation for part in parts if part.speed_rpm == own)
-    status, message = overall(parts)
-    seconds = sum(part.evaluation.statistics["seconds"] for part in parts)
-    return SpeedsEvaluation(
-        design=head.design,
-        geometry=head.geometry,
-        response=head.response,
-        gradient=head.gradient if status.usable else {},
-        steady_state=head.steady_state,
-        status=status,
-        message=message,
-        statistics=head.statistics | {"speeds": len(parts), "seconds": seconds},
-        series=head.series,
-        start=tuple(part.evaluation.start for part in parts) if status.usable else None,
-        parts=tuple(parts),
-    )
+    found = together(head, parts, overall(parts), {"speeds": len(parts)})
+    return dataclasses.replace(found, maxima=None, rivals=(), speeds=tuple(parts))
 
 
 def alone(config: Config, speed_rpm: float | None = None) -> Config:
@@ -144,13 +86,6 @@ def shares(config: Config) -> dict[float, float]:
     return dict(sorted(found.items()))
 
 
-def at_speeds(evaluation: Evaluation) -> tuple[AtSpeed, ...]:
-    """Return the per-speed parts of an evaluation; a single-speed evaluation is its only part."""
-    if isinstance(evaluation, SpeedsEvaluation):
-        return evaluation.parts
-    return (AtSpeed(math.nan, 1.0, evaluation),)
-
-
 def counted(
     config: Config,
     evaluation: Evaluation,
@@ -163,7 +98,7 @@ def counted(
     `value(evaluation, baseline)` counts."""
     pairs = [
         (part.share, part.evaluation, base.evaluation)
-        for part, base in zip(at_speeds(evaluation), at_speeds(baseline), strict=True)
+        for part, base in zip(evaluation.by_speed, baseline.by_speed, strict=True)
         if part.share > 0
     ]
     if config.objective.over_speeds == "weighted":
@@ -188,17 +123,17 @@ def sweep(
     speeds_rpm: Sequence[float],
     design: Any = None,
     progress: Callable[[int, int], None] = lambda done, expected: None,
-) -> tuple[AtSpeed, ...]:
+) -> tuple[Part, ...]:
     """Evaluate `design` (config units; default: the config's own) at each of the speeds, from rest.
 
     `evaluator`: an evaluator for a single speed; `progress` is called with (number of speeds done,
     number of speeds). All parts of the result have equal shares.
     """
-    parts: list[AtSpeed] = []
+    parts: list[Part] = []
 
-    def at(speed: float) -> AtSpeed:
+    def at(speed: float) -> Part:
         found = evaluator.at_speed(speed)(design, series=False)
-        return AtSpeed(speed, 1 / len(speeds_rpm), found)
+        return Part({"speed_rpm": speed}, found, 1 / len(speeds_rpm))
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for part in pool.map(at, speeds_rpm):
@@ -207,7 +142,7 @@ def sweep(
     return tuple(parts)
 
 
-def overall(parts: Sequence[AtSpeed]) -> tuple[Status, str]:
+def overall(parts: Sequence[Part]) -> tuple[Status, str]:
     """Return status and message of the first part that is not usable, or of the first part if all
     are."""
     for part in parts:

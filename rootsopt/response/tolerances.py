@@ -6,63 +6,18 @@ The scenes of a sample differ only in the values of arrays, so they share compil
 import dataclasses
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 
 from rootsopt.config import Config
-from rootsopt.response.evaluation import RESPONSES, Evaluation
+from rootsopt.response.result import Evaluation, Part, together
 from rootsopt.response.runs import HERE, Runs
 from rootsopt.response.scatter import Shift, draw, shifts
 from rootsopt.response.starts import Seeds
 from rootsopt.response.wrapper import Evaluates, Wrapper
 from rootsopt.scene import design_vector
 from rootsopt.status import Status
-
-
-class AtSample(NamedTuple):
-    """The evaluation in one scene.
-
-    `values`: value of each key that scatters, in its unit; empty for the nominal scene;
-    `evaluation` in this scene, of the design moved by its own scatter.
-    """
-
-    values: dict[str, float]
-    evaluation: Evaluation
-
-    def row(self) -> dict[str, Any]:
-        """Return a table row: the sampled numbers, forces and status."""
-        response = self.evaluation.response
-        forces = {name: response.get(name) for name in RESPONSES}
-        return self.values | forces | {"status": self.evaluation.status.label}
-
-
-@dataclasses.dataclass(frozen=True)
-class ToleranceEvaluation(Evaluation):
-    """An `Evaluation` in the nominal scene, together with the evaluations in all scenes of a
-    sample.
-
-    `parts`: that of the nominal scene, then one for each sample. `status`: that of the first part
-    that is not usable. In this case, there is no gradient. If all parts are usable, it is the
-    status of the nominal scene. `start`: one entry for each part.
-    """
-
-    parts: tuple[AtSample, ...] = ()
-
-    @property
-    def nominal(self) -> Evaluation:
-        """Evaluation in the nominal scene."""
-        return self.parts[0].evaluation
-
-    @property
-    def samples(self) -> tuple[AtSample, ...]:
-        """Evaluations in the scenes of the sample, without the nominal scene."""
-        return self.parts[1:]
-
-    def record(self) -> dict[str, Any]:
-        own = {"status": self.status.label, "message": self.message}
-        rows = [part.row() for part in self.samples]
-        return self.nominal.record() | own | {"samples": rows}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,7 +43,7 @@ class ToleranceEvaluator(Wrapper):
     def relative_to(self, baseline: Evaluation) -> "ToleranceEvaluator":
         """Return another evaluator that compares coexisting motions in each scene by their forces
         relative to those of the `baseline` in the nominal scene."""
-        return self._around(self.single.relative_to(nominal_of(baseline)))
+        return self._around(self.single.relative_to(baseline.nominal))
 
     def __call__(self, design=None, start=None, series=True) -> Evaluation:
         """Evaluate a design.
@@ -100,15 +55,15 @@ class ToleranceEvaluator(Wrapper):
         begin = (None,) * (1 + len(self.shifts)) if start is None else start
         head = self.single(nominal, begin[0], series)
         if not head.usable:
-            return together((AtSample({}, head),))
+            return over_scenes((Part({}, head),))
 
-        def at(number: int) -> AtSample:
+        def at(number: int) -> Part:
             shift = self.shifts[number - 1]
             return in_scene(self.single, shift, nominal, begin[number], self.runs)
 
         with ThreadPoolExecutor(self.runs.slots) as pool:
             parts = tuple(pool.map(at, range(1, 1 + len(self.shifts))))
-        return together((AtSample({}, head), *parts))
+        return over_scenes((Part({}, head), *parts))
 
 
 def in_scene(
@@ -117,34 +72,26 @@ def in_scene(
     design: Any,
     start: Seeds,
     runs: Runs = HERE,
-) -> AtSample:
+) -> Part:
     """Evaluate a `design` (d,) in a scene that differs from the nominal one by `shift`.
 
     `evaluator`: that of the nominal scene; `start`: as in `Evaluates.__call__`; `runs`: where."""
     if shift.scene is not None:
         evaluator = evaluator.shifted(shift.scene)
-    return AtSample(shift.values, runs.evaluated(evaluator, design + shift.design, start))
+    return Part(shift.values, runs.evaluated(evaluator, design + shift.design, start))
 
 
-def together(parts: Sequence[AtSample]) -> ToleranceEvaluation:
-    """Combine the evaluations in several scenes into one, reported in the nominal scene.
+def over_scenes(parts: Sequence[Part]) -> Evaluation:
+    """Return the evaluation over several scenes, reported in the nominal scene.
 
-    `parts`: that of the nominal scene first."""
+    `parts`: that of the nominal scene first. The status is that of the first part that is not
+    usable, or of the nominal scene if all are."""
     head = parts[0].evaluation
-    status, message = overall(parts)
-    seconds = sum(part.evaluation.statistics.get("seconds", 0.0) for part in parts)
-    fields = {field.name: getattr(head, field.name) for field in dataclasses.fields(Evaluation)}
-    fields |= {
-        "gradient": head.gradient if status.usable else {},
-        "status": status,
-        "message": message,
-        "statistics": head.statistics | {"samples": len(parts) - 1, "seconds": seconds},
-        "start": tuple(part.evaluation.start for part in parts) if status.usable else None,
-    }
-    return ToleranceEvaluation(**fields, parts=tuple(parts))
+    found = together(head, parts, overall(parts), {"samples": len(parts) - 1})
+    return dataclasses.replace(found, scenes=tuple(parts))
 
 
-def overall(parts: Sequence[AtSample]) -> tuple[Status, str]:
+def overall(parts: Sequence[Part]) -> tuple[Status, str]:
     """Return status and message of the first part that is not usable, or of the nominal scene if
     all are."""
     failed = [part for part in parts if not part.evaluation.usable]
@@ -158,19 +105,4 @@ def overall(parts: Sequence[AtSample]) -> tuple[Status, str]:
     )
 
 
-def nominal_of(evaluation: Evaluation) -> Evaluation:
-    """Return the part of an evaluation in the nominal scene.
-
-    Return an evaluation without such parts unchanged."""
-    return evaluation.nominal if isinstance(evaluation, ToleranceEvaluation) else evaluation
-
-
-__all__ = [
-    "AtSample",
-    "ToleranceEvaluation",
-    "ToleranceEvaluator",
-    "in_scene",
-    "nominal_of",
-    "overall",
-    "together",
-]
+__all__ = ["ToleranceEvaluator", "in_scene", "over_scenes", "overall"]

@@ -1,6 +1,5 @@
 """Tests of scenes and designs whose flanks never touch: `idle`, forces of zero, and advice."""
 
-import dataclasses
 import json
 import math
 import re
@@ -20,7 +19,8 @@ from rootsopt.profiles import geometry
 from rootsopt.response.attractors import Attractor, AttractorEvaluator, Basins, _averaged
 from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.response.records import fading_note, idle_hint, message_of, unsettled
-from rootsopt.response.speeds import AtSpeed, SpeedsEvaluation, overall
+from rootsopt.response.result import Part
+from rootsopt.response.speeds import over_speeds
 from rootsopt.response.starts import Seed
 from rootsopt.scene import Scene, design_vector
 from rootsopt.status import Status
@@ -233,15 +233,17 @@ def test_forces_of_any_size_have_a_finite_objective():
 # Several speeds
 
 
+def status_of(response):
+    return Status.PERIODIC if any(response.values()) else Status.IDLE
+
+
 def several(*responses, shares=(0.0, 1.0)):
     """Return an evaluation at two speeds, idle where the response is zero."""
     parts = tuple(
-        AtSpeed(1000.0 * k, share, made_up(r, Status.PERIODIC if any(r.values()) else Status.IDLE))
+        Part({"speed_rpm": 1000.0 * k}, made_up(r, status_of(r)), share)
         for k, (share, r) in enumerate(zip(shares, responses, strict=True), 1)
     )
-    status, message = overall(parts)
-    head = {f.name: getattr(parts[0].evaluation, f.name) for f in dataclasses.fields(Evaluation)}
-    return SpeedsEvaluation(**head | {"status": status, "message": message}, parts=parts)
+    return over_speeds(parts, 1000.0)
 
 
 def test_one_idle_speed_is_named():

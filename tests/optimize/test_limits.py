@@ -18,7 +18,7 @@ from rootsopt.optimize.search import Search
 from rootsopt.profiles import geometry
 from rootsopt.pump import flow
 from rootsopt.response.records import geometry_record
-from rootsopt.response.speeds import AtSpeed, SpeedsEvaluation
+from rootsopt.response.result import Part
 from rootsopt.response.terms import Term, _terms, register_term
 from rootsopt.scene import Scene
 from rootsopt.status import Status
@@ -131,9 +131,9 @@ def test_forces_are_limited_at_every_speed_that_counts():
     settings = problem.config
     peaks = Maxima(np.array([0.5, 1.5]), np.array([190.0, 200.0]), np.ones((2, 3)))
     slow, fast, unused = evaluation(60.0, 200.0, peaks), evaluation(30.0, 150.0), evaluation(1.0)
-    parts = AtSpeed(2000.0, 0.5, slow), AtSpeed(3000.0, 0.5, fast), AtSpeed(4000.0, 0.0, unused)
-    fields = {f.name: getattr(slow, f.name) for f in dataclasses.fields(slow)}
-    whole = SpeedsEvaluation(**fields, parts=parts)
+    shares = (2000.0, slow, 0.5), (3000.0, fast, 0.5), (4000.0, unused, 0.0)
+    parts = tuple(Part({"speed_rpm": rpm}, one, share) for rpm, one, share in shares)
+    whole = dataclasses.replace(slow, speeds=parts)
     jacobian = np.diag([1.0, 2.0, 3.0])
     high, low = problem.walls(whole, jacobian)
     np.testing.assert_allclose(high.values, np.array([10, 20, -30]) / 180)

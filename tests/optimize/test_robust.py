@@ -16,9 +16,10 @@ from rootsopt.optimize.robust_problem import RobustProblem
 from rootsopt.optimize.search import Search
 from rootsopt.optimize.sqp import Stops, descend
 from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.result import Part
 from rootsopt.response.scatter import draw, shifts
 from rootsopt.response.sensitivity import by_scene
-from rootsopt.response.tolerances import AtSample, ToleranceEvaluator, together
+from rootsopt.response.tolerances import ToleranceEvaluator, over_scenes
 from tests.standins import evaluation_of
 
 CIC = "configs/cic.yaml"
@@ -173,8 +174,8 @@ def toy(monkeypatch, branches, *overrides):
     vars(problem).update(config=config_of(*overrides), baseline=evaluation_of(), reference=1.0)
 
     def evaluate(x):
-        parts = [AtSample({}, evaluation_of(float(k), design=[x])) for k in range(len(branches))]
-        return together([AtSample({}, evaluation_of(0.0, design=[x])), *parts])
+        parts = [Part({}, evaluation_of(float(k), design=[x])) for k in range(len(branches))]
+        return over_scenes([Part({}, evaluation_of(0.0, design=[x])), *parts])
 
     return problem, evaluate
 

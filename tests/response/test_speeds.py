@@ -15,7 +15,8 @@ from rootsopt.response import speeds
 from rootsopt.response.attractors import AttractorEvaluator
 from rootsopt.response.evaluation import Evaluator, _build, _motion
 from rootsopt.response.evaluators import evaluator_for
-from rootsopt.response.speeds import AtSpeed, SpeedsEvaluator
+from rootsopt.response.result import Part
+from rootsopt.response.speeds import SpeedsEvaluator
 from rootsopt.scene import design_vector
 from rootsopt.status import Status
 from tests.standins import evaluation_of
@@ -82,14 +83,14 @@ def test_parts_are_the_evaluations_at_one_speed(baseline, singles):
 
     The scene's own speed comes first in the record, without a share."""
     evaluator, found = baseline
-    assert [part.speed_rpm for part in found.parts] == [2000, 3000, 4000]
-    assert [part.share for part in found.parts] == [0.25, 0, 0.75]
-    for part in (found.parts[0], found.parts[2]):
+    assert [part.speed_rpm for part in found.speeds] == [2000, 3000, 4000]
+    assert [part.share for part in found.speeds] == [0.25, 0, 0.75]
+    for part in (found.speeds[0], found.speeds[2]):
         single, _ = singles[part.speed_rpm]
         assert part.evaluation.response == single.response
         assert part.evaluation.gradient == single.gradient
-    assert found.response == found.parts[1].evaluation.response
-    assert found.gradient == found.parts[1].evaluation.gradient != {}
+    assert found.response == found.speeds[1].evaluation.response
+    assert found.gradient == found.speeds[1].evaluation.gradient != {}
     # The evaluator is left at the scene's speed.
     assert float(evaluator.scene.speed) == pytest.approx(100 * np.pi)
     rows = found.record()["speeds"]
@@ -145,9 +146,9 @@ def test_each_speed_begins_on_its_own_orbit(baseline, moved, monkeypatch):
 
     monkeypatch.setattr(Evaluator, "__call__", spy)
     again = evaluator(start=found.start, series=False)
-    for start, part in zip(seen, found.parts, strict=True):
+    for start, part in zip(seen, found.speeds, strict=True):
         assert start is part.evaluation.start
-    for new, old in zip(again.parts, found.parts, strict=True):
+    for new, old in zip(again.speeds, found.speeds, strict=True):
         periods = [part.evaluation.statistics["transient_mesh_periods"] for part in (new, old)]
         assert periods[0] <= periods[1]
 
@@ -158,7 +159,7 @@ def test_without_speeds_all_is_as_before(baseline):
     evaluator = evaluator_for(config_of(TIGHT))
     found = evaluator(series=False)
     assert "speeds" not in found.record()
-    head = baseline[1].parts[1].evaluation
+    head = baseline[1].speeds[1].evaluation
     assert found.response == head.response
     problem = Problem.of(evaluator.config, evaluator.scene, found)
     weights = {key: 0.5 / found.response[key] for key in ("mean_force_N", "peak_force_N")}
@@ -178,7 +179,7 @@ def test_a_speed_without_steady_state_is_a_status():
     )
     evaluator = evaluator_for(config_of(*scene, "objective.speeds_rpm=[2700, 3900]")).surveying()
     found = evaluator(series=False)
-    assert [part.evaluation.status for part in found.parts] == [
+    assert [part.evaluation.status for part in found.speeds] == [
         Status.NOT_SETTLED,
         Status.PERIODIC,
     ]
@@ -187,7 +188,7 @@ def test_a_speed_without_steady_state_is_a_status():
     assert found.gradient == {}
     assert found.start is None
     assert [row["status"] for row in found.record()["speeds"]] == ["not_settled", "periodic"]
-    problem = Problem.of(config_of(), evaluator.scene, found.parts[1].evaluation)
+    problem = Problem.of(config_of(), evaluator.scene, found.speeds[1].evaluation)
     assert np.isnan(problem.objective(found))
 
 
@@ -201,7 +202,7 @@ def test_motions_that_coexist_at_every_speed():
     assert type(evaluator.single) is AttractorEvaluator
     found = evaluator(series=False)
     assert found.status is Status.PERIODIC
-    for part in found.parts:
+    for part in found.speeds:
         assert len(part.evaluation.steady_state["attractors"]) == 1
     again = evaluator.relative_to(found)(start=found.start, series=False)
     assert again.response["peak_force_N"] == pytest.approx(found.response["peak_force_N"], rel=1e-7)
@@ -343,13 +344,13 @@ def test_every_speed_simulated_counts_in_the_status(monkeypatch, failing):
 
     monkeypatch.setattr(Evaluator, "__call__", single)
     found = evaluator()
-    assert [part.share for part in found.parts] == [0.5, 0.0, 0.5]
+    assert [part.share for part in found.speeds] == [0.5, 0.0, 0.5]
     assert found.status is Status.PASSED_THROUGH
     assert not found.usable
     assert found.start is None
     assert found.message.startswith(f"At {failing:g} rpm: ")
     assert found.statistics["seconds"] == 3
-    parts = [part._replace(evaluation=evaluation_of()) for part in found.parts]
+    parts = [part._replace(evaluation=evaluation_of()) for part in found.speeds]
     assert speeds.overall(parts)[0] is Status.PERIODIC
-    wrong = [AtSpeed(1.0, 0.0, evaluation_of(status=Status.CHAOTIC)), *parts]
+    wrong = [Part({"speed_rpm": 1.0}, evaluation_of(status=Status.CHAOTIC)), *parts]
     assert speeds.overall(wrong)[0] is Status.CHAOTIC

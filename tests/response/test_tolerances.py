@@ -14,7 +14,7 @@ from rootsopt.response.checkpoint import plain_evaluation, read_evaluation
 from rootsopt.response.evaluation import Evaluator, _build, _motion
 from rootsopt.response.scatter import draw, quantiles, shifts
 from rootsopt.response.speeds import SpeedsEvaluator, alone
-from rootsopt.response.tolerances import ToleranceEvaluator, nominal_of
+from rootsopt.response.tolerances import ToleranceEvaluator
 from rootsopt.scene import Scene
 from rootsopt.status import Status
 from tests.standins import evaluation_of
@@ -175,7 +175,7 @@ def test_parts_are_the_evaluations_of_moved_configs(spread):
     evaluator, found = spread
     before = programs()
     assert found.status is Status.PERIODIC
-    assert found.response == nominal_of(found).response == found.parts[0].evaluation.response
+    assert found.response == found.nominal.response == found.scenes[0].evaluation.response
     assert len(found.samples) == 3
     config = evaluator.config
     for part in found.samples[:2]:
@@ -205,12 +205,12 @@ def test_scenes_begin_on_their_own_orbits(spread, monkeypatch):
 
     monkeypatch.setattr(Evaluator, "__call__", spy)
     again = evaluator(start=found.start, series=False)
-    known = {id(part.evaluation.start) for part in found.parts}
+    known = {id(part.evaluation.start) for part in found.scenes}
     assert {id(start) for start in seen} == known
     assert again.response["mean_force_N"] == pytest.approx(found.response["mean_force_N"], 1e-8)
     same = read_evaluation(plain_evaluation(found))
-    assert [part.values for part in same.parts] == [part.values for part in found.parts]
-    assert len(same.start) == len(found.start) == len(found.parts)
+    assert [part.values for part in same.scenes] == [part.values for part in found.scenes]
+    assert len(same.start) == len(found.start) == len(found.scenes)
     for one, other in zip(same.start, found.start, strict=True):
         assert one.state.tobytes() == other.state.tobytes()
         for array, origin in zip(one.orbit, other.orbit, strict=True):
@@ -264,11 +264,11 @@ def test_scatter_over_several_speeds():
     assert [len(start) for start in found.start] == [2, 2, 2]
     for part in found.samples:
         force = 1e3 * part.values["contact.clearance_mm"]
-        assert [p.speed_rpm for p in part.evaluation.parts] == [2000, 3000]
-        for one in part.evaluation.parts:
+        assert [p.speed_rpm for p in part.evaluation.speeds] == [2000, 3000]
+        for one in part.evaluation.speeds:
             assert one.evaluation.response["mean_force_N"] == pytest.approx(force, rel=1e-12)
     again = read_evaluation(plain_evaluation(found))
-    assert again.samples[1].evaluation.parts[0].speed_rpm == 2000
+    assert again.samples[1].evaluation.speeds[0].speed_rpm == 2000
     for other in (
         evaluator.surveying(),
         evaluator.with_maxima(),
@@ -280,5 +280,5 @@ def test_scatter_over_several_speeds():
         assert type(other) is ToleranceEvaluator
         assert other.shifts == evaluator.shifts
     lone = ToleranceEvaluator.of(alone(config), single).at_speed(2500.0)
-    speeds = [part.evaluation.start[1] for part in lone().parts]
+    speeds = [part.evaluation.start[1] for part in lone().scenes]
     np.testing.assert_allclose(speeds, 2500 * np.pi / 30)

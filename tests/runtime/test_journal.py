@@ -14,7 +14,7 @@ from rootsopt.dynamics.maxima import Maxima
 from rootsopt.errors import InputError
 from rootsopt.response.checkpoint import Checkpoint, plain_evaluation
 from rootsopt.response.evaluation import Evaluator
-from rootsopt.response.speeds import AtSpeed, SpeedsEvaluation
+from rootsopt.response.result import Part
 from rootsopt.runtime.journal import Journal, _content, _line, header_of, set_aside
 from rootsopt.status import Status
 from rootsopt.sweeps import points
@@ -46,14 +46,9 @@ def rows_of(kind):
     """Return results as a run would add them."""
     if kind is sweep:
         return [(k, ROW | {"message": f"row {k}"}) for k in (3, 1, 0, 7, 5, 6)]
-    parts = tuple(AtSpeed(rpm, 0.5, evaluation(rpm / 7)) for rpm in (1000.0, 2000.0))
-    several = SpeedsEvaluation(
-        **{
-            f.name: getattr(parts[0].evaluation, f.name)
-            for f in dataclasses.fields(parts[0].evaluation)
-        },
-        parts=parts,
-    )
+    rpms = 1000.0, 2000.0
+    parts = tuple(Part({"speed_rpm": rpm}, evaluation(rpm / 7), 0.5) for rpm in rpms)
+    several = dataclasses.replace(parts[0].evaluation, speeds=parts)
     maxima = Maxima(np.array([0.1]), np.array([1 / 3]), np.array([[2 / 3]]))
     corner = dataclasses.replace(evaluation(0.5), maxima=maxima, rivals=(evaluation(0.25),))
     every = [evaluation(0.1), several, corner, evaluation(float("nan"))]
@@ -101,8 +96,7 @@ def test_floats_and_types_come_back(path):
     assert found.known((0, 3), np.array([1e-300])) is None
     assert found.known((0, 4), np.array([0.0])) is None
     several = found.known((-1, 2), np.array([0.1]))
-    assert type(several) is SpeedsEvaluation
-    assert several.parts[1].evaluation.response == evaluation(2000 / 7).response
+    assert several.speeds[1].evaluation.response == evaluation(2000 / 7).response
     assert found.rows["search", "0123"][1].maxima.slopes.shape == (1, 1)
     assert found.reused == 2
 

@@ -20,8 +20,6 @@ from rootsopt.optimize.robust import search_of
 from rootsopt.output import files, tables
 from rootsopt.output.runs import RunFolder
 from rootsopt.pump.sheet import check_clearances, record_of, warnings
-from rootsopt.response.speeds import at_speeds
-from rootsopt.response.tolerances import nominal_of
 from rootsopt.runtime.timing import CompileClock
 from rootsopt.scene import Scene, check_geometry, outline_mm
 
@@ -286,8 +284,7 @@ def _draw(folder, config: Config, result, data: dict) -> None:
         runs.simulation_figures(folder, result.baseline, config)
     if config.objective.speeds_rpm:
         names = {"baseline": result.baseline, "optimised": result.optimized}
-        known = {name: nominal_of(one) for name, one in names.items() if one is not None}
-        designs = {name: at_speeds(one) for name, one in known.items()}
+        designs = {name: one.speeds for name, one in names.items() if one is not None}
         speeds.speed_figure(folder, designs, "Contact force over the speeds of the objective")
 
 

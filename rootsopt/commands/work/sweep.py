@@ -32,7 +32,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     with _progress(Console(stderr=True)) as progress:
         evaluator = evaluator_for(speeds.alone(config)).without_gradient()
         parts = speeds.sweep(evaluator, speeds.swept_speeds(config), progress=progress)
-    rows = [part.row() for part in parts]
+    rows = [part.row(whole=True) for part in parts]
     status, message = speeds.overall(parts)
     files.write_config(folder, config)
     folder.write_csv("sweep.csv", files.row_columns(rows))

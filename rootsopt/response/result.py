@@ -1,0 +1,179 @@
+"""What is known about one design: at one point, or at several speeds or in several scenes."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rootsopt.dynamics.maxima import Maxima
+from rootsopt.response.records import RESPONSES
+from rootsopt.response.series import Series
+from rootsopt.response.starts import Seed, Seeds
+from rootsopt.status import Status
+
+if TYPE_CHECKING:
+    import xarray
+
+_STEADY = (
+    "kind",
+    "period",
+    "floquet_multiplier",
+    "lyapunov_exponent_per_mesh_period",
+    "lyapunov_standard_error",
+)
+"""Entries of `steady_state` in the row of a speed."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluation:
+    """Everything known about one design in one scene.
+
+    `design`: parameters in config units; `geometry`, `response` (N), `gradient` (N per config
+    unit): dicts with the keys of the result file. `gradient` is empty unless it can be trusted.
+    `steady_state`: kind of motion and its properties; `status` and `message`: outcome and advice;
+    `statistics`: effort and accuracy; `series`: whole orbits over at least one revolution, or a
+    window of a motion that does not settle; `start`: argument `start` for a neighbouring design,
+    None if not known; `maxima`: local maxima of the force over the orbit, slopes in N per config
+    unit; None unless requested and periodic. `rivals`: evaluations of the other motions, if the
+    worst of several motions counts. `speeds`: parts at the speeds of an objective, empty for one
+    speed; `scenes`: parts in the nominal scene and in those of a sample, empty for one scene. The
+    other fields are those at the scene's own speed, in the nominal scene.
+
+    >>> import jax
+    >>> import rootsopt
+    >>> jax.config.update("jax_enable_x64", True)
+    >>> config = rootsopt.load_config("cic")
+    >>> found = rootsopt.evaluate(config)
+    >>> slope = found.gradient["peak_force_N"]["pressure_angle_deg"]
+    >>> print(f"{found.status.label}, {slope:.2f} N per degree")
+    periodic, -6.90 N per degree
+    """
+
+    design: dict[str, float]
+    geometry: dict[str, float]
+    response: dict[str, float]
+    gradient: dict[str, dict[str, float]]
+    steady_state: dict[str, Any]
+    status: Status
+    message: str
+    statistics: dict[str, int | float]
+    series: Series | None
+    start: Seeds = None
+    maxima: Maxima | None = None
+    rivals: "tuple[Evaluation, ...]" = ()
+    speeds: "tuple[Part, ...]" = ()
+    scenes: "tuple[Part, ...]" = ()
+
+    @property
+    def nominal(self) -> "Evaluation":
+        """Evaluation in the nominal scene."""
+        return self.scenes[0].evaluation if self.scenes else self
+
+    @property
+    def samples(self) -> "tuple[Part, ...]":
+        """Parts in the scenes of a sample, without the nominal scene."""
+        return self.scenes[1:]
+
+    @property
+    def by_speed(self) -> "tuple[Part, ...]":
+        """Parts at all speeds; an evaluation at one speed is its only part."""
+        return self.speeds or (Part({}, self),)
+
+    @property
+    def usable(self) -> bool:
+        """Whether the numbers describe a steady state with a gradient."""
+        return self.status.usable
+
+    def to_dataset(self) -> "xarray.Dataset":
+        """Return the series as an `xarray.Dataset` over time, with units and long names.
+
+        Design, geometry, response and status are its attributes.
+
+        Raises ValueError if the evaluation has no series."""
+        if self.series is None:
+            raise ValueError(
+                f"An evaluation must have a series to become a dataset, but this one is "
+                f"{self.status.label} and has none; pass `series=True`, or choose another design"
+            )
+        from rootsopt.response.dataset import dataset
+
+        return dataset(self)
+
+    @property
+    def state(self) -> NDArray[np.float64] | None:
+        """Scaled state (n,) of the orbit at φ1 = 0; None without an orbit, or if there are several
+        motions."""
+        return self.start.state if isinstance(self.start, Seed) else None
+
+    def record(self) -> dict[str, Any]:
+        """Return the record for the result file."""
+        if self.scenes:
+            own = {"status": self.status.label, "message": self.message}
+            return self.nominal.record() | own | {"samples": [one.row() for one in self.samples]}
+        found = {
+            "design": self.design,
+            "geometry": self.geometry,
+            "response": self.response,
+            "gradient": self.gradient,
+            "steady_state": self.steady_state,
+            "status": self.status.label,
+            "message": self.message,
+            "statistics": self.statistics,
+        }
+        if self.speeds:
+            found["speeds"] = [one.row(whole=True) | {"share": one.share} for one in self.speeds]
+        return found
+
+
+class Part(NamedTuple):
+    """The evaluation at one of several points: a speed, or a scene of a sample.
+
+    `values`: value of each key in which the points differ, in its unit: `speed_rpm` of rotor 1, or
+    the keys that scatter; empty for the nominal scene. `share` of the point in the objective."""
+
+    values: dict[str, float]
+    evaluation: Evaluation
+    share: float = 1.0
+
+    @property
+    def speed_rpm(self) -> float:
+        """Speed of rotor 1; NaN unless the points are speeds."""
+        return self.values.get("speed_rpm", math.nan)
+
+    def row(self, whole: bool = False) -> dict[str, Any]:
+        """Return a table row: values, forces and status.
+
+        `whole`: whether to add all other quantities and the kind of motion."""
+        response, steady = self.evaluation.response, self.evaluation.steady_state
+        further, kind = (tuple(response), _STEADY) if whole else ((), ())
+        return {
+            **self.values,
+            **{name: response.get(name) for name in (*RESPONSES, *further)},
+            **{name: steady.get(name) for name in kind},
+            "status": self.evaluation.status.label,
+        }
+
+
+def together(
+    head: Evaluation, parts: Sequence[Part], outcome: tuple[Status, str], counts: dict[str, int]
+) -> Evaluation:
+    """Return the evaluation `head` as that of all `parts`.
+
+    `outcome`: status and message of all. Only if it is usable, the result has a gradient, and a
+    start with one entry for each part. `counts`: numbers to add to the statistics."""
+    status, message = outcome
+    seconds = sum(part.evaluation.statistics.get("seconds", 0.0) for part in parts)
+    return dataclasses.replace(
+        head,
+        gradient=head.gradient if status.usable else {},
+        status=status,
+        message=message,
+        statistics=head.statistics | counts | {"seconds": seconds},
+        start=tuple(part.evaluation.start for part in parts) if status.usable else None,
+    )
+
+
+__all__ = ["Evaluation", "Part", "together"]
