@@ -55,12 +55,14 @@ LATE = {
     "figures/runs.py": {"rootsopt.measured.source"},
     "measured/reading.py": {"rootsopt.measured.dxf"},
     "measured/report.py": {"rootsopt.measured.source"},
-    "response/evaluation.py": {"rootsopt.response.dataset"},
+    # Only an objective over several motions needs these.
+    "response/evaluation.py": {"rootsopt.response.attractors", "rootsopt.response.ensemble"},
+    "response/result.py": {"rootsopt.response.dataset"},
     "scene/families.py": {"rootsopt.measured.source"},
     "sweeps/evaluations.py": {"rootsopt.sweeps.cluster"},
     "sweeps/scenes.py": {"rootsopt.sweeps.cluster"},
-    # Only searches over an ensemble need these.
-    "optimize/search.py": {"rootsopt.optimize", "rootsopt.response.ensemble"},
+    # Only searches over an ensemble need this.
+    "optimize/search.py": {"rootsopt.optimize"},
     # JAX reads the environment when it is imported; it has no public test for a started backend.
     "runtime/environment.py": {"jax", "jax._src"},
 }  # fmt: skip

@@ -22,7 +22,7 @@ from rootsopt.dynamics.flow import flow
 from rootsopt.optimize.noise import standard_error
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.search import Optimization, Search
-from rootsopt.response.ensemble import ERRORS, EnsembleEvaluator
+from rootsopt.response.ensemble import ERRORS, Ensemble, integrator
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.members import run_members
 from rootsopt.runtime.programs import Program
@@ -85,11 +85,11 @@ SIZES = {
 }
 
 
-def resized(config: Config, model: Scene, **changes) -> EnsembleEvaluator:
+def resized(config: Config, model: Scene, **changes) -> Evaluator:
     """Make an evaluator without gradients, with `changes` to the config's `ensemble` section."""
     ensemble = config.ensemble.model_copy(update=changes)
-    single = Evaluator(config.model_copy(update={"ensemble": ensemble}), model)
-    return EnsembleEvaluator(single.surveying(), differentiate=False)
+    config = config.model_copy(update={"ensemble": ensemble})
+    return Evaluator(config, model, Ensemble()).surveying().without_gradient()
 
 
 def line(config: Config, model: Scene, designs: np.ndarray, size: Size) -> list[dict]:
@@ -102,7 +102,7 @@ def line(config: Config, model: Scene, designs: np.ndarray, size: Size) -> list[
     for share, design in zip(np.linspace(0, 1, len(designs)), designs, strict=True):
         evaluation = evaluator(jnp.asarray(design), series=False)
         pair = _pair(evaluator.scene, jnp.asarray(design))
-        (single,) = run_members([pair], rest, settle, size.window, evaluator.integrator)
+        (single,) = run_members([pair], rest, settle, size.window, integrator(evaluator.scene))
         row = {"share": share, **evaluation.design, "single_mean_force_N": single.means[0, 0]}
         for name in ("mean_force_N", "peak_force_N"):
             row[name] = evaluation.response.get(name, np.nan)
@@ -134,11 +134,11 @@ def _pathwise(model: Scene, design, periods, how):
     return jnp.cumsum(by_design, axis=0) / (1 + jnp.arange(periods))[:, None]
 
 
-def pathwise(evaluator: EnsembleEvaluator, design, size: Size) -> list[dict]:
+def pathwise(evaluator: Evaluator, design, size: Size) -> list[dict]:
     """Measure how the derivative of a single motion's mean force grows with the averaging
     window."""
     slopes = np.asarray(
-        _pathwise(evaluator.scene, jnp.asarray(design), size.pathwise, evaluator.integrator)
+        _pathwise(evaluator.scene, jnp.asarray(design), size.pathwise, integrator(evaluator.scene))
     )
     return [
         {"window_mesh_periods": n, "mean_force_by_pressure_angle_N_per_deg": slope}
@@ -154,8 +154,8 @@ def errors_by_members(config: Config, model: Scene, design, size: Size) -> list[
     evaluator = resized(config, model, members=size.large)
     design = jnp.asarray(design)
     start = evaluator(design, series=False)
-    pair = _pair(evaluator.scene, design)
-    (large,) = run_members([pair], start.state, 0, config.ensemble.periods, evaluator.integrator)  # pyright: ignore[reportArgumentType]
+    pair, how = _pair(evaluator.scene, design), integrator(evaluator.scene)
+    (large,) = run_members([pair], np.asarray(start.start), 0, config.ensemble.periods, how)
     means = np.asarray(large.means)[:, 0]
     rows = []
     for members in size.groups:

@@ -24,7 +24,7 @@ from rootsopt.optimize.certificate import certify
 from rootsopt.optimize.local import Local, Look
 from rootsopt.optimize.problem import FEASIBLE, Problem
 from rootsopt.optimize.sqp import EndError, Stops, descend
-from rootsopt.response.evaluators import evaluator_for
+from rootsopt.response.evaluation import Evaluator
 
 REACHED = 1e-6
 """Distance of the objective from the optimum below which a method has reached the optimum."""
@@ -238,7 +238,7 @@ class Recorder:
 
     def __init__(self, task: Task):
         self.config = load(task.config, list(task.overrides))
-        evaluator = evaluator_for(self.config)
+        evaluator = Evaluator.of_objective(self.config)
         baseline = evaluator(series=False)
         self.problem = Problem.of(self.config, evaluator.scene, baseline)
         self.baseline = baseline

@@ -26,7 +26,6 @@ from rootsopt.figures.speeds import LABELS
 from rootsopt.optimize.search import Search
 from rootsopt.response.evaluation import Evaluation, objective_weights
 from rootsopt.response.result import Part
-from rootsopt.response.speeds import sweep
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import design_vector
 
@@ -212,7 +211,7 @@ def study(scene: str, speeds, listed, quick: bool) -> Study:
     evaluators = {f: evaluator_of(settings(scene, f, *small)) for f in ("cic", "ee")}
     found = Study(evaluators["cic"].config, {}, {}, [])
     for family, evaluator in evaluators.items():
-        found.designs[family.upper()] = sweep(evaluator, speeds)
+        found.designs[family.upper()] = evaluator.swept(speeds)
         pair = evaluator.pair(design_vector(evaluator.config))
         found.linear[family.upper()] = linearised(pair)
     for name, keys in list(OPTIMISED.items())[slice(1, 2) if quick else slice(None)]:
@@ -226,10 +225,10 @@ def study(scene: str, speeds, listed, quick: bool) -> Study:
             outcome |= result.optimized.design | {"own_objective": own}
             label = f"CIC, optimised {name}"
             found.linear[label] = linearised(evaluators["cic"].pair(jnp.asarray(design)))
-            found.designs[label] = sweep(evaluators["cic"], speeds, design)
+            found.designs[label] = evaluators["cic"].swept(speeds, design)
             outcome |= worth(found.over(found.designs[label]), speeds)
-            at = sweep(evaluators["cic"], listed, design)
-            those = found.over(at, sweep(evaluators["cic"], listed))
+            at = evaluators["cic"].swept(listed, design)
+            those = found.over(at, evaluators["cic"].swept(listed))
             outcome |= {
                 "mean_over_listed": float(np.mean(those)),
                 "worst_over_listed": float(np.max(those)),

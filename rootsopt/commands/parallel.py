@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     import argparse
     from contextlib import AbstractContextManager
 
-    from rootsopt.response.runs import Runs
+    from rootsopt.response.many import Runs
 
 
 def add_options(parser: "argparse.ArgumentParser | argparse._ArgumentGroup") -> None:

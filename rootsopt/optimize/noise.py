@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rootsopt.optimize.problem import Problem
-from rootsopt.response.ensemble import ERRORS, SIGNIFICANT, EnsembleEvaluator
-from rootsopt.response.evaluation import Evaluation
+from rootsopt.response.ensemble import ERRORS, SIGNIFICANT, independent
+from rootsopt.response.evaluation import Evaluation, Evaluator
 
 _NEAR = 0.1
 """Distance between trials in the unit box below which they count as the same candidate."""
@@ -59,13 +59,13 @@ def add_errors(rows: list[dict[str, Any]], trials: Sequence, problem: Problem) -
         row["objective_standard_error"] = standard_error(problem, trial.evaluation)
 
 
-def verify(problem: Problem, evaluator: EnsembleEvaluator, trials: Sequence) -> Verification:
+def verify(problem: Problem, evaluator: Evaluator, trials: Sequence) -> Verification:
     """Choose the best design with a second ensemble; compare it with the baseline in a third.
 
     `problem`, `evaluator`, `trials`: those of the search. The second and third ensembles are larger
     than that of the search. Gradients come from ensembles of the search's size."""
-    chooser, judge = (evaluator.independent(k).without_gradient() for k in (1, 2))
-    settings = judge.settings
+    chooser, judge = (independent(evaluator, k).without_gradient() for k in (1, 2))
+    settings = judge.config.ensemble
     record: dict[str, Any] = {
         "holds_up": False,
         "members": settings.members,

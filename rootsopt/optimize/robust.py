@@ -6,9 +6,9 @@ simulated in every scene of a fixed sample, and a rule combines the objectives. 
 baseline, nominal optimum and robust optimum are simulated in many fresh scenes."""
 
 import dataclasses
+import itertools
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -19,18 +19,13 @@ from rootsopt.errors import InputError
 from rootsopt.optimize.certificate import Certificate
 from rootsopt.optimize.local import Local
 from rootsopt.optimize.problem import Problem
-from rootsopt.optimize.risk import combine
 from rootsopt.optimize.robust_problem import RobustProblem
 from rootsopt.optimize.search import Optimization, Progress, Search, sensitivity_rows
 from rootsopt.response.checkpoint import Checkpoint
 from rootsopt.response.evaluation import RESPONSES, Evaluation, Evaluator
-from rootsopt.response.runs import HERE, Runs
+from rootsopt.response.many import HERE, Runs, evaluate_many
+from rootsopt.response.reducers import combine
 from rootsopt.response.scatter import Shift, draw, shifts
-from rootsopt.response.tolerances import (
-    ToleranceEvaluator,
-    in_scene,
-)
-from rootsopt.response.wrapper import Evaluates
 from rootsopt.scene import Scene
 
 OBJECTIVE = "objective"
@@ -141,10 +136,10 @@ class RobustSearch(Search):
         super().__init__(config, progress, stop, checkpoint, runs)
         self.nominal, self.first = nominal, self.settings.starts
         self.settings = self.settings.model_copy(update={"screening": 0})
-        self.exact = ToleranceEvaluator.of(config, self.exact, runs)
+        self.exact = self.exact.scattered(runs)
         self._shares: dict[int, NDArray[np.float64]] = {}
 
-    def _simulated(self, evaluator: Evaluates, design, orbit) -> Evaluation:
+    def _simulated(self, evaluator: Evaluator, design, orbit) -> Evaluation:
         """Return the evaluation of a `design` (d,), whose evaluator distributes its sample."""
         return evaluator(design, orbit, series=False)
 
@@ -180,11 +175,10 @@ class RobustSearch(Search):
 
         Return an empty list for several speeds, for several motions, or after `stop`."""
         del certificate
-        assert isinstance(self.exact, ToleranceEvaluator)
-        single = self.exact.single
-        if not isinstance(single, Evaluator) or self.stop.is_set():
+        nominal = self.exact.nominal
+        if not nominal.single or self.stop.is_set():
             return []
-        return sensitivity_rows(single, optimized.nominal, lambda moved: {})
+        return sensitivity_rows(nominal, optimized.nominal, lambda moved: {})
 
     def _local(self, start: int, evaluation: Evaluation, point) -> Local | None:
         problem = self.problem
@@ -271,7 +265,6 @@ class TolerantSearch:
         }
         designs = {name: one.nominal for name, one in known.items() if one is not None}
         drawn = draw(self.config, tolerances.check_samples, fresh=True)
-        single = stage.fast.single if isinstance(stage.fast, ToleranceEvaluator) else stage.fast
         best = found.problem.objective(found.optimized) if found.optimized else float("nan")
         before = self._done + len(found.history)
         per, total = 1 + tolerances.samples, len(drawn) * len(designs)
@@ -287,7 +280,7 @@ class TolerantSearch:
             return self.stop.is_set()
 
         scenes = shifts(self.config, drawn)
-        fresh = compare(single, found.problem, designs, scenes, tick, self.runs)
+        fresh = compare(stage.fast, found.problem, designs, scenes, tick, self.runs)
         if self.stop.is_set():
             return {}, {}
         keys = [one.key for one in self.config.scatters]
@@ -295,7 +288,7 @@ class TolerantSearch:
 
 
 def compare(
-    evaluator: Evaluates,
+    evaluator: Evaluator,
     problem: RobustProblem,
     designs: Mapping[str, Evaluation],
     scenes: Sequence[Shift],
@@ -307,7 +300,7 @@ def compare(
     `evaluator`: that of the nominal scene; `problem`: defines the objective; `designs`: their
     evaluations in the nominal scene, the first one is the baseline. Each motion starts at the
     design's orbit in the nominal scene. Equal designs are simulated only once. `tick`: function
-    called before each simulation; if it returns True, the simulation is left out."""
+    called before each simulation; if it returns True, no further one begins."""
     found: dict[str, Scattered] = {}
     points = {name: problem.point(list(one.design.values())) for name, one in designs.items()}
     reference = 1.0
@@ -324,28 +317,24 @@ def compare(
 
 
 def _scattered(
-    evaluator: Evaluates,
+    evaluator: Evaluator,
     problem: RobustProblem,
     nominal: Evaluation,
     scenes: Sequence[Shift],
     tick: Callable[[], bool],
     runs: Runs,
 ) -> Scattered:
-    """Simulate one design in many scenes. Arguments: see `compare`."""
+    """Simulate one design in many scenes, until `tick` returns True. Arguments: see `compare`."""
     design = np.array(list(nominal.design.values()))
 
-    def at(shift: Shift) -> tuple[str, list[float]]:
-        if tick():
-            return "interrupted", [float("nan")] * len(COMPARED)
-        one = in_scene(evaluator, shift, design, nominal.start, runs).evaluation
-        forces = [one.response.get(name, float("nan")) for name in RESPONSES]
-        values = [problem.objective(one), *forces] if one.usable else [float("nan")] * len(COMPARED)
-        return one.status.label, values
-
-    with ThreadPoolExecutor(runs.slots) as pool:
-        rows = list(pool.map(at, scenes))
-    labels = [label for label, _ in rows]
-    columns = np.array([values for _, values in rows]).T
+    points = evaluator.in_scenes(scenes, design, itertools.repeat(nominal.start))
+    found = evaluate_many(itertools.takewhile(lambda _: not tick(), points), runs)
+    labels = [one.status.label for one in found]
+    rows = np.full((len(found), len(COMPARED)), np.nan)
+    for row, one in zip(rows, found, strict=True):
+        if one.usable:
+            row[:] = problem.objective(one), *(one.response[name] for name in RESPONSES)
+    columns = rows.T
     values: dict[str, NDArray[np.float64]] = dict(zip(COMPARED, columns, strict=True))
     usable = np.isfinite(values[OBJECTIVE])
     assert problem.config.tolerances is not None

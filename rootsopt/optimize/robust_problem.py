@@ -1,8 +1,8 @@
 """The design problem over a sample of scenes with scattered values.
 
 The objective in each scene is that of `Problem`, relative to the baseline in the nominal scene. A
-rule (`rootsopt.optimize.risk`) combines the scenes to one number, which is divided by its value for
-the baseline. The robust objective of the baseline is therefore 1, too."""
+rule (`rootsopt.response.reducers`) combines the scenes to one number, which is divided by its value
+for the baseline. The robust objective of the baseline is therefore 1, too."""
 
 import dataclasses
 
@@ -14,8 +14,8 @@ from rootsopt.optimize.certificate import Certificate
 from rootsopt.optimize.local import Group, Local
 from rootsopt.optimize.optimality import Holder
 from rootsopt.optimize.problem import SCENE_KINDS, Problem
-from rootsopt.optimize.risk import Combined, combine
 from rootsopt.response.evaluation import Evaluation
+from rootsopt.response.reducers import Combined, combine
 from rootsopt.scene import Scene
 
 _HELD = 1e-6

@@ -34,11 +34,9 @@ from rootsopt.optimize.problem import FEASIBLE, Problem, needs_maxima
 from rootsopt.optimize.sqp import Found, Stops, descend
 from rootsopt.response.checkpoint import Checkpoint
 from rootsopt.response.evaluation import Evaluation, Evaluator
-from rootsopt.response.evaluators import evaluator_for
-from rootsopt.response.runs import HERE, Runs
+from rootsopt.response.many import HERE, Point, Runs
 from rootsopt.response.sensitivity import by_scene, quantities
 from rootsopt.response.starts import Seeds
-from rootsopt.response.wrapper import Evaluates
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene
 from rootsopt.status import Status
@@ -280,7 +278,7 @@ class Search:
         self.expected = self.settings.screening + self.settings.starts * (
             self.settings.iterations + 1
         )
-        self.exact = evaluator_for(config)
+        self.exact = Evaluator.of_objective(config)
         # If objectives are noisy, steps without a gain do not show that a descent has converged.
         self.noisy = config.objective.motion == "ensemble"
         self.patience = np.inf if self.noisy else _PATIENCE
@@ -315,7 +313,7 @@ class Search:
         baseline = first
         if self.beginning is not None:
             self.beginning = dataclasses.replace(self.beginning, evaluation=first)
-            baseline = evaluator_for(self.given)()
+            baseline = Evaluator.of_objective(self.given)()
         if not baseline.usable:
             return Optimization(None, baseline, None, [], {}, self.stop.is_set())
         # Forces of coexisting motions are compared relative to the baseline's.
@@ -348,9 +346,7 @@ class Search:
         rows = _history(trials)
         if self.noisy:
             from rootsopt.optimize import noise
-            from rootsopt.response.ensemble import EnsembleEvaluator
 
-            assert isinstance(self.exact, EnsembleEvaluator)
             noise.add_errors(rows, trials, self.problem)
             found = noise.verify(self.problem, self.exact, trials)
             settled = found.problem, found.baseline, found.optimized, rows, found.record
@@ -537,7 +533,7 @@ class Search:
         return trials
 
     def _evaluate(
-        self, evaluator: Evaluates, point, start, iteration, orbit=None, key=None
+        self, evaluator: Evaluator, point, start, iteration, orbit=None, key=None
     ) -> Trial:
         """Evaluate a `point` (d,), or use its stored evaluation, and return it as a new trial.
 
@@ -565,9 +561,9 @@ class Search:
             self.progress(len(self._trials), self.expected, self._best)
         return trial
 
-    def _simulated(self, evaluator: Evaluates, design, orbit) -> Evaluation:
+    def _simulated(self, evaluator: Evaluator, design, orbit) -> Evaluation:
         """Return the evaluation of a `design` (d,), where this search runs its evaluations."""
-        return self.runs.evaluated(evaluator, design, orbit)
+        return self.runs.evaluated(Point(evaluator, design, orbit))
 
     def _verify(self, trials: list[Trial]) -> tuple[Evaluation | None, dict[str, Any]]:
         """Simulate the best designs again, from rest at a tight tolerance, until one is confirmed.
@@ -614,7 +610,7 @@ class Search:
         found, record = attempts[-1 if attempts[-1][1]["holds_up"] else 0]
         return found, record | {"attempts": [one["status"] for _, one in attempts]}
 
-    def _attempts(self, point: NDArray[np.float64]) -> Iterator[tuple[Evaluates, NDArray]]:
+    def _attempts(self, point: NDArray[np.float64]) -> Iterator[tuple[Evaluator, NDArray]]:
         """Yield (evaluator, point) of each attempt to confirm the design at a `point` (d,).
 
         An orbit can fail a check of accuracy at a design although all its neighbours pass."""
@@ -656,7 +652,7 @@ class Search:
         """Return one row per scene quantity, with its effect on forces and objective.
 
         Return an empty list for several speeds, for several motions, or after `stop`."""
-        if not isinstance(self.exact, Evaluator) or self.stop.is_set():
+        if not self.exact.single or self.stop.is_set():
             return []
         level = self.problem.objective(optimized)
 

@@ -22,9 +22,9 @@ from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.settle import BLOCK, Transient, settle, settled_within
 from rootsopt.dynamics.steady import transient_status
-from rootsopt.response.evaluation import Evaluation, Evaluator, objective_weights
+from rootsopt.response.evaluation import Evaluation, Evaluator, Motions, objective_weights
 from rootsopt.response.records import message_of
-from rootsopt.response.wrapper import Wrapper
+from rootsopt.response.reducers import mean
 from rootsopt.runtime.programs import Program
 from rootsopt.runtime.threads import on_all_cores
 from rootsopt.scene import design_vector
@@ -137,7 +137,7 @@ def find(
     """
     config = evaluator.config
     design = design_vector(config) if design is None else jnp.asarray(design)
-    rest = evaluator(design, None, series)
+    rest = evaluator.reached(design, None, series)
     pair = evaluator.pair(design)
     scale, period = float(pair.angle_scale), float(pair.mesh_period)
     relative, rate = _axes(config, pair)
@@ -232,7 +232,7 @@ class _Sorter:
         if number is None and self.tries < _TRIES:
             self.tries += 1
             state = np.asarray(end.state, np.float64)
-            evaluation = self.evaluator(self.design, state, self.series)
+            evaluation = self.evaluator.reached(self.design, state, self.series)
             number = self.add(evaluation, state)
         if number is None:
             return -1, Status.NOT_SETTLED.label
@@ -332,12 +332,12 @@ def _cycle(pair: RotorPair, state, integrator: Integrator):
 
 
 @dataclasses.dataclass(frozen=True)
-class AttractorEvaluator(Wrapper):
-    """Evaluates a design on the basis of all its coexisting motions.
+class Coexisting(Motions):
+    """All coexisting motions of a design.
 
     With `objective.motion: worst`, the result describes the motion with the greatest weighted sum
-    of the objective's measures. Each measure is relative to the `reference` of `single`: a
-    response, usually the baseline's. The default reference is the greatest value among the motions.
+    of the objective's measures. Each measure is relative to the evaluator's reference: a response,
+    usually the baseline's. The default reference is the greatest value among the motions.
 
     With `objective.motion: weighted`, response and gradient are averages, weighted by the shares of
     initial states. The gradient treats these shares as constant. A motion without contact
@@ -347,72 +347,46 @@ class AttractorEvaluator(Wrapper):
     status of that motion, and no gradient.
     """
 
-    single: Evaluator
-
-    def __call__(self, design=None, start=None, series=True) -> Evaluation:
-        """Evaluate a design.
-
-        `design` (d,): in config units, by default the config's own; `start` (m, n): scaled states
-        on motions of a neighbouring design; `series`: whether to compute the series."""
+    def evaluated(self, evaluator: Evaluator, design: Any, start: Any, series: bool) -> Evaluation:
+        """Evaluate a design. `start` (m, n): scaled states on motions of a neighbouring design."""
         known = () if start is None else tuple(np.atleast_2d(start))
-        return self._of(find(self.single, design, known, series))
-
-    def _of(self, basins: Basins) -> Evaluation:
-        """Return the evaluation that combines all motions as `objective.motion` specifies."""
-        usable = [a for a in basins.attractors if a.evaluation.usable]
-        if not usable:
-            return basins.rest
-        orbits = [a for a in basins.attractors if closed(a.evaluation)]
-        chosen = max(usable, key=self._badness(usable)).evaluation
-        rivals = tuple(a.evaluation for a in usable if a.evaluation is not chosen)
-        if self.config.objective.motion == "weighted":
-            chosen, rivals = _averaged(chosen, orbits), ()
-        status = basins.status
-        return dataclasses.replace(
-            chosen,
-            rivals=rivals,
-            gradient=chosen.gradient if status.usable else {},
-            steady_state=chosen.steady_state | {"attractors": basins.summary()},
-            status=status,
-            message=message_of(self.config, status),
-            start=np.stack([np.asarray(a.evaluation.state) for a in orbits]),
-        )
-
-    def _badness(self, attractors: list[Attractor]) -> Callable[[Attractor], float]:
-        weights = objective_weights(self.config)
-        responses = [a.evaluation.response for a in attractors]
-        reference = self.single.reference or {k: max(r[k] for r in responses) for k in weights}
-
-        def badness(attractor: Attractor) -> float:
-            found = attractor.evaluation.response
-            # Skip a measure that is 0 in the reference. If the reference is the baseline's,
-            # `Problem.of` has rejected it.
-            return sum(w * found[k] / reference[k] for k, w in weights.items() if reference[k] > 0)
-
-        return badness
+        return _of(evaluator, find(evaluator, design, known, series))
 
 
-def _averaged(one: Evaluation, attractors: list[Attractor]) -> Evaluation:
-    """Return `one` with response and gradient averaged over the attractors, weighted by their
-    shares."""
-    shares = np.array([a.share for a in attractors])
-    # On a coarse grid, the `known` states may be the only ones that lead to an orbit.
-    shares = shares / shares.sum() if shares.sum() > 0 else np.ones(len(shares)) / len(shares)
-    found = [a.evaluation for a in attractors]
-
-    def average(values: list[float]) -> float:
-        return float(shares @ values)
-
-    def slope(evaluation: Evaluation, name: str, key: str) -> float:
-        # Without contact the force is 0 for all neighbouring designs.
-        return evaluation.gradient[name][key] if evaluation.usable else 0.0
-
+def _of(evaluator: Evaluator, basins: Basins) -> Evaluation:
+    """Return the evaluation that combines all motions as `objective.motion` specifies."""
+    usable = [a for a in basins.attractors if a.evaluation.usable]
+    if not usable:
+        return basins.rest
+    orbits = [a for a in basins.attractors if closed(a.evaluation)]
+    chosen = max(usable, key=_badness(evaluator, usable)).evaluation
+    rivals = tuple(a.evaluation for a in usable if a.evaluation is not chosen)
+    if evaluator.config.objective.motion == "weighted":
+        shares = [a.share for a in orbits]
+        # On a coarse grid, the `known` states may be the only ones that lead to an orbit.
+        chosen, rivals = mean(chosen, [a.evaluation for a in orbits], shares), ()
+    status = basins.status
     return dataclasses.replace(
-        one,
-        maxima=None,
-        response={k: average([e.response[k] for e in found]) for k in one.response},
-        gradient={
-            name: {k: average([slope(e, name, k) for e in found]) for k in row}
-            for name, row in one.gradient.items()
-        },
+        chosen,
+        rivals=rivals,
+        gradient=chosen.gradient if status.usable else {},
+        steady_state=chosen.steady_state | {"attractors": basins.summary()},
+        status=status,
+        message=message_of(evaluator.config, status),
+        start=np.stack([np.asarray(a.evaluation.state) for a in orbits]),
     )
+
+
+def _badness(evaluator: Evaluator, attractors: list[Attractor]) -> Callable[[Attractor], float]:
+    weights = objective_weights(evaluator.config)
+    responses = [a.evaluation.response for a in attractors]
+    greatest = {k: max(r[k] for r in responses) for k in weights}
+    (reference,) = evaluator.references or (greatest,)
+
+    def badness(attractor: Attractor) -> float:
+        found = attractor.evaluation.response
+        # Skip a measure that is 0 in the reference. If the reference is the baseline's,
+        # `Problem.of` has rejected it.
+        return sum(w * found[k] / reference[k] for k, w in weights.items() if reference[k] > 0)
+
+    return badness

@@ -11,13 +11,13 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
 from rootsopt.dynamics.maxima import Maxima
+from rootsopt.response.many import Point
 from rootsopt.response.result import Evaluation, Part
-from rootsopt.response.starts import Seeds, plain, read
-from rootsopt.response.wrapper import Evaluates
+from rootsopt.response.starts import plain, read
 from rootsopt.runtime.journal import Journal
 from rootsopt.status import Status
 
@@ -44,22 +44,20 @@ class Checkpoint(Journal):
 
     def evaluated(
         self,
-        run: Callable[..., Evaluation],
+        run: Callable[[Point], Evaluation],
         stage: str,
-        evaluator: Evaluates,
+        asked: Point,
         point: NDArray[np.float64],
-        design: ArrayLike,
-        start: Seeds,
     ) -> Evaluation:
-        """Return `run(evaluator, design, start)`, or the evaluation stored for the same arguments.
+        """Return `run(asked)`, or the evaluation stored for the same arguments.
 
-        `stage`: name of the evaluator; `point` (d,): the `design` (d,) in the unit box."""
-        begun = json.dumps(plain(start)).encode()
+        `stage`: name of the evaluator; `point` (d,): the design in the unit box."""
+        begun = json.dumps(plain(asked.start)).encode()
         key = stage, hashlib.sha256(point.tobytes() + begun).hexdigest()[:16]
         known = self.known(key, point)
         if known is not None:
             return known
-        found = run(evaluator, design, start)
+        found = run(asked)
         self.keep(key, point, found)
         return found
 

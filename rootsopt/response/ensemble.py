@@ -4,7 +4,7 @@ In a chaotic scene, a single motion cannot guide an optimisation. Its average ov
 jumps between designs that hardly differ, and its derivative grows with the window. The average over
 many motions is meaningful, and its standard error is known.
 
-An `EnsembleEvaluator` starts `ensemble.members` motions from different initial states, lets each
+An `Ensemble` starts `ensemble.members` motions from different initial states, lets each
 settle, and averages the contact force over all of them. The gradient is that of the average over a
 Gaussian neighbourhood of the design. It is the least-squares slope through pairs of opposite
 neighbours, and has its own standard error.
@@ -14,6 +14,7 @@ import dataclasses
 import functools
 import os
 import time
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -34,6 +35,7 @@ from rootsopt.response.evaluation import (
     RESPONSES,
     Evaluation,
     Evaluator,
+    Motions,
     geometry_record,
     idle_hint,
     lyapunov_program,
@@ -48,9 +50,8 @@ from rootsopt.response.members import (
     prepare_members,
     run_members,
 )
-from rootsopt.response.wrapper import Wrapper
 from rootsopt.runtime.programs import Program
-from rootsopt.scene import Scene, design_vector
+from rootsopt.scene import Scene
 from rootsopt.status import Status
 
 _RTOL = 1e-6
@@ -69,13 +70,12 @@ ERRORS = {name: name.replace("_N", "_standard_error_N") for name in RESPONSES}
 
 
 @dataclasses.dataclass(frozen=True)
-class EnsembleEvaluator(Wrapper):
-    """Evaluates designs with an ensemble of motions in the scene of `single`.
+class Ensemble(Motions):
+    """An ensemble of motions, over which the force is averaged.
 
-    A call has the argument `start` (members, n): scaled initial states, such as the `start` of a
-    neighbouring design's evaluation. By default, the initial states are those of
-    `members.initial_states`. `differentiate`: whether to compute the gradient, which takes most of
-    the time.
+    The argument `start` (members, n) of an evaluation are scaled initial states, such as the
+    `start` of a neighbouring design's evaluation. By default, the initial states are those of
+    `members.initial_states`.
 
     An evaluation with the status AVERAGED holds:
 
@@ -95,181 +95,175 @@ class EnsembleEvaluator(Wrapper):
     not computed in surveys.
     """
 
-    single: Evaluator
-    differentiate: bool = True
-
-    @property
-    def integrator(self) -> Integrator:
-        """Integrator of the motions: that of the transient, at a tolerance of at least `_RTOL`."""
-        transient = self.scene.solver.transient
-        return dataclasses.replace(transient, rtol=jnp.maximum(transient.rtol, _RTOL))
-
-    @property
-    def settings(self) -> EnsembleConfig:
-        """The config's `ensemble` section: size and seed of the ensemble, among others."""
-        return self.config.ensemble
-
-    def without_gradient(self) -> "EnsembleEvaluator":
-        """Return another evaluator that does not compute the gradient."""
-        return dataclasses.replace(self, differentiate=False)
-
-    def independent(self, number: int) -> "EnsembleEvaluator":
-        """Return another evaluator, for judging designs that were chosen with this evaluator.
-
-        Its seed is larger by `number`, and it has `VERIFYING` times as many members. Scene and
-        compiled programs are shared."""
-        settings = self.settings
-        larger = {"members": VERIFYING * settings.members, "seed": settings.seed + number}
-        ensemble = settings.model_copy(update=larger)
-        config = self.config.model_copy(update={"ensemble": ensemble})
-        return self._around(dataclasses.replace(self.single, config=config, survey=False))
-
-    def prepare(self, design=None, series=True, maxima=False) -> None:
-        """Compile the programs for evaluating `design` (config units) in the background.
-
-        `series` and `maxima` have no effect."""
-        design = design_vector(self.config) if design is None else jnp.asarray(design)
-        pair, _ = _pair.result_shape(self.scene, design)
-        prepare_members(pair, self.integrator)
-        if not self.single.survey:
-            state = jax.ShapeDtypeStruct((pair.states,), pair.angle_scale.dtype)
-            lyapunov_program.prepare(pair, state, PERIODS, self.scene.solver.transient)
-        _pair.prepare(self.scene, design)
-
-    def __call__(self, design=None, start=None, series=True) -> Evaluation:
-        """Evaluate a design.
-
-        `design` (d,): in config units, by default the config's own; `start` (members, n): scaled
-        initial states; `series`: whether to compute the series of a member.
+    def evaluated(self, evaluator: Evaluator, design: Any, start: Any, series: bool) -> Evaluation:
+        """Evaluate a design. `start` (members, n): scaled initial states; `series`: of a member.
 
         Raises ValueError if `start` has the wrong shape."""
         began = time.perf_counter()
-        design = design_vector(self.config) if design is None else jnp.asarray(design)
-        return self._report(design, self._simulated(design, start), began, series)
+        return _report(evaluator, design, _simulated(evaluator, design, start), began, series)
 
-    def _simulated(self, design, start) -> "_Outcome":
-        pair, shape = _pair(self.scene, design)
-        settle = self.settings.settle_periods
-        if start is None:
-            states = initial_states(pair, self.settings.members, self.settings.seed)
+    def prepare(self, evaluator: Evaluator, design: Any, series: bool, maxima: bool) -> None:
+        """Compile the programs in the background. `series` and `maxima` have no effect."""
+        pair, _ = _pair.result_shape(evaluator.scene, design)
+        prepare_members(pair, integrator(evaluator.scene))
+        if not evaluator.survey:
+            state = jax.ShapeDtypeStruct((pair.states,), pair.angle_scale.dtype)
+            lyapunov_program.prepare(pair, state, PERIODS, evaluator.scene.solver.transient)
+        _pair.prepare(evaluator.scene, design)
+
+
+def integrator(scene: Scene) -> Integrator:
+    """Return the integrator of the motions: that of the transient, at least at `_RTOL`."""
+    transient = scene.solver.transient
+    return dataclasses.replace(transient, rtol=jnp.maximum(transient.rtol, _RTOL))
+
+
+def independent(evaluator: Evaluator, number: int) -> Evaluator:
+    """Return another evaluator, for judging designs that were chosen with `evaluator`.
+
+    Its seed is larger by `number`, and it has `VERIFYING` times as many members. Scene and
+    compiled programs are shared."""
+    settings = evaluator.config.ensemble
+    larger = {"members": VERIFYING * settings.members, "seed": settings.seed + number}
+    ensemble = settings.model_copy(update=larger)
+    config = evaluator.config.model_copy(update={"ensemble": ensemble})
+    return dataclasses.replace(evaluator, config=config, survey=False)
+
+
+def _simulated(evaluator: Evaluator, design, start) -> "_Outcome":
+    built, settings = _pair(evaluator.scene, design), evaluator.config.ensemble
+    pair, settle = built[0], settings.settle_periods
+    if start is None:
+        states = initial_states(pair, settings.members, settings.seed)
+    else:
+        states, settle = np.asarray(start), -(-settle // _AGAIN)
+        if states.shape != (settings.members, pair.states):
+            raise ValueError(
+                f"Argument `start` must be the states (members, n) of an ensemble, but has "
+                f"shape {states.shape}; pass None to start from new states"
+            )
+    return _run(evaluator, [built], states, settle)
+
+
+def _run(evaluator: Evaluator, built: Sequence, states, settle: int) -> "_Outcome":
+    """Simulate ensembles of the designs of which `built` holds pair and geometry."""
+    pairs, shapes = zip(*built, strict=True)
+    periods, how = evaluator.config.ensemble.periods, integrator(evaluator.scene)
+    return _Outcome(pairs[0], shapes[0], run_members(pairs, states, settle, periods, how))
+
+
+def _report(
+    evaluator: Evaluator, design, outcome: "_Outcome", began: float, with_series: bool
+) -> Evaluation:
+    pair, status = outcome.pair, outcome.status
+    (members,) = outcome.runs
+    settings = evaluator.config.ensemble
+    size = {"members": settings.members, "window_mesh_periods": settings.periods}
+    steady: dict[str, Any] = {"kind": "transient"}
+    response: dict[str, float] = {}
+    gradient: dict[str, dict[str, float]] = {}
+    series, last, hint = None, None, ""
+    if status is Status.AVERAGED:
+        values = members.responses
+        least = float(np.finfo(members.greatest.dtype).eps) * float(pair.force_scale)
+        if np.max(members.greatest) <= least:
+            status, hint = Status.IDLE, idle_hint(evaluator.config, float(np.max(members.depth)))
+        response = dict(zip(RESPONSES, map(float, values[:, 0]), strict=True))
+        errors = dict(zip(ERRORS.values(), map(float, values[:, 1]), strict=True))
+        greatest = float(np.max(members.greatest))
+        found, series = _kind(evaluator, pair, members, with_series)
+        if status is Status.IDLE:
+            found["kind"] = "idle"
+        drift, by_drift = mean_and_error(np.asarray(members.drift, np.float64))
+        steady = found | size | errors
+        steady |= {
+            "mean_force_drift_N": float(drift),
+            "mean_force_drift_standard_error_N": float(by_drift),
+            "greatest_force_N": greatest,
+        }
+        last = np.asarray(members.states, np.float64)
+        if float(np.max(members.depth)) > TOO_DEEP * float(evaluator.scene.pitch_radius):
+            status = Status.TOO_DEEP
+    if status is Status.AVERAGED and evaluator.keys and evaluator.differentiate:
+        status, slopes = _slopes(evaluator, design, members)
+        if slopes is not None:
+            gradient, steady["gradient_standard_error"] = (
+                {
+                    name: dict(zip(evaluator.keys, map(float, row), strict=True))
+                    for name, row in zip(RESPONSES, rows, strict=True)
+                }
+                for rows in slopes
+            )
         else:
-            states, settle = np.asarray(start), -(-settle // _AGAIN)
-            if states.shape != (self.settings.members, pair.states):
-                raise ValueError(
-                    f"Argument `start` must be the states (members, n) of an ensemble, but has "
-                    f"shape {states.shape}; pass None to start from new states"
-                )
-        runs = run_members([pair], states, settle, self.settings.periods, self.integrator)
-        return _Outcome(pair, shape, runs)
+            # A neighbour has failed: the results do not represent a neighbourhood.
+            response, steady, series, last = {}, {"kind": "transient"}, None, None
+    return Evaluation(
+        design=dict(zip(evaluator.keys, map(float, design), strict=True)),
+        geometry=geometry_record(evaluator.scene, outcome.shape),
+        response=response,
+        gradient=gradient,
+        steady_state=steady,
+        status=status,
+        message=message_of(evaluator.config, status) + hint,
+        statistics={
+            "settle_mesh_periods": settings.settle_periods,
+            "neighbours": settings.designs // 2 * 2 if gradient else 0,
+            "seconds": time.perf_counter() - began,
+        },
+        series=series,
+        start=last,
+    )
 
-    def _report(self, design, outcome: "_Outcome", began: float, with_series: bool) -> Evaluation:
-        pair, status = outcome.pair, outcome.status
-        (members,) = outcome.runs
-        settings = self.settings
-        size = {"members": settings.members, "window_mesh_periods": settings.periods}
-        steady: dict[str, Any] = {"kind": "transient"}
-        response: dict[str, float] = {}
-        gradient: dict[str, dict[str, float]] = {}
-        series, last, hint = None, None, ""
-        if status is Status.AVERAGED:
-            values = members.responses
-            least = float(np.finfo(members.greatest.dtype).eps) * float(pair.force_scale)
-            if np.max(members.greatest) <= least:
-                status, hint = Status.IDLE, idle_hint(self.config, float(np.max(members.depth)))
-            response = dict(zip(RESPONSES, map(float, values[:, 0]), strict=True))
-            errors = dict(zip(ERRORS.values(), map(float, values[:, 1]), strict=True))
-            greatest = float(np.max(members.greatest))
-            found, series = self._kind(pair, members, with_series)
-            if status is Status.IDLE:
-                found["kind"] = "idle"
-            drift, by_drift = mean_and_error(np.asarray(members.drift, np.float64))
-            steady = found | size | errors
-            steady |= {
-                "mean_force_drift_N": float(drift),
-                "mean_force_drift_standard_error_N": float(by_drift),
-                "greatest_force_N": greatest,
-            }
-            last = np.asarray(members.states, np.float64)
-            if float(np.max(members.depth)) > TOO_DEEP * float(self.scene.pitch_radius):
-                status = Status.TOO_DEEP
-        if status is Status.AVERAGED and self.single.keys and self.differentiate:
-            status, slopes = self._slopes(design, members)
-            if slopes is not None:
-                gradient, steady["gradient_standard_error"] = (
-                    {
-                        name: dict(zip(self.single.keys, map(float, row), strict=True))
-                        for name, row in zip(RESPONSES, rows, strict=True)
-                    }
-                    for rows in slopes
-                )
-            else:
-                # A neighbour has failed: the results do not represent a neighbourhood.
-                response, steady, series, last = {}, {"kind": "transient"}, None, None
-        return Evaluation(
-            design=dict(zip(self.single.keys, map(float, design), strict=True)),
-            geometry=geometry_record(self.scene, outcome.shape),
-            response=response,
-            gradient=gradient,
-            steady_state=steady,
-            status=status,
-            message=message_of(self.config, status) + hint,
-            statistics={
-                "settle_mesh_periods": settings.settle_periods,
-                "neighbours": settings.designs // 2 * 2 if gradient else 0,
-                "seconds": time.perf_counter() - began,
-            },
-            series=series,
-            start=last,
-        )
 
-    def _kind(self, pair, members: Members, with_series):
-        """Return the entries of `steady_state` for the kind of motion, and the series of a member.
+def _kind(evaluator: Evaluator, pair, members: Members, with_series):
+    """Return the entries of `steady_state` for the kind of motion, and the series of a member.
 
-        The Lyapunov exponent is computed for a member whose motion does not repeat, if there is
-        one.
-        """
-        every = np.all(members.repeats, axis=0)
-        kind: dict[str, Any] = {"kind": "transient"}
-        if every.any():
-            kind = {"kind": "periodic", "period": int(np.argmax(every)) + 1}
-        if self.single.survey or (every.any() and not with_series):
-            return kind, None
-        typical = int(np.argmin(np.any(members.repeats, axis=1)))
-        state = jnp.asarray(members.states[typical])
-        found = lyapunov_program(pair, state, PERIODS, self.scene.solver.transient)
-        status = Status.of(int(unsettled_status(pair, found)))
-        steady, _, series = unsettled(pair, status, jax.device_get(found), with_series)
-        del steady["window_mesh_periods"]
-        return steady | (kind if every.any() else {}), series
+    The Lyapunov exponent is computed for a member whose motion does not repeat, if there is
+    one.
+    """
+    every = np.all(members.repeats, axis=0)
+    kind: dict[str, Any] = {"kind": "transient"}
+    if every.any():
+        kind = {"kind": "periodic", "period": int(np.argmax(every)) + 1}
+    if evaluator.survey or (every.any() and not with_series):
+        return kind, None
+    typical = int(np.argmin(np.any(members.repeats, axis=1)))
+    state = jnp.asarray(members.states[typical])
+    found = lyapunov_program(pair, state, PERIODS, evaluator.scene.solver.transient)
+    status = Status.of(int(unsettled_status(pair, found)))
+    steady, _, series = unsettled(pair, status, jax.device_get(found), with_series)
+    del steady["window_mesh_periods"]
+    return steady | (kind if every.any() else {}), series
 
-    def _slopes(self, design, members: Members) -> tuple[Status, NDArray[np.float64] | None]:
-        """Return a status, and gradients of the responses with their standard errors (2, 3, d).
 
-        Gradients and errors are in N per config unit. They are None unless the status is AVERAGED.
-        All neighbours start from the last states of the design's own members.
-        """
-        space = self._space(design)
-        points, steps = neighbours(np.asarray(_point(space, design)), self.settings)
-        designs, jacobian = _around(space, design, points)
-        settle = -(-self.settings.settle_periods // _AGAIN)
+def _slopes(
+    evaluator: Evaluator, design, members: Members
+) -> tuple[Status, NDArray[np.float64] | None]:
+    """Return a status, and gradients of the responses with their standard errors (2, 3, d).
 
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
-            built = list(pool.map(functools.partial(_pair, self.scene), designs))
-        pairs, shapes = zip(*built, strict=True)
-        runs = run_members(pairs, members.states, settle, self.settings.periods, self.integrator)
-        around = _Outcome(pairs[0], shapes[0], runs)
-        if around.status is not Status.AVERAGED:
-            return around.status, None
-        values = np.stack([run.responses[:, 0] for run in around.runs])
-        found = per_config_unit(*fitted_slope(values, steps), np.asarray(jacobian))
-        return Status.AVERAGED, np.stack(found)
+    Gradients and errors are in N per config unit. They are None unless the status is AVERAGED.
+    All neighbours start from the last states of the design's own members.
+    """
+    space, settings = _space(evaluator, design), evaluator.config.ensemble
+    points, steps = neighbours(np.asarray(_point(space, design)), settings)
+    designs, jacobian = _around(space, design, points)
+    settle = -(-settings.settle_periods // _AGAIN)
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        built = list(pool.map(functools.partial(_pair, evaluator.scene), designs))
+    around = _run(evaluator, built, members.states, settle)
+    if around.status is not Status.AVERAGED:
+        return around.status, None
+    values = np.stack([run.responses[:, 0] for run in around.runs])
+    found = per_config_unit(*fitted_slope(values, steps), np.asarray(jacobian))
+    return Status.AVERAGED, np.stack(found)
 
-    def _space(self, design) -> Space:
-        """Return the unit box of the design parameters, extended if `design` lies outside."""
-        space = Space.of(self.config, self.scene, 0.0)
-        lower, upper = np.minimum(space.lower, design), np.maximum(space.upper, design)
-        bounds = jnp.asarray(lower), jnp.asarray(upper)
-        return eqx.tree_at(lambda s: (s.lower, s.upper), space, bounds)
+
+def _space(evaluator: Evaluator, design) -> Space:
+    """Return the unit box of the design parameters, extended if `design` lies outside."""
+    space = Space.of(evaluator.config, evaluator.scene, 0.0)
+    lower, upper = np.minimum(space.lower, design), np.maximum(space.upper, design)
+    bounds = jnp.asarray(lower), jnp.asarray(upper)
+    return eqx.tree_at(lambda s: (s.lower, s.upper), space, bounds)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -369,8 +363,10 @@ __all__ = [
     "ERRORS",
     "SIGNIFICANT",
     "VERIFYING",
-    "EnsembleEvaluator",
+    "Ensemble",
     "fitted_slope",
+    "independent",
+    "integrator",
     "neighbours",
     "per_config_unit",
 ]

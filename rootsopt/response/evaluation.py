@@ -2,7 +2,7 @@
 
 import dataclasses
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -27,6 +27,7 @@ from rootsopt.dynamics.window import PERIODS, integrated_difference, lyapunov
 from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry
 from rootsopt.pump.loads import OrbitLoads, orbit_loads
+from rootsopt.response.many import HERE, IN_TURN, Point, Runs, evaluate_many
 from rootsopt.response.records import (
     RESPONSES,
     bearing_record,
@@ -39,7 +40,9 @@ from rootsopt.response.records import (
     unsettled,
     window_record,
 )
-from rootsopt.response.result import Evaluation
+from rootsopt.response.reducers import over_scenes, over_speeds
+from rootsopt.response.result import Evaluation, Part
+from rootsopt.response.scatter import Shift, draw, shifts
 from rootsopt.response.series import (
     Series,
     contact_series,
@@ -48,7 +51,8 @@ from rootsopt.response.series import (
     window_series,
     with_samples,
 )
-from rootsopt.response.starts import Seed, begun
+from rootsopt.response.speeds import parts_at, shares
+from rootsopt.response.starts import Seed, Seeds, begun
 from rootsopt.response.terms import BEARING, terms_of, values_of
 from rootsopt.runtime.precision import check_precision
 from rootsopt.runtime.programs import Program
@@ -64,32 +68,57 @@ _FINE = 1e-8
 
 
 @dataclasses.dataclass(frozen=True)
+class Motions:
+    """Which steady motions of a design count: base class, for the motion that a start leads to."""
+
+    def evaluated(
+        self, evaluator: "Evaluator", design: Any, start: Any, series: bool
+    ) -> Evaluation:
+        """Evaluate a design at one speed in one scene. Arguments: see `Evaluator.__call__`."""
+        return evaluator.reached(design, start, series)
+
+    def prepare(self, evaluator: "Evaluator", design: Any, series: bool, maxima: bool) -> None:
+        """Compile the programs in the background. Arguments: see `Evaluator.prepare`."""
+        evaluator.prepare_reached(design, series, maxima)
+
+
+@dataclasses.dataclass(frozen=True)
 class Evaluator:
     """Evaluates designs of one config in its `scene`. All designs share compiled programs.
 
     An evaluator is immutable. Methods that return "another evaluator" do not change the evaluator
     on which they are called.
 
+    `motions`: which motions of a design count; `speeds`: pairs (speed in rpm, its share in the
+    objective), including the scene's own speed; empty: only the latter; `shifts`: scenes of a
+    sample, in addition to the nominal one; `runs`: where the sample is evaluated.
+
     `survey`: whether the evaluator is for a search over many designs (see `surveying`);
-    `reference`: response by which forces are divided when coexisting motions are compared;
-    `maxima`: whether to compute all local maxima of the force, with their gradients; `confirm`:
-    whether an orbit that is reported with its series is confirmed by an integration over its
-    period.
+    `references`: for each speed, the response by which forces are divided when coexisting motions
+    are compared; `maxima`: whether to compute all local maxima of the force, with their gradients;
+    `confirm`: whether an orbit that is reported with its series is confirmed by an integration over
+    its period; `differentiate`: whether to compute a gradient that takes most of the time.
 
     """
 
     config: Config
     scene: Scene
+    motions: Motions = Motions()
+    speeds: tuple[tuple[float, float], ...] = ()
+    shifts: tuple[Shift, ...] = ()
+    runs: Runs = dataclasses.field(default=HERE, compare=False, repr=False)
     survey: bool = False
-    reference: dict[str, float] | None = None
+    references: tuple[dict[str, float], ...] = ()
     maxima: bool = False
     confirm: bool = True
+    differentiate: bool = True
 
     @classmethod
     def of(cls, config: Config, rtol: float | None = None, survey: bool = False) -> "Evaluator":
-        """Return the evaluator of a `config`; `rtol` overrides its orbit tolerance.
+        """Return the evaluator of a `config`, for the motion from rest at the scene's own speed.
 
-        `survey`: whether the evaluator is for a search over many designs (see `surveying`).
+        `rtol` overrides the config's orbit tolerance; `survey`: whether the evaluator is for a
+        search over many designs (see `surveying`).
 
         Raises InputError for an unknown objective term or a scene that cannot be simulated."""
         terms_of([*config.objective.terms])
@@ -97,6 +126,42 @@ class Evaluator:
         if rtol is not None:
             found = found.at_tolerance(rtol)
         return found.surveying() if survey else found
+
+    @classmethod
+    def of_objective(cls, config: Config) -> "Evaluator":
+        """Return the evaluator of a `config`, for the motions and speeds that its objective counts.
+
+        Raises InputError as `of` does."""
+        found, motion = cls.of(config), config.objective.motion
+        if motion == "ensemble":
+            from rootsopt.response.ensemble import Ensemble
+
+            found = dataclasses.replace(found, motions=Ensemble())
+        elif motion in ("worst", "weighted"):
+            from rootsopt.response.attractors import Coexisting
+
+            found = dataclasses.replace(found, motions=Coexisting())
+        speeds = tuple(shares(config).items()) if config.objective.speeds_rpm else ()
+        return dataclasses.replace(found, speeds=speeds)
+
+    @property
+    def single(self) -> bool:
+        """Whether an evaluation is that of one motion at one speed in one scene."""
+        return self.motions == Motions() and not (self.speeds or self.shifts)
+
+    @property
+    def nominal(self) -> "Evaluator":
+        """The evaluator in the nominal scene alone."""
+        return dataclasses.replace(self, shifts=())
+
+    def scattered(self, runs: Runs = HERE) -> "Evaluator":
+        """Return another evaluator, over the fixed sample of the config's `tolerances`.
+
+        The response is reported in the nominal scene. A design is usable only if it is usable in
+        every scene. `runs`: where the sample is evaluated."""
+        assert self.config.tolerances is not None
+        sample = draw(self.config, self.config.tolerances.samples)
+        return dataclasses.replace(self, shifts=shifts(self.config, sample), runs=runs)
 
     def at_tolerance(self, rtol: float) -> "Evaluator":
         """Return another evaluator with the orbit tolerance `rtol`."""
@@ -119,18 +184,23 @@ class Evaluator:
         return dataclasses.replace(self, scene=scene)
 
     def relative_to(self, baseline: Evaluation) -> "Evaluator":
-        """Return another evaluator that compares coexisting motions by their forces relative to
-        those of the `baseline`."""
-        return dataclasses.replace(self, reference=baseline.response)
+        """Return another evaluator that compares coexisting motions, at each speed, by their forces
+        relative to those of the `baseline` in the nominal scene."""
+        references = tuple(part.evaluation.response for part in baseline.by_speed)
+        return dataclasses.replace(self, references=references)
 
     def at_speed(self, speed_rpm: float) -> "Evaluator":
-        """Return another evaluator at the speed `speed_rpm`."""
-        return dataclasses.replace(self, scene=at_speed(self.scene, speed_rpm))
+        """Return another evaluator at the speed `speed_rpm` alone."""
+        scene = at_speed(self.scene, speed_rpm)
+        return dataclasses.replace(self, scene=scene, speeds=())
 
-    def shifted(self, shift: Scene) -> "Evaluator":
+    def shifted(self, shift: Scene | None) -> "Evaluator":
         """Return another evaluator whose scene's arrays are moved by those of `shift`.
 
-        `shift`: change in SI units, as a `Scene` with None in place of all that is not moved."""
+        `shift`: change in SI units, as a `Scene` with None in place of all that is not moved; None:
+        no change."""
+        if shift is None:
+            return self
         moved = eqx.apply_updates(self.scene, jax.tree.map(jnp.asarray, shift))
         return dataclasses.replace(self, scene=moved)
 
@@ -144,10 +214,9 @@ class Evaluator:
         return dataclasses.replace(self, confirm=False)
 
     def without_gradient(self) -> "Evaluator":
-        """Return this evaluator unchanged, since its gradient takes little time.
-
-        Other evaluators, such as those of ensembles, skip the gradient."""
-        return self
+        """Return another evaluator that skips the gradient, if computing it takes most of the time:
+        that of an ensemble."""
+        return dataclasses.replace(self, differentiate=False)
 
     @property
     def keys(self) -> tuple[str, ...]:
@@ -155,17 +224,78 @@ class Evaluator:
         return design_keys(self.config)
 
     def __call__(
+        self, design: ArrayLike | None = None, start: Seeds = None, series: bool = True
+    ) -> Evaluation:
+        """Evaluate `design` (config units; default: the config's own) at all points that count.
+
+        `start`: where to begin, the `start` of a neighbouring design's evaluation, or a scaled
+        state (n,) at φ1 = 0; by default at rest (ε = 0, dε/dt = 0). `series`: whether to compute
+        the series, at the scene's own speed in the nominal scene. Without a usable motion in the
+        nominal scene, no sample is simulated.
+        """
+        design = design_vector(self.config) if design is None else jnp.asarray(design)
+        if self.shifts:
+            return self._over_scenes(design, start, series)
+        if self.speeds:
+            return self._over_speeds(design, start, series)
+        return self.motions.evaluated(self, design, start, series)
+
+    def _over_scenes(self, design: Any, start: Any, series: bool) -> Evaluation:
+        begin, *begins = start or (None,) * (1 + len(self.shifts))
+        head = self.nominal(design, begin, series)
+        parts = [Part({}, head)]
+        if head.usable:
+            found = evaluate_many(self.in_scenes(self.shifts, design, begins), self.runs)
+            parts += [Part(s.values, one) for s, one in zip(self.shifts, found, strict=True)]
+        return over_scenes(parts)
+
+    def in_scenes(
+        self, shifts: Iterable[Shift], design: Any, starts: Iterable[Seeds]
+    ) -> Iterator[Point]:
+        """Yield the points of a `design` (d,) in scenes that differ from the nominal one.
+
+        `shifts`: differences of the scenes; `starts`: where to begin in each of them."""
+        for shift, start in zip(shifts, starts, strict=False):
+            yield Point(self.nominal.shifted(shift.scene), design + shift.design, start)
+
+    def _over_speeds(self, design: Any, start: Any, series: bool) -> Evaluation:
+        own, begins = self.config.scene.speed_rpm, start or (None,) * len(self.speeds)
+        points = [
+            Point(self._at(number), design, begin, series and self.speeds[number][0] == own)
+            for number, begin in enumerate(begins)
+        ]
+        # Designs run side by side, so that their speeds need no threads.
+        return over_speeds(parts_at(self.speeds, evaluate_many(points, IN_TURN)), own)
+
+    def _at(self, number: int) -> "Evaluator":
+        """Return the evaluator at one of `speeds`."""
+        references = self.references[number : number + 1]
+        alone = self.at_speed(self.speeds[number][0])
+        return dataclasses.replace(alone, references=references)
+
+    def swept(
+        self,
+        speeds_rpm: Sequence[float],
+        design: ArrayLike | None = None,
+        progress: Callable[[int], None] = lambda done: None,
+    ) -> tuple[Part, ...]:
+        """Evaluate `design` (config units; default: the config's own) at each of the speeds, from
+        rest.
+
+        `progress` is called with the number of speeds done. All parts have equal shares.
+        """
+        points = [Point(self.at_speed(speed), design) for speed in speeds_rpm]
+        found = evaluate_many(points, progress=progress)
+        return parts_at([(speed, 1 / len(speeds_rpm)) for speed in speeds_rpm], found)
+
+    def reached(
         self,
         design: ArrayLike | None = None,
         start: Seed | ArrayLike | None = None,
         series: bool = True,
     ) -> Evaluation:
-        """Evaluate `design` (config units; default: the config's own).
-
-        `start`: where to begin, the `start` of a neighbouring design's evaluation, or a scaled
-        state (n,) at φ1 = 0; by default at rest (ε = 0, dε/dt = 0). `series`: whether to compute
-        the series.
-        """
+        """Evaluate the motion of `design` (config units; default: the config's own) that `start`
+        leads to, at the scene's speed. Arguments: see `__call__`."""
         began = time.perf_counter()
         design = design_vector(self.config) if design is None else jnp.asarray(design)
         pair, tangents, shape = _build(self.scene, design)
@@ -243,6 +373,10 @@ class Evaluator:
         `series`: whether the evaluations will compute the series; `maxima`: whether evaluators
         `with_maxima` will follow."""
         design = design_vector(self.config) if design is None else jnp.asarray(design)
+        self.motions.prepare(self, design, series, maxima)
+
+    def prepare_reached(self, design: Any, series: bool, maxima: bool) -> None:
+        """Compile the programs of `reached` in the background. Arguments: see `prepare`."""
         pair, tangents, _ = _build.result_shape(self.scene, design)
         dtype, solver = pair.angle_scale.dtype, self.scene.solver
         begin = eqx.filter_eval_shape(_at_rest, pair, solver.max_orbit)

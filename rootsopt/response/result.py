@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -157,23 +156,4 @@ class Part(NamedTuple):
         }
 
 
-def together(
-    head: Evaluation, parts: Sequence[Part], outcome: tuple[Status, str], counts: dict[str, int]
-) -> Evaluation:
-    """Return the evaluation `head` as that of all `parts`.
-
-    `outcome`: status and message of all. Only if it is usable, the result has a gradient, and a
-    start with one entry for each part. `counts`: numbers to add to the statistics."""
-    status, message = outcome
-    seconds = sum(part.evaluation.statistics.get("seconds", 0.0) for part in parts)
-    return dataclasses.replace(
-        head,
-        gradient=head.gradient if status.usable else {},
-        status=status,
-        message=message,
-        statistics=head.statistics | counts | {"seconds": seconds},
-        start=tuple(part.evaluation.start for part in parts) if status.usable else None,
-    )
-
-
-__all__ = ["Evaluation", "Part", "together"]
+__all__ = ["Evaluation", "Part"]

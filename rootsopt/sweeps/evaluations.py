@@ -17,9 +17,7 @@ import numpy as np
 
 from rootsopt.errors import InputError
 from rootsopt.response.evaluation import Evaluation
-from rootsopt.response.runs import HERE, Runs
-from rootsopt.response.starts import Seeds
-from rootsopt.response.wrapper import Evaluates
+from rootsopt.response.many import HERE, Point, Runs
 from rootsopt.sweeps.worker import Settings, evaluate
 
 _POLL = 0.5
@@ -48,13 +46,13 @@ class Elsewhere:
         """Twice the number of evaluations that the workers can run at a time."""
         return 2 * self._watch.count()
 
-    def evaluated(self, evaluator: Evaluates, design: Any, start: Seeds = None) -> Evaluation:
-        """Return `evaluator(design, start, series=False)`, computed by a worker.
+    def evaluated(self, point: Point) -> Evaluation:
+        """Return the evaluation of a point, computed by a worker.
 
         Raises `InputError` if the workers cannot be used; `ClosedError` after `close`."""
         import cloudpickle  # Comes with distributed; takes classes of a script or notebook along.
 
-        task = evaluator, np.asarray(design, float), start
+        task = point._replace(design=np.asarray(point.design, float))
         future = self._submit(cloudpickle.dumps(task))
         done = threading.Event()
         future.add_done_callback(lambda _: done.set())

@@ -4,19 +4,18 @@ Points of the same structure share compiled programs. On a CPU, a thread per cor
 one by one: as arrays, all motions would take as many steps as the longest. On an accelerator, they
 are stepped together as arrays."""
 
-import os
+import functools
+import itertools
 import threading
 from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from typing import Any
 
 from rootsopt.config import Config
+from rootsopt.response.many import HERE, as_done
 from rootsopt.response.together import pays
 from rootsopt.sweeps.plan import Plan
 from rootsopt.sweeps.points import Row, simulated, simulated_together
 
-_AHEAD = 2
-"""Number of points per thread that are queued in advance."""
 _BATCH = 256
 """Number of points that an accelerator steps together."""
 
@@ -35,23 +34,15 @@ def in_process(
             if not stop.is_set():
                 yield at_once(config, [(number, plan.at(number)) for number in some], 1)
         return
-    threads = os.cpu_count() or 1
-    waiting = iter(numbers)
-    running: dict[Future[Row], int] = {}
-    with ThreadPoolExecutor(threads) as pool:
-        while True:
-            while len(running) < _AHEAD * threads and not stop.is_set():
-                number = next(waiting, None)
-                if number is None:
-                    break
-                running[pool.submit(simulated, config, plan.at(number))] = number
-            if stop.is_set():
-                running = {one: n for one, n in running.items() if not one.cancel()}
-            if not running:
-                return
-            done, _ = wait(running, timeout=0.2, return_when=FIRST_COMPLETED)
-            if done:
-                yield [(running.pop(one), one.result()) for one in done]
+    points = ((number, plan.at(number)) for number in numbers)
+    asked = itertools.takewhile(lambda _: not stop.is_set(), points)
+    for _, one in as_done(functools.partial(_numbered, config), asked, HERE.slots):
+        yield [one]
+
+
+def _numbered(config: Config, point: tuple[int, dict[str, Any]]) -> tuple[int, Row]:
+    number, values = point
+    return number, simulated(config, values)
 
 
 def at_once(
@@ -63,9 +54,8 @@ def at_once(
     if pays():
         rows = simulated_together(config, [values for _, values in points])
         return [(number, row) for (number, _), row in zip(points, rows, strict=True)]
-    with ThreadPoolExecutor(threads) as pool:
-        rows = pool.map(lambda one: simulated(config, one[1]), points)
-        return [(number, row) for (number, _), row in zip(points, rows, strict=True)]
+    found = sorted(as_done(functools.partial(_numbered, config), points, threads))
+    return [one for _, one in found]
 
 
 def divided(numbers: Sequence[int], size: int) -> Iterator[list[int]]:

@@ -12,9 +12,7 @@ from rootsopt.config.section import bare
 from rootsopt.config.words import sentence
 from rootsopt.errors import InputError
 from rootsopt.response.evaluation import Evaluation, Evaluator
-from rootsopt.response.evaluators import evaluator_for
 from rootsopt.response.together import evaluate_together
-from rootsopt.response.wrapper import Evaluates
 from rootsopt.scene import check_geometry
 from rootsopt.status import Status
 
@@ -65,11 +63,11 @@ def simulated(config: Config, values: Mapping[str, Any]) -> Row:
         return _lost_by(error)
 
 
-def _evaluator(config: Config, values: Mapping[str, Any]) -> Evaluates:
+def _evaluator(config: Config, values: Mapping[str, Any]) -> Evaluator:
     """Return the evaluator of a point. Raises `InputError` if its config is not valid."""
     one = configured(config, values)
     check_geometry(one)
-    return evaluator_for(one)
+    return Evaluator.of_objective(one)
 
 
 def _lost_by(error: Exception) -> Row:
@@ -91,7 +89,7 @@ def simulated_together(config: Config, points: Sequence[Mapping[str, Any]]) -> l
         except Exception as error:
             rows[number] = _lost_by(error)
             continue
-        if isinstance(evaluator, Evaluator):
+        if evaluator.single:
             batch[number] = evaluator
     try:
         found = evaluate_together([*batch.values()])

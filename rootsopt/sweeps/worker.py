@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from rootsopt.config import Config
 from rootsopt.config.families import import_named
 from rootsopt.errors import InputError
+from rootsopt.response.many import HERE
 from rootsopt.runtime import environment, programs
 from rootsopt.runtime.versions import versions
 from rootsopt.sweeps.local import at_once
@@ -43,15 +44,14 @@ def work(
 
 
 def evaluate(settings: Settings, task: bytes) -> bytes:
-    """Return the evaluation of a design.
+    """Return the evaluation of a point.
 
-    `task`: evaluator, design (d,) and start, as in `Evaluates.__call__`. It travels as bytes, as
-    does the result: its arrays need double precision, and its types may need an import. Raises
-    `InputError` if this worker has other versions than the search."""
+    `task`: the `Point`. It travels as bytes, as does the result: its arrays need double precision,
+    and its types may need an import. Raises `InputError` if this worker has other versions than the
+    search."""
     with _one:
         _prepare(settings)
-    evaluator, design, start = pickle.loads(task)
-    return pickle.dumps(evaluator(design, start, series=False))
+    return pickle.dumps(HERE.evaluated(pickle.loads(task)))
 
 
 def dask_setup(worker: Any) -> None:

@@ -15,7 +15,7 @@ from rootsopt.optimize.problem import FEASIBLE, Problem
 from rootsopt.profiles import geometry
 from rootsopt.response.checkpoint import Checkpoint
 from rootsopt.response.evaluation import Evaluation, Evaluator, geometry_record
-from rootsopt.response.runs import HERE, Runs
+from rootsopt.response.many import HERE, Point, Runs
 from rootsopt.response.starts import Seeds
 from rootsopt.response.terms import terms_of, values_of
 from rootsopt.runtime.programs import Program
@@ -152,11 +152,10 @@ class Study:
         point: NDArray[np.float64],
         orbit: Seeds = None,
     ) -> Evaluation:
-        design = self.problem.design(point)
+        asked = Point(evaluator, self.problem.design(point), orbit)
         if self.checkpoint is None:
-            return self.runs.evaluated(evaluator, design, orbit)
-        given = stage, evaluator, point, design, orbit
-        return self.checkpoint.evaluated(self.runs.evaluated, *given)
+            return self.runs.evaluated(asked)
+        return self.checkpoint.evaluated(self.runs.evaluated, stage, asked, point)
 
     def _moving(self, point: NDArray[np.float64], evaluation: Evaluation) -> Sample | None:
         if not evaluation.usable:

@@ -19,7 +19,6 @@ result does not depend on which ends first, or where designs are evaluated (`Run
 
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
 import numpy as np
@@ -35,7 +34,7 @@ from rootsopt.optimize.optimality import judged
 from rootsopt.optimize.problem import FEASIBLE
 from rootsopt.optimize.sqp import Stops, descend
 from rootsopt.response.checkpoint import Checkpoint
-from rootsopt.response.runs import HERE, Runs
+from rootsopt.response.many import HERE, Runs, as_done
 from rootsopt.response.starts import Seeds
 from rootsopt.runtime.threads import one_thread
 from rootsopt.scene import check_geometry
@@ -193,8 +192,7 @@ class Tracer:
 
     def _side_by_side(self, work: Callable[[Task], Done], tasks: Iterable[Task]) -> list[Done]:
         """Return `work(task)` for all tasks, in their order; they run side by side."""
-        with ThreadPoolExecutor(self.runs.slots) as pool:
-            return list(pool.map(work, tasks))
+        return [done for _, done in sorted(as_done(work, tasks, self.runs.slots))]
 
     def _screened(self, point: NDArray[np.float64]):
         return None if self.stop.is_set() else self.study.screened(point)

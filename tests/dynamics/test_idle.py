@@ -16,11 +16,11 @@ from rootsopt.dynamics.window import Window
 from rootsopt.errors import InputError
 from rootsopt.optimize.problem import Problem
 from rootsopt.profiles import geometry
-from rootsopt.response.attractors import Attractor, AttractorEvaluator, Basins, _averaged
+from rootsopt.response.attractors import Attractor, Basins
 from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.response.records import fading_note, idle_hint, message_of, unsettled
+from rootsopt.response.reducers import mean, over_speeds
 from rootsopt.response.result import Part
-from rootsopt.response.speeds import over_speeds
 from rootsopt.response.starts import Seed
 from rootsopt.scene import Scene, design_vector
 from rootsopt.status import Status
@@ -289,7 +289,7 @@ def test_a_motion_without_contact_beside_others_counts_as_zero(monkeypatch):
     assert basins_of(noisy, quiet).status is Status.PERIODIC
     assert basins_of(quiet).status is Status.IDLE
     assert basins_of(noisy, floating).status is Status.IDLE
-    averaged = _averaged(noisy, list(basins_of(noisy, quiet).attractors))
+    averaged = mean(noisy, [noisy, quiet], [0.5, 0.5])
     assert averaged.response == pytest.approx({k: v / 2 for k, v in FORCES.items()})
     assert averaged.gradient["mean_force_N"]["tip_arc_angle_deg"] == 0.5
     monkeypatch.setattr(
@@ -297,7 +297,7 @@ def test_a_motion_without_contact_beside_others_counts_as_zero(monkeypatch):
         lambda single, *rest: basins_of(quiet, noisy),
     )
     for motion, share in (("worst", 1.0), ("weighted", 0.5)):
-        found = AttractorEvaluator(Evaluator.of(config_of(f"objective.motion={motion}")))()
+        found = Evaluator.of_objective(config_of(f"objective.motion={motion}"))()
         assert found.status is Status.PERIODIC
         assert found.response["peak_force_N"] == pytest.approx(share * 200)
         assert found.start.shape == (2, 2)

@@ -9,7 +9,7 @@ from rootsopt.config import DESIGN_KEYS, load
 from rootsopt.optimize import noise
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.search import Trial
-from rootsopt.response.ensemble import ERRORS, SIGNIFICANT, EnsembleEvaluator
+from rootsopt.response.ensemble import ERRORS, SIGNIFICANT
 from rootsopt.response.evaluation import RESPONSES, Evaluation, Evaluator
 from rootsopt.status import Status
 
@@ -65,18 +65,15 @@ def test_many_trials_are_surer_than_one(problem):
 
 
 @dataclasses.dataclass(frozen=True)
-class Judge(EnsembleEvaluator):
+class Judge(Evaluator):
     """An evaluator that knows the true objective of every design; the baseline's is 1."""
 
     truth: float = 1.0
     error: float = 0.02
     asked: list[int] = dataclasses.field(default_factory=list)
 
-    def independent(self, number):
-        self.asked.append(number)
-        return self
-
     def __call__(self, design=None, start=None, series=True):
+        self.asked.append(self.config.ensemble.seed)
         base = np.allclose(np.asarray(design), INSIDE)
         return made_up(1.0 if base else self.truth, self.error, np.asarray(design))
 
@@ -86,9 +83,10 @@ def test_only_a_significant_difference_holds_up(problem, truth, accepted):
     """0.9 differs by more than three combined standard errors of 0.02·√(1 + 1); 0.93 does not.
 
     The objective in the search does not matter."""
-    judge = Judge(Evaluator.of(problem.config), truth=truth)
+    judge = Judge(problem.config, problem.space.scene, truth=truth)
     verdict = noise.verify(problem, judge, [trial([0.5, 0.5, 0.5], 0.4)])
-    assert judge.asked == [1, 2]
+    # One choice, then baseline and choice over another ensemble; then the search's own again.
+    assert judge.asked == [1, 2, 2] + [0] * accepted
     assert (verdict.optimized is not None) == accepted
     record = verdict.record
     assert record["holds_up"] == accepted
@@ -104,7 +102,7 @@ def test_only_a_significant_difference_holds_up(problem, truth, accepted):
 def test_nothing_promised(problem):
     """Without a trial below the baseline, there is no verdict, and the message says what to
     raise."""
-    judge = Judge(Evaluator.of(problem.config), truth=1.0)
+    judge = Judge(problem.config, problem.space.scene, truth=1.0)
     verdict = noise.verify(problem, judge, [trial([0.5, 0.5, 0.5], 1.4)])
     assert verdict.optimized is None
     assert "ensemble.members" in noise.message(verdict.record)
@@ -123,7 +121,7 @@ def test_a_candidate_without_an_average_is_passed_over(problem):
     """The next candidate is judged, although the first had a better objective.
 
     Without another candidate, none is accepted."""
-    judge = Particular(Evaluator.of(problem.config), truth=0.8)
+    judge = Particular(problem.config, problem.space.scene, truth=0.8)
     lost, good = trial([0.9, 0.5, 0.5], 0.3), trial([0.1, 0.5, 0.5], 0.7)
     verdict = noise.verify(problem, judge, [lost, good])
     assert verdict.optimized is not None

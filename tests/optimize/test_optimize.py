@@ -310,7 +310,7 @@ class _Slow(Evaluator):
     """An evaluator that takes ten minutes to verify a design."""
 
     def __call__(self, design=None, start=None, series=True):
-        if self.reference is not None and not self.survey:
+        if self.references and not self.survey:
             time.sleep(600)
         return super().__call__(design, start, series)
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.stats.mstats import hdquantiles
 
 from rootsopt.config.tolerances import TolerancesConfig
-from rootsopt.optimize.risk import combine, order_weights
+from rootsopt.response.reducers import combine, order_weights
 
 
 def rule(**settings) -> TolerancesConfig:

@@ -1,6 +1,7 @@
 """Tests of robust optima: objective over many scenes, its gradient, both stages of the search."""
 
 import csv
+import dataclasses
 import json
 
 import numpy as np
@@ -16,10 +17,10 @@ from rootsopt.optimize.robust_problem import RobustProblem
 from rootsopt.optimize.search import Search
 from rootsopt.optimize.sqp import Stops, descend
 from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.reducers import over_scenes
 from rootsopt.response.result import Part
 from rootsopt.response.scatter import draw, shifts
 from rootsopt.response.sensitivity import by_scene
-from rootsopt.response.tolerances import ToleranceEvaluator, over_scenes
 from tests.standins import evaluation_of
 
 CIC = "configs/cic.yaml"
@@ -48,7 +49,7 @@ def problem_of(evaluator, baseline, *overrides):
 def spread():
     """Return an evaluator over four scenes with all maxima, the baseline, and another design."""
     config = config_of(LOAD, TIP, "solver.rtol=1e-10", "tolerances.samples=4")
-    evaluator = ToleranceEvaluator.of(config, Evaluator.of(config)).with_maxima()
+    evaluator = Evaluator.of(config).scattered().with_maxima()
     baseline = evaluator(series=False)
     problem = RobustProblem.of(config, evaluator.scene, baseline)
     return evaluator, baseline, evaluator(problem.design(POINT), baseline.start, series=False)
@@ -121,7 +122,7 @@ def test_small_scatter_is_the_nominal_objective_and_its_sensitivity():
     width = 1e-5
     config = config_of("solver.rtol=1e-10", "tolerances.samples=8", width=width)
     single = Evaluator.of(config)
-    evaluator = ToleranceEvaluator.of(config, single)
+    evaluator = single.scattered()
     baseline = evaluator(series=False)
     known = by_scene(single, baseline.nominal)
     assert known is not None
@@ -133,7 +134,7 @@ def test_small_scatter_is_the_nominal_objective_and_its_sensitivity():
         assert np.std(forces) == pytest.approx(abs(slope) * np.std(sample), rel=3e-3)
         assert np.corrcoef(forces, np.sign(slope) * sample)[0, 1] > 0.99999
     tiny = config_of("solver.rtol=1e-10", "tolerances.samples=8", width=1e-9)
-    evaluator = ToleranceEvaluator.of(tiny, single)
+    evaluator = dataclasses.replace(single, config=tiny).scattered()
     baseline = evaluator(series=False)
     problem = RobustProblem.of(tiny, evaluator.scene, baseline)
     nominal = Problem.of(tiny, evaluator.scene, baseline.nominal)
@@ -243,9 +244,8 @@ def test_fresh_scenes_from_the_neighbouring_orbit(spread):
     problem = problem_of(evaluator, baseline)
     config = problem.config
     fresh = shifts(config, draw(config, 3, fresh=True))
-    single = evaluator.single
     designs = {"baseline": baseline.nominal, "nominal": moved.nominal, "robust": moved.nominal}
-    found = compare(single, problem, designs, fresh)
+    found = compare(evaluator, problem, designs, fresh)
     assert found["robust"] is found["nominal"] or found["robust"] == found["nominal"]
     assert found["baseline"].combined == 1
     for k, shift in enumerate(fresh):
@@ -254,7 +254,7 @@ def test_fresh_scenes_from_the_neighbouring_orbit(spread):
         peak = found["nominal"].values["peak_force_N"][k]
         assert peak == pytest.approx(one.response["peak_force_N"], rel=1e-6)
     assert found["nominal"].statuses == {"periodic": 3}
-    again = compare(single, problem, designs, fresh)
+    again = compare(evaluator, problem, designs, fresh)
     for name, values in again["nominal"].values.items():
         np.testing.assert_array_equal(values, found["nominal"].values[name])
 

@@ -16,7 +16,7 @@ from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.search import Search, Trial, _history
 from rootsopt.output.tables import rejected_table
 from rootsopt.response.evaluation import Evaluator
-from rootsopt.response.runs import HERE
+from rootsopt.response.many import HERE
 from rootsopt.status import Status
 from tests.standins import evaluation_of
 

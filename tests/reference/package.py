@@ -6,7 +6,7 @@ from typing import Any
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
-CALL = "evaluator_for(load(config, overrides))(series=False).record()"
+CALL = "Evaluator.of_objective(load(config, overrides))(series=False).record()"
 """The call of each case, as stated in the reference file."""
 KEPT = ("design", "geometry", "response", "gradient", "steady_state", "status")
 """Entries of a record that are stored."""
@@ -33,7 +33,7 @@ def evaluate(config: str, overrides: list[str], nudge: float = 0.0) -> dict[str,
     of the speed, to see how far a result depends on rounding. Raises `rootsopt.errors.InputError`
     for a config that is refused."""
     from rootsopt.config import load
-    from rootsopt.response.evaluators import evaluator_for
+    from rootsopt.response.evaluation import Evaluator
 
     path = ROOT / "configs" / f"{config}.yaml"
     overrides = [one.replace("HERE/", f"{HERE}/") for one in overrides]
@@ -41,7 +41,7 @@ def evaluate(config: str, overrides: list[str], nudge: float = 0.0) -> dict[str,
     if nudge:
         speed = found.scene.speed_rpm * (1 + nudge)
         found = load(path, [*overrides, f"scene.speed_rpm={speed!r}"])
-    record = evaluator_for(found)(series=False).record()
+    record = Evaluator.of_objective(found)(series=False).record()
     return {key: record[key] for key in KEPT if key in record}
 
 

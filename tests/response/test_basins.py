@@ -12,9 +12,8 @@ from rootsopt.commands.console import main
 from rootsopt.config import load
 from rootsopt.dynamics.flow import strobe
 from rootsopt.dynamics.integrator import Integrator
-from rootsopt.response.attractors import AttractorEvaluator, _Sorter, find
+from rootsopt.response.attractors import _Sorter, find
 from rootsopt.response.evaluation import Evaluator, evaluate
-from rootsopt.response.evaluators import evaluator_for
 from rootsopt.runtime.programs import Program
 from rootsopt.status import Status
 
@@ -108,10 +107,10 @@ def test_worst_and_weighted(coexisting):
     shares = np.array([one.share for one in basins.attractors])
     responses = [one.evaluation.response for one in basins.attractors]
     settings = *COEXIST, "objective.mean_weight=0", "objective.peak_weight=1"
-    worst = AttractorEvaluator(Evaluator.of(config_of(*settings, "objective.motion=worst")))()
+    worst = Evaluator.of_objective(config_of(*settings, "objective.motion=worst"))()
     assert worst.response["peak_force_N"] == max(r["peak_force_N"] for r in responses)
     weighted = config_of(*settings, "objective.mean_weight=1", "objective.motion=weighted")
-    mean = AttractorEvaluator(Evaluator.of(weighted))()
+    mean = Evaluator.of_objective(weighted)()
     for name in FORCES:
         expected = shares @ [r[name] for r in responses]
         assert mean.response[name] == pytest.approx(expected, rel=1e-9)
@@ -133,8 +132,8 @@ def test_the_reference_decides_which_is_worst(coexisting):
     base = dataclasses.replace(
         basins.rest, response={"mean_force_N": 1e-3, "peak_force_N": 1e6, "rms_force_N": 1.0}
     )
-    single = Evaluator.of(config_of(*COEXIST, "objective.motion=worst"))
-    found = AttractorEvaluator(single).relative_to(base)(series=False)
+    evaluator = Evaluator.of_objective(config_of(*COEXIST, "objective.motion=worst"))
+    found = evaluator.relative_to(base)(series=False)
     assert found.response["mean_force_N"] == max(r["mean_force_N"] for r in responses)
     assert found.response["peak_force_N"] < max(r["peak_force_N"] for r in responses)
 
@@ -153,7 +152,7 @@ def test_a_chaotic_basin_is_no_steady_state():
         "scene.load.torque_N_m=2",
         "scene.speed_rpm=6000",
     )
-    found = evaluator_for(config_of(*scene, "objective.motion=worst"))(series=False)
+    found = Evaluator.of_objective(config_of(*scene, "objective.motion=worst"))(series=False)
     assert found.status is Status.CHAOTIC
     assert not found.usable
     assert found.gradient == {}

@@ -1,6 +1,7 @@
 """Ensembles: averages and standard errors, gradients estimated from neighbours, commands."""
 
 import csv
+import dataclasses
 import functools
 import io
 import itertools
@@ -20,12 +21,12 @@ from rootsopt.output import tables
 from rootsopt.response.ensemble import (
     ERRORS,
     SIGNIFICANT,
-    EnsembleEvaluator,
+    Ensemble,
     fitted_slope,
+    independent,
     neighbours,
 )
 from rootsopt.response.evaluation import RESPONSES, Evaluator
-from rootsopt.response.evaluators import evaluator_for
 from rootsopt.response.members import Members
 from rootsopt.status import Status
 
@@ -39,11 +40,16 @@ def config_of(*overrides):
     return load("configs/cic.yaml", overrides)
 
 
+def ensemble(config, survey=True):
+    single = Evaluator.of(config, survey=survey)
+    return dataclasses.replace(single, motions=Ensemble()).without_gradient()
+
+
 def averaged(*overrides, gradient=False, survey=True, design=None):
     """Evaluate an ensemble, without the Lyapunov exponent unless asked for."""
-    evaluator = EnsembleEvaluator(Evaluator.of(config_of(*overrides), survey=survey))
-    if not gradient:
-        evaluator = evaluator.without_gradient()
+    evaluator = ensemble(config_of(*overrides), survey)
+    if gradient:
+        evaluator = dataclasses.replace(evaluator, differentiate=True)
     return evaluator(None if design is None else jnp.array(design), series=False)
 
 
@@ -238,7 +244,7 @@ def test_same_seed_same_numbers():
 def test_start_is_continued():
     """Members continue from the last states of a neighbour; other shapes are refused."""
     settings = config_of(*CHAOTIC, "ensemble.members=4", "ensemble.periods=4")
-    evaluator = EnsembleEvaluator(Evaluator.of(settings, survey=True)).without_gradient()
+    evaluator = ensemble(settings)
     first = evaluator(series=False)
     on = evaluator(start=first.start, series=False)
     assert on.status is Status.AVERAGED
@@ -334,18 +340,19 @@ def test_a_neighbour_that_fails_leaves_no_gradient(monkeypatch):
 
 
 def test_evaluator_of_a_motion():
-    """`objective.motion` chooses the evaluator; only an ensemble can leave out the gradient."""
-    plain = evaluator_for(config_of())
-    assert type(plain) is Evaluator
-    assert plain.without_gradient() is plain
-    evaluator = evaluator_for(config_of("objective.motion=ensemble")).surveying()
-    assert isinstance(evaluator, EnsembleEvaluator)
-    assert evaluator.single.survey
+    """`objective.motion` chooses the motions that count."""
+    assert Evaluator.of_objective(config_of()).single
+    evaluator = Evaluator.of_objective(config_of("objective.motion=ensemble")).surveying()
+    assert evaluator.motions == Ensemble()
+    assert not evaluator.single
+    assert evaluator.survey
     assert evaluator.differentiate
     assert not evaluator.without_gradient().differentiate
-    other = evaluator.independent(2)
-    assert other.settings.seed == 2
-    assert other.settings.members == 4 * evaluator.settings.members
+    other = independent(evaluator, 2)
+    settings = other.config.ensemble
+    assert not other.survey
+    assert settings.seed == 2
+    assert settings.members == 4 * evaluator.config.ensemble.members
 
 
 # Commands

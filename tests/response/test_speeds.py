@@ -12,11 +12,10 @@ from rootsopt.config import load, parse
 from rootsopt.errors import InputError
 from rootsopt.optimize.problem import Problem
 from rootsopt.response import speeds
-from rootsopt.response.attractors import AttractorEvaluator
+from rootsopt.response.attractors import Coexisting
 from rootsopt.response.evaluation import Evaluator, _build, _motion
-from rootsopt.response.evaluators import evaluator_for
+from rootsopt.response.reducers import overall
 from rootsopt.response.result import Part
-from rootsopt.response.speeds import SpeedsEvaluator
 from rootsopt.scene import design_vector
 from rootsopt.status import Status
 from tests.standins import evaluation_of
@@ -41,7 +40,7 @@ def programs():
 @pytest.fixture(scope="module")
 def baseline():
     """Return an evaluator over two speeds, with 3000 rpm besides, and its own evaluation."""
-    evaluator = SpeedsEvaluator(Evaluator.of(config_of(SPEEDS, WEIGHTS, TIGHT)))
+    evaluator = Evaluator.of_objective(config_of(SPEEDS, WEIGHTS, TIGHT))
     return evaluator, evaluator(series=False)
 
 
@@ -138,13 +137,13 @@ def test_each_speed_begins_on_its_own_orbit(baseline, moved, monkeypatch):
     """The state of an evaluation starts each speed on that speed's own motion."""
     evaluator, found = baseline
     seen = []
-    single = Evaluator.__call__
+    single = Evaluator.reached
 
     def spy(self, design, start, series):
         seen.append(start)
         return single(self, design, start, series)
 
-    monkeypatch.setattr(Evaluator, "__call__", spy)
+    monkeypatch.setattr(Evaluator, "reached", spy)
     again = evaluator(start=found.start, series=False)
     for start, part in zip(seen, found.speeds, strict=True):
         assert start is part.evaluation.start
@@ -155,8 +154,8 @@ def test_each_speed_begins_on_its_own_orbit(baseline, moved, monkeypatch):
 
 def test_without_speeds_all_is_as_before(baseline):
     """Without speeds, evaluator, record and objective are those of one speed to the last bit."""
-    assert type(evaluator_for(config_of())) is Evaluator
-    evaluator = evaluator_for(config_of(TIGHT))
+    assert Evaluator.of_objective(config_of()).single
+    evaluator = Evaluator.of_objective(config_of(TIGHT))
     found = evaluator(series=False)
     assert "speeds" not in found.record()
     head = baseline[1].speeds[1].evaluation
@@ -177,7 +176,8 @@ def test_a_speed_without_steady_state_is_a_status():
         "scene.speed_rpm=3900",
         "solver.max_mesh_periods=64",
     )
-    evaluator = evaluator_for(config_of(*scene, "objective.speeds_rpm=[2700, 3900]")).surveying()
+    config = config_of(*scene, "objective.speeds_rpm=[2700, 3900]")
+    evaluator = Evaluator.of_objective(config).surveying()
     found = evaluator(series=False)
     assert [part.evaluation.status for part in found.speeds] == [
         Status.NOT_SETTLED,
@@ -197,9 +197,9 @@ def test_motions_that_coexist_at_every_speed():
 
     Their forces are relative to the baseline's at that speed."""
     small = "attractors.relatives=1", "attractors.rates=1", "objective.motion=worst"
-    evaluator = evaluator_for(config_of(SPEEDS, *small))
-    assert type(evaluator) is SpeedsEvaluator
-    assert type(evaluator.single) is AttractorEvaluator
+    evaluator = Evaluator.of_objective(config_of(SPEEDS, *small))
+    assert evaluator.motions == Coexisting()
+    assert not evaluator.single
     found = evaluator(series=False)
     assert found.status is Status.PERIODIC
     for part in found.speeds:
@@ -335,14 +335,14 @@ def test_every_speed_simulated_counts_in_the_status(monkeypatch, failing):
 
     That speed has no share in the objective."""
     config = load("configs/cic.yaml", ["objective.speeds_rpm=[4000, 2000]"])
-    evaluator = SpeedsEvaluator(Evaluator.of(config))
+    evaluator = Evaluator.of_objective(config)
 
     def single(self, design, start, series):
         here = float(self.scene.speed) * 60 / (2 * np.pi)
         lost = abs(here - failing) < 1e-6
         return evaluation_of(here, Status.PASSED_THROUGH if lost else Status.PERIODIC)
 
-    monkeypatch.setattr(Evaluator, "__call__", single)
+    monkeypatch.setattr(Evaluator, "reached", single)
     found = evaluator()
     assert [part.share for part in found.speeds] == [0.5, 0.0, 0.5]
     assert found.status is Status.PASSED_THROUGH
@@ -351,6 +351,6 @@ def test_every_speed_simulated_counts_in_the_status(monkeypatch, failing):
     assert found.message.startswith(f"At {failing:g} rpm: ")
     assert found.statistics["seconds"] == 3
     parts = [part._replace(evaluation=evaluation_of()) for part in found.speeds]
-    assert speeds.overall(parts)[0] is Status.PERIODIC
+    assert overall(parts)[0] is Status.PERIODIC
     wrong = [Part({"speed_rpm": 1.0}, evaluation_of(status=Status.CHAOTIC)), *parts]
-    assert speeds.overall(wrong)[0] is Status.CHAOTIC
+    assert overall(wrong)[0] is Status.CHAOTIC

@@ -13,8 +13,6 @@ from rootsopt.errors import InputError
 from rootsopt.response.checkpoint import plain_evaluation, read_evaluation
 from rootsopt.response.evaluation import Evaluator, _build, _motion
 from rootsopt.response.scatter import draw, quantiles, shifts
-from rootsopt.response.speeds import SpeedsEvaluator, alone
-from rootsopt.response.tolerances import ToleranceEvaluator
 from rootsopt.scene import Scene
 from rootsopt.status import Status
 from tests.standins import evaluation_of
@@ -166,7 +164,7 @@ def test_shifted_scenes_are_the_scenes_of_moved_configs(file):
 def spread():
     """Return an evaluator over three scenes, and its evaluation of the own design."""
     config = config_of(*SPREAD, "solver.rtol=1e-10", "tolerances.samples=3")
-    evaluator = ToleranceEvaluator.of(config, Evaluator.of(config))
+    evaluator = Evaluator.of(config).scattered()
     return evaluator, evaluator(series=False)
 
 
@@ -197,13 +195,13 @@ def test_parts_are_the_evaluations_of_moved_configs(spread):
 def test_scenes_begin_on_their_own_orbits(spread, monkeypatch):
     evaluator, found = spread
     seen = []
-    single = Evaluator.__call__
+    single = Evaluator.reached
 
-    def spy(self, design=None, start=None, series=True):
+    def spy(self, design, start, series):
         seen.append(start)
         return single(self, design, start, series)
 
-    monkeypatch.setattr(Evaluator, "__call__", spy)
+    monkeypatch.setattr(Evaluator, "reached", spy)
     again = evaluator(start=found.start, series=False)
     known = {id(part.evaluation.start) for part in found.scenes}
     assert {id(start) for start in seen} == known
@@ -222,7 +220,7 @@ def test_scenes_begin_on_their_own_orbits(spread, monkeypatch):
 class Told(Evaluator):
     """Stand in for an evaluator: its force is the clearance in µm, and fails above 12 µm."""
 
-    def __call__(self, design=None, start=None, series=True):
+    def reached(self, design=None, start=None, series=True):
         clearance = 1e6 * float(self.scene.clearance)
         status = Status.PERIODIC if clearance < 12 else Status.NOT_SETTLED
         start = np.array([clearance, float(self.scene.speed)])
@@ -231,15 +229,14 @@ class Told(Evaluator):
 
 def told(*overrides):
     config = config_of(PLAY, *overrides)
-    return config, Told(config, Scene.from_config(config))
+    return Told.of_objective(config)
 
 
 def test_a_scene_without_steady_state_is_a_status():
     """The status names the first scene that does not settle, and how many do not.
 
     There is neither gradient nor start."""
-    config, single = told(CLEARANCE, "tolerances.samples=16")
-    found = ToleranceEvaluator.of(config, single)()
+    found = told(CLEARANCE, "tolerances.samples=16").scattered()()
     lost = [p for p in found.samples if not p.evaluation.usable]
     assert 0 < len(lost) < 16
     assert found.status is Status.NOT_SETTLED
@@ -247,8 +244,7 @@ def test_a_scene_without_steady_state_is_a_status():
     assert f"contact.clearance_mm = {lost[0].values['contact.clearance_mm']:.6g}: " in found.message
     assert found.start is None
     assert found.response["mean_force_N"] == pytest.approx(10)
-    config, single = told(CLEARANCE, "contact.clearance_mm=0.02")
-    found = ToleranceEvaluator.of(config, single)()
+    found = told(CLEARANCE, "contact.clearance_mm=0.02").scattered()()
     assert found.status is Status.NOT_SETTLED
     assert found.samples == ()
 
@@ -258,8 +254,8 @@ def test_scatter_over_several_speeds():
 
     Methods that return another evaluator keep the sample."""
     narrow = "tolerances.over.contact.clearance_mm.uniform=0.001"
-    config, single = told(narrow, "objective.speeds_rpm=[2000, 3000]", "tolerances.samples=2")
-    evaluator = ToleranceEvaluator.of(config, SpeedsEvaluator(single))
+    several = "objective.speeds_rpm=[2000, 3000]"
+    evaluator = told(narrow, several, "tolerances.samples=2").scattered()
     found = evaluator()
     assert [len(start) for start in found.start] == [2, 2, 2]
     for part in found.samples:
@@ -277,8 +273,7 @@ def test_scatter_over_several_speeds():
         evaluator.without_gradient(),
         evaluator.at_speed(2500.0),
     ):
-        assert type(other) is ToleranceEvaluator
         assert other.shifts == evaluator.shifts
-    lone = ToleranceEvaluator.of(alone(config), single).at_speed(2500.0)
+    lone = evaluator.at_speed(2500.0)
     speeds = [part.evaluation.start[1] for part in lone().scenes]
     np.testing.assert_allclose(speeds, 2500 * np.pi / 30)

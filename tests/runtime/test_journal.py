@@ -14,6 +14,7 @@ from rootsopt.dynamics.maxima import Maxima
 from rootsopt.errors import InputError
 from rootsopt.response.checkpoint import Checkpoint, plain_evaluation
 from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.many import Point
 from rootsopt.response.result import Part
 from rootsopt.runtime.journal import Journal, _content, _line, header_of, set_aside
 from rootsopt.status import Status
@@ -205,7 +206,8 @@ def test_results_of_the_wrong_type_are_dropped(path):
 def test_an_evaluation_is_known_by_its_stage_point_and_start(path):
     asked, one = [], Evaluator.of(CIC)
 
-    def run(evaluator, design, start):
+    def run(point):
+        _, design, start, _ = point
         asked.append((design[0], start))
         return evaluation(design[0] if start is None else start[0])
 
@@ -214,13 +216,13 @@ def test_an_evaluation_is_known_by_its_stage_point_and_start(path):
     numbers = []
     for resume in (False, True):
         journal = search(path, resume)
-        given = [(run, stage, one, point, 2 * point, begun) for stage, begun in tasks]
+        given = [(run, stage, Point(one, 2 * point, begun), point) for stage, begun in tasks]
         numbers.append([journal.evaluated(*task).response["mean_force_N"] for task in given])
         journal.close()
         assert len(asked) == 4
     assert numbers[0] == numbers[1] == [1 / 3, 0.25 / 3, 0.5 / 3, 1 / 3]
     other = search(path, resume=True)
-    other.evaluated(run, "search", one, point + 0.25, point, None)
+    other.evaluated(run, "search", Point(one, point), point + 0.25)
     assert len(asked) == 5
 
 

@@ -15,8 +15,7 @@ from rootsopt.commands import optimize, parallel, pareto
 from rootsopt.config import load
 from rootsopt.errors import InputError
 from rootsopt.response.evaluation import Evaluator
-from rootsopt.response.evaluators import evaluator_for
-from rootsopt.response.runs import HERE, Runs
+from rootsopt.response.many import HERE, Point, Runs
 from rootsopt.sweeps import evaluations
 from rootsopt.sweeps.cluster import Cluster
 from rootsopt.sweeps.evaluations import ClosedError, Elsewhere, evaluating
@@ -32,7 +31,7 @@ def test_a_killed_worker_loses_and_duplicates_no_design(monkeypatch):
     ended, killed, lock = [], [], threading.Lock()
 
     def evaluated(number):
-        found = runs.evaluated(evaluator, designs[number])
+        found = runs.evaluated(Point(evaluator, designs[number]))
         with lock:
             ended.append(number)
             if len(ended) >= 4 and not killed:
@@ -62,7 +61,11 @@ def test_a_design_that_kills_its_process_ends_the_search(monkeypatch):
         Cluster(1, imports=(IMPORT,)).evaluations() as runs,
         pytest.raises(InputError, match=r"several times.*--resume"),
     ):
-        runs.evaluated(evaluator, np.ones(3))
+        runs.evaluated(Point(evaluator, np.ones(3)))
+
+
+def point():
+    return Point(Evaluator.of(load("cic")), np.ones(3))
 
 
 class Client:
@@ -101,21 +104,21 @@ def test_threads_that_wait_end_with_the_search(monkeypatch):
     runs = Elsewhere(None, client, Settings(()))
     assert runs.slots == 6
     with ThreadPoolExecutor(1) as pool:
-        waiting = pool.submit(runs.evaluated, Evaluator.of(load("cic")), np.ones(3))
+        waiting = pool.submit(runs.evaluated, point())
         assert client.asked.wait(10)
         runs.close()
         with pytest.raises(ClosedError):
             waiting.result(10)
     assert client.futures[0].cancelled
     with pytest.raises(ClosedError):
-        runs.evaluated(Evaluator.of(load("cic")), np.ones(3))
+        runs.evaluated(point())
 
 
 def test_a_lost_connection_is_named(monkeypatch):
     monkeypatch.setattr(evaluations, "_POLL", 0.01)
     monkeypatch.setattr(Client, "status", "closed")
     with pytest.raises(InputError, match="connection to the scheduler was lost"):
-        Elsewhere(None, Client(), Settings(())).evaluated(Evaluator.of(load("cic")), np.ones(3))
+        Elsewhere(None, Client(), Settings(())).evaluated(point())
 
 
 def test_a_scheduler_without_workers_is_given_up(monkeypatch):
@@ -123,13 +126,13 @@ def test_a_scheduler_without_workers_is_given_up(monkeypatch):
     monkeypatch.setattr(evaluations, "_DESERTED", 0.05)
     monkeypatch.setattr(Client, "nthreads", lambda self: {})
     with pytest.raises(InputError, match=r"no worker for 0\.05 s"):
-        Elsewhere(None, Client(), Settings(())).evaluated(Evaluator.of(load("cic")), np.ones(3))
+        Elsewhere(None, Client(), Settings(())).evaluated(point())
 
 
 @pytest.mark.parametrize("motion", ["reached", "worst", "ensemble"])
 def test_every_evaluator_travels(motion):
     config = load("cic", [f"objective.motion={motion}"])
-    sent = evaluator_for(config)
+    sent = Evaluator.of_objective(config)
     found = pickle.loads(pickle.dumps(sent))
     assert type(found) is type(sent)
     assert found.config == config
@@ -146,6 +149,7 @@ def test_classes_of_a_script_travel(tmp_path):
         "import numpy as np\n"
         "from rootsopt.config import load\n"
         "from rootsopt.response.evaluation import Evaluator\n"
+        "from rootsopt.response.many import Point\n"
         "from rootsopt.sweeps.evaluations import Elsewhere\n"
         "from rootsopt.sweeps.worker import Settings\n"
         "class Own(Evaluator):\n"
@@ -157,10 +161,10 @@ def test_classes_of_a_script_travel(tmp_path):
         "    def submit(self, function, settings, task, pure):\n"
         f"        open({str(task)!r}, 'wb').write(task)\n"
         "        sys.exit(0)\n"
-        "Elsewhere(None, Client(), Settings(())).evaluated(own, np.ones(3))\n"
+        "Elsewhere(None, Client(), Settings(())).evaluated(Point(own, np.ones(3)))\n"
     )
     subprocess.run([sys.executable, str(script)], check=True, env={**os.environ, "PYTHONPATH": "."})
-    evaluator, design, start = pickle.loads(task.read_bytes())
+    evaluator, design, start, _ = pickle.loads(task.read_bytes())
     assert type(evaluator).answer == 42
     assert design.tolist() == [1.0, 1.0, 1.0]
     assert start is None

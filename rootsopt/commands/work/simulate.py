@@ -11,7 +11,7 @@ from rootsopt.measured import report as outline_report
 from rootsopt.output import files, tables
 from rootsopt.output.runs import RunFolder
 from rootsopt.pump.sheet import check_clearances, record_of, warnings
-from rootsopt.response.evaluators import evaluator_for
+from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.speeds import alone
 from rootsopt.scene import check_geometry, outline_mm
 
@@ -25,7 +25,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     check_geometry(config)
     check_clearances(config)
     with cli.waiting(Console(stderr=True), "compiling and simulating"):
-        evaluation = evaluator_for(alone(config))()
+        evaluation = Evaluator.of_objective(alone(config))()
     files.write_config(folder, config)
     folder.write_csv("profile_design.csv", files.profile_columns(outline_mm(config)))
     if evaluation.series is not None:

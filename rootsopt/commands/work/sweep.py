@@ -13,7 +13,8 @@ from rootsopt.errors import InputError
 from rootsopt.output import files, tables
 from rootsopt.output.runs import RunFolder
 from rootsopt.response import speeds
-from rootsopt.response.evaluators import evaluator_for
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.reducers import overall
 from rootsopt.scene import check_geometry, design_keys, design_vector
 
 
@@ -29,11 +30,12 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     refuse_options(options)
     check_geometry(config)
     cli.load_figures(options, "speeds")
-    with _progress(Console(stderr=True)) as progress:
-        evaluator = evaluator_for(speeds.alone(config)).without_gradient()
-        parts = speeds.sweep(evaluator, speeds.swept_speeds(config), progress=progress)
+    swept = speeds.swept_speeds(config)
+    with _progress(Console(stderr=True), len(swept)) as progress:
+        evaluator = Evaluator.of_objective(speeds.alone(config)).without_gradient()
+        parts = evaluator.swept(swept, progress=progress)
     rows = [part.row(whole=True) for part in parts]
-    status, message = speeds.overall(parts)
+    status, message = overall(parts)
     files.write_config(folder, config)
     folder.write_csv("sweep.csv", files.row_columns(rows))
     data = {
@@ -72,14 +74,14 @@ def refuse_options(options: argparse.Namespace) -> None:
 
 
 @contextlib.contextmanager
-def _progress(console) -> Iterator[Callable[[int, int], None]]:
-    """Yield a function (done, expected) that updates a progress bar.
+def _progress(console, expected: int) -> Iterator[Callable[[int], None]]:
+    """Yield a function (done) that updates a progress bar.
 
     If the console is not a terminal, there is no progress bar and the function does nothing."""
     if not console.is_terminal:
-        yield lambda done, expected: None
+        yield lambda done: None
         return
 
     with Progress(console=console, transient=True) as bar:
         task = bar.add_task("compiling and simulating", total=None)
-        yield lambda done, expected: bar.update(task, completed=done, total=expected)
+        yield lambda done: bar.update(task, completed=done, total=expected)

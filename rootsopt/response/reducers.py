@@ -1,0 +1,159 @@
+"""Reduces many evaluations to one, and many values to one number with its gradient.
+
+Combinations of values are R = Σ w_k(J) J_k, where J_k is the value in scene k of n. The weights w
+add up to 1:
+
+- Mean plus c = `tolerances.k` standard deviations: R = m + c s, with m = Σ J_k / n and
+  s² = Σ (J_k - m)² / n. Hence w_k = (1 + c (J_k - m) / s) / n.
+- Quantile q: the estimator of Harrell and Davis, a weighted mean of all ordered values. The weight
+  of the i-th smallest is B(i/n) - B((i-1)/n). B is the distribution function of the beta
+  distribution with parameters (n + 1) q and (n + 1) (1 - q). This estimator varies less between
+  samples than a single ordered value, and every scene contributes to its gradient. Source: Harrell
+  and Davis, A new distribution-free quantile estimator, Biometrika 69 (1982) 635-640.
+- Worst: the greatest value. Its weight is 1.
+
+Each R is a homogeneous function of J of degree 1. Therefore dR/dJ_k = w_k (Euler's theorem),
+wherever R is differentiable."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rootsopt.config.tolerances import TolerancesConfig
+from rootsopt.response.result import Evaluation, Part
+from rootsopt.status import Status
+
+_EQUAL = 1e-14
+"""Standard deviation, relative to the mean, below which all values count as equal."""
+
+
+class Combined(NamedTuple):
+    """A combination R of n values.
+
+    `value`: R; `weights` (n,): derivatives of R with respect to the values."""
+
+    value: float
+    weights: NDArray[np.float64]
+
+
+def combine(tolerances: TolerancesConfig, values: ArrayLike) -> Combined:
+    """Return the combination of `values` (n,) that `tolerances.combine` selects."""
+    found = np.asarray(values, np.float64)
+    if tolerances.combine == "worst":
+        weights = np.zeros(len(found))
+        weights[np.argmax(found)] = 1.0
+    elif tolerances.combine == "quantile":
+        weights = np.empty(len(found))
+        weights[np.argsort(found, kind="stable")] = order_weights(len(found), tolerances.quantile)
+    else:
+        weights = _mean_and_deviation(found, tolerances.k)
+    return Combined(float(weights @ found), weights)
+
+
+def order_weights(count: int, quantile: float) -> NDArray[np.float64]:
+    """Return the weights (count,) of Harrell and Davis for `count` values in ascending order.
+
+    `quantile`: the quantile q that the weighted mean estimates."""
+    from scipy.special import betainc  # Slow import (0.1 s).
+
+    edges = np.arange(count + 1) / count
+    cumulative = betainc((count + 1) * quantile, (count + 1) * (1 - quantile), edges)
+    return np.diff(cumulative)
+
+
+def _mean_and_deviation(values: NDArray[np.float64], k: float) -> NDArray[np.float64]:
+    away = values - np.mean(values)
+    deviation = float(np.sqrt(np.mean(away**2)))
+    # For equal values, the standard deviation has a corner, and 0 is one of its subgradients.
+    if deviation <= _EQUAL * abs(float(np.mean(values))):
+        return np.full(len(values), 1 / len(values))
+    return (1 + k * away / deviation) / len(values)
+
+
+def over_speeds(parts: Sequence[Part], own: float) -> Evaluation:
+    """Return the evaluation over several speeds, reported at the speed `own` (rpm)."""
+    (head,) = (part.evaluation for part in parts if part.speed_rpm == own)
+    found = _together(head, parts, {"speeds": len(parts)})
+    return dataclasses.replace(found, maxima=None, rivals=(), speeds=tuple(parts))
+
+
+def over_scenes(parts: Sequence[Part]) -> Evaluation:
+    """Return the evaluation over several scenes, reported in the nominal scene.
+
+    `parts`: that of the nominal scene first."""
+    found = _together(parts[0].evaluation, parts, {"samples": len(parts) - 1})
+    return dataclasses.replace(found, scenes=tuple(parts))
+
+
+def _together(head: Evaluation, parts: Sequence[Part], counts: dict[str, int]) -> Evaluation:
+    """Return the evaluation `head` as that of all `parts`; add `counts` to its statistics.
+
+    Only if all parts are usable, the result has a gradient, and a start with one entry for each."""
+    status, message = overall(parts)
+    seconds = sum(part.evaluation.statistics.get("seconds", 0.0) for part in parts)
+    return dataclasses.replace(
+        head,
+        gradient=head.gradient if status.usable else {},
+        status=status,
+        message=message,
+        statistics=head.statistics | counts | {"seconds": seconds},
+        start=tuple(part.evaluation.start for part in parts) if status.usable else None,
+    )
+
+
+def overall(parts: Sequence[Part]) -> tuple[Status, str]:
+    """Return status and message of the first part that is not usable, or of the first part if all
+    are usable."""
+    failed = [part for part in parts if not part.evaluation.usable]
+    first = failed[0] if failed else parts[0]
+    status, message = first.evaluation.status, first.evaluation.message
+    if not (failed and first.values):
+        return status, message
+    if not math.isnan(first.speed_rpm):
+        return status, f"At {first.speed_rpm:g} rpm: {message}"
+    values = ", ".join(f"{key} = {value:.6g}" for key, value in first.values.items())
+    return status, (
+        f"In {len(failed)} of the {len(parts) - 1} scenes of `tolerances`, the motion is not "
+        f"usable. With {values}: {message}"
+    )
+
+
+def mean(head: Evaluation, evaluations: Sequence[Evaluation], shares: ArrayLike) -> Evaluation:
+    """Return `head` with response and gradient averaged over `evaluations`.
+
+    `shares` (n,): weights ≥ 0, scaled to add up to 1; all 0 count as equal. An evaluation that is
+    not usable has no contact: its force is 0 for all neighbouring designs, too."""
+    weights = np.asarray(shares, np.float64)
+    weights = weights if weights.sum() > 0 else np.ones(len(weights))
+    weights = weights / weights.sum()
+
+    def average(values: list[float]) -> float:
+        return float(weights @ values)
+
+    def slope(one: Evaluation, name: str, key: str) -> float:
+        return one.gradient[name][key] if one.usable else 0.0
+
+    return dataclasses.replace(
+        head,
+        maxima=None,
+        response={k: average([one.response[k] for one in evaluations]) for k in head.response},
+        gradient={
+            name: {key: average([slope(one, name, key) for one in evaluations]) for key in row}
+            for name, row in head.gradient.items()
+        },
+    )
+
+
+__all__ = [
+    "Combined",
+    "combine",
+    "mean",
+    "order_weights",
+    "over_scenes",
+    "over_speeds",
+    "overall",
+]
