@@ -151,8 +151,8 @@ class Evaluator:
 
     @property
     def nominal(self) -> "Evaluator":
-        """The evaluator in the nominal scene alone."""
-        return dataclasses.replace(self, shifts=())
+        """The evaluator in the nominal scene alone; it can travel to another process."""
+        return dataclasses.replace(self, shifts=(), runs=HERE)
 
     def scattered(self, runs: Runs = HERE) -> "Evaluator":
         """Return another evaluator, over the fixed sample of the config's `tolerances`.

@@ -4,7 +4,6 @@ Points of the same structure share compiled programs. On a CPU, a thread per cor
 one by one: as arrays, all motions would take as many steps as the longest. On an accelerator, they
 are stepped together as arrays."""
 
-import functools
 import itertools
 import threading
 from collections.abc import Iterable, Iterator, Sequence
@@ -29,20 +28,11 @@ def in_process(
     """Yield lists of (number, record) of the points with these `numbers`, as they are done.
 
     `stop`: event after which no further point begins."""
-    if pays():
-        for some in divided([*numbers], _BATCH):
-            if not stop.is_set():
-                yield at_once(config, [(number, plan.at(number)) for number in some], 1)
-        return
-    points = ((number, plan.at(number)) for number in numbers)
-    asked = itertools.takewhile(lambda _: not stop.is_set(), points)
-    for _, one in as_done(functools.partial(_numbered, config), asked, HERE.slots):
-        yield [one]
-
-
-def _numbered(config: Config, point: tuple[int, dict[str, Any]]) -> tuple[int, Row]:
-    number, values = point
-    return number, simulated(config, values)
+    size, slots = (_BATCH, 1) if pays() else (1, HERE.slots)
+    chunks = ([(one, plan.at(one)) for one in some] for some in divided([*numbers], size))
+    asked = itertools.takewhile(lambda _: not stop.is_set(), chunks)
+    for _, found in as_done(lambda points: at_once(config, points, 1), asked, slots):
+        yield found
 
 
 def at_once(
@@ -51,11 +41,13 @@ def at_once(
     """Return (number, record) of all `points`, each given as (number, values by dotted key).
 
     `threads`: number of points at a time."""
+    numbers, every = zip(*points, strict=True)
     if pays():
-        rows = simulated_together(config, [values for _, values in points])
-        return [(number, row) for (number, _), row in zip(points, rows, strict=True)]
-    found = sorted(as_done(functools.partial(_numbered, config), points, threads))
-    return [one for _, one in found]
+        rows = simulated_together(config, every)
+    else:
+        done = as_done(lambda values: simulated(config, values), every, threads)
+        rows = [row for _, row in sorted(done)]
+    return [*zip(numbers, rows, strict=True)]
 
 
 def divided(numbers: Sequence[int], size: int) -> Iterator[list[int]]:
