@@ -24,7 +24,8 @@ def evaluator_of(config: Config, give_up_early: bool = False) -> Evaluator:
 
     `give_up_early`: whether to give up motions that settle late.
     """
-    return Evaluator.of(config, survey=give_up_early)
+    found = Evaluator.of(config)
+    return found.surveying() if give_up_early else found
 
 
 def evaluate(config: Config) -> Evaluation:

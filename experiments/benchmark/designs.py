@@ -86,8 +86,8 @@ def part_single(job: Job) -> dict[str, Any]:
     import equinox as eqx
     import jax.numpy as jnp
 
+    from experiments._common.batch import coarse, respond
     from experiments._common.simulation import at, evaluator_of
-    from rootsopt.response.batch import coarse, respond
     from rootsopt.scene import integrators
 
     truth, slope = job.known["forces"][0], job.known["slopes"][0]
@@ -168,7 +168,7 @@ class _Batch:
         """Simulate all designs with these tolerances."""
         import jax.numpy as jnp
 
-        from rootsopt.response.batch import coarse, respond_many
+        from experiments._common.batch import coarse, respond_many
         from rootsopt.scene import Scene, integrators
 
         config = load(CIC)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from experiments._common.batch import coarse, respond
 from experiments._common.simulation import evaluator_of as make_evaluator
 from experiments._common.simulation import pair_of_model, stacked
 from experiments.extremes.scenes import Kind
@@ -20,7 +21,6 @@ from rootsopt.dynamics.flow import flow, strobe
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.orbit import Shots, close_orbit
 from rootsopt.dynamics.window import no_tangents
-from rootsopt.response.batch import coarse, respond
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene, design_vector

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from experiments._common.batch import Batch, coarse, on_all_cores, respond
 from experiments._common.engines import FD_STEPS
 from experiments._common.scenes import SHAKY, shipped
 from experiments._common.simulation import stacked
@@ -26,7 +27,6 @@ from rootsopt.config import Config
 from rootsopt.config.units import MM
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.errors import InputError
-from rootsopt.response.batch import Batch, coarse, on_all_cores, respond
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene, check_geometry, design_vector
 from rootsopt.status import Status

@@ -16,11 +16,10 @@ from numpy.typing import NDArray
 
 from rootsopt.config import Config
 from rootsopt.errors import InputError
-from rootsopt.optimize.certificate import Certificate
 from rootsopt.optimize.local import Local
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.robust_problem import RobustProblem
-from rootsopt.optimize.search import Optimization, Progress, Search, sensitivity_rows
+from rootsopt.optimize.search import Optimization, Progress, Search
 from rootsopt.response.checkpoint import Checkpoint
 from rootsopt.response.evaluation import RESPONSES, Evaluation, Evaluator
 from rootsopt.response.many import HERE, Runs, evaluate_many
@@ -139,10 +138,6 @@ class RobustSearch(Search):
         self.exact = self.exact.scattered(runs)
         self._shares: dict[int, NDArray[np.float64]] = {}
 
-    def _simulated(self, evaluator: Evaluator, design, orbit) -> Evaluation:
-        """Return the evaluation of a `design` (d,), whose evaluator distributes its sample."""
-        return evaluator(design, orbit, series=False)
-
     def _problem(self, scene: Scene, baseline: Evaluation) -> Problem:
         return RobustProblem.of(self.config, scene, baseline)
 
@@ -169,16 +164,6 @@ class RobustSearch(Search):
             if apart and self.problem.feasible(point) and len(chosen) < self.settings.starts:
                 chosen.append(point)
         return chosen
-
-    def _sensitivities(self, optimized: Evaluation, certificate: Certificate) -> list[dict]:
-        """Return one row per scene quantity, with its effect on the forces in the nominal scene.
-
-        Return an empty list for several speeds, for several motions, or after `stop`."""
-        del certificate
-        nominal = self.exact.nominal
-        if not nominal.single or self.stop.is_set():
-            return []
-        return sensitivity_rows(nominal, optimized.nominal, lambda moved: {})
 
     def _local(self, start: int, evaluation: Evaluation, point) -> Local | None:
         problem = self.problem

@@ -543,7 +543,9 @@ class Search:
         key = (start, iteration) if key is None else key
         kept = None if self.checkpoint is None else self.checkpoint.known(key, point)
         if kept is None:
-            evaluation = self._simulated(evaluator, self.problem.design(point), orbit)
+            # A sample is distributed by its evaluator.
+            runs = HERE if evaluator.shifts else self.runs
+            evaluation = runs.evaluated(Point(evaluator, self.problem.design(point), orbit))
             if self.checkpoint is not None:
                 self.checkpoint.keep(key, point, evaluation)
         else:
@@ -560,10 +562,6 @@ class Search:
                 self._best = float(np.fmin(self._best, objective))
             self.progress(len(self._trials), self.expected, self._best)
         return trial
-
-    def _simulated(self, evaluator: Evaluator, design, orbit) -> Evaluation:
-        """Return the evaluation of a `design` (d,), where this search runs its evaluations."""
-        return self.runs.evaluated(Point(evaluator, design, orbit))
 
     def _verify(self, trials: list[Trial]) -> tuple[Evaluation | None, dict[str, Any]]:
         """Simulate the best designs again, from rest at a tight tolerance, until one is confirmed.
@@ -651,16 +649,25 @@ class Search:
     def _sensitivities(self, optimized: Evaluation, certificate: Certificate) -> list[dict]:
         """Return one row per scene quantity, with its effect on forces and objective.
 
+        Forces are those in the nominal scene; the effect on the objective is left out for a sample.
         Return an empty list for several speeds, for several motions, or after `stop`."""
-        if not self.exact.single or self.stop.is_set():
+        nominal = self.exact.nominal
+        if not nominal.single or self.stop.is_set():
             return []
+        moved = by_scene(nominal, optimized.nominal)
+        if moved is None:
+            return []
+        slopes = {} if optimized.scenes else self.problem.along_scene(moved, certificate)
         level = self.problem.objective(optimized)
-
-        def percent(moved: Evaluation) -> dict[str, float]:
-            slopes = self.problem.along_scene(moved, certificate)
-            return {key: 100 * slope / level for key, slope in slopes.items()}
-
-        return sensitivity_rows(self.exact, optimized, percent)
+        rows = []
+        for one in quantities(nominal.config):
+            forces = {name: one.step * row[one.key] for name, row in moved.gradient.items()}
+            row = {"quantity": one.name, "key": one.key, "unit": one.unit, "value": one.value}
+            row |= {"step": one.step} | forces
+            if slopes:
+                row["objective_percent"] = one.step * (100 * slopes[one.key] / level)
+            rows.append(row)
+        return rows
 
     def _outcome(self, number: int, found: Found) -> StartOutcome:
         """Return the outcome of a local search by sequential quadratic programming.
@@ -698,32 +705,6 @@ class Search:
         """Return the design at a `point` (d,), in config units by key."""
         values = self.problem.look(point)[0].tolist()
         return dict(zip(self.problem.config.design_keys, values, strict=True))
-
-
-def sensitivity_rows(
-    evaluator: Evaluator,
-    optimized: Evaluation,
-    percent: Callable[[Evaluation], dict[str, float]],
-) -> list[dict[str, Any]]:
-    """Return one row per scene quantity, with its effect on the forces of an optimum.
-
-    `evaluator`, `optimized`: of one motion at one speed; `percent`: function that takes an
-    evaluation with gradients with respect to the quantities, and returns the derivatives of the
-    objective (% per unit, by key), or {} if they are not known. Return an empty list without such
-    gradients."""
-    moved = by_scene(evaluator, optimized)
-    if moved is None:
-        return []
-    objective = percent(moved)
-    rows = []
-    for one in quantities(evaluator.config):
-        forces = {name: one.step * row[one.key] for name, row in moved.gradient.items()}
-        row = {"quantity": one.name, "key": one.key, "unit": one.unit, "value": one.value}
-        row |= {"step": one.step} | forces
-        if objective:
-            row["objective_percent"] = one.step * objective[one.key]
-        rows.append(row)
-    return rows
 
 
 def method_of(config: Config) -> str:

@@ -114,18 +114,12 @@ class Evaluator:
     differentiate: bool = True
 
     @classmethod
-    def of(cls, config: Config, rtol: float | None = None, survey: bool = False) -> "Evaluator":
+    def of(cls, config: Config) -> "Evaluator":
         """Return the evaluator of a `config`, for the motion from rest at the scene's own speed.
-
-        `rtol` overrides the config's orbit tolerance; `survey`: whether the evaluator is for a
-        search over many designs (see `surveying`).
 
         Raises InputError for an unknown objective term or a scene that cannot be simulated."""
         terms_of([*config.objective.terms])
-        found = cls(config, Scene.from_config(config))
-        if rtol is not None:
-            found = found.at_tolerance(rtol)
-        return found.surveying() if survey else found
+        return cls(config, Scene.from_config(config))
 
     @classmethod
     def of_objective(cls, config: Config) -> "Evaluator":

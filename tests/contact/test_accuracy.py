@@ -10,13 +10,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from experiments._common.batch import coarse, respond_many
 from experiments._common.polygons import pair_gap
 from rootsopt.config import load, parse
 from rootsopt.contact.closest import FlankPair
 from rootsopt.errors import InputError
 from rootsopt.profiles import CIC, EE, FreeForm
 from rootsopt.profiles.validity import margins
-from rootsopt.response.batch import coarse, respond_many
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.scene.families import check, profile_of
 from rootsopt.status import Status

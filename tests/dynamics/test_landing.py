@@ -38,7 +38,7 @@ Steps in free flight would be twice as long, and some would pass over a touch.""
 @pytest.fixture(scope="module")
 def lively():
     """Return the lively scene at three tolerances."""
-    evaluator = Evaluator.of(load("configs/cic.yaml", LIVELY), survey=True)
+    evaluator = Evaluator.of(load("configs/cic.yaml", LIVELY)).surveying()
     return {rtol: evaluator.at_tolerance(rtol)(series=False) for rtol in (1e-8, 1e-9, 1e-10)}
 
 
@@ -222,7 +222,7 @@ def test_two_changes_at_one_instant():
         "profile.involute_length_mm=5.77",
         "profile.tip_arc_angle_deg=1.68",
     ]
-    evaluator = Evaluator.of(load("configs/cic.yaml", scene), survey=True)
+    evaluator = Evaluator.of(load("configs/cic.yaml", scene)).surveying()
     design, step, way = np.array([35.23, 5.77, 1.68]), 5e-5, np.array([1.0, -0.7, 0.8])
     found = evaluator(series=False)
     assert found.status is Status.PERIODIC
@@ -265,10 +265,10 @@ def test_the_check_bounds_the_error(scene, design):
         np.array([1.0, -0.7, 0.8]),
         ("mean_force_N", "peak_force_N", "rms_force_N"),
     )
-    evaluator = Evaluator.of(load("configs/cic.yaml", scene), survey=True)
+    evaluator = Evaluator.of(load("configs/cic.yaml", scene)).surveying()
     # Shooting, since differences need forces to 1e-11.
     shooting = load("configs/cic.yaml", [*scene, "solver.orbit=shooting"])
-    sharp = Evaluator.of(shooting, survey=True).at_tolerance(1e-11)
+    sharp = Evaluator.of(shooting).surveying().at_tolerance(1e-11)
 
     def terms(found):
         rows = np.array([list(found.gradient[name].values()) for name in names])

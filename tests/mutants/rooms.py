@@ -107,7 +107,6 @@ _OF = {
     "pump/section": "play leakage",
     "pump/sheet": "pump_flow play leakage",
     "response/checkpoint": "checkpoint journal",
-    "response/batch": "threads accuracy",
     "response/ensemble": "members ensemble",
     "response/members": "members ensemble",
     "response/orbits": "known",

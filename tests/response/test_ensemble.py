@@ -41,8 +41,8 @@ def config_of(*overrides):
 
 
 def ensemble(config, survey=True):
-    single = Evaluator.of(config, survey=survey)
-    return dataclasses.replace(single, motions=Ensemble()).without_gradient()
+    found = dataclasses.replace(Evaluator.of(config), motions=Ensemble()).without_gradient()
+    return found.surveying() if survey else found
 
 
 def averaged(*overrides, gradient=False, survey=True, design=None):
