@@ -8,16 +8,10 @@ from rootsopt.config import Config
 from rootsopt.response.result import Evaluation, Part
 
 
-def alone(config: Config, speed_rpm: float | None = None) -> Config:
-    """Return `config` with the single speed `speed_rpm`, by default the scene's own speed."""
-    speed = config.scene.speed_rpm if speed_rpm is None else speed_rpm
+def alone(config: Config) -> Config:
+    """Return `config` with the scene's own speed as the only one."""
     none = {"speeds_rpm": (), "speed_weights": (), "over_speeds": "weighted"}
-    return config.model_copy(
-        update={
-            "scene": config.scene.model_copy(update={"speed_rpm": speed}),
-            "objective": config.objective.model_copy(update=none),
-        }
-    )
+    return config.model_copy(update={"objective": config.objective.model_copy(update=none)})
 
 
 def shares(config: Config) -> dict[float, float]:
