@@ -16,7 +16,7 @@ from tests.standins import oscillator
 
 
 def told_flow(state, means):
-    """Return a mesh period whose force has the mean `means[k]`; k, the first state, grows by one."""
+    """Return a mesh period whose force has the mean `means[k]`; k, the first state, grows by 1."""
     at = jnp.round(state[0]).astype(int)
     mean = jnp.asarray(means)[at]
     blank = Flow.empty(state.shape[0], 0, 2, 1, Measures(), state.dtype)
