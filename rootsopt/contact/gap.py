@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.contact.point import ContactPoint
 from rootsopt.errors import InputError
@@ -96,6 +96,17 @@ class Contact(eqx.Module):
         """Slices of twisted rotors, for each of which the pair evaluates the contact; `None`: the
         rotors are straight."""
         return None
+
+    @property
+    def sections(self) -> int:
+        """Number of slices; 1 for straight rotors."""
+        return 1
+
+    def in_slice(self, number: Int[Array, ""]) -> "Contact":
+        """Return the contact in the slice with the index `number`; by default, this contact
+        itself."""
+        del number
+        return self
 
     @property
     def length_scale(self) -> Float[Array, ""] | None:

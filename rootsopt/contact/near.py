@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from rootsopt.contact.closest import ClosestApproach, FlankPair, contact_begins
 from rootsopt.contact.gap import Approach, Contact
@@ -27,7 +27,8 @@ class NearContact(Contact):
 
     `pair`: the flanks; `roots` (sides, 2): normal angles ν2 (rad) near the closest approach and,
     for flanks with a cusp, near the other minimum of the gap. If both drive and coast flanks can
-    touch, each has a row; otherwise there is one row.
+    touch, each has a row; otherwise there is one row. For twisted rotors, there is a leading axis
+    for the slices (see `in_slice`).
 
     The tangential offset T of `closest` is linearised at the given root. The error of ν2 is
     therefore of second order in the distance from this root. Repeated evaluations, each from the
@@ -36,7 +37,7 @@ class NearContact(Contact):
     """
 
     pair: FlankPair
-    roots: Float[Array, "sides 2"]
+    roots: Float[Array, "*slices sides 2"]
 
     @property
     def jumps(self) -> bool:
@@ -60,6 +61,9 @@ class NearContact(Contact):
 
     def at_distance(self, distance: Float[Array, ""]) -> "NearContact":
         return eqx.tree_at(lambda contact: contact.pair.center_distance, self, distance)
+
+    def in_slice(self, number: Int[Array, ""]) -> "NearContact":
+        return eqx.tree_at(lambda contact: contact.roots, self, self.roots[number])
 
     def on_side(self, side: Float[Array, ""]) -> "NearContact":
         if self.roots.shape[0] == 1:

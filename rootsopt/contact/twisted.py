@@ -25,6 +25,10 @@ class TwistedContact(WrappedContact):
     count: int = eqx.field(static=True)
 
     @property
+    def sections(self) -> int:
+        return self.count
+
+    @property
     def slices(self) -> Slices:
         return slices_of(self.twist, self.count)
 

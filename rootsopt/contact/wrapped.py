@@ -3,7 +3,7 @@
 import dataclasses
 
 import equinox as eqx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from rootsopt.contact.gap import Approach, Contact, Slices
 from rootsopt.contact.point import ContactPoint
@@ -17,6 +17,13 @@ class WrappedContact(Contact):
     @property
     def slices(self) -> Slices | None:
         return self.section.slices
+
+    @property
+    def sections(self) -> int:
+        return self.section.sections
+
+    def in_slice(self, number: Int[Array, ""]):
+        return dataclasses.replace(self, section=self.section.in_slice(number))
 
     @property
     def smooth(self) -> bool:
@@ -62,3 +69,17 @@ class WrappedContact(Contact):
 
     def margins(self, roll, approach: Approach):
         return self.section.margins(roll, approach)
+
+
+def innermost(contact: Contact) -> Contact:
+    """Return the contact inside all wrappers of `contact`."""
+    while isinstance(contact, WrappedContact):
+        contact = contact.section
+    return contact
+
+
+def around(contact: Contact, inside: Contact) -> Contact:
+    """Return `contact` with the contact `inside` all of its wrappers."""
+    if not isinstance(contact, WrappedContact):
+        return inside
+    return dataclasses.replace(contact, section=around(contact.section, inside))

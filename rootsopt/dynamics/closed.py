@@ -78,7 +78,7 @@ class Start(eqx.Module):
 
 def unknown(pair: RotorPair, longest: int) -> Known:
     """Return the placeholder for an orbit of `pair` of up to `longest` mesh periods."""
-    return Known.empty(sizes(longest), pair.states, 1 + pair.two_sided)
+    return Known.empty(sizes(longest), pair.states, pair.flanks)
 
 
 class _Loop(NamedTuple):

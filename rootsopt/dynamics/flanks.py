@@ -5,9 +5,10 @@ are from a change of contact.
 (`Motion`). They add no state of their own."""
 
 import functools
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -95,14 +96,14 @@ class Margins(NamedTuple):
     `values` (s,): one *margin* for each flag of `RotorPair.switches`, positive where the flag is
     set. With a `NearContact`, each margin is zero at the instant at which its flag changes, and
     smooth around this instant. `counts` (s,): whether each flag matters. The flags of a flank
-    matter where the flank transmits a force. `places`: `Approach.place` of each flank that can
-    touch (two if drive and coast flanks both can). `pushes` (sides,): whether these flanks transmit
-    a force."""
+    matter where the flank transmits a force. `places`: `Approach.place` with a leading axis for the
+    flanks that can touch (see `RotorPair.flanks`). `pushes` (flanks,): whether these flanks
+    transmit a force."""
 
     values: Float[Array, " s"]
     counts: Bool[Array, " s"]
-    places: list[Any]
-    pushes: Bool[Array, " sides"]
+    places: Any
+    pushes: Bool[Array, " flanks"]
 
 
 def touches_of(pair: "RotorPair", motion: Motion) -> tuple[Float[Array, "*sides"], Touch]:
@@ -113,10 +114,7 @@ def touches_of(pair: "RotorPair", motion: Motion) -> tuple[Float[Array, "*sides"
     only the drive flank can touch when ε < 0, and only the coast flank when ε > 0. One search
     for the gap is therefore enough. Otherwise, both results have a leading axis for the sides.
     With twisted rotors, an axis for the slices stands before it."""
-    slices = pair.contact.slices
-    if slices is None:
-        return _section_touches(pair, motion)
-    return jax.vmap(lambda by: _section_touches(pair, at_slice(motion, by)))(slices.offsets)
+    return by_slice(pair, _section_touches, motion)
 
 
 def _section_touches(pair: "RotorPair", motion: Motion) -> tuple[Float[Array, "*sides"], Touch]:
@@ -265,18 +263,13 @@ def switches_of(pair: "RotorPair", motion: Motion):
         found = jnp.concatenate(flags)
         return found, jnp.full_like(found, touch.depth > 0)
 
-    def of_section(motion):
+    def of_section(_, motion):
         if not pair.two_sided:
             return of_flank(jnp.where(motion.relative < 0, 1.0, -1.0), motion)
         sides = jnp.asarray([1.0, -1.0], pair.angle_scale.dtype)
         return tuple(x.ravel() for x in jax.vmap(of_flank, (0, None))(sides, motion))
 
-    slices = pair.contact.slices
-    if slices is None:
-        flags, counts = of_section(motion)
-    else:
-        each = jax.vmap(lambda by: of_section(at_slice(motion, by)))(slices.offsets)
-        flags, counts = (x.ravel() for x in each)
+    flags, counts = (x.ravel() for x in by_slice(pair, of_section, motion))
     if not pair.two_sided:
         flags, counts = jnp.append(flags, motion.relative < 0), jnp.append(counts, True)
     return flags, counts
@@ -285,36 +278,37 @@ def switches_of(pair: "RotorPair", motion: Motion):
 def kink_margins(pair: "RotorPair", motion: Motion, acting, touches: Any) -> Margins:
     """Return the `Margins` at a `motion`.
 
-    `acting`: list of (part, its own states in SI units); `touches`: result of `touches_of`.
+    `acting`: list of (part, its own states in SI units); `touches`: result of `touches_of`."""
 
-    Raises NotImplementedError for twisted rotors, whose orbits collocation does not close."""
-    if pair.contact.slices is not None:
-        raise NotImplementedError("Margins are for straight rotors; these are twisted.")
-
-    def of_flank(side, touch):
+    def of_flank(contact, side, touch):
         found = [
             pair.law.margins(touch.depth, touch.closing),
-            pair.contact.on_side(side).margins(touch.roll, touch.approach),
+            contact.on_side(side).margins(touch.roll, touch.approach),
         ]
         if touch.sliding is not None:
             speed = touch.sliding.speed
             found += [part.drag_margins(speed) for part in pair.all_parts if part.rubs]
-        pushes = pair.law(touch.depth, touch.closing) > 0
         values = jnp.concatenate(found)
-        return values, jnp.full(values.shape, pushes), touch.approach.place, pushes
+        return values, pair.law(touch.depth, touch.closing) > 0, touch.approach.place
 
-    if pair.two_sided:
-        values, counts, both, pushes = jax.vmap(of_flank)(*touches)
-        places = [jax.tree.map(lambda x, k=k: x[k], both) for k in range(2)]
-        values, counts = [values.ravel()], [counts.ravel()]
-    else:
-        values, counts, place, push = of_flank(*touches)
-        values, counts = [values, -motion.relative[None]], [counts, counts[:1]]
-        places, pushes = [place], push[None]
+    def of_section(section, motion, side, touch):
+        del motion
+        if pair.two_sided:
+            return jax.vmap(functools.partial(of_flank, section.contact))(side, touch)
+        found = of_flank(section.contact, side, touch)
+        return jax.tree.map(lambda x: jnp.expand_dims(x, 0), found)
+
+    found = by_slice(pair, of_section, motion, *touches)
+    if pair.contact.slices is not None:
+        found = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), found)
+    values, pushes, places = found
+    counts, values = jnp.repeat(pushes, values.shape[1]), [values.ravel()]
+    if not pair.two_sided:
+        values, counts = [*values, -motion.relative[None]], jnp.append(counts, jnp.any(pushes))
     values += [part.margins(motion, own) for part, own in acting]
-    found, counted = jnp.concatenate(values), jnp.concatenate(counts)
-    counted = jnp.pad(counted, (0, found.size - counted.size), constant_values=True)
-    return Margins(found, counted, places, pushes)
+    every = jnp.concatenate(values)
+    counts = jnp.pad(counts, (0, every.size - counts.size), constant_values=True)
+    return Margins(every, counts, places, pushes)
 
 
 def pushes_of(pair: "RotorPair", motion: Motion) -> Pushes:
@@ -335,23 +329,35 @@ def pushes_of(pair: "RotorPair", motion: Motion) -> Pushes:
         levers = jnp.stack([-touch.approach.lever1, touch.approach.lever2])
         return Pushes(found.push, place, side * found.drive * levers)
 
-    def of_section(motion):
+    def of_section(_, motion):
         sides = jnp.asarray([1.0, -1.0], pair.angle_scale.dtype)
         if not pair.two_sided:
             sides = jnp.where(motion.relative < 0, sides[:1], sides[1:])
         return jax.vmap(of_flank, (0, None))(sides, motion)
 
-    slices = pair.contact.slices
+    found, slices = by_slice(pair, of_section, motion), pair.contact.slices
     if slices is None:
-        return jax.tree.map(lambda x: x[None], of_section(motion))
-    found = jax.vmap(lambda by: of_section(at_slice(motion, by)))(slices.offsets)
+        return jax.tree.map(lambda x: x[None], found)
     weights = slices.weights[:, None, None]
     return Pushes(weights * found.force, found.place, weights * found.torque)
 
 
-def at_slice(motion: Motion, by: Float[Array, ""]) -> Motion:
-    """Return the `motion` of a section that is turned by the angle `by` (rad) from the middle."""
-    return motion._replace(phi=motion.phi + by)
+def by_slice(pair: "RotorPair", of_section: Callable[..., Any], motion: Motion, *more: Any) -> Any:
+    """Return `of_section(pair, motion, *more)` for every slice of twisted rotors.
+
+    The pair's contact is then that of the slice, and `motion` that of the slice's section; `more`:
+    arrays with a leading axis for the slices, which the result has as well. For straight rotors,
+    the only section is the pair itself, and there is no such axis."""
+    slices = pair.contact.slices
+    if slices is None:
+        return of_section(pair, motion, *more)
+
+    def of_slice(number, by, *more):
+        contact = pair.contact.in_slice(number)
+        own = eqx.tree_at(lambda p: p.contact, pair, contact)
+        return of_section(own, motion._replace(phi=motion.phi + by), *more)
+
+    return jax.vmap(of_slice)(jnp.arange(slices.offsets.shape[0]), slices.offsets, *more)
 
 
 def sum_of(terms: Iterable[Array | None]) -> Array | None:

@@ -97,7 +97,7 @@ class RotorPair(eqx.Module):
             raise InputError(
                 "drive and coast flanks of this scene can touch at once, but the contact "
                 f"`{type(self.contact).__name__}` is right for one of them at a time; use "
-                "`SearchContact` (`solver.fidelity` = search)"
+                "`SearchContact`"
             )
 
     @property
@@ -105,6 +105,11 @@ class RotorPair(eqx.Module):
         """Every part of the scene, in the order of their states."""
         named = self.drive, self.load, self.gear, self.friction, self.supports
         return (*(part for part in named if part is not None), *self.parts)
+
+    @property
+    def flanks(self) -> int:
+        """Number of flanks that can touch at once: one or two in each slice."""
+        return self.contact.sections * (1 + self.two_sided)
 
     @property
     def free(self) -> bool:

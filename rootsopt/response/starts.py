@@ -57,7 +57,7 @@ def begun(pair: RotorPair, start: Seed | ArrayLike | None, longest: int) -> Star
     seed = start if isinstance(start, Seed) else None
     state = start if seed is None else seed.state
     given = np.zeros(pair.states, dtype) if state is None else np.asarray(state, dtype)
-    empty = Known.empty(room, pair.states, 1 + pair.two_sided)
+    empty = Known.empty(room, pair.states, pair.flanks)
     nothing = Start(given, empty, _numbers(pair))
     leaves, kind = jax.tree.flatten((empty, nothing.pair))
     if seed is None or len(seed.orbit) != len(leaves):

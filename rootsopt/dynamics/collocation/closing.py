@@ -23,6 +23,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.contact.search import SearchContact
+from rootsopt.contact.wrapped import innermost
 from rootsopt.dynamics.collocation.elements import Elements
 from rootsopt.dynamics.collocation.equation import CollocatedEquation, Points
 from rootsopt.dynamics.collocation.events import (
@@ -167,9 +168,9 @@ def corrected(tolerance: Float[Array, ""]) -> Float[Array, ""]:
 def supported(pair: RotorPair) -> bool:
     """Return whether collocation can close orbits of `pair`.
 
-    The contact must be a `SearchContact`. Every flag of contact law and parts needs a margin (see
+    The contact must be a `SearchContact`, or wrap one. Every flag of contact law and parts needs a margin (see
     `Margins`)."""
-    searched = isinstance(pair.contact, SearchContact)
+    searched = isinstance(innermost(pair.contact), SearchContact)
     return searched and all(_has_margins(type(owner)) for owner in (pair.law, *pair.all_parts))
 
 

@@ -67,14 +67,14 @@ class Elements(NamedTuple):
     """A motion on a `mesh` of e elements with s Gauss points each.
 
     `state` (e, n): scaled state at the start of each element; `slopes` (e, s, n): derivative of the
-    state with respect to time (mesh periods) at the Gauss points; `roots` (e, s + 1, sides, 2):
+    state with respect to time (mesh periods) at the Gauss points; `roots` (e, s + 1, flanks, 2):
     `NearContact.roots` at the Gauss points and at the end of each element.
     """
 
     mesh: Mesh
     state: Float[Array, "e n"]
     slopes: Float[Array, "e s n"]
-    roots: Float[Array, "e p sides 2"]
+    roots: Float[Array, "e p flanks 2"]
 
     @property
     def places(self) -> tuple[Float[Array, "e p"], Float[Array, "e p n"]]:

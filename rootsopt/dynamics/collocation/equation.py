@@ -8,8 +8,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from rootsopt.contact.gap import Contact
 from rootsopt.contact.near import NearContact
 from rootsopt.contact.search import SearchContact
+from rootsopt.contact.wrapped import around, innermost
 from rootsopt.dynamics.collocation.blocks import greatest
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.pair import RotorPair
@@ -21,13 +23,13 @@ class Points(NamedTuple):
 
     `values` (e, p, r): derivatives of the n scaled states with respect to time (mesh periods), q
     integrands (see `CollocatedEquation`), and one margin (see `Margins`); `slopes` (e, p, r, 1 +
-    n): derivatives of `values` with respect to time and state; `roots` (e, p, sides, 2): improved
+    n): derivatives of `values` with respect to time and state; `roots` (e, p, flanks, 2): improved
     `NearContact.roots`; `force` (e, p): contact force (N); `depth` (e, p): penetration (m).
     """
 
     values: Float[Array, "e p r"]
     slopes: Float[Array, "e p r c"]
-    roots: Float[Array, "e p sides 2"]
+    roots: Float[Array, "e p flanks 2"]
     force: Float[Array, "e p"]
     depth: Float[Array, "e p"]
 
@@ -49,25 +51,22 @@ class CollocatedEquation(eqx.Module):
         """Number of integrands."""
         return self.measures.count + self.pair.free
 
-    @property
-    def sides(self) -> int:
-        """Number of flank sides (drive, coast) that can touch at once."""
-        return 1 + self.pair.two_sided
-
-    def near(self, dynamic: Any, static: Any, roots: Float[Array, "sides 2"]) -> RotorPair:
+    def near(self, dynamic: Any, static: Any, roots: Float[Array, "flanks 2"]) -> RotorPair:
         """Return the pair with a contact evaluated near known `roots` (see `NearContact`).
 
         `dynamic`, `static`: the pair's floating-point arrays, and the rest of the pair."""
         pair: RotorPair = eqx.combine(dynamic, static)
-        assert isinstance(pair.contact, SearchContact)
-        return eqx.tree_at(lambda p: p.contact, pair, NearContact(pair.contact.pair, roots))
+        if pair.contact.slices is not None:
+            roots = roots.reshape(pair.contact.sections, -1, 2)
+        contact = NearContact(searched(pair.contact).pair, roots)
+        return eqx.tree_at(lambda p: p.contact, pair, around(pair.contact, contact))
 
     def evaluated(self, dynamic, static, tau, state, roots, which):
         """Return the equation at one instant: a list of values, and the tuple (roots, force,
         depth).
 
         `dynamic`, `static`: the pair's floating-point arrays, and the rest of the pair; `tau`: time
-        (mesh periods); `state` (n,): scaled; `roots` (sides, 2): `NearContact.roots`; `which`:
+        (mesh periods); `state` (n,): scaled; `roots` (flanks, 2): `NearContact.roots`; `which`:
         index of the margin to evaluate. For the results, see `Points`."""
         near = self.near(dynamic, static, roots)
         slope, contact, found = near.derivative_and_margins(tau, state)
@@ -83,7 +82,7 @@ class CollocatedEquation(eqx.Module):
         self,
         tau: Float[Array, "e p"],
         state: Float[Array, "e p n"],
-        roots: Float[Array, "e p sides 2"],
+        roots: Float[Array, "e p flanks 2"],
         which: Int[Array, " e"],
         tangents: Any,
         whole: Bool[Array, ""],
@@ -141,12 +140,16 @@ class CollocatedEquation(eqx.Module):
         return points, back(slopes[:, size : size + count])
 
 
-def _roots(places: list[Any]) -> Float[Array, "sides 2"]:
+def searched(contact: Contact) -> SearchContact:
+    """Return the `SearchContact` that `contact` is, or that it wraps."""
+    found = innermost(contact)
+    assert isinstance(found, SearchContact)
+    return found
+
+
+def _roots(places: Any) -> Float[Array, "flanks 2"]:
     """Return the `NearContact.roots` improved by an evaluation.
 
-    `places`: for each side, the closest approaches found (`Approach.place`)."""
-    moved = [
-        jnp.stack([own.normal2, own.normal2 if rival is None else rival.normal2])
-        for own, rival in places
-    ]
-    return jnp.stack(moved)
+    `places`: the closest approaches found (`Margins.places`)."""
+    own, rival = places
+    return jnp.stack([own.normal2, own.normal2 if rival is None else rival.normal2], axis=-1)

@@ -17,9 +17,10 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.contact.closest import RANKS
-from rootsopt.contact.search import SearchContact
+from rootsopt.contact.wrapped import around
 from rootsopt.dynamics.collocation.blocks import in_blocks
 from rootsopt.dynamics.collocation.elements import Elements
+from rootsopt.dynamics.collocation.equation import searched
 from rootsopt.dynamics.collocation.gauss import GAUSS
 from rootsopt.dynamics.pair import RotorPair
 
@@ -46,17 +47,17 @@ class FlagScan(NamedTuple):
     """Flags along a motion, at p instants in order of time.
 
     `tau` (p,): times (mesh periods); `flags` (p, f): the f flags of the equation; `counts` (p, f):
-    whether each flag matters there; `roots` (e, s + 2, sides): normal angles ν2 (rad) of the
+    whether each flag matters there; `roots` (e, s + 2, flanks): normal angles ν2 (rad) of the
     closest approach, for each of e elements at its s Gauss points and on both sides of its end;
-    `pushes` (e, s + 2, sides): whether the flanks transmit a force; `total`: number of instants in
+    `pushes` (e, s + 2, flanks): whether the flanks transmit a force; `total`: number of instants in
     use.
     """
 
     tau: Float[Array, " p"]
     flags: Bool[Array, "p f"]
     counts: Bool[Array, "p f"]
-    roots: Float[Array, "e q sides"]
-    pushes: Bool[Array, "e q sides"]
+    roots: Float[Array, "e q flanks"]
+    pushes: Bool[Array, "e q flanks"]
     total: Int[Array, ""]
 
 
@@ -81,11 +82,10 @@ def flags_at(pair: RotorPair, tau, state):
     """Return the flags (f,) of the equation, and three further results.
 
     These are: whether each flag matters (f,); the normal angles ν2 (rad) of the closest approach
-    (sides,); whether the flanks transmit a force (sides,). `tau`: time (mesh periods); `state`
+    (flanks,); whether the flanks transmit a force (flanks,). `tau`: time (mesh periods); `state`
     (n,): scaled."""
     found = pair.margins(tau, state)
-    roots = jnp.stack([place.normal2 for place in found.places])
-    return found.values > 0, found.counts, roots, found.pushes
+    return found.values > 0, found.counts, found.places.normal2, found.pushes
 
 
 def ranks(pair: RotorPair) -> list[int]:
@@ -96,12 +96,11 @@ def ranks(pair: RotorPair) -> list[int]:
     1 is the change to the other minimum of the gap next to a cusp, because other flags change with
     it. The rank -1 marks a flag whose change is not an event by itself. All other margins have
     greater ranks, in their order."""
-    assert isinstance(pair.contact, SearchContact)
     nothing = jnp.zeros(())
     law = jax.eval_shape(pair.law.margins, nothing, nothing).shape[0]
     tau, state = nothing, jnp.zeros(pair.states)
     total = jax.eval_shape(lambda: pair.margins(tau, state).values).shape[0]
-    flanks = pair.contact.pair
+    flanks = searched(pair.contact).pair
     profile = flanks.profile
     minima = RANKS if profile.wavy else 0
     edges = jax.eval_shape(lambda: flanks.edges).shape[0]
@@ -119,17 +118,17 @@ def ranks(pair: RotorPair) -> list[int]:
     if profile.wavy:  # These flags also change where the contact moves on without a jump.
         between = range(law + 2, law + 2 + profile.cusp + RANKS)
         order = [-1 if k in between else rank for k, rank in enumerate(order)]
-    both = order * (1 + pair.two_sided)
-    return both + [0] * (total - len(both))
+    every = order * pair.flanks
+    return every + [0] * (total - len(every))
 
 
 @eqx.filter_jit
 def look(pair: RotorPair, elements: Elements) -> FlagScan:
     """Evaluate the flags at the Gauss points of each element, on both sides of its end, and at its
     `extra` instants."""
-    assert isinstance(pair.contact, SearchContact)
-    flanks = dataclasses.replace(pair.contact.pair, together=True)
-    pair = eqx.tree_at(lambda p: p.contact.pair, pair, flanks)
+    contact = searched(pair.contact)
+    grouped = dataclasses.replace(contact, pair=dataclasses.replace(contact.pair, together=True))
+    pair = eqx.tree_at(lambda p: p.contact, pair, around(pair.contact, grouped))
     mesh = elements.mesh
     tau, state = elements.places
     number = jnp.arange(mesh.left.shape[0])

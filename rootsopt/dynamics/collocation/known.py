@@ -34,11 +34,11 @@ class Known(NamedTuple):
         return cls(elements, jnp.ones(()), infinite, infinite, yes, ~yes)
 
     @classmethod
-    def empty(cls, sizes: tuple[int, int], states: int, sides: int) -> "Known":
+    def empty(cls, sizes: tuple[int, int], states: int, flanks: int) -> "Known":
         """Return a placeholder.
 
-        `sizes`: room for elements and for times of the mesh; `states`: number of states; `sides`:
-        number of flank sides that can touch at once."""
+        `sizes`: room for elements and for times of the mesh; `states`: number of states; `flanks`:
+        number of flanks that can touch at once (`RotorPair.flanks`)."""
         elements, times = sizes
         points = len(GAUSS.nodes)
 
@@ -58,7 +58,7 @@ class Known(NamedTuple):
             mesh,
             zeros(elements, states),
             zeros(elements, points, states),
-            zeros(elements, points + 1, sides, 2),
+            zeros(elements, points + 1, flanks, 2),
         )
         no = zeros(dtype=bool)
         return cls(motion, zeros(), zeros(), zeros(), no, no)

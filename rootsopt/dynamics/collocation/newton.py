@@ -97,7 +97,7 @@ def has_stalled(size: Float[Array, ""], before: Float[Array, ""]) -> Bool[Array,
 
 
 def advanced(
-    elements: Elements, step: Step, roots: Float[Array, "e p sides 2"]
+    elements: Elements, step: Step, roots: Float[Array, "e p flanks 2"]
 ) -> tuple[Elements, Float[Array, ""], Float[Array, ""]]:
     """Return the elements after a Newton step, the size of the step, and the share taken of it.
 

@@ -51,12 +51,12 @@ class Rivals(NamedTuple):
     """The instants of an orbit at which the force may be greatest, in p elements.
 
     `element` (p,): indices of elements; `share` (p,): positions in these elements, from 0 (start)
-    to 1 (end); `roots` (p, sides, 2): `NearContact.roots` there.
+    to 1 (end); `roots` (p, flanks, 2): `NearContact.roots` there.
     """
 
     element: Int[Array, " p"]
     share: Float[Array, " p"]
-    roots: Float[Array, "p sides 2"]
+    roots: Float[Array, "p flanks 2"]
 
     @classmethod
     def anywhere(cls, elements: Elements) -> "Rivals":
@@ -189,7 +189,7 @@ def is_settled(before: Rivals, after: Rivals, peak: Peak) -> Bool[Array, ""]:
     return tried & (at_end | (jnp.abs(peak.shift) < _CLOSE))
 
 
-def _roots(roots, element, share) -> Float[Array, "p sides 2"]:
+def _roots(roots, element, share) -> Float[Array, "p flanks 2"]:
     """Return `NearContact.roots` in each `element` at `share`, by the polynomials through those at
     the Gauss points; `roots`: `Elements.roots`."""
     weights = GAUSS.lagrange(share)[..., None, None]

@@ -39,7 +39,7 @@ def from_pieces(pair: RotorPair, pieces: Pieces, period: Int[Array, ""], longest
         right=jnp.where(real, right, 1.0),
         used=used,
     )
-    roots = jnp.zeros((capacity, len(GAUSS.nodes) + 1, 1 + pair.two_sided, 2), dtype)
+    roots = jnp.zeros((capacity, len(GAUSS.nodes) + 1, pair.flanks, 2), dtype)
     states, slopes = pieces.states[row, column], pieces.slopes[row, column]
     return Known.unaligned(Elements(mesh, states, slopes, roots))
 
@@ -123,10 +123,9 @@ def _on_steps(
 
     begin = mesh.ends[0]
     inside = begin[:, None] + mesh.lengths[:, None] * GAUSS.nodes
-    sides = 1 + pair.two_sided
     return Elements(
         mesh=mesh,
         state=motion(begin)[0],
         slopes=motion(inside)[1],
-        roots=jnp.zeros((capacity, len(GAUSS.nodes) + 1, sides, 2), dtype),
+        roots=jnp.zeros((capacity, len(GAUSS.nodes) + 1, pair.flanks, 2), dtype),
     )

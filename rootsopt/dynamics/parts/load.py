@@ -193,8 +193,14 @@ class TwistedLoad(Load):
         return jnp.dot(self.weights, jax.vmap(self.section.torque2)(phi + self.offsets))
 
     def switches(self, motion, own) -> Bool[Array, " s"]:
+        return self._by_slice(self.section.switches, motion, own)
+
+    def margins(self, motion, own) -> Float[Array, " s"]:
+        return self._by_slice(self.section.margins, motion, own)
+
+    def _by_slice(self, flags, motion, own):
         def of_slice(offset):
-            return self.section.switches(motion._replace(phi=motion.phi + offset), own)
+            return flags(motion._replace(phi=motion.phi + offset), own)
 
         return jax.vmap(of_slice)(self.offsets).ravel()
 
