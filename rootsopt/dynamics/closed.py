@@ -19,6 +19,7 @@ from rootsopt.dynamics.collocation.known import Known
 from rootsopt.dynamics.collocation.mesh import sizes
 from rootsopt.dynamics.collocation.motion import ACCURACY, Collocated, apart, closed_orbit
 from rootsopt.dynamics.collocation.seed import PIECES, from_pieces
+from rootsopt.dynamics.collocation.system import unchanged
 from rootsopt.dynamics.flow import Flow
 from rootsopt.dynamics.orbit import Orbit, branch, choose
 from rootsopt.dynamics.pair import RotorPair
@@ -122,14 +123,17 @@ class _Attempts(eqx.Module):
         state = pair.scaled(self.start.state)
         dtype, count = state.dtype, state.shape[0]
         directions = jax.tree.leaves(eqx.filter(self.tangents, eqx.is_inexact_array))[0].shape[0]
-        # The orbit has neither samples nor steps: see `collocation.sampled`.
+        # The orbit has neither samples nor steps: see `collocation.motion`.
         flow = Flow.empty(count, directions, 0, 0, solver.measures, dtype)
         no, zero = jnp.zeros((), bool), jnp.zeros((), int)
         unsound = ~pair.sound
-        pieces = no_pieces(state, solver.max_orbit, PIECES)
+        pieces, known = no_pieces(state, solver.max_orbit, PIECES), unknown(pair, solver.max_orbit)
+        orbit = Orbit.empty(state, directions, flow)
+        if solver.variation:
+            orbit = orbit._replace(variation=unchanged(known.elements, directions))
         found = Steady(
             status=jnp.where(unsound, Status.UNSOUND.code, Status.NOT_SETTLED.code),
-            orbit=Orbit.empty(state, directions, flow),
+            orbit=orbit,
             period=jnp.ones((), int),
             rtol=solver.orbit.rtol,
             verdict=Verdict(no, no, jnp.zeros((), dtype), no, no),
@@ -139,7 +143,7 @@ class _Attempts(eqx.Module):
             ),
             used=zero,
             steps=zero,
-            known=unknown(pair, solver.max_orbit),
+            known=known,
         )
         coarse = jnp.maximum(solver.transient.rtol, _COARSE)
         within = settled_within(coarse).astype(dtype)
@@ -296,7 +300,7 @@ def closed_motion(
     the transient has repeated at two tolerances, the status is NOT_CLOSED. If an orbit near the
     known one is not accepted, the search begins at `start.state`.
 
-    The orbit has no samples of the state and no steps (see `collocation.sampled`). Collocation must
+    The orbit has no samples of the state and no steps (see `collocation.motion`). Collocation must
     support the pair (`collocation.closing.supported`)."""
     radius = jnp.asarray(radius, pair.angle_scale.dtype)
     start = lax.stop_gradient(start)

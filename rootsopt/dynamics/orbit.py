@@ -17,6 +17,7 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int
 
+from rootsopt.dynamics.collocation.system import Step
 from rootsopt.dynamics.flow import Flow, flow
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.linear import solved, spectral_radius
@@ -74,7 +75,8 @@ class Orbit(NamedTuple):
     kinks (scaled); `defect`: residual (scaled) on a grid with halved steps, on which the
     derivatives are computed; `disagreement`: relative difference between the derivatives on both
     grids, plus that from the distance between their orbits. `defect` and `disagreement` are 0 if
-    there was no check.
+    there was no check. `variation`: changes of the whole motion along the directions of the design,
+    `None` unless the orbit was closed by collocation and they were requested.
     """
 
     state: Float[Array, " n"]
@@ -89,6 +91,7 @@ class Orbit(NamedTuple):
     drift: Float[Array, ""]
     defect: Float[Array, ""]
     disagreement: Float[Array, ""]
+    variation: Step | None = None
 
     @classmethod
     def empty(cls, state: Float[Array, " n"], directions: int, flow: Flow) -> "Orbit":

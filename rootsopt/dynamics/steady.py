@@ -49,7 +49,8 @@ class Solver(eqx.Module):
     The other settings have defaults. Coarse surveys of many designs use other values. `shots`:
     maximum number of integrations to close an orbit; `closed`: residual (tolerances) at which an
     orbit may count as closed; `samples`: number of uniform samples of an orbit; `check`: whether to
-    compare the derivatives with those on halved steps; `attempts`: maximum number of attempts.
+    compare the derivatives with those on halved steps; `attempts`: maximum number of attempts;
+    `variation`: whether an orbit closed by collocation has its `Orbit.variation`.
 
     `closing`: how orbits are closed: by `shooting`, by `collocation`, or `auto` (by collocation
     from the orbit of a similar pair, otherwise by shooting). Only shooting closes orbits of pairs
@@ -67,6 +68,7 @@ class Solver(eqx.Module):
     samples: int = eqx.field(static=True, default=SAMPLES)
     check: bool = eqx.field(static=True, default=True)
     attempts: int = eqx.field(static=True, default=16)
+    variation: bool = eqx.field(static=True, default=False)
     closing: str = eqx.field(static=True, default="shooting")
 
 

@@ -4,39 +4,37 @@ A rotor's bearings sit at z = ±(L/2 + a), the timing gear at z = L/2 + g. `docs
 the formulas.
 """
 
-import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
-from rootsopt.dynamics.flow import Equation
-from rootsopt.dynamics.integrator import Integrator
-from rootsopt.dynamics.measures import Measures
-from rootsopt.dynamics.orbit import Orbit
+from rootsopt.dynamics.collocation.blocks import BLOCK, in_blocks, whole_blocks
+from rootsopt.dynamics.collocation.elements import Elements
+from rootsopt.dynamics.collocation.gauss import GAUSS
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.parts import AxisLoads
 from rootsopt.dynamics.parts.resultants import MIRROR, GasResultant
-from rootsopt.dynamics.switches import with_switches
-from rootsopt.dynamics.tangent import linearized
+from rootsopt.dynamics.varied import VariedOrbit
 from rootsopt.profiles import Geometry, Profile, geometry
 from rootsopt.pump.bearings import equivalent_load
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene
 from rootsopt.scene.build import along
 
-_CHUNK = 32
-"""Number of steps linearised together, as arrays."""
 _LONGEST = 8
 """Maximum length of an orbit (mesh periods)."""
 _EVEN = 128
-"""Minimum number of pieces into which the steps of one mesh period are divided."""
+"""Minimum number of pieces into which one mesh period is divided."""
+_FLAGS, _HALVED = 64, 40
+"""Maximum number of instants at which flags of the loads change, and number of bisections that
+locate them."""
 _ASIDE = 1e-9
-"""Half the length (mesh periods) of the short piece around each instant at which a load jumps."""
+"""Distance (mesh periods) before and after a jump at which the integrands are evaluated."""
 POSES = 720
 """Number of angles of rotor 1, over a mesh period, for loads without a motion."""
 
@@ -174,62 +172,6 @@ class OrbitLoads(NamedTuple):
     greatest_slopes: Float[Array, "k d"]
 
 
-class _LoadEquation(Equation):
-    """The equation of motion with the integrals of the bearing loads to the power of the exponent.
-
-    `dynamic` holds the arrays of a `BearingSet`, and `static` the rest of it."""
-
-    def pair(self, dynamic) -> RotorPair:
-        return eqx.combine(dynamic, self.static).pair
-
-    def rates(self, tau, state, contact, dynamic):
-        del contact
-        return self.sizes(tau, state, dynamic)
-
-    def sizes(self, tau, state, dynamic):
-        """Return the bearing loads to the power of the exponent (4,), in units of the force."""
-        bearings = eqx.combine(dynamic, self.static)
-        size = bearings.at(tau, state).sizes / self.force_unit
-        # The root of a load that vanishes has no derivative.
-        pushed = size > 0
-        return jnp.where(pushed, jnp.where(pushed, size, 1.0) ** bearings.exponent, 0.0)
-
-
-class _Pieces(NamedTuple):
-    """Pieces of an orbit's steps, in order of time.
-
-    `begin`, `end`: of each piece (mesh periods; `end` is inf beyond the last); `step`: index of the
-    step that holds it; `first`: start of this step."""
-
-    begin: Float[Array, " pieces"]
-    end: Float[Array, " pieces"]
-    step: Int[Array, " pieces"]
-    first: Float[Array, " pieces"]
-
-
-def _pieces(
-    grid: Float[Array, " steps"], ends: Float[Array, " ends"], corners: Float[Array, " k"], period
-) -> _Pieces:
-    """Return the steps of `grid` (mesh periods), divided at `ends` and at the `corners` of loads.
-
-    `ends`: further ends, unused ones inf; `corners` (k,): in one mesh period; `period` of the orbit
-    (mesh periods). Each corner lies in a short piece, so that no load is evaluated right at a jump.
-    The power of a load needs shorter steps than the motion."""
-    turns = jnp.arange(_LONGEST, dtype=grid.dtype)[:, None, None]
-    sides = _ASIDE * jnp.array([-1.0, 1.0], grid.dtype)[:, None]
-    even = jnp.arange(_EVEN, dtype=grid.dtype) / _EVEN
-    added = jnp.append(jnp.mod(corners + sides, 1.0), even) + turns[..., 0]
-    added = jnp.where(added < period, added, jnp.inf).ravel()
-    end = jnp.sort(jnp.concatenate([grid, ends, lax.stop_gradient(added).astype(grid.dtype)]))
-    begin = jnp.concatenate([jnp.zeros_like(end[:1]), end[:-1]])
-    starts = jnp.concatenate([jnp.zeros_like(grid[:1]), grid[:-1]])
-    used = jnp.sum(grid < jnp.inf)
-    step = jnp.clip(jnp.searchsorted(grid, end), 0, used - 1)
-    # Rounding may put a corner beyond the last step.
-    end = jnp.where(end > grid[used - 1], jnp.inf, end)
-    return _Pieces(begin, end, step, starts[step])
-
-
 def loads_corners(bearings: BearingSet) -> Float[Array, " k"]:
     """Return the times (mesh periods, from 0 to 1) at which the gas forces are not smooth."""
     gas = bearings.loads.gas
@@ -238,125 +180,159 @@ def loads_corners(bearings: BearingSet) -> Float[Array, " k"]:
     return gas.corners() * bearings.pair.lobes / (2 * jnp.pi)
 
 
-@Program
-def orbit_loads(  # 90 lines: the functions of its two loops share the linearised equation.
-    scene: Scene,
-    design: Float[Array, " d"],
-    orbit: Orbit,
-    period: Int[Array, ""],
-    integrator: Integrator,
-) -> OrbitLoads:
-    """Return the bearing loads over a closed `orbit` of `period` mesh periods.
+class _Integrands(NamedTuple):
+    """The loads along an orbit, in the form in which they are averaged.
 
-    `design` (d,): in config units, the one of the orbit; `integrator`: that of the orbit. The
-    derivatives follow the family of orbits, with respect to the design. The steps of the orbit are
-    linearised once more, with the loads as further integrals."""
+    `static`: a `BearingSet` without its floating-point arrays; `unit` (N) of the loads."""
+
+    static: Any
+    unit: Float[Array, ""]
+
+    def at(self, tau, state, dynamic) -> Float[Array, "5"]:
+        """Return the loads (4,) to the power of the exponent, then the duration of a mesh period.
+
+        The latter is relative to that at the drive's speed, and a factor of the former: averages
+        are over time. `dynamic`: arrays of the `BearingSet`."""
+        bearings = eqx.combine(dynamic, self.static)
+        size = bearings.at(tau, state).sizes / self.unit
+        # The root of a load that vanishes has no derivative.
+        pushed = size > 0
+        powers = jnp.where(pushed, jnp.where(pushed, size, 1.0) ** bearings.exponent, 0.0)
+        lapse = bearings.pair.lapse(state) * jnp.ones_like(self.unit)
+        return lapse * jnp.append(powers, 1.0)
+
+
+@Program
+def orbit_loads(scene: Scene, design: Float[Array, " d"], orbit: VariedOrbit) -> OrbitLoads:
+    """Return the bearing loads over a closed `orbit`.
+
+    `design` (d,): in config units, to which the variation of the orbit belongs. Averages are
+    integrals over pieces of the orbit in which the loads are smooth. The greatest load is that
+    among uniform samples."""
 
     def build(design):
         return BearingSet.of(scene, design), jnp.zeros(())
 
     bearings, tangents, _ = along(build, design, jnp.eye(design.shape[0]))
-    pair = bearings.pair
-    dtype, count = orbit.state.dtype, orbit.state.shape[0]
     dynamic, static = eqx.partition(bearings, eqx.is_inexact_array)
     moved = eqx.filter(tangents, eqx.is_inexact_array)
-    unit = lax.stop_gradient(pair.force_scale)
-    # Reserve four integrals, one for each bearing: mean, mean square, and cosine and sine of one
-    # line.
-    room = Measures(orders=np.ones(1))
-    equation = _LoadEquation(static, room, unit, jnp.ones_like(unit), count, integrator.solver())
-    # The loads have corners that the motion does not have, as where the gear's torque changes sign.
-    marked = dataclasses.replace(pair, parts=(*pair.parts, bearings.loads))
-    tolerance = integrator.tolerance
-    ends = with_switches(
-        lax.stop_gradient(marked), orbit.flow, period.astype(dtype), tolerance, orbit.flow.grid
-    )
-    samples = orbit.flow.states.shape[0]
-    tau = period * jnp.arange(samples, dtype=dtype) / samples
-    series = lax.map(lambda at: bearings.at(*at), (tau, orbit.flow.states))
-    sizes = _channels(series, scene)
-    latest = jnp.argmax(sizes, axis=0)
-    # The motion is known at the ends of pieces: one ends at the instant of each greatest load.
-    pieces = _pieces(
-        orbit.flow.grid, jnp.append(ends, tau[latest]), loads_corners(bearings), period
-    )
-    before = jnp.concatenate([orbit.state[None], orbit.flow.corners[:-1]])
-    taken, lanes = jnp.sum(pieces.end < jnp.inf), jnp.arange(_CHUNK)
+    period = orbit.elements.mesh.period
+    unit = lax.stop_gradient(bearings.pair.force_scale)
+    integrands = _Integrands(static, unit)
 
-    def linear_piece(k):
-        begin, end = pieces.begin[k], pieces.end[k]
-        start = equation.start(before[pieces.step[k]], pair.free)
-        state = equation.advanced(pieces.first[k], begin, start, dynamic)[0][:count]
+    def value_and_slopes(function, tau):
+        """Return `function(tau, state, dynamic)`, and its derivatives at constant time."""
+        state, _, varied = orbit.at(tau)
 
-        def run(y, dynamic):
-            return equation.advanced(begin, end, y, dynamic)[0]
+        def push(by_state, by_parameters):
+            primal, change = (state, dynamic), (by_state, by_parameters)
+            return jax.jvp(lambda *now: function(tau, *now), primal, change)
 
-        return linearized(run, equation.start(state, pair.free), dynamic, moved, count)
+        return jax.vmap(push, (1, 0), (None, -1))(varied, moved)
 
-    openings = _openings(dynamic, static, moved) if scene.twist_free else None
+    def integral(begin, end):
+        """Return the integrals over pieces of the orbit, and their derivatives."""
+        tau = begin[:, None] + (end - begin)[:, None] * GAUSS.nodes
+        found = jax.vmap(jax.vmap(lambda tau: value_and_slopes(integrands.at, tau)))(tau)
+        length = end - begin
+        totals, slopes = (GAUSS.whole(x) for x in found)
+        return length[:, None] * totals, length[:, None, None] * slopes
 
-    def opening(k, state):
-        """Return what is added to slopes because the jump inside piece `k`, if any, moves."""
-        assert openings is not None
-        opened, delay = openings
-        begin, end = pieces.begin[k], pieces.end[k]
-        away = (begin + end) / 2 - opened
-        inside = (jnp.abs(away - jnp.round(away)) < _ASIDE / 2) & (end - begin < 3 * _ASIDE)
-        before, after = (equation.sizes(time, state, dynamic) for time in (begin, end))
-        lapse = pair.lapse(state) if pair.free else 1.0
-        return jnp.outer(lapse * (before - after), inside @ delay)
-
-    def advance(carry, job):
-        moved, total, slopes, peaks = carry
-        wanted, end, found, jumps = job
-        after = found.by_state @ moved + found.by_parameters
-        new = total + found.value[count:], slopes + after[count:]
-        total, slopes = jax.tree.map(lambda x, y: jnp.where(wanted, x, y), new, (total, slopes))
-        if jumps is not None:
-            slopes = slopes.at[:4].add(jnp.where(wanted, jumps, 0.0))
-        here = wanted & (tau[latest] == end)
-        peaks = jnp.where(here[:, None, None], after[:count], peaks)
-        return (jnp.where(wanted, after[:count], moved), total, slopes, peaks), None
-
-    def chunk(carry):
-        number, sums = carry
-        place = number * _CHUNK + lanes
-        at = jnp.minimum(place, taken - 1)
-        found = jax.vmap(linear_piece)(at)
-        jumps = None if openings is None else jax.vmap(opening)(at, found.value[:, :count])
-        jobs = place < taken, pieces.end[at], found, jumps
-        sums, _ = lax.scan(advance, sums, jobs)
-        return number + 1, sums
-
-    size = room.count + pair.free
-    peaks = jnp.broadcast_to(orbit.moved, (len(latest), *orbit.moved.shape))
-    totals = jnp.zeros(size, dtype), jnp.zeros((size, orbit.moved.shape[1]), dtype)
-    begin = jnp.zeros((), int), (orbit.moved, *totals, peaks)
-    _, (_, total, slopes, peaks) = lax.while_loop(lambda now: now[0] * _CHUNK < taken, chunk, begin)
-    duration, drift = period.astype(dtype), jnp.zeros(orbit.moved.shape[1], dtype)
-    if pair.free:
-        duration, drift = total[-1], slopes[-1]
-    mean = total[:4] / duration
-    slopes = (slopes[:4] - mean[:, None] * drift) / duration
+    ends = _pieces(orbit.elements, bearings)
+    begins = jnp.append(jnp.zeros_like(ends[:1]), ends[:-1])
+    used = jnp.sum(begins < period)
+    totals, slopes = in_blocks(integral, used, *whole_blocks(begins, ends))
+    real = jnp.arange(totals.shape[0]) < used
+    total = jnp.sum(jnp.where(real[:, None], totals, 0.0), axis=0)
+    slope = jnp.sum(jnp.where(real[:, None, None], slopes, 0.0), axis=0)
+    slope += _leaps(scene, orbit, integrands, dynamic, moved)
+    mean, duration = total[:4] / total[4], total[4]
+    slope = (slope[:4] - mean[:, None] * slope[4]) / duration
     root = 1 / bearings.exponent
     equivalent = unit * mean**root
     factor = equivalent * root / jnp.where(mean > 0, mean, jnp.inf)
+    samples = scene.solver.samples
+    tau = period * jnp.arange(samples) / samples
+    series = lax.map(
+        lambda at: bearings.at(*at), (tau, orbit.elements.motion(tau)), batch_size=BLOCK
+    )
+    sizes = _channels(series, scene)
+    latest = jnp.argmax(sizes, axis=0)
 
-    def rise(channel, tau, state, along_state, along):
-        def one(state, dynamic):
-            found = eqx.combine(dynamic, static).at(tau, state)
-            return _channels(found, scene)[channel]
+    def rise(channel, tau):
+        def one(tau, state, dynamic):
+            return _channels(eqx.combine(dynamic, static).at(tau, state), scene)[channel]
 
-        return jax.jvp(one, (state, dynamic), (along_state, along))[1]
+        return value_and_slopes(one, tau)[1]
 
     # At a sample, time does not move with the design.
-    each = jax.vmap(rise, (None, None, None, 1, 0))
-    channels = jnp.arange(len(latest))
-    rises = jax.vmap(each, (0, 0, 0, 0, None))(
-        channels, tau[latest], orbit.flow.states[latest], peaks, moved
+    rises = jax.vmap(rise)(jnp.arange(len(latest)), tau[latest])
+    return OrbitLoads(equivalent, factor[:, None] * slope, series, jnp.max(sizes, axis=0), rises)
+
+
+def _pieces(elements: Elements, bearings: BearingSet) -> Float[Array, " pieces"]:
+    """Return the ends of pieces of an orbit (mesh periods, ascending) in which loads are smooth.
+
+    They are the ends of the elements, the corners of the loads in each mesh period, and the
+    instants at which flags of the loads change; unused ones are at the end of the orbit. The power
+    of a load needs shorter pieces than the motion."""
+    mesh = elements.mesh
+    period = mesh.period
+    turns = jnp.arange(_LONGEST)[:, None]
+    every = jnp.append(loads_corners(bearings), jnp.arange(1, _EVEN + 1) / _EVEN)
+    own = jnp.mod(mesh.ends[1], period)
+    ends = jnp.append(own, jnp.minimum((every + turns).ravel(), period))
+    ends = jnp.sort(jnp.minimum(lax.stop_gradient(ends), period))
+
+    def flags(tau):
+        motion = bearings.pair.motion(tau, elements.motion(tau))
+        return bearings.loads.switches(motion, np.zeros(0))
+
+    # The loads have corners that the motion does not have, as where the gear's torque changes sign.
+    begins = jnp.append(0.0, ends[:-1])
+    before = jax.vmap(flags)(begins)
+    changes = jnp.any(before != jnp.append(before[1:], before[:1], axis=0), axis=1)
+    # Unused places get the last piece, which is empty.
+    piece = jnp.nonzero(changes, size=_FLAGS, fill_value=len(ends) - 1)[0]
+
+    def halved(_, ends):
+        low, high = ends
+        middle = (low + high) / 2
+        same = jnp.all(jax.vmap(flags)(middle) == jax.vmap(flags)(low), axis=1)
+        return jnp.where(same, middle, low), jnp.where(same, high, middle)
+
+    _, high = lax.fori_loop(0, _HALVED, halved, (begins[piece], ends[piece]))
+    return jnp.sort(jnp.append(ends, high))
+
+
+def _leaps(scene: Scene, orbit: VariedOrbit, integrands: _Integrands, dynamic, moved):
+    """Return what slopes of integrals gain because instants move at which the integrands jump.
+
+    These are the instants at which a pocket opens, and events of the orbit if levers may jump.
+    `dynamic`: arrays of the `BearingSet`, with the derivatives `moved`."""
+    mesh, pair = orbit.elements.mesh, eqx.combine(dynamic, integrands.static).pair
+    times, moves = [], []
+    openings = _openings(dynamic, integrands.static, moved) if scene.twist_free else None
+    if openings is not None:
+        opened = openings[0] + jnp.arange(_LONGEST)[:, None]
+        times.append(opened.ravel())
+        moves.append(jnp.where(opened < mesh.period, 1.0, 0.0)[..., None] * openings[1])
+    if pair.jumps:
+        times.append(mesh.times)
+        moves.append(orbit.variation.times)
+    if not times:
+        return 0.0
+    time, move = (
+        jnp.concatenate(times),
+        jnp.concatenate([x.reshape(-1, x.shape[-1]) for x in moves]),
     )
-    greatest = jnp.max(sizes, axis=0)
-    return OrbitLoads(equivalent, factor[:, None] * slopes, series, greatest, rises)
+
+    def change(tau):
+        sides = tau + _ASIDE * jnp.array([-1.0, 1.0])
+        before, after = jax.vmap(integrands.at, (0, 0, None))(sides, orbit.at(sides)[0], dynamic)
+        return before - after
+
+    return jnp.einsum("mr,md->rd", lax.map(change, time), move)
 
 
 def _openings(dynamic, static, moved) -> tuple[Array, Array] | None:

@@ -20,13 +20,15 @@ from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.settle import BLOCK
 from rootsopt.dynamics.steady import (
     CLOSED,
+    Solver,
     Steady,
     window_status,
 )
+from rootsopt.dynamics.varied import VariedOrbit, varied
 from rootsopt.dynamics.window import PERIODS, integrated_difference, lyapunov
 from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry
-from rootsopt.pump.loads import OrbitLoads, orbit_loads
+from rootsopt.pump.loads import orbit_loads
 from rootsopt.response.many import HERE, IN_TURN, Point, Runs, evaluate_many
 from rootsopt.response.records import (
     RESPONSES,
@@ -47,7 +49,7 @@ from rootsopt.response.series import (
     Series,
     contact_series,
     orbit_series,
-    prepare_samples,
+    sampled,
     window_series,
     with_samples,
 )
@@ -293,24 +295,29 @@ class Evaluator:
         began = time.perf_counter()
         design = design_vector(self.config) if design is None else jnp.asarray(design)
         pair, tangents, shape = _build(self.scene, design)
-        solver = self.scene.solver
+        solver = self._solver
         begin = begun(pair, start, solver.max_orbit)
         found = self.motion(pair, tangents, begin)
         if series and self.confirm:
             found = self._confirmed(pair, tangents, begin, found)
-        if found.known is not None and (series or self.maxima or self.scene.bearings is not None):
+        if series:
             found = with_samples(found, solver.samples)
-        report = self._report(design, (pair, shape), found, began, series)
+        report = self._report(design, (pair, tangents, shape), found, began, series)
         if self.maxima and report.usable:
-            maxima = local_maxima(pair, tangents, found.orbit, int(found.period), solver.orbit)
+            maxima = local_maxima(pair, tangents, varied(pair, tangents, found, solver))
             report = dataclasses.replace(report, maxima=maxima)
         return report
+
+    @property
+    def _solver(self) -> Solver:
+        """Settings of the solver; orbits have their variation, from which all else follows."""
+        return dataclasses.replace(self.scene.solver, variation=True)
 
     def motion(self, pair: RotorPair, tangents: RotorPair, start: Start) -> Steady:
         """Return the steady motion of `pair` that `start` leads to, in arrays of NumPy.
 
         It has derivatives along `tangents`; `start`: result of `starts.begun`."""
-        radius, solver = self.scene.pitch_radius, self.scene.solver
+        radius, solver = self.scene.pitch_radius, self._solver
         found = self._examined(pair, _motion(pair, tangents, start, radius, solver))
         if Status.of(found.status) is not Status.NOT_CLOSED:
             return found
@@ -372,17 +379,20 @@ class Evaluator:
     def prepare_reached(self, design: Any, series: bool, maxima: bool) -> None:
         """Compile the programs of `reached` in the background. Arguments: see `prepare`."""
         pair, tangents, _ = _build.result_shape(self.scene, design)
-        dtype, solver = pair.angle_scale.dtype, self.scene.solver
+        dtype, solver = pair.angle_scale.dtype, self._solver
         begin = eqx.filter_eval_shape(_at_rest, pair, solver.max_orbit)
 
         def then(found: Steady) -> None:
-            if found.known is not None and (series or maxima or self.maxima):
-                found = prepare_samples(found, solver.samples)
+            if found.known is None:
+                return
+            if series:
+                sampled.prepare(found.known.elements, solver.samples)
             if series and self.confirm:
                 known = found.orbit.state, found.orbit.response
                 _integrated.prepare(pair, known, found.period, solver.orbit)
             if maxima or self.maxima:
-                prepare_maxima(pair, tangents, found.orbit, solver.orbit)
+                orbit = VariedOrbit(found.known.elements, found.orbit.variation)
+                prepare_maxima(pair, tangents, orbit)
 
         # The slowest compilation starts first.
         _motion.prepare(pair, tangents, begin, self.scene.pitch_radius, solver, then=then)
@@ -398,21 +408,21 @@ class Evaluator:
         return _build(self.scene, design_vector(self.config))
 
     def evaluation(
-        self, built: tuple[RotorPair, Geometry], found: Steady, began: float
+        self, built: tuple[RotorPair, RotorPair, Geometry], found: Steady, began: float
     ) -> Evaluation:
         """Return the evaluation, without series, of the config's own design with a known motion.
 
-        `built`: its pair and geometry; `found`: its motion; `began`: time at the start (s,
+        `built`: result of `assembled`; `found`: its motion; `began`: time at the start (s,
         `perf_counter`)."""
         return self._report(design_vector(self.config), built, found, began, False)
 
     def _report(self, design, built, found: Steady, began: float, series: bool) -> Evaluation:
         """Return the evaluation of the motion `found`.
 
-        `built`: rotor pair and geometry; `began`: time at the start of the evaluation (s,
-        `perf_counter`); `series`: whether to compute the series."""
+        `built`: rotor pair, its derivatives along the design, and geometry; `began`: time at the
+        start of the evaluation (s, `perf_counter`); `series`: whether to compute the series."""
         seconds, design = time.perf_counter() - began, np.asarray(design, np.float64)
-        (pair, shape), status, orbit = built, Status.of(found.status), found.orbit
+        (pair, tangents, shape), status, orbit = built, Status.of(found.status), found.orbit
         period = int(found.period)
         statistics: dict[str, int | float] = {
             "transient_mesh_periods": int(found.used),
@@ -431,7 +441,8 @@ class Evaluator:
             motion = orbit_series(pair, orbit, period) if series else None
             start = Seed.of(found, pair)
             if self.scene.bearings is not None and (series or {*BEARING} & {*self._names}):
-                loads = jax.device_get(self._bearing_loads(design, found))
+                orbit_found = varied(pair, tangents, found, self._solver)
+                loads = jax.device_get(orbit_loads(self.scene, jnp.asarray(design), orbit_found))
                 for name, (value, slope) in bearing_record(loads).items():
                     response[name] = value
                     if gradient:
@@ -485,12 +496,6 @@ class Evaluator:
     def _names(self) -> tuple[str, ...]:
         """Names of the further terms of the objective."""
         return tuple(self.config.objective.terms)
-
-    def _bearing_loads(self, design, found: Steady) -> OrbitLoads:
-        """Return the loads on the bearings over the orbit of the motion `found`."""
-        integrator = dataclasses.replace(self.scene.solver.orbit, rtol=jnp.asarray(found.rtol))
-        period = jnp.asarray(int(found.period))
-        return orbit_loads(self.scene, jnp.asarray(design), found.orbit, period, integrator)
 
     def _terms(self, design, response, gradient):
         """Return the values of the objective's further terms, and their gradients.

@@ -14,8 +14,8 @@ import numpy as np
 
 from rootsopt.config import Config
 from rootsopt.dynamics.maxima import local_maxima
+from rootsopt.dynamics.varied import varied
 from rootsopt.response.evaluation import Evaluation, Evaluator
-from rootsopt.response.series import with_samples
 from rootsopt.response.starts import begun
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene, along
@@ -156,10 +156,7 @@ def by_scene(evaluator: Evaluator, evaluation: Evaluation) -> Evaluation | None:
             keys = [one.key for one in wanted[begin : begin + size]]
             gradient[name] |= dict(zip(keys, map(float, values), strict=True))
         if maxima is not None:
-            period = int(found.period)
-            if found.known is not None:
-                found = with_samples(found, solver.samples)
-            again = local_maxima(pair, tangents, found.orbit, period, solver.orbit)
+            again = local_maxima(pair, tangents, varied(pair, tangents, found, solver))
             if again.times.shape != maxima.times.shape:
                 return None
             slopes.append(again.slopes[:, : len(some)])

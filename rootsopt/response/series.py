@@ -6,9 +6,10 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from rootsopt.dynamics.collocation.sampled import sampled
+from rootsopt.dynamics.collocation.elements import Elements
 from rootsopt.dynamics.orbit import Orbit
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import Steady
@@ -91,22 +92,14 @@ def window_series(pair: RotorPair, window: Window) -> Series:
 
 
 def with_samples(found: Steady, samples: int) -> Steady:
-    """Return the motion `found`, and add to its orbit what a motion near a known orbit lacks.
-
-    These are the steps, and a number of `samples` of the state."""
-    assert found.known is not None
-    flow = _sampled(found.orbit.flow, found.known.elements, samples)
+    """Return the motion `found`, whose orbit has a number of uniform `samples` of the state."""
+    if found.known is None:
+        return found
+    flow = found.orbit.flow._replace(states=sampled(found.known.elements, samples))
     return found._replace(orbit=found.orbit._replace(flow=flow))
 
 
-def prepare_samples(found: Steady, samples: int) -> Steady:
-    """Compile the program of `with_samples` in the background, and return the shape of its result.
-
-    In `found`, `jax.ShapeDtypeStruct` replaces arrays."""
-    assert found.known is not None
-    _sampled.prepare(found.orbit.flow, found.known.elements, samples)
-    flow = _sampled.result_shape(found.orbit.flow, found.known.elements, samples)
-    return found._replace(orbit=found.orbit._replace(flow=flow))
-
-
-_sampled = Program(sampled, gathered=0)
+@Program
+def sampled(elements: Elements, samples: int) -> Float[Array, "samples n"]:
+    """Return uniform `samples` of the scaled states of an orbit, from φ1 = 0 on."""
+    return elements.motion(elements.mesh.period * jnp.arange(samples) / samples)

@@ -32,6 +32,12 @@ def _(size, batched, count):
     return jnp.max(count), False
 
 
+def whole_blocks(*arrays: Array) -> list[Array]:
+    """Return `arrays`, padded with zeros to a whole number of blocks."""
+    spare = -arrays[0].shape[0] % BLOCK
+    return [jnp.pad(x, ((0, spare), *((0, 0),) * (x.ndim - 1))) for x in arrays]
+
+
 def in_blocks(function: Any, used: Int[Array, ""], *arrays: Any) -> Any:
     """Return `function(*arrays)`, evaluated block by block along the leading axis of elements.
 

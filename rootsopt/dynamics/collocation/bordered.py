@@ -29,6 +29,7 @@ from rootsopt.dynamics.collocation.system import (
     condensed,
     opened,
     spread,
+    unchanged,
 )
 from rootsopt.dynamics.linear import solved
 from rootsopt.dynamics.measures import Measures
@@ -81,14 +82,8 @@ class Line(NamedTuple):
     @classmethod
     def empty(cls, elements: Elements, share: Float[Array, ""]) -> "Line":
         """Return a line with zeros, for motions like `elements`."""
-        count = elements.state.shape[1]
+        count, motion = elements.state.shape[1], unchanged(elements, 1)
         zeros = jnp.zeros
-        motion = Step(
-            zeros((*elements.state.shape, 1)),
-            zeros((*elements.slopes.shape, 1)),
-            zeros((*elements.mesh.times.shape, 1)),
-            zeros((count, count)),
-        )
         square, row, place = zeros((count, count)), zeros(count), zeros(count + 1)
         return cls(share, jnp.asarray(jnp.inf), square, row, square, place, place, motion)
 

@@ -168,8 +168,8 @@ def corrected(tolerance: Float[Array, ""]) -> Float[Array, ""]:
 def supported(pair: RotorPair) -> bool:
     """Return whether collocation can close orbits of `pair`.
 
-    The contact must be a `SearchContact`, or wrap one. Every flag of contact law and parts needs a margin (see
-    `Margins`)."""
+    The contact must be a `SearchContact`, or wrap one. Every flag of contact law and parts needs a
+    margin (see `Margins`)."""
     searched = isinstance(innermost(pair.contact), SearchContact)
     return searched and all(_has_margins(type(owner)) for owner in (pair.law, *pair.all_parts))
 

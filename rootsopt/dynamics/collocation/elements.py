@@ -98,17 +98,26 @@ class Elements(NamedTuple):
 
     def motion(self, tau: Float[Array, "*m"]) -> Float[Array, "*m n"]:
         """Return the scaled state at the times `tau` (mesh periods), continued periodically."""
+        return self.inside(*self.holding(tau))
+
+    def holding(self, tau: Float[Array, "*m"]) -> tuple[Int[Array, "*m"], Float[Array, "*m"]]:
+        """Return the index of the element that contains each of the times `tau` (mesh periods),
+        and the times, moved into the period of the mesh."""
         mesh = self.mesh
         begin = mesh.ends[0]
         tau = mesh.times[0] + jnp.mod(tau - mesh.times[0], mesh.period)
         used = jnp.arange(begin.shape[0]) < mesh.used
         k = jnp.sum(used & (begin <= tau[..., None]), axis=-1) - 1
-        return self.inside(jnp.maximum(k, 0), tau)
+        return jnp.maximum(k, 0), tau
+
+    def share(self, k: Int[Array, "*m"], tau: Float[Array, "*m"]) -> Float[Array, "*m"]:
+        """Return the times `tau` (mesh periods) as fractions of the elements `k`."""
+        length = self.mesh.lengths[k]
+        return (tau - self.mesh.ends[0][k]) / jnp.where(length > 0, length, 1.0)
 
     def inside(self, k: Int[Array, "*m"], tau: Float[Array, "*m"]) -> Float[Array, "*m n"]:
         """Return the scaled state at the times `tau` (mesh periods), from the polynomials of the
         elements `k`."""
-        length = self.mesh.lengths[k]
-        share = (tau - self.mesh.ends[0][k]) / jnp.where(length > 0, length, 1.0)
-        rise = jnp.sum(GAUSS.integrated(share)[..., None] * self.slopes[k], axis=-2)
-        return self.state[k] + length[..., None] * rise
+        weights = GAUSS.integrated(self.share(k, tau))
+        rise = jnp.sum(weights[..., None] * self.slopes[k], axis=-2)
+        return self.state[k] + self.mesh.lengths[k][..., None] * rise

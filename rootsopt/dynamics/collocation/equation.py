@@ -39,12 +39,13 @@ class CollocatedEquation(eqx.Module):
 
     Forces in the integrands are in units of `pair.force_scale`. If rotor 1 is free, the integrands
     are multiplied by `RotorPair.lapse`, which is also the last integrand. `top` (N): roughly the
-    greatest force.
+    greatest force. `variation`: whether a closed orbit has its `OrbitForces.variation`.
     """
 
     pair: RotorPair
     measures: Measures
     top: Float[Array, ""]
+    variation: bool = eqx.field(static=True, default=False)
 
     @property
     def rates(self) -> int:

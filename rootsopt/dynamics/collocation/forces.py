@@ -15,7 +15,7 @@ from rootsopt.dynamics.collocation.elements import Elements
 from rootsopt.dynamics.collocation.equation import CollocatedEquation, Points
 from rootsopt.dynamics.collocation.gauss import GAUSS, summed
 from rootsopt.dynamics.collocation.peak import Peak, Rivals, forces_along, peak_of
-from rootsopt.dynamics.collocation.system import Step, moved_places
+from rootsopt.dynamics.collocation.system import Step, moved_at, moved_places, unchanged
 
 _COINCIDE = 1e-6
 """Distance (fraction of an element's length) between two instants below which they count as one."""
@@ -29,7 +29,8 @@ class OrbitForces(NamedTuple):
     scaled state at φ1 = 0; `moved` (n, d): derivatives of `state`; `monodromy` (n, n): monodromy
     matrix at the start of the mesh; `depth`: greatest penetration (m) at Gauss points and element
     ends; `peak`: the greatest force before the last correction; `correction`: greatest entry of the
-    last correction of the states (scaled).
+    last correction of the states (scaled); `variation`: changes of the whole motion along the
+    directions, `None` unless the equation asks for it.
     """
 
     elements: Elements
@@ -41,6 +42,7 @@ class OrbitForces(NamedTuple):
     depth: Float[Array, ""]
     peak: Peak
     correction: Float[Array, ""]
+    variation: Step | None = None
 
 
 def forces_of(
@@ -69,6 +71,9 @@ def forces_of(
     peak = peak._replace(force=unit * peak.force)
     values = jnp.concatenate([averages[:2], peak.force[None], averages[2:]])
     slopes = jnp.concatenate([by_averages[:2], by_height[None], by_averages[2:]])
+    variation = None
+    if equation.variation:
+        variation = Step(*(x[..., 1:] for x in step[:3]), step.monodromy)
     first = origin(elements)
     used = (jnp.arange(elements.state.shape[0]) < elements.mesh.used)[:, None]
     return OrbitForces(
@@ -81,6 +86,7 @@ def forces_of(
         depth=jnp.max(jnp.where(used, points.depth, -jnp.inf)),
         peak=peak,
         correction=jnp.max(jnp.abs(step.state[..., 0])),
+        variation=variation,
     )
 
 
@@ -98,6 +104,7 @@ def no_forces(equation: CollocatedEquation, elements: Elements, directions: int)
         depth=zero,
         peak=Peak(index, zero, (index, index), zero, zero),
         correction=zero,
+        variation=unchanged(elements, directions) if equation.variation else None,
     )
 
 
@@ -139,17 +146,11 @@ def _by_height(equation: CollocatedEquation, elements: Elements, peak: Peak, eva
     `evaluated`: equation along the orbit with the instants `rivals`, its direct changes, and its
     changes at the Gauss points."""
     points, direct, change = evaluated
-    mesh, k, share = elements.mesh, peak.element, peak.share - peak.shift
+    k, share = peak.element, peak.share - peak.shift
     count = elements.state.shape[1]
     first, last = count, count + equation.rates - 1
     value, bend = points.values[peak.place], points.slopes[peak.place]
-    begin, end = mesh.interval[k], mesh.interval[k] + 1
-    place = mesh.left[k] + (mesh.right[k] - mesh.left[k]) * share
-    time = step.times[begin] * (1 - place) + step.times[end] * place
-    weights = GAUSS.integrated(share)[:, None]
-    longer = (mesh.right[k] - mesh.left[k]) * (step.times[end] - step.times[begin])
-    state = step.state[k] + mesh.lengths[k] * jnp.sum(weights[..., None] * step.slopes[k], axis=0)
-    state += jnp.sum(weights * elements.slopes[k], axis=0)[:, None] * longer
+    time, state = moved_at(elements, step, k, share)
     here = bend[:, :1] * time + bend[:, 1:] @ state + direct[peak.place]
     # The peak may be a little beside the instant of the evaluation. The changes here and at the
     # Gauss points lie on one polynomial.

@@ -10,7 +10,6 @@ from rootsopt.dynamics.collocation.closing import Closed, close
 from rootsopt.dynamics.collocation.equation import CollocatedEquation
 from rootsopt.dynamics.collocation.forces import OrbitForces
 from rootsopt.dynamics.collocation.known import Known
-from rootsopt.dynamics.collocation.sampled import as_flow
 from rootsopt.dynamics.flow import Flow, Pieces
 from rootsopt.dynamics.linear import spectral_radius
 from rootsopt.dynamics.orbit import Orbit
@@ -35,7 +34,7 @@ _ALONG = 8
 class Collocated(NamedTuple):
     """An orbit closed by collocation, with the results of its checks.
 
-    `orbit`: its `flow` has neither samples nor steps (see `sampled`); its `residual` is the last
+    `orbit`: its `flow` has neither samples nor steps (see `_as_flow`); its `residual` is the last
     correction, inf if the orbit is not sound. `sound`: whether Newton's method has converged on a
     mesh that ends at the orbit's events; otherwise the orbit has no meaning. `shorter`: true period
     (mesh periods) if the orbit repeats after a fraction of its period, otherwise 0. `verified`:
@@ -60,11 +59,12 @@ def closed_orbit(
 
     `tangents`: directions of the pair's parameters, stacked along a leading axis; `start`: the
     motion, and the numbers of its pair; `settings`: `orbit` (whose tolerance sets the accuracy),
-    `measures`, `max_orbit`. The result's `flow` has neither samples nor steps."""
+    `measures`, `max_orbit`, `variation`. The result's `flow` has neither samples nor steps."""
     known, neighbour = start
     integrator, measures = settings.orbit, settings.measures
     tolerance = integrator.tolerance
-    equation = CollocatedEquation(pair, measures, lax.stop_gradient(pair.force_scale))
+    top = lax.stop_gradient(pair.force_scale)
+    equation = CollocatedEquation(pair, measures, top, settings.variation)
     closed = close(equation, tangents, known, neighbour, ACCURACY * tolerance)
     found, sound = closed.found, closed.sound & known.sound
     verified = sound & (closed.error <= UNREFINED * ACCURACY * tolerance)
@@ -73,7 +73,7 @@ def closed_orbit(
     shorter = _repeats(found, period, settings.max_orbit, tolerance) * sound
     verified &= shorter == 0
     residual = jnp.where(sound, found.correction, jnp.inf)
-    orbit = _as_orbit(found, as_flow(found), residual, closed.drift, closed.steps)
+    orbit = _as_orbit(found, _as_flow(found), residual, closed.drift, closed.steps)
     return Collocated(orbit, sound, shorter, verified, _known(closed, verified))
 
 
@@ -113,6 +113,32 @@ def _known(closed: Closed, verified: Bool[Array, ""]) -> Known:
     return Known(closed.found.elements, *errors, verified, yes)
 
 
+def _as_flow(found: OrbitForces) -> Flow:
+    """Return the orbit `found` as a `Flow` over its period, with zeros for the derivatives.
+
+    It has neither samples of the state nor steps: only `response.series.sampled` gives samples."""
+    response, count = found.response, found.state.shape[0]
+    mesh, dtype = found.elements.mesh, found.state.dtype
+    begin, length = mesh.ends[0][found.peak.element], mesh.lengths[found.peak.element]
+    rows, columns = count + response.shape[0], count + found.moved.shape[1]
+    return Flow(
+        end=found.state,
+        mean=response[0],
+        mean_square=response[1],
+        peak=response[2],
+        peak_time=jnp.mod(begin + found.peak.share * length, mesh.period),
+        depth=found.depth,
+        states=jnp.zeros((0, count), dtype),
+        grid=jnp.zeros(0, dtype),
+        corners=jnp.zeros((0, count), dtype),
+        steps=jnp.zeros((), int),
+        solved=jnp.ones((), bool),
+        strain=jnp.zeros((), dtype),
+        others=response[3:],
+        slope=jnp.zeros((rows, columns), dtype),
+    )
+
+
 def _as_orbit(found: OrbitForces, out: Flow, residual, drift, steps) -> Orbit:
     """Return an orbit found by collocation.
 
@@ -132,4 +158,5 @@ def _as_orbit(found: OrbitForces, out: Flow, residual, drift, steps) -> Orbit:
         drift=nothing,
         defect=nothing,
         disagreement=drift,
+        variation=found.variation,
     )

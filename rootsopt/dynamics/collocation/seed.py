@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from rootsopt.dynamics.collocation.blocks import BLOCK, in_blocks
+from rootsopt.dynamics.collocation.blocks import in_blocks, whole_blocks
 from rootsopt.dynamics.collocation.closing import FIRST
 from rootsopt.dynamics.collocation.elements import Elements, Mesh
 from rootsopt.dynamics.collocation.gauss import GAUSS
@@ -64,16 +64,10 @@ def from_steps(
     states = jnp.concatenate([state[None], corners])
     steps = jnp.sum(jnp.isfinite(grid))
     slope = jax.vmap(lambda tau, y: pair.derivative(tau, y)[0])
-    slopes = in_blocks(slope, steps + 1, *_padded(times, states))[: times.shape[0]]
+    slopes = in_blocks(slope, steps + 1, *whole_blocks(times, states))[: times.shape[0]]
     every, length = (times, states, slopes), period.astype(state.dtype)
     room = sizes(longest)
     return Known.unaligned(_on_steps(pair, every, steps, length, FIRST * period, room))
-
-
-def _padded(times: Float[Array, " m"], states: Float[Array, "m n"]) -> tuple[Array, Array]:
-    """Return `times` and `states`, padded with zeros to a multiple of `BLOCK`."""
-    spare = -times.shape[0] % BLOCK
-    return jnp.pad(times, (0, spare)), jnp.pad(states, ((0, spare), (0, 0)))
 
 
 def _on_steps(

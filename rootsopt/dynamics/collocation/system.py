@@ -288,6 +288,30 @@ def spread(
     return Step(state, answer, times, chain.monodromy)
 
 
+def unchanged(elements: Elements, columns: int) -> Step:
+    """Return a step with zeros in all of its `columns`, for a motion like `elements`."""
+    count = elements.state.shape[1]
+    parts = elements.state, elements.slopes, elements.mesh.times
+    return Step(*(jnp.zeros((*x.shape, columns)) for x in parts), jnp.zeros((count, count)))
+
+
+def moved_at(
+    elements: Elements, step: Step, k: Int[Array, "*m"], share: Float[Array, "*m"]
+) -> tuple[Float[Array, "*m k"], Float[Array, "*m n k"]]:
+    """Return the changes of times and scaled states at fractions `share` of the elements `k`."""
+    mesh: Mesh = elements.mesh
+    left, right = step.times[mesh.interval[k]], step.times[mesh.interval[k] + 1]
+    width = (mesh.right - mesh.left)[k][..., None]
+    place = mesh.left[k][..., None] + width * share[..., None]
+    weights = GAUSS.integrated(share)[..., None]
+    rise = jnp.sum(weights * elements.slopes[k], axis=-2)
+    inside = jnp.sum(weights[..., None] * step.slopes[k], axis=-3)
+    longer = width * (right - left)
+    states = step.state[k] + mesh.lengths[k][..., None, None] * inside
+    states += rise[..., None] * longer[..., None, :]
+    return left * (1 - place) + right * place, states
+
+
 def moved_places(elements: Elements, step: Step) -> tuple[Array, Array]:
     """Return the changes of times (e, s, k) and scaled states (e, s, n, k) at the Gauss points."""
     mesh: Mesh = elements.mesh
