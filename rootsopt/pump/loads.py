@@ -4,18 +4,19 @@ A rotor's bearings sit at z = ±(L/2 + a), the timing gear at z = L/2 + g. `docs
 the formulas.
 """
 
-from typing import Any, NamedTuple
+import functools
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from rootsopt.dynamics.collocation.blocks import BLOCK, in_blocks, whole_blocks
 from rootsopt.dynamics.collocation.elements import Elements
-from rootsopt.dynamics.collocation.gauss import GAUSS
+from rootsopt.dynamics.collocation.gauss import GAUSS, POINTS
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.parts import AxisLoads
 from rootsopt.dynamics.parts.resultants import MIRROR, GasResultant
@@ -33,6 +34,10 @@ _EVEN = 128
 _FLAGS, _HALVED = 64, 40
 """Maximum number of instants at which flags of the loads change, and number of bisections that
 locate them."""
+_EMPTY = 1e-13
+"""Length (mesh periods) below which a piece counts as empty. Many corners coincide."""
+_INTEGRANDS = 5
+"""Number of quantities that are averaged: a power of each bearing's load, and 1."""
 _ASIDE = 1e-9
 """Distance (mesh periods) before and after a jump at which the integrands are evaluated."""
 POSES = 720
@@ -180,28 +185,6 @@ def loads_corners(bearings: BearingSet) -> Float[Array, " k"]:
     return gas.corners() * bearings.pair.lobes / (2 * jnp.pi)
 
 
-class _Integrands(NamedTuple):
-    """The loads along an orbit, in the form in which they are averaged.
-
-    `static`: a `BearingSet` without its floating-point arrays; `unit` (N) of the loads."""
-
-    static: Any
-    unit: Float[Array, ""]
-
-    def at(self, tau, state, dynamic) -> Float[Array, "5"]:
-        """Return the loads (4,) to the power of the exponent, then the duration of a mesh period.
-
-        The latter is relative to that at the drive's speed, and a factor of the former: averages
-        are over time. `dynamic`: arrays of the `BearingSet`."""
-        bearings = eqx.combine(dynamic, self.static)
-        size = bearings.at(tau, state).sizes / self.unit
-        # The root of a load that vanishes has no derivative.
-        pushed = size > 0
-        powers = jnp.where(pushed, jnp.where(pushed, size, 1.0) ** bearings.exponent, 0.0)
-        lapse = bearings.pair.lapse(state) * jnp.ones_like(self.unit)
-        return lapse * jnp.append(powers, 1.0)
-
-
 @Program
 def orbit_loads(scene: Scene, design: Float[Array, " d"], orbit: VariedOrbit) -> OrbitLoads:
     """Return the bearing loads over a closed `orbit`.
@@ -216,66 +199,82 @@ def orbit_loads(scene: Scene, design: Float[Array, " d"], orbit: VariedOrbit) ->
     bearings, tangents, _ = along(build, design, jnp.eye(design.shape[0]))
     dynamic, static = eqx.partition(bearings, eqx.is_inexact_array)
     moved = eqx.filter(tangents, eqx.is_inexact_array)
-    period = orbit.elements.mesh.period
-    unit = lax.stop_gradient(bearings.pair.force_scale)
-    integrands = _Integrands(static, unit)
-
-    def value_and_slopes(function, tau):
-        """Return `function(tau, state, dynamic)`, and its derivatives at constant time."""
-        state, _, varied = orbit.at(tau)
-
-        def push(by_state, by_parameters):
-            primal, change = (state, dynamic), (by_state, by_parameters)
-            return jax.jvp(lambda *now: function(tau, *now), primal, change)
-
-        return jax.vmap(push, (1, 0), (None, -1))(varied, moved)
-
-    def integral(begin, end):
-        """Return the integrals over pieces of the orbit, and their derivatives."""
-        tau = begin[:, None] + (end - begin)[:, None] * GAUSS.nodes
-        found = jax.vmap(jax.vmap(lambda tau: value_and_slopes(integrands.at, tau)))(tau)
-        length = end - begin
-        totals, slopes = (GAUSS.whole(x) for x in found)
-        return length[:, None] * totals, length[:, None, None] * slopes
-
-    ends = _pieces(orbit.elements, bearings)
-    begins = jnp.append(jnp.zeros_like(ends[:1]), ends[:-1])
-    used = jnp.sum(begins < period)
-    totals, slopes = in_blocks(integral, used, *whole_blocks(begins, ends))
-    real = jnp.arange(totals.shape[0]) < used
-    total = jnp.sum(jnp.where(real[:, None], totals, 0.0), axis=0)
-    slope = jnp.sum(jnp.where(real[:, None, None], slopes, 0.0), axis=0)
-    slope += _leaps(scene, orbit, integrands, dynamic, moved)
-    mean, duration = total[:4] / total[4], total[4]
-    slope = (slope[:4] - mean[:, None] * slope[4]) / duration
-    root = 1 / bearings.exponent
-    equivalent = unit * mean**root
-    factor = equivalent * root / jnp.where(mean > 0, mean, jnp.inf)
+    unit, period = lax.stop_gradient(bearings.pair.force_scale), orbit.elements.mesh.period
     samples = scene.solver.samples
     tau = period * jnp.arange(samples) / samples
-    series = lax.map(
-        lambda at: bearings.at(*at), (tau, orbit.elements.motion(tau)), batch_size=BLOCK
-    )
+    at_samples = tau, orbit.elements.motion(tau)
+    series = lax.map(lambda at: bearings.at(*at), at_samples, batch_size=BLOCK)
     sizes = _channels(series, scene)
     latest = jnp.argmax(sizes, axis=0)
 
-    def rise(channel, tau):
-        def one(tau, state, dynamic):
-            return _channels(eqx.combine(dynamic, static).at(tau, state), scene)[channel]
+    def quantities(tau, state, dynamic):
+        """Return the integrands, then all quantities whose greatest value is reported.
 
-        return value_and_slopes(one, tau)[1]
+        The integrands are the loads to the power of the exponent, and 1. Averages are over time:
+        both are multiplied by the relative duration of a mesh period."""
+        bearings = eqx.combine(dynamic, static)
+        found = bearings.at(tau, state)
+        size = found.sizes / unit
+        # The root of a load that vanishes has no derivative.
+        pushed = size > 0
+        powers = jnp.where(pushed, jnp.where(pushed, size, 1.0) ** bearings.exponent, 0.0)
+        lapse = bearings.pair.lapse(state) * jnp.ones_like(unit)
+        return jnp.concatenate([lapse * powers, lapse[None], _channels(found, scene)])
 
+    def varied(tau):
+        """Return the quantities, and their derivatives along the design, at constant time."""
+        state, _, changes = orbit.at(tau)
+
+        def push(change, along):
+            return jax.jvp(functools.partial(quantities, tau), (state, dynamic), (change, along))
+
+        return jax.vmap(push, (1, 0), (None, -1))(changes, moved)
+
+    begins, ends, count = _pieces(orbit.elements, bearings)
+    leaps, moves = _leaps(scene, orbit, (dynamic, static, moved))
+    sides = leaps[:, None] + _ASIDE * np.array([-1.0, 1.0])
+    # All instants in one array, so that the derivatives are compiled once.
+    single = jnp.append(tau[latest], sides)
+    single = jnp.pad(single, (0, -len(single) % POINTS)).reshape(-1, POINTS)
+    inside = begins[:, None] + (ends - begins)[:, None] * GAUSS.nodes
+    number = len(single)
+    instants = whole_blocks(jnp.concatenate([single, inside]))
+    values, slopes = in_blocks(jax.vmap(jax.vmap(varied)), number + count, *instants)
+
+    def integral(nodes):
+        """Return the integrals over the orbit of values at the nodes of all pieces."""
+        whole = GAUSS.whole(nodes[number : number + len(ends), :, :_INTEGRANDS])
+        return jnp.tensordot(ends - begins, whole, 1)
+
+    def alone(nodes):
+        """Return the values at the greatest loads, and on both sides of the leaps."""
+        flat = nodes[:number].reshape(-1, *nodes.shape[2:])
+        k = np.arange(len(latest))
+        beside = flat[len(latest) : len(latest) + sides.size, :_INTEGRANDS]
+        return flat[k, _INTEGRANDS + k], beside.reshape(*sides.shape, *beside.shape[1:])
+
+    before, after = jnp.moveaxis(alone(values)[1], 1, 0)
+    total = integral(values)
+    # The integrals also change because the instants move at which the integrands jump.
+    slope = integral(slopes) + jnp.einsum("mr,md->rd", before - after, moves)
+    mean, duration = total[:-1] / total[-1], total[-1]
+    slope = (slope[:-1] - mean[:, None] * slope[-1]) / duration
+    root = 1 / bearings.exponent
+    equivalent = unit * mean**root
+    factor = equivalent * root / jnp.where(mean > 0, mean, jnp.inf)
     # At a sample, time does not move with the design.
-    rises = jax.vmap(rise)(jnp.arange(len(latest)), tau[latest])
+    rises = alone(slopes)[0]
     return OrbitLoads(equivalent, factor[:, None] * slope, series, jnp.max(sizes, axis=0), rises)
 
 
-def _pieces(elements: Elements, bearings: BearingSet) -> Float[Array, " pieces"]:
-    """Return the ends of pieces of an orbit (mesh periods, ascending) in which loads are smooth.
+def _pieces(
+    elements: Elements, bearings: BearingSet
+) -> tuple[Float[Array, " pieces"], Float[Array, " pieces"], Int[Array, ""]]:
+    """Return starts and ends (mesh periods) of pieces of an orbit in which the loads are smooth,
+    and the number of pieces in use. The others, which are empty, come last.
 
-    They are the ends of the elements, the corners of the loads in each mesh period, and the
-    instants at which flags of the loads change; unused ones are at the end of the orbit. The power
-    of a load needs shorter pieces than the motion."""
+    Pieces end at the ends of elements, at the corners of the loads in each mesh period, and where a
+    flag of the loads changes. The power of a load needs shorter pieces than the motion."""
     mesh = elements.mesh
     period = mesh.period
     turns = jnp.arange(_LONGEST)[:, None]
@@ -302,37 +301,30 @@ def _pieces(elements: Elements, bearings: BearingSet) -> Float[Array, " pieces"]
         return jnp.where(same, middle, low), jnp.where(same, high, middle)
 
     _, high = lax.fori_loop(0, _HALVED, halved, (begins[piece], ends[piece]))
-    return jnp.sort(jnp.append(ends, high))
+    ends = jnp.sort(jnp.append(ends, high))
+    begins = jnp.append(0.0, ends[:-1])
+    empty = ends - begins < _EMPTY
+    order = jnp.argsort(empty)
+    return begins[order], ends[order], jnp.sum(~empty)
 
 
-def _leaps(scene: Scene, orbit: VariedOrbit, integrands: _Integrands, dynamic, moved):
-    """Return what slopes of integrals gain because instants move at which the integrands jump.
+def _leaps(scene: Scene, orbit: VariedOrbit, bearings) -> tuple[Array, Array]:
+    """Return the times (m,) at which the loads jump (mesh periods), and how they move (m, d).
 
     These are the instants at which a pocket opens, and events of the orbit if levers may jump.
-    `dynamic`: arrays of the `BearingSet`, with the derivatives `moved`."""
-    mesh, pair = orbit.elements.mesh, eqx.combine(dynamic, integrands.static).pair
-    times, moves = [], []
-    openings = _openings(dynamic, integrands.static, moved) if scene.twist_free else None
+    `bearings`: arrays of a `BearingSet`, the rest of it, and the derivatives of the arrays."""
+    mesh, variation = orbit.elements.mesh, orbit.variation
+    dynamic, static, moved = bearings
+    times, moves = [jnp.zeros(0)], [jnp.zeros((0, variation.times.shape[1]))]
+    openings = _openings(dynamic, static, moved) if scene.twist_free else None
     if openings is not None:
-        opened = openings[0] + jnp.arange(_LONGEST)[:, None]
-        times.append(opened.ravel())
-        moves.append(jnp.where(opened < mesh.period, 1.0, 0.0)[..., None] * openings[1])
-    if pair.jumps:
+        opened = (openings[0] + jnp.arange(_LONGEST)[:, None]).ravel()
+        times.append(opened)
+        moves.append((opened < mesh.period)[:, None] * jnp.tile(openings[1], (_LONGEST, 1)))
+    if eqx.combine(dynamic, static).pair.jumps:
         times.append(mesh.times)
-        moves.append(orbit.variation.times)
-    if not times:
-        return 0.0
-    time, move = (
-        jnp.concatenate(times),
-        jnp.concatenate([x.reshape(-1, x.shape[-1]) for x in moves]),
-    )
-
-    def change(tau):
-        sides = tau + _ASIDE * jnp.array([-1.0, 1.0])
-        before, after = jax.vmap(integrands.at, (0, 0, None))(sides, orbit.at(sides)[0], dynamic)
-        return before - after
-
-    return jnp.einsum("mr,md->rd", lax.map(change, time), move)
+        moves.append(variation.times)
+    return jnp.concatenate(times), jnp.concatenate(moves)
 
 
 def _openings(dynamic, static, moved) -> tuple[Array, Array] | None:
