@@ -1,18 +1,15 @@
 """Tests of local maxima of the contact force along an orbit, with their derivatives."""
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from rootsopt import load_config
 from rootsopt.dynamics import maxima
-from rootsopt.dynamics.flow import Flow
 from rootsopt.dynamics.maxima import candidates, shoulders
-from rootsopt.dynamics.measures import Measures
-from rootsopt.dynamics.orbit import SAMPLES, Orbit
+from rootsopt.dynamics.orbit import SAMPLES
+from rootsopt.dynamics.varied import VariedOrbit
 from rootsopt.response import evaluation
 from rootsopt.response.evaluation import Evaluator
-from rootsopt.response.series import prepare_samples
 from rootsopt.response.starts import begun
 
 _STEP = 2e-4
@@ -73,27 +70,13 @@ def test_prepared_programs_are_those_that_are_called(evaluator, found):
     scene = evaluator.scene
     pair, tangents, _ = evaluator.assembled()
     begin = begun(pair, found.start, scene.solver.max_orbit)
-    start = pair, tangents, begin, scene.pitch_radius, scene.solver
-    orbit = prepare_samples(evaluation._motion.result_shape(*start), scene.solver.samples).orbit
-    programs = maxima._forces, maxima._differentiated
+    start = pair, tangents, begin, scene.pitch_radius, evaluator._solver
+    shape = evaluation._motion.result_shape(*start)
+    programs = maxima._forces, maxima._located
     called = [set(program._made) for program in programs]
-    maxima.prepare_maxima(pair, tangents, orbit, scene.solver.orbit)
+    orbit = VariedOrbit(shape.known.elements, shape.orbit.variation)
+    maxima.prepare_maxima(pair, tangents, orbit)
     assert [set(program._made) for program in programs] == called
-
-
-@pytest.mark.parametrize(("used", "room", "cut"), [(10, 64, 2048), (3000, 8192, 4096)])
-def test_steps_of_an_orbit_have_few_sizes(used, room, cut):
-    flow = Flow.empty(2, 1, 8, room, Measures(), jnp.dtype(float))
-    grid = np.where(np.arange(room) < used, np.arange(room), np.inf)
-    corners = np.arange(2.0 * room).reshape(room, 2)
-    orbit = Orbit.empty(jnp.zeros(2), 1, flow)._replace(
-        flow=flow._replace(grid=jnp.asarray(grid), corners=jnp.asarray(corners))
-    )
-    found = maxima._cut(orbit).flow
-    assert found.grid.shape == (cut,)
-    np.testing.assert_array_equal(found.grid[:used], grid[:used])
-    assert np.all(np.isinf(found.grid[used:]))
-    np.testing.assert_array_equal(found.corners[:used], corners[:used])
 
 
 def test_candidates_are_told_apart():
@@ -118,4 +101,4 @@ def test_shoulder_is_found_before_it_is_a_maximum():
         force = 10 + np.cos(2 * np.pi * x) * 0.08 + height * np.exp(-(((x - 0.8) / 0.04) ** 2))
         places, closed = np.append(x, 1.0), np.append(force, force[0])
         assert len(candidates(places, closed)[0]) == expected
-        assert len(shoulders(force)) == (1 if expected == 1 else 0)
+        assert len(shoulders(places, closed)) == (1 if expected == 1 else 0)

@@ -11,11 +11,13 @@ import pytest
 import rootsopt
 from rootsopt import InputError, Scene
 from rootsopt.config.units import DEG
+from rootsopt.dynamics.varied import varied
 from rootsopt.output.files import response_columns
 from rootsopt.profiles import geometry
 from rootsopt.pump import bearings as formulas
 from rootsopt.pump.loads import BearingSet, orbit_loads, static_loads
 from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.series import sampled
 from rootsopt.response.starts import begun
 from rootsopt.response.terms import Forces, needs_forces, terms_of
 from rootsopt.scene.bearings import GRAVITY
@@ -207,10 +209,8 @@ def test_work_and_momentum_of_elastic_bearings():
     start = begun(pair, None, scene.solver.max_orbit)
     found = evaluator.motion(pair, tangents, start)
     assert Status.of(found.status) is Status.PERIODIC
-    loads = orbit_loads(
-        scene, design, found.orbit, jnp.asarray(int(found.period)), scene.solver.orbit
-    )
-    states = found.orbit.flow.states
+    orbit = varied(pair, tangents, found, scene.solver)
+    loads, states = orbit_loads(scene, design, orbit), sampled(orbit.elements, scene.solver.samples)
     tau = int(found.period) * np.arange(len(states)) / len(states)
 
     @jax.jit

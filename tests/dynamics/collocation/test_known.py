@@ -9,13 +9,14 @@ import rootsopt
 from rootsopt.dynamics.collocation.elements import Elements, Mesh
 from rootsopt.dynamics.collocation.equation import Points
 from rootsopt.dynamics.collocation.events import extra
-from rootsopt.dynamics.collocation.forces import OrbitForces
 from rootsopt.dynamics.collocation.gauss import GAUSS, POINTS
 from rootsopt.dynamics.collocation.known import Known, padded, trimmed
 from rootsopt.dynamics.collocation.mesh import roughness, sizes
-from rootsopt.dynamics.collocation.peak import Peak, Rivals, peak_of, rivals_of
-from rootsopt.dynamics.collocation.sampled import PARTS, as_flow, sampled
+from rootsopt.dynamics.collocation.peak import Rivals, peak_of, rivals_of
+from rootsopt.dynamics.collocation.system import Step, moved_at, unchanged
+from rootsopt.dynamics.varied import VariedOrbit
 from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.series import sampled
 from rootsopt.status import Status
 
 PERIOD, BEGIN, USED = 2, 0.3, 10
@@ -51,32 +52,41 @@ def _known(room=(48, 51)):
     return Known(motion, one, one, one, yes, yes)
 
 
-def test_orbit_sampled_as_steps_is_the_motion_over_one_period():
-    """Steps begin at φ1 = 0 even if the mesh does not, and end after exactly one period."""
+def test_samples_of_an_orbit():
+    """They begin at φ1 = 0 even if the mesh does not."""
+    states = sampled(_known().elements, 16)
+    np.testing.assert_allclose(states[:, 0], np.sin(TURN * np.arange(16) / 8), atol=1e-5)
+
+
+def test_orbit_varies_at_constant_time():
+    """The variation of sin(ωτ + p) is cos(ωτ), on a mesh whose inner time also moves.
+
+    The states are those of the orbit, and follow its derivative with respect to time."""
     elements = _known().elements
-    nothing, origin = jnp.zeros(()), jnp.asarray(0)
-    found = OrbitForces(
-        elements=elements,
-        response=jnp.arange(3.0),
-        sensitivity=jnp.zeros((3, 2)),
-        state=jnp.zeros(1),
-        moved=jnp.zeros((1, 2)),
-        monodromy=jnp.zeros((1, 1)),
-        depth=nothing,
-        peak=Peak(jnp.asarray(8), jnp.asarray(0.5), (origin, origin), nothing, nothing),
-        correction=nothing,
-    )
-    flow = sampled(as_flow(found), elements, samples=16)
-    ends = np.asarray(flow.grid)[: PARTS * USED]
-    assert np.all(np.diff(ends) > 0)
-    np.testing.assert_allclose(ends[-1], PERIOD, rtol=1e-15)
-    # Beside an element's ends, which may be events, steps are short: see `sampled`.
-    beside = np.diff(ends, prepend=0.0).reshape(USED, PARTS)[:, [0, -1]]
-    assert np.all(beside < 1e-6)
-    assert np.all(np.isinf(flow.grid[PARTS * USED :]))
-    np.testing.assert_allclose(flow.corners[: PARTS * USED, 0], np.sin(TURN * ends), atol=1e-5)
-    np.testing.assert_allclose(flow.states[:, 0], np.sin(TURN * np.arange(16) / 8), atol=1e-5)
-    np.testing.assert_allclose(float(flow.peak_time), 0.15)
+    begin, _ = elements.mesh.ends
+    tau = begin[:, None] + elements.mesh.lengths[:, None] * GAUSS.nodes
+    shift = 0.1
+    times = jnp.where(elements.mesh.times == 2.0, shift, 0.0)[:, None]
+    still = unchanged(elements, 1)
+    moving = moved_at(elements, still._replace(times=times), *_everywhere(tau))[0][..., 0]
+    start = moved_at(elements, still._replace(times=times), *_everywhere(begin))[0][..., 0]
+    # At places that move with the mesh, the state and its slope change along the motion as well.
+    state = jnp.cos(TURN * begin) * (1 + TURN * start)
+    slopes = -TURN * jnp.sin(TURN * tau) * (1 + TURN * moving)
+    variation = Step(state[:, None, None], slopes[..., None, None], times, still.monodromy)
+    asked = jnp.asarray([0.0, 0.7, 1.9, 1.95, 2.05])
+    found, rate, moved = VariedOrbit(elements, variation).at(asked)
+    np.testing.assert_allclose(found[:, 0], np.sin(TURN * asked), atol=1e-5)
+    # A cubic through the slopes at four points of a quarter of a mesh period.
+    np.testing.assert_allclose(rate[:, 0], TURN * np.cos(TURN * asked), atol=5e-4)
+    np.testing.assert_allclose(moved[:, 0, 0], np.cos(TURN * asked), atol=1e-4)
+
+
+def _everywhere(tau):
+    """Return elements and shares of times in the elements."""
+    elements = _known().elements
+    k = jnp.broadcast_to(jnp.arange(tau.shape[0]).reshape(-1, *(1,) * (tau.ndim - 1)), tau.shape)
+    return k, elements.share(k, tau)
 
 
 def test_known_orbit_is_stored_without_unused_elements():
