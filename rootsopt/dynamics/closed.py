@@ -79,7 +79,7 @@ class Start(eqx.Module):
 
 def unknown(pair: RotorPair, longest: int) -> Known:
     """Return the placeholder for an orbit of `pair` of up to `longest` mesh periods."""
-    return Known.empty(sizes(longest), pair.states, pair.flanks)
+    return Known.empty(sizes(longest, pair.contact.sections), pair.states, pair.flanks)
 
 
 class _Loop(NamedTuple):

@@ -53,7 +53,7 @@ def begun(pair: RotorPair, start: Seed | ArrayLike | None, longest: int) -> Star
     belong to a pair of this kind is not used; the search then begins at its state. `longest`:
     longest period of an orbit (mesh periods). Unlike elsewhere, the state of the result is scaled.
     """
-    dtype, room = pair.angle_scale.dtype, sizes(longest)
+    dtype, room = pair.angle_scale.dtype, sizes(longest, pair.contact.sections)
     seed = start if isinstance(start, Seed) else None
     state = start if seed is None else seed.state
     given = np.zeros(pair.states, dtype) if state is None else np.asarray(state, dtype)

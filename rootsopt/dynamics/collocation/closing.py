@@ -237,6 +237,10 @@ class Closer(eqx.Module):
         """Factor by which meshes are denser than at the usual accuracy, at least 1."""
         return jnp.maximum(_USUAL / self.tolerance, 1.0) ** (1 / _ORDER)
 
+    def most(self, now: Loop) -> Int[Array, ""]:
+        """Return the number of elements above which the mesh is not refined."""
+        return most_elements(now.elements.mesh, self.denser, self.frozen.contact.sections)
+
     @property
     def directions(self) -> int:
         """Number of directions along which forces are differentiated."""
@@ -332,7 +336,7 @@ class Closer(eqx.Module):
         taken = now.elements.mesh.used
         first = jnp.round(_SHARE * self.denser * taken).astype(int) + _EVENT * events.count
         used = jnp.where(now.fits, jnp.where(finer, (_FINER * taken).astype(int), taken), first)
-        most = most_elements(now.elements.mesh, self.denser)
+        most = self.most(now)
         used = jnp.maximum(jnp.minimum(used, most), events.count + 2)
         used = jnp.minimum(used, now.elements.state.shape[0] - 1)
         (place, wanted), (spot, number) = needed(now.elements), counted(now.elements)
@@ -416,7 +420,7 @@ class Closer(eqx.Module):
         error, drift = choose(first, self.uncompared(size), compared)
         steep, least, most = _TURNING
         certain = drift <= jnp.clip(steep * self.tolerance, least, most)
-        full = now.elements.mesh.used >= most_elements(now.elements.mesh, self.denser)
+        full = now.elements.mesh.used >= self.most(now)
         # Newton's method has converged, so the correction must be small. It is large or NaN where
         # the time derivative of a margin vanishes at its event.
         good = found.correction < corrected(self.tolerance)

@@ -22,24 +22,31 @@ periods. Shorter orbits can use the room of longer ones, up to the third number 
 the usual accuracy."""
 _TIMES = 64, 24
 """Number of events above which the search for the orbit fails, counted like elements."""
+_SLICES = 0.5
+"""Growth of these numbers for each further slice of twisted rotors, as a fraction: each slice has
+its own events."""
 
 
-def sizes(periods: int) -> tuple[int, int]:
+def sizes(periods: int, slices: int) -> tuple[int, int]:
     """Return the sizes of the arrays of a mesh, for its elements and for its times.
 
-    They are large enough for orbits of up to `periods` mesh periods."""
+    They are large enough for orbits of up to `periods` mesh periods of rotors with this number of
+    `slices` (1 for straight rotors)."""
     first, further = min(periods, 2), max(periods - 2, 0)
-    elements, times = (first * x + further * y for x, y in (_MOST, _TIMES))
+    growth = 1 + _SLICES * (slices - 1)
+    elements, times = (round(growth * (first * x + further * y)) for x, y in (_MOST, _TIMES))
     return -(-elements // BLOCK) * BLOCK, times + 3
 
 
-def most_elements(mesh: Mesh, denser: Float[Array, ""]) -> Int[Array, ""]:
+def most_elements(mesh: Mesh, denser: Float[Array, ""], slices: int) -> Int[Array, ""]:
     """Return the number of elements above which the `mesh` is not refined.
 
-    `denser`: factor by which meshes are denser than at the usual accuracy. The arrays have room for
-    more if the period is shorter than the longest one. An orbit that needs more elements has an
-    event that the equation does not know, and each further element costs time."""
-    wanted = jnp.round(_FINEST * denser * mesh.period).astype(int)
+    `denser`: factor by which meshes are denser than at the usual accuracy; `slices`: as for
+    `sizes`. The arrays have room for more if the period is shorter than the longest one. An orbit
+    that needs more elements has an event that the equation does not know, and each further element
+    costs time."""
+    growth = 1 + _SLICES * (slices - 1)
+    wanted = jnp.round(growth * _FINEST * denser * mesh.period).astype(int)
     return jnp.minimum(wanted, mesh.left.shape[0]) - 1
 
 
