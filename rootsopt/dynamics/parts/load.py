@@ -131,16 +131,19 @@ class GasLoad(Load):
         phi, half = motion.phi, self.profile.half_pitch
         roll = self._roll(phi)
         addendum = half - jnp.abs(roll - half)
-        ends = [segment.stop for segment in self.profile.segments()[:-1]]
-        passed = [self.profile.normal_at(addendum) - end for end in ends]
-        # The start and the end of each spread jump.
+        passed, within = [], jnp.zeros((), bool)
         for segment in self.profile.segments():
+            begin, end = self.profile.roll_angle(jnp.stack([segment.start, segment.stop]))
+            brief = jnp.zeros((), bool) if segment.land else end - begin < BRIEF
+            # A segment's end that lies inside a spread jump does not matter. (There, the normal
+            # angle of the contact jumps, so that it has no smooth margin.)
+            passed.append(jnp.where(within | brief, 1.0, addendum - begin))
+            within = brief
             if not segment.land:
-                begin, end = self.profile.roll_angle(jnp.stack([segment.start, segment.stop]))
                 share = _spread_share(addendum, begin, end)
-                brief = end - begin < BRIEF
                 passed += [jnp.where(brief, edge, 1.0) for edge in (share, share - 1)]
-        return jnp.stack([jnp.sin(phi * self.profile.lobes), roll - half, *passed])
+        # The first segment begins at the tip.
+        return jnp.stack([jnp.sin(phi * self.profile.lobes), roll - half, *passed[1:]])
 
 
 def over_segments(
