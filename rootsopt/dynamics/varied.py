@@ -135,8 +135,9 @@ def _varied_flow(
     state, slopes = of_elements(found.value, before)
     roots: Any = jnp.zeros((rows, len(GAUSS.nodes) + 1, 0, 2), dtype)
     still = jnp.zeros((2, orbit.moved.shape[1]), dtype)
-    varied = Step(*of_elements(changes, starts), still, orbit.monodromy)
-    return VariedOrbit(Elements(mesh, state, slopes, roots), varied)
+    by_state, by_slopes = of_elements(changes, starts)
+    variation = Step(by_state, by_slopes, still, orbit.monodromy)
+    return VariedOrbit(Elements(mesh, state, slopes, roots), variation)
 
 
 __all__ = ["VariedOrbit", "varied"]

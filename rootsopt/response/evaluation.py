@@ -383,15 +383,23 @@ class Evaluator:
         begin = eqx.filter_eval_shape(_at_rest, pair, solver.max_orbit)
 
         def then(found: Steady) -> None:
-            if found.known is None:
+            if found.known is None or found.orbit.variation is None:
                 return
+            orbit = VariedOrbit(found.known.elements, found.orbit.variation)
+            if self._loaded(series):
+                orbit_loads.prepare(self.scene, design, orbit)
+            rows = np.zeros((found.orbit.response.shape[0], 1))
+            forces = solver.measures.named(rows, 1)
+            added = [name for name in self._names if name not in (*forces, *BEARING)]
+            if added:
+                values, slopes = (jax.ShapeDtypeStruct((3, *d), float) for d in ((), design.shape))
+                values_of.prepare(self.scene, terms_of(added), design, values, slopes)
             if series:
                 sampled.prepare(found.known.elements, solver.samples)
             if series and self.confirm:
                 known = found.orbit.state, found.orbit.response
                 _integrated.prepare(pair, known, found.period, solver.orbit)
             if maxima or self.maxima:
-                orbit = VariedOrbit(found.known.elements, found.orbit.variation)
                 prepare_maxima(pair, tangents, orbit)
 
         # The slowest compilation starts first.
@@ -440,9 +448,9 @@ class Evaluator:
             statistics |= orbit_statistics(found)
             motion = orbit_series(pair, orbit, period) if series else None
             start = Seed.of(found, pair)
-            if self.scene.bearings is not None and (series or {*BEARING} & {*self._names}):
-                orbit_found = varied(pair, tangents, found, self._solver)
-                loads = jax.device_get(orbit_loads(self.scene, jnp.asarray(design), orbit_found))
+            if self._loaded(series):
+                whole = varied(pair, tangents, found, self._solver)
+                loads = jax.device_get(orbit_loads(self.scene, jnp.asarray(design), whole))
                 for name, (value, slope) in bearing_record(loads).items():
                     response[name] = value
                     if gradient:
@@ -491,6 +499,10 @@ class Evaluator:
             series=motion,
             start=start,
         )
+
+    def _loaded(self, series: bool) -> bool:
+        """Return whether an evaluation computes loads on bearings; `series`: with a series."""
+        return self.scene.bearings is not None and (series or bool({*BEARING} & {*self._names}))
 
     @property
     def _names(self) -> tuple[str, ...]:

@@ -301,8 +301,11 @@ def values_of(
         found = [term.value(here, profile, shape, Forces(*forces)) for term in terms]
         return jnp.stack([jnp.asarray(one, float) for one in found])
 
-    by_design, by_forces = jax.jacfwd(every, (0, 1))(design, forces)
-    return every(design, forces), by_design + by_forces @ slopes
+    def twice(*at):
+        return (every(*at),) * 2
+
+    (by_design, by_forces), values = jax.jacfwd(twice, (0, 1), has_aux=True)(design, forces)
+    return values, by_design + by_forces @ slopes
 
 
 class _UsedError(Exception):

@@ -43,11 +43,10 @@ def evaluate_together(evaluators: Sequence[Evaluator]) -> list[Evaluation]:
         stacked = jax.tree.map(lambda *x: jnp.stack(x), *(inputs[k][0] for k in members))
         motions: Steady = jax.device_get(_motions(stacked, inputs[members[0]][1]))
         for row, number in enumerate(members):
-            pair, _, shape = built[number]
             motion = jax.tree.map(lambda x, row=row: x[row], motions)
             if not int(motion.window.done):
                 motion = motion._replace(window=None)
-            found[number] = evaluators[number].evaluation((pair, shape), motion, began)
+            found[number] = evaluators[number].evaluation(built[number], motion, began)
     return [found[number] for number in range(len(evaluators))]
 
 

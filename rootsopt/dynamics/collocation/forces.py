@@ -73,7 +73,8 @@ def forces_of(
     slopes = jnp.concatenate([by_averages[:2], by_height[None], by_averages[2:]])
     variation = None
     if equation.variation:
-        variation = Step(*(x[..., 1:] for x in step[:3]), step.monodromy)
+        columns = (x[..., 1:] for x in (step.state, step.slopes, step.times))
+        variation = Step(*columns, monodromy=step.monodromy)
     first = origin(elements)
     used = (jnp.arange(elements.state.shape[0]) < elements.mesh.used)[:, None]
     return OrbitForces(

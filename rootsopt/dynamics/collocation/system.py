@@ -292,7 +292,8 @@ def unchanged(elements: Elements, columns: int) -> Step:
     """Return a step with zeros in all of its `columns`, for a motion like `elements`."""
     count = elements.state.shape[1]
     parts = elements.state, elements.slopes, elements.mesh.times
-    return Step(*(jnp.zeros((*x.shape, columns)) for x in parts), jnp.zeros((count, count)))
+    nothing = (jnp.zeros((*x.shape, columns)) for x in parts)
+    return Step(*nothing, monodromy=jnp.zeros((count, count)))
 
 
 def moved_at(
