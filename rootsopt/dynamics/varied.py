@@ -102,7 +102,8 @@ def _varied_flow(
         return linearized(run, equation.start(state, pair.free), dynamic, moved, count)
 
     each = jax.vmap(jax.vmap(linear, (None, None, None, 0)), (0, 0, 0, None))
-    found = in_blocks(lambda *step: each(*step, jnp.asarray(nodes, dtype)), taken, *steps)
+    at = jnp.asarray(nodes, dtype)
+    found = in_blocks(lambda begin, end, state: each(begin, end, state, at), taken, *steps)
 
     def advance(now, step):
         by_state, by_parameters = step
