@@ -59,7 +59,8 @@ class ContactLaw(eqx.Module):
         """Return numbers (s,) that are positive where the flags of `switches` are set.
 
         `depth`, `rate`: as in `switches`. Each number passes smoothly through zero where its flag
-        changes. A law that overrides `switches` but not `margins` cannot be used by collocation."""
+        changes. Margins of a class that overrides only `switches` are not used (see
+        `RotorPair.margins`)."""
         del rate
         return jnp.stack([depth])
 

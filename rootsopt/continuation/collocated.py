@@ -26,7 +26,6 @@ from rootsopt.continuation.orbits import (
     pair_at,
 )
 from rootsopt.dynamics.collocation.bordered import Followed, Line, Plane, followed
-from rootsopt.dynamics.collocation.closing import supported
 from rootsopt.dynamics.collocation.known import Known
 from rootsopt.dynamics.collocation.motion import ACCURACY, UNREFINED
 from rootsopt.dynamics.collocation.seed import from_steps
@@ -34,6 +33,7 @@ from rootsopt.dynamics.collocation.system import Step
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.pair import RotorPair
+from rootsopt.dynamics.steady import continues
 from rootsopt.dynamics.verdict import TOO_DEEP
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene
@@ -203,7 +203,7 @@ class CollocatedFamily(OrbitFamily):
 
 def can_follow(scene: Scene, pair: RotorPair) -> bool:
     """Return whether orbits of `pair` in the `scene` can be followed by collocation."""
-    return scene.solver.closing != "shooting" and supported(pair)
+    return continues(pair, scene.solver)
 
 
 @Program

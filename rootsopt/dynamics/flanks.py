@@ -96,8 +96,9 @@ class Margins(NamedTuple):
     `values` (s,): one *margin* for each flag of `RotorPair.switches`, positive where the flag is
     set. With a `NearContact`, each margin is zero at the instant at which its flag changes, and
     smooth around this instant. `counts` (s,): whether each flag matters. The flags of a flank
-    matter where the flank transmits a force. `places`: `Approach.place` with a leading axis for the
-    flanks that can touch (see `RotorPair.flanks`). `pushes` (flanks,): whether these flanks
+    matter where the flank transmits a force. A flag without a margin has the margin 1 or -1 (see
+    `margins_of`). `places`: `Approach.place` with a leading axis for the flanks that can touch (see
+    `RotorPair.flanks`). `pushes` (flanks,): whether these flanks
     transmit a force."""
 
     values: Float[Array, " s"]
@@ -282,12 +283,13 @@ def kink_margins(pair: "RotorPair", motion: Motion, acting, touches: Any) -> Mar
 
     def of_flank(contact, side, touch):
         found = [
-            pair.law.margins(touch.depth, touch.closing),
-            contact.on_side(side).margins(touch.roll, touch.approach),
+            margins_of(pair.law, touch.depth, touch.closing),
+            margins_of(contact.on_side(side), touch.roll, touch.approach),
         ]
         if touch.sliding is not None:
             speed = touch.sliding.speed
-            found += [part.drag_margins(speed) for part in pair.all_parts if part.rubs]
+            rubbing = (part for part in pair.all_parts if part.rubs)
+            found += [margins_of(part, speed, flags="drag_switches") for part in rubbing]
         values = jnp.concatenate(found)
         return values, pair.law(touch.depth, touch.closing) > 0, touch.approach.place
 
@@ -305,10 +307,37 @@ def kink_margins(pair: "RotorPair", motion: Motion, acting, touches: Any) -> Mar
     counts, values = jnp.repeat(pushes, values.shape[1]), [values.ravel()]
     if not pair.two_sided:
         values, counts = [*values, -motion.relative[None]], jnp.append(counts, jnp.any(pushes))
-    values += [part.margins(motion, own) for part, own in acting]
+    values += [margins_of(part, motion, own) for part, own in acting]
     every = jnp.concatenate(values)
     counts = jnp.pad(counts, (0, every.size - counts.size), constant_values=True)
     return Margins(every, counts, places, pushes)
+
+
+def margins_of(owner: Any, *at: Any, flags: str = "switches") -> Float[Array, " s"]:
+    """Return the margins of a contact law, contact or part: 1 or -1 if it only has flags.
+
+    `at`: arguments of its method `flags`, which returns the flags."""
+    if has_margins(type(owner), flags):
+        return getattr(owner, _MARGINS[flags])(*at)
+    return jnp.where(getattr(owner, flags)(*at), 1.0, -1.0)
+
+
+@functools.cache
+def has_margins(kind: type, flags: str = "switches") -> bool:
+    """Return whether a contact law, contact or part of the class `kind` has a margin for each flag.
+
+    It does if the margins are defined in the same class as the method `flags`, or in a subclass of
+    that class."""
+    order = list(kind.__mro__)
+    places = [
+        next(k for k, base in enumerate(order) if name in vars(base))
+        for name in (_MARGINS[flags], flags)
+    ]
+    return places[0] <= places[1]
+
+
+_MARGINS = {"switches": "margins", "drag_switches": "drag_margins"}
+"""Methods that return margins, keyed by those that return flags."""
 
 
 def pushes_of(pair: "RotorPair", motion: Motion) -> Pushes:

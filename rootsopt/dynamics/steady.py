@@ -14,7 +14,6 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from rootsopt.dynamics.collocation.closing import supported
 from rootsopt.dynamics.collocation.known import Known
 from rootsopt.dynamics.flow import Flow
 from rootsopt.dynamics.integrator import Integrator
@@ -389,5 +388,7 @@ def steady_motion(
 
 
 def continues(pair: RotorPair, solver: Solver) -> bool:
-    """Return whether orbits of `pair` can be closed by collocation."""
-    return solver.closing != "shooting" and supported(pair)
+    """Return whether orbits of `pair` are closed by collocation.
+
+    The equation of motion must be smooth between the changes of its flags."""
+    return solver.closing != "shooting" and pair.smooth

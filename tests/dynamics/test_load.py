@@ -74,6 +74,12 @@ def test_gas_torque_has_no_jump_and_its_derivative_is_that_of_differences(length
     here = np.asarray(torque(model, design))
     # It rises by its mean in no less than a quarter of a brief stretch, 0.01 rad.
     assert np.max(abs(np.diff(here))) < np.mean(here) * 1.2 * np.ptp(phi) / 4000 / 0.0025
+    # Margins must not jump where they change their sign: they locate and move events.
+    rest = jnp.zeros_like(phi)
+    gas = eqx.filter_jit(lambda model, design: model.pair(design).load)(model, design)
+    motion = Motion(phi, rest, rest, rest)
+    margins = np.asarray(jax.vmap(gas.margins, (0, None))(motion, rest[:0]))
+    assert np.max(abs(np.diff(margins, axis=0))) < 200 * float(phi[1] - phi[0])
     if length == 8.893:
         return  # The longest to within rounding of its own difference.
     for index, step in enumerate((1e-5, 1e-5, 1e-5)):

@@ -13,7 +13,6 @@ An orbit whose flags agree is solved again on a finer mesh, graded according to 
 coarser mesh. The difference between the two solutions is the error estimate.
 """
 
-import functools
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -22,8 +21,6 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from rootsopt.contact.search import SearchContact
-from rootsopt.contact.wrapped import innermost
 from rootsopt.dynamics.collocation.elements import Elements
 from rootsopt.dynamics.collocation.equation import CollocatedEquation, Points
 from rootsopt.dynamics.collocation.events import (
@@ -163,33 +160,6 @@ def corrected(tolerance: Float[Array, ""]) -> Float[Array, ""]:
     `tolerance`: relative error of the forces to reach. Derivatives are those before this
     correction."""
     return CORRECTED * jnp.sqrt(jnp.maximum(tolerance / _USUAL, 1.0))
-
-
-def supported(pair: RotorPair) -> bool:
-    """Return whether collocation can close orbits of `pair`.
-
-    The contact must be a `SearchContact`, or wrap one. Every flag of contact law and parts needs a
-    margin (see `Margins`)."""
-    searched = isinstance(innermost(pair.contact), SearchContact)
-    return searched and all(_has_margins(type(owner)) for owner in (pair.law, *pair.all_parts))
-
-
-@functools.cache
-def _has_margins(kind: type) -> bool:
-    """Return whether a contact law or part of the class `kind` has a margin for each flag."""
-    names = [("margins", "switches"), ("drag_margins", "drag_switches")]
-    return all(_newer(kind, margin, flag) for margin, flag in names if hasattr(kind, flag))
-
-
-def _newer(kind: type, margin: str, flag: str) -> bool:
-    """Return whether the method `margin` of the class `kind` matches its method `flag`.
-
-    It does if `margin` is defined in the same class as `flag`, or in a subclass of that class."""
-    order = list(kind.__mro__)
-    places = [
-        next(k for k, base in enumerate(order) if name in vars(base)) for name in (margin, flag)
-    ]
-    return places[0] <= places[1]
 
 
 class Closer(eqx.Module):
@@ -480,4 +450,4 @@ def _differences(before: OrbitForces, after: OrbitForces):
     return error, drift
 
 
-__all__ = ["FIRST", "Closed", "Closer", "Loop", "close", "corrected", "supported"]
+__all__ = ["FIRST", "Closed", "Closer", "Loop", "close", "corrected"]

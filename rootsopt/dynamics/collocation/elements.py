@@ -18,10 +18,10 @@ class Mesh(NamedTuple):
 
     `times` (m,) in mesh periods: start of the period, events in ascending order, then the end of
     the period, repeated; `which` (m,): index of the margin (`Margins.values`) that is zero at each
-    time, -1 where the time is fixed; `interval` (e,): index in `times` of the start of the interval
-    that contains the element; `left`, `right` (e,): start and end of the element, as fractions of
-    its interval; `used`: number of elements in use. The unused elements come last and have length
-    0.
+    time, negative where the time stays (`events.FIXED`, `UNSAID`); `interval` (e,): index in
+    `times` of the start of the interval that contains the element; `left`, `right` (e,): start and
+    end of the element, as fractions of its interval; `used`: number of elements in use. The unused
+    elements come last and have length 0.
     """
 
     times: Float[Array, " m"]

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from rootsopt.contact.gap import Contact
 from rootsopt.contact.near import NearContact
 from rootsopt.contact.search import SearchContact
 from rootsopt.contact.wrapped import around, innermost
@@ -55,11 +54,15 @@ class CollocatedEquation(eqx.Module):
     def near(self, dynamic: Any, static: Any, roots: Float[Array, "flanks 2"]) -> RotorPair:
         """Return the pair with a contact evaluated near known `roots` (see `NearContact`).
 
-        `dynamic`, `static`: the pair's floating-point arrays, and the rest of the pair."""
+        `dynamic`, `static`: the pair's floating-point arrays, and the rest of the pair. Another
+        contact than a `SearchContact` is evaluated as it is."""
         pair: RotorPair = eqx.combine(dynamic, static)
+        searched = innermost(pair.contact)
+        if not isinstance(searched, SearchContact):
+            return pair
         if pair.contact.slices is not None:
             roots = roots.reshape(pair.contact.sections, -1, 2)
-        contact = NearContact(searched(pair.contact).pair, roots)
+        contact = NearContact(searched.pair, roots)
         return eqx.tree_at(lambda p: p.contact, pair, around(pair.contact, contact))
 
     def evaluated(self, dynamic, static, tau, state, roots, which):
@@ -77,7 +80,9 @@ class CollocatedEquation(eqx.Module):
         if near.free:
             rates = near.lapse(state) * jnp.append(rates, jnp.ones_like(unit))
         values = [*slope, *rates, found.values[which]]
-        return values, (_roots(found.places), contact.total, contact.depth)
+        if isinstance(innermost(near.contact), NearContact):
+            roots = _roots(found.places)
+        return values, (roots, contact.total, contact.depth)
 
     def along(
         self,
@@ -139,13 +144,6 @@ class CollocatedEquation(eqx.Module):
         others = jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), others)
         points = Points(back(jnp.stack(values)), back(slopes[:, :size]), *others)
         return points, back(slopes[:, size : size + count])
-
-
-def searched(contact: Contact) -> SearchContact:
-    """Return the `SearchContact` that `contact` is, or that it wraps."""
-    found = innermost(contact)
-    assert isinstance(found, SearchContact)
-    return found
 
 
 def _roots(places: Any) -> Float[Array, "flanks 2"]:

@@ -13,15 +13,17 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.contact.closest import RANKS
-from rootsopt.contact.wrapped import around
+from rootsopt.contact.search import SearchContact
+from rootsopt.contact.wrapped import around, innermost
 from rootsopt.dynamics.collocation.blocks import in_blocks
 from rootsopt.dynamics.collocation.elements import Elements
-from rootsopt.dynamics.collocation.equation import searched
 from rootsopt.dynamics.collocation.gauss import GAUSS
+from rootsopt.dynamics.flanks import has_margins, margins_of, touch_of
 from rootsopt.dynamics.pair import RotorPair
 
 _ASIDE = 2e-7, 0.02
@@ -38,6 +40,9 @@ _WITHIN = 0.03, 0.97
 ends are beside it."""
 _ENDS = (1.0, 0.0)
 """End and start of an element, as fractions of its length."""
+FIXED, UNSAID = -1, -2
+"""In place of the index of an event's margin: the time is fixed, as that of φ1 = 0; the time is
+where a flag without a margin changes, and stays until flags are evaluated again."""
 _CHANGES = 2
 """Number of flag changes per event for which there is room. Several flags may change at one event.
 If more change, the search for the orbit fails."""
@@ -65,7 +70,7 @@ class Events(NamedTuple):
     """Events of a motion, in order of time.
 
     `times` (m,) in mesh periods (inf beyond the last); `which` (m,): index of the margin that is
-    zero at each event, -1 where the time is fixed; `count`: number of events; `new`: number of flag
+    zero at each event, or `FIXED` or `UNSAID`; `count`: number of events; `new`: number of flag
     changes that are not at events of the mesh; `gone`: number of events of the mesh at which the
     flag does not change; `fits`: whether the arrays have room for all events.
     """
@@ -85,7 +90,9 @@ def flags_at(pair: RotorPair, tau, state):
     (flanks,); whether the flanks transmit a force (flanks,). `tau`: time (mesh periods); `state`
     (n,): scaled."""
     found = pair.margins(tau, state)
-    return found.values > 0, found.counts, found.places.normal2, found.pushes
+    searches = isinstance(innermost(pair.contact), SearchContact)
+    roots = found.places.normal2 if searches else jnp.zeros(pair.flanks)
+    return found.values > 0, found.counts, roots, found.pushes
 
 
 def ranks(pair: RotorPair) -> list[int]:
@@ -96,39 +103,68 @@ def ranks(pair: RotorPair) -> list[int]:
     1 is the change to the other minimum of the gap next to a cusp, because other flags change with
     it. The rank -1 marks a flag whose change is not an event by itself. All other margins have
     greater ranks, in their order."""
-    nothing = jnp.zeros(())
-    law = jax.eval_shape(pair.law.margins, nothing, nothing).shape[0]
-    tau, state = nothing, jnp.zeros(pair.states)
-    total = jax.eval_shape(lambda: pair.margins(tau, state).values).shape[0]
-    flanks = searched(pair.contact).pair
-    profile = flanks.profile
-    minima = RANKS if profile.wavy else 0
-    edges = jax.eval_shape(lambda: flanks.edges).shape[0]
-    pieces = 2 + profile.cusp + minima + 2 * edges
-    drags = jax.eval_shape(
-        lambda: jnp.concatenate(
-            [jnp.zeros(0), *(part.drag_margins(nothing) for part in pair.all_parts if part.rubs)]
-        )
-    ).shape[0]
-    flank = law + pieces + drags
-    order = [2 + k for k in range(flank)]
-    order[law] = -1
-    if profile.cusp:
-        order[law + 2] = 1
-    if profile.wavy:  # These flags also change where the contact moves on without a jump.
-        between = range(law + 2, law + 2 + profile.cusp + RANKS)
-        order = [-1 if k in between else rank for k, rank in enumerate(order)]
-    every = order * pair.flanks
-    return every + [0] * (total - len(every))
+    of_flank, others = _owners(pair)
+    law, flank = of_flank[0][1], sum(count for _, count in of_flank)
+    order, contact = [2 + k for k in range(flank)], innermost(pair.contact)
+    if isinstance(contact, SearchContact):
+        profile = contact.pair.profile
+        order[law] = -1
+        if profile.cusp:
+            order[law + 2] = 1
+        if profile.wavy:  # These flags also change where the contact moves on without a jump.
+            between = range(law + 2, law + 2 + profile.cusp + RANKS)
+            order = [-1 if k in between else rank for k, rank in enumerate(order)]
+    return order * pair.flanks + [0] * sum(count for _, count in others)
+
+
+def vague(pair: RotorPair) -> list[bool]:
+    """Return whether each flag has no margin of its own, so that it does not tell how an event
+    moves."""
+    of_flank, others = _owners(pair)
+    own, rest = (
+        [not has for has, count in some for _ in range(count)] for some in (of_flank, others)
+    )
+    return own * pair.flanks + rest
+
+
+def _owners(pair: RotorPair) -> tuple[list[tuple[bool, int]], list[tuple[bool, int]]]:
+    """Return whether each owner of flags has margins, and the number of its flags, in their order.
+
+    The first list is that of one flank: contact law, contact, and parts that rub. The second list
+    is that of the pair: the sign of ε where it matters, and all parts."""
+    nothing, state = jnp.zeros(()), jnp.zeros(pair.states)
+    own = eqx.tree_at(lambda p: p.contact, pair, pair.contact.in_slice(jnp.zeros((), int)))
+
+    def flags():
+        motion, acting = own._moving(nothing, state)
+        touch = touch_of(own, jnp.ones(()), motion)
+        rubbing = [part for part in pair.all_parts if part.rubs]
+        contact = own.contact.on_side(jnp.ones(()))
+        of_flank = [
+            margins_of(pair.law, nothing, nothing),
+            margins_of(contact, touch.roll, touch.approach),
+            *(margins_of(part, nothing, flags="drag_switches") for part in rubbing),
+        ]
+        return of_flank, [margins_of(part, motion, states) for part, states in acting]
+
+    of_flank, others = jax.eval_shape(flags)
+    rubbing = [has_margins(type(part), "drag_switches") for part in pair.all_parts if part.rubs]
+    known = [*(has_margins(type(owner)) for owner in (pair.law, innermost(pair.contact))), *rubbing]
+    first = list(zip(known, (x.shape[0] for x in of_flank), strict=True))
+    parts = [has_margins(type(part)) for part in pair.all_parts]
+    last = list(zip(parts, (x.shape[0] for x in others), strict=True))
+    return first, last if pair.two_sided else [(True, 1), *last]
 
 
 @eqx.filter_jit
 def look(pair: RotorPair, elements: Elements) -> FlagScan:
     """Evaluate the flags at the Gauss points of each element, on both sides of its end, and at its
     `extra` instants."""
-    contact = searched(pair.contact)
-    grouped = dataclasses.replace(contact, pair=dataclasses.replace(contact.pair, together=True))
-    pair = eqx.tree_at(lambda p: p.contact, pair, around(pair.contact, grouped))
+    contact = innermost(pair.contact)
+    if isinstance(contact, SearchContact):
+        flanks = dataclasses.replace(contact.pair, together=True)
+        grouped = dataclasses.replace(contact, pair=flanks)
+        pair = eqx.tree_at(lambda p: p.contact, pair, around(pair.contact, grouped))
     mesh = elements.mesh
     tau, state = elements.places
     number = jnp.arange(mesh.left.shape[0])
@@ -255,9 +291,10 @@ def _compared(pair: RotorPair, elements: Elements, seen: FlagScan) -> _Compared:
     ends_at = jnp.where(mesh.last, mesh.interval + 1, mesh.times.shape[0] - 1)[element]
     real = mesh.last[element] & (mesh.times[ends_at] < mesh.times[-1]) & (element < mesh.used)
     declared = (inside == per - 2) & real & (number < seen.total)
-    fixed = mesh.which[ends_at] < 0
     holds = jnp.take_along_axis(differ, jnp.maximum(mesh.which[ends_at], 0)[:, None], 1)[:, 0]
-    kept = declared & (fixed | holds)
+    unsaid = jnp.any(differ & np.asarray(vague(pair), bool), axis=1)
+    holds = jnp.where(mesh.which[ends_at] == UNSAID, unsaid, holds)
+    kept = declared & ((mesh.which[ends_at] == FIXED) | holds)
     return _Compared(differ & ~kept[:, None], later, ends_at, declared, kept)
 
 
@@ -299,6 +336,7 @@ def found_events(
     real = number <= mesh.interval[mesh.used - 1]
     held = jnp.where(same, real, held).at[0].set(False)
     times = jnp.concatenate([located, jnp.where(held, mesh.times, jnp.inf)])
+    flag = jnp.where(jnp.asarray(vague(pair))[flag], UNSAID, flag)
     which = jnp.concatenate([flag, mesh.which])
     times, which, count = _merged(times, which, rank)
     gone = jnp.sum(declared & ~kept)
@@ -350,9 +388,10 @@ def zero_of(margin, low, high, positive):
 def _merged(times, which, rank):
     """Sort events by time, and merge those at the same instant.
 
-    `times`: inf for missing events; `which`: index of each event's margin, or -1; `rank`: see
-    `ranks`. Return the merged times and margins, and the number of events."""
-    importance = jnp.where(which < 0, -1, rank[which])
+    `times`: inf for missing events; `which`: index of each event's margin, `FIXED` or `UNSAID`;
+    `rank`: see `ranks`. Return the merged times and margins, and the number of events."""
+    importance = jnp.where(which == UNSAID, rank.shape[0] + 2, rank[which])
+    importance = jnp.where(which == FIXED, -1, importance)
     order = jnp.lexsort((importance, times))
     times, which, importance = times[order], which[order], importance[order]
     real = times < jnp.inf

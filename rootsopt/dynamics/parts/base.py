@@ -216,8 +216,8 @@ class Part(eqx.Module):
         return jnp.zeros(0, bool)
 
     # Numbers that are positive where these flags are set. Each is smooth across the instant at
-    # which its flag changes, and zero there. Collocation needs them; a part that has flags but no
-    # margins is left to shooting.
+    # which its flag changes, and zero there. Without margins, such instants take more iterations to
+    # find, and derivatives of an orbit are right only if loads and rates do not jump there.
 
     def margins(self, motion: Motion, own: Own) -> Float[Array, " s"]:
         """Return numbers (s,), each positive where the flag of `switches` with the same index is

@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxtyping import Array
 
 import rootsopt
-from rootsopt.contact.law import ContactLaw
 from rootsopt.dynamics import closed
-from rootsopt.dynamics.collocation.closing import supported
+from rootsopt.dynamics.collocation.events import vague
 from rootsopt.dynamics.parts.base import Part
 from rootsopt.dynamics.settle import settle
 from rootsopt.scene import Scene
@@ -31,6 +31,12 @@ STIFF = [
     "scene.speed_rpm=657.2",
     "scene.load.torque_N_m=2.069",
     "scene.timing_gear={stiffness_N_m_per_rad: 42986, damping_ratio: 0.276, backlash_mm: 0.104}",
+]
+TWISTED = [
+    "rotor.helix_deg=40",
+    "solver.slices=4",
+    "contact.friction={static: 0.12, kinetic: 0.1}",
+    "scene.center_distance_error_mm=0.02",
 ]
 FOUR = [
     "profile={family: cic, lobes: 4, pitch_radius_mm: 33.0, pressure_angle_deg: 33, "
@@ -73,8 +79,10 @@ def _both(name, overrides):
         ("cic", FOUR, 1),
         ("cic", LIVELY, 2),
         ("pump", [], 1),
+        ("cic", TWISTED, 1),
+        ("cic", ["contact.wear.depth_mm=0.02"], 1),
     ],
-    ids=["cic", "ee", "ee, steps down to rounding", "four lobes", "lively", "pump"],
+    ids=["cic", "ee", "steps down to rounding", "four lobes", "lively", "pump", "twisted", "worn"],
 )
 def test_collocation_agrees_with_shooting(name, overrides, period):
     (by_one, one), (by_other, other) = _both(name, overrides)
@@ -114,8 +122,7 @@ def test_orbit_closed_over_too_many_periods_is_closed_again(monkeypatch):
 
 
 def test_program_has_the_shapes_of_shooting():
-    """The results of both methods have the same structure, because `auto` has both in one
-    program."""
+    """The results of both methods have the same structure."""
     config = rootsopt.load_config("configs/cic.yaml", ["solver.orbit=auto"])
     scene = Scene.from_config(config)
     design = jnp.asarray(config.design, float)
@@ -123,32 +130,46 @@ def test_program_has_the_shapes_of_shooting():
     assert found.multipliers.shape == (2,)
 
 
-class _Flagged(Part):
-    """A part with a flag but no margin."""
+class _Stop(Part):
+    """A spring on rotor 2 beyond a stop (rad)."""
+
+    stop: Array | float
+
+    def torque_on_2(self, motion, own):
+        del own
+        return -2e4 * jnp.minimum(motion.relative + self.stop, 0.0)
 
     def switches(self, motion, own):
         del own
-        return (motion.relative > 0)[None]
+        return self._excess(motion) > 0
+
+    def margins(self, motion, own):
+        del own
+        return self._excess(motion)
+
+    def _excess(self, motion):
+        return (motion.relative + self.stop)[None]
 
 
-class _Law(ContactLaw):
-    """A law whose only flag is that of the base class."""
+class _Untold(_Stop):
+    """The same, whose flag is newer than its margin."""
 
-    exponent: jax.Array
-
-    def __call__(self, depth, rate):
-        del rate
-        return 1e7 * jnp.maximum(depth, 0.0)
-
-    def depth_at(self, force):
-        return force / 1e7
+    def switches(self, motion, own):
+        return super().switches(motion, own)
 
 
-def test_flags_without_margins_are_left_to_shooting():
+def test_flags_without_margins():
+    """Events that only a flag tells are located by it; forces and gradients are the same."""
     config = rootsopt.load_config("configs/cic.yaml")
-    scene = Scene.from_config(config)
-    make = eqx.filter_jit(lambda s, d: s.pair(d))
-    design = jnp.asarray(config.design, float)
-    assert supported(make(scene, design))
-    assert supported(make(scene.with_law(_Law(jnp.ones(()))), design))
-    assert not supported(make(scene.with_parts(_Flagged()), design))
+    scene, design = Scene.from_config(config), jnp.asarray(config.design, float)
+    relative = rootsopt.evaluate(config).series.relative
+    stop = -0.5 * (relative.min() + relative[relative < 0].mean())
+    found = []
+    for kind in (_Stop, _Untold):
+        with_part = scene.with_parts(kind(stop))
+        pair = eqx.filter_jit(Scene.pair)(with_part, design)
+        assert np.any(vague(pair)) == (kind is _Untold)
+        response = eqx.filter_jit(rootsopt.steady_response)(with_part, design)
+        assert response.status == Status.PERIODIC.code
+        found.append((response.mean, response.peak, response.rms))
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-6)
