@@ -1,8 +1,8 @@
 """Compares orbits closed by collocation with orbits closed by shooting, on random pairs.
 
 The study draws designs and scenes (speed, load, backlash, gear, contact) of several kinds: CIC with
-two to four lobes, EE, arc and involute, five arcs, a free form, with gas and friction, with a
-motor, and lively scenes. For each pair of design and scene that settles, both solvers start from
+two to four lobes, EE, arc and involute, five arcs, a free form, twisted and worn rotors, with gas
+and friction, with a motor, and lively scenes. For each pair of design and scene that settles, both solvers start from
 rest. Forces, their derivatives with respect to design, speed and load, period, multipliers and
 status are compared. The times are those of a second call in the same process.
 """
@@ -44,6 +44,7 @@ GAS = [
     "contact.friction={static: 0.2, kinetic: 0.1, stiction_speed_mm_s: 100, "
     "friction_speed_mm_s: 1000}",
 ]
+TWIST = ["rotor.helix_deg=45", "solver.slices=4"]
 MOTOR = ["scene.drive=torque", "scene.motor={slope_N_m_s_per_rad: 0.1, inertia_kg_m2: 1.0e-3}"]
 KINDS: dict[str, tuple[str, int, list[str]]] = {
     "cic, 3 lobes": ("cic", 3, []),
@@ -57,6 +58,9 @@ KINDS: dict[str, tuple[str, int, list[str]]] = {
     "ee, 2 lobes": ("ee", 2, []),
     "five arcs": ("five_arcs", 3, []),
     "free form": ("free_form", 3, []),
+    "cic, twisted": ("cic", 3, TWIST),
+    "cic, twisted, gas and friction": ("cic", 3, [*TWIST, *GAS]),
+    "ee, worn": ("ee", 3, ["contact.wear.depth_mm=0.02"]),
 }
 """Family, lobes and further overrides of each kind."""
 

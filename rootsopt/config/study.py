@@ -75,7 +75,7 @@ class SolverConfig(Section):
     orbit: Literal["collocation", "shooting", "auto"] = Field(
         "auto",
         description="how periodic orbits are closed: auto and collocation: by collocation aligned "
-        "with contact events where possible; shooting: by shooting, an independent reference",
+        "with contact events; shooting: by shooting, an independent reference",
     )
 
     @model_validator(mode="before")

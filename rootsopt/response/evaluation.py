@@ -295,7 +295,7 @@ class Evaluator:
         began = time.perf_counter()
         design = design_vector(self.config) if design is None else jnp.asarray(design)
         pair, tangents, shape = _build(self.scene, design)
-        solver = self._solver
+        solver = self.solver
         begin = begun(pair, start, solver.max_orbit)
         found = self.motion(pair, tangents, begin)
         if series and self.confirm:
@@ -309,7 +309,7 @@ class Evaluator:
         return report
 
     @property
-    def _solver(self) -> Solver:
+    def solver(self) -> Solver:
         """Settings of the solver; orbits have their variation, from which all else follows."""
         return dataclasses.replace(self.scene.solver, variation=True)
 
@@ -317,7 +317,7 @@ class Evaluator:
         """Return the steady motion of `pair` that `start` leads to, in arrays of NumPy.
 
         It has derivatives along `tangents`; `start`: result of `starts.begun`."""
-        radius, solver = self.scene.pitch_radius, self._solver
+        radius, solver = self.scene.pitch_radius, self.solver
         found = self._examined(pair, _motion(pair, tangents, start, radius, solver))
         if Status.of(found.status) is not Status.NOT_CLOSED:
             return found
@@ -379,7 +379,7 @@ class Evaluator:
     def prepare_reached(self, design: Any, series: bool, maxima: bool) -> None:
         """Compile the programs of `reached` in the background. Arguments: see `prepare`."""
         pair, tangents, _ = _build.result_shape(self.scene, design)
-        dtype, solver = pair.angle_scale.dtype, self._solver
+        dtype, solver = pair.angle_scale.dtype, self.solver
         begin = eqx.filter_eval_shape(_at_rest, pair, solver.max_orbit)
 
         def then(found: Steady) -> None:
@@ -449,7 +449,7 @@ class Evaluator:
             motion = orbit_series(pair, orbit, period) if series else None
             start = Seed.of(found, pair)
             if self._loaded(series):
-                whole = varied(pair, tangents, found, self._solver)
+                whole = varied(pair, tangents, found, self.solver)
                 loads = jax.device_get(orbit_loads(self.scene, jnp.asarray(design), whole))
                 for name, (value, slope) in bearing_record(loads).items():
                     response[name] = value
@@ -551,14 +551,14 @@ def _at_rest(pair: RotorPair, longest: int) -> Start:
     return Start.at(pair, jnp.zeros(pair.states, pair.angle_scale.dtype), longest)
 
 
-def _motion_from(pair: RotorPair, tangents: RotorPair, start: Start, radius, solver) -> Steady:
+def motion_from(pair: RotorPair, tangents: RotorPair, start: Start, radius, solver) -> Steady:
     """Return the steady motion that a `start` with a scaled state leads to."""
     start = eqx.tree_at(lambda start: start.state, start, pair.in_si(start.state))
     return motion(pair, tangents, start, radius, solver)
 
 
 _build = Program(Scene.pair_and_tangents)
-_motion = Program(_motion_from, gathered=0)
+_motion = Program(motion_from, gathered=0)
 _integrated = Program(integrated_difference)
 lyapunov_program = Program(lyapunov)
 unsettled_status = Program(window_status)

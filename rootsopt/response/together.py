@@ -1,7 +1,7 @@
 """Evaluate many scenes at once as arrays, where that is faster than one after the other.
 
-On an accelerator, the motions of all scenes of one structure are stepped together (`vmap`). On a
-CPU they would then take as many steps as the longest, and both branches of every condition.
+On an accelerator, the motions of all scenes of one structure are computed together (`vmap`). On a
+CPU they would then take as many iterations as the longest, and all branches that one of them takes.
 """
 
 import time
@@ -11,12 +11,13 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from rootsopt.dynamics.closed import examined
-from rootsopt.dynamics.steady import Steady, steady_motion
-from rootsopt.response.evaluation import Evaluation, Evaluator
+from rootsopt.dynamics.steady import Steady
+from rootsopt.response.evaluation import Evaluation, Evaluator, motion_from
+from rootsopt.response.starts import begun
 from rootsopt.runtime.programs import Program
+from rootsopt.status import Status
 
 
 def pays() -> bool:
@@ -27,14 +28,16 @@ def pays() -> bool:
 def evaluate_together(evaluators: Sequence[Evaluator]) -> list[Evaluation]:
     """Evaluate the own design of each evaluator's config from rest, without series.
 
-    Scenes of the same structure (parts, number of lobes, solver) are stepped together."""
+    Scenes of the same structure (parts, number of lobes, solver) are computed together. A motion
+    whose orbit is not found then is evaluated again, alone."""
     began = time.perf_counter()
     built = [one.assembled() for one in evaluators]
     groups: dict[Hashable, list[int]] = {}
     inputs = []
     for number, (one, (pair, tangents, _)) in enumerate(zip(evaluators, built, strict=True)):
-        state = np.zeros(pair.states, pair.angle_scale.dtype)
-        arguments = pair, tangents, state, one.scene.pitch_radius, one.scene.solver
+        solver = one.solver
+        begin = begun(pair, None, solver.max_orbit)
+        arguments = pair, tangents, begin, one.scene.pitch_radius, solver
         arrays, others = eqx.partition(arguments, eqx.is_array)
         inputs.append((arrays, others))
         groups.setdefault(_kind(arrays, others), []).append(number)
@@ -46,7 +49,10 @@ def evaluate_together(evaluators: Sequence[Evaluator]) -> list[Evaluation]:
             motion = jax.tree.map(lambda x, row=row: x[row], motions)
             if not int(motion.window.done):
                 motion = motion._replace(window=None)
-            found[number] = evaluators[number].evaluation(built[number], motion, began)
+            if Status.of(motion.status) is Status.NOT_CLOSED:
+                found[number] = evaluators[number](series=False)
+            else:
+                found[number] = evaluators[number].evaluation(built[number], motion, began)
     return [found[number] for number in range(len(evaluators))]
 
 
@@ -60,8 +66,8 @@ def _kind(arrays: Any, others: Any) -> Hashable:
 @Program
 def _motions(arrays, others) -> Steady:
     def one(arrays):
-        pair, tangents, state, radius, solver = eqx.combine(arrays, others)
-        found = steady_motion(pair, tangents, state, radius, solver)
+        pair, tangents, start, radius, solver = eqx.combine(arrays, others)
+        found = motion_from(pair, tangents, start, radius, solver)
         return examined(pair, found, solver)
 
     return jax.vmap(one)(arrays)

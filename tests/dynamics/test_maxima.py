@@ -70,7 +70,7 @@ def test_prepared_programs_are_those_that_are_called(evaluator, found):
     scene = evaluator.scene
     pair, tangents, _ = evaluator.assembled()
     begin = begun(pair, found.start, scene.solver.max_orbit)
-    start = pair, tangents, begin, scene.pitch_radius, evaluator._solver
+    start = pair, tangents, begin, scene.pitch_radius, evaluator.solver
     shape = evaluation._motion.result_shape(*start)
     programs = maxima._forces, maxima._located
     called = [set(program._made) for program in programs]
