@@ -42,8 +42,8 @@ def _states(pair, count):
     return jnp.asarray(tau), jnp.asarray(states)
 
 
-def _near(pair, places):
-    roots = jnp.stack([jnp.stack([place.normal2, place.normal2]) for place in places])
+def _near(pair, normals):
+    roots = jnp.stack([normals, normals], axis=-1)
     return eqx.tree_at(lambda p: p.contact, pair, NearContact(pair.contact.pair, roots))
 
 
@@ -55,7 +55,7 @@ def test_margins_have_the_sign_of_the_flags(name):
     @eqx.filter_jit
     def both(pair, tau, state):
         searched = pair.margins(tau, state)
-        near = _near(pair, searched.places).margins(tau, state)
+        near = _near(pair, searched.places.normal2).margins(tau, state)
         return *pair.switches(tau, state), searched, near
 
     cusp = pair.contact.pair.profile.cusp
@@ -84,10 +84,9 @@ def test_equation_near_a_root_is_that_of_the_search(name):
         return pair.derivative(tau, state)[0]
 
     def near(pair, tau, state, away):
-        places = pair.margins(tau, state).places
-        moved = _near(pair, [place._replace(normal2=place.normal2 + away) for place in places])
-        again = [own for own, _ in moved.margins(tau, state).places]
-        return _near(pair, again).derivative(tau, state)[0]
+        moved = _near(pair, pair.margins(tau, state).places.normal2 + away)
+        own, _ = moved.margins(tau, state).places
+        return _near(pair, own.normal2).derivative(tau, state)[0]
 
     slopes = eqx.filter_jit(lambda p, t, z: (searched(p, t, z), jax.jacfwd(searched, 2)(p, t, z)))
     nearly = eqx.filter_jit(
