@@ -91,8 +91,8 @@ def test_orbit_varies_at_constant_time():
     asked = jnp.asarray([0.0, 0.7, 1.9, 1.95, 2.05])
     found, rate, moved = VariedOrbit(elements, variation).at(asked)
     np.testing.assert_allclose(found[:, 0], np.sin(TURN * asked), atol=1e-5)
-    # A cubic through the slopes at four points of a quarter of a mesh period.
-    np.testing.assert_allclose(rate[:, 0], TURN * np.cos(TURN * asked), atol=5e-4)
+    # The slopes' cubic misses by h⁴ ω⁵ / (4! 70) = 6.4e-4 at the ends of elements.
+    np.testing.assert_allclose(rate[:, 0], TURN * np.cos(TURN * asked), atol=7e-4)
     np.testing.assert_allclose(moved[:, 0, 0], np.cos(TURN * asked), atol=2e-4)
 
 
