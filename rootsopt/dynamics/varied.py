@@ -49,11 +49,10 @@ class VariedOrbit(NamedTuple):
         time."""
         elements = self.elements
         k, tau = elements.holding(tau)
-        share, rate = elements.share(k, tau), GAUSS.lagrange(elements.share(k, tau))
-        state = elements.inside(k, tau)
-        rate = jnp.sum(rate[..., None] * elements.slopes[k], axis=-2)
+        share = elements.share(k, tau)
+        rate = jnp.sum(GAUSS.lagrange(share)[..., None] * elements.slopes[k], axis=-2)
         times, moved = moved_at(elements, self.variation, k, share)
-        return state, rate, moved - rate[..., None] * times[..., None, :]
+        return elements.inside(k, tau), rate, moved - rate[..., None] * times[..., None, :]
 
 
 def varied(pair: RotorPair, tangents: RotorPair, found: Steady, solver: Solver) -> VariedOrbit:

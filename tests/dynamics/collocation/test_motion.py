@@ -158,6 +158,7 @@ class _Untold(_Stop):
         return super().switches(motion, own)
 
 
+@pytest.mark.long
 def test_flags_without_margins():
     """Events that only a flag tells are located by it; forces and gradients are the same."""
     config = rootsopt.load_config("configs/cic.yaml")
