@@ -258,6 +258,7 @@ def default():
 DESIGNS = jnp.array([[36.43, 9.0, 4.0], [28.0, 3.0, 1.5], [30.0, 4.0, 2.0]])
 
 
+@pytest.mark.long
 def test_batch_is_the_designs_one_by_one(default):
     """Responses and gradients of a batch equal those of its designs alone.
 

@@ -195,6 +195,7 @@ def test_standard_error_falls_with_the_members():
     assert np.all((ratio > 1.4) & (ratio < 2.8))
 
 
+@pytest.mark.long
 def test_peak_does_not_grow_with_the_window():
     """The mean of the periods' peaks is the same over long and short windows.
 
