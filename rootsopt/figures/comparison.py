@@ -59,9 +59,8 @@ def plot_departure(
     greatest = away[np.argmax(np.abs(away))]
     ax.set(xlim=(0, along[-1]), xlabel="length along the optimised flank, tip to root (mm)")
     ax.set_ylabel("departure from the baseline (µm)")
-    ax.set_title(
-        f"Departure, at most {abs(greatest):.3g} µm {'out' if greatest > 0 else 'in'}wards"
-    )
+    most, way = f"{float(f'{abs(greatest):.3g}'):g}", "out" if greatest > 0 else "in"
+    ax.set_title(f"Departure, at most {most} µm {way}wards")
     ax.grid(color="0.92", linewidth=0.6)
     return ax
 

@@ -36,7 +36,7 @@ def plot_residual(ax: Axes, history: Sequence[Mapping[str, Any]], required: floa
         )
     ax.axhline(required, color=GREY, linestyle=":", label="required")
     ax.set_xlabel("iteration")
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
     ax.set_ylabel("first-order residual (of the unit box)")
     ax.grid(visible=True, alpha=0.3)
     ax.legend(frameon=False)
@@ -97,7 +97,7 @@ def plot_starts(
         if one["objective"] is not None:
             face = "black" if one["reason"] == "converged" else "none"
             ax.plot(one["start"], one["objective"], "o", mfc=face, mec="black")
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
     ax.margins(y=0.15)
     ax.set_xlim(-0.5, max((one["start"] for one in starts), default=0) + 0.5)
     ax.set(xlabel="local search", ylabel="objective at its end (baseline = 1)")
