@@ -60,7 +60,7 @@ class ContactLaw(eqx.Module):
 
         `depth`, `rate`: as in `switches`. Each number passes smoothly through zero where its flag
         changes. Margins of a class that overrides only `switches` are not used (see
-        `RotorPair.margins`)."""
+        `flanks.margins_of`)."""
         del rate
         return jnp.stack([depth])
 

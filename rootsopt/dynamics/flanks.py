@@ -98,8 +98,7 @@ class Margins(NamedTuple):
     smooth around this instant. `counts` (s,): whether each flag matters. The flags of a flank
     matter where the flank transmits a force. A flag without a margin has the margin 1 or -1 (see
     `margins_of`). `places`: `Approach.place` with a leading axis for the flanks that can touch (see
-    `RotorPair.flanks`). `pushes` (flanks,): whether these flanks
-    transmit a force."""
+    `RotorPair.flanks`). `pushes` (flanks,): whether these flanks transmit a force."""
 
     values: Float[Array, " s"]
     counts: Bool[Array, " s"]

@@ -51,9 +51,8 @@ class Solver(eqx.Module):
     compare the derivatives with those on halved steps; `attempts`: maximum number of attempts;
     `variation`: whether an orbit closed by collocation has its `Orbit.variation`.
 
-    `closing`: how orbits are closed: by `shooting`, by `collocation`, or `auto` (by collocation
-    from the orbit of a similar pair, otherwise by shooting). Only shooting closes orbits of pairs
-    that collocation does not support.
+    `closing`: how orbits are closed: by `shooting`, or, with `collocation` or `auto`, by
+    collocation. Only shooting closes orbits of pairs that are not `smooth`.
     """
 
     transient: Integrator

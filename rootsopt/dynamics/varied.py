@@ -78,8 +78,8 @@ def _varied_flow(
     """Return an orbit that was closed by shooting, with its variation.
 
     `tangents`: directions of the pair's parameters, as for `close_orbit`; `period` of the orbit
-    (mesh periods); `integrator`: that of the orbit. The steps of the integration, each of which
-    ends where a flag changes, are linearised."""
+    (mesh periods); `integrator`: that of the orbit. The steps of the integration end where flags
+    change. They are linearised."""
     count, dtype = orbit.state.shape[0], orbit.state.dtype
     dynamic, static = eqx.partition(pair, eqx.is_inexact_array)
     moved = eqx.filter(tangents, eqx.is_inexact_array)

@@ -146,7 +146,7 @@ def _simulated(evaluator: Evaluator, design, start) -> "_Outcome":
 
 
 def _run(evaluator: Evaluator, built: Sequence, states, settle: int) -> "_Outcome":
-    """Simulate ensembles of the designs of which `built` holds pair and geometry."""
+    """Simulate the ensembles of several designs; `built`: pair and geometry of each."""
     pairs, shapes = zip(*built, strict=True)
     periods, how = evaluator.config.ensemble.periods, integrator(evaluator.scene)
     return _Outcome(pairs[0], shapes[0], run_members(pairs, states, settle, periods, how))

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.contact.closest import RANKS
 from rootsopt.contact.search import SearchContact
-from rootsopt.contact.wrapped import around, innermost
+from rootsopt.contact.wrapped import WrappedContact, around, innermost
 from rootsopt.dynamics.collocation.blocks import in_blocks
 from rootsopt.dynamics.collocation.elements import Elements
 from rootsopt.dynamics.collocation.gauss import GAUSS
@@ -90,7 +90,7 @@ def flags_at(pair: RotorPair, tau, state):
     (flanks,); whether the flanks transmit a force (flanks,). `tau`: time (mesh periods); `state`
     (n,): scaled."""
     found = pair.margins(tau, state)
-    searches = isinstance(innermost(pair.contact), SearchContact)
+    searches = type(innermost(pair.contact)) is SearchContact
     roots = found.places.normal2 if searches else jnp.zeros(pair.flanks)
     return found.values > 0, found.counts, roots, found.pushes
 
@@ -106,7 +106,7 @@ def ranks(pair: RotorPair) -> list[int]:
     of_flank, others = _owners(pair)
     law, flank = of_flank[0][1], sum(count for _, count in of_flank)
     order, contact = [2 + k for k in range(flank)], innermost(pair.contact)
-    if isinstance(contact, SearchContact):
+    if type(contact) is SearchContact:
         profile = contact.pair.profile
         order[law] = -1
         if profile.cusp:
@@ -149,7 +149,11 @@ def _owners(pair: RotorPair) -> tuple[list[tuple[bool, int]], list[tuple[bool, i
 
     of_flank, others = jax.eval_shape(flags)
     rubbing = [has_margins(type(part), "drag_switches") for part in pair.all_parts if part.rubs]
-    known = [*(has_margins(type(owner)) for owner in (pair.law, innermost(pair.contact))), *rubbing]
+    layers = [pair.contact]
+    while isinstance(layers[-1], WrappedContact):
+        layers.append(layers[-1].section)
+    told = all(has_margins(type(layer)) for layer in layers)
+    known = [has_margins(type(pair.law)), told, *rubbing]
     first = list(zip(known, (x.shape[0] for x in of_flank), strict=True))
     parts = [has_margins(type(part)) for part in pair.all_parts]
     last = list(zip(parts, (x.shape[0] for x in others), strict=True))
@@ -161,7 +165,7 @@ def look(pair: RotorPair, elements: Elements) -> FlagScan:
     """Evaluate the flags at the Gauss points of each element, on both sides of its end, and at its
     `extra` instants."""
     contact = innermost(pair.contact)
-    if isinstance(contact, SearchContact):
+    if type(contact) is SearchContact:
         flanks = dataclasses.replace(contact.pair, together=True)
         grouped = dataclasses.replace(contact, pair=flanks)
         pair = eqx.tree_at(lambda p: p.contact, pair, around(pair.contact, grouped))
