@@ -231,16 +231,25 @@ class FlankPair(eqx.Module):
         half = self.profile.half_pitch
         mirrored = trig.sin(jnp.pi / 2 * (roll - half) / half) > 0
         pieces = [found.found, mirrored]
-        if self.profile.cusp:
-            pieces.append(self._beyond_cusp(found) > 0)
+        if self.jumps:
+            pieces.append(self._leap(found) > 0)
         if self.frozen.wavy:
             pieces += [found.rank > 0.5 + number for number in range(RANKS)]
         return jnp.concatenate([jnp.stack(pieces), beyond])
 
-    def _beyond_cusp(self, found: ClosestApproach) -> Float[Array, ""]:
+    @property
+    def jumps(self) -> bool:
+        """Whether the contact may jump from one minimum of the gap to another one."""
+        profile = self.profile
+        return profile.cusp or profile.forked or profile.wavy or not self.rolling
+
+    def _leap(self, found: ClosestApproach) -> Float[Array, ""]:
         """Return a number that is positive if `found` is the minimum of the gap beyond the cusp.
 
-        That minimum lies beyond the cusp, or close before it (`_NEAR_CUSP`)."""
+        That minimum lies beyond the cusp, or close before it (`_NEAR_CUSP`). Without a cusp, the
+        number is 1: other flags then show that the contact may have jumped."""
+        if not self.profile.cusp:
+            return jnp.ones_like(found.gap)
         depth = jnp.maximum(-found.gap, 0.0) / self.frozen.pitch_radius
         return found.normal2 - self.frozen.pitch_normal + _NEAR_CUSP * depth
 
@@ -263,14 +272,14 @@ class FlankPair(eqx.Module):
         and each rotor. The number for a common normal is 1 or -1, because it changes only where the
         flanks are apart.
 
-        `roll`, `found`: as in `switches`; `rival`: gap (m) of the other minimum next to a cusp, if
-        known. The number for this minimum then passes smoothly through zero."""
+        `roll`, `found`: as in `switches`; `rival`: gap (m) of the minimum to which the contact
+        jumps, if known. The number for the jump then passes smoothly through zero."""
         normals = jnp.stack([found.normal1, found.normal2])
         beyond = (normals[:, None] - self.edges).ravel()
         half = self.profile.half_pitch
         numbers = [jnp.where(found.found, 1.0, -1.0), trig.sin(jnp.pi / 2 * (roll - half) / half)]
-        if self.profile.cusp:
-            numbers.append(self._beyond_cusp(found) if rival is None else rival - found.gap)
+        if self.jumps:
+            numbers.append(self._leap(found) if rival is None else rival - found.gap)
         if self.frozen.wavy:
             numbers += [found.rank - 0.5 - number for number in range(RANKS)]
         return jnp.concatenate([jnp.stack(numbers), beyond])

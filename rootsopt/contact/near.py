@@ -25,10 +25,10 @@ The flanks then count as having no common normal."""
 class NearContact(Contact):
     """Gap and levers from one Newton step, next to a closest approach that is already known.
 
-    `pair`: the flanks; `roots` (sides, 2): normal angles ν2 (rad) near the closest approach and,
-    for flanks with a cusp, near the other minimum of the gap. If both drive and coast flanks can
-    touch, each has a row; otherwise there is one row. For twisted rotors, there is a leading axis
-    for the slices (see `in_slice`).
+    `pair`: the flanks; `roots` (sides, 2): normal angles ν2 (rad) near the closest approach and
+    near the minimum of the gap to which the contact jumps, if it does. If both drive and coast
+    flanks can touch, each has a row; otherwise there is one row. For twisted rotors, there is a
+    leading axis for the slices (see `in_slice`).
 
     The tangential offset T of `closest` is linearised at the given root. The error of ν2 is
     therefore of second order in the distance from this root. Repeated evaluations, each from the
@@ -42,7 +42,7 @@ class NearContact(Contact):
     @property
     def jumps(self) -> bool:
         """Whether the levers may jump where two minima of the gap are equally deep."""
-        return self.pair.profile.cusp or not self.pair.rolling
+        return self.pair.jumps
 
     @property
     def two_sided(self) -> bool:
@@ -73,7 +73,7 @@ class NearContact(Contact):
 
     def approach(self, roll, relative) -> Approach:
         found, rival = self._moved(0, roll, relative), None
-        if self.pair.profile.cusp:
+        if self.jumps:
             rival = self._moved(1, roll, relative)
         return Approach(found.gap, found.lever1, found.lever2, (found, rival))
 

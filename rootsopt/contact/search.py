@@ -35,8 +35,7 @@ class SearchContact(Contact):
     @property
     def jumps(self) -> bool:
         """Whether levers may jump where two minima of the gap are equally deep."""
-        profile = self.pair.profile
-        return profile.cusp or profile.forked or not self.pair.rolling
+        return self.pair.jumps
 
     @property
     def two_sided(self) -> bool:

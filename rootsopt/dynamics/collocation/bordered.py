@@ -228,7 +228,7 @@ def followed(
     nothing = jax.tree.map(
         lambda x: jnp.zeros((0, *x.shape)), eqx.filter(pair, eqx.is_inexact_array)
     )
-    searched = rooted(known.elements, look(frozen, known.elements))
+    searched = rooted(frozen, known.elements, look(frozen, known.elements))
     known = known._replace(elements=searched)
     loop = _Follower(
         equation, frozen, nothing, known, frozen, tolerance,

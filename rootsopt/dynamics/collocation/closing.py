@@ -24,10 +24,12 @@ from jaxtyping import Array, Bool, Float, Int
 from rootsopt.dynamics.collocation.elements import Elements
 from rootsopt.dynamics.collocation.equation import CollocatedEquation, Points
 from rootsopt.dynamics.collocation.events import (
+    Events,
     FlagScan,
-    agrees,
     apart,
+    empty_like,
     found_events,
+    known_events,
     look,
     rooted,
 )
@@ -262,18 +264,17 @@ class Closer(eqx.Module):
 
         def look_at():
             seen = look(frozen, now.elements)
-            return seen, now.fits & agrees(frozen, now.elements, seen)
+            return seen, found_events(frozen, now.elements, seen)
 
-        shape = jax.eval_shape(look_at)
-        empty: Any = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shape)
-        seen, agree = branch(now.looks & ~now.over, look_at, lambda: empty)
+        seen, events = branch(now.looks & ~now.over, look_at, lambda: empty_like(look_at))
+        agree = now.fits & (events.new == 0) & (events.gone == 0)
         new = branch(
             now.looks | now.over,
             lambda: self.looked(now, seen, agree),
             lambda: self.stepped(now),
         )
         changes = jnp.where(now.looks, ~agree, now.keeps) & ~new.over
-        return branch(changes, lambda: self.align(new, seen, now.keeps), lambda: new)
+        return branch(changes, lambda: self.align(new, events, now.keeps), lambda: new)
 
     def looked(self, now: Loop, seen: FlagScan, agree: Bool[Array, ""]) -> Loop:
         """Return the loop's state after the flags `seen` along the motion.
@@ -281,7 +282,7 @@ class Closer(eqx.Module):
         `agree`: whether they change exactly at the events of the mesh. The roots for the next step
         come from the search, since those of Newton's method lag behind."""
         keeps = agree & now.solved & (apart(now.elements, seen) <= _FAR * jnp.sqrt(self.ease))
-        motion = choose(agree, rooted(now.elements, seen), now.elements)
+        motion = choose(agree, rooted(self.frozen, now.elements, seen), now.elements)
         closed = now.closed._replace(turns=now.closed.turns + 1)
         fresh = jnp.full_like(now.size, jnp.inf), jnp.zeros_like(now.tries)
         return now._replace(
@@ -296,14 +297,13 @@ class Closer(eqx.Module):
 
         return lax.while_loop(go_on, lambda now: self.turn(now), self.start())
 
-    def align(self, now: Loop, seen: FlagScan, finer: Bool[Array, ""]) -> Loop:
-        """Return the loop's state with the motion on a mesh that ends at its events.
+    def align(self, now: Loop, events: Events, finer: Bool[Array, ""]) -> Loop:
+        """Return the loop's state with the motion on a mesh that ends at its `events`.
 
-        `seen`: flags along the motion; `finer`: whether the mesh already ends at all events, and
-        the new one has more elements."""
-        room = now.elements.mesh.times.shape[0]
-        events = found_events(self.frozen_at(now), now.elements, seen, room, finer)
-        taken = now.elements.mesh.used
+        `finer`: whether the mesh already ends at all events, and the new one has more elements."""
+        mesh, same = now.elements.mesh, (events.new == 0) & (events.gone == 0)
+        events = branch(same, lambda: known_events(self.frozen_at(now), mesh), lambda: events)
+        taken = mesh.used
         first = jnp.round(_SHARE * self.denser * taken).astype(int) + _EVENT * events.count
         used = jnp.where(now.fits, jnp.where(finer, (_FINER * taken).astype(int), taken), first)
         most = self.most(now)

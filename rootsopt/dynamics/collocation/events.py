@@ -8,7 +8,8 @@ Events inside elements are located by the zeros of their margins.
 """
 
 import dataclasses
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -21,9 +22,10 @@ from rootsopt.contact.closest import RANKS
 from rootsopt.contact.search import SearchContact
 from rootsopt.contact.wrapped import WrappedContact, around, innermost
 from rootsopt.dynamics.collocation.blocks import in_blocks
-from rootsopt.dynamics.collocation.elements import Elements
+from rootsopt.dynamics.collocation.elements import Elements, Mesh
 from rootsopt.dynamics.collocation.gauss import GAUSS
-from rootsopt.dynamics.flanks import has_margins, margins_of, touch_of
+from rootsopt.dynamics.flanks import Margins, has_margins, margins_of, touch_of
+from rootsopt.dynamics.orbit import branch
 from rootsopt.dynamics.pair import RotorPair
 
 _ASIDE = 2e-7, 0.02
@@ -43,6 +45,9 @@ _ENDS = (1.0, 0.0)
 FIXED, UNSAID = -1, -2
 """In place of the index of an event's margin: the time is fixed, as that of φ1 = 0; the time is
 where a flag without a margin changes, and stays until flags are evaluated again."""
+_LEAP = 1e-6
+"""Difference (rad) between the normal angles beside a located event above which the contact jumps
+there, from one minimum of the gap to another one."""
 _CHANGES = 2
 """Number of flag changes per event for which there is room. Several flags may change at one event.
 If more change, the search for the orbit fails."""
@@ -90,9 +95,13 @@ def flags_at(pair: RotorPair, tau, state):
     (flanks,); whether the flanks transmit a force (flanks,). `tau`: time (mesh periods); `state`
     (n,): scaled."""
     found = pair.margins(tau, state)
+    return found.values > 0, found.counts, _roots(pair, found), found.pushes
+
+
+def _roots(pair: RotorPair, found: Margins) -> Float[Array, " flanks"]:
+    """Return the normal angles ν2 (rad) of the closest approaches `found`, 0 if not known."""
     searches = type(innermost(pair.contact)) is SearchContact
-    roots = found.places.normal2 if searches else jnp.zeros(pair.flanks)
-    return found.values > 0, found.counts, roots, found.pushes
+    return found.places.normal2 if searches else jnp.zeros(pair.flanks)
 
 
 def ranks(pair: RotorPair) -> list[int]:
@@ -100,21 +109,52 @@ def ranks(pair: RotorPair) -> list[int]:
 
     If several flags change at one instant, the margin with the least rank determines the event.
     Margins that do not depend on the contact have rank 0, since their zeros are most accurate. Rank
-    1 is the change to the other minimum of the gap next to a cusp, because other flags change with
-    it. The rank -1 marks a flag whose change is not an event by itself. All other margins have
-    greater ranks, in their order."""
+    1 is the jump to another minimum of the gap, because other flags change with it. The rank -1
+    marks a flag whose change is not an event by itself. All other margins have greater ranks, in
+    their order."""
     of_flank, others = _owners(pair)
     law, flank = of_flank[0][1], sum(count for _, count in of_flank)
     order, contact = [2 + k for k in range(flank)], innermost(pair.contact)
     if type(contact) is SearchContact:
-        profile = contact.pair.profile
         order[law] = -1
-        if profile.cusp:
+        if contact.jumps:
             order[law + 2] = 1
-        if profile.wavy:  # These flags also change where the contact moves on without a jump.
-            between = range(law + 2, law + 2 + profile.cusp + RANKS)
-            order = [-1 if k in between else rank for k, rank in enumerate(order)]
     return order * pair.flanks + [0] * sum(count for _, count in others)
+
+
+class Leaps(NamedTuple):
+    """How the flags (f,) tell a jump of the contact from one minimum of the gap to another one.
+
+    `margin` (f,): index of the margin that is zero at the jump, for a flag that changes at each of
+    its jumps or may do so; -1 for any other flag. `only` (f,): whether the flag also changes where
+    nothing happens; its change is an event only where the contact jumps. `flank` (f,): index of the
+    flag's flank.
+    """
+
+    margin: Int[np.ndarray, " f"]
+    only: Bool[np.ndarray, " f"]
+    flank: Int[np.ndarray, " f"]
+
+
+def leaps(pair: RotorPair) -> Leaps:
+    """Return how the flags of the `pair` tell a jump of the contact."""
+    of_flank, others = _owners(pair)
+    per, rest = (sum(count for _, count in some) for some in (of_flank, others))
+    margin, only = np.full(per, -1), np.zeros(per, bool)
+    contact = innermost(pair.contact)
+    if type(contact) is SearchContact and contact.jumps:
+        (_, law), (_, own) = of_flank[:2]
+        jump = law + 2
+        margin[jump : law + own] = jump
+        only[jump + 1 : jump + 1 + RANKS * contact.pair.profile.wavy] = True
+    number = np.repeat(np.arange(pair.flanks), per)
+    margins = np.tile(margin, pair.flanks)
+    margins = np.where(margins < 0, -1, margins + per * number)
+    return Leaps(
+        np.pad(margins, (0, rest), constant_values=-1),
+        np.pad(np.tile(only, pair.flanks), (0, rest)),
+        np.pad(number, (0, rest)),
+    )
 
 
 def vague(pair: RotorPair) -> list[bool]:
@@ -228,13 +268,13 @@ def _zero(elements: Elements, values: Float[Array, "e q"], state: int):
     return share, jnp.any(crosses, axis=1)
 
 
-def rooted(elements: Elements, seen: FlagScan) -> Elements:
+def rooted(pair: RotorPair, elements: Elements, seen: FlagScan) -> Elements:
     """Return `elements` with `roots` from `seen`, the result of `look`.
 
     At the end of an element, the first root belongs to the side of the end on which the flanks
-    push. The second root, for the other minimum next to a cusp, belongs to the instant after the
-    end. Both are extrapolated to the end: otherwise derivatives of a peak at a corner of the force
-    would have a relative error of about 5e-6."""
+    push, or to the instant before the end where the contact jumps. The second root, that of the minimum to which the contact may jump, belongs to the instant
+    after the end. Both are extrapolated to the end: otherwise derivatives of a peak at a corner of
+    the force would have a relative error of about 5e-6."""
     inside = len(GAUSS.nodes)
     mesh, number = elements.mesh, jnp.arange(elements.state.shape[0])
     following = jnp.where(number + 1 < mesh.used, number + 1, 0)
@@ -247,6 +287,10 @@ def rooted(elements: Elements, seen: FlagScan) -> Elements:
     aside = seen.tau.reshape(*number.shape, -1)[:, -2:, None] - end
     moved = seen.roots[:, inside:] - aside * jnp.stack([before, after], axis=1)
     own = seen.pushes[:, inside] | ~seen.pushes[:, inside + 1]
+    jumps = np.unique(leaps(pair).margin)
+    which = jnp.where(mesh.last, mesh.which[mesh.interval + 1], FIXED)
+    for flank, jump in enumerate(jumps[jumps >= 0]):
+        own = own.at[:, flank].set(own[:, flank] | (which == jump))
     ends = jnp.stack([jnp.where(own, moved[:, 0], moved[:, 1]), moved[:, 1]], axis=-1)
     points = jnp.repeat(nodes[..., None], 2, axis=-1)
     return elements._replace(roots=jnp.concatenate([points, ends[:, None]], axis=1))
@@ -268,15 +312,14 @@ class _Compared(NamedTuple):
     """Flags along a motion, compared with the events of its mesh.
 
     `fresh` (p, f): whether a flag that matters changes after the instant, but not at an event of
-    the mesh; `later` (p,): next instant (mesh periods); `ends_at` (p,): index of the event at the
-    end of the instant's element; `declared` (p,): whether the instant is the last one before an
-    event of the mesh; `kept` (p,): whether, in addition, the event's flag changes there."""
+    the mesh; `later` (p,): next instant (mesh periods); `held` (m,): whether the time of the mesh
+    is an event at which its flag changes; `gone`: number of events of the mesh at which it does
+    not."""
 
     fresh: Bool[Array, "p f"]
     later: Float[Array, " p"]
-    ends_at: Int[Array, " p"]
-    declared: Bool[Array, " p"]
-    kept: Bool[Array, " p"]
+    held: Bool[Array, " m"]
+    gone: Int[Array, ""]
 
 
 def _compared(pair: RotorPair, elements: Elements, seen: FlagScan) -> _Compared:
@@ -295,70 +338,93 @@ def _compared(pair: RotorPair, elements: Elements, seen: FlagScan) -> _Compared:
     ends_at = jnp.where(mesh.last, mesh.interval + 1, mesh.times.shape[0] - 1)[element]
     real = mesh.last[element] & (mesh.times[ends_at] < mesh.times[-1]) & (element < mesh.used)
     declared = (inside == per - 2) & real & (number < seen.total)
-    holds = jnp.take_along_axis(differ, jnp.maximum(mesh.which[ends_at], 0)[:, None], 1)[:, 0]
-    unsaid = jnp.any(differ & np.asarray(vague(pair), bool), axis=1)
-    holds = jnp.where(mesh.which[ends_at] == UNSAID, unsaid, holds)
-    kept = declared & ((mesh.which[ends_at] == FIXED) | holds)
-    return _Compared(differ & ~kept[:, None], later, ends_at, declared, kept)
+    which = mesh.which[ends_at][:, None]
+    # A jump shows in any flag of its flank.
+    own, unsaid = np.arange(rank.size), np.asarray(vague(pair), bool)
+    tells = (which == own) | (which == leaps(pair).margin) & (which >= 0)
+    tells |= (which == UNSAID) & unsaid
+    kept = declared & ((which[:, 0] == FIXED) | jnp.any(differ & tells, axis=1))
+    held = jnp.full(mesh.times.shape, False).at[jnp.where(kept, ends_at, 0)].set(True)
+    gone = jnp.sum(declared & ~kept)
+    return _Compared(differ & ~kept[:, None], later, held.at[0].set(False), gone)
 
 
-def agrees(pair: RotorPair, elements: Elements, seen: FlagScan) -> Bool[Array, ""]:
-    """Return whether the flags `seen` along `elements` change exactly at the events of the mesh."""
-    found = _compared(pair, elements, seen)
-    return ~jnp.any(found.fresh) & ~jnp.any(found.declared & ~found.kept)
+def known_events(pair: RotorPair, mesh: Mesh) -> Events:
+    """Return the events at which the elements of a `mesh` end."""
+    real = jnp.arange(mesh.times.shape[0]) <= mesh.interval[mesh.used - 1]
+    times, zero = jnp.where(real.at[0].set(False), mesh.times, jnp.inf), jnp.zeros((), int)
+    merged = _merged(times, mesh.which, jnp.asarray(ranks(pair)))
+    return Events(*merged, zero, zero, jnp.ones((), bool))
 
 
-def found_events(
-    pair: RotorPair, elements: Elements, seen: FlagScan, room: int, same: Bool[Array, ""]
-) -> Events:
+def found_events(pair: RotorPair, elements: Elements, seen: FlagScan) -> Events:
     """Return the events of the motion `elements`, whose flags are `seen`.
 
-    `room`: size m of the returned arrays; `same`: whether they are known to be those of the mesh.
-    Then `seen` is not used."""
+    If the flags change exactly at the events of the mesh, these are not listed: they are its
+    `known_events`."""
+    compared = _compared(pair, elements, seen)
+    changed = jnp.any(compared.fresh) | (compared.gone > 0)
+
+    def located():
+        return _located(pair, elements, seen, compared)
+
+    return branch(changed, located, lambda: empty_like(located))
+
+
+def empty_like(function: Callable[[], Any]) -> Any:
+    """Return zeros in place of the result of `function`."""
+    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(function))
+
+
+def _located(pair: RotorPair, elements: Elements, seen: FlagScan, compared: _Compared) -> Events:
+    """Return the result of `found_events` if flags change elsewhere than at events of the mesh."""
     mesh, rank = elements.mesh, jnp.asarray(ranks(pair))
-    fresh, later, ends_at, declared, kept = _compared(pair, elements, seen)
-    most, fresh = _CHANGES * room, fresh & ~same
+    fresh, later, held, gone = compared
+    room = mesh.times.shape[0]
+    most = _CHANGES * room
     # Choose the instants first: to choose among all flags of all instants takes ten times as long.
     some = jnp.nonzero(jnp.any(fresh, axis=1), size=most, fill_value=fresh.shape[0])[0]
     changes = fresh.at[some].get(mode="fill", fill_value=False)
     row, flag = jnp.nonzero(changes, size=most, fill_value=0)
     place = jnp.minimum(some[row], fresh.shape[0] - 1)
-    new = jnp.sum(fresh)
-    value = seen.flags[place, flag]
+    number = jnp.sum(fresh)
+    value, tells = seen.flags[place, flag], leaps(pair)
+    flank = jnp.asarray(tells.flank)[flag]
 
     def locate(k, found):
         def margin(tau):
-            return pair.margins(tau, elements.motion(tau)).values[flag[k]]
+            margins = pair.margins(tau, elements.motion(tau))
+            return margins.values[flag[k]], _roots(pair, margins)[flank[k]]
 
-        return found.at[k].set(zero_of(margin, seen.tau[place[k]], later[place[k]], value[k]))
+        time, before, after = zero_of(margin, seen.tau[place[k]], later[place[k]], value[k])
+        return found[0].at[k].set(time), found[1].at[k].set(jnp.abs(after - before))
 
-    located = lax.fori_loop(
-        0, jnp.minimum(new, most), locate, jnp.full(most, jnp.inf, seen.tau.dtype)
-    )
-    held = jnp.full(mesh.times.shape, False).at[jnp.where(kept, ends_at, 0)].set(True)
-    number = jnp.arange(mesh.times.shape[0])
-    real = number <= mesh.interval[mesh.used - 1]
-    held = jnp.where(same, real, held).at[0].set(False)
+    nothing = jnp.full(most, jnp.inf, seen.tau.dtype), jnp.zeros(most, seen.tau.dtype)
+    located, change = lax.fori_loop(0, jnp.minimum(number, most), locate, nothing)
+    jump, leap = jnp.asarray(tells.margin)[flag], change > _LEAP
+    located = jnp.where(jnp.asarray(tells.only)[flag] & ~leap, jnp.inf, located)
+    new = jnp.sum(located < jnp.inf)
     times = jnp.concatenate([located, jnp.where(held, mesh.times, jnp.inf)])
-    flag = jnp.where(jnp.asarray(vague(pair))[flag], UNSAID, flag)
-    which = jnp.concatenate([flag, mesh.which])
+    which = jnp.where(leap & (jump >= 0), jump, flag)
+    which = jnp.concatenate([jnp.where(jnp.asarray(vague(pair))[flag], UNSAID, which), mesh.which])
     times, which, count = _merged(times, which, rank)
-    gone = jnp.sum(declared & ~kept)
-    fits = (new <= most) & (count <= room - 3)
+    fits = (number <= most) & (count <= room - 3)
     return Events(times[:room], which[:room], count, new, gone, fits)
 
 
 def zero_of(margin, low, high, positive):
-    """Return the instant between `low` and `high` at which the sign of `margin` changes.
+    """Return the instant between `low` and `high` at which the sign of `margin` changes, and what
+    `margin` has returned besides just before and just after it.
 
-    `margin`: function of time (mesh periods); `positive`: whether it is positive at `low`. Chord
-    and bisection are combined by the ITP method (Oliveira and Takahashi, ACM Trans. Math. Softw. 47
-    (2021) 5): a smooth margin takes about ten evaluations, any other hardly more than bisection."""
+    `margin`: function of time (mesh periods), which returns the margin and another number;
+    `positive`: whether the margin is positive at `low`. Chord and bisection are combined by the ITP
+    method (Oliveira and Takahashi, ACM Trans. Math. Softw. 47 (2021) 5): a smooth margin takes
+    about ten evaluations, any other hardly more than bisection."""
     width = high - low
     most = jnp.ceil(jnp.log2(jnp.maximum(width / (2 * _LOCATED), 1.0))) + 1
 
     def closer(ends):
-        low, high, at_low, at_high, count = ends
+        low, high, at_low, at_high, before, after, count = ends
         size, middle = high - low, (low + high) / 2
         spare = _LOCATED * 2 ** (most - count) - size / 2
         drop = at_low - at_high
@@ -371,22 +437,24 @@ def zero_of(margin, low, high, positive):
         place = jnp.where(inside, near, middle - inwards * spare)
         # The first two iterations evaluate both ends, so that the margin is compiled once.
         place = jnp.where(count == -2, low, jnp.where(count == -1, high, place))
-        here = margin(place)
+        here, beside = margin(place)
         lower = jnp.where(count < 0, count == -2, (here > 0) == positive)
         return (
             jnp.where(lower, place, low),
             jnp.where(lower, high, place),
             jnp.where(lower, here, at_low),
             jnp.where(lower, at_high, here),
+            jnp.where(lower, beside, before),
+            jnp.where(lower, after, beside),
             count + 1,
         )
 
     def wide(ends):
         return (ends[1] - ends[0] > 2 * _LOCATED) & (ends[-1] <= most)
 
-    start = low, high, jnp.zeros_like(low), jnp.zeros_like(low), jnp.full_like(most, -2)
-    low, high, *_ = lax.while_loop(wide, closer, start)
-    return (low + high) / 2
+    start = low, high, *[jnp.zeros_like(low)] * 4, jnp.full_like(most, -2)
+    low, high, _, _, before, after, _ = lax.while_loop(wide, closer, start)
+    return (low + high) / 2, before, after
 
 
 def _merged(times, which, rank):
