@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.dynamics.collocation.closing import corrected
 from rootsopt.dynamics.collocation.known import Known
-from rootsopt.dynamics.collocation.mesh import sizes
+from rootsopt.dynamics.collocation.mesh import room_for
 from rootsopt.dynamics.collocation.motion import ACCURACY, Collocated, apart, closed_orbit
 from rootsopt.dynamics.collocation.seed import PIECES, from_pieces
 from rootsopt.dynamics.collocation.system import unchanged
@@ -79,7 +79,7 @@ class Start(eqx.Module):
 
 def unknown(pair: RotorPair, longest: int) -> Known:
     """Return the placeholder for an orbit of `pair` of up to `longest` mesh periods."""
-    return Known.empty(sizes(longest, pair.contact.sections), pair.states, pair.flanks)
+    return Known.empty(room_for(pair, longest), pair.states, pair.flanks)
 
 
 class _Loop(NamedTuple):

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rootsopt.dynamics.closed import Start
 from rootsopt.dynamics.collocation.known import Known, padded, trimmed
-from rootsopt.dynamics.collocation.mesh import sizes
+from rootsopt.dynamics.collocation.mesh import room_for
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import Steady
 from rootsopt.status import Status
@@ -53,7 +53,7 @@ def begun(pair: RotorPair, start: Seed | ArrayLike | None, longest: int) -> Star
     belong to a pair of this kind is not used; the search then begins at its state. `longest`:
     longest period of an orbit (mesh periods). Unlike elsewhere, the state of the result is scaled.
     """
-    dtype, room = pair.angle_scale.dtype, sizes(longest, pair.contact.sections)
+    dtype, room = pair.angle_scale.dtype, room_for(pair, longest)
     seed = start if isinstance(start, Seed) else None
     state = start if seed is None else seed.state
     given = np.zeros(pair.states, dtype) if state is None else np.asarray(state, dtype)

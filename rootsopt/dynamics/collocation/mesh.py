@@ -4,10 +4,13 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from rootsopt.contact.search import SearchContact
+from rootsopt.contact.wrapped import innermost
 from rootsopt.dynamics.collocation.blocks import BLOCK
 from rootsopt.dynamics.collocation.elements import Elements, Mesh
 from rootsopt.dynamics.collocation.events import _SAME
 from rootsopt.dynamics.collocation.gauss import GAUSS
+from rootsopt.dynamics.pair import RotorPair
 
 _FLOOR = 0.15
 """Density of elements that is added everywhere, as a fraction of the mean density. It limits the
@@ -16,9 +19,9 @@ length of elements."""
 
 _MOST, _FINEST = (96, 48), 160
 """Maximum number of elements per mesh period: in each of the first two mesh periods, and in each
-further one. Longer orbits with as many events as a free form are rare, and all orbits pay for the
-room: sorting events takes half of the time from rest with room for 64 events in each of eight mesh
-periods. Shorter orbits can use the room of longer ones, up to the third number per mesh period at
+further one, unless the flank is wavy. A free form has some 45 events in each mesh period. Others
+have fewer, and would pay for the room: sorting events takes half of the time from rest with room
+for 64 events in each of eight mesh periods. Shorter orbits can use the room of longer ones, up to the third number per mesh period at
 the usual accuracy."""
 _TIMES = 64, 24
 """Number of events above which the search for the orbit fails, counted like elements."""
@@ -27,12 +30,20 @@ _SLICES = 0.5
 its own events."""
 
 
-def sizes(periods: int, slices: int) -> tuple[int, int]:
+def room_for(pair: RotorPair, periods: int) -> tuple[int, int]:
+    """Return the `sizes` for orbits of `pair` of up to this number of mesh periods."""
+    contact = innermost(pair.contact)
+    wavy = isinstance(contact, SearchContact) and contact.pair.profile.wavy
+    return sizes(periods, pair.contact.sections, wavy)
+
+
+def sizes(periods: int, slices: int, wavy: bool) -> tuple[int, int]:
     """Return the sizes of the arrays of a mesh, for its elements and for its times.
 
     They are large enough for orbits of up to `periods` mesh periods of rotors with this number of
-    `slices` (1 for straight rotors)."""
-    first, further = min(periods, 2), max(periods - 2, 0)
+    `slices` (1 for straight rotors); `wavy`: whether a flank has many segments."""
+    first = periods if wavy else min(periods, 2)
+    further = periods - first
     growth = 1 + _SLICES * (slices - 1)
     elements, times = (round(growth * (first * x + further * y)) for x, y in (_MOST, _TIMES))
     return -(-elements // BLOCK) * BLOCK, times + 3

@@ -12,7 +12,7 @@ from rootsopt.dynamics.collocation.closing import FIRST
 from rootsopt.dynamics.collocation.elements import Elements, Mesh
 from rootsopt.dynamics.collocation.gauss import GAUSS
 from rootsopt.dynamics.collocation.known import Known
-from rootsopt.dynamics.collocation.mesh import sizes
+from rootsopt.dynamics.collocation.mesh import room_for
 from rootsopt.dynamics.flow import Pieces
 from rootsopt.dynamics.pair import RotorPair
 
@@ -22,7 +22,7 @@ def from_pieces(pair: RotorPair, pieces: Pieces, period: Int[Array, ""], longest
 
     `pieces`: the last mesh periods of the transient, which ends at φ1 = 0, in `PIECES`; `period` of
     the orbit (mesh periods); `longest`: longest period for which the arrays have room."""
-    capacity, count = sizes(longest, pair.contact.sections)
+    capacity, count = room_for(pair, longest)
     dtype, per = pieces.states.dtype, pieces.ends.shape[1]
     number = jnp.arange(capacity)
     used, length = period * per, period.astype(dtype)
@@ -66,7 +66,7 @@ def from_steps(
     slope = jax.vmap(lambda tau, y: pair.derivative(tau, y)[0])
     slopes = in_blocks(slope, steps + 1, *whole_blocks(times, states))[: times.shape[0]]
     every, length = (times, states, slopes), period.astype(state.dtype)
-    room = sizes(longest, pair.contact.sections)
+    room = room_for(pair, longest)
     return Known.unaligned(_on_steps(pair, every, steps, length, FIRST * period, room))
 
 

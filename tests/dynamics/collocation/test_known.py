@@ -98,13 +98,13 @@ def test_orbit_varies_at_constant_time():
 
 def test_known_orbit_is_stored_without_unused_elements():
     """It returns as it was, in arrays of any size that has room for it."""
-    known = _known(sizes(8, 1))
+    known = _known(sizes(8, 1, False))
     cut = trimmed(known)
     assert cut.elements.state.shape[0] == USED
-    again = padded(cut, sizes(8, 1))
+    again = padded(cut, sizes(8, 1, False))
     for one, other in zip(jax.tree.leaves(again), jax.tree.leaves(known), strict=True):
         assert one.shape == other.shape
-    few = jax.tree.map(jnp.asarray, padded(cut, sizes(1, 1)))
+    few = jax.tree.map(jnp.asarray, padded(cut, sizes(1, 1, False)))
     for found in (jax.tree.map(jnp.asarray, again), few):
         for tau in (0.0, 0.7, 2.25):
             np.testing.assert_array_equal(
@@ -113,7 +113,7 @@ def test_known_orbit_is_stored_without_unused_elements():
         np.testing.assert_allclose(roughness(found.elements), roughness(known.elements), rtol=0)
         for name in ("times", "which", "interval", "left", "right"):
             room = len(getattr(found.elements.mesh, name))
-            whole = padded(trimmed(_known(sizes(8, 1))), sizes(8, 1)).elements.mesh
+            whole = padded(trimmed(_known(sizes(8, 1, False))), sizes(8, 1, False)).elements.mesh
             if room == len(getattr(whole, name)):
                 np.testing.assert_array_equal(
                     getattr(found.elements.mesh, name), getattr(known.elements.mesh, name)
