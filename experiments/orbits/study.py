@@ -1,8 +1,8 @@
 """Compares orbits closed by collocation with orbits closed by shooting, on random pairs.
 
 The study draws designs and scenes (speed, load, backlash, gear, contact) of several kinds: CIC with
-two to four lobes, EE, arc and involute, five arcs, a free form, twisted and worn rotors, with gas
-and friction, with a motor, and lively scenes. For each pair of design and scene that settles, both
+two to four lobes, EE, arc and involute, four and five arcs, a free form, twisted and worn rotors, a
+wrong centre distance, with gas and friction, with a motor, and lively scenes. For each pair of design and scene that settles, both
 solvers start from rest. Forces, their derivatives with respect to design, speed and load, period,
 multipliers and status are compared. The times are those of a second call in the same process.
 """
@@ -61,6 +61,8 @@ KINDS: dict[str, tuple[str, int, list[str]]] = {
     "cic, twisted": ("cic", 3, TWIST),
     "cic, twisted, gas and friction": ("cic", 3, [*TWIST, *GAS]),
     "ee, worn": ("ee", 3, ["contact.wear.depth_mm=0.02"]),
+    "four arcs": ("four_arcs", 3, []),
+    "cic, centre distance": ("cic", 3, ["scene.center_distance_error_mm=0.03"]),
 }
 """Family, lobes and further overrides of each kind."""
 
@@ -75,7 +77,7 @@ def pairs(seed: int, kind: str) -> Iterator[list[str]]:
         longest = 33.0 * np.sin(np.radians(angle)) * (np.pi / 2 / lobes - np.radians(tip))
         length = draw.uniform(0.3, 0.95) * longest
         profile: Row = {"family": family, "lobes": lobes, "pitch_radius_mm": 33.0}
-        if family != "ee":
+        if family not in ("ee", "four_arcs"):
             profile |= {
                 "pressure_angle_deg": round(angle, 2),
                 "involute_length_mm": round(length, 3),
@@ -85,6 +87,12 @@ def pairs(seed: int, kind: str) -> Iterator[list[str]]:
         if family == "free_form":  # It follows a CIC profile.
             near = ProfileConfig.model_validate(profile | {"family": "cic"})
             profile = free_form_of(near, COEFFICIENTS)[0].model_dump(exclude_none=True)
+        if family == "four_arcs":
+            profile |= {
+                "arc_center_mm": round(draw.uniform(23, 31), 3),
+                "tip_arc_radius_mm": round(draw.uniform(12, 21), 3),
+                "tip_arc_turn_deg": round(draw.uniform(30, 60), 2),
+            }
         if family == "five_arcs":
             profile = {key: profile[key] for key in ("family", "lobes", "pitch_radius_mm")} | {
                 "tip_arc_angle_deg": round(tip, 2),
