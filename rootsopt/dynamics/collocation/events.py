@@ -146,7 +146,8 @@ def leaps(pair: RotorPair) -> Leaps:
         (_, law), (_, own) = of_flank[:2]
         jump = law + 2
         margin[jump : law + own] = jump
-        only[jump + 1 : jump + 1 + RANKS * contact.pair.profile.wavy] = True
+        if contact.pair.profile.wavy:
+            only[jump : jump + 1 + RANKS] = True
     number = np.repeat(np.arange(pair.flanks), per)
     margins = np.tile(margin, pair.flanks)
     margins = np.where(margins < 0, -1, margins + per * number)
