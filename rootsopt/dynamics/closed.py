@@ -18,10 +18,11 @@ from rootsopt.dynamics.collocation.closing import corrected
 from rootsopt.dynamics.collocation.known import Known
 from rootsopt.dynamics.collocation.mesh import room_for
 from rootsopt.dynamics.collocation.motion import ACCURACY, Collocated, apart, closed_orbit
+from rootsopt.dynamics.collocation.newton import numbers
 from rootsopt.dynamics.collocation.seed import PIECES, from_pieces
 from rootsopt.dynamics.collocation.system import unchanged
 from rootsopt.dynamics.flow import Flow
-from rootsopt.dynamics.orbit import Orbit, branch, choose
+from rootsopt.dynamics.orbit import Orbit, branch
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.settle import Transient, no_pieces, settle, settled_within
 from rootsopt.dynamics.steady import (
@@ -104,11 +105,13 @@ class _Loop(NamedTuple):
 
 
 class _Attempts(eqx.Module):
-    """The loop of `closed_motion`. Its fields hold the arguments of that function."""
+    """The loop of `closed_motion`. Its fields hold the arguments of that function, and the
+    `numbers` of the pair whose orbit is known."""
 
     pair: RotorPair
     tangents: RotorPair
     start: Start
+    neighbour: Float[Array, " m"]
     radius: Float[Array, ""]
     solver: Solver
 
@@ -202,14 +205,13 @@ class _Attempts(eqx.Module):
         solver, pair = self.solver, self.pair
         period, pieces = jnp.maximum(settled.period, 1), settled.pieces
         assert pieces is not None
-        known, neighbour = self.start.known, self.start.pair
+        known = self.start.known
         known = branch(
             now.near,
             lambda: known,
             lambda: from_pieces(pair, pieces, period, solver.max_orbit),
         )
-        own = eqx.filter(pair, eqx.is_inexact_array)
-        neighbour = choose(now.near, neighbour, lax.stop_gradient(own))
+        neighbour = jnp.where(now.near, self.neighbour, lax.stop_gradient(numbers(pair)))
         made = closed_orbit(pair, self.tangents, (known, neighbour), solver)
         within = now.within
         place = jnp.where(now.near, made.orbit.state, settled.state)
@@ -304,7 +306,7 @@ def closed_motion(
     support the pair (`collocation.closing.supported`)."""
     radius = jnp.asarray(radius, pair.angle_scale.dtype)
     start = lax.stop_gradient(start)
-    return _Attempts(pair, tangents, start, radius, solver).run()
+    return _Attempts(pair, tangents, start, numbers(start.pair), radius, solver).run()
 
 
 def examined(pair: RotorPair, found: Steady, solver: Solver) -> Steady:

@@ -5,10 +5,12 @@ not evaluated."""
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.custom_batching import custom_vmap
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Int
 
 BLOCK = 48
@@ -46,17 +48,20 @@ def in_blocks(function: Any, used: Int[Array, ""], *arrays: Any) -> Any:
     them; their results have no meaning."""
     count = jax.tree.leaves(arrays)[0].shape[0]
     size = min(BLOCK, count)
-    function = jax.jit(function)  # traced once, for shapes and values
 
     def sliced(begin):
         return jax.tree.map(lambda x: lax.dynamic_slice_in_dim(x, begin, size), arrays)
 
+    function = eqx.filter_closure_convert(function, *sliced(0))  # traced once
     shapes = jax.eval_shape(function, *sliced(0))
     nothing = jax.tree.map(lambda x: jnp.zeros((count, *x.shape[1:]), x.dtype), shapes)
+    # The numbers of a pair enter the loop as one vector. XLA would copy each of them.
+    numbers, rest = eqx.partition(function, eqx.is_inexact_array)
+    vector, back = ravel_pytree(numbers)
 
     def block(number, found):
         begin = number * size
-        new = function(*sliced(begin))
+        new = eqx.combine(back(vector), rest)(*sliced(begin))
         return jax.tree.map(
             lambda old, x: lax.dynamic_update_slice_in_dim(old, x, begin, 0), found, new
         )

@@ -22,7 +22,13 @@ from rootsopt.dynamics.collocation.events import look, rooted
 from rootsopt.dynamics.collocation.forces import OrbitForces, origin
 from rootsopt.dynamics.collocation.known import Known
 from rootsopt.dynamics.collocation.mesh import ordered
-from rootsopt.dynamics.collocation.newton import advanced, columns_of, evaluated, lines
+from rootsopt.dynamics.collocation.newton import (
+    advanced,
+    columns_of,
+    evaluated,
+    lines,
+    numbers,
+)
 from rootsopt.dynamics.collocation.system import (
     Chain,
     Step,
@@ -161,7 +167,7 @@ class _Follower(Closer):
         pair, tangent = self.family(line.share)
         equation = CollocatedEquation(pair, self.measures, pair.force_scale)
         count, yes = at.state.shape[1], jnp.ones((), bool)
-        points, along = evaluated(equation, at, now.rivals, tangent, yes)
+        points, along = evaluated(equation, numbers(pair), at, now.rivals, tangent, yes)
         found = lines(at, points)
         columns = columns_of(at, found, along)
         parts = condensed(at, found, columns)
@@ -231,7 +237,7 @@ def followed(
     searched = rooted(frozen, known.elements, look(frozen, known.elements))
     known = known._replace(elements=searched)
     loop = _Follower(
-        equation, frozen, nothing, known, frozen, tolerance,
+        equation, frozen, nothing, known, numbers(frozen), tolerance,
         family=family, measures=measures, plane=plane, rising=rising,
     ).run()  # fmt: skip
     closed = loop.closed

@@ -51,6 +51,7 @@ from rootsopt.dynamics.collocation.newton import (
     evaluated,
     has_stalled,
     lines,
+    with_numbers,
 )
 from rootsopt.dynamics.collocation.peak import Rivals, forces_along, is_settled, peak_of, rivals_of
 from rootsopt.dynamics.collocation.system import Step, chained, condensed
@@ -174,7 +175,7 @@ class Closer(eqx.Module):
     frozen: RotorPair
     tangents: Any
     known: Known
-    neighbour: RotorPair
+    neighbour: Float[Array, " m"]
     tolerance: Float[Array, ""]
 
     def start(self) -> Loop:
@@ -240,8 +241,8 @@ class Closer(eqx.Module):
         Newton's step for a pair a small way (`_WAY`) towards the new one, divided by this way."""
         at = now.elements
         way = jnp.where(now.trusted & (now.tries == 0), _WAY, 1.0)
-        equation = between(self.equation, self.neighbour, way)
-        points, along = evaluated(equation, at, now.rivals, self.tangents, now.keeps)
+        pair = between(self.equation.pair, self.neighbour, way)
+        points, along = evaluated(self.equation, pair, at, now.rivals, self.tangents, now.keeps)
         found = lines(at, points)
         columns = columns_of(at, found, along)
         step = chained(at, found, columns, condensed(at, found, columns))
@@ -254,7 +255,7 @@ class Closer(eqx.Module):
         turned = jnp.clip((points.roots - given) / way, -_TURNED, _TURNED)
         points = points._replace(roots=given + turned)
         direct = jnp.pad(along, ((0, 0), (0, 0), (0, 0), (1, 0)))
-        return equation, points, direct, step, now.line
+        return with_numbers(self.equation, pair), points, direct, step, now.line
 
     def turn(self, now: Loop) -> Loop:
         """Evaluate the flags along the motion or make a step, then change the mesh if needed.
@@ -330,15 +331,16 @@ class Closer(eqx.Module):
         at, extra = now.elements, now.elements.mesh.used
         roots = points.roots.at[extra].set(at.roots[extra])
         moved, size, _ = advanced(at, step, roots)
+        along = forces_along(equation, points)
+        peak = peak_of(at, now.rivals, *along)
 
         def kept() -> Loop:
-            found = forces_of(equation, at, now.rivals, (points, direct), step, moved)
+            found = forces_of(equation, at, peak, (points, direct), step, moved)
             return self.keep(now._replace(line=line), found)
 
         def goes_on() -> Loop:
-            along = forces_along(equation, points)
             rivals = rivals_of(at, points, *along, now.rivals)
-            found = is_settled(now.rivals, rivals, peak_of(at, now.rivals, *along))
+            found = is_settled(now.rivals, rivals, peak)
             after = now._replace(elements=moved, rivals=rivals, line=line)
             return self.judged(now, after, size, found)
 
@@ -416,17 +418,17 @@ def close(
     equation: CollocatedEquation,
     tangents: Any,
     known: Known,
-    neighbour: RotorPair,
+    neighbour: Float[Array, " m"],
     tolerance: Float[Array, ""],
 ) -> Closed:
     """Close the orbit near a `known` one, and compute its forces and their derivatives.
 
     `tangents`: d directions of the pair's parameters along which to differentiate, stacked along a
-    leading axis; `neighbour`: pair whose orbit is the known one; `tolerance`: relative error of the
-    forces to reach. If the mesh of the known orbit is aligned with events, the new one is solved on
-    it, and its error follows from the known one. Otherwise, and if the events are others or the
-    error is too large, the mesh is changed until flags and events agree and the error is small
-    enough."""
+    leading axis; `neighbour` (m,): `numbers` of the pair whose orbit is the known one;
+    `tolerance`: relative error of the forces to reach. If the mesh of the known orbit is aligned
+    with events, the new one is solved on it, and its error follows from the known one. Otherwise,
+    and if the events are others or the error is too large, the mesh is changed until flags and
+    events agree and the error is small enough."""
     frozen = lax.stop_gradient(equation.pair)
     return Closer(equation, frozen, tangents, known, neighbour, tolerance).run().closed
 

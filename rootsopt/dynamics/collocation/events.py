@@ -273,9 +273,10 @@ def rooted(pair: RotorPair, elements: Elements, seen: FlagScan) -> Elements:
     """Return `elements` with `roots` from `seen`, the result of `look`.
 
     At the end of an element, the first root belongs to the side of the end on which the flanks
-    push, or to the instant before the end where the contact jumps. The second root, that of the minimum to which the contact may jump, belongs to the instant
-    after the end. Both are extrapolated to the end: otherwise derivatives of a peak at a corner of
-    the force would have a relative error of about 5e-6."""
+    push, or to the instant before the end where the contact jumps. The second root, that of the
+    minimum to which the contact may jump, belongs to the instant after the end. Both are
+    extrapolated to the end: otherwise derivatives of a peak at a corner of the force would have a
+    relative error of about 5e-6."""
     inside = len(GAUSS.nodes)
     mesh, number = elements.mesh, jnp.arange(elements.state.shape[0])
     following = jnp.where(number + 1 < mesh.used, number + 1, 0)

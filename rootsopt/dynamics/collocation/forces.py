@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 from rootsopt.dynamics.collocation.elements import Elements
 from rootsopt.dynamics.collocation.equation import CollocatedEquation, Points
 from rootsopt.dynamics.collocation.gauss import GAUSS, summed
-from rootsopt.dynamics.collocation.peak import Peak, Rivals, forces_along, peak_of
+from rootsopt.dynamics.collocation.peak import Peak
 from rootsopt.dynamics.collocation.system import Step, moved_at, moved_places, unchanged
 
 _COINCIDE = 1e-6
@@ -48,17 +48,17 @@ class OrbitForces(NamedTuple):
 def forces_of(
     equation: CollocatedEquation,
     elements: Elements,
-    rivals: Rivals,
+    peak: Peak,
     evaluated: tuple[Points, Float[Array, "e p r k"]],
     step: Step,
     corrected: Elements,
 ) -> OrbitForces:
     """Return the forces of the closed orbit `elements` and their derivatives.
 
-    `rivals`: instants at which the force may be greatest; `evaluated`: equation along the orbit
-    (`newton.evaluated`), and direct changes of its values in the columns of `step`; `step`: a last
-    correction of the motion, followed by its changes along directions of the parameters;
-    `corrected`: the orbit after the correction."""
+    `peak`: result of `peak_of`; `evaluated`: equation along the orbit (`newton.evaluated`), and
+    direct changes of its values in the columns of `step`; `step`: a last correction of the motion,
+    followed by its changes along directions of the parameters; `corrected`: the orbit after the
+    correction."""
     points, direct = evaluated
     change = _changes(elements, points, direct, step)
     raw, changes = _averages(equation, elements, points, change, step)
@@ -66,7 +66,6 @@ def forces_of(
     top = lax.stop_gradient(equation.top) / unit
     averages, factors = equation.measures.values(raw, unit, top)
     by_averages = changes * factors[:, None]
-    peak = peak_of(elements, rivals, *forces_along(equation, points))
     by_height = unit * _by_height(equation, elements, peak, (points, direct, change), step)
     peak = peak._replace(force=unit * peak.force)
     values = jnp.concatenate([averages[:2], peak.force[None], averages[2:]])

@@ -21,8 +21,8 @@ _MOST, _FINEST = (96, 48), 160
 """Maximum number of elements per mesh period: in each of the first two mesh periods, and in each
 further one, unless the flank is wavy. A free form has some 45 events in each mesh period. Others
 have fewer, and would pay for the room: sorting events takes half of the time from rest with room
-for 64 events in each of eight mesh periods. Shorter orbits can use the room of longer ones, up to the third number per mesh period at
-the usual accuracy."""
+for 64 events in each of eight mesh periods. Shorter orbits can use the room of longer ones, up to
+the third number per mesh period at the usual accuracy."""
 _TIMES = 64, 24
 """Number of events above which the search for the orbit fails, counted like elements."""
 _SLICES = 0.5

@@ -52,13 +52,13 @@ class Collocated(NamedTuple):
 def closed_orbit(
     pair: RotorPair,
     tangents: Any,
-    start: tuple[Known, Any],
+    start: tuple[Known, Float[Array, " m"]],
     settings: "Solver",
 ) -> Collocated:
     """Close the orbit near a known motion.
 
     `tangents`: directions of the pair's parameters, stacked along a leading axis; `start`: the
-    motion, and the numbers of its pair; `settings`: `orbit` (whose tolerance sets the accuracy),
+    motion, and the `numbers` of its pair; `settings`: `orbit` (whose tolerance sets the accuracy),
     `measures`, `max_orbit`, `variation`. The result's `flow` has neither samples nor steps."""
     known, neighbour = start
     integrator, measures = settings.orbit, settings.measures

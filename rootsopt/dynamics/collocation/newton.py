@@ -5,8 +5,8 @@ The sequence of the events stays the same."""
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
 from rootsopt.dynamics.collocation.blocks import in_blocks
@@ -16,6 +16,7 @@ from rootsopt.dynamics.collocation.gauss import GAUSS
 from rootsopt.dynamics.collocation.peak import Rivals
 from rootsopt.dynamics.collocation.system import Columns, Lines, Step, own_column
 from rootsopt.dynamics.pair import RotorPair
+from rootsopt.runtime.kept import kept
 
 _ROOM = 0.7
 """Greatest fraction of an interval's length by which one step may shorten the interval."""
@@ -28,6 +29,7 @@ the step before. The steps then only follow rounding."""
 
 def evaluated(
     equation: CollocatedEquation,
+    at: Float[Array, " m"],
     elements: Elements,
     rivals: Rivals,
     tangents: Any,
@@ -36,7 +38,8 @@ def evaluated(
     """Return the equation along `elements`, and its derivatives along d directions.
 
     It is evaluated at the s Gauss points and the end of each element (p = s + 1), and at the
-    instants `rivals`, on the element after the last one in use. `tangents`: directions of the
+    instants `rivals`, on the element after the last one in use. `at` (m,): `numbers` of the pair,
+    in place of those of the equation's pair; `tangents`: directions of the
     pair's parameters, stacked along a leading axis; `whole`: whether derivatives along them are
     needed. Otherwise they have no meaning. The arrays of the mesh must have room for one more
     element."""
@@ -48,7 +51,8 @@ def evaluated(
     which = jnp.maximum(mesh.which[mesh.interval + 1], 0)
 
     def points(tau, state, roots, which):
-        return equation.along(tau, state, roots, which, tangents, whole)
+        own = with_numbers(equation, at)
+        return own.along(tau, state, roots, which, tangents, whole)
 
     return in_blocks(points, extra + 1, tau, state, roots, which)
 
@@ -80,13 +84,27 @@ def columns_of(elements: Elements, found: Lines, direct: Float[Array, "e p r k"]
 
 
 def between(
-    equation: CollocatedEquation, neighbour: RotorPair, way: Float[Array, ""]
-) -> CollocatedEquation:
-    """Return `equation` for a pair between `neighbour` (`way` = 0) and its own pair (1)."""
-    new, static = eqx.partition(equation.pair, eqx.is_inexact_array)
-    old = eqx.filter(neighbour, eqx.is_inexact_array)
-    here = jax.tree.map(lambda x, y: jnp.where(way == 1, x, y + way * (x - y)), new, old)
-    return eqx.tree_at(lambda e: e.pair, equation, eqx.combine(here, static))
+    pair: RotorPair, neighbour: Float[Array, " m"], way: Float[Array, ""]
+) -> Float[Array, " m"]:
+    """Return the `numbers` of a pair between a neighbour (`way` = 0) and `pair` (1).
+
+    `neighbour` (m,): `numbers` of the neighbour."""
+    own = numbers(pair)
+    return kept(jnp.where(way == 1, own, neighbour + way * (own - neighbour)))
+
+
+def numbers(pair: Any) -> Float[Array, " m"]:
+    """Return all floating-point numbers of a `pair` as one vector.
+
+    XLA compiles a loop of its own for each array that it chooses, copies or mixes."""
+    return ravel_pytree(eqx.filter(pair, eqx.is_inexact_array))[0]
+
+
+def with_numbers(equation: CollocatedEquation, found: Float[Array, " m"]) -> CollocatedEquation:
+    """Return `equation` with a pair of the same kind, given by its `numbers`."""
+    own, rest = eqx.partition(equation.pair, eqx.is_inexact_array)
+    pair = eqx.combine(ravel_pytree(own)[1](found), rest)
+    return eqx.tree_at(lambda e: e.pair, equation, pair)
 
 
 def has_stalled(size: Float[Array, ""], before: Float[Array, ""]) -> Bool[Array, ""]:

@@ -132,11 +132,14 @@ def rivals_of(
     wrong = known - _derivatives(rows[before.element], before.share)[1]
     wrong = jnp.zeros(rows.shape[0], rows.dtype).at[before.element].set(wrong)[element]
     rows, share = rows[element], jnp.asarray(_PLACES)[jnp.argmax(heights[element], axis=1)]
-    for _ in range(_STEPS):
+
+    def closer(_, share):
         _, slope, bend = _derivatives(rows, share)
         # A greater error than this is not that of a polynomial: the motion is not yet a solution.
         error = jnp.where(jnp.abs(wrong) < _BESIDE * jnp.abs(bend), wrong, 0.0)
-        share = jnp.clip(share + _to_vertex(slope + error, bend), _INSIDE, 1.0 - _INSIDE)
+        return jnp.clip(share + _to_vertex(slope + error, bend), _INSIDE, 1.0 - _INSIDE)
+
+    share = lax.fori_loop(0, _STEPS, closer, share)
     # Likewise for the roots: derivatives of the force have an error proportional to theirs.
     astray = points.roots[elements.mesh.used] - _roots(points.roots, before.element, before.share)
     astray = jnp.zeros_like(points.roots[:, 0]).at[before.element].set(astray)[element]
@@ -220,7 +223,15 @@ def _hermite() -> NDArray[np.float64]:
     return np.asarray(np.linalg.inv(np.concatenate([values, slopes])), np.float64)
 
 
-_HERMITE = _hermite()
+def _derived() -> NDArray[np.float64]:
+    """Return the matrices (3, c, c) that convert the c coefficients of a polynomial to those of its
+    value, first and second derivative."""
+    count = 2 * len(GAUSS.nodes)
+    once = np.diag(np.arange(1.0, count), -1)
+    return np.stack([np.eye(count), once, once @ once])
+
+
+_HERMITE, _DERIVED = _hermite(), _derived()
 
 
 def _polynomials(elements: Elements, force, rate) -> Float[Array, "e c"]:
@@ -230,12 +241,8 @@ def _polynomials(elements: Elements, force, rate) -> Float[Array, "e c"]:
     return jnp.concatenate([force[:, :inside], slopes], axis=1) @ _HERMITE.T
 
 
-def _derivatives(rows: Float[Array, "p c"], share: Float[Array, " p"]):
+def _derivatives(rows: Float[Array, "p c"], share: Float[Array, " p"]) -> Float[Array, "3 p"]:
     """Return value, first and second derivative of the polynomials `rows` at `share`."""
-    place = share - 0.5
-    slope = bend = value = jnp.zeros_like(place)
-    for column in rows.T[::-1]:
-        bend = bend * place + 2 * slope
-        slope = slope * place + value
-        value = value * place + column
-    return value, slope, bend
+    powers = (share - 0.5)[:, None] ** jnp.arange(float(rows.shape[1]))
+    # One sum for all: XLA would repeat Horner's scheme for each result that uses a value.
+    return jnp.sum(rows @ _DERIVED * powers, axis=-1)
