@@ -171,8 +171,10 @@ def row_of(kind: str, overrides: list[str]) -> Row:
     (by_one, one, _), (by_other, other, _) = found["collocation"], found["shooting"]
     for k, name in enumerate(FORCES):
         reference = float(getattr(other, name))
-        row[f"{name}_difference"] = abs(float(getattr(one, name)) - reference) / abs(reference)
-        size = np.max(np.abs(by_other[k]))
+        row[f"{name}_difference"] = abs(float(getattr(one, name)) - reference) / (
+            abs(reference) or 1.0  # flanks that never touch
+        )
+        size = np.max(np.abs(by_other[k])) or 1.0
         row[f"{name}_gradient_difference"] = float(np.max(np.abs(by_one[k] - by_other[k])) / size)
     row["multiplier_difference"] = float(
         np.max(np.abs(np.abs(one.multipliers) - np.abs(other.multipliers)))

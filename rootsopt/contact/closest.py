@@ -225,9 +225,8 @@ class FlankPair(eqx.Module):
         `roll`: x (rad); `found`: closest approach at this pose. Where a flag changes, derivatives
         of the gap jump: second derivatives with respect to the pose, and first derivatives of the
         levers with respect to the design."""
-        ends = jnp.stack([segment.stop for segment in self.frozen.segments()[:-1]] or [0.0])
         normals = jnp.stack([found.normal1, found.normal2])
-        beyond = (normals[:, None] > ends).ravel()
+        beyond = (normals[:, None] > self._ends).ravel()
         half = self.profile.half_pitch
         mirrored = trig.sin(jnp.pi / 2 * (roll - half) / half) > 0
         pieces = [found.found, mirrored]
@@ -257,10 +256,19 @@ class FlankPair(eqx.Module):
     def edges(self) -> Float[Array, " k"]:
         """Normal angles (rad) at which a smooth piece of the flank ends (see `margins`).
 
-        These are the ends of the segments, without the pitch crossing. On a wavy flank they are the
-        knots, where higher derivatives jump, and the pitch crossing, where rotor 2's dedendum
-        ends."""
-        pieces = self.profile.stretches() if self.frozen.wavy else self.profile.segments()[:-1]
+        These are the ends of the segments, without the pitch crossing unless the curvature jumps
+        there. On a wavy flank they are the knots, where higher derivatives jump, and the pitch
+        crossing, where rotor 2's dedendum ends."""
+        if not self.frozen.wavy:
+            return self._ends
+        return jnp.stack([piece.stop for piece in self.profile.stretches()])
+
+    @property
+    def _ends(self) -> Float[Array, " k"]:
+        """Normal angles (rad) at which curvature jumps: ends of segments, the last one included if
+        the flank is `inflected`."""
+        pieces = self.profile.segments()
+        pieces = pieces if self.profile.inflected else pieces[:-1]
         return jnp.stack([piece.stop for piece in pieces] or [jnp.zeros(())])
 
     def margins(

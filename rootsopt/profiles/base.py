@@ -253,6 +253,14 @@ class Profile(eqx.Module):
         return True
 
     @property
+    def inflected(self) -> bool:
+        """Whether the curvature jumps at the pitch crossing, where the addendum ends.
+
+        It is continuous there if the pressure angle is stationary, as on an involute. A `cusp` has
+        no curvature; the contact jumps over it."""
+        return not self.cusp
+
+    @property
     def forked(self) -> bool:
         """Whether the gap may have two minima beside a joint of the flank.
 

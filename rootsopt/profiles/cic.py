@@ -150,6 +150,10 @@ class CIC(Profile):
         return jnp.minimum(share - LEAST, 1 + OVERLENGTH - share)
 
     @property
+    def inflected(self) -> bool:
+        return False
+
+    @property
     def forked(self) -> bool:
         return False
 

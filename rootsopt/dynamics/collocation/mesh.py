@@ -19,10 +19,10 @@ length of elements."""
 
 _MOST, _FINEST = (96, 48), 160
 """Maximum number of elements per mesh period: in each of the first two mesh periods, and in each
-further one, unless the flank is wavy. A free form has some 45 events in each mesh period. Others
-have fewer, and would pay for the room: sorting events takes half of the time from rest with room
-for 64 events in each of eight mesh periods. Shorter orbits can use the room of longer ones, up to
-the third number per mesh period at the usual accuracy."""
+further one, unless the flank is wavy or forked. Free forms have some 45 events in each mesh period,
+four arcs up to 35. Others have fewer, and would pay for the room: sorting events takes half of the
+time from rest with room for 64 events in each of eight mesh periods. Shorter orbits can use the
+room of longer ones, up to the third number per mesh period at the usual accuracy."""
 _TIMES = 64, 24
 """Number of events above which the search for the orbit fails, counted like elements."""
 _SLICES = 0.5
@@ -33,16 +33,17 @@ its own events."""
 def room_for(pair: RotorPair, periods: int) -> tuple[int, int]:
     """Return the `sizes` for orbits of `pair` of up to this number of mesh periods."""
     contact = innermost(pair.contact)
-    wavy = isinstance(contact, SearchContact) and contact.pair.profile.wavy
-    return sizes(periods, pair.contact.sections, wavy)
+    profile = contact.pair.profile if isinstance(contact, SearchContact) else None
+    crowded = profile is not None and (profile.wavy or profile.forked)
+    return sizes(periods, pair.contact.sections, crowded)
 
 
-def sizes(periods: int, slices: int, wavy: bool) -> tuple[int, int]:
+def sizes(periods: int, slices: int, crowded: bool) -> tuple[int, int]:
     """Return the sizes of the arrays of a mesh, for its elements and for its times.
 
     They are large enough for orbits of up to `periods` mesh periods of rotors with this number of
-    `slices` (1 for straight rotors); `wavy`: whether a flank has many segments."""
-    first = periods if wavy else min(periods, 2)
+    `slices` (1 for straight rotors); `crowded`: whether each mesh period has many events."""
+    first = periods if crowded else min(periods, 2)
     further = periods - first
     growth = 1 + _SLICES * (slices - 1)
     elements, times = (round(growth * (first * x + further * y)) for x, y in (_MOST, _TIMES))
