@@ -2,9 +2,10 @@
 
 The study draws designs and scenes (speed, load, backlash, gear, contact) of several kinds: CIC with
 two to four lobes, EE, arc and involute, four and five arcs, a free form, twisted and worn rotors, a
-wrong centre distance, with gas and friction, with a motor, and lively scenes. For each pair of design and scene that settles, both
-solvers start from rest. Forces, their derivatives with respect to design, speed and load, period,
-multipliers and status are compared. The times are those of a second call in the same process.
+wrong centre distance, with gas and friction, with a motor, and lively scenes. For each pair of
+design and scene that settles, both solvers start from rest. Forces, their derivatives with respect
+to design, speed and load, period, multipliers and status are compared. The times are those of a
+second call in the same process.
 """
 
 import csv

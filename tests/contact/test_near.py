@@ -11,7 +11,8 @@ import rootsopt
 from rootsopt.contact.closest import FlankPair
 from rootsopt.contact.near import NearContact
 from rootsopt.contact.search import SearchContact
-from rootsopt.profiles.cic import CIC
+from rootsopt.dynamics.collocation.events import leaps
+from rootsopt.profiles import CIC, arc, four_arcs
 from rootsopt.scene import Scene
 
 GAS = [
@@ -19,11 +20,16 @@ GAS = [
     "contact.friction={static: 0.2, kinetic: 0.1, stiction_speed_mm_s: 100, "
     "friction_speed_mm_s: 1000}",
 ]
+FOUR_ARCS = (
+    "profile={family: four_arcs, lobes: 3, pitch_radius_mm: 33.0, arc_center_mm: 23.964, "
+    "tip_arc_radius_mm: 20.659, tip_arc_turn_deg: 34.22}"
+)
 SCENES = {
     "cic": ("cic", []),
     "ee": ("ee", []),
     "gas and friction": ("cic", GAS),
     "pump": ("pump", []),
+    "four arcs": ("cic", [FOUR_ARCS, "optimizer.bounds={}"]),
 }
 
 
@@ -58,18 +64,15 @@ def test_margins_have_the_sign_of_the_flags(name):
         near = _near(pair, searched.places.normal2).margins(tau, state)
         return *pair.switches(tau, state), searched, near
 
-    cusp = pair.contact.pair.profile.cusp
-    rival = jax.eval_shape(
-        lambda: pair.law.margins(jnp.zeros(()), jnp.zeros(()))
-    ).shape[0] + 2  # fmt: skip
+    jumps = set(leaps(pair).margin) - {-1}
+    assert len(jumps) == (pair.flanks if pair.jumps else 0)
     seen = 0
     for tau, state in zip(*_states(pair, 60), strict=True):
         flags, counts, searched, near = both(pair, tau, state)
         np.testing.assert_array_equal(flags, searched.values > 0)
         counted = np.array(counts & searched.counts)
-        if cusp:
-            # Its margin needs the other root, which is known at the event alone.
-            counted[rival] = False
+        # The margin of a jump needs the other root, which is known at the event alone.
+        counted[list(jumps)] = False
         seen += counted.sum()
         np.testing.assert_array_equal(flags[counted], np.asarray(near.values > 0)[counted])
     assert seen > 100
@@ -112,6 +115,60 @@ def test_root_at_the_end_of_a_segment_has_one_slope():
     assert bool(there.place[0].found)
     np.testing.assert_allclose(there.gap, beside.gap, rtol=0, atol=1e-15)
     np.testing.assert_allclose(there.lever1, beside.lever1, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("profile", "kinks"),
+    [(arc(3, 0.033, 0.0297), 1), (CIC(3, 0.033, np.radians(36), 6e-3, np.radians(3)), 0)],
+    ids=["arc", "involute"],
+)
+def test_lever_bends_where_a_margin_changes_its_sign(profile, kinks):
+    """The curvature of an arc jumps at the pitch crossing, that of an involute does not.
+
+    A search shows the kink as a jump of the lever's slope."""
+    flanks = FlankPair.of(profile)
+    relative = jnp.asarray(-1e-3)
+    # Rotor 2 touches at its crossing where half of the mesh has passed, less about ε.
+    rolls = flanks.profile.half_pitch + 4e-3 * jnp.linspace(-1, -1e-3, 4001)
+
+    @jax.jit
+    def look(roll):
+        found = flanks(roll, relative)
+        return found.lever2, flanks.margins(roll, found)
+
+    levers, margins = (np.asarray(x) for x in jax.lax.map(look, rolls))
+    bends = np.abs(np.diff(levers, 2))
+    bends = np.flatnonzero(bends > 1e3 * np.median(bends))
+    changes = np.flatnonzero(np.any(np.diff(np.sign(margins), axis=0) != 0, axis=1))
+    assert len(changes) == kinks
+    for place in changes:
+        assert np.min(np.abs(bends - place)) <= 1
+    assert np.all(np.isin(bends, [c + k for c in changes for k in (-1, 0)]))
+
+
+def test_margin_of_a_jump_is_zero_where_both_minima_are_equally_deep():
+    """The contact of four arcs jumps over their joint. A search finds the same roll angle."""
+    flanks = FlankPair.of(four_arcs(3, 0.033, 0.023964, 0.020659, np.radians(34.22)))
+    assert flanks.jumps
+    relative = jnp.asarray(-1e-3)
+    search = jax.jit(lambda roll: flanks(roll, relative).normal2)
+    joint = float(flanks.profile.roll_angle(flanks.profile.segments()[0].stop))
+    low, high = joint - 0.02, joint + 0.02
+    before, after = float(search(low)), float(search(high))
+    rolls = np.linspace(low, high, 2001)
+    normals = np.asarray(jax.lax.map(search, jnp.asarray(rolls)))
+    (place,) = np.flatnonzero(np.abs(np.diff(normals)) > 0.05)
+    before, after = normals[place : place + 2]
+
+    @jax.jit
+    def margin(roll):
+        contact = NearContact(flanks, jnp.asarray([[before, after]]))
+        return contact.margins(roll, contact.approach(roll, relative))[2]
+
+    found = brentq(lambda x: float(margin(jnp.asarray(x))), *rolls[place : place + 2], xtol=1e-14)
+    inside = lambda x: float(search(jnp.asarray(x))) - (before + after) / 2  # noqa: E731
+    jump = brentq(inside, *rolls[place : place + 2], xtol=1e-14)
+    assert found == pytest.approx(jump, abs=1e-9)
 
 
 @pytest.mark.parametrize("name", ["cic", "pump"])

@@ -176,12 +176,14 @@ def test_event_is_located(margin, most):
 
     def seen(tau):
         places.append(float(tau))
-        return margin(tau)
+        return margin(tau), tau
 
     low, high = jnp.asarray(0.3), jnp.asarray(0.32)
     with jax.disable_jit():
-        found = zero_of(seen, low, high, margin(low) > 0)
+        found, before, after = zero_of(seen, low, high, margin(low) > 0)
     assert abs(float(found) - EVENT) < 4e-10
+    assert before <= found <= after
+    assert after - before < 7e-10
     assert len(places) <= most
     assert min(places) >= 0.3
     assert max(places) <= 0.32
