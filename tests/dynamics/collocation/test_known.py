@@ -1,5 +1,6 @@
 """Tests of orbits closed from those of neighbouring pairs."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 import rootsopt
 from rootsopt.dynamics.collocation.elements import Elements, Mesh
 from rootsopt.dynamics.collocation.equation import Points
-from rootsopt.dynamics.collocation.events import extra
+from rootsopt.dynamics.collocation.events import FIXED, extra, found_events, leaps, look
 from rootsopt.dynamics.collocation.gauss import GAUSS, POINTS
 from rootsopt.dynamics.collocation.known import Known, padded, trimmed
 from rootsopt.dynamics.collocation.mesh import roughness, sizes
@@ -17,6 +18,7 @@ from rootsopt.dynamics.collocation.system import Step, moved_at, unchanged
 from rootsopt.dynamics.varied import VariedOrbit
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.series import sampled
+from rootsopt.scene import Scene
 from rootsopt.status import Status
 
 PERIOD, BEGIN, USED = 2, 0.3, 10
@@ -179,6 +181,53 @@ def test_flags_are_evaluated_where_a_short_touch_shows():
     for turn in (0.5, 1.5):
         assert np.min(np.abs(found - turn)) < 1e-5
     assert np.all((found > first[:, None]) & (found < last[:, None]))
+
+
+def test_a_jump_of_the_contact_is_an_event():
+    """At constant ε, the contact of four arcs jumps over their joint twice in a mesh period.
+
+    Other changes of segment are events of their own. The events are those of a search at many
+    instants."""
+    arcs = "family: four_arcs, lobes: 3, pitch_radius_mm: 33.0, arc_center_mm: 23.964"
+    rest = "tip_arc_radius_mm: 20.659, tip_arc_turn_deg: 34.22"
+    config = rootsopt.load_config("cic", [f"profile={{{arcs}, {rest}}}", "optimizer.bounds={}"])
+    scene = Scene.from_config(config)
+    pair = eqx.filter_jit(lambda s, d: s.pair(d))(scene, jnp.asarray(config.design, float))
+    count, times = 240, 40
+    edges = jnp.linspace(0.0, 1.0, count + 1)
+    mesh = Mesh(
+        times=jnp.ones(times).at[0].set(0.0),
+        which=jnp.full(times, FIXED),
+        interval=jnp.zeros(count, int),
+        left=edges[:-1],
+        right=edges[1:],
+        used=jnp.asarray(count),
+    )
+    still = jnp.asarray([-1e-3 / pair.angle_scale, 0.0])
+    elements = Elements(
+        mesh, jnp.tile(still, (count, 1)), jnp.zeros((count, POINTS, 2)),
+        jnp.zeros((count, POINTS + 1, 1, 2)),
+    )  # fmt: skip
+
+    @eqx.filter_jit
+    def events_of(pair):
+        return found_events(pair, elements, look(pair, elements))
+
+    @eqx.filter_jit
+    def normals_of(pair, instants):
+        return jax.lax.map(lambda tau: pair.margins(tau, still).places.normal2[0], instants)
+
+    events = events_of(pair)
+    (jump,) = set(leaps(pair).margin) - {-1}
+    which, found = np.asarray(events.which), np.asarray(events.times)
+    instants = np.linspace(0.5, 1.0, 8001)[1:-1]
+    change = np.abs(np.diff(np.asarray(normals_of(pair, jnp.asarray(instants)))))
+    jumps = instants[np.flatnonzero(change > 20 * np.median(change))]
+    assert len(jumps) == 2
+    np.testing.assert_allclose(found[which == jump], jumps, rtol=0, atol=1e-4)
+    crossings = found[np.isin(which, np.flatnonzero(leaps(pair).margin == jump)) & (which != jump)]
+    assert len(crossings) == 2
+    assert np.max(np.abs(crossings - 0.75)) < 2e-3
 
 
 @pytest.mark.long
