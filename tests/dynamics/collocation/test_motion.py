@@ -42,6 +42,12 @@ FOUR = [
     "profile={family: cic, lobes: 4, pitch_radius_mm: 33.0, pressure_angle_deg: 33, "
     "involute_length_mm: 6, tip_arc_angle_deg: 2}"
 ]
+ARCS = [
+    "profile={family: four_arcs, lobes: 3, pitch_radius_mm: 33.0, arc_center_mm: 23.964, "
+    "tip_arc_radius_mm: 20.659, tip_arc_turn_deg: 34.22}",
+    "scene.load.torque_N_m=20",
+    "optimizer.bounds={}",
+]
 
 
 def _both(name, overrides):
@@ -81,8 +87,13 @@ def _both(name, overrides):
         ("pump", [], 1),
         ("cic", TWISTED, 1),
         ("cic", ["contact.wear.depth_mm=0.02"], 1),
+        ("cic", ARCS, 1),
+        ("cic", ["scene.center_distance_error_mm=0.03"], 1),
     ],
-    ids=["cic", "ee", "steps down to rounding", "four lobes", "lively", "pump", "twisted", "worn"],
+    ids=[
+        *("cic", "ee", "steps down to rounding", "four lobes", "lively", "pump", "twisted"),
+        *("worn", "contact jumps over a joint", "centre distance"),
+    ],
 )
 def test_collocation_agrees_with_shooting(name, overrides, period):
     (by_one, one), (by_other, other) = _both(name, overrides)
