@@ -11,7 +11,7 @@ import rootsopt
 from rootsopt.contact.closest import FlankPair
 from rootsopt.contact.near import NearContact
 from rootsopt.contact.search import SearchContact
-from rootsopt.dynamics.collocation.events import leaps
+from rootsopt.dynamics.collocation.events import kinds
 from rootsopt.profiles import CIC, arc, four_arcs
 from rootsopt.scene import Scene
 
@@ -64,7 +64,7 @@ def test_margins_have_the_sign_of_the_flags(name):
         near = _near(pair, searched.places.normal2).margins(tau, state)
         return *pair.switches(tau, state), searched, near
 
-    jumps = set(leaps(pair).margin) - {-1}
+    jumps = set(kinds(pair).jump) - {-1}
     assert len(jumps) == (pair.flanks if pair.jumps else 0)
     seen = 0
     for tau, state in zip(*_states(pair, 60), strict=True):

@@ -104,68 +104,47 @@ def _roots(pair: RotorPair, found: Margins) -> Float[Array, " flanks"]:
     return found.places.normal2 if searches else jnp.zeros(pair.flanks)
 
 
-def ranks(pair: RotorPair) -> list[int]:
-    """Return the rank of each margin.
+class Kinds(NamedTuple):
+    """What a change of each of the f flags means.
 
-    If several flags change at one instant, the margin with the least rank determines the event.
-    Margins that do not depend on the contact have rank 0, since their zeros are most accurate. Rank
-    1 is the jump to another minimum of the gap, because other flags change with it. The rank -1
-    marks a flag whose change is not an event by itself. All other margins have greater ranks, in
-    their order."""
-    of_flank, others = _owners(pair)
-    law, flank = of_flank[0][1], sum(count for _, count in of_flank)
-    order, contact = [2 + k for k in range(flank)], innermost(pair.contact)
-    if type(contact) is SearchContact:
-        order[law] = -1
-        if contact.jumps:
-            order[law + 2] = 1
-    return order * pair.flanks + [0] * sum(count for _, count in others)
-
-
-class Leaps(NamedTuple):
-    """How the flags (f,) tell a jump of the contact from one minimum of the gap to another one.
-
-    `margin` (f,): index of the margin that is zero at the jump, for a flag that changes at each of
-    its jumps or may do so; -1 for any other flag. `only` (f,): whether the flag also changes where
-    nothing happens; its change is an event only where the contact jumps. `flank` (f,): index of the
-    flag's flank.
+    `rank` (f,): if several flags change at one instant, that with the least rank determines the
+    event. Flags of parts have rank 0, since the zeros of their margins are most accurate. Rank 1 is
+    the jump to another minimum of the gap, because other flags change with it. The rank -1 marks a
+    flag whose change is not an event. All other flags have greater ranks, in their order.
+    `vague` (f,): whether the flag has no margin of its own, so that it does not tell how an event
+    moves. `jump` (f,): index of the margin that is zero where the contact jumps, if the flag may
+    change there, otherwise -1. `only` (f,): whether the flag's change is an event only if the
+    contact jumps. `flank` (f,): index of the flag's flank.
     """
 
-    margin: Int[np.ndarray, " f"]
+    rank: Int[np.ndarray, " f"]
+    vague: Bool[np.ndarray, " f"]
+    jump: Int[np.ndarray, " f"]
     only: Bool[np.ndarray, " f"]
     flank: Int[np.ndarray, " f"]
 
 
-def leaps(pair: RotorPair) -> Leaps:
-    """Return how the flags of the `pair` tell a jump of the contact."""
-    of_flank, others = _owners(pair)
-    per, rest = (sum(count for _, count in some) for some in (of_flank, others))
-    margin, only = np.full(per, -1), np.zeros(per, bool)
-    contact = innermost(pair.contact)
-    if type(contact) is SearchContact and contact.jumps:
-        (_, law), (_, own) = of_flank[:2]
-        jump = law + 2
-        margin[jump : law + own] = jump
-        if contact.pair.profile.wavy:
-            only[jump : jump + 1 + RANKS] = True
-    number = np.repeat(np.arange(pair.flanks), per)
-    margins = np.tile(margin, pair.flanks)
-    margins = np.where(margins < 0, -1, margins + per * number)
-    return Leaps(
-        np.pad(margins, (0, rest), constant_values=-1),
-        np.pad(np.tile(only, pair.flanks), (0, rest)),
-        np.pad(number, (0, rest)),
-    )
-
-
-def vague(pair: RotorPair) -> list[bool]:
-    """Return whether each flag has no margin of its own, so that it does not tell how an event
-    moves."""
+def kinds(pair: RotorPair) -> Kinds:
+    """Return what changes of the flags of `pair` mean."""
     of_flank, others = _owners(pair)
     own, rest = (
-        [not has for has, count in some for _ in range(count)] for some in (of_flank, others)
+        np.array([not has for has, count in some for _ in range(count)], bool)
+        for some in (of_flank, others)
     )
-    return own * pair.flanks + rest
+    per, law, contact = len(own), of_flank[0][1], innermost(pair.contact)
+    rank, jump, only = 2 + np.arange(per), np.full(per, -1), np.zeros(per, bool)
+    if type(contact) is SearchContact:
+        rank[law] = -1
+        if contact.jumps:
+            place = law + 2
+            rank[place], jump[place : law + of_flank[1][1]] = 1, place
+            only[place : place + 1 + RANKS] = contact.pair.profile.wavy
+    number = np.repeat(np.arange(pair.flanks), per)
+    rank, own, jump, only = (np.tile(row, pair.flanks) for row in (rank, own, jump, only))
+    jump = np.where(jump < 0, -1, jump + per * number)
+    of_pair = (0, rest, -1, False, 0)
+    rows = zip((rank, own, jump, only, number), of_pair, strict=True)
+    return Kinds(*(np.append(row, np.broadcast_to(last, rest.shape)) for row, last in rows))
 
 
 def _owners(pair: RotorPair) -> tuple[list[tuple[bool, int]], list[tuple[bool, int]]]:
@@ -289,7 +268,7 @@ def rooted(pair: RotorPair, elements: Elements, seen: FlagScan) -> Elements:
     aside = seen.tau.reshape(*number.shape, -1)[:, -2:, None] - end
     moved = seen.roots[:, inside:] - aside * jnp.stack([before, after], axis=1)
     own = seen.pushes[:, inside] | ~seen.pushes[:, inside + 1]
-    jumps = np.unique(leaps(pair).margin)
+    jumps = np.unique(kinds(pair).jump)
     which = jnp.where(mesh.last, mesh.which[mesh.interval + 1], FIXED)
     for flank, jump in enumerate(jumps[jumps >= 0]):
         own = own.at[:, flank].set(own[:, flank] | (which == jump))
@@ -329,11 +308,13 @@ def _compared(pair: RotorPair, elements: Elements, seen: FlagScan) -> _Compared:
     mesh = elements.mesh
     places = seen.tau.shape[0]
     per = places // elements.state.shape[0]
-    rank = jnp.asarray(ranks(pair))
+    kind = kinds(pair)
     number = jnp.arange(places)
     after = jnp.where(number + 1 < seen.total, number + 1, 0)
     later = jnp.where(number + 1 < seen.total, seen.tau[after], seen.tau[0] + mesh.period)
-    differ = (seen.flags != seen.flags[after]) & (seen.counts | seen.counts[after]) & (rank >= 0)
+    differ = (
+        (seen.flags != seen.flags[after]) & (seen.counts | seen.counts[after]) & (kind.rank >= 0)
+    )
     differ &= (number < seen.total)[:, None]
     # Find the instants on both sides of an element's end that is an event of the mesh.
     element, inside = number // per, number % per
@@ -342,9 +323,8 @@ def _compared(pair: RotorPair, elements: Elements, seen: FlagScan) -> _Compared:
     declared = (inside == per - 2) & real & (number < seen.total)
     which = mesh.which[ends_at][:, None]
     # A jump shows in any flag of its flank.
-    own, unsaid = np.arange(rank.size), np.asarray(vague(pair), bool)
-    tells = (which == own) | (which == leaps(pair).margin) & (which >= 0)
-    tells |= (which == UNSAID) & unsaid
+    tells = (which == np.arange(kind.rank.size)) | (which == kind.jump) & (which >= 0)
+    tells |= (which == UNSAID) & kind.vague
     kept = declared & ((which[:, 0] == FIXED) | jnp.any(differ & tells, axis=1))
     held = jnp.full(mesh.times.shape, False).at[jnp.where(kept, ends_at, 0)].set(True)
     gone = jnp.sum(declared & ~kept)
@@ -355,10 +335,11 @@ def known_events(pair: RotorPair, mesh: Mesh) -> Events:
     """Return the events at which the elements of a `mesh` end."""
     real = jnp.arange(mesh.times.shape[0]) <= mesh.interval[mesh.used - 1]
     times, zero = jnp.where(real.at[0].set(False), mesh.times, jnp.inf), jnp.zeros((), int)
-    merged = _merged(times, mesh.which, jnp.asarray(ranks(pair)))
+    merged = _merged(times, mesh.which, jnp.asarray(kinds(pair).rank))
     return Events(*merged, zero, zero, jnp.ones((), bool))
 
 
+@eqx.filter_jit
 def found_events(pair: RotorPair, elements: Elements, seen: FlagScan) -> Events:
     """Return the events of the motion `elements`, whose flags are `seen`.
 
@@ -380,7 +361,7 @@ def empty_like(function: Callable[[], Any]) -> Any:
 
 def _located(pair: RotorPair, elements: Elements, seen: FlagScan, compared: _Compared) -> Events:
     """Return the result of `found_events` if flags change elsewhere than at events of the mesh."""
-    mesh, rank = elements.mesh, jnp.asarray(ranks(pair))
+    mesh, kind = elements.mesh, jax.tree.map(jnp.asarray, kinds(pair))
     fresh, later, held, gone = compared
     room = mesh.times.shape[0]
     most = _CHANGES * room
@@ -390,8 +371,7 @@ def _located(pair: RotorPair, elements: Elements, seen: FlagScan, compared: _Com
     row, flag = jnp.nonzero(changes, size=most, fill_value=0)
     place = jnp.minimum(some[row], fresh.shape[0] - 1)
     number = jnp.sum(fresh)
-    value, tells = seen.flags[place, flag], leaps(pair)
-    flank = jnp.asarray(tells.flank)[flag]
+    value, flank = seen.flags[place, flag], kind.flank[flag]
 
     def locate(k, found):
         def margin(tau):
@@ -403,13 +383,13 @@ def _located(pair: RotorPair, elements: Elements, seen: FlagScan, compared: _Com
 
     nothing = jnp.full(most, jnp.inf, seen.tau.dtype), jnp.zeros(most, seen.tau.dtype)
     located, change = lax.fori_loop(0, jnp.minimum(number, most), locate, nothing)
-    jump, leap = jnp.asarray(tells.margin)[flag], change > _LEAP
-    located = jnp.where(jnp.asarray(tells.only)[flag] & ~leap, jnp.inf, located)
+    jump, leap = kind.jump[flag], change > _LEAP
+    located = jnp.where(kind.only[flag] & ~leap, jnp.inf, located)
     new = jnp.sum(located < jnp.inf)
     times = jnp.concatenate([located, jnp.where(held, mesh.times, jnp.inf)])
     which = jnp.where(leap & (jump >= 0), jump, flag)
-    which = jnp.concatenate([jnp.where(jnp.asarray(vague(pair))[flag], UNSAID, which), mesh.which])
-    times, which, count = _merged(times, which, rank)
+    which = jnp.concatenate([jnp.where(kind.vague[flag], UNSAID, which), mesh.which])
+    times, which, count = _merged(times, which, kind.rank)
     fits = (number <= most) & (count <= room - 3)
     return Events(times[:room], which[:room], count, new, gone, fits)
 
@@ -463,7 +443,7 @@ def _merged(times, which, rank):
     """Sort events by time, and merge those at the same instant.
 
     `times`: inf for missing events; `which`: index of each event's margin, `FIXED` or `UNSAID`;
-    `rank`: see `ranks`. Return the merged times and margins, and the number of events."""
+    `rank`: see `Kinds`. Return the merged times and margins, and the number of events."""
     importance = jnp.where(which == UNSAID, rank.shape[0] + 2, rank[which])
     importance = jnp.where(which == FIXED, -1, importance)
     order = jnp.lexsort((importance, times))

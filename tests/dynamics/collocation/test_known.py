@@ -9,7 +9,7 @@ import pytest
 import rootsopt
 from rootsopt.dynamics.collocation.elements import Elements, Mesh
 from rootsopt.dynamics.collocation.equation import Points
-from rootsopt.dynamics.collocation.events import FIXED, extra, found_events, leaps, look
+from rootsopt.dynamics.collocation.events import FIXED, extra, found_events, kinds, look
 from rootsopt.dynamics.collocation.gauss import GAUSS, POINTS
 from rootsopt.dynamics.collocation.known import Known, padded, trimmed
 from rootsopt.dynamics.collocation.mesh import roughness, sizes
@@ -218,14 +218,14 @@ def test_a_jump_of_the_contact_is_an_event():
         return jax.lax.map(lambda tau: pair.margins(tau, still).places.normal2[0], instants)
 
     events = events_of(pair)
-    (jump,) = set(leaps(pair).margin) - {-1}
+    (jump,) = set(kinds(pair).jump) - {-1}
     which, found = np.asarray(events.which), np.asarray(events.times)
     instants = np.linspace(0.5, 1.0, 8001)[1:-1]
     change = np.abs(np.diff(np.asarray(normals_of(pair, jnp.asarray(instants)))))
     jumps = instants[np.flatnonzero(change > 20 * np.median(change))]
     assert len(jumps) == 2
     np.testing.assert_allclose(found[which == jump], jumps, rtol=0, atol=1e-4)
-    crossings = found[np.isin(which, np.flatnonzero(leaps(pair).margin == jump)) & (which != jump)]
+    crossings = found[np.isin(which, np.flatnonzero(kinds(pair).jump == jump)) & (which != jump)]
     assert len(crossings) == 2
     assert np.max(np.abs(crossings - 0.75)) < 2e-3
 

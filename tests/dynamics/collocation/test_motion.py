@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 import rootsopt
 from rootsopt.dynamics import closed
-from rootsopt.dynamics.collocation.events import vague
+from rootsopt.dynamics.collocation.events import kinds
 from rootsopt.dynamics.parts.base import Part
 from rootsopt.dynamics.settle import settle
 from rootsopt.scene import Scene
@@ -180,7 +180,7 @@ def test_flags_without_margins():
     for kind in (_Stop, _Untold):
         with_part = scene.with_parts(kind(stop))
         pair = eqx.filter_jit(Scene.pair)(with_part, design)
-        assert np.any(vague(pair)) == (kind is _Untold)
+        assert np.any(kinds(pair).vague) == (kind is _Untold)
         response = eqx.filter_jit(rootsopt.steady_response)(with_part, design)
         assert response.status == Status.PERIODIC.code
         found.append((response.mean, response.peak, response.rms))
