@@ -5,6 +5,7 @@ code, but every process must trace and lower a function before it can look up th
 looks it up by the function's name, the source code and the kind of its arguments."""
 
 import contextlib
+import ctypes
 import functools
 import gc
 import hashlib
@@ -275,6 +276,8 @@ class Program:
             # A program that cannot be cached can still be used.
             with contextlib.suppress(Exception):
                 _save(place, made, len(structs))
+        del lowered
+        _trim()
         return made
 
     def _place(self, kind: _Kind) -> "_Place | None":
@@ -369,6 +372,14 @@ def _without_collection() -> Iterator[None]:
     finally:
         if paused:
             gc.enable()
+
+
+def _trim() -> None:
+    """Give memory that the compiler has freed back to the system.
+
+    The C library of Linux keeps it otherwise: some 150 MB for each large program."""
+    with contextlib.suppress(OSError, AttributeError, TypeError):
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def _finished(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
