@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 import rootsopt
+from rootsopt.dynamics.collocation.closing import Closed, Closer, Loop, gained
 from rootsopt.dynamics.collocation.elements import Elements, Mesh
 from rootsopt.dynamics.collocation.equation import Points
 from rootsopt.dynamics.collocation.events import extra
+from rootsopt.dynamics.collocation.forces import OrbitForces
 from rootsopt.dynamics.collocation.gauss import GAUSS, POINTS
 from rootsopt.dynamics.collocation.known import Known, padded, trimmed
 from rootsopt.dynamics.collocation.mesh import roughness, sizes
@@ -179,6 +181,44 @@ def test_flags_are_evaluated_where_a_short_touch_shows():
     for turn in (0.5, 1.5):
         assert np.min(np.abs(found - turn)) < 1e-5
     assert np.all((found > first[:, None]) & (found < last[:, None]))
+
+
+@pytest.mark.parametrize("order", [0.55, 2.0, 8.0])
+@pytest.mark.parametrize("more", [1.01, 1.2, 1.4, 2.0])
+def test_estimated_error_of_derivatives_is_a_bound_however_little_the_mesh_grows(order, more):
+    before, after = 1000, round(1000 * more)
+    error = np.array([before, after], float) ** -order
+    _, slope = gained(jnp.asarray(before), jnp.asarray(after))
+    assert (error[0] - error[1]) / slope >= error[1]
+
+
+class _Crowded(Closer):
+    """A loop whose meshes have room for 159 elements."""
+
+    def most(self, now):
+        return jnp.asarray(159)
+
+
+@pytest.mark.parametrize(("used", "ends"), [(113, False), (134, False), (136, True), (158, True)])
+def test_a_mesh_is_refined_only_if_the_finer_one_says_something_new(used, ends):
+    """A mesh of 159 elements has the error of that of 158, and would hide it."""
+    zero, no, start = jnp.zeros(()), jnp.zeros((), bool), _known()
+
+    def forces(slope, elements):
+        mesh = start.elements.mesh._replace(used=jnp.asarray(elements))
+        found = dict.fromkeys(OrbitForces._fields, zero) | {
+            "elements": start.elements._replace(mesh=mesh),
+            "response": jnp.ones(3),
+            "sensitivity": jnp.full((3, 1), slope),
+        }
+        return OrbitForces(**found)
+
+    closed = Closed(forces(1.0, 100), zero, zero, zero, no, zero, zero)
+    now = dict.fromkeys(Loop._fields, zero) | {"closed": closed, "meshes": jnp.asarray(1)}
+    loop = _Crowded(None, None, None, start, None, jnp.asarray(1e-7))
+    after = loop.keep(Loop(**now | {"elements": forces(1.1, used).elements}), forces(1.1, used))
+    assert bool(after.over) is ends
+    assert float(after.closed.drift) > 0.1
 
 
 @pytest.mark.long
