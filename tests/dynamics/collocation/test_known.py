@@ -1,5 +1,7 @@
 """Tests of orbits closed from those of neighbouring pairs."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -205,11 +207,12 @@ class _Crowded(Closer):
 )
 def test_a_mesh_is_refined_only_if_the_finer_one_says_something_new(used, meshes, ends):
     """A mesh of 159 elements has the error of that of 158, and would hide it."""
+    nothing: Any = None
     zero, no, start = jnp.zeros(()), jnp.zeros((), bool), _known()
 
     def forces(slope, elements):
         mesh = start.elements.mesh._replace(used=jnp.asarray(elements))
-        found = dict.fromkeys(OrbitForces._fields, zero) | {
+        found: dict[str, Any] = dict.fromkeys(OrbitForces._fields, zero) | {
             "elements": start.elements._replace(mesh=mesh),
             "response": jnp.ones(3),
             "sensitivity": jnp.full((3, 1), slope),
@@ -217,10 +220,14 @@ def test_a_mesh_is_refined_only_if_the_finer_one_says_something_new(used, meshes
         return OrbitForces(**found)
 
     closed = Closed(forces(1.0, 100), zero, zero, zero, no, zero, zero)
-    now = dict.fromkeys(Loop._fields, zero) | {"closed": closed, "meshes": jnp.asarray(meshes)}
-    loop = _Crowded(None, None, None, start, None, jnp.asarray(1e-7))
-    after = loop.keep(Loop(**now | {"elements": forces(1.1, used).elements}), forces(1.1, used))
-    assert bool(after.over) is ends
+    finer = forces(1.1, used)
+    now: dict[str, Any] = dict.fromkeys(Loop._fields, zero) | {
+        "closed": closed,
+        "elements": finer.elements,
+        "meshes": jnp.asarray(meshes),
+    }
+    loop = _Crowded(nothing, nothing, nothing, start, nothing, jnp.asarray(1e-7))
+    assert bool(loop.keep(Loop(**now), finer).over) is ends
 
 
 @pytest.mark.long
