@@ -28,7 +28,7 @@ def errors_of(rows: Sequence[Row]) -> Figure:
             right.semilogx(errors, share, style, color=color, label=f"{what}, rtol {rtol:g}")
     left.plot([1e-9, 1e-2], [1e-9, 1e-2], "k:", lw=1, label="equal")
     left.set(
-        xlabel="disagreement on halved steps (relative)",
+        xlabel="gradient_disagreement (relative)",
         ylabel="error of the gradients of mean, peak, RMS\nagainst differences (relative)",
         title="Check against error",
     )

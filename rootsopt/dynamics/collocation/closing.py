@@ -71,8 +71,10 @@ _UNCOMPARED = 1e-5, 1e-3, 0.1
 """Estimated relative errors of forces and of their derivatives on a first mesh, as multiples of its
 roughness, which counts as at least the third number. In 45 random pairs, 95 % of the errors were
 below 8e-6 and 1.5e-3 times the roughness."""
-_FINER = 1.4
-"""Factor by which the number of elements grows when the mesh is refined."""
+_FINER, _LAST = 1.4, 1.4**0.5
+"""Factor by which the number of elements grows when the mesh is refined, and least factor for which
+a second or later mesh is refined that has less room than that. A mesh of nearly the same size would
+have nearly the same error, and say nothing about it."""
 _TURNS, _STEPS = 24, 16
 """Maximum number of evaluations of the flags, and of Newton steps after each of them."""
 _WAY = 1e-3
@@ -91,12 +93,11 @@ magnitude, since convergence is quadratic. It is made together with the derivati
 _FAR = 1e-6
 """Difference (rad) between the contact's normal angle in the solved orbit and that found by a
 search, above which the orbit is solved again from the latter, at the usual accuracy."""
-_GAIN = 10.0
-"""Factor by which the difference between the forces on two meshes is divided to estimate the error
-on the finer mesh. In theory the error falls by the larger factor 1.4⁸."""
-_DOUBT = 5.0
-"""Factor by which the difference between derivatives on two meshes is multiplied, since it must
-bound the error of those on the finer mesh and falls less evenly than that of the forces."""
+_GAINS = 10.0, 0.2
+"""Numbers by which the difference between two meshes is divided to estimate the error on the finer
+one, if that has `_FINER` times as many elements: for forces and for derivatives. In theory, both
+errors fall by 1.4⁸. Derivatives fall less evenly, and their estimate must be a bound. `gained`
+returns the numbers for other meshes."""
 _TURNING = 100.0, 2.5e-7, 1e-2
 """Error of derivatives above which the mesh is refined: the first number times the error of the
 forces to reach, at least the second and at most the third."""
@@ -163,6 +164,15 @@ def corrected(tolerance: Float[Array, ""]) -> Float[Array, ""]:
     `tolerance`: relative error of the forces to reach. Derivatives are those before this
     correction."""
     return CORRECTED * jnp.sqrt(jnp.maximum(tolerance / _USUAL, 1.0))
+
+
+def gained(coarse: Int[Array, ""], fine: Int[Array, ""]) -> tuple[Array, Array]:
+    """Return the numbers of `_GAINS` for meshes of `coarse` and `fine` elements.
+
+    Errors fall with a power of the number of elements, the one for which `_GAINS` hold."""
+    power = jnp.log(fine / coarse) / jnp.log(_FINER)
+    force, slope = ((1 + gain) ** power - 1 for gain in _GAINS)
+    return force, slope
 
 
 class Closer(eqx.Module):
@@ -388,11 +398,13 @@ class Closer(eqx.Module):
         size = roughness(found.elements)
         first = now.meshes == 0
         apart, turned = _differences(now.closed.found, found)
-        compared = apart / _GAIN, _DOUBT * turned + _ROUGH
+        force, slope = gained(now.closed.found.elements.mesh.used, now.elements.mesh.used)
+        compared = apart / force, turned / slope + _ROUGH
         error, drift = choose(first, self.uncompared(size), compared)
         steep, least, most = _TURNING
         certain = drift <= jnp.clip(steep * self.tolerance, least, most)
-        full = now.elements.mesh.used >= self.most(now)
+        # Without a comparison, a little finer mesh is better than none.
+        full = jnp.where(first, 1.0, _LAST) * now.elements.mesh.used >= self.most(now)
         # Newton's method has converged, so the correction must be small. It is large or NaN where
         # the time derivative of a margin vanishes at its event.
         good = found.correction < corrected(self.tolerance)

@@ -1,5 +1,7 @@
 """Tests of orbits closed from those of neighbouring pairs."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,9 +9,11 @@ import numpy as np
 import pytest
 
 import rootsopt
+from rootsopt.dynamics.collocation.closing import Closed, Closer, Loop, gained
 from rootsopt.dynamics.collocation.elements import Elements, Mesh
 from rootsopt.dynamics.collocation.equation import Points
 from rootsopt.dynamics.collocation.events import FIXED, extra, found_events, kinds, look
+from rootsopt.dynamics.collocation.forces import OrbitForces
 from rootsopt.dynamics.collocation.gauss import GAUSS, POINTS
 from rootsopt.dynamics.collocation.known import Known, padded, trimmed
 from rootsopt.dynamics.collocation.mesh import roughness, sizes
@@ -228,6 +232,51 @@ def test_a_jump_of_the_contact_is_an_event():
     crossings = found[np.isin(which, np.flatnonzero(kinds(pair).jump == jump)) & (which != jump)]
     assert len(crossings) == 2
     assert np.max(np.abs(crossings - 0.75)) < 2e-3
+
+
+@pytest.mark.parametrize("order", [0.55, 2.0, 8.0])
+@pytest.mark.parametrize("more", [1.01, 1.2, 1.4, 2.0])
+def test_estimated_error_of_derivatives_is_a_bound_however_little_the_mesh_grows(order, more):
+    before, after = 1000, round(1000 * more)
+    error = np.array([before, after], float) ** -order
+    _, slope = gained(jnp.asarray(before), jnp.asarray(after))
+    assert (error[0] - error[1]) / slope >= error[1]
+
+
+class _Crowded(Closer):
+    """A loop whose meshes have room for 159 elements."""
+
+    def most(self, now):
+        return jnp.asarray(159)
+
+
+@pytest.mark.parametrize(
+    ("used", "meshes", "ends"),
+    [(113, 1, False), (134, 1, False), (136, 1, True), (158, 1, True), (158, 0, False)],
+)
+def test_a_mesh_is_refined_only_if_the_finer_one_says_something_new(used, meshes, ends):
+    """A mesh of 159 elements has the error of that of 158, and would hide it."""
+    nothing: Any = None
+    zero, no, start = jnp.zeros(()), jnp.zeros((), bool), _known()
+
+    def forces(slope, elements):
+        mesh = start.elements.mesh._replace(used=jnp.asarray(elements))
+        found: dict[str, Any] = dict.fromkeys(OrbitForces._fields, zero) | {
+            "elements": start.elements._replace(mesh=mesh),
+            "response": jnp.ones(3),
+            "sensitivity": jnp.full((3, 1), slope),
+        }
+        return OrbitForces(**found)
+
+    closed = Closed(forces(1.0, 100), zero, zero, zero, no, zero, zero)
+    finer = forces(1.1, used)
+    now: dict[str, Any] = dict.fromkeys(Loop._fields, zero) | {
+        "closed": closed,
+        "elements": finer.elements,
+        "meshes": jnp.asarray(meshes),
+    }
+    loop = _Crowded(nothing, nothing, nothing, start, nothing, jnp.asarray(1e-7))
+    assert bool(loop.keep(Loop(**now), finer).over) is ends
 
 
 @pytest.mark.long
