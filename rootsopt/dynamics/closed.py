@@ -302,8 +302,8 @@ def closed_motion(
     the transient has repeated at two tolerances, the status is NOT_CLOSED. If an orbit near the
     known one is not accepted, the search begins at `start.state`.
 
-    The orbit has no samples of the state and no steps (see `collocation.motion`). Collocation must
-    support the pair (`collocation.closing.supported`)."""
+    The orbit has no samples of the state and no steps (see `collocation.motion`). The pair must be
+    `smooth`."""
     radius = jnp.asarray(radius, pair.angle_scale.dtype)
     start = lax.stop_gradient(start)
     return _Attempts(pair, tangents, start, numbers(start.pair), radius, solver).run()

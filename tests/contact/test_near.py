@@ -154,7 +154,6 @@ def test_margin_of_a_jump_is_zero_where_both_minima_are_equally_deep():
     search = jax.jit(lambda roll: flanks(roll, relative).normal2)
     joint = float(flanks.profile.roll_angle(flanks.profile.segments()[0].stop))
     low, high = joint - 0.02, joint + 0.02
-    before, after = float(search(low)), float(search(high))
     rolls = np.linspace(low, high, 2001)
     normals = np.asarray(jax.lax.map(search, jnp.asarray(rolls)))
     (place,) = np.flatnonzero(np.abs(np.diff(normals)) > 0.05)
@@ -166,8 +165,10 @@ def test_margin_of_a_jump_is_zero_where_both_minima_are_equally_deep():
         return contact.margins(roll, contact.approach(roll, relative))[2]
 
     found = brentq(lambda x: float(margin(jnp.asarray(x))), *rolls[place : place + 2], xtol=1e-14)
-    inside = lambda x: float(search(jnp.asarray(x))) - (before + after) / 2  # noqa: E731
-    jump = brentq(inside, *rolls[place : place + 2], xtol=1e-14)
+    middle = (before + after) / 2
+    jump = brentq(
+        lambda x: float(search(jnp.asarray(x))) - middle, *rolls[place : place + 2], xtol=1e-14
+    )
     assert found == pytest.approx(jump, abs=1e-9)
 
 
