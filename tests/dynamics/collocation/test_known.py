@@ -12,7 +12,15 @@ import rootsopt
 from rootsopt.dynamics.collocation.closing import Closed, Closer, Loop, gained
 from rootsopt.dynamics.collocation.elements import Elements, Mesh
 from rootsopt.dynamics.collocation.equation import Points
-from rootsopt.dynamics.collocation.events import FIXED, extra, found_events, kinds, look
+from rootsopt.dynamics.collocation.events import (
+    FIXED,
+    FlagScan,
+    extra,
+    found_events,
+    kinds,
+    look,
+    rooted,
+)
 from rootsopt.dynamics.collocation.forces import OrbitForces
 from rootsopt.dynamics.collocation.gauss import GAUSS, POINTS
 from rootsopt.dynamics.collocation.known import Known, padded, trimmed
@@ -232,6 +240,25 @@ def test_a_jump_of_the_contact_is_an_event():
     crossings = found[np.isin(which, np.flatnonzero(kinds(pair).jump == jump)) & (which != jump)]
     assert len(crossings) == 2
     assert np.max(np.abs(crossings - 0.75)) < 2e-3
+    # At a jump, the element before it keeps its own minimum, also if only the other side pushes.
+    half = count // 2
+    times = mesh.times.at[1].set(0.5)
+    share = jnp.linspace(0.0, 1.0, half + 1)
+    cut = Mesh(
+        times,
+        mesh.which.at[1].set(jump),
+        jnp.repeat(jnp.arange(2), half),
+        jnp.tile(share[:-1], 2),
+        jnp.tile(share[1:], 2),
+        mesh.used,
+    )
+    ends = jnp.repeat(cut.ends[1], 2)
+    roots = jnp.zeros((count, POINTS + 2, 1)).at[:, -2:, 0].set(jnp.asarray([1.0, 2.0]))
+    pushes = jnp.zeros(roots.shape, bool).at[:, -1].set(True)
+    empty = jnp.zeros((2 * count, 1), bool)
+    seen = FlagScan(ends, empty, empty, roots, pushes, jnp.asarray(2 * count))
+    own = rooted(pair, elements._replace(mesh=cut), seen).roots[:, -1, 0, 0]
+    np.testing.assert_array_equal(np.flatnonzero(own == 1.0), [half - 1])
 
 
 @pytest.mark.parametrize("order", [0.55, 2.0, 8.0])
