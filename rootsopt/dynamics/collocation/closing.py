@@ -43,6 +43,7 @@ from rootsopt.dynamics.collocation.mesh import (
     needed,
     ordered,
     roughness,
+    snug,
 )
 from rootsopt.dynamics.collocation.newton import (
     advanced,
@@ -86,11 +87,11 @@ CORRECTED = 1e-6
 accuracy."""
 _FAILURES = 4
 """Number of failures of Newton's method above which the search for the orbit fails."""
-_SMALL = 1e-5, 3e-9
-"""Newton step (scaled) below which Newton's method stops: from a similar pair's orbit on the same
-mesh, and otherwise, at the usual accuracy. The step after it would be smaller by orders of
-magnitude, since convergence is quadratic. It is made together with the derivatives."""
-_FAR = 1e-6
+_LARGEST = 3e-3
+"""Greatest Newton step (scaled) at which Newton's method may stop. It stops at a step whose square
+is below the error of the forces to reach. Convergence is quadratic, so the next step, which is made
+together with the derivatives, is about as small."""
+_FAR = 1e-5
 """Difference (rad) between the contact's normal angle in the solved orbit and that found by a
 search, above which the orbit is solved again from the latter, at the usual accuracy."""
 _GAINS = 10.0, 0.2
@@ -236,8 +237,8 @@ class Closer(eqx.Module):
 
     def limit(self, now: Loop) -> Float[Array, ""]:
         """Return the size of a step (scaled) at which Newton's method stops."""
-        near, usual = _SMALL
-        return jnp.where(now.trusted, near * jnp.sqrt(self.ease), usual * self.ease)
+        del now
+        return jnp.minimum(jnp.sqrt(self.tolerance), _LARGEST)
 
     def step(self, now: Loop) -> tuple[CollocatedEquation, Points, Array, Step, Any]:
         """Solve the linearised equation for Newton's step and the directions of the parameters.
@@ -284,7 +285,7 @@ class Closer(eqx.Module):
             lambda: self.looked(now, seen, agree),
             lambda: self.stepped(now),
         )
-        changes = jnp.where(now.looks, ~agree, now.keeps) & ~new.over
+        changes = jnp.where(now.looks, ~agree, new.keeps) & ~new.over
         return branch(changes, lambda: self.align(new, events, now.keeps), lambda: new)
 
     def looked(self, now: Loop, seen: FlagScan, agree: Bool[Array, ""]) -> Loop:
@@ -318,7 +319,7 @@ class Closer(eqx.Module):
         first = jnp.round(_SHARE * self.denser * taken).astype(int) + _EVENT * events.count
         used = jnp.where(now.fits, jnp.where(finer, (_FINER * taken).astype(int), taken), first)
         most = self.most(now)
-        used = jnp.maximum(jnp.minimum(used, most), events.count + 2)
+        used = jnp.maximum(snug(jnp.minimum(used, most)), events.count + 2)
         used = jnp.minimum(used, now.elements.state.shape[0] - 1)
         (place, wanted), (spot, number) = needed(now.elements), counted(now.elements)
         density = jnp.where(now.fits, place, spot), jnp.where(now.fits, wanted, number)
@@ -326,6 +327,7 @@ class Closer(eqx.Module):
         yes = jnp.ones((), bool)
         return now._replace(
             elements=new,
+            rivals=now.rivals.moved(now.elements, new),
             looks=~finer,
             keeps=~yes,
             fits=yes,
@@ -350,7 +352,7 @@ class Closer(eqx.Module):
 
         def goes_on() -> Loop:
             rivals = rivals_of(at, points, *along, now.rivals)
-            found = is_settled(now.rivals, rivals, peak)
+            found = is_settled(now.rivals, rivals, peak, self.ease)
             after = now._replace(elements=moved, rivals=rivals, line=line)
             return self.judged(now, after, size, found)
 
@@ -405,9 +407,11 @@ class Closer(eqx.Module):
         certain = drift <= jnp.clip(steep * self.tolerance, least, most)
         # Without a comparison, a little finer mesh is better than none.
         full = jnp.where(first, 1.0, _LAST) * now.elements.mesh.used >= self.most(now)
-        # Newton's method has converged, so the correction must be small. It is large or NaN where
-        # the time derivative of a margin vanishes at its event.
+        # Newton's method has converged, so the correction must be small. Where it converges slowly,
+        # the steps go on. It is NaN where the time derivative of a margin vanishes at its event.
         good = found.correction < corrected(self.tolerance)
+        failures = now.failures + ~good
+        again = ~good & jnp.isfinite(found.correction) & (failures <= _FAILURES)
         least = jnp.where(first & self.known.aligned, self.known.roughness, 0.0)
         size = jnp.maximum(size, least)
         kept = now.closed
@@ -418,11 +422,16 @@ class Closer(eqx.Module):
             drift=jnp.where(good, drift, kept.drift),
             sound=kept.sound | good,
         )
+        reached = ((error <= self.tolerance) & certain) | full
         return now._replace(
             closed=closed,
             elements=found.elements,
-            meshes=now.meshes + 1,
-            over=((error <= self.tolerance) & certain) | full | ~good,
+            keeps=good,
+            solved=good,
+            tries=jnp.zeros_like(now.tries),
+            failures=failures,
+            meshes=now.meshes + good,
+            over=jnp.where(good, reached, ~again),
         )
 
 

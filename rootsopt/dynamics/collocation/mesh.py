@@ -25,6 +25,8 @@ time from rest with room for 64 events in each of eight mesh periods. Shorter or
 room of longer ones, up to the third number per mesh period at the usual accuracy."""
 _TIMES = 64, 24
 """Number of events above which the search for the orbit fails, counted like elements."""
+_SPARED = 0.06
+"""Greatest share of the elements that is left out to save the evaluation of a further block."""
 _SLICES = 0.5
 """Growth of these numbers for each further slice of twisted rotors, as a fraction: each slice has
 its own events."""
@@ -60,6 +62,14 @@ def most_elements(mesh: Mesh, denser: Float[Array, ""], slices: int) -> Int[Arra
     growth = 1 + _SLICES * (slices - 1)
     wanted = jnp.round(growth * _FINEST * denser * mesh.period).astype(int)
     return jnp.minimum(wanted, mesh.left.shape[0]) - 1
+
+
+def snug(used: Int[Array, ""]) -> Int[Array, ""]:
+    """Return a number of elements that is at most `_SPARED` below `used`, if it needs a block less.
+
+    The equation is evaluated on one element more than are in use."""
+    spare = (used + 1) % BLOCK
+    return jnp.where(spare <= _SPARED * used, used - spare, used)
 
 
 def shared(

@@ -31,8 +31,8 @@ _STEPS = 4
 """Number of Newton steps from the best of these places to the maximum of a polynomial."""
 _CLOSE = 1e-4
 """Distance of the peak from the instant at which the equation is evaluated (fraction of the
-element's length) below which force and derivative are extrapolated to it: both errors are then far
-below those of the orbit."""
+element's length) below which force and derivative are extrapolated to it, at the usual accuracy:
+both errors are then far below those of the orbit."""
 _BESIDE = 1e-2
 """Distance between two instants (fraction of the element's length) below which the errors of their
 interpolated roots count as equal."""
@@ -64,6 +64,17 @@ class Rivals(NamedTuple):
         element = jnp.zeros(RIVALS, int)
         share = jnp.full(RIVALS, 0.5, elements.state.dtype)
         return cls(element, share, _roots(elements.roots, element, share))
+
+    def moved(self, old: Elements, new: Elements) -> "Rivals":
+        """Return the same instants in the elements of another mesh of the motion."""
+        begin, length = new.mesh.ends[0], new.mesh.lengths
+        time, start = self.places(old)[0], begin[0]
+        time = start + jnp.mod(time - start, new.mesh.period)
+        element = jnp.searchsorted(begin, time, side="right") - 1
+        element = jnp.minimum(element, new.mesh.used - 1)
+        size = jnp.where(length[element] > 0, length[element], 1.0)
+        share = jnp.clip((time - begin[element]) / size, _INSIDE, 1.0 - _INSIDE)
+        return Rivals(element, share, _roots(new.roots, element, share))
 
     def places(self, elements: Elements) -> tuple[Float[Array, " p"], Float[Array, "p n"]]:
         """Return times (mesh periods) and scaled states of the instants, on the motion
@@ -182,14 +193,18 @@ def peak_of(
     )
 
 
-def is_settled(before: Rivals, after: Rivals, peak: Peak) -> Bool[Array, ""]:
+def is_settled(
+    before: Rivals, after: Rivals, peak: Peak, ease: Float[Array, ""]
+) -> Bool[Array, ""]:
     """Return whether the peak lies so close to an instant that the extrapolation to it is exact.
 
     `before`: instants at which the equation was evaluated; `peak`: result of `peak_of` for them;
-    `after`: result of `rivals_of` for them."""
+    `after`: result of `rivals_of` for them; `ease`: factor by which the errors to reach exceed
+    those at the usual accuracy."""
+    close = jnp.minimum(_CLOSE * jnp.sqrt(ease), _BESIDE)
     tried = jnp.any(before.element == after.element[0])
     at_end = (jnp.abs(peak.share - 0.5) == 0.5) & (jnp.abs(peak.shift) <= 2 * _INSIDE)
-    return tried & (at_end | (jnp.abs(peak.shift) < _CLOSE))
+    return tried & (at_end | (jnp.abs(peak.shift) < close))
 
 
 def _roots(roots, element, share) -> Float[Array, "p flanks 2"]:
