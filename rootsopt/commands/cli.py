@@ -9,7 +9,9 @@ import contextlib
 import importlib
 import os
 import shlex
+import shutil
 import sys
+import textwrap
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -19,8 +21,17 @@ from rootsopt import report
 from rootsopt.commands import door
 from rootsopt.commands.door import BAD_INPUT, NO_RESULT
 from rootsopt.commands.door import OK as OK
-from rootsopt.config import Config, describe_families, describe_keys, load, notes, sources
-from rootsopt.config.families import import_named
+from rootsopt.config import (
+    Config,
+    describe_families,
+    describe_keys,
+    load,
+    notes,
+    outline_keys,
+    sources,
+)
+from rootsopt.config.explain import GROUPS
+from rootsopt.config.families import families, import_named
 from rootsopt.config.shipped import shipped
 from rootsopt.errors import InputError
 from rootsopt.report import REPORT
@@ -53,6 +64,51 @@ Body = Callable[[Config, argparse.Namespace, "RunFolder"], Outcome]
 It takes the config, the options and the result folder, and writes the files."""
 
 
+class _Format(argparse.RawDescriptionHelpFormatter):
+    """Help with short lines: most options take one."""
+
+    def __init__(self, prog: str):
+        super().__init__(prog, max_help_position=30, width=min(100, _columns()))
+
+
+def _columns() -> int:
+    """Return the width of the terminal, 100 in a pipe."""
+    return shutil.get_terminal_size((100, 24)).columns
+
+
+class _Help(argparse.Action):
+    """The option `--help [GROUP]`: options and the keys used most, or all keys of a group."""
+
+    def __call__(self, parser, namespace, values, option_string=None):
+        del namespace, option_string
+        if values in GROUPS:
+            print(describe_keys(values))
+        else:
+            parser.epilog = _all_keys() if values == "all" else _few_keys()
+            parser.print_help()
+        parser.exit()
+
+
+def _all_keys() -> str:
+    """Return the end of a long help."""
+    keys = (f" {group}\n{describe_keys(group)}" for group in GROUPS)
+    listed = "\n".join(keys)
+    return (
+        f"profile families (profile.family):\n{describe_families()}\n\n"
+        f"config keys (for --set and the file), units in the name:\n{listed}"
+    )
+
+
+def _few_keys() -> str:
+    """Return the end of a short help."""
+    names = textwrap.fill(", ".join(families()), 98, initial_indent="  ", subsequent_indent="  ")
+    return (
+        f"profile families (profile.family):\n{names}\n"
+        f"config keys used most (for --set and the file), units in the name:\n{outline_keys()}\n"
+        f"all keys with ranges and defaults: --help all, or --help {' | '.join(GROUPS)}"
+    )
+
+
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Print `message` as one line on stderr and exit with code 2, as with any bad input."""
@@ -66,15 +122,24 @@ def parser(command: str, purpose: str, writes: bool = True) -> argparse.Argument
     whether the command writes a result folder, and takes the arguments for it."""
     result = _Parser(
         prog=f"rootsopt {command}",
+        usage=f"rootsopt {command} CONFIG [options]",
         description=purpose,
-        epilog=f"profile families (profile.family):\n{describe_families()}\n\n"
-        f"config keys (for --set and the file), units in the name:\n{describe_keys()}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        formatter_class=_Format,
+        add_help=False,
     )
     result.add_argument(
         "config",
         type=Path,
-        help=f"YAML file, or the name of a shipped config ({', '.join(shipped())})",
+        metavar="CONFIG",
+        help=f"YAML file or shipped: {', '.join(shipped())}",
+    )
+    result.add_argument(
+        "-h",
+        "--help",
+        action=_Help,
+        nargs="?",
+        metavar="GROUP",
+        help="show this help, or the keys of a group (see below)",
     )
     if writes:
         _add_folder(result, command)
@@ -84,14 +149,13 @@ def parser(command: str, purpose: str, writes: bool = True) -> argparse.Argument
         default=[],
         metavar="KEY=VALUE",
         dest="overrides",
-        help="override a config key, for example --set scene.speed_rpm=1500; repeatable",
+        help="override a config key: --set scene.speed_rpm=1500; repeatable",
     )
     _add_import(result)
     result.add_argument(
         "--no-cache",
         action="store_true",
-        help="compile again, and keep no compiled programs in the user's cache folder "
-        "(ROOTSOPT_CACHE=DIR names another folder, ROOTSOPT_CACHE=off does the same)",
+        help="compile again, and keep no compiled programs",
     )
     return result
 
@@ -102,20 +166,18 @@ def _add_folder(result: argparse.ArgumentParser, command: str) -> None:
         "-o",
         "--output",
         metavar="DIR",
-        help=f"result folder (default: results/CONFIG-{command}); appears complete when the run "
-        "has ended, and an earlier run in it is moved to DIR.1, DIR.2 ...",
+        help=f"result folder (default: results/CONFIG-{command})",
     )
     result.add_argument(
         "--overwrite",
         action="store_true",
-        help="replace an earlier run in the result folder instead of moving it",
+        help="replace an earlier run there instead of moving it to DIR.1",
     )
     result.add_argument("--no-figures", action="store_true", help="write no figures")
     result.add_argument(
         "--report",
         action="store_true",
-        help=f"write {REPORT}: summary, tables, charts and an animation in one file that opens "
-        "without a network (needs the [pages] extra)",
+        help=f"write {REPORT}, the run on one page (needs rootsopt[pages])",
     )
 
 
@@ -124,9 +186,9 @@ def _add_import(arguments: argparse.ArgumentParser) -> None:
         "--import",
         action="append",
         default=[],
-        metavar="FILE_OR_MODULE",
+        metavar="FILE",
         dest="imports",
-        help="Python file, or module, to run first: it may register profile families; repeatable",
+        help="Python file or module to run first, may add families; repeatable",
     )
 
 

@@ -37,7 +37,8 @@ def _called(arguments: list[str]) -> int:
     usage = "usage: rootsopt COMMAND CONFIG [options]\n\n" + "\n".join(
         f"  {name:<10} {what}" for name, what in COMMANDS.items()
     )
-    usage += "\n\nrootsopt COMMAND --help lists the options and all config keys." + _COMPLETION
+    usage += "\n\nrootsopt COMMAND --help lists the options and the config keys used most."
+    usage += _COMPLETION
     if not arguments or arguments[0] in ("-h", "--help"):
         print(usage)
         return door.OK if arguments else door.BAD_INPUT

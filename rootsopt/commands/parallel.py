@@ -18,20 +18,17 @@ def add_options(parser: "argparse.ArgumentParser | argparse._ArgumentGroup") -> 
         "--workers",
         type=int,
         metavar="N",
-        help="start N processes on this machine (needs rootsopt[cluster]); default: this process, "
-        "with one thread per core",
+        help="start N processes (default: this one, with one thread per core)",
     )
     parser.add_argument(
         "--scheduler",
         metavar="ADDRESS",
-        help="use the workers of a running Dask scheduler, for example tcp://10.0.0.1:8786 (needs "
-        "rootsopt[cluster])",
+        help="use a running Dask scheduler: tcp://10.0.0.1:8786",
     )
     parser.add_argument(
         "--resume",
         action="store_true",
-        help="go on with a run into the same folder that was stopped or killed, from its "
-        "checkpoint; the result is that of an uninterrupted run",
+        help="go on with a run into the same folder that was stopped or killed",
     )
 
 

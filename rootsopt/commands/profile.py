@@ -24,14 +24,12 @@ def options(parser: "argparse.ArgumentParser") -> None:
     parser.add_argument(
         "--project",
         metavar="N",
-        help="write free_form.yaml: the same config with the profile as a free form of N "
-        "coefficients, as the start of an optimisation",
+        help="write free_form.yaml: the profile as a free form of N coefficients",
     )
     parser.add_argument(
         "--resembles",
         action="store_true",
-        help="find the nearest member of every profile family, and its distance (takes about half "
-        "a minute)",
+        help="find the nearest member of every profile family (takes half a minute)",
     )
 
 

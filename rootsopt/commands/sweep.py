@@ -5,11 +5,7 @@ from collections.abc import Sequence
 
 from rootsopt.commands import door, parallel
 
-PURPOSE = (
-    "Simulate one config at many values of any of its keys (--over), each from rest: contact "
-    "force, gradient, kind of motion, as a netCDF or Zarr dataset. Without --over: one design at "
-    "many speeds (sweep.speed_rpm)."
-)
+PURPOSE = "Simulate one config at many values of any of its keys (--over), or at many speeds."
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -27,9 +23,8 @@ def options(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="KEY=VALUES",
-        help="values of a config key: a list (0.05,0.1,0.2; cic,ee; null,10), a range "
-        "(300:6000:39 for 39 values, 1:100:9:log), or both; for samples an interval (300:6000, "
-        "1:100:log) or a list; repeatable: all combinations are simulated",
+        help="values of a config key: a list (0.05,0.1), a range (300:6000:39, 1:100:9:log) "
+        "or, for samples, an interval (300:6000); repeatable",
     )
     group.add_argument(
         "--zip", action="store_true", help="advance all keys together instead of combining them"
@@ -39,31 +34,27 @@ def options(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="KEY,KEY...",
-        help="advance these keys together, and combine them with the others; repeatable",
+        help="advance these keys together; repeatable",
     )
     group.add_argument("--sample", type=int, metavar="N", help="draw N pseudo-random points")
     group.add_argument(
         "--sobol",
         type=int,
         metavar="N",
-        help="draw N points of a scrambled Sobol sequence, which fill the space more evenly (best "
-        "with a power of 2)",
+        help="draw N points of a Sobol sequence, best a power of 2",
     )
     group.add_argument(
         "--tolerances",
         type=int,
         metavar="N",
-        help="simulate N fresh scenes of the config's `tolerances`, instead of --over",
+        help="simulate N fresh scenes of `tolerances`, instead of --over",
     )
-    group.add_argument(
-        "--seed", type=int, metavar="N", help="seed of the samples (default: 0), kept in the files"
-    )
+    group.add_argument("--seed", type=int, metavar="N", help="seed of the samples (default: 0)")
     group = parser.add_argument_group("how a sweep runs (with --over or --tolerances)")
     group.add_argument(
         "--data",
         metavar="NAME",
-        help="name of the dataset in the result folder; its suffix chooses the format: .nc "
-        "(netCDF) or .zarr (Zarr, needs rootsopt[zarr]); default: sweep.nc",
+        help="name of the dataset: *.nc or *.zarr (default: sweep.nc)",
     )
     parallel.add_options(group)
 

@@ -6,7 +6,14 @@ value, and says what is allowed."""
 
 from rootsopt.config.families import FAMILY_KEYS
 from rootsopt.config.plausible import notes
-from rootsopt.config.reading import Config, describe_families, describe_keys, load, parse
+from rootsopt.config.reading import (
+    Config,
+    describe_families,
+    describe_keys,
+    load,
+    outline_keys,
+    parse,
+)
 from rootsopt.config.scene import ProfileConfig
 from rootsopt.config.study import EnsembleConfig, SolverConfig
 from rootsopt.config.units import hint
@@ -29,5 +36,6 @@ __all__ = [
     "load",
     "load_config",
     "notes",
+    "outline_keys",
     "parse",
 ]

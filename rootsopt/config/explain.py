@@ -1,6 +1,7 @@
 """Turns validation errors into one-sentence messages, and lists the config's keys for `--help`."""
 
 import difflib
+import re
 import types
 from collections.abc import Sequence
 from typing import Annotated, Any, NamedTuple, Union, get_args, get_origin
@@ -304,11 +305,56 @@ def keys_of(model: type[BaseModel]) -> list[Key]:
     return found
 
 
-def describe(model: type[BaseModel]) -> str:
-    """Return one line per key for `--help`: meaning, unit, choices or range, and default."""
+GROUPS = {
+    "design": ("profile", "rotor", "optimizer.bounds", "drawing"),
+    "scene": ("scene", "contact"),
+    "pump": ("pump",),
+    "search": (
+        "objective", "constraints", "optimizer", "sweep", "attractors", "pareto", "tolerances",
+        "response", "ensemble",
+    ),
+    "expert": ("solver",),
+}  # fmt: skip
+"""Sections of the config in each group of keys in `--help`. The longest name counts."""
+_USED_MOST = {
+    "profile.family", "profile.lobes", "profile.pitch_radius_mm",
+    "scene.speed_rpm", "scene.drive", "scene.load.torque_N_m",
+    "scene.load.pressure_difference_Pa", "scene.timing_gear.stiffness_N_m_per_rad",
+    "scene.timing_gear.backlash_mm", "contact.clearance_mm", "contact.stiffness_N_per_mm_e",
+    "pump.viscosity_mPa_s", "objective.mean_weight", "objective.peak_weight",
+    "constraints.area_efficiency_min", "optimizer.starts", "solver.accuracy",
+}  # fmt: skip
+"""Keys that a short help lists."""
+
+
+def describe(model: type[BaseModel], group: str = "") -> str:
+    """Return one line per key of a `group` of keys: meaning, unit, choices or range, and default.
+
+    Without a group, return the lines of all keys, in their order."""
     lines = []
     for key in keys_of(model):
+        if group and _group_of(key.name) != group:
+            continue
         last = "required" if key.required else f"default {key.default}" if key.default else ""
         note = ", ".join(note for note in (key.unit, key.choices, key.range, last) if note)
         lines.append(f"  {key.name:<42} {key.meaning}{f' [{note}]' if note else ''}".rstrip())
     return "\n".join(lines)
+
+
+def outline(model: type[BaseModel]) -> str:
+    """Return one short line per key that is used most, by group."""
+    lines = []
+    for group in GROUPS:
+        lines.append(f" {group}")
+        for key in keys_of(model):
+            if key.name in _USED_MOST and _group_of(key.name) == group:
+                meaning = re.split("[;:,(]", key.meaning)[0].strip()
+                unit = f" [{key.unit}]" if key.unit else ""
+                lines.append(f"  {key.name:<39} {meaning}{unit}")
+    return "\n".join(lines)
+
+
+def _group_of(key: str) -> str:
+    """Return the group of a `key`."""
+    found = {start: group for group, starts in GROUPS.items() for start in starts}
+    return found[max((start for start in found if key.startswith(f"{start}.")), key=len)]

@@ -11,7 +11,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from rootsopt.config.document import MOST_BYTES, read_document
 from rootsopt.config.drawing import DrawingConfig
-from rootsopt.config.explain import all_keys, describe, explain
+from rootsopt.config.explain import all_keys, describe, explain, outline
 from rootsopt.config.families import (
     families,
     family_of,
@@ -481,9 +481,14 @@ def _override(data: dict, override: str) -> None:
     target[parts[-1]] = read_document(value, name)
 
 
-def describe_keys() -> str:
-    """Return one line per key for `--help`: meaning, unit, choices or range, and default."""
-    return describe(Config)
+def describe_keys(group: str = "") -> str:
+    """Return one line per key of a `group` (all keys if it is ""), as `--help` prints it."""
+    return describe(Config, group)
+
+
+def outline_keys() -> str:
+    """Return one short line per key that is used most, as `--help` prints it."""
+    return outline(Config)
 
 
 def describe_families() -> str:

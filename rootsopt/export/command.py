@@ -4,15 +4,8 @@ import argparse
 
 from rootsopt.errors import InputError
 
-FORMATS = {
-    "dxf": "rotor.dxf, true arcs and splines on layers, dimensions and title block; "
-    "rotor_points.csv, coordinates of a lobe",
-    "svg": "rotor.svg, true size",
-    "step": "rotor.step and pair.step, solids (needs the [cad] extra)",
-    "stl": "rotor.stl and pair.stl, triangles (needs the [cad] extra)",
-    "gif": "figures/meshing.gif, the pair in motion with contact and force",
-}
-"""Help text of each format: the files that are written and their content. Lengths are in mm."""
+FORMATS = "dxf", "svg", "step", "stl", "gif"
+"""Formats of drawings, solids and the animation; see docs/drawings.md."""
 SOLID = ("step", "stl")
 """Formats of solids, made by the CAD kernel."""
 
@@ -21,13 +14,11 @@ def add_option(parser: argparse.ArgumentParser, default: str) -> None:
     """Add the option `--export` to the `parser` of a command.
 
     `default`: value of the option if the user does not give it."""
-    formats = "; ".join(f"{name}: {files}" for name, files in FORMATS.items())
     parser.add_argument(
         "--export",
         default=default,
         metavar="LIST",
-        help=f"formats to draw the rotors in (mm), for example --export dxf,step; all; none. "
-        f"{formats} (default: {default})",
+        help=f"draw the rotors: {', '.join(FORMATS)}, all or none (default: {default})",
     )
 
 
@@ -41,7 +32,7 @@ def chosen(text: str) -> tuple[str, ...]:
     if names == ("none",):
         return ()
     if names == ("all",):
-        names = tuple(FORMATS)
+        names = FORMATS
     for name in names:
         if name not in FORMATS:
             raise InputError(

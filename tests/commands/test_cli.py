@@ -1,8 +1,10 @@
 """Tests of the commands from outside: files, exit codes, messages."""
 
 import csv
+import importlib
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -14,7 +16,9 @@ import yaml
 
 from rootsopt import profiles
 from rootsopt.commands import profile
-from rootsopt.config import load
+from rootsopt.commands.console import COMMANDS
+from rootsopt.config import describe_keys, load
+from rootsopt.config.explain import GROUPS
 from rootsopt.measured.reading import read, signed_area
 from rootsopt.runtime import programs
 from rootsopt.scene import Scene, design_vector
@@ -193,8 +197,7 @@ def test_unwritable_output_exits_2(tmp_path):
 
 
 def test_console_command_and_help():
-    """An unknown command gets the nearest name as a suggestion. `--help` lists the keys with
-    units."""
+    """An unknown command gets the nearest name as a suggestion. `--help` lists keys with units."""
     run = [
         sys.executable,
         "-c",
@@ -203,10 +206,31 @@ def test_console_command_and_help():
     done = subprocess.run([*run, "optimise"], capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert "optimize" in done.stderr
-    done = subprocess.run([*run, "simulate", "-h"], capture_output=True, text=True, check=False)
+    # A file after the option is not a group of keys.
+    call = [*run, "simulate", "-h", CIC]
+    done = subprocess.run(call, capture_output=True, text=True, check=False)
     assert done.returncode == 0
     assert "scene.timing_gear.backlash_mm" in done.stdout
-    assert "contact.stiffness_N_per_mm_e" in done.stdout
+    assert "[N·m/rad]" in done.stdout
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_is_short_and_its_groups_have_every_key(command, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
+    main = importlib.import_module(f"rootsopt.commands.{command}").main
+
+    def printed(*group):
+        with pytest.raises(SystemExit) as end:
+            main(["--help", *group])
+        assert end.value.code == 0
+        return capsys.readouterr().out
+
+    short = printed()
+    assert len(short.splitlines()) <= 60
+    assert set(re.findall("--help ([a-z |]+)$", short, re.M)[-1].split(" | ")) == set(GROUPS)
+    every = [line for group in GROUPS for line in printed(group).splitlines()]
+    assert sorted(every) == sorted(describe_keys().splitlines())
+    assert set(every) < set(printed("all").splitlines())
 
 
 def test_compiled_programs_are_kept_between_processes(tmp_path):

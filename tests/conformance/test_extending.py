@@ -106,7 +106,8 @@ def test_family_is_optimised(blunt_cycloid, tmp_path):
 
 
 def test_help_of_a_command_has_the_family(blunt_cycloid):
-    call = [sys.executable, "-m", "rootsopt.profile", "--import", str(blunt_cycloid), "--help"]
+    call = [sys.executable, "-m", "rootsopt.profile", "--import", str(blunt_cycloid)]
+    call += ["--help", "all"]
     done = subprocess.run(call, capture_output=True, text=True, cwd=ROOT, check=True)
     assert "parallel curve of an epicycloid" in done.stdout
     assert "profile.crossing_angle_deg" in done.stdout
