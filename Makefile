@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: optimize test test-all docs compat fuzz mutants lint clean
+.PHONY: optimize test test-all docs compat fuzz mutants lint weight clean
 
 optimize: $(VENV)/.run
 	$(BIN)/python -m rootsopt.optimize configs/cic.yaml -o results/cic
@@ -53,6 +53,10 @@ $(VENV)/.dev: $(VENV)/.run
 $(VENV)/.mutants: $(VENV)/.dev
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,mutants]'
 	touch $@
+
+# Statements, files, keys, words, and the limits that a test sets for them.
+weight: $(VENV)/.dev
+	$(BIN)/python -m tests.weight
 
 clean:
 	rm -rf $(VENV) results build

@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.weight import MOST, measured
+
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "rootsopt"
 FILES = sorted(PACKAGE.rglob("*.py"))
@@ -120,3 +122,7 @@ def test_every_package_has_a_room_of_tests():
     packages = {path.name for path in PACKAGE.iterdir() if (path / "__init__.py").is_file()}
     rooms = {path.parent.name for path in (ROOT / "tests").glob("*/test_*.py")}
     assert packages <= rooms
+
+
+def test_project_is_not_heavier_than_agreed():
+    assert {name: number for name, number in measured().items() if number > MOST[name]} == {}

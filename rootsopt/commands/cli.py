@@ -82,7 +82,7 @@ class _Help(argparse.Action):
     def __call__(self, parser, namespace, values, option_string=None):
         del namespace, option_string
         if values in GROUPS:
-            print(describe_keys(values))
+            print(describe_keys(str(values)))
         else:
             parser.epilog = _all_keys() if values == "all" else _few_keys()
             parser.print_help()
