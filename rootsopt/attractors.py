@@ -1,7 +1,9 @@
 """`python -m rootsopt.attractors CONFIG`: find the coexisting motions of one scene."""
 
-from rootsopt.commands.attractors import main
 from rootsopt.commands.door import leave
+from rootsopt.commands.table import attractors
+
+main = attractors.main
 
 if __name__ == "__main__":
     leave(main())

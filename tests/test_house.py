@@ -27,19 +27,14 @@ OPTIONAL = {
 }
 OPTIONAL |= {"netCDF4", "shtab", "xarray", "zarr"}
 SLOW = {"PIL", "optax", "rich", "scipy"}
-COMMANDS = {f"commands/{name}.py" for name in (
-    "attractors", "explore", "optimize", "pareto", "profile", "simulate", "sweep",
-)}  # fmt: skip
 LATE = {
     # The work of a command is loaded once its help or its config has asked for it.
-    **{key: {"rootsopt.commands", "rootsopt"} for key in COMMANDS},
+    "commands/table.py": {"rootsopt.commands", "rootsopt", "argparse"},
     "commands/cli.py": {
         "rootsopt.output.runs", "rootsopt.report.gather", "rootsopt.report.html",
         "rootsopt.runtime",
     },
-    "commands/completion.py": {"rootsopt.commands"},
     "commands/console.py": {"rootsopt", "rootsopt.commands", "rootsopt.errors"},
-    "commands/parallel.py": {"rootsopt.sweeps.evaluations"},
     # Figures are imported in the background; exports, only if they are asked for.
     **{f"commands/work/{name}.py": {"rootsopt.figures", f"rootsopt.figures.{module}"}
        for name, module in (("attractors", "basins"), ("over", "sweep"), ("pareto", "front"),
@@ -50,7 +45,7 @@ LATE = {
     "commands/work/simulate.py": {"rootsopt.export.writing", "rootsopt.figures"},
     "commands/work/sweep.py": {"rootsopt.commands.work", "rootsopt.figures.speeds"},
     "export/writing.py": {"rootsopt.export.animation"},
-    "optimize/__init__.py": {"rootsopt.commands.optimize"},
+    "optimize/__init__.py": {"rootsopt.commands.table"},
     # Modules that import optional or slow libraries.
     "commands/work/explore.py": {"rootsopt.explore.engine", "rootsopt.explore.server"},
     "export/command.py": {"rootsopt.export.solid"},

@@ -1,10 +1,15 @@
 """How heavy the project is: `make weight` prints it, and a test keeps it from growing."""
 
 import ast
+import contextlib
 import functools
+import io
+import os
 import re
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
+from unittest import mock
 
 ROOT = Path(__file__).parents[1]
 MOST = {
@@ -27,7 +32,7 @@ one gives the reason in the changelog: what users can do now that is worth the w
 
 def measured() -> dict[str, int]:
     """Return the project's weight, with the keys of `MOST`."""
-    from rootsopt.commands.console import COMMANDS
+    from rootsopt.commands.table import COMMANDS
     from rootsopt.config import Config
     from rootsopt.config.explain import keys_of
 
@@ -52,7 +57,7 @@ def measured() -> dict[str, int]:
         "floors of packages": _depth(rooms),
         "depth of imports": _depth(imports),
         "config keys": len(keys_of(Config)),
-        "lines of the longest help": max(map(_help_lines, COMMANDS)),
+        "lines of the longest help": max(map(_help_lines, COMMANDS.values())),
         "pages of docs": len(pages),
         "words of docs": words,
     }
@@ -99,14 +104,14 @@ def _depth(graph: dict[str, set[str]]) -> int:
     return max(map(below, graph))
 
 
-def _help_lines(command: str) -> int:
-    import contextlib
-    import importlib
-    import io
-
+def _help_lines(command: Any) -> int:
     text = io.StringIO()
-    with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
-        importlib.import_module(f"rootsopt.commands.{command}").main(["--help"])
+    with (
+        mock.patch.dict(os.environ, COLUMNS="100"),
+        contextlib.redirect_stdout(text),
+        contextlib.suppress(SystemExit),
+    ):
+        command.main(["--help"])
     return len(text.getvalue().splitlines())
 
 

@@ -6,7 +6,7 @@ from docutils import nodes
 from sphinx.util.docutils import SphinxDirective
 
 from rootsopt.commands import cli
-from rootsopt.commands.completion import command_parser
+from rootsopt.commands.table import COMMANDS, Command
 from rootsopt.config import Config
 from rootsopt.config.explain import keys_of
 from rootsopt.config.families import families
@@ -99,10 +99,10 @@ class CommandOptions(SphinxDirective):
     optional_arguments = 1
 
     def run(self) -> list[nodes.Node]:
-        common = cli.parser("COMMAND", "")
+        common = cli.parser(Command("COMMAND", "", ""))
         if not self.arguments:
             return [_options(common, set())]
-        found = command_parser(self.arguments[0])
+        found = cli.parser(COMMANDS[self.arguments[0]])
         shared = {action.dest for action in common._actions}
         purpose = nodes.paragraph(text=found.description or "")
         own = [action for action in found._actions if action.dest not in shared]

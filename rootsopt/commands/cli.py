@@ -21,6 +21,7 @@ from rootsopt import report
 from rootsopt.commands import door
 from rootsopt.commands.door import BAD_INPUT, NO_RESULT
 from rootsopt.commands.door import OK as OK
+from rootsopt.commands.table import Command
 from rootsopt.config import (
     Config,
     describe_families,
@@ -115,15 +116,12 @@ class _Parser(argparse.ArgumentParser):
         self.exit(BAD_INPUT, f"{self.prog}: {message}; see {self.prog} --help\n")
 
 
-def parser(command: str, purpose: str, writes: bool = True) -> argparse.ArgumentParser:
-    """Return a parser with the arguments that every command takes.
-
-    `command`: name of the command; `purpose`: description of the command in its help; `writes`:
-    whether the command writes a result folder, and takes the arguments for it."""
+def parser(command: Command) -> argparse.ArgumentParser:
+    """Return the parser of a `command`: the arguments that every command takes, then its own."""
     result = _Parser(
-        prog=f"rootsopt {command}",
-        usage=f"rootsopt {command} CONFIG [options]",
-        description=purpose,
+        prog=f"rootsopt {command.name}",
+        usage=f"rootsopt {command.name} CONFIG [options]",
+        description=command.purpose,
         formatter_class=_Format,
         add_help=False,
     )
@@ -141,8 +139,8 @@ def parser(command: str, purpose: str, writes: bool = True) -> argparse.Argument
         metavar="GROUP",
         help="show this help, or the keys of a group (see below)",
     )
-    if writes:
-        _add_folder(result, command)
+    if command.writes:
+        _add_folder(result, command.name)
     result.add_argument(
         "--set",
         action="append",
@@ -157,6 +155,7 @@ def parser(command: str, purpose: str, writes: bool = True) -> argparse.Argument
         action="store_true",
         help="compile again, and keep no compiled programs",
     )
+    command.options(result)
     return result
 
 
@@ -205,18 +204,10 @@ def _import_extensions(command: str, argv: Sequence[str] | None) -> None:
         import_named(name)
 
 
-def run(
-    command: str,
-    purpose: str,
-    argv: Sequence[str] | None,
-    add_options: Callable[[argparse.ArgumentParser], None] = lambda _: None,
-    writes: bool = True,
-) -> int:
+def run(command: Command, argv: Sequence[str] | None) -> int:
     """Run a command and return its exit code.
 
-    `command`: name of the command; `purpose`: description in its help; `argv`: arguments (`None`:
-    those of the process); `add_options`: function that adds the command's own arguments to the
-    parser; `writes`: whether the command writes a result folder.
+    `argv`: arguments (`None`: those of the process).
 
     Parse the arguments, load the config and select double precision. Then call the function `body`
     of the module `rootsopt.commands.work.COMMAND` with a new result folder, move the folder to its
@@ -224,34 +215,32 @@ def run(
     which returns the exit code. `InputError` and `OSError` give exit code 2."""
     environment.own_process()
     try:
-        _import_extensions(command, argv)
-        arguments = parser(command, purpose, writes)
-        add_options(arguments)
-        options = arguments.parse_args(argv)
+        _import_extensions(command.name, argv)
+        options = parser(command).parse_args(argv)
         options.given = [*(sys.argv[1:] if argv is None else argv)]
         for name in options.imports:  # Only the whole parser knows abbreviated options.
             import_named(name)
-        if writes and options.output is None:
-            options.output = os.path.join("results", f"{options.config.stem}-{command}")
+        if command.writes and options.output is None:
+            options.output = os.path.join("results", f"{options.config.stem}-{command.name}")
         config = load(options.config, options.overrides)
         for note in notes(config):
             environment.say(note)
         use_float64()
         use_cache(wanted=not options.no_cache)
         with environment.explained():
-            if not writes:
-                return _work(command)(config, options)
-            return _in_folder(command, config, options)
+            if not command.writes:
+                return _work(command.name)(config, options)
+            return _in_folder(command.name, config, options)
     except InputError as error:
         message = " ".join(str(error).split())
-        print(f"rootsopt {command}: {message}", file=sys.stderr)
+        print(f"rootsopt {command.name}: {message}", file=sys.stderr)
         return BAD_INPUT
     except OSError as error:
         where = f"{error.filename}: " if error.filename is not None else ""
-        print(f"rootsopt {command}: {where}{sources.reason(error)}", file=sys.stderr)
+        print(f"rootsopt {command.name}: {where}{sources.reason(error)}", file=sys.stderr)
         return BAD_INPUT
     except KeyboardInterrupt:
-        print(f"rootsopt {command}: stopped by the user", file=sys.stderr)
+        print(f"rootsopt {command.name}: stopped by the user", file=sys.stderr)
         return NO_RESULT
 
 

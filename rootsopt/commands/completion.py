@@ -1,11 +1,11 @@
 """`rootsopt --completion SHELL`: a script that completes commands, options and config keys."""
 
 import argparse
-import importlib
 import importlib.util
 from collections.abc import Iterable, Mapping
-from typing import Any
 
+from rootsopt.commands import cli
+from rootsopt.commands.table import COMMANDS
 from rootsopt.config import Config
 from rootsopt.config.explain import all_keys
 from rootsopt.config.shipped import shipped
@@ -24,11 +24,8 @@ complete -o bashdefault -F _rootsopt rootsopt"""
 """End of the bash script: no blank after a key, because its value follows."""
 
 
-def script(shell: str, commands: Iterable[str]) -> str:
+def script(shell: str) -> str:
     """Return the completion script for a `shell`.
-
-    `commands`: names of the commands. The options of each are those that `rootsopt.commands.cli`
-    gives every command, and those that the function `options` of its module adds, if there is one.
 
     Raises `InputError` for an unknown shell, or if shtab is not installed."""
     if shell not in SHELLS:
@@ -42,23 +39,13 @@ def script(shell: str, commands: Iterable[str]) -> str:
     whole = argparse.ArgumentParser(prog="rootsopt")
     whole.add_argument("--version", action="store_true", help="print the version")
     tree = whole.add_subparsers()
-    for name in commands:
-        parent = command_parser(name)
+    for command in COMMANDS.values():
+        parent = cli.parser(command)
         _complete(parent, shtab.FILE, shtab.DIRECTORY)
-        tree.add_parser(name, help=parent.description, parents=[parent], add_help=False)
+        tree.add_parser(command.name, help=command.purpose, parents=[parent], add_help=False)
     # shtab takes a preamble per shell; its annotation names only text.
     text = shtab.complete(whole, shell, preamble=_preamble())  # type: ignore[arg-type]
     return f"{text}\n{_NO_SPACE}" if shell == "bash" else text
-
-
-def command_parser(name: str) -> argparse.ArgumentParser:
-    """Return the parser of the command `name`, with its own options."""
-    from rootsopt.commands import cli
-
-    module: Any = importlib.import_module(f"rootsopt.commands.{name}")
-    found = cli.parser(name, module.PURPOSE, getattr(module, "WRITES", True))
-    getattr(module, "options", lambda parser: None)(found)
-    return found
 
 
 def _complete(parser: argparse.ArgumentParser, file: Mapping, folder: Mapping) -> None:
@@ -102,4 +89,4 @@ def _preamble() -> dict[str, str]:
     }
 
 
-__all__ = ["SHELLS", "command_parser", "script"]
+__all__ = ["SHELLS", "script"]

@@ -1,21 +1,11 @@
 """The command `rootsopt COMMAND ...`, which runs the command of this name."""
 
 import difflib
-import importlib
 import sys
 from collections.abc import Sequence
 
 from rootsopt.commands import door
-
-COMMANDS = {
-    "optimize": "optimise a design and compare it with the baseline",
-    "simulate": "simulate one design in one scene",
-    "pareto": "trace the best compromises between two or three terms",
-    "sweep": "simulate one design at many speeds, or at values of any keys",
-    "attractors": "find the coexisting motions of one scene",
-    "profile": "compute the geometry of one design",
-    "explore": "move design and scene with sliders on a local page",
-}
+from rootsopt.commands.table import COMMANDS
 
 _COMPLETION = """
 
@@ -35,7 +25,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _called(arguments: list[str]) -> int:
     usage = "usage: rootsopt COMMAND CONFIG [options]\n\n" + "\n".join(
-        f"  {name:<10} {what}" for name, what in COMMANDS.items()
+        f"  {name:<10} {command.brief}" for name, command in COMMANDS.items()
     )
     usage += "\n\nrootsopt COMMAND --help lists the options and the config keys used most."
     usage += _COMPLETION
@@ -55,7 +45,7 @@ def _called(arguments: list[str]) -> int:
         hint = f"; did you mean `{near[0]}`?" if near else f"; valid: {', '.join(COMMANDS)}"
         print(f"rootsopt: `{name}` is not a command{hint}", file=sys.stderr)
         return door.BAD_INPUT
-    return importlib.import_module(f"rootsopt.commands.{name}").main(rest)
+    return COMMANDS[name].main(rest)
 
 
 def _completed(arguments: list[str]) -> int:
@@ -64,7 +54,7 @@ def _completed(arguments: list[str]) -> int:
     from rootsopt.errors import InputError
 
     try:
-        print(completion.script(arguments[0] if arguments else "", COMMANDS))
+        print(completion.script(arguments[0] if arguments else ""))
     except InputError as error:
         print(f"rootsopt: {error}", file=sys.stderr)
         return door.BAD_INPUT

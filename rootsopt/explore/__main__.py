@@ -1,7 +1,7 @@
 """`python -m rootsopt.explore CONFIG`: explore a design and its scene with sliders."""
 
 from rootsopt.commands.door import leave
-from rootsopt.commands.explore import main
+from rootsopt.commands.table import explore
 
 if __name__ == "__main__":
-    leave(main())
+    leave(explore.main())

@@ -7,6 +7,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command `rootsopt optimize` with the arguments `argv` and return the exit code.
 
     If `argv` is `None`, use the arguments of the process."""
-    from rootsopt.commands.optimize import main as command
+    from rootsopt.commands.table import optimize
 
-    return command(argv)
+    return optimize.main(argv)

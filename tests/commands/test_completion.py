@@ -15,7 +15,7 @@ pytest.importorskip("shtab")
 
 @pytest.fixture(scope="module")
 def bash():
-    return completion.script("bash", COMMANDS)
+    return completion.script("bash")
 
 
 def completed(script, words):
@@ -52,7 +52,7 @@ def test_every_option_of_the_help_is_in_the_script(command, bash):
 
 
 def test_zsh_has_a_script():
-    text = completion.script("zsh", COMMANDS)
+    text = completion.script("zsh")
     assert text.startswith("#compdef rootsopt")
     assert "scene.timing_gear.backlash_mm=" in text
 

@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 
 import rootsopt
-from rootsopt.commands.pareto import main
+from rootsopt.commands.table import pareto
 from rootsopt.commands.work.searching import progress_bar
 from rootsopt.config import load
 from rootsopt.figures import page
@@ -30,7 +30,7 @@ FEW = [*RADIUS, "--set", "pareto.points=4"]
 def folder(tmp_path_factory):
     """Return the folder of a finished run without a simulation."""
     place = tmp_path_factory.mktemp("front") / "run"
-    assert main([CIC, "-o", str(place), *FEW]) == 0
+    assert pareto.main([CIC, "-o", str(place), *FEW]) == 0
     return place
 
 
@@ -78,7 +78,7 @@ def test_page_opens_without_a_network(folder):
 
 def test_page_is_left_out_without_its_library(tmp_path, monkeypatch, capfd):
     monkeypatch.setattr(page.importlib.util, "find_spec", lambda name: None)
-    assert main([CIC, "-o", str(tmp_path / "run"), *FEW, "--set", "pareto.points=3"]) == 0
+    assert pareto.main([CIC, "-o", str(tmp_path / "run"), *FEW, "--set", "pareto.points=3"]) == 0
     assert "rootsopt[pages]" in capfd.readouterr().err
     assert not (tmp_path / "run" / page.PAGE).exists()
 
@@ -93,7 +93,7 @@ def test_page_is_left_out_without_its_library(tmp_path, monkeypatch, capfd):
 )
 def test_bad_input_ends_with_one_line(tmp_path, capsys, overrides, words):
     given = [part for override in overrides for part in ("--set", override)]
-    assert main([CIC, "-o", str(tmp_path / "run"), *given]) == 2
+    assert pareto.main([CIC, "-o", str(tmp_path / "run"), *given]) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert words in line
     assert not (tmp_path / "run").exists()
@@ -101,7 +101,7 @@ def test_bad_input_ends_with_one_line(tmp_path, capsys, overrides, words):
 
 def test_contradicting_constraints_end_with_advice(tmp_path, capsys):
     limits = ["--set", "constraints={area_efficiency_min: 0.48, seal_width_min_mm: 25}"]
-    assert main([CIC, "-o", str(tmp_path / "run"), *FEW, *limits]) == 3
+    assert pareto.main([CIC, "-o", str(tmp_path / "run"), *FEW, *limits]) == 3
     out = " ".join(capsys.readouterr().out.split())
     assert "infeasible" in out
     assert "seal width" in out
@@ -127,7 +127,8 @@ def test_the_bar_has_words_while_compiling_and_ends_full():
 
 _STOPPED = """
 import contextlib, os, signal, sys
-from rootsopt.commands import door, pareto
+from rootsopt.commands import door
+from rootsopt.commands.table import pareto
 from rootsopt.commands.work import pareto as work
 
 @contextlib.contextmanager
@@ -166,7 +167,10 @@ def test_front_with_forces(tmp_path):
 
     Its ends are the optima of `optimize`. Each point agrees with a simulation of its config. The
     rates are slopes of the front."""
-    assert main([CIC, "-o", str(tmp_path / "run"), "--no-figures", "--set", "pareto.points=5"]) == 0
+    assert (
+        pareto.main([CIC, "-o", str(tmp_path / "run"), "--no-figures", "--set", "pareto.points=5"])
+        == 0
+    )
     result = json.loads((tmp_path / "run" / "result.json").read_text())
     points = result["points"]
     assert [point["status"] for point in points] == ["certified"] * len(points)

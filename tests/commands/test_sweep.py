@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import xarray
 
-from rootsopt.commands.sweep import main
+from rootsopt.commands.table import sweep
 from rootsopt.sweeps import points
 
 ROOT = Path(__file__).parents[2]
@@ -24,7 +24,7 @@ SPEEDS, FAMILIES = "--over=scene.speed_rpm=1000:2000:2", "--over=profile.family=
 @pytest.fixture(scope="module")
 def run_once(tmp_path_factory):
     folder = tmp_path_factory.mktemp("sweep") / "run"
-    code = main(["cic", SPEEDS, FAMILIES, "-o", str(folder)])
+    code = sweep.main(["cic", SPEEDS, FAMILIES, "-o", str(folder)])
     return code, folder
 
 
@@ -58,7 +58,7 @@ def test_formats_hold_the_same(name, tmp_path, monkeypatch):
     monkeypatch.setattr(points, "check_geometry", broken)
     axes = "--over=rotor.bore_mm=null,10", "--over=scene.speed_rpm=100:6000"
     options = ["--sobol=4", "--seed=5", f"--data={name}", "--no-figures"]
-    assert main(["cic", *axes, *options, "-o", str(tmp_path / "run")]) == 3
+    assert sweep.main(["cic", *axes, *options, "-o", str(tmp_path / "run")]) == 3
     engine = "h5netcdf" if name.endswith(".nc") else "zarr"
     with xarray.open_dataset(tmp_path / "run" / name, engine=engine) as found:
         assert sorted(found["rotor.bore_mm"].values.tolist()) == ["10", "10", "null", "null"]
@@ -87,7 +87,7 @@ def test_formats_hold_the_same(name, tmp_path, monkeypatch):
     ],
 )
 def test_refused_in_one_sentence(options, words, tmp_path, capsys):
-    assert main(["cic", *options, "-o", str(tmp_path / "run")]) == 2
+    assert sweep.main(["cic", *options, "-o", str(tmp_path / "run")]) == 2
     told = capsys.readouterr().err
     assert words in told
     assert told.count("\n") == 1
@@ -100,7 +100,7 @@ def test_refused_in_one_sentence(options, words, tmp_path, capsys):
 )
 def test_missing_package_is_named(package, data, advice, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, package, None)
-    assert main(["cic", SPEEDS, f"--data={data}", "-o", str(tmp_path / "run")]) == 2
+    assert sweep.main(["cic", SPEEDS, f"--data={data}", "-o", str(tmp_path / "run")]) == 2
     told = capsys.readouterr().err
     assert package in told
     assert advice in told
@@ -133,11 +133,11 @@ def test_killed_sweep_goes_on(tmp_path, capsys, monkeypatch):
     process.wait()
     before = kept.read_bytes()
     assert 4 < before.count(b"\n") < 31
-    assert main([*arguments(folder), "--resume", "--set=scene.load.torque_N_m=9"]) == 2
+    assert sweep.main([*arguments(folder), "--resume", "--set=scene.load.torque_N_m=9"]) == 2
     assert "load: torque_N_m (then 4.775, now 9" in capsys.readouterr().err
     assert kept.read_bytes() == before
     monkeypatch.setattr(points, "check_geometry", broken)
-    assert main([*arguments(folder), "--resume"]) == 3
+    assert sweep.main([*arguments(folder), "--resume"]) == 3
     result = json.loads((folder / "result.json").read_text())
     assert result["statuses"] == {"invalid": 30}
     assert result["statistics"]["resumed_points"] == len(before.splitlines(True)) - 1

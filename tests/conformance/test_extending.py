@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rootsopt.commands import optimize
+from rootsopt.commands.table import optimize
 from rootsopt.config import load
 from rootsopt.config.families import (
     Family,

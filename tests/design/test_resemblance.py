@@ -6,7 +6,7 @@ import pytest
 from scipy.optimize import minimize
 from scipy.spatial import KDTree
 
-from rootsopt.commands import profile as command
+from rootsopt.commands.table import profile as command
 from rootsopt.commands.work import profile as work
 from rootsopt.design import resemblance
 from rootsopt.design.resemblance import free_likeness, likeness

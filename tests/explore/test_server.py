@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from rootsopt import explore
-from rootsopt.commands import explore as command
+from rootsopt.commands.table import explore as command
 
 pytest.importorskip("bokeh")
 ROOT = Path(__file__).parents[2]
@@ -234,7 +234,7 @@ def test_ctrl_c_ends_with_success():
 
 def test_nothing_is_loaded_for_other_commands():
     code = (
-        "import sys; from rootsopt.commands import cli, explore; cli.parser('profile', '');"
+        "import sys; from rootsopt.commands import cli, table; cli.parser(table.profile);"
         "import rootsopt.commands.work.profile; print([name for name in sys.modules"
         " if name.split('.')[0] in ('bokeh', 'tornado') or name.startswith('rootsopt.explore')])"
     )

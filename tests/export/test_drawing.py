@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rootsopt.commands import profile as command
+from rootsopt.commands.table import profile as command
 from rootsopt.config import load
 from rootsopt.errors import InputError
 from rootsopt.export.coordinates import coordinates, widest

@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 from experiments._common.polygons import signed_distance
-from rootsopt.commands import profile
+from rootsopt.commands.table import profile
 from rootsopt.config import load
 from rootsopt.design.space import Space
 from rootsopt.errors import InputError

@@ -11,7 +11,7 @@ import pytest
 from ezdxf import units
 
 from experiments._common.polygons import pair_gap
-from rootsopt.commands import profile, simulate
+from rootsopt.commands.table import profile, simulate
 from rootsopt.config import load, parse
 from rootsopt.contact.closest import FlankPair
 from rootsopt.errors import InputError

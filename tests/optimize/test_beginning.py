@@ -11,7 +11,7 @@ import pytest
 import yaml
 from rich.console import Console
 
-from rootsopt.commands import optimize
+from rootsopt.commands.table import optimize
 from rootsopt.commands.work.searching import checkpoint_of
 from rootsopt.config import load, parse
 from rootsopt.design.bounds import bounds_of, widened

@@ -6,8 +6,8 @@ import types
 import numpy as np
 import pytest
 
-from rootsopt.commands import optimize as command
-from rootsopt.commands import pareto
+from rootsopt.commands.table import optimize as command
+from rootsopt.commands.table import pareto
 from rootsopt.commands.work import optimize as work
 from rootsopt.config import parse
 from rootsopt.errors import InputError

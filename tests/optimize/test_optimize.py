@@ -370,7 +370,7 @@ def _refuse():
 
 INTERRUPTED = """
 import os, signal, sys
-from rootsopt.commands import optimize as command
+from rootsopt.commands.table import optimize as command
 from rootsopt.commands.work import searching
 from rootsopt.optimize.search import Search
 wanted, number = int(sys.argv.pop(1)), signal.Signals[sys.argv.pop(1)]

@@ -226,7 +226,7 @@ def test_coefficients_may_reach_their_bound(last):
 
 def test_profile_command_projects(tmp_path, capsys):
     """`--project` writes a config of the same pair, within the distance that it prints."""
-    from rootsopt.commands import profile as command
+    from rootsopt.commands.table import profile as command
 
     source = tmp_path / "cic.yaml"
     source.write_text(SCENE)

@@ -13,7 +13,7 @@ import pytest
 from browser import FLAGS, chromium
 
 from rootsopt import report
-from rootsopt.commands import pareto, profile
+from rootsopt.commands.table import pareto, profile
 from rootsopt.config import load
 from rootsopt.output.files import ResultFolder, response_columns
 from rootsopt.report import charts
@@ -455,7 +455,7 @@ def test_failing_report_does_not_lose_the_run(tmp_path, monkeypatch, capfd):
 
 def test_nothing_is_loaded_without_the_option():
     code = (
-        "import sys; from rootsopt.commands import cli; cli.parser('profile', '');"
+        "import sys; from rootsopt.commands import cli, table; cli.parser(table.profile);"
         "import rootsopt.commands.work.profile; print([name for name in sys.modules"
         " if name.split('.')[0] in ('jinja2', 'plotly') or name.startswith('rootsopt.report.')])"
     )

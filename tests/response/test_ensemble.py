@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from rootsopt import optimize
-from rootsopt.commands import simulate
+from rootsopt.commands.table import simulate
 from rootsopt.config import DESIGN_KEYS, EnsembleConfig, load
 from rootsopt.output import tables
 from rootsopt.response.ensemble import (

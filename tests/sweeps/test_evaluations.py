@@ -11,7 +11,8 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from rootsopt.commands import optimize, parallel, pareto
+from rootsopt.commands.table import optimize, pareto
+from rootsopt.commands.work.searching import runs_of
 from rootsopt.config import load
 from rootsopt.errors import InputError
 from rootsopt.response.evaluation import Evaluator
@@ -177,7 +178,7 @@ def test_without_workers_evaluations_run_here():
 
 def test_the_price_of_workers_is_said_before_they_start(capsys):
     """The context is not entered, so nothing has started yet."""
-    parallel.chosen(Namespace(workers=3, scheduler=None, imports=[], no_cache=False))
+    runs_of(Namespace(workers=3, scheduler=None, imports=[], no_cache=False))
     assert "are no faster than this process" in capsys.readouterr().err
 
 

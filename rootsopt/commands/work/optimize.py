@@ -8,8 +8,14 @@ from contextlib import AbstractContextManager, closing
 import jax.numpy as jnp
 from rich.console import Console
 
-from rootsopt.commands import cli, door, parallel
-from rootsopt.commands.work.searching import checkpoint_of, nothing_known, progress_bar, searched
+from rootsopt.commands import cli, door
+from rootsopt.commands.work.searching import (
+    checkpoint_of,
+    nothing_known,
+    progress_bar,
+    runs_of,
+    searched,
+)
 from rootsopt.config import Config
 from rootsopt.config.families import family_of
 from rootsopt.design.resemblance import likenesses
@@ -38,7 +44,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     with (
         clock,
         door.patience(promise) as stop,
-        parallel.chosen(options) as runs,
+        runs_of(options) as runs,
         _progress(Console(stderr=True)) as progress,
         closing(checkpoint_of("optimize", config, options, folder)) as checkpoint,
     ):

@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import os
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
@@ -17,9 +18,11 @@ from rootsopt.optimize.search import until_stopped
 from rootsopt.output import files
 from rootsopt.output.runs import RunFolder
 from rootsopt.response.checkpoint import Checkpoint
+from rootsopt.response.many import Runs
 from rootsopt.runtime.environment import say
 from rootsopt.runtime.journal import Journal, header_of, set_aside
 from rootsopt.status import Status
+from rootsopt.sweeps.evaluations import evaluating
 
 Found = TypeVar("Found", covariant=True)
 PATIENCE = 5.0
@@ -39,6 +42,18 @@ class Searches(Protocol[Found]):
 
 
 J = TypeVar("J", bound=Journal)
+
+
+def runs_of(options: argparse.Namespace) -> contextlib.AbstractContextManager[Runs]:
+    """Return a context manager for what runs the evaluations of a search with these `options`."""
+    if options.workers is not None:
+        say(
+            f"`--workers {options.workers}` starts processes that load everything again, some 10 s "
+            f"each, and then are no faster than this process, which uses all {os.cpu_count() or 1} "
+            "cores; leave it out unless a design may end its process"
+        )
+    cache = not options.no_cache
+    return evaluating(options.workers, options.scheduler, options.imports, cache)
 
 
 def checkpoint_of(

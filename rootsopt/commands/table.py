@@ -1,0 +1,199 @@
+"""The commands: what each does, and its own options.
+
+This module imports little, so that an interrupt is handled even while others are imported."""
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+from rootsopt.commands import door
+
+if TYPE_CHECKING:
+    from argparse import ArgumentParser, _ArgumentGroup
+
+
+def _none(parser: "ArgumentParser") -> None:
+    """Add no options to a `parser`."""
+
+
+class Command(NamedTuple):
+    """A command, with the work in the module of its name in `rootsopt.commands.work`.
+
+    `name`; `brief`: what it does, for the list of commands; `purpose`: the same, for its help;
+    `options`: adds its own options to a parser; `writes`: whether it writes a result folder."""
+
+    name: str
+    brief: str
+    purpose: str
+    options: "Callable[[ArgumentParser], None]" = _none
+    writes: bool = True
+
+    def main(self, argv: Sequence[str] | None = None) -> int:
+        """Run the command with the arguments `argv` (`None`: those of the process).
+
+        Return the exit code."""
+        return door.through(self.name, lambda: self._run(argv), own=argv is None)
+
+    def _run(self, argv: Sequence[str] | None) -> int:
+        from rootsopt.commands import cli
+
+        return cli.run(self, argv)
+
+
+def _optimize(parser: "ArgumentParser") -> None:
+    _simulate(parser)
+    _shared(parser)
+
+
+def _simulate(parser: "ArgumentParser") -> None:
+    from rootsopt import export
+
+    export.add_option(parser, "none")
+
+
+def _profile(parser: "ArgumentParser") -> None:
+    from rootsopt import export
+
+    # Drawings take less than 1 s, a solid takes 10 s.
+    export.add_option(parser, "dxf,svg")
+    parser.add_argument(
+        "--project",
+        metavar="N",
+        help="write free_form.yaml: the profile as a free form of N coefficients",
+    )
+    parser.add_argument(
+        "--resembles",
+        action="store_true",
+        help="find the nearest member of every profile family (takes half a minute)",
+    )
+
+
+def _sweep(parser: "ArgumentParser") -> None:
+    group = parser.add_argument_group("points of the sweep")
+    group.add_argument(
+        "--over",
+        action="append",
+        default=[],
+        metavar="KEY=VALUES",
+        help="values of a config key: a list (0.05,0.1), a range (300:6000:39, 1:100:9:log) "
+        "or, for samples, an interval (300:6000); repeatable",
+    )
+    group.add_argument(
+        "--zip", action="store_true", help="advance all keys together instead of combining them"
+    )
+    group.add_argument(
+        "--zip-keys",
+        action="append",
+        default=[],
+        metavar="KEY,KEY...",
+        help="advance these keys together; repeatable",
+    )
+    group.add_argument("--sample", type=int, metavar="N", help="draw N pseudo-random points")
+    group.add_argument(
+        "--sobol",
+        type=int,
+        metavar="N",
+        help="draw N points of a Sobol sequence, best a power of 2",
+    )
+    group.add_argument(
+        "--tolerances",
+        type=int,
+        metavar="N",
+        help="simulate N fresh scenes of `tolerances`, instead of --over",
+    )
+    group.add_argument("--seed", type=int, metavar="N", help="seed of the samples (default: 0)")
+    group = parser.add_argument_group("how a sweep runs (with --over or --tolerances)")
+    group.add_argument(
+        "--data", metavar="NAME", help="name of the dataset: *.nc or *.zarr (default: sweep.nc)"
+    )
+    _shared(group)
+
+
+def _shared(parser: "ArgumentParser | _ArgumentGroup") -> None:
+    """Add the options of commands whose evaluations may run elsewhere."""
+    parser.add_argument(
+        "--workers",
+        type=int,
+        metavar="N",
+        help="start N processes (default: this one, with one thread per core)",
+    )
+    parser.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="use a running Dask scheduler: tcp://10.0.0.1:8786",
+    )
+    parser.add_argument(
+        "--resume",
+        action="store_true",
+        help="go on with a run into the same folder that was stopped or killed",
+    )
+
+
+def _explore(parser: "ArgumentParser") -> None:
+    parser.add_argument(
+        "--port",
+        type=_port,
+        default=0,
+        metavar="N",
+        help="port of the page on 127.0.0.1 (default: any free one)",
+    )
+    parser.add_argument(
+        "--no-browser", action="store_true", help="print the page's address without opening it"
+    )
+
+
+def _port(text: str) -> int:
+    import argparse
+
+    number = int(text)
+    if not 0 <= number <= 65535:
+        raise argparse.ArgumentTypeError(f"must be a number from 0 to 65535, but is {text}")
+    return number
+
+
+optimize = Command(
+    "optimize",
+    "optimise a design and compare it with the baseline",
+    "Optimise the design parameters for low contact force and compare with the baseline.",
+    _optimize,
+)
+simulate = Command(
+    "simulate",
+    "simulate one design in one scene",
+    "Simulate one design in one scene: steady state, contact force, its gradient.",
+    _simulate,
+)
+pareto = Command(
+    "pareto",
+    "trace the best compromises between two or three terms",
+    "Trace the best compromises between two or three terms (pareto.terms).",
+    _shared,
+)
+sweep = Command(
+    "sweep",
+    "simulate one design at many speeds, or at values of any keys",
+    "Simulate one config at many values of any of its keys (--over), or at many speeds.",
+    _sweep,
+)
+attractors = Command(
+    "attractors",
+    "find the coexisting motions of one scene",
+    "Find the coexisting motions of a scene and the initial states that lead to each.",
+)
+profile = Command(
+    "profile",
+    "compute the geometry of one design",
+    "Compute the geometry of one design, and export drawings, solids or an animation.",
+    _profile,
+)
+explore = Command(
+    "explore",
+    "move design and scene with sliders on a local page",
+    "Serve a local page with a slider per parameter of design and scene (rootsopt[explore]).",
+    _explore,
+    writes=False,
+)
+COMMANDS = {
+    command.name: command
+    for command in (optimize, simulate, pareto, sweep, attractors, profile, explore)
+}
+"""All commands by name."""
