@@ -357,6 +357,11 @@ def find_installed(name: str) -> None:
                 point.load()
 
 
+def is_shipped(name: str) -> bool:
+    """Return whether the family of this name is one of the package's own."""
+    return _origins[name].partition(".")[0] == __name__.partition(".")[0]
+
+
 def outside_modules() -> set[str]:
     """Return the names of modules outside this package that profiles may depend on.
 

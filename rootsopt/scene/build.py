@@ -115,6 +115,7 @@ class Scene(eqx.Module):
         Raises `RuntimeError` if JAX is not set to double precision, and `InputError` if an outline
         file cannot be used."""
         check_precision()
+        families.note_program(config.profile)
         found = cls(
             family=config.profile.family,
             lobes=config.profile.lobes,

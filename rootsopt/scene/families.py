@@ -1,12 +1,13 @@
 """Makes and checks profiles from family names, keys and units as they appear in a config."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from rootsopt.config import ProfileConfig
-from rootsopt.config.families import families, family_of
+from rootsopt.config.families import families, family_of, is_shipped
 from rootsopt.config.units import DEG, MM
 from rootsopt.config.words import shown
 from rootsopt.errors import InputError
@@ -14,8 +15,11 @@ from rootsopt.measured.conjugacy import conjugacy
 from rootsopt.profiles import Outline, Profile, project
 from rootsopt.profiles.departure import departure
 from rootsopt.profiles.validity import Soundness, margins, soundness
+from rootsopt.runtime.environment import say
 from rootsopt.runtime.programs import Program
 
+_MOST_OPERATIONS = 1500
+"""Number of operations for a point of a flank above which a family has a note."""
 _UNITS = {"turning": ("deg", DEG), "order": ("deg", DEG), "rolling": ("", 1.0), "limits": ("", 1.0)}
 """Units of margins that are not lengths: name of the unit, and its SI value."""
 
@@ -124,6 +128,28 @@ def check(config: ProfileConfig) -> None:
         raise InputError(
             f"the profile of family {config.family} must be sound, but with {given} {fault}; "
             f"{family.remedy or 'change these parameters'}"
+        )
+
+
+def note_program(config: ProfileConfig) -> None:
+    """Print a note on a family from outside whose programs would take long to compile.
+
+    A simulation has dozens of copies of what computes a point of a flank."""
+    if is_shipped(config.family):
+        return
+    profile = profile_of(
+        config.family, config.lobes, jnp.asarray(config.pitch_radius_mm * MM), design_of(config)
+    )
+    made = jax.make_jaxpr(
+        lambda nu: [f(nu) for f in (profile.roll_angle, profile.lever, profile.support)]
+    )
+    count = str(made(profile.half_pitch)).count(" = ")
+    if count > _MOST_OPERATIONS:
+        say(
+            f"family {config.family} takes {count} operations for a point of a flank, but those of "
+            "this package take at most 500, so that its programs may take minutes and gigabytes to "
+            "compile; give it as a `RollPiece`, or write iterations with `jax.lax.fori_loop` "
+            "(docs/extending.md)"
         )
 
 

@@ -26,12 +26,13 @@ from rootsopt.config.families import (
 )
 from rootsopt.errors import InputError
 from rootsopt.profiles import Profile
+from rootsopt.scene import Scene
 from rootsopt.scene.families import profile_of
 from tests.conformance import families as suite
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
-MOST_LINES = 60
+MOST_LINES = 60, 35
 
 
 def block_of(name):
@@ -40,18 +41,67 @@ def block_of(name):
     return next(block for block in blocks if block.startswith(f'"""{name}'))
 
 
+def imported(name, folder):
+    """Write the file `name` of the page into a folder, import it and return its path."""
+    path = folder / name
+    path.write_text(block_of(name), encoding="utf-8")
+    import_named(str(path))
+    return path
+
+
 @pytest.fixture(scope="module")
 def blunt_cycloid(tmp_path_factory):
     """Return the path of the family's file, after importing it."""
-    path = tmp_path_factory.mktemp("family") / "blunt_cycloid.py"
-    path.write_text(block_of(path.name), encoding="utf-8")
     with for_a_time():
-        import_named(str(path))
-        yield path
+        yield imported("blunt_cycloid.py", tmp_path_factory.mktemp("family"))
 
 
-def test_family_is_short(blunt_cycloid):
-    assert len(blunt_cycloid.read_text(encoding="utf-8").splitlines()) <= MOST_LINES
+@pytest.fixture(scope="module")
+def early_fall(blunt_cycloid):
+    """Return the path of the file of the family given by its law, after importing it."""
+    return imported("early_fall.py", blunt_cycloid.parent)
+
+
+def test_families_are_short(blunt_cycloid, early_fall):
+    for path, most in zip((blunt_cycloid, early_fall), MOST_LINES, strict=True):
+        assert len(path.read_text(encoding="utf-8").splitlines()) <= most
+
+
+def test_law_of_the_roll_angle_gives_the_closed_form(early_fall):
+    """With an even fall, the family is the blunt cycloid, to 1e-9 pitch radii."""
+    nu = jnp.linspace(0.0, 1.5, 7)
+
+    def values(name, *design):
+        profile = profile_of(name, 3, jnp.asarray(1.0), jnp.asarray(design))
+        return jax.vmap(lambda nu: jnp.stack([profile.lever(nu), profile.support(nu)]))(nu)
+
+    np.testing.assert_allclose(
+        values("early_fall", 3.0, 20.0, 0.0), values("blunt_cycloid", 3.0, 20.0), atol=1e-9
+    )
+    assert (
+        np.max(np.abs(values("early_fall", 3.0, 20.0, 0.3) - values("blunt_cycloid", 3.0, 20.0)))
+        > 1e-2
+    )
+
+
+@pytest.mark.parametrize("holds", [one for one in suite.CHECKS if "search" not in one.__name__])
+def test_family_given_by_its_law_conforms(early_fall, holds):
+    holds(early_fall.stem)
+
+
+def test_family_with_an_unrolled_iteration_has_a_note(blunt_cycloid, tmp_path, capsys):
+    text = blunt_cycloid.read_text(encoding="utf-8").replace("blunt_cycloid", "unrolled_cycloid")
+    turn = "        beyond = nu - self.tip_arc_angle\n"
+    slow = (
+        f"{turn}        for _ in range(300):\n            beyond = beyond + 0 * jnp.sin(beyond)\n"
+    )
+    assert turn in text
+    (tmp_path / "unrolled.py").write_text(text.replace(turn, slow), encoding="utf-8")
+    with for_a_time():
+        import_named(str(tmp_path / "unrolled.py"))
+        for name, notes in (("blunt_cycloid", 0), ("unrolled_cycloid", 1)):
+            Scene.from_config(load("configs/ee.yaml", [*DESIGN[1::2], f"profile.family={name}"]))
+            assert capsys.readouterr().err.count("operations for a point of a flank") == notes
 
 
 @pytest.mark.parametrize("holds", suite.CHECKS, ids=lambda one: one.__name__)
