@@ -449,6 +449,12 @@ def test_no_number_without_its_status(settled, name):
         assert 0 < mean <= rms <= peak
 
 
+@pytest.mark.parametrize("name", ["periodic", "epicycloid", "doubled", "tripled", "noisy"])
+def test_derivatives_are_those_before_a_negligible_correction(settled, name):
+    """The last correction does not count. On epicycloids one step more than usual makes it so."""
+    assert settled[name].steady_state["residual"] < 3e-9
+
+
 def test_status_does_not_depend_on_the_series():
     """Without a series, a motion that is too deep is still not usable."""
     assert Evaluator.of(SCENES["soft"])(series=False).status is Status.TOO_DEEP

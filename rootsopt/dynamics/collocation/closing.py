@@ -64,8 +64,7 @@ FIRST, _SHARE, _EVENT = 40, 0.5, 1
 events has the second number times as many at the usual accuracy, more at a finer one, and the third
 number per event."""
 _USUAL = 1e-7
-"""Relative error of the forces (usual accuracy) for which `_SHARE`, `_SMALL`, `CORRECTED` and
-`_FAR` hold."""
+"""Relative error of the forces (usual accuracy) for which `_SHARE` and `CORRECTED` hold."""
 _ORDER = 2 * POINTS
 """Order of the forces' error in the length of the elements."""
 _UNCOMPARED = 1e-5, 1e-3, 0.1
@@ -91,9 +90,13 @@ _LARGEST = 3e-3
 """Greatest Newton step (scaled) at which Newton's method may stop. It stops at a step whose square
 is below the error of the forces to reach. Convergence is quadratic, so the next step, which is made
 together with the derivatives, is about as small."""
-_FAR = 1e-5
+_NEGLIGIBLE, _STALLED = 3e-9, 0.5
+"""Correction (scaled) that does not count in the derivatives, at the usual accuracy, and the share
+of the correction before above which it only follows rounding."""
+_FAR = 1e-3
 """Difference (rad) between the contact's normal angle in the solved orbit and that found by a
-search, above which the orbit is solved again from the latter, at the usual accuracy."""
+search, above which the orbit is solved again from the latter. Roots lag one Newton step behind, and
+another minimum of the gap lies much further away."""
 _GAINS = 10.0, 0.2
 """Numbers by which the difference between two meshes is divided to estimate the error on the finer
 one, if that has `_FINER` times as many elements: for forces and for derivatives. In theory, both
@@ -285,7 +288,7 @@ class Closer(eqx.Module):
             lambda: self.looked(now, seen, agree),
             lambda: self.stepped(now),
         )
-        changes = jnp.where(now.looks, ~agree, new.keeps) & ~new.over
+        changes = jnp.where(now.looks, ~agree, now.keeps & new.solved) & ~new.over
         return branch(changes, lambda: self.align(new, events, now.keeps), lambda: new)
 
     def looked(self, now: Loop, seen: FlagScan, agree: Bool[Array, ""]) -> Loop:
@@ -293,12 +296,18 @@ class Closer(eqx.Module):
 
         `agree`: whether they change exactly at the events of the mesh. The roots for the next step
         come from the search, since those of Newton's method lag behind."""
-        keeps = agree & now.solved & (apart(now.elements, seen) <= _FAR * jnp.sqrt(self.ease))
+        keeps = agree & now.solved & (apart(now.elements, seen) <= _FAR)
         motion = choose(agree, rooted(self.frozen, now.elements, seen), now.elements)
         closed = now.closed._replace(turns=now.closed.turns + 1)
         fresh = jnp.full_like(now.size, jnp.inf), jnp.zeros_like(now.tries)
         return now._replace(
-            closed=closed, elements=motion, looks=~agree, keeps=keeps, size=fresh[0], tries=fresh[1]
+            closed=closed,
+            elements=motion,
+            rivals=now.rivals.rooted(now.elements, motion),
+            looks=~agree,
+            keeps=keeps,
+            size=fresh[0],
+            tries=fresh[1],
         )
 
     def run(self) -> Loop:
@@ -407,11 +416,15 @@ class Closer(eqx.Module):
         certain = drift <= jnp.clip(steep * self.tolerance, least, most)
         # Without a comparison, a little finer mesh is better than none.
         full = jnp.where(first, 1.0, _LAST) * now.elements.mesh.used >= self.most(now)
-        # Newton's method has converged, so the correction must be small. Where it converges slowly,
-        # the steps go on. It is NaN where the time derivative of a margin vanishes at its event.
-        good = found.correction < corrected(self.tolerance)
+        # Newton's method has converged, so the correction must be small. It is NaN where the time
+        # derivative of a margin vanishes at its event. Derivatives are those before the correction:
+        # if it is not yet negligible, they are computed once more.
+        correction = found.correction
+        good = correction < corrected(self.tolerance)
+        falls = correction < _STALLED * now.size
         failures = now.failures + ~good
-        again = ~good & jnp.isfinite(found.correction) & (failures <= _FAILURES)
+        again = jnp.isfinite(correction) & falls & (correction > _NEGLIGIBLE * self.ease)
+        again &= failures <= _FAILURES
         least = jnp.where(first & self.known.aligned, self.known.roughness, 0.0)
         size = jnp.maximum(size, least)
         kept = now.closed
@@ -424,14 +437,13 @@ class Closer(eqx.Module):
         )
         reached = ((error <= self.tolerance) & certain) | full
         return now._replace(
-            closed=closed,
+            closed=choose(again, now.closed, closed),
             elements=found.elements,
-            keeps=good,
-            solved=good,
-            tries=jnp.zeros_like(now.tries),
+            solved=good & ~again,
+            size=correction,
             failures=failures,
-            meshes=now.meshes + good,
-            over=jnp.where(good, reached, ~again),
+            meshes=now.meshes + (good & ~again),
+            over=~again & (reached | ~good),
         )
 
 

@@ -76,6 +76,13 @@ class Rivals(NamedTuple):
         share = jnp.clip((time - begin[element]) / size, _INSIDE, 1.0 - _INSIDE)
         return Rivals(element, share, _roots(new.roots, element, share))
 
+    def rooted(self, before: Elements, after: Elements) -> "Rivals":
+        """Return the same instants with their roots moved as those of the elements have been.
+
+        Interpolated roots alone have a greater error than those that follow Newton's steps."""
+        one, other = (_roots(x.roots, self.element, self.share) for x in (before, after))
+        return self._replace(roots=self.roots + (other - one))
+
     def places(self, elements: Elements) -> tuple[Float[Array, " p"], Float[Array, "p n"]]:
         """Return times (mesh periods) and scaled states of the instants, on the motion
         `elements`."""
