@@ -29,7 +29,7 @@ _PLACES = np.linspace(0.0, 1.0, 9)
 """Places in each element at which the polynomials of the force are compared."""
 _STEPS = 4
 """Number of Newton steps from the best of these places to the maximum of a polynomial."""
-_CLOSE = 1e-4
+_CLOSE = 1e-5
 """Distance of the peak from the instant at which the equation is evaluated (fraction of the
 element's length) below which force and derivative are extrapolated to it, at the usual accuracy:
 both errors are then far below those of the orbit."""
