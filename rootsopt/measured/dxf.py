@@ -1,6 +1,5 @@
 """Reads outlines from DXF drawings, text or binary."""
 
-import dataclasses
 import io
 from collections import Counter
 from typing import Any
@@ -8,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from rootsopt.errors import InputError
-from rootsopt.measured.entities import Entity, chain
+from rootsopt.measured.entities import chain, strokes
 from rootsopt.measured.estimates import UNITS
-from rootsopt.measured.guard import each, guarded, short, silenced
+from rootsopt.measured.guard import guarded, short, silenced
 from rootsopt.measured.loop import Loop
 
 with silenced():  # Importing ezdxf writes to its log.
@@ -93,36 +92,34 @@ def from_dxf(data: bytes, name: str, unit: str | None = None) -> list[Loop]:
                 f"({short(reason, 100)}); repair or remove them in the drawing"
             )
     scale = _UNITS.get(code) if isinstance(code, int) else None
-    if unit is not None:
-        scale = UNITS[unit]
+    scale = scale if unit is None else UNITS[unit]
     if scale is None:
         raise InputError(
             f"{name}: $INSUNITS must be the code of a length unit (4: mm, 1: inch, 0: none), but "
             f"is {short(code)}; set the drawing's units, or `profile.outline_unit`"
         )
     with silenced():
-        entities = [Entity.of(entity, name) for entity in _chosen(document, name)]
-    parts = [part for entity in entities if (part := entity.segments(scale))]
+        parts = [strokes(entity, scale, name) for entity in _chosen(document, name)]
+    parts = [part for part in parts if part]
     if not parts:
         raise InputError(
             f"{name}: must hold an outline of {', '.join(_KINDS)}, but those in it have no extent; "
             "export it again"
         )
-    rough = np.concatenate([s.points(s.least) for part in parts for s in part])
+    rough = np.concatenate([stroke.rough for part in parts for stroke in part])
     size = float(np.hypot(np.ptp(rough.real), np.ptp(rough.imag)))
     if not 0 < size < _LARGEST:
         raise InputError(
             f"{name}: must hold an outline, but its entities measure {size:.4g} mm; check the "
             "drawing and its units ($INSUNITS)"
         )
-    spacing = _SPACING * size
-    count = sum(s.intervals(spacing) for part in parts for s in part)
+    count = sum(stroke.intervals(_SPACING * size) for part in parts for stroke in part)
     if count > _POINTS:
         raise InputError(
             f"{name}: must hold an outline of at most {_POINTS} points, but its entities need "
             f"{count}; draw the outline alone on a layer {_LAYER}"
         )
-    return [dataclasses.replace(chain(part, spacing), unit=scale) for part in parts]
+    return [chain(part, _SPACING * size, scale) for part in parts]
 
 
 def _check_tags(data: bytes, binary: bool, name: str) -> Counter[str]:
@@ -135,24 +132,16 @@ def _check_tags(data: bytes, binary: bool, name: str) -> Counter[str]:
     are too many entities. This check is needed because the library reads "1,5" as 1. It also
     accepts a number that is cut off at the end of the file.
     """
-    tags = binary_tags_loader(data) if binary else recover.bytes_loader(io.BytesIO(data))
     counted: Counter[str] = Counter()
-    kind, ended = "", False
-    for number, tag in enumerate(each(iter(tags), name, _NOT, _AGAIN), 1):
-        code, value = tag.code, tag.value
-        if code == 0:
-            kind = (value if isinstance(value, str) else value.decode("latin-1")).strip().upper()
-            ended = kind == "EOF"
-            counted[kind] += 1
-            continue
-        if kind not in _KINDS and kind not in _PARTS:
-            continue
-        if code < 1000 and (code in types.POINT_CODES or types.TYPE_TABLE.get(code) is float):
-            try:
-                sound = abs(float(value)) <= _LARGEST and b"_" not in _raw(value)
-            except ValueError:
-                sound = False
-            if not sound:
+    kind = ""
+    # The guard is around the whole loop, as the library reads the file while it yields tags.
+    with guarded(name, _NOT, _AGAIN):
+        tags = binary_tags_loader(data) if binary else recover.bytes_loader(io.BytesIO(data))
+        for number, (code, value) in enumerate(tags, 1):
+            if code == 0:
+                kind = _raw(value).decode("latin-1").strip().upper()
+                counted[kind] += 1
+            elif kind in (*_KINDS, *_PARTS) and not _sound(code, _raw(value)):
                 where = f"tag {number}" if binary else f"line {2 * number}"
                 raise InputError(
                     f"{name}, {where}: a number of {kind} must be finite and at most "
@@ -165,7 +154,7 @@ def _check_tags(data: bytes, binary: bool, name: str) -> Counter[str]:
             f"{name}: must have at most {_ENTITIES} lines, arcs and vertices, but has {count}; "
             "export the outline alone"
         )
-    if not ended:
+    if kind != "EOF":
         raise InputError(
             f"{name}: must end with the mark EOF of a complete drawing, but does not; {_AGAIN}"
         )
@@ -176,44 +165,46 @@ def _raw(value: Any) -> bytes:
     return value if isinstance(value, bytes) else str(value).encode()
 
 
+def _sound(code: int, value: bytes) -> bool:
+    """Return whether the `value` of a tag is no number, or one that an entity may have."""
+    if code >= 1000 or not (code in types.POINT_CODES or types.TYPE_TABLE.get(code) is float):
+        return True
+    try:
+        return abs(float(value)) <= _LARGEST and b"_" not in value
+    except ValueError:
+        return False
+
+
 def _chosen(document: Drawing, name: str) -> list[Any]:
     """Return the entities that may form the outline: the first of these groups that is not empty.
 
     The groups are: entities on the layer OUTLINE drawn directly; entities on this layer in blocks;
     all entities drawn directly; all entities in blocks. Raises `InputError` if all are empty."""
+
+    def on_layer(entities: list[Any]) -> list[Any]:
+        return [e for e in entities if str(e.dxf.layer).upper() == _LAYER]
+
     with guarded(name, _NOT, _AGAIN):
         everything = list(document.modelspace())
-    direct = [e for e in everything if e.dxftype() in _KINDS]
-    if found := _on_layer(direct, name):
-        return found
-    inserts = [e for e in everything if e.dxftype() == "INSERT"]
-    if not direct and not inserts:
-        raise InputError(
-            f"{name}: must hold an outline of {', '.join(_KINDS)}, but has none of them; draw it "
-            "with these"
-        )
-    blocks = _exploded(inserts, name)
-    found = _on_layer(blocks, name) or direct or blocks
+        direct = [e for e in everything if e.dxftype() in _KINDS]
+        inserts = [e for e in everything if e.dxftype() == "INSERT"]
+        found = on_layer(direct)
+        if not found:
+            blocks = _exploded(inserts, name)
+            found = on_layer(blocks) or direct or blocks
     if not found:
         raise InputError(
-            f"{name}: must hold an outline of {', '.join(_KINDS)}, but its blocks have none of "
-            "them; draw it with these"
+            f"{name}: must hold an outline of {', '.join(_KINDS)}, but "
+            f"{'its blocks have' if inserts else 'has'} none of them; draw it with these"
         )
     return found
-
-
-def _on_layer(entities: list[Any], name: str) -> list[Any]:
-    with guarded(name, _NOT, _AGAIN):
-        return [e for e in entities if str(e.dxf.layer).upper() == _LAYER]
 
 
 def _exploded(inserts: list[Any], name: str) -> list[Any]:
     """Return the entities of inserted and nested blocks, placed as they appear in the drawing.
 
-    `inserts`: the library's block inserts; `name`: name of the drawing in messages."""
-    found: list[Any] = []
-    stack = [(insert, 1) for insert in reversed(inserts)]
-    handled = 0
+    `inserts`: the library's block inserts; `name`: name of the drawing in messages. The library's
+    `recursive_decompose` has no limit on depth or number, and leaves entities on layer 0 there."""
 
     def skipped(entity, reason):
         if entity.dxftype() in _KINDS:
@@ -222,26 +213,21 @@ def _exploded(inserts: list[Any], name: str) -> list[Any]:
                 "explode the blocks in the drawing"
             )
 
-    while stack:
-        insert, depth = stack.pop()
+    found, handled = [], 0
+    queue = [(insert, 1) for insert in inserts]
+    for insert, depth in queue:  # Nested inserts join the queue.
         with guarded(name, "holds a block that cannot be read", "explode the blocks"):
-            repeated = insert.mcount
-            own = []
-            if depth <= _DEEPEST and repeated == 1:
-                own = list(insert.virtual_entities(skipped_entity_callback=skipped))
-            layer = insert.dxf.layer
-            for entity in own:
-                if (
-                    entity.dxf.layer == "0"
-                ):  # In CAD, layer 0 in a block stands for the layer of the insert.
-                    entity.dxf.layer = layer
+            single = depth <= _DEEPEST and insert.mcount == 1
+            own = list(insert.virtual_entities(skipped_entity_callback=skipped)) if single else []
+            for entity in (e for e in own if e.dxf.layer == "0"):
+                entity.dxf.layer = insert.dxf.layer  # As in CAD.
         handled += 1 + len(own)
-        if depth > _DEEPEST or repeated != 1 or handled > _ENTITIES:
+        if not single or handled > _ENTITIES:
             raise InputError(
                 f"{name}: blocks must be inserted singly, nested at most {_DEEPEST} deep, with at "
                 f"most {_ENTITIES} entities in total, but these are not; explode the blocks in the "
                 "drawing"
             )
         found += [e for e in own if e.dxftype() in _KINDS]
-        stack += [(e, depth + 1) for e in reversed(own) if e.dxftype() == "INSERT"]
+        queue += [(e, depth + 1) for e in own if e.dxftype() == "INSERT"]
     return found

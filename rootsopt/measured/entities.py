@@ -1,17 +1,18 @@
 """Points on the entities of a drawing (mm, as x + iy).
 
-An entity is a chain of segments. A segment is a polygonal line, an arc of a circle or ellipse, or a
-spline. Each segment states its number of intervals before it is sampled, so that the size of every
-array is known in advance.
+An entity is a chain of strokes. Each states its number of points before it is sampled, so that the
+size of every array is known in advance. Arcs and splines are sampled on the exact curve: the
+library's own paths replace them by cubic Bézier curves, its flattening spaces the points unevenly,
+and its splines end at degree 10.
 """
 
-import abc
 import dataclasses
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
+from ezdxf.math import ConstructionEllipse, open_uniform_knot_vector
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
@@ -23,8 +24,9 @@ _FEWEST = 24
 """Minimum number of sampling intervals on an arc or spline."""
 _MOST = 100_000
 """Maximum number of sampling intervals derived from the length of an arc or spline."""
-_PER_SPAN = 4
-"""Minimum number of sampling intervals between two adjacent knots of a spline."""
+_PER_SPAN, _ROUGH = 4, 64
+"""Minimum number of sampling intervals between two adjacent knots of a spline, and number of
+intervals on a spline when its extent is measured."""
 _DEGREES = 25
 """Degree above which a spline is rejected."""
 _FITTED = 5_000
@@ -40,248 +42,141 @@ _FRAME = 16
 _TILT = 1e-6
 """Angle (rad) between an entity's plane and the drawing's plane above which the entity is rejected.
 """
-
-
-class Stroke(abc.ABC):
-    """One segment of an entity."""
-
-    curved: bool
-    """Whether the segment's ends are joints (see `Loop`)."""
-    least: int
-    """Number of intervals into which the segment is divided when its extent is measured."""
-
-    @abc.abstractmethod
-    def intervals(self, spacing: float) -> int:
-        """Return the number of intervals needed for points about `spacing` (mm) apart.
-
-        A polygonal line ignores `spacing` and returns its number of corners."""
-
-    @abc.abstractmethod
-    def points(self, count: int) -> NDArray[np.complex128]:
-        """Return points (mm, as x + iy) along the segment, including both ends.
-
-        `count`: number of intervals. A spline may return more points than `count` + 1. A polygonal
-        line ignores `count` and returns its corners."""
+_SPATIAL = ("LINE", "SPLINE")
+"""Kinds of entities whose points are in the drawing's coordinates, so that their stated plane is
+ignored."""
 
 
 @dataclasses.dataclass(frozen=True)
-class _Corners(Stroke):
-    """A polygonal line: corners joined by straight lines."""
+class Stroke:
+    """One piece of an entity: a polygonal line, an arc of a circle or ellipse, or a spline.
 
-    corners: NDArray[np.complex128]
-    curved = False
-    least = 1
+    `rough`: some points (mm, as x + iy) along it, for its extent; of a polygonal line, the corners.
+    `at`: function that returns points along the stroke, both ends included, from the number of
+    intervals. `length`: approximate length (mm). `spans`: number of smooth parts in which intervals
+    are equal, 0 for a polygonal line."""
 
-    def intervals(self, spacing: float) -> int:
-        del spacing
-        return len(self.corners)
-
-    def points(self, count: int) -> NDArray[np.complex128]:
-        del count
-        return self.corners
-
-
-@dataclasses.dataclass(frozen=True)
-class _Ellipse(Stroke):
-    """An elliptic or circular arc: the points center + major cos t + minor sin t.
-
-    The angle t runs from start to start + sweep (rad)."""
-
-    center: complex
-    major: complex
-    minor: complex
-    start: float
-    sweep: float
-    curved = True
-    least = _FEWEST
+    rough: NDArray[np.complex128]
+    at: Callable[[int], NDArray[np.complex128]] | None = None
+    length: float = 0.0
+    spans: int = 0
 
     def intervals(self, spacing: float) -> int:
-        return _bounded(abs(self.major) * abs(self.sweep) / spacing)
+        """Return the number of intervals for points about `spacing` (mm) apart.
 
-    def points(self, count: int) -> NDArray[np.complex128]:
-        t = self.start + self.sweep * np.arange(count + 1) / count
-        return self.center + self.major * np.cos(t) + self.minor * np.sin(t)
+        Of a polygonal line, return the number of its corners."""
+        if not self.spans:
+            return len(self.rough)
+        count = math.ceil(min(max(_FEWEST, self.length / spacing), _MOST))
+        return self.spans * max(_PER_SPAN, math.ceil(count / self.spans))
 
-
-@dataclasses.dataclass(frozen=True)
-class _Spline(Stroke):
-    """A spline in homogeneous coordinates (x, y, weight), sampled evenly between its knots."""
-
-    curve: BSpline
-    knots: NDArray[np.float64]
-    curved = True
-    least = 64
-
-    def intervals(self, spacing: float) -> int:
-        length = np.sum(np.abs(np.diff(self.points(self.least))))
-        spans = len(self.knots) - 1
-        return spans * max(_PER_SPAN, math.ceil(_bounded(length / spacing) / spans))
-
-    def points(self, count: int) -> NDArray[np.complex128]:
-        spans = len(self.knots) - 1
-        each = -(-count // spans)
-        shares = np.arange(each) / each
-        inside = self.knots[:-1, None] + np.diff(self.knots)[:, None] * shares
-        x, y, weight = self.curve(np.append(inside.ravel(), self.knots[-1])).T
-        return (x + 1j * y) / weight
+    def points(self, spacing: float) -> NDArray[np.complex128]:
+        """Return points (mm, as x + iy) about `spacing` (mm) apart, both ends included."""
+        return self.rough if self.at is None else self.at(self.intervals(spacing))
 
 
-def _bounded(count: float) -> int:
-    return math.ceil(min(max(_FEWEST, count), _MOST))
-
-
-def chain(parts: list[Stroke], spacing: float) -> Loop:
+def chain(strokes: list[Stroke], spacing: float, unit: float) -> Loop:
     """Return the points on one entity, about `spacing` (mm) apart on curves, as an open `Loop`.
 
-    `parts`: the entity's segments in order. The ends of arcs and splines are joints."""
+    `strokes`: those of the entity in order; `unit`: length (mm) of the drawing's unit. The ends of
+    arcs and splines are joints."""
     points, joints = [], []
-    for segment in parts:
-        own = segment.points(segment.intervals(spacing))
+    for stroke in strokes:
+        own = stroke.points(spacing)
         marks = np.zeros(len(own), bool)
-        marks[[0, -1]] = segment.curved
+        marks[[0, -1]] = stroke.spans > 0
         if points:
             joints[-1][-1] |= marks[0]
             own, marks = own[1:], marks[1:]
         points.append(own)
         joints.append(marks)
-    return Loop(np.concatenate(points), np.concatenate(joints))
+    return Loop(np.concatenate(points), np.concatenate(joints), unit)
 
 
-@dataclasses.dataclass(frozen=True)
-class Entity:
-    """One entity of a drawing, in the drawing's units.
+def strokes(entity: Any, scale: float, name: str) -> list[Stroke]:
+    """Return the strokes of an ezdxf `entity`, or an empty list if it has no extent.
 
-    `kind`: DXF type; `what`: name in messages; `normal`: normal of the entity's plane; `data`:
-    first arguments of the function in `_KINDS` that makes the segments."""
+    `scale`: mm per drawing unit; `name`: name of the drawing in messages. Raises `InputError` if
+    the entity cannot be read or is not valid."""
+    kind = entity.dxftype()
+    with guarded(name, f"{kind} cannot be read", "repair or remove it in the drawing"):
+        handle = short(entity.dxf.handle or "unknown", 20)
 
-    kind: str
-    what: str
-    normal: tuple[float, ...]
-    data: tuple[Any, ...]
+        def fault(must: str, but: str) -> InputError:
+            return InputError(
+                f"{name}: {kind} (handle {handle}) must {must}, but {but}; repair or remove it in "
+                "the drawing, or draw the outline alone on a layer OUTLINE"
+            )
 
-    @classmethod
-    def of(cls, entity: Any, name: str) -> "Entity":
-        """Build the entity from an ezdxf `entity`. `name`: name of the drawing in messages.
-
-        Raises `InputError` if the entity cannot be read."""
-        kind = entity.dxftype()
-        with guarded(name, f"{kind} cannot be read", "repair or remove it in the drawing"):
-            handle = short(entity.dxf.handle or "unknown", 20)
-            normal = tuple(float(x) for x in entity.dxf.get("extrusion", (0, 0, 1)))
-            data = _KINDS[kind][0](entity)
-        return cls(kind, f"{name}: {kind} (handle {handle})", normal, data)
-
-    def segments(self, scale: float) -> list[Stroke]:
-        """Return the entity's segments in mm, or an empty list if it has no extent.
-
-        `scale`: mm per drawing unit. Raises `InputError` if the entity is not valid.
-        """
-        fault, across = _Fault(self.what), abs(self.normal[2])
-        if self.kind not in _SPATIAL and math.hypot(*self.normal[:2]) > _TILT * across:
+        x, y, z = entity.dxf.get("extrusion", (0, 0, 1))
+        if kind not in _SPATIAL and math.hypot(x, y) > _TILT * abs(z):
             raise fault("lie in the plane of x and y", "is in another")
-        made = _KINDS[self.kind][1](*self.data, _Plane(scale, self.normal[2] < 0), fault)
-        with np.errstate(all="ignore"):
-            whole = all(np.all(np.isfinite(s.points(s.least))) for s in made)
-        if not whole:
+        made = _KINDS[kind](entity, scale, fault)
+        if not all(np.all(np.isfinite(stroke.rough)) for stroke in made):
             raise fault("have a finite size", "has none")
-        return made
+    return made
 
 
-@dataclasses.dataclass(frozen=True)
-class _Plane:
-    """An entity's plane. `scale`: mm per drawing unit; `below`: whether it is seen from below."""
-
-    scale: float
-    below: bool
-
-    def __call__(self, z: Any) -> Any:
-        """Convert points or vectors `z` = x + iy from the entity's plane to the drawing's (mm).
-
-        CAD stores mirrored entities in a plane seen from below, whose x axis is reversed."""
-        return self.scale * (-np.conj(z) if self.below else z)
-
-
-@dataclasses.dataclass(frozen=True)
-class _Fault:
-    """Builds the `InputError` for one entity. `what`: name of the entity in messages."""
-
-    what: str
-
-    def __call__(self, must: str, but: str) -> InputError:
-        return InputError(
-            f"{self.what} must {must}, but {but}; repair or remove it in the drawing, or draw the "
-            "outline alone on a layer OUTLINE"
-        )
-
-
-def _plain(points: Iterable[Any]) -> NDArray[np.complex128]:
-    """Convert the library's points (x, y) or (x, y, z) to complex numbers x + iy; z is dropped."""
+def _plain(points: Iterable[Any], scale: float) -> NDArray[np.complex128]:
+    """Convert the library's points to complex numbers x + iy (mm); z is dropped."""
     rows = np.array([(p[0], p[1]) for p in points], float).reshape(-1, 2)
-    return rows[:, 0] + 1j * rows[:, 1]
+    return scale * (rows @ [1, 1j])
 
 
-def _read_line(entity: Any):
-    return (_plain([entity.dxf.start, entity.dxf.end]),)
-
-
-def _line(ends, plane, fault) -> list[Stroke]:
+def _line(entity: Any, scale: float, fault) -> list[Stroke]:
     del fault
-    return [_Corners(plane.scale * ends)] if ends[0] != ends[1] else []
+    ends = _plain([entity.dxf.start, entity.dxf.end], scale)
+    return [Stroke(ends)] if ends[0] != ends[1] else []
 
 
-def _read_arc(entity: Any):
+def _arc(entity: Any, scale: float, fault) -> list[Stroke]:
     dxf = entity.dxf
-    numbers = (float(x) for x in (dxf.radius, dxf.start_angle, dxf.end_angle))
-    return _plain([dxf.center])[0], *numbers
+    if not dxf.radius > 0:
+        raise fault("have a radius above 0", f"has {dxf.radius:g}")
+    circle = ConstructionEllipse.from_arc(dxf.center, dxf.radius, dxf.extrusion)
+    sweep = math.radians((dxf.end_angle - dxf.start_angle) % 360 or 360)
+    return [_swept(circle, scale, math.radians(dxf.start_angle), sweep)]
 
 
-def _arc(center, radius, first, last, plane, fault) -> list[Stroke]:
-    if not radius > 0:
-        raise fault("have a radius above 0", f"has {radius:g}")
-    axis = radius * np.exp(1j * math.radians(first))
-    sweep = math.radians((last - first) % 360 or 360)
-    return [_Ellipse(plane(center), plane(axis), plane(1j * axis), 0.0, sweep)]
+def _ellipse(entity: Any, scale: float, fault) -> list[Stroke]:
+    if not min(entity.dxf.major_axis.magnitude, entity.minor_axis.magnitude) > 0:
+        raise fault("have axes longer than 0", "has not")
+    first, sweep = entity.dxf.start_param, (entity.dxf.end_param - entity.dxf.start_param)
+    sweep = sweep % math.tau if sweep % math.tau > _FULL else math.tau
+    return [_swept(entity.construction_tool(), scale, first % math.tau, sweep)]
 
 
-def _read_ellipse(entity: Any):
-    dxf = entity.dxf
-    center, major = _plain([dxf.center, dxf.major_axis])
-    minor = _plain([entity.minor_axis])[0]
-    return center, major, minor, float(dxf.start_param), float(dxf.end_param)
+def _swept(ellipse: ConstructionEllipse, scale: float, start: float, sweep: float) -> Stroke:
+    """Return the arc of an `ellipse` from the parameter `start` to `start` + `sweep` (rad)."""
+    axes = [ellipse.center, ellipse.major_axis, ellipse.minor_axis]
+    return _bow(*_plain(axes, scale), start, sweep)
 
 
-def _ellipse(center, major, minor, first, last, plane, fault) -> list[Stroke]:
-    if not min(abs(major), abs(minor)) > 0:
-        raise fault("have axes longer than 0", f"has {abs(major):g} and {abs(minor):g}")
-    first, sweep = first % math.tau, (last - first) % math.tau
-    sweep = sweep if sweep > _FULL else math.tau
-    center, major, minor = (plane.scale * x for x in (center, major, minor))
-    return [_Ellipse(center, major, minor, first, sweep)]
+def _bow(center: complex, major: complex, minor: complex, start: float, sweep: float) -> Stroke:
+    """Return the arc center + major cos t + minor sin t (mm) from t = `start` (rad)."""
+
+    def at(count: int) -> NDArray[np.complex128]:
+        t = start + sweep * np.arange(count + 1) / count
+        return center + major * np.cos(t) + minor * np.sin(t)
+
+    return Stroke(at(_FEWEST), at, abs(major) * abs(sweep), 1)
 
 
-def _read_spline(entity: Any):
-    if len(entity.control_points) == 0 and 2 < len(entity.fit_points) <= _FITTED:
-        tool = entity.construction_tool()
-        return _plain(tool.control_points), tool.degree, _floats(tool.knots()), _floats([])
-    controls = _plain(entity.control_points)
-    return controls, int(entity.dxf.degree), _floats(entity.knots), _floats(entity.weights)
-
-
-def _floats(values: Iterable[Any]) -> NDArray[np.float64]:
-    return np.array([float(x) for x in values], float)
-
-
-def _spline(controls, degree, knots, weights, plane, fault) -> list[Stroke]:
+def _spline(entity: Any, scale: float, fault) -> list[Stroke]:
+    controls, degree = entity.control_points, int(entity.dxf.degree)
+    knots, weights = (np.array(x, float) for x in (entity.knots, entity.weights))
+    if len(controls) == 0 and 2 < len(entity.fit_points) <= _FITTED:
+        fitted = entity.construction_tool()
+        controls, degree, knots = fitted.control_points, fitted.degree, np.array(fitted.knots())
+        weights = np.ones(0)
+    count = len(controls)
     if not 1 <= degree <= _DEGREES:
         raise fault(f"have a degree from 1 to {_DEGREES}", f"has {degree}")
-    count = len(controls)
     if count <= degree:
         raise fault(
             f"have more than {degree} control points (or 3 to {_FITTED} fit points)", f"has {count}"
         )
-    if len(knots) == 0:
-        inner = np.arange(1.0, count - degree)
-        knots = np.concatenate([np.zeros(degree + 1), inner, np.full(degree + 1, count - degree)])
+    knots = knots if len(knots) else np.array(open_uniform_knot_vector(count, degree + 1))
     if len(knots) != count + degree + 1:
         raise fault(f"have {count + degree + 1} knots", f"has {len(knots)}")
     if len(weights) not in (0, count) or not np.all(weights > 0):
@@ -291,67 +186,62 @@ def _spline(controls, degree, knots, weights, plane, fault) -> list[Stroke]:
     # Knots that differ by rounding only are one knot.
     first = np.append(0, np.cumsum(np.diff(knots) > _SAME_KNOT * np.ptp(knots)))
     knots = knots[np.unique(first, return_index=True)[1]][first]
-    domain = knots[degree : count + 1]
-    different, repeated = np.unique(domain, return_counts=True)
+    different, repeated = np.unique(knots[degree : count + 1], return_counts=True)
     if len(different) < 2 or np.any(repeated[1:-1] > degree):
         raise fault(f"have at most {degree} equal knots inside", "has more")
     weights = weights if len(weights) else np.ones(count)
-    points = plane.scale * controls * weights
-    controls = np.stack([points.real, points.imag, weights], axis=1)
-    return [_Spline(BSpline(knots, controls, degree), different)]
+    curve = BSpline(knots, np.stack([_plain(controls, scale) * weights, weights], 1), degree)
+
+    def at(count: int) -> NDArray[np.complex128]:
+        each = -(-count // (len(different) - 1))
+        inside = different[:-1, None] + np.diff(different)[:, None] * (np.arange(each) / each)
+        z, weight = curve(np.append(inside.ravel(), different[-1])).T
+        return z / weight
+
+    rough = at(_ROUGH)
+    length = float(np.sum(np.abs(np.diff(rough))))
+    return [Stroke(rough, at, length, len(different) - 1)]
 
 
-def _read_polyline(entity: Any):
-    if entity.dxftype() == "LWPOLYLINE":
-        rows = entity.get_points("xyb")
-        return _plain(rows), _floats(row[2] for row in rows), bool(entity.closed), False
-    if not (entity.is_2d_polyline or entity.is_3d_polyline):
-        return _plain([]), _floats([]), False, False  # A mesh.
-    # Control vertices of a spline-fitted polyline are not on the curve.
-    vertices = [v for v in entity.vertices if not int(v.dxf.flags) & _FRAME]
-    flat = bool(entity.is_2d_polyline)
-    bulges = _floats(v.dxf.get("bulge", 0.0) if flat else 0.0 for v in vertices)
-    points = _plain(v.dxf.location for v in vertices)
-    return points, bulges, bool(entity.is_closed), bool(entity.is_3d_polyline)
+def _polyline(entity: Any, scale: float, fault) -> list[Stroke]:
+    """Return the straight runs and arcs of a polyline.
 
-
-def _polyline(corners, bulges, closed, spatial, plane, fault) -> list[Stroke]:
-    """Return the straight runs and arcs (mm) of a polyline.
-
-    `corners`: corners x + iy; `bulges`: bulge of the side after each corner; `closed`: whether a
-    last side returns to the first corner; `spatial`: whether the corners are in the drawing's
-    coordinates. A side with a bulge is an arc; its bulge is the tangent of a quarter of the arc's
-    angle."""
+    A side with a bulge is an arc; its bulge is the tangent of a quarter of the arc's angle."""
     del fault
-    corners = plane.scale * corners if spatial else plane(corners)
-    bulges = -bulges if plane.below and not spatial else bulges
-    if closed and len(corners) > 1:
-        corners = np.append(corners, corners[0])
-    made: list[Stroke] = []
-    run = 0
-    steps = np.diff(corners)
-    for k in np.flatnonzero((np.abs(bulges[: len(steps)]) > _STRAIGHT) & (steps != 0)):
+    if entity.dxftype() == "LWPOLYLINE":
+        corners = entity.vertices_in_wcs()
+        bulges = [bulge for (bulge,) in entity.get_points("b")]
+    elif entity.is_2d_polyline or entity.is_3d_polyline:
+        # Control vertices of a spline-fitted polyline are not on the curve.
+        entity.vertices[:] = [v for v in entity.vertices if not int(v.dxf.flags) & _FRAME]
+        corners = entity.points_in_wcs()
+        bulges = [v.dxf.bulge if entity.is_2d_polyline else 0.0 for v in entity.vertices]
+    else:
+        return []  # A mesh.
+    z = _plain(corners, scale)
+    z = np.append(z, z[:1]) if entity.is_closed else z
+    # CAD mirrors a polyline by looking at its plane from below; its arcs then turn the other way.
+    turns = np.array(bulges[: len(z) - 1]) * (-1 if entity.dxf.extrusion.z < 0 else 1)
+    steps, made, run = np.diff(z), [], 0
+    for k in np.flatnonzero((np.abs(turns[: len(steps)]) > _STRAIGHT) & (steps != 0)):
         if k > run:
-            made.append(_Corners(corners[run : k + 1]))
+            made.append(Stroke(z[run : k + 1]))
         run = k + 1
-        center = corners[k] + steps[k] / 2 * (1 + 1j * (1 - bulges[k] ** 2) / (2 * bulges[k]))
-        axis, sweep = corners[k] - center, 4 * math.atan(bulges[k])
-        made.append(_Ellipse(center, axis, 1j * axis, 0.0, sweep))
-    if run < len(corners) - 1 and np.any(steps[run:] != 0):
-        made.append(_Corners(corners[run:]))
+        center = z[k] + steps[k] / 2 * (1 + 1j * (1 - turns[k] ** 2) / (2 * turns[k]))
+        axis = z[k] - center
+        made.append(_bow(center, axis, 1j * axis, 0.0, 4 * math.atan(turns[k])))
+    if np.any(steps[run:] != 0):
+        made.append(Stroke(z[run:]))
     return made
 
 
-_SPATIAL = ("LINE", "SPLINE")
-"""Kinds of entities whose points are in the drawing's coordinates, so that their stated plane is
-ignored."""
 _KINDS = {
-    "LINE": (_read_line, _line),
-    "ARC": (_read_arc, _arc),
-    "ELLIPSE": (_read_ellipse, _ellipse),
-    "SPLINE": (_read_spline, _spline),
-    "LWPOLYLINE": (_read_polyline, _polyline),
-    "POLYLINE": (_read_polyline, _polyline),
+    "LINE": _line,
+    "ARC": _arc,
+    "ELLIPSE": _ellipse,
+    "SPLINE": _spline,
+    "LWPOLYLINE": _polyline,
+    "POLYLINE": _polyline,
 }
-"""Two functions for each kind of entity. The first reads an entity's data from the library's object
-and is called inside `guarded`; the second makes segments from the data."""
+"""Function for each kind of entity that returns its strokes, from the library's object, the mm per
+drawing unit, and a function that makes the error for an entity that is not valid."""

@@ -1,14 +1,14 @@
 """Guards for calls to libraries that read a user's files.
 
-Any exception raised by a library becomes an `InputError`. The library's log records and warnings
-stay off the console. Guard only calls to the library, so that errors of this package stay visible.
+Any exception raised by a library becomes an `InputError`, with the exception as its cause. The
+library's log records and warnings stay off the console. Guard little else than calls to the
+library, because an error of this package would also read as a fault of the file.
 """
 
 import contextlib
 import logging
 import warnings
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 
@@ -21,12 +21,11 @@ _REASON = 120
 
 def short(value: object, width: int = 60) -> str:
     """Return `value` as printable text for a message, shortened to about `width` characters."""
-    text = value if isinstance(value, str) else str(value)
-    size = len(text)
-    text = text[:width] if size > width else text
+    whole = str(value)
+    text = whole[:width]
     if not text.isprintable():
         text = text.encode("unicode_escape").decode("ascii")[: 2 * width]
-    return f"{text}... ({size} characters)" if size > width else text
+    return f"{text}... ({len(whole)} characters)" if len(whole) > width else text
 
 
 @contextlib.contextmanager
@@ -58,26 +57,7 @@ def guarded(name: str, fault: str, remedy: str) -> Iterator[None]:
     except InputError:
         raise
     except Exception as error:
-        raise _error(error, name, fault, remedy) from error
-
-
-def each(items: Iterator[Any], name: str, fault: str, remedy: str) -> Iterator[Any]:
-    """Yield the items of a library's iterator.
-
-    Exceptions raised by the iterator become `InputError`, with `name`, `fault` and `remedy` as in
-    `guarded`. Exceptions raised by the code that uses the items pass unchanged."""
-    while True:
-        try:
-            item = next(items)
-        except StopIteration:
-            return
-        except Exception as error:
-            raise _error(error, name, fault, remedy) from error
-        yield item
-
-
-def _error(error: Exception, name: str, fault: str, remedy: str) -> InputError:
-    reason = short(" ".join(str(error).split()), _REASON)
-    if not reason or isinstance(error, KeyError):
-        reason = f"{type(error).__name__} {reason}".strip()
-    return InputError(f"{name}: {fault}: {reason}; {remedy}")
+        reason = short(" ".join(str(error).split()), _REASON)
+        if not reason or isinstance(error, KeyError):
+            reason = f"{type(error).__name__} {reason}".strip()
+        raise InputError(f"{name}: {fault}: {reason}; {remedy}") from error
