@@ -4,7 +4,7 @@ import dataclasses
 import itertools
 
 import numpy as np
-from jaxtyping import Bool, Complex128
+from jaxtyping import Bool, Complex128, Float64
 from numpy.typing import NDArray
 
 _CUSP = 2.0
@@ -39,6 +39,11 @@ def signed_area(points: Complex128[np.ndarray, " n"]) -> float:
 
     The area is positive if the polygon runs counter-clockwise."""
     return float(np.sum(np.imag(np.conj(points) * np.roll(points, -1)))) / 2
+
+
+def lengths_along(points: Complex128[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+    """Return the length (mm) of the polygonal line from its first point to each of its `points`."""
+    return np.append(0.0, np.cumsum(np.abs(np.diff(points))))
 
 
 @dataclasses.dataclass(frozen=True)
