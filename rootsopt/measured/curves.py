@@ -13,10 +13,12 @@ import numpy as np
 from jaxtyping import Bool, Complex128, Float64
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline, make_interp_spline, make_splprep, splprep
+from scipy.ndimage import maximum_filter1d
 
 from rootsopt.errors import InputError
 from rootsopt.measured.estimates import Estimates
 from rootsopt.measured.guard import guarded
+from rootsopt.measured.loop import lengths_along
 
 _TURNING = 0.3
 """Length (pitch radii) that contributes as much to a curve's parameter as a turn of 1 rad."""
@@ -83,54 +85,38 @@ class MeasuredCurve:
         return parts
 
 
-@dataclasses.dataclass(frozen=True)
-class Frame:
-    """Points and tangents of a curve that runs from the tip towards the root.
-
-    `z` (n,): points (mm); `tangent` (n,): unit tangents; `speed` (n,): |z′| (mm per unit of t);
-    `turning` (n,): rate at which the tangent turns (rad per unit of t)."""
-
-    z: NDArray[np.complex128]
-    tangent: NDArray[np.complex128]
-    speed: NDArray[np.float64]
-    turning: NDArray[np.float64]
-
-    @property
-    def normal(self) -> NDArray[np.complex128]:
-        """Outward unit normals (n,)."""
-        return -1j * self.tangent
-
-
 def stretch(
     curve: MeasuredCurve, place: int, low: float, high: float, count: int
-) -> tuple[NDArray[np.float64], Frame]:
-    """Return (parameters, `Frame` at them): `count` samples of one piece of `curve`.
+) -> tuple[NDArray, ...]:
+    """Return (t, z, direction, speed, turning): `count` samples of one piece of `curve`.
 
-    The samples run from t = `low` to t = `high`; `place`: index of the piece. The data hardly
-    determine the curve next to a cusp, where z′ vanishes. The last intervals before the cusp are
-    therefore not sampled, and the tangent and its turning are extrapolated to the cusp.
-    """
-    ends = np.array([low, high])
-    speed = np.abs(curve.derivatives(np.linspace(low, high, count), place)[1])
-    cusp = speed[[0, -1]] < _CUSP * np.mean(speed)
-    knots = np.unique(curve.pieces[place].t)
-    cusp &= len(knots) > 2 * _SPARED
+    The samples run from t = `low` to t = `high`; `place`: index of the piece. Points z are in mm;
+    `direction` (rad) is that of the outward normal, for a curve from the tip to the root; `speed`
+    is |z′| (mm per unit of t), and `turning` the rate at which the tangent turns (rad per unit of
+    t).
+
+    The data hardly determine the curve next to a cusp, where z′ vanishes. The last intervals before
+    the cusp are therefore not sampled, and the tangent and its turning are extrapolated to the
+    cusp."""
+    t = np.linspace(low, high, count)
+    speed = np.abs(curve.derivatives(t, place)[1])
+    slow, knots = _CUSP * np.mean(speed), np.unique(curve.pieces[place].t)
+    cusp = (speed[[0, -1]] < slow) & (len(knots) > 2 * _SPARED)
     if np.any(cusp):
-        fast = np.linspace(low, high, count)[speed > _CUSP * np.mean(speed)]
+        fast = t[speed > slow]
         spared = [max(knots[_SPARED], fast[0]), min(knots[-1 - _SPARED], fast[-1])]
-        ends = np.where(cusp, spared, ends)
-    t = np.linspace(ends[0], ends[1], count - int(np.sum(cusp)))
-    t = np.concatenate([[low][: int(cusp[0])], t, [high][: int(cusp[1])]])
+        ends = np.where(cusp, spared, [low, high])
+        t = np.linspace(ends[0], ends[1], count - int(np.sum(cusp)))
+        t = np.concatenate([[low][: int(cusp[0])], t, [high][: int(cusp[1])]])
     z, first, second, _ = curve.derivatives(t, place)
     speed = np.abs(first)
-    safe = np.where(speed > 0, speed, 1.0)
-    tangent, turning = first / safe, np.imag(np.conj(first) * second) / safe**2
+    turning = np.imag(np.conj(first) * second) / np.where(speed > 0, speed, 1.0) ** 2
+    direction = np.angle(-1j * first)
     for end, inside in ((0, 1), (-1, -2)):
         if cusp[end]:
-            turning[end] = turning[inside]
-            tangent[end] = tangent[inside] * np.exp(1j * turning[end] * (t[end] - t[inside]))
-            speed[end] = 0.0
-    return t, Frame(z, tangent, speed, turning)
+            turning[end], speed[end] = turning[inside], 0.0
+            direction[end] = direction[inside] + turning[end] * (t[end] - t[inside])
+    return t, z, direction, speed, turning
 
 
 def through(
@@ -183,7 +169,7 @@ def through(
 
 def _smoothed(points: NDArray[np.complex128], smoothing: float, seen: Estimates) -> MeasuredCurve:
     """Return the smoothest quintic spline at an RMS distance `smoothing` (mm) from the points."""
-    t = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(points)))])
+    t = lengths_along(points)
     sides = [np.real(points), np.imag(points)]
     squares = len(points) * smoothing**2
     with guarded(_KEY, "its points cannot be smoothed", "check `profile.outline_smoothing_mm`"):
@@ -230,35 +216,26 @@ def _jumps(points: NDArray[np.complex128]) -> NDArray[np.bool_]:
         return found
     # Entry i belongs to point i + 1.
     curvature, _ = _curvature(points)
-    before, after = (
-        2 * curvature[1:-3] - curvature[:-4],
-        2 * curvature[3:-1] - curvature[4:],
-    )
-    # Entry i belongs to point i + 3.
-    jump = np.abs(before - after)
+    # Entry i belongs to point i + 3. Extrapolate the curvature to it from both sides.
+    ahead, behind = 2 * curvature[3:-1] - curvature[4:], 2 * curvature[1:-3] - curvature[:-4]
+    jump = np.abs(behind - ahead)
     size = np.abs(curvature[1:-3]) + np.abs(curvature[3:-1])
     # At a cusp between convex and concave, curvature grows without bound on both sides.
     bend = np.abs(curvature)
     grows = (bend[3:-5] > bend[1:-7]) & (bend[2:-6] > bend[:-8])
     grows &= (bend[5:-3] > bend[7:-1]) & (bend[6:-2] > bend[8:])
     grows &= curvature[3:-5] * curvature[5:-3] < 0
-    growth = np.where(grows, np.minimum(bend[3:-5], bend[5:-3]), 0.0)
-    cusps = [
-        m + 5
-        for m in np.flatnonzero(jump[2:-2] > 0.9 * size[2:-2])
-        if 0 < growth[m] == np.max(growth[max(m - _BESIDE, 0) : m + _BESIDE + 1])
-    ]
-    found[cusps] = True
-    for i in np.flatnonzero(jump > _JUMP * size):
-        if any(abs(cusp - i - 3) <= _BESIDE for cusp in cusps):
-            continue
-        near = jump[max(i - _BESIDE, 0) : i + _BESIDE + 1]
-        around = np.concatenate(
-            [
-                jump[max(i - _AROUND, 0) : max(i - _BESIDE, 0)],
-                jump[i + _BESIDE + 1 : i + _AROUND + 1],
-            ]
-        )
-        usual = np.median(around) if len(around) else np.inf
-        found[i + 3] = jump[i] == np.max(near) and jump[i] > _ABOVE * usual
+    growth = np.pad(np.where(grows, np.minimum(bend[3:-5], bend[5:-3]), 0.0), 2)
+    cusp = (jump > 0.9 * size) & (growth > 0) & (growth == _beside(growth))
+    joint = (jump > _JUMP * size) & (jump == _beside(jump)) & ~_beside(cusp)
+    for i in np.flatnonzero(joint):
+        before = jump[max(i - _AROUND, 0) : max(i - _BESIDE, 0)]
+        around = np.append(before, jump[i + _BESIDE + 1 : i + _AROUND + 1])
+        joint[i] = jump[i] > _ABOVE * np.median(around)
+    found[3:-3] = cusp | joint
     return found
+
+
+def _beside(values: NDArray) -> NDArray:
+    """Return the greatest of the `values` within `_BESIDE` places of each."""
+    return maximum_filter1d(values, 2 * _BESIDE + 1)

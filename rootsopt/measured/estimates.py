@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Complex128
 from numpy.typing import NDArray
 
-from rootsopt.measured.loop import signed_area
+from rootsopt.measured.loop import moment, signed_area
 
 UNITS = {"mm": 1.0, "cm": 10.0, "m": 1e3, "um": 1e-3, "inch": 25.4}
 """Length (mm) of each unit that the points of a file may have."""
@@ -220,11 +220,11 @@ def scatter(points: Complex128[np.ndarray, " n"]) -> tuple[float, float]:
     distance of the neighbours. The scatter is NaN if the deviations grow by `_GROWTH`; all of them
     is then the error of interpolation. Otherwise, this error is what the growth leaves for it."""
     spacing = float(np.median(np.abs(np.diff(points))))
-    stride, found = 1, _least(points, 1)
+    stride, found = 1, _across(points, 1)
     while found > stride * spacing / _CLEAR and len(points) / (2 * stride) >= _FEWEST:
         stride *= 2
-        found = _least(points, stride)
-    wider = _least(points, 2 * stride)
+        found = _across(points, stride)
+    wider = _across(points, 2 * stride)
     if found < SEEN:
         return found, found
     if not wider < _GROWTH * found:
@@ -233,32 +233,28 @@ def scatter(points: Complex128[np.ndarray, " n"]) -> tuple[float, float]:
     return math.sqrt(found**2 - error**2), error
 
 
-def _least(points: NDArray[np.complex128], stride: int) -> float:
+def _across(points: NDArray[np.complex128], stride: int) -> float:
     """Return the scatter of `points` as in `scatter`, with neighbours `stride` points apart.
 
     It includes the error of the polynomial. NaN if there are too few points."""
-    return min(_across(points, half, stride) for half in _NEIGHBOURS)
-
-
-def _across(points: NDArray[np.complex128], half: int, stride: int) -> float:
-    """Return the scatter of `points` as in `scatter`, from one number of neighbours.
-
-    `half`: number of neighbours on each side; `stride`: their distance, in points."""
-    if len(points) <= 2 * half * stride:
-        return math.nan
-    steps = np.array([k for k in range(-half, half + 1) if k]) * stride
-    chosen = np.arange(0, len(points), 1 + len(points) // _MOST)
-    around = points[(chosen[:, None] + steps) % len(points)]
-    along = around[:, -1] - around[:, 0]
-    local = (around - points[chosen, None]) * np.conj(along / np.abs(along))[:, None]
-    x, y = local.real, local.imag
-    # Lagrange's weights of the neighbours for the value at x = 0.
-    apart = x[:, None, :] - x[:, :, None]
-    ratio = x[:, None, :] / np.where(apart == 0, 1.0, apart)
-    ratio[:, range(len(steps)), range(len(steps))] = 1.0
-    weight = np.prod(ratio, axis=2)
-    deviation = np.sum(weight * y, axis=1) / np.sqrt(1 + np.sum(weight**2, axis=1))
-    return float(_MEDIAN * np.median(np.abs(deviation)))
+    found = []
+    for half in _NEIGHBOURS:
+        if len(points) <= 2 * half * stride:
+            break
+        steps = np.array([k for k in range(-half, half + 1) if k]) * stride
+        chosen = np.arange(0, len(points), 1 + len(points) // _MOST)
+        around = points[(chosen[:, None] + steps) % len(points)]
+        along = around[:, -1] - around[:, 0]
+        local = (around - points[chosen, None]) * np.conj(along / np.abs(along))[:, None]
+        x, y = local.real, local.imag
+        # Lagrange's weights of the neighbours for the value at x = 0.
+        apart = x[:, None, :] - x[:, :, None]
+        ratio = x[:, None, :] / np.where(apart == 0, 1.0, apart)
+        ratio[:, range(len(steps)), range(len(steps))] = 1.0
+        weight = np.prod(ratio, axis=2)
+        deviation = np.sum(weight * y, axis=1) / np.sqrt(1 + np.sum(weight**2, axis=1))
+        found.append(float(_MEDIAN * np.median(np.abs(deviation))))
+    return min(found, default=math.nan)
 
 
 def center(points: Complex128[np.ndarray, " n"], lobes: int) -> tuple[complex, float]:
@@ -268,38 +264,29 @@ def center(points: Complex128[np.ndarray, " n"], lobes: int) -> tuple[complex, f
     of the lobes. Its coefficients and the centre minimise the sum of squared distances of the
     points from this outline (Gauss-Newton steps, from the centroid of the area)."""
     chosen = points[:: 1 + len(points) // _MOST]
-    step = np.roll(points, -1) - points
-    nodes, weights = np.polynomial.legendre.leggauss(2)
-    z = points[:, None] + step[:, None] * (1 + nodes) / 2
-    first = np.sum(np.conj(z) * z * step[:, None] * weights / 2) / 2j
-    place = complex(first / signed_area(points))
+    place, error = moment(points, 1) / signed_area(points), math.nan
     orders = lobes * np.arange(1, 1 + min(_HARMONICS, len(chosen) // (4 * lobes)))
-    error = math.nan
     for _ in range(_PASSES):
         away = chosen - place
         radius, angle = np.abs(away), np.angle(away)
         cos, sin = np.cos(angle[:, None] * orders), np.sin(angle[:, None] * orders)
         series = np.concatenate([np.ones((len(angle), 1)), cos, sin], axis=1)
-        shape = np.linalg.solve(series.T @ series, series.T @ radius)
-        a, b = np.split(shape[1:], 2)
+        a, b = np.split(np.linalg.solve(series.T @ series, series.T @ radius)[1:], 2)
         slope = (cos * b - sin * a) @ orders
         across = radius / np.hypot(radius, slope)
-        # The derivatives include the change of radius and angle of every point.
-        east, north = np.cos(angle), np.sin(angle)
-        by_x = -east - slope * north / radius
-        by_y = -north + slope * east / radius
-        rows = np.concatenate([series, -by_x[:, None], -by_y[:, None]], axis=1)
-        rows *= across[:, None]
+        # A move of the centre changes radius and angle of every point.
+        by_move = away / radius * (1 - 1j * slope / radius)
+        rows = np.column_stack([series, by_move.real, by_move.imag]) * across[:, None]
         inverse = np.linalg.pinv(rows.T @ rows, rcond=1e-12, hermitian=True)
         found = inverse @ (rows.T @ (radius * across))
-        move = complex(found[-2], found[-1])
+        move = complex(*found[-2:])
         place += move
         off = radius * across - rows @ found
-        free = max(1, len(chosen) - rows.shape[1])
-        error = float(np.sqrt(np.sum(off**2) / free * (inverse[-1, -1] + inverse[-2, -2]) / 2))
+        variance = np.sum(off**2) / max(1, len(chosen) - rows.shape[1])
+        error = float(np.sqrt(variance * (inverse[-1, -1] + inverse[-2, -2]) / 2))
         if not abs(move) > _STILL * np.max(radius):
             break
-    return place, error
+    return complex(place), error
 
 
 __all__ = ["UNITS", "Estimates", "center", "estimates", "scatter", "unit_of_size"]

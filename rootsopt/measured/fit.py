@@ -1,7 +1,7 @@
 """Makes a profile from the closed loop of an outline."""
 
 import dataclasses
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from rootsopt.errors import InputError
-from rootsopt.measured.checks import Checks
-from rootsopt.measured.curves import Frame, MeasuredCurve, stretch, through
+from rootsopt.measured.curves import MeasuredCurve, stretch, through
 from rootsopt.measured.estimates import Estimates, estimates
-from rootsopt.measured.loop import Loop, signed_area
+from rootsopt.measured.loop import Loop, lengths_along, moment, signed_area
 from rootsopt.profiles.outline import Outline, Table
 
 _MM = 1e-3
@@ -58,9 +57,59 @@ _MANY = 20.0
 _TRIED = 100_000
 """Number of points above which no values of the smoothing are tried for a message. A trial takes
 20 µs per point."""
-_ESTIMATED = ("scatter_um", "interpolation_um", "center_x_mm", "center_y_mm", "center_error_um")
-"""Names of the fields of `Checks` that may be NaN."""
 _GAUSS = np.polynomial.legendre.leggauss(12)
+
+
+@dataclasses.dataclass(frozen=True)
+class Checks:
+    """Deviations and margins of an imported outline.
+
+    `points`: number of points of the outline as read, without repeated points.
+    `turned_deg`: angle (°) by which the outline was turned to put a lobe's axis on +x.
+    `reversed`: whether the points ran clockwise as read.
+    `axis_offset_um`: distance (µm) of the outline's centroid from the rotor's axis.
+    `lobe_deviation_um`: greatest normal distance between a flank and the mean of the same flank of
+    all lobes (µm).
+    `flank_deviation_um`: greatest normal distance between the mean leading flank and the mirrored
+    mean trailing flank (µm).
+    `fit_deviation_um`: RMS distance of the leading flank's points from the fitted curve (µm); 0 if
+    the curve passes through them.
+    `star_margin_mm`: least distance (mm) between a tangent of the flank and the rotor's axis,
+    negative if a tangent passes the axis on the wrong side.
+    `convexity_margin_mm`: least radius of curvature of the addendum (mm).
+    `axis`: rotor's axis in the file, as x + iy (mm). `seen`: estimates of scatter and of the centre
+    about this axis.
+    `notes`: what the reader converted, chose or changed.
+    """
+
+    points: int
+    turned_deg: float
+    reversed: bool
+    axis_offset_um: float
+    lobe_deviation_um: float
+    flank_deviation_um: float
+    fit_deviation_um: float
+    star_margin_mm: float
+    convexity_margin_mm: float
+    seen: Estimates
+    axis: complex = 0j
+    notes: tuple[str, ...] = ()
+
+    def record(self) -> dict[str, Any]:
+        """Return the fields and the estimates for the result file; the axis is the config's.
+
+        `scatter_um`, `interpolation_um`: see `Estimates` (µm), NaN if unknown. `center_x_mm`,
+        `center_y_mm`: centre (mm) of the lobes' symmetry in the file; `center_error_um`: its
+        standard error (µm)."""
+        center = self.seen.center + self.axis
+        own = {key: value for key, value in vars(self).items() if key not in ("seen", "axis")}
+        return own | {
+            "scatter_um": self.seen.scatter / _MM,
+            "interpolation_um": self.seen.interpolation / _MM,
+            "center_x_mm": center.real,
+            "center_y_mm": center.imag,
+            "center_error_um": self.seen.center_error / _MM,
+        }
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,16 +181,13 @@ def imported(
 
         advising = seen if len(loop.points) > _TRIED else dataclasses.replace(seen, reads=reads)
         outline, checks = _imported(loop, lobes, pitch_radius_mm, smoothing_mm, advising)
-        there = seen.center + axis
-        checks = dataclasses.replace(checks, center_x_mm=there.real, center_y_mm=there.imag)
-    known = (value for name, value in checks.record().items() if name not in _ESTIMATED)
-    found = [*jax.tree.leaves(outline), *known]
-    if not all(np.all(np.isfinite(x)) for x in found):
+    found = [x for x in vars(checks).values() if isinstance(x, float)]
+    if not all(np.all(np.isfinite(x)) for x in (*jax.tree.leaves(outline), *found)):
         raise InputError(
             "`profile.outline_file` must hold a smooth outline, but the curve through its points "
             "is not finite; remove points that are much closer together than others"
         )
-    return outline, checks
+    return outline, dataclasses.replace(checks, seen=seen, axis=axis)
 
 
 def _imported(
@@ -155,7 +201,7 @@ def _imported(
     if backwards:
         points, joints = points[::-1], joints[::-1]
     _check_lobes(loop, lobes, pitch_radius_mm, smoothing_mm, seen)
-    turn = np.angle(_moment(points, lobes)) / lobes
+    turn = np.angle(moment(points, lobes)) / lobes
     points = points * np.exp(-1j * turn)
     how = lobes, pitch_radius_mm, smoothing_mm, seen
     flanks = [[_flank(points, joints, k, side, *how) for k in range(lobes)] for side in (1, -1)]
@@ -181,22 +227,18 @@ def _imported(
         if size := seen.sizing(pitch_radius_mm, loop.unit):
             raise InputError(f"{error}; or {size}") from None
         raise
-    centroid = _moment(points, 1) / signed_area(points)
+    centroid = moment(points, 1) / signed_area(points)
     checks = Checks(
         points=len(points),
         turned_deg=float(np.degrees(-turn)),
         reversed=bool(backwards),
         axis_offset_um=float(abs(centroid)) / _MM,
-        scatter_um=seen.scatter / _MM,
-        interpolation_um=seen.interpolation / _MM,
-        center_x_mm=seen.center.real,
-        center_y_mm=seen.center.imag,
-        center_error_um=seen.center_error / _MM,
         lobe_deviation_um=float(lobe_off) / _MM,
         flank_deviation_um=float(flank_off) / _MM,
         fit_deviation_um=own.off / _MM,
         star_margin_mm=star,
         convexity_margin_mm=convexity,
+        seen=seen,
     )
     return outline, checks
 
@@ -247,16 +289,6 @@ def _check_lobes(loop: Loop, lobes: int, radius: float, smoothing: float, seen: 
         )
 
 
-def _moment(points, order):
-    """Return ∬ z^order dA of a polygon, exactly, with the corners `points` (z = x + iy).
-
-    By Green's theorem, the moment is ∮ z̄ z^order dz / 2i."""
-    start, step = points, np.roll(points, -1) - points
-    nodes, weights = np.polynomial.legendre.leggauss(order // 2 + 2)
-    z = start[:, None] + step[:, None] * (1 + nodes) / 2
-    return np.sum(np.conj(z) * z**order * step[:, None] * weights / 2) / 2j
-
-
 def _flank(points, joints, lobe, side, lobes, radius, smoothing, seen) -> _Flank:
     """Return the leading (`side` = 1) or trailing (-1) flank of the lobe with index `lobe`.
 
@@ -277,45 +309,30 @@ def _flank(points, joints, lobe, side, lobes, radius, smoothing, seen) -> _Flank
     local, joints, angle = local[part], joints[part], angle[part]
     curve = through(local, joints, radius, smoothing, seen)
     low, high = curve.ends[[0, -1]]
-    scan = np.linspace(low, high, 4 * len(local))
-    z = curve(scan)[0]
 
-    lacking = InputError(
-        "`profile.outline_file` must have points all along every flank, but the one at "
-        f"{np.degrees(2 * np.pi * lobe / lobes):.4g} deg lacks its tip, root or pitch "
-        "crossing; add points"
-    )
-
-    def root(values, function):
-        i = np.flatnonzero((values[:-1] < 0) != (values[1:] < 0))
-        if len(i) == 0:
-            raise lacking
-        i = i[len(i) // 2]
-        if not function(scan[i]) * function(scan[i + 1]) <= 0:
-            raise lacking
-        found = brentq(function, scan[i], scan[i + 1], xtol=1e-13)
+    def root(low, high, function) -> float:
+        scan = np.linspace(low, high, 4 * len(local))
+        below = function(curve(scan)[0]) < 0
+        places = np.flatnonzero(below[:-1] != below[1:])
+        ends = scan[places[len(places) // 2] :][:2] if len(places) else scan[:2]
+        if not np.prod(function(curve(ends)[0])) <= 0:
+            raise InputError(
+                "`profile.outline_file` must have points all along every flank, but the one at "
+                f"{np.degrees(2 * np.pi * lobe / lobes):.4g} deg lacks its tip, root or pitch "
+                "crossing; add points"
+            )
+        found = brentq(lambda t: function(curve(np.array([t]))[0])[0], *ends, xtol=1e-13)
         return float(found)  # type: ignore[arg-type]
 
-    def point(t):
-        return curve(np.array([t]))[0][0]
-
-    tip = root(z.imag, lambda t: point(t).imag)
-    turned = z * np.exp(-1j * half)
-    end = root(turned.imag, lambda t: (point(t) * np.exp(-1j * half)).imag)
-    inside = (scan > tip) & (scan < end)
-    pitch = root(
-        np.where(inside, np.abs(z) - radius, np.where(scan <= tip, 1.0, -1.0)),
-        lambda t: abs(point(t)) - radius,
-    )
+    tip = root(low, high, np.imag)
+    end = root(low, high, lambda z: np.imag(z * np.exp(-1j * half)))
+    pitch = root(tip, end, lambda z: np.abs(z) - radius)
     # At a cusp on the pitch circle (EE) the radius hardly determines the parameter.
     near = curve.ends[np.abs(np.abs(curve(curve.ends)[0]) - radius) < _AT * radius]
     pitch = next((float(t) for t in near if tip < t < end), pitch)
-    if not tip < pitch < end:
-        raise lacking
     off = 0.0
     if smoothing > 0:
-        t = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(local)))])
-        off = float(np.sqrt(np.mean(np.abs(curve(t)[0] - local) ** 2)))
+        off = float(np.sqrt(np.mean(np.abs(curve(lengths_along(local))[0] - local) ** 2)))
     return _Flank(curve, tip, pitch, end, off)
 
 
@@ -336,8 +353,8 @@ def _distances(flank: _Flank, own: _Flank) -> NDArray[np.float64]:
     return np.real((place - z) * np.conj(normal))
 
 
-def _stretch(flank: _Flank, start: float, stop: float) -> list[tuple[NDArray[np.float64], Frame]]:
-    """Return (parameters, `Frame` at them) for each piece of a flank from `start` to `stop`.
+def _stretch(flank: _Flank, start: float, stop: float) -> list[tuple[NDArray, ...]]:
+    """Return the samples (see `stretch`) of each piece of a flank from `start` to `stop`.
 
     The pieces have `NODES` parameters in total. The parameter of a joint occurs in both adjacent
     pieces. Raises `InputError` if there are too many pieces."""
@@ -351,10 +368,9 @@ def _stretch(flank: _Flank, start: float, stop: float) -> list[tuple[NDArray[np.
     lengths = np.array([high - low for _, low, high in parts])
     counts = 2 + np.floor((NODES - 2 * len(parts)) * lengths / lengths.sum()).astype(int)
     counts[np.argmax(counts)] += NODES - counts.sum()
-    found = []
-    for (place, low, high), count in zip(parts, counts, strict=True):
-        found.append(stretch(flank.curve, place, low, high, int(count)))
-    return found
+    return [
+        stretch(flank.curve, *part, int(count)) for part, count in zip(parts, counts, strict=True)
+    ]
 
 
 def _outline(
@@ -368,7 +384,7 @@ def _outline(
     upper = _stretch(flank, flank.tip, flank.pitch)
     lower = _stretch(flank, flank.pitch, flank.root)
     t, z, direction, speed, turning = (
-        np.concatenate(rows) for rows in zip(*(_row(part) for part in upper + lower), strict=True)
+        np.concatenate(rows) for rows in zip(*(upper + lower), strict=True)
     )
     direction = _agreed(t, np.unwrap(direction))
     normal = np.exp(1j * direction)
@@ -415,11 +431,6 @@ def _outline(
         seal_width=jnp.asarray(_land(z[:NODES], radius, np.fmax(smoothing, seen.scatter)) * _MM),
     )
     return outline, star, float(np.min(curvature_radius))
-
-
-def _row(part: tuple[NDArray[np.float64], Frame]) -> tuple[NDArray, ...]:
-    t, found = part
-    return t, found.z, np.angle(found.normal), found.speed, found.turning
 
 
 def _agreed(t: NDArray[np.float64], direction: NDArray[np.float64]) -> NDArray[np.float64]:

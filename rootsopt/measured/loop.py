@@ -41,6 +41,16 @@ def signed_area(points: Complex128[np.ndarray, " n"]) -> float:
     return float(np.sum(np.imag(np.conj(points) * np.roll(points, -1)))) / 2
 
 
+def moment(points: Complex128[np.ndarray, " n"], order: int) -> complex:
+    """Return ∬ z^order dA of a polygon, exactly, with the corners `points` (z = x + iy).
+
+    By Green's theorem, the moment is ∮ z̄ z^order dz / 2i."""
+    step = np.roll(points, -1) - points
+    nodes, weights = np.polynomial.legendre.leggauss(order // 2 + 2)
+    z = points[:, None] + step[:, None] * (1 + nodes) / 2
+    return np.sum(np.conj(z) * z**order * step[:, None] * weights / 2) / 2j
+
+
 def lengths_along(points: Complex128[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
     """Return the length (mm) of the polygonal line from its first point to each of its `points`."""
     return np.append(0.0, np.cumsum(np.abs(np.diff(points))))

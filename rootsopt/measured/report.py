@@ -28,12 +28,11 @@ def say(config: Config, out: "Console") -> None:
     centre is not the rotor's axis. They also say whether a clearance was drawn into it."""
     if not config.profile.from_file:
         return
-    from rootsopt.measured.source import advice, estimates_of, note, outline_of
+    from rootsopt.measured.source import advice, outline_of  # As in `record`.
 
     profile, checks = outline_of(config.profile)
-    inset = ""
-    if not estimates_of(config.profile, checks).off_center:
-        inset = inset_note(conjugacy(profile).inset, config.contact.clearance_mm)
-    for message in (note(checks), *advice(config.profile, checks), inset):
-        if message:
-            out.print(message, soft_wrap=True, markup=False, highlight=False)
+    found = advice(config.profile, checks)
+    if not checks.seen.off_center:
+        found += filter(None, [inset_note(conjugacy(profile).inset, config.contact.clearance_mm)])
+    for message in found:
+        out.print(message, soft_wrap=True, markup=False, highlight=False)

@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rootsopt.errors import InputError
-from rootsopt.measured.checks import Checks
-from rootsopt.measured.estimates import Estimates, written
-from rootsopt.measured.fit import imported
+from rootsopt.measured.estimates import written
+from rootsopt.measured.fit import Checks, imported
 from rootsopt.measured.reading import JOIN, Sought, read, untangled
 from rootsopt.profiles.outline import Outline
 
@@ -21,8 +20,8 @@ _NOTABLE = 1.0
 _ECCENTRIC = 1e-3
 """Distance of the lobes' centre of symmetry from the origin (pitch radii) above which simulations
 are refused."""
-_ROUGH = 0.5
-"""Scatter (µm) of points that are not smoothed above which the user gets a note."""
+_ROUGH = 5e-4
+"""Scatter (mm) of points that are not smoothed above which the user gets a note."""
 
 
 def outline_of(config: "ProfileConfig") -> tuple[Outline, Checks]:
@@ -65,8 +64,7 @@ def check_center(config: "ProfileConfig") -> None:
     or differ by about this distance; its motion takes minutes and means nothing."""
     if not config.from_file or config.outline_center is not None:
         return
-    checks = outline_of(config)[1]
-    seen = estimates_of(config, checks)
+    seen = outline_of(config)[1].seen
     if (there := seen.centering()) and abs(seen.center) > _ECCENTRIC * config.pitch_radius_mm:
         raise InputError(
             "`profile.outline_file` must hold an outline around the rotor's axis, the origin, but "
@@ -74,47 +72,29 @@ def check_center(config: "ProfileConfig") -> None:
         )
 
 
-def estimates_of(config: "ProfileConfig", checks: Checks) -> Estimates:
-    """Return the estimates of an outline about the axis of its `config`."""
-    center = complex(checks.center_x_mm, checks.center_y_mm)
-    given = config.outline_center
-    axis = center if given == "fit" else complex(*(given or (0.0, 0.0)))
-    scatter, error = checks.scatter_um * 1e-3, checks.center_error_um * 1e-3
-    between = checks.interpolation_um * 1e-3
-    return Estimates(scatter, center - axis, error, config.pitch_radius_mm, between)
-
-
 def advice(config: "ProfileConfig", checks: Checks) -> list[str]:
-    """Return notes on how a file was read, and on scatter and centre that the config ignores.
+    """Return notes on flanks that differ, how a file was read, and what the config ignores.
 
-    `config`: the profile's config; `checks`: those of its outline."""
-    found = [f"outline: {text}" for text in checks.notes]
-    if config.outline_center == "fit":
-        center = complex(checks.center_x_mm, checks.center_y_mm)
-        found.append(
-            f"outline: the axis is the fitted centre of symmetry, {written(center)} mm in the "
-            f"file, to about {max(checks.center_error_um, 1e-3):.1g} um"
+    `config`: the profile's config; `checks`: those of its outline. Flanks that differ by `_NOTABLE`
+    or more need a note because the profile is made from one flank."""
+    seen, found = checks.seen, list(checks.notes)
+    if max(checks.lobe_deviation_um, checks.flank_deviation_um) >= _NOTABLE:
+        found.insert(
+            0,
+            "the leading flank next to +x represents all flanks, but lobes differ by up to "
+            f"{checks.lobe_deviation_um:.3g} um and the trailing flank differs from it by up to "
+            f"{checks.flank_deviation_um:.3g} um",
         )
-    seen = estimates_of(config, checks)
-    if seen.centering():
-        found.append(f"outline: {seen.centering()}")
-    smoothing = config.outline_smoothing_mm or 0.0
-    if seen.rough(smoothing) and checks.scatter_um > _ROUGH:
-        found.append(f"outline: {seen.remedy(smoothing)}")
-    elif math.isnan(checks.scatter_um) and checks.interpolation_um > _ROUGH:
-        found.append(f"outline: {seen.few}; add points if the forces must be more exact")
-    return found
-
-
-def note(checks: Checks) -> str | None:
-    """Return a note for the user if the flanks differ by `_NOTABLE` or more, otherwise `None`.
-
-    The note is needed because the profile is made from one flank and ignores such differences."""
-    worst = max(checks.lobe_deviation_um, checks.flank_deviation_um)
-    if worst < _NOTABLE:
-        return None
-    return (
-        "outline: the leading flank next to +x represents all flanks, but lobes differ by up to "
-        f"{checks.lobe_deviation_um:.3g} um and the trailing flank differs from it by up to "
-        f"{checks.flank_deviation_um:.3g} um"
-    )
+    if config.outline_center == "fit":
+        found.append(
+            f"the axis is the fitted centre of symmetry, {written(checks.axis)} mm in the file, to "
+            f"about {max(seen.center_error, 1e-6) * 1e3:.1g} um"
+        )
+    if seen.rough(smoothing := config.outline_smoothing_mm or 0.0) and seen.scatter > _ROUGH:
+        unsmooth = seen.remedy(smoothing)
+    elif math.isnan(seen.scatter) and seen.interpolation > _ROUGH:
+        unsmooth = f"{seen.few}; add points if the forces must be more exact"
+    else:
+        unsmooth = ""
+    found += filter(None, (seen.centering(), unsmooth))
+    return [f"outline: {text}" for text in found]

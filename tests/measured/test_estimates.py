@@ -120,14 +120,15 @@ def test_fitted_centre_replaces_the_origin(tmp_path, capsys):
     path = write(tmp_path / "shifted.csv", rotor() + (0.1 - 0.05j))
     config, _, checks = read(path)
     assert checks.lobe_deviation_um > 100
-    (text,) = advice(config, checks)
+    differ, text = advice(config, checks)
+    assert "represents all flanks" in differ
     assert "(0.1, -0.05) mm" in text
     assert "`profile.outline_center` = fit" in text
     for place in ("fit", "[0.1, -0.05]"):
         config, profile, checks = read(path, center=place)
         assert checks.lobe_deviation_um < 1e-3
         assert checks.axis_offset_um < 1e-3
-        assert complex(checks.center_x_mm, checks.center_y_mm) == pytest.approx(0.1 - 0.05j)
+        assert checks.seen.center + checks.axis == pytest.approx(0.1 - 0.05j)
         assert float(profile.outer_radius) == pytest.approx(np.max(np.abs(rotor())) * 1e-3)
     assert advice(*read(path, center="fit")[::2])[0].startswith("outline: the axis is the fitted")
     with pytest.raises(InputError, match=r"centre of symmetry is at \(60, 0\) mm"):
@@ -161,8 +162,8 @@ def test_unit_of_a_drawing_can_be_replaced(tmp_path):
         read(tmp_path / "points.dxf")
     keys = {"unit": "inch", "center": "fit", "smoothing_mm": 0.005}
     _, _, checks = read(tmp_path / "points.dxf", **keys)
-    assert checks.scatter_um == pytest.approx(5, rel=0.15)
-    assert checks.center_x_mm == pytest.approx(0.2, abs=4 * 5e-3 / np.sqrt(len(points)))
+    assert checks.record()["scatter_um"] == pytest.approx(5, rel=0.15)
+    assert checks.record()["center_x_mm"] == pytest.approx(0.2, abs=4 * 5e-3 / np.sqrt(len(points)))
 
 
 def test_a_wrong_pitch_radius_is_told_from_a_wrong_unit(tmp_path):
@@ -189,7 +190,7 @@ def test_refused_points_are_said_to_be_scattered(tmp_path, size):
             read(path, smoothing_mm=smoothing)
         smoothing *= 1.25
     config, _, checks = read(path, smoothing_mm=smoothing)
-    assert checks.scatter_um == pytest.approx(size, rel=0.15)
+    assert checks.record()["scatter_um"] == pytest.approx(size, rel=0.15)
     assert not any("scattered" in text for text in advice(config, checks))
 
 
@@ -201,7 +202,7 @@ def test_points_closer_than_they_scatter_are_to_be_thinned(tmp_path):
     with pytest.raises(InputError, match=r"um apart: keep one in 3"):
         read(path, smoothing_mm=0.005)
     path = write(tmp_path / "thin.csv", dense[::3])
-    assert read(path, smoothing_mm=0.006)[2].scatter_um == pytest.approx(5, rel=0.15)
+    assert read(path, smoothing_mm=0.006)[2].record()["scatter_um"] == pytest.approx(5, rel=0.15)
 
 
 @pytest.mark.parametrize("lobes", [2, 3, 4, 6])
