@@ -11,9 +11,9 @@ import itertools
 
 import numpy as np
 from jaxtyping import Bool, Complex128, Float64
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline, make_interp_spline, make_splprep, splprep
-from scipy.ndimage import maximum_filter1d
 
 from rootsopt.errors import InputError
 from rootsopt.measured.estimates import Estimates
@@ -238,4 +238,4 @@ def _jumps(points: NDArray[np.complex128]) -> NDArray[np.bool_]:
 
 def _beside(values: NDArray) -> NDArray:
     """Return the greatest of the `values` within `_BESIDE` places of each."""
-    return maximum_filter1d(values, 2 * _BESIDE + 1)
+    return np.max(sliding_window_view(np.pad(values, _BESIDE), 2 * _BESIDE + 1), axis=1)

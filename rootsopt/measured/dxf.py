@@ -162,7 +162,7 @@ def _check_tags(data: bytes, binary: bool, name: str) -> Counter[str]:
 
 
 def _raw(value: Any) -> bytes:
-    return value if isinstance(value, bytes) else str(value).encode()
+    return value if isinstance(value, bytes) else str(value).encode(errors="backslashreplace")
 
 
 def _sound(code: int, value: bytes) -> bool:

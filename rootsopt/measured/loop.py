@@ -1,4 +1,4 @@
-"""The points of a closed outline."""
+"""The points of a closed outline, and the small loops in which it crosses itself."""
 
 import dataclasses
 import itertools
@@ -79,28 +79,21 @@ def tails(points: Complex128[np.ndarray, " n"], most: int) -> list[Tail]:
     # Begin after the widest stretch without cusps, so that the two cusps of a tail are neighbours.
     gaps = np.diff(cusps, append=cusps[0] + count)
     begin = cusps[np.argmax(gaps)] + np.max(gaps) // 2
-    order = np.sort((cusps - begin) % count).tolist()
     reach = min(_BESIDE, count // 4)
     found: list[Tail] = []
     free = 0  # First index that belongs to no tail yet.
-    for i, j in itertools.pairwise(order):
-        around = (begin + np.arange(i - reach, j + reach + 1)) % count
-        if (
-            i >= free
-            and j - i < reach
-            and _runs_back(points[around][reach - 1 : reach + j - i + 1])
-        ):
-            found.append(_tail(points[around], around, reach, reach + j - i))
+    for i, j in itertools.pairwise(np.sort((cusps - begin) % count).tolist()):
+        if i < free or j - i >= reach:
+            continue
+        index = (begin + np.arange(i - reach, j + reach + 1)) % count
+        run = np.diff(points[index][reach - 1 : reach + j - i + 1])
+        # Between the cusps, the outline runs back along the step to the first, without turns.
+        back = np.all(np.real(run[1:] * np.conj(run[0])) < 0)
+        direct = abs(np.sum(run[1:])) > _STRAIGHT * np.sum(np.abs(run[1:]))
+        if back and direct:
+            found.append(_tail(points[index], index, reach, reach + j - i))
             free = j + 1
     return found
-
-
-def _runs_back(z: NDArray[np.complex128]) -> bool:
-    """Return whether the points after the second run back along the first step, without turns."""
-    steps = np.diff(z)
-    ahead = np.real(steps[1:] * np.conj(steps[0]))
-    way = np.sum(np.abs(steps[1:]))
-    return bool(np.all(ahead < 0) and abs(z[-1] - z[1]) > _STRAIGHT * way)
 
 
 def _tail(z: NDArray[np.complex128], index: NDArray[np.intp], i: int, j: int) -> Tail:
@@ -124,16 +117,6 @@ def _tail(z: NDArray[np.complex128], index: NDArray[np.intp], i: int, j: int) ->
     k, m = hits[0]
     at = complex(z[p + k] + first[k, m] * along[k, 0])
     return Tail(index[p + k + 1 : j + m + 1], at, size)
-
-
-def trimmed(loop: Loop, cut: list[Tail]) -> Loop:
-    """Return the `loop` without some of its `tails`: the crossings replace them, as joints."""
-    points, joints = loop.points.copy(), loop.joints.copy()
-    kept = np.ones(len(points), bool)
-    for tail in cut:
-        kept[tail.inner[1:]] = False
-        points[tail.inner[0]], joints[tail.inner[0]] = tail.at, True
-    return dataclasses.replace(loop, points=points[kept], joints=joints[kept])
 
 
 def place(z: complex) -> str:

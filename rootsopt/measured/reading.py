@@ -6,7 +6,7 @@ import math
 import os
 import stat
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from rootsopt.errors import InputError
 from rootsopt.measured.estimates import SEEN, SIZED, unit_of_size, written
 from rootsopt.measured.guard import short
 from rootsopt.measured.joining import JOIN, joined
-from rootsopt.measured.loop import Loop, place, signed_area, tails, trimmed
+from rootsopt.measured.loop import Loop, moment, place, signed_area, tails
 from rootsopt.measured.table import from_csv
 
 __all__ = ["JOIN", "Loop", "Sought", "read", "signed_area"]
@@ -55,7 +55,6 @@ _NOT_FILES = (
     (stat.S_ISDIR, "a folder"),
     (stat.S_ISFIFO, "a pipe"),
     (stat.S_ISSOCK, "a socket"),
-    (lambda mode: stat.S_ISCHR(mode) or stat.S_ISBLK(mode), "a device"),
 )
 
 
@@ -71,17 +70,12 @@ class Sought:
     center: Literal["fit"] | tuple[float, float] | None = None
 
 
-@dataclasses.dataclass(frozen=True)
-class _Shape:
-    """Centroid (mm, as x + iy) of a loop with lobes, and its least and greatest radius (mm)."""
+class _Shape(NamedTuple):
+    """A loop with lobes: centroid (mm, as x + iy), greatest radius, and its mean with the least."""
 
     center: complex
-    least: float
     most: float
-
-    @property
-    def middle(self) -> float:
-        return (self.least + self.most) / 2
+    middle: float
 
 
 def read(
@@ -132,27 +126,21 @@ def _joined(chains: list[Loop], sought: Sought | None, name: str, join: float) -
     loops, fault = joined(chains, name, join)
     if found := _rotor(loops, sought, name):
         return found
-    if opened := _wider(chains, sought, name, join):
-        gap, at = opened.gap
-        raise InputError(
-            f"{name}: the outline must be closed within {join:g} mm (`profile.outline_join_mm`), "
-            f"but its widest gap is {gap:.4g} mm, at {place(at)}; set `profile.outline_join_mm` = "
-            f"{_above(gap):.2g}, or join the ends in the drawing"
-        )
+    for wider in (step for step in _JOINS if sought and step > join and len(chains) > 1):
+        opened = None
+        with contextlib.suppress(InputError):  # Too many ends meet, or there are several rotors.
+            opened = _rotor(joined(chains, name, wider)[0], sought, name)
+        if opened is not None:
+            gap, at = opened.gap
+            raise InputError(
+                f"{name}: the outline must be closed within {join:g} mm "
+                f"(`profile.outline_join_mm`), but its widest gap is {gap:.4g} mm, at {place(at)}; "
+                f"set `profile.outline_join_mm` = {_above(gap):.2g}, or join the ends in the "
+                "drawing"
+            )
     if fault is not None:
         raise fault
     return _likely(loops, sought)
-
-
-def _wider(chains: list[Loop], sought: Sought | None, name: str, join: float) -> Loop | None:
-    """Return the rotor's loop that forms if gaps wider than `join` (mm) are closed, or `None`."""
-    if sought is None or len(chains) < 2:
-        return None
-    for wider in (step for step in _JOINS if step > join):
-        with contextlib.suppress(InputError):  # Too many ends meet, or there are several rotors.
-            if found := _rotor(joined(chains, name, wider)[0], sought, name):
-                return found
-    return None
 
 
 def _rotor(loops: list[Loop], sought: Sought | None, name: str) -> Loop | None:
@@ -161,14 +149,13 @@ def _rotor(loops: list[Loop], sought: Sought | None, name: str) -> Loop | None:
     Raises `InputError` if there are several such loops and none or more than one is at the axis."""
     if sought is None:
         return None
-    radius, found = sought.pitch_radius_mm, []
-    for loop in _largest(loops):
-        shape = _shape(loop.points, sought.lobes)
-        if shape and abs(shape.middle / radius - 1) < SIZED:
-            found.append((loop, shape))
-    given = sought.center
-    axis = 0j if given is None or given == "fit" else complex(*given)
-    near = [one for one in found if abs(one[1].center - axis) < radius / 2]
+    found = [
+        (loop, shape)
+        for loop, shape in _lobed(loops, sought)
+        if abs(shape.middle / sought.pitch_radius_mm - 1) < SIZED
+    ]
+    axis = complex(*sought.center) if isinstance(sought.center, tuple) else 0j
+    near = [one for one in found if abs(one[1].center - axis) < sought.pitch_radius_mm / 2]
     if len(found) > 1 and len(near) != 1:
         raise InputError(_several([shape for _, shape in near or found], bool(near), name))
     if not found:
@@ -207,16 +194,21 @@ def _likely(loops: list[Loop], sought: Sought | None) -> Loop:
 
     It is the largest with the rotor's lobes and with its size in another unit, or the largest with
     its lobes, or the largest of all."""
-    ordered = _largest(loops)
     if sought is None or len(loops) == 1:
-        return _noted(ordered[0], len(loops), "the largest")
-    lobed = [(one, shape) for one in ordered if (shape := _shape(one.points, sought.lobes))]
+        return _noted(_largest(loops)[0], len(loops), "the largest")
+    lobed = _lobed(loops, sought)
     sized = [one for one, s in lobed if unit_of_size(s.middle / one.unit, sought.pitch_radius_mm)]
-    return [*sized, *(one for one, _ in lobed), *ordered][0]
+    return [*sized, *(one for one, _ in lobed), *_largest(loops)][0]
 
 
 def _largest(loops: list[Loop]) -> list[Loop]:
     return sorted(loops, key=lambda loop: -abs(signed_area(loop.points)))[:_LOOPS]
+
+
+def _lobed(loops: list[Loop], sought: Sought) -> list[tuple[Loop, _Shape]]:
+    """Return the loops with the symmetry of the rotor's lobes and their shapes, largest first."""
+    shapes = ((loop, _shape(loop.points, sought.lobes)) for loop in _largest(loops))
+    return [(loop, shape) for loop, shape in shapes if shape is not None]
 
 
 def _shape(points: NDArray[np.complex128], lobes: int) -> _Shape | None:
@@ -232,8 +224,7 @@ def _shape(points: NDArray[np.complex128], lobes: int) -> _Shape | None:
     # A rotor is narrower between its tips: its hull is larger.
     if abs(area) > _CONVEX * ConvexHull(np.stack([z.real, z.imag], axis=1)).volume:
         return None
-    after = np.roll(z, -1)
-    center = np.sum((z + after) * np.imag(np.conj(z) * after)) / (6 * area)
+    center = moment(z, 1) / area
     angle, radius = np.angle(z - center), np.abs(z - center)
     order = np.argsort(angle)
     grid = np.arange(_RAYS) * 2 * np.pi / _RAYS
@@ -243,8 +234,8 @@ def _shape(points: NDArray[np.complex128], lobes: int) -> _Shape | None:
     others = np.delete(harmonics, slice(lobes - 1, None, lobes))
     if own < np.max(harmonics) or np.linalg.norm(others) > _UNLIKE * own:
         return None
-    middle = complex(np.mean(points) + center)
-    return _Shape(middle, float(np.min(radius)), float(np.max(radius)))
+    least, most = float(np.min(radius)), float(np.max(radius))
+    return _Shape(complex(np.mean(points) + center), most, (least + most) / 2)
 
 
 def _above(length: float) -> float:
@@ -259,9 +250,9 @@ def _bytes(path: Path, name: str) -> bytes:
     Raises `InputError` if `path` is not a regular file, or the file is unreadable, too large or
     empty."""
     try:
-        found = path.stat()
-        kind = next((what for test, what in _NOT_FILES if test(found.st_mode)), None)
-        if kind is not None:
+        mode = path.stat().st_mode
+        if not stat.S_ISREG(mode):
+            kind = next((what for test, what in _NOT_FILES if test(mode)), "a device")
             raise InputError(
                 f"`profile.outline_file` must be a file, but {name!r} is {kind}; give the path of "
                 "a .csv, .txt or .dxf file"
@@ -306,9 +297,9 @@ def _closed(loop: Loop, name: str, unit: str | None, sought: Sought | None) -> L
         )
     low, high = _SIZES
     # Check the greatest coordinate first, as the difference of large ones may overflow.
-    x, y = np.real(points), np.imag(points)
-    reach = float(max(np.max(np.abs(x)), np.max(np.abs(y))))
-    size = float(max(np.ptp(x), np.ptp(y))) if reach <= high else reach
+    sides = np.stack([points.real, points.imag])
+    reach = float(np.max(np.abs(sides)))
+    size = float(np.max(np.ptp(sides, axis=1))) if reach <= high else reach
     if not low <= size <= high:
         raise InputError(
             f"{name}: must hold an outline of {low:g} to {high:g} mm, but "
@@ -325,14 +316,13 @@ def _closed(loop: Loop, name: str, unit: str | None, sought: Sought | None) -> L
         )
     # Keep the last of coincident points; it is a joint if any of them is one.
     kept = np.flatnonzero(np.append(steps, gap) > _SAME * reach)
-    owner = np.searchsorted(kept, np.flatnonzero(loop.joints)) % len(kept)
     joints = np.zeros(len(kept), bool)
-    joints[owner] = True
+    joints[np.searchsorted(kept, np.flatnonzero(loop.joints)) % len(kept)] = True
     return dataclasses.replace(loop, points=points[kept], joints=joints)
 
 
 def untangled(loop: Loop, lobes: int, pitch_radius_mm: float) -> Loop:
-    """Return the loop without small swallow-tails.
+    """Return the loop without small swallow-tails: the crossings replace them, as joints.
 
     An offset curve has them where the offset exceeds the radius of curvature, as at the pitch
     circle of EE. A cutter that follows the curve cuts them off, so that the trimmed loop is the
@@ -351,19 +341,24 @@ def untangled(loop: Loop, lobes: int, pitch_radius_mm: float) -> Loop:
             f"`profile.outline_file` must hold an outline that does not cross itself, but it has "
             f"{where}; cut them off in the drawing, or remove their points"
         )
-    return dataclasses.replace(
-        trimmed(loop, found), notes=(*loop.notes, f"{where} are cut off where they cross")
-    )
+    points, joints = loop.points.copy(), loop.joints.copy()
+    kept = np.ones(len(points), bool)
+    for tail in found:
+        kept[tail.inner[1:]] = False
+        points[tail.inner[0]], joints[tail.inner[0]] = tail.at, True
+    notes = (*loop.notes, f"{where} are cut off where they cross")
+    return dataclasses.replace(loop, points=points[kept], joints=joints[kept], notes=notes)
 
 
 def _unit(points, unit: str | None, sought: Sought | None) -> str | None:
     """Return advice on the unit in which the `points` would fit the pitch radius, or `None`.
 
     `unit`, `sought`: as in `read`."""
+    if unit is not None or sought is None:
+        return None
     with np.errstate(all="ignore"):
         radius = np.abs(points - np.mean(points))
         middle = float(np.max(radius) + np.min(radius)) / 2
-    fitting = None if sought is None else unit_of_size(middle, sought.pitch_radius_mm)
-    if unit is not None or fitting is None:
-        return None
-    return f"in {fitting} it would fit the pitch radius: set `profile.outline_unit` = {fitting}"
+    if fitting := unit_of_size(middle, sought.pitch_radius_mm):
+        return f"in {fitting} it would fit the pitch radius: set `profile.outline_unit` = {fitting}"
+    return None

@@ -1,4 +1,4 @@
-"""Makes a profile from the outline file that a config names, and keeps recent results."""
+"""Makes a profile from the outline file that a config names, and says what the file holds."""
 
 import dataclasses
 import functools

@@ -65,12 +65,6 @@ class _Columns:
     unit: str | None = None
     angle: str | None = None
 
-    @property
-    def what(self) -> str:
-        """What a line of the table must hold, for messages."""
-        axes = "x and y" if self.angle is None else "r and theta, r"
-        return f"{axes} in {self.unit or 'mm'}"
-
 
 def from_csv(data: bytes, name: str, unit: str | None = None) -> list[Loop]:
     """Return the outlines (mm) in a table, in the order of its lines, as loops without joints.
@@ -122,13 +116,11 @@ def _comment(line: str) -> bool:
 
 def _separator(lines: list[str]) -> str | None:
     """Return the character that splits most lines into two numbers or more, `None` for blanks."""
-
-    def score(split: str | None) -> int:
-        cells = (_cells(line, split) for line in lines)
-        return sum(sum(_number(x) is not None for x in row[:2]) == 2 for row in cells)
-
     known = next((c for c in ";\t," if c in lines[0]), None)
-    return max((known, ";", "\t", None, ","), key=score)
+    return max(
+        (known, ";", "\t", None, ","),
+        key=lambda split: sum(_counted(_cells(line, split)) == 2 for line in lines),
+    )
 
 
 def _check_commas(rows: list[tuple[int, list[str]]], name: str) -> None:
@@ -181,17 +173,13 @@ def _named(axis: str, header: list[str]) -> tuple[int, str | None] | None:
     stated = rf"[\s_/]*(?:[(\[]\s*(?P<inside>.*?)\s*[)\]]|(?P<bare>{_UNIT}))|[\s_]+\w+"
     test = re.compile(f"(?:{_AXES[axis]})(?:{stated})?", re.IGNORECASE)
     cells = [(k, match) for k, cell in enumerate(header) if (match := test.fullmatch(cell.strip()))]
-    found = [(k, _unit(match["inside"] or match["bare"])) for k, match in cells]
-    if len(found) > 1:
-        found = [one for one in found if one[1] == "mm"]
+    found = []
+    for k, match in cells:
+        text, known = match["inside"] or match["bare"], (_LENGTHS | _ANGLES).items()
+        units = (unit for unit, test in known if re.fullmatch(test, text or "", re.IGNORECASE))
+        found.append((k, next(units, "?") if text else None))
+    found = found if len(found) == 1 else [one for one in found if one[1] == "mm"]
     return found[0] if len(found) == 1 else None
-
-
-def _unit(text: str | None) -> str | None:
-    """Return the unit that a header states as `text`: `None` for no text, "?" if not supported."""
-    units = (_LENGTHS | _ANGLES).items()
-    known = (unit for unit, test in units if re.fullmatch(test, text or "", re.IGNORECASE))
-    return next(known, "?") if text else None
 
 
 def _counted(cells: list[str]) -> int:
@@ -204,9 +192,10 @@ def _values(row: list[str], columns: _Columns, name: str, number: int) -> list[f
     cells = [row[k] if k < len(row) else "" for k in columns.places]
     found = [value for cell in cells if (value := _number(cell)) is not None]
     if len(found) < 2 or not all(map(math.isfinite, found)):
+        axes = "x and y" if columns.angle is None else "r and theta, r"
         raise InputError(
-            f"{name}, line {number}: must hold {columns.what}, but is {short(', '.join(row))!r}; "
-            "correct or remove the line"
+            f"{name}, line {number}: must hold {axes} in {columns.unit or 'mm'}, but is "
+            f"{short(', '.join(row))!r}; correct or remove the line"
         )
     return found
 
@@ -263,10 +252,8 @@ def _number(cell: str) -> float | None:
     """Convert a cell to float; return `None` for text that is not a number.
 
     A decimal comma is accepted: a cell with a comma that separates columns is in quotes."""
-    cell = cell.strip()
-    if cell.count(",") == 1 and "." not in cell:
-        cell = cell.replace(",", ".")
+    decimal = cell.count(",") == 1 and "." not in cell
     try:
-        return None if "_" in cell else float(cell)
+        return None if "_" in cell else float(cell.replace(",", ".") if decimal else cell)
     except ValueError:
         return None
