@@ -34,7 +34,7 @@ _FITTED = 5_000
 _SAME_KNOT = 1e-9
 """Difference between adjacent knots (fraction of their range) below which they become one knot."""
 _FULL = 1e-9
-"""Sweep (rad) below which an ELLIPSE is read as a full ellipse."""
+"""Sweep (rad) below which an arc is read as a full circle or ellipse."""
 _STRAIGHT = 1e-12
 """Absolute value of the bulge below which a side of a polyline is read as a straight line."""
 _FRAME = 16
@@ -120,7 +120,7 @@ def strokes(entity: Any, scale: float, name: str) -> list[Stroke]:
 def _plain(points: Iterable[Any], scale: float) -> NDArray[np.complex128]:
     """Convert the library's points to complex numbers x + iy (mm); z is dropped."""
     rows = np.array([(p[0], p[1]) for p in points], float).reshape(-1, 2)
-    return scale * (rows @ [1, 1j])
+    return scale * (rows[:, 0] + 1j * rows[:, 1])
 
 
 def _line(entity: Any, scale: float, fault) -> list[Stroke]:
@@ -133,23 +133,20 @@ def _arc(entity: Any, scale: float, fault) -> list[Stroke]:
     dxf = entity.dxf
     if not dxf.radius > 0:
         raise fault("have a radius above 0", f"has {dxf.radius:g}")
-    circle = ConstructionEllipse.from_arc(dxf.center, dxf.radius, dxf.extrusion)
-    sweep = math.radians((dxf.end_angle - dxf.start_angle) % 360 or 360)
-    return [_swept(circle, scale, math.radians(dxf.start_angle), sweep)]
+    how = dxf.center, dxf.radius, dxf.extrusion, dxf.start_angle, dxf.end_angle
+    return [_swept(ConstructionEllipse.from_arc(*how), scale)]
 
 
 def _ellipse(entity: Any, scale: float, fault) -> list[Stroke]:
     if not min(entity.dxf.major_axis.magnitude, entity.minor_axis.magnitude) > 0:
         raise fault("have axes longer than 0", "has not")
-    first, sweep = entity.dxf.start_param, (entity.dxf.end_param - entity.dxf.start_param)
-    sweep = sweep % math.tau if sweep % math.tau > _FULL else math.tau
-    return [_swept(entity.construction_tool(), scale, first % math.tau, sweep)]
+    return [_swept(entity.construction_tool(), scale)]
 
 
-def _swept(ellipse: ConstructionEllipse, scale: float, start: float, sweep: float) -> Stroke:
-    """Return the arc of an `ellipse` from the parameter `start` to `start` + `sweep` (rad)."""
-    axes = [ellipse.center, ellipse.major_axis, ellipse.minor_axis]
-    return _bow(*_plain(axes, scale), start, sweep)
+def _swept(ellipse: ConstructionEllipse, scale: float) -> Stroke:
+    center, major, minor = _plain([ellipse.center, ellipse.major_axis, ellipse.minor_axis], scale)
+    sweep = (ellipse.end_param - ellipse.start_param) % math.tau
+    return _bow(center, major, minor, ellipse.start_param, sweep if sweep > _FULL else math.tau)
 
 
 def _bow(center: complex, major: complex, minor: complex, start: float, sweep: float) -> Stroke:

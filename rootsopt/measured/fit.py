@@ -84,7 +84,6 @@ class Checks:
 
     points: int
     turned_deg: float
-    reversed: bool
     axis_offset_um: float
     lobe_deviation_um: float
     flank_deviation_um: float
@@ -93,6 +92,7 @@ class Checks:
     convexity_margin_mm: float
     seen: Estimates
     axis: complex = 0j
+    reversed: bool = False
     notes: tuple[str, ...] = ()
 
     def record(self) -> dict[str, Any]:
@@ -169,7 +169,9 @@ def imported(
                 "`profile.outline_center` must be x and y (mm), because the centre of symmetry "
                 "of this outline cannot be found; give both numbers"
             )
-        loop = dataclasses.replace(loop, points=loop.points - axis)
+        points, backwards = loop.points - axis, signed_area(loop.points) < 0
+        way = -1 if backwards else 1
+        loop = dataclasses.replace(loop, points=points[::way], joints=loop.joints[::way])
         seen = dataclasses.replace(seen, center=seen.center - axis)
 
         def reads(smoothing: float) -> bool:
@@ -187,24 +189,20 @@ def imported(
             "`profile.outline_file` must hold a smooth outline, but the curve through its points "
             "is not finite; remove points that are much closer together than others"
         )
-    return outline, dataclasses.replace(checks, seen=seen, axis=axis)
+    return outline, dataclasses.replace(checks, seen=seen, axis=axis, reversed=backwards)
 
 
 def _imported(
     loop: Loop, lobes: int, pitch_radius_mm: float, smoothing_mm: float, seen: Estimates
 ) -> tuple[Outline, Checks]:
-    """Return (profile, deviations) of a `loop` about the origin.
+    """Return (profile, deviations) of a counter-clockwise `loop` about the origin.
 
     `seen`: estimates for messages and for tolerances; for the rest, see `imported`."""
-    points, joints = loop.points, loop.joints
-    backwards = signed_area(points) < 0
-    if backwards:
-        points, joints = points[::-1], joints[::-1]
     _check_lobes(loop, lobes, pitch_radius_mm, smoothing_mm, seen)
-    turn = np.angle(moment(points, lobes)) / lobes
-    points = points * np.exp(-1j * turn)
-    how = lobes, pitch_radius_mm, smoothing_mm, seen
-    flanks = [[_flank(points, joints, k, side, *how) for k in range(lobes)] for side in (1, -1)]
+    turn = np.angle(moment(loop.points, lobes)) / lobes
+    points = loop.points * np.exp(-1j * turn)
+    how = points, loop.joints, lobes, pitch_radius_mm, smoothing_mm, seen
+    flanks = [[_flank(k, side, *how) for k in range(lobes)] for side in (1, -1)]
     own = flanks[0][0]
     apart = np.array([[_distances(flank, own) for flank in group] for group in flanks])
     mean = apart.mean(axis=1)
@@ -231,7 +229,6 @@ def _imported(
     checks = Checks(
         points=len(points),
         turned_deg=float(np.degrees(-turn)),
-        reversed=bool(backwards),
         axis_offset_um=float(abs(centroid)) / _MM,
         lobe_deviation_um=float(lobe_off) / _MM,
         flank_deviation_um=float(flank_off) / _MM,
@@ -247,8 +244,8 @@ def _check_lobes(loop: Loop, lobes: int, radius: float, smoothing: float, seen: 
     """Raise `InputError` unless the `loop` has this number of lobes around the origin.
 
     `radius`: pitch radius (mm); `smoothing`: RMS scatter (mm) to be removed; `seen`: estimates."""
-    points = loop.points if signed_area(loop.points) > 0 else loop.points[::-1]
-    size, there = seen.sizing(radius, loop.unit), seen.centering()
+    points, there = loop.points, seen.centering()
+    size = seen.sizing(radius, loop.unit)
     away = InputError(
         "`profile.outline_file` must hold an outline around the rotor's axis, the origin, but "
         f"it does not go round the origin once; {there or 'move the outline there'}"
@@ -289,7 +286,7 @@ def _check_lobes(loop: Loop, lobes: int, radius: float, smoothing: float, seen: 
         )
 
 
-def _flank(points, joints, lobe, side, lobes, radius, smoothing, seen) -> _Flank:
+def _flank(lobe, side, points, joints, lobes, radius, smoothing, seen) -> _Flank:
     """Return the leading (`side` = 1) or trailing (-1) flank of the lobe with index `lobe`.
 
     `points`, `joints`: points (mm) of the outline and mask of the joints; `lobes`: number of lobes;
@@ -315,7 +312,7 @@ def _flank(points, joints, lobe, side, lobes, radius, smoothing, seen) -> _Flank
         below = function(curve(scan)[0]) < 0
         places = np.flatnonzero(below[:-1] != below[1:])
         ends = scan[places[len(places) // 2] :][:2] if len(places) else scan[:2]
-        if not np.prod(function(curve(ends)[0])) <= 0:
+        if not (low < high and np.prod(function(curve(ends)[0])) <= 0):
             raise InputError(
                 "`profile.outline_file` must have points all along every flank, but the one at "
                 f"{np.degrees(2 * np.pi * lobe / lobes):.4g} deg lacks its tip, root or pitch "

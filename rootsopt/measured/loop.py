@@ -56,16 +56,10 @@ def lengths_along(points: Complex128[np.ndarray, " n"]) -> Float64[np.ndarray, "
     return np.append(0.0, np.cumsum(np.abs(np.diff(points))))
 
 
-@dataclasses.dataclass(frozen=True)
-class Tail:
-    """A swallow-tail: the outline runs forth, back and forth again between two cusps.
-
-    `inner`: indices of the points that trimming removes; `at`: crossing of the two forward runs
-    (mm, as x + iy); `size`: distance (mm) between the cusps."""
-
-    inner: NDArray[np.intp]
-    at: complex
-    size: float
+Tail = tuple[NDArray[np.intp], complex, float]
+"""A swallow-tail, in which the outline runs forth, back and forth again between two cusps: indices
+of the points that trimming removes, crossing of the two forward runs (mm, as x + iy), and distance
+(mm) between the cusps."""
 
 
 def tails(points: Complex128[np.ndarray, " n"], most: int) -> list[Tail]:
@@ -113,10 +107,10 @@ def _tail(z: NDArray[np.complex128], index: NDArray[np.intp], i: int, j: int) ->
         second = np.imag(np.conj(apart) * along) / area
     hits = np.argwhere((first >= 0) & (first < 1) & (second >= 0) & (second < 1))
     if len(hits) == 0:  # Too thin for a crossing: the runs lie on one another.
-        return Tail(index[p + 1 : q], complex(z[i] + z[j]) / 2, size)
+        return index[p + 1 : q], complex(z[i] + z[j]) / 2, size
     k, m = hits[0]
     at = complex(z[p + k] + first[k, m] * along[k, 0])
-    return Tail(index[p + k + 1 : j + m + 1], at, size)
+    return index[p + k + 1 : j + m + 1], at, size
 
 
 def place(z: complex) -> str:

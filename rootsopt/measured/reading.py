@@ -297,7 +297,7 @@ def _closed(loop: Loop, name: str, unit: str | None, sought: Sought | None) -> L
         )
     low, high = _SIZES
     # Check the greatest coordinate first, as the difference of large ones may overflow.
-    sides = np.stack([points.real, points.imag])
+    sides = np.stack([np.real(points), np.imag(points)])
     reach = float(np.max(np.abs(sides)))
     size = float(np.max(np.ptp(sides, axis=1))) if reach <= high else reach
     if not low <= size <= high:
@@ -331,21 +331,21 @@ def untangled(loop: Loop, lobes: int, pitch_radius_mm: float) -> Loop:
     if not found:
         return loop
     some = [
-        f"{place(tail.at)} ({np.degrees(np.angle(tail.at)):.5g} deg, {tail.size * 1e3:.3g} um long)"
-        for tail in found[:_NAMED]
+        f"{place(at)} ({np.degrees(np.angle(at)):.5g} deg, {size * 1e3:.3g} um long)"
+        for _, at, size in found[:_NAMED]
     ]
     more = f" and {len(found) - _NAMED} more" if len(found) > _NAMED else ""
     where = f"{len(found)} small loops (swallow-tails of an offset) at {', '.join(some)}{more}"
-    if max(tail.size for tail in found) > _TAIL * pitch_radius_mm:
+    if max(size for *_, size in found) > _TAIL * pitch_radius_mm:
         raise InputError(
             f"`profile.outline_file` must hold an outline that does not cross itself, but it has "
             f"{where}; cut them off in the drawing, or remove their points"
         )
     points, joints = loop.points.copy(), loop.joints.copy()
     kept = np.ones(len(points), bool)
-    for tail in found:
-        kept[tail.inner[1:]] = False
-        points[tail.inner[0]], joints[tail.inner[0]] = tail.at, True
+    for inner, at, _ in found:
+        kept[inner[1:]] = False
+        points[inner[0]], joints[inner[0]] = at, True
     notes = (*loop.notes, f"{where} are cut off where they cross")
     return dataclasses.replace(loop, points=points[kept], joints=joints[kept], notes=notes)
 

@@ -1,8 +1,6 @@
 """Reads points from a text table (CSV)."""
 
-import codecs
 import csv
-import dataclasses
 import io
 import itertools
 import math
@@ -21,7 +19,6 @@ _LONGEST = 100_000
 _TRIED = 100
 """Number of lines from which the character that separates the columns is found."""
 _REMEDY = "save the points as x,y in mm, one pair per line, as UTF-8 text"
-_WIDE = {codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
 _LACKING = re.compile(
     r"#(?:n/?a|nv|div/0!|value!|wert!|ref!|bezug!|name\?|num!|zahl!|null!)|n/?a|nan|null|none|-+",
     re.IGNORECASE,
@@ -53,19 +50,6 @@ _APART, _FEWEST = 5.0, 8
 least number of points of an outline in a table that holds several."""
 
 
-@dataclasses.dataclass(frozen=True)
-class _Columns:
-    """The two columns that count.
-
-    `places`: their indices; `unit`: unit of lengths that the header states, or `None`; `angle`:
-    unit of the polar angle ("deg", "rad", or "" if it must be told from the numbers), `None` for
-    Cartesian coordinates."""
-
-    places: tuple[int, int] = (0, 1)
-    unit: str | None = None
-    angle: str | None = None
-
-
 def from_csv(data: bytes, name: str, unit: str | None = None) -> list[Loop]:
     """Return the outlines (mm) in a table, in the order of its lines, as loops without joints.
 
@@ -93,16 +77,20 @@ def from_csv(data: bytes, name: str, unit: str | None = None) -> list[Loop]:
     titles = []
     while rows and _counted(rows[0][1]) < (1 if titles else 2):
         titles.append(rows.pop(0)[1])
-    columns = _columns(_headers(titles, heads), name)
-    values = np.array([_values(row, columns, name, number) for number, row in rows]).reshape(-1, 2)
-    points, notes = values @ [1, 1j], []
-    if columns.angle is not None:
-        angle = columns.angle or _angle(values[:, 1], name)
+    # If units stand below the names, both lines form one header.
+    joint = [" ".join(cells).strip() for cells in itertools.zip_longest(*titles, fillvalue="")]
+    places, stated, angle = _columns([joint, *titles[::-1], *heads[::-1]], name)
+    what = f"{'x and y' if angle is None else 'r and theta, r'} in {stated or 'mm'}"
+    values = np.array([_values(row, places, what, f"{name}, line {n}") for n, row in rows])
+    values, notes = values.reshape(-1, 2), []
+    points = values @ [1, 1j]
+    if angle is not None:
+        angle = angle or _angle(values[:, 1], name)
         points = values[:, 0] * np.exp(2j * np.pi * values[:, 1] / _TURN[angle])
         notes.append(f"the columns are read as polar coordinates r, theta ({angle})")
-    if unit is None and columns.unit not in (None, "mm"):
-        notes.append(f"lengths are read in {columns.unit}, as the header of the file says")
-    length = UNITS[unit or columns.unit or "mm"]
+    if unit is None and stated not in (None, "mm"):
+        notes.append(f"lengths are read in {stated}, as the header of the file says")
+    length = UNITS[unit or stated or "mm"]
     return [
         Loop(part * length, np.zeros(len(part), bool), length, notes=tuple(notes))
         for part in _parts(points)
@@ -134,20 +122,13 @@ def _check_commas(rows: list[tuple[int, list[str]]], name: str) -> None:
         )
 
 
-def _headers(titles: list[list[str]], comments: list[list[str]]) -> list[list[str]]:
-    """Return the lines that may name the columns, likely ones first.
+def _columns(headers: list[list[str]], name: str) -> tuple[tuple[int, int], str | None, str | None]:
+    """Return (indices of the columns, unit of lengths, unit of the polar angle) from the headers.
 
-    `titles`, `comments`: cells of the lines above the points, and of the lines that begin with #.
-    If units stand below the names, both lines form one header."""
-    joint = [" ".join(cells).strip() for cells in itertools.zip_longest(*titles, fillvalue="")]
-    return [joint, *titles[::-1], *comments[::-1]]
-
-
-def _columns(headers: list[list[str]], name: str) -> _Columns:
-    """Return the columns that the first of the `headers` names that names x and y, or r and theta.
-
-    Without such a header, these are the first two columns, x and y. Raises `InputError` if a header
-    states units that are not known or differ."""
+    The first of the `headers` that names x and y, or r and theta, counts. Without such a header,
+    the columns are the first two, x and y. A unit is `None` if none is stated. The unit of angle is
+    "deg", "rad", "" if it must be told from the numbers, or `None` for x and y. Raises `InputError`
+    if a header states units that are not known or differ."""
     for header, axes in itertools.product(headers, (("x", "y"), ("r", "theta"))):
         found = [_named(axis, header) for axis in axes]
         if None in found:
@@ -161,8 +142,8 @@ def _columns(headers: list[list[str]], name: str) -> _Columns:
                 f"{' and of angle deg or rad' if polar else ''}, but is {stated!r}; correct it, or "
                 "remove the units and set `profile.outline_unit`"
             )
-        return _Columns((first, second), one, (two or "") if polar else None)
-    return _Columns()
+        return (first, second), one, (two or "") if polar else None
+    return (0, 1), None, None
 
 
 def _named(axis: str, header: list[str]) -> tuple[int, str | None] | None:
@@ -187,15 +168,16 @@ def _counted(cells: list[str]) -> int:
     return sum(_number(x) is not None or bool(_LACKING.fullmatch(x.strip())) for x in cells[:2])
 
 
-def _values(row: list[str], columns: _Columns, name: str, number: int) -> list[float]:
-    """Return the two numbers of a line. `name`, `number`: file and line in messages."""
-    cells = [row[k] if k < len(row) else "" for k in columns.places]
+def _values(row: list[str], places: tuple[int, int], what: str, where: str) -> list[float]:
+    """Return the two numbers of a line at these `places`.
+
+    `what`: what they are, and `where`: file and line, for messages."""
+    cells = [row[k] if k < len(row) else "" for k in places]
     found = [value for cell in cells if (value := _number(cell)) is not None]
     if len(found) < 2 or not all(map(math.isfinite, found)):
-        axes = "x and y" if columns.angle is None else "r and theta, r"
         raise InputError(
-            f"{name}, line {number}: must hold {axes} in {columns.unit or 'mm'}, but is "
-            f"{short(', '.join(row))!r}; correct or remove the line"
+            f"{where}: must hold {what}, but is {short(', '.join(row))!r}; correct or remove the "
+            "line"
         )
     return found
 
@@ -227,7 +209,7 @@ def _parts(points: NDArray[np.complex128]) -> list[NDArray[np.complex128]]:
 
 
 def _text(data: bytes, name: str) -> str:
-    encoding = next((wide for mark, wide in _WIDE.items() if data.startswith(mark)), "utf-8-sig")
+    encoding = "utf-16" if data.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-8-sig"
     try:
         text = data.decode(encoding)
     except UnicodeDecodeError as error:
