@@ -3,12 +3,10 @@
 import importlib.util
 import json
 
-import ezdxf
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from ezdxf import units
 
 from experiments._common.polygons import pair_gap
 from rootsopt.commands.table import profile, simulate
@@ -18,7 +16,7 @@ from rootsopt.errors import InputError
 from rootsopt.measured.conjugacy import conjugacy, inset_note
 from rootsopt.measured.curves import _jumps
 from rootsopt.measured.fit import imported
-from rootsopt.measured.reading import Loop, read, signed_area
+from rootsopt.measured.loop import Loop
 from rootsopt.measured.source import advice, outline_of
 from rootsopt.optimize.design import optimize_design
 from rootsopt.profiles import CIC, EE, geometry, outline
@@ -68,9 +66,9 @@ def cut(points, by):
     return points + 1j * along / np.abs(along) * by
 
 
-def write(path, points, header="x_mm,y_mm", separator=","):
+def write(path, points):
     points = closed(points)
-    np.savetxt(path, points, fmt="%.10g", delimiter=separator, header=header, comments="")
+    np.savetxt(path, points, fmt="%.10g", delimiter=",", header="x_mm,y_mm", comments="")
     return path
 
 
@@ -239,76 +237,6 @@ def test_joints_are_seen():
     found = np.degrees(np.angle(points[np.roll(_jumps(np.roll(points, 77)), -77)]))
     assert np.sum(np.abs(found) < 59) == 8
     assert np.min(np.abs(found - 4)) < 1e-6
-
-
-@pytest.mark.parametrize(("header", "separator"), [("", ";"), ("name", "\t"), ("x_mm y_mm", " ")])
-def test_csv_dialects(tmp_path, header, separator):
-    points = points_of(CIC3, 60)
-    loop = read(write(tmp_path / "points.csv", points, header, separator))
-    assert np.array_equal(loop.points, points)
-
-
-def dxf(path, draw, units):
-    """Write a DXF file with what `draw` adds to its model space."""
-    document = ezdxf.new("R2010", units=units)
-    draw(document.modelspace())
-    document.saveas(path)
-    return read(path)
-
-
-def test_dxf_in_inches_of_polylines_and_lines(tmp_path):
-    """A polyline with arcs and loose lines in any order are scaled and joined.
-
-    The loop of the largest area is used."""
-    corners = [(0, 0, 0), (2, 0, 1), (2, 1, 0), (0, 1, 1)]
-
-    def slot(space):
-        space.add_lwpolyline(corners, format="xyb", close=True)
-        space.add_lwpolyline([(0.5, 0.2), (1, 0.2), (1, 0.6)], close=True)
-
-    loop = dxf(tmp_path / "slot.dxf", slot, units.IN)
-    # Chords of the arcs, at least 24 each: 1 - 2e-3 of their segments.
-    assert signed_area(loop.points) / 25.4**2 == pytest.approx(2 + np.pi / 4, rel=2e-3)
-    assert np.max(loop.points.real) / 25.4 == pytest.approx(2.5, abs=1e-4)
-
-    polygon = np.array([3, 3 + 2j, 1 + 2.5j, 2j, 0])
-    ends = list(zip(polygon, np.roll(polygon, -1), strict=True))
-
-    def lines(space):
-        for k in (2, 0, 4, 1, 3):
-            start, stop = ends[k][:: 1 if k % 2 else -1]
-            space.add_line((start.real, start.imag), (stop.real, stop.imag))
-
-    loop = dxf(tmp_path / "lines.dxf", lines, units.CM)
-    assert sorted(np.abs(loop.points)) == pytest.approx(sorted(10 * np.abs(polygon)))
-    assert abs(signed_area(loop.points)) == pytest.approx(100 * abs(signed_area(polygon)))
-
-
-def test_dxf_of_an_ellipse(tmp_path):
-    """A turned ellipse off the origin is read in millimetres if the file states no unit."""
-
-    def ellipse(space):
-        space.add_ellipse((5, 1), major_axis=(4, 3), ratio=0.6)
-
-    loop = dxf(tmp_path / "ellipse.dxf", ellipse, units.M * 0)
-    local = (loop.points - (5 + 1j)) / (0.8 + 0.6j)
-    assert np.hypot(local.real / 5, local.imag / 3) == pytest.approx(np.ones(len(local)))
-    assert abs(signed_area(loop.points)) == pytest.approx(np.pi * 15, rel=1e-3)
-
-
-def test_dxf_faults_are_named(tmp_path):
-    def gap(space):
-        space.add_line((0, 0), (1, 0))
-        space.add_line((1, 0), (1, 1))
-        space.add_line((1, 1), (0, 0.1))
-
-    with pytest.raises(InputError, match=r"closed within .*widest gap 0.1 mm"):
-        dxf(tmp_path / "gap.dxf", gap, units.MM)
-    with pytest.raises(InputError, match="must hold an outline of LINE, ARC"):
-        dxf(tmp_path / "none.dxf", lambda space: space.add_text("rotor"), units.MM)
-    (tmp_path / "no.dxf").write_text("x,y\n1,2\n")
-    with pytest.raises(InputError, match="is not a DXF file"):
-        read(tmp_path / "no.dxf")
 
 
 FAULTS = {

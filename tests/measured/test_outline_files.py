@@ -113,6 +113,9 @@ def test_malformed_tables(tmp_path, data, message):
         ("\t", True, "X [mm],Y [mm]", "utf-16"),
         (",", False, '"x","y"', "utf-8-sig"),
         (";", False, "Größe,Wert", "utf-8"),
+        (";", False, "", "utf-8"),
+        ("\t", False, "name", "utf-8"),
+        (" ", False, "x_mm,y_mm", "utf-8"),
     ],
 )
 def test_tables_of_spreadsheets(tmp_path, split, comma, header, encoding):
@@ -156,6 +159,11 @@ ENTITIES = {
     ),
     "empty polyline": (lambda s: s.add_lwpolyline([], close=True), "has none of them"),
     "one corner": (lambda s: s.add_lwpolyline([(1, 1)], close=True), "have no extent"),
+    "text": (lambda s: s.add_text("rotor"), "must hold an outline of LINE, ARC"),
+    "gap": (
+        lambda s: [s.add_line((0, 0), (1, 0)), s.add_lwpolyline([(1, 0), (1, 1), (0, 0.1)])],
+        r"closed within .*widest gap 0.1 mm",
+    ),
     "line of no length": (lambda s: s.add_line((1, 1), (1, 1)), "have no extent"),
     "another plane": (
         lambda s: s.add_arc((0, 0), 9, 0, 90, dxfattribs={"extrusion": (1, 0, 0)}),
@@ -261,6 +269,41 @@ def test_versions_of_drawings(tmp_path, version, fmt):
     assert loop.points == pytest.approx(ROTOR, abs=1e-9)
 
 
+def test_dxf_in_inches_of_polylines_and_lines(tmp_path):
+    """A polyline with arcs and loose lines in any order are scaled and joined.
+
+    The loop of the largest area is used."""
+    corners = [(0, 0, 0), (2, 0, 1), (2, 1, 0), (0, 1, 1)]
+
+    def slot(space):
+        space.add_lwpolyline(corners, format="xyb", close=True)
+        space.add_lwpolyline([(0.5, 0.2), (1, 0.2), (1, 0.6)], close=True)
+
+    loop = drawn(tmp_path / "slot.dxf", slot, units=units.IN)
+    # Chords of the arcs, at least 24 each: 1 - 2e-3 of their segments.
+    assert signed_area(loop.points) / 25.4**2 == pytest.approx(2 + np.pi / 4, rel=2e-3)
+    assert np.max(loop.points.real) / 25.4 == pytest.approx(2.5, abs=1e-4)
+
+    polygon = np.array([3, 3 + 2j, 1 + 2.5j, 2j, 0])
+    loop = drawn(
+        tmp_path / "lines.dxf", lambda s: lines(s, polygon, (2, 0, 4, 1, 3)), units=units.CM
+    )
+    assert sorted(np.abs(loop.points)) == pytest.approx(sorted(10 * np.abs(polygon)))
+    assert abs(signed_area(loop.points)) == pytest.approx(100 * abs(signed_area(polygon)))
+
+
+def test_dxf_of_an_ellipse(tmp_path):
+    """A turned ellipse off the origin is read in millimetres if the file states no unit."""
+
+    def ellipse(space):
+        space.add_ellipse((5, 1), major_axis=(4, 3), ratio=0.6)
+
+    loop = drawn(tmp_path / "ellipse.dxf", ellipse, units=0)
+    local = (loop.points - (5 + 1j)) / (0.8 + 0.6j)
+    assert np.hypot(local.real / 5, local.imag / 3) == pytest.approx(np.ones(len(local)))
+    assert abs(signed_area(loop.points)) == pytest.approx(np.pi * 15, rel=1e-3)
+
+
 def test_entities_seen_from_below(tmp_path):
     """CAD mirrors an arc or a polyline by reversing its normal; its x axis is then reversed."""
     below = {"extrusion": (0, 0, -1)}
@@ -275,6 +318,28 @@ def test_entities_seen_from_below(tmp_path):
         (-15, 15), rel=1e-4
     )
     assert abs(signed_area(loop.points)) == pytest.approx(200 + 25 * np.pi, rel=1e-3)
+
+
+def test_splines_are_sampled_on_the_exact_curve(tmp_path):
+    """Rational quarters of a circle, one with its degree raised to 12 (the library ends at 10)."""
+    quarter, weights = np.array([40, 40 + 40j, 40j]), np.array([1, np.sqrt(0.5), 1])
+
+    def draw(space):
+        points, weight = quarter * weights, weights.copy()
+        for turn in range(4):
+            while turn == 3 and len(weight) < 13:
+                share = np.arange(1, len(weight)) / len(weight)
+                points, weight = (
+                    np.array([x[0], *(share * x[:-1] + (1 - share) * x[1:]), x[-1]])
+                    for x in (points, weight)
+                )
+            spline = space.add_spline(degree=len(weight) - 1)
+            spline.control_points = [(z.real, z.imag) for z in points / weight * 1j**turn]
+            spline.weights, spline.knots = weight, [0.0] * len(weight) + [2.0] * len(weight)
+
+    loop = drawn(tmp_path / "circle.dxf", draw)
+    assert np.abs(loop.points) == pytest.approx(40, abs=1e-11)
+    assert np.sum(loop.joints) == 4
 
 
 def test_blocks(tmp_path):
@@ -319,29 +384,19 @@ def test_many_loose_lines_are_joined_in_order(tmp_path, monkeypatch):
 def test_what_does_not_belong_to_the_outline(tmp_path):
     """Repeated lines, centre lines from the axis or a corner, and a bore of arcs have no effect."""
 
-    def draw(space):
-        lines(space, ROTOR)
-        lines(space, ROTOR[:7])  # Six again, and a chord.
-        for end in (60, 60j, -60, -60j):
-            line(space, 0j, end)
-        line(space, ROTOR[30], 0j + 90)
-        space.add_arc((0, 0), 5, 0, 180)
-        space.add_arc((0, 0), 5, 180, 360)
-
     def clean(space):
         lines(space, ROTOR)
-        for k in range(6):
-            line(space, ROTOR[k + 1], ROTOR[k])
-        for end in (60, 60j, -60, -60j):
+        lines(space, ROTOR[6::-1], range(6))
+        for end in 60 * np.exp(2j * np.pi * np.arange(400) / 400):  # A dial: 400 ends at a place.
             line(space, 0j, end)
         line(space, ROTOR[30], 0j + 90)
-        space.add_arc((0, 0), 5, 0, 180)
-        space.add_arc((0, 0), 5, 180, 360)
+        for start in (0, 180):
+            space.add_arc((0, 0), 5, start, start + 180)
 
     loop = drawn(tmp_path / "clean.dxf", clean)
     assert sorted(loop.points, key=np.angle) == pytest.approx(sorted(ROTOR, key=np.angle))
     with pytest.raises(InputError, match=r"must not branch, but 3 ends meet at \("):
-        drawn(tmp_path / "chord.dxf", draw)
+        drawn(tmp_path / "chord.dxf", lambda s: [clean(s), line(s, ROTOR[6], ROTOR[0])])
 
 
 def test_a_gap_is_not_answered_with_the_bore(tmp_path):
