@@ -2,6 +2,7 @@
 
 Messages and results state the estimates. No estimate is used unless the config asks for it."""
 
+import contextlib
 import dataclasses
 import itertools
 import math
@@ -193,18 +194,17 @@ def unit_of_size(middle: float, pitch_radius: float) -> str | None:
 
 def estimates(points: Complex128[np.ndarray, " n"], lobes: int) -> Estimates:
     """Return estimates from the `points` (mm) of a closed outline with this number of `lobes`."""
+    spread = between = error = math.nan
+    middle = complex(math.nan)
     with np.errstate(all="ignore"):
-        try:
+        with contextlib.suppress(np.linalg.LinAlgError):
             spread, between = scatter(points)
-            if len(points) < _PER_FLANK * 2 * lobes:
-                spread = math.nan
             middle, error = center(points, lobes)
-        except np.linalg.LinAlgError:
-            spread, between = math.nan, math.nan
-            middle, error = complex(math.nan), math.nan
+        if len(points) < _PER_FLANK * 2 * lobes:
+            spread = math.nan
         radius = np.abs(points - middle)
         size = float(np.max(radius) + np.min(radius)) / 2
-        return Estimates(spread, middle, error, size, between)
+    return Estimates(spread, middle, error, size, between)
 
 
 def scatter(points: Complex128[np.ndarray, " n"]) -> tuple[float, float]:

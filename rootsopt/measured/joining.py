@@ -50,20 +50,20 @@ def joined(
     inner = _in_loops(vertex, links)
     branched = []
     for members in _groups(vertex, inner):
-        branches = np.flatnonzero(np.bincount(vertex[members].ravel()) > 2)
-        if len(branches):
-            branched.append((members, branches[0]))
+        if np.max(np.bincount(vertex[members].ravel())) > 2:
+            branched.append(members)
         else:
             loops.append(_connected(_walked(chains, members, vertex)))
     best = max((loop.points for loop in loops), key=lambda z: abs(signed_area(z)), default=None)
-    for members, branch in branched:
+    for members in branched:
         whole = np.concatenate([chains[k].points for k in members])
         if best is None or _extent(whole) >= _extent(best):
+            degree = np.bincount(vertex[members].ravel())
+            branch = int(np.argmax(degree > 2))
             at = complex(ends[vertex == branch][0])
             return loops, InputError(
-                f"{name}: an outline must not branch, but "
-                f"{np.count_nonzero(vertex[members] == branch)} ends meet at {place(at)}; remove "
-                f"the entities that do not belong to it, or {_ALONE}"
+                f"{name}: an outline must not branch, but {degree[branch]} ends meet at "
+                f"{place(at)}; remove the entities that do not belong to it, or {_ALONE}"
             )
     must = f"{name}: the outline must be closed within {join:g} mm (`profile.outline_join_mm`), but"
     if best is None:

@@ -387,7 +387,7 @@ def test_what_does_not_belong_to_the_outline(tmp_path):
     def clean(space):
         lines(space, ROTOR)
         lines(space, ROTOR[6::-1], range(6))
-        for end in 60 * np.exp(2j * np.pi * np.arange(400) / 400):  # A dial: 400 ends at a place.
+        for end in 60 * np.exp(2j * np.pi * np.arange(60) / 60):  # A dial: 60 ends at a place.
             line(space, 0j, end)
         line(space, ROTOR[30], 0j + 90)
         for start in (0, 180):
