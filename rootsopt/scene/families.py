@@ -135,7 +135,7 @@ def note_program(config: ProfileConfig) -> None:
     """Print a note on a family from outside whose programs would take long to compile.
 
     A simulation has dozens of copies of what computes a point of a flank."""
-    if is_shipped(config.family):
+    if is_shipped(config.family) or config.from_file:
         return
     profile = profile_of(
         config.family, config.lobes, jnp.asarray(config.pitch_radius_mm * MM), design_of(config)
