@@ -31,9 +31,11 @@ _UNITS: dict[str, tuple[str, dict[str, float]]] = {
     "_Pa": ("Pa", {"bar": 1e5, "kPa": 1e3, "MPa": 1e6, "mbar": 100.0}),
     "_per_K": ("1/K", {"1e-6/K": 1e-6}),
     "_K": ("K", {}),
-    "_force_N": ("N", {"kN": 1e3}),
+    "_N": ("N", {"kN": 1e3}),
     "_cm3": ("cm³", {"litres": 1e3, "mm³": 1e-3}),
     "_mm2": ("mm²", {"m²": 1e6, "cm²": 100.0}),
+    "_l_min": ("l/min", {}),
+    "_um": ("µm", {}),
 }
 
 
@@ -55,8 +57,8 @@ def si_unit(key: str) -> float:
 
 
 def words(key: str) -> str:
-    """Return a design parameter's name in words: `edge_radius_mm` gives "edge radius"."""
-    return key.removesuffix("_mm").removesuffix("_deg").replace("_", " ")
+    """Return the name of a quantity without its unit: `edge_radius_mm` gives "edge radius"."""
+    return without_unit(key).replace("_", " ").replace("rms ", "RMS ")
 
 
 def hint(key: object, value: float, low: float, high: float) -> str:

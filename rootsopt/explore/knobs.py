@@ -6,7 +6,7 @@ from typing import NamedTuple
 from rootsopt.config import Config
 from rootsopt.config.explain import all_keys, field_of, limits_of
 from rootsopt.config.families import family_of
-from rootsopt.config.units import unit_of, without_unit
+from rootsopt.config.units import unit_of, words
 from rootsopt.design.bounds import bounds_of
 
 _SECTIONS = ("profile", "rotor", "contact", "scene")
@@ -113,7 +113,7 @@ def _design(config: Config) -> list[Knob]:
         if not math.isfinite(high):
             high = _AROUND[1] * float(value)
         low, high = max(low, least), min(high, most)
-        name = without_unit(owner.key).replace("_", " ")
+        name = words(owner.key)
         if key != owner.key:
             name = f"{name.removesuffix('s')} {key.rpartition('_')[2]}"
         found.append(
@@ -141,7 +141,7 @@ def _scene(config: Config, key: str, value: float) -> Knob:
     low, high = max(low, least), min(high, most)
     section, _, name = key.rpartition(".")
     return Knob(
-        key, without_unit(name).replace("_", " "), unit_of(name), field.description or "",
+        key, words(name), unit_of(name), field.description or "",
         _GROUPS.get(section, section), float(value), low, high,
         1.0 if whole else _step(high - low), least, most, whole,
     ).with_value(float(value))  # fmt: skip

@@ -7,8 +7,7 @@ from rootsopt.config import Config
 from rootsopt.explore.knobs import Knob
 from rootsopt.explore.session import FromRest, NewMotion, Progress, Searched
 from rootsopt.optimize.search import Optimization
-from rootsopt.output.labels import change, in_words
-from rootsopt.report.names import brief, label, value
+from rootsopt.output.names import brief, in_words, label, percent, value
 from rootsopt.response.evaluation import RESPONSES, Evaluation
 from rootsopt.status import Status
 
@@ -25,9 +24,8 @@ def numbers_table(
     rows = []
     for key in keys:
         one, other = now.get(key), first.get(key)
-        percent = change(other, one).replace("-", "−") if one is not None else ""
-        shown = "" if percent in ("−", "+0.00 %", "−0.00 %", "0.00 %") else percent
-        cells = (label(key), value(one), value(other), shown)
+        change = percent(other, one)
+        cells = label(key), value(one), value(other), "" if change == "0.00 %" else change
         rows.append("".join(_cell(cell) for cell in cells))
     heads = "".join(f"<th>{head}</th>" for head in ("", "now", "at start", "change"))
     return _table(caption, heads, rows)

@@ -11,6 +11,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.lines import Line2D
 
+from rootsopt.config.units import words
 from rootsopt.figures.style import BLUE, COLORS, DASHES, GREY, ORANGE, VERMILION, figure
 from rootsopt.output.files import ResultFolder
 from rootsopt.tradeoffs.front import Front, Standing
@@ -128,9 +129,8 @@ def plot_designs(ax: Axes, front: Front, x: str) -> Axes:
             ends = [front.points[n - 1].terms[x] for n in (one, other)]
             ax.plot(ends, points[[one - 1, other - 1], k], color=color, linestyle=dashes)
         at = [point.terms[x] for point in front.points]
-        name = key.removesuffix("_mm").removesuffix("_deg").replace("_", " ")
         ax.plot(at, points[:, k], "o", color=color, markersize=4)
-        ax.plot([], [], "o", color=color, linestyle=dashes, markersize=4, label=name)
+        ax.plot([], [], "o", color=color, linestyle=dashes, markersize=4, label=words(key))
     ax.set(xlabel=_axis(aim), ylabel="design (0: lower, 1: upper bound)", ylim=(-0.05, 1.05))
     ax.legend(frameon=False, fontsize=8, ncols=math.ceil(len(keys[:12]) / 4))
     ax.grid(color="0.92", linewidth=0.6)

@@ -12,6 +12,7 @@ from rootsopt.figures.style import (
     figure,
 )
 from rootsopt.output.files import ResultFolder
+from rootsopt.output.names import label
 from rootsopt.response.result import Part
 
 _MARKERS = {"periodic": "o", "averaged": "s", "chaotic": "x", "not_settled": "+"}
@@ -19,7 +20,7 @@ _NO_FORCE = "v"
 _FEW = 24
 """Number of speeds above which a line has no markers at its steady motions, except at isolated
 ones."""
-LABELS = {"mean_force_N": "mean force (N)", "peak_force_N": "peak force (N)"}
+LABELS = {key: label(key) for key in ("mean_force_N", "peak_force_N")}
 
 
 def plot_speeds(ax: Axes, designs: Mapping[str, Sequence[Part]], force: str) -> Axes:
@@ -47,7 +48,7 @@ def plot_speeds(ax: Axes, designs: Mapping[str, Sequence[Part]], force: str) -> 
             (point,) = ax.plot(part.speed_rpm, height, marker, color=color, markersize=5.5)
             if not np.isfinite(value):
                 point.set_transform(ax.get_xaxis_transform())
-    ax.set(ylabel=LABELS.get(force, force.replace("_", " ")))
+    ax.set(ylabel=label(force))
     ax.grid(color="0.92", linewidth=0.6)
     ax.set_axisbelow(True)
     return ax

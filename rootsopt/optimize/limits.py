@@ -11,9 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from rootsopt.config import Config
+from rootsopt.config.units import unit_of, words
 from rootsopt.design.space import Constraint
 from rootsopt.errors import InputError
-from rootsopt.response.reporting import in_words, is_force, reporting, unit_in
+from rootsopt.response.reporting import is_force, reporting
 from rootsopt.response.terms import Forces, Term, needs_forces, terms_of
 from rootsopt.scene import Scene
 
@@ -46,12 +47,12 @@ class ForceLimit(NamedTuple):
     @property
     def name(self) -> str:
         """Name of the quantity in words."""
-        return in_words(self.key)
+        return words(self.key)
 
     @property
     def unit(self) -> str:
         """Unit of the quantity, empty if its name does not tell it."""
-        return unit_in(self.key)
+        return unit_of(self.key)
 
     @property
     def sense(self) -> str:
@@ -109,7 +110,7 @@ def term_constraints(config: Config, scene: Scene) -> tuple[TermConstraint, ...]
         if depends_on_forces(config, scene, name, LIMITS):
             continue
         (term,) = terms_of([name], LIMITS)
-        row = in_words(name), name, unit_in(name), jnp.asarray(limit), scale_of(limit), 1.0
+        row = words(name), name, unit_of(name), jnp.asarray(limit), scale_of(limit), 1.0
         found.append(TermConstraint(*row, ceiling=ceiling, term=term))
     return tuple(found)
 

@@ -1,28 +1,44 @@
-"""Tables for the terminal: evaluations, geometries, sweeps, and comparisons with the baseline.
+"""The facts of a run as tables, made from the content of the result file.
 
-They are plain ASCII and fit into 80 columns, so that they look the same in a pipe or a log.
-"""
+The terminal (`rootsopt.output.terminal`) and the report lay out the same tables."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from rich import box
-from rich.console import Group, RenderableType
-from rich.table import Table
-from rich.text import Text
-
-from rootsopt.output.labels import DASH
-from rootsopt.output.labels import change as _change
-from rootsopt.output.labels import fitting as _plain
-from rootsopt.output.labels import in_words as _words
-from rootsopt.output.labels import label_of as _label
-from rootsopt.output.labels import name_and_unit as _split
-from rootsopt.output.labels import number as _number
-from rootsopt.response.evaluation import Evaluation
+from rootsopt.config import Config
+from rootsopt.config.units import words
+from rootsopt.output.names import (
+    brief,
+    in_words,
+    label,
+    limit,
+    name_and_unit,
+    percent,
+    scalars,
+    signed,
+    stated,
+    value,
+)
+from rootsopt.output.table import Cell, Row, Table, status_cell, table
+from rootsopt.pump.sheet import NOTE, missing, warnings
+from rootsopt.response.records import RESPONSES, message_of
 from rootsopt.response.sensitivity import MICROMETRE
 from rootsopt.status import Status
+from rootsopt.tradeoffs.front import Standing
 
+Record = Mapping[str, Any]
+"""The result file, or an entry of it."""
+NAMES = {"baseline": "baseline", "nominal": "nominal member", "optimized": "optimised"}
+"""Names of the designs in the result file of an optimisation, by their key there."""
+_GROUPS = {
+    "response": "contact force",
+    "geometry": "geometry",
+    "margins": "margins of the flank",
+    "outline": "outline from a file",
+    "steady_state": "motion and status",
+}
+"""Headings of a record's entries."""
 _SHEET_FORCES = (
     "mean_force_N",
     "peak_force_N",
@@ -32,505 +48,492 @@ _SHEET_FORCES = (
     "tilting_moment_max_N_m",
 )
 """Keys of the forces that the pump sheet shows."""
-_STATISTICS = {
-    "mean": "mean",
-    "sigma": "standard deviation",
-    "quantile_95": "95 % quantile",
-    "worst": "worst",
-}
-_WIDEST_DESIGN = 5
-"""Number of design parameters above which the table of a front leaves out the designs."""
+_WIDEST = 6
+"""Number of motions above which the numbers that all of them share are omitted."""
 _UNSURE = 0.5
-"""Estimated share of further starts with a new optimum above which the table recommends more
-starts."""
-_Rows = Iterable[tuple[str | Text, ...]]
+"""Estimated share of further starts with a new optimum above which more starts are recommended."""
 
 
-def comparison_table(
-    baseline: Evaluation,
-    optimized: Evaluation,
-    constraints: list[dict[str, Any]],
-    improvement: Mapping[str, float],
-) -> RenderableType:
-    """Return a table that compares the optimised design with the baseline.
+def sections(
+    result: Record, rows: Sequence[Record] = (), most: int = 200
+) -> list[tuple[str, str, list[Table]]]:
+    """Return (anchor, title, tables) of each part of a result that has tables.
 
-    Changes are in % of the baseline. `constraints`: one row {name, baseline, optimized, limit,
-    unit, sense, satisfied, active} per constraint; `improvement`: reductions of the objective and
-    the forces, as fractions of the baseline."""
-    table = _table("Optimised rotor against baseline", "baseline", "optimised", "change")
-    first, second = baseline.record(), optimized.record()
-    _group(table, "design", _pairs(first["design"], second["design"]))
-    _group(table, "geometry", _pairs(first["geometry"], second["geometry"]))
-    response = _pairs(first["response"], second["response"])
-    _group(table, "response", [_objective(improvement), *response])
-    for heading, *rows in _gradients(first["gradient"], second["gradient"]):
-        _group(table, heading, [row[:3] for row in _pairs(*rows)])
-    for heading, *rows in _errors(first["steady_state"], second["steady_state"]):
-        _group(table, heading, [row[:3] for row in _pairs(*rows)])
-    _group(table, "constraints", map(_constraint, constraints))
-    _group(
-        table,
-        "status",
-        [
-            *(row[:3] for row in _pairs(first["steady_state"], second["steady_state"])),
-            ("status", _status(baseline), _status(optimized)),
-        ],
-    )
-    notes = [("baseline", baseline.message), ("optimised", optimized.message)]
-    if baseline.message == optimized.message:
-        notes = [("both", baseline.message)]
-    return Group(table, *(Text(f"{name}: {message}") for name, message in notes))
+    `result`: content of the result file; `rows`: those of a sweep, if the result does not hold
+    them; `most`: number of scenes above which their table is truncated."""
+    found = [
+        ("front", "Best compromises", front_tables(result)),
+        ("numbers", "Numbers", [numbers_table(result), *gradient_tables(result)]),
+        ("scenes", "Scenes", scene_tables(result, rows, most)),
+        ("certificate", "Certificate of the optimum",
+         [constraint_table(result), *certificate_tables(result), rejected_table(result)]),
+        ("tolerances", "Tolerances", [tolerance_table(result)]),
+        ("pump", "Pump sheet", [pump_table(result)]),
+        ("likeness", "Resemblance", likeness_tables(result)),
+    ]  # fmt: skip
+    kept = [(anchor, name, [one for one in tables if one]) for anchor, name, tables in found]
+    return [section for section in kept if section[2]]
 
 
-def nominal_table(
-    baseline: Mapping[str, Any],
-    nominal: Mapping[str, Any],
-    optimized: Mapping[str, Any],
-    improvement: Mapping[str, float],
-    over_nominal: Mapping[str, float],
-) -> RenderableType:
-    """Return a table of a measured baseline, its nominal member and the optimised design.
-
-    `baseline`, `nominal`, `optimized`: records in the result file; `improvement`, `over_nominal`:
-    reductions with respect to baseline and nominal member. Changes are in % of each."""
-    columns = "baseline", "nominal", "optimised", "change", "from nominal"
-    table = _table("Measured rotor, nominal member of the family, and optimum", *columns)
-    first, least = (1 - one.get("objective", math.nan) for one in (improvement, over_nominal))
-    rows = [("objective (baseline = 1)", 1.0, first / least, first)]
-    records = baseline, nominal, optimized
-    places = [("response", key) for key in _SHEET_FORCES[:2]]
-    places += [("geometry", key) for key in ("seal_width_mm", "area_efficiency")]
-    for group, key in places:
-        rows.append((_label(key), *(one.get(group, {}).get(key) for one in records)))
-    for name, *cells in rows:
-        changes = _change(cells[0], cells[2]), _change(cells[1], cells[2])
-        table.add_row(name, *map(_number, cells), *changes)
-    return table
+def tables_of(result: Record, rows: Sequence[Record] = (), most: int = 200) -> list[Table]:
+    """Return the tables of all `sections` in their order, with conflicts of constraints first."""
+    parts = sections(result, rows, most)
+    found = [one for _, _, tables in parts for one in tables]
+    return [one for one in (conflict_table(result), *found) if one]
 
 
-def pump_table(records: Mapping[str, Mapping[str, Any]]) -> RenderableType:
-    """Return the pump sheet of several designs side by side.
-
-    `records`: their records in the result file, by the name of the column. A pump sheet shows the
-    entry `pump` and the forces. With two designs, a last column shows the change in % of the
-    first."""
-    sheets = []
-    for record in records.values():
-        forces = ((key, record.get("response", {}).get(key)) for key in _SHEET_FORCES)
-        sheets.append(record.get("pump", {}) | {key: x for key, x in forces if x is not None})
-    compared = len(sheets) == 2
-    table = _table("Pump sheet", *records, *(["change"] if compared else []))
-    _group(table, "pump", _pairs(*sheets) if compared else _singles(sheets[0]))
-    return table
+def records_of(result: Record) -> dict[str, Record]:
+    """Return the records of all designs or motions of a result, by the names that views show."""
+    found: dict[str, Record] = {name: result.get(key) or {} for key, name in NAMES.items()}
+    found = {name: one for name, one in found.items() if isinstance(one.get("design"), Mapping)}
+    motions = enumerate(result.get("attractors") or (), start=1)
+    found |= {f"motion {number}": record for number, record in motions}
+    found |= {f"point {record['point']}": record for record in result.get("points") or ()}
+    single = isinstance(result.get("design"), Mapping) and not found
+    return {"design": result} if single else found
 
 
-def optimality_table(
-    optimality: Mapping[str, Any], constraints: list[dict[str, Any]]
-) -> RenderableType:
-    """Return a table of the certificate of the optimum.
+def numbers_table(result: Record) -> Table | None:
+    """Return the numbers of all designs or motions side by side, or None for a front.
 
-    It shows the first-order conditions, the effect of each active limit, the active branches of the
-    objective, and the optima that the starts found. `optimality`, `constraints`: these entries of
-    the result file."""
-    table = _table("Certificate of the optimum", "value", "objective")
-    word = optimality["reason"].replace("_", " ")
-    _group(
-        table,
-        "first-order conditions",
-        [
-            ("residual (of the unit box)", _number(optimality["residual"]), word),
-            ("better nearby, promised (relative)", _number(optimality["promised_decrease"]), ""),
-            ("violation (scaled)", _number(optimality["violation"]), ""),
-        ],
-    )
-    prices = [row for row in constraints if abs(row.get("multiplier", 0.0)) > 0]
-    rough = "" if optimality["converged"] else " (rough, because this is no optimum)"
-    _group(table, f"price of a limit{rough}", map(_price, prices))
-    held = optimality["held_by"]
-    if len(held) > 1:
-        _group(table, "branches that hold the optimum (share)", map(_held, held))
-    _group(table, "starts", map(_start, optimality["starts"]))
-    _group(table, "distinct optima", _optima(optimality))
-    return Group(table, Text(optimality["message"]))
+    Changes are in % of the baseline, and of the nominal member of a measured baseline."""
+    records = records_of(result)
+    if not records or result.get("points"):
+        return None
+    names = [*records]
+    compared = names[0] == "baseline" and len(names) > 1
+    heads = ["", *(names if len(names) > 1 else ["value"])]
+    heads += ["change", *(f"from {name}" for name in names[1:-1])] if compared else []
 
+    def row(name: str, numbers: Sequence[Any], changes: bool = True) -> Row:
+        further = [percent(x, numbers[-1]) for x in numbers[:-1]] if compared and changes else []
+        return [name, *map(value, numbers), *further]
 
-def sensitivity_table(rows: list[dict[str, Any]]) -> RenderableType:
-    """Return a table of how small changes of the scene change the forces and the objective.
+    def rows(part: str) -> list[Row]:
+        given = [scalars(one.get(part) or {}) for one in records.values()]
+        keys = dict.fromkeys(key for one in given for key in one)
+        changes = part != "steady_state"
+        return [row(label(key), [one.get(key) for one in given], changes) for key in keys]
 
-    `rows`: entry `sensitivities` of `optimality` in the result file."""
-    table = _table("Sensitivity of the optimum", "mean, N", "peak, N", "objective")
-    for row in rows:
-        length = row["unit"] == "mm" and row["step"] == MICROMETRE
-        step = "+1 um" if length else "+1 %"
-        forces = (f"{row[key]:+.3g}" for key in ("mean_force_N", "peak_force_N"))
-        share = row.get("objective_percent")
-        change = DASH if share is None else f"{share:+.3g} %"
-        table.add_row(f"{row['quantity']} {step}", *forces, change)
-    return table
+    basins = {"share": "share of the initial states", "reached": "reached from rest"}
+    groups: list[tuple[str, list[Row]]] = [("basin", [
+        row(word, [one.get(key) for one in records.values()])
+        for key, word in basins.items() if "attractors" in result
+    ]), ("design", rows("design"))]  # fmt: skip
+    groups += [(heading, rows(part)) for part, heading in _GROUPS.items()]
+    if compared and "improvement" in result:
+        objectives = _objectives(result, len(names))
+        groups.insert(1, ("objective", [row("relative to the baseline", objectives)]))
+    states = [status_cell(str(one.get("status", ""))) for one in records.values()]
+    groups[-1][1].append(["status", *states])
+    if len(names) > _WIDEST:
+        groups = [one for one in groups if one[0] not in ("design", "geometry")]
+    title = "Coexisting motions" if "attractors" in result else "Design, force and geometry"
+    return table(title, heads, groups, _messages(result, records))
 
 
-def robustness_table(
-    robustness: Mapping[str, Any], designs: Mapping[str, Mapping[str, float]]
-) -> RenderableType:
-    """Return a table of baseline, nominal and robust optimum over many scattered scenes.
-
-    `robustness`: this entry of the result file; `designs`: design of `baseline` and `robust`."""
-    fresh = robustness["fresh"]
-    scenes = next(iter(fresh.values()))["scenes"]
-    table = _table(f"Baseline and optima in {scenes} fresh scenes", *fresh)
-    known = dict(designs)
-    if robustness["nominal"]["optimized"] is not None:
-        known["nominal"] = robustness["nominal"]["optimized"]["design"]
-    keys = [*next(iter(known.values()))]
-    cells = ((_label(key), *(_number(known[name][key]) for name in fresh)) for key in keys)
-    _group(table, "design", cells)
-    combined = [_number(one["combined_objective"]) for one in fresh.values()]
-    _group(table, "robust objective", [("relative to the baseline", *combined)])
-    for name in ("objective", "mean_force_N", "peak_force_N"):
-        rows = (
-            (word, *(_number(one[name][key]) for one in fresh.values()))
-            for key, word in _STATISTICS.items()
-        )
-        _group(table, _label(name), rows)
-    shares = [f"{100 * one['failed_share']:.3g} %" for one in fresh.values()]
-    _group(table, "scenes", [("without a usable motion", *shares)])
-    return table
+def _objectives(result: Record, count: int) -> list[float | None]:
+    """Return the objective of baseline, nominal member if there are 3, and optimised design."""
+    gains = (result.get(key) or {} for key in ("improvement", "improvement_over_nominal"))
+    gain, over = (one.get("objective") for one in gains)
+    if gain is None or not math.isfinite(gain):
+        return [None] * count
+    last = 1 - gain
+    member = [None if over is None else last / (1 - over)] if count > 2 else []
+    return [1, *member, last]
 
 
-def conflict_table(rows: list[dict[str, Any]]) -> RenderableType:
-    """Return a table of constraints in conflict, with the nearest limits that can be met.
-
-    `rows`: entry `conflicts` of `infeasible` in the result file."""
-    table = _table("Constraints in conflict", "least violation", "with all others")
-    for row in rows:
-        unit = f" {row['unit']}" if row["unit"] else ""
-        name = f"{row['name']} {row['sense']} {_number(row['limit'])}{unit}"
-        table.add_row(name, _number(row["together"]), _number(row["alone"]))
-    return table
-
-
-def rejected_table(rows: list[dict[str, Any]]) -> RenderableType:
-    """Return a table of the designs that did not hold up when simulated again from rest.
-
-    `rows`: entry `rejected` of `verification` in the result file."""
-    table = _table("Rejected designs", "in the search", "from rest", "reason")
-    for row in rows:
-        design = ", ".join(f"{_label(key)} {_number(x)}" for key, x in row["design"].items())
-        same = row["verified_objective"] is not None
-        reason = "another motion" if same else row["status"].replace("_", " ")
-        reason += f" ({len(row['attempts'])} attempts)"
-        numbers = (_number(row[f"{word}_objective"]) for word in ("searched", "verified"))
-        table.add_row(design, *numbers, Text(reason, style="bold red"))
-    return table
-
-
-def _price(row: Mapping[str, Any]) -> tuple[str, ...]:
-    step = f"{row['relaxed_by']:+g} {row['unit']}".strip()
-    name = f"{_words(row['name'])} {row['sense']} {_number(row['limit'])} {row['unit']}".strip()
-    return name, step, f"{row['relaxed_objective_percent']:+.3g} %"
-
-
-def _held(row: Mapping[str, Any]) -> tuple[str, ...]:
-    at = "" if row["speed_rpm"] is None else f"{_number(row['speed_rpm'])} rpm"
-    if "scene" in row:
-        at = f"scene {row['scene']} of the sample"
-    if row["rotation_deg"] is not None:
-        at += f" peak of {_number(row['force_N'])} N at {row['rotation_deg']:.2f} deg"
-    return at.strip() or "motion", f"{row['share']:.3f}", _number(row["objective"])
-
-
-def _start(row: Mapping[str, Any]) -> tuple[str, ...]:
-    word = row["reason"].replace("_", " ")
-    count = f"{row['evaluations']} designs"
-    return f"start {row['start']}: {word}", count, _number(row["objective"])
-
-
-def _optima(optimality: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    rows = []
-    for number, one in enumerate(optimality["optima"], start=1):
-        times = f"{one['found']} of {len(optimality['starts'])} starts"
-        rows.append((f"optimum {number}", times, _number(one["objective"])))
-    share = optimality["unseen"]["share_of_starts"]
-    if rows:
-        name = "chance that a further start finds a new one"
-        if share is None or share > _UNSURE:
-            name += " (few starts: raise optimizer.starts)"
-        rows.append((name, "unknown" if share is None else f"{100 * share:.3g} %", ""))
-    return rows
-
-
-def evaluation_table(evaluation: Evaluation) -> RenderableType:
-    """Return a table of all results of one design in one scene."""
-    record = evaluation.record()
-    table = _table("Simulation of the rotor pair", "value")
-    _group(table, "design", _singles(record["design"]))
-    _group(table, "geometry", _singles(record["geometry"]))
-    _group(table, "response", _singles(record["response"]))
-    for heading, rows in _gradients(record["gradient"]):
-        _group(table, heading, _singles(rows))
-    for heading, rows in _errors(record["steady_state"]):
-        _group(table, heading, _singles(rows))
-    steady = _singles(record["steady_state"])
-    _group(table, "status", [*steady, ("status", _status(evaluation))])
-    _group(table, "statistics", _singles(record["statistics"]))
-    return Group(table, Text(evaluation.message))
-
-
-def sweep_table(rows: list[dict[str, Any]]) -> RenderableType:
-    """Return a table of one design at many speeds.
-
-    `rows`: one per speed, as `Part.row` returns them."""
-    columns = "mean, N", "peak, N", "period", "multiplier", "status"
-    table = _table("Contact force over speed", *columns)
-    table.columns[0].header = Text("speed, rpm")
-    keys = "mean_force_N", "peak_force_N", "period", "floquet_multiplier"
-    for row in rows:
-        table.add_row(_number(row["speed_rpm"]), *(_number(row[key]) for key in keys), _word(row))
-    return table
-
-
-def speeds_table(
-    baseline: list[dict[str, Any]],
-    optimized: list[dict[str, Any]] = (),  # type: ignore[assignment]
-    objectives: list[dict[str, float]] = (),  # type: ignore[assignment]
-) -> RenderableType:
-    """Return a table that compares the optimised design with the baseline at each speed.
-
-    Without an optimised design, the table shows the baseline alone. `baseline`, `optimized`: one
-    row per speed, as in the entry `speeds` of the result file; `objectives`: one row per speed, as
-    in the entry `objective_by_speed` of the result file."""
-    if not optimized:
-        return sweep_table(baseline)
-    columns = "mean, N", "opt.", "peak, N", "opt.", "objective", "status"
-    table = _table("Contact force over speed, baseline and optimised (opt.)", *columns)
-    table.columns[0].header = Text("speed, rpm")
-    for first, second, one in zip(baseline, optimized, objectives, strict=True):
-        forces = (row[key] for key in ("mean_force_N", "peak_force_N") for row in (first, second))
-        cells = (*forces, one["objective"])
-        table.add_row(_number(first["speed_rpm"]), *map(_number, cells), _word(second))
-    return table
-
-
-def _word(row: Mapping[str, Any]) -> Text:
-    """Return the status label of a `row` as coloured text."""
-    usable = Status[row["status"].upper()].usable
-    return Text(row["status"], style="bold green" if usable else "bold red")
-
-
-def attractor_table(rows: list[dict[str, Any]], lost: Mapping[str, float]) -> RenderableType:
-    """Return a table of coexisting motions, one column per motion.
-
-    `rows`: one {attractor, share, reached, status, ...} per motion. `lost`: share of the initial
-    states that lead to no motion, by status label."""
-    table = _table("Coexisting motions", *(f"motion {row['attractor']}" for row in rows))
-    labels = {
-        "share": "share of initial states",
-        "reached": "reached from rest",
-        "status": "status",
-    }
-    for key in rows[0] if rows else ():
-        if key != "attractor":
-            cells = ["yes" if row[key] is True else _number(row[key]) for row in rows]
-            table.add_row(labels.get(key, _label(key)), *(c.replace("False", "no") for c in cells))
-    notes = [f"{share:.1%} of the initial states: {label}" for label, share in lost.items()]
-    return Group(table, *map(Text, notes))
-
-
-def geometry_table(record: Mapping[str, Any]) -> RenderableType:
-    """Return a table of the geometry of one profile, from its entries in the result file."""
-    table = _table("Rotor profile", "value")
-    _group(table, "design", _singles(record.get("design", {})))
-    _group(table, "geometry", _singles(record.get("geometry", {})))
-    if "margins" in record:
-        _group(table, "margins of the flank", _singles(record["margins"]))
-    if "outline" in record:
-        _group(table, "outline", _singles(record["outline"]))
-    if "pump" in record:
-        _group(table, "pump", _singles(record["pump"]))
-    if record.get("status"):
-        _group(table, "status", [("status", str(record["status"]))])
-    return Group(table, Text(record.get("message") or ""))
-
-
-def front_table(record: Mapping[str, Any]) -> RenderableType:
-    """Return tables of a front: terms, rates and status of each point, the designs, and the gaps.
-
-    `record`: the front as in the result file."""
-    aims = record["terms"]
-    names = [aim["name"] for aim in aims]
-    words = [_split(name)[0] for name in names]
-    columns = [f"{_label(aim['name'])} ({aim['sense']})" for aim in aims]
-    columns += [f"{words[0]} per {other}" for other in words[1:]]
-    table = _table("Best compromises", *columns, "status")
-    table.columns[0].header = Text("point")
-    base = [_number(record["baseline"]["terms"].get(name)) for name in names]
-    table.add_row("baseline", *base, *[DASH] * len(names))
-    table.add_section()
-    for point in record["points"]:
-        certified = point["status"] == "certified"
-        cells = [point["terms"][name] for name in names] + [*point["rates"].values()]
-        word = Text(point["status"], style="bold green" if certified else "bold red")
-        table.add_row(str(point["point"]), *map(_number, cells), word)
-    if not record["points"]:
-        return Group(table)
-    keys = [*record["points"][0]["design"]]
-    parts: list[RenderableType] = [table]
-    if len(keys) <= _WIDEST_DESIGN:
-        designs = _table("Their designs (min, max: at that bound)", *map(_label, keys), "limits")
-        designs.columns[0].header = Text("point")
-        for point in record["points"]:
-            limits = [name for name in point["multipliers"] if " bound of " not in name]
-            cells = [_bounded(key, point) for key in keys]
-            designs.add_row(str(point["point"]), *cells, ", ".join(limits) or DASH)
-        parts.append(designs)
-    return Group(*parts, *map(Text, _notes(record)))
-
-
-def _bounded(key: str, point: Mapping[str, Any]) -> str:
-    """Return a design parameter of a point, with the bound at which it is held."""
-    name = _words(key.removesuffix("_mm").removesuffix("_deg"))
-    sides = {"lower": "min", "upper": "max"}
-    held = [
-        word for side, word in sides.items() if f"{side} bound of {name}" in point["multipliers"]
+def _messages(result: Record, records: Mapping[str, Record]) -> str:
+    """Return the messages of several designs, and the initial states that lead to no motion."""
+    lost = (result.get("lost") or {}).items()
+    notes = [
+        f"{100 * share:.3g} % of the initial states: {in_words(name)}." for name, share in lost
     ]
-    return " ".join([_number(point["design"][key]), *held])
+    told = {name: one.get("message") for name, one in records.items()}
+    if not ("attractors" in result or "design" in result):
+        same = len({*told.values()}) == 1 < len(told)
+        told = {"both": next(iter(told.values()))} if same else told
+        notes += [f"{name}: {text}" for name, text in told.items() if text]
+    return " ".join(notes)
 
 
-def _notes(record: Mapping[str, Any]) -> list[str]:
-    """Return one line per gap of a front, and one about the points that were dropped."""
-    notes = []
-    for gap in record["gaps"]:
-        what = "gap" if gap["kind"] == "terms" else "change of design"
+def gradient_tables(result: Record) -> Iterator[Table | None]:
+    """Yield a table of the gradient of each design that has one, with its standard errors."""
+    records = {} if result.get("points") else records_of(result)
+    for name, record in records.items():
+        gradient = record.get("gradient") or {}
+        errors = record.get("steady_state", {}).get("gradient_standard_error") or {}
+        rows = []
+        for key in record["design"] if any(gradient.values()) else ():
+            slopes = (
+                value(slope.get(key))
+                + (f" ± {value(errors[force][key])}" if key in errors.get(force, {}) else "")
+                for force, slope in gradient.items()
+            )
+            rows.append([label(key), *slopes])
+        title = "Gradient of the force" + (f", {name}" if len(records) > 1 else "")
+        note = "How much each force rises if a design parameter rises by one unit of its own."
+        note += " After ±: standard error." if errors else ""
+        yield table(title, ["per unit of", *map(label, gradient)], [("", rows)], note)
+
+
+def scene_rows(result: Record, rows: Sequence[Record] = ()) -> dict[str, Sequence[Record]]:
+    """Return the rows of each design, one per scene; the name is empty if there is only one."""
+    if rows:
+        return {"": rows}
+    found = {name: record.get("speeds") for name, record in records_of(result).items()}
+    found = {name: speeds for name, speeds in found.items() if speeds}
+    return {"": found["design"]} if [*found] == ["design"] else found
+
+
+def scene_tables(result: Record, rows: Sequence[Record], most: int) -> Iterator[Table | None]:
+    """Yield tables of the scenes of a sweep, or of the speeds of an objective.
+
+    A sweep over any keys has tables of its statuses and of its greatest forces, too."""
+    groups = scene_rows(result, rows)
+    objectives = result.get("objective_by_speed") or ()
+    for name, given in groups.items():
+        if name == NAMES["optimized"] and objectives:
+            given = [{"speed_rpm": x["speed_rpm"], "objective": x["objective"], **row}
+                     for row, x in zip(given, objectives, strict=True)]  # fmt: skip
+        title = "Contact force " + ("over speed" if "speed_rpm" in given[0] else "in each scene")
+        note = f"The first {most} of {len(given)} rows." if len(given) > most else ""
+        yield _list_table(title + (f", {name}" if name else ""), given[:most], note)
+    if "sweep" not in result:
+        return
+    counts = [[status_cell(word), str(n)] for word, n in result["statuses"].items()]
+    title = f"Statuses of {result['sweep']['points']} points"
+    yield table(title, ["", "points"], [("", counts)])
+    usable = [row for row in rows if Status[str(row["status"]).upper()].usable]
+    ranges = [_range(key, usable) for key in RESPONSES if usable]
+    heads = "", "least (N)", "point", "greatest (N)", "point"
+    yield table("Usable points", heads, [("", ranges)])
+
+
+def _range(key: str, rows: Sequence[Record]) -> Row:
+    """Return the least and greatest value of a force over some points, and where they are."""
+    known = [row for row in rows if row.get(key) is not None]
+    ends = [pick(known, key=lambda row: row[key]) for pick in (min, max)] if known else []
+    return [words(key), *(cell for row in ends for cell in (value(row[key]), str(row["point"])))]
+
+
+def _list_table(title: str, rows: Sequence[Record], note: str) -> Table | None:
+    """Return a table of rows {key: value}, with a column for each key that has a value.
+
+    The status is the second column, so that it stands beside the first on a narrow terminal.
+    Below the table stand the values of other keys than the first that are the same in all rows."""
+    rows = [scalars(row) for row in rows]
+    order = dict.fromkeys([*[*rows[0]][:1], "status", *(key for row in rows for key in row)])
+    found = {key: [row.get(key) for row in rows] for key in order}
+    found = {key: values for key, values in found.items() if {*values} != {None}}
+    same = [key for key in [*found][1:] if len({*found[key]}) == 1 < len(rows) and key != "status"]
+    told = [stated(key, found.pop(key)[0], named=True) for key in same]
+    note = " ".join([note, *([f"In all rows: {', '.join(told)}."] if told else [])]).strip()
+    cells = [[status_cell(str(x)) for x in values] if key == "status" else map(value, values)
+             for key, values in found.items()]  # fmt: skip
+    return table(title, [*map(label, found)], [("", [*zip(*cells, strict=True)])], note)
+
+
+def constraint_table(result: Record) -> Table | None:
+    """Return the constraints of an optimisation, with the price of each limit."""
+    rows = []
+    for row in result.get("constraints") or ():
+        word = "met by all" if row.get("always") else "active" if row.get("active") else "satisfied"
+        verdict = Cell(word if row["satisfied"] else "violated", bool(row["satisfied"]))
+        before = Cell(value(row["baseline"]))
+        if row.get("baseline_satisfied") is False:
+            own = row.get("baseline_limit")
+            beyond = "violated" if own is None else f"> {value(own)}"
+            before = Cell(f"{before.text} {beyond}", False)
+        rows.append([limit(row), before, value(row["optimized"]), verdict, _price(row)])
+    heads = "", "baseline", "optimised", "verdict", "price of the limit"
+    note = (
+        "Price: change of the objective if the limit is relaxed by the step, to first order. An "
+        "empty price: the limit does not hold the optimum back."
+    )
+    found = result.get("optimality") or {}
+    if found and not found.get("converged"):
+        note += " The design is no optimum, so prices are rough."
+    return table("Constraints", heads, [("", rows)], note)
+
+
+def _price(row: Record) -> str:
+    change = row.get("relaxed_objective_percent")
+    if change is None or not row.get("multiplier"):
+        return ""
+    return f"{signed(change, '%')} for {signed(row['relaxed_by'], row.get('unit') or '')}"
+
+
+def certificate_tables(result: Record) -> Iterator[Table | None]:
+    """Yield tables on the optimum: conditions, active branches, starts, sensitivities."""
+    found = result.get("optimality")
+    if not found:
+        return
+    good = bool(found["converged"])
+    conditions: list[Row] = [
+        ["residual of the first-order conditions (of the unit box)",
+         Cell(value(found["residual"]), good), f"at most {value(found['required_residual'])}"],
+        ["better nearby, promised (relative)", value(found.get("promised_decrease"))],
+        ["violation of a constraint (scaled)", value(found["violation"]), "0"],
+        ["why the search stopped", Cell(in_words(found["reason"]), good)],
+        ["method", str(found["method"])],
+    ]  # fmt: skip
+    heads = "", "value", "at an optimum"
+    yield table("First-order conditions", heads, [("", conditions)], found["message"])
+    held = [_held(one) for one in found.get("held_by") or ()]
+    note = "Peaks, speeds or motions that are equal at the optimum: none falls alone."
+    heads = "branch", "share", "its objective"
+    yield table("What holds the optimum", heads, [("", held if len(held) > 1 else [])], note)
+    starts: list[Row] = [
+        [f"start {one['start']}", Cell(in_words(one["reason"]), one["reason"] == "converged"),
+         str(one["evaluations"]), value(one["objective"])]
+        for one in found.get("starts") or ()
+    ]  # fmt: skip
+    optima: list[Row] = [
+        [f"optimum {number}", f"found by {one['found']} of {len(starts)} starts", "",
+         value(one["objective"])]
+        for number, one in enumerate(found.get("optima") or (), start=1)
+    ]  # fmt: skip
+    heads = "", "why it ended", "designs", "objective"
+    groups = [("starts", starts), ("distinct optima", optima)]
+    yield table("Local searches", heads, groups, _unseen(found))
+    rows = [_sensitive(one) for one in found.get("sensitivities") or ()]
+    heads = "", "mean force (N)", "peak force (N)", "objective (%)"
+    note = "What a small change of the scene does to the optimised design."
+    yield table("Sensitivity to the scene", heads, [("", rows)], note)
+
+
+def _held(one: Record) -> Row:
+    parts = []
+    if one.get("speed_rpm") is not None:
+        parts.append(stated("speed_rpm", one["speed_rpm"]))
+    if "scene" in one:
+        parts.append(f"scene {one['scene']} of the sample")
+    if one.get("rotation_deg") is not None:
+        parts.append(f"peak of {value(one['force_N'])} N at {one['rotation_deg']:.2f}°")
+    return [", ".join(parts) or "motion", f"{one['share']:.3f}", value(one["objective"])]
+
+
+def _unseen(found: Record) -> str:
+    share = (found.get("unseen") or {}).get("share_of_starts")
+    if share is None:
+        return "So few starts do not tell how many optima are left to find: raise optimizer.starts."
+    more = ": raise optimizer.starts" if share > _UNSURE else ""
+    return (
+        f"About {brief(100 * share, 2)} % of further starts would find an optimum that no start "
+        f"has found yet{more}."
+    )
+
+
+def _sensitive(one: Record) -> Row:
+    step = "+1 µm" if one["unit"] == "mm" and one["step"] == MICROMETRE else "+1 %"
+    keys = "mean_force_N", "peak_force_N", "objective_percent"
+    changes = (value(None) if one.get(key) is None else signed(one[key], "") for key in keys)
+    return [f"{one['quantity']} {step}", *changes]
+
+
+def rejected_table(result: Record) -> Table | None:
+    """Return the designs that did not hold up when simulated again from rest, or None."""
+    rows = []
+    for row in (result.get("verification") or {}).get("rejected") or ():
+        same = row["verified_objective"] is not None
+        reason = "another motion" if same else in_words(row["status"])
+        reason = Cell(f"{reason} ({len(row['attempts'])} attempts)", good=False)
+        numbers = (value(row[f"{word}_objective"]) for word in ("searched", "verified"))
+        rows.append([_design(row["design"]), *numbers, reason])
+    heads = "design", "objective in the search", "from rest", "reason"
+    return table("Rejected designs", heads, [("", rows)])
+
+
+def _design(design: Mapping[str, float]) -> str:
+    return ", ".join(f"{label(key)} {value(x)}" for key, x in design.items())
+
+
+def conflict_table(result: Record) -> Table | None:
+    """Return the constraints in conflict, with the nearest limits that can be met, or None."""
+    rows = [
+        [limit(row), value(row["together"]), value(row["alone"])]
+        for row in (result.get("infeasible") or {}).get("conflicts") or ()
+    ]
+    heads = "constraint", "with the least violation", "possible with all others"
+    return table("Constraints in conflict", heads, [("", rows)])
+
+
+def tolerance_table(result: Record) -> Table | None:
+    """Return baseline, nominal and robust optimum in fresh scenes that scatter, or None."""
+    robustness = result.get("robustness") or {}
+    fresh = robustness.get("fresh") or {}
+    if not fresh:
+        return None
+    nominal = (robustness.get("nominal") or {}).get("optimized")
+    known = {"baseline": result["baseline"], "robust": result["optimized"], "nominal": nominal}
+    designs = [(known.get(name) or {}).get("design", {}) for name in fresh]
+    keys = dict.fromkeys(key for one in designs for key in one)
+    groups = [("design", [[label(key), *(value(one.get(key)) for one in designs)] for key in keys])]
+    combined = [value(one.get("combined_objective")) for one in fresh.values()]
+    groups.append(("robust objective", [["relative to the baseline", *combined]]))
+    for name in ("objective", "mean_force_N", "peak_force_N"):
+        keys = [*next(iter(fresh.values()))[name]]
+        rows = [[label(key), *(value(one[name][key]) for one in fresh.values())] for key in keys]
+        groups.append((label(name), rows))
+    shares = [f"{100 * one['failed_share']:.3g} %" for one in fresh.values()]
+    groups.append(("scenes", [["without a usable motion", *shares]]))
+    count = next(iter(fresh.values()))["scenes"]
+    return table(f"Designs in {count} fresh scenes", ["", *fresh], groups)
+
+
+def pump_table(result: Record) -> Table | None:
+    """Return the pump sheet and the forces of all designs that have a sheet, or None."""
+    sheets = {
+        name: one["pump"] | {key: x for key in _SHEET_FORCES
+                             if (x := (one.get("response") or {}).get(key)) is not None}
+        for name, one in records_of(result).items() if one.get("pump")
+    }  # fmt: skip
+    names = [*sheets]
+    compared = names[:1] == ["baseline"] and len(names) > 1
+    heads = ["", *(names if len(names) > 1 else ["value"]), *(["change"] if compared else [])]
+    rows = []
+    for key in dict.fromkeys(key for sheet in sheets.values() for key in sheet):
+        for name, numbers in _apart(label(key), [sheet.get(key) for sheet in sheets.values()]):
+            changes = [percent(numbers[0], numbers[-1])] if compared else []
+            rows.append([name, *map(value, numbers), *changes])
+    return table("Pump sheet", heads, [("", rows)], _sheet_note(result, sheets))
+
+
+def _sheet_note(result: Record, sheets: Mapping[str, Record]) -> str:
+    """Return the caveats of the last sheet; for a geometry alone, what could be added to it."""
+    if not sheets:
+        return ""
+    name, sheet = [*sheets.items()][-1]
+    prefix = f"{name}: " if len(sheets) > 1 else ""
+    notes = ["Numbers without a unit are fractions.", *(prefix + one for one in warnings(sheet))]
+    if result.get("status") == Status.GEOMETRY_ONLY.label:
+        notes += [NOTE, missing(sheet)]
+    return " ".join(filter(None, notes))
+
+
+def _apart(name: str, given: Sequence[Any]) -> list[tuple[str, Sequence[Any]]]:
+    """Return (name, values) of each row for a quantity: several rows if its values are lists."""
+    if not any(isinstance(one, list | tuple) for one in given):
+        return [(name, given)]
+    lists = [one if isinstance(one, list | tuple) else [one] for one in given]
+    count = max(map(len, lists))
+    return [
+        (f"{name}, {k + 1} of {count}", [one[k] if k < len(one) else None for one in lists])
+        for k in range(count)
+    ]
+
+
+def front_tables(result: Record) -> Iterator[Table | None]:
+    """Yield the points of a front with terms and rates, and their designs with active limits."""
+    points = result.get("points") or ()
+    base = result.get("baseline") or {}
+    if "terms" not in result or not (points or base.get("terms")):
+        return
+    aims = {aim["name"]: aim for aim in result["terms"]}
+    names = [name_and_unit(name)[0] for name in aims]
+    heads = ["point", *(f"{label(name)}, {aim['sense']}" for name, aim in aims.items())]
+    heads += [*(f"{names[0]} per {other}" for other in names[1:]), "status"]
+    first: Row = ["baseline", *(value((base.get("terms") or {}).get(name)) for name in aims)]
+    rows = [
+        [str(point["point"]), *map(value, (point["terms"][name] for name in aims)),
+         *map(value, point["rates"].values()), status_cell(point["status"])]
+        for point in points
+    ]  # fmt: skip
+    note = "Rates: what one more unit of the other term costs in the first, along the front."
+    notes = [note, *_gaps(result)]
+    yield table("Best compromises", heads, [("", [first, *rows])], " ".join(notes))
+    keys = [*points[0]["design"]] if points else []
+    first = ["baseline", *(value((base.get("design") or {}).get(key)) for key in keys)]
+    rows = [
+        [str(point["point"]), *(_bounded(key, point) for key in keys),
+         ", ".join(one for one in point["multipliers"] if " bound of " not in one)]
+        for point in points
+    ]  # fmt: skip
+    heads = ["point", *map(label, keys), "limits that hold it"]
+    note = "min, max: the parameter is at this bound."
+    yield table("Designs of the best compromises", heads, [("", [first, *rows][: len(rows) + 1])],
+                note) if points else None  # fmt: skip
+
+
+def _bounded(key: str, point: Record) -> str:
+    """Return a design parameter of a point, with the bound at which it is held."""
+    sides = {"lower": "min", "upper": "max"}
+    held = [word for side, word in sides.items()
+            if f"{side} bound of {words(key)}" in point["multipliers"]]  # fmt: skip
+    return " ".join([value(point["design"][key]), *held])
+
+
+def _gaps(result: Record) -> Iterator[str]:
+    """Yield a sentence per gap of a front, and one on the points that were dropped."""
+    for gap in result.get("gaps") or ():
+        what = "Gap" if gap["kind"] == "terms" else "Change of design"
         sure = "confirmed" if gap["confirmed"] else "not confirmed: raise pareto.refinements"
-        notes.append(
+        yield (
             f"{what} between points {gap['first']} and {gap['second']}: apart by "
             f"{gap['distance']:.2g} ranges of the terms and {gap['design_distance']:.2g} of the "
-            f"bounds, {sure}"
+            f"bounds, {sure}."
         )
-    count: dict[str, int] = {}
-    for point in record["dropped"]:
-        count[point["status"]] = count.get(point["status"], 0) + 1
-    dropped = ", ".join(f"{n} {_words(word)}" for word, n in count.items())
-    return [*notes, f"dropped: {dropped}"] if dropped else notes
+    dropped = [in_words(point["status"]) for point in result.get("dropped") or ()]
+    counts = [f"{dropped.count(word)} {word}" for word in dict.fromkeys(dropped)]
+    if counts:
+        yield f"Dropped: {', '.join(counts)}."
 
 
-def likeness_table(
-    rows: list[dict[str, Any]], title: str = "The optimised profile resembles"
-) -> RenderableType:
-    """Return a table of the designs of several families that are nearest to a profile.
+def likeness_tables(result: Record) -> list[Table | None]:
+    """Return the family members nearest to the result's profile, and to an outline from a file."""
+    begun = result.get("beginning") or {}
+    return [
+        _likeness("Nearest profiles of the families", result.get("resembles") or (), ""),
+        _likeness("Nearest to the outline of the baseline", begun.get("considered") or (),
+                  begun.get("message", "")),
+    ]  # fmt: skip
 
-    `title`: that of the table; `rows`: one per profile family, as in the entry `resembles` of the
-    result file."""
-    distances = "largest distance, um", "RMS distance, um"
-    table = _table(title, *distances, "nearest member")
+
+def _likeness(title: str, rows: Sequence[Record], note: str) -> Table | None:
+    cells = []
     for row in rows:
-        cells = [f"{key} {_number(value)}" for key, value in row["design"].items()]
-        if row["inset_um"]:
-            cells.insert(0, f"inset {row['inset_um'] / 1e3:.3g} mm")
-        design = ", ".join(cells)
-        away = _number(row["departure_um"]), _number(row["departure_rms_um"])
-        table.add_row(row["family"], *away, design)
-    return table
+        inset = {"inset_mm": row["inset_um"] / 1e3} if row.get("inset_um") else {}
+        away = value(row["departure_um"]), value(row["departure_rms_um"])
+        cells.append([in_words(row["family"]), *away, _design(inset | row["design"])])
+    heads = "family", "largest distance (µm)", "RMS distance (µm)", "nearest member"
+    return table(title, heads, [("", cells)], note)
 
 
-def beginning_table(record: Mapping[str, Any]) -> RenderableType:
-    """Return a table of the fitted profiles from which a search could begin, and where it began.
-
-    `record`: entry `beginning` of the result file."""
-    table = likeness_table(record["considered"], "Nearest to the outline of the baseline")
-    return Group(table, Text(record["message"]))
-
-
-def _table(title: str, *columns: str) -> Table:
-    table = Table(title=title, box=box.ASCII, title_justify="left", title_style="bold")
-    table.add_column("", overflow="fold")
-    for column in columns:
-        table.add_column(column, justify="right", overflow="fold")
-    return table
-
-
-def _group(table: Table, name: str, rows: _Rows) -> None:
-    """Add a heading and its `rows` to a table. Without rows, add a row "none" with dashes."""
-    rows = list(rows) or [("none", *[DASH] * (len(table.columns) - 1))]
-    table.add_section()
-    table.add_row(Text(name, style="bold"))
-    for label, *cells in rows:
-        cells = [cell if isinstance(cell, Text) else Text(cell) for cell in cells]
-        table.add_row(Text(f"  {label}"), *cells)
+def effort_table(result: Record) -> Table | None:
+    """Return effort and accuracy of the run, and the versions it was made with."""
+    records = {} if "points" in result else records_of(result)
+    own = {} if "design" in records else {"run": result}
+    groups = [
+        (name if name == "run" or len(records) > 1 else "simulation", one.get("statistics") or {})
+        for name, one in (own | records).items()
+    ]
+    groups.append(("versions", result.get("versions") or {}))
+    shown = [
+        (name, [[label(key), value(x)] for key, x in scalars(rows).items()])
+        for name, rows in groups
+    ]
+    return table("Effort, accuracy and versions", ["", "value"], shown)
 
 
-def _singles(values: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    return [(_label(key), _number(value)) for key, value in _plain(values).items()]
+def status_table(result: Record, config: Config) -> Table | None:
+    """Return the meaning of every status, those of this run first, with advice for its scene."""
+    met = _statuses_in(result)
+    meanings = {status.label: message_of(config, status) for status in Status}
+    points = {one.label: one.value for one in Standing}
+    here = meanings | points
+    rows = [[status_cell(word), here[word]] for word in met if word in here]
+    known = here if result.get("points") else meanings
+    others = [[in_words(word), text] for word, text in known.items() if word not in met]
+    groups = [("in this run", rows), ("not in this run", others)]
+    return table("What each status means", ["status", "meaning and advice"], groups)
 
 
-def _pairs(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    rows = []
-    first, second = _plain(first), _plain(second)
-    for key in dict.fromkeys([*first, *second]):
-        a, b = first.get(key), second.get(key)
-        rows.append((_label(key), _number(a), _number(b), _change(a, b)))
-    return rows
-
-
-def _objective(improvement: Mapping[str, float]) -> tuple[str, ...]:
-    gain = improvement.get("objective")
-    label = "objective (baseline = 1)"
-    if gain is None or not math.isfinite(gain):
-        return label, DASH, DASH, DASH
-    return label, "1", _number(1 - gain), _change(1.0, 1 - gain)
-
-
-def _constraint(row: Mapping[str, Any]) -> tuple[str | Text, ...]:
-    unit = f" {row['unit']}" if row.get("unit") else ""
-    label = f"{_words(row['name'])} {row['sense']} {_number(row['limit'])}{unit}"
-    if not row["satisfied"]:
-        verdict = Text("violated", style="bold red")
-    else:
-        word = "active" if row.get("active") else "satisfied"
-        verdict = Text("met by all" if row.get("always") else word, style="green")
-    before = Text(_number(row["baseline"]))
-    if row.get("baseline_satisfied") is False:
-        own = row.get("baseline_limit")
-        before.append(" violated" if own is None else f" > {_number(own)}", style="bold red")
-    return label, before, _number(row["optimized"]), verdict
-
-
-def _status(evaluation: Evaluation) -> Text:
-    style = "bold green" if evaluation.usable else "bold red"
-    return Text(evaluation.status.label, style=style)
-
-
-def _gradients(*gradients: Mapping[str, Mapping[str, float]]) -> list[tuple]:
-    """Return one tuple (heading, rows for each of the `gradients`) per response.
-
-    Rows are {label: derivative}. Without gradients, return a single heading without rows."""
-    found = dict.fromkeys(response for gradient in gradients for response in gradient)
-    groups = []
-    for response in found:
-        name, unit = _split(response)
-        rows = (_per_unit(gradient.get(response, {}), unit) for gradient in gradients)
-        groups.append((f"gradient of the {name}", *rows))
-    return groups or [("gradient", *({} for _ in gradients))]
-
-
-def _errors(*steady_states: Mapping[str, Any]) -> list[tuple]:
-    """Return the same tuples as `_gradients`, for the standard errors of gradients.
-
-    Return an empty list if no steady state has such errors."""
-    errors = [steady.get("gradient_standard_error", {}) for steady in steady_states]
-    groups = _gradients(*errors) if any(errors) else []
-    return [(f"standard error of the {heading}", *rows) for heading, *rows in groups]
-
-
-def _per_unit(row: Mapping[str, float], unit: str) -> dict[str, float]:
-    """Return the derivatives in `row` with labels as keys.
-
-    `unit`: unit of the response. An example of a label is "d/d(pressure angle), N/deg"."""
-    labels = ((key, *_split(key)) for key in row)
-    return {
-        f"d/d({name}), {f'{unit}/{per}' if per else unit}": row[key] for key, name, per in labels
-    }
-
-
-plain_table, status_text = _table, _word
-"""Empty table and coloured status for tables that other modules make."""
+def _statuses_in(data: Any) -> dict[str, None]:
+    """Return the labels of all statuses in the result file as keys, in order."""
+    if isinstance(data, list | tuple):
+        return {word: None for inner in data for word in _statuses_in(inner)}
+    if not isinstance(data, Mapping):
+        return {}
+    own = {data[key]: None for key in ("status", "evaluation_status") if key in data}
+    return {word: None for word in own if isinstance(word, str)} | _statuses_in([*data.values()])

@@ -10,9 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from rootsopt.figures.force import amplitude_spectrum
 from rootsopt.figures.style import BLUE, COLORS, GREY, VERMILION
-from rootsopt.output.labels import in_words
+from rootsopt.output.names import brief, in_words, label, stated
 from rootsopt.report.gather import Case, Run, varied
-from rootsopt.report.names import label
 from rootsopt.response.series import Series
 
 _MOST_TURNS = 4
@@ -113,7 +112,7 @@ def _spectrum(
     found: dict[str, Any] = {
         "x": _plain(order),
         "y": _plain(amplitude),
-        "customdata": [_short(value) for value in order * frequency],
+        "customdata": [brief(value) for value in order * frequency],
         "name": name,
         "hovertemplate": f"{hover}<extra>{name}</extra>",
     }
@@ -157,7 +156,8 @@ def scenes_chart(groups: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str,
         if len(lines) > _MOST_CURVES:  # A sample without a grid: single points.
             lines = {(): list(rows)}
         for place, (others, scenes) in enumerate(lines.items(), start=len(traces) // 2):
-            words = [f"{label(key)} {_short(x)}" for key, x in zip(axes[1:], others, strict=False)]
+            pairs = zip(axes[1:], others, strict=False)
+            words = [stated(key, x, named=True) for key, x in pairs]
             title = ", ".join(([name] if name else []) + words)
             joined = bool(others) or len(axes) == 1
             for key in ("mean_force_N", "peak_force_N"):
@@ -233,7 +233,7 @@ def _front_points(group, across: str, up: str, name: str, sure: bool) -> dict[st
     for point in group:
         rows = [f"<b>point {point['point']}</b>, {in_words(point['status'])}"]
         numbers = {**point["terms"], **point["design"]}
-        rows += [f"{html.escape(label(key))}: {_short(value)}" for key, value in numbers.items()]
+        rows += [html.escape(stated(key, x, named=True)) for key, x in numbers.items()]
         texts.append("<br>".join(rows))
     return {
         "x": [point["terms"][across] for point in group],
@@ -289,10 +289,6 @@ def _plain(values: ArrayLike) -> list[float | None]:
     """Return `values` with six significant digits, and None for those that are not finite."""
     numbers = np.asarray(values, float).tolist()
     return [float(f"{x:.6g}") if np.isfinite(x) else None for x in numbers]
-
-
-def _short(value: Any) -> str:
-    return f"{value:.5g}" if isinstance(value, int | float) else str(value)
 
 
 __all__ = ["force_chart", "front_charts", "scenes_chart", "spectrum_chart"]

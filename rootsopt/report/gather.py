@@ -13,6 +13,7 @@ import numpy as np
 from rootsopt.config import Config, load
 from rootsopt.output.files import ResultFolder
 from rootsopt.output.fronts import design_file
+from rootsopt.output.tables import NAMES, records_of
 from rootsopt.response.series import Series
 
 _COLUMNS = {
@@ -90,34 +91,16 @@ class Run:
 
 def _cases(place: Path, config: Config, result: Mapping[str, Any]) -> Iterator[Case]:
     """Yield the designs or motions of a result; at least the config's own design."""
-    found = False
-    for case in _listed(place, config, result):
-        found = True
-        yield case
-    if not found:
-        record = result if isinstance(result.get("design"), Mapping) else {}
-        own = dict(zip(config.design_keys, map(float, config.design), strict=True))
-        design = dict(record.get("design", own))
-        yield Case("design", config, design, record, _series(place, "design"))
-
-
-def _listed(place: Path, config: Config, result: Mapping[str, Any]) -> Iterator[Case]:
-    """Yield the designs or motions that a result lists by name or number."""
-    names = {"baseline": "baseline", "nominal": "nominal member", "optimized": "optimised"}
-    for key, name in names.items():
-        record = result.get(key)
-        if not isinstance(record, Mapping) or not isinstance(record.get("design"), Mapping):
-            continue
+    keys = {name: key for key, name in NAMES.items()}
+    own = dict(zip(config.design_keys, map(float, config.design), strict=True))
+    for name, record in (records_of(result) or {"design": {}}).items():
         # The nominal member of a measured baseline has the family of the optimum.
-        file = place / ("optimized.yaml" if key == "nominal" else f"{key}.yaml")
-        own = load(file) if file.exists() else config
-        yield Case(name, own, dict(record["design"]), record, _series(place, key))
-    for number, record in enumerate(result.get("attractors") or (), start=1):
-        series = _series(place, str(number))
-        yield Case(f"motion {number}", config, dict(record["design"]), record, series)
-    for record in result.get("points") or ():
-        own = load(place / design_file(record["point"]))
-        yield Case(f"point {record['point']}", own, dict(record["design"]), record, None)
+        searched = keys.get(name) in ("nominal", "optimized")
+        file = design_file(record["point"]) if "point" in record else "optimized.yaml"
+        chosen = ("point" in record or searched) and (place / file).exists()
+        series = _series(place, keys.get(name, name.removeprefix("motion ")))
+        used = load(place / file) if chosen else config
+        yield Case(name, used, dict(record.get("design", own)), record, series)
 
 
 def _rows(file: Path) -> Iterator[dict[str, Any]]:

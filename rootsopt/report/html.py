@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import rootsopt
-from rootsopt.output.labels import in_words
-from rootsopt.report import blocks, charts, optimum, wording
-from rootsopt.report.blocks import Block
+from rootsopt.output import tables
+from rootsopt.output.names import in_words
+from rootsopt.output.table import status_cell
+from rootsopt.report import charts, wording
 from rootsopt.report.gather import Run
 from rootsopt.report.meshing import animations
 
@@ -57,6 +58,7 @@ def report_text(run: Run) -> str:
     )
     environment.filters["coded"] = coded
     drawn = _charts(run)
+    status = status_cell(str(run.result.get("status", "")))
     animation = animations(run.cases)
     text = environment.get_template("page.html.j2").render(
         title=wording.title(run),
@@ -64,13 +66,13 @@ def report_text(run: Run) -> str:
         command_line=f"rootsopt {run.command} {run.source}",
         version=rootsopt.__version__,
         day=datetime.date.today().isoformat(),
-        status=blocks.status_cell(str(run.result.get("status", ""))),
-        good=run.usable and blocks.status_cell(str(run.result.get("status", ""))).good is not False,
+        status=status,
+        good=run.usable and status.good is not False,
         asked=wording.asked(run),
         came_out=wording.came_out(run),
         what_next=wording.what_next(run),
-        conflict=optimum.conflict_block(run),
-        sections=_sections(run),
+        conflict=tables.conflict_table(run.result),
+        sections=tables.sections(run.result, run.rows),
         charts=drawn,
         animation=animation,
         data={"charts": [one["figure"] for one in drawn], "animation": animation},
@@ -81,8 +83,8 @@ def report_text(run: Run) -> str:
             }
             for name, data in run.figures.items()
         ],
-        statuses=blocks.status_block(run),
-        effort=blocks.statistics_block(run),
+        statuses=tables.status_table(run.result, run.config),
+        effort=tables.effort_table(run.result),
         style=markupsafe.Markup((_TEMPLATE / "page.css").read_text("utf-8")),
         script=markupsafe.Markup((_TEMPLATE / "page.js").read_text("utf-8")),
         plotly=markupsafe.Markup(offline.get_plotlyjs()) if drawn else "",
@@ -97,51 +99,30 @@ def _command(found: re.Match[str]) -> str:
     return f"<code>{' '.join(kept)}</code>"
 
 
-def _sections(run: Run) -> list[tuple[str, str, list[Block]]]:
-    """Return (anchor, title, tables) of each section that has tables."""
-    front, likeness = blocks.front_block(run), blocks.likeness_block(run)
-    sections = [
-        ("front", "Best compromises", [front]),
-        ("motions", "Coexisting motions", [blocks.attractor_block(run)]),
-        ("numbers", "Numbers", [blocks.result_block(run), *blocks.gradient_blocks(run)]),
-        ("scenes", "Scenes", blocks.speeds_blocks(run)),
-        (
-            "certificate",
-            "Certificate of the optimum",
-            [optimum.constraint_block(run), *optimum.certificate_blocks(run)],
-        ),
-        ("tolerances", "Tolerances", optimum.tolerance_blocks(run)),
-        ("pump", "Pump sheet", [blocks.pump_block(run)]),
-        ("likeness", "Resemblance", [likeness]),
-    ]
-    kept = [(anchor, name, [one for one in tables if one]) for anchor, name, tables in sections]
-    return [section for section in kept if section[2]]
-
-
 def _charts(run: Run) -> list[dict[str, Any]]:
     """Return the interactive charts of a run: title, explanation, and plotly's figure."""
-    found = []
-
-    def add(title: str, note: str, figure: dict[str, Any] | None) -> None:
-        if figure is not None:
-            found.append({"title": title, "note": note, "figure": figure})
-
-    for title, figure in charts.front_charts(run):
-        add(title, "Hover over a point to see its design.", figure)
-    add(
-        "Contact force over time",
-        "Hover for values, drag to zoom, double-click to zoom out. A click moves the rotors below "
-        "to that time.",
-        charts.force_chart(run.cases),
-    )
-    add(
-        "Spectrum of the contact force",
-        "The mean is left out. A click on a name hides or shows its lines.",
-        charts.spectrum_chart(run.cases),
-    )
-    chart = charts.scenes_chart(blocks.scene_rows(run))
-    add("Contact force in each scene", "A cross: no steady state.", chart)
-    return found
+    hover = "Hover over a point to see its design."
+    found = [(title, hover, figure) for title, figure in charts.front_charts(run)]
+    found += [
+        (
+            "Contact force over time",
+            "Hover for values, drag to zoom, double-click to zoom out. A click moves the rotors "
+            "below to that time.",
+            charts.force_chart(run.cases),
+        ),
+        (
+            "Spectrum of the contact force",
+            "The mean is left out. A click on a name hides or shows its lines.",
+            charts.spectrum_chart(run.cases),
+        ),
+        (
+            "Contact force in each scene",
+            "A cross: no steady state.",
+            charts.scenes_chart(tables.scene_rows(run.result, run.rows)),
+        ),
+    ]
+    keys = "title", "note", "figure"
+    return [dict(zip(keys, one, strict=True)) for one in found if one[2] is not None]
 
 
 __all__ = ["report_text"]

@@ -8,9 +8,9 @@ from typing import Any
 
 from rootsopt.config import Config
 from rootsopt.config.families import family_of
-from rootsopt.output.labels import in_words, name_and_unit
+from rootsopt.output.names import brief, in_words, name_and_unit, quantity, stated
+from rootsopt.output.table import status_cell
 from rootsopt.report.gather import Case, Run, varied
-from rootsopt.report.names import brief, last_part, quantity, unit
 from rootsopt.status import Status
 
 _ASKED = {
@@ -64,17 +64,14 @@ def _over(rows: Sequence[Mapping[str, Any]]) -> str:
     """Return a sentence on the values that differ between the scenes of a sweep."""
     parts = []
     for key in varied(rows):
-        name, text = name_and_unit(last_part(key))
-        found = [*dict.fromkeys(row.get(key) for row in rows)]
-        numbers = [x for x in found if isinstance(x, int | float)]
+        name = name_and_unit(key)[0]
+        found: list[Any] = [*dict.fromkeys(row.get(key) for row in rows)]
+        shown = f"{len(found)} values"
         if len(found) <= _FEW:
-            shown = [quantity(x, text) if x in numbers else in_words(str(x)) for x in found]
-            parts.append(f"{name}: {_joined(shown)}")
-        elif len(numbers) == len(found):
-            ends = f"{brief(min(numbers))} to {quantity(max(numbers), text)}"
-            parts.append(f"{name}: {len(found)} values from {ends}")
-        else:
-            parts.append(f"{name}: {len(found)} values")
+            shown = _joined([stated(key, x) for x in found])
+        elif all(isinstance(x, int | float) for x in found):
+            shown += f" from {brief(min(found))} to {stated(key, max(found))}"
+        parts.append(f"{name}: {shown}")
     return f"Between the scenes, these differ: {'; '.join(parts)}."
 
 
@@ -87,26 +84,20 @@ def scene(config: Config) -> str:
         under = f"under a load of {brief(load.torque_N_m)} N·m on rotor 2"
     else:
         under = f"under a pressure difference of {quantity(load.pressure_difference_Pa, 'Pa')}"
-    parts = []
-    if (gear := data.timing_gear) is not None:
-        parts.append(f"a timing gear with {brief(gear.backlash_mm)} mm backlash")
-    if data.motor is not None:
-        parts.append("a motor whose speed falls under load")
-    if config.rotor.helix_deg:
-        parts.append(f"rotors twisted by {quantity(config.rotor.helix_deg, 'deg')}")
-    if config.contact.friction is not None:
-        parts.append("friction between the flanks")
-    if data.supports is not None:
-        parts.append("elastic bearings")
-    if config.contact.clearance_mm:
-        parts.append(f"{brief(config.contact.clearance_mm)} mm clearance")
-    if data.center_distance_error_mm:
-        away = brief(data.center_distance_error_mm)
-        parts.append(f"a centre distance error of {away} mm")
-    if data.phase_error_mrad:
-        parts.append(f"a phase error of {brief(data.phase_error_mrad)} mrad")
-    tail = f", with {_joined(parts)}" if parts else ""
-    tail += "" if data.timing_gear is not None else ", without a timing gear"
+    gear, away = data.timing_gear, data.center_distance_error_mm
+    parts = (
+        gear and f"a timing gear with {brief(gear.backlash_mm)} mm backlash",
+        data.motor and "a motor whose speed falls under load",
+        config.rotor.helix_deg and f"rotors twisted by {quantity(config.rotor.helix_deg, '°')}",
+        config.contact.friction and "friction between the flanks",
+        data.supports and "elastic bearings",
+        config.contact.clearance_mm and f"{brief(config.contact.clearance_mm)} mm clearance",
+        away and f"a centre distance error of {brief(away)} mm",
+        data.phase_error_mrad and f"a phase error of {brief(data.phase_error_mrad)} mrad",
+    )
+    present = [str(part) for part in parts if part]
+    tail = f", with {_joined(present)}" if present else ""
+    tail += "" if gear is not None else ", without a timing gear"
     return f"The scene is {_pair(config)}, {speed} {under}{tail}."
 
 
@@ -136,7 +127,7 @@ def what_next(run: Run) -> list[str]:
     if not run.usable:
         advice = _message(run)[1]
         baseline = run.result.get("baseline") or {}
-        if _failed(baseline) and baseline.get("message"):
+        if status_cell(str(baseline.get("status"))).good is False and baseline.get("message"):
             advice.append(f"Baseline: {baseline['message']}")
         return advice or ["See the meaning of each status at the end of this report."]
     if run.command == "optimize":
@@ -182,20 +173,15 @@ def _after_stop(run: Run) -> list[str]:
 
 def _after_optimum(run: Run) -> list[str]:
     command = shlex.quote(str(run.path / "optimized.yaml"))
-    sentences = []
     found = run.result.get("optimality") or {}
     unproven = bool(found) and not found.get("converged")
-    dear = "" if unproven else _dearest(run.result.get("constraints") or ())
-    if dear:
-        sentences.append(dear)
-    if unproven:
-        sentences.append(str(found.get("message", "")))
-    sentences += [
+    dear = _dearest(run.result.get("constraints") or ())
+    return [
+        *filter(None, [str(found.get("message", "")) if unproven else dear]),
         f"Draw the rotor: `rootsopt profile {command} --export dxf,step`.",
         f"Check it at other speeds: `rootsopt sweep {command}`.",
         f"Check whether other motions coexist: `rootsopt attractors {command}`.",
     ]
-    return sentences
 
 
 def _dearest(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -219,13 +205,14 @@ def _optimised(run: Run) -> list[str]:
         return _single(run.cases[0])
     sentences = []
     before, after = cases["baseline"].record, cases["optimised"].record
-    gain = (run.result.get("improvement") or {}).get("objective")
-    if gain is not None and math.isfinite(gain):
-        sentences.append(f"The objective is {_percent(100 * -gain)} the baseline's.")
-    gain = (run.result.get("improvement_over_nominal") or {}).get("objective")
-    if gain is not None and math.isfinite(gain):
-        member = "that of the nominal member of the family, fitted to the measured baseline"
-        sentences.append(f"It is {_percent(100 * -gain)} {member}.")
+    member = "that of the nominal member of the family, fitted to the measured baseline"
+    for entry, subject, whose in (
+        ("improvement", "The objective", "the baseline's"),
+        ("improvement_over_nominal", "It", member),
+    ):
+        gain = (run.result.get(entry) or {}).get("objective")
+        if gain is not None and math.isfinite(gain):
+            sentences.append(f"{subject} is {_percent(100 * -gain)} {whose}.")
     for key in ("mean_force_N", "peak_force_N"):
         a, b = (one.get("response", {}).get(key) for one in (before, after))
         if a and b is not None:
@@ -233,13 +220,13 @@ def _optimised(run: Run) -> list[str]:
             change = f"{abs(percent):.3g} % {'less' if percent < 0 else 'more'}"
             change = "unchanged" if abs(percent) < _SMALL else change
             sentences.append(f"The {name} goes from {brief(a)} N to {brief(b)} N: {change}.")
-    moved = []
-    for key, new in cases["optimised"].design.items():
-        old = cases["baseline"].design.get(key)
-        if old is not None and len(cases["optimised"].design) <= _FEW:
-            name, text = name_and_unit(key)
-            moved.append(f"{name} {brief(old)} → {quantity(new, text)}")
-    if moved:
+    old, new = (cases[name].design for name in ("baseline", "optimised"))
+    moved = [
+        f"{name_and_unit(key)[0]} {brief(old[key])} → {stated(key, x)}"
+        for key, x in new.items()
+        if key in old
+    ]
+    if moved and len(new) <= _FEW:
         sentences.append(f"Design: {', '.join(moved)}.")
     found = run.result.get("optimality")
     if found:
@@ -257,12 +244,8 @@ def _robust(run: Run) -> list[str]:
     if not fresh:
         return []
     count = next(iter(fresh.values()))["scenes"]
-    means = [f"{name} {_known(one['objective'].get('mean'))}" for name, one in fresh.items()]
+    means = (f"{name} {quantity(one['objective'].get('mean'), '')}" for name, one in fresh.items())
     return [f"Mean objective in {count} fresh scenes that scatter: {', '.join(means)}."]
-
-
-def _known(given: float | None) -> str:
-    return "unknown" if given is None else brief(given, 4)
 
 
 def _percent(change: float) -> str:
@@ -280,10 +263,8 @@ def _traced(run: Run) -> list[str]:
     sentences = [f"The curve has {len(points)} points, {sure} of them certified."]
     for aim in run.result.get("terms") or ():
         numbers = [point["terms"][aim["name"]] for point in points]
-        name, text = name_and_unit(aim["name"])
-        text = unit(text)
-        ends = f"{brief(min(numbers))} to {brief(max(numbers))} {text}".strip()
-        sentences.append(f"Along it, the {name} ranges from {ends}.")
+        ends = f"{brief(min(numbers))} to {stated(aim['name'], max(numbers))}"
+        sentences.append(f"Along it, the {name_and_unit(aim['name'])[0]} ranges from {ends}.")
     gaps = run.result.get("gaps") or []
     if gaps:
         where = [f"{gap['first']} and {gap['second']}" for gap in gaps]
@@ -317,12 +298,7 @@ def _swept(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     axes = varied(rows)
     for word, pick in (("lowest", min), ("highest", max)) if known and axes else ():
         row = pick(known, key=lambda one: one["peak_force_N"])
-        where = []
-        for key in axes:
-            name, text = name_and_unit(last_part(key))
-            given = row.get(key)
-            shown = quantity(given, text) if isinstance(given, int | float) else str(given)
-            where.append(f"{name} {shown}")
+        where = [stated(key, row.get(key), named=True) for key in axes]
         sentences.append(f"The peak force is {word}, {brief(row['peak_force_N'])} N, at "
                          f"{_joined(where)}.")  # fmt: skip
     return sentences
@@ -363,10 +339,11 @@ def _steepest(gradient: Mapping[str, Any]) -> str:
     if not known or len(known) > _FEW:
         return ""
     key = max(known, key=lambda one: abs(known[one]))
-    name, text = name_and_unit(key)
     word = "raises" if known[key] > 0 else "lowers"
-    step = quantity(1, text)
-    return f"Raising the {name} by {step} {word} the peak force by {brief(abs(known[key]))} N."
+    return (
+        f"Raising the {name_and_unit(key)[0]} by {stated(key, 1)} {word} the peak force by "
+        f"{brief(abs(known[key]))} N."
+    )
 
 
 def _objective(config: Config) -> str:
@@ -403,11 +380,6 @@ def _sense(word: str) -> str:
 
 def _joined(words: list[str]) -> str:
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
-
-
-def _failed(record: Any) -> bool:
-    word = str((record or {}).get("status", "")).upper()
-    return word in Status.__members__ and not Status[word].usable
 
 
 __all__ = ["asked", "came_out", "scene", "title", "what_next"]

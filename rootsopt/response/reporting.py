@@ -1,4 +1,4 @@
-"""Names of the quantities that objective, trade-offs and limits can use: forces, lines, terms."""
+"""Checks the quantities that objective, trade-offs and limits can name: forces, lines, terms."""
 
 import re
 from collections.abc import Sequence
@@ -9,27 +9,6 @@ from rootsopt.errors import InputError
 from rootsopt.response.records import RESPONSES
 
 _LINE = re.compile(r"line_(\d+(?:\.\d+)?)_force_N")
-_UNITS = {
-    "_kg_m2": "kg m²",
-    "_l_min": "l/min",
-    "_cm3": "cm³",
-    "_mm2": "mm²",
-    "_mm": "mm",
-    "_deg": "°",
-    "_N": "N",
-}
-
-
-def unit_in(name: str) -> str:
-    """Return the unit of a quantity; empty if it has no unit, or if its name does not contain the
-    unit."""
-    return next((unit for end, unit in _UNITS.items() if name.endswith(end)), "")
-
-
-def in_words(name: str) -> str:
-    """Return the name of a quantity in words, without the unit."""
-    end = next((end for end in _UNITS if name.endswith(end)), "")
-    return name.removesuffix(end).replace("_", " ").replace("rms ", "RMS ")
 
 
 def is_force(config: Config, name: str, key: str) -> bool:
@@ -72,4 +51,4 @@ def reporting(config: Config, names: Sequence[str], key: str) -> Config:
     return config.model_copy(update={"response": response, "objective": objective})
 
 
-__all__ = ["in_words", "is_force", "reporting", "unit_in"]
+__all__ = ["is_force", "reporting"]

@@ -34,8 +34,7 @@ _SCALARS = {
     "lyapunov_exponent_per_mesh_period": ("1", "Lyapunov exponent per mesh period"),
 }
 """Unit and long name of each number that is taken from `steady_state`."""
-_OWN_UNITS = {"_N": "N", "_mm2": "mm2", "_kg_m2": "kg m2", "_deg": "deg", "_cm3": "cm3"}
-_PLAIN = str.maketrans({"·": " ", "°": "deg", "²": "2", "³": "3"})
+_PLAIN = str.maketrans({"·": " ", "°": "deg", "²": "2", "³": "3", "µ": "u"})
 
 
 def dataset_of(
@@ -194,8 +193,7 @@ def written(value: Any) -> str:
 
 def unit(name: str) -> str:
     """Return the unit with which a name ends, as UDUNITS reads it; "1" for a name without one."""
-    known = unit_of(name).translate(_PLAIN)
-    return known or next((u for end, u in _OWN_UNITS.items() if name.endswith(end)), "1")
+    return unit_of(name).translate(_PLAIN) or "1"
 
 
 __all__ = ["dataset_of", "is_numeric", "unit", "written"]

@@ -3,9 +3,10 @@
 from typing import NamedTuple
 
 from rootsopt.config import Config
+from rootsopt.config.units import unit_of, words
 from rootsopt.errors import InputError
 from rootsopt.optimize.limits import LIMITS, depends_on_forces, limited
-from rootsopt.response.reporting import in_words, is_force, reporting, unit_in
+from rootsopt.response.reporting import is_force, reporting
 from rootsopt.response.terms import terms_of
 from rootsopt.scene import Scene
 
@@ -29,12 +30,12 @@ class Aim(NamedTuple):
     @property
     def unit(self) -> str:
         """Unit of the term; "" if its name does not contain a unit."""
-        return unit_in(self.name)
+        return unit_of(self.name)
 
     @property
     def words(self) -> str:
         """Name in words, without the unit."""
-        return in_words(self.name)
+        return words(self.name)
 
     @property
     def label(self) -> str:

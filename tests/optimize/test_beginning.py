@@ -9,7 +9,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import yaml
-from rich.console import Console
 
 from rootsopt.commands.table import optimize
 from rootsopt.commands.work.searching import checkpoint_of
@@ -20,7 +19,6 @@ from rootsopt.errors import InputError
 from rootsopt.optimize import beginning as module
 from rootsopt.optimize.beginning import beginning
 from rootsopt.optimize.search import Optimization, Search
-from rootsopt.output import tables
 from rootsopt.output.runs import RunFolder
 from rootsopt.scene import outline_mm
 from rootsopt.scene.check import shape_of
@@ -104,13 +102,6 @@ def test_improvement_over_the_nominal_member():
     over = Optimization._gains(found, member, 0.75)  # type: ignore[arg-type]
     assert gain == pytest.approx({"objective": 0.5} | dict.fromkeys(forces, 0.5))
     assert over == pytest.approx({"objective": 1 / 3} | dict.fromkeys(forces, 1 / 3))
-    console = Console(width=80, record=True)
-    records = [{"response": one.response} for one in (measured, member, best)]
-    console.print(tables.nominal_table(*records, gain, over))
-    row = next(x for x in console.export_text().splitlines() if "objective" in x)
-    cells = [x.strip() for x in row.split("|")[2:7]]
-    assert cells[1:3] == ["0.75000", "0.50000"]
-    assert [float(x.split()[0]) for x in cells[3:]] == pytest.approx([-50, -33.3], abs=0.1)
 
 
 def test_a_config_without_a_file_has_no_beginning():

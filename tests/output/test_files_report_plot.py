@@ -18,7 +18,8 @@ from rootsopt.figures.force import amplitude_spectrum, plot_force
 from rootsopt.figures.history import plot_history
 from rootsopt.figures.runs import optimization_figures, simulation_figures
 from rootsopt.figures.style import figure
-from rootsopt.output import files, tables
+from rootsopt.output import files, names, tables, terminal
+from rootsopt.output.table import table
 from rootsopt.response.evaluation import Evaluation
 from rootsopt.response.series import Series
 from rootsopt.status import Status
@@ -224,7 +225,7 @@ def test_versions():
 
 def test_importing_files_and_report_does_not_import_matplotlib():
     code = (
-        "from rootsopt.output import files, tables;"
+        "from rootsopt.output import files, tables, terminal;"
         "import sys; sys.exit('matplotlib' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
@@ -233,92 +234,196 @@ def test_importing_files_and_report_does_not_import_matplotlib():
 # --------------------------------------------------------------------------- tables
 
 
-def _render(table):
+def _render(*made):
     console = Console(width=80, force_terminal=False, color_system=None)
     with console.capture() as capture:
-        console.print(table)
+        console.print(terminal.shown(made))
     text = capture.get()
     assert text.isascii()
     assert "\x1b" not in text
-    assert max(map(len, text.splitlines())) <= 80
+    assert max(map(len, text.splitlines()), default=0) <= 80
     return text
 
 
-def _row(text, label):
-    (line,) = [line for line in text.splitlines() if line.startswith(f"|   {label} ")]
-    return [cell.strip() for cell in line.strip("|").split("|")][1:]
+def _row(made, label):
+    """Return the cells of the row of a table with this label, as texts."""
+    (row,) = [row for _, rows in made.groups for row in rows if row[0].text == label]
+    return [cell.text for cell in row[1:]]
 
 
 CONSTRAINTS = [
     {"name": "area_efficiency", "baseline": 0.4344578, "optimized": 0.4344579, "unit": "",
-     "limit": 0.4344578, "sense": ">=", "satisfied": True, "active": True},
+     "limit": 0.4344578, "sense": ">=", "satisfied": True, "active": True, "multiplier": 2.0,
+     "relaxed_by": -0.01, "relaxed_objective_percent": -2.63},
     {"name": "undercut_margin", "baseline": 7.4, "optimized": -0.1, "unit": "mm", "limit": 0.0,
-     "sense": ">=", "satisfied": False, "active": False},
+     "sense": ">=", "satisfied": False, "active": False, "baseline_satisfied": False,
+     "baseline_limit": 7.0},
 ]  # fmt: skip
 
 
-def test_comparison_table():
-    gains = {"objective": 0.25, "mean_force_N": 0.1, "peak_force_N": 0.5}
-    baseline, better = _evaluation(), _evaluation(13.3472988, 41.912427)
-    text = _render(tables.comparison_table(baseline, better, CONSTRAINTS, gains))
-    assert _row(text, "objective (baseline = 1)") == ["1", "0.75000", "-25.00 %"]
-    assert _row(text, "mean force, N") == ["14.830", "13.347", "-10.00 %"]
-    assert _row(text, "peak force, N") == ["83.825", "41.912", "-50.00 %"]
-    assert _row(text, "pressure angle, deg") == ["36.430", "36.430", "+0.00 %"]
-    assert _row(text, "polar inertia, kg m^2")[0] == "0.0021007"
-    assert _row(text, "d/d(pressure angle), N/deg") == ["-0.24457", "-0.24457", ""]
-    assert _row(text, "area efficiency >= 0.43446") == ["0.43446", "0.43446", "active"]
-    assert _row(text, "undercut margin >= 0 mm") == ["7.4000", "-0.10000", "violated"]
-    assert _row(text, "status") == ["periodic", "periodic", ""]
-    assert text.count(Status.PERIODIC.value) == 1
+def _compared(first, second, **gains):
+    return {"baseline": first.record(), "optimized": second.record(), "improvement": gains,
+            "constraints": CONSTRAINTS}  # fmt: skip
 
 
-def test_comparison_table_without_a_usable_result():
-    failed = _failed()
-    text = _render(tables.comparison_table(_evaluation(), failed, [], {"objective": float("nan")}))
-    assert _row(text, "objective (baseline = 1)") == ["-", "-", "-"]
-    assert _row(text, "mean force, N") == ["14.830", "-", "-"]
-    assert _row(text, "d/d(pressure angle), N/deg") == ["-0.24457", "-", ""]
-    assert _row(text, "status") == ["periodic", "passed_through", ""]
-    assert "passed through each other" in text
+def test_numbers_of_two_designs_are_compared():
+    result = _compared(_evaluation(), _evaluation(13.3472988, 41.912427), objective=0.25)
+    made = tables.numbers_table(result)
+    assert _row(made, "relative to the baseline") == ["1", "0.75000", "−25.00 %"]
+    assert _row(made, "mean force (N)") == ["14.830", "13.347", "−10.00 %"]
+    assert _row(made, "peak force (N)") == ["83.825", "41.912", "−50.00 %"]
+    assert _row(made, "pressure angle (°)") == ["36.430", "36.430", "0.00 %"]
+    assert _row(made, "polar inertia (kg·m²)")[0] == "0.0021007"
+    assert _row(made, "status") == ["periodic", "periodic", ""]
+    assert made.note == f"both: {Status.PERIODIC.value}"
+    limits = tables.constraint_table(result)
+    price = ["active", "−2.63 % for −0.01"]
+    assert _row(limits, "area efficiency ≥ 0.43446") == ["0.43446", "0.43446", *price]
+    beyond = ["7.4000 > 7.0000", "−0.10000", "violated", ""]
+    assert _row(limits, "undercut margin ≥ 0 mm") == beyond
+    gradients = [*tables.gradient_tables(result)]
+    assert [one.title.rpartition(", ")[2] for one in gradients] == ["baseline", "optimised"]
+    text = _render(*tables.tables_of(result))
+    assert "polar inertia (kg m^2)" in text
+    assert "undercut margin >= 0 mm" in text
 
 
-def test_evaluation_table():
-    text = _render(tables.evaluation_table(_evaluation()))
-    assert _row(text, "mean force, N") == ["14.830"]
-    assert _row(text, "d/d(involute length), N/mm") == ["0.65000"]
-    assert _row(text, "period, mesh periods") == ["2"]
-    assert _row(text, "status") == ["periodic"]
-    empty = _render(tables.evaluation_table(_failed()))
-    assert empty.count("|   none ") == 2  # response and gradient
-    assert "passed through each other" in empty
+def test_numbers_of_a_nominal_member_stand_between():
+    """Changes are in % of the baseline and of the nominal member."""
+    forces = (100.0, 75.0, 50.0)
+    measured, member, best = (_evaluation(force, force).record() for force in forces)
+    result = {"baseline": measured, "nominal": member, "optimized": best}
+    result |= {"improvement": {"objective": 0.5}, "improvement_over_nominal": {"objective": 1 / 3}}
+    made = tables.numbers_table(result)
+    cells = ["1", "0.75000", "0.50000", "−50.00 %", "−33.33 %"]
+    assert _row(made, "relative to the baseline") == cells
+    assert _row(made, "mean force (N)")[3:] == ["−50.00 %", "−33.33 %"]
+    _render(made)
 
 
-def test_pump_table():
-    """The table shows baseline beside optimum, with rows of both or one of them, and the forces."""
-    first = {"pump": {"flow_ripple": 0.2, "flow_lines": [0.1]}, "response": {"mean_force_N": 10.0}}
-    second = {"pump": {"flow_ripple": 0.1, "tip_leakage_l_min": 2.5}, "response": {}}
-    text = _render(tables.pump_table({"baseline": first, "optimised": second}))
-    assert _row(text, "flow ripple") == ["0.20000", "0.10000", "-50.00 %"]
-    assert _row(text, "tip leakage, l/min") == ["-", "2.5000", "-"]
-    assert _row(text, "mean force, N") == ["10.000", "-", "-"]
-    assert "flow lines" not in text
+def test_numbers_without_a_usable_result():
+    result = _compared(_evaluation(), _failed(), objective=float("nan"))
+    made = tables.numbers_table(result)
+    assert _row(made, "relative to the baseline") == ["–", "–", ""]
+    assert _row(made, "mean force (N)") == ["14.830", "–", ""]
+    assert _row(made, "status") == ["periodic", "passed through", ""]
+    assert made.groups[-1][1][-1][2].good is False
+    assert "passed through each other" in made.note
+    assert len([one for one in tables.gradient_tables(result) if one]) == 1
 
 
-def test_geometry_table():
-    record = {"design": {}, "geometry": {"outer_radius_mm": 44.0, "area_efficiency": 0.40625}}
-    text = _render(tables.geometry_table(record))
-    assert _row(text, "outer radius, mm") == ["44.000"]
-    assert _row(text, "area efficiency") == ["0.40625"]
+def test_numbers_of_one_design():
+    record = _evaluation().record()
+    made = tables.numbers_table(record)
+    assert _row(made, "mean force (N)") == ["14.830"]
+    assert _row(made, "period (mesh periods)") == ["2"]
+    assert _row(made, "status") == ["periodic"]
+    slopes = next(tables.gradient_tables(record))
+    assert _row(slopes, "involute length (mm)") == ["0.65000"]
+    errors = {"mean_force_N": {"involute_length_mm": 0.25}}
+    record = record | {"steady_state": {"gradient_standard_error": errors}}
+    slopes = next(tables.gradient_tables(record))
+    assert _row(slopes, "involute length (mm)") == ["0.65000 ± 0.25000"]
+    assert "0.65000 +- 0.25000" in _render(slopes)
+    assert _row(tables.effort_table(record), "time (s)") == ["21.160"]
+
+
+def test_pump_sheet():
+    """The sheet shows baseline beside optimum, with rows of both or one of them, and the forces."""
+    known = {"design": DESIGN, "response": {"mean_force_N": 10.0}}
+    first = known | {"pump": {"flow_ripple": 0.2, "flow_lines": [0.5, 0.25]}}
+    overlap = {"flank_interference_um": 30.0, "flank_interference_at_deg": 5.0}
+    sheet = {"flow_ripple": 0.1, "tip_leakage_l_min": 2.5, **overlap}
+    made = tables.pump_table({"baseline": first, "optimized": known | {"pump": sheet}})
+    assert _row(made, "flow ripple") == ["0.20000", "0.10000", "−50.00 %"]
+    assert _row(made, "tip leakage (l/min)") == ["–", "2.5000", ""]
+    assert _row(made, "flow lines, 2 of 2") == ["0.25000", "–", ""]
+    assert _row(made, "mean force (N)") == ["10.000", "10.000", "0.00 %"]
+    assert "optimised: The flanks overlap" in made.note
+    _render(made)
+
+
+def test_steps_of_the_scene_have_their_own_unit():
+    """A clearance moves by a micrometre, another length by a hundredth of itself."""
+    row = {"unit": "mm", "mean_force_N": 0.1, "peak_force_N": -0.2}
+    rows = [row | {"quantity": "clearance", "step": 1e-3, "value": 0.1},
+            row | {"quantity": "rotor length", "step": 1.0, "value": 100.0}]  # fmt: skip
+    optimality = {"converged": True, "reason": "converged", "message": "", "residual": 0.0,
+                  "required_residual": 1e-4, "violation": 0.0, "method": "slsqp",
+                  "sensitivities": rows}  # fmt: skip
+    made = [one for one in tables.certificate_tables({"optimality": optimality}) if one][-1]
+    assert _row(made, "clearance +1 µm") == ["+0.1", "−0.2", "–"]
+    assert _row(made, "rotor length +1 %") == ["+0.1", "−0.2", "–"]
+    assert "clearance +1 um" in _render(made)
+
+
+def test_scenes_have_columns_for_what_differs():
+    """Values that all rows share stand below; long tables are truncated, and say so."""
+    rows = [{"speed_rpm": 1000.0 * k, "mean_force_N": 10.0 + k, "peak_force_N": None,
+             "period": 2, "status": "periodic"} for k in range(1, 9)]  # fmt: skip
+    (made,) = tables.scene_tables({}, rows, most=5)
+    assert made.heads == ("speed (rpm)", "status", "mean force (N)")
+    assert len(made.groups[0][1]) == 5
+    assert made.note == "The first 5 of 8 rows. In all rows: period 2 mesh periods."
+    of_both = {"baseline": {"design": DESIGN, "speeds": rows},
+               "optimized": {"design": DESIGN, "speeds": rows},
+               "objective_by_speed": [row | {"objective": 0.5} for row in rows]}  # fmt: skip
+    first, second = tables.scene_tables(of_both, (), most=200)
+    assert "objective" not in first.heads
+    assert "objective 0.5" in second.note
+
+
+def test_wide_tables_are_divided_on_the_terminal():
+    """Every part repeats the first column, fits into the width, and no cell or note is lost."""
+    heads = ["point", *(f"a quantity with number {k}, ½ (mm)" for k in range(30))]
+    rows = [[f"row {k}", *(f"{k}.{j:04d} × 10⁻⁷" for j in range(30))] for k in range(3)]
+    made = table("Wide [table]", heads, [("", rows)], "Nothing is lost → here.")
+    text = _render(made)
+    assert text.count("Wide [table]") > 3
+    for row in rows:
+        assert text.count(row[0]) == text.count("Wide [table]")
+        for cell in row[1:]:
+            assert text.count(f" {terminal.ascii_text(cell)} ") == 1
+    assert "Nothing is lost -> here." in text
+    assert table("Empty", heads, [("", [])]) is None
 
 
 @pytest.mark.parametrize(
-    ("value", "shown"),
-    [(0.0, "0"), (1973.3, "1973.3"), (-1.23456e-7, "-1.235e-07"), (3, "3"), (None, "-"),
-     (float("nan"), "-"), (123456.7, "123457")],
+    ("printed", "plain"),
+    [("5 µm at 4° (°)", "5 um at 4 deg (deg)"), ("−1.2 × 10⁻⁷ kg·m²", "-1.2e-07 kg m^2"),
+     ("3 × 10¹² ≥ – ± ≤", "3e+12 >= - +- <="), ("line at 2 × mesh", "line at 2 x mesh"),
+     ("ψ(β)", "?(?)")],
 )  # fmt: skip
-def test_number(value, shown):
-    assert tables._number(value) == shown
+def test_terminal_replaces_the_signs_of_print(printed, plain):
+    assert terminal.ascii_text(printed) == plain
+
+
+@pytest.mark.parametrize(
+    ("given", "shown"),
+    [(0.0, "0"), (1973.3, "1973.3"), (-1.23456e-7, "−1.235 × 10⁻⁷"), (3, "3"), (None, "–"),
+     (float("nan"), "–"), (123456.7, "123457"), (True, "yes"), ("passed_through", "passed through"),
+     ([1, 2.5], "1, 2.5000")],
+)  # fmt: skip
+def test_values(given, shown):
+    assert names.value(given) == shown
+
+
+@pytest.mark.parametrize(
+    ("key", "shown"),
+    [("scene.timing_gear.backlash_mm", "backlash (mm)"), ("rms_force_N", "RMS force (N)"),
+     ("line_1.5_force_N", "line at 1.5 × mesh frequency (N)"),
+     ("flank_gap_min_um", "flank gap min (µm)"), ("area_efficiency", "area efficiency"),
+     ("tilting_moment_max_N_m", "tilting moment max (N·m)")],
+)  # fmt: skip
+def test_names(key, shown):
+    assert names.label(key) == shown
+
+
+def test_changes():
+    assert names.percent(-2.0, -1.0) == "+50.00 %"
+    assert names.percent(1.0, 1.0 - 1e-9) == "0.00 %"
+    assert names.percent(0.001, 3.0) == "+3 × 10⁵ %"
+    assert names.percent(0.0, 1.0) == names.percent(None, 1.0) == ""
 
 
 # -------------------------------------------------------------------------- figures

@@ -7,7 +7,7 @@ from rich.console import Console
 
 from rootsopt.commands import cli
 from rootsopt.config import Config
-from rootsopt.output import files, tables
+from rootsopt.output import files, tables, terminal
 from rootsopt.output.runs import RunFolder
 from rootsopt.response.attractors import find
 from rootsopt.response.evaluation import Evaluator
@@ -52,7 +52,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
         basin_figures(folder, found, config)
 
     def show(out: Console) -> None:
-        out.print(tables.attractor_table(rows, found.lost))
+        out.print(terminal.shown(tables.tables_of(data)))
         if not found.status.usable:
             out.print(f"{found.status.label}: {data['message']}", soft_wrap=True)
 

@@ -23,9 +23,9 @@ from rootsopt.export import chosen
 from rootsopt.measured import report as outline_report
 from rootsopt.optimize import noise
 from rootsopt.optimize.robust import search_of
-from rootsopt.output import files, tables
+from rootsopt.output import files, tables, terminal
 from rootsopt.output.runs import RunFolder
-from rootsopt.pump.sheet import check_clearances, record_of, warnings
+from rootsopt.pump.sheet import check_clearances, record_of
 from rootsopt.runtime.timing import CompileClock
 from rootsopt.scene import Scene, check_geometry, outline_mm
 
@@ -59,7 +59,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     ran = time.perf_counter() - began
     alike = {} if result.interrupted else _alike(config, result)
     sheets = _sheets(config, result)
-    _write(folder, config, options, result, alike, sheets, clock.seconds, ran)
+    data = _write(folder, config, options, result, alike, sheets, clock.seconds, ran)
     if result.optimized is not None and formats:
         from rootsopt.export.writing import write_simulated
 
@@ -67,33 +67,11 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     total = time.perf_counter() - began
 
     def show(out: Console) -> None:
-        baseline = result.baseline.record().get("speeds")
-        if result.optimized is None:
-            out.print(tables.evaluation_table(result.baseline))
-            if baseline:
-                out.print(tables.speeds_table(baseline))
-        else:
-            numbers = result.constraints, result.improvement
-            out.print(tables.comparison_table(result.baseline, result.optimized, *numbers))
-            if result.nominal is not None:
-                gains = result.improvement, result.improvement_over_nominal
-                measured, nominal, found = sheets.values()
-                out.print(tables.nominal_table(measured, nominal, found, *gains))
-            named = {"baseline": sheets["baseline"], "optimised": sheets["optimized"]}
-            out.print(tables.pump_table(named))
-            for note in warnings(sheets["optimized"]["pump"]):
-                out.print(f"optimised: {note}", soft_wrap=True, highlight=False)
-            if baseline:
-                optimized = result.optimized.record()["speeds"]
-                out.print(tables.speeds_table(baseline, optimized, result.objective_by_speed))
-            _show_optimum(out, result, numbers[0])
-            if alike:
-                out.print(tables.likeness_table(alike["resembles"]))
+        out.print(terminal.shown(tables.tables_of(data)))
+        if result.cost:
+            out.print(result.cost, soft_wrap=True)
         if result.beginning is not None:
             outline_report.say(config, out)
-            out.print(tables.beginning_table(result.beginning.record()))
-        if rejected := result.verification.get("rejected"):
-            out.print(tables.rejected_table(rejected))
         if result.interrupted or result.optimized is None:
             out.print(_message(result))
         out.print(
@@ -104,21 +82,6 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
 
     found = result.optimized is not None and not result.interrupted
     return cli.Outcome(cli.OK if found else cli.NO_RESULT, show)
-
-
-def _show_optimum(out: Console, result, constraints) -> None:
-    """Print what is known about the optimum, with the rows of its `constraints`."""
-    if result.optimality is not None:
-        out.print(tables.optimality_table(result.optimality.record(), constraints))
-        if result.optimality.sensitivities:
-            out.print(tables.sensitivity_table([*result.optimality.sensitivities]))
-    if result.robustness is not None and result.robustness.fresh:
-        record = result.robustness.record()
-        designs = {"baseline": result.baseline, "robust": result.optimized}
-        shown = {name: one.design for name, one in designs.items()}
-        out.print(tables.robustness_table(record, shown))
-    if result.cost:
-        out.print(result.cost, soft_wrap=True)
 
 
 def _contradiction(config: Config, folder: RunFolder, result) -> cli.Outcome:
@@ -133,12 +96,9 @@ def _contradiction(config: Config, folder: RunFolder, result) -> cli.Outcome:
     if result.beginning is not None:
         data["beginning"] = result.beginning.record()
     folder.write_json("result.json", data)
-    rows = found.record()["conflicts"]
 
     def show(out):
-        out.print(tables.conflict_table(rows))
-        if result.beginning is not None:
-            out.print(tables.beginning_table(data["beginning"]))
+        out.print(terminal.shown(tables.tables_of(data)))
         out.print(f"{result.status.label}: {found.message}", soft_wrap=True)
 
     return cli.Outcome(cli.NO_RESULT, show)
@@ -225,8 +185,8 @@ def _interrupted(result) -> str:
     )
 
 
-def _write(folder, config, options, result, alike, sheets, compiled, ran) -> None:
-
+def _write(folder, config, options, result, alike, sheets, compiled, ran) -> dict:
+    """Write the files of a search; return the content of the result file."""
     records = {"baseline": result.baseline, "optimized": result.optimized}
     if result.nominal is not None:
         records["nominal"] = result.nominal
@@ -274,6 +234,7 @@ def _write(folder, config, options, result, alike, sheets, compiled, ran) -> Non
     folder.write_json("result.json", data)
     if not options.no_figures:
         _draw(folder, config, result, data)
+    return files.plain(data)
 
 
 def _draw(folder, config: Config, result, data: dict) -> None:

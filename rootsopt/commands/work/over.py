@@ -13,7 +13,7 @@ from rootsopt.commands.work.searching import opened, progress_bar
 from rootsopt.config import Config
 from rootsopt.config.plausible import notes_on_swept
 from rootsopt.errors import InputError
-from rootsopt.output import datasets, files, sweeps
+from rootsopt.output import datasets, files, sweeps, tables, terminal
 from rootsopt.output.runs import RunFolder
 from rootsopt.runtime.environment import say
 from rootsopt.status import Status
@@ -23,6 +23,8 @@ from rootsopt.sweeps.scenes import Points, checked, complete, runner
 from rootsopt.sweeps.table import dataset_of
 
 _DATA = "sweep.nc"
+_FEW = 40
+"""Number of points above which the terminal shows only the first."""
 _FIRST = "compiling and simulating"
 _PROMISE = "keeping the points that are done and writing the files"
 
@@ -54,7 +56,8 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     seconds = time.perf_counter() - began
     dataset = dataset_of(config, plan, records)
     files.write_config(folder, config)
-    folder.write_csv("sweep.csv", files.row_columns(sweeps.rows_of(plan, records)))
+    rows = sweeps.rows_of(plan, records)
+    folder.write_csv("sweep.csv", files.row_columns(rows))
     datasets.write_dataset(folder, name, dataset)
     statistics: dict[str, Any] = {"seconds": seconds, "resumed_points": known}
     statistics["points_per_second"] = (len(records) - known) / seconds
@@ -70,12 +73,12 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
         folder.overwrite = False  # An earlier result is more valuable than this one.
 
     def show(out: Console) -> None:
-        out.print(sweeps.tables_of(plan, records, dataset))
+        out.print(terminal.shown(tables.tables_of(record, rows, _FEW)))
         out.print(f"{record['status']}: {record['message']}", soft_wrap=True, markup=False)
         rate = statistics["points_per_second"]
         out.print(f"{len(records) - known} points in {seconds:.1f} s, {rate:.3g} per second")
 
-    usable = done and any(Status[row["status"].upper()].usable for row in records.values())
+    usable = done and any(Status[row["status"].upper()].usable for row in rows)
     return cli.Outcome(cli.OK if usable else cli.NO_RESULT, show)
 
 

@@ -16,7 +16,7 @@ from rootsopt.commands.work.searching import (
     searched,
 )
 from rootsopt.config import Config
-from rootsopt.output import files, fronts, tables
+from rootsopt.output import files, fronts, tables, terminal
 from rootsopt.output.runs import RunFolder
 from rootsopt.runtime.environment import say
 from rootsopt.runtime.timing import CompileClock
@@ -65,10 +65,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
         folder.overwrite = False  # An earlier result is more valuable than this one.
 
     def show(out: Console) -> None:
-        if front.infeasible is not None:
-            out.print(tables.conflict_table(record["infeasible"]["conflicts"]))
-        elif front.baseline_terms:
-            out.print(tables.front_table(record))
+        out.print(terminal.shown(tables.tables_of(record)))
         out.print(f"{front.status.label}: {front.message}", soft_wrap=True)
         out.print(
             f"{front.searches} searches, {front.evaluations} designs, compile "

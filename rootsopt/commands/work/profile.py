@@ -12,10 +12,10 @@ from rootsopt.errors import InputError
 from rootsopt.export import chosen
 from rootsopt.export.writing import write
 from rootsopt.measured import report as outline_report
-from rootsopt.output import files, tables
+from rootsopt.output import files, tables, terminal
 from rootsopt.output.runs import RunFolder
 from rootsopt.profiles import Profile, geometry
-from rootsopt.pump.sheet import NOTE, missing, sheet, warnings
+from rootsopt.pump.sheet import sheet
 from rootsopt.response.records import geometry_record
 from rootsopt.scene import Scene, check_geometry, design_keys, design_vector, outline_mm
 from rootsopt.scene.families import free_form_of, margins_of
@@ -60,14 +60,9 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     projected = None if coefficients is None else _projected(folder, config, coefficients)
 
     def show(out: Console) -> None:
-        out.print(tables.geometry_table(record))
-        rows = record["pump"]
-        for note in (*warnings(rows), NOTE, missing(rows)):
-            if note:
-                out.print(note, soft_wrap=True, highlight=False)
+        out.print(terminal.shown(tables.tables_of(record)))
+        out.print(record["message"], soft_wrap=True, highlight=False)
         outline_report.say(config, out)
-        if alike:
-            out.print(tables.likeness_table(alike, "This profile resembles"))
         if projected is not None:
             out.print(projected, soft_wrap=True)
 

@@ -8,9 +8,9 @@ from rootsopt.commands import cli
 from rootsopt.config import Config
 from rootsopt.export import chosen
 from rootsopt.measured import report as outline_report
-from rootsopt.output import files, tables
+from rootsopt.output import files, tables, terminal
 from rootsopt.output.runs import RunFolder
-from rootsopt.pump.sheet import check_clearances, record_of, warnings
+from rootsopt.pump.sheet import check_clearances, record_of
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.speeds import alone
 from rootsopt.scene import check_geometry, outline_mm
@@ -31,8 +31,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     if evaluation.series is not None:
         folder.write_csv("response_design.csv", files.response_columns(evaluation.series))
     data = evaluation.record() | outline_report.record(config)
-    weighed = config.pump is not None or config.scene.bearings is not None
-    if weighed:
+    if config.pump is not None or config.scene.bearings is not None:
         data["pump"] = record_of(config, [*evaluation.design.values()])
     folder.write_json("result.json", data | {"versions": files.versions()})
     if formats:
@@ -45,11 +44,9 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
         runs.simulation_figures(folder, evaluation, config)
 
     def show(out: Console) -> None:
-        out.print(tables.evaluation_table(evaluation))
-        if weighed:
-            out.print(tables.pump_table({"value": data}))
-            for note in warnings(data["pump"]):
-                out.print(note, soft_wrap=True, highlight=False)
+        shown = [*tables.tables_of(data), tables.effort_table(data)]
+        out.print(terminal.shown(shown))
+        out.print(evaluation.message, soft_wrap=True, markup=False, highlight=False)
         outline_report.say(config, out)
 
     return cli.Outcome(cli.OK if evaluation.usable else cli.NO_RESULT, show)

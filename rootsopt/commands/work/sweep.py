@@ -10,7 +10,7 @@ from rich.progress import Progress
 from rootsopt.commands import cli
 from rootsopt.config import Config
 from rootsopt.errors import InputError
-from rootsopt.output import files, tables
+from rootsopt.output import files, tables, terminal
 from rootsopt.output.runs import RunFolder
 from rootsopt.response import speeds
 from rootsopt.response.evaluation import Evaluator
@@ -54,7 +54,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
         speed_figure(folder, {name: parts}, f"Contact force of the {name} pair over speed")
 
     def show(out: Console) -> None:
-        out.print(tables.sweep_table(rows))
+        out.print(terminal.shown(tables.tables_of(data, most=len(rows))))
         if not status.usable:
             out.print(f"{status.label}: {message}", soft_wrap=True)
 
