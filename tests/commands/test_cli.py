@@ -152,7 +152,7 @@ def test_no_usable_result_exits_3(tmp_path):
     for module in ("simulate", "optimize"):
         done = command(module, config, "-o", tmp_path / module, "--no-figures")
         assert done.returncode == 3, done.stderr
-        assert "passed_through" in done.stdout
+        assert "passed through" in done.stdout
         result = json.loads((tmp_path / module / "result.json").read_text())
         record = result if module == "simulate" else result["baseline"]
         assert record["status"] == "passed_through"

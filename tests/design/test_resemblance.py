@@ -140,4 +140,4 @@ def test_profile_command_names_the_family(tmp_path, monkeypatch, capsys):
     (row,) = json.loads((tmp_path / "out" / "result.json").read_text())["resembles"]
     assert row["family"] == "arc"
     assert 300 < row["departure_um"] < 450
-    assert "This profile resembles" in capsys.readouterr().out
+    assert "Nearest profiles of the families" in capsys.readouterr().out

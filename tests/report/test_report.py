@@ -2,6 +2,7 @@
 
 import dataclasses
 import html as entities
+import io
 import json
 import re
 import subprocess
@@ -11,10 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from browser import FLAGS, chromium
+from rich.console import Console
 
 from rootsopt import report
 from rootsopt.commands.table import pareto, profile
 from rootsopt.config import load
+from rootsopt.output import tables, terminal
 from rootsopt.output.files import ResultFolder, response_columns
 from rootsopt.report import charts
 from rootsopt.report.gather import Run
@@ -292,6 +295,15 @@ def test_optimum_is_reported_in_the_users_words(tmp_path):
         "flow lines, 2 of 2 0.010000",
     ):
         assert words in text
+    # The terminal shows the same tables, with the same facts.
+    console = Console(width=80, file=io.StringIO(), record=True)
+    shown = tables.tables_of(given)
+    console.print(terminal.shown(shown))
+    plain, printed = console.export_text(), text.replace("\N{NO-BREAK SPACE}", " ")
+    cells = {cell.text for one in shown for _, rows in one.groups for row in rows for cell in row}
+    assert len(cells) > 40
+    assert [text for text in cells if " ".join(text.split()) not in printed] == []
+    assert [text for text in cells if terminal.ascii_text(text)[:20] not in plain] == []
     # Of two limits, the one whose relaxation lowers the objective more.
     other = {"name": "seal_width", "unit": "mm", "relaxed_by": -0.1, "multiplier": 0.1}
     given["constraints"] = [limit, limit | other | {"relaxed_objective_percent": -0.4}]
