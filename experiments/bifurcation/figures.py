@@ -9,7 +9,7 @@ from matplotlib.ticker import FuncFormatter
 
 from experiments._common.style import BLUE, GREEN, ORANGE, VERMILION, grid_below, sheet
 from experiments.bifurcation.study import Diagram, beside, ranges
-from rootsopt.continuation.branch import Bifurcation, Kind
+from rootsopt.continuation import Bifurcation, Kind
 from rootsopt.status import Status
 
 NAMES = {
@@ -55,7 +55,7 @@ def draw_branches(ax, diagram: Diagram, quantity: str, color: str) -> None:
         marker, _ = MARKS[special.kind]
         face = "white" if marker != "x" else color
         ax.plot(
-            special.value, getattr(special.point, quantity), marker, color=color, ms=5.5,
+            special.point.value, getattr(special.point, quantity), marker, color=color, ms=5.5,
             mfc=face, mew=1.3, zorder=4,
         )  # fmt: skip
     unsettled = chaotic(diagram)

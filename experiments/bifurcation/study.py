@@ -16,8 +16,7 @@ import numpy as np
 from experiments._common.scenes import shipped
 from experiments._common.simulation import evaluator_of
 from rootsopt.config import Config
-from rootsopt.continuation import branch as continuation
-from rootsopt.continuation.branch import Branch, End, Kind, StepSizes
+from rootsopt.continuation import Branch, End, Kind, StepSizes, follow, follow_doubled
 from rootsopt.errors import InputError
 
 Row = dict[str, Any]
@@ -25,6 +24,7 @@ Say = Callable[[str], None]
 STARTS = ((0.0, 0.0), (-0.2, -1.8), (-1.0, 0.0), (-3.0, 0.0), (0.8, 5.0), (-0.5, -8.0))
 """Scaled initial states (ε, dε/dt) tried at every value of the parameter."""
 LIVELY = ("scene.timing_gear.backlash_mm=0.2", "scene.timing_gear.damping_ratio=0.2")
+SPEED, TORQUE = "scene.speed_rpm", "scene.load.torque_N_m"
 SCENES = {"shipped": (), "livelier": LIVELY}
 SLOWEST = {"shipped": 300, "livelier": 3500}
 """Lowest speed (rpm) studied, by pair. At lower speeds the livelier pair bounces so often per mesh
@@ -47,21 +47,27 @@ CELLS = 570
 class Diagram:
     """Branches of one pair in one scene over one parameter.
 
-    `seeds`: (value of the parameter, status) of each simulation that searched for orbits.
+    `key`: dotted key of the parameter; `seeds`: (value of the parameter, status) of each simulation
+    that searched for orbits.
     """
 
     scene: str
     family: str
-    parameter: str
+    key: str
     low: float
     high: float
     branches: list[Branch]
     seeds: list[tuple[float, str]]
 
+    @property
+    def parameter(self) -> str:
+        """Name of the parameter: the last part of its key."""
+        return self.key.rpartition(".")[2]
+
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """Plan of a diagram: a pair in a scene, a parameter and its range.
+    """Plan of a diagram: a pair in a scene, the dotted key of a parameter and its range.
 
     Further fields: number of parameter values at which simulations start, and scaled initial states
     tried at each value.
@@ -69,7 +75,7 @@ class Plan:
 
     scene: str
     config: Config
-    parameter: str
+    key: str
     low: float
     high: float
     seeds: int
@@ -85,16 +91,16 @@ def plans(quick: bool) -> list[Plan]:
     }
     if quick:
         config = configs["livelier", "cic"]
-        return [Plan("livelier", config, "speed_rpm", 3500, 4500, 1, STARTS[1:2])]
+        return [Plan("livelier", config, SPEED, 3500, 4500, 1, STARTS[1:2])]
     cic = configs["shipped", "cic"]
     return [
         *(
-            Plan(scene, config, "speed_rpm", SLOWEST[scene], 6000, 6, STARTS[:3])
+            Plan(scene, config, SPEED, SLOWEST[scene], 6000, 6, STARTS[:3])
             for (scene, _), config in configs.items()
         ),
-        Plan("shipped", cic, "torque_N_m", 0.5, 10.0, 2, STARTS[:2]),
-        Plan("shipped", cic, "backlash_mm", 0.02, 0.4, 4, STARTS[:2]),
-        Plan("shipped", cic, "involute_length_mm", 1.0, 9.0, 2, STARTS[:2]),
+        Plan("shipped", cic, TORQUE, 0.5, 10.0, 2, STARTS[:2]),
+        Plan("shipped", cic, "scene.timing_gear.backlash_mm", 0.02, 0.4, 4, STARTS[:2]),
+        Plan("shipped", cic, "profile.involute_length_mm", 1.0, 9.0, 2, STARTS[:2]),
     ]
 
 
@@ -114,9 +120,9 @@ def run(
 def explore(plan: Plan, say: Say) -> Diagram:
     """Simulate from all starts of a plan, and follow every orbit found. Return the diagram."""
     config, low, high = plan.config, plan.low, plan.high
-    diagram = Diagram(plan.scene, config.profile.family, plan.parameter, low, high, [], [])
+    diagram = Diagram(plan.scene, config.profile.family, plan.key, low, high, [], [])
     for value in np.linspace(low, high, plan.seeds + 2)[1:-1]:
-        here = continuation.with_value(config, plan.parameter, float(value))
+        here = config.moved({plan.key: float(value)})
         patient, hasty = evaluator_of(here), evaluator_of(here, give_up_early=True)
         found: list[tuple[float, float]] = []
         for number, start in enumerate(plan.starts):
@@ -131,21 +137,22 @@ def explore(plan: Plan, say: Say) -> Diagram:
                 continue
             found.append(forces)
             period = evaluation.steady_state["period"]
-            follow_on(diagram, here, evaluation.state, period, forces, say)
+            follow_on(diagram, (here, float(value)), evaluation.state, period, forces, say)
     return diagram
 
 
-def follow_on(diagram: Diagram, config: Config, state, period: int, forces, say: Say) -> None:
+def follow_on(
+    diagram: Diagram, at: tuple[Config, float], state, period: int, forces, say: Say
+) -> None:
     """Follow an orbit, and the orbits related to it by period doubling, unless they are known.
 
-    `state` (scaled), `period` and `forces` identify the orbit. Branches are added to `diagram`."""
-    value = continuation.value_of(config, diagram.parameter)
+    `at`: config, and value of the parameter; `state` (scaled), `period` and `forces` identify the
+    orbit. Branches are added to `diagram`."""
+    config, value = at
     if period > LONGEST or known(diagram, value, period, forces):
         return
     try:
-        first = continuation.follow(
-            config, diagram.parameter, state, period, limits(diagram, period)
-        )
+        first = follow(config, diagram.key, state, period, limits(diagram, period))
     except InputError as error:
         say(f"{value:g}: {error}")
         return
@@ -157,23 +164,19 @@ def follow_on(diagram: Diagram, config: Config, state, period: int, forces, say:
         for special in branch.bifurcations:
             doubling = special.kind is Kind.PERIOD_DOUBLING
             # If the orbit of single period was unstable before, the doubled orbit is unstable too.
-            if 2 * branch.period > DOUBLED or not doubling:
+            if 2 * branch.family.period > DOUBLED or not doubling:
                 continue
             if not any(p.stable for p in beside(branch, special)):
                 continue
-            doubled = continuation.follow_doubled(
-                branch, special, limits(diagram, 2 * branch.period)
-            )
+            doubled = follow_doubled(branch, special, points(2 * branch.family.period))
             if doubled is not None and not known_branch([*diagram.branches, *queue], doubled):
                 queue.append(doubled)
         for end, point in zip(branch.ends, (branch.points[0], branch.points[-1]), strict=True):
             if end is End.HALVED:
-                here = continuation.with_value(config, diagram.parameter, point.value)
-                half = branch.period // 2
+                here = config.moved({diagram.key: point.value})
+                half = branch.family.period // 2
                 try:
-                    simple = continuation.follow(
-                        here, diagram.parameter, point.state, half, limits(diagram, half)
-                    )
+                    simple = follow(here, diagram.key, point.state, half, limits(diagram, half))
                 except InputError:
                     continue
                 if not known_branch([*diagram.branches, *queue], simple):
@@ -187,7 +190,12 @@ def beside(branch: Branch, special) -> tuple:
 
 def limits(diagram: Diagram, period: int) -> StepSizes:
     """Return range, step sizes and maximum number of points of a branch of this `period`."""
-    return StepSizes(diagram.low, diagram.high, points=max(POINTS // period, FEWEST))
+    return StepSizes(diagram.low, diagram.high, points=points(period))
+
+
+def points(period: int) -> int:
+    """Return the maximum number of points of a branch of this `period`."""
+    return max(POINTS // period, FEWEST)
 
 
 def known(diagram: Diagram, value: float, period: int, forces) -> bool:
@@ -195,7 +203,7 @@ def known(diagram: Diagram, value: float, period: int, forces) -> bool:
     return any(
         np.allclose(forces, (point.mean, point.peak), rtol=1e-3)
         for branch in diagram.branches
-        if branch.period == period
+        if branch.family.period == period
         for point in branch.at(value)
     )
 
@@ -206,7 +214,7 @@ def known_branch(branches: list[Branch], new: Branch) -> bool:
     return any(
         np.allclose((middle.mean, middle.peak), (point.mean, point.peak), rtol=1e-3)
         for branch in branches
-        if branch.period == new.period
+        if branch.family.period == new.family.period
         for point in branch.at(middle.value)
     )
 
@@ -216,7 +224,7 @@ def described(diagram: Diagram, branch: Branch) -> str:
     ends = " and ".join(end.name.lower().replace("_", " ") for end in branch.ends)
     values = [point.value for point in branch.points]
     return (
-        f"{diagram.scene} {diagram.family} {diagram.parameter}: period {branch.period}, "
+        f"{diagram.scene} {diagram.family} {diagram.parameter}: period {branch.family.period}, "
         f"{len(values)} points in {min(values):.5g} … {max(values):.5g}, "
         f"{len(branch.bifurcations)} special, ends: {ends}"
     )
@@ -243,10 +251,10 @@ def ranges(diagram: Diagram) -> dict[str, list[list[float]]]:
 
 def peak_ratio(branch: Branch, point) -> float:
     """Return the ratio of an orbit's peak force to the static force that carries the load."""
-    torque = branch.config.scene.load.torque_N_m
-    torque = point.value if branch.parameter == "torque_N_m" else torque
+    config = branch.family.config
+    torque = point.value if branch.family.key == TORQUE else config.scene.load.torque_N_m
     assert torque is not None  # Scenes here have a constant load.
-    return point.peak / (torque / (branch.config.profile.pitch_radius_mm * 1e-3))
+    return point.peak / (torque / (config.profile.pitch_radius_mm * 1e-3))
 
 
 def runs(mask: np.ndarray, edges: np.ndarray) -> Iterator[list[float]]:
@@ -307,7 +315,6 @@ def orbit_row(point) -> Row:
         "peak_force_N": point.peak,
         "rms_force_N": point.rms,
         "stable": point.stable,
-        "gap_time": point.gap_time,
         "residual": point.residual,
     }
     for number, multiplier in enumerate(point.multipliers, 1):
@@ -330,7 +337,7 @@ def summary(diagrams: list[Diagram], seconds: float) -> dict[str, Any]:
                 "several_stable": overlaps(diagram),
                 "branches": [
                     {
-                        "period": branch.period,
+                        "period": branch.family.period,
                         "points": len(branch.points),
                         "ends": [end.name.lower() for end in branch.ends],
                     }

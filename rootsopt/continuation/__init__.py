@@ -1,7 +1,6 @@
 """Continuation: families of periodic orbits, followed along a parameter."""
 
-from rootsopt.continuation.branch import Bifurcation as Bifurcation
-from rootsopt.continuation.branch import Branch as Branch
-from rootsopt.continuation.branch import Kind as Kind
-from rootsopt.continuation.branch import follow as follow
-from rootsopt.continuation.branch import follow_doubled as follow_doubled
+from rootsopt.continuation.arclength import End, StepSizes
+from rootsopt.continuation.branch import Bifurcation, Branch, Kind, follow, follow_doubled
+
+__all__ = ["Bifurcation", "Branch", "End", "Kind", "StepSizes", "follow", "follow_doubled"]

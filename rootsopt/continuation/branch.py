@@ -1,11 +1,11 @@
 """Follow periodic orbits along a parameter, through folds, with their stability.
 
-A branch begins at a known orbit (`Evaluation.state` and its period). It is a solution curve of the
-equations in `orbits`, followed by pseudo-arclength continuation (`arclength`). Unstable orbits,
-which a simulation does not show, are followed like stable orbits; `BranchPoint.stable`
-distinguishes them.
+A branch begins at a known orbit (`Evaluation.state` and its period). It is the curve of an
+`OrbitFamily`, followed by pseudo-arclength continuation (`arclength`). Unstable orbits, which a
+simulation does not show, are followed like stable orbits; `BranchPoint.stable` distinguishes them.
 """
 
+import contextlib
 import dataclasses
 import enum
 import itertools
@@ -14,29 +14,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rootsopt.config import Config
-from rootsopt.continuation.arclength import (
-    End,
-    Path,
-    Spot,
-    StepSizes,
-    StoppedError,
-    corrected,
-    follow_curve,
-)
-from rootsopt.continuation.collocated import CollocatedFamily, can_follow
-from rootsopt.continuation.orbits import (
-    LONGEST,
-    PLACES,
-    BranchPoint,
-    OrbitFamily,
-    parameters,
-    place_of,
-    value_of,
-    with_value,
-)
-from rootsopt.dynamics.verdict import RESIDUAL
+from rootsopt.continuation.arclength import End, Spot, StepSizes, StoppedError, follow_curve
+from rootsopt.continuation.family import SPAN, BranchPoint, OrbitFamily
 from rootsopt.errors import InputError
 
+LONGEST = 8
+"""Longest orbit that can be followed (mesh periods)."""
 _HALVED = 0.004
 """Distance (unit of `StepSizes`) below which the states at the start and the middle of an orbit
 count as equal. A branch whose steps have become too small there ends at an orbit of half the period
@@ -62,37 +45,37 @@ class Kind(enum.Enum):
 class Bifurcation:
     """A bifurcation of a branch.
 
-    `kind` of bifurcation; `point`: the orbit at the bifurcation; `after`: index of the branch's
-    last point before the bifurcation.
+    `kind` of bifurcation; `spot`: where it is on the curve; `after`: index of the branch's last
+    point before the bifurcation.
     """
 
     kind: Kind
-    point: BranchPoint
+    spot: Spot
     after: int
 
     @property
-    def value(self) -> float:
-        """Value of the parameter at the bifurcation, in the config's unit."""
-        return self.point.value
+    def point(self) -> BranchPoint:
+        """The orbit at the bifurcation."""
+        return self.spot.data
 
 
 @dataclasses.dataclass(frozen=True)
 class Branch:
     """A family of orbits of the same period, followed along a parameter.
 
-    `config` of the orbit from which the branch was followed; `parameter`: name of the parameter;
-    `period` of all orbits (mesh periods); `points`: the orbits, in order; `bifurcations` on the
-    branch; `ends`: why the branch begins and ends where it does; `limits`: range of the parameter
-    (config's unit) and step sizes.
+    `family`: config, key of the parameter, period and limits; `spots`: the curve, in order;
+    `bifurcations` on the branch; `ends`: why the branch begins and ends where it does.
     """
 
-    config: Config
-    parameter: str
-    period: int
-    points: tuple[BranchPoint, ...]
+    family: OrbitFamily
+    spots: tuple[Spot, ...]
     bifurcations: tuple[Bifurcation, ...]
     ends: tuple[End, End]
-    limits: StepSizes
+
+    @property
+    def points(self) -> tuple[BranchPoint, ...]:
+        """The orbits, in order."""
+        return tuple(spot.data for spot in self.spots)
 
     def at(self, value: float) -> list[BranchPoint]:
         """Return all orbits of the branch at one `value` of the parameter (config's unit).
@@ -100,83 +83,62 @@ class Branch:
         Each orbit is closed again at exactly this value, and left out if that fails. The branch's
         last point is returned unchanged. The list is empty if the branch does not pass the value.
         """
-        orbits = OrbitFamily(self.config, self.parameter, self.period, self.limits)
         found = []
-        for old, new in zip(self.points[:-1], self.points[1:], strict=True):
-            ends = sorted((old.value, new.value))
-            if not ends[0] <= value < ends[1]:
+        for old, new in itertools.pairwise(self.spots):
+            low, high = sorted((old.data.value, new.data.value))
+            if not low <= value < high:
                 continue
-            share = (value - old.value) / (new.value - old.value)
-            places = [orbits.place(point.state, point.value) for point in (old, new)]
-            guess = places[0] + share * (places[1] - places[0])
-            try:
-                found.append(orbits.closed(guess))
-            except StoppedError:
-                continue
-        if self.points[-1].value == value:
-            found.append(self.points[-1])
-        return found
+            share = (value - old.data.value) / (new.data.value - old.data.value)
+            guess = old.place + share * (new.place - old.place)
+            near, fixed = old if share < 0.5 else new, np.eye(len(guess))[-1]
+            with contextlib.suppress(StoppedError):
+                found.append(self.family(guess, fixed, near).data)
+        return found + [point for point in self.points[-1:] if point.value == value]
 
 
-def follow(
-    config: Config,
-    parameter: str,
-    state: ArrayLike,
-    period: int,
-    limits: StepSizes,
-    ways: tuple[int, ...] = (-1, 1),
-) -> Branch:
+def follow(config: Config, key: str, state: ArrayLike, period: int, limits: StepSizes) -> Branch:
     """Follow the orbit of `period` mesh periods near the scaled `state` (n,) along a parameter.
 
-    `limits`: range of the parameter (config's unit), which must contain the config's own value, and
-    step sizes. A step of length 1 spans the range, or changes the scaled state by `SPAN`. `ways`:
-    directions to follow, -1 for falling and 1 for rising values of the parameter.
+    The branch extends in both directions, towards falling and rising values of the parameter.
 
-    Raises `InputError` for an unknown parameter, or an invalid `period` or
-    `ways`; for limits that exclude the config's value, or that the config cannot have; and if there
-    is no orbit to start from.
+    `key`: dotted key of the parameter, such as `scene.speed_rpm`; scene or design must
+    depend linearly on it. `limits`: range of the parameter (config's unit), which must contain the
+    config's own value, and step sizes. A step of length 1 spans the range, or changes the scaled
+    state by `SPAN`.
+
+    Raises `InputError` for an invalid `key` or `period`; for limits that exclude the config's
+    value, or that the config cannot have; if collocation does not close orbits of this config; and
+    if there is no orbit to start from.
     """
-    value = value_of(config, parameter)
-    if not limits.low <= value <= limits.high:
+    if not 1 <= period <= LONGEST:
+        raise InputError(f"Argument `period` must be 1 to {LONGEST}, but is {period}")
+    family = OrbitFamily(config, key, period, limits)
+    value, place = family.value(family.share), np.append(np.asarray(state) / SPAN, family.share)
+    if not 0 <= family.share <= 1:
         raise InputError(
-            f"`{place_of(parameter)}` must lie in the range to follow, {limits.low:g} to "
-            f"{limits.high:g}, but is {value:g}"
+            f"`{key}` must lie in the range to follow, {limits.low:g} to {limits.high:g}, but is "
+            f"{value:g}"
         )
-    if not 1 <= period <= LONGEST or not set(ways) <= {-1, 1} or not ways:
-        raise InputError(
-            f"Argument `period` must be 1 to {LONGEST}, and `ways` -1, 1 or both, but they are "
-            f"{period} and {ways}"
-        )
-    for bound in (limits.low, limits.high):
-        with_value(config, parameter, bound)
-    orbits = _family(config, parameter, period, limits)
-    place = orbits.place(state, value)
-    fixed = np.eye(len(place))[-1]
+    rising = np.eye(len(place))[-1]
     try:
-        start = corrected(orbits, place, fixed, fixed)
+        start = family.begun(place, rising)
     except StoppedError as stop:
         raise InputError(
-            f"there is no orbit of {period} mesh periods near the state at "
-            f"`{place_of(parameter)}` = {value:g}: {stop.end.value} Start from the state of a "
-            "periodic Evaluation"
+            f"there is no orbit of {period} mesh periods near the state at `{key}` = {value:g}: "
+            f"{stop.end.value} Start from the state of a periodic Evaluation"
         ) from None
-    branches = []
-    for way in ways:
-        first = start._replace(tangent=way * np.sign(start.tangent[-1] or 1) * start.tangent)
-        branches.append(_branch(orbits, follow_curve(orbits, first, orbits.steps, _TESTS)))
-        if branches[-1].ends[1] is End.CLOSED:
-            break
-    return branches[0] if len(branches) == 1 else _joined(*branches)
+    falling = _branch(family, start.along(-rising))
+    if falling.ends[1] is End.CLOSED:
+        return falling
+    return _joined(falling, _branch(family, start.along(-falling.spots[0].tangent)))
 
 
-def follow_doubled(
-    branch: Branch, bifurcation: Bifurcation, limits: StepSizes | None = None
-) -> Branch | None:
+def follow_doubled(branch: Branch, bifurcation: Bifurcation, points: int = 400) -> Branch | None:
     """Follow the branch of twice the period that begins at a period doubling of `branch`.
 
     The search for its first orbit starts a little away from the bifurcation, displaced along the
-    eigenvector of the multiplier -1. `limits`: by default the limits of `branch`. The result is
-    None if no orbit of twice the period is found, or if twice the period exceeds 8 mesh periods.
+    eigenvector of the multiplier -1. `points`: maximum number of points. The result is None if no
+    orbit of twice the period is found, or if twice the period exceeds 8 mesh periods.
 
     Raises `ValueError` if `bifurcation` is not a period doubling."""
     if bifurcation.kind is not Kind.PERIOD_DOUBLING:
@@ -184,107 +146,67 @@ def follow_doubled(
             "Argument `bifurcation` must be a period doubling, but is "
             f"{bifurcation.kind.name.lower()}"
         )
-    if 2 * branch.period > LONGEST:
+    simple, place, line = branch.family, bifurcation.spot.place, bifurcation.point.made.line
+    if 2 * simple.period > LONGEST:
         return None
-    limits = limits or branch.limits
-    simple = OrbitFamily(branch.config, branch.parameter, branch.period, limits)
-    orbits = _family(branch.config, branch.parameter, 2 * branch.period, limits)
-    place = simple.place(bifurcation.point.state, bifurcation.value)
-    fixed = np.eye(len(place))[-1]
-    try:
-        known = corrected(simple, place, fixed, fixed).look.data
-        multipliers, vectors = np.linalg.eig(known.monodromy)
-        flipped = known.to_state @ np.real(vectors[:, np.argmin(np.abs(multipliers + 1))])
-        across = np.append(flipped / np.linalg.norm(flipped), 0.0)
-    except StoppedError:
-        return None
-    # Both directions lead to the same orbit, shifted by `branch.period`. Near a grazing contact one
-    # of them may fail.
+    limits = dataclasses.replace(simple.limits, points=points)
+    family = OrbitFamily(simple.config, simple.key, 2 * simple.period, limits)
+    multipliers, vectors = np.linalg.eig(line.monodromy)
+    flipped = line.to_state @ np.real(vectors[:, np.argmin(np.abs(multipliers + 1))])
+    across = np.append(flipped / np.linalg.norm(flipped), 0.0)
+    # Both directions lead to the same orbit, shifted by the single period. Near a grazing contact
+    # one of them may fail.
     fallen = None
     for size, way in itertools.product(_SIZES, (1, -1)):
-        aside = way * across
         try:
-            start = corrected(orbits, place + size * aside, aside, aside)
+            start = family.begun(place + size * way * across, way * across)
         except StoppedError:
             continue
-        if start.look.data.half_way <= 0.2 * size:
+        if start.data.half_way <= 0.2 * size:
             continue
-        found = _branch(orbits, follow_curve(orbits, start, orbits.steps, _TESTS))
-        if found.ends[1] is not End.HALVED or len(found.points) >= _FEW:
+        found = _branch(family, start.along(way * across))
+        if found.ends[1] is not End.HALVED or len(found.spots) >= _FEW:
             return found
         fallen = found
     return fallen
 
 
-def _family(config: Config, parameter: str, period: int, limits: StepSizes) -> OrbitFamily:
-    """Return the equations of orbits, closed by collocation if the config allows it."""
-    by_shooting = OrbitFamily(config, parameter, period, limits)
-    if not can_follow(by_shooting.scene, by_shooting.pair):
-        return by_shooting
-    return CollocatedFamily(config, parameter, period, limits)
-
-
-def _branch(orbits: OrbitFamily, path: Path) -> Branch:
-    """Return the branch that consists of the points of `path`, with its bifurcations."""
-    end = path.end
-    if end is End.STEP_TOO_SMALL and orbits.period % 2 == 0:
-        half_way = path.spots[-1].look.data.half_way
-        end = End.HALVED if half_way < _HALVED else end
+def _branch(family: OrbitFamily, start: Spot) -> Branch:
+    """Return the branch that leads from `start` in the direction of its tangent."""
+    steps = dataclasses.replace(family.limits, low=0.0, high=1.0)
+    path = follow_curve(family, start, steps, _TESTS)
+    halved = family.period % 2 == 0 and path.spots[-1].data.half_way < _HALVED
+    end = End.HALVED if halved and path.end is End.STEP_TOO_SMALL else path.end
     bifurcations = []
     for after, name, spot in path.crossings:
-        kind, point = Kind[name], orbits.point(spot)
         # Two real multipliers with product 1 are a neutral saddle, which is not a bifurcation.
-        real = np.all(np.abs(point.multipliers.imag) < 1e-9)
-        if kind is not Kind.NEIMARK_SACKER or not real:
-            bifurcations.append(Bifurcation(kind, point, after))
-    return Branch(
-        config=orbits.config,
-        parameter=orbits.parameter,
-        period=orbits.period,
-        points=tuple(map(orbits.point, path.spots)),
-        bifurcations=tuple(bifurcations),
-        ends=(End.START, end),
-        limits=orbits.limits,
-    )
+        real = np.all(np.abs(spot.data.multipliers.imag) < 1e-9)
+        if Kind[name] is not Kind.NEIMARK_SACKER or not real:
+            bifurcations.append(Bifurcation(Kind[name], spot, after))
+    return Branch(family, tuple(path.spots), tuple(bifurcations), (End.START, end))
 
 
 def _joined(falling: Branch, rising: Branch) -> Branch:
     """Join two branches that begin at the same point, with the points of `falling` reversed."""
-    count = len(falling.points) - 1
-    points = tuple(
-        dataclasses.replace(point, slope=-point.slope) for point in falling.points[:0:-1]
-    )
+    count = len(falling.spots) - 1
     turned = [
         dataclasses.replace(one, after=count - 1 - one.after) for one in falling.bifurcations[::-1]
     ]
     moved = [dataclasses.replace(one, after=count + one.after) for one in rising.bifurcations]
-    return dataclasses.replace(
-        rising,
-        points=points + rising.points,
-        bifurcations=(*turned, *moved),
-        ends=(falling.ends[1], rising.ends[1]),
+    spots = [spot.along(-spot.tangent) for spot in falling.spots[:0:-1]]
+    return Branch(
+        rising.family, (*spots, *rising.spots), (*turned, *moved), (falling.ends[1], rising.ends[1])
     )
 
 
-def _fold(spot: Spot) -> float:
-    return float(spot.tangent[-1])
-
-
-def _doubling(spot: Spot) -> float:
-    monodromy = spot.look.data.monodromy
-    return float(np.linalg.det(monodromy + np.eye(len(monodromy))))
-
-
 def _torus(spot: Spot) -> float:
-    multipliers = np.linalg.eigvals(spot.look.data.monodromy)
+    multipliers = spot.data.multipliers
     first, second = np.triu_indices(len(multipliers), 1)
     return float(np.prod(multipliers[first] * multipliers[second] - 1).real)
 
 
-_TESTS = {"FOLD": _fold, "PERIOD_DOUBLING": _doubling, "NEIMARK_SACKER": _torus}
-
-
-__all__ = [
-    "PLACES", "RESIDUAL", "Bifurcation", "Branch", "BranchPoint", "End", "Kind", "StepSizes",
-    "follow", "follow_doubled", "parameters", "value_of", "with_value",
-]  # fmt: skip
+_TESTS = {
+    "FOLD": lambda spot: float(spot.tangent[-1]),
+    "PERIOD_DOUBLING": lambda spot: float(np.prod(spot.data.multipliers + 1).real),
+    "NEIMARK_SACKER": _torus,
+}

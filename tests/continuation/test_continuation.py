@@ -1,150 +1,29 @@
-"""Tests of curves followed through folds, and of periodic orbits of the rotor pair."""
+"""Tests of periodic orbits of the rotor pair, followed through folds and period doublings."""
 
 import csv
-import dataclasses
-import itertools
 import json
 import os
 import subprocess
 import sys
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from rootsopt.config import load
-from rootsopt.continuation.arclength import (
-    CORNER,
-    End,
-    Linearization,
-    StepSizes,
-    StoppedError,
-    corrected,
-    follow_curve,
-    tangent,
-)
-from rootsopt.continuation.branch import (
-    Kind,
-    follow,
-    follow_doubled,
-    parameters,
-    value_of,
-    with_value,
-)
-from rootsopt.continuation.orbits import OrbitFamily, longest_gap
+from rootsopt.continuation import End, Kind, StepSizes, follow, follow_doubled
+from rootsopt.continuation.arclength import StoppedError
+from rootsopt.continuation.family import OrbitFamily
+from rootsopt.dynamics.flow import strobe
 from rootsopt.errors import InputError
 from rootsopt.response.evaluation import Evaluator
+from rootsopt.scene import Scene, design_vector
 from rootsopt.status import Status
 
-# Curves with a closed form
-
-
-def curve_of(residual, jacobian):
-    """Return a curve of one equation in (x, parameter)."""
-
-    def look(place, memory, careful):
-        return Linearization(np.array([residual(*place)]), np.array([jacobian(*place)]))
-
-    return look
-
-
-CIRCLE = curve_of(lambda x, p: x**2 + p**2 - 1, lambda x, p: [2 * x, 2 * p])
-CUBIC = curve_of(lambda x, p: p - x + x**3, lambda x, p: [3 * x**2 - 1, 1.0])
-FOLD = {"FOLD": lambda spot: float(spot.tangent[-1])}
-
-
-def start_of(curve, x, p, way=1.0):
-    return corrected(curve, np.array([x, p]), np.array([0.0, 1.0]), np.array([0.0, way]))
-
-
-def test_circle_is_closed_with_a_fold_on_either_side():
-    """Every point lies on the circle, the folds are at ±1, and the curve ends at its start."""
-    path = follow_curve(CIRCLE, start_of(CIRCLE, 1.0, 0.0), StepSizes(-2, 2, 0.02, 1e-6, 0.1), FOLD)
-    assert path.end is End.CLOSED
-    places = np.array([spot.place for spot in path.spots])
-    np.testing.assert_allclose(np.hypot(*places.T), 1, atol=1e-10)
-    turned = np.unwrap(np.arctan2(places[:, 1], places[:, 0]))[-1]
-    assert turned == pytest.approx(2 * np.pi, abs=0.2)
-    assert [name for _, name, _ in path.crossings] == ["FOLD", "FOLD"]
-    found = [spot.place for _, _, spot in path.crossings]
-    np.testing.assert_allclose(found, [[0, 1], [0, -1]], atol=1e-8)
-
-
-def test_cubic_passes_both_folds_to_the_end_of_the_range():
-    """λ = x - x³ has folds at x = ±1/√3; three points at λ = 0 are on one curve."""
-    path = follow_curve(CUBIC, start_of(CUBIC, -1.4, 1.3, -1), StepSizes(-1.5, 1.5), FOLD)
-    assert path.end is End.RANGE_END
-    assert path.spots[-1].place[-1] == -1.5
-    x, p = np.array([spot.place for spot in path.spots]).T
-    assert np.count_nonzero(np.diff(np.sign(p))) == 3
-    folds = np.array([spot.place for _, _, spot in path.crossings])
-    top = 1 / np.sqrt(3)
-    np.testing.assert_allclose(folds, [[-top, -top + top**3], [top, top - top**3]], atol=1e-8)
-    assert all(spot.tangent @ after.tangent > 0.9 for spot, after in itertools.pairwise(path.spots))
-    for index, _, spot in path.crossings:
-        assert x[index] <= spot.place[0] <= x[index + 1]
-
-
-def test_steps_follow_the_rate_of_convergence():
-    """Steps grow to the maximum on a straight stretch."""
-    line = curve_of(lambda x, p: x - p, lambda x, p: [1.0, -1.0])
-    path = follow_curve(line, start_of(line, 0.0, 0.0), StepSizes(-1, 1, 1e-3, 1e-6, 0.05))
-    strides = [np.linalg.norm(b.place - a.place) for a, b in itertools.pairwise(path.spots)]
-    np.testing.assert_allclose(strides[:3], [1e-3, 1.5e-3, 2.25e-3], rtol=1e-9)
-    assert max(strides) == pytest.approx(0.05)
-
-
-def test_ends_are_named():
-    """A curve ends after too many points, where it stops, and if its start leaves the range at
-    once."""
-    few = follow_curve(CIRCLE, start_of(CIRCLE, 1.0, 0.0), StepSizes(-2, 2, points=7))
-    assert (few.end, len(few.spots)) == (End.MAX_POINTS, 7)
-
-    def until(place, memory, careful):
-        if place[-1] > 0.5:
-            raise StoppedError(End.TOO_DEEP)
-        return CIRCLE(place, memory, careful)
-
-    path = follow_curve(until, start_of(CIRCLE, 1.0, 0.0), StepSizes(-2, 2))
-    assert path.end is End.TOO_DEEP
-    assert path.spots[-1].place[-1] == pytest.approx(0.5, abs=1e-4)
-    outward = follow_curve(CIRCLE, start_of(CIRCLE, 1.0, 0.0), StepSizes(-1, 0))
-    assert (outward.end, len(outward.spots)) == (End.RANGE_END, 1)
-    nowhere = curve_of(lambda x, p: x**2 + 1, lambda x, p: [2 * x, 0.0])
-    with pytest.raises(StoppedError):
-        start_of(nowhere, 0.7, 0.0)
-
-
-def test_a_corner_is_passed():
-    """λ = -|x| turns by a right angle; the curve is found again beyond the corner, which is
-    recorded."""
-    roof = curve_of(lambda x, p: p + abs(x), lambda x, p: [np.sign(x), 1.0])
-    path = follow_curve(roof, start_of(roof, -1.0, -1.0), StepSizes(-2, 1), FOLD)
-    assert path.end is End.RANGE_END
-    assert path.spots[-1].place == pytest.approx([2.0, -2.0])
-    assert [name for _, name, _ in path.crossings] == [CORNER, "FOLD"]
-    assert path.crossings[1][2].place == pytest.approx([0, 0], abs=1e-3)
-
-
-def test_tangent_is_normal_to_the_equations():
-    jacobian = np.array([[1.0, 2.0, 3.0], [-1.0, 0.5, 1.0]])
-    along = np.array([0.0, 0.0, -1.0])
-    found = tangent(jacobian, along)
-    np.testing.assert_allclose(jacobian @ found, 0, atol=1e-14)
-    assert np.linalg.norm(found) == pytest.approx(1)
-    assert found[-1] < 0
-
-
-@pytest.mark.parametrize(
-    ("wrong", "word"),
-    [({"low": 3.0}, "low"), ({"least": 0.1}, "least"), ({"points": 0}, "points")],
-)
-def test_steps_are_checked(wrong, word):
-    with pytest.raises(ValueError, match=word):
-        dataclasses.replace(StepSizes(0.0, 1.0), **wrong)
-
-
-# Orbits
-
+SPEED, BACKLASH = "scene.speed_rpm", "scene.timing_gear.backlash_mm"
+TORQUE, INVOLUTE = "scene.load.torque_N_m", "profile.involute_length_mm"
 SCENE = (
     "scene.load.torque_N_m=4.775",
     "scene.timing_gear={stiffness_N_m_per_rad: 2.0e4, damping_ratio: 0.2, backlash_mm: 0.2}",
@@ -164,7 +43,25 @@ def branch():
     found = Evaluator.of(config)(start=np.array(START), series=False)
     assert found.status is Status.PERIODIC
     assert found.steady_state["period"] == 1
-    return follow(config, "speed_rpm", found.state, 1, RANGE)
+    return follow(config, SPEED, found.state, 1, RANGE)
+
+
+@jax.jit
+def _ends(scene, design, states):
+    """Return the states (m, n) after one mesh period from each of the scaled `states` (m, n)."""
+    pair, integrator = scene.pair(design), scene.solver.orbit
+    fine = eqx.tree_at(lambda found: found.rtol, integrator, jnp.asarray(1e-10))
+    return jax.lax.map(lambda state: strobe(pair, state, 1, fine).states[-1], states)
+
+
+def by_integration(point):
+    """Return the end of a motion over one mesh period, and its derivative (n, n) with respect to
+    the start, by central differences."""
+    config = config_at(point.value)
+    step = 1e-6 * np.vstack([np.eye(2), -np.eye(2)])
+    states = np.vstack([point.state, point.state + step])
+    end, *ends = np.asarray(_ends(Scene.from_config(config), design_vector(config), states))
+    return end, (np.array(ends[:2]) - np.array(ends[2:])).T / 2e-6
 
 
 def test_points_agree_with_orbits_closed_for_themselves(branch):
@@ -192,6 +89,19 @@ def test_points_agree_with_orbits_closed_for_themselves(branch):
     assert steady >= 2
 
 
+def test_points_are_orbits_of_an_integration(branch):
+    """Stable or not, the motion returns, and its multipliers are those of central differences."""
+    assert {point.stable for point in branch.points} == {True, False}
+    for point in branch.points[::4]:
+        end, monodromy = by_integration(point)
+        np.testing.assert_allclose(end, point.state, atol=1e-6)
+        found = np.sort_complex(np.linalg.eigvals(monodromy))
+        np.testing.assert_allclose(np.sort_complex(point.multipliers), found, atol=1e-4, rtol=1e-4)
+        line = point.made.line
+        moved = line.to_state @ line.monodromy @ np.linalg.inv(line.to_state)
+        np.testing.assert_allclose(moved, monodromy, atol=5e-4 * np.max(np.abs(monodromy)))
+
+
 def test_every_point_is_closed(branch):
     assert max(point.residual for point in branch.points) < 1e-9
     assert branch.ends == (End.RANGE_END, End.RANGE_END)
@@ -205,11 +115,12 @@ def test_branch_turns_back_at_folds(branch):
     for fold in folds:
         near = np.min(np.abs(fold.point.multipliers - 1))
         assert near < 1e-3
-        assert abs(fold.point.slope) < 1e-4
-        before, after = branch.points[fold.after], branch.points[fold.after + 1]
-        assert before.slope * after.slope < 0
-        assert before.stable != after.stable
-    assert sorted(fold.value for fold in folds) == pytest.approx([3804.646, 4133.342], abs=0.01)
+        assert abs(fold.spot.tangent[-1]) < 1e-4
+        before, after = branch.spots[fold.after : fold.after + 2]
+        assert before.tangent[-1] * after.tangent[-1] < 0
+        assert before.data.stable != after.data.stable
+    values = sorted(fold.point.value for fold in folds)
+    assert values == pytest.approx([3804.646, 4133.342], abs=0.01)
     orbits = branch.at(4000.0)
     assert len(orbits) == 3
     assert [orbit.stable for orbit in orbits].count(True) == 2
@@ -219,42 +130,106 @@ def test_branch_turns_back_at_folds(branch):
     assert branch.at(9000.0) == []
 
 
-@pytest.mark.parametrize("parameter", ["speed_rpm", "torque_N_m", "backlash_mm", "damping_ratio",
-                                       "involute_length_mm"])  # fmt: skip
-def test_derivatives_are_those_of_finite_differences(branch, parameter):
-    """The Jacobian with respect to state (monodromy matrix) and parameter agrees with differences.
+def test_plane_holds_the_place(branch):
+    """The orbit lies in the plane that was asked for, at a fixed parameter or across the curve."""
+    start = branch.spots[len(branch.spots) // 2]
+    guess = start.place + 0.008 * start.tangent
+    for across in (start.tangent, np.eye(3)[-1], np.eye(3)[1]):
+        spot = branch.family(guess, across, start)
+        assert across @ (spot.place - guess) == pytest.approx(0, abs=1e-10)
+        assert np.linalg.norm(spot.tangent) == pytest.approx(1)
+        assert abs(spot.tangent @ start.tangent) > 0.99
+        assert spot.along(start.tangent).orientation == start.orientation
 
-    All are computed on repeated steps."""
-    point = branch.at(4000.0)[0]
-    config = config_at(4000.0)
-    value = value_of(config, parameter)
-    orbits = OrbitFamily(config, parameter, 1, StepSizes(0.9 * value, 1.0 * value + 1e-3))
-    place = orbits.place(point.state, value)
-    fixed = np.eye(3)[-1]
-    spot = corrected(orbits, place, fixed, fixed)
-    step = 1e-7
-    for column in range(3):
-        aside = step * np.eye(3)[column]
-        ends = [orbits(spot.place + s * aside, spot.look.memory, False).residual for s in (1, -1)]
-        slope = (ends[0] - ends[1]) / (2 * step)
-        np.testing.assert_allclose(
-            slope, spot.look.jacobian[:, column], rtol=1e-4, atol=1e-5 * np.max(np.abs(slope))
-        )
-    multipliers = np.linalg.eigvals(spot.look.jacobian[:, :2] + np.eye(2))
-    np.testing.assert_allclose(
-        np.sort_complex(multipliers), np.sort_complex(point.multipliers), rtol=1e-3
-    )
+
+def test_tangent_is_the_derivative_along_the_curve(branch):
+    start = branch.spots[len(branch.spots) // 2]
+    ends = [
+        branch.family(start.place + step * start.tangent, start.tangent, start).place
+        for step in (1e-4, -1e-4)
+    ]
+    chord = ends[0] - ends[1]
+    np.testing.assert_allclose(chord / np.linalg.norm(chord), start.tangent, atol=1e-5)
+
+
+def test_orbit_that_its_neighbour_does_not_lead_to(branch, monkeypatch):
+    """It begins with an integration instead; other reasons to stop are final."""
+    family, start = branch.family, branch.spots[0]
+    guess = start.place + 1e-3 * start.tangent
+    right, closed, asked = family(guess, start.tangent, start), family._closed, []
+    end = End.STEP_TOO_SMALL
+
+    def fails_first(known, *rest):
+        asked.append(float(known[2]))
+        if len(asked) == 1:
+            raise StoppedError(end)
+        return closed(known, *rest)
+
+    monkeypatch.setattr(family, "_closed", fails_first)
+    again = family(guess, start.tangent, start)
+    assert asked == [pytest.approx(1e-3, abs=1e-9), 0.0]
+    np.testing.assert_allclose(again.place, right.place, atol=1e-9)
+    np.testing.assert_allclose(np.abs(again.tangent @ right.tangent), 1, atol=1e-9)
+    end = End.TOO_DEEP
+    asked.clear()
+    with pytest.raises(StoppedError, match="too deep"):
+        family(guess, start.tangent, start)
+
+
+TWISTED = ("rotor.helix_deg=20", "solver.slices=2")
+MOTOR = (
+    "scene.drive=torque",
+    "scene.motor={slope_N_m_s_per_rad: 0.1, inertia_kg_m2: 1.0e-3}",
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "key", "ends"),
+    [
+        ("cic", (), SPEED, (2000, 4000)),
+        ("cic", (), TORQUE, (1, 10)),
+        ("cic", (), BACKLASH, (0.05, 0.4)),
+        ("cic", (), "scene.timing_gear.damping_ratio", (0.1, 0.6)),
+        ("cic", (), INVOLUTE, (5, 9)),
+        ("free", (), "profile.coefficients_2", (0.9, 1.1)),
+        ("ee", (), "contact.clearance_mm", (0.0, 0.01)),
+        ("pump", (), "scene.load.pressure_difference_Pa", (1e4, 4e4)),
+        ("cic", MOTOR, TORQUE, (1, 10)),
+        ("ee", TWISTED, "rotor.helix_deg", (5, 40)),
+        ("ee", (*TWISTED, "optimizer.bounds.helix_deg=[0, 90]"), "rotor.helix_deg", (5, 40)),
+    ],
+)
+def test_scenes_along_a_curve_are_those_of_the_configs(name, changes, key, ends):
+    """Scene and design at 30 % of the range are those of a config with this value."""
+    config = load(f"configs/{name}.yaml", list(changes))
+    family = OrbitFamily(config, key, 1, StepSizes(*ends))
+    value = 0.7 * ends[0] + 0.3 * ends[1]
+    assert family.value(0.3) == pytest.approx(value)
+    own = family.value(family.share)
+    moved = config.moved({key: own})
+    np.testing.assert_allclose(moved.design, config.design, rtol=1e-9)
+    scenes = [
+        Scene.from_config(config).renewed(one)
+        for one in (moved, config, config.moved({key: value}))
+    ]
+    change = jax.tree.map(lambda x: 0.3 * x, family.range.change)
+    scene, design = eqx.apply_updates(family.range.low, change)
+    np.testing.assert_allclose(design, config.moved({key: value}).design, rtol=1e-12)
+    for one, other in ((scene, scenes[2]), (scenes[0], scenes[1])):
+        assert jax.tree.structure(one) == jax.tree.structure(other)
+        for x, y in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+            np.testing.assert_allclose(x, y, rtol=1e-9)
 
 
 def test_units_of_the_state_are_those_of_each_config(branch):
     """States can be used as a start even if the scale of the angle changes with the parameter."""
     point = branch.at(4000.0)[0]
     config = config_at(4000.0)
-    other = follow(config, "backlash_mm", point.state, 1, StepSizes(0.19, 0.21), ways=(-1,))
-    end = other.points[-1]
-    assert (end.value, other.ends) == (0.19, (End.START, End.RANGE_END))
-    there = with_value(config, "backlash_mm", 0.19)
-    alone = Evaluator.of(there)(start=end.state, series=False)
+    other = follow(config, BACKLASH, point.state, 1, StepSizes(0.19, 0.21))
+    end = other.points[0]
+    assert (end.value, other.points[-1].value) == (0.19, 0.21)
+    assert other.ends == (End.RANGE_END, End.RANGE_END)
+    alone = Evaluator.of(config.moved({BACKLASH: 0.19}))(start=end.state, series=False)
     np.testing.assert_allclose(alone.state, end.state, rtol=1e-6)
     assert alone.response["peak_force_N"] == pytest.approx(end.peak, rel=1e-6)
 
@@ -262,35 +237,33 @@ def test_units_of_the_state_are_those_of_each_config(branch):
 def test_period_doubling_leads_to_the_doubled_orbit(branch, monkeypatch):
     """Below 3651 rpm the orbit is unstable, and one of twice the period is born.
 
-    It is found on the other side if the first side gives none."""
+    A multiplier there is -1 by central differences, too. The doubled orbit is found on the other
+    side if the first side gives none."""
     lowest = min((p for p in branch.at(3900.0) if p.stable), key=lambda p: p.peak)
-    below = follow(
-        config_at(3900.0), "speed_rpm", lowest.state, 1, StepSizes(3600, 4000), ways=(-1,)
-    )
+    below = follow(config_at(3900.0), SPEED, lowest.state, 1, StepSizes(3600, 4000))
     (doubling,) = (one for one in below.bifurcations if one.kind is Kind.PERIOD_DOUBLING)
-    assert np.min(np.abs(doubling.point.multipliers + 1)) < 1e-3
-    assert doubling.value == pytest.approx(3650.23, abs=0.5)
+    assert np.min(np.abs(doubling.point.multipliers + 1)) < 1e-6
+    multipliers = np.linalg.eigvals(by_integration(doubling.point)[1])
+    assert np.min(np.abs(multipliers + 1)) < 1e-4
+    assert doubling.point.value == pytest.approx(3650.528, abs=0.01)
     assert below.points[doubling.after].stable
     assert not below.points[doubling.after + 1].stable
-    asked, sides = [], []
+    sides, begun = [], OrbitFamily.begun
 
-    def one_side(orbits, place, *rest):
-        asked.append(orbits.period)
-        sides.append(rest[0])
-        if asked == [1, 2]:
+    def one_side(family, place, across):
+        sides.append(across)
+        if len(sides) == 1:
             raise StoppedError(End.STEP_TOO_SMALL)
-        return corrected(orbits, place, *rest)
+        return begun(family, place, across)
 
-    monkeypatch.setattr("rootsopt.continuation.branch.corrected", one_side)
-    doubled = follow_doubled(below, doubling, StepSizes(3600, 4000, points=6))
+    monkeypatch.setattr(OrbitFamily, "begun", one_side)
+    doubled = follow_doubled(below, doubling, points=6)
     # The sign of the eigenvector depends on the machine; one side may fail at the first distance.
-    assert asked[:3] == [1, 2, 2]
-    assert set(asked[3:]) <= {2}
     assert np.linalg.norm(sides[1]) == pytest.approx(1)
-    np.testing.assert_array_equal(sides[2], -sides[1])
+    np.testing.assert_array_equal(sides[1], -sides[0])
     assert doubled is not None
     assert doubled.ends[1] is not End.HALVED
-    assert doubled.period == 2
+    assert doubled.family.period == 2
     assert max(point.residual for point in doubled.points) < 1e-9
     simple = below.at(doubled.points[-1].value)
     assert all(abs(p.peak - doubled.points[-1].peak) > 1e-3 * p.peak for p in simple)
@@ -299,35 +272,69 @@ def test_period_doubling_leads_to_the_doubled_orbit(branch, monkeypatch):
 
 
 def test_wrong_input_is_explained(branch):
-    config, state = config_at(4000.0), branch.at(4000.0)[0].state
-    with pytest.raises(InputError, match=r"speed_rpm.*torque_N_m.*backlash_mm"):
-        follow(config, "speed", state, 1, RANGE)
-    with pytest.raises(InputError, match="must lie in the range"):
-        follow(config, "speed_rpm", state, 1, StepSizes(4100, 4200))
-    with pytest.raises(InputError, match="backlash_mm"):
-        follow(config, "backlash_mm", state, 1, StepSizes(-0.1, 0.3))
+    config, state = config_at(4000.0), branch.points[0].state
+    for key, limits, said in (
+        ("scene.speed", RANGE, r"did you mean `scene\.speed_rpm`"),
+        (
+            SPEED,
+            StepSizes(4100, 4200),
+            "must lie in the range to follow, 4100 to 4200, but is 4000",
+        ),
+        (BACKLASH, StepSizes(-0.1, 0.3), r"backlash_mm` must be at least 0"),
+        ("contact.exponent", StepSizes(2.0, 2.5), "`contact.exponent` must be a number to which"),
+        ("solver.accuracy", StepSizes(1e-6, 1e-4), "`solver.accuracy` must be a number to which"),
+        ("scene", RANGE, "`scene` must be a section"),
+        ("profile.lobes", StepSizes(2, 4), "`profile.lobes` must be a number to which"),
+        ("rotor.helix_deg", StepSizes(0, 40), "`rotor.helix_deg` must be a number to which"),
+    ):
+        with pytest.raises(InputError, match=said):
+            follow(config, key, state, 1, limits)
     with pytest.raises(InputError, match="period"):
-        follow(config, "speed_rpm", state, 0, RANGE)
+        follow(config, SPEED, state, 0, RANGE)
     bare = load("configs/ee.yaml", ["scene.timing_gear=null"])
-    assert parameters(bare) == ("speed_rpm", "torque_N_m")
-    with pytest.raises(InputError, match="no timing gear"):
-        value_of(bare, "backlash_mm")
+    with pytest.raises(InputError, match="timing_gear"):
+        follow(bare, BACKLASH, state, 1, StepSizes(0.1, 0.3))
+    shooting = load("configs/cic.yaml", ["solver.orbit=shooting"])
+    with pytest.raises(InputError, match=r"solver\.orbit.*collocation.*is shooting"):
+        follow(shooting, SPEED, state, 1, StepSizes(2000, 4000))
+    with pytest.raises(InputError, match="no orbit of 1 mesh periods"):
+        follow(config, SPEED, [40.0, 300.0], 1, RANGE)
 
 
 def test_a_design_ends_where_no_profile_can_be_made(branch):
     """The branch ends where the roll angle allows no longer involute."""
     config = config_at(4000.0)
     state = branch.at(4000.0)[0].state
-    path = follow(config, "involute_length_mm", state, 1, StepSizes(8.9, 9.5), ways=(1,))
+    path = follow(config, INVOLUTE, state, 1, StepSizes(8.9, 9.5))
     assert path.ends[1] is End.NO_GEOMETRY
     assert path.points[-1].value == pytest.approx(9.071, abs=2e-3)
+    assert max(point.residual for point in path.points) < 1e-9
 
 
-def test_longest_gap_goes_around():
-    assert longest_gap(np.array([0, 1, 0, 0, 1, 0], bool)) == 2 / 6
-    assert longest_gap(np.array([0, 0, 1, 0, 0, 1, 0], bool)) == 3 / 7
-    assert longest_gap(np.zeros(4, bool)) == 1
-    assert longest_gap(np.ones(4, bool)) == 0
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("name", "changes", "key", "limits"),
+    [
+        ("cic", SCENE, SPEED, (2900, 3100)),
+        ("cic", (), INVOLUTE, (5, 9)),
+        ("ee", (), BACKLASH, (0.02, 0.4)),
+        ("pump", (), "scene.load.pressure_difference_Pa", (1e4, 4e4)),
+        ("cic", MOTOR, TORQUE, (1, 10)),
+    ],
+)
+def test_orbits_are_those_by_shooting(name, changes, key, limits):
+    config = load(f"configs/{name}.yaml", [*changes, "solver.orbit=shooting"])
+    start = Evaluator.of(config)(series=False)
+    assert start.usable
+    free, period = config.replaced({"solver.orbit": "auto"}), start.steady_state["period"]
+    path = follow(free, key, start.state, period, StepSizes(*limits, points=3))
+    for point in path.points[::2]:
+        other = Evaluator.of(config.moved({key: point.value}))(start=point.state, series=False)
+        found = [other.response[f"{name}_force_N"] for name in ("mean", "peak", "rms")]
+        np.testing.assert_allclose([point.mean, point.peak, point.rms], found, rtol=2e-6)
+        np.testing.assert_allclose(other.state, point.state, rtol=1e-5, atol=1e-6)
+        largest = other.steady_state["floquet_multiplier"]
+        assert np.max(np.abs(point.multipliers)) == pytest.approx(largest, abs=2e-5)
 
 
 @pytest.mark.long

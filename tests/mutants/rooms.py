@@ -4,10 +4,9 @@ from pathlib import Path
 
 _TESTS = Path(__file__).parents[1]
 _OF = {
-    "continuation/arclength": "orbits continuation",
+    "continuation/arclength": "arclength continuation",
     "continuation/branch": "continuation",
-    "continuation/collocated": "collocated continuation",
-    "continuation/orbits": "orbits continuation",
+    "continuation/family": "continuation",
     "contact/closest": "closed_forms contact accuracy conjugacy families gradients",
     "contact/gap": "conformance",
     "contact/impact": "impact contact extremes",
@@ -20,7 +19,7 @@ _OF = {
     "contact/wrapped": "worn twisted",
     "dynamics/closed": "start motion steady",
     "dynamics/collocation/blocks": "system mesh",
-    "dynamics/collocation/bordered": "collocated continuation",
+    "dynamics/collocation/bordered": "continuation",
     "dynamics/collocation/closing": "motion known",
     "dynamics/collocation/elements": "mesh system",
     "dynamics/collocation/equation": "system motion",
@@ -49,7 +48,7 @@ _OF = {
     "dynamics/settle": "dynamics steady gradients",
     "dynamics/steady": "orbit measures steady gradients extremes",
     "dynamics/stepping": "stepping flow",
-    "dynamics/switches": "pair steady gradients continuation",
+    "dynamics/switches": "pair steady gradients",
     "dynamics/tangent": "orbit steady gradients measures",
     "dynamics/varied": "known maxima loads",
     "dynamics/verdict": "pair extremes steady accuracy",

@@ -7,7 +7,6 @@ import pytest
 import rootsopt
 from rootsopt import InputError, Scene
 from rootsopt.config.units import DEG
-from rootsopt.continuation.orbits import place_of, with_value
 from rootsopt.design.bounds import bounds_of
 from rootsopt.design.space import Space
 from rootsopt.optimize.search import Search
@@ -39,12 +38,6 @@ def test_twist_is_the_last_parameter(name):
     design = space.design(jnp.asarray(point))
     assert float(design[-1]) == pytest.approx(22.5)
     np.testing.assert_allclose(space.point(design), point, atol=1e-12)
-
-
-def test_orbits_can_be_followed_over_the_twist():
-    config = rootsopt.load_config("cic", FREE)
-    assert with_value(config, "helix_deg", 50.0).rotor.helix_deg == 50.0
-    assert place_of("helix_deg") == "rotor.helix_deg"
 
 
 def test_derivatives_are_those_of_the_scene():
