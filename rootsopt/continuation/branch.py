@@ -90,9 +90,9 @@ class Branch:
                 continue
             share = (value - old.data.value) / (new.data.value - old.data.value)
             guess = old.place + share * (new.place - old.place)
-            near, fixed = old if share < 0.5 else new, np.eye(len(guess))[-1]
+            fixed = np.eye(len(guess))[-1]
             with contextlib.suppress(StoppedError):
-                found.append(self.family(guess, fixed, near).data)
+                found.append(self.family(guess, fixed, old if share < 0.5 else new).data)
         return found + [point for point in self.points[-1:] if point.value == value]
 
 

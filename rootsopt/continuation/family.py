@@ -97,9 +97,8 @@ class OrbitFamily:
     `scene.speed_rpm`; `period`: k; `limits`: range of the parameter (config's unit) and step sizes.
     The attribute `share` is the config's own place in the range.
 
-    Raises `InputError` for an unknown key, for a value that the config cannot have, for a key on
-    which scene and design do not depend linearly, and for a config whose orbits collocation does not
-    close.
+    Raises `InputError` for an unknown key, a value that the config cannot have, a key on which
+    scene and design do not depend linearly, and a config whose orbits collocation does not close.
     """
 
     def __init__(self, config: Config, key: str, period: int, limits: StepSizes):
@@ -134,7 +133,7 @@ class OrbitFamily:
         # A number that the scene sets later is NaN here.
         self.range = _Range(ends[1], tree(jnp.nan_to_num(change)), pair.angle_scale)
 
-    def value(self, share: float) -> float:
+    def value(self, share: Any) -> float:
         """Return the parameter's value (config's unit) at a `share` of its range."""
         return float(self.limits.low * (1 - share) + self.limits.high * share)
 

@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+import types
 
 import equinox as eqx
 import jax
@@ -191,7 +192,7 @@ MOTOR = (
         ("cic", (), BACKLASH, (0.05, 0.4)),
         ("cic", (), "scene.timing_gear.damping_ratio", (0.1, 0.6)),
         ("cic", (), INVOLUTE, (5, 9)),
-        ("free", (), "profile.coefficients_2", (0.9, 1.1)),
+        ("free", (), "profile.coefficients_2", (0.2, 0.4)),
         ("ee", (), "contact.clearance_mm", (0.0, 0.01)),
         ("pump", (), "scene.load.pressure_difference_Pa", (1e4, 4e4)),
         ("cic", MOTOR, TORQUE, (1, 10)),
@@ -199,8 +200,11 @@ MOTOR = (
         ("ee", (*TWISTED, "optimizer.bounds.helix_deg=[0, 90]"), "rotor.helix_deg", (5, 40)),
     ],
 )
-def test_scenes_along_a_curve_are_those_of_the_configs(name, changes, key, ends):
+def test_scenes_along_a_curve_are_those_of_the_configs(monkeypatch, name, changes, key, ends):
     """Scene and design at 30 % of the range are those of a config with this value."""
+    pair = types.SimpleNamespace(angle_scale=jnp.asarray(1e-3))
+    monkeypatch.setattr("rootsopt.continuation.family._pair", lambda *scene: pair)
+    monkeypatch.setattr("rootsopt.continuation.family.continues", lambda *pair: True)
     config = load(f"configs/{name}.yaml", list(changes))
     family = OrbitFamily(config, key, 1, StepSizes(*ends))
     value = 0.7 * ends[0] + 0.3 * ends[1]
