@@ -129,7 +129,7 @@ class OrbitFamily:
                 "`solver.orbit` must be `auto` or `collocation`, and the contact smooth between "
                 f"events, for orbits to be followed, but `solver.orbit` is {config.solver.orbit}"
             )
-        self.share = float(np.round((own - low)[most] / change[most], 12))
+        self.share = float((own - low)[most] / change[most])
         # A number that the scene sets later is NaN here.
         self.range = _Range(ends[1], tree(jnp.nan_to_num(change)), pair.angle_scale)
 
@@ -176,7 +176,7 @@ class OrbitFamily:
         opened = np.column_stack([monodromy - np.eye(len(state)), line.by_share])
         point = BranchPoint(
             value=self.value(line.share),
-            state=state * (self.range.unit / unit),
+            state=state * float(self.range.unit / unit),
             period=self.period,
             mean=mean,
             peak=peak,

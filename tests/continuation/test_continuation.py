@@ -7,6 +7,7 @@ import subprocess
 import sys
 import types
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -17,7 +18,6 @@ from rootsopt.config import load
 from rootsopt.continuation import End, Kind, StepSizes, follow, follow_doubled
 from rootsopt.continuation.arclength import StoppedError
 from rootsopt.continuation.family import OrbitFamily
-from rootsopt.dynamics.flow import strobe
 from rootsopt.errors import InputError
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.scene import Scene, design_vector
@@ -47,22 +47,39 @@ def branch():
     return follow(config, SPEED, found.state, 1, RANGE)
 
 
+def start_of(branch):
+    """Return the orbit at which the branch began, far from any grazing contact."""
+    return min(branch.spots, key=lambda spot: np.max(np.abs(spot.data.state - START)))
+
+
 @jax.jit
 def _ends(scene, design, states):
-    """Return the states (m, n) after one mesh period from each of the scaled `states` (m, n)."""
-    pair, integrator = scene.pair(design), scene.solver.orbit
-    fine = eqx.tree_at(lambda found: found.rtol, integrator, jnp.asarray(1e-10))
-    return jax.lax.map(lambda state: strobe(pair, state, 1, fine).states[-1], states)
+    """Return the states (m, n) after one mesh period from each of the scaled `states` (m, n).
+
+    A step of any length could miss a short touch in free flight."""
+    pair = scene.pair(design)
+    term = diffrax.ODETerm(lambda tau, state, _: pair.derivative(tau, state)[0])
+    control = diffrax.PIDController(rtol=1e-11, atol=1e-11, dtmax=1 / 256)
+
+    def end(state):
+        solver = diffrax.Dopri8(scan_kind="lax")
+        out = diffrax.diffeqsolve(
+            term, solver, 0.0, 1.0, 1e-3, state, stepsize_controller=control, max_steps=100_000
+        )
+        return out.ys[-1]
+
+    return jax.lax.map(end, states)
 
 
 def by_integration(point):
     """Return the end of a motion over one mesh period, and its derivative (n, n) with respect to
-    the start, by central differences."""
-    config = config_at(point.value)
-    step = 1e-6 * np.vstack([np.eye(2), -np.eye(2)])
-    states = np.vstack([point.state, point.state + step])
+    the start, by central differences.
+
+    Noise of the integration, 1e-9, and curvature both stay below 1e-4 of it."""
+    config, step = config_at(point.value), 1e-4
+    states = point.state + step * np.vstack([np.zeros(2), np.eye(2), -np.eye(2)])
     end, *ends = np.asarray(_ends(Scene.from_config(config), design_vector(config), states))
-    return end, (np.array(ends[:2]) - np.array(ends[2:])).T / 2e-6
+    return end, (np.array(ends[:2]) - np.array(ends[2:])).T / (2 * step)
 
 
 def test_points_agree_with_orbits_closed_for_themselves(branch):
@@ -91,16 +108,18 @@ def test_points_agree_with_orbits_closed_for_themselves(branch):
 
 
 def test_points_are_orbits_of_an_integration(branch):
-    """Stable or not, the motion returns, and its multipliers are those of central differences."""
-    assert {point.stable for point in branch.points} == {True, False}
-    for point in branch.points[::4]:
+    """Stable or not, the motion returns, and its monodromy is that of central differences."""
+    points = branch.points[::8]
+    assert {point.stable for point in points} == {True, False}
+    for point in points:
         end, monodromy = by_integration(point)
         np.testing.assert_allclose(end, point.state, atol=1e-6)
-        found = np.sort_complex(np.linalg.eigvals(monodromy))
-        np.testing.assert_allclose(np.sort_complex(point.multipliers), found, atol=1e-4, rtol=1e-4)
         line = point.made.line
         moved = line.to_state @ line.monodromy @ np.linalg.inv(line.to_state)
         np.testing.assert_allclose(moved, monodromy, atol=5e-4 * np.max(np.abs(monodromy)))
+        np.testing.assert_allclose(
+            np.sort_complex(point.multipliers), np.sort_complex(np.linalg.eigvals(moved))
+        )
 
 
 def test_every_point_is_closed(branch):
@@ -133,7 +152,7 @@ def test_branch_turns_back_at_folds(branch):
 
 def test_plane_holds_the_place(branch):
     """The orbit lies in the plane that was asked for, at a fixed parameter or across the curve."""
-    start = branch.spots[len(branch.spots) // 2]
+    start = start_of(branch)
     guess = start.place + 0.008 * start.tangent
     for across in (start.tangent, np.eye(3)[-1], np.eye(3)[1]):
         spot = branch.family(guess, across, start)
@@ -144,7 +163,7 @@ def test_plane_holds_the_place(branch):
 
 
 def test_tangent_is_the_derivative_along_the_curve(branch):
-    start = branch.spots[len(branch.spots) // 2]
+    start = start_of(branch)
     ends = [
         branch.family(start.place + step * start.tangent, start.tangent, start).place
         for step in (1e-4, -1e-4)
@@ -248,10 +267,10 @@ def test_period_doubling_leads_to_the_doubled_orbit(branch, monkeypatch):
     (doubling,) = (one for one in below.bifurcations if one.kind is Kind.PERIOD_DOUBLING)
     assert np.min(np.abs(doubling.point.multipliers + 1)) < 1e-6
     multipliers = np.linalg.eigvals(by_integration(doubling.point)[1])
-    assert np.min(np.abs(multipliers + 1)) < 1e-4
+    assert np.min(np.abs(multipliers + 1)) < 1e-3
     assert doubling.point.value == pytest.approx(3650.528, abs=0.01)
-    assert below.points[doubling.after].stable
-    assert not below.points[doubling.after + 1].stable
+    assert not below.points[doubling.after].stable
+    assert below.points[doubling.after + 1].stable
     sides, begun = [], OrbitFamily.begun
 
     def one_side(family, place, across):
@@ -285,11 +304,11 @@ def test_wrong_input_is_explained(branch):
             "must lie in the range to follow, 4100 to 4200, but is 4000",
         ),
         (BACKLASH, StepSizes(-0.1, 0.3), r"backlash_mm` must be at least 0"),
-        ("contact.exponent", StepSizes(2.0, 2.5), "`contact.exponent` must be a number to which"),
-        ("solver.accuracy", StepSizes(1e-6, 1e-4), "`solver.accuracy` must be a number to which"),
+        ("contact.exponent", StepSizes(2.0, 2.5), "`contact.exponent` must be a number on which"),
+        ("solver.accuracy", StepSizes(1e-6, 1e-4), "`solver.accuracy` must be a number on which"),
         ("scene", RANGE, "`scene` must be a section"),
-        ("profile.lobes", StepSizes(2, 4), "`profile.lobes` must be a number to which"),
-        ("rotor.helix_deg", StepSizes(0, 40), "`rotor.helix_deg` must be a number to which"),
+        ("profile.lobes", StepSizes(2, 4), "`profile.lobes` must be a whole number"),
+        ("rotor.helix_deg", StepSizes(0, 40), "`rotor.helix_deg` must be a number on which"),
     ):
         with pytest.raises(InputError, match=said):
             follow(config, key, state, 1, limits)
