@@ -13,18 +13,18 @@ from unittest import mock
 
 ROOT = Path(__file__).parents[1]
 MOST = {
-    "statements of the package": 27_900,
-    "statements of the tests": 20_200,
-    "statements of the experiments": 7_200,
+    "statements of the package": 26_900,
+    "statements of the tests": 20_170,
+    "statements of the experiments": 7_190,
     "packages": 20,
-    "files of the package": 311,
+    "files of the package": 279,
     "lines of the longest file": 810,
-    "floors of packages": 19,
-    "depth of imports": 40,
+    "floors of packages": 18,
+    "depth of imports": 38,
     "config keys": 153,
     "lines of the longest help": 60,
     "pages of docs": 49,
-    "words of docs": 43_000,
+    "words of docs": 42_800,
 }
 """Greatest values that are accepted. Lower them when the project becomes lighter. Whoever raises
 one gives the reason in the changelog: what users can do now that is worth the weight."""
