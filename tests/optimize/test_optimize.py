@@ -370,6 +370,7 @@ def _refuse():
 
 INTERRUPTED = """
 import os, signal, sys
+from rootsopt.commands import door
 from rootsopt.commands.table import optimize as command
 from rootsopt.commands.work import searching
 from rootsopt.optimize.search import Search
@@ -388,7 +389,7 @@ def begun(self):
         import time; time.sleep(60)
     return run(self)
 Search._evaluate, Search.run = counted, begun
-command.door.leave(command.main())
+door.leave(command.main())
 """
 
 

@@ -280,7 +280,7 @@ def test_optimize_command(tmp_path, capsys):
     ]
     options = [f"--set={one}" for one in overrides]
     assert main(["optimize", CIC, "-o", str(tmp_path), *options]) == 0
-    assert "Baseline and optima in 4 fresh scenes" in capsys.readouterr().out
+    assert "Designs in 4 fresh scenes" in capsys.readouterr().out
     result = json.loads((tmp_path / "result.json").read_text())
     record = result["robustness"]
     assert set(record["fresh"]) == {"baseline", "nominal", "robust"}

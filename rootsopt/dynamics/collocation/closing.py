@@ -361,7 +361,7 @@ class Closer(eqx.Module):
 
         def goes_on() -> Loop:
             rivals = rivals_of(at, points, *along, now.rivals)
-            found = is_settled(now.rivals, rivals, peak, self.ease)
+            found = is_settled(now.rivals, rivals, peak, self.tolerance / _USUAL)
             after = now._replace(elements=moved, rivals=rivals, line=line)
             return self.judged(now, after, size, found)
 

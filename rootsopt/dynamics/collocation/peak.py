@@ -29,10 +29,11 @@ _PLACES = np.linspace(0.0, 1.0, 9)
 """Places in each element at which the polynomials of the force are compared."""
 _STEPS = 4
 """Number of Newton steps from the best of these places to the maximum of a polynomial."""
-_CLOSE = 1e-5
+_CLOSE, _LEAST = 1e-5, 1e-9
 """Distance of the peak from the instant at which the equation is evaluated (fraction of the
-element's length) below which force and derivative are extrapolated to it, at the usual accuracy:
-both errors are then far below those of the orbit."""
+element's length) below which force and derivative are extrapolated to it: both errors are then far
+below those of the orbit. The first number holds at the usual accuracy, and grows with the error to
+reach; the second is the least distance."""
 _BESIDE = 1e-2
 """Distance between two instants (fraction of the element's length) below which the errors of their
 interpolated roots count as equal."""
@@ -201,14 +202,14 @@ def peak_of(
 
 
 def is_settled(
-    before: Rivals, after: Rivals, peak: Peak, ease: Float[Array, ""]
+    before: Rivals, after: Rivals, peak: Peak, accuracy: Float[Array, ""]
 ) -> Bool[Array, ""]:
     """Return whether the peak lies so close to an instant that the extrapolation to it is exact.
 
     `before`: instants at which the equation was evaluated; `peak`: result of `peak_of` for them;
-    `after`: result of `rivals_of` for them; `ease`: factor by which the errors to reach exceed
-    those at the usual accuracy."""
-    close = jnp.minimum(_CLOSE * jnp.sqrt(ease), _BESIDE)
+    `after`: result of `rivals_of` for them; `accuracy`: error to reach, in multiples of that at the
+    usual accuracy."""
+    close = jnp.clip(_CLOSE * accuracy, _LEAST, _BESIDE)
     tried = jnp.any(before.element == after.element[0])
     at_end = (jnp.abs(peak.share - 0.5) == 0.5) & (jnp.abs(peak.shift) <= 2 * _INSIDE)
     return tried & (at_end | (jnp.abs(peak.shift) < close))
