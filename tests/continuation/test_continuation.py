@@ -172,28 +172,34 @@ def test_tangent_is_the_derivative_along_the_curve(branch):
     np.testing.assert_allclose(chord / np.linalg.norm(chord), start.tangent, atol=1e-5)
 
 
-def test_orbit_that_its_neighbour_does_not_lead_to(branch, monkeypatch):
-    """It begins with an integration instead; other reasons to stop are final."""
+@pytest.mark.parametrize("wrong", [True, False])
+def test_orbit_to_which_its_neighbour_does_not_lead(branch, monkeypatch, wrong):
+    """It is closed from an integration, whether its neighbour leads to none or to a wrong one.
+
+    Other reasons to stop are final."""
     family, start = branch.family, branch.spots[0]
-    guess = start.place + 1e-3 * start.tangent
-    right, closed, asked = family(guess, start.tangent, start), family._closed, []
+    way, guess = start.tangent, start.place + 1e-3 * start.tangent
+    right, closed, asked = family(guess, way, start), family._closed, []
+    aside = 1e-4 * np.cross(way, [0.0, 0.0, 1.0])
     end = End.STEP_TOO_SMALL
 
-    def fails_first(known, *rest):
+    def misled(known, *rest):
         asked.append(float(known[2]))
-        if len(asked) == 1:
-            raise StoppedError(end)
-        return closed(known, *rest)
+        if len(asked) > 1:
+            return closed(known, *rest)
+        if wrong and end is End.STEP_TOO_SMALL:
+            return right._replace(place=right.place + aside)
+        raise StoppedError(end)
 
-    monkeypatch.setattr(family, "_closed", fails_first)
-    again = family(guess, start.tangent, start)
+    monkeypatch.setattr(family, "_closed", misled)
+    again = family(guess, way, start)
     assert asked == [pytest.approx(1e-3, abs=1e-9), 0.0]
     np.testing.assert_allclose(again.place, right.place, atol=1e-9)
     np.testing.assert_allclose(np.abs(again.tangent @ right.tangent), 1, atol=1e-9)
     end = End.TOO_DEEP
     asked.clear()
     with pytest.raises(StoppedError, match="too deep"):
-        family(guess, start.tangent, start)
+        family(guess, way, start)
 
 
 TWISTED = ("rotor.helix_deg=20", "solver.slices=2")
