@@ -108,7 +108,7 @@ def follow(config: Config, key: str, state: ArrayLike, period: int, limits: Step
 
     Raises `InputError` for an invalid `key` or `period`; for limits that exclude the config's
     value, or that the config cannot have; if collocation does not close orbits of this config; and
-    if there is no orbit to start from.
+    if no orbit is found for the first point.
     """
     if not 1 <= period <= LONGEST:
         raise InputError(f"Argument `period` must be 1 to {LONGEST}, but is {period}")
@@ -121,7 +121,7 @@ def follow(config: Config, key: str, state: ArrayLike, period: int, limits: Step
         )
     rising = np.eye(len(place))[-1]
     try:
-        start = family.begun(place, rising)
+        start = family.from_integration(place, rising)
     except StoppedError as stop:
         raise InputError(
             f"there is no orbit of {period} mesh periods near the state at `{key}` = {value:g}: "
@@ -159,7 +159,7 @@ def follow_doubled(branch: Branch, bifurcation: Bifurcation, points: int = 400) 
     fallen = None
     for size, way in itertools.product(_SIZES, (1, -1)):
         try:
-            start = family.begun(place + size * way * across, way * across)
+            start = family.from_integration(place + size * way * across, way * across)
         except StoppedError:
             continue
         if start.data.half_way <= 0.2 * size:

@@ -150,9 +150,9 @@ class OrbitFamily:
                 raise
         # Next to a grazing contact, the neighbour's events may not be those of this orbit. From a
         # neighbour alone, a short touch was overlooked: a multiplier was -1.06 instead of -0.99.
-        return self.begun(guess, across)
+        return self.from_integration(guess, across)
 
-    def begun(self, guess: NDArray[np.float64], across: NDArray[np.float64]) -> Spot:
+    def from_integration(self, guess: NDArray[np.float64], across: NDArray[np.float64]) -> Spot:
         """Return the orbit in a plane, as a call does, from an integration that begins at
         `guess`."""
         return self._closed(_seed(self.range, guess, self.period), guess, across)

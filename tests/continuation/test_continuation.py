@@ -277,15 +277,15 @@ def test_period_doubling_leads_to_the_doubled_orbit(branch, monkeypatch):
     assert doubling.point.value == pytest.approx(3650.528, abs=0.01)
     assert not below.points[doubling.after].stable
     assert below.points[doubling.after + 1].stable
-    sides, begun = [], OrbitFamily.begun
+    sides, closed = [], OrbitFamily.from_integration
 
     def one_side(family, place, across):
         sides.append(across)
         if len(sides) == 1:
             raise StoppedError(End.STEP_TOO_SMALL)
-        return begun(family, place, across)
+        return closed(family, place, across)
 
-    monkeypatch.setattr(OrbitFamily, "begun", one_side)
+    monkeypatch.setattr(OrbitFamily, "from_integration", one_side)
     doubled = follow_doubled(below, doubling, points=6)
     # The sign of the eigenvector depends on the machine; one side may fail at the first distance.
     assert np.linalg.norm(sides[1]) == pytest.approx(1)
