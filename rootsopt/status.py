@@ -95,8 +95,9 @@ class Status(enum.Enum):
     )
 
     NOT_CLOSED = (
-        "The motion repeats, but its orbit could not be closed by collocation, so that forces and "
-        "gradient are not known. Set solver.orbit to shooting, which takes ten times as long."
+        "The motion repeats, but its orbit could not be closed, so that the forces are those of a "
+        "window of the motion, and their gradient is not known. Change solver.accuracy, or move "
+        "the scene a little."
     )
 
     @property

@@ -1,8 +1,7 @@
 """Evaluate many designs at once, with one compiled program.
 
-A batch is for surveys. Each design gets one attempt: the orbit is closed to a tenth of the
-tolerance, and derivatives are not checked on halved steps. A design that needs more attempts is
-reported as not settled or inaccurate. Give such a design to an `Evaluator`.
+A batch is for surveys. Motions without an orbit are not examined further: give such a design to an
+`Evaluator`.
 """
 
 import dataclasses
@@ -13,16 +12,13 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from rootsopt.dynamics.closed import Start, steady_motion
 from rootsopt.dynamics.integrator import Integrator
-from rootsopt.dynamics.steady import Solver, steady_motion
+from rootsopt.dynamics.steady import Solver
 from rootsopt.runtime.programs import Program
 from rootsopt.runtime.threads import on_all_cores
 from rootsopt.scene import Scene
 from rootsopt.status import Status
-
-SAMPLES = 840
-"""Number of uniform samples of an orbit, from which the peak is located. It is divisible by every
-period (mesh periods) up to eight."""
 
 
 class Batch(NamedTuple):
@@ -68,11 +64,6 @@ def coarse(
         orbit=orbit,
         max_periods=jnp.asarray(float(max_periods)),
         max_orbit=max_orbit,
-        shots=8,
-        closed=0.1,
-        samples=SAMPLES,
-        check=False,
-        attempts=1,
     )
 
 
@@ -93,9 +84,8 @@ def respond(
         pair, tangents, _ = scene.pair_and_tangents(design)
     else:
         pair, tangents, _ = scene.pair_and_tangents(design, ())
-    found = steady_motion(
-        pair, tangents, state.astype(pair.angle_scale.dtype), scene.pitch_radius, solver
-    )
+    start = Start.at(pair, pair.in_si(state), solver.max_orbit)
+    found = steady_motion(pair, tangents, start, scene.pitch_radius, solver)
     orbit = found.orbit
     mean, square, peak = found.forces[:3]
     rms = jnp.sqrt(jnp.maximum(square, 0.0))

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -18,7 +19,7 @@ from jax import lax
 from experiments._common.driver import NoResultError
 from experiments._common.scenes import shipped
 from rootsopt.config import Config
-from rootsopt.dynamics.flow import flow
+from rootsopt.dynamics.flow import one_period
 from rootsopt.optimize.noise import standard_error
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.search import Optimization, Search
@@ -120,18 +121,18 @@ def _pathwise(model: Scene, design, periods, how):
 
     Returns derivatives (periods, d): row k is for the mean over all mesh periods up to the k-th.
     """
-    pair, tangents, _ = model.pair_and_tangents(design)
 
-    def step(carry, _):
-        state, moved = carry
-        out = flow(pair, state, jnp.ones(()), how, 63, tangents)
-        slope, along = out.slope[:, :2], out.slope[:, 2:]
-        every = slope @ moved + along
-        return (out.end, every[:2]), every[2]
+    def means(design):
+        pair = model.pair(design)
 
-    start = jnp.zeros(2), jnp.zeros((2, design.shape[0]))
-    _, by_design = lax.scan(step, start, length=periods)
-    return jnp.cumsum(by_design, axis=0) / (1 + jnp.arange(periods))[:, None]
+        def step(state, _):
+            out = one_period(pair, state, how)
+            return out.end, out.response[0]
+
+        every = lax.scan(step, jnp.zeros(2), length=periods)[1]
+        return jnp.cumsum(every) / (1 + jnp.arange(periods))
+
+    return jax.jacfwd(means)(design)
 
 
 def pathwise(evaluator: Evaluator, design, size: Size) -> list[dict]:

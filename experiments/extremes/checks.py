@@ -13,14 +13,12 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from experiments._common.batch import coarse, respond
+from experiments._common.shooting import closed as shot_of
 from experiments._common.simulation import evaluator_of as make_evaluator
 from experiments._common.simulation import pair_of_model, stacked
 from experiments.extremes.scenes import Kind
 from rootsopt.config import Config
-from rootsopt.dynamics.flow import flow, strobe
 from rootsopt.dynamics.integrator import Integrator
-from rootsopt.dynamics.orbit import Shots, close_orbit
-from rootsopt.dynamics.window import no_tangents
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.runtime.programs import Program
 from rootsopt.scene import Scene, design_vector
@@ -36,12 +34,10 @@ promise is broken."""
 CORNER = 1e-9
 """Tolerance below which the limit on the deviation no longer falls. A peak on a corner of the force
 is known only to about 1e-8 (docs/accuracy.md)."""
-SHARP = "dopri8", 1e-12, 20_000
-"""Method, tolerance and maximum number of steps of the reference."""
+CLOSED = 1e-9
+"""Distance between start and end (scaled) above which a reference is not closed."""
 FEW = 50
 """Contact oscillations per mesh period above which SciPy (explicit, in Python) is not used."""
-PATIENCE = 24
-"""Length (mesh periods) of the plain integration if Newton's method does not close a reference."""
 DEPTHS = np.concatenate([[-1e-3, 0.0], np.geomspace(1e-36, 1e-2, 39)])
 RATES = np.concatenate([-np.geomspace(1e-9, 1e3, 7), [0.0], np.geomspace(1e-9, 1e3, 4)])
 POSES = 4
@@ -194,28 +190,6 @@ def simulate(case: Case) -> None:
 # Promise 3: the truth
 
 
-@Program
-def _sharp(model: Scene, design, state, period):
-    method, rtol, steps = SHARP
-    pair = model.pair(design)
-    how = Integrator(method, jnp.asarray(rtol), steps)
-    orbit = close_orbit(pair, no_tangents(pair), state, period, Shots(how))
-    return orbit._replace(flow=orbit.flow._replace(grid=jnp.zeros(0)))
-
-
-@Program
-def _patient(model: Scene, design, state, period):
-    """Integrate without Newton's method. Return the last period of the motion and its start
-    state."""
-    method, rtol, steps = SHARP
-    pair = model.pair(design)
-    how = Integrator(method, jnp.asarray(100 * rtol), steps)
-    states = strobe(pair, state, PATIENCE, how).states
-    last = states[PATIENCE - 1 - period]
-    out = flow(pair, last, period.astype(float), how, 2520, no_tangents(pair))
-    return out._replace(grid=jnp.zeros(0)), last
-
-
 @eqx.filter_jit
 def _rates(pair, tau, state):
     slope, contact = pair.derivative(tau, state)
@@ -223,24 +197,14 @@ def _rates(pair, tau, state):
 
 
 def refine(case: Case) -> None:
-    """Measure how far a periodic result deviates from the nearby orbit found with `SHARP`
-    settings."""
-    model = Scene.from_config(case.config)
-    design = np.asarray(design_vector(case.config))
-    period = np.asarray(case.row["period"])
-    orbit = jax.device_get(_sharp(model, design, case.state, period))
-    closed = bool(orbit.flow.solved) and float(orbit.residual) < 1e-9
-    closed = closed and float(orbit.flow.strain) < 100.0  # A solver would have accepted the steps.
-    state, numbers = orbit.state, orbit.response[:3]
-    if not closed:
-        out, state = jax.device_get(_patient(model, design, case.state, period))
-        closed = bool(out.solved) and float(np.max(np.abs(out.end - state))) < 1e-4
-        numbers = np.array([out.mean, out.mean_square, out.peak])
-    mean, square, peak = numbers
-    truth = np.array([mean, peak, np.sqrt(square)])
+    """Measure how far a periodic result deviates from the nearby orbit closed by shooting."""
+    pair = pair_of_model(Scene.from_config(case.config), design_vector(case.config))
+    truth = shot_of(pair, case.state, int(case.row["period"]))
+    closed = truth.miss < CLOSED
+    mean, peak, _ = truth.forces
     names = ("mean_force_N", "peak_force_N", "rms_force_N")
     found = np.array([case.row[name] for name in names])
-    off = np.abs(found - truth) / np.maximum(truth, case.row["static_force_N"])
+    off = np.abs(found - truth.forces) / np.maximum(truth.forces, case.row["static_force_N"])
     allowed = ALLOWED * max(case.config.solver.orbit_tolerance, CORNER)
     case.row |= {
         "reference": "closed" if closed else "not closed",
@@ -248,11 +212,11 @@ def refine(case: Case) -> None:
         "reference_peak_N": float(peak),
         "mean_off": float(off[0]),
         "peak_off": float(off[1]),
-        "moved": float(np.max(np.abs(state - case.state))),
-        "reference_multiplier": float(orbit.multiplier),
+        "moved": float(np.max(np.abs(truth.state - case.state))),
+        "reference_multiplier": truth.multiplier,
         "share_of_allowed": float(max(off[:2]) / allowed),
     }
-    case.state = np.asarray(state)
+    case.state = truth.state
 
 
 def by_scipy(case: Case) -> None:

@@ -14,18 +14,15 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
 from experiments._common.scenes import CIC, FORCES
+from experiments._common.shooting import closed, differentiated
 from experiments._common.simulation import evaluator_of
 from rootsopt.config import load
-from rootsopt.dynamics.integrator import Integrator
-from rootsopt.dynamics.orbit import Shots, agreement, close_orbit
-from rootsopt.dynamics.window import no_tangents
+from rootsopt.dynamics.verdict import agreement
 from rootsopt.response.evaluation import Evaluation, Evaluator
-from rootsopt.scene import Scene
 
 Row = dict[str, Any]
 TOLERANCES = (1e-8, 1e-9, 1e-10)
@@ -119,37 +116,22 @@ def full(draw: np.random.Generator) -> dict[str, Any]:
     }
 
 
-@eqx.filter_jit
-def forces(model: Scene, design, state, period, how: Integrator):
-    """Close an orbit. Return (mean, peak, RMS) force (N), the residual, and whether the solver
-    succeeded.
-    """
-    pair = model.pair(design)
-    orbit = close_orbit(pair, no_tangents(pair), state, period, Shots(how, check=False))
-    mean, square, peak = orbit.response
-    return jnp.stack([mean, peak, jnp.sqrt(square)]), orbit.residual, orbit.flow.solved
-
-
 def differences(
     evaluator: Evaluator, found: Evaluation, step: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Differentiate the forces along `WAY` by central differences with a relative `step` and half
-    of it, extrapolated to step 0.
+    """Differentiate the forces along `WAY`, in relative steps.
 
     Returns the derivatives (3,) in N per unit of relative change, and their estimated errors (3,).
     Both are NaN where an orbit does not close."""
-    how = Integrator("dopri8", jnp.asarray(1e-12), evaluator.scene.solver.orbit.max_steps)
     design = np.array(list(found.design.values()))
-    period, state = jnp.asarray(found.steady_state["period"]), jnp.asarray(found.state)
+    period = int(found.steady_state["period"])
 
     def at(change: float) -> np.ndarray:
-        moved = jnp.asarray(design * (1 + change * WAY[: len(design)]))
-        force, residual, solved = forces(evaluator.scene, moved, state, period, how)
-        closed = bool(solved) and float(residual) < 1e-10
-        return np.asarray(force) if closed else np.full(len(MEASURES), np.nan)
+        moved = design * (1 + change * WAY[: len(design)])
+        shot = closed(evaluator.pair(moved), found.state, period)
+        return shot.forces if shot.miss < 1e-10 else np.full(len(MEASURES), np.nan)
 
-    wide, close = ((at(h) - at(-h)) / (2 * h) for h in (step, step / 2))
-    return (4 * close - wide) / 3, np.abs(close - wide)
+    return differentiated(at, step)
 
 
 def evaluated(evaluator: Evaluator) -> Iterator[tuple[float, Evaluation]]:

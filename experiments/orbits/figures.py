@@ -12,9 +12,7 @@ from experiments.orbits.study import FORCES, Row
 def differences_of(rows: Sequence[Row]) -> Figure:
     """Draw the distribution of the differences in forces and in their derivatives."""
     picture, axes = sheet(10, 4.2, 1, 2)
-    good = [
-        row for row in rows if {row["collocation_status"], row["shooting_status"]} == {"periodic"}
-    ]
+    good = [row for row in rows if row["status"] == "periodic"]
     titles = {"difference": "Forces", "gradient_difference": "Derivatives"}
     for ax, (what, title) in zip(axes[0], titles.items(), strict=True):
         for name, color in zip(FORCES, COLORS[:3], strict=True):

@@ -31,7 +31,7 @@ SCENES: dict[str, tuple[str, list[str]]] = {
 }
 """Config and overrides of each scene."""
 EXACT = 1e-10
-"""Orbit tolerance of the reference, which is closed by shooting."""
+"""Orbit tolerance of the reference."""
 
 
 def processor_time(call: Callable[[], Any], repeats: int) -> tuple[float, Any]:
@@ -69,26 +69,22 @@ def rows_of(scene: str, repeats: int, say: Callable[[str], None] = lambda text: 
     path, overrides = SCENES[scene]
     config = load(path, overrides)
     own = Evaluator.of(config)
-    shooting = Evaluator.of(load(path, [*overrides, "solver.orbit=shooting"]))
     base = np.asarray(config.design, float)
     draw = np.random.default_rng(0)
     design = base * (1 + AWAY * draw.uniform(-1, 1, base.shape))
     say(f"{scene}: compiling")
     neighbour = own(base, series=False)
-    exact = shooting.at_tolerance(EXACT)(design, start=neighbour.start, series=False)
+    exact = own.at_tolerance(EXACT)(design, series=False)
     if not (neighbour.usable and exact.usable):
         return [{"scene": scene, "tool": f"{neighbour.status.label}, {exact.status.label}"}]
     truth = _numbers(exact)
 
-    state = neighbour.state
     near = own(design, start=neighbour.start, series=False)
     used = near.statistics.get("from_neighbour", 0)
     name = "evaluate, neighbour" if used else "evaluate, neighbour refused"
     calls = {
         name: lambda: own(design, start=neighbour.start, series=False),
         "evaluate, from rest": lambda: own(design, series=False),
-        "shooting from the neighbour's state": lambda: shooting(design, state, series=False),
-        "shooting from rest": lambda: shooting(design, series=False),
     }
     rows = _public(scene, config, (base, design), truth, repeats)
     for tool, call in calls.items():

@@ -21,8 +21,8 @@ from experiments._common.scenes import FORCES, shipped
 from experiments._common.simulation import evaluator_of
 from rootsopt.config import Config
 from rootsopt.config.units import MM
-from rootsopt.dynamics.integrator import Integrator
-from rootsopt.dynamics.orbit import Shots, close_orbit
+from rootsopt.dynamics.closed import Start, steady_motion
+from rootsopt.dynamics.orbit import Orbit
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.runtime.programs import Program
@@ -159,14 +159,8 @@ class Pairs:
 
 def _slopes(evaluator: Evaluator, one: Evaluation, values) -> NDArray[np.float64]:
     """Differentiate log mean and log peak force with respect to the log quantities, (2, p)."""
-    orbit = _orbit(
-        evaluator.scene,
-        design_vector(evaluator.config),
-        jnp.asarray(values),
-        jnp.asarray(one.state),
-        jnp.asarray(one.steady_state["period"]),
-        evaluator.scene.solver.orbit,
-    )
+    design, state = design_vector(evaluator.config), jnp.asarray(one.state)
+    orbit = _orbit(evaluator.scene, design, jnp.asarray(values), state)
     mean, _, peak = np.asarray(orbit.response)
     by_mean, _, by_peak = np.asarray(orbit.sensitivity)
     return np.stack([by_mean / mean, by_peak / peak]) * values
@@ -189,7 +183,7 @@ def pair_of(model: Scene, design, values: Float[Array, " p"]) -> RotorPair:
 
 
 @Program
-def _orbit(model: Scene, design, values: Float[Array, " p"], state, period, how: Integrator):
+def _orbit(model: Scene, design, values: Float[Array, " p"], state) -> Orbit:
     """Close the orbit, with derivatives with respect to the values."""
 
     def arrays(values):
@@ -197,7 +191,9 @@ def _orbit(model: Scene, design, values: Float[Array, " p"], state, period, how:
 
     push = functools.partial(jax.jvp, arrays, (values,))
     tangents = jax.vmap(lambda direction: push((direction,))[1])(jnp.eye(values.shape[0]))
-    return close_orbit(pair_of(model, design, values), tangents, state, period, Shots(how))
+    pair, solver = pair_of(model, design, values), model.solver
+    start = Start.at(pair, pair.in_si(state), solver.max_orbit)
+    return steady_motion(pair, tangents, start, model.pitch_radius, solver).orbit
 
 
 def polished(

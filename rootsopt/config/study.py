@@ -28,6 +28,7 @@ _REMOVED: dict[str, tuple[Any, str]] = {
     "map_rolls": (None, _SEARCHED),
     "map_relatives": (None, _SEARCHED),
     "gradient": ("forward", "both modes of differentiation gave the same gradient"),
+    "orbit": ("auto", "orbits are closed by collocation, and confirmed by an integration"),
     "precision": ("float64", "motions are integrated in double precision"),
 }
 """Keys of former versions: (former default, which a resolved config holds; why it was removed)."""
@@ -71,11 +72,6 @@ class SolverConfig(Section):
     )
     max_orbit_periods: Annotated[int, Field(ge=1, le=8)] = Field(
         8, description="longest periodic orbit to find, in mesh periods"
-    )
-    orbit: Literal["collocation", "shooting", "auto"] = Field(
-        "auto",
-        description="how periodic orbits are closed: auto and collocation: by collocation aligned "
-        "with contact events; shooting: by shooting, an independent reference",
     )
 
     @model_validator(mode="before")

@@ -81,7 +81,7 @@ class Contact(eqx.Module):
     def jumps(self) -> bool:
         """Whether levers may jump where a flag of `switches` changes.
 
-        A contact with jumps needs a `lever_scale`. The gap itself must be continuous."""
+        The gap is continuous there."""
         return False
 
     @property
@@ -115,11 +115,6 @@ class Contact(eqx.Module):
         The gap's error is the rounding error of a number of this size. `None`: the gap's rounding
         error is negligible."""
         return None
-
-    @property
-    def lever_scale(self) -> Float[Array, ""] | None:
-        """Typical size of the levers (m); by default, `length_scale`."""
-        return self.length_scale
 
     @property
     def center_distance(self) -> Float[Array, ""]:

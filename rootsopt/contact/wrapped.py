@@ -42,10 +42,6 @@ class WrappedContact(Contact):
         return self.section.length_scale
 
     @property
-    def lever_scale(self) -> Float[Array, ""] | None:
-        return self.section.lever_scale
-
-    @property
     def center_distance(self) -> Float[Array, ""]:
         return self.section.center_distance
 

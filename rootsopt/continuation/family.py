@@ -24,7 +24,6 @@ from rootsopt.dynamics.collocation.motion import ACCURACY, UNREFINED
 from rootsopt.dynamics.collocation.seed import PIECES, from_pieces
 from rootsopt.dynamics.flow import strobe
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.steady import continues
 from rootsopt.dynamics.verdict import TOO_DEEP
 from rootsopt.errors import InputError
 from rootsopt.runtime.programs import Program
@@ -124,10 +123,10 @@ class OrbitFamily:
                 "`scene.timing_gear.backlash_mm`, or that of a design parameter"
             )
         pair = _pair(scene, design_vector(config))
-        if not continues(pair, scene.solver):
+        if not pair.smooth:
             raise InputError(
-                "`solver.orbit` must be `auto` or `collocation`, and the contact smooth between "
-                f"events, for orbits to be followed, but `solver.orbit` is {config.solver.orbit}"
+                f"Contact {type(pair.contact).__name__} must be `smooth` between events for orbits "
+                "to be followed, but is not; give its `switches`"
             )
         self.share = float((own - low)[most] / change[most])
         # A number that the scene sets later is NaN here.

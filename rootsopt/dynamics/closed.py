@@ -21,26 +21,26 @@ from rootsopt.dynamics.collocation.motion import ACCURACY, Collocated, apart, cl
 from rootsopt.dynamics.collocation.newton import numbers
 from rootsopt.dynamics.collocation.seed import PIECES, from_pieces
 from rootsopt.dynamics.collocation.system import unchanged
-from rootsopt.dynamics.flow import Flow
 from rootsopt.dynamics.orbit import Orbit, branch
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.settle import Transient, no_pieces, settle, settled_within
 from rootsopt.dynamics.steady import (
-    NEARLY,
+    OPEN,
     Solver,
     Steady,
     Verdict,
     among,
-    continues,
     final,
     judged,
-    steady_motion,
     transient_status,
     window_status,
 )
 from rootsopt.dynamics.window import PERIODS, Window, lyapunov
 from rootsopt.status import Status
 
+_NEARLY = 0.05
+"""Scaled difference below which states nearly repeat. Newton's method then decides whether there is
+an orbit, possibly of a shorter period."""
 _COARSE = 1e-5
 """Tolerance of the first transient, unless that of the solver is coarser: it only has to lead to
 the neighbourhood of the orbit. Each further attempt is ten times finer."""
@@ -105,7 +105,7 @@ class _Loop(NamedTuple):
 
 
 class _Attempts(eqx.Module):
-    """The loop of `closed_motion`. Its fields hold the arguments of that function, and the
+    """The loop of `steady_motion`. Its fields hold the arguments of that function, and the
     `numbers` of the pair whose orbit is known."""
 
     pair: RotorPair
@@ -124,21 +124,18 @@ class _Attempts(eqx.Module):
         """Return the initial state of the loop."""
         solver, pair = self.solver, self.pair
         state = pair.scaled(self.start.state)
-        dtype, count = state.dtype, state.shape[0]
+        dtype = state.dtype
         directions = jax.tree.leaves(eqx.filter(self.tangents, eqx.is_inexact_array))[0].shape[0]
-        # The orbit has neither samples nor steps: see `collocation.motion`.
-        flow = Flow.empty(count, directions, 0, 0, solver.measures, dtype)
         no, zero = jnp.zeros((), bool), jnp.zeros((), int)
         unsound = ~pair.sound
         pieces, known = no_pieces(state, solver.max_orbit, PIECES), unknown(pair, solver.max_orbit)
-        orbit = Orbit.empty(state, directions, flow)
+        orbit = Orbit.empty(state, directions, solver.measures.count + 1)
         if solver.variation:
             orbit = orbit._replace(variation=unchanged(known.elements, directions))
         found = Steady(
             status=jnp.where(unsound, Status.UNSOUND.code, Status.NOT_SETTLED.code),
             orbit=orbit,
             period=jnp.ones((), int),
-            rtol=solver.orbit.rtol,
             verdict=Verdict(no, no, jnp.zeros((), dtype), no, no),
             window=None,
             settled=Transient(
@@ -186,7 +183,7 @@ class _Attempts(eqx.Module):
         failure = transient_status(self.pair, found)
         # The motion nearly repeats. The difference may be noise of the coarse steps: let Newton's
         # method decide.
-        nearly = (failure == Status.NOT_SETTLED.code) & (found.spread < NEARLY)
+        nearly = (failure == Status.NOT_SETTLED.code) & (found.spread < _NEARLY)
         period = jnp.where(nearly, found.nearest, found.period)
         return found._replace(period=period), jnp.where(nearly, -1, failure)
 
@@ -251,8 +248,7 @@ class _Attempts(eqx.Module):
 
         `start`: scaled state near which the orbit has to be; `period` of the orbit (mesh periods);
         `within`: scaled distance to which the transient's states repeated."""
-        rtol = self.solver.orbit.rtol
-        limits = rtol, within, corrected(ACCURACY * rtol)
+        limits = within, corrected(ACCURACY * self.solver.orbit.rtol)
         orbit = made.orbit
         verdict, status = judged(self.pair, self.solver, self.radius, orbit, start, limits)
         unsure = among(status, (Status.PERIODIC, Status.INACCURATE)) & ~made.verified
@@ -262,29 +258,12 @@ class _Attempts(eqx.Module):
             orbit=orbit,
             period=period,
             verdict=verdict,
-            steps=found.steps + orbit.flow.steps,
             known=made.known,
         )
         return final(self.pair, found, self.radius)
 
 
-def motion(
-    pair: RotorPair,
-    tangents: RotorPair,
-    start: Start,
-    radius: Float[Array, ""],
-    solver: Solver,
-) -> Steady:
-    """Find the steady motion of `pair`, by `closed_motion` where collocation supports it.
-
-    Otherwise the orbit is closed by shooting. For the arguments, see `closed_motion`. A motion that
-    does not settle is left to `examined`."""
-    if continues(pair, solver):
-        return closed_motion(pair, tangents, start, radius, solver)
-    return steady_motion(pair, tangents, pair.scaled(start.state), radius, solver)
-
-
-def closed_motion(
+def steady_motion(
     pair: RotorPair,
     tangents: RotorPair,
     start: Start,
@@ -300,38 +279,43 @@ def closed_motion(
     An orbit is rejected if it is not stable or not near the end of the transient. The transient
     then continues, followed by another attempt (`_ATTEMPTS`). If the last attempt fails although
     the transient has repeated at two tolerances, the status is NOT_CLOSED. If an orbit near the
-    known one is not accepted, the search begins at `start.state`.
-
-    The orbit has no samples of the state and no steps (see `collocation.motion`). The pair must be
-    `smooth`."""
+    known one is not accepted, the search begins at `start.state`. A motion without an orbit is left
+    to `examined`."""
     radius = jnp.asarray(radius, pair.angle_scale.dtype)
     start = lax.stop_gradient(start)
     return _Attempts(pair, tangents, start, numbers(start.pair), radius, solver).run()
 
 
 def examined(pair: RotorPair, found: Steady, solver: Solver) -> Steady:
-    """Return the motion `found` of `pair`; one that has not settled is judged by a window of it.
+    """Return the motion `found` of `pair`; one without an orbit is judged by a window of it.
 
     The window begins at the end of the transient, and distinguishes chaos from a long transient."""
     state, integrator = found.settled.state, solver.transient
-    unsettled = (found.status == Status.NOT_SETTLED.code) & (solver.examine > 0)
+    unsettled = among(found.status, OPEN) & (solver.examine > 0)
     window = branch(
         unsettled,
         lambda: lyapunov(pair, state, PERIODS, integrator),
         lambda: Window.empty(state, PERIODS, integrator.tolerance),
     )
-    status = jnp.where(unsettled, window_status(pair, window), found.status)
-    return not_closed(found._replace(window=window, status=status))
+    return seen(pair, found, window, unsettled)
 
 
-def not_closed(found: Steady) -> Steady:
-    """Return the motion `found`, whose status is NOT_CLOSED if it repeats and shows no chaos.
+def seen(
+    pair: RotorPair, found: Steady, window: Window | None, whole: Bool[Array, ""] | bool = True
+) -> Steady:
+    """Return the motion `found` of `pair`, which has no orbit, with a `window` of it.
 
-    The status of a motion after shooting stays."""
-    if found.known is None:
-        return found
-    repeats = (found.status == Status.NOT_SETTLED.code) & (found.settled.period > 0)
-    return found._replace(status=jnp.where(repeats, Status.NOT_CLOSED.code, found.status))
+    `whole`: whether the window was integrated. The status follows from it. But a motion that
+    repeats is NOT_CLOSED if the window says neither chaos nor what is wrong with it."""
+    status, repeats = found.status, found.settled.period > 0
+    if window is not None:
+        judged = window_status(pair, window)
+        # A motion that repeats at two tolerances is not chaotic.
+        sure = ~among(judged, OPEN) | (status == Status.NOT_SETTLED.code)
+        status = jnp.where(among(status, OPEN) & whole & sure, judged, status)
+    open_ = (status == Status.NOT_SETTLED.code) & repeats
+    status = jnp.where(open_, Status.NOT_CLOSED.code, status)
+    return found._replace(window=window, status=status)
 
 
-__all__ = ["Start", "closed_motion", "examined", "motion", "not_closed", "unknown"]
+__all__ = ["Start", "examined", "seen", "steady_motion", "unknown"]

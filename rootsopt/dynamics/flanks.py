@@ -31,8 +31,7 @@ class FlankForce(NamedTuple):
     The force on rotor 1 is equal and opposite.
 
     For twisted rotors, forces, torques and `push` are sums over the slices, and the levers are
-    means. `means` then holds the mean penetration (m) of the slices and its rate (m/s), if levers
-    may jump: a jump in one slice is a kink of this mean. Otherwise, `means` is None."""
+    means."""
 
     drive: Float[Array, "*n"]
     coast: Float[Array, "*n"]
@@ -43,7 +42,6 @@ class FlankForce(NamedTuple):
     torque1: Float[Array, "*n"]
     torque2: Float[Array, "*n"]
     push: Float[Array, "*n 2"] | None = None
-    means: Float[Array, "*n 2"] | None = None
 
     @property
     def total(self) -> Float[Array, "*n"]:
@@ -136,8 +134,6 @@ def force_of(pair: "RotorPair", motion: Motion, touches: Any = None) -> FlankFor
         return _section_force(pair, motion, *touches)
     found = jax.vmap(functools.partial(_section_force, pair), (None, 0, 0))(motion, *touches)
     whole = jax.tree.map(lambda x: jnp.tensordot(slices.weights, x, 1), found)
-    if pair.jumps:
-        whole = whole._replace(means=jnp.stack([whole.depth, whole.closing]))
     deepest = jnp.argmax(found.depth)
     return whole._replace(depth=found.depth[deepest], closing=found.closing[deepest])
 

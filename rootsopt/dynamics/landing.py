@@ -39,23 +39,17 @@ class LandingControl(diffrax.AbstractAdaptiveStepSizeController):
     """The step size control `base`, extended so that steps end where free flight may end.
 
     `edges`: scaled ε at which a flank or the gear may begin to touch; `inside`: scaled |ε| above
-    which a flank may touch at any time; `first`: length of the first step (mesh periods);
-    `unit`: mesh periods per unit of the independent variable.
+    which a flank may touch at any time; `first`: length of the first step (mesh periods).
     """
 
     base: diffrax.PIDController
     edges: Float[Array, " edges"]
     inside: Float[Array, ""]
     first: Float[Array, ""]
-    unit: Float[Array, ""]
 
     @classmethod
-    def of(
-        cls, base: diffrax.PIDController, pair: RotorPair, unit: Float[Array, ""] | float
-    ) -> "LandingControl":
-        """Return the control based on `base` for a `pair` whose `timescales` are known.
-
-        `unit`: mesh periods per unit of the independent variable."""
+    def of(cls, base: diffrax.PIDController, pair: RotorPair) -> "LandingControl":
+        """Return the control based on `base` for a `pair` whose `timescales` are known."""
         assert pair.timescales is not None
         scale = pair.angle_scale
         play = pair.timescales.free / scale
@@ -68,7 +62,7 @@ class LandingControl(diffrax.AbstractAdaptiveStepSizeController):
         swing = _FIRST[1] * pair.timescales.swing / pair.mesh_period
         swing = jnp.minimum(_FIRST[0], swing)
         numbers = lax.stop_gradient((jnp.stack(edges), inside, swing))
-        return cls(base, *(x.astype(dtype) for x in numbers), jnp.asarray(unit, dtype))  # pyright: ignore[reportCallIssue]
+        return cls(base, *(x.astype(dtype) for x in numbers))  # pyright: ignore
 
     @property
     def rtol(self):  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -89,22 +83,22 @@ class LandingControl(diffrax.AbstractAdaptiveStepSizeController):
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         # Without `dt0`, diffrax adds no check of it. The check would be a callback to Python, and
         # programs with callbacks cannot be cached.
-        first = self.first / self.unit if dt0 is None else dt0
+        first = self.first if dt0 is None else dt0
         return self.base.init(terms, t0, t1, y0, first, args, func, error_order)
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, state):
         keep, start, stop, jump, new, result = self.base.adapt_step_size(
             t0, t1, y0, y1_candidate, args, y_error, error_order, state
         )
-        step = self.unit * (t1 - t0)
+        step = t1 - t0
         before, after = y0[:2], y1_candidate[:2]
         away, late = self._passed(before, after, step)
         again = keep & (late > _LATE * _BEYOND)
         # Step to the edge, estimated by the secant, and a little beyond.
         shorter = jnp.maximum(step - late, 0.0) + _BEYOND
         most = jnp.where(away, _AFTER * _BEYOND, self._ahead(before, after, step))
-        following = jnp.minimum(stop - start, most / self.unit)
-        following = jnp.where(again, shorter / self.unit, jnp.where(keep, following, stop - start))
+        following = jnp.minimum(stop - start, most)
+        following = jnp.where(again, shorter, jnp.where(keep, following, stop - start))
         keep &= ~again
         start = jnp.where(again, t0, start)
         new = tuple(jnp.where(again, old, x) for old, x in zip(state, new, strict=True))

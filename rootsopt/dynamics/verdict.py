@@ -10,11 +10,9 @@ from jaxtyping import Array, Bool, Float
 
 from rootsopt.contact.impact import force_rounding
 from rootsopt.dynamics.linear import solved
-from rootsopt.dynamics.orbit import Orbit, agreement
+from rootsopt.dynamics.orbit import Orbit
 from rootsopt.dynamics.settle import NOISE
 
-RESIDUAL = 1e-9
-"""Residual (scaled) above which an orbit does not count as closed."""
 TOO_DEEP = 0.02
 """Penetration (pitch radii) above which the forces of an orbit are not valid."""
 UNRESOLVED = 1e-2
@@ -24,16 +22,10 @@ _UNKNOWN = 0.1
 """Estimated error of an orbit (scaled) above which the orbit is rejected."""
 _FREE = 1e-6
 """Distance from 1 below which a Floquet multiplier counts as 1. A multiplier above 1 also does."""
-_DEFECT = 1e3
-"""Residual on halved steps (tolerances) above which an orbit's derivatives are uncertain. This
-limit is multiplied by the greatest entries of the state and of the monodromy matrix, where they
-exceed 1."""
-_DRIFT = 1e3, 1e-5
-"""Change of an orbit's start since the last search for kinks above which the derivatives are
-uncertain. The limit is the first number (tolerances), but at least the second (scaled). After a
-greater change, some kinks may lie inside long steps."""
-_STRAINED = 100.0
-"""Estimated error of a repeated step (tolerances) above which an orbit is rejected."""
+_AGREE = 10.0, 1e-3, 3e-2
+"""Estimated relative error of the derivatives above which they are uncertain. The limit is the
+first number times the square root of the tolerance, at least the second number and at most the
+third."""
 
 
 class Verdict(NamedTuple):
@@ -42,7 +34,7 @@ class Verdict(NamedTuple):
     `idle`: whether no flank ever touches (`is_idle`); `steady`: whether the orbit is the stable
     motion that the transient led to (`judged`); `rounding`: relative error of the greatest force
     (`force_rounding`); `consistent`: whether mean ≤ RMS ≤ peak (`is_consistent`); `certain`:
-    whether the derivatives are reliable (`is_certain`).
+    whether the derivatives are reliable (`agreement`).
     """
 
     idle: Bool[Array, ""]
@@ -55,9 +47,8 @@ class Verdict(NamedTuple):
 def verdict(
     orbit: Orbit,
     state: Float[Array, " n"],
-    within: Float[Array, ""] | float,
+    limits: tuple[Float[Array, ""] | float, Float[Array, ""] | float],
     rtols: tuple[Float[Array, ""] | float, Float[Array, ""] | float],
-    residual: Float[Array, ""] | float,
     scales: tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]],
 ) -> Verdict:
     """Return the results of all checks of an `orbit`.
@@ -65,14 +56,14 @@ def verdict(
     `scales`: exponent of the contact law, pitch radius (m), unit of force (N). For the other
     arguments, see `judged`."""
     exponent, radius, force = scales
-    rounding = force_rounding(orbit.flow.depth, exponent, radius)
-    steady = judged(orbit, state, within, rtols, residual)
+    rounding = force_rounding(orbit.depth, exponent, radius)
+    steady = judged(orbit, state, limits, rtols)
     return Verdict(
         idle=is_idle(orbit, float(jnp.finfo(orbit.state.dtype).eps) * force, steady),
         steady=steady,
-        rounding=jnp.where(orbit.flow.peak > 0, rounding, 0.0),
+        rounding=jnp.where(orbit.response[2] > 0, rounding, 0.0),
         consistent=is_consistent(orbit, 10 * rtols[1] * force),
-        certain=is_certain(orbit, jnp.asarray(rtols[1])),
+        certain=orbit.disagreement <= agreement(jnp.asarray(rtols[1])),
     )
 
 
@@ -87,28 +78,27 @@ def is_idle(
     anywhere. In any other case, an orbit without contact says nothing about the motion.
     """
     free = jnp.isnan(orbit.multiplier) | (orbit.multiplier > 1 - _FREE)
-    return (orbit.flow.mean <= least) & (orbit.flow.peak <= least) & (free | steady)
+    return (orbit.response[0] <= least) & (orbit.response[2] <= least) & (free | steady)
 
 
 def judged(
     orbit: Orbit,
     state: Float[Array, " n"],
-    within: Float[Array, ""] | float,
+    limits: tuple[Float[Array, ""] | float, Float[Array, ""] | float],
     rtols: tuple[Float[Array, ""] | float, Float[Array, ""] | float],
-    residual: Float[Array, ""] | float,
 ) -> Bool[Array, ""]:
     """Return whether an orbit is the stable motion that a transient led to.
 
-    `rtols`: tolerances of transient and orbit; `state` (n,): end of the transient (scaled);
-    `within`: scaled distance to which the transient's states repeated; `residual`: greatest
-    residual (scaled) of a closed orbit. The limits grow with the state if it exceeds 1. There are
-    four conditions:
+    `state` (n,): end of the transient (scaled); `limits`: scaled distance to which the transient's
+    states repeated, and greatest residual (scaled) of a closed orbit; `rtols`: tolerances of
+    transient and orbit. The limits grow with the state if it exceeds 1. There are four conditions:
 
-    - The orbit closes to `residual`, on steps that the solver would accept.
+    - The orbit closes to the residual.
     - Its Floquet multipliers lie inside the unit circle.
     - It does not amplify errors of the size of its tolerance too much: I - M is far from singular.
     - It lies near `state`.
     """
+    within, residual = limits
     size = jnp.maximum(1.0, jnp.max(jnp.abs(orbit.state)))
     multiplier = orbit.multiplier
     unit = jnp.eye(orbit.state.shape[0], dtype=orbit.state.dtype)
@@ -116,7 +106,7 @@ def judged(
     noise = NOISE * jnp.maximum(*rtols) * size
     near = 10 * within / jnp.maximum(1 - multiplier, 1e-3) + noise
     moved = jnp.max(jnp.abs(orbit.state - state))
-    closed = (orbit.residual <= residual * size) & (orbit.flow.strain <= _STRAINED)
+    closed = orbit.residual <= residual * size
     return closed & (multiplier < 1) & (gain * rtols[1] < _UNKNOWN) & (moved <= near)
 
 
@@ -131,16 +121,9 @@ def is_consistent(orbit: Orbit, least: Float[Array, ""]) -> Bool[Array, ""]:
     return ordered & (mean >= -least)
 
 
-def is_certain(orbit: Orbit, rtol: Float[Array, ""]) -> Bool[Array, ""]:
-    """Return whether the derivatives of an orbit integrated at `rtol` are reliable.
+def agreement(tolerance: Float[Array, ""]) -> Float[Array, ""]:
+    """Return the `Orbit.disagreement` above which an orbit's derivatives are uncertain.
 
-    There are three conditions. On halved steps, the orbit must close to a multiple of the
-    tolerance. The derivatives on these steps must agree with the original ones. The orbit must have
-    moved only a little since the last search for kinks."""
-    size = jnp.maximum(1.0, jnp.max(jnp.abs(orbit.state)))
-    gain = jnp.maximum(1.0, jnp.max(jnp.abs(orbit.monodromy)))
-    closes = orbit.defect <= _DEFECT * rtol * size * gain
-    agree = orbit.disagreement <= agreement(rtol.astype(orbit.state.dtype))
-    tolerances, least = _DRIFT
-    near = orbit.drift <= jnp.maximum(tolerances * rtol, least) * size
-    return closes & agree & near
+    `tolerance`: relative tolerance of the orbit."""
+    scale, least, most = _AGREE
+    return jnp.clip(scale * jnp.sqrt(tolerance), least, most)

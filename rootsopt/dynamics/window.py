@@ -13,17 +13,14 @@ eight times smaller: noise then makes the growth factor eight times greater, cha
 
 from typing import Any, NamedTuple
 
-import diffrax
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from rootsopt.dynamics.flow import Period, one_period
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.stepping import integrated, interpolated
 
 PERIODS = 128
 """Length of a window (mesh periods)."""
@@ -44,9 +41,6 @@ _KEPT = 105
 """Number of states stored per mesh period."""
 _FAINT = 1e-9
 """Force (in units of the pair's `force_scale`) below which a relative difference has no meaning."""
-_SAMPLES = 630
-"""Number of uniform samples per mesh period for locating the peak force; a multiple of `_KEPT`."""
-
 _Arrays = Array | np.ndarray
 """Array type of a window: JAX arrays, or NumPy arrays after a copy from the device."""
 
@@ -104,7 +98,7 @@ class Window(NamedTuple):
         """Scaled state from which the next mesh period is integrated."""
         return jnp.where(self.second, self.beside, self.end)
 
-    def after(self, out: "Period") -> "Window":
+    def after(self, out: Period) -> "Window":
         """Return the window after one more integration over a mesh period; `out`: its flow.
 
         The two motions take turns: the second one is then put back beside the first."""
@@ -184,49 +178,6 @@ def _numpy_of(array: Any) -> Any:
     return np if isinstance(array, np.ndarray) else jnp
 
 
-class Period(NamedTuple):
-    """A motion over one mesh period, with what `Window.after` needs.
-
-    The peak in `response` (3,) is that of `_SAMPLES` uniform samples; `duration`: in usual mesh
-    periods, from which it differs if rotor 1 is free."""
-
-    end: Float[Array, " n"]
-    response: Float[Array, " 3"]
-    states: Float[Array, "samples n"]
-    depth: Float[Array, ""]
-    solved: Bool[Array, ""]
-    duration: Float[Array, ""]
-
-
-def one_period(pair: RotorPair, start: Float[Array, " n"], integrator: Integrator) -> Period:
-    """Integrate the scaled state `start` (n,) over one mesh period from φ1 = 0.
-
-    `flow` would do the same, but compiles three times as many operations: it locates the peak."""
-    count, dtype = start.shape[0], start.dtype
-    control, solver = integrator.controller(pair=pair), integrator.solver()
-
-    def slope(tau, y, pair):
-        moved, contact = pair.derivative(tau, y[:count])
-        force = contact.total / pair.force_scale
-        lapse = pair.lapse(y[:count]) if pair.free else jnp.ones_like(force)
-        return jnp.append(moved, lapse * jnp.stack([force, force**2, force**0]))
-
-    begun = jnp.append(start, jnp.zeros(3, dtype))
-    most, term = integrator.max_steps, diffrax.ODETerm(slope)
-    out = integrated(term, solver, control, begun, pair, most, recorded=True)
-
-    def sample(share):
-        swing = interpolated(out, solver, share)[0][:count]
-        contact = pair.contact_at(share, swing)
-        return swing, contact.total, contact.depth
-
-    states, force, depth = lax.map(sample, jnp.arange(_SAMPLES, dtype=dtype) / _SAMPLES)
-    mean, square = out.end[count : count + 2] / out.end[-1]
-    unit = pair.force_scale
-    response = jnp.stack([unit * mean, unit**2 * square, jnp.max(force)])
-    return Period(out.end[:count], response, states, jnp.max(depth), out.solved, out.end[-1])
-
-
 def lyapunov(
     pair: RotorPair, state: Float[Array, " n"], periods: int, integrator: Integrator
 ) -> Window:
@@ -271,12 +222,3 @@ def integrated_difference(
     apart = jnp.abs(found - given) / jnp.maximum(given, _FAINT * pair.force_scale)
     largest = jnp.maximum(jnp.max(apart), jnp.max(jnp.abs(end - state)))
     return jnp.where(solved & jnp.isfinite(largest), largest, jnp.inf)
-
-
-def no_tangents(pair: RotorPair) -> RotorPair:
-    """Return an empty stack of parameter directions for `pair`.
-
-    With it, `flow` computes derivatives with respect to the state only."""
-    return jax.tree.map(
-        lambda x: jnp.zeros((0, *x.shape), x.dtype), eqx.filter(pair, eqx.is_inexact_array)
-    )

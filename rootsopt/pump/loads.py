@@ -20,6 +20,7 @@ from rootsopt.dynamics.collocation.gauss import GAUSS, POINTS
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.parts import AxisLoads
 from rootsopt.dynamics.parts.resultants import MIRROR, GasResultant
+from rootsopt.dynamics.steady import SAMPLES
 from rootsopt.dynamics.varied import VariedOrbit
 from rootsopt.profiles import Geometry, Profile, geometry
 from rootsopt.pump.bearings import equivalent_load
@@ -200,8 +201,7 @@ def orbit_loads(scene: Scene, design: Float[Array, " d"], orbit: VariedOrbit) ->
     dynamic, static = eqx.partition(bearings, eqx.is_inexact_array)
     moved = eqx.filter(tangents, eqx.is_inexact_array)
     unit, period = lax.stop_gradient(bearings.pair.force_scale), orbit.elements.mesh.period
-    samples = scene.solver.samples
-    tau = period * jnp.arange(samples) / samples
+    tau = period * jnp.arange(SAMPLES) / SAMPLES
     at_samples = tau, orbit.elements.motion(tau)
     series = lax.map(lambda at: bearings.at(*at), at_samples, batch_size=BLOCK)
     sizes = _channels(series, scene)

@@ -13,18 +13,13 @@ from numpy.typing import ArrayLike
 
 from rootsopt.config import Config
 from rootsopt.config.units import RPM
-from rootsopt.dynamics.closed import Start, motion, not_closed
+from rootsopt.dynamics.closed import Start, seen, steady_motion
 from rootsopt.dynamics.maxima import local_maxima, prepare_maxima
 from rootsopt.dynamics.measures import PEAK_NORM, line_name
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.settle import BLOCK
-from rootsopt.dynamics.steady import (
-    CLOSED,
-    Solver,
-    Steady,
-    window_status,
-)
-from rootsopt.dynamics.varied import VariedOrbit, varied
+from rootsopt.dynamics.steady import CLOSED, OPEN, SAMPLES, Solver, Steady, window_status
+from rootsopt.dynamics.varied import varied
 from rootsopt.dynamics.window import PERIODS, integrated_difference, lyapunov
 from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry
@@ -51,7 +46,6 @@ from rootsopt.response.series import (
     orbit_series,
     sampled,
     window_series,
-    with_samples,
 )
 from rootsopt.response.speeds import parts_at, shares
 from rootsopt.response.starts import Seed, Seeds, begun
@@ -63,8 +57,8 @@ from rootsopt.status import Status
 
 _APART = 1e-4, 1e3
 """Difference between an orbit closed by collocation and an integration over its period (see
-`integrated_difference`) above which the orbit is closed by shooting: the first number, at least the
-second times the tolerance of orbits."""
+`integrated_difference`) above which the orbit is rejected: the first number, at least the second
+times the tolerance of orbits."""
 _FINE = 1e-8
 """Greatest tolerance of this integration."""
 
@@ -300,11 +294,9 @@ class Evaluator:
         found = self.motion(pair, tangents, begin)
         if series and self.confirm:
             found = self._confirmed(pair, tangents, begin, found)
-        if series:
-            found = with_samples(found, solver.samples)
         report = self._report(design, (pair, tangents, shape), found, began, series)
         if self.maxima and report.usable:
-            maxima = local_maxima(pair, tangents, varied(pair, tangents, found, solver))
+            maxima = local_maxima(pair, tangents, varied(found))
             report = dataclasses.replace(report, maxima=maxima)
         return report
 
@@ -317,40 +309,29 @@ class Evaluator:
         """Return the steady motion of `pair` that `start` leads to, in arrays of NumPy.
 
         It has derivatives along `tangents`; `start`: result of `starts.begun`."""
-        radius, solver = self.scene.pitch_radius, self.solver
-        found = self._examined(pair, _motion(pair, tangents, start, radius, solver))
-        if Status.of(found.status) is not Status.NOT_CLOSED:
-            return found
-        return self._by_shooting(pair, tangents, start)
-
-    def _by_shooting(self, pair: RotorPair, tangents: RotorPair, start: Start) -> Steady:
-        """Return the result of `motion`, with an orbit closed by shooting.
-
-        Shooting has a program of its own, which is compiled only for the rare motions that need
-        it."""
-        solver = dataclasses.replace(self.scene.solver, closing="shooting")
-        found = _motion(pair, tangents, start, self.scene.pitch_radius, solver)
+        found = _motion(pair, tangents, start, self.scene.pitch_radius, self.solver)
         return self._examined(pair, found)
 
     def _examined(self, pair: RotorPair, found: Steady) -> Steady:
         """Return the motion `found`, with the status that `closed.examined` would give it.
 
         The window has a program of its own, which few motions need."""
-        if Status.of(found.status) is not Status.NOT_SETTLED:
+        if Status.of(found.status) not in OPEN:
             return found
+        window = None
         if float(self.scene.solver.examine) > 0:
             state, integrator = found.settled.state, self.scene.solver.transient
             window = jax.device_get(lyapunov_program(pair, state, PERIODS, integrator))
-            found = found._replace(window=window, status=unsettled_status(pair, window))
-        return not_closed(found)
+        return _seen(pair, found, window)
 
     def _confirmed(
         self, pair: RotorPair, tangents: RotorPair, start: Start, found: Steady
     ) -> Steady:
         """Return the motion `found` from `start`, if an integration over its period confirms it.
 
-        Otherwise, return the motion whose orbit is closed by shooting."""
-        if found.known is None or Status.of(found.status) not in CLOSED:
+        An orbit near a known one may lack a touch of the flanks. It is searched for once more,
+        without the known orbit. Any other that is not confirmed is NOT_CLOSED."""
+        if Status.of(found.status) not in CLOSED:
             return found
         orbit, integrator = found.orbit, self.scene.solver.orbit
         # A coarse integration would say nothing about the orbit.
@@ -359,8 +340,13 @@ class Evaluator:
         fine = dataclasses.replace(integrator, rtol=rtol)
         apart = float(_integrated(pair, (orbit.state, orbit.response), found.period, fine))
         least, tolerances = _APART
-        close = apart <= max(least, tolerances * float(integrator.rtol))
-        return found if close else self._by_shooting(pair, tangents, start)
+        if apart <= max(least, tolerances * float(integrator.rtol)):
+            return found
+        if start.known.sound and not int(found.used):
+            alone = dataclasses.replace(start, known=start.known._replace(sound=np.zeros((), bool)))
+            return self._confirmed(pair, tangents, alone, self.motion(pair, tangents, alone))
+        status = np.asarray(Status.NOT_CLOSED.code)
+        return self._examined(pair, found._replace(status=status))
 
     def pair(self, design: ArrayLike) -> RotorPair:
         """Return the rotor pair of `design` (config units)."""
@@ -383,9 +369,7 @@ class Evaluator:
         begin = eqx.filter_eval_shape(_at_rest, pair, solver.max_orbit)
 
         def then(found: Steady) -> None:
-            if found.known is None or found.orbit.variation is None:
-                return
-            orbit = VariedOrbit(found.known.elements, found.orbit.variation)
+            orbit = varied(found)
             if self._loaded(series):
                 orbit_loads.prepare(self.scene, design, orbit)
             rows = np.zeros((found.orbit.response.shape[0], 1))
@@ -395,7 +379,7 @@ class Evaluator:
                 values, slopes = (jax.ShapeDtypeStruct((3, *d), float) for d in ((), design.shape))
                 values_of.prepare(self.scene, terms_of(added), design, values, slopes)
             if series:
-                sampled.prepare(found.known.elements, solver.samples)
+                sampled.prepare(found.known.elements)
             if series and self.confirm:
                 known = found.orbit.state, found.orbit.response
                 _integrated.prepare(pair, known, found.period, solver.orbit)
@@ -406,7 +390,7 @@ class Evaluator:
         _motion.prepare(pair, tangents, begin, self.scene.pitch_radius, solver, then=then)
         _build.prepare(self.scene, design)
         if series:
-            count = pair.lobes * solver.samples
+            count = pair.lobes * SAMPLES
             times = jax.ShapeDtypeStruct((count,), float)
             contact_series.prepare(pair, times, jax.ShapeDtypeStruct((count, pair.states), dtype))
 
@@ -430,7 +414,7 @@ class Evaluator:
         `built`: rotor pair, its derivatives along the design, and geometry; `began`: time at the
         start of the evaluation (s, `perf_counter`); `series`: whether to compute the series."""
         seconds, design = time.perf_counter() - began, np.asarray(design, np.float64)
-        (pair, tangents, shape), status, orbit = built, Status.of(found.status), found.orbit
+        (pair, _, shape), status, orbit = built, Status.of(found.status), found.orbit
         period = int(found.period)
         statistics: dict[str, int | float] = {
             "transient_mesh_periods": int(found.used),
@@ -445,11 +429,11 @@ class Evaluator:
             named = self.scene.solver.measures.named(orbit.response[:, None], period)
             response = {name: value for name, (value, _) in named.items()}
             steady = {"kind": "periodic"} | orbit_record(orbit, period)
-            statistics |= orbit_statistics(found)
-            motion = orbit_series(pair, orbit, period) if series else None
+            statistics |= orbit_statistics(found, self.solver)
+            motion = orbit_series(pair, found) if series else None
             start = Seed.of(found, pair)
             if self._loaded(series):
-                whole = varied(pair, tangents, found, self.solver)
+                whole = varied(found)
                 loads = jax.device_get(orbit_loads(self.scene, jnp.asarray(design), whole))
                 for name, (value, slope) in bearing_record(loads).items():
                     response[name] = value
@@ -474,12 +458,12 @@ class Evaluator:
                 steady |= window_record(found.window)
                 motion = window_series(pair, found.window) if series else None
             else:
-                hint = idle_hint(self.config, float(orbit.flow.depth))
+                hint = idle_hint(self.config, float(orbit.depth))
                 if found.verdict.steady:
                     # The timing gear holds the pair. A pair that floats can rest anywhere.
                     steady |= orbit_record(orbit, period)
                     start = Seed.of(found, pair)
-                    motion = orbit_series(pair, orbit, period) if series else None
+                    motion = orbit_series(pair, found) if series else None
         elif status is Status.UNSOUND and pair.soundness is not None:
             hint = f" Here, {fault_of(pair.soundness)}."
         elif found.window is not None:
@@ -554,7 +538,7 @@ def _at_rest(pair: RotorPair, longest: int) -> Start:
 def motion_from(pair: RotorPair, tangents: RotorPair, start: Start, radius, solver) -> Steady:
     """Return the steady motion that a `start` with a scaled state leads to."""
     start = eqx.tree_at(lambda start: start.state, start, pair.in_si(start.state))
-    return motion(pair, tangents, start, radius, solver)
+    return steady_motion(pair, tangents, start, radius, solver)
 
 
 _build = Program(Scene.pair_and_tangents)
@@ -562,6 +546,7 @@ _motion = Program(motion_from, gathered=0)
 _integrated = Program(integrated_difference)
 lyapunov_program = Program(lyapunov)
 unsettled_status = Program(window_status)
+_seen = Program(seen)
 
 
 def objective_weights(config: Config) -> dict[str, float]:

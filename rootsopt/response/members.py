@@ -13,14 +13,12 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 from numpy.typing import NDArray
 
-from rootsopt.dynamics.flow import flow, strobe
+from rootsopt.dynamics.flow import one_period, strobe
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.runtime.programs import Program
 from rootsopt.status import Status
 
-_SAMPLES = 63
-"""Number of uniform samples per mesh period for locating the peak force."""
 _MEMBERS = 4
 """Number of members in one call of the compiled program."""
 _MEMORY = 17
@@ -152,7 +150,7 @@ def member(
     the motion. The fields of the result lack the leading axis of `Members`. This is a pure
     function."""
     dtype = state.dtype
-    one, none, low = jnp.ones((), dtype), jnp.zeros((), dtype), jnp.full((), -jnp.inf, dtype)
+    none, low = jnp.zeros((), dtype), jnp.full((), -jnp.inf, dtype)
 
     def pass_by(_, carry):
         state, solved = carry
@@ -163,13 +161,13 @@ def member(
 
     def count(index, carry):
         state, solved, means, drift, greatest, depth, memory = carry
-        out = flow(pair, state, one, integrator, _SAMPLES)
+        out = one_period(pair, state, integrator)
         return (
             out.end,
             solved & out.solved,
-            means + jnp.stack([out.mean, out.mean_square, out.peak]),
-            drift + jnp.sign(2 * index - (periods - 1)) * out.mean,
-            jnp.maximum(greatest, out.peak),
+            means + out.response,
+            drift + jnp.sign(2 * index - (periods - 1)) * out.response[0],
+            jnp.maximum(greatest, out.response[2]),
             jnp.maximum(depth, out.depth),
             jnp.concatenate([memory[1:], out.end[None]]),
         )

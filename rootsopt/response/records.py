@@ -9,7 +9,7 @@ from rootsopt.config import Config
 from rootsopt.config.units import MM
 from rootsopt.dynamics.orbit import Orbit
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.steady import Steady
+from rootsopt.dynamics.steady import OPEN, Solver, Steady
 from rootsopt.dynamics.window import Window
 from rootsopt.profiles import Geometry
 from rootsopt.pump.loads import OrbitLoads
@@ -79,20 +79,17 @@ def floquet(monodromy) -> list[list[float]]:
     return [[float(z.real), float(z.imag)] for z in ordered]
 
 
-def orbit_statistics(found: Steady) -> dict[str, int | float]:
-    """Return the result file's statistics of a closed orbit: effort and accuracy."""
+def orbit_statistics(found: Steady, solver: Solver) -> dict[str, int | float]:
+    """Return the result file's statistics of an orbit that `solver` closed: effort and accuracy."""
     orbit = found.orbit
     statistics: dict[str, int | float] = {
         "newton_steps": int(orbit.newton_steps),
-        "orbit_rtol": float(found.rtol),
+        "orbit_rtol": float(solver.orbit.rtol),
         "force_rounding": float(found.verdict.rounding),
+        "orbit_elements": int(found.known.elements.mesh.used),
     }
-    if found.known is not None:
-        statistics |= {"collocated": 1, "orbit_elements": int(found.known.elements.mesh.used)}
-        if not int(found.used):
-            statistics["from_neighbour"] = 1
-    else:
-        statistics |= {"orbit_steps": int(orbit.flow.steps), "orbit_defect": float(orbit.defect)}
+    if not int(found.used):
+        statistics["from_neighbour"] = 1
     if np.isfinite(orbit.disagreement):  # Infinite: there was no room for a comparison.
         statistics["gradient_disagreement"] = float(orbit.disagreement)
     return statistics
@@ -117,7 +114,7 @@ def unsettled(
     `status` of the motion; `window`: a window of the motion; `series`: whether to compute the
     series. Otherwise, the series is None."""
     steady = {"kind": _KINDS.get(status, "transient")} | window_record(window)
-    if status not in (Status.CHAOTIC, Status.NOT_SETTLED, Status.IDLE):
+    if status not in (*OPEN, Status.IDLE):
         return steady, {}, None
     mean, square, peak = np.asarray(window.forces, np.float64)
     values = map(float, (mean, peak, np.sqrt(square)))

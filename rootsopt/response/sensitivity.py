@@ -138,7 +138,7 @@ def by_scene(evaluator: Evaluator, evaluation: Evaluation) -> Evaluation | None:
     size = max(1, len(evaluation.design))
     directions = [_direction(config, evaluator.scene, one) for one in wanted]
     blank = jax.tree.map(np.zeros_like, directions[0])
-    gradient: dict[str, dict[str, float]] = {name: {} for name in evaluation.gradient}
+    gradient: dict[str, dict[str, float]] = {}
     slopes, maxima = [], evaluation.maxima
     for begin in range(0, len(wanted), size):
         # Pad to as many directions as there are design parameters, to reuse the compiled program.
@@ -151,16 +151,16 @@ def by_scene(evaluator: Evaluator, evaluation: Evaluation) -> Evaluation | None:
             return None
         rows = np.column_stack([found.orbit.response, found.orbit.sensitivity])
         named = solver.measures.named(rows, int(found.period))
-        for name in gradient.keys() & named.keys():
+        for name in evaluation.response.keys() & named.keys():
             values = named[name][1][: len(some)]
             keys = [one.key for one in wanted[begin : begin + size]]
-            gradient[name] |= dict(zip(keys, map(float, values), strict=True))
+            row = gradient.setdefault(name, {})
+            row |= dict(zip(keys, map(float, values), strict=True))
         if maxima is not None:
-            again = local_maxima(pair, tangents, varied(pair, tangents, found, solver))
+            again = local_maxima(pair, tangents, varied(found))
             if again.times.shape != maxima.times.shape:
                 return None
             slopes.append(again.slopes[:, : len(some)])
-    gradient = {name: row for name, row in gradient.items() if row}
     if maxima is not None:
         maxima = maxima._replace(slopes=np.concatenate(slopes, axis=1))
     return dataclasses.replace(evaluation, gradient=gradient, maxima=maxima)

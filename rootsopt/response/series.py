@@ -10,9 +10,8 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from rootsopt.dynamics.collocation.elements import Elements
-from rootsopt.dynamics.orbit import Orbit
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.steady import Steady
+from rootsopt.dynamics.steady import SAMPLES, Steady
 from rootsopt.dynamics.window import Window
 from rootsopt.runtime.programs import Program
 
@@ -76,12 +75,12 @@ def series_of(pair: RotorPair, tau, states) -> Series:
     )
 
 
-def orbit_series(pair: RotorPair, orbit: Orbit, period: int) -> Series:
-    """Return the series of the orbit, repeated to cover at least one revolution of rotor 1."""
-    samples = orbit.flow.states.shape[0]
+def orbit_series(pair: RotorPair, found: Steady) -> Series:
+    """Return the series of a closed orbit, repeated to cover at least one revolution of rotor 1."""
+    period = int(found.period)
     cycles = -(-pair.lobes // period)
-    tau = period * np.arange(cycles * samples) / samples
-    return series_of(pair, tau, np.tile(np.asarray(orbit.flow.states), (cycles, 1)))
+    tau = period * np.arange(cycles * SAMPLES) / SAMPLES
+    return series_of(pair, tau, np.tile(np.asarray(sampled(found.known.elements)), (cycles, 1)))
 
 
 def window_series(pair: RotorPair, window: Window) -> Series:
@@ -91,15 +90,7 @@ def window_series(pair: RotorPair, window: Window) -> Series:
     return series_of(pair, np.arange(periods * samples) / samples, states.reshape(-1, count))
 
 
-def with_samples(found: Steady, samples: int) -> Steady:
-    """Return the motion `found`, whose orbit has a number of uniform `samples` of the state."""
-    if found.known is None:
-        return found
-    flow = found.orbit.flow._replace(states=sampled(found.known.elements, samples))
-    return found._replace(orbit=found.orbit._replace(flow=flow))
-
-
 @Program
-def sampled(elements: Elements, samples: int) -> Float[Array, "samples n"]:
-    """Return uniform `samples` of the scaled states of an orbit, from φ1 = 0 on."""
-    return elements.motion(elements.mesh.period * jnp.arange(samples) / samples)
+def sampled(elements: Elements) -> Float[Array, "samples n"]:
+    """Return `SAMPLES` uniform samples of the scaled states of an orbit, from φ1 = 0 on."""
+    return elements.motion(elements.mesh.period * jnp.arange(SAMPLES) / SAMPLES)

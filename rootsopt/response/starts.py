@@ -34,9 +34,9 @@ class Seed(NamedTuple):
     def of(cls, found: Steady, pair: RotorPair) -> "Seed":
         """Return a seed on the motion `found` of `pair`.
 
-        Only a periodic orbit that was closed by collocation is part of it."""
+        Only a periodic orbit is part of it."""
         state = np.asarray(found.orbit.state, np.float64)
-        if found.known is None or Status.of(found.status) is not Status.PERIODIC:
+        if Status.of(found.status) is not Status.PERIODIC:
             return cls(state)
         return cls(state, tuple(jax.tree.leaves((trimmed(found.known), _numbers(pair)))))
 

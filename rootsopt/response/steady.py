@@ -6,7 +6,6 @@ the orbit. JAX transformations only multiply by this matrix. Therefore forward a
 agree to rounding. Derivatives that are not requested are not computed.
 """
 
-import dataclasses
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -18,10 +17,10 @@ from jax.custom_batching import sequential_vmap
 from jaxtyping import Array, Complex, Float, Int
 from numpy.typing import ArrayLike
 
-from rootsopt.dynamics.closed import Start, examined, motion, unknown
+from rootsopt.dynamics.closed import Start, examined, steady_motion
 from rootsopt.dynamics.linear import eigenvalues
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.steady import CLOSED, Solver, Steady, among
+from rootsopt.dynamics.steady import CLOSED, OPEN, Solver, Steady, among
 from rootsopt.profiles.validity import Soundness
 from rootsopt.runtime.precision import check_precision
 from rootsopt.runtime.programs import Program
@@ -94,8 +93,8 @@ def steady_response(
     `jax.jit` of a function that calls this one compiles twice as fast with the option
     `compiler_options=rootsopt.COMPILER_OPTIONS`.
 
-    A motion that repeats, but whose orbit cannot be closed by collocation, has the status
-    NOT_CLOSED under `jit` and `vmap`. Otherwise its orbit is closed by shooting.
+    Without a periodic orbit to trust, forces are those of a window of the motion, and derivatives
+    are NaN.
 
     Raises ValueError if the design has the wrong shape, or if `start` belongs to another kind of
     scene; RuntimeError if JAX is not set to double precision; NotImplementedError if a
@@ -207,13 +206,9 @@ def _solved(scene: Scene, design, start, along: tuple[int, ...]) -> tuple[Respon
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arguments)):
         return _inline(*arguments)
     found = _compiled(*arguments, False)
-    # Rare: a window and shooting have programs of their own, which are compiled only now.
-    if int(found[0].status) == Status.NOT_SETTLED.code:
-        found = _compiled(*arguments, True)
-    if int(found[0].status) != Status.NOT_CLOSED.code:
-        return found
-    solver = dataclasses.replace(scene.solver, closing="shooting")
-    return _compiled(dataclasses.replace(scene, solver=solver), *arguments[1:], True)
+    # Rare: a window has a program of its own, which is compiled only now.
+    status = Status.of(found[0].status)
+    return _compiled(*arguments, True) if status in OPEN else found
 
 
 def _solve(
@@ -236,7 +231,7 @@ def _solve(
     pair, tangents, _ = along(build, chosen, _basis(chosen))
     start = _start_of(pair, start, scene.solver)
     radius, solver = scene.pitch_radius, scene.solver
-    found = motion(pair, tangents, start, radius, solver)
+    found = steady_motion(pair, tangents, start, radius, solver)
     if windowed:
         found = examined(pair, found, solver)
     return _named(scene.solver, pair, tangents, found)
@@ -299,8 +294,7 @@ def _next_start(solver: Solver, pair: RotorPair, found: Steady, state: Float[Arr
     failed = (Status.UNSOUND, Status.PASSED_THROUGH, Status.STALLED, Status.NON_FINITE)
     failed = among(found.status, (*failed, Status.SOLVER_FAILED))
     rest = pair.in_si(jnp.zeros_like(state))
-    known = unknown(pair, solver.max_orbit) if found.known is None else found.known
-    known = known._replace(sound=known.sound & among(found.status, CLOSED))
+    known = found.known._replace(sound=found.known.sound & among(found.status, CLOSED))
     numbers = eqx.filter(pair, eqx.is_inexact_array)
     return Start(jnp.where(failed, rest, state), known, numbers)
 

@@ -17,7 +17,6 @@ from rootsopt.dynamics.steady import Steady
 from rootsopt.response.evaluation import Evaluation, Evaluator, motion_from
 from rootsopt.response.starts import begun
 from rootsopt.runtime.programs import Program
-from rootsopt.status import Status
 
 
 def pays() -> bool:
@@ -28,8 +27,7 @@ def pays() -> bool:
 def evaluate_together(evaluators: Sequence[Evaluator]) -> list[Evaluation]:
     """Evaluate the own design of each evaluator's config from rest, without series.
 
-    Scenes of the same structure (parts, number of lobes, solver) are computed together. A motion
-    whose orbit is not found then is evaluated again, alone."""
+    Scenes of the same structure (parts, number of lobes, solver) are computed together."""
     began = time.perf_counter()
     built = [one.assembled() for one in evaluators]
     groups: dict[Hashable, list[int]] = {}
@@ -49,10 +47,7 @@ def evaluate_together(evaluators: Sequence[Evaluator]) -> list[Evaluation]:
             motion = jax.tree.map(lambda x, row=row: x[row], motions)
             if not int(motion.window.done):
                 motion = motion._replace(window=None)
-            if Status.of(motion.status) is Status.NOT_CLOSED:
-                found[number] = evaluators[number](series=False)
-            else:
-                found[number] = evaluators[number].evaluation(built[number], motion, began)
+            found[number] = evaluators[number].evaluation(built[number], motion, began)
     return [found[number] for number in range(len(evaluators))]
 
 

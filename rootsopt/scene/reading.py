@@ -141,7 +141,6 @@ def solver_of(config: Config) -> Solver:
         max_periods=jnp.asarray(float(settings.max_mesh_periods)),
         examine=jnp.asarray(1.0),
         max_orbit=settings.max_orbit_periods,
-        closing=settings.orbit,
     )
 
 

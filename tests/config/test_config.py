@@ -334,7 +334,6 @@ def test_nan_and_infinity_are_refused(key, value):
     [
         ("profile.family", ("cic", "ee")),
         ("solver.method", ("tsit5", "dopri8")),
-        ("solver.orbit", ("collocation", "shooting")),
         ("scene.drive", ("prescribed",)),
         ("optimizer.method", ("adam",)),
     ],
@@ -481,7 +480,6 @@ def test_hint_is_given_only_where_it_fits(value):
 
 
 CHOICES = [
-    ("solver.orbit", "shooting", ("SHOOTING", "Shooting", " shooting ", "Shoo-ting")),
     ("solver.method", "dopri8", ("Dopri8", "DOPRI-8", "dopri 8")),
     ("optimizer.method", "rmsprop", ("RMSprop", "RMS prop", "rms-prop")),
     ("objective.motion", "worst", ("WORST",)),
@@ -690,14 +688,14 @@ def test_overrides_replace_and_create_nested_keys():
             "scene.speed_rpm=1000",
             "scene.speed_rpm = 1500",
             "constraints.area_efficiency_min=0.4",
-            "solver.orbit=shooting",
+            "solver.method=dopri8",
         ],
     )
     assert config.scene.timing_gear is not None
     assert config.scene.timing_gear.stiffness_N_m_per_rad == 2e4
     assert config.scene.speed_rpm == 1500.0
     assert config.constraints.area_efficiency_min == 0.4
-    assert config.solver.orbit == "shooting"
+    assert config.solver.method == "dopri8"
 
 
 def test_override_can_take_a_part_away():

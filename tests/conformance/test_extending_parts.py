@@ -15,12 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from experiments._common.shooting import closed, differentiated
+from rootsopt import steady_response
 from rootsopt.config import load
 from rootsopt.dynamics.integrator import Integrator
-from rootsopt.dynamics.orbit import Shots, close_orbit
 from rootsopt.dynamics.parts import Context
-from rootsopt.dynamics.settle import settle, settled_within
 from rootsopt.scene import Scene
+from rootsopt.status import Status
 from tests.conformance.laws import check_law
 from tests.conformance.parts import check_in_pair, check_part
 
@@ -141,7 +142,7 @@ def balance(pair, start, how):
 
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(slope), how.solver(), 0.0, 1.0, None, jnp.pad(start, (0, 4)),
-        stepsize_controller=how.controller(), max_steps=how.max_steps,
+        stepsize_controller=diffrax.PIDController(how.rtol, how.rtol), max_steps=how.max_steps,
         adjoint=diffrax.ForwardMode(),
     )  # fmt: skip
     end = solution.ys[-1]
@@ -164,60 +165,41 @@ def test_energy_balance_with_a_part_of_ones_own(page, model, design):
     assert abs(end[3]) < 10
 
 
-@eqx.filter_jit
-def closed(scene, design, factors, state, period, how):
-    """Return a closed orbit with derivatives with respect to factors on four numbers.
-
-    They are the stiffness of coupling and law, the stop, and the load."""
-
-    def entries(scene):
-        (coupling,) = scene.extra
-        return coupling.stiffness, scene.law.stiffness, coupling.stop, scene.load_torque
-
-    def pair(factors):
-        values = [x * f for x, f in zip(entries(scene), factors, strict=True)]
-        return eqx.tree_at(entries, scene, values).pair(design)
-
-    def arrays(factors):
-        return eqx.filter(pair(factors), eqx.is_inexact_array)
-
-    tangents = jax.vmap(lambda unit: jax.jvp(arrays, (factors,), (unit,))[1])(jnp.eye(4))
-    return close_orbit(pair(factors), tangents, state, period, Shots(how))
-
-
-@eqx.filter_jit
-def settled(pair, how):
-    start = jnp.zeros(pair.states)
-    return settle(pair, start, how, settled_within(how.rtol), jnp.asarray(400), 4)
-
-
 def test_gradient_with_respect_to_numbers_of_ones_own(page, model, design):
-    """Gradients of mean and mean square agree with central differences of orbits.
+    """Gradients of mean and RMS force agree with central differences of orbits by shooting.
 
     They are with respect to stiffness and stop of the coupling, stiffness of the law, and load. The
     orbit crosses the stop, a kink."""
     scene = model.with_parts(page.coupling.FlexibleCoupling(**COUPLING))
     scene = scene.with_law(page.law.HuntCrossley(**LAW))
-    transient = settled(built(scene, design), Integrator("tsit5", jnp.asarray(1e-8), 4096))
-    assert int(transient.period) > 0
-    how = Integrator("dopri8", jnp.asarray(1e-12), 4096)
-    ones = jnp.ones(4)
-    here = closed(scene, design, ones, transient.state, transient.period, how)
-    assert float(here.residual) < 1e-9
-    assert float(here.multiplier) < 1
-    pair = built(scene, design)
-    twist = np.asarray(here.flow.states)[:, 3] * float(pair.angle_scale) + float(
-        pair.parts[0].start(None)[0]
-    )
+
+    def entries(scene):
+        (coupling,) = scene.extra
+        return coupling.stiffness, scene.law.stiffness, coupling.stop, scene.load_torque
+
+    def varied(factors):
+        values = [x * f for x, f in zip(entries(scene), factors, strict=True)]
+        return eqx.tree_at(entries, scene, values)
+
+    @jax.jit
+    def forces(factors):
+        found = steady_response(varied(factors), design)
+        return jnp.stack([found.mean, found.rms]), found
+
+    slopes, here = jax.jacfwd(forces, has_aux=True)(jnp.ones(4))
+    assert Status.of(here.status) is Status.PERIODIC
+    pair, period = built(scene, design), int(here.period)
+    motion = here.start.known.elements.motion(period * jnp.arange(2000) / 2000)[:, 3]
+    twist = motion * float(pair.angle_scale) + float(pair.parts[0].start(None)[0])
     assert np.min(twist) < COUPLING["stop"] < np.max(twist)
-    assert 0.1 < np.max(np.abs(here.flow.states)[:, 3]) < 10
+    assert 0.1 < np.max(np.abs(motion)) < 10
     # Along two directions in which all four count.
     for way in (np.array([1.0, 0.6, 0.8, 0.3]), np.array([-0.4, 1.0, 0.5, -0.2])):
-        responses = [
-            closed(scene, design, ones + side * way, here.state, transient.period, how).response
-            for side in (2e-5, -2e-5)
-        ]
-        slope = np.asarray(responses[0] - responses[1])[:2] / 4e-5
-        assert np.asarray(here.sensitivity)[:2] @ way == pytest.approx(slope, rel=1e-6)
-    sizes = np.abs(np.asarray(here.sensitivity)[0])
+
+        def shot(change, way=way):
+            moved = built(varied(jnp.asarray(1 + change * way)), design)
+            return closed(moved, pair.scaled(here.state), period).forces[::2]
+
+        assert slopes @ way == pytest.approx(differentiated(shot, 4e-5)[0], rel=5e-6)
+    sizes = np.abs(np.asarray(slopes)[0])
     assert np.min(sizes) > 1e-3 * np.max(sizes)

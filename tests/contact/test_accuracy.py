@@ -282,21 +282,3 @@ def test_batch_is_the_designs_one_by_one(default):
     apart = dataclasses.replace(evaluator.scene, clearance=jnp.asarray(3e-4))
     idle = respond_many(apart, designs, jnp.zeros((3, 2)), solver)
     assert [Status.of(code) for code in idle.status] == [Status.IDLE] * 3
-
-
-@pytest.mark.long
-def test_batch_at_a_coarse_tolerance(default):
-    """Kinks are searched for again where the orbit has moved since the first search.
-
-    Otherwise gradients would be wrong by about 1e-2 at this tolerance."""
-    evaluator, _ = default
-    scene = evaluator.scene
-
-    def batch(*rtols):
-        both = (dataclasses.replace(scene.solver.orbit, rtol=jnp.asarray(x)) for x in rtols)
-        return respond_many(scene, DESIGNS, jnp.zeros((3, 2)), coarse(scene, *both))
-
-    loose, fine = batch(1e-5, 1e-6), batch(1e-7, 1e-10)
-    np.testing.assert_allclose(loose.response, fine.response, rtol=1e-6)
-    largest = np.max(np.abs(fine.gradient), axis=2, keepdims=True)
-    assert np.max(np.abs(loose.gradient - fine.gradient) / largest) < 1e-3

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from experiments._common.shooting import closed
 from rootsopt.config import load
 from rootsopt.continuation import End, Kind, StepSizes, follow, follow_doubled
 from rootsopt.continuation.arclength import StoppedError
@@ -227,9 +228,8 @@ MOTOR = (
 )
 def test_scenes_along_a_curve_are_those_of_the_configs(monkeypatch, name, changes, key, ends):
     """Scene and design at 30 % of the range are those of a config with this value."""
-    pair = types.SimpleNamespace(angle_scale=jnp.asarray(1e-3))
+    pair = types.SimpleNamespace(angle_scale=jnp.asarray(1e-3), smooth=True)
     monkeypatch.setattr("rootsopt.continuation.family._pair", lambda *scene: pair)
-    monkeypatch.setattr("rootsopt.continuation.family.continues", lambda *pair: True)
     config = load(f"configs/{name}.yaml", list(changes))
     family = OrbitFamily(config, key, 1, StepSizes(*ends))
     value = 0.7 * ends[0] + 0.3 * ends[1]
@@ -323,9 +323,6 @@ def test_wrong_input_is_explained(branch):
     bare = load("configs/ee.yaml", ["scene.timing_gear=null"])
     with pytest.raises(InputError, match="timing_gear"):
         follow(bare, BACKLASH, state, 1, StepSizes(0.1, 0.3))
-    shooting = load("configs/cic.yaml", ["solver.orbit=shooting"])
-    with pytest.raises(InputError, match=r"solver\.orbit.*collocation.*is shooting"):
-        follow(shooting, SPEED, state, 1, StepSizes(2000, 4000))
     with pytest.raises(InputError, match="no orbit of 1 mesh periods"):
         follow(config, SPEED, [40.0, 300.0], 1, RANGE)
 
@@ -352,18 +349,17 @@ def test_a_design_ends_where_no_profile_can_be_made(branch):
     ],
 )
 def test_orbits_are_those_by_shooting(name, changes, key, limits):
-    config = load(f"configs/{name}.yaml", [*changes, "solver.orbit=shooting"])
+    config = load(f"configs/{name}.yaml", list(changes))
     start = Evaluator.of(config)(series=False)
     assert start.usable
-    free, period = config.replaced({"solver.orbit": "auto"}), start.steady_state["period"]
-    path = follow(free, key, start.state, period, StepSizes(*limits, points=3))
+    period = start.steady_state["period"]
+    path = follow(config, key, start.state, period, StepSizes(*limits, points=3))
     for point in path.points[::2]:
-        other = Evaluator.of(config.moved({key: point.value}))(start=point.state, series=False)
-        found = [other.response[f"{name}_force_N"] for name in ("mean", "peak", "rms")]
-        np.testing.assert_allclose([point.mean, point.peak, point.rms], found, rtol=2e-6)
+        moved = config.moved({key: point.value})
+        other = closed(Evaluator.of(moved).pair(moved.design), point.state, period)
+        np.testing.assert_allclose([point.mean, point.peak, point.rms], other.forces, rtol=2e-6)
         np.testing.assert_allclose(other.state, point.state, rtol=1e-5, atol=1e-6)
-        largest = other.steady_state["floquet_multiplier"]
-        assert np.max(np.abs(point.multipliers)) == pytest.approx(largest, abs=2e-5)
+        assert np.max(np.abs(point.multipliers)) == pytest.approx(other.multiplier, abs=2e-5)
 
 
 @pytest.mark.long

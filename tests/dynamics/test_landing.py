@@ -8,14 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from experiments._common.shooting import closed, differentiated
 from rootsopt.config import load
-from rootsopt.dynamics.flow import Flow
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.landing import LandingControl
-from rootsopt.dynamics.measures import Measures
-from rootsopt.dynamics.orbit import Orbit, agreement, disagreement
-from rootsopt.dynamics.switches import halved, has_room
-from rootsopt.dynamics.verdict import is_certain
+from rootsopt.dynamics.orbit import Orbit
+from rootsopt.dynamics.verdict import agreement, verdict
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.scene import Scene, design_vector
 from rootsopt.status import Status
@@ -81,7 +79,7 @@ def control(**over) -> LandingControl:
     )
     pair = Scene.from_config(config).pair(design_vector(config))
     how = Integrator("tsit5", jnp.asarray(1e-8), 4096)
-    found = how.controller(1.0, pair)
+    found = how.controller(pair)
     assert isinstance(found, LandingControl)
     return found
 
@@ -194,19 +192,6 @@ def test_a_touch_between_two_stages_is_met(rtol):
     assert energy == pytest.approx(0.5, abs=max(300 * rtol, 1e-9))
 
 
-@pytest.mark.parametrize("rtol", [1e-4, 1e-6])
-def test_an_orbit_that_a_loose_tolerance_does_not_close_is_integrated_more_finely(lively, rtol):
-    """The orbit is that of the usual tolerance, and the statistics state the tolerance used."""
-    loose = [*LIVELY, f"solver.rtol={rtol}", "solver.orbit=shooting"]
-    evaluator = Evaluator.of(load("configs/cic.yaml", loose))
-    found = evaluator(series=False)
-    assert found.status is Status.PERIODIC
-    assert found.statistics["orbit_rtol"] == pytest.approx(1e-8)
-    usual = lively[1e-8]
-    for name, value in usual.response.items():
-        assert found.response[name] == pytest.approx(value, rel=1e-6)
-
-
 def test_two_changes_at_one_instant():
     """Gradients are correct if seal and contact pass the same joint 1e-9 mesh periods apart.
 
@@ -266,23 +251,18 @@ def test_the_check_bounds_the_error(scene, design):
         ("mean_force_N", "peak_force_N", "rms_force_N"),
     )
     evaluator = Evaluator.of(load("configs/cic.yaml", scene)).surveying()
-    # Shooting, since differences need forces to 1e-11.
-    shooting = load("configs/cic.yaml", [*scene, "solver.orbit=shooting"])
-    sharp = Evaluator.of(shooting).surveying().at_tolerance(1e-11)
 
     def terms(found):
         rows = np.array([list(found.gradient[name].values()) for name in names])
         return rows * design * way
 
     found = {rtol: evaluator.at_tolerance(rtol)(design, series=False) for rtol in (1e-8, 1e-10)}
-    state = found[1e-10].state
+    state, period = found[1e-10].state, found[1e-10].steady_state["period"]
 
     def forces(change):
-        moved = sharp(jnp.asarray(design * (1 + change * way)), start=state, series=False)
-        return np.array([moved.response[name] for name in names])
+        return closed(evaluator.pair(design * (1 + change * way)), state, period).forces
 
-    wide, close = ((forces(h) - forces(-h)) / (2 * h) for h in (4e-5, 2e-5))
-    truth, noise = (4 * close - wide) / 3, np.abs(close - wide)
+    truth, noise = differentiated(forces, 4e-5)
     for rtol, one in found.items():
         slopes = terms(one)
         size = np.max(np.abs(slopes), axis=1)
@@ -294,59 +274,15 @@ def test_the_check_bounds_the_error(scene, design):
         assert np.max(error) < {1e-8: 2e-7, 1e-10: 1e-7}[rtol]
 
 
-def test_a_check_without_room_is_none():
-    """If a grid has no room for all halved steps, nothing is compared."""
-    grid = jnp.asarray([0.1, 0.1 + 2e-6, 0.5, jnp.inf, jnp.inf])
-    assert bool(has_room(grid))
-    assert not bool(has_room(grid[:4]))
-
-
-def test_halved_steps():
-    grid = jnp.asarray([0.1, 0.4, 0.5, jnp.inf, jnp.inf, jnp.inf, jnp.inf])
-    assert np.asarray(halved(grid))[:6] == pytest.approx([0.05, 0.1, 0.25, 0.4, 0.45, 0.5])
-    # Without room for all steps, only the longest are halved.
-    assert np.asarray(halved(grid[:4])) == pytest.approx([0.1, 0.25, 0.4, 0.5])
-    # A short step around a change is not halved.
-    about = jnp.asarray([0.1, 0.1 + 2e-6, 0.3, jnp.inf, jnp.inf])
-    assert np.asarray(halved(about)) == pytest.approx([0.05, 0.1, 0.1 + 2e-6, 0.2, 0.3], abs=1e-5)
-
-
-def test_disagreement_is_that_of_the_orbits_derivatives():
-    """The disagreement agrees with the implicit function theorem written in NumPy."""
-    draw = np.random.default_rng(0)
-    count, designs = 2, 3
-    first = draw.normal(size=(count + 3, count + designs))
-    first[:count, :count] *= 0.3
-    second = first + 1e-4 * draw.normal(size=first.shape)
-
-    def derivatives(slope):
-        inverse = np.linalg.inv(np.eye(count) - slope[:count, :count])
-        moved = inverse @ slope[:count, count:]
-        forces = slope[count : count + 2]
-        return [inverse, moved, *(forces[:, count:] + forces[:, :count] @ moved)]
-
-    both = zip(derivatives(first), derivatives(second), strict=True)
-    truth = max(np.max(np.abs(a - b)) / np.max(np.abs(a)) for a, b in both)
-    found = disagreement(jnp.asarray(first), jnp.asarray(second), count)
-    assert float(found) == pytest.approx(truth)
-    assert float(disagreement(jnp.asarray(first), jnp.asarray(first), count)) == 0
-    # A pair without design parameters is compared by its monodromy matrix.
-    bare = [jnp.asarray(x[:, :count]) for x in (first, second)]
-    assert 0 < float(disagreement(*bare, count)) <= truth
-
-
 def test_what_is_not_certain_has_no_derivatives():
-    flow = Flow.empty(2, 3, 8, 16, Measures(), jnp.float64)
-    orbit = Orbit.empty(jnp.zeros(2), 3, flow)
-    rtol = jnp.asarray(1e-8)
-    assert is_certain(orbit, rtol)
-    for wrong in (
-        {"disagreement": 1.1 * agreement(rtol)},
-        {"disagreement": jnp.asarray(jnp.nan)},
-        {"defect": jnp.asarray(1.1e-5)},
-        {"drift": jnp.asarray(1.1e-5)},
-    ):
-        assert not is_certain(orbit._replace(**wrong), rtol), wrong
-    # Where the monodromy matrix multiplies errors, they may be as much greater.
-    lively = orbit._replace(defect=jnp.asarray(1.1e-5), monodromy=2 * jnp.eye(2))
-    assert is_certain(lively, rtol)
+    rtol, orbit = jnp.asarray(1e-8), Orbit.empty(jnp.zeros(2), 3, 3)
+    scales = jnp.asarray(1.5), jnp.asarray(0.033), jnp.asarray(100.0)
+
+    def certain(apart):
+        found = orbit._replace(disagreement=jnp.asarray(apart))
+        return bool(verdict(found, jnp.zeros(2), (1e-3, 1e-9), (rtol, rtol), scales).certain)
+
+    limit = float(agreement(rtol))
+    assert certain(0.9 * limit)
+    assert not certain(1.1 * limit)
+    assert not certain(np.nan)

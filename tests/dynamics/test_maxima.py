@@ -6,7 +6,7 @@ import pytest
 from rootsopt import load_config
 from rootsopt.dynamics import maxima
 from rootsopt.dynamics.maxima import candidates, shoulders
-from rootsopt.dynamics.orbit import SAMPLES
+from rootsopt.dynamics.steady import SAMPLES
 from rootsopt.dynamics.varied import VariedOrbit
 from rootsopt.response import evaluation
 from rootsopt.response.evaluation import Evaluator

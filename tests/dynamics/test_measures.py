@@ -1,8 +1,5 @@
-"""Tests of spectral lines, p-norm, and orbits of more than two states."""
+"""Tests of spectral lines and of the p-norm."""
 
-import dataclasses
-
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,12 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rootsopt import steady_response
 from rootsopt.config import load
-from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.linear import spectral_radius
-from rootsopt.dynamics.orbit import Shots, close_orbit
-from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.window import no_tangents
 from rootsopt.errors import InputError
 from rootsopt.optimize.problem import Problem
 from rootsopt.response.evaluation import Evaluator, objective_weights
@@ -81,14 +75,9 @@ def test_what_is_not_asked_for_is_not_computed():
     assert more.scene.solver.measures.count == 4
 
     def size(evaluator):
-        pair = evaluator.scene.pair(jnp.array([36.43, 9.0, 4.0]))
-        one, shots = jnp.asarray(1), Shots(how, evaluator.scene.solver.measures)
-        jaxpr = jax.make_jaxpr(
-            lambda y: close_orbit(pair, no_tangents(pair), y, one, shots).response
-        )(jnp.zeros(2))
-        return len(str(jaxpr))
+        scene, design = evaluator.scene, jnp.array([36.43, 9.0, 4.0])
+        return len(str(jax.make_jaxpr(lambda design: steady_response(scene, design).mean)(design)))
 
-    how = Integrator("tsit5", jnp.asarray(1e-6), 256)
     assert size(plain) < size(more)
 
 
@@ -140,52 +129,3 @@ def test_spectral_radius(count, seed):
 def test_spectral_radius_of_a_nilpotent_matrix_is_zero():
     matrix = jnp.zeros((3, 3)).at[0, 1].set(1.0)
     assert float(spectral_radius(matrix)) == 0
-
-
-class Lagging(RotorPair):
-    """A pair with a third state: the load follows the contact torque with a lag of 0.1 mesh
-    periods."""
-
-    def derivative(self, tau, state):
-        slope, contact = super().derivative(tau, state[:2])
-        lag = 10 * (contact.torque2 / 10 - state[2])
-        share = state[2] / self.inertia * self.mesh_period**2 / self.angle_scale
-        return jnp.stack([slope[0], slope[1] - share, lag]), contact
-
-    def switches(self, tau, state):
-        return super().switches(tau, state[:2])
-
-    def contact_at(self, tau, state):
-        return super().contact_at(tau, state[:2])
-
-
-@pytest.mark.long
-def test_an_orbit_of_three_states():
-    """The orbit closes to 1e-9, and its derivative agrees with differences of orbits."""
-    model = Evaluator.of(load("configs/cic.yaml", [])).scene
-    how = Integrator("dopri8", jnp.asarray(1e-11), 4096)
-
-    @eqx.filter_jit
-    def orbit(load):
-        def arrays(load):
-            pair = model.pair(jnp.array([36.43, 9.0, 4.0]))
-            pair = eqx.tree_at(lambda pair: pair.load.torque, pair, load)
-            fields = {f.name: getattr(pair, f.name) for f in dataclasses.fields(pair)}
-            return eqx.partition(Lagging(**fields), eqx.is_inexact_array)
-
-        (dynamic, static), tangents = arrays(load), jax.jacfwd(lambda x: arrays(x)[0])(load)
-        tangents = jax.tree.map(lambda x: x[None], tangents)
-        start = jnp.array([-0.6, -0.4, 0.3])
-        return close_orbit(
-            eqx.combine(dynamic, static), tangents, start, jnp.asarray(1), Shots(how)
-        )
-
-    here = orbit(jnp.asarray(4.775))
-    assert float(here.residual) < 1e-9
-    assert here.monodromy.shape == (3, 3)
-    assert float(here.multiplier) == pytest.approx(np.hypot(*floquet(here.monodromy)[0]), rel=1e-6)
-    assert float(here.multiplier) < 1
-    step = 1e-3
-    up, down = (np.asarray(orbit(jnp.asarray(4.775 + h)).response) for h in (step, -step))
-    slope = np.asarray(here.sensitivity)[:, 0]
-    assert slope[:2] == pytest.approx((up - down)[:2] / (2 * step), rel=1e-5)

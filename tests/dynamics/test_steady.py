@@ -10,11 +10,9 @@ import numpy as np
 import pytest
 
 from rootsopt.config import DESIGN_KEYS, load
-from rootsopt.dynamics.flow import flow, strobe
+from rootsopt.dynamics.flow import strobe
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.linear import spectral_radius
-from rootsopt.dynamics.peak import BESIDE, BESIDE_UNIT, one_sided
-from rootsopt.dynamics.window import no_tangents
 from rootsopt.response.evaluation import RESPONSES, Evaluator, evaluate
 from rootsopt.response.records import message_of
 from rootsopt.status import Status
@@ -72,7 +70,9 @@ def force_at(pair, start, times, how):
         dt0=1e-4,
         y0=start,
         saveat=diffrax.SaveAt(ts=times),
-        stepsize_controller=diffrax.ClipStepSizeController(how.controller(), step_ts=times),
+        stepsize_controller=diffrax.ClipStepSizeController(
+            diffrax.PIDController(how.rtol, how.rtol), step_ts=times
+        ),
         max_steps=200_000,
     ).ys
     return jax.vmap(lambda t, y: pair.contact_at(t, y).total)(times, states)
@@ -233,53 +233,6 @@ def test_gradient_is_that_of_finite_differences(sharp, orbits, name):
     np.testing.assert_allclose(exact, found, rtol=1e-4)
 
 
-@pytest.mark.long
-def test_recorded_steps_give_the_same_motion(sharp, orbits):
-    """Repeating the recorded steps does not change the motion.
-
-    On them, central differences of the flow agree with its slope down to small steps. On adaptive
-    steps, noise would hide this."""
-    evaluation = orbits["shorter involute"][1]
-    state = jnp.asarray(evaluation.state)
-    pair = pair_of(sharp.scene, jnp.array(DESIGNS["shorter involute"]))
-    how, one = integrator(1e-8), jnp.asarray(1.0)
-    still = no_tangents(pair)
-    once = eqx.filter_jit(lambda y: flow(pair, y, one, how, 64, still))(state)
-    again = eqx.filter_jit(lambda y: flow(pair, y, one, how, 64, still, once.grid))
-    np.testing.assert_allclose(again(state).response, once.response, rtol=1e-12)
-    np.testing.assert_allclose(again(state).slope, once.slope, rtol=1e-9)
-    for step in (1e-4, 1e-5, 1e-6):
-        ends = [again(state.at[1].add(sign * step)).end for sign in (1, -1)]
-        difference = (ends[0] - ends[1]) / (2 * step)
-        # Rounding of the search, some 1e-13, over the step; 1e-8 of step noise would give 1e-2.
-        np.testing.assert_allclose(difference, once.slope[:2, 1], atol=1e-6)
-
-
-@pytest.mark.long
-def test_repeated_steps_tell_of_their_error(sharp, orbits):
-    """Steps chosen for a motion repeat it within about a tolerance; half as many do not.
-
-    Steps of another motion do not either. Steps just chosen have no error estimate."""
-    state, one = jnp.asarray(orbits["shorter involute"][1].state), jnp.asarray(1.0)
-    design, how = jnp.array(DESIGNS["shorter involute"]), integrator(1e-8)
-    pair = pair_of(sharp.scene, design)
-
-    def strains():
-        still = no_tangents(pair)
-        once = eqx.filter_jit(lambda y: flow(pair, y, one, how, 64, still))(state)
-        again = eqx.filter_jit(lambda y, grid: flow(pair, y, one, how, 64, still, grid))
-        count = int(jnp.sum(once.grid < jnp.inf))
-        ends = once.grid[(count - 1) % 2 : count : 2]
-        half = jnp.pad(ends, (0, once.grid.size - ends.size), constant_values=jnp.inf)
-        moved = state.at[1].add(0.3)
-        repeated = again(state, once.grid), again(state, half), again(moved, once.grid)
-        return [float(each.strain) for each in (once, *repeated)]
-
-    none, own, halved, foreign = strains()
-    assert none == 0 < own < 2
-    assert min(halved, foreign) > 10
-
-
 def test_peak_on_a_corner_has_its_gradient():
     """If the peak is on a corner of the force, its derivative is neither of the two beside it.
 
@@ -299,7 +252,8 @@ def test_peak_on_a_corner_has_its_gradient():
 
 @pytest.mark.parametrize("design", [(28.0, 3.0, 1.5), (34.0, 7.0, 3.0)])
 def test_gradient_at_the_default_tolerance(design):
-    """The gradient agrees with that at 1e-11, because steps end where the equation is not smooth.
+    """The gradient agrees with that at 1e-11, because elements end where the equation is not
+    smooth.
 
     Otherwise, gradients would be wrong by 1e-3 to 6e-3."""
     evaluator = Evaluator.of(load("configs/cic.yaml"))
@@ -309,71 +263,6 @@ def test_gradient_at_the_default_tolerance(design):
     )
     error = np.max(np.abs(usual - tight), axis=1) / np.max(np.abs(tight), axis=1)
     assert np.max(error) < 5e-5
-
-
-def test_weights_of_a_peak():
-    """The weights are correct for a smooth peak, a corner and a jump.
-
-    For a smooth peak, they give the instant at which the force stops rising. For a corner, they
-    give the mean of both sides, at the corner, for which the force is stationary. The located
-    instant is slightly beside it. For a jump, they give its higher side."""
-    times = np.array(BESIDE)
-    unit = BESIDE_UNIT
-
-    def weights(force, noise=0.0):
-        # Forces and exact rates. Rounding of the gap hides in the forces, not in their rates.
-        rates = jax.vmap(jax.grad(lambda t: force(t / unit)))(times * unit)
-        found = jnp.stack([force(times) + 3e-7 * noise * (times % 3 - 1), rates], axis=1)
-        value, weights = one_sided(found, noise)
-        assert np.sum(weights) == pytest.approx(1)
-        return float(value), np.asarray(weights[:, 0])
-
-    value, found = weights(lambda t: 0 * t + 3.0)
-    assert value == 3
-    np.testing.assert_array_equal(found, [1, 0, 0, 0, 0, 0, 0])
-    # Any smooth derivative is interpolated to t = 0.3 and t = 5, where the force stops rising.
-    for top in (0.3, 5.0):
-        for noise in (0.0, 1.0):
-            value, found = weights(lambda t, top=top: 3 - 1e-9 * (t - top) ** 2, noise)
-            assert value == pytest.approx(3, rel=1e-6)
-            assert found @ (5 + 2 * times) == pytest.approx(5 + 2 * top, rel=1e-6)
-    # A peak that was located inaccurately is still found, with its value.
-    value, found = weights(lambda t: 3 - 1e-9 * (t - 300) ** 2)
-    assert value == pytest.approx(3, rel=1e-12)
-    assert found @ (5 + 2 * times) == pytest.approx(605, rel=1e-6)
-    # A jump away from the peak is not taken for a peak.
-    value, found = weights(lambda t: jnp.where(t > -30, 4.0, 1.0) + 0 * t)
-    assert value == 4
-    np.testing.assert_array_equal(found, [1, 0, 0, 0, 0, 0, 0])
-    # Rising 2, falling 6 per unit around t = 0.1, of a force in which this is much or little. Noise
-    # a hundredth of that fall would leave an error of a hundredth in weights from differences.
-    for size, noise in ((1.0, 0.0), (1e-7, 1.0)):
-        value, found = weights(
-            lambda t, size=size: 5 + size * jnp.minimum(2 * (t - 0.1), -6 * (t - 0.1)), noise
-        )
-        assert value == pytest.approx(5, abs=1e-12 + 2e-6 * noise)
-        shares = [found[0], found[1] + found[2], found[3] + found[4], *found[5:]]
-        np.testing.assert_allclose(shares, [0, 0.75, 0.25, 0, 0], rtol=1e-9)
-    # Values and rates that change beside the corner at `top` are extrapolated to it. Those beside
-    # it would be off by 0.002 and more.
-    for top in (-0.9, 0.0, 0.4):
-        slide = times - top
-        value, found = weights(
-            lambda t, top=top: (
-                5 + jnp.minimum(2 * (t - top), -6 * (t - top)) + 1e-4 * (t - top) ** 2
-            )
-        )
-        sides = np.where(slide < 0, 5 + 1e-3 * slide, 9 + 3e-3 * slide)
-        assert value == pytest.approx(5, abs=1e-3)
-        assert found @ sides == pytest.approx(0.75 * 5 + 0.25 * 9, abs=2e-5)
-    # If the corner is not between the nearest times, nothing is extrapolated across it.
-    _, found = weights(lambda t: 5 + jnp.minimum(2 * (t - 1.5), -6 * (t - 1.5)))
-    np.testing.assert_allclose(found, [0, 0, 0.75, 0, 0.25, 0, 0], rtol=1e-9)
-    for side in (1, -1):
-        value, found = weights(lambda t, side=side: jnp.where(side * t > 0, 4 + t / 9, 1 + t / 9))
-        chosen = times[np.argmax(found)]
-        assert side * chosen > 0
-        assert value == pytest.approx(4 + chosen / 9)
 
 
 # Statuses

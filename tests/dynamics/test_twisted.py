@@ -12,8 +12,8 @@ import rootsopt
 from rootsopt import Scene, Status
 from rootsopt.contact.search import SearchContact
 from rootsopt.contact.twisted import TwistedContact, slices_of
+from rootsopt.dynamics.closed import Start, steady_motion
 from rootsopt.dynamics.parts import TwistedLoad
-from rootsopt.dynamics.steady import steady_motion
 from rootsopt.runtime.programs import Program
 from rootsopt.scene.build import along
 from rootsopt.scene.slicing import MOST, sliced_mean, slices_needed
@@ -141,13 +141,14 @@ def test_number_of_slices_follows_the_error():
 def test_gradients_against_differences():
     """EE at 25°: the contact jumps between two minima, one slice after the other."""
     scene, design = scene_of("ee", *TIGHT, "rotor.helix_deg=25", "solver.slices=3")
-    motion, start = Program(steady_motion), np.zeros(2)
+    motion = Program(steady_motion)
 
     def found(helix):
         def build(helix):
             return dataclasses.replace(scene, helix=helix).pair_and_shape(jnp.asarray(design))
 
         pair, tangents, _ = along(build, jnp.asarray(helix), jnp.ones(1))
+        start = Start.at(pair, jnp.zeros(2), scene.solver.max_orbit)
         made = motion(pair, tangents, start, scene.pitch_radius, scene.solver)
         assert Status.of(made.status) is Status.PERIODIC
         return np.asarray(made.orbit.response), np.asarray(made.orbit.sensitivity)[:, 0]

@@ -1,6 +1,4 @@
-"""The explorer's session, and its page in a real browser.
-
-Orbits are closed by shooting, whose programs are half as large as those of collocation."""
+"""The explorer's session, and its page in a real browser."""
 
 import dataclasses
 import queue
@@ -39,7 +37,7 @@ SPEED, TIP, LOAD = "scene.speed_rpm", "profile.tip_arc_angle_deg", "scene.load.t
 
 @pytest.fixture(scope="module")
 def engine():
-    made = Engine(load(CIC, ["solver.orbit=shooting"]))
+    made = Engine(load(CIC))
     made.prepare()
     return made
 

@@ -209,8 +209,8 @@ def test_work_and_momentum_of_elastic_bearings():
     start = begun(pair, None, scene.solver.max_orbit)
     found = evaluator.motion(pair, tangents, start)
     assert Status.of(found.status) is Status.PERIODIC
-    orbit = varied(pair, tangents, found, scene.solver)
-    loads, states = orbit_loads(scene, design, orbit), sampled(orbit.elements, scene.solver.samples)
+    orbit = varied(found)
+    loads, states = orbit_loads(scene, design, orbit), sampled(orbit.elements)
     tau = int(found.period) * np.arange(len(states)) / len(states)
 
     @jax.jit

@@ -7,9 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rootsopt.dynamics.flow import Flow
+from rootsopt.dynamics.flow import Period
 from rootsopt.dynamics.integrator import Integrator
-from rootsopt.dynamics.measures import Measures
 from rootsopt.response import ensemble, members
 from rootsopt.response.members import Members
 from tests.standins import oscillator
@@ -19,15 +18,13 @@ def told_flow(state, means):
     """Return a mesh period whose force has the mean `means[k]`; k, the first state, grows by 1."""
     at = jnp.round(state[0]).astype(int)
     mean = jnp.asarray(means)[at]
-    blank = Flow.empty(state.shape[0], 0, 2, 1, Measures(), state.dtype)
-    return blank._replace(
+    return Period(
         end=state.at[0].add(1.0).at[1].set(at % 3 + 0.001 * at),
-        mean=mean,
-        mean_square=2 * mean**2,
-        peak=3 * mean + at % 2,
-        depth=-mean,
+        response=jnp.stack([mean, 2 * mean**2, 3 * mean + at % 2]),
         states=jnp.stack([state, -2 * state]),
+        depth=-mean,
         solved=jnp.asarray(True),
+        duration=jnp.ones(()),
     )
 
 
@@ -38,7 +35,7 @@ def test_averages_of_a_member(monkeypatch):
     half."""
     settle = 3
     means = np.random.default_rng(0).uniform(1, 2, 20) + np.arange(20)
-    monkeypatch.setattr(members, "flow", lambda pair, state, *rest: told_flow(state, means))
+    monkeypatch.setattr(members, "one_period", lambda pair, state, *rest: told_flow(state, means))
     monkeypatch.setattr(
         members,
         "strobe",
@@ -80,7 +77,9 @@ def test_a_member_repeats_after_its_period(monkeypatch):
         return jnp.array([0.5, 0.0]).at[1].set((jnp.round(state[1]) + 1) % 3)
 
     blank = told_flow(jnp.zeros(2), [1.0])
-    monkeypatch.setattr(members, "flow", lambda pair, state, *rest: blank._replace(end=step(state)))
+    monkeypatch.setattr(
+        members, "one_period", lambda pair, state, *rest: blank._replace(end=step(state))
+    )
     averages = averages_from(jnp.zeros(2))
     # A cycle of k counts once the last k + 1 states have been there k mesh periods before.
     for periods, seen in ((40, [2, 5]), (13, [2, 5]), (12, [2]), (7, [2]), (6, [])):

@@ -124,7 +124,7 @@ def test_start_of_another_kind_is_refused(scene, first):
 
 @pytest.mark.long
 def test_orbit_that_is_not_closed_is_said_to_be(scene, monkeypatch):
-    """Inside `jit` it has a status; otherwise shooting closes it."""
+    """Its forces are those of a window of the motion, and its gradient is not a number."""
     monkeypatch.setattr("rootsopt.dynamics.closed.corrected", jnp.zeros_like)
     # With a window of 16 mesh periods, which says that the motion is not chaotic.
     monkeypatch.setattr("rootsopt.dynamics.closed.PERIODS", 16)
@@ -137,24 +137,25 @@ def test_orbit_that_is_not_closed_is_said_to_be(scene, monkeypatch):
     assert Status.of(found[1].status) is Status.NOT_CLOSED
     assert np.all(np.isnan(slope))
     assert not bool(found[1].start.known.sound)
+    usual = steady_response(scene, DESIGN)
+    assert found[0] == pytest.approx(float(usual.mean), rel=1e-4)
+    assert found[1].peak == pytest.approx(float(usual.peak), rel=1e-3)
     asked = []
 
     def program(scene, *rest):
-        asked.append((scene.solver.closing, rest[-1]))
-        return found[1]._replace(status=codes[len(asked) - 1]), slope
+        asked.append(rest[-1])
+        return found[1], slope
 
-    # The window and shooting have programs of their own.
-    codes = Status.NOT_SETTLED.code, Status.NOT_CLOSED.code, Status.PERIODIC.code
+    # The window has a program of its own.
     monkeypatch.setattr("rootsopt.response.steady._compiled", program)
-    assert Status.of(steady_response(scene, DESIGN).status) is Status.PERIODIC
-    assert asked == [("auto", False), ("auto", True), ("shooting", True)]
+    assert Status.of(steady_response(scene, DESIGN).status) is Status.NOT_CLOSED
+    assert asked == [False, True]
 
 
 def test_reported_orbit_is_integrated(scene, monkeypatch):
-    """An orbit that an integration over its period contradicts is closed by shooting."""
+    """An orbit that an integration over its period contradicts is no result."""
     evaluator = Evaluator.of(CONFIG)
     usual = evaluator()
-    assert usual.statistics["collocated"] == 1
     pair, how = evaluator.pair(DESIGN), scene.solver.orbit
     square = usual.response["rms_force_N"] ** 2
     forces = jnp.asarray([usual.response["mean_force_N"], square])
@@ -165,7 +166,19 @@ def test_reported_orbit_is_integrated(scene, monkeypatch):
     assert apart(pair, (state * 1.01, forces), jnp.asarray(1), how) > 1e-4
     monkeypatch.setattr("rootsopt.response.evaluation._APART", (0.0, 0.0))
     again = evaluator()
-    assert "collocated" not in again.statistics
-    assert again.response["peak_force_N"] == pytest.approx(usual.response["peak_force_N"], rel=1e-7)
+    assert again.status is Status.NOT_CLOSED
+    assert again.gradient == {}
+    assert again.response["peak_force_N"] == pytest.approx(usual.response["peak_force_N"], rel=1e-3)
     # Without a series, nothing is integrated.
-    assert evaluator(series=False).statistics["collocated"] == 1
+    assert evaluator(series=False).status is Status.PERIODIC
+    # An orbit near a known one is searched for again from its state.
+    asked = []
+    monkeypatch.setattr(
+        "rootsopt.response.evaluation._integrated",
+        lambda *given: asked.append(given) or (1.0 if len(asked) == 1 else 0.0),
+    )
+    monkeypatch.setattr("rootsopt.response.evaluation._APART", (1e-4, 0.0))
+    again = evaluator(start=usual.start)
+    assert again.status is Status.PERIODIC
+    assert len(asked) == 2
+    assert "from_neighbour" not in again.statistics

@@ -142,7 +142,7 @@ RUNS = {
     "optimize": ["optimizer.screening=4", "optimizer.starts=2", "optimizer.iterations=12"],
     "pareto": ["optimizer.screening=4", "pareto.points=3", "optimizer.iterations=6"],
     "attractors": ["scene.timing_gear.backlash_mm=0.2"],
-    "simulate": ["solver.orbit=shooting"],
+    "simulate": ["solver.accuracy=1e-7"],
 }
 
 

@@ -10,7 +10,7 @@ from rootsopt.dynamics.collocation.closing import Closed, close
 from rootsopt.dynamics.collocation.equation import CollocatedEquation
 from rootsopt.dynamics.collocation.forces import OrbitForces
 from rootsopt.dynamics.collocation.known import Known
-from rootsopt.dynamics.flow import Flow, Pieces
+from rootsopt.dynamics.flow import Pieces
 from rootsopt.dynamics.linear import spectral_radius
 from rootsopt.dynamics.orbit import Orbit
 from rootsopt.dynamics.pair import RotorPair
@@ -20,9 +20,10 @@ if TYPE_CHECKING:
 
 ACCURACY = 10.0
 """Requested relative error of the forces, in tolerances of the orbit's integrator."""
-UNREFINED = 10.0
+UNREFINED, _ROUNDED = 10.0, 5e-9
 """Estimated error of the forces above which an orbit is rejected, in multiples of the requested
-error. The estimate exceeds the request if the mesh has no room for refinement."""
+error, but at least the second number. The estimate exceeds the request if the mesh has no room for
+refinement, or if rounding of the gap hides it: beside the cusp of EE, forces round at some 1e-9."""
 _REPEATS = 1e3, 1e-5
 """Scaled difference between the states at φ1 = 0 and after a fraction of the period, below which
 this fraction is the orbit's true period. The limit is the first number (tolerances), but at least
@@ -34,8 +35,7 @@ _ALONG = 8
 class Collocated(NamedTuple):
     """An orbit closed by collocation, with the results of its checks.
 
-    `orbit`: its `flow` has neither samples nor steps (see `_as_flow`); its `residual` is the last
-    correction, inf if the orbit is not sound. `sound`: whether Newton's method has converged on a
+    `orbit`: the orbit; `sound`: whether Newton's method has converged on a
     mesh that ends at the orbit's events; otherwise the orbit has no meaning. `shorter`: true period
     (mesh periods) if the orbit repeats after a fraction of its period, otherwise 0. `verified`:
     whether the orbit is sound and accurate, and does not repeat. `known`: the orbit in the form
@@ -59,7 +59,7 @@ def closed_orbit(
 
     `tangents`: directions of the pair's parameters, stacked along a leading axis; `start`: the
     motion, and the `numbers` of its pair; `settings`: `orbit` (whose tolerance sets the accuracy),
-    `measures`, `max_orbit`, `variation`. The result's `flow` has neither samples nor steps."""
+    `measures`, `max_orbit`, `variation`."""
     known, neighbour = start
     integrator, measures = settings.orbit, settings.measures
     tolerance = integrator.tolerance
@@ -67,13 +67,13 @@ def closed_orbit(
     equation = CollocatedEquation(pair, measures, top, settings.variation)
     closed = close(equation, tangents, known, neighbour, ACCURACY * tolerance)
     found, sound = closed.found, closed.sound & known.sound
-    verified = sound & (closed.error <= UNREFINED * ACCURACY * tolerance)
+    verified = sound & (closed.error <= jnp.maximum(UNREFINED * ACCURACY * tolerance, _ROUNDED))
     period = jnp.round(found.elements.mesh.period).astype(int)
     # The transient may have mistaken several periods of the orbit for one.
     shorter = _repeats(found, period, settings.max_orbit, tolerance) * sound
     verified &= shorter == 0
     residual = jnp.where(sound, found.correction, jnp.inf)
-    orbit = _as_orbit(found, _as_flow(found), residual, closed.drift, closed.steps)
+    orbit = _as_orbit(pair, found, residual, closed)
     return Collocated(orbit, sound, shorter, verified, _known(closed, verified))
 
 
@@ -113,50 +113,25 @@ def _known(closed: Closed, verified: Bool[Array, ""]) -> Known:
     return Known(closed.found.elements, *errors, verified, yes)
 
 
-def _as_flow(found: OrbitForces) -> Flow:
-    """Return the orbit `found` as a `Flow` over its period, with zeros for the derivatives.
-
-    It has neither samples of the state nor steps: only `response.series.sampled` gives samples."""
-    response, count = found.response, found.state.shape[0]
-    mesh, dtype = found.elements.mesh, found.state.dtype
-    begin, length = mesh.ends[0][found.peak.element], mesh.lengths[found.peak.element]
-    rows, columns = count + response.shape[0], count + found.moved.shape[1]
-    return Flow(
-        end=found.state,
-        mean=response[0],
-        mean_square=response[1],
-        peak=response[2],
-        peak_time=jnp.mod(begin + found.peak.share * length, mesh.period),
-        depth=found.depth,
-        states=jnp.zeros((0, count), dtype),
-        grid=jnp.zeros(0, dtype),
-        corners=jnp.zeros((0, count), dtype),
-        steps=jnp.zeros((), int),
-        solved=jnp.ones((), bool),
-        strain=jnp.zeros((), dtype),
-        others=response[3:],
-        slope=jnp.zeros((rows, columns), dtype),
-    )
-
-
-def _as_orbit(found: OrbitForces, out: Flow, residual, drift, steps) -> Orbit:
-    """Return an orbit found by collocation.
-
-    `out`: its flow over one period; `residual`: its residual; `drift`: estimated error of its
-    derivatives; `steps`: number of Newton steps."""
-    nothing = jnp.zeros_like(found.depth)
+def _as_orbit(
+    pair: RotorPair, found: OrbitForces, residual: Float[Array, ""], closed: Closed
+) -> Orbit:
+    """Return the orbit `found` of `pair`; `residual`: that of the orbit; `closed`: its closing."""
+    mesh, peak = found.elements.mesh, found.peak
+    time = mesh.ends[0][peak.element] + peak.share * mesh.lengths[peak.element]
+    # The force of a pair that is not smooth may jump where no element ends.
+    known = 1.0 if pair.smooth else jnp.nan
     return Orbit(
         state=found.state,
-        flow=out,
         residual=residual,
         monodromy=found.monodromy,
         multiplier=spectral_radius(found.monodromy),
         response=found.response,
-        sensitivity=found.sensitivity,
-        moved=found.moved,
-        newton_steps=steps,
-        drift=nothing,
-        defect=nothing,
-        disagreement=drift,
+        sensitivity=known * found.sensitivity,
+        moved=known * found.moved,
+        peak_time=jnp.mod(time, mesh.period),
+        depth=found.depth,
+        newton_steps=closed.steps,
+        disagreement=closed.drift,
         variation=found.variation,
     )

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import rootsopt
+from experiments._common.shooting import closed as shooting
 from rootsopt.dynamics.collocation.closing import Closed, Closer, Loop, gained
 from rootsopt.dynamics.collocation.elements import Elements, Mesh
 from rootsopt.dynamics.collocation.equation import Points
@@ -68,8 +69,9 @@ def _known(room=(48, 51)):
 
 def test_samples_of_an_orbit():
     """They begin at φ1 = 0 even if the mesh does not."""
-    states = sampled(_known().elements, 16)
-    np.testing.assert_allclose(states[:, 0], np.sin(TURN * np.arange(16) / 8), atol=1e-5)
+    states = sampled(_known().elements)
+    share = np.arange(len(states)) / len(states)
+    np.testing.assert_allclose(states[:, 0], np.sin(TURN * PERIOD * share), atol=1e-5)
 
 
 def test_orbit_varies_at_constant_time():
@@ -307,67 +309,72 @@ def test_a_mesh_is_refined_only_if_the_finer_one_says_something_new(used, meshes
 
 
 @pytest.mark.long
-def test_free_form_from_a_neighbour_is_that_by_shooting():
+def test_free_form_from_a_neighbour_is_that_from_rest():
     """Elements end at its knots too, and gradients with respect to its coefficients are exact."""
-    config = rootsopt.load_config("configs/free.yaml")
-    evaluator = Evaluator.of(config)
+    evaluator = Evaluator.of(rootsopt.load_config("configs/free.yaml"))
     base = evaluator(series=False)
     wave = 1 + 2e-3 * np.cos(3.0 * np.arange(len(base.design)))
     design = np.array(list(base.design.values())) * wave
     near = evaluator(design, start=base.start, series=False)
     assert near.statistics["from_neighbour"] == 1
-    exact = config.replaced({"solver.orbit": "shooting", "solver.rtol": 1e-10})
-    usual = Evaluator.of(exact)(design, series=False)
-    for force, value in usual.response.items():
-        np.testing.assert_allclose(near.response[force], value, rtol=1e-6)
-        slopes = np.array([list(one.gradient[force].values()) for one in (near, usual)])
-        np.testing.assert_allclose(slopes[0], slopes[1], rtol=0, atol=3e-4 * np.max(np.abs(slopes)))
+    _assert_alike(near, evaluator.at_tolerance(1e-10)(design, series=False), 1e-6, 3e-4)
+    _assert_shot(evaluator, near, 1e-6)
+
+
+FORCES = ("mean_force_N", "peak_force_N", "rms_force_N")
+
+
+def _assert_alike(one, other, forces, slopes):
+    """Forces are equal to a relative error, and gradients to one of the greatest entry."""
+    for name in FORCES:
+        np.testing.assert_allclose(one.response[name], other.response[name], rtol=forces)
+    for name, slope in other.gradient.items():  # EE has no parameters
+        rows = np.array([list(one.gradient[name].values()), list(slope.values())])
+        np.testing.assert_allclose(*rows, rtol=0, atol=slopes * np.max(np.abs(rows)))
+
+
+def _assert_shot(evaluator, found, within):
+    """The forces are those of an orbit closed by integrations."""
+    pair = evaluator.pair(np.array(list(found.design.values())))
+    truth = shooting(pair, found.state, found.steady_state["period"])
+    np.testing.assert_allclose([found.response[n] for n in FORCES], truth.forces, rtol=within)
 
 
 @pytest.mark.parametrize("name", ["cic", pytest.param("ee", marks=pytest.mark.long)])
-def test_orbit_from_a_neighbour_is_that_by_shooting(name):
+def test_orbit_from_a_neighbour_is_that_from_rest(name):
     """At half the speed, other events occur."""
     config = rootsopt.load_config(f"configs/{name}.yaml")
-    assert config.solver.orbit == "auto"
     evaluator = Evaluator.of(config)
-    fresh = Evaluator.of(config.replaced({"solver.orbit": "shooting"}))
     base = evaluator(series=False)
     assert "from_neighbour" not in base.statistics
     for factor, slack in ((1.003, 5e-6), (0.5, 1e-2)):
         moved = evaluator.at_speed(config.scene.speed_rpm * factor)
         near = moved(start=base.start, series=False)
-        exact = fresh.at_speed(config.scene.speed_rpm * factor).at_tolerance(1e-10)
-        usual = exact(start=base.start, series=False)
+        usual = moved.at_tolerance(1e-10)(series=False)
         assert "from_neighbour" not in usual.statistics
         assert near.status is usual.status is Status.PERIODIC
         if factor > 1:
             assert near.statistics["from_neighbour"] == 1
             # The first step is along the tangent. The peak of EE takes three more to locate.
             assert near.statistics["newton_steps"] <= 3 + 3 * (name == "ee")
-        for force, value in usual.response.items():
-            np.testing.assert_allclose(near.response[force], value, rtol=2e-6)
-        for force, slope in usual.gradient.items():  # EE has no parameters
-            slopes = np.array([list(near.gradient[force].values()), list(slope.values())])
-            most = np.max(np.abs(slopes))
-            np.testing.assert_allclose(slopes[0], slopes[1], rtol=0, atol=slack * most)
-    # A chain of neighbours begins on an orbit that was closed by collocation.
+        _assert_alike(near, usual, 2e-6, slack)
+        _assert_shot(moved, near, 2e-6)
+    # A chain of neighbours.
     again = evaluator.at_speed(config.scene.speed_rpm * 1.006)
     near = evaluator.at_speed(config.scene.speed_rpm * 1.003)(start=base.start, series=False)
     assert again(start=near.start, series=False).statistics["from_neighbour"] == 1
 
 
-def test_maxima_near_a_neighbour_are_those_by_shooting():
+def test_maxima_near_a_neighbour_are_those_from_rest():
     """At this speed, some of the local maxima follow events."""
-    # Collocation is refined for mean, RMS and peak; at 1e-8, lower maxima err by some 1e-6.
+    # An orbit is refined for mean, RMS and peak; at 1e-8, lower maxima err by some 1e-6.
     overrides = ["scene.speed_rpm=1000", "solver.rtol=1e-9"]
-    config = rootsopt.load_config("configs/cic.yaml", overrides)
-    evaluator = Evaluator.of(config).with_maxima()
-    fresh = Evaluator.of(config.replaced({"solver.orbit": "shooting"})).with_maxima()
+    evaluator = Evaluator.of(rootsopt.load_config("configs/cic.yaml", overrides)).with_maxima()
     base = evaluator(series=False)
     for factor in (0.998, 0.999, 1.003):
         design = factor * np.array(list(base.design.values()))
         near = evaluator(design, start=base.start, series=False)
-        usual = fresh(design, start=base.start, series=False)
+        usual = evaluator.at_tolerance(1e-10)(design, series=False)
         assert near.statistics["from_neighbour"] == 1
         assert "from_neighbour" not in usual.statistics
         one, other = near.maxima, usual.maxima
@@ -380,20 +387,15 @@ def test_maxima_near_a_neighbour_are_those_by_shooting():
 
 
 def test_a_coarser_accuracy_saves_work_and_bounds_the_error():
-    config = rootsopt.load_config("configs/cic.yaml")
-    sharp = config.replaced({"solver.orbit": "shooting", "solver.rtol": 1e-10})
-    truth = Evaluator.of(sharp)(series=False)
-    names, work = ("mean_force_N", "peak_force_N", "rms_force_N"), []
+    config, work = rootsopt.load_config("configs/cic.yaml"), []
+    truth = Evaluator.of(config).at_tolerance(1e-11)(series=False)
     for accuracy in (1e-2, 1e-5, 1e-7):
         tool = Evaluator.of(config.replaced({"solver.accuracy": accuracy}))
         # With series, the orbit must be confirmed by an integration.
         found = tool(series=accuracy == 1e-2)
         assert found.status is Status.PERIODIC
-        assert found.statistics["collocated"] == 1
-        for name in names:
-            assert found.response[name] == pytest.approx(truth.response[name], rel=accuracy)
-            slopes = np.array([list(one.gradient[name].values()) for one in (found, truth)])
-            assert np.max(np.abs(slopes[0] - slopes[1])) < accuracy * np.max(np.abs(slopes))
+        _assert_alike(found, truth, accuracy, accuracy)
+        _assert_shot(tool, found, accuracy)
         effort = found.statistics
         # Two meshes cannot show the last 2.5e-7 of the error.
         assert effort["gradient_disagreement"] <= max(accuracy, 2.5e-7)

@@ -1,0 +1,126 @@
+"""Closes an orbit by shooting, to check the package, which closes orbits by collocation.
+
+The two share the equation of motion alone. diffrax integrates it at a tolerance of 1e-12 without
+knowing its events; the monodromy matrix and all derivatives are differences. It takes a hundred
+times as long."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from numpy.typing import NDArray
+
+from rootsopt.dynamics.pair import RotorPair
+
+_TOLERANCE, _LONGEST = 1e-12, 1 / 256
+"""Tolerance and longest step (mesh periods) of the integration."""
+_STEPS = 2**16
+"""Maximum number of steps of an integration."""
+_CLOSED, _NEWTON = 1e-11, 8
+"""Distance between start and end (scaled) of a closed orbit, and maximum number of Newton steps."""
+_AWAY = 1e-6
+"""Change of a state (scaled) for the differences that give the monodromy matrix. Newton's method
+then gains six digits per step."""
+_GOLDEN = (5**0.5 - 1) / 2
+_CUTS = 40
+"""Number of sections of the interval in which the peak lies."""
+
+
+class Shot(NamedTuple):
+    """An orbit: scaled `state` at φ1 = 0; mean, peak and RMS force (N); distance between start and
+    end (scaled); greatest modulus of the Floquet multipliers."""
+
+    state: NDArray[np.float64]
+    forces: NDArray[np.float64]
+    miss: float
+    multiplier: float
+
+
+def closed(pair: RotorPair, state: Any, period: int) -> Shot:
+    """Close the orbit of `period` mesh periods near the scaled `state` (n,)."""
+    state = np.asarray(state, float)
+
+    def fly(start: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        end, forces = _flown(pair, jnp.asarray(start), jnp.asarray(float(period)))
+        return np.asarray(end), np.asarray(forces)
+
+    unit = np.eye(len(state))
+    end, forces = fly(state)
+    monodromy = np.stack([(fly(state + _AWAY * way)[0] - end) / _AWAY for way in unit], axis=1)
+    for _ in range(_NEWTON):
+        if np.max(np.abs(end - state)) < _CLOSED:
+            break
+        state = state + np.linalg.solve(unit - monodromy, end - state)
+        end, forces = fly(state)
+    multiplier = np.max(np.abs(np.linalg.eigvals(monodromy)))
+    return Shot(state, forces, float(np.max(np.abs(end - state))), float(multiplier))
+
+
+def differentiated(
+    forces: Callable[[float], NDArray[np.float64]], step: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the derivatives of `forces` at 0, and their estimated errors.
+
+    Central differences with `step` and half of it are extrapolated to step 0."""
+    wide, close = ((forces(h) - forces(-h)) / (2 * h) for h in (step, step / 2))
+    return (4 * close - wide) / 3, np.abs(close - wide)
+
+
+@eqx.filter_jit
+def _flown(pair: RotorPair, start: Any, period: Any) -> tuple[Any, Any]:
+    """Return the state at the end of `period` mesh periods; mean, peak and RMS force (N)."""
+    count, unit = start.shape[0], pair.force_scale
+
+    def force(tau: Any, y: Any, _: Any) -> Any:
+        return pair.contact_at(tau, y[:count]).total / unit
+
+    def rates(tau: Any, y: Any, _: Any) -> Any:
+        slope, contact = pair.derivative(tau, y[:count])
+        size = contact.total / unit
+        lapse = pair.lapse(y[:count]) * jnp.ones_like(size)
+        return jnp.append(slope, lapse * jnp.stack([size, size**2, jnp.ones_like(size)]))
+
+    term, solver = diffrax.ODETerm(rates), diffrax.Dopri8()
+    begin, here = jnp.zeros(()), jnp.append(start, jnp.zeros(3))
+    saved = diffrax.SubSaveAt(t0=True, steps=True), diffrax.SubSaveAt(t0=True, steps=True, fn=force)
+    out = diffrax.diffeqsolve(
+        term,
+        solver,
+        begin,
+        period,
+        1e-5,
+        here,
+        saveat=diffrax.SaveAt(subs=[*saved, diffrax.SubSaveAt(t1=True)]),
+        stepsize_controller=diffrax.PIDController(_TOLERANCE, _TOLERANCE, dtmax=_LONGEST),
+        max_steps=_STEPS,
+        throw=False,
+    )
+    assert out.ts is not None
+    assert out.ys is not None
+    times, states, sizes, end = out.ts[0], out.ys[0], out.ys[1], out.ys[2][0]
+    # The peak lies between the steps beside the greatest force at the end of a step.
+    top = jnp.argmax(jnp.where(jnp.isfinite(times), sizes, -jnp.inf))
+    first = jnp.maximum(top - 1, 0)
+    after = times[jnp.minimum(top + 1, times.shape[0] - 1)]
+    last = jnp.where(jnp.isfinite(after), after, period)
+
+    def height(tau: Any) -> Any:
+        memory = solver.init(term, times[first], tau, states[first], None)
+        y = solver.step(term, times[first], tau, states[first], None, memory, made_jump=False)[0]
+        return force(tau, y, None)
+
+    def cut(_: Any, ends: Any) -> Any:
+        low, high = ends
+        one, other = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+        lower, upper = lax.map(height, jnp.stack([one, other]))
+        return jnp.where(lower > upper, low, one), jnp.where(lower > upper, other, high)
+
+    low, high = lax.fori_loop(0, _CUTS, cut, (times[first], last))
+    peak = jnp.maximum(height((low + high) / 2), jnp.max(jnp.nan_to_num(sizes, posinf=0.0)))
+    mean, square = end[count : count + 2] / end[-1]
+    solved = out.result == diffrax.RESULTS.successful
+    return end[:count], jnp.where(solved, unit * jnp.stack([mean, peak, jnp.sqrt(square)]), jnp.nan)
