@@ -117,10 +117,12 @@ def one_period(pair: RotorPair, start: Float[Array, " n"], integrator: Integrato
     def slope(tau, y, pair):
         moved, contact = pair.derivative(tau, y[:count])
         force = contact.total / pair.force_scale
-        lapse = pair.lapse(y[:count]) if pair.free else jnp.ones_like(force)
-        return jnp.append(moved, lapse * jnp.stack([force, force**2, force**0]))
+        rates = jnp.stack([force, force**2])
+        if pair.free:
+            rates = pair.lapse(y[:count]) * jnp.append(rates, jnp.ones_like(force))
+        return jnp.append(moved, rates)
 
-    begun = jnp.append(start, jnp.zeros(3, dtype))
+    begun = jnp.append(start, jnp.zeros(2 + pair.free, dtype))
     most, term = integrator.max_steps, diffrax.ODETerm(slope)
     out = integrated(term, solver, control, begun, pair, most, recorded=True)
 
@@ -140,9 +142,8 @@ def one_period(pair: RotorPair, start: Float[Array, " n"], integrator: Integrato
     nothing = jnp.zeros((), dtype)
     numbers = jnp.arange(SAMPLES + _BESIDE, dtype=dtype)
     states, force, depth = lax.scan(sample, (nothing, nothing), numbers)[1]
-    mean, square = out.end[count : count + 2] / out.end[-1]
+    duration = out.end[-1] if pair.free else jnp.ones((), dtype)
+    mean, square = out.end[count : count + 2] / duration
     unit = pair.force_scale
     response = jnp.stack([unit * mean, unit**2 * square, jnp.max(force)])
-    return Period(
-        out.end[:count], response, states[:SAMPLES], jnp.max(depth), out.solved, out.end[-1]
-    )
+    return Period(out.end[:count], response, states[:SAMPLES], jnp.max(depth), out.solved, duration)

@@ -558,11 +558,11 @@ def test_solvers_agree(method, orbit_by, tight_orbit):
 
 
 def test_error_falls_with_the_tolerance(orbit_by, tight_orbit):
-    """With rtol a hundred times smaller, mean and peak are closer to the limit, with more steps."""
+    """With rtol a hundred times smaller, mean and RMS are closer to the limit, with more steps."""
     errors, steps = [], []
     for rtol in (1e-5, 1e-7, 1e-9):
         found, count = orbit_by("tsit5", rtol)
-        errors.append(np.max(abs(found / tight_orbit - 1)[:2]))
+        errors.append(np.max(abs(found / tight_orbit - 1)[::2]))
         steps.append(count)
     assert errors[0] > 3 * errors[1] > 9 * errors[2]
     assert errors[2] < 1e-6

@@ -24,7 +24,7 @@ def swing(tau, y, gravity):
 def both(method, gravity=4000.0, max_steps=512):
     """Return the integration by this loop and by diffrax."""
     integrator = Integrator(method, jnp.asarray(1e-6), max_steps)
-    solver, control = integrator.solver(), integrator.controller()
+    solver, control = integrator.solver(), diffrax.PIDController(1e-6, 1e-6, dtmax=1 / 32)
     term = diffrax.ODETerm(swing)
 
     @jax.jit

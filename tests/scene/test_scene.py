@@ -113,7 +113,7 @@ def test_motion_of_all_parts_is_scipys():
     def run(start):
         return diffrax.diffeqsolve(
             diffrax.ODETerm(lambda tau, y, _: pair.derivative(tau, y)[0]), how.solver(),
-            0.0, SHARE, None, start, stepsize_controller=how.controller(),
+            0.0, SHARE, None, start, stepsize_controller=diffrax.PIDController(how.rtol, how.rtol),
             max_steps=how.max_steps, adjoint=diffrax.ForwardMode(),
         ).ys[-1]  # fmt: skip
 
@@ -190,7 +190,7 @@ def test_energy_balance_with_all_parts():
     def run(start):
         solution = diffrax.diffeqsolve(
             diffrax.ODETerm(slope), how.solver(), 0.0, 1.0, None, jnp.pad(start, (0, 5)),
-            stepsize_controller=how.controller(), max_steps=how.max_steps,
+            stepsize_controller=diffrax.PIDController(how.rtol, how.rtol), max_steps=how.max_steps,
             adjoint=diffrax.ForwardMode(),
         )  # fmt: skip
         end = solution.ys[-1]
