@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from rootsopt.dynamics.parts.base import Part as Part
     from rootsopt.errors import InputError as InputError
     from rootsopt.optimize.design import optimize_design as optimize_design
-    from rootsopt.optimize.search import Optimization as Optimization
+    from rootsopt.optimize.outcome import Optimization as Optimization
     from rootsopt.profiles.base import Profile as Profile
     from rootsopt.profiles.base import Segment as Segment
     from rootsopt.response.evaluation import Evaluation as Evaluation
@@ -50,7 +50,7 @@ _PUBLIC = {
     "Family": "rootsopt.config.families:Family",
     "Front": "rootsopt.tradeoffs.front:Front",
     "InputError": "rootsopt.errors:InputError",
-    "Optimization": "rootsopt.optimize.search:Optimization",
+    "Optimization": "rootsopt.optimize.outcome:Optimization",
     "Parameter": "rootsopt.config.families:Parameter",
     "Part": "rootsopt.dynamics.parts.base:Part",
     "Profile": "rootsopt.profiles.base:Profile",

@@ -7,8 +7,8 @@ from matplotlib.figure import Figure
 from experiments._common.style import BLACK, BLUE, GREEN, PURPLE, VERMILION, grid_below, sheet
 from experiments.chaos.study import Results
 from rootsopt.optimize.noise import standard_error
+from rootsopt.optimize.outcome import Optimization
 from rootsopt.optimize.problem import Problem
-from rootsopt.optimize.search import Optimization
 from rootsopt.response.ensemble import ERRORS
 
 Rows = list[dict]

@@ -21,8 +21,9 @@ from experiments._common.scenes import shipped
 from rootsopt.config import Config
 from rootsopt.dynamics.flow import one_period
 from rootsopt.optimize.noise import standard_error
+from rootsopt.optimize.outcome import Optimization
 from rootsopt.optimize.problem import Problem
-from rootsopt.optimize.search import Optimization, Search
+from rootsopt.optimize.search import Search
 from rootsopt.response.ensemble import ERRORS, Ensemble, integrator
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.members import run_members

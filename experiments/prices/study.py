@@ -11,7 +11,8 @@ from experiments._common.driver import NoResultError
 from experiments._common.scenes import CIC
 from rootsopt.config import load
 from rootsopt.optimize.optimality import RESIDUAL
-from rootsopt.optimize.search import Optimization, Search
+from rootsopt.optimize.outcome import Optimization
+from rootsopt.optimize.search import Search
 
 Row = dict[str, Any]
 AGREES = 0.02

@@ -16,8 +16,8 @@ from experiments._common.scenes import shipped
 from rootsopt.config import Config
 from rootsopt.config.tolerances import Scatter
 from rootsopt.optimize.design import optimize_design
+from rootsopt.optimize.outcome import Optimization
 from rootsopt.optimize.robust import Robustness
-from rootsopt.optimize.search import Optimization
 
 Say = Callable[[str], None]
 FORCES = ("mean_force_N", "peak_force_N")

@@ -14,7 +14,7 @@ from rootsopt.errors import InputError
 from rootsopt.explore.engine import Engine, Poses, Shape, poses_of, same_motion
 from rootsopt.explore.latest import Latest
 from rootsopt.optimize.design import optimize_design
-from rootsopt.optimize.search import Optimization
+from rootsopt.optimize.outcome import Optimization
 from rootsopt.response.evaluation import Evaluation
 
 _IDLE = 0.4

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from rootsopt.config import Config
 from rootsopt.explore.knobs import Knob
 from rootsopt.explore.session import FromRest, NewMotion, Progress, Searched
-from rootsopt.optimize.search import Optimization
+from rootsopt.optimize.outcome import Optimization
 from rootsopt.output.names import brief, in_words, label, percent, value
 from rootsopt.response.evaluation import RESPONSES, Evaluation
 from rootsopt.status import Status

@@ -4,8 +4,8 @@ import threading
 from collections.abc import Callable
 
 from rootsopt.config import Config
+from rootsopt.optimize.outcome import Optimization
 from rootsopt.optimize.robust import search_of
-from rootsopt.optimize.search import Optimization
 from rootsopt.runtime.threads import one_thread
 from rootsopt.scene import check_geometry
 from rootsopt.sweeps.evaluations import evaluating

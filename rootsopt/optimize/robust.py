@@ -15,11 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rootsopt.config import Config
+from rootsopt.config.study import OptimizerConfig
 from rootsopt.errors import InputError
 from rootsopt.optimize.local import Local
+from rootsopt.optimize.outcome import Optimization
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.robust_problem import RobustProblem
-from rootsopt.optimize.search import Optimization, Progress, Search
+from rootsopt.optimize.search import Progress, Search, Stage
 from rootsopt.response.checkpoint import Checkpoint
 from rootsopt.response.evaluation import RESPONSES, Evaluation, Evaluator
 from rootsopt.response.many import HERE, Runs, evaluate_many
@@ -118,55 +120,39 @@ class Robustness:
         }
 
 
-class RobustSearch(Search):
+class RobustStage(Stage):
     """The second stage: local searches from the optima of the first stage, over a sample.
 
-    `nominal`: outcome of the first stage, with a problem; other arguments: see `Search`."""
+    `nominal`: outcome of the first stage, with a problem; `first`: see `Stage`."""
 
-    def __init__(
-        self,
-        config: Config,
-        nominal: Optimization,
-        progress: Progress | None = None,
-        stop: threading.Event | None = None,
-        checkpoint: Checkpoint | None = None,
-        runs: Runs = HERE,
-    ):
-        super().__init__(config, progress, stop, checkpoint, runs)
-        self.nominal, self.first = nominal, self.settings.starts
-        self.settings = self.settings.model_copy(update={"screening": 0})
-        self.exact = self.exact.scattered(runs)
+    apart = 0.03
+
+    def __init__(self, nominal: Optimization, first: int):
+        self.nominal, self.first = nominal, first
         self._shares: dict[int, NDArray[np.float64]] = {}
 
-    def _problem(self, scene: Scene, baseline: Evaluation) -> Problem:
-        return RobustProblem.of(self.config, scene, baseline)
+    def settings(self, given: OptimizerConfig) -> OptimizerConfig:
+        return given.model_copy(update={"screening": 0})
 
-    def _feasible(self, baseline_point) -> list[NDArray[np.float64]]:
+    def evaluator(self, exact: Evaluator, runs: Runs) -> Evaluator:
+        return exact.scattered(runs)
+
+    def problem(self, config: Config, scene: Scene, baseline: Evaluation) -> Problem:
+        return RobustProblem.of(config, scene, baseline)
+
+    def sample(self, problem: Problem, own, settings) -> list[NDArray[np.float64]]:
         """Return the points of the nominal optimum and of the other optima of the first stage.
 
-        Without an optimum, return the baseline's point, moved onto the feasible set."""
-        found = []
-        if self.nominal.optimized is not None:
-            found.append(self.problem.point(list(self.nominal.optimized.design.values())))
+        Without an optimum, return the baseline's `own` point. All are moved onto the feasible
+        set."""
+        del settings
+        found = [] if self.nominal.optimized is None else [self.nominal.optimized.design]
         if self.nominal.optimality is not None:
-            optima = self.nominal.optimality.optima
-            found += [self.problem.point(list(one.design.values())) for one in optima]
-        found = found or [baseline_point]
-        self._sample = [self.problem.project(point) for point in found]
-        return [point for point in self._sample if self.problem.feasible(point)]
+            found += [one.design for one in self.nominal.optimality.optima]
+        points = [problem.point(list(design.values())) for design in found] or [own]
+        return [problem.project(point) for point in points]
 
-    def _starts(self, trials) -> list[NDArray[np.float64]]:
-        """Return the optima of the first stage, without those close to another in the unit box."""
-        del trials
-        chosen: list[NDArray[np.float64]] = []
-        for point in self._sample:
-            apart = all(np.linalg.norm(point - other) > 0.03 for other in chosen)
-            if apart and self.problem.feasible(point) and len(chosen) < self.settings.starts:
-                chosen.append(point)
-        return chosen
-
-    def _local(self, start: int, evaluation: Evaluation, point) -> Local | None:
-        problem = self.problem
+    def local(self, problem: Problem, start: int, evaluation: Evaluation, point) -> Local | None:
         assert isinstance(problem, RobustProblem)
         if not evaluation.usable:
             return None
@@ -209,8 +195,8 @@ class TolerantSearch:
         self._done, self._expected = len(nominal.history), self._stage.expected
         self._nominal = nominal
         how = self._report, self.stop, self.checkpoint, self.runs
-        stage = RobustSearch(self.config, nominal, *how)
-        self._stage = stage
+        second = RobustStage(nominal, self.config.optimizer.starts)
+        self._stage = stage = Search(self.config, *how, second)
         found = stage.run()
         if found.problem is None:
             return found
@@ -235,7 +221,7 @@ class TolerantSearch:
     def _report(self, done: int, expected: int, best: float) -> None:
         self.progress(self._done + done, self._expected + expected, best)
 
-    def _compared(self, stage: RobustSearch, found: Optimization) -> tuple[dict, dict]:
+    def _compared(self, stage: Search, found: Optimization) -> tuple[dict, dict]:
         """Return the fields `fresh` and `scenes` of `Robustness`."""
         tolerances = self.config.tolerances
         assert tolerances is not None
@@ -364,7 +350,7 @@ def search_of(
 __all__ = [
     "COMPARED",
     "OBJECTIVE",
-    "RobustSearch",
+    "RobustStage",
     "Robustness",
     "Scattered",
     "TolerantSearch",

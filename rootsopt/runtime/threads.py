@@ -3,13 +3,18 @@
 import contextlib
 import os
 import threading
+import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 from threadpoolctl import threadpool_limits
+
+T = TypeVar("T")
+POLL = 0.05
+"""Interval (s) at which a waiting thread checks whether it should stop."""
 
 
 class _OneThread(contextlib.ContextDecorator):
@@ -53,3 +58,34 @@ def on_all_cores(work: Callable[..., Any], *arrays: Any) -> Any:
 
 
 __all__ = ["on_all_cores", "one_thread"]
+
+
+def until_stopped(work: Callable[[], T], stop: threading.Event, patience: float) -> T | None:
+    """Run `work()` in its own thread, and return its result, or `None` if it ends too late.
+
+    `stop`: event that asks `work` to end. Once it is set, this function waits at most `patience`
+    (s). The first `KeyboardInterrupt` sets `stop`; a second one is raised. Because `work` has its
+    own thread, an interrupt takes effect even while compiled code is running."""
+    future: Future[T] = Future()
+
+    def do() -> None:
+        try:
+            future.set_result(work())
+        except BaseException as error:
+            future.set_exception(error)
+
+    threading.Thread(target=do, daemon=True).start()
+    late = float("inf")
+    while True:
+        try:
+            wait([future], POLL)
+            if stop.is_set():
+                late = min(late, time.monotonic() + patience)
+        except KeyboardInterrupt:
+            if stop.is_set():
+                raise
+            stop.set()
+        if future.done():
+            return future.result()
+        if time.monotonic() > late:
+            return None

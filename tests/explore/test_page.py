@@ -23,7 +23,7 @@ from rootsopt.explore.session import (
     Searched,
     Session,
 )
-from rootsopt.optimize.search import Optimization
+from rootsopt.optimize.outcome import Optimization
 from rootsopt.profiles import EE
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.status import Status

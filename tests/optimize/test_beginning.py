@@ -18,7 +18,8 @@ from rootsopt.design.resemblance import Likeness
 from rootsopt.errors import InputError
 from rootsopt.optimize import beginning as module
 from rootsopt.optimize.beginning import beginning
-from rootsopt.optimize.search import Optimization, Search
+from rootsopt.optimize.outcome import Optimization
+from rootsopt.optimize.search import Search
 from rootsopt.output.runs import RunFolder
 from rootsopt.scene import outline_mm
 from rootsopt.scene.check import shape_of

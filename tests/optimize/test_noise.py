@@ -7,8 +7,8 @@ import pytest
 
 from rootsopt.config import DESIGN_KEYS, load
 from rootsopt.optimize import noise
+from rootsopt.optimize.outcome import Trial
 from rootsopt.optimize.problem import Problem
-from rootsopt.optimize.search import Trial
 from rootsopt.response.ensemble import ERRORS, SIGNIFICANT
 from rootsopt.response.evaluation import RESPONSES, Evaluation, Evaluator
 from rootsopt.status import Status

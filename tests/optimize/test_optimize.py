@@ -21,10 +21,11 @@ from rootsopt.design.space import Space, sobol
 from rootsopt.errors import InputError
 from rootsopt.optimize.infeasible import explain
 from rootsopt.optimize.problem import Problem
-from rootsopt.optimize.search import Search, until_stopped
+from rootsopt.optimize.search import Search, Stage
 from rootsopt.profiles import geometry
 from rootsopt.profiles.validity import margins
 from rootsopt.response.evaluation import Evaluation, Evaluator
+from rootsopt.runtime.threads import until_stopped
 from rootsopt.scene import Scene
 from rootsopt.status import Status
 
@@ -202,10 +203,10 @@ def test_contradicting_constraints_are_explained():
     Each can be met at the value that the other one leaves, found on a grid by projection."""
     limits = "constraints.outer_radius_max_mm=42.0", "constraints.area_efficiency_min=0.44"
     settings = config(*limits, "optimizer.screening=4", "constraints.seal_width_min_mm=0.1")
-    search = Search(settings)
-    search.problem = Problem.of(settings, Scene.from_config(settings), baseline(settings))
-    assert search._feasible(np.full(3, 0.5)) == []
-    found = explain(search.problem, search._sample)
+    problem = Problem.of(settings, Scene.from_config(settings), baseline(settings))
+    sample = Stage().sample(problem, np.full(3, 0.5), settings.optimizer)
+    assert not any(map(problem.feasible, sample))
+    found = explain(problem, sample)
     by_name = {one.name: one for one in found.conflicts}
     assert {"area efficiency", "outer radius"} <= by_name.keys()
     assert found.violation > 0.1

@@ -2,7 +2,7 @@
 
 import dataclasses
 import threading
-import types
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -10,8 +10,9 @@ import pytest
 from rootsopt.config import load
 from rootsopt.design.space import sobol
 from rootsopt.optimize import noise
+from rootsopt.optimize.outcome import Trial, history_of
 from rootsopt.optimize.problem import Problem
-from rootsopt.optimize.search import Search, Trial, _history
+from rootsopt.optimize.search import Search, Stage, _apart, _ranked
 from rootsopt.output.tables import rejected_table
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.many import HERE
@@ -25,6 +26,23 @@ def trial_of(point, objective, feasible=True) -> Trial:
     return Trial(np.asarray(point, float), 0, 0, evaluation, objective, feasible)
 
 
+@dataclasses.dataclass(frozen=True)
+class Knowing(Evaluator):
+    """An evaluator that knows the objective of each point, and at tighter tolerances a `tight`
+    one."""
+
+    truth: Callable = lambda point: 1.0
+    tight: Callable = lambda point: 1.0
+
+    def __call__(self, design=None, start=None, series=True):
+        found = self.truth(tuple(design))
+        status = Status.PERIODIC if np.isfinite(found) else Status.INACCURATE
+        return evaluation_of(found, status, design)
+
+    def at_tolerance(self, rtol):
+        return dataclasses.replace(self, truth=self.tight)
+
+
 def searching(truth=lambda point: 1.0, tight=None, **settings) -> Search:
     """Return a search over points of the unit box whose verification finds the `truth`.
 
@@ -32,10 +50,12 @@ def searching(truth=lambda point: 1.0, tight=None, **settings) -> Search:
     search = object.__new__(Search)
     search.stop, search._refuted, search._trials = threading.Event(), [], []
     search._found, search.checkpoint, search.noisy, search.runs = {}, None, True, HERE
-    search.method = settings.get("method")
-    search.settings = types.SimpleNamespace(screening=0, seed=0, starts=2)
-    vars(search.settings).update(settings)
-    search.problem = types.SimpleNamespace(
+    search.config = load("configs/cic.yaml")
+    given = {"screening": 0, "seed": 0, "starts": 2} | settings
+    search.settings = search.config.optimizer.model_copy(update=given)
+    search.method = search.settings.method
+    search.problem = object.__new__(Problem)
+    vars(search.problem).update(
         design=lambda point: point,
         objective=lambda evaluation: evaluation.response.get("mean_force_N", float("nan")),
         project=lambda point: point,
@@ -44,18 +64,9 @@ def searching(truth=lambda point: 1.0, tight=None, **settings) -> Search:
         excess=lambda evaluation: 0.0,
     )
     search._bar = 1.0
-
-    def told(truth):
-        def exact(point):
-            found = truth(tuple(point))
-            status = Status.PERIODIC if np.isfinite(found) else Status.INACCURATE
-            return evaluation_of(found, status, point)
-
-        return exact
-
-    search.exact = told(truth)
-    search.exact.at_tolerance = lambda rtol: told(tight or truth)
-    search.config = types.SimpleNamespace(solver=types.SimpleNamespace(orbit_tolerance=1e-8))
+    known = Knowing.of(search.config)
+    search.exact = dataclasses.replace(known, truth=truth, tight=tight or truth)
+    search.stage = Stage()
     return search
 
 
@@ -76,7 +87,7 @@ def test_a_promise_must_hold_up(promised, true, accepted):
     """A design is accepted only if its verified objective beats the baseline and agrees within 1
     %."""
     search = searching(lambda point: true)
-    found, record = search._verify([trial_of([0.3, 0.4], promised)])
+    found, record = search._verification().confirmed([trial_of([0.3, 0.4], promised)])
     assert (found is not None) == accepted
     assert record["holds_up"] == accepted
     if accepted:
@@ -100,20 +111,20 @@ def test_the_best_feasible_trial_that_holds_up_is_taken():
         trial_of([0.11, 0.1], 0.51),
         trial_of([0.1, 0.1], 0.5),
     ]
-    found, record = search._verify(trials)
+    found, record = search._verification().confirmed(trials)
     assert found is not None
     assert found.design == {"x0": 0.5, "x1": 0.5}
     (rejected,) = record["rejected"]
     assert rejected["verified_objective"] == 0.95
     assert not rejected["holds_up"]
-    best = [row["best_objective"] for row in _history(trials)]
+    best = [row["best_objective"] for row in history_of(trials)]
     np.testing.assert_array_equal(best, [0.65, 0.65, 0.65, 0.6, 0.51, 0.5])
-    starts = searching(starts=9)._starts(trials)
+    starts = _apart(_ranked(trials), Stage.apart, 9)
     np.testing.assert_array_equal(starts, [[0.1, 0.1], [0.5, 0.5], [0.7, 0.2]])
     only_infeasible = trial_of([0.9, 0.9], 0.3, feasible=False)
-    assert search._verify([only_infeasible])[0] is None
-    assert np.isnan(_history([only_infeasible])[0]["best_objective"])
-    assert searching()._starts([only_infeasible]) == []
+    assert search._verification().confirmed([only_infeasible])[0] is None
+    assert np.isnan(history_of([only_infeasible])[0]["best_objective"])
+    assert _ranked([only_infeasible]) == []
 
 
 SPECK = (0.3, 0.7)
@@ -137,7 +148,7 @@ def test_a_verification_is_repeated_more_tightly_and_beside_the_design(truth, ti
     0 attempts: none succeeds, and the record of the rejected design says so."""
     search = searching(truth, tight)
     trials = [trial_of(SPECK, 0.8), trial_of([0.8, 0.2], 0.95)]
-    found, record = search._verify(trials)
+    found, record = search._verification().confirmed(trials)
     assert found is not None
     if attempts:
         assert len(record["attempts"]) == attempts
@@ -180,9 +191,9 @@ class Told(Evaluator):
 def test_a_descent_goes_half_way_back_from_where_there_is_no_steady_state():
     """Other steps are those of the update rule, each from the orbit of the previous trial."""
     search = searching(method="sgd", learning_rate=0.2, iterations=6)
-    search.problem.descent = lambda point, slope: slope
-    search.problem.slope = lambda evaluation, point: 2 * (point - 0.6)
-    search.patience, search.expected = np.inf, 7
+    vars(search.problem)["descent"] = lambda point, slope: slope
+    vars(search.problem)["slope"] = lambda evaluation, point: 2 * (point - 0.6)
+    search.expected = 7
     search._lock, search._done, search._best = threading.Lock(), 0, float("nan")
     progress = []
     search.progress = lambda *numbers: progress.append(numbers)
@@ -241,12 +252,17 @@ def test_the_seed_of_a_search_chooses_its_screening():
     """The screened points are the baseline's own and the Sobol sample of `optimizer.seed`."""
     own = np.array([0.5, 0.5, 0.5])
     samples = {}
+
+    def screened(seed):
+        search = searching(screening=6, seed=seed)
+        return search.stage.sample(search.problem, own, search.settings)
+
     for seed in (0, 1, 5):
-        points = searching(screening=6, seed=seed)._feasible(own)
+        points = screened(seed)
         np.testing.assert_array_equal(points[0], own)
         samples[seed] = np.array(points[1:])
         np.testing.assert_array_equal(samples[seed], sobol(6, seed, 3))
     assert not np.any(samples[0] == samples[1])
     assert not np.any(samples[1] == samples[5])
-    again = searching(screening=6, seed=5)._feasible(own)
+    again = screened(5)
     np.testing.assert_array_equal(again[1:], samples[5])

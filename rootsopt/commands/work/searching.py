@@ -14,13 +14,13 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from rootsopt.commands import cli
 from rootsopt.config import Config
-from rootsopt.optimize.search import until_stopped
 from rootsopt.output import files
 from rootsopt.output.runs import RunFolder
 from rootsopt.response.checkpoint import Checkpoint
 from rootsopt.response.many import Runs
 from rootsopt.runtime.environment import say
 from rootsopt.runtime.journal import Journal, header_of, set_aside
+from rootsopt.runtime.threads import until_stopped
 from rootsopt.status import Status
 from rootsopt.sweeps.evaluations import evaluating
 

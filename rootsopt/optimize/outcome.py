@@ -1,0 +1,213 @@
+"""What a search returns: its trials, and its outcome with the gains over the baseline."""
+
+import dataclasses
+import operator
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rootsopt.optimize.beginning import Beginning
+from rootsopt.optimize.certificate import certify
+from rootsopt.optimize.infeasible import Infeasible
+from rootsopt.optimize.local import Local
+from rootsopt.optimize.optimality import Optimality
+from rootsopt.optimize.problem import FEASIBLE, Problem
+from rootsopt.response.evaluation import Evaluation
+from rootsopt.status import Status
+
+if TYPE_CHECKING:
+    from rootsopt.optimize.robust import Robustness
+
+
+@dataclasses.dataclass(frozen=True)
+class Trial:
+    """One evaluated design of a search.
+
+    `point` (d,): the design in the unit box. `start`: index of the local search, -1 for the
+    screening. `iteration`: index of the evaluation in the local search. `evaluation`:
+    result of the simulation. `objective`: its objective, NaN without a usable steady state.
+    `feasible`: whether all constraints of the geometry are satisfied. `local`: objective and
+    constraints with gradients, `None` if not known. `excess`: scaled amount by which limits of
+    forces are exceeded, at most 0 if they hold."""
+
+    point: NDArray[np.float64]
+    start: int
+    iteration: int
+    evaluation: Evaluation
+    objective: float
+    feasible: bool
+    local: Local | None = None
+    excess: float = 0.0
+
+    @property
+    def residual(self) -> float:
+        """Residual of the first-order conditions at the point; NaN if not known."""
+        return float("nan") if self.local is None else certify(self.local, self.point).residual
+
+    @property
+    def candidate(self) -> bool:
+        """Whether the design may become the result: it is feasible and has an objective."""
+        return self.begins and self.excess <= FEASIBLE
+
+    @property
+    def begins(self) -> bool:
+        """Whether a local search may begin at the design: only limits of forces may be violated."""
+        return self.feasible and not np.isnan(self.objective)
+
+
+@dataclasses.dataclass(frozen=True)
+class Optimization:
+    """Outcome of a search.
+
+    `problem`: the design problem, `None` if the baseline has no usable steady state. `baseline`:
+    evaluation of the baseline. `optimized`: evaluation of the best design, `None` if no design
+    better than the baseline was confirmed. `history`: one row per trial.
+
+    `verification`: the best design's objective in the search and in the verification, and
+    `holds_up`: whether they agree. `holds_up` is `None` if the search was stopped before the
+    verification. `interrupted`: whether the search was stopped.
+
+    `optimality`: first-order conditions at the best design, and outcomes of the local searches. It
+    is `None` without a verified design, or if the objective is an average over an ensemble.
+    `infeasible`: why no design satisfies all constraints, `None` if a design does. `robustness`:
+    the nominal optimum and the comparison with it, if scene or design scatter (`tolerances`).
+    `beginning`: the fitted design that began the search; `None` unless the baseline's profile is
+    from a file.
+
+    >>> import jax
+    >>> import rootsopt
+    >>> jax.config.update("jax_enable_x64", True)
+    >>> quick = ["optimizer.starts=1", "optimizer.screening=0", "optimizer.iterations=2"]
+    >>> found = rootsopt.optimize_design(rootsopt.load_config("cic", quick))
+    >>> sorted(found.improvement)
+    ['mean_force_N', 'objective', 'peak_force_N', 'rms_force_N']
+    """
+
+    problem: Problem | None
+    baseline: Evaluation
+    optimized: Evaluation | None
+    history: list[dict[str, Any]]
+    verification: dict[str, Any]
+    interrupted: bool = False
+    optimality: Optimality | None = None
+    infeasible: Infeasible | None = None
+    robustness: "Robustness | None" = None
+    beginning: Beginning | None = None
+
+    @property
+    def status(self) -> Status:
+        """Status of the search as a whole."""
+        if self.interrupted:
+            return Status.INTERRUPTED
+        if not self.baseline.usable:
+            return self.baseline.status
+        if self.infeasible is not None:
+            return Status.INFEASIBLE
+        if self.optimized is None:
+            return Status.NOT_IMPROVED
+        if self.optimality is not None and not self.optimality.converged:
+            return Status.NOT_CONVERGED
+        return self.optimized.status
+
+    @property
+    def improvement(self) -> dict[str, float]:
+        """Reductions of the objective and of the mean, peak and RMS force.
+
+        Each is a fraction of the baseline's value. The mapping is empty without an optimised
+        design."""
+        return self._gains(self.baseline, 1.0)
+
+    @property
+    def nominal(self) -> Evaluation | None:
+        """Evaluation of the family member fitted to a baseline from a file.
+
+        `None` without such a baseline, or if the member has no usable steady state."""
+        found = None if self.beginning is None else self.beginning.evaluation
+        return found if found is not None and found.usable else None
+
+    @property
+    def improvement_over_nominal(self) -> dict[str, float]:
+        """The same reductions as fractions of the values of `nominal`; empty without it.
+
+        The difference from `improvement` is the share of the measured rotor's own deviations."""
+        if self.problem is None or self.nominal is None:
+            return {}
+        return self._gains(self.nominal, self.problem.objective(self.nominal))
+
+    def _gains(self, first: Evaluation, objective: float) -> dict[str, float]:
+        """Return the reductions with respect to the evaluation `first` with this objective."""
+        if self.problem is None or self.optimized is None:
+            return {}
+        gains = {"objective": 1 - self.problem.objective(self.optimized) / objective}
+        for key in ("mean_force_N", "peak_force_N", "rms_force_N"):
+            before, after = first.response[key], self.optimized.response[key]
+            gains[key] = 1 - after / before if before > 0 else 0.0
+        return gains
+
+    @property
+    def cost(self) -> str:
+        """Sentence for a design that is worse than the baseline, because this violates limits.
+
+        It is empty for a better design, and without an optimised one."""
+        gain = self.improvement.get("objective", 0.0)
+        if self.problem is None or gain >= 0:
+            return ""
+        names = ", ".join(self.problem.broken(self.baseline))
+        return (
+            f"The baseline violates: {names}. The reported design is the best that was found to "
+            f"meet all limits. Its objective is {-100 * gain:.3g} % above that of the baseline."
+        )
+
+    @property
+    def constraints(self) -> list[dict[str, Any]]:
+        """Constraints at the optimum, one row each; empty without an optimised design."""
+        if self.problem is None or self.optimized is None:
+            return []
+        certificate = None if self.optimality is None else self.optimality.certificate
+        return self.problem.constraint_rows(self.optimized, certificate)
+
+    @property
+    def objective_by_speed(self) -> list[dict[str, float]]:
+        """Objective of the optimised design at each speed, one row per speed.
+
+        The list is empty without `objective.speeds_rpm` or without an optimised design."""
+        if self.problem is None or self.optimized is None:
+            return []
+        return self.problem.by_speed(self.optimized)
+
+
+def near(point: NDArray[np.float64], others: Sequence[NDArray[np.float64]]) -> bool:
+    """Return whether `point` (d,) is closer than 0.02 to one of the points in `others`."""
+    return any(np.linalg.norm(point - other) < 0.02 for other in others)
+
+
+candidate = operator.attrgetter("candidate")
+objective = operator.attrgetter("objective")
+
+
+def history_of(trials: list[Trial]) -> list[dict[str, Any]]:
+    """Return one row per trial for the history, each with the best objective so far."""
+    rows, best = [], float("nan")
+    for number, trial in enumerate(trials, start=1):
+        if trial.candidate:
+            best = float(np.fmin(best, trial.objective))
+        evaluation = trial.evaluation
+        rows.append(
+            {
+                "evaluation": number,
+                "start": trial.start,
+                "iteration": trial.iteration,
+                "objective": trial.objective,
+                "best_objective": best,
+                "mean_force_N": evaluation.response.get("mean_force_N", float("nan")),
+                "peak_force_N": evaluation.response.get("peak_force_N", float("nan")),
+                **evaluation.design,
+                "area_efficiency": evaluation.geometry["area_efficiency"],
+                "feasible": trial.feasible and trial.excess <= FEASIBLE,
+                "residual": trial.residual,
+                "status": evaluation.status.label,
+            }
+        )
+    return rows
