@@ -23,8 +23,8 @@ MOST = {
     "depth of imports": 38,
     "config keys": 153,
     "lines of the longest help": 60,
-    "pages of docs": 49,
-    "words of docs": 42_800,
+    "pages of docs": 42,
+    "words of docs": 31_851,
 }
 """Greatest values that are accepted. Lower them when the project becomes lighter. Whoever raises
 one gives the reason in the changelog: what users can do now that is worth the weight."""

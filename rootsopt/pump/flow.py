@@ -5,7 +5,7 @@ at distance s from the pitch point, ρ1² + ρ2² = 2 (r² + s²), and the flow 
 
     Q = ω L (r_a² - r² - s²).
 
-r is the pitch radius, r_a the outer radius, L the rotor's length. `docs/flow.md` derives this and
+r is the pitch radius, r_a the outer radius, L the rotor's length. `docs/pump.md` derives this and
 what follows from it.
 """
 

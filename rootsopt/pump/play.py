@@ -2,7 +2,7 @@
 
 A turn of rotor 2 moves its points on circles about its axis. It ends where the angle between the
 two outlines, seen from this axis, becomes zero at some radius. This holds for any outline that does
-not fold back as seen from the axis, conjugate or not, and for turns of any size. `docs/play.md`
+not fold back as seen from the axis, conjugate or not, and for turns of any size. `docs/pump.md`
 derives the closed forms."""
 
 import equinox as eqx
