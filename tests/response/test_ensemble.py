@@ -186,14 +186,6 @@ def test_standard_errors_are_honest():
     assert np.max(apart) > 0.3
 
 
-def test_standard_error_falls_with_the_members():
-    """The standard error falls as the square root of the number of members."""
-    few = np.mean([numbers(chaotic(seed=s, members=8))[1] for s in range(4)], axis=0)
-    many = np.mean([numbers(chaotic(seed=s))[1] for s in range(4)], axis=0)
-    ratio = few / many
-    assert np.all((ratio > 1.4) & (ratio < 2.8))
-
-
 @pytest.mark.long
 def test_peak_does_not_grow_with_the_window():
     """The mean of the periods' peaks is the same over long and short windows.
