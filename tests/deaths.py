@@ -1,6 +1,6 @@
 """Runs that fail or end at a chosen file operation; `python -m tests.deaths` tries them all.
 
-The tests and the fuzzing campaign `kills` use this module. It needs no JAX, so that it can fork."""
+It needs no JAX, so that it can fork."""
 
 import argparse
 import errno
