@@ -88,7 +88,7 @@ def job(interpreter: str, newest: bool, place: Path, package: Path, tree: Path) 
     shutil.rmtree(place, ignore_errors=True)
     folder = place / ("Scripts" if os.name == "nt" else "bin")
     python, script = str(folder / "python"), str(folder / "rootsopt")
-    constraints = place.with_suffix(".txt")
+    constraints = Path(f"{place}.txt")
     constraints.write_text("" if newest else "\n".join(bounds()))
     imports = [*IMPORTS, *(["build123d"] if newest else [])]
     wanted = f"{package}[{EXTRAS},{CAD}]" if newest else f"{package}[{EXTRAS}]"
@@ -102,7 +102,7 @@ def job(interpreter: str, newest: bool, place: Path, package: Path, tree: Path) 
     }
     own = {"ROOTSOPT_CACHE": str(place / "cache")}
     end = time.monotonic() + _JOB_SECONDS
-    with place.with_suffix(".log").open("w") as log:
+    with open(f"{place}.log", "w") as log:
         for name, command in steps.items():
             print("==", name, file=log, flush=True)
             how = {"cwd": tree, "env": os.environ | own, "stdout": log, "stderr": log}
@@ -128,7 +128,7 @@ def main() -> int:
         for versions in VERSIONS:
             place = FOLDER / f"{versions}-{Path(python).name}"
             outcomes.append(job(python, versions == "newest", place, package, tree))
-            print(f"{place.name}: {outcomes[-1]}; log in {place.with_suffix('.log')}", flush=True)
+            print(f"{place.name}: {outcomes[-1]}; log in {place}.log", flush=True)
     return int({*outcomes} != {"passed"})
 
 
