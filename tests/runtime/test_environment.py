@@ -4,7 +4,6 @@ import ast
 import functools
 import json
 import os
-import re
 import subprocess
 import sys
 import types
@@ -66,28 +65,6 @@ def command(name, output, **variables):
         check=False,
         env=os.environ | variables,
     )
-
-
-def test_a_command_computes_the_same_whatever_the_environment_says(tmp_path):
-    """With all variables at once, results stay the same.
-
-    Variables that would change numbers or stop the run are named in a line on stderr."""
-    answers, tables = [], []
-    for name, variables in {"plain": {}, "odd": SET_ASIDE | HARMLESS}.items():
-        done = command("simulate", tmp_path / name, **variables)
-        assert done.returncode == 0, done.stderr
-        answers.append(json.loads((tmp_path / name / "result.json").read_text()))
-        tables.append(
-            [line for line in done.stdout.splitlines() if re.search("force|radius", line)]
-        )
-        named = set(re.findall(r"\b([A-Z][A-Z0-9_]+)=", done.stderr))
-        assert named == set(variables) & set(SET_ASIDE), done.stderr
-        lines = done.stderr.splitlines()
-        assert all(line.startswith("rootsopt: ignored: ") for line in lines), done.stderr
-    assert answers[0]["response"] == answers[1]["response"]
-    assert answers[0]["geometry"] == answers[1]["geometry"]
-    assert len(tables[0]) >= 4
-    assert tables[0] == tables[1]
 
 
 ODD = {
@@ -346,16 +323,6 @@ def test_warnings_never_end_a_command(monkeypatch):
         environment.own_process()
         with pytest.raises(UserWarning, match="only"):
             warnings.warn("only that", UserWarning, stacklevel=1)
-
-
-@pytest.mark.parametrize(
-    ("setting", "value", "agrees"),
-    [(True, "1", True), (True, "TRUE", True), (False, "0", True), (False, "", True),
-     (False, "yes", False), (True, "0", False), (False, "junk", False), ("allow", "allow", True),
-     ("allow", "raise", False), (0, "0", True), (0, "7", False), (None, "float32", False)],
-)  # fmt: skip
-def test_a_variable_that_agrees_is_not_named(setting, value, agrees):
-    assert environment._agrees(setting, value) is agrees
 
 
 def test_nothing_is_said_where_nobody_can_read_it(monkeypatch):

@@ -233,17 +233,6 @@ def test_what_is_not_ours_is_never_unpickled(folder, traced, monkeypatch, tmp_pa
     Bomb.went_off = False
 
 
-def test_an_exchanged_program_is_compiled_anew(folder, traced):
-    """A signed file of another program under this name is compiled anew."""
-    ask(Program(scaled), power=2)
-    (second,) = folder.iterdir()
-    ask(Program(scaled), power=3)
-    (third,) = set(folder.iterdir()) - {second}
-    third.write_bytes(second.read_bytes())
-    ask(Program(scaled), power=3)
-    assert len(traced) == 3
-
-
 @pytest.mark.skipif(os.name != "posix", reason="permissions of POSIX")
 def test_a_cache_others_may_write_to_is_said_once_and_not_used(folder, traced, monkeypatch, capsys):
     ask(Program(scaled))
@@ -299,18 +288,6 @@ def test_programs_that_call_out_are_not_kept(folder):
     Loaded without being lowered, they would call functions that are not set up."""
     np.testing.assert_allclose(Program(solved)(jnp.eye(2) * 2), [1, 0])
     assert not list(folder.iterdir())
-
-
-def test_the_oldest_programs_give_way(folder, monkeypatch):
-    ask(Program(scaled))
-    (oldest,) = folder.iterdir()
-    os.utime(oldest, (1e9, 1e9))
-    monkeypatch.setattr(store, "MOST_BYTES", 2.5 * oldest.stat().st_size)
-    for power in (3, 4):
-        ask(Program(scaled), power=power)
-    kept = list(folder.iterdir())
-    assert len(kept) == 2
-    assert oldest not in kept
 
 
 def place():
