@@ -4,7 +4,9 @@ import ast
 from pathlib import Path
 
 import pytest
+import yaml
 
+import rootsopt
 from tests.weight import MOST, measured
 
 ROOT = Path(__file__).parents[1]
@@ -117,6 +119,11 @@ def test_every_package_has_a_room_of_tests():
     packages = {path.name for path in PACKAGE.iterdir() if (path / "__init__.py").is_file()}
     rooms = {path.parent.name for path in (ROOT / "tests").glob("*/test_*.py")}
     assert packages <= rooms
+
+
+def test_citation_names_this_version():
+    found = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
+    assert str(found["version"]) == rootsopt.__version__
 
 
 def test_project_is_not_heavier_than_agreed():
