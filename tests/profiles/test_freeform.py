@@ -265,7 +265,11 @@ def test_single_arc_is_improved_by_a_search():
 @pytest.mark.parametrize(
     ("family", "inside"),
     [
-        ("four_arcs", "arc_center_mm: 30.0, tip_arc_radius_mm: 13.0, tip_arc_turn_deg: 40.0"),
+        pytest.param(
+            "four_arcs",
+            "arc_center_mm: 30.0, tip_arc_radius_mm: 13.0, tip_arc_turn_deg: 40.0",
+            marks=pytest.mark.long,
+        ),
         ("free_form", f"tip_arc_angle_deg: 2.0, coefficients: {SHARES.tolist()}"),
     ],
 )
