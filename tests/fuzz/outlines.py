@@ -186,11 +186,13 @@ def _section(tags: list[list[str]], name: str) -> tuple[int, int]:
 
 
 def damaged_tags(data: bytes, chance: random.Random) -> bytes:
-    """Return the data with values, codes or whole tags of a text DXF changed, mostly of
-    entities."""
-    tags = _tags(data)
-    low, high = _section(tags, "ENTITIES") if chance.random() < 0.8 else (0, len(tags))
+    """Return the data with values, codes or whole tags of a text DXF changed.
+
+    Most of them are those of entities, or of the header with unit and version."""
+    tags, name = _tags(data), chance.choice(["ENTITIES", "ENTITIES", "HEADER", ""])
+    low, high = _section(tags, name) if name else (0, len(tags))
     low, high = (low, high) if high > low else (0, len(tags))
+    versions = [*map(str, range(26)), "AC1009", "AC1032", "AC9999"] if name == "HEADER" else []
     for _ in range(chance.choice([1, 1, 1, 3, 20])):
         k = min(chance.randrange(low, high), len(tags) - 1)
         match chance.randrange(6):
@@ -201,24 +203,8 @@ def damaged_tags(data: bytes, chance: random.Random) -> bytes:
             case 2:
                 tags[k][0] = chance.choice(["0", "10", "20", "40", "-5", "1071", "99999", "x", ""])
             case _:
-                tags[k][1] = chance.choice(BAD)
+                tags[k][1] = chance.choice(BAD + versions)
     return _text(tags)
-
-
-def damaged_header(data: bytes, chance: random.Random) -> bytes:
-    """Return the data with units, version or another header variable changed, or without a
-    header."""
-    tags = _tags(data)
-    low, high = _section(tags, "HEADER")
-    places = [k for k in range(low, high) if tags[k][0].strip() == "9"]
-    special = [k for k in places if tags[k][1] in ("$INSUNITS", "$ACADVER", "$DWGCODEPAGE")]
-    for _ in range(chance.choice([1, 2])):
-        k = chance.choice(special if special and chance.random() < 0.7 else places) + 1
-        k = min(k, len(tags) - 1)
-        tags[k][1] = chance.choice([*BAD, *map(str, range(26)), "AC1009", "AC1032", "AC9999"])
-        if chance.random() < 0.2:
-            tags[k][0] = chance.choice(["40", "1", "10", "70", "310"])
-    return _text(tags[: low - 2] + tags[high + 1 :] if chance.random() < 0.1 else tags)
 
 
 def damaged_entities(data: bytes, chance: random.Random) -> bytes:
@@ -355,7 +341,7 @@ def malformed(chance: random.Random) -> tuple[bytes, str]:
     if not name.endswith(".dxf"):
         kinds.append(damaged_cells)
     elif name != "binary.dxf":
-        kinds += [damaged_tags, damaged_header, damaged_entities]
+        kinds += [damaged_tags, damaged_entities]
     return chance.choice(kinds)(good()[name], chance), Path(name).suffix
 
 
