@@ -24,9 +24,11 @@ PYTHONS ?= python3.11 python3.12 python3.13
 compat: $(VENV)/.dev
 	$(BIN)/python -m tests.compat --pythons $(PYTHONS)
 
-# Random configs, outline files and kills against the commands (about an hour).
+# Thousands of random configs, outline files and environments (about an hour).
 fuzz: $(VENV)/.dev
-	$(BIN)/python -m tests.fuzz
+	$(BIN)/python -m pytest --hypothesis-profile=fuzz -k "random or damaged_files" \
+	  tests/config/test_document.py tests/measured/test_outline_files.py
+	$(BIN)/python -m pytest --hypothesis-profile=fuzz -k random tests/runtime/test_environment.py
 
 # Mistakes put in on purpose, each to be noticed by a test (hours; goes on where it was stopped).
 mutants: $(VENV)/.mutants

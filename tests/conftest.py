@@ -47,6 +47,8 @@ except InputError:  # XLA versions differ in the flags that they take, and none 
     use_float64()
 use_cache()
 settings.register_profile("rootsopt", deadline=None, derandomize=True, max_examples=25)
+# Of `make fuzz`, with other examples in each run.
+settings.register_profile("fuzz", deadline=None, max_examples=5_000, print_blob=True)
 settings.load_profile("rootsopt")
 
 

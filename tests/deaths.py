@@ -1,14 +1,13 @@
 """Runs that fail or end at a chosen file operation; `python -m tests.deaths` tries them all.
 
-The tests and the fuzzing campaign `kills` use this module. It needs no JAX, so that it can fork."""
+It needs no JAX, so that it can fork."""
 
-import argparse
 import errno
+import functools
 import hashlib
 import itertools
 import os
 import shutil
-import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -70,16 +69,12 @@ class faulty:  # noqa: N801
 
             disk._exchanged = exchanged
         if "unlink" in self.system.operations:
-            removed = self.system.counted("rmtree", _in_halves)
+            removed = self.system.counted("rmtree", shutil.rmtree)
             disk.shutil = SimpleNamespace(rmtree=removed)  # type: ignore[assignment]
         return self.system
 
     def __exit__(self, *_) -> None:
         disk.os, lock.os, disk._exchanged, disk._renameat2, disk.shutil = self.before
-
-
-def _in_halves(path, ignore_errors=True) -> None:
-    shutil.rmtree(path, ignore_errors=ignore_errors)
 
 
 def full_disk(name: str, do: Callable[[], Any]) -> None:
@@ -137,18 +132,10 @@ def scratch() -> Path:
     return Path(tempfile.mkdtemp(prefix="deaths-", dir=memory if usable else None))
 
 
-def failures(kind: str, before: str, exchanges: bool, at: int) -> tuple[bool, list[str]]:
+def failures(place: Path, kind: str, before: str, exchanges: bool, at: int):
     """Let operation number `at` of a run fail (`full`), or the process end before or after it.
 
     Return whether there was such an operation, and what is wrong afterwards."""
-    place = scratch()
-    try:
-        return _failures(place, kind, before, exchanges, at)
-    finally:
-        shutil.rmtree(place, ignore_errors=True)
-
-
-def _failures(place: Path, kind: str, before: str, exchanges: bool, at: int):
     new = digest_of("new")
     (place / "parent").mkdir()
     target = prepared(place / "parent", before)
@@ -159,30 +146,25 @@ def _failures(place: Path, kind: str, before: str, exchanges: bool, at: int):
     if now not in (old, new) and not (now is None and not exchanges):
         wrong.append("the folder is neither the old run nor the new one")
     if kind == "full":
-        if reported is not None and ("\n" in reported or "no space left" not in reported):
-            wrong.append(f"reported as {reported!r}")
-        if reported is not None and now != old:
-            wrong.append("the folder is not as it was")
-        if reported is None and now != new:
-            wrong.append("no failure reported, but the new run is not there")
-        left = [name for name in os.listdir(target.parent) if name.startswith(".")]
-        if left or (reported is not None and sorted(os.listdir(target.parent)) != listing):
-            wrong.append(f"left behind: {sorted(os.listdir(target.parent))}")
+        names = sorted(os.listdir(target.parent))
+        if reported is None:
+            fine = now == new and not any(name.startswith(".") for name in names)
+        else:
+            fine = now == old and names == listing and "\n" not in reported
+            fine &= "no space left" in reported
+        wrong += [] if fine else [f"reported as {reported!r}, {now=}, with {names}"]
     write_run(target, "next")
     if digest(target) != digest_of("next"):
         wrong.append("the next run is not whole")
     names = os.listdir(target.parent)
-    if any(name.startswith(".") for name in names):
-        wrong.append(f"the next run leaves {names}")
     kept = {digest(target.parent / name) for name in names}
-    if before == "run" and old not in kept:
-        wrong.append("the older run is lost")
-    if now == new and new not in kept:
-        wrong.append("the new run is lost")
-    allowed = {old, new, digest_of("next")}
-    if kept - allowed:
-        wrong.append("a folder aside is no whole run")
-    return hit, wrong
+    faults = {
+        f"the next run leaves {names}": any(name.startswith(".") for name in names),
+        "the older run is lost": before == "run" and old not in kept,
+        "the new run is lost": now == new and new not in kept,
+        "a folder aside is no whole run": kept - {old, new, digest_of("next")},
+    }
+    return hit, wrong + [fault for fault, is_so in faults.items() if is_so]
 
 
 def _tried(target: Path, kind: str, before: str, exchanges: bool, at: int):
@@ -207,14 +189,14 @@ def _tried(target: Path, kind: str, before: str, exchanges: bool, at: int):
     return os.waitstatus_to_exitcode(status) == 9, None
 
 
+@functools.cache
 def digest_of(text: str) -> str | None:
     """Return the digest of a complete run."""
     place = scratch()
-    try:
-        write_run(place / "run", text)
-        return digest(place / "run")
-    finally:
-        shutil.rmtree(place)
+    write_run(place / "run", text)
+    found = digest(place / "run")
+    shutil.rmtree(place)
+    return found
 
 
 def every_operation(kind: str) -> tuple[int, list[str]]:
@@ -222,7 +204,9 @@ def every_operation(kind: str) -> tuple[int, list[str]]:
     tried, wrong = 0, []
     for before, exchanges in itertools.product(BEFORE, (True, False)):
         for at in itertools.count(1):
-            hit, found = failures(kind, before, exchanges, at)
+            place = scratch()
+            hit, found = failures(place, kind, before, exchanges, at)
+            shutil.rmtree(place)
             where = f"{kind} at operation {at}, target {before}, exchange {exchanges}"
             wrong += [f"{where}: {text}" for text in found]
             if not hit:
@@ -231,18 +215,8 @@ def every_operation(kind: str) -> tuple[int, list[str]]:
     return tried, wrong
 
 
-def main() -> int:
-    """Try every operation; print one line for each failure."""
-    parser = argparse.ArgumentParser(prog="python -m tests.deaths", description=__doc__)
-    parser.add_argument("kinds", nargs="*", default=["full", "before", "after"])
-    bad = False
-    for kind in parser.parse_args().kinds:
-        tried, wrong = every_operation(kind)
-        print(f"{kind}: {tried} operations, {len(wrong)} wrong")
-        print(*wrong, sep="\n", end="\n" if wrong else "")
-        bad |= bool(wrong) or tried < 40
-    return int(bad)
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    for kind in ("full", "before", "after"):
+        tried, wrong = every_operation(kind)
+        print(f"{kind}: {tried} operations, {len(wrong)} wrong", *wrong, sep="\n")
+        assert tried > 40

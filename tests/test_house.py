@@ -3,8 +3,9 @@
 import ast
 from pathlib import Path
 
-import pytest
+import yaml
 
+import rootsopt
 from tests.weight import MOST, measured
 
 ROOT = Path(__file__).parents[1]
@@ -65,12 +66,14 @@ LATE = {
 }  # fmt: skip
 
 
-def functions_of(path):
-    """Return (function, lines of the source file) for all functions in a file."""
-    text = path.read_text(encoding="utf-8")
-    kinds = ast.FunctionDef | ast.AsyncFunctionDef
-    nodes = [node for node in ast.walk(ast.parse(text)) if isinstance(node, kinds)]
-    return nodes, text.splitlines()
+FUNCTIONS = {
+    path: [
+        node
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+    ]
+    for path in FILES
+}
 
 
 def test_root_holds_the_face_and_the_doors():
@@ -80,43 +83,46 @@ def test_root_holds_the_face_and_the_doors():
         assert len((PACKAGE / name).read_text(encoding="utf-8").splitlines()) <= 15
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: path.relative_to(PACKAGE).as_posix())
-def test_imports_stand_at_the_top(path):
+def test_imports_stand_at_the_top():
     """Optional and slow libraries may be imported inside a function, and what `LATE` lists."""
-    allowed = OPTIONAL | SLOW | LATE.get(path.relative_to(PACKAGE).as_posix(), set())
-    for function in functions_of(path)[0]:
-        for node in ast.walk(function):
+    wrong = []
+    for path in FILES:
+        allowed = OPTIONAL | SLOW | LATE.get(path.relative_to(PACKAGE).as_posix(), set())
+        for node in (node for function in FUNCTIONS[path] for node in ast.walk(function)):
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             names += [node.module] if isinstance(node, ast.ImportFrom) else []
-            for name in names:
-                assert name in allowed or name.partition(".")[0] in OPTIONAL | SLOW, (
-                    f"line {node.lineno} imports {name} inside {function.name}"
-                )
+            late = {name for name in names if name.partition(".")[0] not in OPTIONAL | SLOW}
+            wrong += [f"{path}:{node.lineno} imports {name}" for name in late - allowed]
+    assert wrong == []
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: path.relative_to(PACKAGE).as_posix())
-def test_long_functions_say_why(path):
+def test_long_functions_say_why():
     """A comment on the first line of the definition, or on the line above it, gives the reason."""
-    nodes, lines = functions_of(path)
-    for node in nodes:
-        length = node.end_lineno - node.lineno + 1
-        taken = node.args
-        count = len(taken.posonlyargs + taken.args + taken.kwonlyargs)
-        count += (taken.vararg is not None) + (taken.kwarg is not None)
-        if length <= MOST_LINES and count <= MOST_PARAMETERS:
-            continue
-        first = min([node.lineno, *(one.lineno for one in node.decorator_list)])
-        near = [*lines[first - 2 : first], lines[node.lineno - 1]]
-        prescribed = node.name == "adapt_step_size"  # By diffrax, as beside its `init`.
-        assert prescribed or any("#" in line for line in near), (
-            f"{node.name} has {length} lines and {count} parameters"
-        )
+    wrong = []
+    for path in FILES:
+        lines = path.read_text(encoding="utf-8").splitlines()
+        for node in FUNCTIONS[path]:
+            taken, length = node.args, node.end_lineno - node.lineno + 1
+            count = len(taken.posonlyargs + taken.args + taken.kwonlyargs)
+            count += (taken.vararg is not None) + (taken.kwarg is not None)
+            first = min([node.lineno, *(one.lineno for one in node.decorator_list)])
+            said = any("#" in one for one in [*lines[first - 2 : first], lines[node.lineno - 1]])
+            # By diffrax, as beside its `init`.
+            said |= node.name == "adapt_step_size"
+            if not said and (length > MOST_LINES or count > MOST_PARAMETERS):
+                wrong.append(f"{path}: {node.name} has {length} lines and {count} parameters")
+    assert wrong == []
 
 
 def test_every_package_has_a_room_of_tests():
     packages = {path.name for path in PACKAGE.iterdir() if (path / "__init__.py").is_file()}
     rooms = {path.parent.name for path in (ROOT / "tests").glob("*/test_*.py")}
     assert packages <= rooms
+
+
+def test_citation_names_this_version():
+    found = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
+    assert str(found["version"]) == rootsopt.__version__
 
 
 def test_project_is_not_heavier_than_agreed():

@@ -14,12 +14,14 @@ import pytest
 import yaml
 
 from rootsopt import profiles
+from rootsopt.commands import console
 from rootsopt.commands.table import COMMANDS, profile
 from rootsopt.config import describe_keys, load
 from rootsopt.config.explain import GROUPS
 from rootsopt.measured.reading import read, signed_area
 from rootsopt.runtime import programs
 from rootsopt.scene import Scene, design_vector
+from tests.runtime.test_environment import HARMLESS, SET_ASIDE
 
 ROOT = Path(__file__).parents[2]
 CIC = str(ROOT / "configs" / "cic.yaml")
@@ -118,15 +120,8 @@ def test_optimize_writes_the_contract(tmp_path):
     assert abs(signed_area(loop)) == pytest.approx(best["area_mm2"], rel=1e-3)
 
 
-def test_simulate_ee_and_profile(tmp_path):
-    """Both commands write one record at top level. `profile` simulates nothing, and EE has an empty
-    design."""
-    done = command("simulate", EE, "-o", tmp_path / "ee", "--no-figures")
-    assert done.returncode == 0, done.stdout + done.stderr
-    record = json.loads((tmp_path / "ee" / "result.json").read_text())
-    assert record["design"] == {}
-    assert record["gradient"] == {}
-    assert record["response"]["peak_force_N"] > record["response"]["mean_force_N"] > 0
+def test_profile_writes_one_record(tmp_path):
+    """`profile` simulates nothing, and tells what looks like another unit."""
     odd = "--set", "scene.load.torque_N_m=4775"
     done = command("profile", EE, "-o", tmp_path / "p", "--set", "profile.lobes=2", *odd)
     assert done.returncode == 0, done.stderr
@@ -194,22 +189,15 @@ def test_unwritable_output_exits_2(tmp_path):
     assert blocker.read_text() == ""
 
 
-def test_console_command_and_help():
-    """An unknown command gets the nearest name as a suggestion. `--help` lists keys with units."""
-    run = [
-        sys.executable,
-        "-c",
-        "import sys; from rootsopt.commands.console import main; sys.exit(main())",
-    ]
-    done = subprocess.run([*run, "optimise"], capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert "optimize" in done.stderr
-    # A file after the option is not a group of keys.
-    call = [*run, "simulate", "-h", CIC]
-    done = subprocess.run(call, capture_output=True, text=True, check=False)
-    assert done.returncode == 0
-    assert "scene.timing_gear.backlash_mm" in done.stdout
-    assert "[N·m/rad]" in done.stdout
+def test_console_command(capsys):
+    """An unknown command gets the nearest name as a suggestion.
+
+    A file after `-h` is not a group of keys."""
+    assert console.main(["optimise"]) == 2
+    assert "optimize" in capsys.readouterr().err
+    with pytest.raises(SystemExit, match="0"):
+        console.main(["simulate", "-h", CIC])
+    assert "backlash_mm" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -230,25 +218,35 @@ def test_help_is_short_and_its_groups_have_every_key(command, capsys, monkeypatc
     assert set(every) < set(printed("all").splitlines())
 
 
-def test_compiled_programs_are_kept_between_processes(tmp_path):
-    """A second run finds every program in the cache and gives the same numbers.
+def test_simulate_in_an_odd_environment_with_the_programs_of_a_plain_one(tmp_path):
+    """A second run finds every program in the cache, and gives the same numbers to the last bit.
 
-    The first run shares the cache of the session. The second run has a copy of it, which no other
-    process writes to."""
-    answers = []
-    for run, cache in (("first", os.environ["ROOTSOPT_CACHE"]), ("second", tmp_path / "cache")):
-        if run == "second":
+    It has a copy of the cache, which no other process writes to. All variables are odd. Those that
+    would change numbers or stop the run are named in a line on stderr."""
+    cache, kept, answers, tables = Path(os.environ["ROOTSOPT_CACHE"]), {}, [], []
+    for run, variables in {"plain": {}, "odd": SET_ASIDE | HARMLESS}.items():
+        if run == "odd":
             unfinished = shutil.ignore_patterns(".*")
-            shutil.copytree(os.environ["ROOTSOPT_CACHE"], cache, ignore=unfinished)
+            cache = Path(shutil.copytree(cache, tmp_path / "cache", ignore=unfinished))
             kept = {path.name: path.stat().st_ino for path in cache.iterdir()}
-        arguments = EE, "--no-figures", "-o", tmp_path / run
-        done = command("simulate", *arguments, ROOTSOPT_CACHE=str(cache))
+        arguments = "simulate", EE, "--no-figures", "-o", tmp_path / run
+        done = command(*arguments, **variables | {"ROOTSOPT_CACHE": str(cache)})
         assert done.returncode == 0, done.stderr
-        assert done.stderr == ""
-        answers.append(json.loads((tmp_path / run / "result.json").read_text())["response"])
+        named = set(re.findall(r"\b([A-Z][A-Z0-9_]+)=", done.stderr))
+        assert named == set(variables) & set(SET_ASIDE), done.stderr
+        told = done.stderr.splitlines()
+        assert all(line.startswith("rootsopt: ignored: ") for line in told), done.stderr
+        record = json.loads((tmp_path / run / "result.json").read_text())
+        answers.append({key: record[key] for key in ("design", "geometry", "gradient", "response")})
+        lines = done.stdout.splitlines()
+        tables.append([line for line in lines if re.search("force|radius", line)])
     assert {"motion_from", "pair_and_tangents"} <= {name.split("-")[0] for name in kept}
     assert kept == {path.name: path.stat().st_ino for path in cache.iterdir()}
     assert answers[0] == answers[1]
+    assert answers[0]["design"] == answers[0]["gradient"] == {}
+    assert answers[0]["response"]["peak_force_N"] > answers[0]["response"]["mean_force_N"] > 0
+    assert len(tables[0]) >= 4
+    assert tables[0] == tables[1]
 
 
 def test_no_programs_are_kept_if_told_so(tmp_path, monkeypatch, capsys):

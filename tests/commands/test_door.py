@@ -247,8 +247,18 @@ def test_commands_import_late_what_a_run_may_not_need():
     """What is slow to import is imported where it is used; figures in the background."""
     names = "attractors", "optimize", "pareto", "simulate", "sweep"
     work = ", ".join(f"rootsopt.commands.work.{name}" for name in names)
-    code = f"import sys, {work}; print([n for n in ("
-    code += "'matplotlib', 'optax', 'PIL', 'scipy', 'xarray') if n in sys.modules])"
+    slow = (
+        "matplotlib",
+        "optax",
+        "PIL",
+        "scipy",
+        "xarray",
+        "jinja2",
+        "plotly",
+        "rootsopt.report.html",
+    )
+    code = "import sys; from rootsopt.commands import cli, table; cli.parser(table.profile)"
+    code += f"\nimport {work}; print([n for n in {slow} if n in sys.modules])"
     assert python(code).communicate()[0] == "[]\n"
 
 

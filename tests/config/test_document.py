@@ -1,5 +1,5 @@
-"""Tests of the YAML reader: what it accepts, rejects and limits. Also a reduced fuzzing
-campaign."""
+"""Tests of the YAML reader: what it accepts, rejects and limits. Also random
+configs."""
 
 import os
 import random
@@ -10,6 +10,8 @@ import time
 from pathlib import Path
 
 import pytest
+from hypothesis import assume, event, given
+from hypothesis import strategies as st
 
 from rootsopt.config import load, parse
 from rootsopt.config.document import MOST_BYTES, read_document
@@ -17,9 +19,7 @@ from rootsopt.config.words import named, sentence, shown
 from rootsopt.errors import InputError
 from tests.config.test_config import MINIMAL
 from tests.fuzz import configs
-from tests.fuzz.report import Report
-
-LONGEST = 500
+from tests.fuzz.verdict import LONGEST, wrong_message
 
 
 def refusal(text, *overrides):
@@ -29,7 +29,7 @@ def refusal(text, *overrides):
         parse(text, overrides)
     assert time.process_time() - began < 2
     message = str(caught.value)
-    assert configs.wrong_message(message) is None
+    assert wrong_message(message) is None
     return message
 
 
@@ -277,7 +277,7 @@ def test_odd_path_is_refused(name, words):
     with pytest.raises(InputError) as caught:
         load(name)
     assert words in str(caught.value)
-    assert configs.wrong_message(str(caught.value)) is None
+    assert wrong_message(str(caught.value)) is None
 
 
 @pytest.mark.parametrize(
@@ -302,7 +302,7 @@ def test_bytes_that_are_no_config_are_refused(tmp_path, data, words):
     with pytest.raises(InputError) as caught:
         load(path)
     assert words in str(caught.value)
-    assert configs.wrong_message(str(caught.value)) is None
+    assert wrong_message(str(caught.value)) is None
 
 
 def test_byte_order_mark_of_utf8_is_taken(tmp_path):
@@ -364,20 +364,31 @@ def test_command_refuses_in_one_line(tmp_path, text, options, words):
     assert len(done.stderr) < LONGEST + 100
 
 
-def test_random_configs(monkeypatch):
-    """Some hundred configs of `python -m tests.fuzz configs` pass, without geometry."""
-    monkeypatch.setattr(configs, "_GEOMETRIES", 0.0)
-    report = Report("configs", 280, 300)
-    configs.run(report, 0)
-    assert report.failures == []
-    assert report.total >= 280
-    kinds = {kind.rpartition(", ")[0] for kind in report.tried}
-    assert kinds == set(configs.CLASSES)
-    assert sum(n for kind, n in report.tried.items() if kind.endswith("accepted")) > 20
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("configs")
 
 
-def test_campaign_notices(tmp_path, monkeypatch):
-    """The campaign reports five kinds of failure.
+@pytest.mark.parametrize("kind", configs.CLASSES)
+@given(seed=st.integers(0))
+def test_random_configs(kind, folder, seed):
+    """Random configs are refused in one line, or accepted and read back as they were written."""
+    config, failure = configs.tried(configs.CLASSES[kind](random.Random(seed)), folder)
+    assert failure is None
+    event("refused" if config is None else "accepted")
+
+
+@pytest.mark.long
+@given(seed=st.integers(0))
+def test_geometry_of_random_configs(folder, seed):
+    """The geometry of an accepted config is finite, or refused in one line."""
+    config, _ = configs.tried(configs.CLASSES["numbers within limits"](random.Random(seed)), folder)
+    assume(config is not None)
+    assert configs.wrong_geometry(config) is None
+
+
+def test_failures_of_random_configs_are_noticed(tmp_path, monkeypatch):
+    """Five kinds of failure are reported.
 
     They are a traceback, a long message, a message of two lines, a late one, and a config that is
     not read back."""

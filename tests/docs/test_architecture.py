@@ -1,6 +1,7 @@
 """docs/architecture.md is true: what it names exists, and its table has the order of the layers."""
 
 import ast
+import functools
 import re
 import tomllib
 from pathlib import Path
@@ -28,6 +29,7 @@ def code_in(text):
     return re.findall(r"`([^`]*)`", text)
 
 
+@functools.cache
 def names_of(path):
     """Return all names of classes, functions, methods and fields that a source file defines."""
     found = set()

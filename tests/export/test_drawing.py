@@ -16,7 +16,6 @@ from rootsopt.export.coordinates import coordinates, widest
 from rootsopt.export.drawing import Drawing
 from rootsopt.export.dxf import dxf_bytes
 from rootsopt.export.pieces import Arc, outline_pieces, polyline
-from rootsopt.measured.reading import Sought, read
 from rootsopt.profiles import CIC, EE, geometry
 from rootsopt.scene import Scene, design_keys, design_vector
 
@@ -92,15 +91,6 @@ def test_every_dimension_is_drawn():
         kinds = {part.dxftype() for part in block}
         assert "LINE" in kinds
         assert kinds & {"MTEXT", "TEXT"}
-
-
-def test_drawing_is_read_back_as_an_outline(tmp_path):
-    """Frame, table and dimensions are not mistaken for the rotor."""
-    shape = PROFILES["cic 3"]
-    (tmp_path / "rotor.dxf").write_bytes(dxf_bytes(drawing(shape)))
-    loop = read(tmp_path / "rotor.dxf", sought=Sought(3, 1e3 * R)).points
-    area = np.sum(np.imag(np.conj(loop) * np.roll(loop, -1))) / 2
-    assert abs(area) == pytest.approx(float(geometry(shape).area) * 1e6, rel=1e-4)
 
 
 @pytest.mark.parametrize("name", PROFILES)

@@ -26,7 +26,7 @@ from rootsopt.export.dxf import dxf_bytes
 from rootsopt.export.pieces import Arc, Spline, outline_pieces, polyline
 from rootsopt.profiles import CIC, EE, geometry, outline, place_pair
 from rootsopt.response.series import Series
-from rootsopt.scene import Scene, check_geometry, design_keys, design_vector
+from rootsopt.scene import Scene, check_geometry, design_vector
 from rootsopt.scene.families import profile_of
 
 ROOT = Path(__file__).parents[2]
@@ -420,13 +420,3 @@ def test_bore_must_fit():
     with pytest.raises(InputError, match=r"`rotor.bore_mm` must be less than 44 .* but is 44"):
         check_geometry(config)
     check_geometry(load(ROOT / "configs/ee.yaml", ["rotor.bore_mm=43.9"]))
-
-
-def test_notes_name_the_design():
-    config = load(ROOT / "configs/cic.yaml", ["rotor.bore_mm=12", "rotor.helix_deg=30"])
-    values = design_vector(config)
-    design = dict(zip(design_keys(config), map(float, values), strict=True))
-    made = Drawing.of(config, Scene.from_config(config).profile(jnp.asarray(values)), design)
-    text = "\n".join(made.notes)
-    for words in ("pressure_angle_deg = 36.43", "bore 12 mm", "twist 30 deg", "66 mm", "3 lobes"):
-        assert words in text

@@ -1,1 +1,1 @@
-"""Fuzzing of the commands: configs, outline files, environments, kills; run by `make fuzz`."""
+"""Odd configs and outline files, made from a seed; `make fuzz` tries thousands of them."""

@@ -1,36 +1,31 @@
 """Random configs of several classes, loaded as the commands load them.
 
-A case fails if loading takes longer than `SECONDS` of CPU time, or raises anything but
-`InputError`. It also fails if the message of the error is empty, long, of several lines or
-unprintable. An accepted config must load again from its own `to_yaml` as the same config. For some
-of them the geometry is made, which must be finite or rejected."""
+A case fails if loading takes too long, or raises anything but an `InputError` with a proper
+message. An accepted config must load again from its own `to_yaml` as the same config, and its
+geometry must be finite or rejected."""
 
 import copy
 import functools
 import random
-import signal
-import tempfile
-import time
 from collections.abc import Callable
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import jax
+import numpy as np
 import yaml
 
 from rootsopt.config import FAMILY_KEYS, Config, load, parse
 from rootsopt.config.explain import all_keys, field_of, limits_of
 from rootsopt.config.section import choices
-from rootsopt.errors import InputError
-from tests.fuzz.report import Report
+from rootsopt.profiles import geometry
+from rootsopt.runtime.programs import Program
+from rootsopt.scene import Scene, check_geometry, design_vector
+from tests.fuzz.verdict import fault_of, guarded
 
 SECONDS = 2.0
 """CPU time (s) above which loading a config counts as a failure."""
-LONGEST = 500
-"""Length (characters) of a message above which it counts as a failure."""
 SHIPPED = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
-_GEOMETRIES = 0.02
-"""Share of accepted configs whose geometry is made."""
 _ONES = (1, 1, 1, 2, 3, 8)
 """Numbers of changes made at once, drawn at random."""
 
@@ -38,115 +33,40 @@ Case = tuple[bytes, tuple[str, ...]]
 """Bytes of a config file, and overrides."""
 
 
-class _LateError(BaseException):
-    """Raised if loading takes too long; code that catches `Exception` does not stop it."""
-
-
-def run(report: Report, seed: int) -> None:
-    """Try random configs of every class in turn until the report is full."""
-    from rootsopt.runtime.environment import use_float64
-
-    use_float64()
-    number = 0
-    with tempfile.TemporaryDirectory() as folder:
-        while not report.over:
-            for name, make in CLASSES.items():
-                case = make(random.Random(f"{name} {seed} {number}"))
-                config, failure = tried(case, Path(folder))
-                draw = random.Random(number)
-                if config is not None and failure is None and draw.random() < _GEOMETRIES:
-                    failure = wrong_geometry(config)
-                end = "accepted" if config is not None else "refused"
-                where = f"case {number} of seed {seed}, {_brief(case)}"
-                report.add(f"{name}, {end}", failure and f"{where}: {failure}")
-            number += 1
-
-
 def tried(case: Case, folder: Path) -> tuple[Config | None, str | None]:
     """Return the config of a case if it is accepted, and a description of the failure, if any."""
-    data, overrides = case
     path = folder / "case.yaml"
-    path.write_bytes(data)
-    try:
-        with _guarded():
-            config = load(path, overrides)
-        with _guarded(4):
+    path.write_bytes(case[0])
+    config = None
+
+    def loaded():
+        nonlocal config
+        config = load(path, case[1])
+
+    failure = fault_of(loaded, SECONDS)
+    if config is not None and failure is None:
+        with guarded(4 * SECONDS):
             same = parse(config.to_yaml().encode().decode()) == config
-        return config, None if same else "does not load again as it was written"
-    except InputError as error:
-        return None, wrong_message(str(error))
-    except _LateError:
-        return None, f"takes longer than {SECONDS} s"
-    except Exception as error:
-        return None, f"{type(error).__name__}: {str(error)[:200]!r}"
+        failure = None if same else "does not load again as it was written"
+    return config, failure
 
 
-def wrong_message(message: str) -> str | None:
-    """Return what is wrong with the message of an `InputError`, or None."""
-    faults = {
-        "empty": not message.strip(),
-        "long": len(message) > LONGEST,
-        "of several lines": len(message.splitlines()) > 1,
-        "not printable": not message.isprintable(),
-        "a traceback": "Traceback" in message,
-    }
-    found = [fault for fault, is_so in faults.items() if is_so]
-    return f"message is {', '.join(found)}: {message[:200]!r}" if found else None
+@Program
+def _measured(model, design):
+    return geometry(model.profile(design))
 
 
 def wrong_geometry(config: Config) -> str | None:
-    """Return what is wrong with the geometry of an accepted config, or None.
+    """Return what is wrong with the geometry of an accepted config, or None."""
 
-    The geometry must be finite or rejected."""
-    import jax
-    import numpy as np
-
-    from rootsopt.profiles import geometry
-    from rootsopt.runtime.programs import Program
-    from rootsopt.scene import Scene, check_geometry, design_vector
-
-    global _measured
-    if _measured is None:
-        _measured = Program(lambda model, design: geometry(model.profile(design)))
-    try:
+    def made():
         check_geometry(config)
-        model = Scene.from_config(config)
-        shape = _measured(model, design_vector(config))
-    except InputError as error:
-        return wrong_message(str(error))
-    except Exception as error:
-        return f"geometry: {type(error).__name__}: {str(error)[:200]!r}"
-    finite = all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(shape))
-    return None if finite and float(shape.area) > 0 else f"geometry is not finite: {shape}"
+        shape = _measured(Scene.from_config(config), design_vector(config))
+        finite = all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(shape))
+        if not (finite and float(shape.area) > 0):
+            raise ArithmeticError(f"not finite: {shape}")
 
-
-_measured: Any = None
-
-
-@contextmanager
-def _guarded(times: float = 1):
-    """Raise `_LateError` in code that takes more CPU time than `times` times `SECONDS`."""
-    seconds = times * SECONDS
-
-    def late(*_):
-        raise _LateError
-
-    before = signal.signal(signal.SIGVTALRM, late)
-    began = time.process_time()
-    # Raise it repeatedly, because an exception inside a destructor is lost.
-    signal.setitimer(signal.ITIMER_VIRTUAL, seconds, 0.1)
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_VIRTUAL, 0)
-        signal.signal(signal.SIGVTALRM, before)
-        if time.process_time() - began > seconds:
-            raise _LateError
-
-
-def _brief(case: Case) -> str:
-    data, overrides = case
-    return f"{data[:80]!r}{'...' if len(data) > 80 else ''} {[o[:80] for o in overrides]}"
+    return fault_of(made)
 
 
 # What configs are made of

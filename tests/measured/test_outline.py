@@ -20,7 +20,7 @@ from rootsopt.measured.loop import Loop
 from rootsopt.measured.source import advice, outline_of
 from rootsopt.optimize.design import optimize_design
 from rootsopt.profiles import CIC, EE, geometry, outline
-from rootsopt.scene import Scene, check_geometry, design_vector
+from rootsopt.scene import check_geometry
 from rootsopt.scene.families import free_form_of
 from rootsopt.tradeoffs.trace import pareto_front
 
@@ -298,33 +298,6 @@ def test_profile_command_reads_its_own_files(tmp_path):
         area = float(found.area) * 1e6
         assert area == pytest.approx(record["geometry"]["area_mm2"], rel=1e-7)
         assert max(-conjugacy(found).least, conjugacy(found).most) < 5e-8
-
-
-@pytest.mark.long
-def test_pair_has_the_forces_of_the_profile(tmp_path):
-    """Force and torques of a whole pair agree, drive and coast, over poses and speeds."""
-    path = write(tmp_path / "points.csv", points_of(CIC3))
-    config = parse(CONFIG.format(path))
-    truth = parse(
-        CONFIG.format(path),
-        [
-            "profile.family=cic",
-            "profile.outline_file=null",
-            "profile.pressure_angle_deg=36.43",
-            "profile.involute_length_mm=8.5",
-            "profile.tip_arc_angle_deg=4",
-        ],
-    )
-    poses = np.random.default_rng(1).uniform([0, -2e-3, -5], [2.1, 2e-3, 5], (200, 3))
-    pairs = [Scene.from_config(c).pair(design_vector(c)) for c in (config, truth)]
-    forces = [
-        jax.jit(lambda x, p=p: jax.lax.map(lambda s: p.contact_force(*s), x))(poses) for p in pairs
-    ]
-    largest = float(jnp.max(forces[1].total))
-    assert largest > 100
-    for name in ("drive", "coast", "torque1", "torque2"):
-        one, other = (np.asarray(getattr(f, name)) for f in forces)
-        assert np.max(np.abs(one - other)) < 1e-4 * largest * (R if "torque" in name else 1)
 
 
 @pytest.mark.long

@@ -43,13 +43,9 @@ _OF = {
     "dynamics/timescales": "extremes dynamics",
     "dynamics/flanks": "pair drive dynamics scene steady",
     "dynamics/pair": "pair drive dynamics scene steady",
-    "dynamics/peak": "flow extremes steady gradients",
-    "dynamics/saltation": "gradients steady",
     "dynamics/settle": "dynamics steady gradients",
     "dynamics/steady": "orbit measures steady gradients extremes",
     "dynamics/stepping": "stepping flow",
-    "dynamics/switches": "pair steady gradients",
-    "dynamics/tangent": "orbit steady gradients measures",
     "dynamics/varied": "known maxima loads",
     "dynamics/verdict": "pair extremes steady accuracy",
     "dynamics/window": "window idle steady",
@@ -140,54 +136,3 @@ ROOMS = {
     f"rootsopt/{module}.py": tuple(_FILES[f"test_{word}"] for word in words.split())
     for module, words in _OF.items()
 }
-
-
-_FOLDERS = (
-    "contact",
-    "continuation",
-    "design",
-    "dynamics",
-    "optimize",
-    "profiles",
-    "pump",
-    "tradeoffs",
-)
-_RESPONSE = (
-    "checkpoint",
-    "ensemble",
-    "many",
-    "members",
-    "reducers",
-    "result",
-    "scatter",
-    "sensitivity",
-    "speeds",
-    "starts",
-    "steady",
-    "terms",
-    "together",
-)
-
-
-def modules(root: Path) -> list[str]:
-    """Return the numerical modules.
-
-    Raises `LookupError` for a module without tests, or tests without a module."""
-    found = {path.relative_to(root).as_posix() for path in _numerical(root)}
-    if found != set(ROOMS):
-        odd = ", ".join(sorted(found ^ set(ROOMS)))
-        raise LookupError(f"tests/mutants/rooms.py and the package differ in {odd}")
-    return sorted(found)
-
-
-def _numerical(root: Path):
-    package = root / "rootsopt"
-    yield package / "config" / "families.py"
-    for name in _RESPONSE:
-        yield package / "response" / f"{name}.py"
-    for name in ("axes", "plan", "table"):
-        yield package / "sweeps" / f"{name}.py"
-    for folder in _FOLDERS:
-        for path in (package / folder).rglob("*.py"):
-            if path.name not in ("__init__.py", "__main__.py"):
-                yield path

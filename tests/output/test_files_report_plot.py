@@ -4,8 +4,6 @@ import csv
 import dataclasses
 import json
 import os
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -128,13 +126,6 @@ def test_csv_refuses_uneven_columns(tmp_path):
     assert os.listdir(tmp_path) == []
 
 
-def test_profile_columns():
-    columns = files.profile_columns(np.array([[45.0, 0.0], [0.0, 30.0]]))
-    assert {name: list(values) for name, values in columns.items()} == {
-        "x_mm": [45.0, 0.0], "y_mm": [0.0, 30.0],
-    }  # fmt: skip
-
-
 def test_json_has_null_for_what_is_not_finite(tmp_path):
     data = {
         "a": float("nan"),
@@ -151,33 +142,6 @@ def test_json_has_null_for_what_is_not_finite(tmp_path):
         "a": None, "b": [None, 1.5], "c": [1, 2],
         "d": {"e": True, "f": None, "g": "chaotic"},
     }  # fmt: skip
-
-
-def test_files_are_replaced_whole_and_leave_nothing_else(tmp_path):
-    folder = files.ResultFolder(tmp_path)
-    folder.write_text("config.yaml", "old")
-    folder.write_text("config.yaml", "new")
-    folder.write_text("figures/note.txt", "x")
-    assert sorted(os.listdir(tmp_path)) == ["config.yaml", "figures"]
-    assert os.listdir(tmp_path / "figures") == ["note.txt"]
-    assert (tmp_path / "config.yaml").read_text() == "new"
-
-
-@pytest.mark.parametrize("step", ["fsync", "replace"])
-def test_a_failing_write_keeps_the_old_file(tmp_path, monkeypatch, step):
-    folder = files.ResultFolder(tmp_path)
-    folder.write_text("result.json", "old")
-
-    def fail(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(files.disk.os, step, fail)
-    with pytest.raises(InputError, match="no space left on device") as caught:
-        folder.write_text("result.json", "new")
-    assert "\n" not in str(caught.value)
-    monkeypatch.undo()
-    assert os.listdir(tmp_path) == ["result.json"]
-    assert (tmp_path / "result.json").read_text() == "old"
 
 
 def test_a_new_folder_is_made_with_its_parents(tmp_path):
@@ -213,22 +177,6 @@ def test_impossible_names_are_refused(tmp_path, monkeypatch, name):
     with pytest.raises(InputError):
         files.ResultFolder(name)
     assert os.listdir(tmp_path) == []
-
-
-def test_versions():
-    found = files.versions()
-    assert set(found) == {
-        "python", "rootsopt", "jax", "jaxlib", "diffrax", "optax", "equinox", "numpy",
-    }  # fmt: skip
-    assert found["numpy"] == np.__version__
-
-
-def test_importing_files_and_report_does_not_import_matplotlib():
-    code = (
-        "from rootsopt.output import files, tables, terminal;"
-        "import sys; sys.exit('matplotlib' in sys.modules)"
-    )
-    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 
 
 # --------------------------------------------------------------------------- tables
@@ -441,11 +389,6 @@ def test_spectrum_of_a_cosine(count):
     assert np.count_nonzero(expected) == 2
     assert frequency[0] == pytest.approx(50)
     np.testing.assert_allclose(amplitude, expected, atol=1e-12)
-
-
-def test_spectrum_at_the_highest_frequency():
-    _, amplitude = amplitude_spectrum(3.0 * (-1.0) ** np.arange(8), 0.1)
-    np.testing.assert_allclose(amplitude, [0, 0, 0, 3], atol=1e-12)
 
 
 def test_force_panels_show_each_peak_on_a_common_time_axis():

@@ -265,7 +265,7 @@ def test_a_command_on_a_full_disk(quick, capsys, monkeypatch):
     for at in range(1, 200):
         capsys.readouterr()
         with faulty(WRITING, at, full_disk) as system:
-            code = _profile(target)
+            code = _profile(target, "--export", "svg")
         if system.count < at:
             break
         told = capsys.readouterr().err

@@ -1,14 +1,14 @@
-"""Profiles agree with closed forms, the paper's equations and numerical differentiation."""
+"""CIC and EE agree with closed forms and the paper's equations.
+
+Areas against polygons are in `test_areas.py`; normals, speeds and the law of gearing of all
+families in the conformance suite."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from scipy import integrate
 
-from rootsopt.profiles import CIC, EE, flank, geometry, outline
+from rootsopt.profiles import CIC, EE, geometry, outline
 
 R = 0.033
 DEG = np.pi / 180
@@ -54,82 +54,6 @@ def both_flanks(profile, nu):
     normals = [point.beta + jnp.pi / 2 - point.psi for point in (addendum, dedendum)]
     centers = [point.beta for point in (addendum, dedendum)]
     return [profile.position(addendum), profile.position(dedendum)], normals, centers
-
-
-def inner_normals(profile, count=15, margin=0.02):
-    """Return normal angles strictly inside the smooth segments.
-
-    They keep clear of joints and pitch point."""
-    pieces = [
-        np.linspace(a + margin * (b - a), b - margin * (b - a), count)
-        for a, b in ((float(s.start), float(s.stop)) for s in profile.segments())
-        if b > a
-    ]
-    return np.concatenate(pieces)
-
-
-# Area
-
-
-def mean_square_distance(lobes, alpha, u, tip):
-    """Return ⟨s²⟩ over the roll angle of a CIC.
-
-    It comes from plane geometry and adaptive quadrature."""
-    half = np.pi / (2 * lobes)
-    beta_u = half - u / (R * np.sin(alpha))
-    normal = np.exp(1j * (beta_u + np.pi / 2 - alpha))
-    end = R * np.exp(1j * beta_u) + u / np.tan(alpha) * normal
-    ray = np.exp(1j * tip)
-    # The arc's centre end - ρ·normal lies on the ray.
-    rho = (end * np.conj(ray)).imag / (normal * np.conj(ray)).imag
-    center = end - rho * normal
-
-    def on_arc(beta):
-        return (rho - abs(R * np.exp(1j * beta) - center)) ** 2
-
-    def on_involute(beta):
-        return (R * np.cos(alpha) * (half - beta)) ** 2
-
-    land = tip * (abs(center) + rho - R) ** 2
-    arc = integrate.quad(on_arc, tip, beta_u, epsabs=0, epsrel=1e-12, limit=400)[0]
-    involute = integrate.quad(on_involute, beta_u, half, epsabs=0, epsrel=1e-12)[0]
-    return (land + arc + involute) / half
-
-
-@given(
-    lobes=st.integers(2, 6),
-    alpha=st.floats(0.5, 0.85),
-    fraction=st.floats(0.2, 1.0),
-    tip_share=st.floats(0.0, 0.4),
-)
-def test_area_of_cic_is_that_of_the_mean_square_contact_distance(lobes, alpha, fraction, tip_share):
-    """Area = π (r² + ⟨s²⟩) for every CIC with monotone roll angle."""
-    tip = tip_share * np.pi / (2 * lobes)
-    profile = cic(lobes, alpha, fraction, tip)
-    mean = mean_square_distance(lobes, alpha, float(profile.involute_length), tip)
-    # Gauss-Legendre of an analytic integrand: rounding, times some 100 operations.
-    np.testing.assert_allclose(measure(profile).area, np.pi * (R**2 + mean), rtol=1e-11)
-
-
-@pytest.mark.parametrize("lobes", range(2, 7))
-def test_area_of_ee_is_that_of_the_mean_square_contact_distance(lobes):
-    """Area = π (r² + ⟨s²⟩) with s = (r/N) sin(N(π/2N - β))."""
-    half = np.pi / (2 * lobes)
-    square = integrate.quad(lambda b: (R / lobes * np.sin(lobes * (half - b))) ** 2, 0, half)[0]
-    area = measure(EE(lobes, R)).area
-    np.testing.assert_allclose(area, np.pi * (R**2 + square / half), rtol=1e-12)
-
-
-@every_profile
-def test_area_and_inertia_are_those_of_a_fine_polygon(profile):
-    """Green's theorem on the roll-angle form agrees with shoelace sums of the outline."""
-    x, y = np.asarray(outline(profile, 1500)).T
-    cross = x[:-1] * y[1:] - x[1:] * y[:-1]
-    second = sum(q[:-1] ** 2 + q[:-1] * q[1:] + q[1:] ** 2 for q in (x, y))
-    shape = measure(profile)
-    # Chord against arc: (h / radius)² / 12 with h about 0.02 mm on radii of 5 mm and more.
-    np.testing.assert_allclose(shape.area, cross.sum() / 2, rtol=1e-6)
-    np.testing.assert_allclose(shape.polar_area_moment, (cross * second).sum() / 12, rtol=1e-6)
 
 
 # Numbers from literature and closed forms
@@ -219,6 +143,8 @@ def test_land_is_equation_1_and_its_mate_the_circle_that_touches_it(profile):
     turned = np.pi / profile.lobes - theta
     polar = np.stack([np.cos(turned), np.sin(turned)], -1)
     np.testing.assert_allclose(positions[1], (2 * R - outer) * polar, rtol=0, atol=1e-14)
+    bend = profile.dedendum_curvature_radius(jnp.asarray(theta))
+    np.testing.assert_allclose(bend[theta < tip], 2 * R - outer, rtol=1e-12)
 
 
 @every_cic
@@ -229,74 +155,6 @@ def test_tip_arc_is_one_circle_tangent_to_land_and_involute(profile):
     points = np.asarray(both_flanks(profile, nu)[0][0]) @ [1, 1j]
     normals = (points - center) / float(profile.arc_radius)
     np.testing.assert_allclose(normals, np.exp(1j * np.asarray(nu)), rtol=0, atol=1e-12)
-
-
-# The law of gearing, normals and curvature, by numerical differentiation
-
-
-def differentiated(profile, nu, step=1e-4):
-    """Return positions (m) of both flanks with first and second differences over ν, as complex."""
-    around = [both_flanks(profile, jnp.asarray(nu + k * step))[0] for k in (-1, 0, 1)]
-    for before, here, after in zip(*around, strict=True):
-        before, here, after = (np.asarray(p) @ [1, 1j] for p in (before, here, after))
-        yield here, (after - before) / (2 * step), (after - 2 * here + before) / step**2
-
-
-@every_profile
-def test_normal_angle_is_the_direction_of_the_outline_normal(profile):
-    """ν is the polar angle of the outward normal, on the dedendum π/N - 2β + ν."""
-    nu = inner_normals(profile)
-    _, normals, centers = both_flanks(profile, jnp.asarray(nu))
-    np.testing.assert_allclose(normals[0], nu, atol=1e-14)
-    np.testing.assert_allclose(normals[1], np.pi / profile.lobes - 2 * centers[0] + nu, atol=1e-14)
-    # Counter-clockwise the addendum runs with ν, the dedendum against it.
-    for sense, normal, (_, slope, _) in zip(
-        (1, -1), normals, differentiated(profile, nu), strict=True
-    ):
-        outward = sense * slope / 1j
-        # Central differences: step² = 1e-8 times curve derivatives of order 1 to 100.
-        angle = np.angle(outward * np.exp(-1j * np.asarray(normal)))
-        np.testing.assert_allclose(angle, 0, atol=2e-6)
-
-
-@every_profile
-def test_normals_pass_through_the_pitch_point(profile):
-    """Law of gearing: the normal at a flank point meets the pitch circle at β."""
-    nu = inner_normals(profile)
-    _, _, centers = both_flanks(profile, jnp.asarray(nu))
-    for beta, (point, slope, _) in zip(centers, differentiated(profile, nu), strict=True):
-        tangent = slope / abs(slope)
-        miss = ((point - R * np.exp(1j * np.asarray(beta))) * np.conj(tangent)).real
-        # Direction error of the differences (2e-6, above) times a distance below r.
-        np.testing.assert_allclose(miss, 0, atol=2e-6 * R)
-
-
-@every_profile
-def test_speeds_and_curvature_radii_are_those_of_the_curve(profile):
-    """addendum_speed and dedendum_curvature_radius (signed), against finite differences."""
-    nu = inner_normals(profile, margin=0.05)
-    speeds = [profile.addendum_speed(jnp.asarray(nu)), profile.dedendum_speed(jnp.asarray(nu))]
-    bends = [1 / speeds[0], 1 / profile.dedendum_curvature_radius(jnp.asarray(nu))]
-    for sense, speed, bend, (_, slope, second) in zip(
-        (1, -1), speeds, bends, differentiated(profile, nu), strict=True
-    ):
-        curvature = sense * (np.conj(slope) * second).imag / abs(slope) ** 3
-        # step² times curve derivatives, and for the second difference 1e-16 / step².
-        np.testing.assert_allclose(speed, abs(slope), rtol=1e-5)
-        np.testing.assert_allclose(bend, curvature, rtol=1e-5, atol=1e-4 / R)
-
-
-@every_cic
-def test_outline_of_cic_has_no_corners(profile):
-    """C¹: the greatest turn between neighbouring chords falls with the node spacing."""
-
-    def greatest_turn(points):
-        edges = np.diff(np.asarray(outline(profile, points)) @ [1, 1j])
-        return np.max(abs(np.angle(np.roll(edges, -1) / edges)))
-
-    # A corner of angle κ would hold the turn at κ; without one it falls fourfold.
-    assert greatest_turn(1600) < 0.3 * greatest_turn(400)
-    assert greatest_turn(1600) < 0.01
 
 
 # The outline
@@ -323,19 +181,6 @@ def test_outline_has_the_symmetry_of_its_lobes(profile):
     np.testing.assert_allclose(turned, np.roll(points, -per_lobe), rtol=0, atol=1e-15)
     mirrored = np.roll(np.conj(points)[::-1], 1)
     np.testing.assert_allclose(mirrored, points, rtol=0, atol=1e-15)
-
-
-@every_profile
-def test_flank_runs_from_tip_to_root(profile):
-    """One flank goes from r_a at polar angle 0 over the pitch circle to r_i at π/N."""
-    points = np.asarray(flank(profile, 100)) @ [1, 1j]
-    shape = measure(profile)
-    assert abs(points[0]) == pytest.approx(float(shape.outer_radius), rel=1e-12)
-    assert np.angle(points[0]) == pytest.approx(0, abs=1e-12)
-    assert abs(points[-1]) == pytest.approx(float(shape.root_radius), rel=1e-12)
-    assert np.angle(points[-1]) == pytest.approx(np.pi / profile.lobes, abs=1e-12)
-    pitch = R * np.exp(1j * np.pi / (2 * profile.lobes))
-    assert np.min(abs(points - pitch)) < 1e-12
 
 
 # Design derivatives
@@ -378,30 +223,7 @@ def test_design_derivatives_of_geometry(lobes, design):
     )
 
 
-def test_geometry_maps_over_designs():
-    """geometry() gives the same under vmap as one design at a time."""
-    alpha = jnp.array([0.6, 0.65, 0.7])
-    tip = jnp.array([0.02, 0.05, 0.0])
-
-    def shape(alpha, tip):
-        return geometry(CIC(3, R, alpha, 8e-3, tip))
-
-    mapped = jax.jit(jax.vmap(shape))(alpha, tip)
-    for i in range(3):
-        single = measure(CIC(3, R, alpha[i], 8e-3, tip[i]))
-        for many, one in zip(jax.tree.leaves(mapped), jax.tree.leaves(single), strict=True):
-            np.testing.assert_allclose(many[i], one, rtol=1e-12)
-
-
 # The inverse of the roll angle
-
-
-@pytest.mark.parametrize("name", [n for n in profiles() if n not in ("paper", "longest involute")])
-def test_normal_at_inverts_the_roll_angle(name):
-    """ν(β(ν)) = ν from the tip to the pitch point."""
-    profile = profiles()[name]
-    nu = jnp.linspace(0, float(profile.pitch_normal), 301)
-    np.testing.assert_allclose(profile.normal_at(profile.roll_angle(nu)), nu, atol=1e-12)
 
 
 def test_involute_is_preferred_where_the_roll_angle_turns_back():

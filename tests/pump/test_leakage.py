@@ -256,26 +256,6 @@ def test_tips_in_series_share_the_pressure_ratio():
     assert flux(up, first) < rate < 1.1 * flux(up, first)
 
 
-@pytest.mark.long
-def test_slopes_are_those_of_differences():
-    """Of the efficiency, with respect to the design and the clearance."""
-    scene = scene_of(*LIQUID)
-    design = jnp.asarray([36.0, 8.0, 4.0])
-
-    @eqx.filter_jit
-    def efficiency(design, clearance):
-        moved = eqx.tree_at(lambda s: s.clearance, scene, clearance)
-        return leaks(moved, design).efficiency
-
-    here = design, scene.clearance
-    slopes = jax.jit(jax.jacfwd(efficiency, (0, 1)))(*here)
-    for k, step in enumerate(np.diag([1e-4, 1e-4, 1e-4])):
-        expected = (efficiency(design + step, here[1]) - efficiency(design - step, here[1])) / 2e-4
-        assert float(slopes[0][k]) == pytest.approx(float(expected), rel=2e-3, abs=1e-9)
-    expected = (efficiency(design, here[1] + 1e-8) - efficiency(design, here[1] - 1e-8)) / 2e-8
-    assert float(slopes[1]) == pytest.approx(float(expected), rel=1e-4)
-
-
 def test_curvature_of_circles():
     """On the land, two circles about their axes touch: radii r_a and 2r - r_a."""
     profile = made("five_arcs")

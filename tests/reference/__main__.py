@@ -1,12 +1,9 @@
-"""`python -m tests.reference [NAME ...]`: evaluate the cases again and compare with stored results.
+"""`python -m tests.reference [NAME ...]`: store the package's results of the cases.
 
-Prints the greatest relative difference of each quantity, and the cases in which one is too great.
-The exit code is 1 if there is such a case. With --write it writes the results instead."""
+`pytest tests/studies/test_reference.py` compares the present results with those stored."""
 
 import argparse
 import sys
-import time
-from collections.abc import Iterator
 from typing import Any
 
 from tests.reference import kept, package
@@ -28,88 +25,37 @@ def result_of(case: Case) -> dict[str, Any]:
     return how | found | {"rounding": rounding}
 
 
-def written(cases: list[Case]) -> int:
-    """Write the results of the cases beside those stored already; return the exit code."""
-    results, failed = kept.read(), 0
-    for case, said in _in_turn(cases):
-        try:
-            results[case.name] = result_of(case)
-        except ChangedError as error:
-            print(f"{said}: NOT KEPT, as it depends on rounding: {error}", flush=True)
-            failed += 1
-            continue
-        found = results[case.name]
-        most = {name: f"{off:.1e}" for name, off in found["rounding"].items() if off}
-        period = found["steady_state"].get("period", "-")
-        print(f"{said}: {found['status']}, period {period}, by rounding {most}", flush=True)
-        kept.write({one.name: results[one.name] for one in CASES if one.name in results})
-    return int(failed > 0)
-
-
-def compared(cases: list[Case]) -> int:
-    """Evaluate the cases again and print their differences from the stored results.
-
-    Returns the exit code."""
-    results, failed, worst = kept.read(), 0, {}
-    for case, said in _in_turn(cases):
-        try:
-            off, allowed = check(case, results)
-        except ChangedError as error:
-            off, allowed = {}, {}
-            failed += 1
-            print(f"{said}: FAILED: {error}", flush=True)
-            continue
-        beyond = {name: f"{x:.1e}" for name, x in off.items() if not x <= allowed[name]}
-        failed += bool(beyond)
-        print(f"{said}: " + (f"FAILED: {beyond}" if beyond else "as kept"), flush=True)
-        for name, x in off.items():
-            if allowed[name] < 1e-2:
-                worst[name] = max(worst.get(name, (0.0, "")), (x, case.name))
-    for name, (x, where) in worst.items():
-        print(f"{name:<11} at most {x:.1e} apart ({where})")
-    print(f"{failed} of {len(cases)} cases failed")
-    return int(failed > 0)
-
-
 def check(case: Case, results: dict[str, Any]) -> tuple[dict[str, float], dict[str, float]]:
     """Return the differences of a case from its stored result, and those allowed.
 
     Raises `ChangedError`."""
-    if case.name not in results:
-        raise ChangedError("nothing is kept; run with --write")
     result = results[case.name]
     if (case.config, case.overrides) != (result["config"], result["overrides"]):
-        raise ChangedError("the case itself; run with --write and its name")
+        raise ChangedError("the case itself; store it again by its name")
     return differences(package.evaluate(case.config, case.overrides), result), limits(result)
 
 
-def _in_turn(cases: list[Case]) -> Iterator[tuple[Case, str]]:
-    """Yield each case with a line of progress, which has the time of the case before."""
-    began = time.monotonic()
-    for number, case in enumerate(cases):
-        yield case, f"{time.monotonic() - began:6.0f} s  {number + 1}/{len(cases)} {case.name}"
-
-
 def main() -> int:
-    """Compare or write the named cases, or all without a name."""
+    """Store the named cases, or all without a name."""
     parser = argparse.ArgumentParser(prog="python -m tests.reference", description=__doc__)
     parser.add_argument("names", nargs="*", metavar="NAME", help="cases whose name begins so")
-    parser.add_argument("--write", action="store_true", help="keep what the package gives now")
-    parser.add_argument("--missing", action="store_true", help="only cases without a kept result")
-    parser.add_argument("--list", action="store_true", help="print the cases and their overrides")
+    parser.add_argument("--missing", action="store_true", help="only cases without a stored result")
     options = parser.parse_args()
-    names = tuple(options.names) or ("",)
-    cases = [case for case in CASES if case.name.startswith(names)]
-    if options.missing:
-        cases = [case for case in cases if case.name not in kept.read()]
-    if not cases:
-        parser.error("no case is left; --list shows those that there are")
-    if options.list:
-        for case in cases:
-            print(f"{case.name}: {case.config} {' '.join(case.overrides)}")
-        return 0
     package.start()
-    return written(cases) if options.write else compared(cases)
+    results, failed = kept.read(), 0
+    for case in CASES:
+        known = options.missing and case.name in results
+        if known or not case.name.startswith(tuple(options.names) or ""):
+            continue
+        try:
+            results[case.name] = found = result_of(case)
+        except ChangedError as error:
+            print(f"{case.name}: NOT STORED, as it depends on rounding: {error}", flush=True)
+            failed += 1
+            continue
+        print(f"{case.name}: {found['status']}, by rounding {found['rounding']}", flush=True)
+        kept.write({one.name: results[one.name] for one in CASES if one.name in results})
+    return int(failed > 0)
 
 
 if __name__ == "__main__":

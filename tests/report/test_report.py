@@ -6,7 +6,6 @@ import io
 import json
 import re
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -431,17 +430,6 @@ def test_failing_report_does_not_lose_the_run(tmp_path, monkeypatch, capfd):
     assert "no idea" in capfd.readouterr().err
     assert (tmp_path / "run" / "result.json").exists()
     assert not (tmp_path / "run" / report.REPORT).exists()
-
-
-def test_nothing_is_loaded_without_the_option():
-    code = (
-        "import sys; from rootsopt.commands import cli, table; cli.parser(table.profile);"
-        "import rootsopt.commands.work.profile; print([name for name in sys.modules"
-        " if name.split('.')[0] in ('jinja2', 'plotly') or name.startswith('rootsopt.report.')])"
-    )
-    run = [sys.executable, "-c", code]
-    done = subprocess.run(run, capture_output=True, text=True, check=True, cwd=ROOT)
-    assert done.stdout.strip() == "[]"
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,6 @@ import dataclasses
 import json
 import random
 
-import jax
 import numpy as np
 import pytest
 
@@ -82,24 +81,6 @@ def test_results_come_back_exactly(path, kind):
     journal.add([(rows[0][0], rows[1][1])])  # The first result of a key counts.
     journal.close()
     assert path.read_bytes() == data
-
-
-def test_floats_and_types_come_back(path):
-    filled(path, search)
-    found = search(path, resume=True)
-    one = found.known((0, 3), np.array([0.0]))
-    for given, back in zip(
-        jax.tree.leaves(evaluation(0.1).start), jax.tree.leaves(one.start), strict=True
-    ):
-        assert (back.dtype, back.shape) == (given.dtype, given.shape)
-        assert back.tobytes() == given.tobytes()
-    assert one.status is Status.PERIODIC
-    assert found.known((0, 3), np.array([1e-300])) is None
-    assert found.known((0, 4), np.array([0.0])) is None
-    several = found.known((-1, 2), np.array([0.1]))
-    assert several.speeds[1].evaluation.response == evaluation(2000 / 7).response
-    assert found.rows["search", "0123"][1].maxima.slopes.shape == (1, 1)
-    assert found.reused == 2
 
 
 def test_every_cut_leaves_a_file_to_go_on_with(path):

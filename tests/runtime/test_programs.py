@@ -233,17 +233,6 @@ def test_what_is_not_ours_is_never_unpickled(folder, traced, monkeypatch, tmp_pa
     Bomb.went_off = False
 
 
-def test_an_exchanged_program_is_compiled_anew(folder, traced):
-    """A signed file of another program under this name is compiled anew."""
-    ask(Program(scaled), power=2)
-    (second,) = folder.iterdir()
-    ask(Program(scaled), power=3)
-    (third,) = set(folder.iterdir()) - {second}
-    third.write_bytes(second.read_bytes())
-    ask(Program(scaled), power=3)
-    assert len(traced) == 3
-
-
 @pytest.mark.skipif(os.name != "posix", reason="permissions of POSIX")
 def test_a_cache_others_may_write_to_is_said_once_and_not_used(folder, traced, monkeypatch, capsys):
     ask(Program(scaled))
@@ -301,18 +290,6 @@ def test_programs_that_call_out_are_not_kept(folder):
     assert not list(folder.iterdir())
 
 
-def test_the_oldest_programs_give_way(folder, monkeypatch):
-    ask(Program(scaled))
-    (oldest,) = folder.iterdir()
-    os.utime(oldest, (1e9, 1e9))
-    monkeypatch.setattr(store, "MOST_BYTES", 2.5 * oldest.stat().st_size)
-    for power in (3, 4):
-        ask(Program(scaled), power=power)
-    kept = list(folder.iterdir())
-    assert len(kept) == 2
-    assert oldest not in kept
-
-
 def place():
     """Return name and purpose of a program in the store.
 
@@ -321,97 +298,74 @@ def place():
     return Program(scaled)._place(kind)[1:]
 
 
-def flags(monkeypatch, _):
-    before = place()
-    monkeypatch.setenv("XLA_FLAGS", f"{os.environ['XLA_FLAGS']} --xla_cpu_enable_fast_math=true")
-    return before
-
-
-def checks(monkeypatch, _):
-    before = place()
-    monkeypatch.setenv("EQX_ON_ERROR", "nan")
-    return before
+def variable(name, more):
+    return lambda patch: patch.setenv(name, os.environ.get(name, "") + more)
 
 
 def version(package):
-    def change(monkeypatch, _):
-        before, found = place(), metadata.version
-        programs._versions.cache_clear()
-        other = {package: "0"}
-        monkeypatch.setattr(metadata, "version", lambda name: other.get(name) or found(name))
-        return before
-
-    return change
+    found, other = metadata.version, {package: "0"}
+    return lambda patch: patch.setattr(
+        metadata, "version", lambda name: other.get(name) or found(name)
+    )
 
 
-def machine(monkeypatch, _):
-    before = place()
-    programs._machine.cache_clear()
-    monkeypatch.setattr(platform, "machine", lambda: "abacus")
-    return before
-
-
-def processor(monkeypatch, _):
-    """Remove an instruction from the processor's description; return the place before that.
+def processor(patch):
+    """Remove an instruction from the processor's description.
 
     A kept program with that instruction would end the process."""
-    before, found = place(), Path.read_text
-    programs._machine.cache_clear()
+    found = Path.read_text
 
     def other(path, *args, **kwargs):
         text = found(path, *args, **kwargs)
         return re.sub(r"(?m)^(flags|Features)(.*) \w+$", r"\1\2", text)
 
-    monkeypatch.setattr(Path, "read_text", other)
-    monkeypatch.setattr(platform, "processor", lambda: "other")
-    return before
+    patch.setattr(Path, "read_text", other)
+    patch.setattr(platform, "processor", lambda: "other")
 
 
 def setting(name, value):
-    def change(monkeypatch, _):
-        before = place()
-        found = jax.config.values[name]
+    return lambda patch: patch.setitem(SETTINGS, name, value)
+
+
+class Settings(dict):
+    """Settings of JAX, as a dictionary that can be patched."""
+
+    def __setitem__(self, name, value):
+        super().__setitem__(name, value)
         jax.config.update(name, value)
-        UNDO.append(lambda: jax.config.update(name, found))
-        return before
-
-    return change
 
 
-UNDO = []
+SETTINGS = Settings(jax.config.values)
 CHANGES = {
-    "flags of XLA": flags,
-    "checks of equinox": checks,
+    "flags of XLA": variable("XLA_FLAGS", " --xla_cpu_enable_fast_math=true"),
+    "checks of equinox": variable("EQX_ON_ERROR", "nan"),
     "precision": setting("jax_enable_x64", False),
     "matrix products": setting("jax_default_matmul_precision", "bfloat16"),
     "promotion": setting("jax_numpy_dtype_promotion", "strict"),
     "seeds": setting("jax_random_seed_offset", 1),
-    "machine": machine,
+    "machine": lambda patch: patch.setattr(platform, "machine", lambda: "abacus"),
     "processor": processor,
     **{package: version(package) for package in programs._PACKAGES},
 }
 
 
 @pytest.mark.parametrize("what", CHANGES)
-def test_a_program_is_another_after_a_change(what, folder, monkeypatch, tmp_path):
+def test_a_program_is_another_after_a_change(what, folder, monkeypatch):
     """A change of anything that the result depends on gives another program.
 
     After the change is undone, the first program is found again."""
-    caches = programs._machine, programs._versions
-    first = place()
+
+    def fresh():
+        programs._machine.cache_clear()
+        programs._versions.cache_clear()
+        return place()
+
+    first = fresh()
     assert place() == first
-    try:
-        with monkeypatch.context() as patch:
-            before = CHANGES[what](patch, tmp_path)
-            after = place()
-            assert before[0] != after[0]
-            assert before[1] != after[1]
-    finally:
-        while UNDO:
-            UNDO.pop()()
-        for cache in caches:
-            cache.cache_clear()
-    assert place() == first
+    with monkeypatch.context() as patch:
+        CHANGES[what](patch)
+        assert all(one != other for one, other in zip(first, fresh(), strict=True))
+    assert fresh() == first
 
 
 @pytest.fixture

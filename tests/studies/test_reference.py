@@ -20,7 +20,7 @@ def results():
 def agrees(case, results):
     """Assert that a case gives its stored results."""
     if case.name not in results:
-        pytest.skip("nothing is kept of it: python -m tests.reference --write --missing")
+        pytest.skip("nothing is kept of it: python -m tests.reference --missing")
     off, allowed = check(case, results)
     assert {name: x for name, x in off.items() if not x <= allowed[name]} == {}
 
@@ -63,7 +63,7 @@ OF_CONFIGS = {"cic", "ee", "free_form"}
 def test_every_status_occurs(results):
     """Every status occurs, and so do periods of 1, 2, 3 and more."""
     if missing := [case.name for case in CASES if case.name not in results]:
-        pytest.skip(f"not kept: {', '.join(missing)}: python -m tests.reference --write --missing")
+        pytest.skip(f"not kept: {', '.join(missing)}: python -m tests.reference --missing")
     statuses = {found["status"] for found in results.values()}
     assert statuses >= STATUSES
     periods = {found["steady_state"].get("period") for found in results.values()}

@@ -39,10 +39,6 @@ def imported(path):
     return found
 
 
-def test_there_are_studies():
-    assert len(STUDIES) >= 16
-
-
 @pytest.mark.parametrize("study", STUDIES)
 def test_files(study):
     """Each study has the same three files.
