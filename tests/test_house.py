@@ -24,7 +24,6 @@ OPTIONAL = {
     "ezdxf",
     "jinja2",
     "markupsafe",
-    "plotly",
 }
 OPTIONAL |= {"netCDF4", "shtab", "xarray", "zarr"}
 SLOW = {"PIL", "optax", "rich", "scipy"}

@@ -253,7 +253,7 @@ def _in_folder(command: str, config: Config, options: argparse.Namespace) -> int
     from rootsopt.output.runs import RunFolder
 
     if options.report:
-        report.require()
+        report.require("`--report`")
     body: Body = _work(command)
     with (
         RunFolder(options.output, command, options.overwrite) as folder,

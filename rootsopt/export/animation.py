@@ -78,25 +78,40 @@ def rolling_contacts(
 
 @dataclasses.dataclass(frozen=True)
 class Frames:
-    """Frames of a simulated motion, evenly spaced.
+    """Frames of a motion, evenly spaced.
 
-    `time` (n,): time (s); `rotation`, `relative` (n,): rotation of rotor 1 and ε (rad); `forces`:
-    largest force (N) on drive and coast flank in the time interval of each frame, (n,) each;
-    `samples`: number of samples of the motion that the frames cover.
+    `time` (n,): time (s); `rotation`, `relative` (n,): rotation of rotor 1 and ε (rad); `flanks`:
+    contacts of the drive and of the coast flanks; `forces`: largest force (N) on drive and coast
+    flank in the time interval of each frame, (n,) each, None in perfect rolling; `samples`: number
+    of samples of the motion that the frames cover.
     """
 
     time: NDArray[np.float64]
     rotation: NDArray[np.float64]
     relative: NDArray[np.float64]
-    forces: tuple[NDArray[np.float64], NDArray[np.float64]]
+    flanks: tuple[Contacts, Contacts]
+    forces: tuple[NDArray[np.float64], NDArray[np.float64]] | None
     samples: int
 
+    def shares(self) -> list[NDArray[np.float64]]:
+        """Return the length (n,) of each flank's arrow, as a fraction of the longest one."""
+        if self.forces is None:
+            return [flank.present.astype(float) for flank in self.flanks]
+        longest = max(1e-30, *map(np.max, self.forces))
+        return [force / longest for force in self.forces]
 
-def frames_of(series: Series, lobes: int, periods: int) -> Frames:
-    """Return the frames of a motion over `periods` mesh periods.
 
-    `periods` is limited to 4 and to the length of `series`; `lobes`: number of lobes."""
-    pitch = 2 * np.pi / lobes
+def frames_of(profile: Profile, series: Series | None = None, periods: int = 1) -> Frames:
+    """Return the frames of a motion over `periods` mesh periods, or of perfect rolling over one.
+
+    `periods` is limited to 4 and to the length of `series`. In perfect rolling, where one flank
+    takes over from the other, both ends touch; only one of them is present."""
+    pitch = 2 * np.pi / profile.lobes
+    if series is None:
+        rotation = pitch * np.arange(_FRAMES) / _FRAMES
+        drive, coast = _both(profile, rotation)
+        coast = dataclasses.replace(coast, present=coast.present & ~drive.present)
+        return Frames(0 * rotation, rotation, 0 * rotation, (drive, coast), None, 0)
     whole = max(1, round(float(np.ptp(series.rotation)) / pitch))
     periods = max(1, min(periods, whole, _MOST_PERIODS))
     samples = len(series.time) * periods // whole
@@ -106,66 +121,44 @@ def frames_of(series: Series, lobes: int, periods: int) -> Frames:
         np.array([np.max(force[a : max(b, a + 1)]) for a, b in itertools.pairwise(edges)])
         for force in (series.drive_force, series.coast_force)
     )
-    time, rotation = series.time[middle], series.rotation[middle]
-    return Frames(time, rotation, series.relative[middle], (drive, coast), samples)
+    rotation = series.rotation[middle]
+    return Frames(series.time[middle], rotation, series.relative[middle],
+                  _both(profile, rotation), (drive, coast), samples)  # fmt: skip
 
 
-def rolling_frames(profile: Profile) -> tuple[NDArray[np.float64], list[Contacts]]:
-    """Return frames of perfect rolling over one lobe pitch: rotations (n,) (rad), and the contacts
-    of drive and coast flanks.
-
-    Where one flank takes over from the other, both ends touch. Only one of them is present."""
-    rotation = 2 * np.pi / profile.lobes * np.arange(_FRAMES) / _FRAMES
-    flanks = [rolling_contacts(profile, rotation, coast) for coast in (False, True)]
-    flanks[1] = dataclasses.replace(flanks[1], present=flanks[1].present & ~flanks[0].present)
-    return rotation, flanks
+def _both(profile: Profile, rotation: NDArray[np.float64]) -> tuple[Contacts, Contacts]:
+    return rolling_contacts(profile, rotation), rolling_contacts(profile, rotation, coast=True)
 
 
-def rolling_gif(drawing: Drawing, profile: Profile) -> bytes:
-    """Return the content of a GIF of the pair in perfect rolling over one lobe pitch.
+def meshing_gif(
+    drawing: Drawing, profile: Profile, series: Series | None = None, periods: int = 1
+) -> bytes:
+    """Return the content of a GIF of the meshing pair.
 
-    `drawing`, `profile`: drawing and profile of the rotor. The GIF shows the contact and the
-    direction of its force. The size of the force is not shown, because only a simulation can give
-    it.
+    `drawing`, `profile`: drawing and profile of the rotor; `series`, `periods`: as in `frames_of`.
+    An arrow's length is proportional to the largest force in the time interval of its frame, and a
+    graph shows the force. In perfect rolling, arrows show the direction of the force alone, because
+    only a simulation can give its size.
     """
-    rotation, flanks = rolling_frames(profile)
-    made, axes = figure(9, 5.4)
-    scene = _Scene(axes[0, 0], drawing)
+    frames = frames_of(profile, series, periods)
+    rows = 1 if series is None else 2
+    made, axes = figure(9, 5.4 + 2 * (rows - 1), rows, 1, height_ratios=[2.6, 1][:rows])
+    scene, cursor = _Scene(axes[0, 0], drawing), None
     axes[0, 0].set_title("Perfect rolling: contact and direction of its force on rotor 2")
+    if series is not None:
+        axes[0, 0].set_title("Contact force on rotor 2; the arrow's length shows the force below")
+        cursor = _force_panel(axes[1, 0], series, frames.samples)
+    degrees = np.degrees(frames.rotation - frames.rotation[0])
+    shares = frames.shares()
 
     def draw(i: int) -> None:
-        scene.turn(rotation[i], rotation[i])
-        for arrow, flank in zip(scene.arrows, flanks, strict=True):
-            arrow.show(flank.point[i], flank.normal[i], float(flank.present[i]))
+        scene.turn(frames.rotation[i], frames.rotation[i] + frames.relative[i])
+        for arrow, flank, share in zip(scene.arrows, frames.flanks, shares, strict=True):
+            arrow.show(flank.point[i], flank.normal[i], float(share[i]))
+        if cursor is not None:
+            cursor.set_xdata([degrees[i], degrees[i]])
 
-    return _gif(made, draw, len(rotation))
-
-
-def simulation_gif(drawing: Drawing, profile: Profile, series: Series, periods: int) -> bytes:
-    """Return the content of a GIF of a simulated motion over `periods` mesh periods.
-
-    `drawing`, `profile`: drawing and profile of the rotor; `series`: the simulated motion.
-    `periods` is limited to 4 and to the length of `series`. The GIF shows the contacts, and a graph
-    of the force over the rotation. An arrow's length is proportional to the largest force in the
-    time interval of its frame.
-    """
-    frames = frames_of(series, profile.lobes, periods)
-    rotation, relative, forces = frames.rotation, frames.relative, frames.forces
-    longest = max(1e-30, *map(np.max, forces))
-    flanks = [rolling_contacts(profile, rotation, coast) for coast in (False, True)]
-    made, axes = figure(9, 7.4, 2, 1, gridspec_kw={"height_ratios": [2.6, 1]})
-    scene = _Scene(axes[0, 0], drawing)
-    axes[0, 0].set_title("Contact force on rotor 2; the arrow's length shows the force below")
-    cursor = _force_panel(axes[1, 0], series, frames.samples)
-    degrees = np.degrees(rotation - series.rotation[0])
-
-    def draw(i: int) -> None:
-        scene.turn(rotation[i], rotation[i] + relative[i])
-        for arrow, flank, force in zip(scene.arrows, flanks, forces, strict=True):
-            arrow.show(flank.point[i], flank.normal[i], float(force[i] / longest))
-        cursor.set_xdata([degrees[i], degrees[i]])
-
-    return _gif(made, draw, len(rotation))
+    return _gif(made, draw, len(degrees))
 
 
 def _force_panel(ax: Axes, series: Series, samples: int):

@@ -51,12 +51,9 @@ def write(
     if set(formats) & set(SOLID):
         files |= _solids(drawing, formats, folder.place)
     if "gif" in formats:
-        from rootsopt.export.animation import rolling_gif, simulation_gif
+        from rootsopt.export.animation import meshing_gif
 
-        if series is None:
-            files["figures/meshing.gif"] = rolling_gif(drawing, profile)
-        else:
-            files["figures/meshing.gif"] = simulation_gif(drawing, profile, series, periods)
+        files["figures/meshing.gif"] = meshing_gif(drawing, profile, series, periods)
     for name, data in files.items():
         folder.write_bytes(name, data)
     return [*files, *([POINTS] if "dxf" in formats else [])]

@@ -1,4 +1,4 @@
-"""The option `--report`: one HTML file that shows a run and opens without a network."""
+"""Pages that open without a network: the option `--report`, and the front of `rootsopt pareto`."""
 
 import importlib.util
 
@@ -6,17 +6,21 @@ from rootsopt.errors import InputError
 
 REPORT = "report.html"
 """Name of the report in the result folder."""
-_LIBRARIES = "jinja2", "plotly"
+FRONT = "front.html"
+"""Name of the interactive page of a front in the result folder."""
+_LIBRARIES = "bokeh", "jinja2"
 
 
-def require() -> None:
-    """Raise `InputError` unless the libraries that make the report are installed."""
-    missing = [name for name in _LIBRARIES if importlib.util.find_spec(name) is None]
-    if missing:
-        raise InputError(
-            f"`--report` needs {' and '.join(missing)}; install with `pip install "
-            "'rootsopt[pages]'`, or leave `--report` out"
-        )
+def missing(extra: str = "pages") -> str:
+    """Return the libraries of pages that are not installed, and how to install the `extra`."""
+    names = [name for name in _LIBRARIES if importlib.util.find_spec(name) is None]
+    return f"{' and '.join(names)}; install with `pip install 'rootsopt[{extra}]'`" if names else ""
 
 
-__all__ = ["REPORT", "require"]
+def require(what: str, extra: str = "pages") -> None:
+    """Raise `InputError` unless the libraries of pages are installed, which `what` needs."""
+    if words := missing(extra):
+        raise InputError(f"{what} needs {words}")
+
+
+__all__ = ["FRONT", "REPORT", "missing", "require"]

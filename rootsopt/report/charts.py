@@ -1,19 +1,38 @@
-"""Interactive charts of a report, as figures that plotly's script draws in the browser."""
+"""Interactive charts of a report, as figures that Bokeh's script draws in the browser."""
 
-import html
+# The models of Bokeh accept more than their annotations say.
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+
 import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from bokeh.models import HoverTool, Legend, Span
+from bokeh.plotting import figure
+from bokeh.themes import Theme
+from numpy.typing import NDArray
 
 from rootsopt.figures.force import amplitude_spectrum
-from rootsopt.figures.style import BLUE, COLORS, GREY, VERMILION
-from rootsopt.output.names import brief, in_words, label, stated
-from rootsopt.report.gather import Case, Run, varied
+from rootsopt.figures.style import BLUE, COLORS, GREY, ORANGE, VERMILION
+from rootsopt.output.names import brief, in_words, label, stated, value
+from rootsopt.report.gather import Case, varied
 from rootsopt.response.series import Series
 
+_INK = "#1a1a1a"
+_TEXT = {"text_font_size": "12px", "text_color": _INK, "text_font_style": "normal"}
+THEME = Theme(json={"attrs": {
+    "Plot": {"background_fill_color": None, "border_fill_color": None, "margin": 0,
+             "outline_line_color": "#cfd6da", "min_border_left": 52, "min_border_right": 8},
+    "Title": {"text_font_size": "13px", "text_color": _INK},
+    "Axis": {"axis_label_standoff": 3, "minor_tick_line_color": None}
+    | {f"{part}_{key}": x for part in ("axis_label", "major_label") for key, x in _TEXT.items()},
+    "Grid": {"grid_line_color": "#e6eaec"},
+    "Legend": {"border_line_color": None, "background_fill_color": None, "margin": 0, "padding": 2,
+               "label_text_font_size": "12px", "label_text_color": _INK},
+    "Toolbar": {"logo": None},
+}})  # fmt: skip
+"""Style of all charts on pages, for a Bokeh document."""
 _MOST_TURNS = 4
 """Number of revolutions above which the chart of a motion shows only a part at first."""
 _MOST_SAMPLES = 20_000
@@ -26,47 +45,59 @@ _FLOOR = 1e-4
 """Smallest amplitude in a spectrum, as a fraction of the largest."""
 _MOST_CURVES = 8
 """Number of lines above which a chart of a sweep shows single points instead."""
-_SYMBOLS = {True: "circle", False: "x"}
-_MARKS = "circle", "diamond", "square", "triangle-up"
-_MEANS = "mean_force_N", "rms_force_N"
-"""Forces that are drawn as dotted lines, to tell them from the peak."""
-_DASHES = "solid", "dash", "dot", "dashdot"
+_MARKS = "circle", "diamond", "square", "triangle"
+_DASHES = "solid", "dashed", "dotted", "dashdot"
 
 
-def force_chart(cases: Sequence[Case]) -> dict[str, Any] | None:
+def chart(across: str, up: str, height: int = 360, **options: Any) -> Any:
+    """Return an empty figure with labels of its axes, and a legend above it that hides lines."""
+    if "tools" not in options:
+        options |= {"tools": "box_zoom,pan,wheel_zoom,reset,save", "active_drag": "box_zoom"}
+    options["sizing_mode"] = "stretch_width"
+    made = figure(height=height, x_axis_label=across, y_axis_label=up, **options)
+    made.add_layout(Legend(orientation="horizontal", click_policy="hide"), "above")
+    return made
+
+
+def hover(made: Any, renderers: Sequence[Any], tips: Mapping[str, str], **options: Any) -> None:
+    """Show `tips`, (name, field of the data), beside the pointer over some lines or points."""
+    tool = HoverTool(tooltips=[*tips.items()], renderers=[*renderers], **options)
+    made.add_tools(tool)
+
+
+def force_chart(cases: Sequence[Case]) -> Any | None:
     """Return the chart of the contact force over time, or None if no case has a motion.
 
-    A single case shows the force on each flank. Several cases show the sum of both."""
+    A single case shows the force on each flank. Several cases show the sum of both. A line marks
+    the instant that the page's animation shows."""
     moving = _moving(cases)
     if not moving:
         return None
-    traces: list[dict[str, Any]] = []
-    for k, (case, series) in enumerate(moving):
-        shown = _thinned(series.force)
-        time = 1e3 * (series.time[shown] - series.time[0])
-        name, color = html.escape(case.name), COLORS[k % len(COLORS)]
-        dash = _DASHES[k % len(_DASHES)]
-        curves = [(name, color, dash, series.force)]
-        if len(moving) == 1:
-            name, color = "", GREY
-            curves = [
-                ("drive flank", BLUE, "solid", series.drive_force),
-                ("coast flank", VERMILION, "solid", series.coast_force),
-            ]
-        traces += [_line(time, force[shown], *style) for *style, force in curves]
-        mean = case.record.get("response", {}).get("mean_force_N")
-        if mean is not None:
-            words = f"mean, {name}" if name else "mean"
-            line = _line(time[[0, -1]], [mean, mean], words, color, "dot")
-            traces.append(line | {"hoverinfo": "skip", "hovertemplate": None})
-    layout = _layout("time (ms)", "contact force (N)")
-    layout["hovermode"] = "x unified"
-    layout["yaxis"]["rangemode"] = "tozero"
+    longest = max(1e3 * float(np.ptp(series.time)) for _, series in moving)
     turns = max(float(np.ptp(series.rotation)) / (2 * np.pi) for _, series in moving)
-    if turns > 1.5 * _MOST_TURNS:
-        longest = max(1e3 * float(np.ptp(series.time)) for _, series in moving)
-        layout["xaxis"]["range"] = [0, longest * _MOST_TURNS / turns]
-    return {"data": traces, "layout": layout, "cursor": True}
+    shown = longest * (_MOST_TURNS / turns if turns > 1.5 * _MOST_TURNS else 1)
+    made = chart("time (ms)", "contact force (N)", x_range=(0, shown))
+    made.y_range.start = 0
+    looks = zip(itertools.cycle(COLORS), itertools.cycle(_DASHES))
+    curves = [(case.name, *look, case, run, run.force)
+              for (case, run), look in zip(moving, looks, strict=False)]  # fmt: skip
+    if len(moving) == 1:
+        case, run = moving[0]
+        curves = [("drive flank", BLUE, "solid", case, run, run.drive_force),
+                  ("coast flank", VERMILION, "solid", case, run, run.coast_force)]  # fmt: skip
+    for name, color, dash, case, run, force in curves:
+        kept = _thinned(run.force)
+        time = 1e3 * (run.time[kept] - run.time[0])
+        style = {"color": color, "legend_label": name}
+        line = made.line(time, force[kept], line_dash=dash, line_width=1.6, **style)
+        tips = {name: "@y{%.5g} N", "time": "@x{%.5g} ms"}
+        hover(made, [line], tips, mode="vline", formatters={"@x": "printf", "@y": "printf"})
+        mean = case.record.get("response", {}).get("mean_force_N")
+        if mean is not None and (len(moving) > 1 or name == "drive flank"):
+            style |= {"legend_label": "mean", "color": GREY} if len(moving) == 1 else {}
+            made.line(time[[0, -1]], [mean, mean], line_dash="dotted", line_width=1.6, **style)
+    made.add_layout(Span(location=0, dimension="height", line_color="#111", name="cursor"))
+    return made
 
 
 def _moving(cases: Sequence[Case]) -> list[tuple[Case, Series]]:
@@ -74,7 +105,7 @@ def _moving(cases: Sequence[Case]) -> list[tuple[Case, Series]]:
     return [(case, case.series) for case in cases if case.series is not None]
 
 
-def spectrum_chart(cases: Sequence[Case]) -> dict[str, Any] | None:
+def spectrum_chart(cases: Sequence[Case]) -> Any | None:
     """Return the chart of the force's spectrum, or None if no case has a force that varies.
 
     The samples are uniform in rotation, so that the lines are multiples of the mesh frequency even
@@ -86,191 +117,132 @@ def spectrum_chart(cases: Sequence[Case]) -> dict[str, Any] | None:
         order, amplitude = amplitude_spectrum(series.force, step)
         shown = order <= _HARMONICS + 0.5
         frequency = step / float(np.mean(np.diff(series.time)))
-        spectra.append((html.escape(case.name), order[shown], amplitude[shown], frequency))
+        spectra.append((case.name, order[shown], amplitude[shown], frequency))
     top = max((float(np.max(one[2], initial=0.0)) for one in spectra), default=0.0)
     if top <= 0:
         return None
-    traces: list[dict[str, Any]] = []
-    for k, (name, order, amplitude, frequency) in enumerate(spectra):
-        marks = _spectrum(name, order, amplitude, frequency, k)
-        stems = [_stems(marks, _FLOOR * top)] if marks["mode"] == "markers" else []
-        traces += [*stems, marks]
-    layout = _layout("multiple of the mesh frequency", "force amplitude (N)")
-    ends = [float(np.log10(_FLOOR * top)), float(np.log10(2 * top))]
-    layout["yaxis"] |= {"type": "log", "range": ends, "exponentformat": "power"}
-    return {"data": traces, "layout": layout}
+    ends, axes = (_FLOOR * top, 2 * top), ("multiple of the mesh frequency", "force amplitude (N)")
+    made = chart(*axes, y_axis_type="log", y_range=ends)
+    tips = {"force": "@y{%.4g} N", "at": "@x{%.4g} × mesh frequency, @hertz Hz"}
+    looks = zip(itertools.cycle(COLORS), itertools.cycle(_MARKS))
+    for (name, order, amplitude, frequency), (color, mark) in zip(spectra, looks, strict=False):
+        hertz = [brief(x) for x in order * frequency]
+        data = {"x": order, "y": amplitude, "hertz": hertz}
+        style: dict[str, Any] = {"source": data, "color": color, "legend_label": name}
+        if len(order) > _LINES:
+            drawn = made.line("x", "y", **style)
+        else:
+            made.segment("x", _FLOOR * top, "x", "y", line_width=1.5, **style)
+            drawn = made.scatter("x", "y", size=7, marker=mark, **style)
+        hover(made, [drawn], {"": name} | tips, formatters={"@x": "printf", "@y": "printf"})
+    return made
 
 
-def _spectrum(
-    name: str, order: NDArray, amplitude: NDArray, frequency: float, place: int
-) -> dict[str, Any]:
-    """Return the trace of a spectrum: a mark per multiple, or a curve if there are many.
-
-    `frequency`: mesh frequency (Hz); `place`: index of the spectrum in its chart."""
-    color = COLORS[place % len(COLORS)]
-    hover = "%{y:.4g} N at %{x:.4g} × mesh frequency, %{customdata} Hz"
-    found: dict[str, Any] = {
-        "x": _plain(order),
-        "y": _plain(amplitude),
-        "customdata": [brief(value) for value in order * frequency],
-        "name": name,
-        "hovertemplate": f"{hover}<extra>{name}</extra>",
-    }
-    if len(order) > _LINES:
-        return found | {"mode": "lines", "line": {"color": color, "width": 1}}
-    symbol = _MARKS[place % len(_MARKS)]
-    return found | {"mode": "markers", "marker": {"color": color, "size": 7, "symbol": symbol}}
-
-
-def _stems(marks: Mapping[str, Any], floor: float) -> dict[str, Any]:
-    """Return the trace of a spectrum's vertical lines, from `floor` (N) up to the `marks`.
-
-    `marks`: trace of the points at the ends of the lines."""
-    across, up = [], []
-    for x, y in zip(marks["x"], marks["y"], strict=True):
-        across += [x, x, None]
-        up += [floor, y, None]
-    line = {"color": marks["marker"]["color"], "width": 1.5}
-    return {
-        "x": across, "y": up, "mode": "lines", "line": line,
-        "showlegend": False, "hoverinfo": "skip",
-    }  # fmt: skip
-
-
-def scenes_chart(groups: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, Any] | None:
+def scenes_chart(groups: Mapping[str, Sequence[Mapping[str, Any]]]) -> Any | None:
     """Return a chart of mean and peak force over the first quantity that varies between scenes.
 
     `groups`: rows of each design, one per scene, by its name. Each combination of the other
     quantities is a line of its own. Scenes without a steady state are marked by a cross. The result
     is None if there is nothing to draw."""
-    traces: list[dict[str, Any]] = []
-    across = ""
-    for name, rows in groups.items():
-        axes = varied(rows)
-        if not axes:
-            continue
-        across = across or axes[0]
-        lines: dict[tuple, list[Mapping[str, Any]]] = {}
-        for row in rows:
-            lines.setdefault(tuple(row.get(key) for key in axes[1:]), []).append(row)
-        if len(lines) > _MOST_CURVES:  # A sample without a grid: single points.
-            lines = {(): list(rows)}
-        for place, (others, scenes) in enumerate(lines.items(), start=len(traces) // 2):
-            pairs = zip(axes[1:], others, strict=False)
-            words = [stated(key, x, named=True) for key, x in pairs]
-            title = ", ".join(([name] if name else []) + words)
-            joined = bool(others) or len(axes) == 1
-            for key in ("mean_force_N", "peak_force_N"):
-                shown = f"{title}: {label(key)}" if title else label(key)
-                traces.append(_scenes(scenes, axes[0], key, shown, place, joined))
-    traces = [trace for trace in traces if trace["x"]]
-    if not traces:
+    curves = [one for name, rows in groups.items() for one in _curves(name, rows)]
+    known = [(title, key, place, joined, drawn) for place, (title, joined, rows) in
+             enumerate(curves) for key in ("mean_force_N", "peak_force_N")
+             if (drawn := [row for row in rows if row.get(key) is not None])]  # fmt: skip
+    if not known:
         return None
-    layout = _layout(html.escape(label(across)), "contact force (N)")
-    layout["yaxis"]["rangemode"] = "tozero"
-    return {"data": traces, "layout": layout}
+    across = next(varied(rows)[0] for rows in groups.values() if varied(rows))
+    found = {row[across]: None for *_, rows in known for row in rows if across in row}
+    numeric = all(isinstance(one, int | float) for one in found)
+    names: dict[str, Any] = {} if numeric else {"x_range": [*map(str, found)]}
+    made = chart(label(across), "contact force (N)", **names)
+    made.y_range.start = 0
+    for title, key, place, joined, rows in known:
+        _scenes(made, [row for row in rows if row.get(across) is not None], across, key,
+                (title, place, joined, numeric))  # fmt: skip
+    return made
 
 
-def _scenes(
-    rows: Sequence[Mapping[str, Any]], across: str, key: str, name: str, place: int, joined: bool
-) -> dict[str, Any]:
-    """Return the trace of the force `key` over the quantity `across`.
+def _curves(name: str, rows: Sequence[Mapping[str, Any]]) -> list[tuple[str, bool, list]]:
+    """Return (title, whether a line joins its points, rows) of each curve of a design."""
+    axes = varied(rows)
+    lines: dict[tuple, list[Mapping[str, Any]]] = {}
+    for row in rows if axes else ():
+        lines.setdefault(tuple(row.get(key) for key in axes[1:]), []).append(row)
+    if len(lines) > _MOST_CURVES:  # A sample without a grid: single points.
+        lines = {(): list(rows)}
+    found = []
+    for others, scenes in lines.items():
+        words = [stated(key, x, named=True) for key, x in zip(axes[1:], others, strict=False)]
+        title = ", ".join(filter(None, [name, *words]))
+        found.append((title, bool(others) or len(axes) == 1, scenes))
+    return found
 
-    `place`: index of the scenes in the chart, which chooses the colour; `joined`: whether a line
-    joins its points."""
-    drawn = [row for row in rows if row.get(key) is not None and row.get(across) is not None]
-    if joined and all(isinstance(row[across], int | float) for row in drawn):
-        drawn.sort(key=lambda row: row[across])
-    color = COLORS[place % len(COLORS)]
-    steady = [row.get("status") in ("periodic", "averaged", None) for row in drawn]
-    return {
-        "x": [row[across] for row in drawn],
-        "y": [row[key] for row in drawn],
-        "text": [html.escape(in_words(str(row.get("status", "")))) for row in drawn],
-        "name": html.escape(name),
-        "mode": "lines+markers" if joined else "markers",
-        "line": {"color": color, "width": 1.5, "dash": "dot" if key in _MEANS else "solid"},
-        "marker": {"color": color, "size": 8, "symbol": [_SYMBOLS[x] for x in steady]},
-        "hovertemplate": "%{y:.5g} N at %{x}, %{text}<extra>%{fullData.name}</extra>",
+
+def _scenes(made: Any, rows: list, across: str, key: str, curve: tuple[str, int, bool, bool]):
+    """Draw the force `key` over the quantity `across`; `curve`: as in `scenes_chart`."""
+    title, place, joined, numeric = curve
+    if numeric and joined:
+        rows = sorted(rows, key=lambda row: row[across])
+    steady = [row.get("status") in ("periodic", "averaged", None) for row in rows]
+    data = {
+        "x": [row[across] if numeric else str(row[across]) for row in rows],
+        "y": [row[key] for row in rows],
+        "mark": ["circle" if one else "x" for one in steady],
+        "status": [in_words(str(row.get("status", ""))) for row in rows],
+        "at": [stated(across, row[across]) for row in rows],
     }
+    name = f"{title}: {label(key)}" if title else label(key)
+    style: dict[str, Any] = {"color": COLORS[place % len(COLORS)], "legend_label": name}
+    if joined:
+        dash = "dotted" if key == "mean_force_N" else "solid"
+        made.line("x", "y", source=data, line_width=1.5, line_dash=dash, **style)
+    points = made.scatter("x", "y", source=data, size=8, marker="mark", **style)
+    tips = {name: "@y{%.5g} N", label(across): "@at", "status": "@status"}
+    hover(made, [points], tips, formatters={"@y": "printf"})
 
 
-def front_charts(run: Run) -> list[tuple[str, dict[str, Any]]]:
-    """Return (title, chart) of each pair of terms of a front."""
-    points = run.result.get("points") or []
-    aims = run.result.get("terms") or []
-    if not points:
-        return []
-    at = {point["point"]: point["terms"] for point in points}
-    charts = []
-    for up, across in itertools.combinations([aim["name"] for aim in aims], 2):
-        xs: list[Any] = []
-        ys: list[Any] = []
-        for first, second in run.result.get("edges") or ():
-            xs += [at[first][across], at[second][across], None]
-            ys += [at[first][up], at[second][up], None]
-        line = {"color": GREY, "width": 1.2}
-        traces: list[dict[str, Any]] = [
-            {"x": xs, "y": ys, "mode": "lines", "line": line, "hoverinfo": "skip",
-             "showlegend": False}
-        ]  # fmt: skip
-        for sure, name in ((True, "certified"), (False, "not certified")):
-            group = [point for point in points if (point["status"] == "certified") is sure]
-            if group:
-                traces.append(_front_points(group, across, up, name, sure))
-        base = (run.result.get("baseline") or {}).get("terms") or {}
-        if base.get(across) is not None and base.get(up) is not None:
-            star = {"symbol": "star", "size": 15, "color": VERMILION}
-            traces.append({"x": [base[across]], "y": [base[up]], "mode": "markers",
-                           "name": "baseline", "marker": star})  # fmt: skip
-        layout = _layout(html.escape(label(across)), html.escape(label(up)))
-        charts.append((f"{label(up)} against {label(across)}", {"data": traces, "layout": layout}))
+def front_charts(result: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a chart of each pair of terms of a front, by title.
+
+    `result`: content of the result file."""
+    points = result.get("points") or []
+    charts = {}
+    names = [aim["name"] for aim in result.get("terms") or ()] if points else []
+    for up, across in itertools.combinations(names, 2):
+        made = chart(label(across), label(up), name=f"{across} {up}")
+        at = {point["point"]: point["terms"] for point in points}
+        lines = ([[at[k][name] for k in pair] for pair in result.get("edges") or ()]
+                 for name in (across, up))  # fmt: skip
+        made.multi_line(*lines, color=GREY, line_width=1.2)
+        for name, group, style in _groups(result):
+            data = {key: [one["terms"][key] for one in group] for key in (across, up)}
+            facts = [{**one["terms"], **one.get("design", {})} for one in group]
+            tips = {key: [value(one.get(key)) for one in facts] for key in facts[0]}
+            data |= {f"shown {key}": shown for key, shown in tips.items()}
+            data["what"] = [f"{one.get('point', '')} {in_words(one['status'])}" for one in group]
+            drawn = made.scatter(across, up, source=data, legend_label=name, **style)
+            hover(made, [drawn], {"point": "@what"}
+                  | {label(key): f"@{{shown {key}}}" for key in tips})  # fmt: skip
+        charts[f"{label(up)} against {label(across)}"] = made
     return charts
 
 
-def _front_points(group, across: str, up: str, name: str, sure: bool) -> dict[str, Any]:
-    texts = []
-    for point in group:
-        rows = [f"<b>point {point['point']}</b>, {in_words(point['status'])}"]
-        numbers = {**point["terms"], **point["design"]}
-        rows += [html.escape(stated(key, x, named=True)) for key, x in numbers.items()]
-        texts.append("<br>".join(rows))
-    return {
-        "x": [point["terms"][across] for point in group],
-        "y": [point["terms"][up] for point in group],
-        "text": texts,
-        "hovertemplate": "%{text}<extra></extra>",
-        "mode": "markers",
-        "name": name,
-        "marker": {"size": 11, "color": BLUE, "symbol": "circle" if sure else "circle-open"},
-    }
-
-
-def _line(x: ArrayLike, y: ArrayLike, name: str, color: str, dash: str) -> dict[str, Any]:
-    return {
-        "x": _plain(x),
-        "y": _plain(y),
-        "name": name,
-        "mode": "lines",
-        "line": {"color": color, "width": 1.6, "dash": dash},
-        "hovertemplate": "%{y:.5g} N",
-    }
-
-
-def _layout(across: str, up: str) -> dict[str, Any]:
-    axis = {"gridcolor": "#e4e4e4", "zerolinecolor": "#bbb", "automargin": True}
-    return {
-        "height": 360,
-        "margin": {"l": 64, "r": 16, "t": 8, "b": 48},
-        "paper_bgcolor": "#fff",
-        "plot_bgcolor": "#fff",
-        "font": {"family": "system-ui, sans-serif", "size": 13, "color": "#1a1a1a"},
-        "legend": {"orientation": "h", "y": 1.02, "yanchor": "bottom"},
-        "showlegend": True,
-        "hoverlabel": {"align": "left"},
-        "xaxis": {"title": {"text": across}, **axis},
-        "yaxis": {"title": {"text": up}, **axis},
-    }
+def _groups(result: Mapping[str, Any]) -> list[tuple[str, list, dict[str, Any]]]:
+    """Return (name, points, style of the marks) of each kind of point that a front has."""
+    points, base = result["points"], result.get("baseline") or {}
+    sides = {gap[end] for gap in result.get("gaps") or () for end in ("first", "second")}
+    sure = [point for point in points if point["status"] == "certified"]
+    hollow = {"fill_color": None, "line_width": 2}
+    groups = [
+        ("side of a gap", [one for one in points if one["point"] in sides],
+         {"size": 19, "line_color": ORANGE} | hollow),
+        ("certified", sure, {"size": 11, "color": BLUE}),
+        ("not certified", [one for one in points if one not in sure],
+         {"size": 11, "line_color": BLUE} | hollow),
+        ("baseline", [base] if base.get("terms") else [],
+         {"size": 15, "marker": "star", "color": VERMILION}),
+    ]  # fmt: skip
+    return [group for group in groups if group[1]]
 
 
 def _thinned(force: NDArray[np.float64], most: int = _MOST_SAMPLES) -> NDArray[np.intp]:
@@ -285,10 +257,5 @@ def _thinned(force: NDArray[np.float64], most: int = _MOST_SAMPLES) -> NDArray[n
     return np.array(sorted(found))
 
 
-def _plain(values: ArrayLike) -> list[float | None]:
-    """Return `values` with six significant digits, and None for those that are not finite."""
-    numbers = np.asarray(values, float).tolist()
-    return [float(f"{x:.6g}") if np.isfinite(x) else None for x in numbers]
-
-
-__all__ = ["force_chart", "front_charts", "scenes_chart", "spectrum_chart"]
+__all__ = ["THEME", "chart", "force_chart", "front_charts", "hover", "scenes_chart",
+           "spectrum_chart"]  # fmt: skip

@@ -1,23 +1,37 @@
-"""Makes the report of a run: one HTML file that opens without a network.
+"""Lays out pages: the report of a run, and the page of a front. Both open without a network.
 
-The page is a Jinja2 template, and plotly's script is part of it. Everything that comes from a
+The pages are Jinja2 templates, and Bokeh's script is part of them. Everything that comes from a
 config or a result is escaped."""
+
+# pyright: reportArgumentType=false
+# (Bokeh takes any text for the identifier of an element.)
 
 import base64
 import datetime
+import functools
 import re
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import jinja2
+from bokeh.embed import json_item
+from bokeh.resources import Resources
+from markupsafe import Markup, escape
+
 import rootsopt
 from rootsopt.output import tables
+from rootsopt.output.fronts import design_file
 from rootsopt.output.names import in_words
-from rootsopt.output.table import status_cell
+from rootsopt.output.table import Table, status_cell
 from rootsopt.report import charts, wording
 from rootsopt.report.gather import Run
 from rootsopt.report.meshing import animations
+from rootsopt.scene import outline_mm
+from rootsopt.tradeoffs.front import Front
 
-_TEMPLATE = Path(__file__).with_name("template")
+TEMPLATE = Path(__file__).with_name("template")
+"""Folder of the templates, styles and scripts."""
 _CAPTIONS = {
     "profiles.png": "Rotor profile, and its flank",
     "meshing.png": "The pair at six rotations of one lobe pitch",
@@ -38,29 +52,74 @@ _UNIT = re.compile(r"(?<=\d) (?=(?:N·m|N|%|mm|µm|ms|rpm|bar|Pa|kPa|mrad|l/min)
 """Spaces between a number and its unit, where a line must not break."""
 
 
-def report_text(run: Run) -> str:
-    """Return the HTML of the report of a `run`. Characters that UTF-8 lacks become `?`."""
-    import jinja2
-    import markupsafe
-    from plotly import offline
-
-    def coded(text: str) -> markupsafe.Markup:
-        """Return a sentence with `commands` set as code, and numbers beside their units."""
-        text = _UNIT.sub("\N{NO-BREAK SPACE}", text)
-        return markupsafe.Markup(_CODE.sub(_command, str(markupsafe.escape(text))))
-
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(_TEMPLATE),
+@functools.cache
+def _environment() -> jinja2.Environment:
+    made = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(TEMPLATE),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["coded"] = coded
+    made.filters["coded"] = _coded
+    made.policies["json.dumps_kwargs"] = {}  # Bokeh reads its models in the order of writing.
+    return made
+
+
+def _coded(text: str) -> Markup:
+    """Return a sentence with `commands` set as code, and numbers beside their units."""
+    text = _UNIT.sub("\N{NO-BREAK SPACE}", text)
+    return Markup(_CODE.sub(_command, str(escape(text))))
+
+
+def _command(found: re.Match[str]) -> str:
+    """Return the HTML of a command, whose options are not divided at their hyphens."""
+    words = found[1].split(" ")
+    kept = (f'<span class="word">{x}</span>' if x.startswith("-") else x for x in words)
+    return f"<code>{' '.join(kept)}</code>"
+
+
+def table_html(table: Table | None) -> str:
+    """Return a table as HTML; "" for None."""
+    made: Any = _environment().get_template("table.html.j2").module
+    return "" if table is None else str(made.table(table))
+
+
+def _part(*names: str) -> Markup:
+    """Return files of the template folder, one after the other, as they are."""
+    return Markup("\n".join((TEMPLATE / name).read_text("utf-8") for name in names))
+
+
+def _page(template: str, drawn: Iterable[Any], data: Mapping[str, Any], **facts: Any) -> str:
+    """Return a page with charts. Characters that UTF-8 lacks become `?`.
+
+    `drawn`: the charts; `data`: what the scripts of the page read; `facts`: what its template
+    reads."""
+    items = [json_item(one, f"chart-{k}", charts.THEME) for k, one in enumerate(drawn)]
+    name = template.partition(".")[0]
+    text = (
+        _environment()
+        .get_template(template)
+        .render(
+            data={"charts": items, **data},
+            style=_part("page.css", "pair.css"),
+            script=_part("charts.js", "pair.js", f"{name}.js"),
+            bokeh=Markup(Resources("inline", components=["bokeh"]).js_raw[0]) if items else "",
+            **facts,
+        )
+    )
+    return text.encode("utf-8", "replace").decode("utf-8")
+
+
+def report_text(run: Run) -> str:
+    """Return the HTML of the report of a `run`."""
     drawn = _charts(run)
     status = status_cell(str(run.result.get("status", "")))
     animation = animations(run.cases)
-    text = environment.get_template("page.html.j2").render(
+    return _page(
+        "page.html.j2",
+        [chart for *_, chart in drawn],
+        {"animation": animation},
         title=wording.title(run),
         run=run,
         command_line=f"rootsopt {run.command} {run.source}",
@@ -73,9 +132,9 @@ def report_text(run: Run) -> str:
         what_next=wording.what_next(run),
         conflict=tables.conflict_table(run.result),
         sections=tables.sections(run.result, run.rows),
-        charts=drawn,
+        charts=[(title, note) for title, note, _ in drawn],
         animation=animation,
-        data={"charts": [one["figure"] for one in drawn], "animation": animation},
+        pair=_part("pair.html"),
         figures=[
             {
                 "caption": _CAPTIONS.get(name, in_words(name.removesuffix(".png")).capitalize()),
@@ -85,29 +144,44 @@ def report_text(run: Run) -> str:
         ],
         statuses=tables.status_table(run.result, run.config),
         effort=tables.effort_table(run.result),
-        style=markupsafe.Markup((_TEMPLATE / "page.css").read_text("utf-8")),
-        script=markupsafe.Markup((_TEMPLATE / "page.js").read_text("utf-8")),
-        plotly=markupsafe.Markup(offline.get_plotlyjs()) if drawn else "",
     )
-    return text.encode("utf-8", "replace").decode("utf-8")
 
 
-def _command(found: re.Match[str]) -> str:
-    """Return the HTML of a command, whose options are not divided at their hyphens."""
-    words = found[1].split(" ")
-    kept = (f'<span class="word">{x}</span>' if x.startswith("-") else x for x in words)
-    return f"<code>{' '.join(kept)}</code>"
+def front_text(front: Front) -> str:
+    """Return the HTML of the page of a `front`: a click on a point shows its rotor and config."""
+    result = front.record()
+    drawn = charts.front_charts(result)
+    points = {}
+    for one in front.points:
+        config = front.config_of(one)
+        points[str(one.number)] = {
+            "file": design_file(one.number).rpartition("/")[2],
+            "yaml": config.to_yaml(),
+            "outline": outline_mm(config, [*one.design.values()]).round(3).tolist(),
+            "status": f"{in_words(one.standing.label)}: {one.standing.value}",
+            "terms": one.terms,
+        }
+    words = [aim.words for aim in front.aims]
+    return _page(
+        "front.html.j2",
+        drawn.values(),
+        {"points": points},
+        title=f"Trade-off of {', '.join(words[:-1])} against {words[-1]}",
+        message=front.message,
+        charts=[*drawn],
+        tables=[*tables.front_tables(result)],
+    )
 
 
-def _charts(run: Run) -> list[dict[str, Any]]:
-    """Return the interactive charts of a run: title, explanation, and plotly's figure."""
+def _charts(run: Run) -> list[tuple[str, str, Any]]:
+    """Return (title, explanation, chart) of each interactive chart of a run."""
     hover = "Hover over a point to see its design."
-    found = [(title, hover, figure) for title, figure in charts.front_charts(run)]
+    found = [(title, hover, made) for title, made in charts.front_charts(run.result).items()]
     found += [
         (
             "Contact force over time",
-            "Hover for values, drag to zoom, double-click to zoom out. A click moves the rotors "
-            "below to that time.",
+            "Hover for values, drag to zoom; a button at the right zooms out. A click moves the "
+            "rotors below to that time.",
             charts.force_chart(run.cases),
         ),
         (
@@ -121,8 +195,7 @@ def _charts(run: Run) -> list[dict[str, Any]]:
             charts.scenes_chart(tables.scene_rows(run.result, run.rows)),
         ),
     ]
-    keys = "title", "note", "figure"
-    return [dict(zip(keys, one, strict=True)) for one in found if one[2] is not None]
+    return [one for one in found if one[2] is not None]
 
 
-__all__ = ["report_text"]
+__all__ = ["TEMPLATE", "front_text", "report_text", "table_html"]

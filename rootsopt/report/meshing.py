@@ -1,102 +1,84 @@
-"""Data of the animation in a report: outlines, poses, contact points and forces."""
+"""Data of the animated pair on pages: outlines, poses, contact points and forces."""
 
-import re
 from collections.abc import Sequence
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from rootsopt.errors import InputError
-from rootsopt.export.animation import Contacts, frames_of, rolling_contacts, rolling_frames
-from rootsopt.export.pieces import outline_pieces, polyline
-from rootsopt.export.svg import outline_path
+from rootsopt.config import Config
+from rootsopt.config.units import MM
+from rootsopt.export.animation import Contacts, frames_of
+from rootsopt.profiles import Profile, outline
 from rootsopt.report.gather import Case
+from rootsopt.response.series import Series
 from rootsopt.scene import Scene
 
-_NUMBER = re.compile(r"-?\d+\.\d+")
 
-
-def animations(cases: Sequence[Case]) -> dict[str, Any] | None:
-    """Return the data of the animation of all `cases`, or None if no rotor can be drawn.
+def animations(cases: Sequence[Case]) -> dict[str, Any]:
+    """Return the data of the animation of all `cases`.
 
     Cases with the same design share a rotor. A case without a motion is shown in perfect rolling.
     """
-    rotors: list[dict[str, Any]] = []
-    known: dict[tuple, int | None] = {}
+    rotors: dict[tuple, dict[str, Any]] = {}
     shown: list[dict[str, Any]] = []
     for case in cases:
         key = (case.config.profile.family, *case.design.values())
         scene = Scene.from_config(case.config)
         profile = scene.profile(jnp.asarray(np.array([*case.design.values()], dtype=float)))
-        if key not in known:
-            rotor = _rotor(case, profile)
-            known[key] = None if rotor is None else len(rotors)
-            rotors += [] if rotor is None else [rotor]
-        if (number := known[key]) is None:
-            continue
-        shown.append({"name": case.name, "rotor": number} | _motion(case, profile))
-    return {"rotors": rotors, "cases": shown} if shown else None
+        if key not in rotors:
+            rotors[key] = rotor(case.config, np.asarray(outline(profile, points=240)) / MM)
+        period = case.record.get("steady_state", {}).get("period")
+        found = {"name": case.name, "rotor": [*rotors].index(key)}
+        shown.append(found | motion(profile, case.series, period))
+    return {"rotors": [*rotors.values()], "cases": shown}
 
 
-def _rotor(case: Case, profile) -> dict[str, Any] | None:
-    """Return the drawing of a rotor: path of its outline and sizes (mm).
-
-    The result is None if the outline cannot be drawn."""
-    config = case.config
-    try:
-        pieces = outline_pieces(profile)
-    except InputError:
-        return None
-    outer = np.max(np.abs(polyline(pieces, 0.02 * config.profile.pitch_radius_mm)))
+def rotor(config: Config, points: ArrayLike) -> dict[str, Any]:
+    """Return outline and sizes (mm) of a rotor; `points` (n, 2): its closed outline (mm)."""
+    points = np.asarray(points)
     error = config.scene.center_distance_error_mm or 0.0
     return {
-        "path": _NUMBER.sub(lambda found: f"{float(found[0]):.4f}", outline_path(pieces)),
+        "outline": np.round(points, 4).tolist(),
         "lobes": config.profile.lobes,
         "pitch": config.profile.pitch_radius_mm,
-        "outer": round(float(outer), 6),
+        "outer": round(float(np.max(np.hypot(*points.T))), 6),
         "center": 2 * config.profile.pitch_radius_mm + error,
         "bore": config.rotor.bore_mm,
     }
 
 
-def _motion(case: Case, profile) -> dict[str, Any]:
-    """Return the frames of a case: angles (°), contacts, and forces (N) if they are known."""
-    series = case.series
-    if series is None:
-        rotation, flanks = rolling_frames(profile)
-        return {
-            "rotation": _rounded(np.degrees(rotation), 3),
-            "contacts": [_contacts(one) for one in flanks],
-            "forces": None,
-        }
-    lobes = case.config.profile.lobes
-    period = case.record.get("steady_state", {}).get("period")
-    frames = frames_of(series, lobes, int(period or lobes))
-    flanks = [rolling_contacts(profile, frames.rotation, coast) for coast in (False, True)]
-    return {
+def motion(profile: Profile, series: Series | None = None, period: int | None = None):
+    """Return the frames of a motion: angles (°), contacts, and forces (N) if they are known.
+
+    `series`: the motion, None in perfect rolling; `period` (mesh periods), if it is known."""
+    frames = frames_of(profile, series, period or profile.lobes)
+    found: dict[str, Any] = {
         "rotation": _rounded(np.degrees(frames.rotation), 3),
+        "contacts": [*map(_contacts, frames.flanks)],
+        "forces": None,
+    }
+    if series is None or frames.forces is None:
+        return found
+    return found | {
         "relative": _rounded(1e3 * frames.relative, 6),
         "time": _rounded(1e3 * (frames.time - series.time[0]), 6),
-        "contacts": [_contacts(one) for one in flanks],
         "forces": [_rounded(force, 4) for force in frames.forces],
     }
 
 
 def _contacts(flank: Contacts) -> dict[str, list]:
     """Return the contact points (mm) and normals of a flank, and where it touches in rolling."""
-    return {
-        "x": _rounded(flank.point[:, 0], 4),
-        "y": _rounded(flank.point[:, 1], 4),
-        "nx": _rounded(flank.normal[:, 0], 5),
-        "ny": _rounded(flank.normal[:, 1], 5),
-        "present": [bool(one) for one in flank.present],
+    parts = (*flank.point.T, *flank.normal.T)
+    found = {
+        name: _rounded(part, 5) for name, part in zip(("x", "y", "nx", "ny"), parts, strict=True)
     }
+    return found | {"present": flank.present.tolist()}
 
 
-def _rounded(values: ArrayLike | NDArray, places: int) -> list[float]:
-    return [round(float(x), places) + 0.0 for x in np.asarray(values)]
+def _rounded(values: ArrayLike, places: int) -> list[float]:
+    return np.round(np.asarray(values), places).tolist()
 
 
-__all__ = ["animations"]
+__all__ = ["animations", "motion", "rotor"]

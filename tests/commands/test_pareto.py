@@ -9,13 +9,14 @@ import sys
 from pathlib import Path
 
 import pytest
+from browser import Browser
 from rich.console import Console
 
 import rootsopt
+from rootsopt import report
 from rootsopt.commands.table import pareto
 from rootsopt.commands.work.searching import progress_bar
 from rootsopt.config import load
-from rootsopt.figures import page
 from rootsopt.output.fronts import design_file
 from rootsopt.scene import Scene, design_vector
 from rootsopt.tradeoffs.study import geometry_of
@@ -64,23 +65,51 @@ def test_config_of_a_point_is_its_design(folder):
 
 
 def test_page_opens_without_a_network(folder):
-    pytest.importorskip("plotly")
-    text = (folder / page.PAGE).read_text("utf-8")
+    pytest.importorskip("bokeh")
+    text = (folder / report.FRONT).read_text("utf-8")
     assert not re.search(r"<(script|link|img)[^>]*(src|href)=", text)
-    (data,) = re.findall(r"^const points = (.*);$", text, re.M)
-    points = json.loads(data)
+    assert "default-src 'none'" in text
+    (data,) = re.findall(r'<script type="application/json" id="data">(.*?)</script>', text, re.S)
+    found = json.loads(data)
+    points = found["points"]
     assert [*points] == ["1", "2", "3", "4"]
+    assert len(found["charts"]) == 1
     written = (folder / design_file(3)).read_text("utf-8")
     assert points["3"]["yaml"] == written
     assert len(points["3"]["outline"]) > 100
-    assert text.count("<tr data-point=") == 4
+    assert [text.count(f'<th scope="row">{k}</th>') for k in points] == [2, 2, 2, 2]
+
+
+def test_click_on_a_point_shows_its_config(folder, tmp_path):
+    """A click on the chart, and one on a row, choose a point; the console stays silent."""
+    page = Browser(tmp_path)
+    try:
+        page.open((folder / report.FRONT).as_uri())
+        place = """
+        if (!window.Bokeh || !Bokeh.documents.length) return false;
+        const plot = Bokeh.documents[0].roots()[0], view = Bokeh.index.find_one_by_id(plot.id);
+        const box = view.canvas_view.el.getBoundingClientRect(), frame = view.frame;
+        if (!frame) return false;
+        const [across, up] = plot.name.split(" "), terms = data.points["3"].terms;
+        return [box.left + frame.x_scale.compute(terms[across]),
+                box.top + frame.y_scale.compute(terms[up])];"""
+        page.drag(*page.wait(place), 0)
+        read = 'return [at("name").textContent, at("yaml").textContent];'
+        name, yaml = page.wait(read.replace("return", 'if (at("save").disabled) return 0; return'))
+        assert name == "Point 3"
+        assert yaml == (folder / design_file(3)).read_text("utf-8")
+        page.run("rows[0].click()")
+        assert page.run(read)[0] == "Point 1 (dashed: point 3)"
+        assert [line for line in page.console() if not line.startswith("INFO")] == []
+    finally:
+        page.close()
 
 
 def test_page_is_left_out_without_its_library(tmp_path, monkeypatch, capfd):
-    monkeypatch.setattr(page.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(report.importlib.util, "find_spec", lambda name: None)
     assert pareto.main([CIC, "-o", str(tmp_path / "run"), *FEW, "--set", "pareto.points=3"]) == 0
     assert "rootsopt[pages]" in capfd.readouterr().err
-    assert not (tmp_path / "run" / page.PAGE).exists()
+    assert not (tmp_path / "run" / report.FRONT).exists()
 
 
 @pytest.mark.parametrize(
@@ -128,6 +157,7 @@ def test_the_bar_has_words_while_compiling_and_ends_full():
 _STOPPED = """
 import contextlib, os, signal, sys
 from rootsopt.commands import door
+from rootsopt import report
 from rootsopt.commands.table import pareto
 from rootsopt.commands.work import pareto as work
 

@@ -54,7 +54,7 @@ LEFT = (
     "tests/output/test_runs.py::test_nothing_is_written_outside_of_the_runs_own_folder",
 )
 """Tests that need the package's source, compiled programs or the extra `cad`."""
-IMPORTS = "distributed", "zarr", "bokeh", "plotly", "jinja2", "shtab", "h5netcdf"
+IMPORTS = "distributed", "zarr", "bokeh", "jinja2", "shtab", "h5netcdf"
 _JOB_SECONDS = 1500
 
 

@@ -20,7 +20,7 @@ from rootsopt.config import load
 from rootsopt.design.space import Space
 from rootsopt.errors import InputError
 from rootsopt.export import chosen, solid, svg
-from rootsopt.export.animation import rolling_contacts, simulation_gif
+from rootsopt.export.animation import meshing_gif, rolling_contacts
 from rootsopt.export.drawing import Drawing
 from rootsopt.export.dxf import dxf_bytes
 from rootsopt.export.pieces import Arc, Spline, outline_pieces, polyline
@@ -379,7 +379,7 @@ def test_arrow_follows_the_force(few_frames):
     turn = 2 * np.pi * np.arange(360) / 360
     force = np.where(np.arange(360) % 120 >= 60, 50.0, 0.0)
     series = Series(turn, turn, 0 * turn, 0 * turn, force, 0 * turn, 0 * turn)
-    data = simulation_gif(drawing(shape), shape, series, 1)
+    data = meshing_gif(drawing(shape), shape, series, 1)
     with Image.open(io.BytesIO(data)) as picture:
         assert picture.n_frames == 8
         blue = []

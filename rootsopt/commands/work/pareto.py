@@ -7,6 +7,7 @@ from contextlib import AbstractContextManager, closing
 
 from rich.console import Console
 
+from rootsopt import report
 from rootsopt.commands import cli, door
 from rootsopt.commands.work.searching import (
     checkpoint_of,
@@ -53,14 +54,15 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     fronts.write_front(folder, front)
     folder.write_json("result.json", record | {"versions": files.versions()})
     if front.points and not options.no_figures:
-        from rootsopt.figures import page
         from rootsopt.figures.front import front_figure
 
         front_figure(folder, front)
-        if page.available():
-            page.write_page(folder, front)
+        if words := report.missing():
+            say(f"{report.FRONT} is not written, because it needs {words}")
         else:
-            say(page.MISSING)
+            from rootsopt.report.html import front_text
+
+            folder.write_text(report.FRONT, front_text(front))
     if front.interrupted and not front.points:
         folder.overwrite = False  # An earlier result is more valuable than this one.
 
