@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from rootsopt.config import Config
 from rootsopt.config.units import MM
-from rootsopt.export.animation import Contacts, frames_of, rolling_contacts, rolling_frames
 from rootsopt.profiles import Geometry, Profile, geometry, outline
+from rootsopt.report.meshing import motion, rotor
 from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.response.records import geometry_record
 from rootsopt.response.series import Series
@@ -27,31 +27,16 @@ _AGREES = 1e-3
 """Relative difference of mean, peak and RMS force below which two motions count as the same."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Poses:
-    """Rotations φ (n,) of rotor 1 (rad) at which the pair is drawn, with the contacts.
-
-    `time` (n,): time (ms) since the start of the motion; `relative` (n,): ε (rad); `drive`,
-    `coast`: contacts of these flanks; `forces`: largest force (N) on drive and coast flank around
-    each rotation, (n,) each; `None` in perfect rolling."""
-
-    time: NDArray[np.float64]
-    rotation: NDArray[np.float64]
-    relative: NDArray[np.float64]
-    drive: Contacts
-    coast: Contacts
-    forces: tuple[NDArray[np.float64], NDArray[np.float64]] | None
-
-
 class Shape(NamedTuple):
     """Geometry of a config.
 
     `outline` (n, 2): closed outline (mm); `record`: the entry `geometry` of the result file;
-    `poses`: the pair in perfect rolling; `profile`: the profile itself."""
+    `pair`: the rotor, and its frames in perfect rolling, as in `rootsopt.report.meshing`;
+    `profile`: the profile itself."""
 
     outline: NDArray[np.float64]
     record: dict[str, float]
-    poses: Poses
+    pair: dict[str, Any]
     profile: Profile
 
 
@@ -84,10 +69,8 @@ class Engine:
         scene = Scene.from_config(config)
         profile, record = _shape(scene, design_vector(config))
         shown = np.asarray(outline(profile, points=_POINTS)) / MM
-        rotation, (drive, coast) = rolling_frames(profile)
-        zeros = np.zeros_like(rotation)
-        poses = Poses(zeros, rotation, zeros, drive, coast, None)
-        return Shape(shown, geometry_record(scene, record), poses, profile)
+        pair = {"rotor": rotor(config, shown[::4]), "motion": motion(profile)}
+        return Shape(shown, geometry_record(scene, record), pair, profile)
 
     def near(self, config: Config, start: Seeds) -> Evaluation:
         """Return the evaluation of a `config` from the `start` of a similar one.
@@ -119,26 +102,16 @@ def _shape(scene: Scene, design) -> tuple[Profile, Geometry]:
     return profile, geometry(profile)
 
 
-def poses_of(profile: Profile, evaluation: Evaluation) -> Poses | None:
-    """Return the poses of the motion of an `evaluation`; `None` if it has no series."""
-    series = evaluation.series
-    if series is None:
-        return None
-    periods = int(evaluation.steady_state.get("period") or profile.lobes)
-    frames = frames_of(series, profile.lobes, periods)
-    drive, coast = (rolling_contacts(profile, frames.rotation, one) for one in (False, True))
-    time = 1e3 * (frames.time - series.time[0])
-    return Poses(time, frames.rotation, frames.relative, drive, coast, frames.forces)
+def frames(profile: Profile, evaluation: Evaluation) -> dict[str, Any]:
+    """Return the frames of the motion of an `evaluation`; those of rolling if it has no series."""
+    return motion(profile, evaluation.series, evaluation.steady_state.get("period"))
 
 
 def cut(series: Series) -> Series:
     """Return the first revolutions of a long motion."""
-    turns = (series.rotation - series.rotation[0]) / (2 * np.pi)
-    kept = turns < _TURNS
-    values: dict[str, Any] = {
-        field.name: None if (one := getattr(series, field.name)) is None else one[kept]
-        for field in dataclasses.fields(series)
-    }
+    kept = series.rotation - series.rotation[0] < 2 * np.pi * _TURNS
+    given = ((one.name, getattr(series, one.name)) for one in dataclasses.fields(series))
+    values: dict[str, Any] = {name: None if x is None else x[kept] for name, x in given}
     return Series(**values)
 
 
@@ -150,4 +123,4 @@ def same_motion(one: Evaluation, other: Evaluation) -> bool:
     return all(abs(a - b) <= _AGREES * max(abs(a), abs(b), 1e-12) for a, b in pairs)
 
 
-__all__ = ["Engine", "Poses", "Shape", "cut", "poses_of", "same_motion"]
+__all__ = ["Engine", "Shape", "cut", "frames", "same_motion"]

@@ -4,21 +4,22 @@
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
 
 import functools
-from collections.abc import Sequence
+import itertools
+import json
+import math
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from bokeh.core.templates import get_env
 from bokeh.document import Document
 from bokeh.models import Button, CustomJS, Div, NumericInput, Row, Slider
 from bokeh.models.layouts import Column, LayoutDOM
 
-import rootsopt
 from rootsopt.explore import texts
 from rootsopt.explore.engine import Engine, cut
 from rootsopt.explore.knobs import Knob, knobs_of
-from rootsopt.explore.pictures import ForcePicture, PairPicture, ProfilePicture
+from rootsopt.explore.pictures import ForcePicture, ProfilePicture
 from rootsopt.explore.session import (
     FromRest,
     Message,
@@ -30,36 +31,42 @@ from rootsopt.explore.session import (
     Searched,
     Session,
 )
+from rootsopt.report.charts import THEME
+from rootsopt.report.html import TEMPLATE as PAGES
 
 _TEMPLATE = Path(__file__).with_name("template")
 _SLOW = 1.0
 """Time (s) of a computation above which the page says how long it has been running."""
-_QUICK = 0.2
-"""Time (s) of an evaluation below which the pair is drawn once, with its forces."""
 _TICK = 250
 """Interval (ms) at which the page looks for slow computations, and fades numbers that are late."""
-_FRESH, _FADED = {"opacity": "1"}, {"opacity": "0.35"}
-"""Styles of numbers that belong to the present values, and of those that are late."""
 _FIELD = ":host { font-size: 13px; } .bk-input { padding: 1px 6px; height: 24px; min-height: 0; }"
 _BUTTON = ".bk-btn { padding: 3px 9px; font-size: 13px; }"
 _DIGITS = 12
 """Significant digits of a value that a slider sets."""
 
 
+def _file(name: str, folder: Path = _TEMPLATE) -> str:
+    """Return the text of a file of a template folder."""
+    return (folder / name).read_text("utf-8")
+
+
 def script(name: str, /, **arguments: Any) -> CustomJS:
     """Return the script `name` of the template folder, as a callback with these `arguments`."""
-    return CustomJS(args=arguments, code=(_TEMPLATE / f"{name}.js").read_text("utf-8"))
-
-
-@functools.cache
-def _style() -> str:
-    return (_TEMPLATE / "widgets.css").read_text("utf-8")
+    return CustomJS(args=arguments, code=_file(f"{name}.js"))
 
 
 def text(content: str = "", name: str | None = None, **options: Any) -> Div:
     """Return an element that shows HTML, in the style of the page."""
     options = {"sizing_mode": "stretch_width", "margin": 0} | options
-    return Div(text=content, name=name, stylesheets=[_style()], **options)
+    return Div(text=content, name=name, stylesheets=[_file("widgets.css")], **options)
+
+
+def fade(models: Sequence[LayoutDOM], faded: bool) -> None:
+    """Fade what does not belong to the present values, or show it again."""
+    styles = {"opacity": "0.35" if faded else "1"}
+    for one in models:
+        if one.styles != styles:
+            one.styles = styles
 
 
 class Page:
@@ -74,16 +81,14 @@ class Page:
         self.source = source
         self.config = engine.given
         self.knobs = knobs_of(self.config)
-        self.first: tuple[dict[str, float], Any] = ({}, None)
+        self.start: dict[str, Any] = {}  # record of the first values
+        self.shape: NewShape | None = None
         self.motion: NewMotion | None = None
         self.rest: FromRest | None = None
-        self.shape: NewShape | None = None
         self.problem: Problem | None = None
         self.progress: Progress | None = None
         self.cancelled = self.setting = self.closed = self.late = False
         self.before = -1  # number of the motion shown at the last tick
-        self.saved = 0  # number of configs handed to the browser
-        self.drawn = -1  # number of the shape of the pair that is drawn
         self._build()
         self.session = Session(engine, self.post)
         document.add_periodic_callback(self._tick, _TICK)
@@ -101,46 +106,49 @@ class Page:
     # The models of the page
 
     def _build(self) -> None:
-        self.status = text(name="status_text")
-        self.notes = text(name="notes_text")
+        self.status, self.notes, self.numbers, self.gradient = (
+            text(name=f"{name}_text") for name in ("status", "notes", "numbers", "gradient")
+        )
         self.search = text(name="search_text", visible=False)
-        self.latency = text(name="latency_text", syncable=False)
-        self.mark = Div(text="", visible=False, name="mark")
-        self.file = Div(text="", visible=False, name="file")
+        latency = text(name="latency_text", syncable=False)
+        self.mark, self.file, self.pair = (
+            Div(text="", visible=False, name=name) for name in ("mark", "file", "pair")
+        )
+        self.facts: dict[str, Any] = {}  # what `pair` holds
         self.sliders: dict[str, Slider] = {}
         self.fields: dict[str, NumericInput] = {}
-        self.profile, self.pair, self.force = ProfilePicture(), PairPicture(), ForcePicture()
-        self.document.js_on_event("document_ready", self.pair.connect(self.force.cursor))
-        self.geometry, self.forces = text(name="geometry_text"), text(name="force_text")
-        self.gradient = text(name="gradient_text")
+        self.profile, self.force = ProfilePicture(), ForcePicture()
         stretch: dict[str, Any] = {"sizing_mode": "stretch_width", "margin": 0}
+        hidden = (self.mark, self.file, self.pair)
         roots: dict[str, LayoutDOM] = {
-            "status": Column(self.status, self.notes, self.search, self.latency, **stretch),
+            "status": Column(self.status, self.notes, self.search, latency, **stretch),
             "buttons": self._buttons(),
-            "controls": self._controls(),
-            "profile": self.profile.root,
-            "pair": self.pair.root,
-            "force": self.force.root,
-            "numbers": Column(self.geometry, self.forces, self.mark, self.file, **stretch),
+            "controls": Column(*self._controls(), **stretch),
+            "profile": self.profile.figure,
+            "force": self.force.figure,
+            "numbers": Column(self.numbers, *hidden, **stretch),
             "gradient": Column(self.gradient, **stretch),
         }
         for name, root in roots.items():
             root.name = name
             self.document.add_root(root)
-        self.mark.js_on_change("text", script("shown", mark=self.mark, latency=self.latency))
+        draw = script("pair", data=self.pair, cursor=self.force.cursor)
+        self.pair.js_on_change("text", draw)
+        self.document.js_on_event("document_ready", draw)
+        self.force.figure.js_on_event("tap", CustomJS(code="rootsoptView.seek(cb_obj.x)"))
+        self.mark.js_on_change("text", script("shown", mark=self.mark, latency=latency))
         name = f"{Path(self.source).stem}-explored.yaml"
         self.file.js_on_change("tags", script("save", file=self.file, name=name))
-        heading = f"rootsopt explore {self.source}"
-        self.document.title = heading
-        self.document.template = get_env().from_string(
-            (_TEMPLATE / "page.html.j2").read_text("utf-8")
-        )
+        self.document.title = f"rootsopt explore {self.source}"
+        self.document.theme = THEME
+        self.document.template = get_env().from_string(_file("page.html.j2"))
         self.document.template_variables.update(
-            heading=heading,
-            version=rootsopt.__version__,
-            style=(_TEMPLATE / "page.css").read_text("utf-8"),
+            heading=self.document.title,
+            style=_file("page.css") + _file("pair.css", PAGES),
+            pair=_file("pair.html", PAGES),
+            script=_file("pair.js", PAGES),
         )
-        self._say(texts.status_line("preparing", "wait", "Computing the first profile …"))
+        self.status.text = texts.status_line("preparing", "wait", "Computing the first profile …")
         self._show_numbers()
 
     def _buttons(self) -> Row:
@@ -150,26 +158,23 @@ class Page:
         self.from_rest = Button(label="Show from rest", disabled=True, name="from_rest")
         self.reset = Button(label="Back to start", name="reset")
         self.optimize.disabled = not self.config.design_keys
-        self.optimize.on_click(self._optimize)
-        self.cancel.on_click(self._cancel)
-        self.save.on_click(lambda: self.session.save())
-        self.from_rest.on_click(lambda: self.session.show_from_rest())
-        self.reset.on_click(lambda: self._set({knob.key: knob.value for knob in self.knobs}))
-        every = (self.optimize, self.cancel, self.save, self.from_rest, self.reset)
-        for button in every:
+        for button, work in (
+            (self.optimize, self._optimize),
+            (self.cancel, self._cancel),
+            (self.save, lambda: self.session.save()),
+            (self.from_rest, lambda: self.session.show_from_rest()),
+            (self.reset, lambda: self._set({knob.key: knob.value for knob in self.knobs})),
+        ):
+            button.on_click(work)
             button.margin = (1, 2, 1, 2)
             button.stylesheets = [_BUTTON]
-        return Row(*every, margin=0)
+        return Row(self.optimize, self.cancel, self.save, self.from_rest, self.reset, margin=0)
 
-    def _controls(self) -> Column:
-        rows: list[LayoutDOM] = []
-        group = ""
-        for knob in self.knobs:
-            if knob.group != group:
-                group = knob.group
-                rows.append(text(f"<h2>{group}</h2>"))
-            rows.append(self._row(knob))
-        return Column(*rows, sizing_mode="stretch_width", margin=0)
+    def _controls(self) -> Iterator[LayoutDOM]:
+        """Yield the headings of the groups, and the knobs of each."""
+        for group, knobs in itertools.groupby(self.knobs, key=lambda knob: knob.group):
+            yield text(f"<h2>{group}</h2>")
+            yield from map(self._row, knobs)
 
     def _row(self, knob: Knob) -> Row:
         """Return label, slider and number field of a knob, in one row."""
@@ -178,15 +183,15 @@ class Page:
             step=knob.step, title=None, show_value=False, tooltips=False, name=f"slider {knob.key}",
             sizing_mode="stretch_width", margin=(4, 10, 0, 10), bar_color="#9fc3d9",
         )  # fmt: skip
-        limits = [one if np.isfinite(one) else None for one in (knob.least, knob.most)]
+        limits = [one if math.isfinite(one) else None for one in (knob.least, knob.most)]
         field = NumericInput(
             value=int(knob.value) if knob.whole else knob.value,
             mode="int" if knob.whole else "float", low=limits[0], high=limits[1],
             width=78, margin=0, stylesheets=[_FIELD], name=f"field {knob.key}",
         )  # fmt: skip
         keep = script("knob", slider=slider, field=field)
-        slider.js_on_change("value", keep)
-        field.js_on_change("value", keep)
+        for one in (slider, field):
+            one.js_on_change("value", keep)
         field.on_change("value", functools.partial(self._moved, knob.key))
         self.sliders[knob.key], self.fields[knob.key] = slider, field
         label = text(texts.knob_label(knob), width=132, sizing_mode=None, align="center")
@@ -225,9 +230,8 @@ class Page:
     def _lock(self, locked: bool) -> None:
         """Lock the sliders during a search, whose result they take."""
         self.cancel.visible = locked
-        for one in (self.optimize, self.save, self.reset):
-            one.disabled = locked
-        for one in (*self.sliders.values(), *self.fields.values()):
+        buttons = self.optimize, self.save, self.reset
+        for one in (*buttons, *self.sliders.values(), *self.fields.values()):
             one.disabled = locked
 
     # What the session says
@@ -243,143 +247,96 @@ class Page:
 
     def _take(self, message: Message) -> None:
         refused = self.problem is not None and message.number < self.problem.number
-        if isinstance(message, Problem):
-            self._take_problem(message)
-        elif isinstance(message, NewShape) and not refused:
-            self._take_shape(message)
-        elif isinstance(message, NewMotion) and not refused:
-            self._take_motion(message)
-        elif isinstance(message, FromRest) and not refused:
-            self.rest = message
-            self.from_rest.disabled = message.same
-            if self.motion is not None and self.motion.number == message.number:
-                self._say(texts.motion_line(self.motion, message))
-        elif isinstance(message, Progress):
-            self.progress = message
-            if not self.cancelled:
-                self.search.text = texts.progress_line(message, False)
-        elif isinstance(message, Searched):
-            self._lock(False)
-            self.search.text = texts.searched_line(message)
-            if message.values:
-                self._set(dict(message.values))
-        elif isinstance(message, Saved):
-            self.file.text = message.text
-            self.saved += 1
-            self.file.tags = [self.saved]
+        match message:
+            case Progress():
+                self.progress = message
+                if not self.cancelled:
+                    self.search.text = texts.progress_line(message, False)
+            case Searched():
+                self._lock(False)
+                self.search.text = texts.searched_line(message)
+                if message.values:
+                    self._set(dict(message.values))
+            case Saved():
+                self.file.text = message.text
+                self.file.tags = [*self.file.tags, message.number]
+            case Problem() if not refused:
+                self._take_problem(message)
+            case NewShape() if not refused:
+                self._take_shape(message)
+            case NewMotion() if not refused:
+                self._take_motion(message)
+            case FromRest() if not refused:
+                self.rest = message
+                self.from_rest.disabled = message.same
+                if self.motion is not None and self.motion.number == message.number:
+                    self.status.text = texts.motion_line(self.motion, message)
 
     def _take_problem(self, problem: Problem) -> None:
-        if self.problem is not None and problem.number < self.problem.number:
-            return
         self.problem, self.motion, self.rest = problem, None, None
-        drawn = self.shape is not None and self.shape.number == problem.number
-        if not drawn:
-            self.profile.dim(True)
-            self.pair.dim(True)
+        if self.shape is None or self.shape.number != problem.number:
+            self.shape = None
+            fade([self.profile.figure], True)
+            self._tell_pair(dim=True)
         self.notes.text = ""
         self.force.clear("no motion")
-        self._show_numbers(drawn)
-        self._fresh(True)
-        self._say(texts.status_line("not valid", "bad", problem.words))
+        self._show_numbers()
+        self.status.text = texts.status_line("not valid", "bad", problem.words)
         self.mark.text = f"problem {problem.number}"
 
     def _take_shape(self, message: NewShape) -> None:
         self.shape, self.problem = message, None
         self.notes.text = texts.notes_lines(message.notes)
-        radius = self._radius()
-        if not self.first[0]:
-            self.first = message.shape.record, None
-            self.profile.start(message.shape.outline)
-        for picture in (self.profile, self.pair):
-            picture.dim(False)
-        self.profile.draw(message.shape.outline, radius)
-        if not self._quick:
-            self._draw_pair()
+        self.start.setdefault("geometry", message.shape.record)
+        fade([self.profile.figure], False)
+        self.profile.draw(message.shape)
         if self.motion is None:
-            self.pair.move(message.shape.poses)
-        self._show_geometry()
+            self._tell_pair(**message.shape.pair)
+        self._tell_pair(rotor=message.shape.pair["rotor"], dim=False)
+        self._show_numbers(self.late)
 
     def _take_motion(self, motion: NewMotion) -> None:
         if self.motion is not None and motion.number < self.motion.number:
             return
         self.motion = motion
-        self.rest = None if self.rest and self.rest.number != motion.number else self.rest
+        self.rest = self.rest if self.rest and self.rest.number == motion.number else None
         found = motion.evaluation
-        self._draw_pair()
-        if self.first[1] is None and motion.final:
-            self.first = self.first[0], found
-            if found.series is not None:
-                self.force.start(cut(found.series))
-        if motion.poses is not None:
-            self.pair.move(motion.poses)
-        elif self.shape is not None:
-            self.pair.move(self.shape.shape.poses)
+        first = motion.final and "response" not in self.start
+        if first:
+            self.start |= found.record()
+        self._tell_pair(motion=motion.frames)
         if found.series is None:
             self.force.clear("no motion to show")
         else:
-            self.force.draw(cut(found.series), found.response)
-        self._show_forces()
-        self._fresh(True)
+            self.force.draw(cut(found.series), found.response, first)
+        self._show_numbers()
         self.from_rest.disabled = True
-        self._say(texts.motion_line(motion, self.rest))
+        self.status.text = texts.motion_line(motion, self.rest)
         self.mark.text = f"motion {motion.number}"
 
     # What is shown
 
-    @property
-    def _quick(self) -> bool:
-        """Whether the motion is likely to follow the shape at once, and the pair with it."""
-        motion = self.motion
-        return motion is not None and motion.evaluation.statistics["seconds"] < _QUICK
+    def _tell_pair(self, **facts: Any) -> None:
+        """Let the page draw the pair with some new `facts`: rotor, motion, dim."""
+        self.facts |= facts
+        self.pair.text = json.dumps(self.facts)
 
-    def _draw_pair(self) -> None:
-        shape = self.shape
-        if shape is not None and shape.number != self.drawn:
-            self.drawn = shape.number
-            self.pair.draw(shape.shape, self._radius(), self._error())
-
-    def _radius(self) -> float:
-        key = "profile.pitch_radius_mm"
-        return self.session.values.get(key, self.config.profile.pitch_radius_mm)
-
-    def _error(self) -> float:
-        key = "scene.center_distance_error_mm"
-        return self.session.values.get(key, self.config.scene.center_distance_error_mm or 0.0)
-
-    def _say(self, line: str) -> None:
-        self.status.text = line
-
-    def _show_numbers(self, drawn: bool = False) -> None:
-        if not drawn:
-            self.geometry.text = texts.geometry_table({}, self.first[0])
-        self._show_forces()
-
-    def _show_geometry(self) -> None:
-        record = {} if self.shape is None else self.shape.shape.record
-        self.geometry.text = texts.geometry_table(record, self.first[0])
-
-    def _show_forces(self) -> None:
+    def _show_numbers(self, faded: bool = False) -> None:
         now = None if self.motion is None else self.motion.evaluation
-        self.forces.text = texts.force_table(now, self.first[1])
-        self.gradient.text = texts.gradient_table(self.config, now, self.knobs)
-
-    def _fresh(self, fresh: bool) -> None:
-        """Fade forces and gradient unless they belong to the present values."""
-        styles = _FRESH if fresh else _FADED
-        faded: Sequence[LayoutDOM] = (self.forces, self.gradient, self.force.figure)
-        for one in faded:
-            if one.styles != styles:
-                one.styles = styles
+        record = {} if now is None else now.record()
+        record |= {} if self.shape is None else {"geometry": self.shape.shape.record}
+        self.numbers.text = texts.numbers_table(record, self.start)
+        self.gradient.text = texts.gradient_table(self.config, now)
+        fade([self.numbers, self.gradient, self.force.figure], faded)
 
     def _tick(self) -> None:
         """Fade late numbers, and say how long a slow computation has been running."""
         seconds = self.session.seconds
         shown = self.motion.number if self.motion is not None else -1
         late = self.shape is not None and self.problem is None and shown < self.shape.number
-        self._fresh(not (late and self.late and shown == self.before))
+        faded = late and self.late and shown == self.before
+        fade([self.numbers, self.gradient, self.force.figure], faded)
         self.late, self.before = late, shown
-        if late:
-            self._draw_pair()
         if self.closed or seconds < _SLOW:
             return
         if not self.engine.ready.is_set():
@@ -387,13 +344,13 @@ class Page:
                 "Compiling the programs for this kind of pair. The first time takes one to several "
                 f"minutes, later starts some seconds ({seconds:.0f} s so far)."
             )
-            self._say(texts.status_line("preparing", "wait", words))
+            self.status.text = texts.status_line("preparing", "wait", words)
         else:
             words = (
                 f"Computing for {seconds:.0f} s. A new number of lobes, or a twist where there was "
                 "none, needs other programs, which are compiled first."
             )
-            self._say(texts.status_line("computing", "wait", words))
+            self.status.text = texts.status_line("computing", "wait", words)
 
 
 __all__ = ["Page"]

@@ -3,7 +3,6 @@
 A session knows nothing of the page. It tells it what is new by messages, from several threads."""
 
 import dataclasses
-import functools
 import sys
 import threading
 from collections.abc import Callable, Mapping
@@ -11,7 +10,7 @@ from typing import Any
 
 from rootsopt.config import Config, notes
 from rootsopt.errors import InputError
-from rootsopt.explore.engine import Engine, Poses, Shape, poses_of, same_motion
+from rootsopt.explore.engine import Engine, Shape, frames, same_motion
 from rootsopt.explore.latest import Latest
 from rootsopt.optimize.design import optimize_design
 from rootsopt.optimize.outcome import Optimization
@@ -45,13 +44,13 @@ class NewShape(Message):
 
 @dataclasses.dataclass(frozen=True)
 class NewMotion(Message):
-    """The `evaluation`, and the `poses` of its motion.
+    """The `evaluation`, and the `frames` of its motion, as in `rootsopt.report.meshing`.
 
     `near`: whether the motion was reached from that of other values, and not from rest; `final`:
     whether the status is final. If not, a computation from rest follows."""
 
     evaluation: Evaluation
-    poses: Poses | None
+    frames: Mapping[str, Any]
     near: bool
     final: bool = True
 
@@ -126,12 +125,12 @@ class Session:
     def show_from_rest(self) -> None:
         """Show the motion that starts at rest, even if another one is known."""
         number = self.number
-        self._rests.submit(lambda: self._refusing(number, lambda: self._from_rest(number, True)))
+        self._submit(self._rests, number, lambda: self._from_rest(number, True))
 
     def save(self) -> None:
         """Make the YAML of the values, and compute their motion from rest, as `simulate` does."""
         number = self.number
-        self._rests.submit(lambda: self._refusing(number, lambda: self._save(number)))
+        self._submit(self._rests, number, lambda: self._save(number))
 
     def optimize(self) -> None:
         """Search for the optimum from the present values, in a thread of its own."""
@@ -170,14 +169,13 @@ class Session:
         """Compute shape and motion of the values with this `number`."""
         self._motions.clear()
         self._rests.clear()
-        self._shapes.submit(lambda: self._refusing(number, lambda: self._compute_shape(number)))
+        self._submit(self._shapes, number, lambda: self._compute_shape(number))
 
     def _compute_shape(self, number: int) -> None:
         config = self.config()
         shape = self.engine.shape(config)
         self.show(NewShape(number, shape, notes(config)))
-        work = functools.partial(self._compute_motion, number, config, shape)
-        self._motions.submit(lambda: self._refusing(number, work))
+        self._submit(self._motions, number, lambda: self._compute_motion(number, config, shape))
 
     def _compute_motion(self, number: int, config: Config, shape: Shape) -> None:
         self.engine.ready.wait()
@@ -187,11 +185,10 @@ class Session:
         if found.usable:
             self._start = found.start
         final = found.usable or not near
-        self._present(NewMotion(number, found, poses_of(shape.profile, found), near, final))
+        self._present(NewMotion(number, found, frames(shape.profile, found), near, final))
         if near:
             delay = self.idle if found.usable else 0.0
-            work = functools.partial(self._from_rest, number, False)
-            self._rests.submit(lambda: self._refusing(number, work), delay)
+            self._submit(self._rests, number, lambda: self._from_rest(number, False), delay)
 
     def _present(self, motion: NewMotion) -> None:
         self._shown = motion
@@ -219,8 +216,7 @@ class Session:
         if useless or (forced and not same):
             if found.usable:
                 self._start = found.start
-            poses = poses_of(shape.profile, found)
-            self._present(NewMotion(number, found, poses, False))
+            self._present(NewMotion(number, found, frames(shape.profile, found), False))
         else:
             self.show(self._rest)
         return found
@@ -230,12 +226,18 @@ class Session:
         if found is not None:
             self.show(Saved(number, self.config().to_yaml(), found))
 
-    def _refusing(self, number: int, work: Callable[[], object]) -> None:
-        """Do `work`; if the values are refused, say so."""
-        try:
-            work()
-        except InputError as error:
-            self.show(Problem(number, str(error)))
+    def _submit(
+        self, lane: Latest, number: int, work: Callable[[], object], delay: float = 0.0
+    ) -> None:
+        """Let a `lane` do `work` after a `delay` (s); if the values are refused, say so."""
+
+        def refusing() -> None:
+            try:
+                work()
+            except InputError as error:
+                self.show(Problem(number, str(error)))
+
+        lane.submit(refusing, delay)
 
     def _optimize(self, number: int, stop: threading.Event) -> None:
         def progress(done: int, expected: int, best: float) -> None:

@@ -1,83 +1,44 @@
 """Texts and tables of the explorer's page, as HTML. Everything from a config is escaped."""
 
+import dataclasses
 import html
 from collections.abc import Iterable, Mapping
+from typing import Any
 
 from rootsopt.config import Config
 from rootsopt.explore.knobs import Knob
 from rootsopt.explore.session import FromRest, NewMotion, Progress, Searched
 from rootsopt.optimize.outcome import Optimization
-from rootsopt.output.names import brief, in_words, label, percent, value
+from rootsopt.output import tables
+from rootsopt.output.names import brief, in_words, name_and_unit, percent
+from rootsopt.report.html import table_html
 from rootsopt.response.evaluation import RESPONSES, Evaluation
 from rootsopt.status import Status
 
-_STEADY = ("period", "floquet_multiplier", "lyapunov_exponent_per_mesh_period")
-_FORCES = {"mean_force_N": "mean", "peak_force_N": "peak", "rms_force_N": "RMS"}
+
+def numbers_table(now: Mapping[str, Any], first: Mapping[str, Any]) -> str:
+    """Return the table of forces, geometry and kind of motion, at the start and now.
+
+    `now`, `first`: records as in the result file, perhaps without some entries: their numbers are
+    dashes."""
+    parts = ("geometry", "response", "steady_state", "status")
+    records = [{"design": {}} | {key: one[key] for key in parts if key in one}
+               for one in (first, now)]  # fmt: skip
+    found = tables.numbers_table(dict(zip(("baseline", "optimized"), records, strict=True)))
+    heads = "", "at start", "now", "change"
+    return table_html(found and dataclasses.replace(found, title="Numbers", heads=heads))
 
 
-def numbers_table(
-    caption: str, now: Mapping[str, object], first: Mapping[str, object], keys: Iterable[str]
-) -> str:
-    """Return a table of quantities: now, at the start, and the change in % of the start.
-
-    `keys`: keys of the result file in the order of the rows; an unknown number is a dash."""
-    rows = []
-    for key in keys:
-        one, other = now.get(key), first.get(key)
-        change = percent(other, one)
-        cells = label(key), value(one), value(other), "" if change == "0.00 %" else change
-        rows.append("".join(_cell(cell) for cell in cells))
-    heads = "".join(f"<th>{head}</th>" for head in ("", "now", "at start", "change"))
-    return _table(caption, heads, rows)
-
-
-def geometry_table(now: Mapping[str, float], first: Mapping[str, float]) -> str:
-    """Return the table of the geometry, now and at the start."""
-    return numbers_table("Geometry", now, first, first or now)
-
-
-def force_table(now: Evaluation | None, first: Evaluation | None) -> str:
-    """Return the table of forces and kind of motion; dashes where nothing is known."""
-    known, start = (_measures(one) for one in (now, first))
-    keys = dict.fromkeys([*RESPONSES, *start, *known])
-    return numbers_table("Contact force and motion", known, start, keys)
-
-
-def _measures(evaluation: Evaluation | None) -> dict[str, object]:
-    if evaluation is None:
-        return {}
-    steady = evaluation.steady_state
-    return {**evaluation.response, **{key: steady[key] for key in _STEADY if steady.get(key)}}
-
-
-def gradient_table(config: Config, evaluation: Evaluation | None, knobs: Iterable[Knob]) -> str:
+def gradient_table(config: Config, evaluation: Evaluation | None) -> str:
     """Return the table of the derivatives of the forces, per unit of each design parameter."""
-    design = {knob.key.removeprefix("profile."): knob for knob in knobs if knob.group == "Design"}
     if not config.design_keys:
         words = f"The family {html.escape(config.profile.family)} has no design parameters."
         return f'<p><b>Gradient</b></p><p class="note">{words}</p>'
-    gradient = {} if evaluation is None else evaluation.gradient
-    rows = []
-    for key in config.design_keys:
-        knob = design[key]
-        unit = f" (N/{knob.unit})" if knob.unit else " (N)"
-        slopes = [gradient.get(name, {}).get(key) for name in _FORCES]
-        shown = ("–" if one is None else f"{one:+.4g}".replace("-", "−") for one in slopes)
-        rows.append("".join(map(_cell, (knob.name + unit, *shown))))
-    heads = "".join(f"<th>{head}</th>" for head in ("force per unit of", *_FORCES.values()))
-    return _table("Gradient", heads, rows)
-
-
-def _table(caption: str, heads: str, rows: Iterable[str]) -> str:
-    body = "".join(f"<tr>{row}</tr>" for row in rows)
-    return (
-        f"<table><caption>{caption}</caption><thead><tr>{heads}</tr></thead>"
-        f"<tbody>{body}</tbody></table>"
-    )
-
-
-def _cell(text: str) -> str:
-    return f"<td>{html.escape(text)}</td>"
+    unknown = dict.fromkeys(config.design_keys)
+    gradient = {name: unknown for name in RESPONSES}
+    if evaluation is not None and evaluation.gradient:
+        gradient = evaluation.gradient
+    return table_html(next(tables.gradient_tables({"design": unknown, "gradient": gradient})))
 
 
 def status_line(word: str, kind: str, words: str, note: str = "") -> str:
@@ -151,13 +112,8 @@ def searched_line(ended: Searched) -> str:
 
 def _improved(found: Optimization) -> str:
     """Return how much the optimum is below the design at which the search began."""
-    names = {"objective": "objective", "mean_force_N": "mean", "peak_force_N": "peak"}
-    gains = found.improvement
-    changes = (
-        f"{word} {-100 * gains[key]:+.1f} %".replace("-", "−")
-        for key, word in names.items()
-        if key in gains
-    )
+    gains = found.improvement.items()
+    changes = (f"{name_and_unit(key)[0]} {percent(1, 1 - gain)}" for key, gain in gains)
     return f"Against the start of the search: {', '.join(changes)}."
 
 
@@ -165,14 +121,9 @@ def _certified(found: Optimization) -> str:
     """Return the certificate of an optimum: first-order conditions, and the limits that hold it."""
     if found.optimality is None:
         return "Without a certificate."
-    record = found.optimality.record()
-    state = "hold" if record["converged"] else "do not hold"
-    held = [row["name"] for row in found.constraints if row.get("active")]
+    held = [in_words(row["name"]) for row in found.constraints if row.get("active")]
     limits = f" Limits that hold it: {', '.join(held)}." if held else ""
-    return (
-        f"First-order conditions {state}: residual {brief(record['residual'], 2)}, at most "
-        f"{brief(record['required_residual'], 2)} required.{limits}"
-    )
+    return found.optimality.record()["message"] + limits
 
 
 def knob_label(knob: Knob) -> str:
@@ -183,12 +134,11 @@ def knob_label(knob: Knob) -> str:
 
 
 __all__ = [
-    "force_table",
-    "geometry_table",
     "gradient_table",
     "knob_label",
     "motion_line",
     "notes_lines",
+    "numbers_table",
     "progress_line",
     "searched_line",
     "status_line",

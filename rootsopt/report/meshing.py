@@ -55,7 +55,7 @@ def motion(profile: Profile, series: Series | None = None, period: int | None = 
     `series`: the motion, None in perfect rolling; `period` (mesh periods), if it is known."""
     frames = frames_of(profile, series, period or profile.lobes)
     found: dict[str, Any] = {
-        "rotation": _rounded(np.degrees(frames.rotation), 3),
+        "rotation": _rounded(np.degrees(frames.rotation), 9),
         "contacts": [*map(_contacts, frames.flanks)],
         "forces": None,
     }
@@ -63,7 +63,7 @@ def motion(profile: Profile, series: Series | None = None, period: int | None = 
         return found
     return found | {
         "relative": _rounded(1e3 * frames.relative, 6),
-        "time": _rounded(1e3 * (frames.time - series.time[0]), 6),
+        "time": _rounded(1e3 * (frames.time - series.time[0]), 9),
         "forces": [_rounded(force, 4) for force in frames.forces],
     }
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import queue
+import re
 import threading
 import time
 from pathlib import Path
@@ -155,12 +156,12 @@ class Better(Optimization):
 
 def test_changes_have_the_sign_of_what_they_change():
     """Now against the start in the tables; the optimum against the start of its search."""
-    table = texts.force_table(evaluation_of(90.0), evaluation_of(100.0))
-    assert "−10.00 %" in table
+    table = texts.numbers_table(evaluation_of(90.0).record(), evaluation_of(100.0).record())
+    assert "−10.00\N{NO-BREAK SPACE}%" in table
     start = evaluation_of(100.0)
     found = Better(None, start, start, [], {})
     line = texts.searched_line(Searched(0, found, {}))
-    assert "objective −20.0 %, peak +10.0 %" in line
+    assert "objective −20.00 %, peak force +10.00 %" in line
 
 
 def test_forces_near_a_motion_are_those_from_rest(session, engine):
@@ -170,9 +171,9 @@ def test_forces_near_a_motion_are_those_from_rest(session, engine):
     motion = session.next(NewMotion, number)
     assert motion.near
     assert motion.evaluation.series is not None
-    turned = np.degrees(motion.poses.rotation - motion.poses.rotation[0])
+    turned, taken = (np.subtract(motion.frames[key], motion.frames[key][0])
+                     for key in ("rotation", "time"))  # fmt: skip
     # 3050 revolutions per minute are 18.3 degrees per millisecond.
-    taken = motion.poses.time - motion.poses.time[0]
     np.testing.assert_allclose(taken, turned / 18.3, rtol=1e-6, atol=1e-9)
     assert session.next(FromRest, number).same
     config = load(CIC, [f"{SPEED}=3050", f"{TIP}=4.2"])
@@ -332,9 +333,11 @@ def read(page):
         const list = x => Array.from(x);
         return {
           outline: list(model("outline_now").data.x), force: list(model("force_now").data.drive),
-          numbers: model("force_text").text, geometry: model("geometry_text").text,
+          numbers: model("numbers_text").text,
           gradient: model("gradient_text").text, status: model("status_text").text,
-          field: model("field profile.pressure_angle_deg").value, pose: model("pose").text,
+          field: model("field profile.pressure_angle_deg").value,
+          pose: document.getElementById("pose").textContent,
+          rotors: [...document.querySelectorAll("#pair .rotor")].map(one => one.getAttribute("d")),
           wide: document.documentElement.scrollWidth,
           outside: performance.getEntriesByType("resource").map(one => one.name)
             .filter(name => !name.startsWith(location.origin) && !name.startsWith("data:")),
@@ -362,7 +365,7 @@ def test_dragged_slider_moves_outline_force_and_numbers(page):
     page.wait("return window.rootsoptDelay > 0;")
     page.wait(MODEL + "return model('status_text').text.includes('the motion is the same');")
     after = read(page)
-    for key in ("outline", "force", "numbers", "geometry", "gradient"):
+    for key in ("outline", "force", "numbers", "gradient", "rotors"):
         assert after[key] != before[key], key
     assert len(after["force"]) > 100
     assert "drive flank" in after["pose"]
@@ -378,7 +381,7 @@ def test_values_that_do_not_fit_show_no_old_numbers(page):
     after = read(page)
     assert "must be less than 30" in after["status"]
     assert after["force"] == []
-    assert "–" in after["numbers"].split("</td>")[1]
+    assert re.search(r"mean force \(N\)</th>\s*<td>[^<]*</td>\s*<td>–</td>", after["numbers"])
     assert after["outline"] == before["outline"]  # faded
     page.run(MODEL + f"model('field {TIP}').value = 4;")
     page.wait(MODEL + "return model('mark').text.startsWith('motion');")

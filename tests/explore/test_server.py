@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from rootsopt import explore
+from rootsopt import report
 from rootsopt.commands.table import explore as command
 
 pytest.importorskip("bokeh")
@@ -202,7 +202,7 @@ def test_server_listens_on_the_loopback_address_only(address):
 
 
 def test_library_is_named_if_it_is_missing(monkeypatch, capsys):
-    monkeypatch.setattr(explore.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(report.importlib.util, "find_spec", lambda name: None)
     assert command.main([CIC]) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert "pip install 'rootsopt[explore]'" in line
