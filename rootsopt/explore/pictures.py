@@ -27,7 +27,7 @@ class ProfilePicture:
         empty: dict[str, list[float]] = {"x": [], "y": []}
         self.now = ColumnDataSource(empty, name="outline_now")
         self.before, self.pitch = ColumnDataSource(empty), ColumnDataSource(empty)
-        self.ends = ColumnDataSource(empty)
+        self.ends = ColumnDataSource({"x": [-1.0, 1.0], "y": [-1.0, 1.0]})
         self._reach = self._radius = 0.0
         line = {"line_color": "#111111", "line_width": 1.5}
         self.figure.patch("x", "y", source=self.now, fill_color=SKY, fill_alpha=0.35, **line)

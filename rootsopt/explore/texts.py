@@ -15,18 +15,24 @@ from rootsopt.report.html import table_html
 from rootsopt.response.evaluation import RESPONSES, Evaluation
 from rootsopt.status import Status
 
+_STEADY = "period", "floquet_multiplier", "lyapunov_exponent_per_mesh_period"
+"""Numbers of the kind of motion that the page has room for."""
+
 
 def numbers_table(now: Mapping[str, Any], first: Mapping[str, Any]) -> str:
     """Return the table of forces, geometry and kind of motion, at the start and now.
 
     `now`, `first`: records as in the result file, perhaps without some entries: their numbers are
     dashes."""
-    parts = ("geometry", "response", "steady_state", "status")
-    records = [{"design": {}} | {key: one[key] for key in parts if key in one}
-               for one in (first, now)]  # fmt: skip
-    found = tables.numbers_table(dict(zip(("baseline", "optimized"), records, strict=True)))
+    found = tables.numbers_table({"baseline": _shown(first), "optimized": _shown(now)})
     heads = "", "at start", "now", "change"
     return table_html(found and dataclasses.replace(found, title="Numbers", heads=heads))
+
+
+def _shown(record: Mapping[str, Any]) -> dict[str, Any]:
+    steady = {key: record.get("steady_state", {}).get(key) for key in _STEADY}
+    shown = {key: record[key] for key in ("geometry", "response", "status") if key in record}
+    return {"design": {}, "steady_state": {key: x for key, x in steady.items() if x}} | shown
 
 
 def gradient_table(config: Config, evaluation: Evaluation | None) -> str:
