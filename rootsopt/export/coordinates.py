@@ -1,16 +1,19 @@
 """Coordinates of one lobe for the grinder, and the width of a lobe (mm)."""
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import brentq
 
-from rootsopt.export.pieces import Arc, DrawnPiece
+from rootsopt.export.pieces import DrawnPiece
 
 _SAME = 1e-9
 """Distance along the outline (fraction of the outline's length) below which two points count as
 one."""
+_SAMPLES = 65
+"""Number of points of a piece between which crossings are sought."""
 
 
 class Coordinates(NamedTuple):
@@ -41,7 +44,8 @@ def coordinates(pieces: Sequence[DrawnPiece], lobes: int, count: int) -> Coordin
 
     `pieces`: closed outline, as from `outline_pieces`; `lobes`: number of lobes."""
     ends = np.concatenate([[0.0], np.cumsum([piece.length for piece in pieces])])
-    total, tip = ends[-1], _tip(pieces, ends)
+    number, share = _at_angle(pieces, 0.0)
+    total, tip = ends[-1], ends[number] + share * pieces[number].length
     half = total / (2 * lobes)
     along = np.linspace(-half, half, count)
     corners = (ends[:-1] - tip + total / 2) % total - total / 2
@@ -60,74 +64,38 @@ def coordinates(pieces: Sequence[DrawnPiece], lobes: int, count: int) -> Coordin
     return Coordinates(point, normal, along)
 
 
-def _tip(pieces: Sequence[DrawnPiece], ends: NDArray[np.float64]) -> float:
-    """Return the distance along the outline at which it crosses the x axis at the tip on +x."""
-    for piece, start in zip(pieces, ends, strict=False):
-        y = [float(np.imag(piece.at(share))) for share in (0.0, 1.0)]
-        if y[0] > 0 or y[1] <= 0 or np.real(piece.at(0.5)) < 0:
-            continue
-        low, high = 0.0, 1.0
-        for _ in range(60):
-            middle = (low + high) / 2
-            low, high = (middle, high) if np.imag(piece.at(middle)) <= 0 else (low, middle)
-        return float(start + high * piece.length)
-    raise ValueError("Argument `pieces` must be an outline with a lobe tip on +x, but is not")
-
-
 def widest(pieces: Sequence[DrawnPiece], lobes: int) -> complex:
     """Return the point (mm) on the upper flank of the lobe on +x at which the lobe is widest.
 
     Its width is twice the point's y coordinate. If the lobe widens all the way down to the root,
     the point is that on the pitch circle, at the angle π / (2 `lobes`)."""
-    found = [point for piece in pieces for point in _tops(piece)]
-    reach = max(abs(piece.start) for piece in pieces)
-    inside = [
-        point for point in found
-        if 0 < np.angle(point) < np.pi / lobes - _SAME and point.imag > _SAME * reach
-    ]  # fmt: skip
+    found = []
+    for piece in pieces:
+        for share in _falls(lambda x, piece=piece: np.imag(piece.heading(x))):
+            found.append(complex(piece.at(share)))
+    inside = [point for point in found if 0 < np.angle(point) < np.pi / lobes - _SAME]
     if inside:
         return max(inside, key=lambda point: point.real)
-    return _at_angle(pieces, np.pi / (2 * lobes))
+    number, share = _at_angle(pieces, np.pi / (2 * lobes))
+    return complex(pieces[number].at(share))
 
 
-def _tops(piece: DrawnPiece) -> list[complex]:
-    """Return the points of a piece at which y is greatest among their neighbours."""
-    if isinstance(piece, Arc):
-        if piece.sweep < 0:
-            return []
-        turn = (np.pi / 2 - piece.begin) % (2 * np.pi)
-        return [complex(piece.center + 1j * piece.radius)] if turn <= piece.sweep else []
-    points = []
-    for curve in piece.beziers():
-        y = curve.imag
-        slope = np.diff(y)
-        # Slope of a cubic Bézier curve as a polynomial: 3 ((1-t)² d0 + 2 t (1-t) d1 + t² d2).
-        a, b, c = slope[0] - 2 * slope[1] + slope[2], 2 * (slope[1] - slope[0]), slope[0]
-        for root in np.roots([a, b, c]):
-            t = float(np.real(root))
-            if abs(np.imag(root)) < _SAME and 0 <= t <= 1 and 2 * a * t + b < 0:
-                weights = np.array([(1 - t) ** 3, 3 * t * (1 - t) ** 2, 3 * t**2 * (1 - t), t**3])
-                points.append(complex(weights @ curve))
-    return points
-
-
-def _at_angle(pieces: Sequence[DrawnPiece], angle: float) -> complex:
-    """Return the point of the outline at a polar angle (rad) between 0 and that of the root."""
+def _at_angle(pieces: Sequence[DrawnPiece], angle: float) -> tuple[int, float]:
+    """Return number and share of the piece at which the outline crosses a polar angle (rad)."""
     turn = np.exp(-1j * angle)
-    for piece in pieces:
-        share = np.linspace(0.0, 1.0, 65)
-        y = np.imag(piece.at(share) * turn)
-        crossed = np.flatnonzero((y[:-1] <= 0) & (y[1:] > 0))
-        for k in crossed:
-            low, high = share[k], share[k + 1]
-            for _ in range(60):
-                middle = (low + high) / 2
-                above = np.imag(piece.at(middle) * turn) > 0
-                low, high = (low, middle) if above else (middle, high)
-            point = complex(piece.at(high))
-            if np.real(point * turn) > 0:
-                return point
+    for number, piece in enumerate(pieces):
+        for share in _falls(lambda x, piece=piece: -np.imag(piece.at(x) * turn)):
+            if np.real(piece.at(share) * turn) > 0:
+                return number, share
     raise ValueError("Argument `pieces` must be a closed outline around the origin, but is not")
+
+
+def _falls(function: Callable[[Any], Any]) -> Iterator[float]:
+    """Yield the shares (0 to 1) at which a `function` of them falls below 0."""
+    share = np.linspace(0.0, 1.0, _SAMPLES)
+    value = function(share)
+    for k in np.flatnonzero((value[:-1] >= 0) & (value[1:] < 0)):
+        yield float(brentq(lambda x: float(function(x)), share[k], share[k + 1], xtol=1e-15))
 
 
 __all__ = ["Coordinates", "coordinates", "widest"]

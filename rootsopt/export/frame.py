@@ -1,5 +1,6 @@
 """Dimensions, title block and table of coordinates of a DXF drawing."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,8 @@ _ROWS = 19
 """Number of points from tip to root in the table of the drawing."""
 _LETTER = 0.9
 """Width of a letter as a fraction of its height, with room to spare."""
+_BY_LAYER = 256
+"""Colour index of lines that have the colour of their layer."""
 
 
 def add_style(document: Any, drawing: Drawing) -> None:
@@ -70,31 +73,21 @@ def add_dimensions(space: Any, drawing: Drawing) -> None:
 
 
 def add_title_block(space: Any, drawing: Drawing) -> None:
-    """Add the title block below the rotor, with the notes beside it, and the border of the sheet.
+    """Add the title block below the rotor, and the border of the sheet.
 
     `space`: modelspace of ezdxf."""
-    outer, height = drawing.outer_radius, letter(drawing)
+    height = letter(drawing)
     left, right, top = edges(drawing)
-    row = 1.9 * height
-    count = max(len(drawing.block), len(drawing.notes) + 1)
-    upper = -1.3 * outer
-    bottom = upper - row * count
-    split = right - (_wide(drawing) + 1) * height
-    names = max(len(name) for name, _ in drawing.block) * _LETTER * height + height
+    row, upper = 1.9 * height, -1.3 * drawing.outer_radius
+    bottom = upper - row * max(len(drawing.block), len(drawing.notes) + 1)
     frame = {"layer": TITLE}
     corners = [(left, bottom), (right, bottom), (right, top), (left, top)]
     space.add_lwpolyline(corners, close=True, dxfattribs=frame)
     space.add_line((left, upper), (right, upper), dxfattribs=frame)
-    space.add_line((split, upper), (split, bottom), dxfattribs=frame)
-    space.add_line((split + names, upper), (split + names, bottom), dxfattribs=frame)
-    for k, (name, text) in enumerate(drawing.block):
-        y = upper - row * (k + 1)
-        if k + 1 < count:
-            space.add_line((split, y), (right, y), dxfattribs=frame)
-        for x, words in ((split, name), (split + names, text)):
-            place = x + 0.5 * height, y + 0.45 * height
-            attributes = {"layer": TITLE}
-            space.add_text(plain(words), height=height, dxfattribs=attributes).set_placement(place)
+    names = max(len(name) for name, _ in drawing.block) * _LETTER * height + height
+    split = right - (_wide(drawing) + 1) * height
+    widths = names, right - split - names
+    _add_texts(space, TITLE, drawing.block, (split, upper), widths, height)
 
 
 def add_table(space: Any, drawing: Drawing) -> None:
@@ -104,34 +97,38 @@ def add_table(space: Any, drawing: Drawing) -> None:
     found = coordinates(drawing.pieces, drawing.lobes, 2 * _ROWS - 1)
     half = np.linspace(0.0, found.along[-1], _ROWS)
     kept = [int(np.argmin(np.abs(found.along - place))) for place in half]
-    columns = found.columns()
-    names = "x_mm", "y_mm", "radius_mm", "normal_deg"
+    columns = [found.columns()[name][kept] for name in ("x_mm", "y_mm", "radius_mm", "normal_deg")]
+    rows = [["no.", "x", "y", "radius", "normal, deg"]]
+    for k, numbers in enumerate(zip(*columns, strict=True)):
+        rows.append([str(k), *(f"{round(x, 4) + 0.0:.4f}" for x in numbers)])
     height = 0.8 * letter(drawing)
-    wide, row = 11 * _LETTER * height, 1.85 * height
+    wide = 11 * _LETTER * height
     right, top = edges(drawing)[1:]
-    left = right - 4.6 * wide
-    heads = ["no.", "x", "y", "radius", "normal, deg"]
-    rows = [heads, *([str(k), *(f"{round(columns[name][i], 4) + 0.0:.4f}" for name in names)]
-                     for k, i in enumerate(kept))]  # fmt: skip
+    place = right - 4.6 * wide, top - 2.4 * height
     title = "Half a lobe, tip to root (all points: rotor_points.csv)"
-    attributes = {"layer": TABLE}
-    place = left, top - 1.6 * height
-    space.add_text(title, height=height, dxfattribs=attributes).set_placement(place)
-    for k, cells in enumerate(rows):
-        y = top - 2.4 * height - row * (k + 1) - (0.4 * height if k else 0)
-        for column, text in enumerate(cells):
-            x = left + (0.5 * wide if column == 0 else (column + 0.5) * wide)
-            put = space.add_text(text, height=height, dxfattribs=attributes)
-            put.set_placement((x, y), align=_right())
-        if k == 0:
-            line = y - 0.5 * height
-            space.add_line((left, line), (right, line), dxfattribs=attributes)
+    text = space.add_text(title, height=height, dxfattribs={"layer": TABLE})
+    text.set_placement((place[0], top - 1.6 * height))
+    _add_texts(space, TABLE, rows, place, [0.6 * wide, *4 * [wide]], height)
 
 
-def _right() -> Any:
-    from ezdxf.enums import TextEntityAlignment
+def _add_texts(space: Any, layer: str, rows: Sequence[Sequence[str]], place: tuple[float, float],
+               widths: Sequence[float], height: float) -> None:  # fmt: skip
+    """Add a table of texts with its grid.
 
-    return TextEntityAlignment.RIGHT
+    `place`: upper left corner (mm); `widths` of the columns (mm); `height` of the letters (mm)."""
+    from ezdxf.addons import TablePainter
+    from ezdxf.enums import MTextEntityAlignment
+
+    made = TablePainter(place, len(rows), len(widths), cell_height=1.9 * height)
+    made.fg_layer_name = made.grid_layer_name = layer
+    look = {"char_height": height, "margin_x": 0.5 * height}
+    style = made.new_cell_style("text", align=MTextEntityAlignment.MIDDLE_LEFT, **look)
+    style.set_border_style(made.new_border_style(color=_BY_LAYER))
+    for column, width in enumerate(widths):
+        made.set_col_width(column, width)
+        for row, texts in enumerate(rows):
+            made.text_cell(row, column, plain(texts[column]), style="text")
+    made.render(space)
 
 
 def edges(drawing: Drawing) -> tuple[float, float, float]:

@@ -168,11 +168,6 @@ def outline_pieces(profile: Profile) -> list[DrawnPiece]:
     return _closed(_merged(around, ROUND * float(profile.pitch_radius) * _MM))
 
 
-def area(pieces: list[DrawnPiece]) -> float:
-    """Return the area (mm²) inside the closed outline `pieces`, exact for arcs and splines."""
-    return sum(map(_swept, pieces))
-
-
 def polyline(pieces: list[DrawnPiece], chord: float) -> Complex128[np.ndarray, " n"]:
     """Return a closed polygon (n,) in mm whose corners lie on the outline `pieces`.
 
@@ -183,20 +178,6 @@ def polyline(pieces: list[DrawnPiece], chord: float) -> Complex128[np.ndarray, "
         count = max(2, int(np.ceil(piece.length / chord)))
         parts.append(piece.at(np.arange(count) / count))
     return np.concatenate([*parts, parts[0][:1]])
-
-
-def _swept(piece: DrawnPiece) -> float:
-    """Return ∫ (x dy - y dx) / 2 along a piece (mm²)."""
-    if isinstance(piece, Arc):
-        across = np.imag(np.conj(piece.center) * (piece.stop - piece.start))
-        return float(across + piece.radius**2 * piece.sweep) / 2
-    # The integrand is a polynomial of degree 5 between knots.
-    curve = BSpline(piece.knots, piece.controls, 3)
-    nodes, weights = _GAUSS
-    ends = np.unique(piece.knots)
-    half = np.diff(ends)[:, None] / 2
-    at = ends[:-1, None] + half * (1 + nodes)
-    return float(np.sum(np.imag(np.conj(curve(at)) * curve.derivative()(at)) * half * weights)) / 2
 
 
 def _flank(profile: Profile) -> list[DrawnPiece]:
