@@ -37,8 +37,10 @@ LATE = {
     "commands/console.py": {"rootsopt", "rootsopt.commands", "rootsopt.errors"},
     # Figures are imported in the background; exports, only if they are asked for.
     **{f"commands/work/{name}.py": {"rootsopt.figures", f"rootsopt.figures.{module}"}
-       for name, module in (("attractors", "basins"), ("over", "sweep"), ("pareto", "front"),
-                            ("profile", "runs"))},
+       for name, module in (("attractors", "basins"), ("over", "sweep"), ("profile", "runs"))},
+    "commands/work/pareto.py": {
+        "rootsopt.figures", "rootsopt.figures.front", "rootsopt.report.html",
+    },
     "commands/work/optimize.py": {
         "rootsopt.export.writing", "rootsopt.figures", "rootsopt.figures.tolerances",
     },

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
+from scipy.optimize import root_scalar
 
 from rootsopt.export.pieces import DrawnPiece
 
@@ -95,7 +95,8 @@ def _falls(function: Callable[[Any], Any]) -> Iterator[float]:
     share = np.linspace(0.0, 1.0, _SAMPLES)
     value = function(share)
     for k in np.flatnonzero((value[:-1] >= 0) & (value[1:] < 0)):
-        yield float(brentq(lambda x: float(function(x)), share[k], share[k + 1], xtol=1e-15))
+        bracket = share[k], share[k + 1]
+        yield root_scalar(lambda x: float(function(x)), bracket=bracket, xtol=1e-15).root
 
 
 __all__ = ["Coordinates", "coordinates", "widest"]

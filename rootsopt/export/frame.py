@@ -116,7 +116,7 @@ def _add_texts(space: Any, layer: str, rows: Sequence[Sequence[str]], place: tup
     """Add a table of texts with its grid.
 
     `place`: upper left corner (mm); `widths` of the columns (mm); `height` of the letters (mm)."""
-    from ezdxf.addons import TablePainter
+    from ezdxf.addons.tablepainter import TablePainter
     from ezdxf.enums import MTextEntityAlignment
 
     made = TablePainter(place, len(rows), len(widths), cell_height=1.9 * height)

@@ -9,7 +9,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from rootsopt.config import Config
-from rootsopt.figures.style import COLORS, GREY, figure
+from rootsopt.figures.style import COLORS, GREY, figure, lay_grid, write
 from rootsopt.output.files import ResultFolder
 from rootsopt.response.attractors import Attractor, Basins
 
@@ -66,7 +66,6 @@ def plot_motions(axes: Sequence[Axes], attractors: Sequence[Attractor], colors, 
         time = np.concatenate([periods + k * length for k in range(copies)])
         ax.plot(time, np.tile(series.force, copies), color=color, linewidth=1.1)
         ax.set(ylabel="force (N)", xlim=(0, shown))
-        ax.grid(color="0.92", linewidth=0.6)
     axes[0].set_title("Contact force of each motion")
     axes[-1].set_xlabel("time (mesh periods)")
 
@@ -113,19 +112,15 @@ def basin_figures(folder: ResultFolder, basins: Basins, config: Config) -> list[
     pairs = list(zip(basins.attractors, _colors(basins), strict=True))
     shown = [(one, color) for one, color in pairs if one.evaluation.series is not None][:_PANELS]
     entries = _entries(basins)
-    made, (panels,) = figure(13, 5.6 + 0.12 * len(entries), 1, 2, width_ratios=[1, 1.1])
-    made.legend(handles=entries, loc="outside lower center", ncols=2, frameon=False)
+    made, (panels,) = figure(13, 5.6 + 0.12 * len(entries), 1, 2, grid=False, width_ratios=[1, 1.1])
     plot_basins(panels[0], basins)
     panels[1].remove()
     if shown:
         rows = panels[1].get_subplotspec().subgridspec(len(shown), 1)
         axes = rows.subplots(squeeze=False, sharex=True, sharey=True)[:, 0]
         attractors, colors = zip(*shown, strict=True)
+        lay_grid(axes)
         plot_motions(list(axes), attractors, colors, config.profile.lobes)
         axes[0].set_ylim(0, None)
-    made.suptitle(
-        f"{config.profile.family.upper()} at {config.scene.speed_rpm:g} rpm: coexisting motions"
-    )
-    name = "figures/basins.png"
-    folder.write_figure(name, made)
-    return [name]
+    title = f"{config.profile.family.upper()} at {config.scene.speed_rpm:g} rpm: coexisting motions"
+    return [write(folder, "basins", made, title, entries, 2)]

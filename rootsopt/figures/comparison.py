@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
-from rootsopt.figures.style import BLUE, COLORS, DASHES, GREY
+from rootsopt.figures.style import BLUE, GREY, looks
 from rootsopt.profiles.departure import beyond, feet
 from rootsopt.response.series import Series
 
@@ -16,17 +16,16 @@ def plot_forces_together(ax: Axes, series: Mapping[str, Series], turn: float) ->
 
     `series`: simulated motions, keyed by the design's name; `turn`: rotation (rad) to show. Return
     `ax`."""
-    for (name, run), color, dashes in zip(series.items(), COLORS, DASHES * 2, strict=False):
+    for run, look in zip(series.values(), looks(series), strict=True):
         first = turn * np.ceil(run.rotation[0] / turn - 1e-9)
         if run.rotation[-1] < first + turn:
             first = run.rotation[0]
         shown = (run.rotation >= first - 1e-12) & (run.rotation <= first + turn + 1e-12)
         angle = np.degrees(run.rotation[shown] - first)
-        ax.plot(angle, run.force[shown], color=color, linestyle=dashes, linewidth=1.4, label=name)
+        ax.plot(angle, run.force[shown], linewidth=1.4, **look)
     ax.set(xlim=(0, np.degrees(turn)), xlabel="rotation of rotor 1 (°)")
     ax.set(ylabel="contact force (N)", title="Contact force")
     ax.set_ylim(bottom=0)
-    ax.grid(color="0.92", linewidth=0.6)
     ax.legend(frameon=False)
     return ax
 
@@ -61,7 +60,6 @@ def plot_departure(
     ax.set_ylabel("departure from the baseline (µm)")
     most, way = f"{float(f'{abs(greatest):.3g}'):g}", "out" if greatest > 0 else "in"
     ax.set_title(f"Departure, at most {most} µm {way}wards")
-    ax.grid(color="0.92", linewidth=0.6)
     return ax
 
 

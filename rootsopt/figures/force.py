@@ -7,11 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.markers import CARETDOWN
 from numpy.typing import ArrayLike, NDArray
 
-from rootsopt.figures.style import (
-    BLUE,
-    COLORS,
-    VERMILION,
-)
+from rootsopt.figures.style import BLUE, COLORS, VERMILION, beside
 from rootsopt.response.series import Series
 
 _MOST_TURNS = 4  # revolutions in a force panel, at most
@@ -47,8 +43,7 @@ def plot_force(
         label = f"peak {number(peak)} N"
         ax.plot(first, peak, color="black", marker=CARETDOWN, ls="", markersize=9, label=label)
         ax.set(title=name, ylabel="contact force (N)", xlim=(0, len(force) * step))
-        ax.grid(color="0.92", linewidth=0.6)
-        ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1), frameon=False)
+        beside(ax)
     top = max(max(responses[k]["peak_force_N"], np.max(series[k].force)) for k in series)
     for ax in axes:
         ax.set_ylim(0, 1.12 * top if top > 0 else 1)
@@ -120,8 +115,6 @@ def plot_spectrum(
         else:
             ax.plot(frequency, amplitude, color=color, linewidth=0.7)
         ax.set(title=name, ylabel="force amplitude (N)", xlim=(0, limit / 1e3))
-        ax.grid(color="0.92", linewidth=0.6)
-        ax.set_axisbelow(True)
     for ax in axes:
         ax.set_yscale("log")
         ax.set_ylim(*((1e-4 * top, 2 * top) if top > 0 else (1e-4, 1)))

@@ -12,7 +12,7 @@ from matplotlib.colors import Normalize
 from matplotlib.lines import Line2D
 
 from rootsopt.config.units import words
-from rootsopt.figures.style import BLUE, COLORS, DASHES, GREY, ORANGE, VERMILION, figure
+from rootsopt.figures.style import BLUE, COLORS, DASHES, GREY, ORANGE, VERMILION, figure, write
 from rootsopt.output.files import ResultFolder
 from rootsopt.tradeoffs.front import Front, Standing
 
@@ -52,8 +52,6 @@ def plot_front(ax: Axes, front: Front, x: str, y: str) -> Axes:
         base = front.baseline_terms
         ax.plot(base[x], base[y], "*", color=VERMILION, markersize=13, zorder=4)
     ax.set(xlabel=_axis(aims[x]), ylabel=_axis(aims[y]))
-    ax.grid(color="0.92", linewidth=0.6)
-    ax.set_axisbelow(True)
     return ax
 
 
@@ -62,8 +60,8 @@ def _axis(aim) -> str:
     return f"{aim.label}, {better}"
 
 
-def _legend(made, front: Front) -> None:
-    """Add the meaning of all markers that the figure shows below its panels."""
+def _entries(front: Front) -> list[Line2D]:
+    """Return legend entries with the meaning of all markers that the figure shows."""
     line = Line2D
     standings = {point.standing for point in front.points}
     plain: dict[str, Any] = {"color": BLUE, "linestyle": ""}
@@ -84,8 +82,7 @@ def _legend(made, front: Front) -> None:
     if front.baseline_terms:
         entries.append(line([], [], color=VERMILION, linestyle="", marker="*", markersize=12,
                             label="baseline"))  # fmt: skip
-    made.legend(handles=entries, loc="outside lower center", ncols=min(len(entries), 6),
-                frameon=False)  # fmt: skip
+    return entries
 
 
 def front_figure(folder: ResultFolder, front: Front) -> list[str]:
@@ -107,13 +104,10 @@ def front_figure(folder: ResultFolder, front: Front) -> list[str]:
             norm = Normalize(min(values), max(values))
             colours = ScalarMappable(norm, "viridis")
             made.colorbar(colours, ax=ax, location="top", label=third.label, shrink=0.8)
-    _legend(made, front)
     words = [aim.words for aim in front.aims]
-    family = front.config.profile.family.upper()
-    made.suptitle(f"{family}: trade-off of {', '.join(words[:-1])} against {words[-1]}")
-    name = "figures/front.png"
-    folder.write_figure(name, made)
-    return [name]
+    title = f"trade-off of {', '.join(words[:-1])} against {words[-1]}"
+    title = f"{front.config.profile.family.upper()}: {title}"
+    return [write(folder, "front", made, title, _entries(front), 6)]
 
 
 def plot_designs(ax: Axes, front: Front, x: str) -> Axes:
@@ -133,8 +127,6 @@ def plot_designs(ax: Axes, front: Front, x: str) -> Axes:
         ax.plot([], [], "o", color=color, linestyle=dashes, markersize=4, label=words(key))
     ax.set(xlabel=_axis(aim), ylabel="design (0: lower, 1: upper bound)", ylim=(-0.05, 1.05))
     ax.legend(frameon=False, fontsize=8, ncols=math.ceil(len(keys[:12]) / 4))
-    ax.grid(color="0.92", linewidth=0.6)
-    ax.set_axisbelow(True)
     return ax
 
 

@@ -11,10 +11,7 @@ from numpy.typing import NDArray
 from rootsopt.config import DESIGN_KEYS
 from rootsopt.config.families import is_list
 from rootsopt.figures.force import number
-from rootsopt.figures.style import (
-    COLORS,
-    GREY,
-)
+from rootsopt.figures.style import COLORS, GREY, beside
 
 _MARKERS = "os^Dvp"
 
@@ -40,11 +37,10 @@ def plot_history(
             else:
                 _trace(ax, rows, key, style)
         ax.set_ylabel("objective / baseline" if key == "objective" else _label(key))
-        ax.grid(color="0.92", linewidth=0.6)
     axes[0].axhline(1, color="black", linewidth=0.8, linestyle=":", label="baseline")
     _best(axes, keys, history)
     _outside(axes[0], history)
-    axes[0].legend(loc="upper left", bbox_to_anchor=(1.01, 1), frameon=False)
+    beside(axes[0])
     axes[-1].set_xlabel("evaluation")
     return axes
 
@@ -70,7 +66,7 @@ def _traces(ax, rows, key):
         label = {0: "first, at the tip", len(names) - 1: "last, at the pitch circle"}.get(k)
         ax.plot(x, _values(rows, name), color=shade, linewidth=1.2, label=label)
     if not ax.get_legend():
-        ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1), frameon=False)
+        beside(ax)
 
 
 def _starts(history) -> Iterator[tuple[list[Mapping[str, Any]], dict[str, Any]]]:

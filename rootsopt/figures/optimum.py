@@ -38,7 +38,6 @@ def plot_residual(ax: Axes, history: Sequence[Mapping[str, Any]], required: floa
     ax.set_xlabel("iteration")
     ax.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
     ax.set_ylabel("first-order residual (of the unit box)")
-    ax.grid(visible=True, alpha=0.3)
     ax.legend(frameon=False)
     return ax
 
@@ -106,7 +105,6 @@ def plot_starts(
     spare = max(0.0, _RANGE - (high - low)) / 2
     ax.set_ylim(low - spare, high + spare)
     ax.ticklabel_format(axis="y", useOffset=False)
-    ax.grid(visible=True, alpha=0.3)
     if optima:
         ax.legend(frameon=False, fontsize=8)
     return ax

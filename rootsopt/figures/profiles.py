@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from numpy.typing import NDArray
 
-from rootsopt.figures.style import COLORS, DASHES, GREY, ORANGE, SKY, VERMILION
+from rootsopt.figures.style import GREY, ORANGE, SKY, VERMILION, looks
 from rootsopt.profiles import place_pair
 
 
@@ -47,13 +47,11 @@ def plot_flank(
 
 
 def _overlay(ax, outlines, pitch_radius_mm):
-    for (name, points), color, dashes in zip(outlines.items(), COLORS, DASHES * 2, strict=False):
-        ax.plot(*points.T, color=color, linestyle=dashes, linewidth=1.6, label=name)
+    for points, look in zip(outlines.values(), looks(outlines), strict=True):
+        ax.plot(*points.T, linewidth=1.6, **look)
     _circle(ax, (0, 0), pitch_radius_mm, f"pitch circle, {pitch_radius_mm:g} mm")
     ax.set_aspect("equal")
     ax.set(xlabel="x (mm)", ylabel="y (mm)")
-    ax.grid(color="0.92", linewidth=0.6)
-    ax.set_axisbelow(True)
 
 
 def _circle(ax, center, radius, label=None):
@@ -95,14 +93,12 @@ def plot_conjugacy(ax: Axes, gaps: Mapping[str, tuple[NDArray, NDArray]]) -> Axe
 
     `gaps`: (angles (n,) in degrees, gaps (n,) in µm) of each pair, keyed by its name. The angle is
     0 when a tip of rotor 1 is on the line of centres. Return `ax`."""
-    for (name, (angle, gap)), color, dashes in zip(gaps.items(), COLORS, DASHES * 2, strict=False):
-        ax.plot(angle, gap, color=color, linestyle=dashes, linewidth=1.6, label=name)
+    for (angle, gap), look in zip(gaps.values(), looks(gaps), strict=True):
+        ax.plot(angle, gap, linewidth=1.6, **look)
     ax.axhline(0, color="black", linewidth=0.8)
     low, high = ax.get_ylim()
     if low < 0:
         ax.axhspan(low, 0, color=VERMILION, alpha=0.08, linewidth=0, label="overlap")
     ax.set(ylim=(low, high), xlabel="angle of rotor 1 from tip on the line of centres (°)")
     ax.set(ylabel="gap at ε = 0 (µm)", title="Gap in rolling")
-    ax.grid(color="0.92", linewidth=0.6)
-    ax.set_axisbelow(True)
     return ax

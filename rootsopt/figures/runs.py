@@ -13,9 +13,7 @@ from rootsopt.figures.force import plot_force, plot_spectrum
 from rootsopt.figures.history import plot_history
 from rootsopt.figures.optimum import plot_prices, plot_residual, plot_starts
 from rootsopt.figures.profiles import plot_conjugacy, plot_flank, plot_meshing, plot_profiles
-from rootsopt.figures.style import (
-    figure,
-)
+from rootsopt.figures.style import figure, write
 from rootsopt.measured.conjugacy import conjugacy, gaps_um
 from rootsopt.output.files import ResultFolder
 from rootsopt.response.evaluation import Evaluation
@@ -29,8 +27,8 @@ def profile_figures(folder: ResultFolder, config: Config, record: Mapping[str, A
     for a profile read from a file, conjugacy.png."""
     points = _outline(config, record.get("design", {}))
     names = [
-        _write(folder, "profiles", _profiles({config.profile.family.upper(): points}, config)),
-        _write(folder, "meshing", _meshing(points, config)),
+        _profiles(folder, {config.profile.family.upper(): points}, config),
+        _meshing(folder, points, config),
     ]
     if config.profile.from_file:
         from rootsopt.measured.source import outline_of  # For outlines only: it takes 0.5 s.
@@ -39,7 +37,7 @@ def profile_figures(folder: ResultFolder, config: Config, record: Mapping[str, A
         gaps = gaps_um(conjugacy(outline_of(config.profile)[0]))
         plot_conjugacy(axes[0, 0], {Path(config.profile.outline_file or "").name: gaps})
         axes[0, 0].legend(frameon=False)
-        names.append(_write(folder, "conjugacy", made))
+        names.append(write(folder, "conjugacy", made, ""))
     return names
 
 
@@ -68,14 +66,14 @@ def optimization_figures(
         "optimised": _outline(config, optimized.design),
     }
     names = [
-        _write(folder, "profiles", _profiles(outlines, config)),
-        _write(folder, "meshing", _meshing(outlines["optimised"], config, "optimised rotors")),
+        _profiles(folder, outlines, config),
+        _meshing(folder, outlines["optimised"], config, "optimised rotors"),
     ]
     names += _force_figures(folder, designs, config)
-    names.append(_write(folder, "comparison", _comparison(designs, outlines, config)))
+    names.append(_comparison(folder, designs, outlines, config))
     if history:
         keys = FAMILY_KEYS[config.profile.family]
-        names.append(_write(folder, "history", _history(history, keys)))
+        names.append(write(folder, "history", _history(history, keys), "Optimisation history"))
     return names
 
 
@@ -93,32 +91,23 @@ def certificate_figure(
     plot_residual(axes[0, 0], history, optimality["required_residual"])
     plot_prices(axes[0, 1], constraints, optimality["converged"])
     plot_starts(axes[0, 2], optimality["starts"], optimality["optima"])
-    made.suptitle("Certificate of the optimum")
-    return _write(folder, "optimum", made)
+    return write(folder, "optimum", made, "Certificate of the optimum")
 
 
 def _outline(config, design):
     return outline_mm(config, np.asarray([design[key] for key in design_keys(config)]))
 
 
-def _write(folder, name, made) -> str:
-    file = f"figures/{name}.png"
-    folder.write_figure(file, made)
-    return file
-
-
-def _profiles(outlines, config):
+def _profiles(folder, outlines, config):
     radius = config.profile.pitch_radius_mm
     made, axes = figure(13, 5.7, 1, 2, gridspec_kw={"width_ratios": [1, 1.5]})
     plot_profiles(axes[0, 0], outlines, radius)
     plot_flank(axes[0, 1], outlines, config.profile.lobes, radius)
-    lines, names = axes[0, 0].get_legend_handles_labels()
-    made.legend(lines, names, loc="outside lower center", ncols=len(names), frameon=False)
-    made.suptitle(f"Rotor profile{'s' if len(outlines) > 1 else ''}: {' and '.join(outlines)}")
-    return made
+    title = f"Rotor profile{'s' if len(outlines) > 1 else ''}: {' and '.join(outlines)}"
+    return write(folder, "profiles", made, title, axes[0, 0].get_legend_handles_labels()[0])
 
 
-def _comparison(designs, outlines, config):
+def _comparison(folder, designs, outlines, config):
     lobes, radius = config.profile.lobes, config.profile.pitch_radius_mm
     series = {name: one.series for name, one in designs.items() if one.series is not None}
     made, axes = figure(12, 4.8, 1, 1 + bool(series))
@@ -127,19 +116,18 @@ def _comparison(designs, outlines, config):
     if series:
         periods = [one.steady_state.get("period") or lobes for one in designs.values()]
         plot_forces_together(axes[0, 0], series, 2 * np.pi / lobes * min(max(periods), lobes))
-    made.suptitle("Optimised design and baseline")
-    return made
+    return write(folder, "comparison", made, "Optimised design and baseline")
 
 
-def _meshing(points, config, what="rotors"):
+def _meshing(folder, points, config, what="rotors"):
     lobes = config.profile.lobes
     angles = np.arange(6) * 60 / lobes
-    made, axes = figure(11, 5.6, 2, 3, sharex=True, sharey=True)
+    made, axes = figure(11, 5.6, 2, 3, grid=False, sharex=True, sharey=True)
     plot_meshing(list(axes.ravel()), points, lobes, config.profile.pitch_radius_mm, angles)
     made.supxlabel("x (mm)")
     made.supylabel("y (mm)")
-    made.suptitle(f"Meshing of the {what} over one lobe pitch ({360 / lobes:g}°)")
-    return made
+    title = f"Meshing of the {what} over one lobe pitch ({360 / lobes:g}°)"
+    return write(folder, "meshing", made, title)
 
 
 def _force_figures(folder, designs, config) -> list[str]:
@@ -150,12 +138,11 @@ def _force_figures(folder, designs, config) -> list[str]:
     count, shared = len(series), {"sharex": True, "sharey": True}
     made, axes = figure(10, 1.2 + 2.6 * count, count, 1, **shared)
     plot_force(list(axes[:, 0]), series, responses)
-    made.suptitle(f"Contact force over time at {speed:g} rpm")
-    names = [_write(folder, "force", made)]
+    names = [write(folder, "force", made, f"Contact force over time at {speed:g} rpm")]
     made, axes = figure(10, 1.4 + 2.6 * count, count, 1, **shared)
     plot_spectrum(list(axes[:, 0]), series, config.profile.lobes * speed / 60)
-    made.suptitle(f"Spectrum of the contact force at {speed:g} rpm")
-    return [*names, _write(folder, "spectrum", made)]
+    title = f"Spectrum of the contact force at {speed:g} rpm"
+    return [*names, write(folder, "spectrum", made, title)]
 
 
 def _history(history, keys):
@@ -165,5 +152,4 @@ def _history(history, keys):
         10, tall, len(heights), 1, sharex=True, gridspec_kw={"height_ratios": heights}
     )
     plot_history(list(axes[:, 0]), history, keys)
-    made.suptitle("Optimisation history")
     return made

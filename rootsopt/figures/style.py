@@ -1,5 +1,7 @@
 """Colours and line styles of all figures, and figures that need no display."""
 
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -11,6 +13,8 @@ from matplotlib.layout_engine import LayoutEngine
 from matplotlib.spines import Spine
 from matplotlib.transforms import Bbox, BboxTransformFrom, BboxTransformTo
 from numpy.typing import NDArray
+
+from rootsopt.output.files import ResultFolder
 
 # Okabe and Ito's palette: distinguishable with any colour vision, and in grey.
 BLUE, VERMILION, GREEN = "#0072B2", "#D55E00", "#009E73"
@@ -142,11 +146,49 @@ def _shrunk(legend: Any) -> bool:
 
 
 def figure(
-    width: float, height: float, rows: int = 1, columns: int = 1, **options: Any
+    width: float, height: float, rows: int = 1, columns: int = 1, grid: bool = True, **options: Any
 ) -> tuple[Figure, NDArray]:
     """Return a figure that needs no display, and its array of axes of shape (rows, columns).
 
-    `width`, `height`: size in inches; `options`: keyword arguments of `Figure.subplots`."""
+    `width`, `height`: size in inches; `grid`: whether the panels have one; `options`: keyword
+    arguments of `Figure.subplots`."""
     made = Figure(figsize=(width, height), layout=Margins())
     FigureCanvasAgg(made)
-    return made, made.subplots(rows, columns, squeeze=False, **options)
+    axes = made.subplots(rows, columns, squeeze=False, **options)
+    if grid:
+        lay_grid(axes)
+    return made, axes
+
+
+def lay_grid(axes: NDArray) -> None:
+    """Draw a light grid behind everything else on `axes`."""
+    for ax in axes.flat:
+        ax.grid(color="0.92", linewidth=0.6)
+        ax.set_axisbelow(True)
+
+
+def looks(names: Iterable[str]) -> Iterator[dict[str, Any]]:
+    """Yield colour, line style and label of the curve of each name."""
+    for name, color, dashes in zip(names, cycle(COLORS), cycle(DASHES)):
+        yield {"color": color, "linestyle": dashes, "label": name}
+
+
+def write(
+    folder: ResultFolder, name: str, made: Figure, title: str,
+    entries: Sequence[Any] = (), columns: int = 4,
+) -> str:  # fmt: skip
+    """Write a figure with its `title` and a legend below all panels; return the file's name.
+
+    `entries`: entries of the legend, in at most so many `columns`."""
+    if entries:
+        made.legend(handles=entries, loc="outside lower center", ncols=min(len(entries), columns),
+                    frameon=False)  # fmt: skip
+    made.suptitle(title)
+    file = f"figures/{name}.png"
+    folder.write_figure(file, made)
+    return file
+
+
+def beside(ax: Axes) -> None:
+    """Place the legend of a panel at its right."""
+    ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1), frameon=False)

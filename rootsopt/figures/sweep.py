@@ -5,26 +5,19 @@ from typing import Any
 
 import numpy as np
 import xarray
-from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
-from rootsopt.figures.style import COLORS, DASHES, figure
+from rootsopt.figures.speeds import LABELS, MARKERS, plot_line, status_entries
+from rootsopt.figures.style import COLORS, figure, looks, write
 from rootsopt.output.files import ResultFolder
 from rootsopt.status import Status
 from rootsopt.sweeps.plan import Plan
 from rootsopt.sweeps.table import is_numeric, unit, written
 
-FORCES = {"mean_force_N": "mean force (N)", "peak_force_N": "peak force (N)"}
-_MARKERS = {"periodic": "o", "averaged": "s", "chaotic": "x", "not_settled": "+", "idle": "1"}
-_OTHERS = "v^<>d*Pph2"
-"""Markers for statuses without a marker of their own, in the order in which these appear."""
 _FEW = len(COLORS)
 """Number of values of the second key above which it is drawn as a map, not as lines."""
-_DENSE = 24
-"""Number of values on a line above which steady motions have no markers."""
 
 
 class _Axis:
@@ -67,24 +60,11 @@ def sweep_figure(folder: ResultFolder, plan: Plan, dataset: xarray.Dataset) -> l
     if len(plan.keys) > 2:
         return []
     axes = [_Axis(key, values) for one in plan.dimensions for key, values in one.columns.items()]
-    markers = _markers(dataset)
-    if len(axes) == 1 or (len(plan.shape) == 2 and min(plan.shape) <= _FEW):
-        made = _lines(axes, plan, dataset, markers)
-    else:
-        made = _map(axes, plan, dataset, markers)
-    name = "figures/sweep.png"
-    folder.write_figure(name, made)
-    return [name]
+    lines = len(axes) == 1 or (len(plan.shape) == 2 and min(plan.shape) <= _FEW)
+    return [(_lines if lines else _map)(folder, axes, plan, dataset)]
 
 
-def _markers(dataset: xarray.Dataset) -> dict[str, str]:
-    """Return a marker for each status in the dataset."""
-    found = [str(label) for label in dict.fromkeys(dataset.status.values.ravel())]
-    others = iter(_OTHERS * (1 + len(found) // len(_OTHERS)))
-    return {label: _MARKERS.get(label) or next(others) for label in found}
-
-
-def _lines(axes, plan: Plan, dataset: xarray.Dataset, markers) -> Figure:
+def _lines(folder: ResultFolder, axes, plan: Plan, dataset: xarray.Dataset) -> str:
     """Draw the forces over one key, with a line for each value of the other key, if there is one.
 
     The first key is on the axis, unless the second one has too many values, or only the second one
@@ -94,27 +74,22 @@ def _lines(axes, plan: Plan, dataset: xarray.Dataset, markers) -> Figure:
     swapped = along is not None and (not few[1] or (few[0] and numbers == [False, True]))
     if along is not None and swapped:
         across, along = along, across
-    made, panels = figure(9, 6.6, len(FORCES), 1, sharex=True)
-    for ax, (force, label) in zip(panels[:, 0], FORCES.items(), strict=True):
-        values, labels = _table(dataset, force, swapped), _table(dataset, "status", swapped)
-        for column in range(values.shape[1]):
-            _line(ax, across, (values[:, column], labels[:, column]), column, markers)
+    names = [""] if along is None else [*map(along.words, along.values)]
+    order = np.argsort(across.at, kind="stable")
+    made, panels = figure(9, 6.6, len(LABELS), 1, sharex=True)
+    for ax, (force, label) in zip(panels[:, 0], LABELS.items(), strict=True):
+        values, labels = (_table(dataset, key, swapped)[order] for key in (force, "status"))
+        for column, look in enumerate(looks(names)):
+            plot_line(ax, across.at[order], values[:, column], labels[:, column].astype(str), look,
+                      across.numeric, column)  # fmt: skip
         ax.set_ylabel(label)
         if np.isfinite(values).any():
             ax.set_ylim(0, 1.05 * np.nanmax(values) or 1)
-        ax.grid(color="0.92", linewidth=0.6)
-        ax.set_axisbelow(True)
     across.on(panels[-1, 0].xaxis)
     panels[-1, 0].set_xlabel(across.label)
-    entries = _entries(markers)
-    if along is not None:
-        entries = [
-            Line2D([], [], color=COLORS[k], linestyle=_dash(k), label=along.words(value))
-            for k, value in enumerate(along.values)
-        ] + entries
-    made.legend(handles=entries, loc="outside lower center", ncols=4, frameon=False)
-    made.suptitle(f"Contact force over {across.key}")
-    return made
+    entries = [] if along is None else [Line2D([], [], **look) for look in looks(names)]
+    entries += status_entries(dataset.status.values.ravel().astype(str))
+    return write(folder, "sweep", made, f"Contact force over {across.key}", entries)
 
 
 def _table(dataset: xarray.Dataset, name: str, swapped: bool) -> NDArray:
@@ -124,38 +99,14 @@ def _table(dataset: xarray.Dataset, name: str, swapped: bool) -> NDArray:
     return values.T if swapped else values
 
 
-def _dash(number: int) -> Any:
-    return DASHES[number % len(DASHES)]
-
-
-def _line(ax: Axes, across: _Axis, column: tuple[NDArray, NDArray], number: int, markers) -> None:
-    """Draw a force over a key: a line through usable points, and a marker for each status."""
-    order = np.argsort(across.at, kind="stable")
-    at, (values, labels) = across.at[order], (part[order] for part in column)
-    usable = np.array([Status[str(label).upper()].usable for label in labels])
-    color = COLORS[number]
-    style: dict[str, Any] = {"color": color, "linestyle": _dash(number), "linewidth": 1.5}
-    if across.numeric:
-        ax.plot(at, np.where(usable, values, np.nan), **style)
-    beside = np.concatenate([[False], usable, [False]])
-    alone = usable & ~(beside[:-2] | beside[2:])
-    for label, marker in markers.items():
-        here = (labels == label) & (~usable | alone | (len(at) <= _DENSE) | (not across.numeric))
-        known, lost = here & np.isfinite(values), here & ~np.isfinite(values)
-        ax.plot(at[known], values[known], marker, color=color, markersize=5.5)
-        # Points without a force stand at the bottom, a row for each line.
-        low = np.full(lost.sum(), 0.03 + 0.035 * number)
-        transform = ax.get_xaxis_transform()
-        ax.plot(at[lost], low, marker, color=color, markersize=5.5, transform=transform)
-
-
-def _map(axes, plan: Plan, dataset: xarray.Dataset, markers) -> Figure:
+def _map(folder: ResultFolder, axes, plan: Plan, dataset: xarray.Dataset) -> str:
     """Draw the forces over two keys as colours: a map of a grid, or points of a sample."""
     across, up = axes
-    made, panels = figure(12, 5.4, 1, len(FORCES), sharex=True, sharey=True)
+    made, panels = figure(12, 5.4, 1, len(LABELS), grid=False, sharex=True, sharey=True)
     labels = dataset.status.values.astype(str)
+    lost = [one for one in dict.fromkeys(labels.ravel()) if not Status[one.upper()].usable]
     grid = len(plan.shape) == 2
-    for ax, (force, label) in zip(panels[0], FORCES.items(), strict=True):
+    for ax, (force, label) in zip(panels[0], LABELS.items(), strict=True):
         values = dataset[force].values
         known = values[np.isfinite(values)]
         norm = Normalize(*((known.min(), known.max()) if known.size else (0, 1)))
@@ -170,34 +121,16 @@ def _map(axes, plan: Plan, dataset: xarray.Dataset, markers) -> Figure:
             places = [across.at, up.at]
             drawn = ax.scatter(*places, c=values, norm=norm, cmap="viridis", s=36)
         made.colorbar(drawn, ax=ax, label=label)
-        for status, marker in markers.items():
-            if not Status[status.upper()].usable:
-                here = labels == status
-                ax.plot(places[0][here], places[1][here], marker, color="black",
-                        markersize=6, markerfacecolor="none")  # fmt: skip
+        for status in lost:
+            here = labels == status
+            ax.plot(places[0][here], places[1][here], MARKERS[status], color="black",
+                    markersize=6, markerfacecolor="none")  # fmt: skip
         across.on(ax.xaxis)
         up.on(ax.yaxis)
         ax.set_xlabel(across.label)
     panels[0, 0].set_ylabel(up.label)
-    entries = _entries({k: v for k, v in markers.items() if not Status[k.upper()].usable}, "none")
-    if entries:
-        made.legend(handles=entries, loc="outside lower center", ncols=5, frameon=False)
-    made.suptitle(f"Contact force over {across.key} and {up.key}")
-    return made
+    title = f"Contact force over {across.key} and {up.key}"
+    return write(folder, "sweep", made, title, status_entries(lost, "none"), 5)
 
 
-def _entries(markers: dict[str, str], face: str = "black") -> list[Line2D]:
-    """Return legend entries for the markers of statuses; `face`: colour of their faces."""
-    found = []
-    for label, marker in markers.items():
-        words = label.replace("_", " ")
-        if label in ("chaotic", "not_settled"):
-            words += ", average of a window"
-        elif face == "black" and Status[label.upper()].usable:
-            words += ", joined by lines"
-        style: dict[str, Any] = {"linestyle": "", "marker": marker, "markerfacecolor": face}
-        found.append(Line2D([], [], color="black", label=words, **style))
-    return found
-
-
-__all__ = ["FORCES", "sweep_figure"]
+__all__ = ["sweep_figure"]

@@ -45,8 +45,6 @@ def plot_distribution(ax: Axes, designs: Mapping[str, ArrayLike], label: str) ->
                 label=NAMES[name], **style)  # fmt: skip
         ax.axvline(float(np.quantile(values, 0.95)), linewidth=1.0, alpha=0.8, **style)
     ax.set(xlabel=label, ylabel="share of the scenes (%)")
-    ax.grid(color="0.92", linewidth=0.6)
-    ax.set_axisbelow(True)
     return ax
 
 
