@@ -10,12 +10,15 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 from numpy.typing import NDArray
 from PIL import Image
 
 from rootsopt.export.drawing import Drawing
 from rootsopt.export.pieces import polyline
-from rootsopt.figures.style import BLUE, GREY, ORANGE, SKY, VERMILION, figure
+from rootsopt.figures.force import plot_flank_force
+from rootsopt.figures.profiles import draw_rotor
+from rootsopt.figures.style import BLUE, ORANGE, SKY, VERMILION, beside, figure
 from rootsopt.profiles import Profile, place_pair
 from rootsopt.response.series import Series
 from rootsopt.runtime.programs import Program
@@ -142,7 +145,7 @@ def meshing_gif(
     """
     frames = frames_of(profile, series, periods)
     rows = 1 if series is None else 2
-    made, axes = figure(9, 5.4 + 2 * (rows - 1), rows, 1, height_ratios=[2.6, 1][:rows])
+    made, axes = figure(9, 5.4 + 2 * (rows - 1), rows, 1, grid=False, height_ratios=[2.6, 1][:rows])
     scene, cursor = _Scene(axes[0, 0], drawing), None
     axes[0, 0].set_title("Perfect rolling: contact and direction of its force on rotor 2")
     if series is not None:
@@ -169,8 +172,7 @@ def _force_panel(ax: Axes, series: Series, samples: int):
     degrees = np.degrees(series.rotation[shown] - series.rotation[0])
     forces = series.drive_force[shown], series.coast_force[shown]
     for (name, color), force in zip(_FLANKS, forces, strict=True):
-        ax.fill_between(degrees, force, color=color, alpha=0.15, linewidth=0)
-        ax.plot(degrees, force, color=color, linewidth=1.2, label=name)
+        plot_flank_force(ax, degrees, force, color, name)
     top = max(map(np.max, forces))
     ax.set(
         xlim=(0, degrees[-1]),
@@ -178,7 +180,7 @@ def _force_panel(ax: Axes, series: Series, samples: int):
         xlabel="rotation of rotor 1 (°)",
         ylabel="contact force (N)",
     )
-    ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1), frameon=False)
+    beside(ax)
     return ax.axvline(0, color="black", linewidth=1.0)
 
 
@@ -215,8 +217,13 @@ class _Scene:
         points = polyline(drawing.pieces, _CHORD * drawing.outer_radius)
         self.outline = np.stack([np.real(points), np.imag(points)], axis=-1)
         self.lobes, self.center = drawing.lobes, 2 * drawing.pitch_radius
-        named = (SKY, "rotor 1 ↺", 0.0), (ORANGE, "rotor 2 ↻", self.center)
-        self.rotors = [self._rotor(ax, drawing, *one) for one in named]
+        hole = 0.0 if drawing.bore is None else drawing.bore / 2
+        self.rotors = []
+        for name, color, x in (("rotor 1 ↺", SKY, 0.0), ("rotor 2 ↻", ORANGE, self.center)):
+            rotor = draw_rotor(ax, self.outline, color, x, drawing.pitch_radius)
+            self.rotors.append(rotor)
+            ax.add_patch(Circle((x, 0), hole, facecolor="white", edgecolor="black"))
+            ax.annotate(name, (x, -hole), (0, -16), textcoords="offset points", ha="center")
         for name, color in _FLANKS:
             ax.plot([], [], "o", color=color, label=name)
         self.label = ax.text(0.01, 0.98, "", transform=ax.transAxes, va="top")
@@ -226,26 +233,11 @@ class _Scene:
         ax.legend(loc="lower left", fontsize="small", framealpha=0.9)
         self.arrows = [_Arrow(ax, color, _ARROW * drawing.pitch_radius) for _, color in _FLANKS]
 
-    def _rotor(self, ax, drawing, color, name, x):
-        """Draw a rotor with its axis at `x` (mm); return the patch of its outline."""
-        line = {"edgecolor": "black", "linewidth": 0.8}
-        (patch,) = ax.fill(*self.outline.T, facecolor=color, alpha=0.75, **line)
-        circle = np.exp(1j * np.linspace(0, 2 * np.pi, 181))
-        pitch = drawing.pitch_radius * circle
-        ax.plot(x + np.real(pitch), np.imag(pitch), "--", color=GREY, linewidth=0.9)
-        hole = 0.0 if drawing.bore is None else drawing.bore / 2
-        if hole > 0:
-            bore = hole * circle
-            ax.fill(x + np.real(bore), np.imag(bore), facecolor="white", **line)
-        ax.plot(x, 0, "o", color="black", markersize=4)
-        ax.annotate(name, (x, -hole), (0, -16), textcoords="offset points", ha="center")
-        return patch
-
     def turn(self, first: float, second: float) -> None:
         """Turn rotor 1 to the angle `first` and rotor 2 to the angle `second` (rad)."""
         placed = place_pair(self.outline, self.lobes, self.center, first, second)
         for rotor, points in zip(self.rotors, placed, strict=True):
-            rotor.set_xy(points)
+            rotor.set_verts([points])
         pitch = 360 / self.lobes
         self.label.set_text(f"φ = {np.degrees(first) % pitch:5.1f}° of {pitch:g}°")
 

@@ -34,8 +34,8 @@ def plot_force(
         force = run.force[shown]
         step = (run.time[1] - run.time[0]) * 1e3
         time = step * np.arange(len(force))
-        _flank_force(ax, time, run.drive_force[shown], BLUE, "drive flank")
-        _flank_force(ax, time, run.coast_force[shown], VERMILION, "coast flank")
+        plot_flank_force(ax, time, run.drive_force[shown], BLUE, "drive flank")
+        plot_flank_force(ax, time, run.coast_force[shown], VERMILION, "coast flank")
         mean, peak = responses[name]["mean_force_N"], responses[name]["peak_force_N"]
         label = f"mean {number(mean)} N"
         ax.axhline(mean, color="black", linestyle="--", linewidth=1.1, label=label)
@@ -51,7 +51,8 @@ def plot_force(
     return axes
 
 
-def _flank_force(ax, time, force, color, label):
+def plot_flank_force(ax: Axes, time: NDArray, force: NDArray, color: str, label: str) -> None:
+    """Draw the force on a flank over time or rotation, with a shade below it."""
     if not np.any(force > 0):
         label += " (no contact)"
     ax.fill_between(time, force, color=color, alpha=0.15, linewidth=0)

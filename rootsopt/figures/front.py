@@ -2,21 +2,46 @@
 
 import itertools
 import math
+from collections.abc import Mapping
 from typing import Any
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
-from matplotlib.lines import Line2D
 
 from rootsopt.config.units import words
 from rootsopt.figures.style import BLUE, COLORS, DASHES, GREY, ORANGE, VERMILION, figure, write
 from rootsopt.output.files import ResultFolder
 from rootsopt.tradeoffs.front import Front, Standing
 
-_DROPPED = (Standing.DOMINATED,)
+_LOOKS: dict[str, dict[str, Any]] = {
+    "certified": {"marker": "o", "color": BLUE, "markersize": 6.5},
+    "not certified": {"marker": "o", "color": BLUE, "markersize": 6.5, "markerfacecolor": "white"},
+    "best in one term": {"marker": "s", "color": BLUE, "markersize": 10, "markerfacecolor": "none"},
+    "dominated": {"marker": "x", "color": GREY, "markersize": 5},
+    "side of a gap": {"marker": "o", "color": ORANGE, "markersize": 13, "markerfacecolor": "none"},
+    "baseline": {"marker": "*", "color": VERMILION, "markersize": 13},
+}
+"""Look of each kind of point."""
+
+
+def kinds(result: Mapping[str, Any]) -> dict[str, list[Mapping[str, Any]]]:
+    """Return the points of each kind that a front has, in the order of drawing.
+
+    `result`: content of the result file, as from `Front.record`. A side of a gap, and the best
+    point in a term, are of another kind, too."""
+    points, base = result["points"], result.get("baseline") or {}
+    sides = {gap[end] for gap in result.get("gaps") or () for end in ("first", "second")}
+    sure = Standing.CERTIFIED.label
+    dropped = result.get("dropped") or ()
+    found = {
+        "side of a gap": [one for one in points if one["point"] in sides],
+        "certified": [one for one in points if one["status"] == sure],
+        "not certified": [one for one in points if one["status"] != sure],
+        "best in one term": [one for one in points if one.get("end_of")],
+        "dominated": [one for one in dropped if one["status"] == Standing.DOMINATED.label],
+        "baseline": [base] if base.get("terms") else [],
+    }
+    return {kind: group for kind, group in found.items() if group}
 
 
 def plot_front(ax: Axes, front: Front, x: str, y: str) -> Axes:
@@ -25,32 +50,21 @@ def plot_front(ax: Axes, front: Front, x: str, y: str) -> Axes:
     Lines connect neighbours, but not across a gap. For three terms, colours show the third. Return
     `ax`."""
     aims = {aim.name: aim for aim in front.aims}
-    third = next((name for name in aims if name not in (x, y)), None)
-    for one, other in front.edges:
-        ends = [front.points[k - 1].terms for k in (one, other)]
+    for edge in front.edges:
+        ends = [front.points[k - 1].terms for k in edge]
         ax.plot([p[x] for p in ends], [p[y] for p in ends], color=GREY, linewidth=1, zorder=1)
-    if third is not None:
-        values = [point.terms[third] for point in front.points]
-        norm = Normalize(min(values), max(values))
+    for kind, group in kinds(front.record()).items():
+        across, up = ([one["terms"][name] for one in group] for name in (x, y))
+        ax.plot(across, up, linestyle="", label=kind, **_LOOKS[kind])
+    text: dict[str, Any] = {"textcoords": "offset points", "xytext": (6, -9), "fontsize": 8}
     for point in front.points:
-        color = BLUE if third is None else matplotlib.colormaps["viridis"](norm(point.terms[third]))
-        sure = point.standing is Standing.CERTIFIED
-        fill = color if sure else "white"
-        marker = "s" if point.end_of else "o"
-        at = point.terms[x], point.terms[y]
-        ax.plot(*at, marker, color=color, markerfacecolor=fill, markersize=6.5, zorder=3)
-        text: dict[str, Any] = {"textcoords": "offset points", "xytext": (6, -9), "fontsize": 8}
-        ax.annotate(str(point.number), at, color="0.3", **text)
-    for point in front.dropped:
-        if point.standing in _DROPPED:
-            ax.plot(point.terms[x], point.terms[y], "x", color=GREY, markersize=5, zorder=2)
-    for gap in front.gaps:
-        ends = [front.points[k - 1].terms for k in (gap.first, gap.second)]
-        for end in ends:
-            ax.plot(end[x], end[y], "o", color=ORANGE, markerfacecolor="none", markersize=12)
-    if front.baseline_terms:
-        base = front.baseline_terms
-        ax.plot(base[x], base[y], "*", color=VERMILION, markersize=13, zorder=4)
+        ax.annotate(str(point.number), (point.terms[x], point.terms[y]), color="0.3", **text)
+    third = next((aim for aim in front.aims if aim.name not in (x, y)), None)
+    if third is not None:
+        places = ([point.terms[name] for point in front.points] for name in (x, y, third.name))
+        across, up, values = places
+        colours = ax.scatter(across, up, c=values, cmap="viridis", s=40, zorder=3)
+        ax.figure.colorbar(colours, ax=ax, location="top", label=third.label, shrink=0.8)
     ax.set(xlabel=_axis(aims[x]), ylabel=_axis(aims[y]))
     return ax
 
@@ -58,31 +72,6 @@ def plot_front(ax: Axes, front: Front, x: str, y: str) -> Axes:
 def _axis(aim) -> str:
     better = "less is better" if aim.sense == "min" else "more is better"
     return f"{aim.label}, {better}"
-
-
-def _entries(front: Front) -> list[Line2D]:
-    """Return legend entries with the meaning of all markers that the figure shows."""
-    line = Line2D
-    standings = {point.standing for point in front.points}
-    plain: dict[str, Any] = {"color": BLUE, "linestyle": ""}
-    entries = [line([], [], marker="o", label="certified", **plain)]
-    if standings - {Standing.CERTIFIED}:
-        entries.append(line([], [], marker="o", markerfacecolor="white", label="not certified",
-                            **plain))  # fmt: skip
-    if any(point.end_of for point in front.points):
-        entries.append(line([], [], marker="s", label="best in one term", **plain))
-    if any(point.standing in _DROPPED for point in front.dropped):
-        entries.append(line([], [], color=GREY, linestyle="", marker="x", label="dominated"))
-    if front.gaps:
-        kinds = {gap.kind for gap in front.gaps}
-        what = {"terms": "gap", "design": "change of design"}
-        names = " or ".join(what[kind] for kind in ("terms", "design") if kind in kinds)
-        entries.append(line([], [], color=ORANGE, linestyle="", marker="o", markersize=11,
-                            markerfacecolor="none", label=f"side of a {names}"))  # fmt: skip
-    if front.baseline_terms:
-        entries.append(line([], [], color=VERMILION, linestyle="", marker="*", markersize=12,
-                            label="baseline"))  # fmt: skip
-    return entries
 
 
 def front_figure(folder: ResultFolder, front: Front) -> list[str]:
@@ -99,15 +88,10 @@ def front_figure(folder: ResultFolder, front: Front) -> list[str]:
         made, axes = figure(14, 5.4, 1, len(pairs))
         for ax, (y, x) in zip(axes[0], pairs, strict=True):
             plot_front(ax, front, x, y)
-            third = next(aim for aim in front.aims if aim.name not in (x, y))
-            values = [point.terms[third.name] for point in front.points]
-            norm = Normalize(min(values), max(values))
-            colours = ScalarMappable(norm, "viridis")
-            made.colorbar(colours, ax=ax, location="top", label=third.label, shrink=0.8)
     words = [aim.words for aim in front.aims]
     title = f"trade-off of {', '.join(words[:-1])} against {words[-1]}"
     title = f"{front.config.profile.family.upper()}: {title}"
-    return [write(folder, "front", made, title, _entries(front), 6)]
+    return [write(folder, "front", made, title, axes[0, 0].get_legend_handles_labels()[0], 6)]
 
 
 def plot_designs(ax: Axes, front: Front, x: str) -> Axes:
@@ -130,4 +114,4 @@ def plot_designs(ax: Axes, front: Front, x: str) -> Axes:
     return ax
 
 
-__all__ = ["front_figure", "plot_designs", "plot_front"]
+__all__ = ["front_figure", "kinds", "plot_designs", "plot_front"]

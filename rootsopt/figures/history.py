@@ -12,6 +12,7 @@ from rootsopt.config import DESIGN_KEYS
 from rootsopt.config.families import is_list
 from rootsopt.figures.force import number
 from rootsopt.figures.style import COLORS, GREY, beside
+from rootsopt.output.names import label
 
 _MARKERS = "os^Dvp"
 
@@ -36,20 +37,13 @@ def plot_history(
                 _traces(ax, rows, key)
             else:
                 _trace(ax, rows, key, style)
-        ax.set_ylabel("objective / baseline" if key == "objective" else _label(key))
+        ax.set_ylabel("objective / baseline" if key == "objective" else label(key))
     axes[0].axhline(1, color="black", linewidth=0.8, linestyle=":", label="baseline")
     _best(axes, keys, history)
     _outside(axes[0], history)
     beside(axes[0])
     axes[-1].set_xlabel("evaluation")
     return axes
-
-
-def _label(key: str) -> str:
-    """Return the name of a design parameter with its unit."""
-    units = {"_deg": " (°)", "_mm": " (mm)"}
-    unit = next((end for end in units if key.endswith(end)), "")
-    return key.removesuffix(unit).replace("_", " ") + units.get(unit, "")
 
 
 def _traces(ax, rows, key):
@@ -63,8 +57,8 @@ def _traces(ax, rows, key):
     x = _values(rows, "evaluation")
     for k, name in enumerate(names):
         shade = colormaps["cividis"](k / max(len(names) - 1, 1))
-        label = {0: "first, at the tip", len(names) - 1: "last, at the pitch circle"}.get(k)
-        ax.plot(x, _values(rows, name), color=shade, linewidth=1.2, label=label)
+        end = {0: "first, at the tip", len(names) - 1: "last, at the pitch circle"}.get(k)
+        ax.plot(x, _values(rows, name), color=shade, linewidth=1.2, label=end)
     if not ax.get_legend():
         beside(ax)
 
@@ -136,10 +130,10 @@ def _outside(ax, history):
     margin = 0.12 * max(high - low, 0.02)
     ax.set_ylim(low - margin, high + 1.5 * margin)
     marks = ((values > high, "^", "above the axis"), (~np.isfinite(values), "x", "unusable design"))
-    for mask, marker, label in marks:
+    for mask, marker, name in marks:
         if np.any(mask):
             top = np.full(np.count_nonzero(mask), 0.96)
             over = {"transform": ax.get_xaxis_transform(), "linestyle": "", "color": "black"}
-            ax.plot(x[mask], top, marker=marker, markersize=6, label=label, **over)
+            ax.plot(x[mask], top, marker=marker, markersize=6, label=name, **over)
     if not all(bool(row.get("feasible", True)) for row in history):
         ax.plot([], [], "o", color=GREY, markerfacecolor="white", label="constraint not met")

@@ -60,6 +60,20 @@ def _circle(ax, center, radius, label=None):
     ax.plot(x, y, "--", color=GREY, linewidth=0.9, label=label)
 
 
+def draw_rotor(
+    ax: Axes, points: NDArray[np.float64], color: str, x: float, pitch_radius_mm: float
+) -> PolyCollection:
+    """Draw a rotor whose outline is `points` (n, 2), with its axis at `x` and its pitch circle.
+
+    Lengths are in mm. Return the outline, which `set_verts` moves."""
+    look = {"facecolor": color, "alpha": 0.75, "edgecolor": "black", "linewidth": 0.8}
+    drawn = PolyCollection([points], **look)  # `fill` takes ten times as long.
+    ax.add_collection(drawn)
+    _circle(ax, (x, 0), pitch_radius_mm)
+    ax.plot(x, 0, "o", color="black", markersize=4)
+    return drawn
+
+
 def plot_meshing(
     axes: Sequence[Axes] | NDArray,
     outline_mm: NDArray[np.float64],
@@ -77,10 +91,7 @@ def plot_meshing(
         pair = place_pair(np.asarray(outline_mm), lobes, center, turn, turn)
         names = "rotor 1 ↺", "rotor 2 ↻"
         for points, color, x, name in zip(pair, (SKY, ORANGE), (0, center), names, strict=True):
-            look = {"facecolor": color, "alpha": 0.75, "edgecolor": "black", "linewidth": 0.8}
-            ax.add_collection(PolyCollection([points], **look))  # `fill` takes ten times as long.
-            _circle(ax, (x, 0), pitch_radius_mm)
-            ax.plot(x, 0, "o", color="black", markersize=4)
+            draw_rotor(ax, points, color, x, pitch_radius_mm)
             ax.annotate(name, (x, 0), (0, 7), textcoords="offset points", ha="center")
         ax.axhline(0, color="black", linewidth=0.6, linestyle="-.")
         ax.set_aspect("equal")

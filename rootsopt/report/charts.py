@@ -14,6 +14,7 @@ from bokeh.themes import Theme
 from numpy.typing import NDArray
 
 from rootsopt.figures.force import amplitude_spectrum
+from rootsopt.figures.front import kinds
 from rootsopt.figures.style import BLUE, COLORS, GREY, ORANGE, VERMILION
 from rootsopt.output.names import brief, in_words, label, stated, value
 from rootsopt.report.gather import Case, varied
@@ -46,6 +47,16 @@ _FLOOR = 1e-4
 _MOST_CURVES = 8
 """Number of lines above which a chart of a sweep shows single points instead."""
 _MARKS = "circle", "diamond", "square", "triangle"
+_HOLLOW: dict[str, Any] = {"fill_color": None, "line_width": 2}
+_LOOKS: dict[str, dict[str, Any]] = {
+    "certified": {"size": 11, "color": BLUE},
+    "not certified": {"size": 11, "line_color": BLUE} | _HOLLOW,
+    "best in one term": {"size": 15, "marker": "square", "line_color": BLUE} | _HOLLOW,
+    "dominated": {"size": 8, "marker": "x", "color": GREY},
+    "side of a gap": {"size": 19, "line_color": ORANGE} | _HOLLOW,
+    "baseline": {"size": 15, "marker": "star", "color": VERMILION},
+}
+"""Look of each kind of point of a front."""
 _DASHES = "solid", "dashed", "dotted", "dashdot"
 
 
@@ -214,35 +225,17 @@ def front_charts(result: Mapping[str, Any]) -> dict[str, Any]:
         lines = ([[at[k][name] for k in pair] for pair in result.get("edges") or ()]
                  for name in (across, up))  # fmt: skip
         made.multi_line(*lines, color=GREY, line_width=1.2)
-        for name, group, style in _groups(result):
+        for name, group in kinds(result).items():
             data = {key: [one["terms"][key] for one in group] for key in (across, up)}
             facts = [{**one["terms"], **one.get("design", {})} for one in group]
             tips = {key: [value(one.get(key)) for one in facts] for key in facts[0]}
             data |= {f"shown {key}": shown for key, shown in tips.items()}
             data["what"] = [f"{one.get('point', '')} {in_words(one['status'])}" for one in group]
-            drawn = made.scatter(across, up, source=data, legend_label=name, **style)
+            drawn = made.scatter(across, up, source=data, legend_label=name, **_LOOKS[name])
             hover(made, [drawn], {"point": "@what"}
                   | {label(key): f"@{{shown {key}}}" for key in tips})  # fmt: skip
         charts[f"{label(up)} against {label(across)}"] = made
     return charts
-
-
-def _groups(result: Mapping[str, Any]) -> list[tuple[str, list, dict[str, Any]]]:
-    """Return (name, points, style of the marks) of each kind of point that a front has."""
-    points, base = result["points"], result.get("baseline") or {}
-    sides = {gap[end] for gap in result.get("gaps") or () for end in ("first", "second")}
-    sure = [point for point in points if point["status"] == "certified"]
-    hollow = {"fill_color": None, "line_width": 2}
-    groups = [
-        ("side of a gap", [one for one in points if one["point"] in sides],
-         {"size": 19, "line_color": ORANGE} | hollow),
-        ("certified", sure, {"size": 11, "color": BLUE}),
-        ("not certified", [one for one in points if one not in sure],
-         {"size": 11, "line_color": BLUE} | hollow),
-        ("baseline", [base] if base.get("terms") else [],
-         {"size": 15, "marker": "star", "color": VERMILION}),
-    ]  # fmt: skip
-    return [group for group in groups if group[1]]
 
 
 def _thinned(force: NDArray[np.float64], most: int = _MOST_SAMPLES) -> NDArray[np.intp]:
