@@ -6,14 +6,13 @@ import itertools
 
 import numpy as np
 import pytest
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
 
 from rootsopt.config import load
 from rootsopt.figures import runs
 from rootsopt.figures.comparison import plot_departure, plot_forces_together
 from rootsopt.figures.optimum import plot_prices, plot_residual, plot_starts
-from rootsopt.figures.style import figure
+from rootsopt.figures.style import figure, write
+from rootsopt.output.files import ResultFolder
 from rootsopt.response.series import Series
 from rootsopt.scene import outline_mm
 
@@ -150,15 +149,17 @@ def test_long_labels_have_room():
     assert overlaps(runs._history(histories(keys), keys)) == []
 
 
-def test_legends_and_common_labels_have_room():
-    """A legend wider than its figure gets a smaller font."""
-    made, axes = figure(5, 4, 2, 2, sharex=True, sharey=True)
-    for ax in axes.ravel():
-        ax.plot([0, 1], [-1e6, 1e6], label="not settled, average of a window")
-        ax.set_title("a title")
-    made.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center")
-    made.legend(handles=[*axes[0, 0].lines] * 3, loc="outside upper center", ncols=3)
-    made.supxlabel("x (mm)")
-    made.supylabel("y (mm)")
-    made.colorbar(ScalarMappable(Normalize(0, 10), "viridis"), ax=axes[1, 1], label="force (N)")
-    assert overlaps(made) == []
+def test_legends_and_common_labels_have_room(tmp_path):
+    """A legend wider than its figure gets fewer columns."""
+    for common in (False, True):
+        made, axes = figure(5, 4, 2, 2, sharex=True, sharey=True)
+        for ax in axes.ravel():
+            ax.plot([0, 1], [-1e6, 1e6], label="not settled, average of a window")
+            ax.set_title("a title")
+        if common:
+            made.supxlabel("x (mm)")
+            made.supylabel("y (mm)")
+        lines = [] if common else [*axes[0, 0].lines] * 3
+        assert write(ResultFolder(tmp_path), "wide", made, "title", lines) == "figures/wide.png"
+        assert [legend._ncols for legend in made.legends] == [1] * (not common)
+        assert overlaps(made) == []
