@@ -2,14 +2,15 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import cycle
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from rootsopt.output.files import ResultFolder
+if TYPE_CHECKING:
+    from rootsopt.output.files import ResultFolder
 
 # Okabe and Ito's palette: distinguishable with any colour vision, and in grey.
 BLUE, VERMILION, GREEN = "#0072B2", "#D55E00", "#009E73"
@@ -50,7 +51,7 @@ def looks(names: Iterable[str]) -> Iterator[dict[str, Any]]:
 
 
 def write(
-    folder: ResultFolder, name: str, made: Figure, title: str,
+    folder: "ResultFolder", name: str, made: Figure, title: str,
     entries: Sequence[Any] = (), columns: int = 4,
 ) -> str:  # fmt: skip
     """Write a figure with its `title` and a legend below all panels; return the file's name.
@@ -59,7 +60,7 @@ def write(
     for count in range(min(len(entries), columns), 0, -1):
         legend = made.legend(handles=entries, loc="outside lower center", ncols=count,
                              frameon=False)  # fmt: skip
-        if count == 1 or legend.get_tightbbox().width <= made.bbox.width:
+        if count == 1 or legend.get_window_extent().width <= made.bbox.width:
             break
         legend.remove()
     made.suptitle(title)

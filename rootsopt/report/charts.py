@@ -17,7 +17,8 @@ from rootsopt.figures.force import amplitude_spectrum
 from rootsopt.figures.front import kinds
 from rootsopt.figures.style import BLUE, COLORS, GREY, ORANGE, VERMILION
 from rootsopt.output.names import brief, in_words, label, stated, value
-from rootsopt.report.gather import Case, varied
+from rootsopt.output.tables import varied
+from rootsopt.report.gather import Case
 from rootsopt.response.series import Series
 
 _INK = "#1a1a1a"

@@ -2,9 +2,8 @@
 
 import csv
 import dataclasses
-import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -136,14 +135,4 @@ def _series(place: Path, name: str) -> Series | None:
     return Series(**values, depth=np.full(len(table), np.nan))
 
 
-def varied(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the keys of the quantities that vary between scenes, beginning with a numeric one.
-
-    These are the keys before the forces in each row."""
-    keys = list(itertools.takewhile(lambda key: not key.endswith("_force_N"), rows[0]))
-    kept = [key for key in keys if key not in ("status", "point", "message")]
-    varied = [key for key in kept if len({row.get(key) for row in rows}) > 1] or kept[:1]
-    return sorted(varied, key=lambda key: not isinstance(rows[0].get(key), int | float))
-
-
-__all__ = ["Case", "Run", "varied"]
+__all__ = ["Case", "Run"]

@@ -1,7 +1,7 @@
 """Data of the animated pair on pages: outlines, poses, contact points and forces."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,12 +11,14 @@ from rootsopt.config import Config
 from rootsopt.config.units import MM
 from rootsopt.export.animation import Contacts, frames_of
 from rootsopt.profiles import Profile, outline
-from rootsopt.report.gather import Case
 from rootsopt.response.series import Series
 from rootsopt.scene import Scene
 
+if TYPE_CHECKING:
+    from rootsopt.report.gather import Case
 
-def animations(cases: Sequence[Case]) -> dict[str, Any]:
+
+def animations(cases: Sequence["Case"]) -> dict[str, Any]:
     """Return the data of the animation of all `cases`.
 
     Cases with the same design share a rotor. A case without a motion is shown in perfect rolling.

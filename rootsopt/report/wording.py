@@ -4,14 +4,17 @@ import math
 import re
 import shlex
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rootsopt.config import Config
 from rootsopt.config.families import family_of
 from rootsopt.output.names import brief, in_words, name_and_unit, quantity, stated
 from rootsopt.output.table import status_cell
-from rootsopt.report.gather import Case, Run, varied
+from rootsopt.output.tables import varied
 from rootsopt.status import Status
+
+if TYPE_CHECKING:
+    from rootsopt.report.gather import Case, Run
 
 _ASKED = {
     "optimize": "Find the design with the lowest objective, and compare it with the baseline.",
@@ -35,13 +38,13 @@ _SMALL = 0.05
 """Absolute change (%) below which a quantity counts as unchanged."""
 
 
-def title(run: Run) -> str:
+def title(run: "Run") -> str:
     """Return the title of the report."""
     pattern = _TITLES.get(run.command, "{pair}")
     return pattern.format(pair=_pair(run.config)).strip()
 
 
-def asked(run: Run) -> list[str]:
+def asked(run: "Run") -> list[str]:
     """Return sentences on the task of the run."""
     sentences = [_ASKED.get(run.command, f"Run the command {run.command}."), scene(run.config)]
     if run.command == "optimize":
@@ -101,7 +104,7 @@ def scene(config: Config) -> str:
     return f"The scene is {_pair(config)}, {speed} {under}{tail}."
 
 
-def came_out(run: Run) -> list[str]:
+def came_out(run: "Run") -> list[str]:
     """Return sentences on the result of the run."""
     makers = {"optimize": _optimised, "pareto": _traced, "attractors": _coexisting}
     status = in_words(str(run.result.get("status", ""))).capitalize()
@@ -113,13 +116,13 @@ def came_out(run: Run) -> list[str]:
     return sentences + (_swept(run.rows) if run.rows else _single(run.cases[0]))
 
 
-def _message(run: Run) -> tuple[str, list[str]]:
+def _message(run: "Run") -> tuple[str, list[str]]:
     """Return the first sentence of the run's message, and the others."""
     first, *rest = re.split(r"(?<=[.!?]) (?=[A-Z])", str(run.result.get("message") or ""))
     return first, rest
 
 
-def what_next(run: Run) -> list[str]:
+def what_next(run: "Run") -> list[str]:
     """Return sentences on what to do next."""
     command = shlex.quote(str(run.path / "config.yaml"))
     if _stopped(run):
@@ -157,12 +160,12 @@ def what_next(run: Run) -> list[str]:
     return [f"Optimise the design: `rootsopt optimize {command}`."]
 
 
-def _stopped(run: Run) -> bool:
+def _stopped(run: "Run") -> bool:
     """Return whether the user has stopped the run."""
     return run.result.get("status") in (Status.INTERRUPTED.label, Status.NOT_SIMULATED.label)
 
 
-def _after_stop(run: Run) -> list[str]:
+def _after_stop(run: "Run") -> list[str]:
     """Return a sentence on how to go on with a run that was stopped."""
     again = f"rootsopt {run.command} {run.source}"
     if run.command not in ("optimize", "sweep"):
@@ -171,7 +174,7 @@ def _after_stop(run: Run) -> list[str]:
     return [f"Go on from where it stopped: `{again}{resume}`."]
 
 
-def _after_optimum(run: Run) -> list[str]:
+def _after_optimum(run: "Run") -> list[str]:
     command = shlex.quote(str(run.path / "optimized.yaml"))
     found = run.result.get("optimality") or {}
     unproven = bool(found) and not found.get("converged")
@@ -198,7 +201,7 @@ def _dearest(rows: Sequence[Mapping[str, Any]]) -> str:
     )
 
 
-def _optimised(run: Run) -> list[str]:
+def _optimised(run: "Run") -> list[str]:
     """Return sentences on an optimum, or on the baseline if there is none."""
     cases = {case.name: case for case in run.cases}
     if "optimised" not in cases:
@@ -238,7 +241,7 @@ def _optimised(run: Run) -> list[str]:
     return sentences + _robust(run)
 
 
-def _robust(run: Run) -> list[str]:
+def _robust(run: "Run") -> list[str]:
     """Return a sentence on the designs in fresh scenes, or none if nothing scatters."""
     fresh = (run.result.get("robustness") or {}).get("fresh") or {}
     if not fresh:
@@ -255,7 +258,7 @@ def _percent(change: float) -> str:
     return f"{abs(change):.3g} % {'below' if change < 0 else 'above'}"
 
 
-def _traced(run: Run) -> list[str]:
+def _traced(run: "Run") -> list[str]:
     points = run.result.get("points") or []
     if not points:
         return []
@@ -272,7 +275,7 @@ def _traced(run: Run) -> list[str]:
     return sentences
 
 
-def _coexisting(run: Run) -> list[str]:
+def _coexisting(run: "Run") -> list[str]:
     rows = run.result.get("attractors") or []
     if not rows:
         return ["No motion could be told apart."]
@@ -304,7 +307,7 @@ def _swept(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     return sentences
 
 
-def _single(case: Case) -> list[str]:
+def _single(case: "Case") -> list[str]:
     """Return sentences on one simulated design."""
     record = case.record
     whose = "The baseline's contact force" if case.name == "baseline" else "The contact force"
