@@ -22,7 +22,7 @@ class ProfilePicture:
         ranges = [DataRange1d(range_padding=0.03) for _ in range(2)]
         self.figure = chart(
             "x (mm)", "y (mm)", 285, tools="", toolbar_location=None, match_aspect=True,
-            x_range=ranges[0], y_range=ranges[1], title="Profile (dashed: at start)",
+            x_range=ranges[0], y_range=ranges[1], title="Profile, start dashed",
         )  # fmt: skip
         empty: dict[str, list[float]] = {"x": [], "y": []}
         self.now = ColumnDataSource(empty, name="outline_now")

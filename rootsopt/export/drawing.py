@@ -1,6 +1,7 @@
 """Content of the drawing of one rotor, shared by all formats (mm)."""
 
 import dataclasses
+import textwrap
 
 import rootsopt
 from rootsopt.config import Config
@@ -83,14 +84,9 @@ class Drawing:
 
 
 def _wrapped(words: list[str]) -> list[str]:
-    """Return lines with all `words`, separated by commas, of about `_LINE` characters."""
-    lines: list[str] = []
-    for word in words:
-        if lines and len(lines[-1]) + len(word) < _LINE:
-            lines[-1] += f", {word}"
-        else:
-            lines.append(word)
-    return lines
+    """Return lines with all `words`, separated by commas, of at most `_LINE` characters."""
+    text = ", ".join(word.replace(" ", "\N{NO-BREAK SPACE}") for word in words)
+    return [line.replace("\N{NO-BREAK SPACE}", " ") for line in textwrap.wrap(text, _LINE)]
 
 
 def _block(config: Config) -> tuple[tuple[str, str], ...]:
