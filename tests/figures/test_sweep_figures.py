@@ -4,6 +4,7 @@ import pytest
 
 from rootsopt.config import load
 from rootsopt.figures import sweep as drawing
+from rootsopt.figures.speeds import MARKERS
 from rootsopt.output.files import ResultFolder
 from rootsopt.output.sweeps import outcome, rows_of, summary
 from rootsopt.output.tables import scene_tables
@@ -54,6 +55,10 @@ def test_statuses_are_in_every_figure(axes, options, panels, tmp_path, monkeypat
     entries = [text.get_text() for one in figure.legends for text in one.get_texts()]
     for label in found - ({"periodic"} if panels == 4 else set()):
         assert any(entry.startswith(label) for entry in entries)
+
+
+def test_every_status_has_a_marker_of_its_own():
+    assert [*map(len, (MARKERS, {*MARKERS.values()}))] == [len(Status)] * 2
 
 
 def test_no_figure_over_three_keys(tmp_path):
