@@ -13,18 +13,18 @@ from unittest import mock
 
 ROOT = Path(__file__).parents[1]
 MOST = {
-    "statements of the package": 26_900,
-    "statements of the tests": 18_520,
+    "statements of the package": 25_311,
+    "statements of the tests": 18_544,
     "statements of the experiments": 7_190,
     "packages": 20,
-    "files of the package": 279,
-    "lines of the longest file": 810,
+    "files of the package": 277,
+    "lines of the longest file": 647,
     "floors of packages": 18,
     "depth of imports": 38,
-    "config keys": 153,
+    "config keys": 152,
     "lines of the longest help": 60,
     "pages of docs": 42,
-    "words of docs": 31_851,
+    "words of docs": 31_532,
 }
 """Greatest values that are accepted. Lower them when the project becomes lighter. Whoever raises
 one gives the reason in the changelog: what users can do now that is worth the weight."""

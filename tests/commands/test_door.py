@@ -254,7 +254,7 @@ def test_commands_import_late_what_a_run_may_not_need():
         "scipy",
         "xarray",
         "jinja2",
-        "plotly",
+        "bokeh",
         "rootsopt.report.html",
     )
     code = "import sys; from rootsopt.commands import cli, table; cli.parser(table.profile)"
