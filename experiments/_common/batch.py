@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from rootsopt.dynamics.closed import Start, steady_motion
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.steady import Solver
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 from rootsopt.runtime.threads import on_all_cores
 from rootsopt.scene import Scene
 from rootsopt.status import Status
@@ -125,11 +125,11 @@ def respond_many(
     )
 
 
-@Program
+@CachedFunction
 def _together(scene, designs, states, *settings) -> Batch:
     return jax.vmap(lambda design, state: respond(scene, design, state, *settings))(designs, states)
 
 
-@Program
+@CachedFunction
 def _in_turn(scene, designs, states, *settings) -> Batch:
     return lax.map(lambda at: respond(scene, *at, *settings), (designs, states))

@@ -27,7 +27,7 @@ from rootsopt.optimize.search import Search
 from rootsopt.response.ensemble import ERRORS, Ensemble, integrator
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.members import run_members
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene
 
 SCENE = (
@@ -113,10 +113,10 @@ def line(config: Config, model: Scene, designs: np.ndarray, size: Size) -> list[
     return rows
 
 
-_pair = Program(Scene.pair)
+_pair = CachedFunction(Scene.pair)
 
 
-@Program
+@CachedFunction
 def _pathwise(model: Scene, design, periods, how):
     """Differentiate the mean force with respect to the design, along the motion from rest.
 

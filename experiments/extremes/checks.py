@@ -20,7 +20,7 @@ from experiments.extremes.scenes import Kind
 from rootsopt.config import Config
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.response.evaluation import Evaluator
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene, design_vector
 from rootsopt.status import Status
 
@@ -135,7 +135,7 @@ def equation(cases: list[Case], seed: int) -> dict[str, Any]:
 # Promise 2: the motion
 
 
-@Program
+@CachedFunction
 def _simulate(model: Scene, design, tolerances, method: str):
     pair = model.pair(design)
     transient, orbit = (Integrator(method, tolerances[k], STEPS) for k in range(2))

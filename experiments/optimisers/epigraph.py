@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from rootsopt.optimize.certificate import certify
-from rootsopt.optimize.local import Group, Local, Look
+from rootsopt.optimize.local import Group, Linearization, Look
 from rootsopt.optimize.sqp import EndError, Stops
 
 SCALE = 0.1
@@ -34,16 +34,16 @@ class Epigraph:
     `look`: function that evaluates the problem at a point; `start` (d,): first point; `first`: the
     problem there; `stops`: criteria for the end."""
 
-    def __init__(self, look: Look, start: NDArray[np.float64], first: Local, stops: Stops):
+    def __init__(self, look: Look, start: NDArray[np.float64], first: Linearization, stops: Stops):
         self.look, self.stops, self.size = look, stops, len(start)
         self.evaluations = 1
-        self.known: dict[bytes, Local | None] = {start.tobytes(): first}
+        self.known: dict[bytes, Linearization | None] = {start.tobytes(): first}
         self.good, self.best = first, (start, first)
         slots = [2 * len(group.values) + _SLOTS for group in (*first.groups, *first.walls)]
         self.slots = [np.full((count, 2), np.nan) for count in slots]
         self.used = [np.zeros(count) for count in slots]
 
-    def at(self, point: NDArray[np.float64]) -> Local | None:
+    def at(self, point: NDArray[np.float64]) -> Linearization | None:
         """Return the problem at a `point` (d,), which is evaluated only on the first call.
 
         Raises `EndError` at the optimum, or if the evaluations have run out."""

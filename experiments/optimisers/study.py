@@ -21,7 +21,7 @@ from scipy.optimize import BFGS, NonlinearConstraint, minimize
 from experiments.optimisers.epigraph import SCALE, Epigraph
 from rootsopt.config import load
 from rootsopt.optimize.certificate import certify
-from rootsopt.optimize.local import Local, Look
+from rootsopt.optimize.local import Linearization, Look
 from rootsopt.optimize.problem import FEASIBLE, Problem
 from rootsopt.optimize.sqp import EndError, Stops, descend
 from rootsopt.response.evaluation import Evaluator
@@ -252,7 +252,7 @@ class Recorder:
         self.rows: list[dict[str, float]] = []
         self.near, self.began = self.baseline.start, time.perf_counter()
 
-    def __call__(self, point: np.ndarray) -> Local | None:
+    def __call__(self, point: np.ndarray) -> Linearization | None:
         """Evaluate the problem at a point and record it."""
         design = self.problem.design(point)
         evaluation = self.evaluator(design, start=self.near, series=False)

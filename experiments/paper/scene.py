@@ -25,7 +25,7 @@ from rootsopt.dynamics.closed import Start, steady_motion
 from rootsopt.dynamics.orbit import Orbit
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.response.evaluation import Evaluation, Evaluator
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene, design_vector
 from rootsopt.status import Status
 
@@ -182,7 +182,7 @@ def pair_of(model: Scene, design, values: Float[Array, " p"]) -> RotorPair:
     return tuned.pair(design)
 
 
-@Program
+@CachedFunction
 def _orbit(model: Scene, design, values: Float[Array, " p"], state) -> Orbit:
     """Close the orbit, with derivatives with respect to the values."""
 

@@ -27,7 +27,7 @@ from rootsopt.config import Config
 from rootsopt.config.units import MM
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.errors import InputError
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene, check_geometry, design_vector
 from rootsopt.status import Status
 
@@ -98,7 +98,7 @@ def scenes(kind: str, count: int, seed: int) -> list[Config]:
     return [*known, *(config for config, _ in zip(drawn(kind, seed), range(count), strict=False))]
 
 
-@Program
+@CachedFunction
 def _respond(models: Scene, designs, states, tolerances, periods, gradient: bool) -> Batch:
     def one(at):
         model, design, state = at

@@ -26,7 +26,7 @@ from rootsopt.figures.speeds import LABELS
 from rootsopt.optimize.search import Search
 from rootsopt.response.evaluation import Evaluation, objective_weights
 from rootsopt.response.result import Part
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import design_vector
 
 Row = dict[str, Any]
@@ -55,7 +55,7 @@ def settings(scene: str, family: str, *more: str) -> Config:
     return shipped(family, *SCENES[scene], *more)
 
 
-@Program
+@CachedFunction
 def equilibria(pair: RotorPair, phases):
     """Find the static equilibria of a pair at `phases` (n,) of the mesh period, with rotor 1 fixed.
 

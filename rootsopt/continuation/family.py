@@ -26,7 +26,7 @@ from rootsopt.dynamics.flow import strobe
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.verdict import TOO_DEEP
 from rootsopt.errors import InputError
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene, along, design_vector
 
 SPAN = 20.0
@@ -191,10 +191,10 @@ class OrbitFamily:
         return Spot(place, np.asarray(line.tangent), orientation, point)
 
 
-_pair = Program(Scene.pair)
+_pair = CachedFunction(Scene.pair)
 
 
-@Program
+@CachedFunction
 def _seed(over: _Range, guess: Float[Array, " m"], period: int):
     """Return the motion of `period` mesh periods that begins at the place `guess` (m,).
 
@@ -206,7 +206,7 @@ def _seed(over: _Range, guess: Float[Array, " m"], period: int):
     return known, Line.empty(known.elements, guess[-1]).motion, jnp.zeros(())
 
 
-@Program
+@CachedFunction
 def _follow(over: _Range, start: Any, guess: Float[Array, " m"], across: Float[Array, " m"]):
     """Return the orbit whose place lies in the plane through `guess` (m,) normal to `across` (m,).
 

@@ -32,7 +32,7 @@ from rootsopt.measured.conjugacy import conjugacy
 from rootsopt.profiles import Outline, Profile, project
 from rootsopt.profiles.departure import beyond, departures, feet, flank_points
 from rootsopt.profiles.validity import PURE, margins
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene.families import check, classical, profile_of
 
 COEFFICIENTS = 12
@@ -349,7 +349,7 @@ def _promising(seen: _Comparison, width, size: float, room) -> NDArray[np.float6
     return np.zeros(count) if found.x is None else found.x[:count]
 
 
-@Program
+@CachedFunction
 def _member(family: str, lobes: int, radius: Float[Array, ""], design):
     """Return (flank, its derivatives, margins, their derivatives) of a member of a `family`.
 

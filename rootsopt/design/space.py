@@ -23,7 +23,7 @@ from rootsopt.config.units import DEG, MM, si_unit, unit_of, words
 from rootsopt.design.bounds import bounds_of, floors_of
 from rootsopt.profiles import Geometry, Profile, geometry
 from rootsopt.profiles.validity import ProfileMargins, margins
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene
 
 _SOUND = (
@@ -226,7 +226,7 @@ class Space(eqx.Module):
         slacks_and_slopes.prepare(self, jax.ShapeDtypeStruct(self.lower.shape, self.lower.dtype))
 
 
-@Program
+@CachedFunction
 def slacks_and_slopes(space: Space, point):
     """Return (design (d,), its Jacobian (d, d), slacks (m,), their Jacobian (m, d)) at `point`.
 

@@ -15,7 +15,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.dynamics.collocation.closing import corrected
-from rootsopt.dynamics.collocation.known import Known
+from rootsopt.dynamics.collocation.known import KnownOrbit
 from rootsopt.dynamics.collocation.mesh import room_for
 from rootsopt.dynamics.collocation.motion import ACCURACY, Collocated, apart, closed_orbit
 from rootsopt.dynamics.collocation.newton import numbers
@@ -59,7 +59,7 @@ class Start(eqx.Module):
     """
 
     state: Any
-    known: Known
+    known: KnownOrbit
     pair: Any
 
     @classmethod
@@ -78,9 +78,9 @@ class Start(eqx.Module):
         return one == two
 
 
-def unknown(pair: RotorPair, longest: int) -> Known:
+def unknown(pair: RotorPair, longest: int) -> KnownOrbit:
     """Return the placeholder for an orbit of `pair` of up to `longest` mesh periods."""
-    return Known.empty(room_for(pair, longest), pair.states, pair.flanks)
+    return KnownOrbit.empty(room_for(pair, longest), pair.states, pair.flanks)
 
 
 class _Loop(NamedTuple):
@@ -291,7 +291,7 @@ def examined(pair: RotorPair, found: Steady, solver: Solver) -> Steady:
 
     The window begins at the end of the transient, and distinguishes chaos from a long transient."""
     state, integrator = found.settled.state, solver.transient
-    unsettled = among(found.status, OPEN) & (solver.examine > 0)
+    unsettled = among(found.status, OPEN) & (solver.probe_chaos > 0)
     window = branch(
         unsettled,
         lambda: lyapunov(pair, state, PERIODS, integrator),

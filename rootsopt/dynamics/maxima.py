@@ -31,7 +31,7 @@ from rootsopt.dynamics.collocation.blocks import in_blocks
 from rootsopt.dynamics.collocation.elements import Elements
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.varied import VariedOrbit
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 
 MOST = 12
 """Maximum number of local maxima that are reported: the greatest ones."""
@@ -160,7 +160,7 @@ def _dip(forces: NDArray[np.float64], one: int, other: int) -> float:
     return float(max(inner.min(), outer.min()))
 
 
-@Program
+@CachedFunction
 def _forces(pair: RotorPair, elements: Elements) -> tuple[Float[Array, "e q"], Float[Array, "e q"]]:
     """Return times (mesh periods) and contact forces (N) at the `_PLACES` of elements in use."""
     mesh = elements.mesh
@@ -170,7 +170,7 @@ def _forces(pair: RotorPair, elements: Elements) -> tuple[Float[Array, "e q"], F
     return tau, in_blocks(each, mesh.used, tau, elements.inside(number, tau))
 
 
-@Program
+@CachedFunction
 def _located(
     pair: RotorPair,
     tangents: RotorPair,

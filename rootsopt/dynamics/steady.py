@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from rootsopt.dynamics.collocation.known import Known
+from rootsopt.dynamics.collocation.known import KnownOrbit
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.orbit import Orbit
@@ -26,17 +26,17 @@ class Solver(eqx.Module):
 
     `transient`, `orbit`: integrators of the transient, and of the check of an orbit, whose
     tolerance sets the accuracy of the orbit; `measures`: averages of the force to compute;
-    `max_periods`: maximum length of the transient (mesh periods); `examine`: 1 to integrate a
+    `max_periods`: maximum length of the transient (mesh periods); `probe_chaos`: 1 to integrate a
     window of a motion that does not settle (see `closed.examined`), 0 to skip it; `max_orbit`:
     longest period of an orbit to find (mesh periods), at most 8; `variation`: whether an orbit has
-    its `Orbit.variation`. `max_periods` and `examine` are floats, as are all leaves.
+    its `Orbit.variation`. `max_periods` and `probe_chaos` are floats, as are all leaves.
     """
 
     transient: Integrator
     orbit: Integrator
     measures: Measures
     max_periods: Float[Array, ""]
-    examine: Float[Array, ""]
+    probe_chaos: Float[Array, ""]
     max_orbit: int = eqx.field(static=True)
     variation: bool = eqx.field(static=True, default=False)
 
@@ -59,7 +59,7 @@ class Steady(NamedTuple):
     settled: Transient
     used: Int[Array, ""]
     steps: Int[Array, ""]
-    known: Known
+    known: KnownOrbit
 
     @property
     def forces(self) -> Float[Array, " r"]:

@@ -16,7 +16,7 @@ from rootsopt.response.records import geometry_record
 from rootsopt.response.series import Series
 from rootsopt.response.speeds import alone
 from rootsopt.response.starts import Seeds
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene, check_geometry, design_vector
 
 _POINTS = 240
@@ -95,7 +95,7 @@ class Engine:
         self.ready.set()
 
 
-@Program
+@CachedFunction
 def _shape(scene: Scene, design) -> tuple[Profile, Geometry]:
     """Return profile and geometry of a design (d,) in config units."""
     profile = scene.profile(design)

@@ -21,7 +21,7 @@ from rootsopt.figures.profiles import draw_rotor
 from rootsopt.figures.style import BLUE, ORANGE, SKY, VERMILION, beside, figure
 from rootsopt.profiles import Profile, place_pair
 from rootsopt.response.series import Series
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 
 _MM = 1e3
 _FRAMES = 40  # frames per mesh period
@@ -47,7 +47,7 @@ class Contacts:
     present: NDArray[np.bool_]
 
 
-@Program
+@CachedFunction
 def _rolling(profile, roll):
     """Return (pressure angles (rad), signed distances from the pitch point (m)) of contacts.
 

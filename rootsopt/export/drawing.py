@@ -8,12 +8,12 @@ from rootsopt.config import Config
 from rootsopt.config.drawing import DrawingConfig
 from rootsopt.export.pieces import DrawnPiece, outline_pieces
 from rootsopt.profiles import Geometry, Profile, geometry
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 
 _MM = 1e3
 _LINE = 72
 """Length (characters) above which a line of design parameters is broken."""
-_shape = Program(geometry)
+_shape = CachedFunction(geometry)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -19,7 +19,7 @@ from scipy.interpolate import BSpline, make_interp_spline
 
 from rootsopt.errors import InputError
 from rootsopt.profiles import Profile
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 
 TOLERANCE = 1e-7
 """Deviation (pitch radii) of a spline from the true flank above which nodes are added to the
@@ -192,7 +192,7 @@ def _flank(profile: Profile) -> list[DrawnPiece]:
     return [piece for piece in pieces if piece.length > 1e-12 * size]
 
 
-@Program
+@CachedFunction
 def _points(profile, nu):
     """Return the values on the addendum and on the dedendum at normal angles `nu` (rad).
 

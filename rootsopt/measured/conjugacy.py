@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rootsopt.contact.closest import FlankPair
 from rootsopt.errors import InputError
 from rootsopt.profiles import Profile
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 
 _MICRON = 1e-6
 _CERTAIN = 1e-6, 1.5
@@ -111,7 +111,7 @@ def conjugacy(profile: Profile) -> Conjugacy:
     return Conjugacy(roll, np.where(found, gap, np.nan))
 
 
-@Program
+@CachedFunction
 def _gaps(profile, roll):
     pair = FlankPair.of(profile, 2 * profile.pitch_radius, two_sided=True)
     sides = jnp.stack([roll, -roll])

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.optimize.local import Local
+from rootsopt.optimize.local import Linearization
 
 RESIDUAL = 1e-4
 """First-order residual above which a design does not count as converged."""
@@ -62,7 +62,7 @@ class Certificate(NamedTuple):
         return self.residual <= tolerance and self.violation <= feasibility
 
 
-def certify(local: Local, point: NDArray[np.float64], near: float = NEAR) -> Certificate:
+def certify(local: Linearization, point: NDArray[np.float64], near: float = NEAR) -> Certificate:
     """Return the certificate of a `point` (d,) of the unit box.
 
     `local`: objective and constraints at the point, with gradients. `near`: distance above which

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rootsopt.optimize.outcome import Trial
 from rootsopt.optimize.problem import Problem
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 
 _PATIENCE = 4
 """Number of successive steps without a gain above which a descent ends."""
@@ -72,13 +72,13 @@ def _rule(method: str, learning_rate: float, iterations: int):
     return getattr(optax, method)(optax.cosine_decay_schedule(learning_rate, iterations, 0.05))
 
 
-@Program
+@CachedFunction
 def _init(method, learning_rate, iterations, point):
     """Return the initial state of an update rule at `point` (d,)."""
     return _rule(method, learning_rate, iterations).init(point)
 
 
-@Program
+@CachedFunction
 def _update(method, learning_rate, iterations, slope, state):
     """Return (step (d,), next state) of an update rule, given the gradient `slope` (d,)."""
     return _rule(method, learning_rate, iterations).update(slope, state)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from rootsopt.design.space import Constraint
 from rootsopt.optimize.limits import ForceLimit
-from rootsopt.optimize.local import Group, Local, Look
+from rootsopt.optimize.local import Group, Linearization, Look
 from rootsopt.optimize.problem import FEASIBLE, Problem
 from rootsopt.optimize.sqp import Found, Stops, descend
 
@@ -103,13 +103,13 @@ def explain(
         found = _geometry(problem, point) if look is None else look(point)
         return None if found is None else _groups(found)
 
-    def greatest(point: NDArray[np.float64]) -> Local | None:
+    def greatest(point: NDArray[np.float64]) -> Linearization | None:
         groups = parts(point)
         if groups is None:
             return None
         every = [np.concatenate(arrays) for arrays in zip(*groups, strict=True)]
         nothing = np.zeros(0), np.zeros((0, len(point)))
-        return Local(0.0, np.zeros(len(point)), (Group(*every),), *nothing)
+        return Linearization(0.0, np.zeros(len(point)), (Group(*every),), *nothing)
 
     best = _best([descend(greatest, start, stops) for start in starts])
     if best is None or best.certificate is None or best.local is None:
@@ -126,15 +126,15 @@ def explain(
     return Infeasible(best.local.objective, tuple(conflicts), design, look is not None)
 
 
-def _geometry(problem: Problem, point: NDArray[np.float64]) -> Local | None:
+def _geometry(problem: Problem, point: NDArray[np.float64]) -> Linearization | None:
     """Return the constraints of the geometry at a `point` (d,), without an objective."""
     slack, normals = problem.look(point)[2:]
     if not np.all(np.isfinite(slack)) or not np.all(np.isfinite(normals)):
         return None
-    return Local(0.0, np.zeros(len(point)), (), slack, normals)
+    return Linearization(0.0, np.zeros(len(point)), (), slack, normals)
 
 
-def _groups(local: Local) -> tuple[Group, ...]:
+def _groups(local: Linearization) -> tuple[Group, ...]:
     """Return all constraints and walls as groups of branches that must be at most 0.
 
     The index of a constraint or wall is the kind of its branches."""
@@ -162,13 +162,13 @@ def _alone(
     from which to search. Return `None` if the searches find no point that satisfies the other
     constraints."""
 
-    def look(point: NDArray[np.float64]) -> Local | None:
+    def look(point: NDArray[np.float64]) -> Linearization | None:
         groups = parts(point)
         if groups is None:
             return None
         others = groups[:k] + groups[k + 1 :]
         nothing = np.zeros(0), np.zeros((0, len(point)))
-        return Local(0.0, np.zeros(len(point)), (groups[k],), *nothing, others)
+        return Linearization(0.0, np.zeros(len(point)), (groups[k],), *nothing, others)
 
     found = [descend(look, start, stops) for start in starts]
     found = [one for one in found if one.local is not None and one.local.violation <= FEASIBLE]

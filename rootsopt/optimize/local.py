@@ -34,7 +34,7 @@ class Group(NamedTuple):
         return float(np.max(self.values))
 
 
-class Local(NamedTuple):
+class Linearization(NamedTuple):
     """Objective and m constraints at one point x (d,), with their gradients.
 
     `smooth`: smooth part of the objective; `slope` (d,): its gradient; `groups`: the maxima that
@@ -67,8 +67,8 @@ class Local(NamedTuple):
         return self.slope + sum((share @ g.slopes for share, g in pairs), np.zeros(len(self.slope)))
 
 
-Look = Callable[[NDArray[np.float64]], Local | None]
+Look = Callable[[NDArray[np.float64]], Linearization | None]
 """Function that returns the problem at a point (d,), or `None` if there is no objective at this
 point."""
 
-__all__ = ["Group", "Local", "Look"]
+__all__ = ["Group", "Linearization", "Look"]

@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.optimize.local import Group, Local, Look
+from rootsopt.optimize.local import Group, Linearization, Look
 
 _STEP = 1e-3
 """Step (unit box) of the difference quotients that give the Hessians."""
@@ -38,13 +38,15 @@ class Models:
 
     The n functions are, in this order: the smooth part of the objective; the branches of each
     maximum; the m constraints; the branches of each wall, with the opposite sign. `point` (d,):
-    centre; `local`: the problem there, with the n values and gradients in `rows`; `bends` (n, d,
+    centre; `local`: the problem there, with the n values and gradients in `rows`; `hessians` (n, d,
     d): Hessians; `limits`: function for the constraints, which otherwise have models, too."""
 
-    def __init__(self, point: NDArray[np.float64], local: Local, limits: Limits | None = None):
+    def __init__(
+        self, point: NDArray[np.float64], local: Linearization, limits: Limits | None = None
+    ):
         self.point, self.local, self.limits, self.rows = point, local, limits, _rows(local)
         count, size = self.rows[1].shape
-        self.bends = np.zeros((count, size, size))
+        self.hessians = np.zeros((count, size, size))
         sizes = [len(group.values) for group in local.groups]
         self.owner = np.repeat(np.arange(len(sizes)), sizes)
         self._begin = 1 + len(self.owner)
@@ -55,7 +57,7 @@ class Models:
 
         `at`: function that evaluates the problem at a point."""
         size = len(self.point)
-        columns = np.zeros_like(self.bends)
+        columns = np.zeros_like(self.hessians)
         for axis in range(size):
             step = np.zeros(size)
             step[axis] = _STEP if self.point[axis] < 0.5 else -_STEP
@@ -65,9 +67,9 @@ class Models:
             slopes, known = _matched(self.local, found)
             change = (slopes - self.rows[1]) / step[axis]
             columns[known, axis] = change[known]
-        self.bends = (columns + np.swapaxes(columns, 1, 2)) / 2
+        self.hessians = (columns + np.swapaxes(columns, 1, 2)) / 2
 
-    def moved(self, point: NDArray[np.float64], local: Local) -> "Models":
+    def moved(self, point: NDArray[np.float64], local: Linearization) -> "Models":
         """Return the models at a new `point` (d,), where the problem is `local`.
 
         The Hessians of both models are updated with the change of the gradients. The Hessian of a
@@ -75,20 +77,20 @@ class Models:
         slopes, known = _matched(self.local, local)
         step = point - self.point
         for k in np.flatnonzero(known):
-            left = slopes[k] - self.rows[1][k] - self.bends[k] @ step
+            left = slopes[k] - self.rows[1][k] - self.hessians[k] @ step
             weight = float(left @ step)
             if abs(weight) > 1e-8 * np.linalg.norm(left) * np.linalg.norm(step):
-                self.bends[k] += np.outer(left, left) / weight
+                self.hessians[k] += np.outer(left, left) / weight
         found = Models(point, local, self.limits)
         for k, place in enumerate(_places(self.local, local)):
             if place >= 0:
-                found.bends[place] = self.bends[k]
+                found.hessians[place] = self.hessians[k]
         return found
 
     def values(self, step: NDArray[np.float64]) -> Rows:
         """Return the models' values (n,) and gradients (n, d) after a `step` (d,)."""
         value, slope = self.rows
-        bent = self.bends @ step
+        bent = self.hessians @ step
         return value + slope @ step + bent @ step / 2, slope + bent
 
     def slacks(self, step: NDArray[np.float64]) -> Rows:
@@ -172,7 +174,7 @@ class Models:
         return reach * np.clip(found.x[:size], low, high)
 
 
-def _rows(local: Local) -> Rows:
+def _rows(local: Linearization) -> Rows:
     """Return the values (n,) and gradients (n, d) of the n functions listed in `Models`."""
     values = [np.array([local.smooth]), *(g.values for g in local.groups), local.slack]
     slopes = [local.slope[None], *(g.slopes for g in local.groups), local.normals]
@@ -181,7 +183,7 @@ def _rows(local: Local) -> Rows:
     return np.concatenate(values), np.concatenate(slopes)
 
 
-def _places(one: Local, other: Local) -> NDArray[np.int64]:
+def _places(one: Linearization, other: Linearization) -> NDArray[np.int64]:
     """Return the index (n,) of each function of the problem `one` among those of `other`.
 
     The index of a branch that `other` does not have is -1."""
@@ -200,7 +202,9 @@ def _places(one: Local, other: Local) -> NDArray[np.int64]:
     return np.concatenate(places)
 
 
-def _matched(one: Local, other: Local) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def _matched(
+    one: Linearization, other: Linearization
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Return the gradients (n, d) in the problem `other` of the functions of the problem `one`.
 
     Also return a mask (n,) of the functions that `other` has."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rootsopt.optimize.beginning import Beginning
 from rootsopt.optimize.certificate import certify
 from rootsopt.optimize.infeasible import Infeasible
-from rootsopt.optimize.local import Local
+from rootsopt.optimize.local import Linearization
 from rootsopt.optimize.optimality import Optimality
 from rootsopt.optimize.problem import FEASIBLE, Problem
 from rootsopt.response.evaluation import Evaluation
@@ -38,7 +38,7 @@ class Trial:
     evaluation: Evaluation
     objective: float
     feasible: bool
-    local: Local | None = None
+    local: Linearization | None = None
     excess: float = 0.0
 
     @property

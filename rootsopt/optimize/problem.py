@@ -24,12 +24,12 @@ from rootsopt.optimize.limits import (
     force_limits,
     term_constraints,
 )
-from rootsopt.optimize.local import Group, Local
+from rootsopt.optimize.local import Group, Linearization
 from rootsopt.optimize.optimality import Holder
 from rootsopt.response.evaluation import Evaluation, objective_weights
 from rootsopt.response.speeds import counted
 from rootsopt.response.terms import sense_of
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene
 
 _NO_LINE = 1e-9
@@ -54,13 +54,13 @@ FEASIBLE = 1e-6
 distance from a bound of the unit box above which the bound counts as inactive."""
 
 
-@Program
+@CachedFunction
 def _nearest(space: Space, design):
     """Return the point (d,) of the unit box nearest to a `design` (d,) in config units."""
     return space.point(design)
 
 
-@Program
+@CachedFunction
 def _ranges(space: Space, design):
     """Return {key: (high, least, most)} for the parameters whose range depends on others.
 
@@ -69,7 +69,7 @@ def _ranges(space: Space, design):
     return {key: (high, *within[key]) for key, (_, high) in space.ranges(design).items()}
 
 
-_slacks_of = Program(Space.slacks_of)
+_slacks_of = CachedFunction(Space.slacks_of)
 
 
 def needs_maxima(config: Config, limits: Sequence[ForceLimit]) -> bool:
@@ -188,7 +188,7 @@ class Problem:
                 by_design += share * weight * np.array(list(one.gradient[key].values()))
         return np.asarray(by_design @ np.asarray(jacobian))
 
-    def local(self, evaluation: Evaluation, point) -> Local | None:
+    def local(self, evaluation: Evaluation, point) -> Linearization | None:
         """Return the objective and the constraints at a `point`, with gradients.
 
         `evaluation`: evaluation of the design at this point. Return `None` if it has no usable
@@ -219,7 +219,7 @@ class Problem:
             groups = [Group(*together)]
         scaled = tuple(g._replace(slopes=g.slopes @ jacobian) for g in groups)
         walls = self.walls(evaluation, jacobian)
-        return Local(smooth, slope @ jacobian, scaled, slack, normals, walls)
+        return Linearization(smooth, slope @ jacobian, scaled, slack, normals, walls)
 
     def walls(self, evaluation: Evaluation, jacobian: NDArray[np.float64]) -> tuple[Group, ...]:
         """Return one wall for each of `limits`, with the amount by which an evaluated design

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from rootsopt.config import Config
 from rootsopt.config.study import OptimizerConfig
 from rootsopt.errors import InputError
-from rootsopt.optimize.local import Local
+from rootsopt.optimize.local import Linearization
 from rootsopt.optimize.outcome import Optimization
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.robust_problem import RobustProblem
@@ -152,7 +152,9 @@ class RobustStage(Stage):
         points = [problem.point(list(design.values())) for design in found] or [own]
         return [problem.project(point) for point in points]
 
-    def local(self, problem: Problem, start: int, evaluation: Evaluation, point) -> Local | None:
+    def local(
+        self, problem: Problem, start: int, evaluation: Evaluation, point
+    ) -> Linearization | None:
         assert isinstance(problem, RobustProblem)
         if not evaluation.usable:
             return None

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rootsopt.config import Config
 from rootsopt.optimize.certificate import Certificate
-from rootsopt.optimize.local import Group, Local
+from rootsopt.optimize.local import Group, Linearization
 from rootsopt.optimize.optimality import Holder
 from rootsopt.optimize.problem import SCENE_KINDS, Problem
 from rootsopt.response.evaluation import Evaluation
@@ -74,7 +74,7 @@ class RobustProblem(Problem):
 
     def local(
         self, evaluation: Evaluation, point, shares: NDArray[np.float64] | None = None
-    ) -> Local | None:
+    ) -> Linearization | None:
         """Return the robust objective and the constraints at a `point`, with gradients.
 
         If the worst scene counts, the scenes are branches of one maximum. Otherwise the maxima of
@@ -107,17 +107,17 @@ class RobustProblem(Problem):
                 groups.append(Group(one.tags, share * one.values, share * one.slopes))
         scaled = tuple(self._scaled(group) for group in groups)
         limits = parts[0].slack, parts[0].normals, walls
-        return Local(smooth / self.reference, slope / self.reference, scaled, *limits)
+        return Linearization(smooth / self.reference, slope / self.reference, scaled, *limits)
 
     def shares(self, weights: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the shares (n,) with which the maxima of each scene become groups in `local`."""
         return np.maximum(weights, 0.0)
 
-    def _worst(self, parts: list[Local]) -> Local:
+    def _worst(self, parts: list[Linearization]) -> Linearization:
         branches = [self._scaled(_branches(part, SCENE_KINDS * k)) for k, part in enumerate(parts)]
         group = Group(*(np.concatenate(arrays) for arrays in zip(*branches, strict=True)))
         zero = np.zeros_like(parts[0].slope)
-        return Local(0.0, zero, (group,), parts[0].slack, parts[0].normals)
+        return Linearization(0.0, zero, (group,), parts[0].slack, parts[0].normals)
 
     def _scaled(self, group: Group) -> Group:
         size = self.reference
@@ -147,13 +147,13 @@ class RobustProblem(Problem):
         return held
 
 
-def top_slope(local: Local) -> NDArray[np.float64]:
+def top_slope(local: Linearization) -> NDArray[np.float64]:
     """Return the gradient (d,) of an objective, with the greatest branch of each maximum."""
     rows = (group.slopes[np.argmax(group.values)] for group in local.groups)
     return local.slope + sum(rows, np.zeros_like(local.slope))
 
 
-def _branches(local: Local, kind: int) -> Group:
+def _branches(local: Linearization, kind: int) -> Group:
     """Return an objective as the branches of one maximum.
 
     `kind`: number added to the kinds of the branches. If the objective is a sum of several maxima,

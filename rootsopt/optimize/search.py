@@ -26,7 +26,7 @@ from rootsopt.optimize.beginning import beginning
 from rootsopt.optimize.descent import descended
 from rootsopt.optimize.infeasible import Infeasible, explain
 from rootsopt.optimize.limits import force_limits, limited
-from rootsopt.optimize.local import Local
+from rootsopt.optimize.local import Linearization
 from rootsopt.optimize.outcome import Optimization, Trial, history_of, near, objective
 from rootsopt.optimize.problem import FEASIBLE, Problem, needs_maxima
 from rootsopt.optimize.sqp import Found, Stops, descend
@@ -82,7 +82,7 @@ class Stage:
 
     def local(
         self, problem: Problem, start: int, evaluation: Evaluation, point: NDArray[np.float64]
-    ) -> Local | None:
+    ) -> Linearization | None:
         """Return objective and constraints at a `point` (d,) of the local search `start`."""
         del start
         return problem.local(evaluation, point)
@@ -291,7 +291,7 @@ class Search:
         `points`: feasible points (d,), used if the local searches found none."""
         starts: list[Seeds] = [None]
 
-        def look(point: NDArray[np.float64]) -> Local | None:
+        def look(point: NDArray[np.float64]) -> Linearization | None:
             if self.stop.is_set():
                 return None
             evaluation = self.sharp(self.problem.design(point), start=starts[-1], series=False)
@@ -311,7 +311,7 @@ class Search:
         trials: list[Trial] = []
         last: list[Trial] = []
 
-        def look(point: NDArray[np.float64]) -> Local | None:
+        def look(point: NDArray[np.float64]) -> Linearization | None:
             orbit = last[-1].evaluation.start if last else None
             trial = self._evaluate(self.sharp, point, number, len(trials), orbit)
             trials.append(trial)

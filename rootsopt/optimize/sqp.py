@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rootsopt.optimize.certificate import RESIDUAL, Certificate, certify
-from rootsopt.optimize.local import Local, Look
+from rootsopt.optimize.local import Linearization, Look
 from rootsopt.optimize.models import Limits, Models
 
 _FIRST, _GREATEST, _LEAST = 0.1, 0.5, 1e-5
@@ -71,7 +71,7 @@ class Found(NamedTuple):
     decrease of the objective that the models still promise nearby, NaN if not known."""
 
     point: NDArray[np.float64]
-    local: Local | None
+    local: Linearization | None
     certificate: Certificate | None
     reason: str
     evaluations: int
@@ -184,7 +184,7 @@ class _Descent:
         self.promised = ahead / max(abs(models.local.objective), _SMALL)
         return step, float(decrease)
 
-    def _merit(self, local: Local) -> float:
+    def _merit(self, local: Linearization) -> float:
         return local.objective + self.price * local.violation
 
     def _measure(self) -> None:
@@ -212,7 +212,7 @@ class _Descent:
             self.reach = min(2 * self.reach, _GREATEST)
         return better
 
-    def _at(self, point: NDArray[np.float64]) -> Local | None:
+    def _at(self, point: NDArray[np.float64]) -> Linearization | None:
         """Return the problem at a `point` (d,).
 
         Raises `EndError` if the search should end."""

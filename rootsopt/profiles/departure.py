@@ -14,7 +14,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from rootsopt.profiles.base import Profile
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 
 _NODES = 400
 """Default of `nodes`, the least number of points of a flank on each side of the pitch circle."""
@@ -84,7 +84,7 @@ def flank_points(profile: Profile, nodes: int = _NODES) -> NDArray[np.float64]:
     return np.asarray(_points(profile, np.union1d(np.linspace(0, stop, nodes), ends)))
 
 
-@Program
+@CachedFunction
 def _points(profile: Profile, nu):
     addendum, dedendum = (profile.position(f(nu)) for f in (profile.addendum, profile.dedendum))
     return jnp.concatenate([addendum, dedendum[::-1]])

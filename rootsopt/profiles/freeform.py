@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from rootsopt.profiles import trigonometry as trig
 from rootsopt.profiles.base import Profile, Quadrature, Segment
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 
 _DEGREE = 2
 """Degree of the B-spline."""
@@ -227,7 +227,7 @@ def project(profile: Profile, count: int) -> FreeForm:
     return FreeForm(profile.lobes, profile.pitch_radius, jnp.asarray(start), shares)
 
 
-@Program
+@CachedFunction
 def _pressure_angles(profile: Profile, nu):
     return profile.addendum(nu).psi
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rootsopt.profiles.base import Profile, Quadrature
 from rootsopt.profiles.outline import Outline
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 
 _GRADING = 4.0
 """Constant g of the graded quadrature rule, which maps Gauss-Legendre nodes x to tanh(g x) /
@@ -148,12 +148,12 @@ def flank_nodes(profile: Profile, points: int) -> Float[Array, " n"]:
     return jnp.asarray(np.concatenate(nodes))
 
 
-@Program
+@CachedFunction
 def _both(profile, nu):
     return profile.position(profile.addendum(nu)), profile.position(profile.dedendum(nu))
 
 
-@Program
+@CachedFunction
 def _element(profile, nu):
     """Return the density of nodes (m/rad) of `profile` at the normal angles `nu` (rad).
 

@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float
 
 from rootsopt.profiles.base import Profile
 from rootsopt.profiles.outline import Outline
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 
 PURE = ("turning", "rolling", "order", "limits")
 """Names of the margins that are angles or ratios. All other margins are lengths, or lengths per
@@ -109,7 +109,7 @@ def soundness(
     return Soundness._make([*checked, own, room])
 
 
-@Program
+@CachedFunction
 def margins(profile: Profile) -> ProfileMargins:
     """Return the margins of a profile.
 

@@ -24,7 +24,7 @@ from rootsopt.dynamics.steady import SAMPLES
 from rootsopt.dynamics.varied import VariedOrbit
 from rootsopt.profiles import Geometry, Profile, geometry
 from rootsopt.pump.bearings import equivalent_load
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene
 from rootsopt.scene.build import along
 
@@ -186,7 +186,7 @@ def loads_corners(bearings: BearingSet) -> Float[Array, " k"]:
     return gas.corners() * bearings.pair.lobes / (2 * jnp.pi)
 
 
-@Program
+@CachedFunction
 def orbit_loads(scene: Scene, design: Float[Array, " d"], orbit: VariedOrbit) -> OrbitLoads:
     """Return the bearing loads over a closed `orbit`.
 
@@ -350,7 +350,7 @@ def _channels(loads: BearingLoads, scene: Scene) -> Float[Array, "*n k"]:
     return jnp.concatenate([loads.sizes, loads.axial_sizes], axis=-1)
 
 
-@Program
+@CachedFunction
 def static_loads(scene: Scene, design: Float[Array, " d"]) -> tuple[Array, Array]:
     """Return (equivalent, greatest) loads (4,) in N of the bearings if the gear carries the load.
 

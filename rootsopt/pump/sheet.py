@@ -15,7 +15,7 @@ from rootsopt.pump import flow
 from rootsopt.pump.leakage import leakage
 from rootsopt.pump.loads import static_loads
 from rootsopt.pump.play import Play, play
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene, design_vector
 from rootsopt.scene.medium import Medium
 
@@ -168,7 +168,7 @@ KEYS = (
 """Keys of the sheet, in the order of its rows."""
 
 
-@Program
+@CachedFunction
 def _flow(scene: Scene, design: Float[Array, " d"]) -> dict[str, Array]:
     scene, profile = scene.at(design), scene.profile(design)
     shape = geometry(profile)
@@ -198,7 +198,7 @@ def _has_play(scene: Scene) -> bool:
     return odd or shrunk or float(scene.clearance) > 0
 
 
-@Program
+@CachedFunction
 def _play(scene: Scene, design: Float[Array, " d"]) -> dict[str, Array]:
     profile = scene.profile(design)
     found = play_of(scene, profile)
@@ -247,7 +247,7 @@ def _leaking(scene: Scene, medium: Medium, design: Float[Array, " d"]) -> dict[s
     return {key: value.tolist() for key, value in rows.items() if not absent.get(key)}
 
 
-@Program
+@CachedFunction
 def _leaks(scene: Scene, design: Float[Array, " d"]) -> tuple[Array, dict[str, Array]]:
     """Return (least gap of the flanks (m), rows of the sheet)."""
     assert scene.medium is not None

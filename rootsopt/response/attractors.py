@@ -25,7 +25,7 @@ from rootsopt.dynamics.steady import transient_status
 from rootsopt.response.evaluation import Evaluation, Evaluator, Motions, objective_weights
 from rootsopt.response.records import message_of
 from rootsopt.response.reducers import mean
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 from rootsopt.runtime.threads import on_all_cores
 from rootsopt.scene import design_vector
 from rootsopt.status import Status
@@ -314,17 +314,17 @@ def _end(pair, state, integrator, tolerance, limit, most):
     return end, transient_status(pair, end)
 
 
-@Program
+@CachedFunction
 def _in_turn(pair, states, *settings):
     return jax.lax.map(lambda state: _end(pair, state, *settings), states)
 
 
-@Program
+@CachedFunction
 def _together(pair, states, *settings):
     return jax.vmap(lambda state: _end(pair, state, *settings))(states)
 
 
-@Program
+@CachedFunction
 def _cycle(pair: RotorPair, state, integrator: Integrator):
     """Return the scaled states (`_LONGEST`, n) at the starts of successive mesh periods, from
     `state` on."""

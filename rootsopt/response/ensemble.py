@@ -50,7 +50,7 @@ from rootsopt.response.members import (
     prepare_members,
     run_members,
 )
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene
 from rootsopt.status import Status
 
@@ -343,16 +343,16 @@ def per_config_unit(
     return slope @ inverse, np.sqrt(np.diagonal(spread, axis1=1, axis2=2))
 
 
-_pair = Program(Scene.pair_and_shape)
+_pair = CachedFunction(Scene.pair_and_shape)
 
 
-@Program
+@CachedFunction
 def _point(space: Space, design):
     """Return the point (d,) of the unit box nearest to a design (d,) in config units."""
     return space.point(design)
 
 
-@Program
+@CachedFunction
 def _around(space: Space, design, points):
     """Return the designs at `points` of the unit box, and the Jacobian of the design with respect
     to the point."""

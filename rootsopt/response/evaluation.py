@@ -51,7 +51,7 @@ from rootsopt.response.speeds import parts_at, shares
 from rootsopt.response.starts import Seed, Seeds, begun
 from rootsopt.response.terms import BEARING, terms_of, values_of
 from rootsopt.runtime.precision import check_precision
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene, check_geometry, design_keys, design_vector, fault_of
 from rootsopt.status import Status
 
@@ -164,7 +164,7 @@ class Evaluator:
         mesh periods. A design that does not settle is not examined further."""
         least = max(self.config.solver.max_mesh_periods // 4, 8 * BLOCK)
         hasty = self._solving(
-            lambda solver: (solver.max_periods, solver.examine),
+            lambda solver: (solver.max_periods, solver.probe_chaos),
             (jnp.asarray(float(least)), jnp.asarray(0.0)),
         )
         return dataclasses.replace(hasty, survey=True)
@@ -319,7 +319,7 @@ class Evaluator:
         if Status.of(found.status) not in OPEN:
             return found
         window = None
-        if float(self.scene.solver.examine) > 0:
+        if float(self.scene.solver.probe_chaos) > 0:
             state, integrator = found.settled.state, self.scene.solver.transient
             window = jax.device_get(lyapunov_program(pair, state, PERIODS, integrator))
         return _seen(pair, found, window)
@@ -541,12 +541,12 @@ def motion_from(pair: RotorPair, tangents: RotorPair, start: Start, radius, solv
     return steady_motion(pair, tangents, start, radius, solver)
 
 
-_build = Program(Scene.pair_and_tangents)
-_motion = Program(motion_from, gathered=0)
-_integrated = Program(integrated_difference)
-lyapunov_program = Program(lyapunov)
-unsettled_status = Program(window_status)
-_seen = Program(seen)
+_build = CachedFunction(Scene.pair_and_tangents)
+_motion = CachedFunction(motion_from, gathered=0)
+_integrated = CachedFunction(integrated_difference)
+lyapunov_program = CachedFunction(lyapunov)
+unsettled_status = CachedFunction(window_status)
+_seen = CachedFunction(seen)
 
 
 def objective_weights(config: Config) -> dict[str, float]:

@@ -41,7 +41,7 @@ class Runs(Protocol):
         ...
 
 
-class Here(NamedTuple):
+class LocalRunner(NamedTuple):
     """Runs evaluations in this process, in the thread that asks for them.
 
     `slots`: number of threads that should ask."""
@@ -53,9 +53,9 @@ class Here(NamedTuple):
         return point.evaluator(*point[1:])
 
 
-HERE = Here(cpu_count() or 1)
+HERE = LocalRunner(cpu_count() or 1)
 """One thread per core."""
-IN_TURN = Here(1)
+IN_TURN = LocalRunner(1)
 """No further thread: for points of a design, if designs run side by side."""
 
 
@@ -96,4 +96,4 @@ def as_done(
             done = [(running.pop(one), one.result()) for one in ended]
 
 
-__all__ = ["HERE", "IN_TURN", "Here", "Point", "Runs", "as_done", "evaluate_many"]
+__all__ = ["HERE", "IN_TURN", "LocalRunner", "Point", "Runs", "as_done", "evaluate_many"]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rootsopt.dynamics.flow import one_period, strobe
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 from rootsopt.status import Status
 
 _MEMBERS = 4
@@ -192,12 +192,12 @@ def member(
     )
 
 
-@Program
+@CachedFunction
 def _in_turn(pair, states, settle, periods, integrator) -> Members:
     return lax.map(lambda state: member(pair, state, settle, periods, integrator), states)
 
 
-@Program
+@CachedFunction
 def _together(pairs, states, settle, periods, integrator) -> Members:
     run = functools.partial(member, settle=settle, periods=periods, integrator=integrator)
     return jax.vmap(lambda pair: jax.vmap(lambda state: run(pair, state))(states))(pairs)

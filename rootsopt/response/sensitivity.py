@@ -17,7 +17,7 @@ from rootsopt.dynamics.maxima import local_maxima
 from rootsopt.dynamics.varied import varied
 from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.response.starts import begun
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene, along
 from rootsopt.status import Status
 
@@ -113,7 +113,7 @@ def _direction(config: Config, scene: Scene, quantity: Quantity) -> Scene:
     return jax.tree_util.tree_map_with_path(change, *arrays)
 
 
-@Program
+@CachedFunction
 def _along(scene: Scene, design, directions: Scene):
     """Return the rotor pair of a design, and its derivatives along several directions of the scene.
 

@@ -13,7 +13,7 @@ from rootsopt.dynamics.collocation.elements import Elements
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import SAMPLES, Steady
 from rootsopt.dynamics.window import Window
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Series:
         return self.drive_force + self.coast_force
 
 
-@Program
+@CachedFunction
 def contact_series(pair: RotorPair, tau, states):
     """Return (mesh period (s), relative durations (t,), (ε (rad), dε/dt (rad/s)), flank contact).
 
@@ -90,7 +90,7 @@ def window_series(pair: RotorPair, window: Window) -> Series:
     return series_of(pair, np.arange(periods * samples) / samples, states.reshape(-1, count))
 
 
-@Program
+@CachedFunction
 def sampled(elements: Elements) -> Float[Array, "samples n"]:
     """Return `SAMPLES` uniform samples of the scaled states of an orbit, from φ1 = 0 on."""
     return elements.motion(elements.mesh.period * jnp.arange(SAMPLES) / SAMPLES)

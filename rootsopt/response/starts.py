@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rootsopt.dynamics.closed import Start
-from rootsopt.dynamics.collocation.known import Known, padded, trimmed
+from rootsopt.dynamics.collocation.known import KnownOrbit, padded, trimmed
 from rootsopt.dynamics.collocation.mesh import room_for
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import Steady
@@ -23,8 +23,8 @@ class Seed(NamedTuple):
     """Where an evaluation of a similar design or scene begins.
 
     `state` (n,): scaled, at φ1 = 0; `orbit`: the closed orbit through it, as the arrays of a
-    `Known` (see `collocation.known.trimmed`), then those of its pair. It is empty if the orbit is
-    not known.
+    `KnownOrbit` (see `collocation.known.trimmed`), then those of its pair. It is empty if the orbit
+    is not known.
     """
 
     state: NDArray[np.float64]
@@ -57,7 +57,7 @@ def begun(pair: RotorPair, start: Seed | ArrayLike | None, longest: int) -> Star
     seed = start if isinstance(start, Seed) else None
     state = start if seed is None else seed.state
     given = np.zeros(pair.states, dtype) if state is None else np.asarray(state, dtype)
-    empty = Known.empty(room, pair.states, pair.flanks)
+    empty = KnownOrbit.empty(room, pair.states, pair.flanks)
     nothing = Start(given, empty, _numbers(pair))
     leaves, kind = jax.tree.flatten((empty, nothing.pair))
     if seed is None or len(seed.orbit) != len(leaves):

@@ -23,7 +23,7 @@ from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import CLOSED, OPEN, Solver, Steady, among
 from rootsopt.profiles.validity import Soundness
 from rootsopt.runtime.precision import check_precision
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene, along
 from rootsopt.status import Status
 
@@ -366,4 +366,4 @@ def _once_jvp(primals, tangents):
 
 
 _inline = eqx.filter_jit(_once)
-_compiled = Program(_solve)
+_compiled = CachedFunction(_solve)

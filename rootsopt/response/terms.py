@@ -21,7 +21,7 @@ from rootsopt.pump import flow
 from rootsopt.pump.leakage import leakage
 from rootsopt.pump.loads import still_loads
 from rootsopt.pump.sheet import MRAD, UM, play_of, ripple_of
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene
 from rootsopt.scene.medium import Medium
 
@@ -283,7 +283,7 @@ def terms_of(names: Sequence[str], key: str = "objective.terms") -> tuple[Term, 
     return tuple(_terms[name] for name in names)
 
 
-@Program
+@CachedFunction
 def values_of(
     scene: Scene,
     terms: tuple[Term, ...],

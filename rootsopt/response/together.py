@@ -16,7 +16,7 @@ from rootsopt.dynamics.closed import examined
 from rootsopt.dynamics.steady import Steady
 from rootsopt.response.evaluation import Evaluation, Evaluator, motion_from
 from rootsopt.response.starts import begun
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 
 
 def pays() -> bool:
@@ -58,7 +58,7 @@ def _kind(arrays: Any, others: Any) -> Hashable:
     return tree, shapes, tuple(jax.tree.leaves(others))
 
 
-@Program
+@CachedFunction
 def _motions(arrays, others) -> Steady:
     def one(arrays):
         pair, tangents, start, radius, solver = eqx.combine(arrays, others)

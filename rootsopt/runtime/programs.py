@@ -1,8 +1,9 @@
 """Programs that are compiled before they are needed, in parallel, and cached between processes.
 
 Tracing and compiling take longer than the computations themselves. JAX's own cache stores compiled
-code, but every process must trace and lower a function before it can look up the code. A `Program`
-looks it up by the function's name, the source code and the kind of its arguments."""
+code, but every process must trace and lower a function before it can look up the code. A
+`CachedFunction` looks it up by the function's name, the source code and the kind of its
+arguments."""
 
 import contextlib
 import ctypes
@@ -149,7 +150,7 @@ class _Made(NamedTuple):
     @classmethod
     def of(cls, call: Callable[..., Any], result_shape: Any, gathered: int | None) -> "_Made":
         """Return the program `call` with a result like `result_shape`; `gathered`: as in
-        `Program`."""
+        `CachedFunction`."""
         leaves, tree = jax.tree.flatten(result_shape)
         spots = [number for number, leaf in enumerate(leaves) if _is_array(leaf)]
         alone, parts = _parts(result_shape, gathered)
@@ -167,7 +168,7 @@ class _Made(NamedTuple):
         return cls(call, result_shape, result)
 
 
-class Program:
+class CachedFunction:
     """A function whose arguments are JAX pytrees, compiled once for each kind of arguments.
 
     As with `equinox.filter_jit`, arrays are traced. All other leaves are static and must be
@@ -332,7 +333,7 @@ def _parts(
     """Return how many arrays of a `result` are not gathered, and how the others are joined.
 
     There is one vector for each type of array. For each type, there is a list of its arrays: number
-    in the result, begin and end in the vector. `gathered`: as in `Program`."""
+    in the result, begin and end in the vector. `gathered`: as in `CachedFunction`."""
     arrays = [x for x in jax.tree.leaves(result) if _is_array(x)]
     if gathered is None:
         return len(arrays), {}
@@ -415,7 +416,7 @@ def _save(place: _Place, made: _Made, number: int) -> None:
 def _loaded(place: _Place | None, gathered: int | None) -> _Made | None:
     """Return the cached program at `place`, or `None` if no program can be loaded from it.
 
-    `gathered`: as for `Program`."""
+    `gathered`: as for `CachedFunction`."""
     if place is None:
         return None
     try:

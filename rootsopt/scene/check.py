@@ -8,7 +8,7 @@ from rootsopt.config import Config
 from rootsopt.config.units import MM
 from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry, geometry, outline
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import families
 from rootsopt.scene.build import Scene
 from rootsopt.scene.reading import design_vector
@@ -45,7 +45,7 @@ def shape_of(config: Config) -> Geometry:
     return _shape(Scene.from_config(config), design_vector(config))
 
 
-@Program
+@CachedFunction
 def _shape(scene: Scene, design):
     """Return the geometry of a design (d,) in config units."""
     return geometry(scene.profile(design))
@@ -60,4 +60,4 @@ def outline_mm(config: Config, design: ArrayLike | None = None) -> NDArray[np.fl
     return np.asarray(outline(profile, points=240)) / MM
 
 
-_profile = Program(Scene.profile)
+_profile = CachedFunction(Scene.profile)

@@ -16,7 +16,7 @@ from rootsopt.profiles import Outline, Profile, project
 from rootsopt.profiles.departure import departure
 from rootsopt.profiles.validity import Soundness, margins, soundness
 from rootsopt.runtime.environment import say
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 
 _MOST_OPERATIONS = 1500
 """Number of operations for a point of a flank above which a family has a note."""
@@ -180,13 +180,13 @@ def margins_of(config: ProfileConfig) -> dict[str, float]:
     return record
 
 
-@Program
+@CachedFunction
 def _margins(family, lobes, pitch_radius, design):
     """Return the margins (SI units) of the profile of a design in config units."""
     return margins(profile_of(family, lobes, pitch_radius, design))
 
 
-@Program
+@CachedFunction
 def _soundness(family, lobes, pitch_radius, design):
     """Return the margins of all checks of a profile's design, in config units."""
     profile = profile_of(family, lobes, pitch_radius, design)

@@ -139,7 +139,7 @@ def solver_of(config: Config) -> Solver:
         orbit=orbit,
         measures=measures(config),
         max_periods=jnp.asarray(float(settings.max_mesh_periods)),
-        examine=jnp.asarray(1.0),
+        probe_chaos=jnp.asarray(1.0),
         max_orbit=settings.max_orbit_periods,
     )
 

@@ -10,7 +10,7 @@ from rootsopt.config import Config
 from rootsopt.contact.law import ContactLaw
 from rootsopt.contact.search import SearchContact
 from rootsopt.profiles import Profile
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 
 MOST = 32
 """Maximum number of slices that is chosen automatically."""
@@ -76,7 +76,7 @@ def sliced_mean(
     return between @ weights
 
 
-@Program
+@CachedFunction
 def _torques(profile: Profile, law: ContactLaw, clearance, depth) -> Float[Array, " n"]:
     """Return the contact torques (n,) in N·m on rotor 2 at `_POSES` angles of rotor 1."""
     contact = SearchContact.of(profile)

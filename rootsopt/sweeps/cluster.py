@@ -21,7 +21,7 @@ from rootsopt.config.words import shown
 from rootsopt.errors import InputError
 from rootsopt.runtime.versions import versions
 from rootsopt.status import Status
-from rootsopt.sweeps.evaluations import Elsewhere, Watch, gone, refusal
+from rootsopt.sweeps.evaluations import DaskRunner, Watch, gone, refusal
 from rootsopt.sweeps.local import divided
 from rootsopt.sweeps.plan import Plan
 from rootsopt.sweeps.points import Row, lost
@@ -95,12 +95,12 @@ class Cluster:
             )
 
     @contextlib.contextmanager
-    def evaluations(self) -> Iterator[Elsewhere]:
+    def evaluations(self) -> Iterator[DaskRunner]:
         """Yield what runs the evaluations of a search on the workers.
 
         Raises `InputError` if the scheduler cannot be used."""
         with self._client(self._settings.threads) as client:
-            found = Elsewhere(self._dask, client, self._settings)
+            found = DaskRunner(self._dask, client, self._settings)
             try:
                 yield found
             finally:

@@ -32,7 +32,7 @@ class ClosedError(Exception):
     """Raised in threads that still wait for an evaluation when the search has ended."""
 
 
-class Elsewhere:
+class DaskRunner:
     """Runs evaluations on the workers of a Dask `client`.
 
     `dask`: the package distributed; `settings`: what the workers must agree on."""
@@ -156,4 +156,4 @@ def evaluating(
         yield found
 
 
-__all__ = ["ClosedError", "Elsewhere", "Watch", "evaluating", "gone", "refusal"]
+__all__ = ["ClosedError", "DaskRunner", "Watch", "evaluating", "gone", "refusal"]

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rootsopt.optimize.certificate import Certificate
-from rootsopt.optimize.local import Group, Local
+from rootsopt.optimize.local import Group, Linearization
 from rootsopt.tradeoffs.study import Sample
 
 RHO = 1e-3
@@ -63,7 +63,7 @@ class Scalar(NamedTuple):
         lead = [*self.leading]
         return float(np.max(((u - self.reference) / self.steps)[lead]) + RHO * np.sum(u))
 
-    def local(self, sample: Sample) -> Local:
+    def local(self, sample: Sample) -> Linearization:
         """Return objective and constraints at a `sample`, with gradients."""
         smooth, slope = 0.0, np.zeros(len(sample.point))
         together: list[Group] = []
@@ -82,7 +82,7 @@ class Scalar(NamedTuple):
                 slope = slope + RHO * group.slopes[0] / width
         first = Group(*(np.concatenate(arrays) for arrays in zip(*together, strict=True)))
         limits = sample.slack, sample.normals, sample.walls
-        return Local(smooth, slope, (first, *corners), *limits)
+        return Linearization(smooth, slope, (first, *corners), *limits)
 
     def weights(self, sample: Sample, certificate: Certificate) -> NDArray[np.float64]:
         """Return the weights (k,) of the scaled terms in the maximum at an optimum; their sum is 1.

@@ -18,7 +18,7 @@ from rootsopt.response.evaluation import Evaluation, Evaluator, geometry_record
 from rootsopt.response.many import HERE, Point, Runs
 from rootsopt.response.starts import Seeds
 from rootsopt.response.terms import terms_of, values_of
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene, design_vector
 from rootsopt.status import Status
 from rootsopt.tradeoffs.aims import Aim, aims_of, freed, reported, simulated
@@ -214,7 +214,7 @@ def _finite(sample: Sample) -> Sample | None:
     return sample if all(np.all(np.isfinite(array)) for array in arrays) else None
 
 
-@Program
+@CachedFunction
 def _shape(scene: Scene, design):
     """Return the geometry of a design (d,) in config units."""
     return geometry(scene.profile(design))

@@ -29,7 +29,7 @@ from rootsopt.design.space import sobol
 from rootsopt.errors import InputError
 from rootsopt.optimize.certificate import RESIDUAL, certify
 from rootsopt.optimize.infeasible import Infeasible, explain
-from rootsopt.optimize.local import Local
+from rootsopt.optimize.local import Linearization
 from rootsopt.optimize.optimality import judged
 from rootsopt.optimize.problem import FEASIBLE
 from rootsopt.optimize.sqp import Stops, descend
@@ -379,7 +379,7 @@ class Tracer:
         samples: dict[bytes, Sample] = {}
         last: list[Seeds] = [orbit]
 
-        def look(point: NDArray[np.float64]) -> Local | None:
+        def look(point: NDArray[np.float64]) -> Linearization | None:
             sample = self.study.sample(point, last[0])
             course.evaluations += 1
             self._count(evaluations=1)

@@ -14,7 +14,7 @@ from rootsopt.contact.search import SearchContact
 from rootsopt.contact.twisted import TwistedContact, slices_of
 from rootsopt.dynamics.closed import Start, steady_motion
 from rootsopt.dynamics.parts import TwistedLoad
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene.build import along
 from rootsopt.scene.slicing import MOST, sliced_mean, slices_needed
 
@@ -141,7 +141,7 @@ def test_number_of_slices_follows_the_error():
 def test_gradients_against_differences():
     """EE at 25°: the contact jumps between two minima, one slice after the other."""
     scene, design = scene_of("ee", *TIGHT, "rotor.helix_deg=25", "solver.slices=3")
-    motion = Program(steady_motion)
+    motion = CachedFunction(steady_motion)
 
     def found(helix):
         def build(helix):

@@ -9,7 +9,7 @@ from rootsopt.dynamics import window
 from rootsopt.dynamics.flow import strobe
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.response.evaluation import Evaluator, lyapunov_program
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 from tests.standins import oscillator
 
 PERIODS = 1024
@@ -76,7 +76,7 @@ WILD = (
 )
 
 
-@Program
+@CachedFunction
 def _later(pair, state, integrator):
     return strobe(pair, state, 64, integrator).states[-1]
 

@@ -19,7 +19,7 @@ from rootsopt.config import FAMILY_KEYS, Config, load, parse
 from rootsopt.config.explain import all_keys, field_of, limits_of
 from rootsopt.config.section import choices
 from rootsopt.profiles import geometry
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene, check_geometry, design_vector
 from tests.fuzz.verdict import fault_of, guarded
 
@@ -51,7 +51,7 @@ def tried(case: Case, folder: Path) -> tuple[Config | None, str | None]:
     return config, failure
 
 
-@Program
+@CachedFunction
 def _measured(model, design):
     return geometry(model.profile(design))
 

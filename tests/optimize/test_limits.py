@@ -12,7 +12,7 @@ from rootsopt.errors import InputError
 from rootsopt.optimize.certificate import Certificate
 from rootsopt.optimize.infeasible import explain
 from rootsopt.optimize.limits import TermConstraint, force_limits, limited, term_constraints
-from rootsopt.optimize.local import Local
+from rootsopt.optimize.local import Linearization
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.search import Search
 from rootsopt.profiles import geometry
@@ -219,7 +219,7 @@ def test_limits_of_forces_in_conflict_are_explained():
             (wall,) = [w for w, one in zip(problem.walls(found, np.eye(3)), problem.limits,
                                            strict=True) if one is limit]  # fmt: skip
             walls.append(wall._replace(slopes=slope))
-        return Local(0.0, np.zeros(3), (), *problem.look(point)[2:], tuple(walls))
+        return Linearization(0.0, np.zeros(3), (), *problem.look(point)[2:], tuple(walls))
 
     start = problem.project(np.full(3, 0.5))
     found = explain(problem, [start], look)

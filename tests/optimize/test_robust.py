@@ -10,7 +10,7 @@ import pytest
 from rootsopt.commands.console import main
 from rootsopt.config import load
 from rootsopt.optimize.certificate import certify
-from rootsopt.optimize.local import Group, Local
+from rootsopt.optimize.local import Group, Linearization
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.robust import Scattered, compare, search_of, without
 from rootsopt.optimize.robust_problem import RobustProblem
@@ -156,7 +156,7 @@ def toy(monkeypatch, branches, *overrides):
         values = np.array([level + slope * (x - place) ** 2 for level, slope, place in rows])
         slopes = np.array([[2 * slope * (x - place)] for _, slope, place in rows])
         tags = np.array([[0.0, k / len(rows)] for k in range(len(rows))])
-        return Local(0.0, np.zeros(1), (Group(tags, values, slopes),), np.zeros(0),
+        return Linearization(0.0, np.zeros(1), (Group(tags, values, slopes),), np.zeros(0),
                      np.zeros((0, 1)))  # fmt: skip
 
     def scene(one):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rootsopt.optimize.certificate import certify
-from rootsopt.optimize.local import Group, Local
+from rootsopt.optimize.local import Group, Linearization
 from rootsopt.optimize.models import Models
 from rootsopt.optimize.sqp import Stops, descend
 
@@ -21,7 +21,7 @@ def smooth(x, limit=0.5):
     value = (x[0] - 0.9) ** 2 + 2 * (x[1] - 0.8) ** 2
     slope = np.array([2 * (x[0] - 0.9), 4 * (x[1] - 0.8)])
     normals = np.array([[-1.0, -1.0]])
-    return Local(value, slope, (), np.array([2 * limit - x.sum()]), normals)
+    return Linearization(value, slope, (), np.array([2 * limit - x.sum()]), normals)
 
 
 def corner(x, lift=0.0):
@@ -34,12 +34,14 @@ def corner(x, lift=0.0):
         [2 * (x[0] - 0.2), 2 * (x[1] - 0.3)],
         [2 * (x[0] - 0.8), 4 * (x[1] - 0.5)],
     ]
-    return Local(0.0, np.zeros(2), (group(values, slopes),), np.zeros(0), np.zeros((0, 2)))
+    return Linearization(0.0, np.zeros(2), (group(values, slopes),), np.zeros(0), np.zeros((0, 2)))
 
 
 def bounded(x):
     """Return the problem 2 x - 3 y, whose minimum is a corner of the box."""
-    return Local(2 * x[0] - 3 * x[1], np.array([2.0, -3.0]), (), np.zeros(0), np.zeros((0, 2)))
+    return Linearization(
+        2 * x[0] - 3 * x[1], np.array([2.0, -3.0]), (), np.zeros(0), np.zeros((0, 2))
+    )
 
 
 def ended(x):
@@ -47,7 +49,7 @@ def ended(x):
     if x[0] > 0.7:
         return None
     slope = np.array([-1.0, 2 * (x[1] - 0.4)])
-    return Local(
+    return Linearization(
         -x[0] + (x[1] - 0.4) ** 2, slope, (), np.array([0.69 - x[0]]), np.array([[-1.0, 0.0]])
     )
 
@@ -114,7 +116,7 @@ def test_a_stationary_point_that_is_worse_is_not_the_result():
     def look(x):
         value, slope = (3.0, 0.0) if x[0] > 0.33 else (-100 * (x[0] - 0.3), -100.0)
         seen.append(value)
-        return Local(value, np.array([slope, 0.0]), (), np.zeros(0), np.zeros((0, 2)))
+        return Linearization(value, np.array([slope, 0.0]), (), np.zeros(0), np.zeros((0, 2)))
 
     found = descend(look, np.array([0.3, 0.5]))
     assert 3.0 in seen
@@ -139,7 +141,7 @@ def test_steps_that_fail_do_not_count_as_convergence():
 
     def look(x):
         value = 1 + (10 * abs(x[0] - 0.5) if x[0] != 0.5 else 0)
-        return Local(value, np.array([-0.1, 0.0]), (), np.zeros(0), np.zeros((0, 2)))
+        return Linearization(value, np.array([-0.1, 0.0]), (), np.zeros(0), np.zeros((0, 2)))
 
     found = descend(look, np.array([0.5, 0.5]))
     assert found.reason == "no_progress"
@@ -151,7 +153,7 @@ def test_contradicting_constraints_are_infeasible():
 
     def look(x):
         slack, normals = np.array([x[0] - 0.8, 0.2 - x[0]]), np.array([[1.0, 0], [-1.0, 0]])
-        return Local(x[1], np.array([0.0, 1.0]), (), slack, normals)
+        return Linearization(x[1], np.array([0.0, 1.0]), (), slack, normals)
 
     found = descend(look, np.array([0.1, 0.9]))
     assert found.reason == "infeasible"
@@ -187,7 +189,7 @@ def beside(kind, gap):
         walls = group([-gap], [[-1.0, 0.0]]), far
     else:  # The other branch of a maximum: each rises by 4 where the other falls.
         slope, limits = np.zeros(2), (group([1.0, 1.0 - 4 * gap], [[2.0, 0], [-2.0, 0]]),)
-    return Local(0.0, slope, limits, slack, normals, walls), point
+    return Linearization(0.0, slope, limits, slack, normals, walls), point
 
 
 @pytest.mark.parametrize("kind", ["lower bound", "upper bound", "constraint", "wall", "branch"])
@@ -230,34 +232,34 @@ def curved(seed, count=6, branches=3):
     branches, and two constraints."""
     rng = np.random.default_rng(seed)
     roots = rng.normal(size=(branches + 3, count, count)) * np.sqrt(3.0 / count)
-    bends = roots @ np.swapaxes(roots, 1, 2)
-    bends[-2:] *= -1
+    hessians = roots @ np.swapaxes(roots, 1, 2)
+    hessians[-2:] *= -1
     centers, slopes = rng.uniform(0.3, 0.7, (2, branches + 3, count))
     lift = np.append(np.zeros(branches + 1), [1.2, 1.2])
 
     def look(x, order=None):
         away = x - centers
-        bent = np.einsum("kij,kj->ki", bends, away)
+        bent = np.einsum("kij,kj->ki", hessians, away)
         values = np.einsum("ki,ki->k", slopes + bent / 2, away) + lift
         rows = slopes + bent
         order = np.arange(branches) if order is None else order
         tags = np.stack([np.zeros(branches), 0.1 + 0.3 * np.arange(branches)], axis=1)[order]
         maxima = Group(tags, values[1 : branches + 1][order], rows[1 : branches + 1][order])
         first, last = slice(0, 1), slice(branches + 1, None)
-        return Local(values[0], rows[first][0], (maxima,), values[last], rows[last])
+        return Linearization(values[0], rows[first][0], (maxima,), values[last], rows[last])
 
-    return look, bends
+    return look, hessians
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_models_of_quadratic_functions_are_exact(seed):
     """The models are exact in whatever order the branches are listed at each point."""
-    look, bends = curved(seed)
+    look, hessians = curved(seed)
     rng = np.random.default_rng(seed)
     point = rng.uniform(0.2, 0.8, 6)
     models = Models(point, look(point))
     models.measure(lambda x: look(x, rng.permutation(3)))
-    np.testing.assert_allclose(models.bends, bends, atol=1e-8)
+    np.testing.assert_allclose(models.hessians, hessians, atol=1e-8)
     step = rng.uniform(-0.1, 0.1, 6)
     expected = look(point + step)
     value, slope = models.values(step)
@@ -293,35 +295,35 @@ def valley(x):
     value = 1 + 3 * (v - u**2) ** 2 + 3e-4 * (1 - u) ** 2
     slope = 2 * np.array([-12 * u * (v - u**2) - 6e-4 * (1 - u), 6 * (v - u**2)])
     bound = np.array([1.2 - x[0] ** 2 - x[1] ** 2])
-    return Local(value, slope, (), bound, -2 * x[None])
+    return Linearization(value, slope, (), bound, -2 * x[None])
 
 
 def stiff(x):
     """Return a steep function: 1e-9 above its minimum, the slope is still 1e-3 per unit box."""
     away = 20 * (x - 0.4)
     slope = 20 * np.sinh(away)
-    return Local(1 + np.sum(np.cosh(away) - 1), slope, (), np.zeros(0), np.zeros((0, 2)))
+    return Linearization(1 + np.sum(np.cosh(away) - 1), slope, (), np.zeros(0), np.zeros((0, 2)))
 
 
 def saddle(x):
     """Return a function whose gradient vanishes at (0.5, 0.5), a saddle."""
     away = x - 0.5
     value = 1 + away[0] ** 2 - 0.1 * away[1] ** 2
-    return Local(value, np.array([2, -0.2]) * away, (), np.zeros(0), np.zeros((0, 2)))
+    return Linearization(value, np.array([2, -0.2]) * away, (), np.zeros(0), np.zeros((0, 2)))
 
 
 def waves(seed):
     """Return a function with corners between waves, and curved limits of the geometry."""
     rng = np.random.default_rng(seed)
     turns, shifts = rng.normal(size=(4, 4)) * 3, rng.uniform(0, 6, 4)
-    bends, centre = rng.uniform(0.5, 2, (2, 4)), rng.uniform(0.2, 0.8, (2, 4))
+    hessians, centre = rng.uniform(0.5, 2, (2, 4)), rng.uniform(0.2, 0.8, (2, 4))
 
     def look(x):
         phase = turns @ x + shifts
         values, slopes = 1 + 0.2 * np.sin(phase), 0.2 * np.cos(phase)[:, None] * turns
         away = x - centre
-        slack, normals = 0.02 - np.sum(bends * away**4, axis=1), -4 * bends * away**3
-        return Local(0.0, np.zeros(4), (group(values, slopes),), slack, normals)
+        slack, normals = 0.02 - np.sum(hessians * away**4, axis=1), -4 * hessians * away**3
+        return Linearization(0.0, np.zeros(4), (group(values, slopes),), slack, normals)
 
     return look
 
@@ -370,7 +372,9 @@ def test_branches_of_higher_order_are_followed():
         values = [np.exp(2 * x[0]) + x[1] ** 4, np.exp(-3 * (x[0] - 0.5)) + (1 - x[1]) ** 2]
         slopes = [[2 * np.exp(2 * x[0]), 4 * x[1] ** 3],
                   [-3 * np.exp(-3 * (x[0] - 0.5)), -2 * (1 - x[1])]]  # fmt: skip
-        return Local(0.0, np.zeros(2), (group(values, slopes),), np.zeros(0), np.zeros((0, 2)))
+        return Linearization(
+            0.0, np.zeros(2), (group(values, slopes),), np.zeros(0), np.zeros((0, 2))
+        )
 
     one, other = (descend(look, np.array(start)) for start in ([0.9, 0.1], [0.2, 0.9]))
     assert one.converged
@@ -384,7 +388,7 @@ def walled(x, limit=0.35, lift=0.0):
     values = np.array([x[0] ** 2 + x[1] + lift, x[0] + x[1] ** 2 + lift])
     slopes = np.array([[2 * x[0], 1.0], [1.0, 2 * x[1]]])
     wall = Group(np.array([[0.0, 0.2], [0.0, 0.7]]), values / limit - 1, slopes / limit)
-    return Local(value, slope, (), np.zeros(0), np.zeros((0, 2)), (wall,))
+    return Linearization(value, slope, (), np.zeros(0), np.zeros((0, 2)), (wall,))
 
 
 @pytest.mark.parametrize("start", [[0.1, 0.1], [0.9, 0.8], [0.0, 1.0]])

@@ -13,7 +13,7 @@ from rootsopt.config.families import families, family_of
 from rootsopt.errors import InputError
 from rootsopt.profiles import CIC, EE, arc
 from rootsopt.profiles.validity import margins, soundness
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene.families import check, profile_of
 from tests.conformance import families as suite
 from tests.conformance.families import (
@@ -250,7 +250,7 @@ def test_unsound_profiles_are_refused(family, changes, fault):
         check(config)
 
 
-@Program
+@CachedFunction
 def _margins_of(family, design):
     profile = profile_of(family, LOBES, jnp.asarray(R), design)
     return soundness(profile, jnp.asarray(0.0), family_of(family).inherent)

@@ -14,7 +14,7 @@ from rootsopt.dynamics.flow import strobe
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.response.attractors import _Sorter, find
 from rootsopt.response.evaluation import Evaluator, evaluate
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 from rootsopt.status import Status
 
 COEXIST = (
@@ -37,7 +37,7 @@ def coexisting():
     return evaluator, find(evaluator, series=True)
 
 
-long_run = Program(lambda pair, state, how: strobe(pair, state, 240, how).states)
+long_run = CachedFunction(lambda pair, state, how: strobe(pair, state, 240, how).states)
 
 
 def test_motions_that_coexist_are_told_apart(coexisting):

@@ -11,7 +11,7 @@ import pytest
 
 from rootsopt.config import load
 from rootsopt.response.evaluation import Evaluator
-from rootsopt.response.many import IN_TURN, Here, Point, as_done, evaluate_many
+from rootsopt.response.many import IN_TURN, LocalRunner, Point, as_done, evaluate_many
 from tests.standins import evaluation_of
 
 
@@ -21,7 +21,7 @@ def late(number, *_):
     return evaluation_of(float(number))
 
 
-@pytest.mark.parametrize("runs", [IN_TURN, Here(3)])
+@pytest.mark.parametrize("runs", [IN_TURN, LocalRunner(3)])
 def test_results_are_in_the_order_of_the_points(runs):
     done = []
     points = [Point(late, number) for number in range(7)]

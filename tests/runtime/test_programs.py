@@ -24,10 +24,10 @@ from rootsopt.commands import cli
 from rootsopt.config import load
 from rootsopt.config.families import for_a_time, import_named
 from rootsopt.design import space
-from rootsopt.dynamics.collocation.known import Known
+from rootsopt.dynamics.collocation.known import KnownOrbit
 from rootsopt.pump import sheet
 from rootsopt.runtime import environment, programs, store
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 from rootsopt.runtime.timing import CompileClock
 from rootsopt.scene import Scene
 
@@ -83,7 +83,7 @@ def ask(program, power=2, size=3, name="a"):
 
 
 def test_a_program_is_traced_once_for_each_kind_of_arguments(traced):
-    program = Program(scaled)
+    program = CachedFunction(scaled)
     ask(program)
     ask(program)
     assert len(traced) == 1
@@ -93,7 +93,7 @@ def test_a_program_is_traced_once_for_each_kind_of_arguments(traced):
 
 
 def test_a_program_inside_another_is_a_plain_function(traced):
-    program = Program(scaled)
+    program = CachedFunction(scaled)
     factors = Factor(jnp.arange(3.0), 2)
     answer = jax.vmap(lambda value: program(Factor(value, 2), jnp.ones(2), "a").total["sum"])(
         factors.value
@@ -103,7 +103,7 @@ def test_a_program_inside_another_is_a_plain_function(traced):
 
 
 def test_prepared_programs_are_ready_when_called(traced):
-    program = Program(scaled)
+    program = CachedFunction(scaled)
     shape = jax.ShapeDtypeStruct((3,), float)
     kind = Factor(jax.ShapeDtypeStruct((), float), 2), shape, "a"
     assert program.result_shape(*kind).total["sum"].shape == ()
@@ -124,7 +124,7 @@ def test_shape_of_the_result_is_told_before_the_program_is_compiled(traced, monk
         began.set()
         raise ValueError("ignored")
 
-    program = Program(scaled)
+    program = CachedFunction(scaled)
     arguments = Factor(jnp.asarray(2.0), 3), np.ones(3), "a"
     program.prepare(*arguments, then=then)
     found = program(*arguments)
@@ -139,7 +139,7 @@ def test_a_failure_is_raised_by_the_call_and_not_remembered():
             raise ValueError("no")
         return x + 1
 
-    program = Program(moody)
+    program = CachedFunction(moody)
     program.prepare(jnp.ones(2))
     for thread in threading.enumerate():
         if thread is not threading.current_thread() and "_make" in thread.name:
@@ -151,16 +151,16 @@ def test_a_failure_is_raised_by_the_call_and_not_remembered():
 
 
 def test_kept_programs_are_found_without_tracing(tmp_path, traced):
-    """Another process, here another `Program` of the same function, finds a kept program."""
+    """Another process, here another `CachedFunction` of the same function, finds a kept program."""
     programs.keep_in(tmp_path / "new" / "folder")
-    first = ask(Program(scaled))
+    first = ask(CachedFunction(scaled))
     assert len(list((tmp_path / "new" / "folder").iterdir())) == 1
-    again = ask(Program(scaled))
+    again = ask(CachedFunction(scaled))
     assert traced == ["a"]
     assert first.total["sum"] == again.total["sum"]
-    assert Program(scaled).result_shape(Factor(jnp.ones(()), 2), np.ones(3), "a").name == "a"
+    assert CachedFunction(scaled).result_shape(Factor(jnp.ones(()), 2), np.ones(3), "a").name == "a"
     assert traced == ["a"]
-    ask(Program(scaled), power=3)
+    ask(CachedFunction(scaled), power=3)
     assert len(traced) == 2
 
 
@@ -168,10 +168,10 @@ def test_results_are_fetched_at_once_if_asked_for(tmp_path, traced):
     """Shapes, types and values are those of a plain program, also if it comes from the cache."""
     programs.keep_in(tmp_path / "cache")
     number = np.array([1.0, 2.0])
-    plain = Program(several)(number, "a")
+    plain = CachedFunction(several)(number, "a")
     for first in (1, 0):
         for _ in range(2):
-            found = Program(several, gathered=first)(number, "a")
+            found = CachedFunction(several, gathered=first)(number, "a")
             assert isinstance(found[0], jax.Array if first else np.ndarray)
             assert jax.tree.structure(found) == jax.tree.structure(plain)
             for value, other in zip(jax.tree.leaves(found), jax.tree.leaves(plain), strict=True):
@@ -189,15 +189,15 @@ def folder(tmp_path):
 
 
 def test_a_damaged_or_unwritable_cache_is_no_error(folder, traced):
-    ask(Program(scaled))
+    ask(CachedFunction(scaled))
     (file,) = folder.iterdir()
     file.write_bytes(file.read_bytes()[:100])
-    ask(Program(scaled))
+    ask(CachedFunction(scaled))
     assert len(traced) == 2
-    ask(Program(scaled))
+    ask(CachedFunction(scaled))
     assert len(traced) == 2
     assert programs.keep_in(file / "below a file") is None
-    ask(Program(scaled))
+    ask(CachedFunction(scaled))
     assert len(traced) == 3
 
 
@@ -213,7 +213,7 @@ class Bomb:
 @pytest.mark.parametrize("signed", ["not", "with another key", "for another program"])
 def test_what_is_not_ours_is_never_unpickled(folder, traced, monkeypatch, tmp_path, signed):
     """Programs that others put into the folder are compiled anew."""
-    ask(Program(scaled))
+    ask(CachedFunction(scaled))
     (file,) = folder.iterdir()
     bomb = zlib.compress(pickle.dumps(Bomb()))
     if signed == "not":
@@ -223,10 +223,10 @@ def test_what_is_not_ours_is_never_unpickled(folder, traced, monkeypatch, tmp_pa
         if signed == "with another key":
             monkeypatch.setattr(store, "key_folder", lambda: tmp_path / "of others")
         store.Store(folder).write(name, purpose, bomb)
-    ask(Program(scaled))
+    ask(CachedFunction(scaled))
     assert len(traced) == 2
     assert not Bomb.went_off
-    ask(Program(scaled))
+    ask(CachedFunction(scaled))
     assert len(traced) == 2
     pickle.loads(zlib.decompress(bomb))
     assert Bomb.went_off
@@ -235,13 +235,13 @@ def test_what_is_not_ours_is_never_unpickled(folder, traced, monkeypatch, tmp_pa
 
 @pytest.mark.skipif(os.name != "posix", reason="permissions of POSIX")
 def test_a_cache_others_may_write_to_is_said_once_and_not_used(folder, traced, monkeypatch, capsys):
-    ask(Program(scaled))
+    ask(CachedFunction(scaled))
     folder.chmod(0o777)
     monkeypatch.setenv("ROOTSOPT_CACHE", str(folder))
     monkeypatch.setattr(environment, "_noticed", set())
     for _ in range(2):
         cli.use_cache()
-        ask(Program(scaled))
+        ask(CachedFunction(scaled))
     assert len(traced) == 3
     (line,) = capsys.readouterr().err.splitlines()
     assert str(folder) in line
@@ -254,7 +254,7 @@ def test_a_cache_that_cannot_be_used_is_not_spoken_of(traced, monkeypatch, capsy
     for choice in (tmp_path / "file", tmp_path / "file" / "below", "off", "OFF", "0", "no"):
         monkeypatch.setenv("ROOTSOPT_CACHE", str(choice))
         cli.use_cache()
-        ask(Program(scaled))
+        ask(CachedFunction(scaled))
     assert len(traced) == 6
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
     assert capsys.readouterr().err == ""
@@ -267,7 +267,7 @@ def test_programs_called_from_python_are_kept_without_being_asked(traced, monkey
     for choice, kept in ((str(tmp_path / "cache"), 1), ("off", 0)):
         monkeypatch.setattr(programs, "_chosen", False)
         monkeypatch.setenv("ROOTSOPT_CACHE", choice)
-        ask(Program(scaled), size=3 + kept)
+        ask(CachedFunction(scaled), size=3 + kept)
     assert len(traced) == 2
     assert len(list((tmp_path / "cache").iterdir())) == 1
 
@@ -278,7 +278,7 @@ def test_the_cache_may_be_named_from_the_current_folder(traced, monkeypatch, tmp
     cli.use_cache()
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
-    ask(Program(scaled))
+    ask(CachedFunction(scaled))
     assert len(list((tmp_path / "cache").iterdir())) == 1
 
 
@@ -286,7 +286,7 @@ def test_programs_that_call_out_are_not_kept(folder):
     """Programs that call library functions are not kept.
 
     Loaded without being lowered, they would call functions that are not set up."""
-    np.testing.assert_allclose(Program(solved)(jnp.eye(2) * 2), [1, 0])
+    np.testing.assert_allclose(CachedFunction(solved)(jnp.eye(2) * 2), [1, 0])
     assert not list(folder.iterdir())
 
 
@@ -295,7 +295,7 @@ def place():
 
     Its arguments are integers, so that the precision changes nothing in them."""
     _, kind = programs._split((Factor(jnp.asarray(2, "int8"), 2), np.ones(3, "int8"), "a"))
-    return Program(scaled)._place(kind)[1:]
+    return CachedFunction(scaled)._place(kind)[1:]
 
 
 def variable(name, more):
@@ -460,12 +460,15 @@ def test_a_program_of_sources_elsewhere_follows_them(folder, monkeypatch, tmp_pa
         importlib.invalidate_caches()
         own = importlib.import_module("own_room")
         answers.append(
-            (float(Program(own.function)(jnp.ones(()))), float(Program(grown)(own.Part(2.0), 1.0)))
+            (
+                float(CachedFunction(own.function)(jnp.ones(()))),
+                float(CachedFunction(grown)(own.Part(2.0), 1.0)),
+            )
         )
     assert answers == [(2.0, 3.0), (3.0, 5.0)]
     assert len(list(folder.iterdir())) == 4
     del own.__file__
-    assert float(Program(own.function)(jnp.ones(2))[0]) == 3.0
+    assert float(CachedFunction(own.function)(jnp.ones(2))[0]) == 3.0
     assert len(list(folder.iterdir())) == 4
 
 
@@ -500,7 +503,7 @@ def test_host_arithmetic_compiles_nothing():
     scene = Scene.from_config(config)
     jax.config.update("jax_no_execution", True)  # Any operation on arrays raises an error.
     try:
-        assert not np.any(Known.empty((7, 9), 3, 2).elements.mesh.times)
+        assert not np.any(KnownOrbit.empty((7, 9), 3, 2).elements.mesh.times)
         assert not sheet._has_play(scene)
         assert not [*space._reaching(config)]
     finally:
@@ -514,7 +517,7 @@ def grown(part, x):
 def test_time_spent_compiling_side_by_side_counts_once():
     began = time.perf_counter()
     with CompileClock() as clock:
-        program = Program(scaled)
+        program = CachedFunction(scaled)
         for power in range(2, 8):
             program.prepare(Factor(jnp.asarray(2.0), power), np.ones(3), "a")
         for power in range(2, 8):

@@ -18,7 +18,7 @@ from rootsopt.config import load
 from rootsopt.errors import InputError
 from rootsopt.optimize import design
 from rootsopt.runtime.environment import own_process
-from rootsopt.runtime.programs import Program
+from rootsopt.runtime.programs import CachedFunction
 from rootsopt.runtime.threads import on_all_cores, one_thread
 from rootsopt.tradeoffs import trace
 
@@ -30,7 +30,7 @@ def counts():
     return {one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"}
 
 
-@Program
+@CachedFunction
 def mixed(rows, shift):
     return jnp.exp(rows) * 2, jnp.sum(jnp.sin(rows), axis=-1) + shift
 

@@ -19,7 +19,7 @@ from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.many import HERE, Point, Runs
 from rootsopt.sweeps import evaluations
 from rootsopt.sweeps.cluster import Cluster
-from rootsopt.sweeps.evaluations import ClosedError, Elsewhere, evaluating
+from rootsopt.sweeps.evaluations import ClosedError, DaskRunner, evaluating
 from rootsopt.sweeps.worker import Settings
 from tests.sweeps.test_cluster import IMPORT, kill_a_worker, no_workers
 from tests.sweeps.workers import DEADLY, force
@@ -102,7 +102,7 @@ class Future:
 def test_threads_that_wait_end_with_the_search(monkeypatch):
     monkeypatch.setattr(evaluations, "_POLL", 0.01)
     client = Client()
-    runs = Elsewhere(None, client, Settings(()))
+    runs = DaskRunner(None, client, Settings(()))
     assert runs.slots == 6
     with ThreadPoolExecutor(1) as pool:
         waiting = pool.submit(runs.evaluated, point())
@@ -119,7 +119,7 @@ def test_a_lost_connection_is_named(monkeypatch):
     monkeypatch.setattr(evaluations, "_POLL", 0.01)
     monkeypatch.setattr(Client, "status", "closed")
     with pytest.raises(InputError, match="connection to the scheduler was lost"):
-        Elsewhere(None, Client(), Settings(())).evaluated(point())
+        DaskRunner(None, Client(), Settings(())).evaluated(point())
 
 
 def test_a_scheduler_without_workers_is_given_up(monkeypatch):
@@ -127,7 +127,7 @@ def test_a_scheduler_without_workers_is_given_up(monkeypatch):
     monkeypatch.setattr(evaluations, "_DESERTED", 0.05)
     monkeypatch.setattr(Client, "nthreads", lambda self: {})
     with pytest.raises(InputError, match=r"no worker for 0\.05 s"):
-        Elsewhere(None, Client(), Settings(())).evaluated(point())
+        DaskRunner(None, Client(), Settings(())).evaluated(point())
 
 
 @pytest.mark.parametrize("motion", ["reached", "worst", "ensemble"])
@@ -151,7 +151,7 @@ def test_classes_of_a_script_travel(tmp_path):
         "from rootsopt.config import load\n"
         "from rootsopt.response.evaluation import Evaluator\n"
         "from rootsopt.response.many import Point\n"
-        "from rootsopt.sweeps.evaluations import Elsewhere\n"
+        "from rootsopt.sweeps.evaluations import DaskRunner\n"
         "from rootsopt.sweeps.worker import Settings\n"
         "class Own(Evaluator):\n"
         "    answer = 42\n"
@@ -162,7 +162,7 @@ def test_classes_of_a_script_travel(tmp_path):
         "    def submit(self, function, settings, task, pure):\n"
         f"        open({str(task)!r}, 'wb').write(task)\n"
         "        sys.exit(0)\n"
-        "Elsewhere(None, Client(), Settings(())).evaluated(Point(own, np.ones(3)))\n"
+        "DaskRunner(None, Client(), Settings(())).evaluated(Point(own, np.ones(3)))\n"
     )
     subprocess.run([sys.executable, str(script)], check=True, env={**os.environ, "PYTHONPATH": "."})
     evaluator, design, start, _ = pickle.loads(task.read_bytes())

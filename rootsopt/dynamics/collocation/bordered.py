@@ -20,7 +20,7 @@ from rootsopt.dynamics.collocation.elements import Elements
 from rootsopt.dynamics.collocation.equation import CollocatedEquation, Points
 from rootsopt.dynamics.collocation.events import look, rooted
 from rootsopt.dynamics.collocation.forces import OrbitForces, origin
-from rootsopt.dynamics.collocation.known import Known
+from rootsopt.dynamics.collocation.known import KnownOrbit
 from rootsopt.dynamics.collocation.mesh import ordered
 from rootsopt.dynamics.collocation.newton import (
     advanced,
@@ -104,12 +104,12 @@ class Followed(NamedTuple):
 
     found: OrbitForces
     line: Line
-    known: Known
+    known: KnownOrbit
 
 
 def moved_along(
-    known: Known, motion: Step, distance: Float[Array, ""]
-) -> tuple[Known, Bool[Array, ""]]:
+    known: KnownOrbit, motion: Step, distance: Float[Array, ""]
+) -> tuple[KnownOrbit, Bool[Array, ""]]:
     """Return the orbit `known`, moved by a `distance` along the curve; `motion`: `Line.motion`.
 
     Its `Elements.roots` are not valid any more. Also return whether all events keep their order."""
@@ -218,7 +218,7 @@ def _mixed(own: float, by_share: Float[Array, ""]) -> Float[Array, "2 1"]:
 def followed(
     family: Family,
     measures: Measures,
-    start: tuple[Known, Step, Float[Array, ""]],
+    start: tuple[KnownOrbit, Step, Float[Array, ""]],
     plane: Plane,
     tolerance: Float[Array, ""],
 ) -> Followed:
@@ -244,7 +244,7 @@ def followed(
     yes = jnp.ones((), bool)
     errors = closed.roughness, closed.error, closed.drift
     return Followed(
-        closed.found, loop.line, Known(closed.found.elements, *errors, closed.sound, yes)
+        closed.found, loop.line, KnownOrbit(closed.found.elements, *errors, closed.sound, yes)
     )
 
 

@@ -35,7 +35,7 @@ from rootsopt.dynamics.collocation.events import (
 )
 from rootsopt.dynamics.collocation.forces import OrbitForces, forces_of, no_forces
 from rootsopt.dynamics.collocation.gauss import POINTS
-from rootsopt.dynamics.collocation.known import Known
+from rootsopt.dynamics.collocation.known import KnownOrbit
 from rootsopt.dynamics.collocation.mesh import (
     aligned,
     counted,
@@ -188,7 +188,7 @@ class Closer(eqx.Module):
     equation: CollocatedEquation
     frozen: RotorPair
     tangents: Any
-    known: Known
+    known: KnownOrbit
     neighbour: Float[Array, " m"]
     tolerance: Float[Array, ""]
 
@@ -450,7 +450,7 @@ class Closer(eqx.Module):
 def close(
     equation: CollocatedEquation,
     tangents: Any,
-    known: Known,
+    known: KnownOrbit,
     neighbour: Float[Array, " m"],
     tolerance: Float[Array, ""],
 ) -> Closed:

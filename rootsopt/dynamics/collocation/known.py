@@ -11,7 +11,7 @@ from rootsopt.dynamics.collocation.elements import Elements, Mesh
 from rootsopt.dynamics.collocation.gauss import GAUSS
 
 
-class Known(NamedTuple):
+class KnownOrbit(NamedTuple):
     """A closed orbit from which orbits of similar pairs can be closed.
 
     `elements`: its motion; `roughness`: that of the elements (`mesh.roughness`) for which the
@@ -28,13 +28,13 @@ class Known(NamedTuple):
     aligned: Bool[Array, ""]
 
     @classmethod
-    def unaligned(cls, elements: Elements) -> "Known":
+    def unaligned(cls, elements: Elements) -> "KnownOrbit":
         """Return the motion `elements`, whose mesh does not end at events yet, as a known orbit."""
         infinite, yes = jnp.asarray(jnp.inf), jnp.ones((), bool)
         return cls(elements, jnp.ones(()), infinite, infinite, yes, ~yes)
 
     @classmethod
-    def empty(cls, sizes: tuple[int, int], states: int, flanks: int) -> "Known":
+    def empty(cls, sizes: tuple[int, int], states: int, flanks: int) -> "KnownOrbit":
         """Return a placeholder.
 
         `sizes`: room for elements and for times of the mesh; `states`: number of states; `flanks`:
@@ -64,7 +64,7 @@ class Known(NamedTuple):
         return cls(motion, zeros(), zeros(), zeros(), no, no)
 
 
-def trimmed(known: Known) -> Known:
+def trimmed(known: KnownOrbit) -> KnownOrbit:
     """Return the orbit `known` in arrays of NumPy without the unused elements and times, to store
     it."""
     mesh, *parts = jax.tree.map(np.asarray, known.elements)
@@ -74,10 +74,10 @@ def trimmed(known: Known) -> Known:
     shares = mesh.interval[:count], mesh.left[:count], mesh.right[:count]
     short = Mesh(mesh.times[:times], mesh.which[:times], *shares, mesh.used)
     rest: Any = map(np.asarray, known[1:])
-    return Known(Elements(short, *(part[:count] for part in parts)), *rest)
+    return KnownOrbit(Elements(short, *(part[:count] for part in parts)), *rest)
 
 
-def padded(known: Known, room: tuple[int, int]) -> Known:
+def padded(known: KnownOrbit, room: tuple[int, int]) -> KnownOrbit:
     """Return a `trimmed` orbit in arrays with `room` for elements and for times of the mesh."""
     mesh, *parts = known.elements
     elements, times = room[0] - len(mesh.left), room[1] - len(mesh.times)
@@ -99,4 +99,4 @@ def padded(known: Known, room: tuple[int, int]) -> Known:
     return known._replace(elements=Elements(full, *wide))  # pyright: ignore[reportArgumentType]
 
 
-__all__ = ["Known", "padded", "trimmed"]
+__all__ = ["KnownOrbit", "padded", "trimmed"]

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 from rootsopt.dynamics.collocation.closing import Closed, close
 from rootsopt.dynamics.collocation.equation import CollocatedEquation
 from rootsopt.dynamics.collocation.forces import OrbitForces
-from rootsopt.dynamics.collocation.known import Known
+from rootsopt.dynamics.collocation.known import KnownOrbit
 from rootsopt.dynamics.flow import Pieces
 from rootsopt.dynamics.linear import spectral_radius
 from rootsopt.dynamics.orbit import Orbit
@@ -46,13 +46,13 @@ class Collocated(NamedTuple):
     sound: Bool[Array, ""]
     shorter: Int[Array, ""]
     verified: Bool[Array, ""]
-    known: Known
+    known: KnownOrbit
 
 
 def closed_orbit(
     pair: RotorPair,
     tangents: Any,
-    start: tuple[Known, Float[Array, " m"]],
+    start: tuple[KnownOrbit, Float[Array, " m"]],
     settings: "Solver",
 ) -> Collocated:
     """Close the orbit near a known motion.
@@ -93,7 +93,7 @@ def _repeats(
     return jnp.where(jnp.any(same), shorter[jnp.argmax(same)], 0)
 
 
-def apart(known: Known, pieces: Pieces) -> Float[Array, ""]:
+def apart(known: KnownOrbit, pieces: Pieces) -> Float[Array, ""]:
     """Return the greatest scaled difference between a closed orbit and the end of a transient.
 
     `pieces`: the last mesh periods of the transient, which ends at φ1 = 0."""
@@ -106,11 +106,11 @@ def apart(known: Known, pieces: Pieces) -> Float[Array, ""]:
     return jnp.max(jnp.where(within, miss, 0.0))
 
 
-def _known(closed: Closed, verified: Bool[Array, ""]) -> Known:
+def _known(closed: Closed, verified: Bool[Array, ""]) -> KnownOrbit:
     """Return the orbit `closed` in the form from which orbits of similar pairs can be closed."""
     yes = jnp.ones((), bool)
     errors = closed.roughness, closed.error, closed.drift
-    return Known(closed.found.elements, *errors, verified, yes)
+    return KnownOrbit(closed.found.elements, *errors, verified, yes)
 
 
 def _as_orbit(

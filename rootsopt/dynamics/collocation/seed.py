@@ -8,13 +8,15 @@ from jaxtyping import Array, Int
 from rootsopt.dynamics.collocation.closing import FIRST
 from rootsopt.dynamics.collocation.elements import Elements, Mesh
 from rootsopt.dynamics.collocation.gauss import GAUSS
-from rootsopt.dynamics.collocation.known import Known
+from rootsopt.dynamics.collocation.known import KnownOrbit
 from rootsopt.dynamics.collocation.mesh import room_for
 from rootsopt.dynamics.flow import Pieces
 from rootsopt.dynamics.pair import RotorPair
 
 
-def from_pieces(pair: RotorPair, pieces: Pieces, period: Int[Array, ""], longest: int) -> Known:
+def from_pieces(
+    pair: RotorPair, pieces: Pieces, period: Int[Array, ""], longest: int
+) -> KnownOrbit:
     """Return the end of a transient as a start for closing its orbit by collocation.
 
     `pieces`: the last mesh periods of the transient, which ends at φ1 = 0, in `PIECES`; `period` of
@@ -38,7 +40,7 @@ def from_pieces(pair: RotorPair, pieces: Pieces, period: Int[Array, ""], longest
     )
     roots = jnp.zeros((capacity, len(GAUSS.nodes) + 1, pair.flanks, 2), dtype)
     states, slopes = pieces.states[row, column], pieces.slopes[row, column]
-    return Known.unaligned(Elements(mesh, states, slopes, roots))
+    return KnownOrbit.unaligned(Elements(mesh, states, slopes, roots))
 
 
 PIECES = FIRST, GAUSS.nodes

@@ -24,7 +24,7 @@ from rootsopt.dynamics.collocation.events import (
 )
 from rootsopt.dynamics.collocation.forces import OrbitForces
 from rootsopt.dynamics.collocation.gauss import GAUSS, POINTS
-from rootsopt.dynamics.collocation.known import Known, padded, trimmed
+from rootsopt.dynamics.collocation.known import KnownOrbit, padded, trimmed
 from rootsopt.dynamics.collocation.mesh import roughness, sizes
 from rootsopt.dynamics.collocation.peak import Rivals, peak_of, rivals_of
 from rootsopt.dynamics.collocation.system import Step, moved_at, unchanged
@@ -64,7 +64,7 @@ def _known(room=(48, 51)):
     )
     one = jnp.ones(())
     yes = jnp.ones((), bool)
-    return Known(motion, one, one, one, yes, yes)
+    return KnownOrbit(motion, one, one, one, yes, yes)
 
 
 def test_samples_of_an_orbit():
