@@ -17,14 +17,14 @@ import inspect
 import re
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import Field, create_model
+from pydantic import Field
 from pydantic.fields import FieldInfo
 
-from rootsopt.config.section import bare, between
+from rootsopt.config.section import Listed, bare, between
 from rootsopt.config.units import si_unit
 from rootsopt.config.words import placed, sentence
 from rootsopt.errors import InputError
@@ -139,7 +139,7 @@ class Parameter:
         `bounds`: (low, high) in the key's unit. This method accepts all bounds; a subclass may
         reject some."""
 
-    def field(self, families: list[str]) -> tuple[Any, Any]:
+    def field(self, families: Iterable[str]) -> tuple[Any, FieldInfo]:
         """Return (annotation, pydantic field) of the key.
 
         The field's description names the `families` that use the key."""
@@ -149,26 +149,23 @@ class Parameter:
         kind: Any = Annotated[float, limits]
         if self.count is not None:
             least, most = self.count
-            many = tuple[kind, ...]
-            kind = Annotated[many, Field(min_length=least, max_length=most)]
-        return kind | None, Field(None, description=f"{', '.join(families)}: {self.help}")
+            kind = Annotated[tuple[kind, ...], Field(min_length=least, max_length=most), Listed]
+        text = f"{', '.join(families)}: {self.help} (bounds: {self._bounds_words()})"
+        return kind | None, Field(None, description=text)
 
-    def bounds_field(self) -> tuple[Any, Any]:
-        """Return (annotation, pydantic field) for the optimisation bounds of the key."""
-        least, most = self.bounds_limits or (self.lowest, self.highest)
-        note = f"{self._bounds_words()}; from {least:g} to {most:g}"
-        kind: Any = Pair if self.default_bounds is not None else Pair | None
-        return kind, Field(self.default_bounds, description=note)
+    @property
+    def bounds_range(self) -> Pair:
+        """Least and greatest bound in a config."""
+        return self.bounds_limits or (self.lowest, self.highest)
 
     def _bounds_words(self) -> str:
-        if self.bounds_note:
-            return self.bounds_note
-        pair = self.default_bounds or self.usual
-        if pair is None:
-            return "default: 0.5 to 1.5 times the config's own value"
-        size = " pitch radii" if self.radii is not None and self.default_bounds is None else ""
-        each = "of each number; " if self.count is not None else ""
-        return f"{each}default: {pair[0]:g} to {pair[1]:g}{size}"
+        pair, most = self.default_bounds or self.usual, self.bounds_limits
+        text = "default: 0.5 to 1.5 times the config's own value"
+        if pair is not None:
+            size = " pitch radii" if self.radii and not self.default_bounds else ""
+            text = f"default: {pair[0]:g} to {pair[1]:g}{size}"
+        limits = f"; from {most[0]:g} to {most[1]:g}" if most else ""
+        return (self.bounds_note or text) + limits
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -271,7 +268,6 @@ class Family:
 _families: dict[str, Family] = {}
 _origins: dict[str, str] = {}
 _parameters: dict[str, Parameter] = {}
-_followers: list[Callable[[], None]] = []
 FAMILY_KEYS: dict[str, tuple[str, ...]] = {}
 """Keys of the design parameters of each registered family; `register_family` updates it."""
 
@@ -321,13 +317,6 @@ def is_list(key: str) -> bool:
 def users_of(key: str) -> list[str]:
     """Return the names of the families that have a parameter with this key."""
     return [family.name for family in _families.values() if key in family.keys]
-
-
-def on_change(update: Callable[[], None]) -> None:
-    """Register a function `update` to be called after each change to the table of families.
-
-    Functions are called in the order in which they were registered."""
-    _followers.append(update)
 
 
 @contextlib.contextmanager
@@ -402,8 +391,6 @@ def _follow() -> None:
     for family in _families.values():
         _parameters.update({parameter.key: parameter for parameter in family.parameters})
         FAMILY_KEYS[family.name] = family.keys
-    for update in _followers:
-        update()
 
 
 def _found(hook: Hook | None) -> Callable[..., Any]:
@@ -483,19 +470,6 @@ _RESERVED = (
 
 def _wrong(argument: str, wanted: str, found: Any) -> ValueError:
     return ValueError(f"Argument `{argument}` of a family must {wanted}, but is {found}")
-
-
-def replace_fields(model: Any, fields: Mapping[str, Any]) -> None:
-    """Replace all fields of a pydantic `model` in place.
-
-    `fields`: a complete `FieldInfo` for each name, or a pair (annotation, field) from which to make
-    one."""
-    new = {name: field for name, field in fields.items() if not isinstance(field, FieldInfo)}
-    made = create_model("Fields", **new).model_fields
-    found = {name: made.get(name, field) for name, field in fields.items()}
-    model.model_fields.clear()
-    model.model_fields.update(found)
-    model.model_rebuild(force=True)
 
 
 def import_named(name: str) -> None:

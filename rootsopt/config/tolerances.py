@@ -1,7 +1,7 @@
 """Config section `tolerances`: how far values of scene and design scatter in manufacture."""
 
 import difflib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import Field, model_validator
@@ -169,6 +169,20 @@ class TolerancesConfig(Section):
             half = self.normal_limit * size if kind == "normal" else size
             found.append(Scatter(key, kind, nominal, size, half))
         return tuple(found)
+
+    def extremes(self, values: Mapping[str, float]) -> Iterator[tuple[str, dict[str, float], str]]:
+        """Yield scenes that must be valid, each as (requirement, its values by key, remedy).
+
+        They are the `conditions`, and the ends of the distributions. `values`: as for `scatters`.
+        """
+        for name, given in self.conditions.items():
+            what = f"the scene `{name}` of `tolerances.conditions` must be a valid one"
+            yield what, given, "correct its values"
+        for one in self.scatters(values) if self.over else ():
+            remedy = f"narrow the distribution or move the nominal value, {one.nominal:.6g}"
+            for end in (one.nominal - one.half, one.nominal + one.half):
+                what = f"`tolerances.over.{one.key}` lets the key reach {end:.6g}"
+                yield what, {one.key: end}, remedy
 
 
 def scatterable(config: Any) -> dict[str, float]:
