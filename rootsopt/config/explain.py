@@ -48,7 +48,8 @@ def explain(
     known = tree(model)
     first = next((p for p in problems if _is_unknown(p)), problems[0])
     if _is_unknown(first):
-        return _unknown(known, [part for part in first["loc"] if part != "[key]"])
+        words = re.findall("'(.+?)'", first.get("ctx", {}).get("expected", ""))
+        return _unknown(known, [part for part in first["loc"] if part != "[key]"], words)
     place, rest = _split(known, first["loc"])
     field, key = known.get(place), ".".join(map(named, place.split(".")))
     first = _branch(first, problems, len(first["loc"]) - len(rest))
@@ -146,15 +147,15 @@ def _advice(place: str, kind: str, value: Any, field: FieldInfo | None) -> str:
     return ""
 
 
-def _unknown(known: Mapping[str, FieldInfo], place: list) -> str:
-    """Return the message on an unknown key, `place`."""
+def _unknown(known: Mapping[str, FieldInfo], place: list, words: list[str]) -> str:
+    """Return the message on an unknown key, `place`.
+
+    `words`: keys that a dictionary may have, empty for a section."""
     prefix, last = "".join(f"{part}." for part in place[:-1]), str(place[-1])[:80]
     text = f"`{'.'.join(map(named, place))}` is not a known key"
     same = (key for key in known if key.rpartition(".")[2] == last)
     names = [key.removeprefix(prefix) for key in known if key.startswith(prefix)]
-    names = [name for name in names if "." not in name]
-    if section := known.get(prefix[:-1]):
-        names += choices(section)
+    names = words or [name for name in names if "." not in name]
     close = difflib.get_close_matches(last, names, n=1, cutoff=0.5)
     if meant := next(same, "") or "".join(f"{prefix}{name}" for name in close):
         return f"{text}; did you mean `{meant}`?"

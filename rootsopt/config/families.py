@@ -403,42 +403,55 @@ def _found(hook: Hook | None) -> Callable[..., Any]:
 
 
 def _check(family: Family) -> None:
-    name, keys = family.name, family.keys
-    if not _WORD.fullmatch(name):
-        raise _wrong("name", "be lower-case letters, digits and _", name)
+    """Raise `ValueError` if a family is incomplete, or has a name or a key that is taken."""
+    name, keys, made = family.name, family.keys, family.maker is not None
+    for parameter in family.parameters:
+        _check_parameter(parameter)
     if taken := next((one for one in _families if bare(one) == bare(name)), None):
         raise ValueError(
             f"Argument `family` must have a new name, but {taken} is taken; choose another one, or "
             "restart Python to change a family: compiled programs are kept under its name"
         )
+    listed = ", ".join(keys)
+    unknown = ", ".join(sorted(family.inherent - {*MARGINS}))
+    beyond, value = next(_beyond(family), ("", None))
+    lists = [parameter.count is not None for parameter in family.parameters]
+    silent = made and bool(keys) and not family.by_limits and not family.remedy
+    foreign = made and {*family.example} != {*keys}
+    wanted = ", ".join(("lobes", "pitch_radius", *(one.argument for one in family.parameters)))
+    unfit = _unfit(family)
+    for wrong, argument, must, found in (
+        (not _WORD.fullmatch(name), "name", "be lower-case letters, digits and _", name),
+        (len(set(keys)) < len(keys), "parameters", "have every key once", listed),
+        (any(lists[:-1]), "parameters", "have a list of numbers last", listed),
+        (unknown, "inherent", f"be among {', '.join(MARGINS)}", unknown),
+        (silent, "remedy", "say what to change if a profile is not sound", "empty"),
+        (foreign, "example", f"have the keys {listed}", ", ".join(family.example)),
+        (beyond, "example", f"respect the limits of {beyond}", value),
+        (unfit, "maker", f"take the arguments {wanted}", f"a function with {unfit}"),
+    ):
+        if wrong:
+            raise ValueError(f"Argument `{argument}` of a family must {must}, but is {found}")
+
+
+def _beyond(family: Family) -> Iterator[tuple[str, Any]]:
+    """Yield (key, value) of each number in a family's example that its key does not allow."""
     for parameter in family.parameters:
-        _check_parameter(parameter)
-    if len(set(keys)) < len(keys):
-        raise _wrong("parameters", "have every key once", ", ".join(keys))
-    if any(parameter.count is not None for parameter in family.parameters[:-1]):
-        raise _wrong("parameters", "have a list of numbers last", ", ".join(keys))
-    if unknown := family.inherent - {*MARGINS}:
-        raise _wrong("inherent", f"be among {', '.join(MARGINS)}", ", ".join(sorted(unknown)))
-    if family.maker is None:
-        return
-    if not family.by_limits and not family.remedy and keys:
-        raise _wrong("remedy", "say what to change if a profile is not sound", "empty")
-    if {*family.example} != {*keys}:
-        raise _wrong("example", f"have the keys {', '.join(keys)}", ", ".join(family.example))
-    for parameter in family.parameters:
-        values = family.example[parameter.key]
-        for value in values if parameter.count is not None else (values,):
+        given = family.example.get(parameter.key, ())
+        for value in given if isinstance(given, tuple | list) else (given,):
             if not parameter.lowest <= value <= parameter.highest:
-                raise _wrong("example", f"respect the limits of {parameter.key}", value)
-    if callable(family.maker):
-        arguments = {parameter.argument: 0 for parameter in family.parameters}
-        try:
-            inspect.signature(family.maker).bind(0, 0, **arguments)
-        except TypeError as error:
-            wanted = ", ".join(("lobes", "pitch_radius", *arguments))
-            raise _wrong(
-                "maker", f"take the arguments {wanted}", f"a function with {error}"
-            ) from None
+                yield parameter.key, value
+
+
+def _unfit(family: Family) -> str:
+    """Return why a family's maker cannot be called with its parameters, or "" if it can."""
+    if not callable(family.maker):
+        return ""
+    try:
+        inspect.signature(family.maker).bind(0, 0, **{one.argument: 0 for one in family.parameters})
+    except TypeError as error:
+        return str(error)
+    return ""
 
 
 def _check_parameter(parameter: Parameter) -> None:
@@ -466,10 +479,6 @@ def _check_parameter(parameter: Parameter) -> None:
 _RESERVED = (
     *("family", "lobes", "pitch_radius_mm", "outline_file", "outline_smoothing_mm", "helix_deg"),
 )
-
-
-def _wrong(argument: str, wanted: str, found: Any) -> ValueError:
-    return ValueError(f"Argument `{argument}` of a family must {wanted}, but is {found}")
 
 
 def import_named(name: str) -> None:

@@ -42,6 +42,7 @@ this unit."""
 
 _FARTHEST = 1e5
 """Absolute value (mm) above which a coordinate of a rotor's axis is rejected."""
+_Coordinate = Annotated[float, between(-_FARTHEST, _FARTHEST)]
 
 
 def _is_center(value: Any) -> bool:
@@ -53,7 +54,7 @@ def _is_center(value: Any) -> bool:
 
 
 _Center = Annotated[
-    Literal["fit"] | Annotated[tuple[float, float], Listed],
+    Literal["fit"] | Annotated[tuple[_Coordinate, _Coordinate], Listed],
     such(
         f"fit, or x and y of the axis in mm, as in [0.1, 0.2], each at most {_FARTHEST:g}",
         _is_center,
