@@ -147,7 +147,7 @@ class ProfileConfig(Section):
     @classmethod
     def fields(cls) -> Mapping[str, FieldInfo]:
         """Return all keys, with the parameters of all registered families before `outline_file`."""
-        model = _with_fields({key: users_of(key) for key in parameters()})
+        model = model_of(*families().values())
         names = [*cls.model_fields]
         place = names.index(_OUTLINE[0])
         order = *names[:place], *parameters(), *names[place:]
@@ -189,16 +189,15 @@ class ProfileConfig(Section):
 _OUTLINE = tuple(key for key in ProfileConfig.model_fields if key.startswith("outline_"))
 
 
-def _with_fields(users: Mapping[str, Sequence[str]]) -> type[ProfileConfig]:
-    """Return a model with parameters as additional keys. `users`: their families, by key."""
-    fields: Any = {key: parameters()[key].field(users[key]) for key in users}
-    return create_model("ProfileConfig", __base__=ProfileConfig, **fields)
-
-
 @functools.cache
-def model_of(family: Family) -> type[ProfileConfig]:
-    """Return the section's model for a registered `family`."""
-    return _with_fields({key: [family.name] for key in family.keys})
+def model_of(*owners: Family) -> type[ProfileConfig]:
+    """Return the section's model for a registered family, or for several at once."""
+    fields: Any = {
+        one.key: one.field(family.name for family in owners if one.key in family.keys)
+        for owner in owners
+        for one in owner.parameters
+    }
+    return create_model("ProfileConfig", __base__=ProfileConfig, **fields)
 
 
 def _require_own(family: Family, data: Mapping[str, Any], given: set[str]) -> None:

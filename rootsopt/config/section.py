@@ -97,14 +97,16 @@ class Section(BaseModel):
         if not isinstance(data, dict):
             return data
         found = dict(data)
-        for name, field in cls.model_fields.items():
+        for name, value in data.items():
+            field = cls.model_fields.get(name)
+            if field is None or not isinstance(value, str | dict):
+                continue
             words = {bare(word): word for word in choices(field)}
-            value = found.get(name)
             if isinstance(value, str):
                 found[name] = words.get(bare(value), value)
-            elif isinstance(value, dict) and words:
-                right = {words.get(bare(str(key)), key): inner for key, inner in value.items()}
-                found[name] = right if len(right) == len(value) else value
+                continue
+            right = {words.get(bare(str(key)), key): inner for key, inner in value.items()}
+            found[name] = right if len(right) == len(value) else value
         return found
 
 
