@@ -409,8 +409,15 @@ def _fitted() -> list[str]:
     return [NEAREST, *(name for name, family in families().items() if family.fitted)]
 
 
-_Bounds = Annotated[tuple[float, ...], Listed, such("two numbers, as in [1, 2]",
-                                                     lambda pair: len(pair) == 2)]  # fmt: skip
+_Bounds = Annotated[
+    tuple[float, float],
+    Listed,
+    such(
+        "two numbers, as in [1, 2]",
+        lambda pair: not isinstance(pair, list | tuple) or len(pair) == 2,
+        before=True,
+    ),
+]
 
 
 class OptimizerConfig(Section):
