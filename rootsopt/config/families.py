@@ -139,7 +139,7 @@ class Parameter:
         `bounds`: (low, high) in the key's unit. This method accepts all bounds; a subclass may
         reject some."""
 
-    def field(self, families: Iterable[str]) -> tuple[Any, FieldInfo]:
+    def field(self, families: Iterable[str]) -> tuple[Any, Any]:
         """Return (annotation, pydantic field) of the key.
 
         The field's description names the `families` that use the key."""

@@ -212,7 +212,8 @@ def _require_own(family: Family, data: Mapping[str, Any], given: set[str]) -> No
     missing = [key for key in required if key not in given]
     if not foreign and not missing:
         return
-    radius, values = data.get("pitch_radius_mm"), dict[str, Any].fromkeys(foreign, "null")
+    radius = data.get("pitch_radius_mm")
+    values: dict[str, Any] = {key: "null" for key in foreign}
     scale = radius / EXAMPLE_RADIUS if isinstance(radius, int | float) else 1.0
     for key in family.keys if foreign and missing and family.keys else missing:
         value = family.example.get(key, "FILE")
