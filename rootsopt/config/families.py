@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
-from pydantic.fields import FieldInfo
 
 from rootsopt.config.section import Listed, bare, between
 from rootsopt.config.units import si_unit
