@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from rootsopt.commands import cli
 from rootsopt.commands.table import COMMANDS
 from rootsopt.config import Config
-from rootsopt.config.explain import all_keys
+from rootsopt.config.explain import tree
 from rootsopt.config.shipped import shipped
 from rootsopt.errors import InputError
 
@@ -66,7 +66,7 @@ def _complete(parser: argparse.ArgumentParser, file: Mapping, folder: Mapping) -
 
 
 def _keys() -> list[str]:
-    return [f"{key}=" for key in all_keys(Config)]
+    return [f"{key}=" for key in tree(Config)]
 
 
 def _words(words: Iterable[str]) -> str:

@@ -15,7 +15,7 @@ from rootsopt.config.reading import (
     parse,
 )
 from rootsopt.config.scene import ProfileConfig
-from rootsopt.config.study import EnsembleConfig, SolverConfig
+from rootsopt.config.study import TWIST, EnsembleConfig, SolverConfig
 from rootsopt.config.units import hint
 
 load_config = load
@@ -26,6 +26,7 @@ DESIGN_KEYS = FAMILY_KEYS["cic"]
 __all__ = [
     "DESIGN_KEYS",
     "FAMILY_KEYS",
+    "TWIST",
     "Config",
     "EnsembleConfig",
     "ProfileConfig",

@@ -196,20 +196,14 @@ _CONSTANTS = {
 def _whole(text: str) -> int:
     if _WHOLE.fullmatch(text) is None:
         raise ValueError
-    sign = -1 if text.startswith("-") else 1
-    digits = text.lstrip("+-").replace("_", "")
-    bases = {"0b": 2, "0o": 8, "0x": 16}
-    base = bases.get(digits[:2], 10)
-    return sign * int(digits if base == 10 else digits[2:], base)
+    digits = text.replace("_", "")
+    return int(digits, 0 if digits.lstrip("+-")[1:2] in ("b", "o", "x") else 10)
 
 
 def _real(text: str) -> float:
     if _NUMBER.fullmatch(text) is None:
         return float(_whole(text))
-    named_ones = text.lower().lstrip("+-").lstrip(".")
-    if named_ones in ("inf", "nan"):
-        return float("-" * text.startswith("-") + named_ones)
-    return float(text.replace("_", ""))
+    return float(text.lower().replace("_", "").replace(".inf", "inf").replace(".nan", "nan"))
 
 
 def _scalar(kind: str, read: Callable[[str], Any]) -> None:

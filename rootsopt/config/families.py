@@ -17,14 +17,13 @@ import inspect
 import re
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import Field, create_model
-from pydantic.fields import FieldInfo
+from pydantic import Field
 
-from rootsopt.config.section import bare, between
+from rootsopt.config.section import Listed, bare, between
 from rootsopt.config.units import si_unit
 from rootsopt.config.words import placed, sentence
 from rootsopt.errors import InputError
@@ -139,7 +138,7 @@ class Parameter:
         `bounds`: (low, high) in the key's unit. This method accepts all bounds; a subclass may
         reject some."""
 
-    def field(self, families: list[str]) -> tuple[Any, Any]:
+    def field(self, families: Iterable[str]) -> tuple[Any, Any]:
         """Return (annotation, pydantic field) of the key.
 
         The field's description names the `families` that use the key."""
@@ -149,26 +148,23 @@ class Parameter:
         kind: Any = Annotated[float, limits]
         if self.count is not None:
             least, most = self.count
-            many = tuple[kind, ...]
-            kind = Annotated[many, Field(min_length=least, max_length=most)]
-        return kind | None, Field(None, description=f"{', '.join(families)}: {self.help}")
+            kind = Annotated[tuple[kind, ...], Field(min_length=least, max_length=most), Listed]
+        text = f"{', '.join(families)}: {self.help} (bounds: {self._bounds_words()})"
+        return kind | None, Field(None, description=text)
 
-    def bounds_field(self) -> tuple[Any, Any]:
-        """Return (annotation, pydantic field) for the optimisation bounds of the key."""
-        least, most = self.bounds_limits or (self.lowest, self.highest)
-        note = f"{self._bounds_words()}; from {least:g} to {most:g}"
-        kind: Any = Pair if self.default_bounds is not None else Pair | None
-        return kind, Field(self.default_bounds, description=note)
+    @property
+    def bounds_range(self) -> Pair:
+        """Least and greatest bound in a config."""
+        return self.bounds_limits or (self.lowest, self.highest)
 
     def _bounds_words(self) -> str:
-        if self.bounds_note:
-            return self.bounds_note
-        pair = self.default_bounds or self.usual
-        if pair is None:
-            return "default: 0.5 to 1.5 times the config's own value"
-        size = " pitch radii" if self.radii is not None and self.default_bounds is None else ""
-        each = "of each number; " if self.count is not None else ""
-        return f"{each}default: {pair[0]:g} to {pair[1]:g}{size}"
+        pair, most = self.default_bounds or self.usual, self.bounds_limits
+        text = "default: 0.5 to 1.5 times the config's own value"
+        if pair is not None:
+            size = " pitch radii" if self.radii and not self.default_bounds else ""
+            text = f"default: {pair[0]:g} to {pair[1]:g}{size}"
+        limits = f"; from {most[0]:g} to {most[1]:g}" if most else ""
+        return (self.bounds_note or text) + limits
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -271,7 +267,6 @@ class Family:
 _families: dict[str, Family] = {}
 _origins: dict[str, str] = {}
 _parameters: dict[str, Parameter] = {}
-_followers: list[Callable[[], None]] = []
 FAMILY_KEYS: dict[str, tuple[str, ...]] = {}
 """Keys of the design parameters of each registered family; `register_family` updates it."""
 
@@ -321,13 +316,6 @@ def is_list(key: str) -> bool:
 def users_of(key: str) -> list[str]:
     """Return the names of the families that have a parameter with this key."""
     return [family.name for family in _families.values() if key in family.keys]
-
-
-def on_change(update: Callable[[], None]) -> None:
-    """Register a function `update` to be called after each change to the table of families.
-
-    Functions are called in the order in which they were registered."""
-    _followers.append(update)
 
 
 @contextlib.contextmanager
@@ -402,8 +390,6 @@ def _follow() -> None:
     for family in _families.values():
         _parameters.update({parameter.key: parameter for parameter in family.parameters})
         FAMILY_KEYS[family.name] = family.keys
-    for update in _followers:
-        update()
 
 
 def _found(hook: Hook | None) -> Callable[..., Any]:
@@ -416,42 +402,55 @@ def _found(hook: Hook | None) -> Callable[..., Any]:
 
 
 def _check(family: Family) -> None:
-    name, keys = family.name, family.keys
-    if not _WORD.fullmatch(name):
-        raise _wrong("name", "be lower-case letters, digits and _", name)
+    """Raise `ValueError` if a family is incomplete, or has a name or a key that is taken."""
+    name, keys, made = family.name, family.keys, family.maker is not None
+    for parameter in family.parameters:
+        _check_parameter(parameter)
     if taken := next((one for one in _families if bare(one) == bare(name)), None):
         raise ValueError(
             f"Argument `family` must have a new name, but {taken} is taken; choose another one, or "
             "restart Python to change a family: compiled programs are kept under its name"
         )
+    listed = ", ".join(keys)
+    unknown = ", ".join(sorted(family.inherent - {*MARGINS}))
+    beyond, value = next(_beyond(family), ("", None))
+    lists = [parameter.count is not None for parameter in family.parameters]
+    silent = made and bool(keys) and not family.by_limits and not family.remedy
+    foreign = made and {*family.example} != {*keys}
+    wanted = ", ".join(("lobes", "pitch_radius", *(one.argument for one in family.parameters)))
+    unfit = _unfit(family)
+    for wrong, argument, must, found in (
+        (not _WORD.fullmatch(name), "name", "be lower-case letters, digits and _", name),
+        (len(set(keys)) < len(keys), "parameters", "have every key once", listed),
+        (any(lists[:-1]), "parameters", "have a list of numbers last", listed),
+        (unknown, "inherent", f"be among {', '.join(MARGINS)}", unknown),
+        (silent, "remedy", "say what to change if a profile is not sound", "empty"),
+        (foreign, "example", f"have the keys {listed}", ", ".join(family.example)),
+        (beyond, "example", f"respect the limits of {beyond}", value),
+        (unfit, "maker", f"take the arguments {wanted}", f"a function with {unfit}"),
+    ):
+        if wrong:
+            raise ValueError(f"Argument `{argument}` of a family must {must}, but is {found}")
+
+
+def _beyond(family: Family) -> Iterator[tuple[str, Any]]:
+    """Yield (key, value) of each number in a family's example that its key does not allow."""
     for parameter in family.parameters:
-        _check_parameter(parameter)
-    if len(set(keys)) < len(keys):
-        raise _wrong("parameters", "have every key once", ", ".join(keys))
-    if any(parameter.count is not None for parameter in family.parameters[:-1]):
-        raise _wrong("parameters", "have a list of numbers last", ", ".join(keys))
-    if unknown := family.inherent - {*MARGINS}:
-        raise _wrong("inherent", f"be among {', '.join(MARGINS)}", ", ".join(sorted(unknown)))
-    if family.maker is None:
-        return
-    if not family.by_limits and not family.remedy and keys:
-        raise _wrong("remedy", "say what to change if a profile is not sound", "empty")
-    if {*family.example} != {*keys}:
-        raise _wrong("example", f"have the keys {', '.join(keys)}", ", ".join(family.example))
-    for parameter in family.parameters:
-        values = family.example[parameter.key]
-        for value in values if parameter.count is not None else (values,):
+        given = family.example.get(parameter.key, ())
+        for value in given if isinstance(given, tuple | list) else (given,):
             if not parameter.lowest <= value <= parameter.highest:
-                raise _wrong("example", f"respect the limits of {parameter.key}", value)
-    if callable(family.maker):
-        arguments = {parameter.argument: 0 for parameter in family.parameters}
-        try:
-            inspect.signature(family.maker).bind(0, 0, **arguments)
-        except TypeError as error:
-            wanted = ", ".join(("lobes", "pitch_radius", *arguments))
-            raise _wrong(
-                "maker", f"take the arguments {wanted}", f"a function with {error}"
-            ) from None
+                yield parameter.key, value
+
+
+def _unfit(family: Family) -> str:
+    """Return why a family's maker cannot be called with its parameters, or "" if it can."""
+    if not callable(family.maker):
+        return ""
+    try:
+        inspect.signature(family.maker).bind(0, 0, **{one.argument: 0 for one in family.parameters})
+    except TypeError as error:
+        return str(error)
+    return ""
 
 
 def _check_parameter(parameter: Parameter) -> None:
@@ -479,23 +478,6 @@ def _check_parameter(parameter: Parameter) -> None:
 _RESERVED = (
     *("family", "lobes", "pitch_radius_mm", "outline_file", "outline_smoothing_mm", "helix_deg"),
 )
-
-
-def _wrong(argument: str, wanted: str, found: Any) -> ValueError:
-    return ValueError(f"Argument `{argument}` of a family must {wanted}, but is {found}")
-
-
-def replace_fields(model: Any, fields: Mapping[str, Any]) -> None:
-    """Replace all fields of a pydantic `model` in place.
-
-    `fields`: a complete `FieldInfo` for each name, or a pair (annotation, field) from which to make
-    one."""
-    new = {name: field for name, field in fields.items() if not isinstance(field, FieldInfo)}
-    made = create_model("Fields", **new).model_fields
-    found = {name: made.get(name, field) for name, field in fields.items()}
-    model.model_fields.clear()
-    model.model_fields.update(found)
-    model.model_rebuild(force=True)
 
 
 def import_named(name: str) -> None:

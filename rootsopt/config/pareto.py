@@ -4,14 +4,21 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from rootsopt.config.section import Section, tuples
+from rootsopt.config.section import Listed, Section, require, such
 from rootsopt.config.words import shown
 
 
 class ParetoConfig(Section):
     """The terms that `rootsopt pareto` trades against each other, and the number of points."""
 
-    terms: tuple[str, ...] = Field(
+    terms: Annotated[
+        tuple[str, ...],
+        Listed,
+        such(
+            "two or three different terms, as [peak_force_N, area_efficiency]",
+            lambda terms: len(set(terms)) == len(terms) in (2, 3),
+        ),
+    ] = Field(
         ("peak_force_N", "area_efficiency"),
         description="two or three quantities: forces and lines as in `response`, geometry as in "
         "`geometry`, displaced_volume_cm3, theoretical_flow_l_min, flow_ripple, "
@@ -39,22 +46,12 @@ class ParetoConfig(Section):
         12, description="greatest number of further points where neighbours lie far apart"
     )
 
-    @model_validator(mode="before")
-    @classmethod
-    def _lists(cls, data):
-        return tuples(data)
-
     @model_validator(mode="after")
-    def _few(self):
-        if not 2 <= len(self.terms) <= 3 or len(set(self.terms)) != len(self.terms):
-            raise ValueError(
-                "`pareto.terms` must be two or three different terms, as [peak_force_N, "
-                f"area_efficiency], but is {shown([*self.terms])}"
-            )
+    def _own(self):
         for name in self.senses:
-            if name not in self.terms:
-                raise ValueError(
-                    f"`pareto.senses` must name terms of `pareto.terms` ({', '.join(self.terms)}), "
-                    f"but names {shown(name)}; add the term, or remove its sense"
-                )
+            require(
+                name in self.terms,
+                f"`pareto.senses` must name terms of `pareto.terms` ({', '.join(self.terms)}), "
+                f"but names {shown(name)}; add the term, or remove its sense",
+            )
         return self

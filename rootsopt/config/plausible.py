@@ -5,11 +5,12 @@ micro pumps and for boosters of a metre. Many follow the size of the rotor, whos
 mass a unit changes by a factor of a thousand, where machines differ by a factor of ten."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rootsopt.config.families import parameters
-from rootsopt.config.units import MM, hint, unit_of
+from rootsopt.config.study import TWIST
+from rootsopt.config.units import MM, RPM, hint, unit_of
 
 if TYPE_CHECKING:
     from rootsopt.config.reading import Config
@@ -18,96 +19,63 @@ _BAR = 1e5
 """One bar (Pa)."""
 
 
-def _one(_: "Config") -> float:
-    return 1.0
+def _sizes(config: "Config") -> dict[str, float]:
+    """Return the sizes that usual ranges follow, by name, in the units of the keys that use them.
 
-
-def _radius(config: "Config") -> float:
-    """Return the pitch radius (mm)."""
-    return config.profile.pitch_radius_mm
-
-
-def _disc(config: "Config") -> float:
-    """Return the area (mm²) of the pitch circle."""
-    return math.pi * _radius(config) ** 2
-
-
-def _volume(config: "Config") -> float:
-    """Return the volume (cm³) of a cylinder on the pitch circle."""
-    return _disc(config) * config.rotor.length_mm * 1e-3
-
-
-def _mass(config: "Config") -> float:
-    """Return the mass (kg) of a solid cylinder on the pitch circle."""
-    return _volume(config) * 1e-6 * config.rotor.density_kg_m3
-
-
-def _inertia(config: "Config") -> float:
-    """Return the moment of inertia (kg·m²) of this cylinder."""
-    return _mass(config) * (_radius(config) * MM) ** 2 / 2
-
-
-def _rolling(config: "Config") -> float:
-    """Return the speed (rpm) at which the pitch circles roll at 1 m/s."""
-    return 60 / (2 * math.pi * _radius(config) * MM)
-
-
-def _bar(config: "Config") -> float:
-    """Return the load torque (N·m) of 1 bar. A load of the config may be 0 or wrong itself."""
-    return config.gas_torque(_BAR)
-
-
-def _slope(config: "Config") -> float:
-    """Return the torque of 1 bar per speed of the scene (N·m·s/rad)."""
-    return _bar(config) / (config.scene.speed_rpm * 2 * math.pi / 60)
-
-
-def _critical(config: "Config") -> float:
-    """Return the critical damping (N·s/mm) of a rotor on its bearings."""
-    supports = config.scene.supports
+    Mass and inertia are those of a solid cylinder on the pitch circle. A load of the config may be
+    0 or wrong itself, so that torques follow 1 bar; `force` at the pitch circle carries the load.
+    `rolling`: speed at which the pitch circles roll at 1 m/s. `critical`: critical damping of a
+    rotor on its bearings."""
+    radius, supports = config.profile.pitch_radius_mm, config.scene.supports
+    disc, torque = math.pi * radius**2, config.gas_torque(_BAR)
+    volume = disc * config.rotor.length_mm * 1e-3
+    mass = volume * 1e-6 * config.rotor.density_kg_m3
     stiffness = 0.0 if supports is None else supports.stiffness_N_per_mm / MM
-    return 2 * math.sqrt(stiffness * _mass(config)) * MM
-
-
-def _force(config: "Config") -> float:
-    """Return the force (N) at the pitch circle that carries the load."""
-    return config.load_torque / (_radius(config) * MM)
+    return {
+        "one": 1.0,
+        "radius": radius,
+        "disc": disc,
+        "volume": volume,
+        "inertia": mass * (radius * MM) ** 2 / 2,
+        "rolling": 1 / (radius * MM * RPM),
+        "bar": torque,
+        "slope": torque / (config.scene.speed_rpm * RPM),
+        "critical": 2 * math.sqrt(stiffness * mass) * MM,
+        "force": config.load_torque / (radius * MM),
+    }
 
 
 class Usual(NamedTuple):
-    """Usual range of a quantity: `low` to `high`, times its `size` in a config.
-
-    `size`: function of the config that returns the unit of `low` and `high`, in the unit of the
-    key."""
+    """Usual range of a quantity: `low` to `high`, times a `size` of the config (see `_sizes`)."""
 
     low: float
     high: float
-    size: Callable[["Config"], float] = _one
+    size: str = "one"
 
     def ends(self, config: "Config") -> tuple[float, float]:
         """Return the range in the unit of the key."""
-        size = self.size(config)
+        size = _sizes(config)[self.size]
         return self.low * size, self.high * size
 
 
 _PRESSURE = Usual(300, 5e6)
-_TORQUE = Usual(1e-3, 50, _bar)
-_SPEED = Usual(0.2, 120, _rolling)
-_GAP = Usual(1e-5, 0.035, _radius)
-_LENGTH = Usual(5e-3, 2, _radius)
-_MARGIN = Usual(1e-3, 1, _radius)
+_TORQUE = Usual(1e-3, 50, "bar")
+_SPEED = Usual(0.2, 120, "rolling")
+_GAP = Usual(1e-5, 0.035, "radius")
+_LENGTH = Usual(5e-3, 2, "radius")
+_MARGIN = Usual(1e-3, 1, "radius")
 _ANGLE = Usual(0.2, 180)
 _TWIST = Usual(4, 360)
 _WARMING = Usual(0.5, 250)
 _EXPANSION = Usual(5e-7, 5e-5)
-_RADIUS = Usual(1, 2, _radius)
+_RADIUS = Usual(1, 2, "radius")
 USUAL: dict[str, Usual] = {
     "profile.pitch_radius_mm": Usual(8, 1000),
     "profile.outline_smoothing_mm": Usual(1e-5, 0.2),
     "profile.outline_join_mm": Usual(1e-6, 0.2),
-    "rotor.length_mm": Usual(0.1, 20, _radius),
+    "rotor.length_mm": Usual(0.1, 20, "radius"),
     "rotor.density_kg_m3": Usual(500, 2.2e4),
-    "rotor.bore_mm": Usual(0.02, 2, _radius),
+    "rotor.bore_mm": Usual(0.02, 2, "radius"),
     "rotor.helix_deg": _TWIST,
     "contact.stiffness_N_per_mm_e": Usual(1e3, 1e9),
     "contact.max_damping_N_s_per_mm": Usual(1e-3, 50),
@@ -120,19 +88,19 @@ USUAL: dict[str, Usual] = {
     "contact.wear.depth_mm": _GAP,
     "scene.speed_rpm": _SPEED,
     "scene.motor.torque_N_m": _TORQUE,
-    "scene.motor.slope_N_m_s_per_rad": Usual(1e-3, 1e3, _slope),
-    "scene.motor.inertia_kg_m2": Usual(1e-3, 1e3, _inertia),
+    "scene.motor.slope_N_m_s_per_rad": Usual(1e-3, 1e3, "slope"),
+    "scene.motor.inertia_kg_m2": Usual(1e-3, 1e3, "inertia"),
     "scene.load.torque_N_m": _TORQUE,
     "scene.load.pressure_difference_Pa": _PRESSURE,
-    "scene.timing_gear.stiffness_N_m_per_rad": Usual(50, 1e6, _bar),
+    "scene.timing_gear.stiffness_N_m_per_rad": Usual(50, 1e6, "bar"),
     "scene.timing_gear.damping_ratio": Usual(1e-3, 1),
     "scene.timing_gear.backlash_mm": _GAP,
-    "scene.supports.stiffness_N_per_mm": Usual(50, 2e5, _radius),
-    "scene.supports.damping_N_s_per_mm": Usual(1e-3, 5, _critical),
+    "scene.supports.stiffness_N_per_mm": Usual(50, 2e5, "radius"),
+    "scene.supports.damping_N_s_per_mm": Usual(1e-3, 5, "critical"),
     "scene.bearings.gear_pressure_angle_deg": Usual(5, 45),
     "scene.bearings.port_deg": Usual(1, 90),
-    "scene.bearings.bearing_distance_mm": Usual(0.02, 10, _radius),
-    "scene.bearings.gear_distance_mm": Usual(0.02, 20, _radius),
+    "scene.bearings.bearing_distance_mm": Usual(0.02, 10, "radius"),
+    "scene.bearings.gear_distance_mm": Usual(0.02, 20, "radius"),
     "scene.heat.rotor_warming_K": _WARMING,
     "scene.heat.housing_warming_K": _WARMING,
     "scene.heat.rotor_expansion_per_K": _EXPANSION,
@@ -147,7 +115,6 @@ USUAL: dict[str, Usual] = {
     "attractors.relative_range_mrad": Usual(1e-2, 300),
     "attractors.rate_range_rad_s": Usual(1e-3, 1e4),
     "sweep.speed_rpm": _SPEED,
-    "optimizer.bounds.helix_deg": _TWIST,
     "pump.viscosity_mPa_s": Usual(5e-3, 2e5),
     "pump.pressure_difference_Pa": _PRESSURE,
     "pump.tip_clearance_mm": _GAP,
@@ -159,16 +126,16 @@ USUAL: dict[str, Usual] = {
     "drawing.tolerance_mm": _GAP,
 }
 """Usual range of each key with a unit, other than design parameters."""
-_DESIGN = {"pressure_angle_deg": Usual(5, 85), "tip_arc_turn_deg": Usual(3, 180)}
+_DESIGN = {"pressure_angle_deg": Usual(5, 85), "tip_arc_turn_deg": Usual(3, 180), TWIST: _TWIST}
 """Usual ranges of design parameters that differ from those of their unit."""
 _UNITS = {"mm": _LENGTH, "°": _ANGLE}
 """Usual range of a design parameter, by unit."""
 _TERMS = {
-    "_force_N": Usual(1e-2, 1e3, _force),
-    "_radius_mm": Usual(0.02, 2, _radius),
-    "area_mm2": Usual(0.2, 4, _disc),
-    "displaced_volume_cm3": Usual(0.2, 5, _volume),
-    "polar_inertia_kg_m2": Usual(0.1, 5, _inertia),
+    "_force_N": Usual(1e-2, 1e3, "force"),
+    "_radius_mm": Usual(0.02, 2, "radius"),
+    "area_mm2": Usual(0.2, 4, "disc"),
+    "displaced_volume_cm3": Usual(0.2, 5, "volume"),
+    "polar_inertia_kg_m2": Usual(0.1, 5, "inertia"),
 }
 """Usual ranges of limited quantities, by the ends of their names."""
 
@@ -176,7 +143,7 @@ _TERMS = {
 def usual_of(key: str) -> Usual | None:
     """Return the usual range of a dotted key; `None` for a key without a unit."""
     section, _, name = key.rpartition(".")
-    if section in ("profile", "optimizer.bounds") and name in parameters():
+    if section == "optimizer.bounds" or (section == "profile" and name in parameters()):
         return _DESIGN.get(name) or _UNITS.get(unit_of(name))
     if key.startswith("constraints.terms."):
         return next((usual for end, usual in _TERMS.items() if name.endswith(end)), None)
@@ -231,8 +198,9 @@ def _numbers(section: Any, prefix: str = "") -> Iterator[tuple[str, float]]:
         value, key = getattr(section, name), prefix + name
         if hasattr(type(value), "model_fields"):
             yield from _numbers(value, f"{key}.")
-        elif key == "constraints.terms":
-            yield from ((f"{key}.{term}", _greatest(sides)) for term, sides in value.items())
+        elif key in ("constraints.terms", "optimizer.bounds"):
+            numbers = ((f"{key}.{one}", _greatest(sides)) for one, sides in value.items())
+            yield from ((one, number) for one, number in numbers if number)
         elif value != field.default and (number := _greatest(value)):
             yield key, number
 

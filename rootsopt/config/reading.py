@@ -1,5 +1,6 @@
 """The complete config, and the functions that read it from YAML."""
 
+import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -7,18 +8,12 @@ from typing import Any
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, SerializeAsAny, ValidationError, model_validator
 
 from rootsopt.config.document import MOST_BYTES, read_document
 from rootsopt.config.drawing import DrawingConfig
-from rootsopt.config.explain import all_keys, describe, explain, outline
-from rootsopt.config.families import (
-    families,
-    family_of,
-    find_installed,
-    on_change,
-    replace_fields,
-)
+from rootsopt.config.explain import describe, explain, outline, tree
+from rootsopt.config.families import families, family_of, find_installed, is_list
 from rootsopt.config.pareto import ParetoConfig
 from rootsopt.config.pump import PumpConfig
 from rootsopt.config.scene import (
@@ -27,12 +22,13 @@ from rootsopt.config.scene import (
     RotorConfig,
     SceneConfig,
 )
-from rootsopt.config.section import Section, bare
+from rootsopt.config.section import Section, bare, put, require
 from rootsopt.config.shipped import advice, located
 from rootsopt.config.smoothing import following_mm
 from rootsopt.config.sources import regular_file
 from rootsopt.config.study import (
     NEAREST,
+    TWIST,
     AttractorsConfig,
     ConstraintsConfig,
     EnsembleConfig,
@@ -44,16 +40,12 @@ from rootsopt.config.study import (
 )
 from rootsopt.config.tolerances import Scatter, TolerancesConfig, mounted, scatterable, unknown_key
 from rootsopt.config.units import hint
-from rootsopt.config.words import named, placed, sentence, shown
+from rootsopt.config.words import placed, sentence, shown
 from rootsopt.errors import InputError
 
 _MOST_PARTS = 8
 """Number of dotted parts in a key above which an override is rejected. Config keys have at most
 three parts."""
-
-
-TWIST = "helix_deg"
-"""Key of the twist, in the section `rotor` and among the design parameters."""
 
 
 class Config(Section):
@@ -65,7 +57,7 @@ class Config(Section):
     {'pressure_angle_deg': 36.43, 'involute_length_mm': 9.0, 'tip_arc_angle_deg': 4.0}
     """
 
-    profile: ProfileConfig
+    profile: SerializeAsAny[ProfileConfig]
     rotor: RotorConfig
     contact: ContactConfig
     scene: SceneConfig
@@ -111,7 +103,7 @@ class Config(Section):
         """Whether the twist of the rotors is the last design parameter.
 
         A rotor from a file has no design parameters; the one fitted to it has the twist."""
-        return self.optimizer.bounds.helix_deg is not None and not self.profile.from_file
+        return TWIST in self.optimizer.bounds and not self.profile.from_file
 
     def with_design(self, design: Sequence[float] | NDArray[np.float64]) -> "Config":
         """Return a copy of the config with another `design` (d,), without checking it."""
@@ -128,24 +120,23 @@ class Config(Section):
         the same way as a file. Defaults that follow other keys, such as the smoothing length,
         follow the new values. Raises `InputError` for an unknown key or a value that is not
         allowed."""
-        try:
-            return Config.model_validate(self.plain(values))
-        except ValidationError as error:
-            raise InputError(sentence(f"{explain(error, Config)}")) from None
+        return _checked(self.plain(values))
 
     def check_values(self, values: Mapping[str, Any]) -> None:
         """Raise `InputError` for an unknown key, or a value that its key cannot have by itself.
 
         `values`: new values by dotted key. A value that merely does not fit the other values is
         accepted: `replaced` rejects it."""
+        given = self._joined(values)
+        data = self.plain(given)
+        for key, value in given.items():
+            section, _, name = key.partition(".")
+            if section == "profile" and "." not in name:
+                data[section] = self.profile.alone(name, value)
         try:
-            Config.model_validate(self.plain(values))
+            Config.model_validate(data)
         except ValidationError as error:
-            keys = [
-                ["profile", self._entry(k)[0]] if self._entry(k)[0] else k.split(".")
-                for k in values
-            ]
-            if message := explain(error, Config, keys):
+            if message := explain(error, Config, [key.split(".") for key in given]):
                 raise InputError(sentence(message)) from None
 
     def plain(self, values: Mapping[str, Any] | None = None) -> dict[str, Any]:
@@ -159,60 +150,40 @@ class Config(Section):
             section = getattr(self, name)
             if section is not None and key not in section.model_fields_set:
                 data[name].pop(key, None)
-        for key, value in (values or {}).items():
-            parts = key.split(".")
-            name, entry = self._entry(key)
-            if name:
-                data["profile"][name][entry] = value
-                continue
-            target = data
-            for i, part in enumerate(parts[:-1]):
-                inner = target.setdefault(part, {})
-                if not isinstance(inner, dict):
-                    place = ".".join(map(named, parts[: i + 1]))
-                    raise InputError(f"`{named(key)}` is not a known key: `{place}` holds no keys")
-                target = inner
-            target[parts[-1]] = value
+        for key, value in self._joined(values or {}).items():
+            put(data, key, value)
         return data
 
-    def _entry(self, key: str) -> tuple[str, int]:
-        """Return (name, place) of the list entry that a `key` such as `profile.coefficients_3`
-        names.
+    def _joined(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Return `values` by dotted key with whole lists instead of single entries of them.
 
-        For any other key, return ("", 0)."""
-        section, _, entry = key.partition(".")
-        name, _, number = entry.rpartition("_")
-        single = entry in self.profile.parameters
-        if section != "profile" or entry not in self.profile.design_keys or single:
-            return "", 0
-        return name, int(number) - 1
+        `profile.coefficients_3` names the third entry of `profile.coefficients`."""
+        found: dict[str, Any] = {}
+        for key, value in values.items():
+            name, _, number = key.rpartition("_")
+            entry = key.removeprefix("profile.")
+            if not is_list(name.removeprefix("profile.")) or entry not in self.profile.design_keys:
+                found[key] = value
+                continue
+            entries = [*found.get(name, self.value(name))]
+            entries[int(number) - 1] = value
+            found[name] = tuple(entries)
+        return found
+
+    def value(self, key: str) -> Any:
+        """Return the value at a dotted `key`, `None` if the config has no such key or section."""
+        return functools.reduce(lambda at, part: getattr(at, part, None), key.split("."), self)
 
     @property
     def scatters(self) -> tuple[Scatter, ...]:
         """Distributions of the keys that scatter; empty without `tolerances`."""
         return () if self.tolerances is None else self.tolerances.scatters(scatterable(self))
 
-    def moved(self, values: Mapping[str, float]) -> "Config":
-        """Return a copy in which some numbers are replaced, without checking them.
+    def moved(self, values: Mapping[str, Any]) -> "Config":
+        """Return a copy in which some values are replaced, without checking them.
 
-        `values`: new numbers by dotted key. The keys, design parameters included, are those that
-        `scatterable` lists."""
-        data: Config = self
-        design = {f"profile.{key}" for key in self.profile.design_keys}
-        for key, value in values.items():
-            if key not in design:
-                data = _with(data, key, value)
-                continue
-            parameters = dict(self.profile.parameters)
-            name = key.removeprefix("profile.")
-            if name not in parameters:
-                name, _, number = name.rpartition("_")
-                entries = [*getattr(data.profile, name)]
-                entries[int(number) - 1] = value
-                data = _with(data, f"profile.{name}", tuple(entries))
-            else:
-                data = _with(data, key, value)
-        return data
+        `values`: new values by dotted key, as for `plain`. The keys exist."""
+        return functools.reduce(lambda at, one: _with(at, *one), self._joined(values).items(), self)
 
     @property
     def load_torque(self) -> float:
@@ -260,96 +231,64 @@ class Config(Section):
         return self
 
     @model_validator(mode="after")
-    def _twisting(self):
-        scene = self.scene
+    def _fitting(self):
+        scene, profile, family = self.scene, self.profile, self.optimizer.family
         gas = scene.load.pressure_difference_Pa is not None
-        if self.twist_free and gas and scene.supports is not None and scene.bearings is not None:
-            raise ValueError(
-                "`optimizer.bounds.helix_deg` must be absent with elastic `scene.supports`, "
-                "`scene.bearings` and a load `pressure_difference_Pa`: the twist moves the instant "
-                "at which a pocket opens and the axes are pushed, which gradients leave out; "
-                "remove one of the four"
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _searched_family(self):
-        family, own = self.optimizer.family, self.profile.family
-        if not self.profile.from_file and family not in (NEAREST, own):
-            raise ValueError(
-                f"`optimizer.family` must be {own}, the family of the profile, or be left out, but "
-                f"is {family}: only for an outline from a file can the search vary another family"
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _sized_bounds(self):
-        profile = self.profile
+        require(
+            None in (scene.supports, scene.bearings) or not (self.twist_free and gas),
+            "`optimizer.bounds.helix_deg` must be absent with elastic `scene.supports`, "
+            "`scene.bearings` and a load `pressure_difference_Pa`: the twist moves the instant "
+            "at which a pocket opens and the axes are pushed, which gradients leave out; "
+            "remove one of the four",
+        )
+        require(
+            profile.from_file or family in (NEAREST, profile.family),
+            f"`optimizer.family` must be {profile.family}, the family of the profile, or be left "
+            f"out, but is {family}: only for an outline from a file can the search vary another "
+            "family",
+        )
         for parameter in family_of(profile.family).parameters:
-            key, limits = parameter.key, parameter.limits(profile.pitch_radius_mm)
-            pair = getattr(self.optimizer.bounds, key)
-            if limits is None or pair is None or limits[0] <= pair[0] < pair[1] <= limits[1]:
-                continue
-            low, high = limits
-            raise ValueError(
+            key, sized = parameter.key, parameter.limits(profile.pitch_radius_mm)
+            low, high = sized or parameter.bounds_range
+            pair = self.optimizer.bounds.get(key, (low, high))
+            require(
+                low <= pair[0] and pair[1] <= high,
                 f"`optimizer.bounds.{key}` must lie in [{low:.4g}, {high:.4g}] at "
                 f"`profile.pitch_radius_mm` = {profile.pitch_radius_mm:g}, but is {[*pair]}"
-                + hint(key, pair[1], low, high)
+                + hint(key, pair[1], low, high),
             )
         return self
 
     @model_validator(mode="after")
     def _scattering(self):
-        tolerances = self.tolerances
+        tolerances, alone = self.tolerances, self.model_copy(update={"tolerances": None})
         if tolerances is None:
             return self
-        valid, known = scatterable(self), dict.fromkeys(all_keys(Config))
+        valid, known = scatterable(self), tree(Config)
         for key in (*tolerances.over, *tolerances.changed):
-            if key not in valid:
-                raise ValueError(unknown_key(key, valid, known))
-        if self.objective.motion == "ensemble":
-            raise ValueError(
-                "`tolerances` must be absent for `objective.motion` ensemble, whose averages have "
-                "noise; remove `tolerances`, or set `objective.motion` to reached, worst or "
-                "weighted"
-            )
-        if self.objective.speeds_rpm and "scene.speed_rpm" in tolerances.over:
-            raise ValueError(
-                "`tolerances.over` must not name `scene.speed_rpm` if `objective.speeds_rpm` lists "
-                "the speeds; remove one of them"
-            )
-        alone = self.model_copy(update={"tolerances": None})
-        for name, values in tolerances.conditions.items():
+            require(key in valid, unknown_key(key, valid, known))
+        require(
+            self.objective.motion != "ensemble",
+            "`tolerances` must be absent for `objective.motion` ensemble, whose averages have "
+            "noise; remove `tolerances`, or set `objective.motion` to reached, worst or weighted",
+        )
+        require(
+            not self.objective.speeds_rpm or "scene.speed_rpm" not in tolerances.over,
+            "`tolerances.over` must not name `scene.speed_rpm` if `objective.speeds_rpm` lists "
+            "the speeds; remove one of them",
+        )
+        for what, values, remedy in tolerances.extremes(valid):
             data = alone.moved(values).model_dump(mode="json", exclude_none=True)
             try:
                 Config.model_validate(data)
             except ValidationError as error:
-                raise ValueError(
-                    f"the scene `{name}` of `tolerances.conditions` must be a valid one, but "
-                    f"{explain(error, Config)}; correct its values"
-                ) from None
-        if tolerances.conditions:
-            return self
-        for one in tolerances.scatters(valid):
-            for end in (one.nominal - one.half, one.nominal + one.half):
-                data = alone.moved({one.key: end}).model_dump(mode="json", exclude_none=True)
-                try:
-                    Config.model_validate(data)
-                except ValidationError as error:
-                    raise ValueError(
-                        f"`tolerances.over.{one.key}` lets the key reach {end:.6g}, but "
-                        f"{explain(error, Config)}; narrow the distribution or move the nominal "
-                        f"value, {one.nominal:.6g}"
-                    ) from None
+                raise ValueError(f"{what}, but {explain(error, Config)}; {remedy}") from None
         return self
 
     def to_yaml(self) -> str:
         """Return the resolved config as YAML, with every default written out."""
         data = self.model_dump(mode="json", exclude_none=True)
         return yaml.safe_dump(data, sort_keys=False, allow_unicode=True)
-
-
-on_change(lambda: replace_fields(Config, dict(Config.model_fields)))
 
 
 _FOLLOWING = (("contact", "smoothing_mm"), ("pump", "pressure_difference_Pa"))
@@ -414,10 +353,15 @@ def parse(
         _override(data, override)
     _place_files(data, Path())
     _find_family(data)
+    return _checked(data, f"{name}: ")
+
+
+def _checked(data: dict, prefix: str = "") -> Config:
+    """Return the config of plain values. `prefix`: start of the message of an error."""
     try:
         return Config.model_validate(data)
     except ValidationError as error:
-        raise InputError(sentence(f"{name}: {explain(error, Config)}")) from None
+        raise InputError(sentence(f"{prefix}{explain(error, Config)}")) from None
 
 
 def _find_family(data: dict) -> None:
@@ -469,16 +413,7 @@ def _override(data: dict, override: str) -> None:
         raise InputError(f"{name}: must be dotted.key=value, as in scene.speed_rpm=1500")
     if len(parts) > _MOST_PARTS:
         raise InputError(f"{name}: has more than {_MOST_PARTS} dotted keys; no key is that deep")
-    target = data
-    for i, part in enumerate(parts[:-1]):
-        inner = target.get(part)
-        if inner is None:
-            inner = target[part] = {}
-        if not isinstance(inner, dict):
-            place = ".".join(map(named, parts[: i + 1]))
-            raise InputError(f"{name}: `{place}` holds no keys")
-        target = inner
-    target[parts[-1]] = read_document(value, name)
+    put(data, ".".join(parts), read_document(value, name))
 
 
 def describe_keys(group: str = "") -> str:

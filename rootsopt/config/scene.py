@@ -1,26 +1,37 @@
 """Config sections that define what is simulated: profile, rotor, contact, scene."""
 
+import functools
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field, field_validator, model_validator
+from pydantic import BeforeValidator, Field, create_model, model_validator
+from pydantic.fields import FieldInfo
 
 from rootsopt.config import catalogue as _catalogue  # noqa: F401  (fills the table)
 from rootsopt.config.families import (
     EXAMPLE_RADIUS,
+    Family,
     families,
     family_of,
-    on_change,
     parameters,
-    replace_fields,
     users_of,
 )
-from rootsopt.config.section import Radius, Section, Speed, Torque, between
+from rootsopt.config.section import (
+    Among,
+    Listed,
+    Radius,
+    Section,
+    Speed,
+    Torque,
+    bare,
+    between,
+    require,
+    such,
+)
 from rootsopt.config.units import hint
-from rootsopt.config.words import shown
 
 _USUAL = 0.01, 2.0
 """Usual range (pitch radii) of a profile's lengths.
@@ -34,20 +45,37 @@ _FARTHEST = 1e5
 _Coordinate = Annotated[float, between(-_FARTHEST, _FARTHEST)]
 
 
-def _is_bool(value: Any) -> bool:
-    return isinstance(value, bool)
+def _is_center(value: Any) -> bool:
+    """Return whether a value is the word `fit`, or two coordinates (mm)."""
+    if not isinstance(value, list | tuple):
+        return value == "fit"
+    numbers = [x for x in value if isinstance(x, int | float) and not isinstance(x, bool)]
+    return len(numbers) == len(value) == 2 and all(abs(x) <= _FARTHEST for x in numbers)
+
+
+_Center = Annotated[
+    Literal["fit"] | Annotated[tuple[_Coordinate, _Coordinate], Listed],
+    such(
+        f"fit, or x and y of the axis in mm, as in [0.1, 0.2], each at most {_FARTHEST:g}",
+        _is_center,
+        before=True,
+    ),
+]
+_Path = Annotated[str, such("a path of characters that can be printed", str.isprintable)]
 
 
 class ProfileConfig(Section):
     """The rotor profile.
 
-    The parameters of all registered families are additional keys. Each is `None` unless it belongs
-    to the config's own `family`."""
+    An instance belongs to the subclass that `model_of` makes for its `family`, whose further keys
+    are the family's parameters."""
 
-    family: str = Field(description="profile family; outline: read from a file")
+    family: Annotated[str, Among(families)] = Field(
+        description="profile family; outline: read from a file"
+    )
     lobes: Annotated[int, Field(ge=2, le=6)] = Field(description="number of lobes")
     pitch_radius_mm: Radius = Field(description="pitch radius, half the centre distance")
-    outline_file: str | None = Field(
+    outline_file: _Path | None = Field(
         None, description="outline: CSV or DXF file, relative to the config's folder"
     )
     outline_smoothing_mm: Annotated[float, between(0, 10)] | None = Field(
@@ -56,7 +84,7 @@ class ProfileConfig(Section):
         "through them",
     )
 
-    outline_center: Literal["fit"] | tuple[_Coordinate, _Coordinate] | None = Field(
+    outline_center: _Center | None = Field(
         None,
         description="outline: x and y (mm) of the rotor's axis in the file, or fit: the centre of "
         "the lobes' rotational symmetry; absent: the origin",
@@ -99,109 +127,105 @@ class ProfileConfig(Section):
             update={one.key: tuple(v) if one.count is not None else v for one, v in values}
         )
 
+    def alone(self, key: str, value: Any) -> dict[str, Any]:
+        """Return the plain section of a rotor of this size that has a parameter `key`.
+
+        It is one of another family if the section's own does not have the key."""
+        data = self.model_dump(mode="json", exclude_none=True) | {key: value}
+        names = users_of(key) or ["outline"] * (key in _OUTLINE)
+        if not names or self.family in names or value is None:
+            return data
+        size = {name: data[name] for name in ("lobes", "pitch_radius_mm")}
+        example = family_of(names[0]).example or {_OUTLINE[0]: "rotor.csv"}
+        return {"family": names[0], **size, **example, key: value}
+
     @property
     def from_file(self) -> bool:
         """Whether the profile is read from a file rather than made from parameters."""
         return family_of(self.family).maker is None
 
-    @model_validator(mode="before")
     @classmethod
-    def _lists(cls, data):
-        if not isinstance(data, dict):
-            return data
-        lists = {key for key, parameter in parameters().items() if parameter.count is not None}
-        lists.add("outline_center")
-        given = {key: data[key] for key in lists & data.keys() if isinstance(data[key], list)}
-        return data | {key: tuple(value) for key, value in given.items()}
+    def fields(cls) -> Mapping[str, FieldInfo]:
+        """Return all keys, with the parameters of all registered families before `outline_file`."""
+        model = model_of(*families().values())
+        names = [*cls.model_fields]
+        place = names.index(_OUTLINE[0])
+        order = *names[:place], *parameters(), *names[place:]
+        return {name: model.model_fields[name] for name in order}
 
-    @field_validator("outline_center", mode="before")
+    @model_validator(mode="wrap")
     @classmethod
-    def _centered(cls, value):
-        plain = isinstance(value, tuple) and len(value) == 2
-        plain = plain and all(isinstance(x, int | float) and abs(x) <= _FARTHEST for x in value)
-        if value is None or value == "fit" or (plain and not any(map(_is_bool, value))):
-            return value
-        raise ValueError(
-            "`profile.outline_center` must be fit, or x and y of the axis in mm, as in [0.1, 0.2], "
-            f"each at most {_FARTHEST:g}, but is {shown(value)}"
-        )
+    def _of_family(cls, data, handler):
+        """Choose the model by the family, and report keys that are missing or not its own."""
+        if cls is not ProfileConfig or not isinstance(data, dict):
+            return handler(data)
+        known = {*parameters(), *_OUTLINE}
+        data = {key: v for key, v in data.items() if v is not None or key not in known}
+        name = bare(str(data.get("family")))
+        family = next((one for key, one in families().items() if bare(key) == name), None)
+        if family is None:
+            return handler({key: value for key, value in data.items() if key not in known})
+        if known | cls.model_fields.keys() >= data.keys():
+            _require_own(family, data, known & data.keys())
+        return model_of(family).model_validate(data)
 
     @model_validator(mode="after")
     def _sized(self):
-        for key, parameter in parameters().items():
-            value, limits = getattr(self, key), parameter.limits(self.pitch_radius_mm)
-            if value is None or limits is None or limits[0] <= value <= limits[1]:
+        for parameter in family_of(self.family).parameters:
+            key, limits = parameter.key, parameter.limits(self.pitch_radius_mm)
+            value = getattr(self, key)
+            if limits is None or limits[0] <= value <= limits[1]:
                 continue
-            assert parameter.radii is not None
             low, high = limits
             word = f"at least {low:.4g}" if value < low else f"at most {high:.4g}"
-            share = parameter.radii[0] if value < low else parameter.radii[1]
+            share = (low if value < low else high) / self.pitch_radius_mm
             raise ValueError(
                 f"`profile.{key}` must be {word} ({share:g} pitch radii), but is {value:g}"
                 + hint(key, value, *(share * self.pitch_radius_mm for share in _USUAL))
             )
         return self
 
-    @model_validator(mode="after")
-    def _outline(self):
-        if self.outline_file is not None and not self.outline_file.isprintable():
-            raise ValueError(
-                "`profile.outline_file` must be the path of a file, but is "
-                f"{shown(self.outline_file)}, which has characters that cannot be printed"
-            )
-        return self
 
-    @model_validator(mode="after")
-    def _family_keys(self):
-        outline = [key for key in _FIELDS if key.startswith("outline_")]
-        keys = family_of(self.family).keys
-        own, required = (outline, ("outline_file",)) if self.from_file else (keys, keys)
-        given = [key for key in (*parameters(), *outline) if getattr(self, key) is not None]
-        foreign = [key for key in given if key not in own]
-        missing = [key for key in required if key not in given]
-        if foreign or missing:
-            raise ValueError(_completed(self, foreign, missing))
-        return self
+_OUTLINE = tuple(key for key in ProfileConfig.model_fields if key.startswith("outline_"))
 
 
-def _completed(profile: ProfileConfig, foreign: Sequence[str], missing: Sequence[str]) -> str:
-    """Return the message on keys that are `foreign` to the family of a `profile`, or `missing`.
+@functools.cache
+def model_of(*owners: Family) -> type[ProfileConfig]:
+    """Return the section's model for a registered family, or for several at once."""
+    fields: Any = {
+        one.key: one.field(family.name for family in owners if one.key in family.keys)
+        for owner in owners
+        for one in owner.parameters
+    }
+    return create_model("ProfileConfig", __base__=ProfileConfig, **fields)
 
-    It lists the overrides that make the profile complete. Missing keys get the values of the
-    family's example at this pitch radius, and so do keys that another family shares: its values may
-    not fit."""
-    family, scale = family_of(profile.family), profile.pitch_radius_mm / EXAMPLE_RADIUS
-    values: dict[str, Any] = dict.fromkeys(foreign, "null")
+
+def _require_own(family: Family, data: Mapping[str, Any], given: set[str]) -> None:
+    """Raise `ValueError` if `given` keys are foreign to a family, or if keys of it are missing.
+
+    The message lists the overrides that complete the section `data`. Missing keys get the values of
+    the family's example at this pitch radius, and so do keys that another family shares: its values
+    may not fit."""
+    from_file = family.maker is None
+    own, required = (_OUTLINE, _OUTLINE[:1]) if from_file else (family.keys, family.keys)
+    foreign = [key for key in (*parameters(), *_OUTLINE) if key in given and key not in own]
+    missing = [key for key in required if key not in given]
+    if not foreign and not missing:
+        return
+    radius = data.get("pitch_radius_mm")
+    values: dict[str, Any] = {key: "null" for key in foreign}
+    scale = radius / EXAMPLE_RADIUS if isinstance(radius, int | float) else 1.0
     for key in family.keys if foreign and missing and family.keys else missing:
         value = family.example.get(key, "FILE")
         value = f"{value * scale:.4g}" if key.endswith("_mm") else value
         values[key] = [*value] if isinstance(value, tuple) else value
     first = f"`profile.{[*foreign, *missing][0]}` " + (
-        f"does not belong to family {profile.family}; for this family, add"
+        f"does not belong to family {family.name}; for this family, add"
         if foreign
-        else f"is required for family {profile.family}; add, for example,"
+        else f"is required for family {family.name}; add, for example,"
     )
     sets = [shlex.quote(f"profile.{key}={value}") for key, value in values.items()]
-    return " --set ".join((first, *sets))
-
-
-_FIELDS = dict(ProfileConfig.model_fields)
-
-
-def _derive() -> None:
-    """Set the fields of `ProfileConfig` from the table of families."""
-    first, last = (
-        {name: field for name, field in _FIELDS.items() if name.startswith("outline") is behind}
-        for behind in (False, True)
-    )
-    words = Literal[tuple(families())]  # type: ignore[valid-type]
-    first |= {"family": (words, Field(description=_FIELDS["family"].description))}
-    made = {key: parameter.field(users_of(key)) for key, parameter in parameters().items()}
-    replace_fields(ProfileConfig, first | made | last)
-
-
-_derive()
-on_change(_derive)
+    raise ValueError(" --set ".join((first, *sets)))
 
 
 class RotorConfig(Section):
@@ -232,17 +256,17 @@ class FrictionConfig(Section):
 
     @model_validator(mode="after")
     def _ordered(self):
-        if self.static < self.kinetic:
-            raise ValueError(
-                "`contact.friction.static` must be at least `contact.friction.kinetic` = "
-                f"{self.kinetic:g}, but is {self.static:g}; raise it, or lower the other"
-            )
-        if self.friction_speed_mm_s <= self.stiction_speed_mm_s:
-            raise ValueError(
-                "`contact.friction.friction_speed_mm_s` must be greater than "
-                f"`contact.friction.stiction_speed_mm_s` = {self.stiction_speed_mm_s:g}, but is "
-                f"{self.friction_speed_mm_s:g}"
-            )
+        require(
+            self.static >= self.kinetic,
+            "`contact.friction.static` must be at least `contact.friction.kinetic` = "
+            f"{self.kinetic:g}, but is {self.static:g}; raise it, or lower the other",
+        )
+        require(
+            self.friction_speed_mm_s > self.stiction_speed_mm_s,
+            "`contact.friction.friction_speed_mm_s` must be greater than "
+            f"`contact.friction.stiction_speed_mm_s` = {self.stiction_speed_mm_s:g}, but is "
+            f"{self.friction_speed_mm_s:g}; raise it, or lower the other",
+        )
         return self
 
 
@@ -308,11 +332,11 @@ class LoadConfig(Section):
 
     @model_validator(mode="after")
     def _one(self):
-        if (self.torque_N_m is None) == (self.pressure_difference_Pa is None):
-            raise ValueError(
-                "`scene.load` must hold either `torque_N_m` or `pressure_difference_Pa`, but holds "
-                + ("neither; add one" if self.torque_N_m is None else "both; set one to null")
-            )
+        require(
+            (self.torque_N_m is None) != (self.pressure_difference_Pa is None),
+            "`scene.load` must hold either `torque_N_m` or `pressure_difference_Pa`, but holds "
+            + ("neither; add one" if self.torque_N_m is None else "both; set one to null"),
+        )
         return self
 
 
@@ -429,17 +453,16 @@ class SceneConfig(Section):
 
     @model_validator(mode="after")
     def _belong(self):
-        if (self.drive == "torque") != (self.motor is not None):
-            raise ValueError(
-                "`scene.motor` is missing; `scene.drive` = torque needs it, with "
-                "`slope_N_m_s_per_rad`"
-                if self.motor is None
-                else "`scene.motor` belongs to `scene.drive` = torque; remove `scene.motor` or set "
-                "`scene.drive`"
-            )
-        if self.phase_error_mrad is not None and self.timing_gear is None:
-            raise ValueError(
-                "`scene.phase_error_mrad` is a mounting error of `scene.timing_gear`, which is "
-                "missing; add the gear or remove the error"
-            )
+        require(
+            (self.drive == "torque") == (self.motor is not None),
+            "`scene.motor` is missing; `scene.drive` = torque needs it, with `slope_N_m_s_per_rad`"
+            if self.motor is None
+            else "`scene.motor` belongs to `scene.drive` = torque; remove `scene.motor` or set "
+            "`scene.drive`",
+        )
+        require(
+            self.phase_error_mrad is None or self.timing_gear is not None,
+            "`scene.phase_error_mrad` is a mounting error of `scene.timing_gear`, which is "
+            "missing; add the gear or remove the error",
+        )
         return self

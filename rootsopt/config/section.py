@@ -1,15 +1,63 @@
-"""Base class of the config's sections, and types for their numbers."""
+"""Base class of the config's sections, and types for their values."""
 
+import dataclasses
 import re
 import types
+from collections.abc import Callable, Iterable, Mapping
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic.fields import FieldInfo
+from pydantic_core import PydanticCustomError, core_schema
+
+from rootsopt.config.words import named
+from rootsopt.errors import InputError
 
 
 def between(low: float, high: float) -> Any:
     """Return a pydantic field for a finite number from `low` to `high`, both ends included."""
     return Field(ge=low, le=high, allow_inf_nan=False)
+
+
+def such(wanted: str, holds: Callable[[Any], bool], before: bool = False) -> Any:
+    """Return a pydantic validator that accepts values for which `holds` is true.
+
+    `wanted`: what a value must be, for the message; `before`: whether it sees values before their
+    type is checked."""
+
+    def check(value: Any) -> Any:
+        if not holds(value):
+            raise PydanticCustomError(UNMET, "{wanted}", {"wanted": wanted})
+        return value
+
+    return BeforeValidator(check) if before else AfterValidator(check)
+
+
+UNMET = "unmet"
+"""Type of the errors of `such`."""
+
+
+def require(holds: bool, message: str) -> None:
+    """Raise `ValueError` with this message unless keys fit each other, that is, `holds`."""
+    if not holds:
+        raise ValueError(message)
+
+
+@dataclasses.dataclass(frozen=True)
+class Among:
+    """Type annotation of a word that must be among `words`, which may grow at run time."""
+
+    words: Callable[[], Iterable[str]]
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        return core_schema.no_info_before_validator_function(self._check, handler(source))
+
+    def _check(self, word: Any) -> Any:
+        words = [repr(one) for one in self.words()]
+        if repr(word) not in words:
+            expected = f"{', '.join(words[:-1])} or {words[-1]}"
+            raise PydanticCustomError("literal_error", "{expected}", {"expected": expected})
+        return word
 
 
 Speed = Annotated[float, between(1e-2, 1e6)]
@@ -22,6 +70,12 @@ Order = Annotated[float, between(1e-2, 1e3)]
 """Order of a spectral line: its frequency as a multiple of the mesh frequency."""
 Torque = Annotated[float, between(0, 1e7)]
 """Magnitude of a load or motor torque (N·m)."""
+Seed = Annotated[int, Field(ge=0, le=2**31 - 1)]
+"""Seed of random numbers."""
+Listed = Field(strict=False)
+"""Mark of a tuple that is given as a list, because YAML has no tuples."""
+Increasing = such("two increasing numbers", lambda pair: len(pair) == 2 and pair[0] < pair[1])
+"""Mark of a pair (low, high)."""
 
 
 class Section(BaseModel):
@@ -32,46 +86,49 @@ class Section(BaseModel):
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
+    @classmethod
+    def fields(cls) -> Mapping[str, FieldInfo]:
+        """Return all keys that this section may have, with their pydantic fields."""
+        return cls.model_fields
+
     @model_validator(mode="before")
     @classmethod
     def _canonical(cls, data):
         if not isinstance(data, dict):
             return data
         found = dict(data)
-        for name, field in cls.model_fields.items():
-            words = {bare(word): word for word in choices(field.annotation)}
-            value = found.get(name)
+        for name, value in data.items():
+            field = cls.model_fields.get(name)
+            if field is None or not isinstance(value, str | dict):
+                continue
+            words = {bare(word): word for word in choices(field)}
             if isinstance(value, str):
                 found[name] = words.get(bare(value), value)
-            elif isinstance(value, dict) and words:
-                named = {words.get(bare(str(key)), key): inner for key, inner in value.items()}
-                found[name] = named if len(named) == len(value) else value
+                continue
+            right = {words.get(bare(str(key)), key): inner for key, inner in value.items()}
+            found[name] = right if len(right) == len(value) else value
         return found
 
 
-def choices(annotation: Any) -> tuple[str, ...]:
-    """Return the words that a type allows for a value, or for the keys of a dictionary.
+def choices(kind: Any) -> tuple[str, ...]:
+    """Return the words that a field or type allows for a value, or for the keys of a dictionary.
 
     Return () for a type without a list of choices."""
-    if get_origin(annotation) is Literal:
-        return get_args(annotation)
-    if get_origin(annotation) in (Union, types.UnionType, Annotated, dict):
-        return tuple(word for part in get_args(annotation) for word in choices(part))
-    return ()
+    if isinstance(kind, Among):
+        return tuple(kind.words())
+    if get_origin(kind) is Literal:
+        return get_args(kind)
+    parts = get_args(kind)
+    if isinstance(kind, FieldInfo):
+        parts = kind.annotation, *kind.metadata
+    elif get_origin(kind) not in (Union, types.UnionType, Annotated, dict):
+        return ()
+    return tuple(word for part in parts for word in choices(part))
 
 
 def bare(word: str) -> str:
     """Return a word in lower case, without spaces, `-` and `_`, for comparison with other words."""
     return re.sub(r"[-_\s]", "", word.casefold())
-
-
-def tuples(data: Any) -> Any:
-    """Return a section's `data` with tuples in place of lists, because YAML has no tuples.
-
-    Return anything but a dictionary unchanged."""
-    if isinstance(data, dict):
-        return {k: tuple(v) if isinstance(v, list) else v for k, v in data.items()}
-    return data
 
 
 def number(key: Any) -> Any:
@@ -80,3 +137,19 @@ def number(key: Any) -> Any:
         return float(key) if isinstance(key, str) else key
     except ValueError:
         return key
+
+
+def put(data: dict, key: str, value: Any) -> None:
+    """Set the `value` at a dotted `key` in plain `data`, and create the sections around it.
+
+    Raises `InputError` if a section is a plain value."""
+    *parts, last = key.split(".")
+    target = data
+    for count, part in enumerate(parts, 1):
+        if target.get(part) is None:
+            target[part] = {}
+        target = target[part]
+        if not isinstance(target, dict):
+            place = ".".join(map(named, parts[:count]))
+            raise InputError(f"`{named(key)}` is not a known key: `{place}` holds no keys")
+    target[last] = value

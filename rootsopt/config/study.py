@@ -6,12 +6,25 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from rootsopt.config.families import families, on_change, parameters, replace_fields
-from rootsopt.config.section import Order, Section, Speed, Weight, bare, between, number, tuples
+from rootsopt.config.families import Parameter, families, parameters
+from rootsopt.config.section import (
+    Among,
+    Increasing,
+    Listed,
+    Order,
+    Section,
+    Seed,
+    Speed,
+    Weight,
+    bare,
+    between,
+    number,
+    require,
+    such,
+)
 from rootsopt.config.units import hint
 from rootsopt.config.words import named, shown
 
-_Seed = Annotated[int, Field(ge=0, le=2**31 - 1)]
 NEAREST = "nearest"
 """Word in `optimizer.family` for the named family that is nearest to an outline."""
 _LEAST_WEIGHT = 1e-6
@@ -106,13 +119,26 @@ class SolverConfig(Section):
         return self.transient_rtol or self.accuracy / 100
 
 
+_Share = Annotated[float, between(1e-6, 1e6)]
+
+
+def _few(what: str) -> Any:
+    """Return a mark of lists and dictionaries of at most `_MOST_LINES` different numbers.
+
+    `what`: what the numbers are, in a message."""
+    return such(
+        f"at most {_MOST_LINES} {what}",
+        lambda numbers: len(set(numbers)) == len(numbers) <= _MOST_LINES,
+    )
+
+
 class ObjectiveConfig(Section):
     """Weighted sum of measures of the contact force, each relative to the baseline."""
 
     mean_weight: Weight = Field(0.5, description="weight of the mean contact force")
     peak_weight: Weight = Field(0.5, description="weight of the peak contact force")
     rms_weight: Weight = Field(0.0, description="weight of the RMS contact force")
-    line_weights: dict[Order, Weight] = Field(
+    line_weights: Annotated[dict[Order, Weight], _few("orders")] = Field(
         default_factory=dict,
         description="weights of spectral lines, {order: weight}, order in mesh frequencies",
     )
@@ -131,10 +157,10 @@ class ObjectiveConfig(Section):
         None,
         description="p of the p-norm that replaces the peak in the search; absent: the peak itself",
     )
-    speeds_rpm: tuple[Speed, ...] = Field(
+    speeds_rpm: Annotated[tuple[Speed, ...], Listed, _few("different speeds")] = Field(
         (), description="speeds of the objective, as [2000, 3000]; empty: scene.speed_rpm"
     )
-    speed_weights: tuple[Annotated[float, between(1e-6, 1e6)], ...] = Field(
+    speed_weights: Annotated[tuple[_Share, ...], Listed] = Field(
         (), description="weights of these speeds in the objective; empty: equal weights"
     )
     over_speeds: Literal["weighted", "worst"] = Field(
@@ -144,7 +170,6 @@ class ObjectiveConfig(Section):
     @model_validator(mode="before")
     @classmethod
     def _orders(cls, data):
-        data = tuples(data)
         # A key given by `--set` or in JSON is a string.
         if isinstance(data, dict) and isinstance(given := data.get("line_weights"), dict):
             lines = {number(k): v for k, v in given.items()}
@@ -153,89 +178,65 @@ class ObjectiveConfig(Section):
 
     @model_validator(mode="after")
     def _some_weight(self):
-        if len(self.line_weights) > _MOST_LINES:
-            raise ValueError(
-                f"`objective.line_weights` must be at most {_MOST_LINES} orders, but is "
-                f"{shown(self.line_weights)}"
-            )
-        lines = sum(self.line_weights.values())
-        terms = sum(self.terms.values())
-        if self.mean_weight + self.peak_weight + self.rms_weight + lines + terms < _LEAST_WEIGHT:
-            raise ValueError(
-                "`objective.mean_weight`, `objective.peak_weight`, `objective.rms_weight`, "
-                "`objective.line_weights` and `objective.terms` must not all be 0 (together at "
-                f"least {_LEAST_WEIGHT:g})"
-            )
-        if self.motion == "ensemble" and terms > 0:
-            raise ValueError(
-                "`objective.terms` belong to a periodic motion; remove them or set "
-                "`objective.motion` to reached, worst or weighted"
-            )
-        if self.motion == "ensemble" and (lines > 0 or self.peak_norm is not None):
-            raise ValueError(
-                "`objective.line_weights` and `objective.peak_norm` belong to a periodic motion; "
-                "remove them or set `objective.motion` to reached, worst or weighted"
+        lines, terms = sum(self.line_weights.values()), sum(self.terms.values())
+        whole = self.mean_weight + self.peak_weight + self.rms_weight + lines + terms
+        require(
+            whole >= _LEAST_WEIGHT,
+            "`objective.mean_weight`, `objective.peak_weight`, `objective.rms_weight`, "
+            "`objective.line_weights` and `objective.terms` must not all be 0 (together at least "
+            f"{_LEAST_WEIGHT:g})",
+        )
+        periodic = {
+            "`objective.terms` belong": terms > 0,
+            "`objective.line_weights` and `objective.peak_norm` belong": lines > 0
+            or self.peak_norm is not None,
+        }
+        for words, given in periodic.items():
+            require(
+                not given or self.motion != "ensemble",
+                f"{words} to a periodic motion; remove them or set `objective.motion` to reached, "
+                "worst or weighted",
             )
         return self
 
     @model_validator(mode="after")
     def _speeds(self):
-        speeds, weights = self.speeds_rpm, self.speed_weights
-        if len(set(speeds)) != len(speeds) or len(speeds) > 32:
-            raise ValueError(
-                "`objective.speeds_rpm` must be at most 32 different speeds, but is "
-                f"{shown([*speeds])}"
-            )
-        worst = self.over_speeds == "worst"
-        if not speeds and (weights or worst):
-            key = "speed_weights" if weights else "over_speeds"
-            raise ValueError(
-                f"`objective.{key}` belongs to `objective.speeds_rpm`, which is empty; add speeds "
-                f"or remove `objective.{key}`"
-            )
-        if weights and len(weights) != len(speeds):
-            raise ValueError(
-                f"`objective.speed_weights` must be {len(speeds)} numbers, one for each of "
-                f"`objective.speeds_rpm`, but is {shown([*weights])}"
-            )
-        if weights and worst:
-            raise ValueError(
-                "`objective.speed_weights` belongs to `objective.over_speeds` = weighted, but "
-                "`over_speeds` is worst; remove one of them"
-            )
-        if speeds and self.motion == "ensemble":
-            raise ValueError(
-                "`objective.speeds_rpm` must be empty for `objective.motion` ensemble, but is "
-                f"{shown([*speeds])}: the noise of an average is estimated at one speed; optimise "
-                "at one, and check the others with `rootsopt sweep`"
-            )
+        speeds, weights, worst = self.speeds_rpm, self.speed_weights, self.over_speeds == "worst"
+        key = "speed_weights" if weights else "over_speeds"
+        require(
+            bool(speeds) or not (weights or worst),
+            f"`objective.{key}` belongs to `objective.speeds_rpm`, which is empty; add speeds or "
+            f"remove `objective.{key}`",
+        )
+        require(
+            len(weights) in (0, len(speeds)),
+            f"`objective.speed_weights` must be {len(speeds)} numbers, one for each of "
+            f"`objective.speeds_rpm`, but is {shown([*weights])}",
+        )
+        require(
+            not (weights and worst),
+            "`objective.speed_weights` belongs to `objective.over_speeds` = weighted, but "
+            "`over_speeds` is worst; remove one of them",
+        )
+        require(
+            not speeds or self.motion != "ensemble",
+            "`objective.speeds_rpm` must be empty for `objective.motion` ensemble, but is "
+            f"{shown([*speeds])}: the noise of an average is estimated at one speed; optimise "
+            "at one, and check the others with `rootsopt sweep`",
+        )
         return self
 
 
 class ResponseConfig(Section):
     """Quantities reported in addition to the mean, peak and RMS of the contact force."""
 
-    lines: tuple[Order, ...] = Field(
+    lines: Annotated[tuple[Order, ...], Listed, _few("different orders")] = Field(
         (), description="spectral lines of the force, orders in mesh frequencies, as [1, 2]"
     )
 
-    @model_validator(mode="before")
-    @classmethod
-    def _lists(cls, data):
-        return tuples(data)
 
-    @model_validator(mode="after")
-    def _few(self):
-        if len(set(self.lines)) != len(self.lines) or len(self.lines) > 32:
-            raise ValueError(
-                "`response.lines` must be at most 32 different orders, but is "
-                f"{shown([*self.lines])}"
-            )
-        return self
-
-
-_Milliradians = tuple[Annotated[float, between(-1e3, 1e3)], Annotated[float, between(-1e3, 1e3)]]
-_Rates = tuple[Annotated[float, between(-1e6, 1e6)], Annotated[float, between(-1e6, 1e6)]]
+_Milliradians = Annotated[tuple[Annotated[float, between(-1e3, 1e3)], ...], Listed, Increasing]
+_Rates = Annotated[tuple[Annotated[float, between(-1e6, 1e6)], ...], Listed, Increasing]
 
 
 class AttractorsConfig(Section):
@@ -254,21 +255,6 @@ class AttractorsConfig(Section):
         None,
         description="(low, high) of the relative speed; absent: up to twice the speed of impacts",
     )
-
-    @model_validator(mode="before")
-    @classmethod
-    def _pairs(cls, data):
-        return tuples(data)
-
-    @model_validator(mode="after")
-    def _ordered(self):
-        for key in ("relative_range_mrad", "rate_range_rad_s"):
-            pair = getattr(self, key)
-            if pair is not None and not pair[0] < pair[1]:
-                raise ValueError(
-                    f"`attractors.{key}` must be two increasing numbers, but is {shown([*pair])}"
-                )
-        return self
 
 
 class EnsembleConfig(Section):
@@ -291,33 +277,32 @@ class EnsembleConfig(Section):
         description="standard deviation of these designs, as a fraction of the bounds; designs "
         "stay within the bounds",
     )
-    seed: _Seed = Field(0, description="seed of states and designs")
+    seed: Seed = Field(0, description="seed of states and designs")
+
+
+def _is_range(wanted: dict[str, float]) -> bool:
+    """Return whether a range has ends in ascending order and a whole number of points."""
+    low, high, points = (wanted.get(key, -1) for key in ("from", "to", "points"))
+    return 0 <= low < high and points == int(points) and 2 <= points <= 10_000
+
+
+_Range = Annotated[
+    dict[Literal["from", "to", "points"], Annotated[float, between(1e-2, 1e6)]],
+    such(
+        "{from: .., to: .., points: ..} with from below to and 2 to 10000 points",
+        _is_range,
+    ),
+]
 
 
 class SweepConfig(Section):
     """The speeds of `rootsopt sweep`."""
 
-    speed_rpm: (
-        dict[Literal["from", "to", "points"], Annotated[float, between(1e-2, 1e6)]] | None
-    ) = Field(
+    speed_rpm: _Range | None = Field(
         None,
         description="{from: 300, to: 6000, points: 39}; absent: `objective.speeds_rpm`, or if "
         "empty 39 speeds from 0.1 to 2 times `scene.speed_rpm`",
     )
-
-    @model_validator(mode="after")
-    def _range(self):
-        wanted = self.speed_rpm
-        if wanted is None:
-            return self
-        whole = wanted.get("points", 0)
-        ordered = wanted.get("from", 0) < wanted.get("to", 0)
-        if len(wanted) < 3 or not (ordered and whole == int(whole) and 2 <= whole <= 10_000):
-            raise ValueError(
-                "`sweep.speed_rpm` must be {from: .., to: .., points: ..} with from below to and "
-                f"2 to 10000 points, but is {shown(wanted)}"
-            )
-        return self
 
 
 _Floor = Annotated[float, between(0, 5000)]
@@ -375,94 +360,64 @@ class ConstraintsConfig(Section):
 
     @model_validator(mode="after")
     def _ordered(self):
-        low, high = self.outer_radius_min_mm, self.outer_radius_max_mm
-        if low is not None and high is not None and not low < high:
-            raise ValueError(
-                "`constraints.outer_radius_max_mm` must be greater than "
-                f"`constraints.outer_radius_min_mm` = {low:g}, but is {high:g}"
-            )
+        low, high = self.outer_radius_min_mm or 0.0, self.outer_radius_max_mm or math.inf
+        require(
+            low < high,
+            "`constraints.outer_radius_max_mm` must be greater than "
+            f"`constraints.outer_radius_min_mm` = {low:g}, but is {high:g}",
+        )
         for name, sides in self.terms.items():
-            if not sides:
-                raise ValueError(
-                    f"`constraints.terms.{named(name)}` must have `min`, `max` or both, as in "
-                    "{max: 200}, but is empty"
-                )
-            if len(sides) == 2 and not sides["min"] < sides["max"]:
-                raise ValueError(
-                    f"`constraints.terms.{named(name)}.max` must be greater than its `min` = "
-                    f"{sides['min']:g}, but is {sides['max']:g}"
-                )
+            key = f"`constraints.terms.{named(name)}"
+            require(bool(sides), f"{key}` must have `min`, `max` or both, as in {{max: 200}}, but "
+                    "is empty")  # fmt: skip
+            low, high = sides.get("min", -math.inf), sides.get("max", math.inf)
+            require(low < high, f"{key}.max` must be greater than its `min` = {low:g}, but is "
+                    f"{high:g}")  # fmt: skip
         return self
 
     @model_validator(mode="after")
     def _reachable(self):
         for name, sides in self.terms.items():
-            if sides.get("max", 0) < 0 and (name in _SIZES or _LINE.fullmatch(name)):
-                raise ValueError(
-                    f"`constraints.terms.{name}.max` must be at least 0, but is {sides['max']:g}: "
-                    "the quantity is never negative; raise or remove the limit"
-                )
-            for other, factor in _above(name):
-                floor, ceiling = sides.get("min"), self.terms.get(other, {}).get("max")
-                if floor is not None and ceiling is not None and floor > factor * ceiling:
-                    raise ValueError(
-                        f"`constraints.terms.{name}.min` must be at most {factor * ceiling:.4g}, "
-                        f"but is {floor:g}: `constraints.terms.{other}.max` is {ceiling:g}, and "
-                        f"{name} is never above {factor:.3g} times {other}; change one of the two"
-                    )
-        return self
-
-
-class BoundsConfig(Section):
-    """Bounds (low, high) of each design parameter in an optimisation.
-
-    Further keys are the parameters of all registered families."""
-
-    helix_deg: tuple[float, float] | None = Field(
-        None,
-        description="bounds of `rotor.helix_deg`, from -360 to 360, which make the twist a design "
-        "parameter; absent: the twist is fixed",
-    )
-
-    @model_validator(mode="before")
-    @classmethod
-    def _pairs(cls, data):
-        return tuples(data)
-
-    @model_validator(mode="after")
-    def _ordered(self):
-        for key, parameter in parameters().items():
-            pair = getattr(self, key)
-            least, most = parameter.bounds_limits or (parameter.lowest, parameter.highest)
-            if pair is not None and not least <= pair[0] < pair[1] <= most:
-                advice = hint(key, pair[0], least, most)
-                if pair[0] == pair[1]:
-                    near = pair[0] + 1e-3 * (abs(pair[0]) or 1.0)
-                    advice = f"; to hold it, give a narrow range, such as [{pair[0]:g}, {near:g}]"
-                raise ValueError(
-                    f"`optimizer.bounds.{key}` must be two increasing numbers in "
-                    f"[{least:g}, {most:g}], but is {shown([*pair])}{advice}"
-                )
-        twist = self.helix_deg
-        if twist is not None and not -360 <= twist[0] < twist[1] <= 360:
-            raise ValueError(
-                "`optimizer.bounds.helix_deg` must be two increasing numbers in [-360, 360], but "
-                f"is {shown([*twist])}"
+            low, high = sides.get("min", -math.inf), sides.get("max", math.inf)
+            require(
+                high >= 0 or not (name in _SIZES or _LINE.fullmatch(name)),
+                f"`constraints.terms.{name}.max` must be at least 0, but is {high:g}: the "
+                "quantity is never negative; raise or remove the limit",
             )
+            for other, factor in _above(name):
+                ceiling = self.terms.get(other, {}).get("max", math.inf)
+                require(
+                    low <= factor * ceiling,
+                    f"`constraints.terms.{name}.min` must be at most {factor * ceiling:.4g}, but "
+                    f"is {low:g}: `constraints.terms.{other}.max` is {ceiling:g}, and {name} is "
+                    f"never above {factor:.3g} times {other}; change one of the two",
+                )
         return self
 
 
-_BOUNDS = dict(BoundsConfig.model_fields)
+TWIST = "helix_deg"
+"""Key of the twist, in the section `rotor`, among the bounds and among the design parameters."""
 
 
-def _derive() -> None:
-    """Set the fields of `BoundsConfig` from the table of families."""
-    made = {key: parameter.bounds_field() for key, parameter in parameters().items()}
-    replace_fields(BoundsConfig, made | _BOUNDS)
+def _searched() -> dict[str, Parameter]:
+    """Return the parameters that have bounds: those of all registered families, and the twist."""
+    return parameters() | {TWIST: Parameter(TWIST, "twist", -360, 360)}
 
 
-_derive()
-on_change(_derive)
+def _fitted() -> list[str]:
+    """Return the words of `optimizer.family`."""
+    return [NEAREST, *(name for name, family in families().items() if family.fitted)]
+
+
+_Bounds = Annotated[
+    tuple[float, float],
+    Listed,
+    such(
+        "two numbers, as in [1, 2]",
+        lambda pair: not isinstance(pair, list | tuple) or len(pair) == 2,
+        before=True,
+    ),
+]
 
 
 class OptimizerConfig(Section):
@@ -483,22 +438,39 @@ class OptimizerConfig(Section):
     screening: Annotated[int, Field(ge=0, le=4096)] = Field(
         48, description="designs screened to place the starts; 0 starts at the baseline only"
     )
-    seed: _Seed = Field(0, description="seed of the screening sample")
-    family: str = Field(
+    seed: Seed = Field(0, description="seed of the screening sample")
+    family: Annotated[str, Among(_fitted)] = Field(
         NEAREST,
         description="profile family outline: family whose parameters are varied, from the member "
         "nearest to the outline; nearest: the named family that comes nearest",
     )
-    bounds: BoundsConfig = Field(default_factory=lambda: BoundsConfig.model_validate({}))
+    bounds: dict[Annotated[str, Among(_searched)], _Bounds] = Field(
+        default_factory=dict,
+        description="(low, high) of design parameters, as {pressure_angle_deg: [25, 45]}; defaults "
+        "stand beside each parameter; helix_deg frees the twist, from -360 to 360",
+    )
 
+    @model_validator(mode="before")
+    @classmethod
+    def _written_out(cls, data):
+        """Add the default bounds that every config states, and drop those that are null."""
+        given = data.get("bounds", {}) if isinstance(data, dict) else None
+        if not isinstance(given, dict):
+            return data
+        usual = {one.key: one.default_bounds for one in parameters().values() if one.default_bounds}
+        return data | {"bounds": usual | {k: v for k, v in given.items() if v is not None}}
 
-def _derive_optimizer() -> None:
-    """Set the fields of `OptimizerConfig` from the table of families."""
-    fields = dict(OptimizerConfig.model_fields)
-    words = NEAREST, *(name for name, family in families().items() if family.fitted)
-    described = Field(NEAREST, description=fields["family"].description)
-    replace_fields(OptimizerConfig, fields | {"family": (Literal[words], described)})  # type: ignore
-
-
-_derive_optimizer()
-on_change(_derive_optimizer)
+    @model_validator(mode="after")
+    def _ordered(self):
+        for key, pair in self.bounds.items():
+            least, most = _searched()[key].bounds_range
+            advice = hint(key, pair[0], least, most)
+            if pair[0] == pair[1]:
+                near = pair[0] + 1e-3 * (abs(pair[0]) or 1.0)
+                advice = f"; to hold it, give a narrow range, such as [{pair[0]:g}, {near:g}]"
+            require(
+                least <= pair[0] < pair[1] <= most,
+                f"`optimizer.bounds.{key}` must be two increasing numbers in [{least:g}, "
+                f"{most:g}], but is {shown([*pair])}{advice}",
+            )
+        return self

@@ -1,18 +1,24 @@
 """Config section `tolerances`: how far values of scene and design scatter in manufacture."""
 
 import difflib
-from collections.abc import Mapping
-from typing import Annotated, Any, Literal, NamedTuple
+from collections.abc import Callable, Iterator, Mapping
+from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 from pydantic import Field, model_validator
 
-from rootsopt.config.section import Section, bare, between
-from rootsopt.config.words import named, shown
+from rootsopt.config.section import Section, bare, between, require, such
+from rootsopt.config.words import named
 
-_KINDS = ("normal", "uniform", "triangular")
 _RELATIVE = "relative_"
-DISTRIBUTIONS = (*_KINDS, *(_RELATIVE + kind for kind in _KINDS))
+_Kind = Literal[
+    "normal", "uniform", "triangular", "relative_normal", "relative_uniform", "relative_triangular"
+]
+DISTRIBUTIONS = get_args(_Kind)
 """Names of the distributions. The width of a `relative_` one is a fraction of the key's value."""
+_Distribution = Annotated[
+    dict[_Kind, Annotated[float, Field(gt=0, le=1e9)]],
+    such("one distribution, as in {normal: 0.002}", lambda given: len(given) == 1),
+]
 _SECTIONS = ("rotor", "contact", "scene")
 _NOT_PHYSICAL = ("rotor.helix_deg", "contact.smoothing_mm")
 """Keys in `_SECTIONS` that cannot scatter: they are not quantities of the simulated pair."""
@@ -32,8 +38,6 @@ _PLAIN = {
     "friction": "contact.friction.kinetic",
 }
 """Common words for quantities, each with the key that the user probably means."""
-_DEEPEST = 4
-"""Number of nested sections above which the keys of `tolerances.over` are rejected."""
 
 
 class Scatter(NamedTuple):
@@ -55,11 +59,11 @@ class Scatter(NamedTuple):
 class TolerancesConfig(Section):
     """Scatter of scene and design, for a robust optimum. Without this section, nothing scatters."""
 
-    over: dict[str, dict[str, Annotated[float, Field(gt=0, le=1e9)]]] = Field(
+    over: dict[str, _Distribution] = Field(
         default_factory=dict,
         description="distribution by key, as {contact.clearance_mm: {normal: 0.002}}; normal: "
-        "standard deviation; uniform, triangular: half width; relative_normal, relative_uniform, "
-        "relative_triangular: the same as a fraction of the key's value",
+        "standard deviation; uniform, triangular: half width; relative_...: the same as a fraction "
+        "of the key's value",
     )
     conditions: dict[str, dict[str, Annotated[float, between(-1e9, 1e9)]]] = Field(
         default_factory=dict,
@@ -95,50 +99,35 @@ class TolerancesConfig(Section):
     def _flat(cls, data):
         if not isinstance(data, dict):
             return data
-        if isinstance(data.get("over"), dict):
-            data = data | {"over": _flattened(data["over"])}
-        named_scenes = data.get("conditions")
-        if not isinstance(named_scenes, dict) or not named_scenes:
+        if isinstance(over := data.get("over"), dict):
+            data = data | {"over": _distributions(over)}
+        scenes = data.get("conditions")
+        if not isinstance(scenes, dict) or not scenes:
             return data
         flat = {
-            name: _dotted(values) if isinstance(values, dict) else values
-            for name, values in named_scenes.items()
+            name: _dotted(values, lambda _: False) if isinstance(values, dict) else values
+            for name, values in scenes.items()
         }
         # With `conditions`, no sample is drawn.
         return data | {"conditions": flat, "samples": max(2, len(flat)), "check_samples": 0}
 
     @model_validator(mode="after")
     def _one_each(self):
-        if self.conditions:
-            if self.over:
-                raise ValueError(
-                    "`tolerances` must hold either `over` or `conditions`, but holds both; remove "
-                    "one"
-                )
-            if len(self.conditions) < 2:
-                raise ValueError(
-                    "`tolerances.conditions` must name two or more scenes, but names "
-                    f"{len(self.conditions)}; add one, as new: {{}}"
-                )
-            return self
-        if not self.over:
-            raise ValueError(
-                "`tolerances.over` must name at least one key, as in {contact.clearance_mm: "
-                "{normal: 0.002}}; add one or remove `tolerances`"
-            )
-        for key, given in self.over.items():
-            place = f"`tolerances.over.{named(key)}`"
-            if len(given) != 1:
-                raise ValueError(
-                    f"{place} must be one distribution, as in {{normal: 0.002}}, but is "
-                    f"{shown(given)}"
-                )
-            (name,) = given
-            if name not in DISTRIBUTIONS:
-                raise ValueError(
-                    f"{place} must be one of {', '.join(DISTRIBUTIONS)}, but is {shown(name)}"
-                    + _near(name, DISTRIBUTIONS)
-                )
+        over, count = self.over, len(self.conditions)
+        require(
+            not (over and count),
+            "`tolerances` must hold either `over` or `conditions`, but holds both; remove one",
+        )
+        require(
+            count != 1,
+            f"`tolerances.conditions` must name two or more scenes, but names {count}; add one, "
+            "as new: {}",
+        )
+        require(
+            bool(over or count),
+            "`tolerances.over` must name at least one key, as in {contact.clearance_mm: "
+            "{normal: 0.002}}; add one or remove `tolerances`",
+        )
         return self
 
     @property
@@ -169,6 +158,20 @@ class TolerancesConfig(Section):
             half = self.normal_limit * size if kind == "normal" else size
             found.append(Scatter(key, kind, nominal, size, half))
         return tuple(found)
+
+    def extremes(self, values: Mapping[str, float]) -> Iterator[tuple[str, dict[str, float], str]]:
+        """Yield scenes that must be valid, each as (requirement, its values by key, remedy).
+
+        They are the `conditions`, and the ends of the distributions. `values`: as for `scatters`.
+        """
+        for name, given in self.conditions.items():
+            what = f"the scene `{name}` of `tolerances.conditions` must be a valid one"
+            yield what, given, "correct its values"
+        for one in self.scatters(values) if self.over else ():
+            remedy = f"narrow the distribution or move the nominal value, {one.nominal:.6g}"
+            for end in (one.nominal - one.half, one.nominal + one.half):
+                what = f"`tolerances.over.{one.key}` lets the key reach {end:.6g}"
+                yield what, {one.key: end}, remedy
 
 
 def scatterable(config: Any) -> dict[str, float]:
@@ -202,7 +205,7 @@ def mounted(data: Any) -> Any:
     over = parts[1].get("over") if parts and isinstance(parts[1], dict) else None
     if not isinstance(over, dict) or not isinstance(parts[0], dict):
         return data
-    scatter = [name for name in _MOUNTING if f"scene.{name}" in _flattened(over)]
+    scatter = [name for name in _MOUNTING if f"scene.{name}" in _distributions(over)]
     absent = {name: 0.0 for name in scatter if parts[0].get(name) is None}
     return data | {"scene": parts[0] | absent} if absent else data
 
@@ -237,34 +240,32 @@ def _near(word: str, words: Any) -> str:
     return f"; did you mean `{found[0]}`?" if found else ""
 
 
-def _dotted(data: dict, prefix: str = "") -> dict[str, Any]:
-    """Return {dotted key: value} from nested sections."""
+def _dotted(data: dict, is_value: Callable[[dict], bool], prefix: str = "") -> dict[str, Any]:
+    """Return {dotted key: value} from nested sections.
+
+    A later value replaces an earlier one of the same key. `is_value`: whether a dictionary is the
+    value of a key rather than a section."""
     found: dict[str, Any] = {}
     for key, value in data.items():
-        found |= (
-            _dotted(value, f"{prefix}{key}.")
-            if isinstance(value, dict)
-            else {f"{prefix}{key}": value}
-        )
+        nested = isinstance(value, dict) and not is_value(value)
+        inner = _dotted(value, is_value, f"{prefix}{key}.") if nested else {f"{prefix}{key}": value}
+        found |= inner
     return found
 
 
-def _flattened(data: dict, prefix: str = "", depth: int = 0) -> dict[str, Any]:
-    """Return {dotted key: distribution} from nested sections, as overrides with dots make them.
-
-    A later entry replaces an earlier one of the same key."""
+def _distributions(over: dict) -> dict[str, Any]:
+    """Return {dotted key: distribution}, from nested sections as overrides with dots make them."""
     words = {bare(word): word for word in DISTRIBUTIONS}
-    found: dict[str, Any] = {}
-    for key, value in data.items():
-        name = f"{prefix}{key}"
-        nested = isinstance(value, dict) and any(isinstance(one, dict) for one in value.values())
-        if nested and depth < _DEEPEST:
-            found |= _flattened(value, f"{name}.", depth + 1)
-        elif isinstance(value, dict):
-            found[name] = {words.get(bare(str(kind)), kind): v for kind, v in value.items()}
-        else:
-            found[name] = value
-    return found
+
+    def is_value(given: dict) -> bool:
+        return not any(isinstance(one, dict) for one in given.values())
+
+    def named_right(given: Any) -> Any:
+        if not isinstance(given, dict):
+            return given
+        return {words.get(bare(str(kind)), kind): width for kind, width in given.items()}
+
+    return {key: named_right(given) for key, given in _dotted(over, is_value).items()}
 
 
 __all__ = ["DISTRIBUTIONS", "Scatter", "TolerancesConfig", "mounted", "scatterable", "unknown_key"]

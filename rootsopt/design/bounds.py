@@ -1,6 +1,6 @@
 """Bounds of the design parameters, from the config or by default."""
 
-from rootsopt.config import Config
+from rootsopt.config import TWIST, Config
 from rootsopt.config.families import Parameter, family_of
 from rootsopt.errors import InputError
 
@@ -18,8 +18,7 @@ def bounds_of(config: Config) -> list[tuple[float, float]]:
         values = getattr(config.profile, parameter.key)
         count = len(values) if isinstance(values, tuple) else 1
         found += [_pair(config, parameter)] * count
-    twist = config.optimizer.bounds.helix_deg
-    return [*found, twist] if config.twist_free and twist is not None else found
+    return [*found, config.optimizer.bounds[TWIST]] if config.twist_free else found
 
 
 def floors_of(config: Config) -> tuple[float, ...]:
@@ -30,7 +29,7 @@ def floors_of(config: Config) -> tuple[float, ...]:
     for parameter in family_of(config.profile.family).parameters:
         values = getattr(config.profile, parameter.key)
         count = len(values) if isinstance(values, tuple) else 1
-        given = getattr(config.optimizer.bounds, parameter.key) is not None
+        given = config.optimizer.bounds.get(parameter.key) is not None
         found += [0.0 if given else parameter.floor] * count
     return (*found, 0.0) if config.twist_free else tuple(found)
 
@@ -43,7 +42,7 @@ def widened(config: Config) -> tuple[Config, tuple[str, ...]]:
     changes: dict[str, tuple[float, float]] = {}
     lobes, radius = config.profile.lobes, config.profile.pitch_radius_mm
     for parameter in family_of(config.profile.family).parameters:
-        given = getattr(config.optimizer.bounds, parameter.key)
+        given = config.optimizer.bounds.get(parameter.key)
         if given is not None and tuple(given) != parameter.default_bounds:
             continue
         low, high = given or parameter.bounds(config.profile)
@@ -51,7 +50,7 @@ def widened(config: Config) -> tuple[Config, tuple[str, ...]]:
         values = value if isinstance(value, tuple) else (value,)
         if low <= min(values) and max(values) <= high:
             continue
-        least, most = parameter.bounds_limits or (parameter.lowest, parameter.highest)
+        least, most = parameter.bounds_range
         sized = parameter.limits(radius) or (least, most)
         least, most = max(least, sized[0]), min(most, sized[1])
         room = _ROOM * (high - low)
@@ -63,13 +62,12 @@ def widened(config: Config) -> tuple[Config, tuple[str, ...]]:
         changes[parameter.key] = pair
     if not changes:
         return config, ()
-    bounds = config.optimizer.bounds.model_copy(update=changes)
-    optimizer = config.optimizer.model_copy(update={"bounds": bounds})
-    return config.model_copy(update={"optimizer": optimizer}), tuple(changes)
+    bounds = config.optimizer.bounds | changes
+    return config.moved({"optimizer.bounds": bounds}), tuple(changes)
 
 
 def _pair(config: Config, parameter: Parameter) -> tuple[float, float]:
-    given = getattr(config.optimizer.bounds, parameter.key)
+    given = config.optimizer.bounds.get(parameter.key)
     if given is None:
         return parameter.bounds(config.profile)
     parameter.check_bounds(given, config.profile.lobes)

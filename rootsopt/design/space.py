@@ -249,7 +249,7 @@ def _reaching(config: Config):
     radius, ranges = np.asarray(profile.pitch_radius_mm), partial(family.dependent, profile.lobes)
     # Only the keys are needed: what computes the ranges would be compiled, one operation at a time.
     for key in jax.eval_shape(ranges, radius, **named):
-        given = getattr(config.optimizer.bounds, key)
+        given = config.optimizer.bounds.get(key)
         if given is not None:
             factor, name = si_unit(key), f"greatest {words(key)}"
             limit = jnp.asarray(given[0] * factor)

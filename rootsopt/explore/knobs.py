@@ -3,8 +3,10 @@
 import math
 from typing import NamedTuple
 
+from pydantic.fields import FieldInfo
+
 from rootsopt.config import Config
-from rootsopt.config.explain import all_keys, field_of, limits_of
+from rootsopt.config.explain import is_whole, limits_of, tree
 from rootsopt.config.families import family_of
 from rootsopt.config.units import unit_of, words
 from rootsopt.design.bounds import bounds_of
@@ -81,9 +83,9 @@ def knobs_of(config: Config) -> list[Knob]:
     Design parameters span their bounds in an optimisation. Parts that the scene does not have, and
     keys that are not set, have no knobs."""
     found = _design(config)
-    parameters = set(config.profile.parameters)
+    parameters, fields = set(config.profile.parameters), tree(Config)
     for section in _SECTIONS:
-        for key in all_keys(Config):
+        for key, field in fields.items():
             if key.partition(".")[0] != section or "." not in key:
                 continue
             name = key.rpartition(".")[2]
@@ -91,9 +93,9 @@ def knobs_of(config: Config) -> list[Knob]:
                 continue
             if key in _FOLLOWS and name not in config.contact.model_fields_set:
                 continue
-            value = _value(config, key)
+            value = config.value(key)
             if isinstance(value, int | float) and not isinstance(value, bool):
-                found.append(_scene(config, key, value))
+                found.append(_scene(field, key, value))
     order = [*_ORDER, *dict.fromkeys(knob.group for knob in found)]
     return sorted(found, key=lambda knob: order.index(knob.group))
 
@@ -129,12 +131,9 @@ def _count(value: object) -> int:
     return len(value) if isinstance(value, tuple) else 1
 
 
-def _scene(config: Config, key: str, value: float) -> Knob:
+def _scene(field: FieldInfo, key: str, value: float) -> Knob:
     """Return the knob of any other number of the config."""
-    field = field_of(Config, key.split("."))
-    assert field is not None
-    least, most = limits_of(field.annotation, field.metadata).ends
-    whole = isinstance(value, int) and "float" not in str(field.annotation)
+    (least, most), whole = limits_of(field).ends, is_whole(field)
     low, high = _span(key, float(value))
     if whole:
         low, high = least, most
@@ -163,13 +162,6 @@ def _step(width: float) -> float:
         return 1.0
     power = 10.0 ** math.floor(math.log10(width / _STEPS))
     return max(one * power for one in (1, 2, 5) if one * power * _STEPS <= width * (1 + 1e-9))
-
-
-def _value(config: Config, key: str) -> object:
-    inner: object = config
-    for part in key.split("."):
-        inner = getattr(inner, part, None)
-    return inner
 
 
 __all__ = ["Knob", "knobs_of"]

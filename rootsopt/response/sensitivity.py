@@ -6,7 +6,7 @@ the same compiled program as the derivatives with respect to the design.
 """
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -73,35 +73,20 @@ def quantities(config: Config) -> list[Quantity]:
     have are left out. So are quantities that are 0, except the first three."""
     found = []
     for key, name in _LENGTHS:
-        value = _value(config, key)
+        value = config.value(key)
         if value is not None:
             found.append(Quantity(key, name, "mm", value, MICROMETRE))
     for key, name, unit in _OTHERS:
-        value = _value(config, key)
+        value = config.value(key)
         if value:
             found.append(Quantity(key, name, unit, value, _PERCENT * value))
     return found
 
 
-def _value(config: Config, key: str) -> float | None:
-    """Return the number at a dotted config key, or None if there is no number."""
-    found: Any = config
-    for name in key.split("."):
-        found = getattr(found, name, None)
-    return float(found) if isinstance(found, int | float) else None
-
-
-def _with(config: Any, key: str, value: float) -> Any:
-    """Return a copy of a config section in which the number at a dotted key is `value`."""
-    name, _, rest = key.partition(".")
-    inner = _with(getattr(config, name), rest, value) if rest else value
-    return config.model_copy(update={name: inner})
-
-
 def _direction(config: Config, scene: Scene, quantity: Quantity) -> Scene:
     """Return the derivatives of the scene's arrays with respect to a `quantity`, as a `Scene`."""
     size = _STEP * (abs(quantity.value) or 1.0)
-    moved = Scene.from_config(_with(config, quantity.key, quantity.value + size))
+    moved = Scene.from_config(config.moved({quantity.key: quantity.value + size}))
     here = Scene.from_config(config)
 
     def change(path, before, after):

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from rootsopt.config import Config
+from rootsopt.config import TWIST, Config
 from rootsopt.contact.law import ContactLaw
 from rootsopt.contact.search import SearchContact
 from rootsopt.profiles import Profile
@@ -24,7 +24,7 @@ _REFERENCE = 400
 
 def greatest_twist(config: Config) -> float:
     """Return the greatest magnitude (°) of the twist of a `config`, within its bounds if free."""
-    bounds = config.optimizer.bounds.helix_deg if config.twist_free else None
+    bounds = config.optimizer.bounds[TWIST] if config.twist_free else None
     return max(map(abs, (config.rotor.helix_deg, *(bounds or ()))))
 
 

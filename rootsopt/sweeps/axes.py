@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from rootsopt.config import Config
 from rootsopt.config.document import read_document
-from rootsopt.config.explain import field_of
+from rootsopt.config.explain import is_whole, tree
 from rootsopt.config.words import shown
 from rootsopt.errors import InputError
 
@@ -177,14 +177,7 @@ def _interval(key: str, item: str) -> Any:
         )
     if log and min(low, high) <= 0:
         raise InputError(f"`{key}`: a logarithmic range must have positive ends, but is {item}")
-    return Interval(low, high, points, log, _whole(key))
-
-
-def _whole(key: str) -> bool:
-    """Return whether a key accepts only whole numbers."""
-    field = field_of(Config, key.split("."))
-    kind = "" if field is None else str(field.annotation)
-    return "int" in kind and "float" not in kind
+    return Interval(low, high, points, log, is_whole(tree(Config).get(key)))
 
 
 __all__ = ["MOST", "Axis", "Interval", "axis_of", "parse_over"]

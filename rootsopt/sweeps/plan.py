@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from rootsopt.config import Config
-from rootsopt.config.explain import all_keys
+from rootsopt.config.explain import tree
 from rootsopt.config.words import near, shown
 from rootsopt.design.space import sobol as sobol_points
 from rootsopt.errors import InputError
@@ -179,7 +179,7 @@ def _meant(key: str, message: str) -> str:
     """Return the end of a message: the known key that is most similar to an unknown one."""
     if "is not a known key" not in message or "did you mean" in message:
         return ""
-    known = {one.rpartition(".")[2]: one for one in reversed([*all_keys(Config)])}
+    known = {one.rpartition(".")[2]: one for one in reversed([*tree(Config)])}
     guess = near(key, [*known.values()]) or known.get(near(key.rpartition(".")[2], [*known]), "")
     return f"; did you mean `{guess}`?" if guess else ""
 

@@ -9,7 +9,7 @@ import yaml
 
 import rootsopt
 from rootsopt.config import Config
-from rootsopt.config.explain import field_of
+from rootsopt.config.explain import tree
 from rootsopt.config.units import unit_of
 from rootsopt.response.records import RESPONSES
 from rootsopt.status import Status
@@ -169,7 +169,7 @@ def _coordinates(plan: Plan) -> dict[str, Any]:
             numbers = {"long_name": f"number of the {one.name.partition('_')[0]}"}
             found[one.name] = one.name, np.arange(one.size), numbers
         for key, values in one.columns.items():
-            field = field_of(Config, key.split("."))
+            field = tree(Config).get(key)
             long = field.description if field is not None and field.description else key
             attributes = {"units": unit(key), "long_name": long}
             if not is_numeric(values):

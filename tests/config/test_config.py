@@ -435,7 +435,7 @@ def test_help_has_unit_default_range_and_choices():
     assert lines["scene.drive"].endswith("[prescribed | torque, default prescribed]")
     assert lines["profile.tip_arc_angle_deg"].endswith("[°, from 0 below 45]")
     assert "N·m/rad" in lines["scene.timing_gear.stiffness_N_m_per_rad"]
-    assert "from 1 to 80" in lines["optimizer.bounds.pressure_angle_deg"]
+    assert "default: 25 to 45; from 1 to 80" in lines["profile.pressure_angle_deg"]
 
 
 @pytest.mark.parametrize(

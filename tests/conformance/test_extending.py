@@ -240,7 +240,7 @@ def test_family_may_be_taken_back():
     text = ["profile={family: mine, lobes: 3, pitch_radius_mm: 33, depth_mm: 2}"]
     with for_a_time():
         register_family(Family(**GOOD))
-        assert load("configs/ee.yaml", text).optimizer.bounds.depth_mm is None
+        assert load("configs/ee.yaml", text).profile.parameters == {"depth_mm": 2.0}
         assert __name__ in outside_modules()
     assert __name__ not in outside_modules()
     with pytest.raises(InputError, match=r"`profile\.depth_mm` is not a known key"):

@@ -16,8 +16,8 @@ import numpy as np
 import yaml
 
 from rootsopt.config import FAMILY_KEYS, Config, load, parse
-from rootsopt.config.explain import all_keys, field_of, limits_of
-from rootsopt.config.section import choices
+from rootsopt.config.explain import is_whole, limits_of, tree
+from rootsopt.config.section import choices, put
 from rootsopt.profiles import geometry
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene, check_geometry, design_vector
@@ -94,7 +94,7 @@ def _tree(draw: random.Random) -> dict:
 @functools.cache
 def _keys() -> list[str]:
     """Return all dotted keys and sections."""
-    return list(all_keys(Config))
+    return list(tree(Config))
 
 
 SIZES = (0, 1, 2, 3, 5, 7, 12, 20, 33, 34, 50, 100, 200, 500, 1000, 2000, 6000, 200_000)
@@ -315,7 +315,7 @@ DESIGNS: dict[str, dict[str, Any]] = {
     "free_form": {"tip_arc_angle_deg": 4.0, "coefficients": [0.2, 0.1, 0.0, 0.1, 0.3, 0.5]},
 }
 """A sound design of each family at 33 mm and three lobes."""
-UNDRAWN = ("profile.", "scene.", "sweep.", "pareto.", "tolerances.")
+UNDRAWN = ("profile.", "scene.", "sweep.", "pareto.", "tolerances.", "optimizer.bounds")
 """Sections whose choices are not drawn at random."""
 TIED = ("optimizer.family", "objective.motion", "objective.over_speeds")
 """Choices that require certain other keys."""
@@ -333,27 +333,18 @@ def _inside(draw: random.Random, low: float, high: float) -> float:
     return min(high, max(low, low * (high / low) ** draw.random()))
 
 
-def _set(data: dict, key: str, value: Any) -> None:
-    *place, last = key.split(".")
-    for part in place:
-        data = data.setdefault(part, {})
-    data[last] = value
-
-
 @functools.cache
 def _numbers() -> dict[str, tuple[float, float, bool]]:
     """Return limits of every plain number outside `profile`, and whether it is whole."""
     found = {}
-    for key in _keys():
-        field: Any = field_of(Config, key.split("."))
-        words = str(field.annotation)
-        limits = limits_of(field.annotation, field.metadata)
+    for key, field in tree(Config).items():
+        words, limits = str(field.annotation), limits_of(field)
         low, high = limits.ends
         low += 1e-6 * (limits.gt is not None)
         high -= 1e-6 * (limits.lt is not None)
         plain = "tuple" not in words and "dict" not in words and high < float("inf")
         if plain and not key.startswith("profile."):
-            found[key] = low, high, "int" in words
+            found[key] = low, high, is_whole(field)
     return found
 
 
@@ -374,6 +365,7 @@ def _valid(draw: random.Random) -> Case:
         turn = 3 / profile["lobes"] if key.endswith("_deg") else 1.0
         profile[key] = value * size * turn * 10 ** draw.gauss(0, spread)
     data: dict[str, Any] = {"profile": profile}
+    fields = tree(Config)
     gone = [part for part in OPTIONAL if draw.random() < 0.5]
     if draw.random() < 0.2:
         data["tolerances"] = {"over": SCATTER}
@@ -384,7 +376,7 @@ def _valid(draw: random.Random) -> Case:
     data["scene"] = {"drive": "torque" if motor else "prescribed"}
     for key, (low, high, whole) in _numbers().items():
         name = key.split(".")[-1]
-        needed = field_of(Config, key.split(".")).is_required()  # type: ignore[union-attr]
+        needed = fields[key].is_required()
         if any(key.startswith(part) for part in gone) or ("motor" in key and not motor):
             continue
         if key.startswith("scene.load.") and name != load:
@@ -393,7 +385,7 @@ def _valid(draw: random.Random) -> Case:
             continue
         if needed or draw.random() < 0.5 or key.startswith(("scene.load.", "contact.friction")):
             value = _inside(draw, low, high)
-            _set(data, key, round(value) if whole else value)
+            put(data, key, round(value) if whole else value)
     if "contact.friction" not in gone:
         friction = data["contact"]["friction"]
         stiction = friction["stiction_speed_mm_s"]
@@ -405,17 +397,17 @@ def _valid(draw: random.Random) -> Case:
     if any(part not in gone for part in ("contact.friction", "scene.supports")):
         data["scene"].pop("center_distance_error_mm", None)
     for part in set(OPTIONAL[1:]) - set(gone):
-        _set(data, part, data.get(part.split(".")[0], {}).get(part.split(".")[1], {}))
-    for key in _keys():
-        words = choices(field_of(Config, key.split(".")).annotation)  # type: ignore[union-attr]
+        put(data, part, data.get(part.split(".")[0], {}).get(part.split(".")[1], {}))
+    for key, field in fields.items():
+        words = choices(field)
         free = not key.startswith(UNDRAWN) and key not in TIED
         if words and free and draw.random() < 0.2:
             word = draw.choice(words)
-            _set(data, key, draw.choice((word, word.upper(), word.replace("_", "-").title())))
+            put(data, key, draw.choice((word, word.upper(), word.replace("_", "-").title())))
     if draw.random() < 0.3:
         word = draw.choice(("weighted", "Worst"))
-        _set(data, "objective.speeds_rpm", [1000, 2000.5])
-        _set(data, "objective.over_speeds", word)
+        put(data, "objective.speeds_rpm", [1000, 2000.5])
+        put(data, "objective.over_speeds", word)
     return yaml.safe_dump(data, sort_keys=False).encode(), ()
 
 

@@ -63,7 +63,7 @@ def test_config_names_distributions_in_two_ways():
     [
         ([CLEARANCE], ["reach -0.008", "at least 0", "narrow"]),
         ([PLAY, "tolerances.over.contact.clearence_mm.normal=1"], ["mean `contact.clearance_mm`"]),
-        ([PLAY, "tolerances.over.contact.clearance_mm.nomal=1"], ["mean `normal`"]),
+        ([PLAY, "tolerances.over.contact.clearance_mm.nomal=1"], ["normal`?"]),
         ([PLAY, "tolerances.over.contact.clearance_mm.normal=0"], ["greater than 0"]),
         (["tolerances.over.contact.friction.kinetic.normal=1"], ["give", "nominal value"]),
         (
