@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+from collections import Counter
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -158,12 +159,9 @@ def test_benchmark(tmp_path, programs):
     out = run("benchmark", tmp_path, programs)
     rows = rows_of(tmp_path / "benchmark.csv")
     assert all(float(row["run_s"]) > 0 for row in rows)
-    parts = {row["part"] for row in rows}
-    expected = {"scipy", "numba", "single", "batch 4", "revolutions", "main job"}
-    assert parts == expected
-    for row in rows:
-        if row["value_error"]:
-            assert float(row["value_error"]) < 1e-2
+    parts = {"scipy", "numba", "single", "batch 4", "revolutions", "main job"}
+    assert {row["part"] for row in rows} == parts
+    assert max(float(row["value_error"] or 0) for row in rows) < 1e-2
     assert all(float(row["peak_memory_MB"]) > 10 for row in rows)
     result = json.loads((tmp_path / "benchmark.json").read_text())
     assert result["not_measured"] == {}
@@ -311,8 +309,7 @@ def test_landscape(tmp_path, programs):
     assert record["agrees"]
     rows = rows_of(tmp_path / "landscape.csv")
     assert len(rows) == record["grid_designs"] + record["finer_designs"]
-    assert record["grid_designs"] > 5
-    assert record["finer_designs"] > 5
+    assert min(record["grid_designs"], record["finer_designs"]) > 5
 
 
 @pytest.mark.long
@@ -382,8 +379,8 @@ def test_optimisers(tmp_path, programs):
     """Every method improves on the start of every problem, and each evaluation is recorded."""
     run("optimisers", tmp_path, programs)
     rows = rows_of(tmp_path / "optimisers.csv")
-    for method in ("slsqp", "augmented_lagrangian", "interior_point"):
-        own = [row for row in rows if row["method"] == method]
-        assert 2 < len(own) <= 30
+    designs = Counter(row["method"] for row in rows)
+    assert {"slsqp", "augmented_lagrangian", "interior_point"} <= set(designs)
+    assert all(2 < number <= 30 for number in designs.values())
     record = json.loads((tmp_path / "optimisers.json").read_text())
     assert all(row["designs"] > 1 for row in record["summary"])
