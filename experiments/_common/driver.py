@@ -74,14 +74,9 @@ class Run:
         """Whether this is a reduced run (`--quick`)."""
         return self.options.quick
 
-    @property
-    def seconds(self) -> float:
-        """Time (s) since the start."""
-        return time.perf_counter() - self.began
-
     def say(self, text: str) -> None:
         """Report progress on stderr, with the time."""
-        print(f"{self.seconds:7.1f} s  {text}", file=sys.stderr, flush=True)
+        print(f"{time.perf_counter() - self.began:7.1f} s  {text}", file=sys.stderr, flush=True)
 
     def csv(
         self, name: str, rows: Sequence[Mapping[str, Any]], keys: Iterable[str] | None = None

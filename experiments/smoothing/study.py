@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from experiments._common.batch import Batch, coarse, on_all_cores, respond
 from experiments._common.driver import Run
 from experiments._common.engines import FD_STEPS
-from experiments._common.scenes import SHAKY, shipped
+from experiments._common.scenes import FORCES, SHAKY, shipped
 from experiments._common.simulation import stacked
 from experiments._common.style import BLUE, GREEN, VERMILION, grid_below, sheet
 from rootsopt.config import Config
@@ -232,33 +232,21 @@ def measure(kind: str, size: Size, say: Say) -> Measured:
 
 def rows_of(measured: Measured) -> list[dict[str, Any]]:
     """Return a row for every scene at every smoothing length."""
-    rows = []
-    for width, orbit in measured.orbits.items():
-        for k, config in enumerate(measured.configs):
-            gear, load_ = config.scene.timing_gear, config.scene.load
-            assert gear is not None
-            mean, peak, rms = orbit.response[k]
-            rows.append(
-                {
-                    "kind": measured.kind,
-                    "scene": k,
-                    "speed_rpm": config.scene.speed_rpm,
-                    "torque_N_m": load_.torque_N_m,
-                    "pressure_difference_Pa": load_.pressure_difference_Pa,
-                    "gear_stiffness_N_m_per_rad": gear.stiffness_N_m_per_rad,
-                    "gear_damping_ratio": gear.damping_ratio,
-                    "backlash_mm": gear.backlash_mm,
-                    "smoothing_mm": width,
-                    "status": Status.of(int(orbit.status[k])).label,
-                    "period": orbit.period[k],
-                    "mean_force_N": mean,
-                    "peak_force_N": peak,
-                    "rms_force_N": rms,
-                    "bias": measured.bias(width)[k],
-                    "solver_steps": orbit.steps[k],
-                }
-            )
-    return rows
+    return [
+        {
+            "kind": measured.kind,
+            "scene": k,
+            "scene_values": config.scene.model_dump_json(exclude_none=True),
+            "smoothing_mm": width,
+            "status": Status.of(int(orbit.status[k])).label,
+            "period": orbit.period[k],
+            **dict(zip((*FORCES, "rms_force_N"), orbit.response[k], strict=True)),
+            "bias": measured.bias(width)[k],
+            "solver_steps": orbit.steps[k],
+        }
+        for width, orbit in measured.orbits.items()
+        for k, config in enumerate(measured.configs)
+    ]
 
 
 def summary(measured: Measured) -> dict[str, Any]:
