@@ -7,7 +7,6 @@ A batch is for surveys. Motions without an orbit are not examined further: give 
 import dataclasses
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
@@ -114,20 +113,12 @@ def respond_many(
     """Return the responses of n designs, each started from its own scaled state.
 
     `designs` (n, d): in config units; `states` (n, s): scaled states at φ1 = 0; `solver`: see
-    `coarse`; `gradient`: whether to compute derivatives. On CPUs one thread per core evaluates one
-    design at a time, so that no design waits for a slower one. On other devices all designs are
-    stepped together.
+    `coarse`; `gradient`: whether to compute derivatives. One thread per core evaluates one design
+    at a time, so that no design waits for a slower one.
     """
-    if jax.default_backend() != "cpu":
-        return _together(scene, designs, states, solver, gradient)
     return on_all_cores(
         lambda designs, states: _in_turn(scene, designs, states, solver, gradient), designs, states
     )
-
-
-@CachedFunction
-def _together(scene, designs, states, *settings) -> Batch:
-    return jax.vmap(lambda design, state: respond(scene, design, state, *settings))(designs, states)
 
 
 @CachedFunction

@@ -1,32 +1,26 @@
-"""Tables on standard output."""
+"""Tables and records on standard output."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from rich.console import Console
-from rich.table import Table
-
-_WIDTH = 250
-"""Width of a table (characters): wider than a terminal, so that no column is cut in a file."""
+Row = dict[str, Any]
+"""A line of a table: values by column."""
 
 
 def show(
     title: str, rows: Sequence[Mapping[str, Any]], columns: Iterable[str] | None = None
 ) -> None:
-    """Print rows as a table under a title.
+    """Print rows as a Markdown table under a title, so that a page can take it over.
 
-    `columns`: keys to show, in order, by default the keys of the first row. Text columns are
-    left-aligned, all others right-aligned.
+    `columns`: keys to show, in order, by default the keys of the first row.
     """
-    keys = list(rows[0]) if columns is None else list(columns)
-    table = Table(title=title)
-    for key in keys:
-        words = any(isinstance(row.get(key), str) for row in rows)
-        table.add_column(key.replace("_", " "), justify="left" if words else "right")
-    for row in rows:
-        table.add_row(*(_cell(row.get(key)) for key in keys))
-    Console(width=_WIDTH).print(table)
+    keys = list(rows[0] if columns is None else columns) if rows else []
+    lines = [[key.replace("_", " ") for key in keys], ["---"] * len(keys)]
+    lines += [[_cell(row.get(key)) for key in keys] for row in rows]
+    print(f"\n{title}\n")
+    for line in lines:
+        print(f"| {' | '.join(line)} |")
 
 
 def print_record(record: Mapping[str, Any]) -> None:

@@ -18,28 +18,37 @@ def ready(result: Any) -> Any:
     return jax.block_until_ready(result)
 
 
-def times_of(call: Callable[[], Any], repeats: int, at_most: float = math.inf) -> list[float]:
+def times_of(
+    call: Callable[[], Any],
+    repeats: int,
+    at_most: float = math.inf,
+    clock: Callable[[], float] = time.perf_counter,
+) -> list[float]:
     """Return the times (s) of up to `repeats` calls; start no call after `at_most` seconds."""
     times: list[float] = []
     while not times or (len(times) < repeats and sum(times) < at_most):
-        began = time.perf_counter()
+        began = clock()
         call()
-        times.append(time.perf_counter() - began)
+        times.append(clock() - began)
     return times
 
 
-def median_time(
-    call: Callable[[], Any], repeats: int, at_most: float = math.inf
-) -> tuple[float, Any]:
+def median_time(call: Callable[[], Any], repeats: int, *limits: Any) -> tuple[float, Any]:
     """Return the median time (s) of up to `repeats` calls, and the last result.
 
-    No further call is made after `at_most` seconds."""
+    `limits`: see `times_of`."""
     results = []
 
     def keep() -> None:
         results[:] = [call()]
 
-    return statistics.median(times_of(keep, repeats, at_most)), results[0]
+    return statistics.median(times_of(keep, repeats, *limits)), results[0]
+
+
+def processor_time(call: Callable[[], Any], repeats: int) -> tuple[float, Any]:
+    """Return the median processor time (s) of a warm call, and its result."""
+    call()
+    return median_time(call, repeats, math.inf, time.process_time)
 
 
 def first_and_warm(

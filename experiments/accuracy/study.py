@@ -8,29 +8,33 @@ by shooting (`experiments._common.shooting`). Scenes without a reference are rep
 random scenes.
 """
 
-import time
-from collections.abc import Callable, Iterator
+import functools
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
+from experiments._common.driver import Run
 from experiments._common.scenes import CIC, shipped
 from experiments._common.shooting import closed
 from experiments._common.simulation import evaluator_of
+from experiments._common.style import BLACK, BLUE, VERMILION, grid_below, sheet
+from experiments._common.tables import Row, show
+from experiments._common.timing import processor_time
 from rootsopt.config import load
 from rootsopt.errors import InputError
 from rootsopt.response.evaluation import Evaluation
 from rootsopt.status import Status
 
-Row = dict[str, Any]
 REQUESTS = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7)
 """Values of `solver.accuracy`."""
 SHARP, CHECKED = "solver.rtol=1e-12", 1e-7
 """Setting of the reference, and relative difference from the forces by shooting above which it is
 no reference."""
+COUNT, QUICK_COUNT, REPEATS = 60, 1, 5
+"""Number of scenes of a full and of a reduced run, and number of timed evaluations."""
 NAMES = ("mean_force_N", "peak_force_N", "rms_force_N")
-QUICK_COUNT, REPEATS = 1, 5
-"""Number of scenes of a reduced run, and number of timed evaluations."""
 
 
 def scenes(seed: int) -> Iterator[tuple[str, list[str]]]:
@@ -85,11 +89,7 @@ def measure(family: str, overrides: list[str]) -> list[Row]:
     rows = []
     for wanted in REQUESTS:
         tool = evaluator_of(shipped(family, *overrides, f"solver.accuracy={wanted}"))
-        found, spent = tool(series=False), []
-        for _ in range(REPEATS):
-            began = time.process_time()
-            tool(series=False)
-            spent.append(time.process_time() - began)
+        seconds, found = processor_time(functools.partial(tool, series=False), REPEATS)
         rows.append(
             {
                 "family": family,
@@ -97,32 +97,12 @@ def measure(family: str, overrides: list[str]) -> list[Row]:
                 "accuracy": wanted,
                 "status": found.status.label,
                 "error": error(found, truth),
-                "seconds": float(np.median(spent)),
+                "seconds": seconds,
                 "elements": found.statistics.get("orbit_elements", 0),
                 "solver_steps": found.statistics["solver_steps"],
                 "newton_steps": found.statistics["newton_steps"],
             }
         )
-    return rows
-
-
-def run(
-    quick: bool, count: int = 60, seed: int = 0, say: Callable[[str], None] = lambda text: None
-) -> list[Row]:
-    """Measure random scenes until `count` of them have a reference; return all rows."""
-    count = QUICK_COUNT if quick else count
-    rows: list[Row] = []
-    done = 0
-    for family, overrides in scenes(seed):
-        try:
-            new = measure(family, overrides)
-        except InputError:
-            continue  # an impossible geometry
-        rows += new
-        done += bool(new)
-        say(f"{done}/{count} {family} " + " ".join(f"{row['error']:.0e}" for row in new))
-        if done >= count:
-            break
     return rows
 
 
@@ -146,3 +126,53 @@ def summary(rows: list[Row]) -> list[Row]:
             }
         )
     return table
+
+
+def errors(rows: list[Row]) -> Figure:
+    """Draw the errors of all scenes, and the time relative to the usual accuracy."""
+    figure, axes = sheet(10.0, 4.4, columns=2)
+    left, right = axes[0]
+    spread = np.random.default_rng(0)
+    asked = np.array([row["accuracy"] for row in rows])
+    reached = np.clip([row["error"] for row in rows], 1e-12, 1.0)
+    shifted = asked * 10 ** spread.uniform(-0.2, 0.2, len(asked))
+    left.loglog(shifted, reached, "o", color=BLUE, mfc="none", ms=4, label="a scene")
+    line = np.array([REQUESTS[-1], REQUESTS[0]])
+    left.loglog(line, line, "-", color=BLACK, lw=1, label="accuracy asked for")
+    left.set_xlabel("solver.accuracy (points spread for legibility)")
+    left.set_ylabel("relative error of forces and gradient, the largest")
+    left.legend(fontsize=8)
+    table = summary(rows)
+    right.semilogx(REQUESTS, [row["time_over_usual"] for row in table], "s-", color=VERMILION)
+    right.set_xlabel("solver.accuracy")
+    right.set_ylabel("time of an evaluation, over that at 1e-5 (median)")
+    right.set_ylim(bottom=0)
+    for ax in (left, right):
+        ax.invert_xaxis()
+        grid_below(ax)
+    figure.suptitle(f"{table[0]['scenes']} random designs and scenes, from rest", fontsize=11)
+    return figure
+
+
+def run(job: Run) -> bool:
+    """Measure random scenes until enough of them have a reference; write all rows and the table.
+
+    Returns whether 95 % of the errors are within each accuracy."""
+    rows: list[Row] = []
+    done, count = 0, QUICK_COUNT if job.quick else COUNT
+    for family, overrides in scenes(0):
+        try:
+            new = measure(family, overrides)
+        except InputError:
+            continue  # an impossible geometry
+        rows += new
+        done += bool(new)
+        job.say(f"{done}/{count} {family} " + " ".join(f"{row['error']:.0e}" for row in new))
+        if done >= count:
+            break
+    table = summary(rows)
+    job.csv("accuracy.csv", rows)
+    job.json("accuracy.json", {"table": table})
+    job.figure("accuracy.png", errors(rows))
+    show("Accuracy asked for and reached", table)
+    return all(row["within"] >= 0.95 for row in table)

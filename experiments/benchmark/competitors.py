@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from experiments._common.engines import FD_STEPS, Scene, Simulator
+from experiments._common.engines import FD_STEPS, Scene
 from experiments._common.engines.scipy_nodes import NODES_1E3, ScipyNodes
 from experiments._common.scenes import CIC
 from experiments._common.timing import first_and_warm, median_time
@@ -22,8 +22,8 @@ from rootsopt.config import load
 
 
 def tuned(
-    make: Callable[..., Simulator], settings: Sequence[dict[str, Any]], truth: Any
-) -> tuple[dict[str, Any], Simulator]:
+    make: Callable[..., Any], settings: Sequence[dict[str, Any]], truth: Any
+) -> tuple[dict[str, Any], Any]:
     """Choose the fastest of `settings` that is accurate enough at the baseline.
 
     If no setting is accurate enough, choose the most accurate. Returns the setting and the
@@ -40,7 +40,7 @@ def tuned(
 
 
 def competitor_rows(
-    name: str, tool: Simulator, settings: dict[str, Any], job: Job, more: Row, repeats: int
+    name: str, tool: Any, settings: dict[str, Any], job: Job, more: Row, repeats: int
 ) -> list[Row]:
     """Time a competitor: forces alone, then forces with gradient. Return the rows."""
     truth, slope = job.known["forces"][0], job.known["slopes"][0]

@@ -6,151 +6,289 @@ accurate to 1e-3:
 (b) the pair compiled by Numba, with central differences;
 (c) rootsopt, one design and batches;
 (d) cost over revolutions and batch size;
-(e) the main job from a cold process, without and with cached programs;
-(f) large batches on a GPU.
+(e) the main job from a cold process, without and with cached programs.
 
-Each part runs in its own process (`--part NAME`, which writes JSON), so that peak memory is
-measured for each part. No module here loads JAX before a part needs it. Build, compile and run are
-timed separately, and the error reached is listed next to the time.
+Each part runs in its own process, so that peak memory is measured for each part. This module does
+not load JAX. Build, compile and run are timed separately, and the error reached is listed next to
+the time.
 """
 
-import json
+import dataclasses
+import importlib
+import multiprocessing
 import os
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from experiments._common.driver import NoResultError
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
+
+from experiments._common.driver import NoResultError, Run, start_process
 from experiments._common.scenes import CIC
-from experiments._common.timing import MB
-from experiments.benchmark.competitors import part_numba, part_scipy
-from experiments.benchmark.designs import part_batch, part_reference, part_single
-from experiments.benchmark.job import BATCH_SECONDS, Job, Row, row
-from experiments.benchmark.pieces import part_orbit, part_revolutions
+from experiments._common.style import BLUE, ORANGE, grid_below, sheet
+from experiments._common.tables import print_record, show
+from experiments._common.timing import MB, peak_memory
+from experiments.benchmark.job import ACCURACY, BATCH_SECONDS, GRADIENT_ACCURACY, Job, Row, row
 
-Say = Callable[[str], None]
 SIZES = (16, 256, 1024)
-GPU_SIZES = (256, 4096, 16384, 65536)
-MODULE = "experiments.benchmark"
-"""Name of the module that the process of a part runs."""
-RESULT = "part.json"
-"""Name of the file with a part's findings, in the result folder of its process."""
-
-PARTS: dict[str, Callable[[Job], dict[str, Any]]] = {
-    "reference": part_reference,
-    "scipy": part_scipy,
-    "numba": part_numba,
-    "single": part_single,
-    "batch": part_batch,
-    "orbit": part_orbit,
-    "revolutions": part_revolutions,
-    "gpu": part_batch,
-}
+COMPETITORS = "scipy", "numba"
+"""Parts without rootsopt."""
 
 
-def timed_child(
-    command: list[str], environment: dict[str, str], log: Path
-) -> tuple[float, float, int]:
-    """Run a process; return wall time (s), peak memory (MB) and exit code."""
-    began = time.perf_counter()
-    with open(log, "wb") as sink:
-        child = subprocess.Popen(command, env=environment, stdout=sink, stderr=sink)
-        _, status, usage = os.wait4(child.pid, 0)
-    # wait4 has collected the exit status, which Popen does not know.
-    child.returncode = os.waitstatus_to_exitcode(status)
-    return time.perf_counter() - began, usage.ru_maxrss * 1024 * MB, child.returncode
+def exponent(points: Sequence[tuple[float, float]]) -> float | None:
+    """Return the exponent of a power law fitted to (size, time); `None` for fewer than two
+    points."""
+    if len(points) < 2:
+        return None
+    x, y = np.log(np.array(points)).T
+    return float(np.polyfit(x, y, 1)[0])
 
 
+@dataclasses.dataclass(frozen=True)
+class Lookup:
+    """Looks up measured times of a finished run by tool and task."""
+
+    rows: list[Row]
+
+    def best(self, tool: str, what: str) -> Row | None:
+        """Return the fastest row with sufficient accuracy for the task `what`, or `None`.
+
+        Rows of all tools whose names start with `tool` are considered."""
+        rows = [r for r in self.rows if r["tool"].startswith(tool) and r["what"] == what]
+        fine = [
+            r
+            for r in rows
+            if (r.get("value_error") or 0.0) <= ACCURACY
+            and (r.get("gradient_error") or 0.0) <= GRADIENT_ACCURACY
+        ]
+        return min(fine, key=lambda r: r["per_design_ms"], default=None)
+
+    def ratio(self, slow: tuple[str, str], fast: tuple[str, str]) -> float | None:
+        """Return the time per design of `slow` divided by that of `fast`, each a (tool, task)."""
+        one, other = self.best(*slow), self.best(*fast)
+        return one["per_design_ms"] / other["per_design_ms"] if one and other else None
+
+    def seconds(self, what: str) -> float | None:
+        """Return the time (s) of the first task whose name ends with `what`."""
+        found = [r["run_s"] for r in self.rows if r["what"].endswith(what)]
+        return found[0] if found else None
+
+    def points(self, part: str, what: str, size: str = "designs") -> list[tuple[float, float]]:
+        """Return (size, seconds) of the rows of a part with the task `what`, or with any."""
+        rows = [r for r in self.rows if r["part"].startswith(part) and what in ("", r["what"])]
+        return [(r[size], r["run_s"]) for r in rows]
+
+
+def figure_of(rows: list[Row]) -> Figure:
+    """Draw the time per design by tool, and the times over revolutions and over batch size."""
+    figure, axes = sheet(15, 5.6, 1, 3, width_ratios=(1.5, 1, 1))
+    bars, turns, batches = axes[0]
+    look = Lookup(rows)
+    timed = [r for r in rows if r["what"] in ("value", "value+gradient")]
+    names = list(dict.fromkeys(r["tool"] for r in timed))
+    for shift, (what, color) in enumerate((("value", ORANGE), ("value+gradient", BLUE))):
+        chosen = [r for r in timed if r["what"] == what]
+        place = [names.index(r["tool"]) + 0.38 * (shift - 0.5) for r in chosen]
+        label = what.replace("+", " + ")
+        bars.barh(place, [r["per_design_ms"] for r in chosen], 0.36, color=color, label=label)
+        for y, r in zip(place, chosen, strict=True):
+            bars.annotate(
+                short(r["per_design_ms"]), (r["per_design_ms"], y), (3, 0),
+                textcoords="offset points", va="center", fontsize=7,
+            )  # fmt: skip
+    bars.set_yticks(range(len(names)), names, fontsize=8)
+    bars.invert_yaxis()
+    bars.margins(x=0.15)
+    bars.set(xscale="log", xlabel="time per design, warm (ms)")
+    bars.legend(fontsize=8, loc="lower right")
+    draw_power(
+        turns, look.points("revolutions", "", "revolutions"), "from rest, no statistics", BLUE, "o"
+    )
+    turns.set(xlabel="revolutions", ylabel="time (s)")
+    for what, color, mark in (("value", ORANGE, "s"), ("value+gradient", BLUE, "o")):
+        draw_power(batches, look.points("batch ", what), what.replace("+", " + "), color, mark)
+    batches.set(xlabel="designs in a batch", ylabel="time of the batch (s)")
+    for ax in (turns, batches):
+        ax.set(xscale="log", yscale="log")
+        for axis in (ax.xaxis, ax.yaxis):
+            axis.set_major_formatter("{x:g}")
+            axis.set_minor_formatter(NullFormatter())
+        if ax.lines:
+            ax.legend(fontsize=8)
+    for ax in (bars, turns, batches):
+        grid_below(ax, axis="x" if ax is bars else "both", color="0.9")
+    figure.suptitle(f"Shipped CIC scene; mean and peak force to {ACCURACY:g}", fontsize=11)
+    return figure
+
+
+def short(value: float) -> str:
+    """Format `value` with two significant digits, without a power of ten."""
+    return f"{value:.0f}" if value >= 100 else f"{value:.2g}"
+
+
+def draw_power(
+    ax: Any, points: list[tuple[float, float]], label: str, color: str, mark: str
+) -> None:
+    """Draw (size, seconds) points on logarithmic axes, with the exponent of a power law in the
+    label.
+    """
+    if not points:
+        return
+    slope = exponent(points)
+    name = label if slope is None else f"{label}: exponent {slope:.2f}"
+    ax.plot(*zip(*points, strict=True), marker=mark, color=color, lw=1.4, label=name)
+
+
+COLUMNS = (
+    *("part", "tool", "what", "designs", "per_design_ms", "run_s", "build_s", "compile_s"),
+    *("value_error", "gradient_error", "peak_memory_MB", "settings", "note"),
+)
+"""Columns of the table, in order."""
+
+
+def targets(rows: list[Row]) -> list[Row]:
+    """Return a row per target, with the measured value; `reached` is `None` if not measured."""
+    look = Lookup(rows)
+    both, value, one, many = "value+gradient", "value", "rootsopt, ", "rootsopt, batch of 256"
+    single = Lookup([r for r in rows if r["part"] == "single" or r["tool"].startswith("(")])
+    orbit = [1e3 * r["run_s"] for r in rows if r["tool"] == "orbit"]
+    limits = (
+        ("value + gradient, speed-up over (a)", ">=", 200.0,
+         single.ratio(("(a)", both), (one, both)), "one design"),
+        ("the same in a batch of 256", ">=", 200.0,
+         look.ratio(("(a)", both), (many, both)), "per design"),
+        ("value + gradient, speed-up over (b)", ">=", 1.0,
+         single.ratio(("(b)", both), (one, both)), "one design"),
+        ("the same in a batch of 256", ">=", 1.0,
+         look.ratio(("(b)", both), (many, both)), "per design"),
+        ("one value, in units of (b)'s time", "<=", 3.0,
+         single.ratio((one, value), ("(b)", value)), "one design"),
+        ("a value in a batch of 256, in units of (b)'s time", "<=", 1.0,
+         look.ratio((many, value), ("(b)", value)), "per design"),
+        ("value + gradient on the orbit (ms)", "<=", 50.0,
+         orbit[0] if orbit else None, "to 1e-6, one core"),
+        ("exponent of cost over revolutions", "<=", 1.1,
+         exponent(look.points("revolutions", "", "revolutions")), "1 is linear"),
+        ("exponent of cost over batch size", "<=", 1.1,
+         exponent(look.points("batch ", both)), "value + gradient"),
+        ("main job, cold process (s)", "<=", 20.0, look.seconds(", cold"), "no cache"),
+        ("main job, programs cached (s)", "<=", 8.0, look.seconds(", cached"), "second run"),
+    )  # fmt: skip
+    return [
+        {
+            "target": name,
+            "limit": f"{sign} {limit:g}",
+            "figure": figure,
+            "reached": None if figure is None else (figure >= limit) == (sign == ">="),
+            "note": note,
+        }
+        for name, sign, limit, figure, note in limits
+    ]
+
+
+def measured(part: Job) -> tuple[dict[str, Any], float]:
+    """Run one part in this process; return its findings, and the peak memory (MB).
+
+    Only the parts of rootsopt load JAX."""
+    if part.part not in COMPETITORS:
+        start_process()
+    module = "competitors" if part.part in COMPETITORS else "designs"
+    work = getattr(importlib.import_module(f"experiments.benchmark.{module}"), f"part_{part.part}")
+    return work(part), peak_memory()
+
+
+@dataclasses.dataclass
 class Parts:
     """Runs the parts one after the other and collects their rows and findings."""
 
-    def __init__(self, quick: bool, scratch: Path, say: Say):
-        self.quick, self.scratch, self.say = quick, scratch, say
-        self.rows: list[Row] = []
-        self.known: dict[str, Any] = {}
-        self.failed: dict[str, str] = {}
+    job: Run
+    rows: list[Row]
+    known: dict[str, Any]
+    failed: dict[str, str]
 
     def part(self, name: str, size: int = 0) -> bool:
         """Run a part in its own process; return whether it gave a result."""
         said = name + (f" {size}" if size else "")
-        state, log, folder = (self.scratch / one for one in ("known.json", "log.txt", "part"))
-        out = folder / RESULT
-        state.write_text(json.dumps(self.known))
-        out.unlink(missing_ok=True)
-        command = [sys.executable, "-m", MODULE, "--part", name, "--size", str(size)]
-        command += ["--known", str(state), "-o", str(folder)] + ["--quick"] * self.quick
-        seconds, memory, code = timed_child(command, dict(os.environ), log)
-        if code != 0 or not out.exists():
-            tail = log.read_text(errors="replace").strip().splitlines()
-            self.failed[said] = tail[-1] if tail else f"exit code {code}"
-            self.say(f"{said} failed after {seconds:.0f} s: {self.failed[said]}")
+        task = Job(name, self.job.quick, size, self.known)
+        context = multiprocessing.get_context("spawn")
+        try:
+            with ProcessPoolExecutor(1, mp_context=context) as pool:
+                found, memory = pool.submit(measured, task).result()
+        except Exception as error:  # The other parts can still be measured.
+            self.failed[said] = f"{type(error).__name__}: {error}"
+            self.job.say(f"{said} failed: {self.failed[said]}")
             return False
-        found = json.loads(out.read_text())
         for one in found.pop("rows", []):
             self.rows.append({"part": said, **one, "peak_memory_MB": memory})
         self.known |= found
-        self.say(f"{said}: {seconds:.0f} s")
+        self.job.say(said)
         return True
 
-    def batches(self, name: str, sizes: Sequence[int]) -> None:
+    def batches(self, sizes: Sequence[int]) -> None:
         """Run batches from small to large, while they are expected to end in time."""
         for size in sizes:
-            before = [r for r in self.rows if r["part"].startswith(f"{name} ")]
+            before = [r for r in self.rows if r["part"].startswith("batch ")]
             # Each batch is run at least twice.
             expected = sum(2e-3 * r["per_design_ms"] * size for r in before[-2:])
             if expected > BATCH_SECONDS:
-                self.failed[f"{name} {size}"] = f"not run: {expected:.0f} s expected"
-                self.say(f"{name} {size} {self.failed[f'{name} {size}']}")
-            elif not self.part(name, size):
+                self.failed[f"batch {size}"] = f"not run: {expected:.0f} s expected"
+            elif not self.part("batch", size):
                 break
 
-    def main_job(self) -> None:
+    def main_job(self, scratch: Path) -> None:
         """Run the main job from a cold process: without cache, with an empty and a filled one."""
         job, options = "rootsopt.optimize", []
         cases = ["cold", "filling the cache", "cached"]
-        if self.quick:
+        if self.job.quick:
             job, cases, options = "rootsopt.profile", cases[2:], ["--no-figures"]
-        environment = os.environ | {"ROOTSOPT_CACHE": str(self.scratch / "cache")}
+        environment = os.environ | {"ROOTSOPT_CACHE": str(scratch / "cache")}
         for case in cases:
-            folder = self.scratch / case.split()[0]
+            folder = scratch / case.split()[0]
             command = [sys.executable, "-m", job, CIC, "-o", str(folder), *options]
             command += ["--no-cache"] * (case == "cold")
-            seconds, memory, code = timed_child(command, environment, self.scratch / "log.txt")
-            one = row("rootsopt", f"{job.split('.')[1]}, {case}", seconds, note=f"exit {code}")
+            began = time.perf_counter()
+            child = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL)
+            _, status, usage = os.wait4(child.pid, 0)
+            seconds, memory = time.perf_counter() - began, usage.ru_maxrss * 1024 * MB
+            # wait4 has collected the exit status, which Popen does not know.
+            child.returncode = os.waitstatus_to_exitcode(status)
+            note = f"exit {child.returncode}"
+            one = row("rootsopt", f"{job.split('.')[1]}, {case}", seconds, note=note)
             self.rows.append({"part": "main job", **one, "peak_memory_MB": memory})
-            if code != 0:
-                self.failed[f"main job, {case}"] = f"exit code {code}"
-            self.say(f"main job, {case}: {seconds:.1f} s")
+            if child.returncode != 0:
+                self.failed[f"main job, {case}"] = note
+            self.job.say(f"main job, {case}: {seconds:.1f} s")
 
 
-def run(quick: bool, gpu: bool = False, say: Say = lambda text: None) -> Parts:
-    """Run all parts. Raises `NoResultError` if the reference cannot be computed.
+def run(job: Run) -> None:
+    """Run all parts; write and print their rows and the targets.
 
-    A reduced run uses small sizes, and omits the longest parts.
+    A reduced run uses small sizes, and omits the longest part. Raises `NoResultError` if the
+    reference cannot be computed.
     """
+    parts = Parts(job, [], {}, {})
+    if not parts.part("reference"):
+        raise NoResultError(f"there is no reference: {parts.failed['reference']}")
+    for name in ("scipy", "numba", "single"):
+        parts.part(name)
+    parts.batches((4,) if job.quick else SIZES)
+    for name in ("revolutions",) if job.quick else ("revolutions", "orbit"):
+        parts.part(name)
     with tempfile.TemporaryDirectory() as scratch:
-        parts = Parts(quick, Path(scratch), say)
-        if not parts.part("reference"):
-            raise NoResultError(f"there is no reference: {parts.failed['reference']}")
-        for name in ("scipy", "numba", "single"):
-            parts.part(name)
-        if "choice" in parts.known:
-            parts.batches("batch", (4,) if quick else SIZES)
-        parts.part("revolutions")
-        if quick:
-            parts.failed["orbit"] = "omitted in a reduced run"
-        else:
-            parts.part("orbit")
-        parts.main_job()
-        if gpu and "choice" in parts.known:
-            parts.batches("gpu", GPU_SIZES)
-    return parts
-
-
-def run_part(name: str, quick: bool, size: int, known: dict[str, Any]) -> dict[str, Any]:
-    """Run one part in this process; return its findings, with its rows under `rows`."""
-    return PARTS[name](Job(name, quick, size, known))
+        parts.main_job(Path(scratch))
+    rows, goals = parts.rows, targets(parts.rows)
+    # Columns in their usual order; those that only some rows have come last.
+    job.csv("benchmark.csv", rows, dict.fromkeys([*COLUMNS, *(key for one in rows for key in one)]))
+    record = {"rows": rows, "targets": goals, "not_measured": parts.failed}
+    job.json("benchmark.json", record | {"reference": parts.known, "processors": os.cpu_count()})
+    job.figure("benchmark.png", figure_of(rows))
+    show("Benchmark", rows, COLUMNS)
+    print_record({f"not measured: {name}": reason for name, reason in parts.failed.items()})
+    show("Targets", goals)

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from experiments._common.driver import Run
 from experiments._common.scenes import shipped
 from experiments._common.simulation import evaluator_of
 from rootsopt.config import Config
@@ -104,19 +105,6 @@ def plans(quick: bool) -> list[Plan]:
     ]
 
 
-def run(
-    quick: bool,
-    say: Say = lambda text: None,
-    keep: Callable[[list[Diagram]], None] = lambda diagrams: None,
-) -> list[Diagram]:
-    """Explore all plans. After each plan, call `keep` with all diagrams so far."""
-    diagrams: list[Diagram] = []
-    for plan in plans(quick):
-        diagrams.append(explore(plan, say))
-        keep(diagrams)
-    return diagrams
-
-
 def explore(plan: Plan, say: Say) -> Diagram:
     """Simulate from all starts of a plan, and follow every orbit found. Return the diagram."""
     config, low, high = plan.config, plan.low, plan.high
@@ -149,16 +137,27 @@ def follow_on(
     `at`: config, and value of the parameter; `state` (scaled), `period` and `forces` identify the
     orbit. Branches are added to `diagram`."""
     config, value = at
-    if period > LONGEST or known(diagram, value, period, forces):
+    if period > LONGEST or known(diagram.branches, value, period, forces):
         return
-    try:
-        first = follow(config, diagram.key, state, period, limits(diagram, period))
-    except InputError as error:
-        say(f"{value:g}: {error}")
-        return
+
+    def followed(config: Config, state: Any, period: int) -> Branch | None:
+        sizes = StepSizes(diagram.low, diagram.high, points=points(period))
+        try:
+            return follow(config, diagram.key, state, period, sizes)
+        except InputError as error:
+            return say(f"{value:g}: {error}")
+
+    def already(branch: Branch) -> bool:
+        middle = branch.points[len(branch.points) // 2]
+        own = middle.value, branch.family.period, (middle.mean, middle.peak)
+        return known(diagram.branches, *own)
+
+    first = followed(config, state, period)
     queue = [first]
     while queue:
         branch = queue.pop(0)
+        if branch is None or (branch is not first and already(branch)):
+            continue
         diagram.branches.append(branch)
         say(described(diagram, branch))
         for special in branch.bifurcations:
@@ -166,21 +165,12 @@ def follow_on(
             # If the orbit of single period was unstable before, the doubled orbit is unstable too.
             if 2 * branch.family.period > DOUBLED or not doubling:
                 continue
-            if not any(p.stable for p in beside(branch, special)):
-                continue
-            doubled = follow_doubled(branch, special, points(2 * branch.family.period))
-            if doubled is not None and not known_branch([*diagram.branches, *queue], doubled):
-                queue.append(doubled)
+            if any(point.stable for point in beside(branch, special)):
+                queue.append(follow_doubled(branch, special, points(2 * branch.family.period)))
         for end, point in zip(branch.ends, (branch.points[0], branch.points[-1]), strict=True):
             if end is End.HALVED:
                 here = config.moved({diagram.key: point.value})
-                half = branch.family.period // 2
-                try:
-                    simple = follow(here, diagram.key, point.state, half, limits(diagram, half))
-                except InputError:
-                    continue
-                if not known_branch([*diagram.branches, *queue], simple):
-                    queue.append(simple)
+                queue.append(followed(here, point.state, branch.family.period // 2))
 
 
 def beside(branch: Branch, special) -> tuple:
@@ -188,34 +178,18 @@ def beside(branch: Branch, special) -> tuple:
     return branch.points[special.after : special.after + 2]
 
 
-def limits(diagram: Diagram, period: int) -> StepSizes:
-    """Return range, step sizes and maximum number of points of a branch of this `period`."""
-    return StepSizes(diagram.low, diagram.high, points=points(period))
-
-
 def points(period: int) -> int:
     """Return the maximum number of points of a branch of this `period`."""
     return max(POINTS // period, FEWEST)
 
 
-def known(diagram: Diagram, value: float, period: int, forces) -> bool:
-    """Return whether a branch of the diagram contains the orbit with this `period` and `forces`."""
+def known(branches: list[Branch], value: float, period: int, forces) -> bool:
+    """Return whether one of the `branches` contains the orbit with this `period` and `forces`."""
     return any(
         np.allclose(forces, (point.mean, point.peak), rtol=1e-3)
-        for branch in diagram.branches
+        for branch in branches
         if branch.family.period == period
         for point in branch.at(value)
-    )
-
-
-def known_branch(branches: list[Branch], new: Branch) -> bool:
-    """Return whether the middle of the `new` branch lies on a known branch of the same period."""
-    middle = new.points[len(new.points) // 2]
-    return any(
-        np.allclose((middle.mean, middle.peak), (point.mean, point.peak), rtol=1e-3)
-        for branch in branches
-        if branch.family.period == new.family.period
-        for point in branch.at(middle.value)
     )
 
 
@@ -231,22 +205,25 @@ def described(diagram: Diagram, branch: Branch) -> str:
 
 
 def ranges(diagram: Diagram) -> dict[str, list[list[float]]]:
-    """Return the ranges of the parameter with stable quiet orbits, stable noisy orbits, both,
-    none."""
+    """Return the ranges of the parameter with stable orbits.
+
+    Keys: `quiet`, `noisy`, `both`, `none`, and `several` for more than one, quiet or noisy."""
     edges = np.linspace(diagram.low, diagram.high, CELLS + 1)
     centres = (edges[1:] + edges[:-1]) / 2
     quiet, noisy = np.zeros(CELLS, bool), np.zeros(CELLS, bool)
+    count = np.zeros(CELLS, int)
     for branch in diagram.branches:
         for old, new in itertools.pairwise(branch.points):
             if not (old.stable and new.stable):
                 continue
             (low, a), (high, b) = sorted((p.value, peak_ratio(branch, p)) for p in (old, new))
-            inside = (centres >= low) & (centres <= high)
+            inside = (centres > low) & (centres <= high)
             ratio = np.interp(centres[inside], [low, high], [a, b])
             quiet[inside] |= ratio <= QUIET
             noisy[inside] |= ratio > QUIET
+            count += inside
     found = {"quiet": quiet, "noisy": noisy, "both": quiet & noisy, "none": ~(quiet | noisy)}
-    return {name: list(runs(mask, edges)) for name, mask in found.items()}
+    return {k: list(runs(mask, edges)) for k, mask in (found | {"several": count > 1}).items()}
 
 
 def peak_ratio(branch: Branch, point) -> float:
@@ -262,19 +239,6 @@ def runs(mask: np.ndarray, edges: np.ndarray) -> Iterator[list[float]]:
     change = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]])))
     for begin, end in change.reshape(-1, 2):
         yield [float(edges[begin]), float(edges[end])]
-
-
-def overlaps(diagram: Diagram) -> list[list[float]]:
-    """Return the ranges of the parameter with more than one stable orbit, quiet or noisy."""
-    edges = np.linspace(diagram.low, diagram.high, CELLS + 1)
-    centres = (edges[1:] + edges[:-1]) / 2
-    count = np.zeros(CELLS, int)
-    for branch in diagram.branches:
-        for old, new in itertools.pairwise(branch.points):
-            if old.stable and new.stable:
-                low, high = sorted((old.value, new.value))
-                count += (centres > low) & (centres <= high)
-    return list(runs(count > 1, edges))
 
 
 # Rows and record
@@ -323,7 +287,7 @@ def orbit_row(point) -> Row:
     return row
 
 
-def summary(diagrams: list[Diagram], seconds: float) -> dict[str, Any]:
+def summary(diagrams: list[Diagram]) -> dict[str, Any]:
     """Return ranges, branches, and the simulations that led to no periodic orbit."""
     return {
         "quiet_up_to_static_forces": QUIET,
@@ -334,7 +298,6 @@ def summary(diagrams: list[Diagram], seconds: float) -> dict[str, Any]:
                 "parameter": diagram.parameter,
                 "range": [diagram.low, diagram.high],
                 "stable": ranges(diagram),
-                "several_stable": overlaps(diagram),
                 "branches": [
                     {
                         "period": branch.family.period,
@@ -350,5 +313,20 @@ def summary(diagrams: list[Diagram], seconds: float) -> dict[str, Any]:
             for diagram in diagrams
         ],
         "largest_residual": max((row["residual"] for row in point_rows(diagrams)), default=None),
-        "seconds": seconds,
     }
+
+
+def run(job: Run) -> None:
+    """Follow all branches; write and print everything known after every parameter."""
+    from experiments.bifurcation import figures
+
+    diagrams: list[Diagram] = []
+    for plan in plans(job.quick):
+        last = explore(plan, job.say)
+        diagrams.append(last)
+        job.csv("bifurcation.csv", point_rows(diagrams))
+        job.csv("special_points.csv", special_rows(diagrams))
+        job.json("bifurcation.json", summary(diagrams))
+        for name, figure in figures.pictures(diagrams).items():
+            job.figure(f"bifurcation_{name}.png", figure)
+        print(f"{last.scene} {last.family} {last.parameter}: {ranges(last)}", flush=True)

@@ -7,17 +7,19 @@
 """
 
 import dataclasses
-import time
-from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
-from experiments._common.driver import NoResultError
+from experiments._common.driver import NoResultError, Run
 from experiments._common.scenes import shipped
+from experiments._common.style import BLACK, BLUE, GREEN, PURPLE, VERMILION, grid_below, sheet
+from experiments._common.tables import print_record
 from rootsopt.config import Config
 from rootsopt.dynamics.flow import one_period
 from rootsopt.optimize.noise import standard_error
@@ -73,17 +75,11 @@ class Size:
     slopes: tuple[tuple[int, int], ...]
 
 
-def _slopes(designs: int, members: int, count: int) -> tuple[tuple[int, int], ...]:
-    """Return sizes (designs, members) of gradients, starting from the given size.
-
-    First come `count` sizes with doubling members, then `count` - 1 with doubling designs."""
-    more = [(designs, members * 2**k) for k in range(count)]
-    return (*more, *((designs * 2**k, members) for k in range(1, count)))
-
-
+SLOPES = (16, 4), (16, 8), (16, 16), (16, 32), (32, 4), (64, 4), (128, 4)
+"""Sizes (designs, members) of the gradients: first more members, then more designs."""
 SIZES = {
-    False: Size(25, 32, 128, 96, 512, (4, 8, 16, 32, 64), _slopes(16, 4, 4)),
-    True: Size(3, 4, 8, 8, 16, (4, 8), _slopes(8, 4, 1)),
+    False: Size(25, 32, 128, 96, 512, (4, 8, 16, 32, 64), SLOPES),
+    True: Size(3, 4, 8, 8, 16, (4, 8), ((8, 4),)),
 }
 
 
@@ -199,96 +195,6 @@ def gradients(config: Config, model: Scene, design, size: Size) -> list[dict]:
     return rows
 
 
-def summary(problem: Problem, result: Optimization) -> dict[str, Any]:
-    """Return a record of baseline and optimum, evaluated by the verifying ensemble.
-
-    The record includes the significance of the gain."""
-    found: dict[str, Any] = {"verification": result.verification}
-    for name, one in (("baseline", result.baseline), ("optimized", result.optimized)):
-        if one is not None:
-            found[name] = {
-                "design": one.design,
-                **one.response,
-                **one.steady_state,
-                "objective": problem.objective(one),
-                "objective_standard_error": standard_error(problem, one),
-            }
-    record = result.verification
-    if "combined_standard_error" in record:
-        gain = 1 - record["verified_objective"]
-        found["gain_in_standard_errors"] = gain / record["combined_standard_error"]
-    return found
-
-
-@dataclasses.dataclass(frozen=True)
-class Results:
-    """Results of the study: the optimisation, and a table of rows for each other part."""
-
-    config: Config
-    problem: Problem
-    optimization: Optimization
-    line: list[dict]
-    pathwise: list[dict]
-    members: list[dict]
-    gradients: list[dict]
-    seconds: dict[str, float]
-
-    @property
-    def tables(self) -> dict[str, list[dict]]:
-        """Return the rows by the name of their part."""
-        return {
-            "line": self.line,
-            "pathwise": self.pathwise,
-            "history": self.optimization.history,
-            "members": self.members,
-            "gradients": self.gradients,
-        }
-
-    def record(self) -> dict[str, Any]:
-        """Return summary, scene and times for a result file."""
-        return summary(self.problem, self.optimization) | {
-            "scene": list(SCENE),
-            "ensemble": self.config.ensemble.model_dump(),
-            "seconds": self.seconds,
-        }
-
-
-def run(quick: bool, say: Callable[[str], None] = lambda text: None) -> Results:
-    """Optimise, then study the baseline and the line of designs to the optimum.
-
-    Raises `NoResultError` if the baseline has no average.
-    """
-    seconds: dict[str, float] = {}
-
-    def timed(name: str, work: Callable[..., Any], *given: Any) -> Any:
-        began = time.perf_counter()
-        found = work(*given)
-        seconds[name] = time.perf_counter() - began
-        say(f"{name}: {seconds[name]:.0f} s")
-        return found
-
-    size = SIZES[quick]
-    config = shipped("cic", *SCENE, *(QUICK if quick else FULL))
-    search = Search(config)
-    result = timed("optimization", search.run)
-    problem = result.problem
-    if problem is None or not result.baseline.usable:
-        raise NoResultError(f"baseline {result.baseline.status.label}")
-    model = search.exact.scene
-    designs = designs_between(problem, result, size.line)
-    evaluator = resized(config, model)
-    return Results(
-        config,
-        problem,
-        result,
-        line=timed("line", line, config, model, designs, size),
-        pathwise=timed("pathwise", pathwise, evaluator, designs[0], size),
-        members=timed("members", errors_by_members, config, model, designs[0], size),
-        gradients=timed("gradients", gradients, config, model, designs[0], size),
-        seconds=seconds,
-    )
-
-
 def designs_between(problem: Problem, result: Optimization, count: int) -> np.ndarray:
     """Return designs (count, d) on a line from the baseline to the optimum.
 
@@ -301,3 +207,149 @@ def designs_between(problem: Problem, result: Optimization, count: int) -> np.nd
     shares = np.linspace(0, 1, count)[:, None]
     points = (1 - shares) * first + shares * problem.point(end)
     return np.array([problem.design(point) for point in points])
+
+
+def summary(problem: Problem, result: Optimization) -> dict[str, Any]:
+    """Return a record of baseline and optimum, evaluated by the verifying ensemble.
+
+    The record includes the significance of the gain."""
+    record = result.verification
+    found: dict[str, Any] = {"verification": record}
+    for name, one in (("baseline", result.baseline), ("optimized", result.optimized)):
+        if one is not None:
+            found[name] = {
+                "design": one.design,
+                **one.response,
+                **one.steady_state,
+                "objective": problem.objective(one),
+                "objective_standard_error": standard_error(problem, one),
+            }
+    if "combined_standard_error" in record:
+        gain = 1 - record["verified_objective"]
+        found["gain_in_standard_errors"] = gain / record["combined_standard_error"]
+    return found
+
+
+def run(job: Run) -> None:
+    """Optimise, then study the baseline and the line of designs to the optimum.
+
+    Raises `NoResultError` if the baseline has no average.
+    """
+    size = SIZES[job.quick]
+    config = shipped("cic", *SCENE, *(QUICK if job.quick else FULL))
+    search = Search(config)
+    result = search.run()
+    problem = result.problem
+    if problem is None or not result.baseline.usable:
+        raise NoResultError(f"baseline {result.baseline.status.label}")
+    job.say("optimised")
+    model = search.exact.scene
+    designs = designs_between(problem, result, size.line)
+    tables = {"history": result.history, "line": line(config, model, designs, size)}
+    tables["pathwise"] = pathwise(resized(config, model), designs[0], size)
+    tables["members"] = errors_by_members(config, model, designs[0], size)
+    tables["gradients"] = gradients(config, model, designs[0], size)
+    for name, rows in tables.items():
+        job.csv(f"chaos_{name}.csv", rows)
+    record = summary(problem, result) | {"ensemble": config.ensemble.model_dump()}
+    job.json("chaos.json", record)
+    job.figure("chaos.png", panels(problem, result, tables))
+    print_record(record)
+
+
+Rows = list[dict]
+
+
+def panels(problem: Problem, result: Optimization, tables: dict[str, Rows]) -> Figure:
+    """Draw the four panels of the figure: averages, derivatives, optimisation, standard errors."""
+    figure, axes = sheet(12.5, 9, 2, 2)
+    (a, b), (c, d) = axes
+    averages(a, tables["line"])
+    derivatives(b, tables["pathwise"], tables["gradients"])
+    optimisation(c, problem, result)
+    standard_errors(d, tables["members"], tables["gradients"])
+    for ax in axes.flat:
+        grid_below(ax)
+    return figure
+
+
+def column(rows: Rows, key: str) -> np.ndarray:
+    """Return the column `key` (n,) of `rows`, with NaN for entries that are not numbers."""
+    return np.array([np.nan if row[key] is None else row[key] for row in rows], float)
+
+
+def averages(ax: Axes, rows: Rows) -> None:
+    """Draw the averages of one motion and of an ensemble along the line of designs."""
+    share = column(rows, "share")
+    ax.plot(share, column(rows, "single_mean_force_N"), ".-", color=VERMILION, lw=0.8,
+           label="one motion from rest")  # fmt: skip
+    ax.errorbar(share, column(rows, "mean_force_N"), column(rows, ERRORS["mean_force_N"]), fmt="o",
+               color=BLUE, ms=4, capsize=2, label="ensemble, ± standard error")  # fmt: skip
+    ax.set(xlabel="fraction of the way from baseline to optimum", ylabel="mean contact force (N)")
+    ax.set_ylim(0, None)
+    ax.set_title("(a) Average along a line of designs")
+    ax.legend(frameon=False)
+
+
+def derivatives(ax: Axes, rows: Rows, estimates: Rows) -> None:
+    """Draw the growing derivative of one motion over the window, and the ensemble's slope."""
+    window = column(rows, "window_mesh_periods")
+    by_angle = np.abs(column(rows, "mean_force_by_pressure_angle_N_per_deg"))
+    ax.semilogy(window, by_angle, "-", color=VERMILION, label="one motion, differentiated")
+    slope, error = (estimates[-1][k] for k in ("gradient_N_per_deg", "standard_error_N_per_deg"))
+    ax.axhline(abs(slope), color=BLUE, label=f"ensemble: {slope:.1f} ± {error:.1f} N/deg")
+    ax.set(xlabel="window (mesh periods)", ylabel="|d mean force / d pressure angle| (N/deg)")
+    ax.set_title("(b) Derivative at the baseline")
+    ax.legend(frameon=False)
+
+
+def optimisation(ax: Axes, problem: Problem, result: Optimization) -> None:
+    """Draw the objective over the evaluations, and both verified designs."""
+    rows = result.history
+    number, objective = column(rows, "evaluation"), column(rows, "objective")
+    error = column(rows, "objective_standard_error")
+    screened = column(rows, "start") < 0
+    for chosen, color, label in ((screened, "0.55", "screening"), (~screened, BLUE, "descent")):
+        ax.errorbar(number[chosen], objective[chosen], error[chosen], fmt="o", color=color, ms=4,
+                   capsize=2, label=f"{label}, ± standard error")  # fmt: skip
+    last = number[-1] + 2
+    verified = [("baseline, verified", result.baseline, BLACK, "s")]
+    verified += [("optimum, verified", result.optimized, GREEN, "D")] if result.optimized else []
+    for offset, (label, one, color, mark) in enumerate(verified):
+        ax.errorbar([last + offset], [problem.objective(one)],
+                   [standard_error(problem, one)], fmt=mark, color=color, ms=7, capsize=3,
+                   label=label)  # fmt: skip
+    ax.axhline(1, color=BLACK, lw=0.8, ls=":")
+    ax.set(xlabel="evaluation", ylabel="objective (baseline = 1)")
+    ax.set_ylim(0, None)
+    ax.set_title("(c) Optimisation of the ensemble's average")
+    ax.legend(frameon=False, ncols=2, loc="lower left")
+
+
+def standard_errors(ax: Axes, members: Rows, estimates: Rows) -> None:
+    """Draw the standard errors of average and gradient over the number of motions."""
+    count = column(members, "members")
+    stated = column(members, "stated_standard_error_N")
+    ax.loglog(count, stated, "o", color=BLUE, label="stated standard error (N)")
+    ax.errorbar(1.04 * count, column(members, "scatter_of_groups_N"),
+               column(members, "error_of_scatter_N"), fmt="x", color=VERMILION, ms=7, capsize=2,
+               label="scatter of independent groups (N)")  # fmt: skip
+    ax.loglog(count, stated[0] * np.sqrt(count[0] / count), ":", color="0.4", lw=1,
+             label="∝ 1/√(motions)")  # fmt: skip
+    least = estimates[0]["designs"]
+    for chosen, mark, color, label in (
+        ([e for e in estimates if e["designs"] == least], "s-", GREEN, "more members each"),
+        ([e for e in estimates if e["members"] == estimates[0]["members"]], "D--", PURPLE,
+         "more designs"),
+    ):  # fmt: skip
+        motions = column(chosen, "designs") * column(chosen, "members")
+        errors = column(chosen, "standard_error_N_per_deg")
+        said = f"gradient (N/deg): {label}"
+        ax.loglog(motions, errors, mark, color=color, ms=5, lw=1, label=said)
+        ax.loglog(motions, errors[0] * np.sqrt(motions[0] / motions), ":", color="0.4", lw=1)
+    ax.set(
+        xlabel="motions: members, or designs × members", ylabel="standard error of the mean force"
+    )
+    ax.set_ylim(0.3, None)
+    ax.set_title("(d) Standard error of average and gradient")
+    ax.legend(frameon=False)

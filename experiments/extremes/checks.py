@@ -1,8 +1,6 @@
-"""Checks of each scene: finite numbers, named status, deviation from a reference, public
-functions."""
+"""Checks of each scene: finite numbers, named status, deviation from a reference."""
 
 import dataclasses
-import math
 import time
 from typing import Any
 
@@ -14,12 +12,10 @@ from scipy.integrate import solve_ivp
 
 from experiments._common.batch import coarse, respond
 from experiments._common.shooting import closed as shot_of
-from experiments._common.simulation import evaluator_of as make_evaluator
 from experiments._common.simulation import pair_of_model, stacked
 from experiments.extremes.scenes import Kind
 from rootsopt.config import Config
 from rootsopt.dynamics.integrator import Integrator
-from rootsopt.response.evaluation import Evaluator
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene, design_vector
 from rootsopt.status import Status
@@ -143,9 +139,7 @@ def _simulate(model: Scene, design, tolerances, method: str):
     out = respond(model, design, jnp.zeros(pair.states), solver)
     assert pair.timescales is not None
     swings = pair.mesh_period / (2 * jnp.pi * pair.timescales.swing)
-    # Rounding error of the gap, as a fraction of the static penetration.
-    rounding = jnp.finfo(pair.angle_scale.dtype).eps * model.pitch_radius
-    return out, swings, rounding / pair.law.depth_at(pair.force_scale), pair.force_scale
+    return out, swings, pair.force_scale
 
 
 def _arguments(case: Case) -> tuple[Any, ...]:
@@ -165,7 +159,7 @@ def simulate(case: Case) -> None:
     arguments = _arguments(case)
     began = time.perf_counter()
     found = _simulate(*arguments)
-    out, swings, rounding, force = jax.device_get(found)
+    out, swings, force = jax.device_get(found)
     status = Status.of(int(out.status))
     numbers = np.concatenate([np.ravel(out.response), np.ravel(out.gradient)])
     mean, peak, rms = map(float, out.response)
@@ -174,7 +168,6 @@ def simulate(case: Case) -> None:
         "seconds": time.perf_counter() - began,
         "steps": int(out.steps),
         "swings": float(swings),
-        "gap_rounding": float(rounding),
         "static_force_N": float(force),
         "status": status.label,
         "period": int(out.period),
@@ -212,8 +205,6 @@ def refine(case: Case) -> None:
         "reference_peak_N": float(peak),
         "mean_off": float(off[0]),
         "peak_off": float(off[1]),
-        "moved": float(np.max(np.abs(truth.state - case.state))),
-        "reference_multiplier": truth.multiplier,
         "share_of_allowed": float(max(off[:2]) / allowed),
     }
     case.state = truth.state
@@ -242,29 +233,3 @@ def by_scipy(case: Case) -> None:
         "scipy_end": float(np.max(np.abs(done.y[:2, -1] - case.state))),
         "scipy_mean_off": abs(mean - truth) / max(truth, case.row["static_force_N"]),
     }
-
-
-# Promise 4: the public path
-
-
-def evaluate(case: Case, evaluator: Evaluator) -> None:
-    """Evaluate a scene as the commands do, and add the result to the row of `case`."""
-    began = time.perf_counter()
-    evaluation = evaluator(series=False)
-    record = evaluation.record()
-    numbers = [*record["response"].values()]
-    numbers += [x for row in record["gradient"].values() for x in row.values()]
-    case.row |= {
-        "evaluator_status": record["status"],
-        "evaluator_seconds": time.perf_counter() - began,
-        "evaluator_periods": int(record["statistics"]["transient_mesh_periods"]),
-        "evaluator_mean_N": record["response"].get("mean_force_N", math.nan),
-        "named": bool(case.row["named"] and np.all(np.isfinite(numbers))),
-    }
-
-
-def evaluator_of(config: Config, horizon: int) -> Evaluator:
-    """Make the evaluator of a config, with a transient of at most `horizon` mesh periods."""
-    changes = {"max_mesh_periods": horizon, "max_steps_per_period": STEPS}
-    solver = config.solver.model_copy(update=changes)
-    return make_evaluator(config.model_copy(update={"solver": solver}))

@@ -96,12 +96,8 @@ class Kind:
 
 
 @functools.cache
-def _shipped(name: str) -> Config:
-    return shipped(name)
-
-
 def _base(kind: Kind) -> Config:
-    return _shipped("pump" if kind.scene == "pump" else kind.family)
+    return shipped("pump" if kind.scene == "pump" else kind.family)
 
 
 def config_of(kind: Kind, values: dict[str, float]) -> Config:

@@ -7,27 +7,37 @@
 3. Truth: a sample of the periodic results is closed again from the same state by dopri8 at 1e-12,
    and by SciPy's DOP853 along that orbit. The relative deviation of mean and peak
    force must be below `ALLOWED` times the tolerance.
-4. Public path: a sample goes through the evaluator from config to record, some with up to 1000
-   revolutions.
 
 `scenes.py` draws the scenes, `checks.py` checks each of them.
 """
 
 import dataclasses
-import itertools
-import time
+import os
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from experiments.extremes import checks as ask
-from experiments.extremes.checks import FEW, HORIZON, Case
-from experiments.extremes.scenes import Kind, cloud, grid, row_of
-from rootsopt.config import Config
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
-Say = Callable[[str], None]
-Keep = Callable[[list[Case]], None]
+from experiments._common.driver import Run
+from experiments._common.style import (
+    BLACK,
+    BLUE,
+    COLORS,
+    GREEN,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILION,
+    sheet,
+)
+from experiments._common.tables import Row, print_record
+from experiments.extremes import checks as ask
+from experiments.extremes.checks import ALLOWED, FEW, Case
+from experiments.extremes.scenes import Kind, cloud, grid, row_of
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,18 +45,14 @@ class Size:
     """Numbers of scenes.
 
     `kinds`: each kind with its number of random scenes; `gridded`: whether the grid is added;
-    `references`, `scipy`, `evaluated`: number of scenes of each kind that go to the reference (a
-    third where the reference needs its own program), to SciPy, and through the evaluator; `long`:
-    number of evaluated scenes with the long transient `horizon` (mesh periods).
+    `references`, `scipy`: number of scenes of each kind that go to the reference (a
+    third where the reference needs its own program) and to SciPy.
     """
 
     kinds: tuple[tuple[Kind, int], ...]
     gridded: bool
     references: int
     scipy: int
-    evaluated: int
-    long: int
-    horizon: int = 3000
 
 
 FULL = Size(
@@ -64,53 +70,116 @@ FULL = Size(
     gridded=True,
     references=24,
     scipy=4,
-    evaluated=60,
-    long=10,
 )
 QUICK = Size(
     kinds=((Kind(), 40),),
     gridded=False,
     references=0,
     scipy=3,
-    evaluated=0,
-    long=0,
 )
+COLOURS = {
+    "periodic": BLUE,
+    "not_settled": SKY,
+    "idle": "#999999",
+    "passed_through": "#F0E442",
+    "too_deep": ORANGE,
+    "inaccurate": "#882255",
+    "unresolved": PURPLE,
+    "stalled": GREEN,
+    "solver_failed": VERMILION,
+    "non_finite": BLACK,
+}
+MOST = 7
+"""Maximum number of solvers shown; those with most scenes come first."""
+_EDGES = np.logspace(-2, 8, 11)
+MARKS = "os^vD<>"
 
 
-@dataclasses.dataclass(frozen=True)
-class Results:
-    """All scenes with their rows, and the counts of non-finite values of law and equation."""
+def atlas(rows: list[Row]) -> Figure:
+    """Draw the outcomes of each solver, and the deviations from the reference."""
+    counts = Counter(row["method"] for row in rows)
+    groups = [name for name, _ in counts.most_common(MOST)]
+    columns = min(3, len(groups) + 1)
+    lines = -(-(len(groups) + 1) // columns)
+    figure, axes = sheet(4.0 * columns, 3.4 * lines, lines, columns)
+    axes = axes.ravel()
+    present = [name for name in COLOURS if any(row["status"] == name for row in rows)]
+    for ax, group in zip(axes, groups, strict=False):
+        outcomes(ax, group, [row for row in rows if row["method"] == group], present)
+    ax = axes[len(groups)]
+    deviations(ax, groups, [row for row in rows if row.get("reference") == "closed"])
+    ax.legend(fontsize=5.5)
+    for ax in axes[len(groups) + 1 :]:
+        ax.axis("off")
+    for ax in axes:
+        ax.tick_params(labelsize=7)
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=8)
+    return figure
 
-    cases: list[Case]
-    checks: dict[str, Any]
 
-    @property
-    def rows(self) -> list[dict[str, Any]]:
-        """Return a row per scene."""
-        return [case.row for case in self.cases]
+def outcomes(ax: Axes, group: str, mine: list[Row], present: list[str]) -> None:
+    """Draw the share of each outcome over the number of contact oscillations in a mesh period.
+
+    `group`: method of the solver; `mine`: rows of this solver; `present`:
+    outcomes to draw."""
+    bins = len(_EDGES) - 1
+    swings = np.clip([row["swings"] for row in mine], _EDGES[0], _EDGES[-1] * 0.999)
+    place = np.digitize(swings, _EDGES) - 1
+    total = np.bincount(place, minlength=bins)
+    below = np.zeros(bins)
+    for name in present:
+        hit = np.array([row["status"] == name for row in mine])
+        share = np.bincount(place[hit], minlength=bins) / np.maximum(total, 1)
+        ax.bar(
+            _EDGES[:-1], share, bottom=below, width=np.diff(_EDGES), align="edge",
+            color=COLOURS[name], edgecolor="white", linewidth=0.3,
+            label=name.replace("_", " "),
+        )  # fmt: skip
+        below += share
+    ax.set_xscale("log")
+    ax.set_xlim(_EDGES[0], _EDGES[-1])
+    ax.set_ylim(0, 1)
+    ax.set_title(f"{group} ({len(mine)} scenes)", fontsize=9)
+    ax.set_xlabel("oscillations of the contact in a mesh period", fontsize=8)
+    ax.set_ylabel("share of scenes", fontsize=8)
 
 
-def run(
-    quick: bool,
-    jobs: int = 2,
-    say: Say = lambda text: None,
-    keep: Keep = lambda cases: None,
-) -> Results:
-    """Draw and check all scenes, `jobs` at a time; call `keep` with all scenes after every
-    stage."""
-    size = QUICK if quick else FULL
+def deviations(ax: Axes, groups: list[str], judged: list[Row]) -> None:
+    """Draw the deviation from the reference over the tolerance by solver, with the allowed
+    limit."""
+    for mark, colour, group in zip(MARKS, COLORS, groups, strict=False):
+        mine = [row for row in judged if row["method"] == group]
+        if mine:
+            ax.loglog(
+                [row["solver.rtol"] for row in mine],
+                [max(row["mean_off"], row["peak_off"], 1e-13) for row in mine],
+                mark, ms=4, mfc="none", color=colour,
+                label=group,
+            )  # fmt: skip
+    line = np.array([1e-12, 1e-2])
+    ax.loglog(line, ALLOWED * line, "k-", lw=1, label=f"{ALLOWED:g} × tolerance")
+    ax.set_xlabel("tolerance", fontsize=8)
+    ax.set_ylabel("relative deviation of mean or peak force", fontsize=8)
+    ax.set_title(f"deviation from the reference ({len(judged)} scenes)", fontsize=9)
+    ax.grid(alpha=0.3)
+
+
+def run(job: Run) -> bool:
+    """Draw and check all scenes, one per core at a time; write a row per scene after every stage.
+
+    Returns whether all promises are kept."""
+    size = QUICK if job.quick else FULL
     cases = drawn(size)
-    say(f"{len(cases)} scenes")
+    job.say(f"{len(cases)} scenes")
     checks = {"law": ask.law(cases), "equation": ask.equation(cases, seed=1)}
-    say(f"law and equation: {checks}")
+    job.say(f"law and equation: {checks}")
 
     def each(what: str, task: Callable[[Case], None], chosen: list[Case]) -> None:
-        began = time.perf_counter()
-        with ThreadPoolExecutor(jobs) as pool:
-            for done, _ in enumerate(pool.map(task, chosen), 1):
-                if done % 200 == 0:
-                    say(f"{what}: {done} of {len(chosen)}")
-        say(f"{what}: {len(chosen)} in {time.perf_counter() - began:.0f} s")
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            list(pool.map(task, chosen))
+        job.say(f"{what}: {len(chosen)}")
+        job.csv("extremes.csv", [case.row for case in cases])
 
     # The program of the next kind compiles while scenes of this kind are simulated.
     first = [next(case for case in cases if case.kind == kind) for kind, _ in size.kinds]
@@ -118,27 +187,24 @@ def run(
         for case in first[number : number + 2]:
             ask.prepare(case)
         each(kind.label, ask.simulate, [case for case in cases if case.kind == kind])
-        keep(cases)
     picked, compared = samples(size, cases)
     each("reference", ask.refine, picked)
-    keep(cases)
     each("scipy", ask.by_scipy, compared)
-    for kind, _ in size.kinds[: 2 if size.evaluated else 0]:
-        mine = [case for case in cases if case.kind == kind][: size.evaluated]
-        for place, case in enumerate(mine):
-            horizon = size.horizon if place < size.long else 8 * HORIZON
-            ask.evaluate(case, ask.evaluator_of(case.config, horizon))
-    keep(cases)
-    return Results(cases, checks)
+    rows = [case.row for case in cases]
+    found = summary(rows, checks)
+    job.json("extremes.json", found)
+    job.figure("extremes.png", atlas(rows))
+    print_record(found)
+    return not any(found[key] for key in ("unnamed", "not_finite", "beyond_allowed"))
 
 
 def drawn(size: Size) -> list[Case]:
     """Draw the scenes of all kinds; the grid belongs to the first kind."""
     cases: list[Case] = []
     for kind, count in size.kinds:
-        configs: Iterable[Config] = cloud(kind, count, seed=0)
+        configs = [*cloud(kind, count, seed=0)]
         if size.gridded and kind == Kind():
-            configs = itertools.chain(configs, grid(kind))
+            configs += grid(kind)
         cases += [
             Case(kind, c, {"kind": kind.label, **dataclasses.asdict(kind), **row_of(c)})
             for c in configs
@@ -151,43 +217,35 @@ def samples(size: Size, cases: list[Case]) -> tuple[list[Case], list[Case]]:
     picked: list[Case] = []
     compared: list[Case] = []
     for kind, _ in size.kinds:
-        shape = kind.lobes, kind.family, kind.scene
+        good = [case for case in cases if case.kind == kind and case.row["status"] == "periodic"]
         if kind.lobes in (4, 5, 6):
             continue
-        mine = [case for case in cases if case.kind == kind]
-        good = [case for case in mine if case.row["status"] == "periodic"]
-        own = shape != (3, "cic", "gear")
+        own = (kind.lobes, kind.family, kind.scene) != (3, "cic", "gear")
         picked += good[: size.references // (3 if own else 1)]
         if kind.scene != "pump":  # tests/planar.py has its independent equation.
             compared += [case for case in good if case.row["swings"] < FEW][: size.scipy]
     return picked, compared
 
 
-def summary(results: Results) -> dict[str, Any]:
+def summary(rows: list[Row], checks: dict[str, Any]) -> dict[str, Any]:
     """Return counts of each status, the worst deviations, and counts of broken promises."""
-    rows, checks = results.rows, results.checks
-    kinds = dict.fromkeys(row["kind"] for row in rows)
-    judged = [row for row in rows if row.get("reference") == "closed"]
+
+    def worst(key: str, chosen: list[Row]) -> float | None:
+        return max((row[key] for row in chosen if key in row), default=None)
+
     table = {}
-    for kind in kinds:
+    for kind in dict.fromkeys(row["kind"] for row in rows):
         mine = [row for row in rows if row["kind"] == kind]
-        closed = [row for row in judged if row["kind"] == kind]
+        closed = [row for row in mine if row.get("reference") == "closed"]
         table[kind] = {
             "scenes": len(mine),
             "status": dict(Counter(row["status"] for row in mine)),
-            "longest_s": max(row["seconds"] for row in mine),
-            "compared": len(closed),
-            "reference_not_closed": sum(
-                row["kind"] == kind and row.get("reference") == "not closed" for row in rows
-            ),
-            "beyond_allowed": sum(row["share_of_allowed"] > 1 for row in closed),
-            "worst_share_of_allowed": max((r["share_of_allowed"] for r in closed), default=None),
-            "worst_mean_off": max((row["mean_off"] for row in closed), default=None),
-            "worst_peak_off": max((row["peak_off"] for row in closed), default=None),
+            "longest_s": worst("seconds", mine),
+            "references": dict(Counter(row["reference"] for row in mine if "reference" in row)),
+            "worst_share_of_allowed": worst("share_of_allowed", closed),
         }
     counts = [checks["law"], *checks["equation"].values()]
-    scipy = [row for row in rows if "scipy_end" in row]
-    public = [row for row in rows if "evaluator_status" in row]
+    judged = [row for row in rows if row.get("reference") == "closed"]
     return {
         "scenes": len(rows),
         "kinds": table,
@@ -197,14 +255,8 @@ def summary(results: Results) -> dict[str, Any]:
         "compared": len(judged),
         "beyond_allowed": sum(row["share_of_allowed"] > 1 for row in judged),
         "scipy": {
-            "compared": len(scipy),
-            "worst_end": max((row["scipy_end"] for row in scipy), default=None),
-            "worst_mean_off": max((row["scipy_mean_off"] for row in scipy), default=None),
-        },
-        "evaluator": {
-            "scenes": len(public),
-            "status": dict(Counter(row["evaluator_status"] for row in public)),
-            "longest_s": max((row["evaluator_seconds"] for row in public), default=None),
-            "most_mesh_periods": max((row["evaluator_periods"] for row in public), default=None),
+            "compared": sum("scipy_end" in row for row in rows),
+            "worst_end": worst("scipy_end", rows),
+            "worst_mean_off": worst("scipy_mean_off", rows),
         },
     }

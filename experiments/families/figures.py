@@ -19,7 +19,7 @@ from experiments._common.style import (
     grid_below,
     sheet,
 )
-from experiments.families.tables import Row, by_study, is_missing, title
+from experiments.families.study import Row, by_study, is_missing, title
 from rootsopt.config.families import families
 from rootsopt.config.units import MM, si_unit
 from rootsopt.figures.profiles import plot_flank
@@ -74,8 +74,8 @@ def ranking_figure(data: dict[str, Any]) -> Figure:
 
 
 def _panel_name(row: Row) -> str:
-    name = row["family"].replace("_", " ")
-    return name if row["reached"] else f"{name} (area {row['area_efficiency']:.4f})"
+    area = "" if row["reached"] else f" (area {row['area_efficiency']:.4f})"
+    return row["family"].replace("_", " ") + area
 
 
 def profiles_figure(data: dict[str, Any]) -> Figure:

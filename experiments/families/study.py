@@ -8,35 +8,33 @@ of mean and peak force, each relative to the reference's. The free form starts f
 families. The optimised designs are then simulated in further scenes.
 """
 
+import contextlib
 import functools
 import itertools
 import multiprocessing
-import time
-from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from experiments._common.driver import start_process
+from experiments._common.driver import Run, start_process
 from experiments._common.scenes import FORCES
 from experiments._common.simulation import evaluate, objective, profile_of
+from experiments._common.tables import Row, show
 from experiments.families.reach import Reach, changed, in_housing, of_family, problem_of, reach
 from rootsopt.config import Config, load, parse
-from rootsopt.config.units import MM
 from rootsopt.errors import InputError
 from rootsopt.optimize.search import Search
-from rootsopt.profiles import Profile
 from rootsopt.profiles.departure import departure
 from rootsopt.response.evaluation import Evaluation
 from rootsopt.scene import check_geometry, design_vector, outline_mm
 from rootsopt.scene.families import classical, free_form_of, with_design
 
-Row = dict[str, Any]
 REFERENCES = ("configs/ee.yaml", "configs/cic.yaml")
+LONG = ("design", "outline_mm", "config")
+"""Entries of a row that the CSV file omits."""
 EQUAL = 5e-5
 """Difference of area efficiency below which two values count as equal."""
 TRIED = 6
@@ -58,30 +56,6 @@ QUICK = ("cic", "arc")
 """Families of a reduced run."""
 
 
-def curvature(profile: Profile) -> dict[str, float]:
-    """Return the smallest radii of curvature (mm), by name: of the addendum, and of the contact.
-
-    The radius of the contact of two flanks is 1 / (1/ρ1 + 1/ρ2). Both radii are 0 at a cusp.
-    """
-    addendum, relative = np.inf, np.inf
-    for one in profile.segments():
-        start, stop = float(one.start), float(one.stop)
-        if stop - start < 1e-9:
-            continue
-        nu = jnp.asarray(start + (stop - start) * (np.arange(2000) + 0.5) / 2000)
-        first = np.asarray(profile.addendum_speed(nu))
-        addendum = min(addendum, first.min())
-        if not one.land:
-            bend = 1 / first + 1 / np.asarray(profile.dedendum_curvature_radius(nu))
-            relative = min(relative, (1 / np.maximum(bend, 1e-9)).min())
-    # Half an interval from a cusp, its radius is some micrometres.
-    cusp = profile.cusp and float(profile.addendum_speed(profile.pitch_normal)) < 1e-9
-    return {
-        "least_radius_mm": 0.0 if cusp else addendum / MM,
-        "least_relative_radius_mm": 0.0 if cusp else relative / MM,
-    }
-
-
 def weighed(config: Config, response: dict[str, float], reference: dict[str, float]) -> Config:
     """Set the weights of mean and peak force, so that the search minimises the wanted objective.
 
@@ -95,17 +69,13 @@ def weighed(config: Config, response: dict[str, float], reference: dict[str, flo
     )
 
 
-def optimised(config: Config, reference: dict[str, float]) -> tuple[Config, int]:
-    """Optimise from the design of a config. Return the config with the best design, and the number
-    of designs simulated."""
+def optimised(config: Config, reference: dict[str, float]) -> Config:
+    """Optimise from the design of a config. Return the config with the best design."""
     start = evaluate(config)
     if not start.usable:
-        return config, 1
-    result = Search(weighed(config, start.response, reference)).run()
-    count = 1 + len(result.history)
-    if result.optimized is None:
-        return config, count
-    return with_values(config, list(result.optimized.design.values())), count
+        return config
+    best = Search(weighed(config, start.response, reference)).run().optimized
+    return config if best is None else with_values(config, list(best.design.values()))
 
 
 def with_values(config: Config, design: ArrayLike) -> Config:
@@ -113,34 +83,30 @@ def with_values(config: Config, design: ArrayLike) -> Config:
     return config.model_copy(update={"profile": with_design(config.profile, design)})
 
 
-def placed(
-    base: Config, found: Reach, reference: Evaluation, quick: bool
-) -> tuple[Config, bool, int]:
+def placed(base: Config, found: Reach, reference: Evaluation, quick: bool) -> tuple[Config, bool]:
     """Choose the start of a search among designs of different area efficiency, by simulation.
 
-    Returns the config of the start with its limit of area efficiency, whether the family reaches
-    the reference's efficiency, and the number of designs simulated.
+    Returns the config of the start with its limit of area efficiency, and whether the family
+    reaches the reference's efficiency.
     """
     bore, floor = (reference.geometry[key] for key in ("outer_radius_mm", "area_efficiency"))
-    reached = found.efficiencies[-1] >= floor - EQUAL
+    reached = bool(found.efficiencies[-1] >= floor - EQUAL)
     least = (floor if reached else found.efficiencies[-1]) - EQUAL
     few = {"screening": 2, "starts": 1, "iterations": 3} if quick else SEARCH
     config = changed(in_housing(base, bore, float(least)), optimizer=few)
     if not found.points.shape[1]:
-        return config, bool(reached), 0
+        return config, reached
     there = found.points[found.efficiencies >= least]
     places = np.unique(np.linspace(0, len(there) - 1, 1 if quick else TRIED).astype(int))
     problem = problem_of(config)
     tried = [with_values(config, problem.design(there[k])) for k in places]
     marks = [objective(evaluate(one), reference.response) for one in tried]
-    best = int(np.argmin(np.nan_to_num(marks, nan=np.inf)))
-    return tried[best], bool(reached), len(tried)
+    return tried[int(np.argmin(np.nan_to_num(marks, nan=np.inf)))], reached
 
 
 def row_of(study: str, config: Config, reference: dict[str, float]) -> dict[str, Any]:
     """Return a row with all numbers of one design; `study`: name of the housing."""
     check_geometry(config)
-    profile = profile_of(config)
     here = evaluate(config)
     row: dict[str, Any] = {
         "study": study,
@@ -152,7 +118,6 @@ def row_of(study: str, config: Config, reference: dict[str, float]) -> dict[str,
         "status": here.status.label,
         **{key: here.geometry[key] for key in ("outer_radius_mm", "area_efficiency")},
         **{key: here.geometry[key] for key in ("seal_width_mm", "undercut_margin_mm")},
-        **curvature(profile),
     }
     for name, change in SCENES.items():
         there = evaluate(changed(config, scene=change))
@@ -175,23 +140,19 @@ def one_family(path: str, family: str, quick: bool) -> dict[str, Any] | None:
     """Return the row of a family's best design in the housing of the reference at `path`.
 
     The result is `None` if the family does not fit."""
-    began = time.perf_counter()
     reference, base = reference_of(path)
     config = in_housing(of_family(reference, family), base.geometry["outer_radius_mm"], 0.0)
     found = reach(config, 24) if quick else reach(config)
     if found is None:
         return None
-    config, reached, count = placed(config, found, base, quick)
+    config, reached = placed(config, found, base, quick)
     if found.points.shape[1]:
-        config, more = optimised(config, base.response)
-        count += more
+        config = optimised(config, base.response)
     return {
         **row_of(Path(path).stem, config, base.response),
         "reached": reached,
         "least_efficiency": float(found.efficiencies[0]),
         "most_efficiency": float(found.efficiencies[-1]),
-        "evaluations": count,
-        "seconds": time.perf_counter() - began,
         "config": config.to_yaml(),
     }
 
@@ -203,85 +164,145 @@ def free_starts(rows: list[Row], count: int) -> list[tuple[Row, Config, Config]]
     A flank that meshes all at once, such as the arc of `circle_epicycloid`, has no sound free form.
     """
     found: list[tuple[Row, Config, Config]] = []
-    refusal: InputError | None = None
     for row in sorted(rows, key=lambda row: row["objective"]):
         config = parse(row["config"])
         profile, _ = free_form_of(config.profile, COEFFICIENTS)
-        try:
+        with contextlib.suppress(InputError):
             free = changed(config, profile=profile.model_dump())
             check_geometry(free)
-        except InputError as error:
-            refusal = error
-        else:
             found.append((row, config, free))
-        if len(found) == count:
-            break
-    if not found and refusal is not None:
-        raise refusal
-    return found
+    return found[:count]
 
 
 def free_form(path: str, start: tuple[Row, Config, Config], quick: bool) -> Row:
     """Optimise a free form from one of the `free_starts`. Return its row."""
-    began = time.perf_counter()
-    _, base = reference_of(path, quick)
+    _, base = reference_of(path)
     best, given, config = start
-    followed = profile_of(given)
     settings: dict[str, Any] = {"bounds": {"tip_arc_angle_deg": (0.0, 45 / given.profile.lobes)}}
     settings |= SEARCH_FREE | ({"iterations": 2} if quick else {})
     config = changed(
         config,
         optimizer=settings,
     )
-    config, count = optimised(config, base.response)
-    made = profile_of(config)
+    config = optimised(config, base.response)
     return {
         **row_of(Path(path).stem, config, base.response),
         "reached": best["reached"],
         "begun_at": best["family"],
-        "departure_um": departure(made, followed) / 1e-6,
-        "evaluations": count,
-        "seconds": time.perf_counter() - began,
+        "departure_um": departure(profile_of(config), profile_of(given)) / 1e-6,
         "config": config.to_yaml(),
     }
 
 
-def run(
-    quick: bool,
-    paths: Sequence[str] = REFERENCES,
-    families: Sequence[str] | None = None,
-    jobs: int = 2,
-    say: Callable[[str], None] = lambda text: None,
-) -> dict[str, Any]:
-    """Study all families in all housings, `jobs` at a time in their own processes.
+def by_study(data: dict[str, Any]) -> dict[str, list[Row]]:
+    """Return the rows of each housing, sorted with the best first.
 
-    `paths`: reference configs; `families`: by default all classical families. Returns the records
-    of the references, and a row per design, with free forms last. A reduced run takes the last
-    housing and the families `QUICK`.
+    Designs that reach the reference's area efficiency come first, then designs that do not, then
+    designs without a periodic motion.
     """
-    paths, families = (paths[-1:], QUICK) if quick else (paths, families or classical())
-    references = {Path(path).stem: reference_of(path, quick)[1].record() for path in paths}
+    studies: dict[str, list[Row]] = {name: [] for name in data["references"]}
+    for row in data["rows"]:
+        studies[row["study"]].append(row)
+    for rows in studies.values():
+        rows.sort(key=lambda row: (is_missing(row), not row["reached"], row["objective"]))
+    return studies
+
+
+def is_missing(row: Row) -> bool:
+    """Return whether a row has no periodic motion."""
+    return not np.isfinite(row["objective"])
+
+
+def title(name: str, reference: Row) -> str:
+    """Return a title for a housing: bore, area efficiency, and `name` of the reference config."""
+    shape = reference["geometry"]
+    return (
+        f"Bore {2 * shape['outer_radius_mm']:.1f} mm, area efficiency "
+        f"{shape['area_efficiency']:.4f} (those of {name}.yaml)"
+    )
+
+
+def print_tables(data: dict[str, Any]) -> None:
+    """Print the ranking for each housing, and designs with their forces in further scenes."""
+    for name, rows in by_study(data).items():
+        forces = "{mean_force_N:.2f} N mean, {peak_force_N:.1f} N peak"
+        reference = data["references"][name]
+        said = forces.format(**reference["response"])
+        ranked = sum(row["reached"] and not is_missing(row) for row in rows)
+        show(
+            f"### {title(name, reference)}; the reference has {said}",
+            [
+                {
+                    "": str(place) if place <= ranked else "-",
+                    "family": f"`{row['family']}`",
+                    "objective": row["status"] if is_missing(row) else f"{row['objective']:.4f}",
+                    "forces": forces.format(**row),
+                    "area efficiency": f"{row['area_efficiency']:.4f}",
+                    "reachable": "{:.4f} to {:.4f}".format(
+                        *(row.get(f"{end}_efficiency", np.nan) for end in ("least", "most"))
+                    ),
+                    "seal, mm": f"{row['seal_width_mm']:.2f}",
+                    "undercut margin, mm": f"{row['undercut_margin_mm']:.2f}",
+                }
+                for place, row in enumerate(rows, 1)
+            ],
+        )
+        show(
+            "Designs, and their forces in further scenes",
+            [
+                {"family": f"`{row['family']}`", "design": _design_text(row)}
+                | {scene: f"{_forces_text(row, scene)}" for scene in SCENES}
+                for row in rows
+            ],
+        )
+
+
+def _design_text(row: Row) -> str:
+    if row["family"] == "free_form":
+        return f"started at `{row['begun_at']}`, {row['departure_um']:.0f} µm from it"
+    return ", ".join(f"{key} {value:.4g}" for key, value in row["design"].items()) or "(none)"
+
+
+def _forces_text(row: Row, scene: str) -> str:
+    mean, peak = (row[f"{scene}: {key}"] for key in FORCES)
+    return f"{mean:.2f}, {peak:.1f} N, {row[f'{scene}: status']}"
+
+
+def run(job: Run) -> None:
+    """Study all families in all housings, two at a time in their own processes.
+
+    Free forms come last. A reduced run takes the last housing and the families `QUICK`.
+    """
+    from experiments.families import figures
+
+    quick = job.quick
+    paths, families = (REFERENCES[-1:], QUICK) if quick else (REFERENCES, classical())
     tasks = list(itertools.product(paths, families))
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(
-        jobs, mp_context=context, initializer=start_process, initargs=(True,)
+        2, mp_context=context, initializer=start_process, initargs=(True,)
     ) as pool:
         pending = [pool.submit(one_family, *task, quick) for task in tasks]
         rows: list[Row] = []
         for (path, family), future in zip(tasks, pending, strict=True):
             row = future.result()
             found = "does not fit" if row is None else f"{row['objective']:.4f}, {row['status']}"
-            say(f"{Path(path).stem:8s} {family:18s} {found}")
+            job.say(f"{Path(path).stem:8s} {family:18s} {found}")
             rows += [row] if row else []
-        free = []
         for path in paths:
             own = [row for row in rows if row["study"] == Path(path).stem and row["reached"]]
-            own = [row for row in own if np.isfinite(row["objective"])]
+            own = [row for row in own if not is_missing(row)]
             starts = free_starts(own, 1 if quick else STARTS) if own else []
-            free.append([pool.submit(free_form, path, start, quick) for start in starts])
-        for futures in free:
-            found = [future.result() for future in futures]
-            for row in found:
-                say(f"{row['study']:8s} free_form {row['objective']:.4f} from {row['begun_at']}")
-            rows += sorted(found, key=lambda row: np.nan_to_num(row["objective"], nan=np.inf))[:1]
-    return {"references": references, "rows": rows}
+            free = [pool.submit(free_form, path, start, quick) for start in starts]
+            made = [future.result() for future in free]
+            for row in made:
+                job.say(f"{row['study']:8s} free_form {row['objective']:.4f}, {row['begun_at']}")
+            rows += sorted(made, key=lambda row: np.nan_to_num(row["objective"], nan=np.inf))[:1]
+    references = {Path(path).stem: reference_of(path)[1].record() for path in paths}
+    data = {"references": references, "rows": rows}
+    job.json("families.json", data)
+    job.csv("families.csv", rows, [key for key in rows[0] if key not in LONG])
+    job.figure("families.png", figures.ranking_figure(data))
+    job.figure("families_profiles.png", figures.profiles_figure(data))
+    job.figure("overview.png", figures.overview())
+    print_tables(data)

@@ -4,22 +4,22 @@ The baseline of the config is the projection of the best CIC. Both designs are m
 objective of `configs/cic.yaml`, relative to the paper's CIC.
 """
 
-import dataclasses
-from typing import Any
-
+import jax.numpy as jnp
 import numpy as np
+from matplotlib.figure import Figure
 
-from experiments._common.driver import NoResultError
-from experiments._common.scenes import CIC
+from experiments._common.driver import NoResultError, Run
+from experiments._common.scenes import CIC, shipped
 from experiments._common.simulation import evaluate, objective, profile_of
-from rootsopt.config import Config, load
+from experiments._common.style import BLUE, grid_below, sheet
+from experiments._common.tables import print_record, show
+from rootsopt.config import load
 from rootsopt.design.resemblance import likenesses
 from rootsopt.optimize.search import Search
 from rootsopt.profiles import Profile
 from rootsopt.profiles.departure import departure, flank_points
 from rootsopt.scene.families import with_design
 
-CONFIG = "configs/free.yaml"
 MM, UM = 1e-3, 1e-6
 
 
@@ -44,35 +44,56 @@ def signed_departures(profile: Profile, other: Profile) -> tuple[np.ndarray, np.
     return np.abs(points), away
 
 
-@dataclasses.dataclass(frozen=True)
-class Results:
-    """Results of the study.
+def comparison(start: Profile, found: Profile) -> Figure:
+    """Draw flanks, pressure angle, rate at which the pressure angle falls, and departure."""
+    made, axes = sheet(11, 7, 2, 2)
+    styles = {"best CIC": (start, "black", "--"), "free form from it": (found, BLUE, "-")}
+    for name, (profile, color, dashes) in styles.items():
+        line = {"color": color, "linestyle": dashes, "linewidth": 1.8, "label": name}
+        nu = jnp.linspace(0.0, profile.pitch_normal, 2001)
+        point = profile.addendum(nu)
+        axes[0, 0].plot(*(flank_points(profile) / MM).T, **line)
+        axes[0, 1].plot(np.degrees(point.beta), np.degrees(point.psi), **line)
+        axes[1, 0].plot(np.degrees(nu), 1 - np.asarray(profile.roll_rate(nu)), **line)
+    away = signed_departures(found, start)
+    axes[1, 1].plot(*away, color=BLUE, linewidth=1.8)
+    axes[1, 1].axhline(0, color="black", linewidth=0.9, linestyle="--")
+    pitch = float(start.pitch_radius) / MM
+    axes[1, 1].axvline(pitch, color="0.5", linewidth=0.9, linestyle=":")
+    axes[1, 1].annotate(
+        "pitch circle", (pitch, 0.02), (3, 0), xycoords=("data", "axes fraction"),
+        textcoords="offset points", fontsize=9,
+    )  # fmt: skip
+    axes[0, 0].set(xlabel="x (mm)", ylabel="y (mm)", title="Flank, tip to root", aspect="equal")
+    axes[0, 1].set(xlabel="roll angle β (°)", ylabel="pressure angle ψ (°)", ylim=(0, 95))
+    axes[0, 1].set_title("Pressure angle")
+    axes[1, 0].set(xlabel="normal angle ν (°)", ylabel="share τ = -dψ/dν")
+    axes[1, 0].set_title("The share τ that the coefficients set")
+    axes[1, 1].set(xlabel="radius (mm)", ylabel="normal distance (µm)")
+    axes[1, 1].set_title("Departure from the best CIC, positive outwards")
+    for ax in axes.ravel():
+        grid_below(ax)
+    handles, names = axes[0, 0].get_legend_handles_labels()
+    made.legend(handles, names, loc="outside lower center", ncols=2, frameon=False)
+    return made
 
-    Fields: the profiles before and after the search, the result of the search, the config with the
-    optimised design, and a record that compares both designs with the paper's.
+
+def run(job: Run) -> None:
+    """Optimise the free form, and compare it with its baseline and the paper's CIC.
+
+    Writes the config with the optimised design. Raises `NoResultError` if the search finds no
+    better design.
     """
-
-    start: Profile
-    found: Profile
-    config: Config
-    record: dict[str, Any]
-
-
-def run(quick: bool, config: str = CONFIG) -> Results:
-    """Optimise the free form of a config, and compare it with its baseline and the paper's CIC.
-
-    Raises `NoResultError` if the search finds no better design.
-    """
-    settings = load(config, ["optimizer.iterations=4"] if quick else [])
+    config = shipped("free", *(["optimizer.iterations=4"] if job.quick else []))
     paper = evaluate(load(CIC))
-    result = Search(settings).run()
+    result = Search(config).run()
     if result.optimized is None:
         raise NoResultError("the search found nothing better; raise optimizer.iterations")
     start, found = (
-        profile_of(settings, list(one.design.values()))
-        for one in (result.baseline, result.optimized)
+        profile_of(config, list(one.design.values())) for one in (result.baseline, result.optimized)
     )
-    profile = with_design(settings.profile, list(result.optimized.design.values()))
+    profile = with_design(config.profile, list(result.optimized.design.values()))
+    job.folder.write_text("freeform.yaml", config.model_copy(update={"profile": profile}).to_yaml())
     designs = {"paper": paper, "best CIC": result.baseline, "free form": result.optimized}
     record = {
         "designs": {
@@ -82,6 +103,9 @@ def run(quick: bool, config: str = CONFIG) -> Results:
         "evaluations": len(result.history),
         "optimality": {} if result.optimality is None else result.optimality.record(),
         "departure_um": departure(found, start) / UM,
-        "resembles": [] if quick else [one.record() for one in likenesses(found)],
+        "resembles": [] if job.quick else [one.record() for one in likenesses(found)],
     }
-    return Results(start, found, settings.model_copy(update={"profile": profile}), record)
+    job.json("freeform.json", record)
+    job.figure("freeform.png", comparison(start, found))
+    show("Designs", [{"design": name, **row} for name, row in record["designs"].items()])
+    print_record({key: record[key] for key in record if key != "designs"})

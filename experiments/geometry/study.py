@@ -7,14 +7,15 @@ polygons, each with half the spacing of the last, are extrapolated (Romberg).
 """
 
 import functools
-from collections.abc import Callable
-from typing import Any
+import itertools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from experiments._common.driver import Run
+from experiments._common.tables import Row, show
 from rootsopt.config import FAMILY_KEYS
 from rootsopt.config.families import family_of, parameters
 from rootsopt.config.units import DEG, MM
@@ -23,7 +24,6 @@ from rootsopt.profiles.cic import CIC
 from rootsopt.profiles.validity import PURE, margins
 from rootsopt.scene.families import profile_of
 
-Row = dict[str, Any]
 RADIUS_MM = 33.0
 LOBES = (2, 3, 4, 5, 6)
 FAMILIES = tuple(family for family in FAMILY_KEYS if family != "outline")
@@ -31,8 +31,8 @@ COEFFICIENTS = (3, 8, 24)
 """Numbers of coefficients for which free forms are drawn."""
 QUICK = ("cic", "ee", "arc"), (2, 3)
 """Families and lobes of a reduced run."""
-QUICK_DRAWS = 50
-"""Number of designs drawn per family and number of lobes in a reduced run."""
+DRAWS, QUICK_DRAWS = 2000, 50
+"""Number of designs drawn per family and number of lobes: in a full and in a reduced run."""
 _LEVELS = 4
 _SHORT, _SPAN, _WHOLE = 64, 512, 2048
 """Number of sides of the finest polygon: per interval of a curve, per knot span of a free form, and
@@ -195,31 +195,6 @@ def errors(family: str, lobes: int, count: int, random: np.random.Generator, siz
     return kept, np.asarray(compared(family, lobes, padded))[: len(kept)]
 
 
-def run(
-    quick: bool,
-    draws: int = 2000,
-    seed: int = 0,
-    say: Callable[[str], None] = lambda text: None,
-) -> list[Row]:
-    """Compare all families; return a row per family, number of coefficients and number of lobes.
-
-    `draws`: number of random designs per row. A reduced run takes the families and lobes of
-    `QUICK`, and few designs.
-    """
-    families, lobes = (FAMILIES, LOBES) if not quick else QUICK
-    random = np.random.default_rng(seed)
-    rows: list[Row] = []
-    for family in families:
-        for size in COEFFICIENTS if family == "free_form" else (0,):
-            for number in lobes:
-                count = QUICK_DRAWS if quick else draws
-                found = errors(family, number, count, random, size)
-                rows.append(row_of(family, number, size, *found))
-                worst = np.max(found[1], initial=0.0)
-                say(f"{rows[-1]['family']}, {number} lobes: {len(found[0])} sound, {worst:.1e}")
-    return rows
-
-
 def row_of(family: str, lobes: int, size: int, designs: np.ndarray, found: np.ndarray) -> Row:
     """Return a row with the largest errors among valid designs (n, d), and the design with the
     worst.
@@ -237,3 +212,22 @@ def row_of(family: str, lobes: int, size: int, designs: np.ndarray, found: np.nd
     values = [] if worst is None else designs[worst]
     row["worst_design"] = " ".join(f"{x:.9g}" for x in values) if FAMILY_KEYS[family] else ""
     return row
+
+
+def run(job: Run) -> None:
+    """Compare all families; write a row per family, number of coefficients and number of lobes.
+
+    A reduced run takes the families and lobes of `QUICK`, and few designs.
+    """
+    families, lobes = QUICK if job.quick else (FAMILIES, LOBES)
+    random = np.random.default_rng(0)
+    rows: list[Row] = []
+    for family in families:
+        sizes = COEFFICIENTS if family == "free_form" else (0,)
+        for size, number in itertools.product(sizes, lobes):
+            found = errors(family, number, QUICK_DRAWS if job.quick else DRAWS, random, size)
+            rows.append(row_of(family, number, size, *found))
+            worst = np.max(found[1], initial=0.0)
+            job.say(f"{rows[-1]['family']}, {number} lobes: {len(found[0])} sound, {worst:.1e}")
+    job.csv("geometry.csv", rows)
+    show("Area and inertia against polygons", rows)

@@ -8,23 +8,23 @@ one direction of the design are compared with central differences of the forces 
 with another method (dopri8) at 1e-12.
 """
 
-import csv
-import dataclasses
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from matplotlib.figure import Figure
 
+from experiments._common.driver import Run
 from experiments._common.scenes import CIC, FORCES
 from experiments._common.shooting import closed, differentiated
 from experiments._common.simulation import evaluator_of
+from experiments._common.style import COLORS, sheet
+from experiments._common.tables import Row, show
 from rootsopt.config import load
 from rootsopt.dynamics.verdict import agreement
 from rootsopt.response.evaluation import Evaluation, Evaluator
 
-Row = dict[str, Any]
 TOLERANCES = (1e-8, 1e-9, 1e-10)
 MEASURES = (*FORCES, "rms_force_N")
 """Names of the forces whose gradients are compared."""
@@ -181,18 +181,6 @@ def rows_of(
     return rows
 
 
-@dataclasses.dataclass(frozen=True)
-class Draw:
-    """Choice of random pairs: their number, the seed, and a part of the kinds.
-
-    `part` (k, n): every n-th kind, starting with the k-th.
-    """
-
-    count: int = 200
-    seed: int = 0
-    part: tuple[int, int] = (0, 1)
-
-
 def wanted_of(quick: bool, count: int) -> dict[str, int]:
     """Return the number of pairs of each kind. Half of the pairs are of the kind `FULL`.
 
@@ -202,28 +190,6 @@ def wanted_of(quick: bool, count: int) -> dict[str, int]:
     kinds = [kind for kind in KINDS if kind not in (FULL, LONG)]
     share = count // 2 // len(kinds)
     return {FULL: count - share * len(kinds)} | dict.fromkeys(kinds, share) | {LONG: count // 20}
-
-
-def run(
-    quick: bool,
-    draw: Draw | None = None,
-    say: Callable[[str], None] = lambda text: None,
-    keep: Callable[[list[Row]], None] = lambda rows: None,
-) -> list[Row]:
-    """Measure the pairs chosen by `draw`; return three rows per pair, one per tolerance.
-
-    After each pair, `keep` is called with all rows so far. A reduced run measures four pairs of one
-    kind.
-    """
-    draw = draw or Draw()
-    part, parts = draw.part
-    wanted = wanted_of(quick, QUICK_COUNT if quick else draw.count)
-    rows: list[Row] = []
-    for kind in list(wanted)[part::parts]:
-        for new in pairs_of_kind(kind, wanted[kind], draw.seed, say):
-            rows += new
-            keep(rows)
-    return rows
 
 
 def pairs_of_kind(
@@ -253,95 +219,91 @@ def pairs_of_kind(
         yield new
 
 
-def read(folder: Path) -> list[dict[str, Any]]:
-    """Read the rows of all parts from the result folder."""
-    rows = []
-    for path in sorted(folder.glob("gradients_*.csv")):
-        with open(path, newline="") as file:
-            rows += list(csv.DictReader(file))
-    return rows
+def errors_of(rows: Sequence[Row]) -> Figure:
+    """Draw the gradient error over the estimate of its check, and its distribution by tolerance."""
+    picture, axes = sheet(10, 4.2, 1, 2)
+    left, right = axes[0]
+    for rtol, color, marker in zip(TOLERANCES, COLORS[:3], "os^", strict=True):
+        good = [r for r in rows if r["rtol"] == rtol and r["status"] == "periodic"]
+        off = np.array([[r[f"{name}_error"] for name in MEASURES] for r in good]).ravel()
+        said = np.repeat([r["gradient_disagreement"] for r in good], len(MEASURES))
+        kept = np.isfinite(off)
+        left.loglog(said[kept], off[kept], marker, color=color, ms=3, alpha=0.5, label=f"{rtol:g}")
+        for name, style in zip(FORCES, ("-", "--"), strict=True):
+            errors = np.sort([r[f"{name}_error"] for r in good])
+            errors = errors[np.isfinite(errors)]
+            share = 100 * (np.arange(errors.size) + 1) / errors.size
+            what = name.split("_")[0]
+            right.semilogx(errors, share, style, color=color, label=f"{what}, rtol {rtol:g}")
+    left.plot([1e-9, 1e-2], [1e-9, 1e-2], "k:", lw=1, label="equal")
+    left.set(
+        xlabel="gradient_disagreement (relative)",
+        ylabel="error of the gradients of mean, peak, RMS\nagainst differences (relative)",
+        title="Check against error",
+    )
+    left.legend(title="solver.rtol")
+    right.set(
+        xlabel="error of the gradient against differences (relative)",
+        ylabel="share of design–scene pairs below (%)",
+        title="Errors, mean and peak force",
+        ylim=(0, 100),
+    )
+    right.legend(fontsize=8)
+    for ax in (left, right):
+        ax.grid(alpha=0.3)
+    return picture
 
 
-@dataclasses.dataclass(frozen=True)
-class Judgement:
-    """Summary of all pairs: counts by period, quantiles of the errors, broken promises.
+def run(job: Run) -> bool:
+    """Measure random pairs; write three rows per pair, one per tolerance, after each pair.
 
-    `errors`: rtol → (periodic pairs, all pairs, force → (median, 95 % quantile, maximum, number of
-    gradients compared)). `ratios`: median, 95 % and 99 % quantile and maximum of the errors
-    relative to the `gradient_disagreement`; noise of the differences is no error. `broken`: a line
-    for each gradient whose error exceeds the limit of its check, for each pair that has a result at
-    one tolerance but none at a finer tolerance, and if too many errors exceed the
-    `gradient_disagreement`.
-    """
-
-    pairs: int
-    periods: dict[int, int]
-    errors: dict[float, tuple[int, int, dict[str, tuple[float, float, float, int]]]]
-    ratios: tuple[float, ...]
-    broken: list[str]
-
-    def lines(self) -> Iterator[str]:
-        """Yield the lines of the table, as text."""
-        yield f"{self.pairs} pairs"
-        yield f"periods: {self.periods}"
-        for rtol, (good, count, forces) in self.errors.items():
-            parts = [f"rtol {rtol:g}: {good} periodic of {count}"]
-            for name, (median, most, worst, compared) in forces.items():
-                parts.append(
-                    f"{name}: median {median:.1e}, 95 % {most:.1e}, maximum {worst:.1e}"
-                    f" ({compared} compared)"
-                )
-            yield "; ".join(parts)
-        quantiles = ", ".join(f"{ratio:.1e}" for ratio in self.ratios)
-        yield f"error / disagreement: median, 95 %, 99 %, maximum {quantiles}"
-        yield from self.broken
-        yield f"{len(self.broken)} promises broken"
+    A reduced run measures four pairs of one kind. Returns whether all promises are kept."""
+    wanted = wanted_of(job.quick, QUICK_COUNT if job.quick else job.options.count)
+    rows: list[Row] = []
+    for kind, count in wanted.items():
+        for new in pairs_of_kind(kind, count, job.options.seed, job.say):
+            rows += new
+            job.csv("gradients.csv", rows)
+    job.figure("gradients.png", errors_of(rows))
+    table, broken = judge(rows)
+    show("Largest error of the gradients of mean, peak and RMS", table)
+    print(*broken, f"{len(broken)} promises broken", sep="\n")
+    return not broken
 
 
-def judge(rows: Sequence[Row]) -> Judgement:
-    """Summarise the rows of all parts, and compare errors with the promises of the checks."""
-    scenes: dict[str, dict[float, Row]] = {}
-    for row in rows:
-        scenes.setdefault(row["scene"], {})[float(row["rtol"])] = row
-    periods = sorted(int(float(found[TOLERANCES[0]]["period"])) for found in scenes.values())
-    errors, broken = {}, []
+def judge(rows: Sequence[Row]) -> tuple[list[Row], list[str]]:
+    """Return the table of errors by tolerance, and a line for each broken promise.
+
+    Promises are broken by a gradient whose error exceeds the limit of its check, by a pair that has
+    a result at one tolerance but none at a finer tolerance, and by too many errors above the
+    `gradient_disagreement`. The noise of the differences is no error."""
+    table, broken = [], []
+    ratios: list[float] = []
     for rtol in TOLERANCES:
-        mine = [found[rtol] for found in scenes.values()]
+        mine = [row for row in rows if row["rtol"] == rtol]
         good = [row for row in mine if row["status"] == "periodic"]
-        quantiles = {}
-        for name in MEASURES:
-            off = np.array([float(row[f"{name}_error"]) for row in good])
-            off = off[np.isfinite(off)]
-            shares = np.quantile(off, [0.5, 0.95, 1.0]).tolist() if off.size else [np.nan] * 3
-            quantiles[name] = (*shares, off.size)
-        errors[rtol] = len(good), len(mine), quantiles
+        off, noise = (
+            np.array([row[f"{name}_{what}"] for row in good for name in MEASURES])
+            for what in ("error", "noise")
+        )
+        off, noise = off.reshape(-1, len(MEASURES)), noise.reshape(-1, len(MEASURES))
         limit = float(agreement(jnp.asarray(rtol)))
-        for row in good:
-            beyond = [float(row[f"{k}_error"]) - float(row[f"{k}_noise"]) for k in MEASURES]
-            worst = np.nanmax([0.0, *beyond])
-            if worst > limit:
-                broken.append(f"OFF {rtol} {worst} {row['scene']}")
-    for scene, found in scenes.items():
-        usable = [found[rtol]["status"] == "periodic" for rtol in TOLERANCES]
-        if usable[0] and not all(usable):
-            broken.append(f"WORSE {[found[rtol]['status'] for rtol in TOLERANCES]} {scene}")
-    ratios = ratios_of(rows)
-    if ratios.size and np.mean(ratios > 1) > BEYOND:
-        broken.append(f"UNBOUNDED {100 * np.mean(ratios > 1):.1f} % of {ratios.size} gradients")
-    shares = np.quantile(ratios, [0.5, 0.95, 0.99, 1.0]) if ratios.size else np.full(4, np.nan)
-    counts = {k: periods.count(k) for k in dict.fromkeys(periods)}
-    return Judgement(len(scenes), counts, errors, tuple(shares.tolist()), broken)
-
-
-def ratios_of(rows: Sequence[Row]) -> np.ndarray:
-    """Return the errors of all gradients, less the noise of the differences, relative to the
-    `gradient_disagreement`."""
-    found = [
-        (float(row[f"{name}_error"]), float(row[f"{name}_noise"]), row["gradient_disagreement"])
-        for row in rows
-        if row["status"] == "periodic"
-        for name in MEASURES
-    ]
-    off, noise, said = np.array(found, dtype=float).reshape(-1, 3).T
-    ratios = np.maximum(off - noise, 0.0) / said
-    return ratios[np.isfinite(ratios)]
+        for row, beyond in zip(good, np.maximum(off - noise, 0.0), strict=True):
+            ratios += (beyond / row["gradient_disagreement"]).tolist()
+            if np.nanmax([0.0, *beyond]) > limit:
+                broken.append(f"OFF {rtol} {np.nanmax(beyond)} {row['scene']}")
+        worst = np.nanmax(off, axis=1)
+        worst = worst[np.isfinite(worst)]
+        shares = np.quantile(worst, [0.5, 0.75, 0.95, 1.0]).tolist() if worst.size else [np.nan] * 4
+        names = "median", "75_%_below", "95_%_below", "maximum"
+        counts = {"rtol": f"{rtol:g}", "pairs": len(mine), "periodic": len(good)}
+        table.append(counts | dict(zip(names, shares, strict=True)))
+    for scene in dict.fromkeys(row["scene"] for row in rows):
+        ends = [row["status"] for row in rows if row["scene"] == scene]
+        if ends[0] == "periodic" and set(ends) != {"periodic"}:
+            broken.append(f"WORSE {ends} {scene}")
+    known = [ratio for ratio in ratios if np.isfinite(ratio)]
+    if known and np.mean(np.array(known) > 1) > BEYOND:
+        share = 100 * np.mean(np.array(known) > 1)
+        broken.append(f"UNBOUNDED {share:.1f} % of {len(known)} gradients")
+    return table, broken

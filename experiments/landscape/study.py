@@ -7,29 +7,36 @@ the best designs that lie apart. Points outside the constraints are moved onto t
 step uses the gradient of the objective. The best design of all grids is simulated at the full
 tolerance, and compared with the result of `rootsopt optimize`."""
 
-import dataclasses
 import itertools
 import os
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from experiments._common.driver import NoResultError
+from experiments._common.driver import NoResultError, Run
 from experiments._common.scenes import CIC
+from experiments._common.style import VERMILION, sheet
+from experiments._common.tables import Row, show
 from rootsopt.config import load
+from rootsopt.optimize.outcome import Optimization
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.search import Search
 
-Row = dict[str, Any]
 GRID = 6
 """Number of points along each axis of the coarsest grid."""
 QUICK_GRID = 5
 """Number of points along each axis in a reduced run."""
+DESIGNS = 400
+"""Minimum number of designs of the first grid."""
+SEEDS, QUICK_SEEDS = 10, 2
+"""Number of seeds of the screening: in a full run, and in a reduced run."""
 QUICK = (
     "optimizer.screening=4",
     "optimizer.starts=1",
@@ -44,28 +51,6 @@ AGREES = 1e-3
 """Relative difference of the objectives below which optimum and grid agree."""
 SAME = 1e-5
 """Relative range of the objectives below which runs with different seeds agree."""
-
-
-class Case(NamedTuple):
-    """A scene of the study: its name, and the overrides of the config."""
-
-    name: str
-    overrides: tuple[str, ...]
-
-
-CASES = (
-    Case("3000 rpm", ()),
-    Case("5000 rpm", ("scene.speed_rpm=5000",)),
-    Case("peak alone, wide backlash",
-         ("objective.mean_weight=0", "scene.timing_gear.backlash_mm=0.2")),
-    Case("RMS, little damping", (
-        "objective.mean_weight=0", "objective.peak_weight=0", "objective.rms_weight=1",
-        "scene.timing_gear.damping_ratio=0.2")),
-    Case("worst of two speeds", (
-        "objective.speeds_rpm=[2500, 3500]", "objective.over_speeds=worst")),
-)  # fmt: skip
-QUICK_CASES = 1
-"""Number of scenes in a reduced run."""
 
 
 def feasible_grid(problem: Problem, wanted: int, first: int = GRID) -> tuple[np.ndarray, float]:
@@ -128,128 +113,136 @@ def finer(
     return np.unique(np.round(np.array(found).reshape(-1, 3), 12), axis=0)
 
 
-@dataclasses.dataclass(frozen=True)
-class Results:
-    """Results in one scene: a row per design of the grids, and the optimum with its objective.
-
-    `name`: that of the scene; `grid_best`: objective of the best design of all grids at the full
-    tolerance; `evaluations`: designs of the optimiser; `converged`: whether its design has a
-    certificate; `optima`: number of distinct optima that it found; `seconds`: run time of the
-    grids."""
-
-    name: str
-    rows: list[Row]
-    design: dict[str, float]
-    objective: float
-    grid_best: float
-    evaluations: int
-    converged: bool
-    optima: int
-    seconds: float
-
-    @property
-    def best(self) -> Row:
-        """Best design of all grids."""
-        return min(self.rows, key=lambda row: np.nan_to_num(row["objective"], nan=np.inf))
-
-    def record(self) -> dict[str, Any]:
-        """Return a comparison of the optimum with the best design of the grids."""
-        values = np.array([row["objective"] for row in self.rows])
-        first = np.array([row["level"] for row in self.rows]) == 0
-        return {
-            "scene": self.name,
-            "grid_designs": int(first.sum()),
-            "finer_designs": int((~first).sum()),
-            "without_steady_state": int(np.isnan(values).sum()),
-            "first_grid_best": float(np.nanmin(values[first])),
-            "grid_best": self.grid_best,
-            "optimizer": self.objective,
-            "optimizer_over_grid_best": self.objective / self.grid_best - 1,
-            "optimizer_designs": self.evaluations,
-            "certified": self.converged,
-            "optima": self.optima,
-            "agrees": bool(self.objective <= (1 + AGREES) * self.grid_best),
-            "grid_design": {key: self.best[key] for key in self.design},
-            "optimizer_design": self.design,
-            "seconds": self.seconds,
-        }
+NAMES = {
+    "pressure_angle_deg": "pressure angle (°)",
+    "involute_length_mm": "involute length (mm)",
+    "tip_arc_angle_deg": "tip arc angle (°)",
+}
+CASES: dict[str, tuple[str, ...]] = {
+    "3000 rpm": (),
+    "5000 rpm": ("scene.speed_rpm=5000",),
+    "peak alone, wide backlash": (
+        "objective.mean_weight=0", "scene.timing_gear.backlash_mm=0.2"),
+    "RMS, little damping": (
+        "objective.mean_weight=0", "objective.peak_weight=0", "objective.rms_weight=1",
+        "scene.timing_gear.damping_ratio=0.2"),
+    "worst of two speeds": (
+        "objective.speeds_rpm=[2500, 3500]", "objective.over_speeds=worst"),
+}  # fmt: skip
+"""Overrides of the config by scene. A reduced run has the first scene only."""
+SHOWN = (
+    *("scene", "grid_designs", "finer_designs", "without_steady_state", "first_grid_best"),
+    *("grid_best", "optimizer", "optimizer_over_grid_best", "optimizer_designs", "certified"),
+    "optima",
+)
+"""Columns of the printed table."""
 
 
-def compared(config: str, case: Case, quick: bool, designs: int) -> Results:
-    """Optimise in one scene, and simulate grids of designs.
+def searched(quick: bool, *overrides: str) -> tuple[Search, Optimization]:
+    """Optimise the shipped pair with `overrides`. Return the search and its result."""
+    search = Search(load(CIC, [*(QUICK if quick else ()), *overrides]))
+    return search, search.run()
 
-    Raises `NoResultError` if the optimiser finds no design better than the baseline.
+
+def compared(name: str, quick: bool) -> tuple[Row, list[Row]]:
+    """Optimise in the scene `name`, and simulate grids of designs.
+
+    Returns a record of the comparison, and a row per design of the grids. Raises `NoResultError` if
+    the optimiser finds no design better than the baseline.
     """
-    search = Search(load(config, [*(QUICK if quick else ()), *case.overrides]))
-    result = search.run()
-    if result.problem is None or result.optimized is None:
-        raise NoResultError(f"{case.name}: the optimiser has no result: {result.verification}")
-    began = time.perf_counter()
-    problem = result.problem
-    first, wanted = (QUICK_GRID, 1) if quick else (GRID, designs)
-    points, spacing = feasible_grid(problem, wanted, first)
+    search, result = searched(quick, *CASES[name])
+    problem, optimum, known = result.problem, result.optimized, result.optimality
+    if problem is None or optimum is None:
+        raise NoResultError(f"{name}: the optimiser has no result: {result.verification}")
+    points, spacing = feasible_grid(problem, *((1, QUICK_GRID) if quick else (DESIGNS, GRID)))
     rows = survey(search, points, 0)
     for level in range(1, 1 + (QUICK_LEVELS if quick else LEVELS)):
         spacing /= 2
-        values = np.array([row["objective"] for row in rows])
-        new = finer(problem, points, values, spacing)
+        new = finer(problem, points, np.array([row["objective"] for row in rows]), spacing)
         rows += survey(search, new, level)
         points = np.concatenate([points, new])
+    values, first = np.array([(row["objective"], row["level"] == 0) for row in rows]).T
+    first, place = first.astype(bool), int(np.nanargmin(values))
+    best = problem.objective(search.exact(problem.design(points[place]), series=False))
+    own = problem.objective(optimum)
+    return {
+        "scene": name,
+        "grid_designs": int(first.sum()),
+        "finer_designs": int((~first).sum()),
+        "without_steady_state": int(np.isnan(values).sum()),
+        "first_grid_best": float(np.nanmin(values[first])),
+        "grid_best": best,
+        "optimizer": own,
+        "optimizer_over_grid_best": own / best - 1,
+        "optimizer_designs": len(result.history),
+        "certified": known is not None and known.converged,
+        "optima": 0 if known is None else len(known.optima),
+        "agrees": bool(own <= (1 + AGREES) * best),
+        "grid_design": {key: rows[place][key] for key in optimum.design},
+        "optimizer_design": optimum.design,
+    }, rows
+
+
+def designs(found: Sequence[tuple[Row, list[Row]]]) -> Figure:
+    """Draw the objective over each pair of parameters, with the best designs on top.
+
+    One row per scene."""
+    figure, axes = sheet(11, 0.6 + 2.7 * len(found), len(found), 3)
+    for (record, rows), line in zip(found, axes, strict=True):
+        _scene(figure, record, rows, line)
+    for ax, (x, _) in zip(axes[-1], itertools.combinations(NAMES, 2), strict=True):
+        ax.set_xlabel(NAMES[x])
+    return figure
+
+
+def _scene(figure: Figure, record: Row, rows: list[Row], axes: Any) -> None:
+    """Draw one scene in a row of axes."""
     values = np.array([row["objective"] for row in rows])
-    best = search.exact(problem.design(points[np.nanargmin(values)]), series=False)
-    optimality = result.optimality
-    return Results(
-        name=case.name,
-        rows=rows,
-        design=result.optimized.design,
-        objective=problem.objective(result.optimized),
-        grid_best=problem.objective(best),
-        evaluations=len(result.history),
-        converged=optimality is not None and optimality.converged,
-        optima=0 if optimality is None else len(optimality.optima),
-        seconds=time.perf_counter() - began,
+    low, high = np.nanmin(values), np.nanpercentile(values, 95)
+    order = np.argsort(-np.where(np.isnan(values), np.inf, values))
+    good = ~np.isnan(values[order])
+    star = {"marker": "*", "ms": 15, "mfc": "none", "mec": VERMILION, "mew": 1.8}
+    marks = ("optimizer", star), ("grid", {"marker": "+", "ms": 9, "color": "black"})
+    labels = (
+        f"optimiser: {record['optimizer']:.4f}",
+        f"best of the grids: {record['grid_best']:.4f}",
     )
+    for ax, (x, y) in zip(axes, itertools.combinations(NAMES, 2), strict=True):
+        px, py = (np.array([row[k] for row in rows])[order] for k in (x, y))
+        if not good.all():
+            ax.plot(px[~good], py[~good], "x", color="0.6", ms=3, label="no steady state")
+        ax.scatter(px[good], py[good], c=values[order][good], s=9, vmin=low, vmax=high)
+        for (name, style), label in zip(marks, labels, strict=True):
+            best = record[f"{name}_design"]
+            ax.plot(best[x], best[y], ls="", label=label, **style)
+        ax.set_ylabel(NAMES[y])
+    axes[0].set_title(record["scene"], loc="left", fontsize=10)
+    axes[0].legend(loc="best", fontsize=7)
+    shades = ScalarMappable(Normalize(low, high), "viridis")
+    figure.colorbar(shades, ax=axes[-1], label="objective")
 
 
-def by_seed(config: str, seeds: int, quick: bool) -> list[Row]:
-    """Optimise a config once for each seed of its screening; return a row per run."""
-    rows = []
-    for seed in range(seeds):
-        search = Search(load(config, [*(QUICK if quick else ()), f"optimizer.seed={seed}"]))
-        result = search.run()
-        known = result.optimality
-        rows.append(
-            {
-                "seed": seed,
-                "objective": 1 - result.improvement.get("objective", np.nan),
-                "residual": np.nan if known is None else known.certificate.residual,
-                "optima": 0 if known is None else len(known.optima),
-                "designs": len(result.history),
-                "status": result.status.label,
-            }
-        )
-    return rows
+def run(job: Run) -> bool:
+    """Optimise in every scene, simulate a grid in each, and search with several seeds.
 
-
-def spread(rows: list[Row]) -> float:
-    """Return the range of the objectives of `by_seed`, relative to the least one."""
-    values = [row["objective"] for row in rows]
-    return float(np.ptp(values) / np.min(values))
-
-
-def run(
-    quick: bool,
-    config: str = CIC,
-    designs: int = 400,
-    say: Callable[[str], None] = lambda text: None,
-) -> list[Results]:
-    """Optimise a config in every scene, and simulate a grid of at least `designs` designs in each.
-
-    Raises `NoResultError` if the optimiser finds no design better than the baseline.
-    """
+    Returns whether the optimum is that of the grids in every scene, for every seed."""
     found = []
-    for case in CASES[: QUICK_CASES if quick else None]:
-        found.append(compared(config, case, quick, designs))
-        record: Mapping[str, Any] = found[-1].record()
-        say(f"{case.name}: grid {record['grid_best']:.6f}, optimiser {record['optimizer']:.6f}")
-    return found
+    for name in list(CASES)[: 1 if job.quick else None]:
+        found.append(compared(name, job.quick))
+        record = found[-1][0]
+        job.say(f"{name}: {record['grid_best']:.6f}, optimiser {record['optimizer']:.6f}")
+    seeds = []
+    for seed in range(QUICK_SEEDS if job.quick else SEEDS):
+        _, result = searched(job.quick, f"optimizer.seed={seed}")
+        own = 1 - result.improvement.get("objective", np.nan)
+        seeds.append({"seed": seed, "objective": own, "designs": len(result.history)})
+    values = [row["objective"] for row in seeds]
+    apart = float(np.ptp(values) / np.min(values))
+    records = [record for record, _ in found]
+    job.csv("landscape.csv", [{"scene": r["scene"], **row} for r, rows in found for row in rows])
+    job.json("landscape.json", {"scenes": records, "seeds": seeds, "range_over_seeds": apart})
+    job.figure("landscape.png", designs(found))
+    exact = [r | {key: f"{r[key]:.6f}" for key in ("grid_best", "optimizer")} for r in records]
+    show("Objective of the best design, baseline = 1", exact, SHOWN)
+    print(f"searches with different seeds: relative range {apart:.1e}")
+    return all(record["agrees"] for record in records) and (job.quick or apart <= SAME)

@@ -6,19 +6,22 @@ of each lobe, and noise. They are in clockwise order, and turned by an angle. Th
 family `outline`.
 """
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
+from experiments._common.driver import Run
 from experiments._common.polygons import signed_distance
 from experiments._common.scenes import CIC
 from experiments._common.simulation import evaluate, profile_of
+from experiments._common.style import BLUE, GREY, grid_below, sheet
+from experiments._common.tables import print_record
 from rootsopt.config import Config, load
-from rootsopt.measured.conjugacy import Conjugacy, conjugacy
+from rootsopt.figures.profiles import plot_conjugacy
+from rootsopt.measured.conjugacy import conjugacy, gaps_um
 from rootsopt.measured.source import outline_of
-from rootsopt.output.files import ResultFolder
 from rootsopt.profiles import Profile, outline
 from rootsopt.scene import check_geometry, design_keys
 
@@ -64,44 +67,54 @@ def off_um(points: np.ndarray, design: Profile) -> np.ndarray:
     return 1e3 * signed_distance(np.stack([np.real(points), np.imag(points)], axis=1), fine)
 
 
-@dataclasses.dataclass(frozen=True)
-class Results:
-    """Results of the study.
+def deviations(design: Profile, profile: Profile, points: np.ndarray, gaps: Any) -> Figure:
+    """Draw the deviation from the design over the radius, and the gap in rolling.
 
-    Fields: both profiles, the measured points in the axes of the design (mm), the gaps in rolling
-    by name, and the record of all numbers.
-    """
+    `profile`: that of the measured `points` (complex, mm); `gaps`: gaps in rolling, by name."""
+    made, axes = sheet(11, 4.2, 1, 2)
+    left, right = axes[0]
+    left.plot(np.abs(points), off_um(points, design), ".", color=GREY, ms=2, label="points")
+    fitted = complex_points(profile, 240)
+    fitted = fitted[(np.angle(fitted) >= 0) & (np.angle(fitted) <= np.pi / design.lobes)]
+    left.plot(np.abs(fitted), off_um(fitted, design), color=BLUE, label="flank that is simulated")
+    pitch = float(design.pitch_radius) / MM
+    left.axvline(pitch, color="black", ls="--", lw=0.9)
+    left.annotate(
+        "pitch circle", (pitch, 0.97), (3, 0), ha="left", va="top",
+        xycoords=("data", "axes fraction"), textcoords="offset points", fontsize=9,
+    )  # fmt: skip
+    left.set(xlabel="radius (mm)", ylabel="deviation, outwards (µm)", title="From the design")
+    grid_below(left)
+    left.legend(frameon=False, loc="upper left")
+    plot_conjugacy(right, {name: gaps_um(one) for name, one in gaps.items()})
+    right.legend(frameon=False)
+    return made
 
-    config: Config
-    design: Profile
-    profile: Profile
-    points: np.ndarray
-    gaps: dict[str, Conjugacy]
-    record: dict[str, Any]
 
-
-def run(quick: bool, folder: ResultFolder, config: str = CIC) -> Results:
+def run(job: Run) -> None:
     """Make a measured rotor, import it, and compare it with its design.
 
-    The points are written into `folder` as measured.csv, which the import reads. A reduced run
-    omits the simulations.
+    The points are written as measured.csv, which the import reads. A reduced run omits the
+    simulations.
     """
-    settings = load(config)
+    settings = load(CIC)
     design = profile_of(settings)
     points = measured(design)
     columns = {"x_mm": np.real(points), "y_mm": np.imag(points)}
-    other = imported(settings, folder.write_csv("measured.csv", columns).absolute())
+    other = imported(settings, job.folder.write_csv("measured.csv", columns).absolute())
     check_geometry(other)
     profile, checks = outline_of(other.profile)
     gaps = {"design": conjugacy(design), "measured": conjugacy(profile)}
-    own = points * np.exp(1j * np.radians(checks.turned_deg))
     record: dict[str, Any] = {
         "outline": checks.record() | gaps["measured"].record(),
         "form_found_um": float(np.max(off_um(complex_points(profile, 240), design))),
         "form_given_um": FORM / MM,
     }
-    if not quick:
-        for name, one in (("design", settings), ("measured", other)):
-            evaluation = evaluate(one)
-            record[name] = {"status": evaluation.status.label} | evaluation.response
-    return Results(settings, design, profile, own, gaps, record)
+    simulated = {} if job.quick else {"design": settings, "measured": other}
+    for name, one in simulated.items():
+        found = evaluate(one)
+        record[name] = {"status": found.status.label} | found.response
+    own = points * np.exp(1j * np.radians(checks.turned_deg))
+    job.figure("measured.png", deviations(design, profile, own, gaps))
+    job.json("measured.json", record)
+    print_record(record)

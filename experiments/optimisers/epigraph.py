@@ -126,6 +126,3 @@ class Epigraph:
             if place >= 0:
                 slots[place], self.used[k][place] = group.tags[branch], self.evaluations
         return places
-
-
-__all__ = ["SCALE", "Epigraph"]

@@ -5,21 +5,26 @@ exact gradients, start at the baseline and end when their evaluations run out. T
 value that any of them reaches counts as the optimum.
 """
 
-import dataclasses
+import contextlib
 import importlib.util
 import time
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.optimize import BFGS, NonlinearConstraint, minimize
 
+from experiments._common.driver import Run
+from experiments._common.tables import show
 from experiments.optimisers.epigraph import SCALE, Epigraph
 from rootsopt.config import load
+from rootsopt.figures.style import COLORS, DASHES, figure
 from rootsopt.optimize.certificate import certify
 from rootsopt.optimize.local import Linearization, Look
 from rootsopt.optimize.problem import FEASIBLE, Problem
@@ -79,9 +84,16 @@ def sqp(look: "Recorder", start: NDArray[np.float64], stops: Stops) -> None:
     descend(look, start, stops, look.problem.limits_at)
 
 
-def _problem(look: Look, start: NDArray[np.float64], stops: Stops) -> Epigraph | None:
-    first = look(start)
-    return None if first is None else Epigraph(look, start, first, stops)
+def on_epigraph(solve: Callable[[Epigraph, Stops], None]) -> Method:
+    """Return a method that works on the epigraph of a problem, until an evaluation ends it."""
+
+    def method(look: Look, start: NDArray[np.float64], stops: Stops) -> None:
+        first = look(start)
+        if first is not None:
+            with contextlib.suppress(EndError):
+                solve(Epigraph(look, start, first, stops), stops)
+
+    return method
 
 
 def _bounds(problem: Epigraph, count: int) -> list[tuple[float | None, float | None]]:
@@ -89,14 +101,12 @@ def _bounds(problem: Epigraph, count: int) -> list[tuple[float | None, float | N
     return [(0.0, 1.0 / SCALE)] * problem.size + free * (count - problem.size)
 
 
-def augmented_lagrangian(look: Look, start: NDArray[np.float64], stops: Stops) -> None:
+@on_epigraph
+def augmented_lagrangian(problem: Epigraph, _stops: Stops) -> None:
     """Run an augmented Lagrangian with optax's L-BFGS (Nocedal and Wright, algorithm 17.4).
 
     L-BFGS knows no bounds: each bounded variable is a sine of a free one. The step length is found
     by halving (Armijo)."""
-    problem = _problem(look, start, stops)
-    if problem is None:
-        return
     size = problem.size
     z = problem.start()
     z[:size] = np.arcsin(np.clip(2 * SCALE * z[:size] - 1, -_INSIDE, _INSIDE))
@@ -117,17 +127,14 @@ def augmented_lagrangian(look: Look, start: NDArray[np.float64], stops: Stops) -
         slope = slope - penalty * short @ normals
         return float(value + penalty / 2 * short @ short), slope * by_free
 
-    try:
-        for _ in range(_OUTER):
-            z = _lbfgs(merit, z)
-            slack = problem.constraints(bounded(z)[0])[0]
-            violation = np.max(np.maximum(-slack, 0.0))
-            weights = np.maximum(weights - penalty * slack, 0.0)
-            if violation > before / 2:
-                penalty = min(_GROWTH * penalty, _MOST)
-            before = violation
-    except EndError:
-        return
+    for _ in range(_OUTER):
+        z = _lbfgs(merit, z)
+        slack = problem.constraints(bounded(z)[0])[0]
+        violation = np.max(np.maximum(-slack, 0.0))
+        weights = np.maximum(weights - penalty * slack, 0.0)
+        if violation > before / 2:
+            penalty = min(_GROWTH * penalty, _MOST)
+        before = violation
 
 
 def _lbfgs(
@@ -159,11 +166,9 @@ def _lbfgs(
     return z
 
 
-def interior_point(look: Look, start: NDArray[np.float64], stops: Stops) -> None:
+@on_epigraph
+def interior_point(problem: Epigraph, _stops: Stops) -> None:
     """Run SciPy's trust-constr: an interior point method within a trust region."""
-    problem = _problem(look, start, stops)
-    if problem is None:
-        return
     z = problem.start()
     limits = NonlinearConstraint(
         lambda z: problem.constraints(z)[0],
@@ -173,30 +178,25 @@ def interior_point(look: Look, start: NDArray[np.float64], stops: Stops) -> None
         hess=BFGS(),
     )
     options = {"maxiter": 10_000, "gtol": 1e-12, "xtol": 1e-12, "barrier_tol": 1e-10}
-    try:
-        minimize(
-            problem.value,
-            z,
-            jac=True,
-            hess=BFGS(),
-            method="trust-constr",
-            bounds=_bounds(problem, len(z)),
-            constraints=limits,
-            options=options,
-        )
-    except EndError:
-        return
+    minimize(
+        problem.value,
+        z,
+        jac=True,
+        hess=BFGS(),
+        method="trust-constr",
+        bounds=_bounds(problem, len(z)),
+        constraints=limits,
+        options=options,
+    )
 
 
-def moving_asymptotes(look: Look, start: NDArray[np.float64], stops: Stops) -> None:
+@on_epigraph
+def moving_asymptotes(problem: Epigraph, stops: Stops) -> None:
     """Run NLopt's method of moving asymptotes (Svanberg 2002, globally convergent).
 
     Raises ImportError without the package `nlopt`."""
     import nlopt  # type: ignore[import-not-found]
 
-    problem = _problem(look, start, stops)
-    if problem is None:
-        return
     z = problem.start()
     count = len(problem.constraints(z)[0])
     search = nlopt.opt(nlopt.LD_MMA, len(z))
@@ -219,10 +219,8 @@ def moving_asymptotes(look: Look, start: NDArray[np.float64], stops: Stops) -> N
     search.set_min_objective(value)
     search.add_inequality_mconstraint(limits, np.full(count, 1e-9))
     search.set_maxeval(stops.evaluations)
-    try:
+    with contextlib.suppress(nlopt.RoundoffLimited, RuntimeError):
         search.optimize(z)
-    except (EndError, nlopt.RoundoffLimited, RuntimeError):
-        return
 
 
 METHODS: dict[str, Method] = {
@@ -271,70 +269,84 @@ class Recorder:
         return found
 
 
-@dataclasses.dataclass(frozen=True)
-class Results:
-    """Every evaluation of every method on every problem, and a summary row for each pair."""
-
-    rows: list[dict[str, Any]]
-    missing: tuple[str, ...]
-
-    def summary(self) -> list[dict[str, Any]]:
-        """Return evaluations and time to the optimum, by problem and method."""
-        found = []
-        for task in dict.fromkeys(row["problem"] for row in self.rows):
-            rows = [row for row in self.rows if row["problem"] == task]
-            best = min((row["objective"] for row in rows if _met(row)), default=np.nan)
-            for method in dict.fromkeys(row["method"] for row in rows):
-                own = [row for row in rows if row["method"] == method]
-                met = [row for row in own if _met(row)]
-                hits = [row for row in met if row["objective"] <= best + REACHED]
-                found.append(
-                    {
-                        "problem": task,
-                        "method": method,
-                        "evaluations": hits[0]["evaluation"] if hits else None,
-                        "seconds": hits[0]["seconds"] if hits else None,
-                        "above_best": min((r["objective"] for r in met), default=np.nan) - best,
-                        "residual": min((r["residual"] for r in met), default=np.nan),
-                        "designs": len(own),
-                    }
-                )
-        return found
-
-    def reached(self) -> dict[str, int]:
-        """Return the number of problems on which each method has reached the optimum."""
-        counts: dict[str, int] = {}
-        for row in self.summary():
-            counts[row["method"]] = counts.get(row["method"], 0) + (row["evaluations"] is not None)
-        return counts
+def summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return evaluations and time to the optimum, by problem and method."""
+    found = []
+    for task in dict.fromkeys(row["problem"] for row in rows):
+        here = [row for row in rows if row["problem"] == task]
+        best = min((row["objective"] for row in here if _met(row)), default=np.nan)
+        for method in dict.fromkeys(row["method"] for row in here):
+            own = [row for row in here if row["method"] == method]
+            met = [row for row in own if _met(row)]
+            hits = [row for row in met if row["objective"] <= best + REACHED]
+            found.append(
+                {
+                    "problem": task,
+                    "method": method,
+                    "evaluations": hits[0]["evaluation"] if hits else None,
+                    "seconds": hits[0]["seconds"] if hits else None,
+                    "above_best": min((r["objective"] for r in met), default=np.nan) - best,
+                    "residual": min((r["residual"] for r in met), default=np.nan),
+                    "designs": len(own),
+                }
+            )
+    return found
 
 
 def _met(row: dict[str, Any]) -> bool:
     return bool(np.isfinite(row["objective"]) and row["violation"] <= FEASIBLE)
 
 
-def _stops(evaluations: int) -> Stops:
-    """Return stops so tight that a method ends at its own criterion, or at `evaluations`."""
-    return Stops(feasibility=FEASIBLE, evaluations=evaluations)
+_NAMES = {"slsqp": "SQP (default)", "mma": "MMA"}
+"""Names of methods in the legend; others are written as words."""
 
 
-def run(
-    quick: bool,
-    tasks: Sequence[Task] = TASKS,
-    say: Callable[[str], None] = lambda text: None,
-) -> Results:
-    """Run every method on every problem; a method whose package is missing is left out."""
-    methods: dict[str, Method] = dict(METHODS)
+def solved(rows: list[dict[str, Any]]) -> Figure:
+    """Draw, for each method, the number of problems whose optimum it has reached.
+
+    `rows`: those of `summary`."""
+    made, axes = figure(6.5, 3.6)
+    ax = axes[0, 0]
+    problems = len({row["problem"] for row in rows})
+    styles = zip(dict.fromkeys(row["method"] for row in rows), COLORS, DASHES, strict=False)
+    for method, color, dashes in styles:
+        own = [row["evaluations"] for row in rows if row["method"] == method]
+        counts = np.sort([count for count in own if count is not None])
+        number = np.arange(len(counts) + 1)
+        x = np.concatenate([[0], counts, [EVALUATIONS]])
+        name = _NAMES.get(method, method.replace("_", " ").replace("lagrangian", "Lagrangian"))
+        y = np.append(number, number[-1])
+        ax.step(x, y, where="post", label=name, color=color, linestyle=dashes)
+    ax.set_xlabel("designs simulated")
+    ax.set_ylabel(f"problems solved to 1e-6, of {problems}")
+    ax.set_ylim(0, problems + 0.3)
+    ax.set_xlim(0, EVALUATIONS)
+    ax.legend(frameon=False, loc="center right")
+    return made
+
+
+def run(job: Run) -> bool:
+    """Run every method on every problem; a method whose package is missing is left out.
+
+    Returns whether the package's own method solves at least as many problems as any other."""
+    methods = dict(METHODS)
     if importlib.util.find_spec("nlopt") is None:
         del methods["mma"]
-    tasks = tasks[:QUICK_TASKS] if quick else tasks
+    # So tight that a method ends at its own criterion, or when the evaluations run out.
+    stops = Stops(feasibility=FEASIBLE, evaluations=QUICK if job.quick else EVALUATIONS)
     rows: list[dict[str, Any]] = []
-    for task in tasks:
+    for task in TASKS[: QUICK_TASKS if job.quick else None]:
         look = Recorder(task)
         look(look.start)  # Compiles.
         for name, method in methods.items():
             look.reset()
-            method(look, look.start, _stops(QUICK if quick else EVALUATIONS))
+            method(look, look.start, stops)
             rows += [{"problem": task.name, "method": name, **row} for row in look.rows]
-            say(f"{task.name}: {name}, {len(look.rows)} designs")
-    return Results(rows, tuple(METHODS.keys() - methods.keys()))
+            job.say(f"{task.name}: {name}, {len(look.rows)} designs")
+    table = summary(rows)
+    reached = Counter(row["method"] for row in table if row["evaluations"] is not None)
+    job.csv("optimisers.csv", rows)
+    job.json("optimisers.json", {"summary": table, "solved": reached})
+    job.figure("optimisers.png", solved(table))
+    show("Evaluations and time to the optimum", table)
+    return job.quick or reached["slsqp"] >= max(reached.values())

@@ -8,7 +8,7 @@ batches."""
 import functools
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -34,7 +34,7 @@ _REPEATS, _SECONDS = 5, 10.0
 """Maximum number of timed calls, and time (s) after which no further call is made."""
 
 
-def rows_of(sizes: list[int], say: Callable[[str], None] = lambda text: None) -> Iterator[Row]:
+def rows_of(sizes: Sequence[int], say: Callable[[str], None] = lambda text: None) -> Iterator[Row]:
     """Yield a row for each of `sizes` and each start."""
     config = load(CIC, [])
     machine, base = Scene.from_config(config), np.asarray(config.design, float)
@@ -113,19 +113,3 @@ def _differences(found: list[np.ndarray], truth: list[Any]) -> Row:
         "force_difference": float(np.max(np.abs(found[0][:count] / forces[:count] - 1))),
         "gradient_difference": float(np.max(apart / np.max(np.abs(slopes[:count]), axis=-1))),
     }
-
-
-def lines(rows: list[Row]) -> list[str]:
-    """Return the table."""
-    head = (
-        f"{'device':24s} {'start':10s} {'designs':>8s} {'together':>8s} {'s':>9s} "
-        f"{'designs/s':>10s} {'GB':>6s} {'periodic':>8s} {'forces':>8s} {'gradient':>8s} "
-        f"{'compile s':>9s}"
-    )
-    return [head] + [
-        f"{row['device']:24s} {row['start']:10s} {row['designs']:8d} {row['together']:8d} "
-        f"{row['s']:9.3f} {row['designs_per_s']:10.0f} {(row['peak_bytes'] or 0) / 1e9:6.2f} "
-        f"{row['periodic']:8.4f} {row['force_difference']:8.0e} "
-        f"{row['gradient_difference']:8.0e} {row['compile_s']:9.1f}"
-        for row in rows
-    ]

@@ -8,13 +8,12 @@ Forces, their derivatives along one direction of design, speed and load, and the
 are compared. If it repeats, but its orbit is not known, the pair is listed.
 """
 
-import csv
 import dataclasses
 import functools
 import json
+import os
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -22,8 +21,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experiments._common.driver import Run
 from experiments._common.scenes import CIC
 from experiments._common.shooting import closed, differentiated
+from experiments._common.tables import Row, show
 from rootsopt import steady_response
 from rootsopt.config import Config, load
 from rootsopt.config.scene import ProfileConfig
@@ -32,7 +33,6 @@ from rootsopt.scene import Scene, check_geometry, design_vector
 from rootsopt.scene.families import free_form_of
 from rootsopt.status import Status
 
-Row = dict[str, Any]
 FORCES = "mean", "peak", "rms"
 LEFT = "not_closed", "inaccurate"
 """Statuses of motions that repeat, but whose orbit or gradient is not known."""
@@ -42,6 +42,8 @@ COEFFICIENTS = 12
 """Number of coefficients of the free form."""
 STEP = 1e-5
 """Relative step of the differences. Orbits by shooting are accurate to about 1e-11."""
+AGREE = 1e-4
+"""Relative difference of forces above which the two solvers disagree."""
 QUICK_COUNT = 2
 """Number of pairs of a reduced run."""
 GAS = [
@@ -193,23 +195,41 @@ def compared(config: Config, solve: Callable[..., Any] | None = None) -> Row:
     return row | {"multiplier_difference": abs(modulus - truth.multiplier), "miss": truth.miss}
 
 
-def run(
-    quick: bool,
-    count: int = 72,
-    seed: int = 0,
-    say: Callable[[str], None] = lambda text: None,
-    keep: Callable[[list[Row]], None] = lambda rows: None,
-) -> list[Row]:
-    """Evaluate pairs until `count` of them, evenly distributed over the kinds, are periodic.
+def run(job: Run) -> bool:
+    """Compare orbits, or time them (`--speed`, `--batches`).
 
-    Returns a row for each pair whose motion settles. `keep` is called with all rows so far after
-    each pair. A reduced run compares a few pairs of one kind."""
-    kinds = list(KINDS)[: 1 if quick else None]
-    each = QUICK_COUNT if quick else -(-count // len(kinds))
+    Returns whether the forces agree, or whether all tools have a time."""
+    if job.options.speed:
+        return timed(job)
+    if job.options.batches:
+        return batched(job)
+    rows = differences_of(job)
+    periodic = [row for row in rows if row["status"] == "periodic"]
+    names = [f"{name}_{what}" for what in ("difference", "gradient_difference") for name in FORCES]
+    table = []
+    for name in [*names, "multiplier_difference"]:
+        # The noise of the differences that give a gradient is no error of the gradient.
+        noise = name.replace("gradient_difference", "gradient_noise")
+        off = [max(row[name] - (row[noise] if noise != name else 0.0), 0.0) for row in periodic]
+        table.append({"of": name, "median": float(np.median(off)), "greatest": max(off)})
+    show(f"{len(periodic)} orbits by collocation and by shooting", table)
+    for row in rows:
+        if row["status"] in LEFT:
+            print(f"{row['status']}, period {row['period']}: {row['kind']}, {row['scene']}")
+    return max(row["greatest"] for row in table[: len(FORCES)]) <= AGREE
+
+
+def differences_of(job: Run) -> list[Row]:
+    """Evaluate pairs until enough of them, evenly distributed over the kinds, are periodic.
+
+    Writes and returns a row for each pair whose motion settles, updated after each pair. A reduced
+    run compares a few pairs of one kind."""
+    kinds = list(KINDS)[: 1 if job.quick else None]
+    each = QUICK_COUNT if job.quick else -(-job.options.count // len(kinds))
     rows: list[Row] = []
     for kind in kinds:
         done = 0
-        for number, overrides in enumerate(pairs(seed, kind)):
+        for number, overrides in enumerate(pairs(job.options.seed, kind)):
             if done >= each or number >= PATIENCE * each:
                 break
             try:
@@ -219,62 +239,30 @@ def run(
             if row["status"] in ("periodic", *LEFT):
                 done += row["status"] == "periodic"
                 rows.append(row)
-                keep(rows)
-            say(f"{kind}: {done} of {each}")
+                job.csv("orbits.csv", rows)
+            job.say(f"{kind}: {done} of {each}")
     return rows
 
 
-def read(folder: Path) -> list[Row]:
-    """Return the rows that a run has written."""
-    with (folder / "orbits.csv").open(newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
+def timed(job: Run) -> bool:
+    """Time an orbit from a neighbour's on one core; write and print a row for each tool."""
+    if hasattr(os, "sched_setaffinity"):  # before JAX starts its threads
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+    from experiments.orbits import speed
+
+    rows = speed.rows_of(3 if job.quick else 20, job.say)
+    job.csv("speed.csv", rows)
+    show("Value and gradient", rows)
+    return True
 
 
-@dataclasses.dataclass(frozen=True)
-class Judgement:
-    """Summary of all rows.
+def batched(job: Run) -> bool:
+    """Time batches of designs; write and print a row for each size and start."""
+    from experiments.orbits import batches
 
-    `periodic`: number of periodic pairs; `differences`: greatest and median value of each
-    difference; `left`: a line for each pair that settles, but whose orbit is not known."""
-
-    periodic: int
-    differences: dict[str, tuple[float, float]]
-    left: tuple[str, ...]
-
-    def lines(self) -> list[str]:
-        """Return the table."""
-        head = [
-            f"periodic: {self.periodic} pairs; orbit not known: {len(self.left)}",
-            f"{'difference':32s} {'median':>9s} {'greatest':>9s}",
-        ]
-        spread = (f"{k:32s} {v[1]:9.1e} {v[0]:9.1e}" for k, v in self.differences.items())
-        return [*head, *spread, *self.left]
-
-
-def judge(rows: list[Row]) -> Judgement:
-    """Summarise the rows.
-
-    The noise of the differences that give a gradient is no error of the gradient."""
-    closed = [row for row in rows if row["status"] == "periodic"]
-    names = [f"{name}_difference" for name in FORCES]
-    names += [f"{name}_gradient_difference" for name in FORCES] + ["multiplier_difference"]
-
-    def value(row: Row, name: str) -> float:
-        noise = row.get(name.replace("gradient_difference", "gradient_noise"), 0.0)
-        off = float(row[name])
-        return max(off - float(noise), 0.0) if name.endswith("gradient_difference") else off
-
-    spread = {name: np.array([value(row, name) for row in closed]) for name in names}
-    return Judgement(
-        periodic=len(closed),
-        differences={
-            name: (float(np.max(values)), float(np.median(values)))
-            for name, values in spread.items()
-            if values.size
-        },
-        left=tuple(
-            f"{row['status']}, period {row['period']}: {row['kind']}, {row['scene']}"
-            for row in rows
-            if row["status"] in LEFT
-        ),
-    )
+    rows: list[Row] = []
+    for row in batches.rows_of(batches.SIZES[: 1 if job.quick else None], job.say):
+        rows.append(row)
+        job.csv("batches.csv", rows)
+    show("Batches of designs", rows)
+    return all(row["force_difference"] <= AGREE for row in rows)

@@ -1,13 +1,18 @@
 """Figures of the paper's scene: forces, how far they determine it, and the search."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from experiments._common.style import BLUE, COLORS, grid_below, sheet
 from experiments.paper.scene import FAMILIES, PAPER, QUANTITIES, Response, config_of
-from experiments.paper.study import Found, Row
+from experiments.paper.study import Row
 from rootsopt.figures.force import plot_force, plot_spectrum
+
+if TYPE_CHECKING:
+    from experiments.paper.search import Samples
 
 LOWEST, HIGHEST = 0.1, 300.0
 """Range of misfits (%) shown. Larger misfits and non-periodic motions are at the upper edge."""
@@ -56,7 +61,7 @@ def uniqueness_figure(alone: list[Row], solved: list[Row]) -> Figure:
     return made
 
 
-def search_figure(found: Found) -> Figure:
+def search_figure(found: "Samples") -> Figure:
     """Draw the misfit of the searched scenes over each quantity; mark periodic ones."""
     made, axes = sheet(11, 6.4, 2, 3, sharey=True)
     misfit = 100 * found.misfits

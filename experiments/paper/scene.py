@@ -8,7 +8,6 @@ solve for values that reproduce the paper's forces.
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -103,14 +102,9 @@ class Response:
         )
 
     @property
-    def errors(self) -> NDArray[np.float64]:
-        """Relative differences from the paper's forces, by pair (2, 2)."""
-        return self.forces / PAPER - 1
-
-    @property
     def misfit(self) -> float:
         """Largest relative difference from the paper's forces; infinite without forces."""
-        worst = np.max(np.abs(self.errors))
+        worst = np.max(np.abs(self.forces / PAPER - 1))
         return float(worst) if np.isfinite(worst) else np.inf
 
     @property
@@ -127,12 +121,11 @@ class Response:
 class Pairs:
     """Evaluates both pairs for values of the quantities, with shared compiled programs.
 
-    `give_up_early`: whether to give up a motion that settles late; `overrides` of the configs, each
-    `dotted.key=value`.
+    `give_up_early`: whether to give up a motion that settles late.
     """
 
-    def __init__(self, *overrides: str, give_up_early: bool = False):
-        self.overrides, self.give_up_early = overrides, give_up_early
+    def __init__(self, give_up_early: bool = False):
+        self.give_up_early = give_up_early
 
     def __call__(
         self,
@@ -146,7 +139,7 @@ class Pairs:
         values = np.asarray(values, float)
         evaluations, rows = [], []
         for family in FAMILIES:
-            config = config_of(family, values, *self.overrides)
+            config = config_of(family, values)
             evaluator = evaluator_of(config, self.give_up_early)
             one = evaluator(series=series)
             evaluations.append(one)
@@ -258,19 +251,3 @@ def _least_step(slopes, wanted, free: Sequence[int]) -> NDArray[np.float64]:
     step = np.zeros(slopes.shape[1])
     step[list(free)] = np.linalg.pinv(slopes[:, list(free)], rcond=1e-3) @ wanted
     return step
-
-
-def summary(response: Response) -> dict[str, Any]:
-    """Return values, forces, errors and regimes (periods of both motions) for the result file."""
-    pairs = {}
-    for family, one, row, errors in zip(
-        FAMILIES, response.evaluations, response.forces, response.errors, strict=True
-    ):
-        pairs[family] = {
-            "status": one.status.label,
-            "steady_state": one.steady_state,
-            "forces_N": dict(zip(FORCES, map(float, row), strict=True)),
-            "errors": dict(zip(FORCES, map(float, errors), strict=True)),
-        }
-    values = {q.key: float(v) for q, v in zip(QUANTITIES, response.values, strict=True)}
-    return {"values": values, "misfit": response.misfit, **pairs}

@@ -9,7 +9,7 @@ the four forces from the paper's forces, over the whole box of plausible values.
 import dataclasses
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -77,10 +77,6 @@ class Samples(NamedTuple):
         """Whether the motions of both pairs repeat, for each scene (n,)."""
         return np.all(self.periods > 0, axis=1)
 
-    @classmethod
-    def joined(cls, parts: list["Samples"]) -> "Samples":
-        return cls(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-
 
 def rotors_of(family: str) -> Rotors:
     """Return the data of a pair that all scenes share; `family`: its profile family."""
@@ -91,26 +87,9 @@ def rotors_of(family: str) -> Rotors:
     radius, lobes = config.profile.pitch_radius_mm * 1e-3, config.profile.lobes
     rotor = Rotor(lobes, radius, 0.0, math.pi / (2 * lobes), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     idle = Search(np.zeros((1, 5)), np.zeros(1))
-    contact_config, scene = config.contact, config.scene
-    unset = Scene(
-        lobes=lobes,
-        pitch_radius=radius,
-        length=math.nan,
-        density=config.rotor.density_kg_m3,
-        stiffness=contact_config.stiffness_N_per_mm_e / 1e-3**contact_config.exponent,
-        exponent=contact_config.exponent,
-        damping=contact_config.max_damping_N_s_per_mm * 1e3,
-        full_damping_depth=contact_config.full_damping_depth_mm * 1e-3,
-        smoothing=contact_config.rounding_mm * 1e-3,
-        clearance=math.nan,
-        speed=scene.speed_rpm * 2 * math.pi / 60,
-        load_torque=math.nan,
-        gear_stiffness=math.nan,
-        gear_damping_ratio=math.nan,
-        half_backlash=math.nan,
-        gear_rounding=contact_config.rounding_mm * 1e-3 / radius,
-    )
-    return Rotors(float(geometry(profile).polar_area_moment), table, rotor, idle, unset)
+    # Both configs share the scene. `motion_at` replaces the quantities.
+    scene = Scene.of(config_of(FAMILIES[0]))
+    return Rotors(float(geometry(profile).polar_area_moment), table, rotor, idle, scene)
 
 
 def _table(profile: Profile) -> Table:
@@ -222,19 +201,17 @@ def explore(
     generations: int,
     population: int,
     quantities: Sequence[Quantity] = QUANTITIES,
-    report: Callable[[Samples], None] = lambda samples: None,
 ) -> Samples:
     """Return all scenes that differential evolution tries, with the random `seed`.
 
     The search covers the box of the ranges of `quantities`, with `population` scenes per quantity
-    in each generation. `report` is called with the scenes of each evaluation.
+    in each generation.
     """
     pairs = [rotors_of(family) for family in FAMILIES]
     parts: list[Samples] = []
 
     def cost(points):
         parts.append(scan(pairs, values_at(points.T, quantities)))
-        report(parts[-1])
         return costs(parts[-1])
 
     differential_evolution(
@@ -251,7 +228,7 @@ def explore(
         updating="deferred",
         vectorized=True,
     )
-    return Samples.joined(parts)
+    return Samples(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
 def regimes(samples: Samples, within: float) -> list[int]:

@@ -4,26 +4,26 @@ Section 4 of the paper gives the mean and maximum contact force of a CIC and an 
 give the rotors' length, load, timing gear or backlash. `run` simulates the values of
 `configs/paper_cic.yaml` and `configs/paper_ee.yaml` from rest. It searches for coexisting motions,
 and applies other definitions of mean and maximum. It changes each quantity alone, then with the
-others solved for again. `look` searches for other values in the box of plausible ones.
+others solved for again. `search` searches for other values in the box of plausible ones.
 """
 
 import dataclasses
-import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from experiments._common.driver import NoResultError
+from experiments._common.driver import NoResultError, Run
+from experiments._common.scenes import FORCES
 from experiments._common.simulation import evaluator_of
+from experiments._common.tables import Row, show
 from experiments.paper.scene import (
     FAMILIES,
     PAPER,
     QUANTITIES,
     Pairs,
-    Quantity,
     Response,
     compensated,
     config_of,
@@ -66,24 +66,7 @@ TARGET = 0.1
 """Relative error of a force above which a search has no result."""
 POLISHED = 4
 """Number of regimes whose best scene is solved for the paper's forces."""
-Row = dict[str, Any]
 Say = Callable[[str], None]
-
-
-def row_of(response: Response) -> Row:
-    """Return a row with values, forces, periods and misfit of a response."""
-    row: Row = {q.key: v for q, v in zip(QUANTITIES, response.values, strict=True)}
-    for family, (mean, peak), period, one in zip(
-        FAMILIES, response.forces, response.periods, response.evaluations, strict=True
-    ):
-        row |= {
-            f"{family}_status": one.status.label,
-            f"{family}_period": period,
-            f"{family}_multiplier": one.steady_state.get("floquet_multiplier"),
-            f"{family}_mean_force_N": mean,
-            f"{family}_peak_force_N": peak,
-        }
-    return row | {"misfit": response.misfit}
 
 
 def motions(values: ArrayLike) -> list[Row]:
@@ -164,123 +147,88 @@ def profile(pairs: Pairs, found: Response, say: Say) -> list[Row]:
     return rows
 
 
-@dataclasses.dataclass(frozen=True)
-class Results:
-    """Responses with the shipped and with other values of the quantities, and tables of rows.
-
-    `alone`: each quantity changed alone (`slices`); `solved`: with the others solved for again
-    (`profile`); `motions`, `definitions`: results of the functions of these names. In a reduced
-    run, only `alone` has rows.
-    """
-
-    shipped: Response
-    others: dict[str, Response]
-    alone: list[Row]
-    solved: list[Row]
-    motions: list[Row]
-    definitions: list[Row]
-
-    @property
-    def tables(self) -> dict[str, list[Row]]:
-        """Return all tables that have rows, by the name of their part."""
-        named = {
-            "motions": self.motions,
-            "definitions": self.definitions,
-            "slices": self.alone,
-            "profile": self.solved,
+def row_of(response: Response) -> Row:
+    """Return a row with values, forces, periods and misfit of a response."""
+    row: Row = {q.key: v for q, v in zip(QUANTITIES, response.values, strict=True)}
+    for family, (mean, peak), period, one in zip(
+        FAMILIES, response.forces, response.periods, response.evaluations, strict=True
+    ):
+        row |= {
+            f"{family}_status": one.status.label,
+            f"{family}_period": period,
+            f"{family}_multiplier": one.steady_state.get("floquet_multiplier"),
+            f"{family}_mean_force_N": mean,
+            f"{family}_peak_force_N": peak,
         }
-        return {name: rows for name, rows in named.items() if rows}
+    return row | {"misfit": response.misfit}
 
 
-def run(
-    quick: bool,
-    say: Say = lambda text: None,
-    tell: Callable[[str, Response], None] = lambda name, response: None,
-) -> Results:
+def run(job: Run) -> bool:
+    """Simulate the shipped values or, with --search, search for other values."""
+    return search(job) if job.options.search else reproduce(job)
+
+
+def reproduce(job: Run) -> bool:
     """Simulate the shipped values, and study how far the paper's forces determine them.
 
-    `tell` is called with the name and each response as soon as the response is known. Raises
-    `NoResultError` unless both motions are periodic and both configs hold the same values.
+    A reduced run only changes each quantity alone. Raises `NoResultError` unless both motions are
+    periodic.
     """
+    from experiments.paper import figures
+
     many = Pairs(give_up_early=True)
-    values = values_of(config_of("cic"))
-    if not np.array_equal(values, values_of(config_of("ee"))):
-        raise NoResultError(
-            "configs/paper_cic.yaml and configs/paper_ee.yaml must share all values, but differ"
-        )
-    found = Pairs()(values, slopes=not quick, series=True)
-    tell("shipped", found)
+    found = Pairs()(values_of(config_of("cic")), slopes=not job.quick, series=True)
     if not found.usable:
         raise NoResultError("the shipped values must give two periodic motions, but do not")
-    alone = slices(many, found.values, CHANGES[quick], say)
-    if quick:
-        return Results(found, {}, alone, [], [], [])
-    coexisting, defined = motions(found.values), definitions(found.values)
-    others = {}
-    for name, start in OTHERS.items():
-        others[name] = polished(many, start)
-        tell(name, others[name])
-    solved = profile(many, found, say)
-    return Results(found, others, alone, solved, coexisting, defined)
+    responses = {"shipped": found}
+    tables = {"slices": slices(many, found.values, CHANGES[job.quick], job.say)}
+    if not job.quick:
+        responses |= {name: polished(many, start) for name, start in OTHERS.items()}
+        tables["motions"], tables["definitions"] = motions(found.values), definitions(found.values)
+        tables["profile"] = profile(many, found, job.say)
+    record: dict[str, Any] = {name: row_of(one) for name, one in responses.items()}
+    if found.slopes is not None:
+        singular = np.linalg.svd(found.slopes.reshape(4, -1))
+        record |= {"singular_values": singular[1], "free_directions": singular[2][4:]}
+        record["slopes"] = dict(zip(FAMILIES, found.slopes, strict=True))
+    for name, rows in tables.items():
+        job.csv(f"paper_{name}.csv", rows)
+    job.csv("paper.csv", [row_of(found)])
+    job.json("paper.json", record)
+    for name, made in zip(("force", "spectrum"), figures.force_figures(found), strict=True):
+        job.figure(f"paper_{name}.png", made)
+    made = figures.uniqueness_figure(tables["slices"], tables.get("profile", []))
+    job.figure("paper_uniqueness.png", made)
+    show("Values, forces and motions", [{"": k} | row_of(one) for k, one in responses.items()])
+    return True
 
 
-@dataclasses.dataclass(frozen=True)
-class Found:
-    """Results of a search: its scenes, its time (s), and the best scenes solved for the paper's
-    forces.
+def search(job: Run) -> bool:
+    """Search for other values of the quantities; write and print the best.
 
-    `polished`: periods of both motions → (misfit in the search, response after solving).
-    """
-
-    values: NDArray[np.float64]
-    forces: NDArray[np.float64]
-    periods: NDArray[np.int64]
-    misfits: NDArray[np.float64]
-    seconds: float
-    polished: dict[tuple[int, ...], tuple[float, Response]]
-
-    @property
-    def periodic(self) -> NDArray[np.bool_]:
-        """Whether the motions of both pairs repeat, for each scene (n,)."""
-        return np.all(self.periods > 0, axis=1)
-
-    @property
-    def enough(self) -> bool:
-        """Whether some values give all four forces within the relative error `TARGET`."""
-        return any(response.misfit <= TARGET for _, response in self.polished.values())
-
-
-def look(
-    quick: bool,
-    seed: int = 0,
-    least_clearance: float = QUANTITIES[-1].low,
-    say: Say = lambda text: None,
-) -> Found:
-    """Search for other values of the quantities.
-
-    `least_clearance` (mm): smallest clearance searched. A reduced run takes one generation, and
-    does not solve for the paper's forces.
-    """
+    A reduced run takes one generation, and does not solve for the paper's forces. Returns whether
+    some values give all four forces within the relative error `TARGET`."""
     # Numba is optional.
+    from experiments.paper import figures
     from experiments.paper.search import explore, regimes
 
-    began = time.perf_counter()
-    least = [np.inf]
-
-    def report(samples: Any) -> None:
-        best = int(np.argmin(np.where(samples.periodic, samples.misfits, np.inf)))
-        if samples.periodic[best] and samples.misfits[best] < least[0]:
-            least[0] = samples.misfits[best]
-            say(f"{least[0]:.1%} {samples.values[best]}")
-
     *others, clearance = QUANTITIES
-    box: list[Quantity] = [*others, dataclasses.replace(clearance, low=least_clearance)]
-    generations, population = QUICK_SEARCH if quick else (GENERATIONS, POPULATION)
-    samples = explore(seed, generations, population, box, report)
-    seconds = time.perf_counter() - began
-    pairs, solved = Pairs(give_up_early=True), {}
-    for place in [] if quick else regimes(samples, 0.3)[:POLISHED]:
-        periods = tuple(map(int, samples.periods[place]))
-        solved[periods] = samples.misfits[place], polished(pairs, samples.values[place])
-        say(f"periods {periods}: {solved[periods][1].misfit:.2%}")
-    return Found(*samples, samples.misfits, seconds, solved)
+    seed, least = job.options.seed, job.options.least_clearance
+    box = [*others, dataclasses.replace(clearance, low=least or clearance.low)]
+    size = QUICK_SEARCH if job.quick else (GENERATIONS, POPULATION)
+    found = explore(seed, *size, box)
+    job.say(f"{len(found.values)} scenes, least misfit {found.misfits.min():.1%}")
+    columns: dict[str, Any] = {q.key: found.values[:, k] for k, q in enumerate(QUANTITIES)}
+    for k, family in enumerate(FAMILIES):
+        columns |= {f"{family}_{name}": found.forces[:, k, j] for j, name in enumerate(FORCES)}
+        columns[f"{family}_period"] = found.periods[:, k]
+    job.folder.write_csv("paper_search.csv", columns | {"misfit": found.misfits})
+    job.figure("paper_search.png", figures.search_figure(found))
+    pairs, rows = Pairs(give_up_early=True), []
+    for place in [] if job.quick else regimes(found, 0.3)[:POLISHED]:
+        response = polished(pairs, found.values[place])
+        rows.append({"searched_misfit": found.misfits[place]} | row_of(response))
+    record = {"scenes": len(found.values), "seed": seed, "solved": rows}
+    job.json("paper_search.json", record)
+    show("Best values, solved for the paper's forces", rows)
+    return job.quick or any(row["misfit"] <= TARGET for row in rows)

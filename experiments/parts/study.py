@@ -2,27 +2,21 @@
 
 The smallest scene is contact alone, driven at constant speed. The study adds each part on its own,
 then all parts. It counts states, and equations in the traced right-hand side. It times one
-right-hand side inside a compiled loop. It also times the first simulation with gradient, which
-includes compilation, and later simulations. Ratios are relative to the smallest scene in the same
-run.
+right-hand side inside a compiled loop. Ratios are relative to the smallest scene in the same run.
 """
-
-import statistics
-import time
-from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from experiments._common.driver import Run
 from experiments._common.scenes import CIC, shipped
-from experiments._common.simulation import evaluator_of, pair_of_model
+from experiments._common.simulation import pair_of_model
+from experiments._common.tables import Row, show
 from experiments._common.timing import ready, times_of
 from rootsopt.config import Config, load
 from rootsopt.scene import Scene, design_vector
 
-Row = dict[str, Any]
 # The flanks alone hold a light load at high speed. At lower speed, the lobes pass each other.
 BARE = (
     "scene.timing_gear=null",
@@ -76,36 +70,19 @@ def right_hand_side(config: Config, calls: int) -> dict[str, float]:
     return {"states": pair.states, "equations": size, "rhs_us": 1e6 * min(times) / calls}
 
 
-def evaluation(config: Config, repeats: int) -> dict[str, float | str]:
-    """Time evaluations with gradient: the first (s), with compilation, and later ones (ms)."""
-    evaluator = evaluator_of(config)
-    began = time.perf_counter()
-    found = evaluator(series=False)
-    first = time.perf_counter() - began
-    times = times_of(lambda: evaluator(series=False), repeats)
-    return {
-        "first_s": first,
-        "evaluation_ms": 1e3 * statistics.median(times),
-        "solver_steps": found.statistics["solver_steps"],
-        "status": found.status.label,
-    }
+def run(job: Run) -> None:
+    """Measure every part on its own, and all together; write and print a row for each.
 
-
-def run(quick: bool, say: Callable[[str], None] = lambda text: None) -> list[Row]:
-    """Measure every part on its own, and all together; return a row for each.
-
-    A reduced run measures only the right-hand sides of three scenes, with few calls.
+    A reduced run measures three scenes, with few calls.
     """
     scenes = {name: load(CIC, [*BARE, *more]) for name, more in PARTS.items()}
     scenes["all of them"] = shipped("pump")
-    if quick:
+    if job.quick:
         scenes = {name: scenes[name] for name in ("smallest", "timing gear", "all of them")}
     rows: list[Row] = []
     for name, config in scenes.items():
-        row: Row = {"part": name} | right_hand_side(config, 500 if quick else 20000)
-        row["rhs_ratio"] = row["rhs_us"] / (rows[0] if rows else row)["rhs_us"]
-        if not quick:
-            row |= evaluation(config, 5)
-        rows.append(row)
-        say(name)
-    return rows
+        row: Row = {"part": name} | right_hand_side(config, 500 if job.quick else 20000)
+        rows.append(row | {"rhs_ratio": row["rhs_us"] / (rows[0] if rows else row)["rhs_us"]})
+        job.say(name)
+    job.csv("parts.csv", rows)
+    show("Parts of a scene", rows)

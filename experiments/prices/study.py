@@ -4,17 +4,16 @@ In each case, the optimum of a config is found with its certificate. Each constr
 multiplier is then moved by a small step in both directions, and the search starts again from the
 screening. The central difference of the two optimal objectives is compared with the multiplier."""
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from experiments._common.driver import NoResultError
+from experiments._common.driver import NoResultError, Run
 from experiments._common.scenes import CIC
+from experiments._common.tables import Row, show
 from rootsopt.config import load
 from rootsopt.optimize.optimality import RESIDUAL
 from rootsopt.optimize.outcome import Optimization
 from rootsopt.optimize.search import Search
 
-Row = dict[str, Any]
 AGREES = 0.02
 """Relative difference of price and difference quotient below which they agree."""
 QUICK = (
@@ -88,45 +87,6 @@ CASES = (
 )
 
 
-def run(quick: bool, say: Callable[[str], None] = lambda text: None) -> list[Row]:
-    """Return one row per limit of all cases, with price and difference quotient.
-
-    `quick`: only the first limit of the first case, from one start. Raises `NoResultError` if a
-    search ends without a certificate, or if a limit has no price."""
-    rows: list[Row] = []
-    for case in CASES[:1] if quick else CASES:
-        least = QUICK if quick else ()
-        held = [one.override.format(one.value) for one in case.limits]
-        middle = _solved(case.title, [*case.overrides, *held, *least])
-        for k, one in enumerate(case.limits[:1] if quick else case.limits):
-            price = _price(middle, one.name, case.title)
-            ends = []
-            for side in (-1, 1):
-                moved = one.override.format(one.value + side * one.step)
-                ends.append(_value(_solved(case.title, [
-                    *case.overrides, *held[:k], moved, *held[k + 1 :], *least])))  # fmt: skip
-            quotient = (ends[1] - ends[0]) / (2 * one.step)
-            rows.append(_row(case, one, middle, price, quotient))
-            say(f"{case.title}, {one.name}: {price:.5g} by multiplier, {quotient:.5g} by moving")
-    return rows
-
-
-def _row(case: Case, one: Limit, middle: Optimization, price: float, quotient: float) -> Row:
-    assert middle.optimality is not None
-    return {
-        "case": case.title,
-        "limit": one.name,
-        "value": one.value,
-        "step": one.step,
-        "objective": _value(middle),
-        "price": price,
-        "by_moving": quotient,
-        "difference": abs(price / quotient - 1) if quotient else float("nan"),
-        "equal_peaks": len(middle.optimality.holders),
-        "residual": middle.optimality.certificate.residual,
-    }
-
-
 def _solved(title: str, overrides: list[str]) -> Optimization:
     found = Search(load(CIC, overrides)).run()
     if found.optimality is None or not found.optimality.converged:
@@ -143,13 +103,43 @@ def _value(found: Optimization) -> float:
     return found.problem.objective(found.optimized)
 
 
-def _price(found: Optimization, name: str, title: str) -> float:
+def _price(found: Optimization, one: Limit, title: str) -> float:
     for row in found.constraints:
-        if row["name"] == name and row.get("multiplier"):
+        if row["name"] == one.name and row.get("multiplier"):
             return row["multiplier"]
-    raise NoResultError(f"{title}: {name} has no price at the optimum")
+    raise NoResultError(f"{title}: {one.name} has no price at the optimum")
 
 
-def kept(rows: list[Row]) -> bool:
-    """Return whether all prices agree with the optima of moved limits."""
+def run(job: Run) -> bool:
+    """Compare price and difference quotient of every limit of all cases; write a row for each.
+
+    A reduced run takes the first limit of the first case, from one start. Raises `NoResultError` if
+    a search ends without a certificate, or if a limit has no price. Returns whether all agree."""
+    rows: list[Row] = []
+    for case in CASES[:1] if job.quick else CASES:
+        held = [*case.overrides, *(one.override.format(one.value) for one in case.limits)]
+        least = QUICK if job.quick else ()
+        middle = _solved(case.title, [*held, *least])
+        for one in case.limits[:1] if job.quick else case.limits:
+            # The last of several overrides of a key counts.
+            ends = [
+                _value(_solved(case.title, [*held, one.override.format(value), *least]))
+                for value in (one.value - one.step, one.value + one.step)
+            ]
+            price, quotient = _price(middle, one, case.title), (ends[1] - ends[0]) / (2 * one.step)
+            rows.append(
+                {
+                    "case": case.title,
+                    "limit": one.name,
+                    "value": one.value,
+                    "step": one.step,
+                    "objective": _value(middle),
+                    "price": price,
+                    "by_moving": quotient,
+                    "difference": abs(price / quotient - 1) if quotient else float("nan"),
+                }
+            )
+            job.say(f"{case.title}, {one.name}: {price:.5g}, by moving {quotient:.5g}")
+    job.csv("prices.csv", rows)
+    show("Change of the objective per unit of a limit", rows)
     return all(row["difference"] <= AGREES for row in rows)

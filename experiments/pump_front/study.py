@@ -11,20 +11,25 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
+from experiments._common.driver import Run
 from experiments._common.scenes import shipped
 from experiments._common.simulation import profile_of
+from experiments._common.style import BLACK, COLORS, GREY, MARKS, grid_below, sheet
+from experiments._common.tables import Row, show
 from rootsopt.config import Config
 from rootsopt.config.families import family_of
 from rootsopt.errors import InputError
 from rootsopt.profiles import geometry
 from rootsopt.pump import relative_flow
-from rootsopt.pump.sheet import sheet
+from rootsopt.pump.sheet import sheet as pump_sheet
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.scene import Scene, design_vector
 from rootsopt.tradeoffs.trace import pareto_front
 
-Row = dict[str, Any]
 TERMS = "mean_force_N", "leakage_fraction", "flow_ripple"
 """Terms of the trade-off; less of each is better."""
 REFERENCE = "ee"
@@ -69,7 +74,7 @@ def row_of(config: Config, terms: dict[str, float], geometry_of: dict[str, float
     """Return the columns that every row has, for the design of a `config`.
 
     `terms`, `geometry_of`: its terms, and its geometry with the keys of the result file."""
-    found = sheet(Scene.from_config(config), design_vector(config))
+    found = pump_sheet(Scene.from_config(config), design_vector(config))
     shape = {key: geometry_of[key] for key in ("area_efficiency", "seal_width_mm")}
     ratio = geometry_of["outer_radius_mm"] / config.profile.pitch_radius_mm
     return (
@@ -103,13 +108,9 @@ def reference() -> Row:
     """Return the row of the reference, which is a single design."""
     config = config_of(REFERENCE)
     found = Evaluator.of(config.replaced({"objective.terms": dict.fromkeys(TERMS[1:], 0.1)}))()
-    terms = {name: found.response[name] for name in TERMS}
+    shown = {name: found.response[name] for name in (*TERMS, "peak_force_N")}
     row = {"family": REFERENCE, "point": 1, "status": found.status.label}
-    return (
-        row
-        | row_of(config, terms, found.geometry)
-        | {"peak_force_N": found.response["peak_force_N"]}
-    )
+    return row | row_of(config, shown, found.geometry)
 
 
 def mark_best(rows: Sequence[Row]) -> None:
@@ -122,19 +123,85 @@ def mark_best(rows: Sequence[Row]) -> None:
         row["best_of_all"] = not bool(beaten.any())
 
 
-def run(quick: bool, say: Callable[[str], None] = lambda text: None) -> list[Row]:
-    """Trace the fronts of all `FAMILIES`.
+_LABELS = {
+    "mean_force_N": ("mean contact force (N)", 1.0),
+    "leakage_fraction": ("leakage (% of the flow)", 100.0),
+    "flow_ripple": ("flow ripple (%)", 100.0),
+    "radius_ratio": ("outer radius / pitch radius", 1.0),
+}
+_PANELS = (
+    ("leakage_fraction", "mean_force_N"),
+    ("flow_ripple", "mean_force_N"),
+    ("flow_ripple", "leakage_fraction"),
+    ("radius_ratio", "flow_ripple"),
+)
+_EFFICIENCIES = 0.35, 0.40, 0.45, 0.50
+
+
+def fronts(rows: list[Row]) -> Figure:
+    """Draw all best compromises, filled if no other family has a better one.
+
+    The last panel shows that outer radius and area efficiency fix the ripple."""
+    made, axes = sheet(11, 8.6, 2, 2)
+    families = [*dict.fromkeys(row["family"] for row in rows if row["family"] != REFERENCE)]
+    styles = {name: (COLORS[k % 6], MARKS[k % 7]) for k, name in enumerate(families)}
+    styles[REFERENCE] = BLACK, "*"
+    for ax, (x, y) in zip(axes.ravel(), _PANELS, strict=True):
+        for row in rows:
+            color, mark = styles[row["family"]]
+            at = [_LABELS[key][1] * row[key] for key in (x, y)]
+            fill = color if row["best_of_all"] else "none"
+            size = 11 if row["family"] == REFERENCE else 6
+            ax.plot(*at, mark, color=color, markerfacecolor=fill, ms=size, zorder=3)
+        ax.set(xlabel=_LABELS[x][0], ylabel=_LABELS[y][0])
+        grid_below(ax)
+    _iso_efficiency(axes[1, 1])
+    entries = [
+        Line2D([], [], color=color, marker=mark, linestyle="", label=name.replace("_", " "))
+        for name, (color, mark) in styles.items()
+    ]
+    plain: dict[str, Any] = {"color": GREY, "marker": "o", "linestyle": ""}
+    entries.append(Line2D([], [], label="best of all families", **plain))
+    entries.append(Line2D([], [], label="best of its family", markerfacecolor="none", **plain))
+    made.legend(handles=entries, loc="outside lower center", ncols=6, frameon=False)
+    return made
+
+
+def _iso_efficiency(ax: Axes) -> None:
+    """Draw the closed form of the ripple over the radius ratio at several area efficiencies."""
+    (low, high), (bottom, top) = ax.get_xlim(), ax.get_ylim()
+    ratio = np.linspace(low, high, 200)
+    for eta in _EFFICIENCIES:
+        ripple = 100 * (ratio - 1) ** 2 / (eta * ratio**2)
+        ax.plot(ratio, ripple, color=GREY, linewidth=0.8, zorder=1)
+        inside = np.flatnonzero((ripple > bottom) & (ripple < top))
+        if inside.size:
+            place = inside[int(0.85 * inside.size)]
+            beside = {"textcoords": "offset points", "xytext": (4, -4), "fontsize": 8}
+            ax.annotate(f"η = {eta:.2f}", (ratio[place], ripple[place]), color="0.3", **beside)
+    ax.set(xlim=(low, high), ylim=(bottom, top))
+
+
+SHOWN = (
+    *("family", "point", "mean_force_N", "peak_force_N", "leakage_fraction", "flow_ripple"),
+    *("radius_ratio", "area_efficiency", "displaced_volume_cm3", "status", "best_of_all"),
+)
+"""Columns of the printed table."""
+
+
+def run(job: Run) -> None:
+    """Trace the fronts of all `FAMILIES`; write and print a row per best compromise.
 
     A reduced run has one family, and as few points as a front of three terms can have."""
     rows = [reference()]
     volume = rows[0]["displaced_volume_cm3"]
-    say(f"{REFERENCE}: {volume:.4g} cm³ per revolution")
-    for family in QUICK if quick else FAMILIES:
+    job.say(f"{REFERENCE}: {volume:.4g} cm³ per revolution")
+    for family in QUICK if job.quick else FAMILIES:
         try:
-            found = front_of(family, volume, 2 if quick else DIVISIONS, say)
+            rows += front_of(family, volume, 2 if job.quick else DIVISIONS, job.say)
         except InputError as error:
-            say(f"{family}: {error}")
-            continue
-        rows += found
+            job.say(f"{family}: {error}")
     mark_best(rows)
-    return rows
+    job.csv("pump_front.csv", rows)
+    job.figure("pump_front.png", fronts(rows))
+    show("Best compromises of every family", rows, SHOWN)

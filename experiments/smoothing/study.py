@@ -17,12 +17,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from experiments._common.batch import Batch, coarse, on_all_cores, respond
+from experiments._common.driver import Run
 from experiments._common.engines import FD_STEPS
-from experiments._common.scenes import SHAKY, shipped
+from experiments._common.scenes import FORCES, SHAKY, shipped
 from experiments._common.simulation import stacked
+from experiments._common.style import BLUE, GREEN, VERMILION, grid_below, sheet
 from rootsopt.config import Config
 from rootsopt.config.units import MM
 from rootsopt.dynamics.integrator import Integrator
@@ -57,11 +60,11 @@ COUNTS = {"cic": 60, "ee": 30, "pump": 5}
 """Number of random scenes of each kind."""
 
 
-def drawn(kind: str, seed: int) -> Iterator[Config]:
+def drawn(kind: str) -> Iterator[Config]:
     """Yield random scenes of a `kind` (key of `COUNTS`) without end.
 
     Designs are random as well if the profile family has parameters."""
-    draw = np.random.default_rng([seed, *kind.encode()])
+    draw = np.random.default_rng([0, *kind.encode()])
 
     def even_in_logarithm(low: float, high: float) -> float:
         return float(10 ** draw.uniform(np.log10(low), np.log10(high)))
@@ -92,10 +95,10 @@ def drawn(kind: str, seed: int) -> Iterator[Config]:
         yield config
 
 
-def scenes(kind: str, count: int, seed: int) -> list[Config]:
+def scenes(kind: str, count: int) -> list[Config]:
     """Load the known scenes of a kind and draw `count` random ones."""
     known = [shipped(name, *changes) for name, changes in KNOWN[kind]]
-    return [*known, *(config for config, _ in zip(drawn(kind, seed), range(count), strict=False))]
+    return [*known, *(config for config, _ in zip(drawn(kind), range(count), strict=False))]
 
 
 @CachedFunction
@@ -182,14 +185,7 @@ class Size:
     differentiated: int = 20
 
 
-def size_of(quick: bool, count: int | None) -> Size:
-    """Choose the size of a run. `count`: random scenes of the kind `cic`, with fewer of other
-    kinds.
-    """
-    if quick:
-        return Size({"cic": 5}, (1e-6, 1e-4, DEFAULT), (DEFAULT,), 2)
-    share = 1.0 if count is None else count / COUNTS["cic"]
-    return Size({kind: round(share * number) for kind, number in COUNTS.items()})
+QUICK = Size({"cic": 5}, (1e-6, 1e-4, DEFAULT), (DEFAULT,), 2)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -207,11 +203,11 @@ class Measured:
         return bias(self.orbits[width], self.orbits[WIDTHS[0]])
 
 
-def measure(kind: str, size: Size, seed: int, say: Say) -> Measured:
+def measure(kind: str, size: Size, say: Say) -> Measured:
     """Simulate the scenes of a kind to their orbits, then close the orbits at all smoothing
     lengths.
     """
-    configs = scenes(kind, size.counts[kind], seed)
+    configs = scenes(kind, size.counts[kind])
     models = stacked(configs)
     designs = np.stack([np.asarray(design_vector(config)) for config in configs])
     rest = np.zeros((len(configs), 11 if kind == "pump" else 2))
@@ -236,33 +232,21 @@ def measure(kind: str, size: Size, seed: int, say: Say) -> Measured:
 
 def rows_of(measured: Measured) -> list[dict[str, Any]]:
     """Return a row for every scene at every smoothing length."""
-    rows = []
-    for width, orbit in measured.orbits.items():
-        for k, config in enumerate(measured.configs):
-            gear, load_ = config.scene.timing_gear, config.scene.load
-            assert gear is not None
-            mean, peak, rms = orbit.response[k]
-            rows.append(
-                {
-                    "kind": measured.kind,
-                    "scene": k,
-                    "speed_rpm": config.scene.speed_rpm,
-                    "torque_N_m": load_.torque_N_m,
-                    "pressure_difference_Pa": load_.pressure_difference_Pa,
-                    "gear_stiffness_N_m_per_rad": gear.stiffness_N_m_per_rad,
-                    "gear_damping_ratio": gear.damping_ratio,
-                    "backlash_mm": gear.backlash_mm,
-                    "smoothing_mm": width,
-                    "status": Status.of(int(orbit.status[k])).label,
-                    "period": orbit.period[k],
-                    "mean_force_N": mean,
-                    "peak_force_N": peak,
-                    "rms_force_N": rms,
-                    "bias": measured.bias(width)[k],
-                    "solver_steps": orbit.steps[k],
-                }
-            )
-    return rows
+    return [
+        {
+            "kind": measured.kind,
+            "scene": k,
+            "scene_values": config.scene.model_dump_json(exclude_none=True),
+            "smoothing_mm": width,
+            "status": Status.of(int(orbit.status[k])).label,
+            "period": orbit.period[k],
+            **dict(zip((*FORCES, "rms_force_N"), orbit.response[k], strict=True)),
+            "bias": measured.bias(width)[k],
+            "solver_steps": orbit.steps[k],
+        }
+        for width, orbit in measured.orbits.items()
+        for k, config in enumerate(measured.configs)
+    ]
 
 
 def summary(measured: Measured) -> dict[str, Any]:
@@ -290,24 +274,68 @@ def summary(measured: Measured) -> dict[str, Any]:
     return {"scenes": measured.tried, "settled": len(measured.configs), "by_width": by_width}
 
 
-def run(
-    quick: bool,
-    count: int | None = None,
-    seed: int = 0,
-    say: Say = lambda text: None,
-    keep: Callable[[list[Measured]], None] = lambda found: None,
-) -> list[Measured]:
-    """Measure all kinds of scenes; after each kind, call `keep` with all results so far.
+ORDER = (BLUE, VERMILION, GREEN)
+COLORS: dict[str, str] = {"cic": BLUE, "ee": VERMILION, "pump": GREEN}
+NAMES = {"cic": "CIC", "ee": "EE", "pump": "pump"}
+MARKS = {"cic": "o", "ee": "s", "pump": "^"}
 
-    `count`: number of random scenes of the kind `cic`; `seed` of the random scenes."""
-    size = size_of(quick, count)
+
+def lengths(found: list[Measured]) -> Figure:
+    """Draw the bias of the forces and the error of the gradients over the smoothing length."""
+    made, axes = sheet(12, 6, 1, 2)
+    (left, right) = axes[0]
+    for measured in found:
+        kind, color = measured.kind, COLORS[measured.kind]
+        widths = np.array(sorted(set(measured.orbits) - {DEFAULT}))
+        beyond = widths[1:]
+        known = [measured.bias(width) for width in beyond]
+        for share, style in ((1.0, "-"), (0.5, ":")):
+            level = [np.nanquantile(values, share) for values in known]
+            name = "greatest" if share == 1 else "median"
+            left.loglog(
+                beyond, np.maximum(level, 1e-13), style, marker=MARKS[kind], color=color,
+                label=f"{NAMES[kind]}: {name} of {len(measured.configs)}",
+            )  # fmt: skip
+        own = [config.contact.rounding_mm for config in measured.configs]
+        left.loglog(
+            own, np.maximum(measured.bias(DEFAULT), 1e-13), MARKS[kind], color=color, mfc="none",
+            ms=5, label=f"{NAMES[kind]}: default, each scene",
+        )  # fmt: skip
+        for number, name in enumerate(("mean", "peak", "RMS")):
+            for width, off in measured.gradients.items():
+                values = off[:, number]
+                places = np.array(own[: len(values)]) if width == DEFAULT else width
+                right.loglog(
+                    places * 1.25 ** (number - 1) * np.ones_like(values),
+                    np.maximum(values, 1e-12),
+                    "os^"[number],
+                    color=ORDER[number],
+                    mfc="none",
+                    ms=4,
+                    label=name if width == DEFAULT else None,
+                )
+    left.axhline(LIMIT, color="black", linestyle="--", linewidth=1, label="limit")
+    left.set_ylabel(f"relative bias of the forces, against {WIDTHS[0]:g} mm")
+    right.set_ylabel("relative error of the gradient (CIC scenes)")
+    for ax in axes[0]:
+        ax.set_xlabel("contact.smoothing_mm (mm)")
+        grid_below(ax)
+        ax.legend(fontsize=8, frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3)
+    return made
+
+
+def run(job: Run) -> bool:
+    """Measure all kinds of scenes. Returns whether the default's bias is below the limit."""
+    size = QUICK if job.quick else Size(COUNTS)
     found: list[Measured] = []
     for kind in size.counts:
-        found.append(measure(kind, size, seed, say))
-        keep(found)
-    return found
-
-
-def within_limit(found: list[Measured]) -> bool:
-    """Return whether the bias of the default smoothing stays below `LIMIT` in all scenes."""
+        found.append(measure(kind, size, job.say))
+        # Save after each kind: the last one compiles for long.
+        job.csv("smoothing.csv", [row for one in found for row in rows_of(one)])
+        job.json("smoothing.json", {one.kind: summary(one) for one in found})
+        job.figure("smoothing.png", lengths(found))
+        part = summary(found[-1])
+        print(f"{kind}: {part['settled']} of {part['scenes']} scenes settle")
+        for width, row in part["by_width"].items():
+            print(f"  {width} mm: {row}")
     return bool(max(np.nanmax(one.bias(DEFAULT)) for one in found) < LIMIT)

@@ -1,5 +1,7 @@
 """Figures of contact force, objective and resonances over speed."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -14,15 +16,14 @@ from experiments._common.style import (
     grid_below,
     sheet,
 )
-from experiments.speed.study import OPTIMISED, Results
+from experiments.speed.study import OPTIMISED, Row, Study
 from rootsopt.figures.speeds import LABELS, legend_entries, plot_speeds
 
 TITLES = {"shipped": "shipped scene", "light": "gear damping ratio 0.1"}
 
 
-def over_speed(results: Results) -> Figure:
+def over_speed(studies: dict[str, Study]) -> Figure:
     """Draw mean and peak force over speed, one column per scene."""
-    studies = results.studies
     made, axes = sheet(13, 7.4, 2, len(studies), sharex=True, sharey="row")
     *shown, _ = OPTIMISED
     labels = ["CIC", "EE", *(f"CIC, optimised {name}" for name in shown)]
@@ -44,9 +45,8 @@ def over_speed(results: Results) -> Figure:
     return made
 
 
-def objectives(results: Results) -> Figure:
+def objectives(studies: dict[str, Study], listed: Sequence[float]) -> Figure:
     """Draw the objective of the optimised designs over speed, relative to CIC at the same speed."""
-    studies = results.studies
     made, axes = sheet(13, 4.6, 1, len(studies), sharey=True)
     styles = dict(zip(OPTIMISED, ((GREEN, "-", "o"), (PURPLE, "--", "s"),
                                   (ORANGE, ":", "^")), strict=True))  # fmt: skip
@@ -58,7 +58,7 @@ def objectives(results: Results) -> Figure:
             if parts is None:
                 continue
             values = found.over(parts)
-            at = [3000.0] if name == "at 3000 rpm" else results.listed
+            at = [3000.0] if name == "at 3000 rpm" else listed
             ax.plot(speeds, values, color=color, linestyle=dashes, label=f"optimised {name}")
             heights = np.interp(at, speeds, values)
             ax.plot(at, heights, marker, color=color, markersize=5)
@@ -77,10 +77,9 @@ def objectives(results: Results) -> Figure:
     return made
 
 
-def resonances(results: Results) -> Figure:
+def resonances(studies: dict[str, Study], rows: list[Row], peaks: list[Row]) -> Figure:
     """Draw peak force over speed, with resonance crossings and maxima: shipped pairs, optimised
     CIC."""
-    studies, rows, peaks = results.studies, results.resonances, results.peaks
     shown = {
         "CIC": BLUE,
         "EE": VERMILION,

@@ -10,16 +10,17 @@ equals a natural frequency.
 import dataclasses
 import math
 import time
-from collections.abc import Callable
-from typing import Any
+from collections import Counter
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.signal import find_peaks
 
+from experiments._common.driver import Run
 from experiments._common.scenes import shipped
 from experiments._common.simulation import evaluator_of
+from experiments._common.tables import Row, print_record
 from rootsopt.config import Config
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.figures.speeds import LABELS
@@ -29,7 +30,6 @@ from rootsopt.response.result import Part
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import design_vector
 
-Row = dict[str, Any]
 SCENES = {"shipped": (), "light": ("scene.timing_gear.damping_ratio=0.1",)}
 OPTIMISED = {
     "at 3000 rpm": (),
@@ -248,55 +248,43 @@ def worth(along: np.ndarray, speeds) -> Row:
     }
 
 
-@dataclasses.dataclass
-class Results:
-    """Results of the study: scenes by name, speeds (rpm) of the objective, and tables of rows.
-
-    The tables are sweeps, crossings and maxima. `chance`: share of the maxima expected at a
-    crossing by chance, by scene and design.
-    """
-
-    studies: dict[str, Study]
-    listed: tuple[float, ...]
-    rows: list[Row]
-    resonances: list[Row]
-    peaks: list[Row]
-    chance: dict[str, float]
-
-    def record(self) -> dict[str, Any]:
-        """Return a summary of frequencies, optimisations, maxima and statuses."""
-        return {
-            "linearised": {scene: found.linear for scene, found in self.studies.items()},
-            "optimisations": [row for found in self.studies.values() for row in found.outcomes],
-            "maxima": len(self.peaks),
-            "maxima_at_a_crossing": sum(abs(row["apart"]) <= NEAR for row in self.peaks),
-            "maxima_at_a_crossing_by_chance": sum(
-                self.chance[f"{row['scene']}, {row['design']}"] for row in self.peaks
-            ),
-            "statuses": {
-                f"{scene}, {name}": {
-                    status: sum(p.evaluation.status.label == status for p in parts)
-                    for status in dict.fromkeys(p.evaluation.status.label for p in parts)
-                }
-                for scene, found in self.studies.items()
-                for name, parts in found.designs.items()
-            },
-        }
-
-
-def run(quick: bool, say: Callable[[str], None] = lambda text: None) -> Results:
+def run(job: Run) -> None:
     """Study all scenes; a reduced run takes one scene, few speeds and one short optimisation."""
-    speeds = np.linspace(300, 6000, 5 if quick else 115).tolist()
-    listed = (2000.0, 4000.0) if quick else tuple(np.arange(500.0, 6001.0, 500.0).tolist())
-    results = Results({}, listed, [], [], [], {})
-    for scene in list(SCENES)[: 1 if quick else None]:
-        found = results.studies[scene] = study(scene, speeds, listed, quick)
+    from experiments.speed import figures
+
+    speeds = np.linspace(300, 6000, 5 if job.quick else 115).tolist()
+    listed = (2000.0, 4000.0) if job.quick else tuple(np.arange(500.0, 6001.0, 500.0).tolist())
+    studies: dict[str, Study] = {}
+    rows: list[Row] = []
+    crossed: list[Row] = []
+    peaks: list[Row] = []
+    by_chance, statuses = 0.0, {}
+    for scene in list(SCENES)[: 1 if job.quick else None]:
+        found = studies[scene] = study(scene, speeds, listed, job.quick)
         for name, parts in found.designs.items():
             here = {"scene": scene, "design": name}
-            results.rows += [here | part.row(whole=True) for part in parts]
+            rows += [here | part.row(whole=True) for part in parts]
             across = crossings(found.linear[name], found.config.profile.lobes, speeds)
-            results.resonances += [here | row for row in across]
-            results.peaks += [here | row for row in maxima(parts, across)]
-            results.chance[f"{scene}, {name}"] = covered(across, speeds)
-        say(f"{scene}: {len(found.designs)} designs at {len(speeds)} speeds")
-    return results
+            crossed += [here | row for row in across]
+            tops = maxima(parts, across)
+            peaks += [here | row for row in tops]
+            by_chance += covered(across, speeds) * len(tops)
+            labels = (part.evaluation.status.label for part in parts)
+            statuses[f"{scene}, {name}"] = dict(Counter(labels))
+        job.say(f"{scene}: {len(found.designs)} designs at {len(speeds)} speeds")
+    record = {
+        "linearised": {scene: found.linear for scene, found in studies.items()},
+        "optimisations": [row for found in studies.values() for row in found.outcomes],
+        "maxima": len(peaks),
+        "maxima_at_a_crossing": sum(abs(row["apart"]) <= NEAR for row in peaks),
+        "maxima_at_a_crossing_by_chance": by_chance,
+        "statuses": statuses,
+    }
+    job.csv("speed.csv", rows)
+    job.csv("speed_resonances.csv", crossed)
+    job.csv("speed_maxima.csv", peaks)
+    job.json("speed.json", record)
+    job.figure("speed.png", figures.over_speed(studies))
+    job.figure("speed_objective.png", figures.objectives(studies, listed))
+    job.figure("speed_resonances.png", figures.resonances(studies, crossed, peaks))
+    print_record(record)

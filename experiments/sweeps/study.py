@@ -11,18 +11,23 @@ import os
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from matplotlib.figure import Figure
+
+from experiments._common.driver import Run
 from experiments._common.scenes import CIC
+from experiments._common.style import BLUE, ORANGE, grid_below, sheet
+from experiments._common.tables import Row, show
 from rootsopt.config import Config, load
 from rootsopt.sweeps.local import divided
 from rootsopt.sweeps.plan import Plan, plan_of
 from rootsopt.sweeps.points import simulated_together
-from rootsopt.sweeps.scenes import Points, Run, complete, runner
+from rootsopt.sweeps.scenes import Points, complete, runner
+from rootsopt.sweeps.scenes import Run as Way
 
-Row = dict[str, Any]
 ROUNDS = 2
 """Number of times that everything is measured; the fastest round counts."""
 SPEED, ANGLE = "scene.speed_rpm", "profile.pressure_angle_deg"
@@ -32,39 +37,8 @@ INVALID = (5.0, 10.0)
 """Pressure angles (°) with which the shipped CIC profile is not sound."""
 
 
-def run(quick: bool, say: Callable[[str], None]) -> tuple[list[Row], list[Row]]:
-    """Measure points with a simulation, and points without one; return a row for each way."""
-    config = load(CIC)
-    workers = (None, 1) if quick else (None, 1, 2)
-    points = 8 if quick else 96
-    _timed(config, plan_of({SPEED: "1000:1001:2"}), None)
-    ways = []
-    for count in workers:
-        plan = plan_of({SPEED: f"1000:4000:{points}"})
-        best = _best(config, plan, count, 1 if quick else ROUNDS)
-        ways.append({"way": _name(count)} | best)
-        say(f"{_name(count)}: {best['points_per_second']:.3g} points per second")
-    if not quick:
-        plan = plan_of({SPEED: f"1000:4000:{4 * TOGETHER}"})
-        name = f"this process, {TOGETHER} at a time (vmap)"
-        ways.append({"way": name} | _timed(config, plan, None, _together))
-        say(f"{name}: {ways[-1]['points_per_second']:.3g} points per second")
-    first = ways[0]["points_per_second"]
-    for row in ways:
-        row["relative_to_one_process"] = row["points_per_second"] / first
-    collector = []
-    for count in workers:
-        plan = plan_of({ANGLE: f"{INVALID[0]}:{INVALID[1]}:{64 if quick else 1000}"})
-        best = _best(config, plan, count, 1 if quick else ROUNDS)
-        collector.append({"way": _name(count)} | best)
-        say(f"collector, {_name(count)}: {best['points_per_second']:.4g} points per second")
-    return ways, collector
-
-
 def _name(workers: int | None) -> str:
-    if workers is None:
-        return "this process"
-    return f"{workers} worker{'s' if workers > 1 else ''}"
+    return f"{workers} worker{'s' * (workers > 1)}" if workers else "this process"
 
 
 def _best(config: Config, plan: Plan, workers: int | None, rounds: int) -> Row:
@@ -81,7 +55,7 @@ def _together(config: Config, plan: Plan, numbers: Sequence[int], stop: threadin
         yield [*zip(some, rows, strict=True)]
 
 
-def _timed(config: Config, plan: Plan, workers: int | None, run: Run | None = None) -> Row:
+def _timed(config: Config, plan: Plan, workers: int | None, run: Way | None = None) -> Row:
     """Run a sweep with its file; return start-up time (s), total time (s) and rate.
 
     `run`: how to simulate the points, by default as a sweep does with this number of `workers`.
@@ -109,3 +83,51 @@ def _timed(config: Config, plan: Plan, workers: int | None, run: Run | None = No
         "load_average": os.getloadavg()[0],
         "cores": os.cpu_count(),
     }
+
+
+def throughput(ways: list[Row]) -> Figure:
+    """Draw the rate of points, and the time until the first points, for each way to run them."""
+    figure, axes = sheet(9, 1.4 + 0.5 * len(ways), 1, 2, sharey=True)
+    shown = {
+        "points_per_second": ("points per second, after the first", BLUE, "%.1f"),
+        "start_s": ("time to the first points (s)", ORANGE, "%.1f"),
+    }
+    for ax, (key, (label, color, form)) in zip(axes[0], shown.items(), strict=True):
+        bars = ax.barh(range(len(ways)), [row[key] for row in ways], 0.6, color=color)
+        ax.bar_label(bars, fmt=form, padding=3, fontsize=9)
+        ax.set_yticks(range(len(ways)), [row["way"] for row in ways])
+        ax.margins(x=0.15)
+        ax.set_xlabel(label)
+        grid_below(ax, axis="x")
+    axes[0, 0].invert_yaxis()
+    return figure
+
+
+def run(job: Run) -> None:
+    """Measure points with a simulation, and points without one; write a row for each way."""
+    config = load(CIC)
+    workers, rounds = ((None, 1), 1) if job.quick else ((None, 1, 2), ROUNDS)
+    _timed(config, plan_of({SPEED: "1000:1001:2"}), None)
+    plans = {
+        "sweeps": plan_of({SPEED: f"1000:4000:{8 if job.quick else 96}"}),
+        "sweeps_collector": plan_of(
+            {ANGLE: f"{INVALID[0]}:{INVALID[1]}:{64 if job.quick else 1000}"}
+        ),
+    }
+    tables: dict[str, list[Row]] = {}
+    for name, plan in plans.items():
+        rows = tables[name] = []
+        for count in workers:
+            rows.append({"way": _name(count)} | _best(config, plan, count, rounds))
+            job.say(
+                f"{name}, {_name(count)}: {rows[-1]['points_per_second']:.3g} points per second"
+            )
+    ways = tables["sweeps"]
+    if not job.quick:
+        plan = plan_of({SPEED: f"1000:4000:{4 * TOGETHER}"})
+        name = f"this process, {TOGETHER} at a time (vmap)"
+        ways.append({"way": name} | _timed(config, plan, None, _together))
+    for name, rows in tables.items():
+        job.csv(f"{name}.csv", rows)
+        show(f"Points of {name}.csv", rows)
+    job.figure("sweeps.png", throughput(ways))

@@ -6,16 +6,19 @@ number of lobes share a compiled program; straight rotors are those with a twist
 degree.
 """
 
-from collections.abc import Callable
-from typing import Any
+import itertools
 
+import numpy as np
+from matplotlib.figure import Figure
+
+from experiments._common.driver import Run
 from experiments._common.scenes import shipped
-from rootsopt.config import Config
-from rootsopt.pump.sheet import sheet
+from experiments._common.style import COLORS, MARKS, grid_below, sheet
+from experiments._common.tables import Row, show
+from rootsopt.pump.sheet import sheet as pump_sheet
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.scene import Scene, design_vector
 
-Row = dict[str, Any]
 LOBES = 2, 3, 4
 TWISTS = 1e-6, 10.0, 20.0, 30.0, 45.0, 60.0, 75.0, 90.0
 _SLICES = 6
@@ -30,9 +33,11 @@ _FORCES = (
 )
 
 
-def config_of(lobes: int, twist: float, slices: int = _SLICES) -> Config:
-    """Return the config of EE rotors with `lobes` and a `twist` (°)."""
-    return shipped(
+def evaluated(lobes: int, twist: float, slices: int) -> Row:
+    """Return the row of EE rotors with `lobes` and a `twist` (°): ripple, forces and loads.
+
+    Without an orbit, forces are `None`."""
+    config = shipped(
         "ee",
         f"profile.lobes={lobes}",
         "scene.load={pressure_difference_Pa: 6.0e4}",
@@ -40,26 +45,51 @@ def config_of(lobes: int, twist: float, slices: int = _SLICES) -> Config:
         f"rotor.helix_deg={twist!r}",
         f"solver.slices={slices}",
     )
-
-
-def evaluated(lobes: int, twist: float, slices: int) -> Row:
-    """Return the row of one pair: ripple, forces and loads. Without an orbit, forces are `None`."""
-    config = config_of(lobes, twist, slices)
     found = Evaluator.of(config)()
-    rows = sheet(Scene.from_config(config), design_vector(config))
-    row: Row = {"lobes": lobes, "twist_deg": round(twist, 3), "flow_ripple": rows["flow_ripple"]}
-    row |= {name: found.response.get(name) for name in _FORCES}
-    return row | {"status": found.status.label}
+    ripple = pump_sheet(Scene.from_config(config), design_vector(config))["flow_ripple"]
+    row: Row = {"lobes": lobes, "twist_deg": round(twist, 3), "flow_ripple": ripple}
+    return row | {k: found.response.get(k) for k in _FORCES} | {"status": found.status.label}
 
 
-def run(quick: bool, say: Callable[[str], None] = lambda text: None) -> list[Row]:
-    """Evaluate every number of lobes at every twist.
+_PANELS = {
+    "flow_ripple": ("flow ripple (%)", 100.0),
+    "mean_force_N": ("mean contact force (N)", 1.0),
+    "peak_force_N": ("peak contact force (N)", 1.0),
+    "bearing_load_equivalent_N": ("equivalent bearing load (N)", 1.0),
+    "axial_force_max_N": ("greatest axial force (N)", 1.0),
+    "tilting_moment_max_N_m": ("greatest tilting moment (N m)", 1.0),
+}
+
+
+def over_twist(rows: list[Row]) -> Figure:
+    """Draw each quantity over the twist, one line per number of lobes."""
+    figure, axes = sheet(11, 6.6, 2, 3, sharex=True)
+    numbers = sorted({row["lobes"] for row in rows})
+    for ax, (key, (label, factor)) in zip(axes.ravel(), _PANELS.items(), strict=True):
+        for lobes, color, mark in zip(numbers, COLORS, MARKS, strict=False):
+            own = [row for row in rows if row["lobes"] == lobes]
+            values = [np.nan if row[key] is None else factor * row[key] for row in own]
+            twists = [row["twist_deg"] for row in own]
+            ax.plot(twists, values, color=color, marker=mark, ms=4, label=f"{lobes} lobes")
+        ax.set_ylabel(label)
+        ax.set_ylim(bottom=0)
+        grid_below(ax)
+    for ax in axes[-1]:
+        ax.set_xlabel("twist over the length (°)")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
+    return figure
+
+
+def run(job: Run) -> None:
+    """Evaluate every number of lobes at every twist; write and print the table.
 
     A reduced run has three lobes, two twists and two slices."""
-    lobes, twists, slices = ((3,), (1e-6, 30.0), 2) if quick else (LOBES, TWISTS, _SLICES)
+    lobes, twists, slices = ((3,), (1e-6, 30.0), 2) if job.quick else (LOBES, TWISTS, _SLICES)
     rows: list[Row] = []
-    for number in lobes:
-        for twist in twists:
-            rows.append(evaluated(number, twist, slices))
-            say(f"{number} lobes, {twist:.3g}°: {rows[-1]['status']}")
-    return rows
+    for number, twist in itertools.product(lobes, twists):
+        rows.append(evaluated(number, twist, slices))
+        job.say(f"{number} lobes, {twist:.3g}°: {rows[-1]['status']}")
+    job.csv("twist.csv", rows)
+    job.figure("twist.png", over_twist(rows))
+    show("Twisted rotors", rows)

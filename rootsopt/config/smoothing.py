@@ -32,7 +32,7 @@ def following_mm(
     exponent e and depth of full damping (mm) of the flanks.
 
     This smoothing changes the forces by less than 1e-4 of their values. The command `python -m
-    experiments.smoothing` measures this."""
+    experiments smoothing` measures this."""
     torque = max(load_torque, _LEAST_LOAD)
     stiffness, exponent, full = contact
     force = torque / (pitch_radius_mm * 1e-3)

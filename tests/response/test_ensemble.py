@@ -402,7 +402,7 @@ def test_simulate_an_ensemble(tmp_path):
 @pytest.mark.long
 def test_experiment(tmp_path):
     """The study runs, and writes its tables and its figure."""
-    command = [sys.executable, "-m", "experiments.chaos", "--quick", "-o", str(tmp_path)]
+    command = [sys.executable, "-m", "experiments", "chaos", "--quick", "-o", str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     data = json.loads((tmp_path / "chaos.json").read_text())

@@ -1,11 +1,11 @@
 """Studies, run with `--quick`, write their files and give sane numbers."""
 
 import csv
-import importlib
 import json
 import os
 import subprocess
 import sys
+from collections import Counter
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from experiments.__main__ import studies
 from experiments._common import engines
 from experiments._common.engines.scipy_nodes import ScipyNodes
 from experiments._common.scenes import FORCES
@@ -25,6 +26,7 @@ from rootsopt.scene import Scene, design_vector
 pytest.importorskip("numba")
 
 PNG = b"\x89PNG"
+KNOWN = studies()
 
 
 @pytest.fixture(scope="module")
@@ -39,13 +41,13 @@ def programs(tmp_path_factory):
 
 
 def run(study, folder, environment, *options):
-    """Make a reduced run of a study; return its standard output. Its figures are pictures."""
-    command = [sys.executable, "-m", f"experiments.{study}", "--quick", "-o", str(folder), *options]
+    """Make a reduced run of a study, which draws its published figures; return its output."""
+    command = [sys.executable, "-m", "experiments", study, "--quick", "-o", str(folder), *options]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert {path.read_bytes()[:4] for path in folder.glob("*.png")} <= {PNG}
-    figures = importlib.import_module(f"experiments.{study}.__main__").FIGURES
-    assert options or {*figures} <= {path.name for path in folder.iterdir()}
+    drawn = {path.name for path in folder.glob("*.png") if path.read_bytes()[:4] == PNG}
+    searched = "--search" in options
+    assert drawn == {x for x in KNOWN[study][1].published if ("search" in x) == searched}
     return done.stdout
 
 
@@ -63,7 +65,7 @@ def test_gradients(tmp_path, programs):
     """Gradients of a few random pairs are those of differences, at every tolerance."""
     said = run("gradients", tmp_path, programs)
     assert said.endswith("0 promises broken\n")
-    rows = rows_of(tmp_path / "gradients_0_of_1.csv")
+    rows = rows_of(tmp_path / "gradients.csv")
     assert len(rows) == 12
     assert max(numbers(rows, "mean_force_N_error")) < 1e-4
 
@@ -74,12 +76,12 @@ def test_gradients_that_are_off_are_told():
     good |= {f"{name}_error": 9e-7 for name in gradients.MEASURES}
     good |= {f"{name}_noise": 1e-8 for name in gradients.MEASURES}
     rows = [good | {"rtol": rtol} for rtol in gradients.TOLERANCES]
-    assert gradients.judge(rows).broken == []
+    assert gradients.judge(rows)[1] == []
     for name in gradients.MEASURES:
-        said, more = gradients.judge([*rows[:2], rows[2] | {f"{name}_error": 1e-2}]).broken
+        said, more = gradients.judge([*rows[:2], rows[2] | {f"{name}_error": 1e-2}])[1]
         assert said.startswith("OFF 1e-10")
         assert more == "UNBOUNDED 11.1 % of 9 gradients"
-    (said,) = gradients.judge([*rows[:2], rows[2] | {"status": "not_settled"}]).broken
+    (said,) = gradients.judge([*rows[:2], rows[2] | {"status": "not_settled"}])[1]
     assert said.startswith("WORSE")
 
 
@@ -100,7 +102,7 @@ def test_tolerances(tmp_path, programs):
     """All designs are evaluated in every fresh scene.
 
     The robust optimum is no worse over the search's sample."""
-    run("tolerances", tmp_path, programs, "--case", "shipped")
+    run("tolerances", tmp_path, programs)
     rows = rows_of(tmp_path / "tolerances.csv")
     assert [row["design"] for row in rows] == ["baseline", "nominal", "robust"]
     assert numbers(rows, "robust_objective")[0] == 1 > max(numbers(rows, "robust_objective")[1:])
@@ -157,15 +159,12 @@ def test_benchmark(tmp_path, programs):
     out = run("benchmark", tmp_path, programs)
     rows = rows_of(tmp_path / "benchmark.csv")
     assert all(float(row["run_s"]) > 0 for row in rows)
-    parts = {row["part"] for row in rows}
-    expected = {"scipy", "numba", "single", "batch 4", "revolutions", "main job"}
-    assert parts == expected
-    for row in rows:
-        if row["value_error"]:
-            assert float(row["value_error"]) < 1e-2
+    parts = {"scipy", "numba", "single", "batch 4", "revolutions", "main job"}
+    assert {row["part"] for row in rows} == parts
+    assert max(float(row["value_error"] or 0) for row in rows) < 1e-2
     assert all(float(row["peak_memory_MB"]) > 10 for row in rows)
     result = json.loads((tmp_path / "benchmark.json").read_text())
-    assert set(result["not_measured"]) == {"orbit"}
+    assert result["not_measured"] == {}
     goals = {goal["target"]: goal for goal in result["targets"]}
     assert len(result["targets"]) == 11
     assert all(name.split(",")[0] in out for name in goals)
@@ -310,8 +309,7 @@ def test_landscape(tmp_path, programs):
     assert record["agrees"]
     rows = rows_of(tmp_path / "landscape.csv")
     assert len(rows) == record["grid_designs"] + record["finer_designs"]
-    assert record["grid_designs"] > 5
-    assert record["finer_designs"] > 5
+    assert min(record["grid_designs"], record["finer_designs"]) > 5
 
 
 @pytest.mark.long
@@ -381,8 +379,8 @@ def test_optimisers(tmp_path, programs):
     """Every method improves on the start of every problem, and each evaluation is recorded."""
     run("optimisers", tmp_path, programs)
     rows = rows_of(tmp_path / "optimisers.csv")
-    for method in ("slsqp", "augmented_lagrangian", "interior_point"):
-        own = [row for row in rows if row["method"] == method]
-        assert 2 < len(own) <= 30
+    designs = Counter(row["method"] for row in rows)
+    assert {"slsqp", "augmented_lagrangian", "interior_point"} <= set(designs)
+    assert all(2 < number <= 30 for number in designs.values())
     record = json.loads((tmp_path / "optimisers.json").read_text())
     assert all(row["designs"] > 1 for row in record["summary"])

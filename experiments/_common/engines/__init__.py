@@ -9,7 +9,7 @@ closed orbits.
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,6 @@ from rootsopt.config import Config
 
 _MM = 1e-3
 _DEG = math.pi / 180
-
 Design = Sequence[float]
 """A CIC design: pressure angle (deg), involute length (mm), tip arc angle (deg)."""
 
@@ -212,20 +211,6 @@ class Result:
         return np.array([self.mean, self.peak, self.rms])
 
 
-class Simulator(Protocol):
-    """Interface of the SciPy and Numba simulators."""
-
-    def simulate(self, design: Design) -> Result:
-        """Start from ε = 0, dε/dt = 0 at φ = 0, settle, then average over the window."""
-        ...
-
-    def gradient(
-        self, design: Design, steps: Sequence[float] = FD_STEPS
-    ) -> tuple[Result, NDArray[np.float64]]:
-        """Return the result and d(mean, peak, RMS) / d(design), N per config unit, (3, 3)."""
-        ...
-
-
 def central_differences(
     simulate: Callable[[Design], Result], design: Design, steps: Sequence[float]
 ) -> tuple[Result, NDArray[np.float64]]:
@@ -242,3 +227,41 @@ def central_differences(
             ends.append(simulate(moved).response)
         columns.append((ends[0] - ends[1]) / (2 * step))
     return simulate(design), np.stack(columns, axis=1)
+
+
+# The contact law and the rounded ends of the backlash
+
+
+def ramp(x: float, width: float) -> float:
+    if x >= width:
+        return max(x, 0.0)
+    t = max(x, 0.0) / width
+    return width * t * t * (2 - t)
+
+
+def smooth_step(x: float) -> float:
+    t = min(max(x, 0.0), 1.0)
+    return t * t * (3 - 2 * t)
+
+
+def balanced_ramp(x: float, width: float) -> float:
+    """Return a smooth ramp, as `ramp`, but with the same integral as max(0, x)."""
+    t = min(max(x, 0.0) / width, 1.0) if width > 0 else 1.0
+    return max(x, 0.0) if t == 1 else width * t * t * (4.5 - 6 * t + 2.5 * t * t)
+
+
+def balanced_step(x: float) -> float:
+    """Return a smooth step, as `smooth_step`, but with the same integral as a step at 0."""
+    t = min(max(x, 0.0), 1.0)
+    return t * t * (18 - 32 * t + 15 * t * t)
+
+
+def impact(motion: Motion, depth: float, rate: float) -> float:
+    """Return the IMPACT force (N) at a penetration (m) that grows at `rate` (m/s)."""
+    if depth <= 0:
+        return 0.0
+    delta = ramp(depth, motion.smoothing)
+    elastic = motion.stiffness * delta**motion.exponent
+    damped = motion.damping * smooth_step(delta / motion.full_damping_depth) * rate
+    share = min(motion.smoothing / motion.full_damping_depth, 1.0)
+    return ramp(elastic + damped, share * elastic)

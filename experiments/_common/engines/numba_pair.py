@@ -14,6 +14,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from experiments._common.engines import (
@@ -23,14 +24,23 @@ from experiments._common.engines import (
     Result,
     Rotor,
     Scene,
+    balanced_ramp,
+    balanced_step,
     central_differences,
+    impact,
     motion_of,
+    ramp,
     rotor_of,
+    smooth_step,
 )
 
 # Omit the check for division by zero. Floating point may be contracted and reordered, but keeps NaN
 # and infinity.
-_compiled = njit(error_model="numpy", fastmath={"contract", "reassoc", "arcp", "nsz"})
+_FAST = {"contract", "reassoc", "arcp", "nsz"}
+_compiled = njit(error_model="numpy", fastmath=_FAST)
+# Compiled code may call these functions, which remain functions of Python.
+for law in (ramp, smooth_step, balanced_ramp, balanced_step, impact):
+    register_jitable(error_model="numpy", fastmath=_FAST)(law)
 
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(24)
 
@@ -398,48 +408,6 @@ def mapped(half, table, roll, relative):
 
 
 @_compiled
-def _ramp(x, width):
-    if x >= width:
-        return max(x, 0.0)
-    if x <= 0:
-        return 0.0
-    t = x / width
-    return width * t * t * (2 - t)
-
-
-@_compiled
-def _smooth_step(x):
-    t = min(max(x, 0.0), 1.0)
-    return t * t * (3 - 2 * t)
-
-
-@_compiled
-def _balanced_ramp(x, width):
-    """Return a smooth ramp, as `_ramp`, but with the same integral as max(0, x)."""
-    t = min(max(x, 0.0) / width, 1.0) if width > 0 else 1.0
-    return max(x, 0.0) if t == 1 else width * t * t * (4.5 - 6 * t + 2.5 * t * t)
-
-
-@_compiled
-def _balanced_step(x):
-    """Return a smooth step, as `_smooth_step`, but with the same integral as a step at 0."""
-    t = min(max(x, 0.0), 1.0)
-    return t * t * (18 - 32 * t + 15 * t * t)
-
-
-@_compiled
-def _impact(motion, depth, rate):
-    """Return the IMPACT force (N) at a penetration (m) that grows at `rate` (m/s)."""
-    if depth <= 0:
-        return 0.0
-    delta = _ramp(depth, motion.smoothing)
-    elastic = motion.stiffness * delta**motion.exponent
-    damped = motion.damping * _smooth_step(delta / motion.full_damping_depth) * rate
-    share = min(motion.smoothing / motion.full_damping_depth, 1.0)
-    return _ramp(elastic + damped, share * elastic)
-
-
-@_compiled
 def _slope(rotor, motion, table, search, tau, angle, rate):
     """Return scaled acceleration and contact force (N) at the time τ in a scaled state."""
     relative = motion.angle_scale * angle
@@ -454,12 +422,12 @@ def _slope(rotor, motion, table, search, tau, angle, rate):
     depth = -gap - motion.clearance
     if depth > 0:
         closing = side * (lever1 * motion.speed - lever2 * (motion.speed + speed2))
-        force = _impact(motion, depth, closing)
+        force = impact(motion, depth, closing)
     torque = side * lever2 * force - motion.load_torque
     excess = abs(relative) - motion.half_backlash
     if excess > 0:
-        engaged = _balanced_step(excess / motion.gear_rounding) if motion.gear_rounding > 0 else 1.0
-        spring = -side * motion.gear_stiffness * _balanced_ramp(excess, motion.gear_rounding)
+        engaged = balanced_step(excess / motion.gear_rounding) if motion.gear_rounding > 0 else 1.0
+        spring = -side * motion.gear_stiffness * balanced_ramp(excess, motion.gear_rounding)
         torque -= spring + motion.gear_damping * engaged * speed2
     return torque * motion.agility, force
 

@@ -25,7 +25,10 @@ from experiments._common.engines import (
     Result,
     Rotor,
     Scene,
+    balanced_ramp,
+    balanced_step,
     central_differences,
+    impact,
     motion_of,
     rotor_of,
 )
@@ -305,48 +308,13 @@ def _signed_distances(nodes, segments):
 # Equation of motion
 
 
-def _ramp(x: float, width: float) -> float:
-    if x >= width:
-        return max(x, 0.0)
-    t = max(x, 0.0) / width
-    return width * t * t * (2 - t)
-
-
-def _smooth_step(x: float) -> float:
-    t = min(max(x, 0.0), 1.0)
-    return t * t * (3 - 2 * t)
-
-
-def _balanced_ramp(x: float, width: float) -> float:
-    """Return a smooth ramp, as `_ramp`, but with the same integral as max(0, x)."""
-    t = min(max(x, 0.0) / width, 1.0) if width > 0 else 1.0
-    return max(x, 0.0) if t == 1 else width * t * t * (4.5 - 6 * t + 2.5 * t * t)
-
-
-def _balanced_step(x: float) -> float:
-    """Return a smooth step, as `_smooth_step`, but with the same integral as a step at 0."""
-    t = min(max(x, 0.0), 1.0)
-    return t * t * (18 - 32 * t + 15 * t * t)
-
-
-def _impact(motion: Motion, depth: float, rate: float) -> float:
-    """Return the IMPACT force (N) at a penetration (m) that grows at `rate` (m/s)."""
-    if depth <= 0:
-        return 0.0
-    delta = _ramp(depth, motion.smoothing)
-    elastic = motion.stiffness * delta**motion.exponent
-    damped = motion.damping * _smooth_step(delta / motion.full_damping_depth) * rate
-    share = min(motion.smoothing / motion.full_damping_depth, 1.0)
-    return _ramp(elastic + damped, share * elastic)
-
-
 def _gear(motion: Motion, relative: float, rate: float) -> float:
     """Return the torque (N·m) of the timing gear against ε."""
     excess = abs(relative) - motion.half_backlash
     if excess <= 0:
         return 0.0
-    engaged = _balanced_step(excess / motion.gear_rounding) if motion.gear_rounding > 0 else 1.0
-    spring = motion.gear_stiffness * _balanced_ramp(excess, motion.gear_rounding)
+    engaged = balanced_step(excess / motion.gear_rounding) if motion.gear_rounding > 0 else 1.0
+    spring = motion.gear_stiffness * balanced_ramp(excess, motion.gear_rounding)
     return math.copysign(spring, relative) + motion.gear_damping * engaged * rate
 
 
@@ -379,7 +347,7 @@ class _Equation:
         roll = -side * (motion.turn * tau + relative / 2)
         gap, lever1, lever2 = self.contact(roll, side * relative)
         closing = side * (lever1 * motion.speed - lever2 * (motion.speed + speed2))
-        force = _impact(motion, -gap - motion.clearance, closing)
+        force = impact(motion, -gap - motion.clearance, closing)
         torque = side * lever2 * force - motion.load_torque - _gear(motion, relative, speed2)
         return torque * motion.agility, force
 

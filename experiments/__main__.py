@@ -1,0 +1,99 @@
+"""Run a study, or all of them: `python -m experiments NAME`, `python -m experiments --all`.
+
+Without a name, the studies are listed. Exit code 0: success. 2: bad input, one message on stderr.
+3: no result, or the results break a promise that a study checks.
+"""
+
+import argparse
+import importlib
+import pkgutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from experiments._common.driver import NoResultError, Study, conduct
+from rootsopt.commands.door import BAD_INPUT, NO_RESULT, OK
+from rootsopt.errors import InputError
+from rootsopt.runtime import environment
+
+COMMAND = "python -m experiments"
+RESULTS = Path("results/experiments")
+"""Folder of the result folders, relative to the repository root."""
+
+
+def studies() -> dict[str, tuple[str, Study]]:
+    """Return text and declaration of every study, by name; the text begins with the question."""
+    found = {}
+    for module in pkgutil.iter_modules([str(Path(__file__).parent)]):
+        if module.ispkg and not module.name.startswith("_"):
+            package = importlib.import_module(f"experiments.{module.name}")
+            found[module.name] = package.__doc__, package.STUDY
+    return found
+
+
+def parser_of(known: dict[str, tuple[str, Study]]) -> argparse.ArgumentParser:
+    """Return a parser with a subcommand for each of the `known` studies."""
+    parser = argparse.ArgumentParser(prog=COMMAND, description=f"{__doc__}".split("\n")[0])
+    parser.add_argument("--all", action="store_true", help="run all studies, one after the other")
+    _add_common(parser, RESULTS, "small sizes")
+    inner = parser.add_subparsers(dest="name", metavar="NAME", prog=COMMAND)
+    for name, (text, study) in known.items():
+        form = argparse.RawDescriptionHelpFormatter
+        one = inner.add_parser(name, description=text, formatter_class=form)
+        _add_common(one, RESULTS / name, study.quick)
+        for option, settings in study.options.items():
+            one.add_argument(option, **settings)
+    return parser
+
+
+def _add_common(parser: argparse.ArgumentParser, folder: Path, quick: str) -> None:
+    said = "folder of the results (default: %(default)s)"
+    parser.add_argument("-o", "--output", type=Path, metavar="DIR", default=folder, help=said)
+    parser.add_argument("--quick", action="store_true", help=f"reduced run: {quick}")
+    said = "also write the published figures into docs/"
+    parser.add_argument("--docs", action="store_true", help=said)
+
+
+def run_all(known: dict[str, tuple[str, Study]], options: argparse.Namespace) -> int:
+    """Run all studies, each in a process of its own; print time and exit code of each."""
+    flags = ["--quick"] * options.quick + ["--docs"] * options.docs
+    ends = []
+    for name, (_, study) in known.items():
+        for more in ((), *study.further):
+            began = time.perf_counter()
+            folder = options.output / " ".join([name, *more]).replace(" --", "_").replace(" ", "_")
+            command = [sys.executable, "-m", "experiments", name, *more, "-o", str(folder), *flags]
+            code = subprocess.run(command, check=False).returncode
+            ends.append((code, f"{time.perf_counter() - began:8.0f} s  {' '.join([name, *more])}"))
+    for code, text in ends:
+        print(f"exit code {code} {text}")
+    return NO_RESULT if any(code for code, _ in ends) else OK
+
+
+def main() -> int:
+    """Run what the command line asks for; return the exit code."""
+    known = studies()
+    parser = parser_of(known)
+    options = parser.parse_args()
+    if options.quick and options.docs:
+        parser.error("--docs publishes figures and cannot be combined with --quick; remove one")
+    environment.own_process()
+    if options.all:
+        return run_all(known, options)
+    if options.name is None:
+        print("\n".join(f"{name:<14}{text.splitlines()[0]}" for name, (text, _) in known.items()))
+        return OK
+    try:
+        kept = conduct(options.name, known[options.name][1], options)
+    except InputError as error:
+        print(f"{COMMAND} {options.name}: {' '.join(str(error).split())}", file=sys.stderr)
+        return BAD_INPUT
+    except NoResultError as error:
+        print(f"{COMMAND} {options.name}: {error}", file=sys.stderr)
+        return NO_RESULT
+    return OK if kept else NO_RESULT
+
+
+if __name__ == "__main__":
+    sys.exit(main())
