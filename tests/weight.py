@@ -13,9 +13,9 @@ from unittest import mock
 
 ROOT = Path(__file__).parents[1]
 MOST = {
-    "statements of the package": 25_163,
-    "statements of the tests": 18_540,
-    "statements of the experiments": 6_097,
+    "statements of the package": 25_162,
+    "statements of the tests": 18_539,
+    "statements of the experiments": 6_103,
     "packages": 20,
     "files of the package": 277,
     "lines of the longest file": 647,

@@ -13,9 +13,12 @@ def show(
 ) -> None:
     """Print rows as a Markdown table under a title, so that a page can take it over.
 
-    `columns`: keys to show, in order, by default the keys of the first row.
+    `columns`: keys to show, in order, by default the keys of the first row. Nothing is printed
+    without rows.
     """
-    keys = list(rows[0] if columns is None else columns) if rows else []
+    if not rows:
+        return
+    keys = list(rows[0] if columns is None else columns)
     lines = [[key.replace("_", " ") for key in keys], ["---"] * len(keys)]
     lines += [[_cell(row.get(key)) for key in keys] for row in rows]
     print(f"\n{title}\n")

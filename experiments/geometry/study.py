@@ -8,6 +8,7 @@ polygons, each with half the spacing of the last, are extrapolated (Romberg).
 
 import functools
 import itertools
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -214,20 +215,30 @@ def row_of(family: str, lobes: int, size: int, designs: np.ndarray, found: np.nd
     return row
 
 
-def run(job: Run) -> None:
-    """Compare all families; write a row per family, number of coefficients and number of lobes.
+def study(
+    draws: int,
+    seed: int = 0,
+    families: Sequence[str] = FAMILIES,
+    lobes: Sequence[int] = LOBES,
+    say: Callable[[str], None] = lambda text: None,
+) -> list[Row]:
+    """Compare families; return a row per family, number of coefficients and number of lobes.
 
-    A reduced run takes the families and lobes of `QUICK`, and few designs.
-    """
-    families, lobes = QUICK if job.quick else (FAMILIES, LOBES)
-    random = np.random.default_rng(0)
+    `draws`: number of designs drawn for each row."""
+    random = np.random.default_rng(seed)
     rows: list[Row] = []
     for family in families:
         sizes = COEFFICIENTS if family == "free_form" else (0,)
         for size, number in itertools.product(sizes, lobes):
-            found = errors(family, number, QUICK_DRAWS if job.quick else DRAWS, random, size)
+            found = errors(family, number, draws, random, size)
             rows.append(row_of(family, number, size, *found))
             worst = np.max(found[1], initial=0.0)
-            job.say(f"{rows[-1]['family']}, {number} lobes: {len(found[0])} sound, {worst:.1e}")
+            say(f"{rows[-1]['family']}, {number} lobes: {len(found[0])} sound, {worst:.1e}")
+    return rows
+
+
+def run(job: Run) -> None:
+    """Compare all families, or in a reduced run those of `QUICK`; write and print the rows."""
+    rows = study(QUICK_DRAWS, 0, *QUICK, job.say) if job.quick else study(DRAWS, say=job.say)
     job.csv("geometry.csv", rows)
     show("Area and inertia against polygons", rows)
