@@ -13,9 +13,9 @@ from unittest import mock
 
 ROOT = Path(__file__).parents[1]
 MOST = {
-    "statements of the package": 25_162,
-    "statements of the tests": 18_539,
-    "statements of the experiments": 6_103,
+    "statements of the package": 25_170,
+    "statements of the tests": 18_545,
+    "statements of the experiments": 6_107,
     "packages": 20,
     "files of the package": 277,
     "lines of the longest file": 647,
@@ -24,7 +24,7 @@ MOST = {
     "config keys": 139,
     "lines of the longest help": 60,
     "pages of docs": 42,
-    "words of docs": 31_532,
+    "words of docs": 31_527,
 }
 """Greatest values that are accepted. Lower them when the project becomes lighter. Whoever raises
 one gives the reason in the changelog: what users can do now that is worth the weight."""

@@ -22,9 +22,9 @@ _STEPS = 2**16
 """Maximum number of steps of an integration."""
 _CLOSED, _NEWTON = 1e-11, 8
 """Distance between start and end (scaled) of a closed orbit, and maximum number of Newton steps."""
-_AWAY = 1e-6
-"""Change of a state (scaled) for the differences that give the monodromy matrix. Newton's method
-then gains six digits per step."""
+_AWAY, _SLOW = 1e-6, 0.01
+"""Change of a state (scaled) for the differences that give the monodromy matrix, and factor on the
+distance between start and end in one Newton step above which the matrix is computed again."""
 _GOLDEN = (5**0.5 - 1) / 2
 _CUTS = 40
 """Number of sections of the interval in which the peak lies."""
@@ -50,11 +50,15 @@ def closed(pair: RotorPair, state: Any, period: int) -> Shot:
 
     unit = np.eye(len(state))
     end, forces = fly(state)
-    monodromy = np.stack([(fly(state + _AWAY * way)[0] - end) / _AWAY for way in unit], axis=1)
+    monodromy, before = unit, 0.0
     for _ in range(_NEWTON):
-        if np.max(np.abs(end - state)) < _CLOSED:
+        miss = np.max(np.abs(end - state))
+        if miss > _SLOW * before:
+            columns = [(fly(state + _AWAY * way)[0] - end) / _AWAY for way in unit]
+            monodromy = np.stack(columns, axis=1)
+        if miss < _CLOSED:
             break
-        state = state + np.linalg.solve(unit - monodromy, end - state)
+        state, before = state + np.linalg.solve(unit - monodromy, end - state), miss
         end, forces = fly(state)
     multiplier = np.max(np.abs(np.linalg.eigvals(monodromy)))
     return Shot(state, forces, float(np.max(np.abs(end - state))), float(multiplier))

@@ -100,6 +100,10 @@ class ProfileConfig(Section):
         "are joined; absent: 0.001",
     )
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        # A class that is made at run time cannot be found by its name in another process.
+        return _restored, (self.family, self.__getstate__())
+
     @property
     def parameters(self) -> dict[str, float | tuple[float, ...]]:
         """Design parameters of the config's family by key, in the units of the keys."""
@@ -198,6 +202,14 @@ def model_of(*owners: Family) -> type[ProfileConfig]:
         for one in owner.parameters
     }
     return create_model("ProfileConfig", __base__=ProfileConfig, **fields)
+
+
+def _restored(family: str, state: dict[str, Any]) -> ProfileConfig:
+    """Return a pickled section."""
+    model = model_of(family_of(family))
+    section = model.__new__(model)
+    section.__setstate__(state)
+    return section
 
 
 def _require_own(family: Family, data: Mapping[str, Any], given: set[str]) -> None:

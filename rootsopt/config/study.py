@@ -34,17 +34,18 @@ _MOST_LINES = 32
 
 
 _SEARCHED = "contact is always found by the search, the most accurate of the former models"
-_REMOVED: dict[str, tuple[Any, str]] = {
-    "fidelity": ("search", _SEARCHED),
-    "nodes": (400, _SEARCHED),
-    "map_error": (1e-4, _SEARCHED),
-    "map_rolls": (None, _SEARCHED),
-    "map_relatives": (None, _SEARCHED),
-    "gradient": ("forward", "both modes of differentiation gave the same gradient"),
-    "orbit": ("auto", "orbits are closed by collocation, and confirmed by an integration"),
-    "precision": ("float64", "motions are integrated in double precision"),
+_REMOVED: dict[str, tuple[tuple[Any, ...], str]] = {
+    "fidelity": (("search",), _SEARCHED),
+    "nodes": ((400,), _SEARCHED),
+    "map_error": ((1e-4,), _SEARCHED),
+    "map_rolls": ((None,), _SEARCHED),
+    "map_relatives": ((None,), _SEARCHED),
+    "gradient": (("forward",), "both modes of differentiation gave the same gradient"),
+    "orbit": (("auto", "collocation"), "collocation closes orbits; an integration confirms them"),
+    "precision": (("float64",), "motions are integrated in double precision"),
 }
-"""Keys of former versions: (former default, which a resolved config holds; why it was removed)."""
+"""Keys of former versions: (values that are still true, among them the default, which a resolved
+config holds; why the key was removed)."""
 _REMOVED_METHODS = ("dopri5", "kvaerno3", "kvaerno5")
 """Values of `solver.method` of former versions."""
 
@@ -93,9 +94,9 @@ class SolverConfig(Section):
         """Drop keys of former versions. Reject values that would now have no effect."""
         if not isinstance(data, dict):
             return data
-        for key, (accepted, reason) in _REMOVED.items():
-            value = data.get(key, accepted)
-            if value != accepted and bare(str(value)) != accepted:
+        for key in _REMOVED.keys() & data.keys():
+            (accepted, reason), value = _REMOVED[key], data[key]
+            if value not in accepted and bare(str(value)) not in accepted:
                 raise ValueError(
                     f"`solver.{key}` must be left out, but is {shown(value)}: {reason}; remove it, "
                     "and set `solver.accuracy` to trade accuracy for time"

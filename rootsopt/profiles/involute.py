@@ -61,7 +61,7 @@ def check(profile: "ProfileConfig") -> None:
     positive; or the dedendum undercut."""
     alpha: Any = getattr(profile, _ANGLE)
     length: Any = getattr(profile, _LENGTH)
-    tip: Any = getattr(profile, _TIP) or 0.0
+    tip: Any = getattr(profile, _TIP, 0.0)
     radius, sine = profile.pitch_radius_mm, math.sin(alpha * DEG)
     half = 90.0 / profile.lobes
     if tip >= half:

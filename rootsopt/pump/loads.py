@@ -248,7 +248,7 @@ def orbit_loads(scene: Scene, design: Float[Array, " d"], orbit: VariedOrbit) ->
 
     def alone(nodes):
         """Return the values at the greatest loads, and on both sides of the leaps."""
-        flat = nodes[:number].reshape(-1, *nodes.shape[2:])
+        flat = nodes[:number].reshape(number * POINTS, *nodes.shape[2:])
         k = np.arange(len(latest))
         beside = flat[len(latest) : len(latest) + sides.size, :_INTEGRANDS]
         return flat[k, _INTEGRANDS + k], beside.reshape(*sides.shape, *beside.shape[1:])

@@ -654,6 +654,7 @@ FORMER = {
     "map_rolls": ("null", "96"),
     "map_relatives": ("null", "16"),
     "gradient": ("forward", "reverse"),
+    "orbit": ("Collocation", "shooting"),
     "precision": ("Float64", "float32"),
 }
 

@@ -6,6 +6,7 @@ mm."""
 
 import dataclasses
 import functools
+import pickle
 import re
 
 import jax
@@ -268,9 +269,10 @@ def designs_are_points_of_the_unit_box_and_back(family):
 
 
 def config_is_read_and_written(family):
-    """Check that the example is accepted, is the same after writing, and can take another
-    design."""
+    """Check that the example is accepted, is the same after writing and in another process, and can
+    take another design."""
     config = parse(text_of(family))
+    assert pickle.loads(pickle.dumps(config)) == config
     check(config.profile)
     assert parse(config.to_yaml()) == config
     assert config.profile.parameters == {**family_of(family).example}

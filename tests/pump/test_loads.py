@@ -233,3 +233,9 @@ def test_work_and_momentum_of_elastic_bearings():
     # Evenly spaced samples resolve short impacts, and jumps, to some 1e-4 of the greatest power.
     assert abs(np.mean(np.sum(powers, axis=0))) < 3e-4 * np.max(gross)
     assert gross[-1] > 1e-3 * np.max(gross)
+
+
+@pytest.mark.long
+def test_a_profile_without_parameters_has_loads():
+    found = rootsopt.evaluate(rootsopt.load_config("ee", [GAS, BEARINGS]))
+    assert found.response["bearing_load_max_N"] > found.response["bearing_load_equivalent_N"] > 0
