@@ -305,16 +305,16 @@ def seen(
 ) -> Steady:
     """Return the motion `found` of `pair`, which has no orbit, with a `window` of it.
 
-    `whole`: whether the window was integrated. The status follows from it. But a motion that
-    repeats is NOT_CLOSED if the window says neither chaos nor what is wrong with it."""
+    The status follows from the window, if it was integrated (`whole`). A motion that repeats is
+    NOT_CLOSED if the window shows neither chaos nor a failure."""
     status, repeats = found.status, found.settled.period > 0
     if window is not None:
         judged = window_status(pair, window)
         # A motion that repeats at two tolerances is not chaotic.
         sure = ~among(judged, OPEN) | (status == Status.NOT_SETTLED.code)
         status = jnp.where(among(status, OPEN) & whole & sure, judged, status)
-    open_ = (status == Status.NOT_SETTLED.code) & repeats
-    status = jnp.where(open_, Status.NOT_CLOSED.code, status)
+    missed = (status == Status.NOT_SETTLED.code) & repeats
+    status = jnp.where(missed, Status.NOT_CLOSED.code, status)
     return found._replace(window=window, status=status)
 
 
