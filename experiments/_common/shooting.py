@@ -22,9 +22,10 @@ _STEPS = 2**16
 """Maximum number of steps of an integration."""
 _CLOSED, _NEWTON = 1e-11, 8
 """Distance between start and end (scaled) of a closed orbit, and maximum number of Newton steps."""
-_AWAY, _SLOW = 1e-6, 0.01
-"""Change of a state (scaled) for the differences that give the monodromy matrix, and factor on the
-distance between start and end in one Newton step above which the matrix is computed again."""
+_AWAY, _SLOW = 1e-5, 0.01
+"""Change of a state (scaled) for the central differences that give the monodromy matrix, and factor
+on the distance between start and end in one Newton step above which it is computed again.
+"""
 _GOLDEN = (5**0.5 - 1) / 2
 _CUTS = 40
 """Number of sections of the interval in which the peak lies."""
@@ -54,8 +55,9 @@ def closed(pair: RotorPair, state: Any, period: int) -> Shot:
     for _ in range(_NEWTON):
         miss = np.max(np.abs(end - state))
         if miss > _SLOW * before:
-            columns = [(fly(state + _AWAY * way)[0] - end) / _AWAY for way in unit]
-            monodromy = np.stack(columns, axis=1)
+            sides = [[fly(state + sign * _AWAY * way)[0] for sign in (1, -1)] for way in unit]
+            ahead, behind = np.moveaxis(np.array(sides), 1, 0)
+            monodromy = (ahead - behind).T / (2 * _AWAY)
         if miss < _CLOSED:
             break
         state, before = state + np.linalg.solve(unit - monodromy, end - state), miss
