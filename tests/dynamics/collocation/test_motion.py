@@ -76,7 +76,8 @@ def test_orbit_is_that_by_shooting(name, overrides, period):
         assert row[f"{force}_difference"] < 5e-7
         slack = max(2e-5, 2 * row[f"{force}_gradient_noise"])
         assert row[f"{force}_gradient_difference"] < slack < 1e-3
-    assert row["multiplier_difference"] < 1e-5
+    # Kinks within 1e-5 of the state leave some 1e-5 in the differences of the reference.
+    assert row["multiplier_difference"] < 5e-5
 
 
 @pytest.mark.long
