@@ -14,7 +14,7 @@ from unittest import mock
 ROOT = Path(__file__).parents[1]
 MOST = {
     "statements of the package": 25_170,
-    "statements of the tests": 18_545,
+    "statements of the tests": 18_546,
     "statements of the experiments": 6_108,
     "packages": 20,
     "files of the package": 277,

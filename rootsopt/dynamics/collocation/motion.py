@@ -35,7 +35,7 @@ _ALONG = 8
 class Collocated(NamedTuple):
     """An orbit closed by collocation, with the results of its checks.
 
-    `orbit`: the orbit; `sound`: whether Newton's method has converged on a
+    `orbit`: as the last Newton step leaves it; `sound`: whether Newton's method has converged on a
     mesh that ends at the orbit's events; otherwise the orbit has no meaning. `shorter`: true period
     (mesh periods) if the orbit repeats after a fraction of its period, otherwise 0. `verified`:
     whether the orbit is sound and accurate, and does not repeat. `known`: the orbit in the form
