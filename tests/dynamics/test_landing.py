@@ -262,7 +262,7 @@ def test_the_check_bounds_the_error(scene, design):
     def forces(change):
         return closed(evaluator.pair(design * (1 + change * way)), state, period).forces
 
-    truth, noise = differentiated(forces, 4e-5)
+    truth, noise = differentiated(forces, 1e-3)
     for rtol, one in found.items():
         slopes = terms(one)
         size = np.max(np.abs(slopes), axis=1)
