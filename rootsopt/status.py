@@ -51,10 +51,7 @@ class Status(enum.Enum):
         "are not accurate enough to be reported. Tighten solver.accuracy, or raise "
         "contact.smoothing_mm or solver.max_steps_per_period."
     )
-    IDLE = (
-        "No flank touches: the contact force is zero and has no gradient. Raise "
-        "scene.load.torque_N_m, or lower contact.clearance_mm."
-    )
+    IDLE = "No flank touches: the contact force is zero."
     NOT_IMPROVED = (
         "No feasible design better than the baseline was found. Lower "
         "constraints.area_efficiency_min, widen optimizer.bounds, or raise optimizer.screening."
@@ -124,8 +121,8 @@ class Status(enum.Enum):
 
     @property
     def usable(self) -> bool:
-        """Whether a result with this status has a steady state with a gradient."""
-        return self in (Status.PERIODIC, Status.AVERAGED)
+        """Whether a result with this status is what was asked for, with a gradient."""
+        return self in (Status.PERIODIC, Status.AVERAGED, Status.IDLE, Status.GEOMETRY_ONLY)
 
     @property
     def label(self) -> str:

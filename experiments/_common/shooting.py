@@ -72,14 +72,15 @@ def differentiated(
     """Return the derivatives of `forces` at 0, and their estimated errors.
 
     Central differences with `step`, half of it and so on, at `levels` steps (at least 3), are
-    extrapolated in pairs to step 0. Of two neighbours that agree best, each component takes the
-    second (C. J. F. Ridders, Adv. Eng. Softw. 4 (1982) 75-76): steps that are too long and those
-    whose differences are rounding are left out."""
+    extrapolated in pairs to step 0. Each component takes the result that agrees best with both of
+    its neighbours (C. J. F. Ridders, Adv. Eng. Softw. 4 (1982) 75-76): steps that are too long and
+    those whose differences are rounding are left out."""
     steps = step * 0.5 ** np.arange(levels)
     slopes = np.array([(forces(h) - forces(-h)) / (2 * h) for h in steps])
     limits = (4 * slopes[1:] - slopes[:-1]) / 3
     errors = np.abs(np.diff(limits, axis=0))
     errors = np.where(np.isfinite(errors), errors, np.inf)
+    errors = np.maximum(errors[1:], errors[:-1]) if levels > 3 else errors
     best = np.argmin(errors, axis=0)[None]
     value, error = (np.take_along_axis(x, best, axis=0)[0] for x in (limits[1:], errors))
     return np.where(np.isfinite(error), value, np.nan), error

@@ -234,6 +234,10 @@ class ResponseConfig(Section):
     lines: Annotated[tuple[Order, ...], Listed, _few("different orders")] = Field(
         (), description="spectral lines of the force, orders in mesh frequencies, as [1, 2]"
     )
+    reserve: bool = Field(
+        False,
+        description="whether `steady_response` returns the reserve, as reports do",
+    )
 
 
 _Milliradians = Annotated[tuple[Annotated[float, between(-1e3, 1e3)], ...], Listed, Increasing]

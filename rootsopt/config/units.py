@@ -4,6 +4,8 @@ import math
 
 MM = 1e-3
 """One millimetre (m)."""
+UM = 1e-6
+"""One micrometre (m)."""
 DEG = math.pi / 180
 """One degree (rad)."""
 RPM = 2 * math.pi / 60

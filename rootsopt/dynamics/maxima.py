@@ -17,7 +17,8 @@ parameter, before and after the corner. Both sides remain equal, so the corner's
 (s₁ d₂ - s₂ d₁) / (s₁ - s₂). At a smooth maximum this is a weighted mean of two equal derivatives.
 """
 
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -28,11 +29,13 @@ from jaxtyping import Array, Float, Int
 from numpy.typing import NDArray
 
 from rootsopt.dynamics.collocation.blocks import in_blocks
-from rootsopt.dynamics.collocation.elements import Elements
+from rootsopt.dynamics.collocation.elements import Elements, Mesh
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.varied import VariedOrbit
 from rootsopt.runtime.programs import CachedFunction
 
+Quantity: TypeAlias = Callable[[RotorPair, Float[Array, ""], Float[Array, " n"]], Any]
+"""A number of a pair at a time (mesh periods) and a scaled state (n,)."""
 MOST = 12
 """Maximum number of local maxima that are reported: the greatest ones."""
 _BESIDES = 4
@@ -160,55 +163,91 @@ def _dip(forces: NDArray[np.float64], one: int, other: int) -> float:
     return float(max(inner.min(), outer.min()))
 
 
+def contact_force(pair: RotorPair, tau: Float[Array, ""], state: Float[Array, " n"]) -> Any:
+    """Return the contact force (N) of `pair` at `tau` (mesh periods) and scaled `state`."""
+    return pair.contact_at(tau, state).total
+
+
 @CachedFunction
 def _forces(pair: RotorPair, elements: Elements) -> tuple[Float[Array, "e q"], Float[Array, "e q"]]:
-    """Return times (mesh periods) and contact forces (N) at the `_PLACES` of elements in use."""
+    """Return times (mesh periods) and contact forces (N) at several places of each element."""
+    return along_elements(contact_force, pair, elements)
+
+
+def along_elements(
+    quantity: Quantity, pair: RotorPair, elements: Elements
+) -> tuple[Float[Array, "e q"], Any]:
+    """Return times (mesh periods) and values of a `quantity` at the `_PLACES` of elements.
+
+    Those of elements that are not in use have no meaning."""
     mesh = elements.mesh
     tau = mesh.ends[0][:, None] + mesh.lengths[:, None] * _PLACES
     number = jnp.broadcast_to(jnp.arange(tau.shape[0])[:, None], tau.shape)
-    each = jax.vmap(jax.vmap(lambda tau, state: pair.contact_at(tau, state).total))
+    each = jax.vmap(jax.vmap(lambda tau, state: quantity(pair, tau, state)))
     return tau, in_blocks(each, mesh.used, tau, elements.inside(number, tau))
 
 
+def around(mesh: Mesh, values: Float[Array, "e q"], times: Float[Array, "e q"]) -> Array:
+    """Return the time (mesh periods) of the greatest of the `values`, and those of its neighbours.
+
+    `values`, `times`: from `along_elements`. The result (3,) is a column of `places` in `located`.
+    """
+    used = (jnp.arange(values.shape[0]) < mesh.used)[:, None]
+    best = jnp.argmax(jnp.where(used, values, -jnp.inf))
+    # The elements in use come first, and the motion continues periodically.
+    flat, last = times.ravel(), mesh.used * len(_PLACES) - 1
+    before = jnp.where(best > 0, flat[jnp.maximum(best - 1, 0)], flat[last] - mesh.period)
+    after = jnp.where(best < last, flat[jnp.minimum(best + 1, last)], flat[0] + mesh.period)
+    return jnp.stack([flat[best], before, after])
+
+
 @CachedFunction
-def _located(
+def _located(pair: RotorPair, tangents: RotorPair, orbit: VariedOrbit, places, count):
+    """Return the result of `located` for the contact force."""
+    return located(contact_force, pair, tangents, orbit, places, count)
+
+
+def located(
+    quantity: Quantity,
     pair: RotorPair,
     tangents: RotorPair,
     orbit: VariedOrbit,
     places: Float[Array, "3 k"],
-    count: Int[Array, ""],
+    count: Int[Array, ""] | int,
 ) -> tuple[Float[Array, " k"], Float[Array, " k"], Float[Array, "k d"]]:
-    """Return times (mesh periods) and forces (N) of the first `count` of k maxima, and the forces'
-    derivatives.
+    """Return times (mesh periods) and values of the first `count` of k maxima of a `quantity`, and
+    the derivatives of the values.
 
     `places`: an instant near each maximum, then the instants between which it lies."""
     dynamic, static = eqx.partition(pair, eqx.is_inexact_array)
     moved = eqx.filter(tangents, eqx.is_inexact_array)
     spread = jnp.linspace(-1, 1, _CLOSER)
 
-    def force(tau, state, dynamic):
-        return eqx.combine(dynamic, static).contact_at(tau, state).total
+    def value_at(tau, state, dynamic):
+        return quantity(eqx.combine(dynamic, static), tau, state)
 
     def closer(number, now):
         best, top, low, high = now
         reach = (2.0 / (_CLOSER - 1)) ** number * (high - low)
         tried = jnp.clip(best + reach * spread, low, high)
-        forces = jax.vmap(force, (0, 0, None))(tried, orbit.elements.motion(tried), dynamic)
-        k = jnp.argmax(forces)
-        better = forces[k] > top
-        return jnp.where(better, tried[k], best), jnp.where(better, forces[k], top), low, high
+        values = jax.vmap(value_at, (0, 0, None))(tried, orbit.elements.motion(tried), dynamic)
+        k = jnp.argmax(values)
+        better = values[k] > top
+        return jnp.where(better, tried[k], best), jnp.where(better, values[k], top), low, high
 
     def slopes(tau):
-        """Return the force at `tau`, its derivative along the motion, and along the directions."""
+        """Return the value at `tau`, its derivative along the motion, and along the directions."""
         state, rate, along = orbit.at(tau)
 
         def push(time, state_change, change):
-            return jax.jvp(force, (tau, state, dynamic), (time, state_change, change))
+            return jax.jvp(value_at, (tau, state, dynamic), (time, state_change, change))
 
-        zero = jnp.zeros_like(tau)
-        still = jax.tree.map(jnp.zeros_like, dynamic)
-        value, by_time = push(zero + 1, rate, still)
-        return value, by_time, jax.vmap(lambda x, y: push(zero, x, y)[1], (1, 0))(along, moved)
+        # One direction more, along the motion: the quantity is traced only once.
+        times = jnp.append(1.0, jnp.zeros(along.shape[-1]))
+        still = jax.tree.map(lambda x: jnp.pad(x, ((1, 0),) + ((0, 0),) * (x.ndim - 1)), moved)
+        changes = jnp.concatenate([rate[:, None], along], axis=1)
+        values, slopes = jax.vmap(push, (0, 1, 0))(times, changes, still)
+        return values[0], slopes[0], slopes[1:]
 
     def one(k, found):
         start = places[0, k], -jnp.inf, places[1, k], places[2, k]
@@ -224,7 +263,7 @@ def _located(
             moves = orbit.variation.times[event]
             higher = jnp.argmax(values)
             there = turned[higher] + jnp.stack([before, after])[higher] * moves
-            jumps = jnp.abs(values[1] - values[0]) > _JUMP * top
+            jumps = jnp.abs(values[1] - values[0]) > _JUMP * jnp.abs(top)
             slope = jnp.where(jumps, there, slope)
         return tuple(x.at[k].set(y) for x, y in zip(found, (best, top, slope), strict=True))
 
@@ -233,4 +272,14 @@ def _located(
     return lax.fori_loop(0, count, one, (nothing, nothing, rows))
 
 
-__all__ = ["MOST", "Maxima", "candidates", "local_maxima", "prepare_maxima", "shoulders"]
+__all__ = [
+    "MOST",
+    "Maxima",
+    "along_elements",
+    "around",
+    "candidates",
+    "local_maxima",
+    "located",
+    "prepare_maxima",
+    "shoulders",
+]

@@ -79,8 +79,19 @@ class Steady(NamedTuple):
 
     @property
     def sensitivity(self) -> Float[Array, "r d"]:
-        """Derivatives of `forces` along the requested directions; NaN unless periodic."""
-        return jnp.where(self.status == Status.PERIODIC.code, self.orbit.sensitivity, jnp.nan)
+        """Derivatives of `forces` along the requested directions.
+
+        They are 0 if the timing gear keeps the flanks apart, and NaN without a periodic orbit."""
+        found = self.orbit.sensitivity
+        found = jnp.where(self.status == Status.PERIODIC.code, found, jnp.nan)
+        return jnp.where(self.held, jnp.zeros_like(found), found)
+
+    @property
+    def held(self) -> Bool[Array, ""]:
+        """Whether the timing gear keeps the flanks apart, on a stable orbit.
+
+        Without a torque that brings it back, a pair without contact can rest anywhere."""
+        return (self.status == Status.IDLE.code) & self.verdict.idle & self.verdict.steady
 
 
 CLOSED = (Status.PERIODIC, Status.INACCURATE, Status.TOO_DEEP, Status.UNRESOLVED)

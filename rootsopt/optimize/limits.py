@@ -8,14 +8,13 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 
 from rootsopt.config import Config
 from rootsopt.config.units import unit_of, words
 from rootsopt.design.space import Constraint
 from rootsopt.errors import InputError
-from rootsopt.response.reporting import is_force, reporting
-from rootsopt.response.terms import Forces, Term, needs_forces, terms_of
+from rootsopt.response.reporting import depends_on_forces, is_force, reporting
+from rootsopt.response.terms import Forces, Term, terms_of
 from rootsopt.scene import Scene
 
 LIMITS = "constraints.terms"
@@ -93,16 +92,6 @@ def limited(config: Config) -> Config:
     return reporting(config, names, LIMITS) if names else config
 
 
-def depends_on_forces(config: Config, scene: Scene, name: str, key: str) -> bool:
-    """Return whether the quantity `name` is a force, or a term that reads forces.
-
-    `key`: config key that holds the name. Raises `InputError` if no quantity has this name."""
-    if is_force(config, name, key):
-        return True
-    (term,) = terms_of([name], key)
-    return needs_forces(scene, term, jnp.asarray(np.asarray(config.design, np.float64)))
-
-
 def term_constraints(config: Config, scene: Scene) -> tuple[TermConstraint, ...]:
     """Return the constraints on those quantities of `constraints.terms` that read no forces."""
     found = []
@@ -151,7 +140,6 @@ __all__ = [
     "PEAK",
     "ForceLimit",
     "TermConstraint",
-    "depends_on_forces",
     "force_limits",
     "limited",
     "scale_of",

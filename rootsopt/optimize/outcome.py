@@ -14,7 +14,7 @@ from rootsopt.optimize.infeasible import Infeasible
 from rootsopt.optimize.local import Linearization
 from rootsopt.optimize.optimality import Optimality
 from rootsopt.optimize.problem import FEASIBLE, Problem
-from rootsopt.response.evaluation import Evaluation
+from rootsopt.response.evaluation import RESPONSES, Evaluation, objective_weights
 from rootsopt.status import Status
 
 if TYPE_CHECKING:
@@ -113,7 +113,7 @@ class Optimization:
 
     @property
     def improvement(self) -> dict[str, float]:
-        """Reductions of the objective and of the mean, peak and RMS force.
+        """Reductions of the objective, of mean, peak and RMS force, and of all weighted terms.
 
         Each is a fraction of the baseline's value. The mapping is empty without an optimised
         design."""
@@ -141,9 +141,11 @@ class Optimization:
         if self.problem is None or self.optimized is None:
             return {}
         gains = {"objective": 1 - self.problem.objective(self.optimized) / objective}
-        for key in ("mean_force_N", "peak_force_N", "rms_force_N"):
-            before, after = first.response[key], self.optimized.response[key]
-            gains[key] = 1 - after / before if before > 0 else 0.0
+        counted = (*RESPONSES, *objective_weights(self.problem.config))
+        for key in dict.fromkeys(counted):
+            before, after = (one.response.get(key) for one in (first, self.optimized))
+            if before is not None and after is not None:
+                gains[key] = 1 - after / before if before > 0 else 0.0
         return gains
 
     @property

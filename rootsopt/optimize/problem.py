@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rootsopt.config import Config
 from rootsopt.config.units import unit_of, words
 from rootsopt.design.space import RangeConstraint, Space, slacks_and_slopes
-from rootsopt.dynamics.measures import line_name
+from rootsopt.dynamics.measures import PEAK_NORM, line_name
 from rootsopt.errors import InputError
 from rootsopt.optimize.certificate import NEAR, Certificate
 from rootsopt.optimize.limits import (
@@ -26,11 +26,12 @@ from rootsopt.optimize.limits import (
 )
 from rootsopt.optimize.local import Group, Linearization
 from rootsopt.optimize.optimality import Holder
-from rootsopt.response.evaluation import Evaluation, objective_weights
+from rootsopt.response.evaluation import RESPONSES, Evaluation, objective_weights
 from rootsopt.response.speeds import counted
 from rootsopt.response.terms import sense_of
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene
+from rootsopt.status import Status
 
 _NO_LINE = 1e-9
 """Amplitude of the baseline's spectral line (relative to its mean force) below which an objective
@@ -123,10 +124,18 @@ class Problem:
                     f"force has no such line{at} (its motion repeats every {period} mesh periods); "
                     "remove it"
                 )
+            said = f"its {name} is {one.response[name]:g}{at}"
+            if one.status is Status.IDLE and name in (*RESPONSES, PEAK_NORM):
+                raise InputError(
+                    "the weights of `objective` must be on quantities that the baseline has, but "
+                    f"{said}, because its flanks never touch; minimise what counts then, as in "
+                    "`objective={mean_weight: 0, peak_weight: 0, terms: {leakage_fraction: 1}}` or "
+                    "with flow_ripple, gear_force_N or static_bearing_load_max_N, and keep "
+                    "contact_reserve_um above a limit under `constraints.terms`"
+                )
             raise InputError(
-                f"the weights of `objective` must be on forces that the baseline has, but its "
-                f"{name} is {one.response[name]:g}{at}; raise the load, lower "
-                "`contact.clearance_mm`, or set the weight to 0"
+                f"the weights of `objective` must be on quantities of the baseline, but {said}; "
+                "set the weight to 0"
             )
         floor = baseline.geometry["area_efficiency"]
         space = Space.of(config, scene, floor, term_constraints(config, scene))

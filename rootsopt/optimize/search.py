@@ -35,6 +35,7 @@ from rootsopt.response.checkpoint import Checkpoint
 from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.response.many import HERE, Point, Runs
 from rootsopt.response.starts import Seeds
+from rootsopt.response.still import Still, needed_motion
 from rootsopt.runtime.threads import POLL
 from rootsopt.scene import Scene
 
@@ -126,6 +127,11 @@ class Search:
                 f"{config.profile.family}: it has no design parameter; use `simulate` for it, "
                 "or make the twist one with `optimizer.bounds.helix_deg`"
             )
+        evaluator = needed_motion(config)
+        if isinstance(evaluator.motions, Still):
+            # Nothing moves, so that no choice of motions matters.
+            config = config.replaced({"objective.motion": "reached"})
+            self.given = self.given.replaced({"objective.motion": "reached"})
         self.config = config
         self.settings = self.stage.settings(config.optimizer)
         self.progress = progress or (lambda done, expected, best: None)
@@ -133,7 +139,7 @@ class Search:
         self.expected = self.settings.screening + self.settings.starts * (
             self.settings.iterations + 1
         )
-        self.exact = self.stage.evaluator(Evaluator.of_objective(config), runs)
+        self.exact = self.stage.evaluator(evaluator, runs)
         self.noisy = config.objective.motion == "ensemble"
         self.checkpoint = checkpoint
         self.stop = threading.Event() if stop is None else stop
@@ -166,7 +172,7 @@ class Search:
         baseline = first
         if self.beginning is not None:
             self.beginning = dataclasses.replace(self.beginning, evaluation=first)
-            baseline = Evaluator.of_objective(self.given)()
+            baseline = needed_motion(self.given)()
         if not baseline.usable:
             return Optimization(None, baseline, None, [], {}, self.stop.is_set())
         # Forces of coexisting motions are compared relative to the baseline's.

@@ -52,7 +52,7 @@ def table(
 
 def status_cell(word: str) -> Cell:
     """Return the cell of a status: its label in words, marked favourable or not."""
-    known = {status.label: status.usable or status is Status.GEOMETRY_ONLY for status in Status}
+    known = {status.label: status.usable for status in Status}
     known |= {one.label: one is Standing.CERTIFIED for one in Standing}
     return Cell(in_words(word), known.get(word))
 

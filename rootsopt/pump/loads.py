@@ -12,14 +12,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from rootsopt.dynamics.collocation.blocks import BLOCK, in_blocks, whole_blocks
-from rootsopt.dynamics.collocation.elements import Elements
 from rootsopt.dynamics.collocation.gauss import GAUSS, POINTS
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.parts import AxisLoads
 from rootsopt.dynamics.parts.resultants import MIRROR, GasResultant
+from rootsopt.dynamics.pieces import LONGEST, smooth_pieces
 from rootsopt.dynamics.steady import SAMPLES
 from rootsopt.dynamics.varied import VariedOrbit
 from rootsopt.profiles import Geometry, Profile, geometry
@@ -28,15 +28,6 @@ from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene
 from rootsopt.scene.build import along
 
-_LONGEST = 8
-"""Maximum length of an orbit (mesh periods)."""
-_EVEN = 128
-"""Minimum number of pieces into which one mesh period is divided."""
-_FLAGS, _HALVED = 64, 40
-"""Maximum number of instants at which flags of the loads change, and number of bisections that
-locate them."""
-_EMPTY = 1e-13
-"""Length (mesh periods) below which a piece counts as empty. Many corners coincide."""
 _INTEGRANDS = 5
 """Number of quantities that are averaged: a power of each bearing's load, and 1."""
 _ASIDE = 1e-9
@@ -230,7 +221,12 @@ def orbit_loads(scene: Scene, design: Float[Array, " d"], orbit: VariedOrbit) ->
 
         return jax.vmap(push, (1, 0), (None, -1))(changes, moved)
 
-    begins, ends, count = _pieces(orbit.elements, bearings)
+    def flags(tau):
+        motion = bearings.pair.motion(tau, orbit.elements.motion(tau))
+        return bearings.loads.switches(motion, np.zeros(0))
+
+    # The loads have corners that the motion does not have, as where the gear's torque changes sign.
+    begins, ends, count = smooth_pieces(orbit.elements, loads_corners(bearings), flags)
     leaps, moves = _leaps(scene, orbit, (dynamic, static, moved))
     sides = leaps[:, None] + _ASIDE * np.array([-1.0, 1.0])
     # All instants in one array, so that the derivatives are compiled once.
@@ -267,47 +263,6 @@ def orbit_loads(scene: Scene, design: Float[Array, " d"], orbit: VariedOrbit) ->
     return OrbitLoads(equivalent, factor[:, None] * slope, series, jnp.max(sizes, axis=0), rises)
 
 
-def _pieces(
-    elements: Elements, bearings: BearingSet
-) -> tuple[Float[Array, " pieces"], Float[Array, " pieces"], Int[Array, ""]]:
-    """Return starts and ends (mesh periods) of pieces of an orbit in which the loads are smooth,
-    and the number of pieces in use. The others, which are empty, come last.
-
-    Pieces end at the ends of elements, at the corners of the loads in each mesh period, and where a
-    flag of the loads changes. The power of a load needs shorter pieces than the motion."""
-    mesh = elements.mesh
-    period = mesh.period
-    turns = jnp.arange(_LONGEST)[:, None]
-    every = jnp.append(loads_corners(bearings), jnp.arange(1, _EVEN + 1) / _EVEN)
-    own = jnp.mod(mesh.ends[1], period)
-    ends = jnp.append(own, jnp.minimum((every + turns).ravel(), period))
-    ends = jnp.sort(jnp.minimum(lax.stop_gradient(ends), period))
-
-    def flags(tau):
-        motion = bearings.pair.motion(tau, elements.motion(tau))
-        return bearings.loads.switches(motion, np.zeros(0))
-
-    # The loads have corners that the motion does not have, as where the gear's torque changes sign.
-    begins = jnp.append(0.0, ends[:-1])
-    before = jax.vmap(flags)(begins)
-    changes = jnp.any(before != jnp.append(before[1:], before[:1], axis=0), axis=1)
-    # Unused places get the last piece, which is empty.
-    piece = jnp.nonzero(changes, size=_FLAGS, fill_value=len(ends) - 1)[0]
-
-    def halved(_, ends):
-        low, high = ends
-        middle = (low + high) / 2
-        same = jnp.all(jax.vmap(flags)(middle) == jax.vmap(flags)(low), axis=1)
-        return jnp.where(same, middle, low), jnp.where(same, high, middle)
-
-    _, high = lax.fori_loop(0, _HALVED, halved, (begins[piece], ends[piece]))
-    ends = jnp.sort(jnp.append(ends, high))
-    begins = jnp.append(0.0, ends[:-1])
-    empty = ends - begins < _EMPTY
-    order = jnp.argsort(empty)
-    return begins[order], ends[order], jnp.sum(~empty)
-
-
 def _leaps(scene: Scene, orbit: VariedOrbit, bearings) -> tuple[Array, Array]:
     """Return the times (m,) at which the loads jump (mesh periods), and how they move (m, d).
 
@@ -318,9 +273,9 @@ def _leaps(scene: Scene, orbit: VariedOrbit, bearings) -> tuple[Array, Array]:
     times, moves = [jnp.zeros(0)], [jnp.zeros((0, variation.times.shape[1]))]
     openings = _openings(dynamic, static, moved) if scene.twist_free else None
     if openings is not None:
-        opened = (openings[0] + jnp.arange(_LONGEST)[:, None]).ravel()
+        opened = (openings[0] + jnp.arange(LONGEST)[:, None]).ravel()
         times.append(opened)
-        moves.append((opened < mesh.period)[:, None] * jnp.tile(openings[1], (_LONGEST, 1)))
+        moves.append((opened < mesh.period)[:, None] * jnp.tile(openings[1], (LONGEST, 1)))
     if eqx.combine(dynamic, static).pair.jumps:
         times.append(mesh.times)
         moves.append(variation.times)

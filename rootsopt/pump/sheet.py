@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rootsopt.config import Config
-from rootsopt.config.units import DEG, MM
+from rootsopt.config.units import DEG, MM, UM
 from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry, Profile, geometry
 from rootsopt.pump import flow
@@ -25,8 +25,6 @@ L_MIN = 1e-3 / 60
 """One litre per minute (m³/s)."""
 MRAD = 1e-3
 """One milliradian (rad)."""
-UM = 1e-6
-"""One micrometre (m)."""
 _ROUNDING = 1e-8
 """Overlap (m) of the flanks up to which it counts as rounding of an outline."""
 LINES = 4

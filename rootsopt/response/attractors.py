@@ -85,17 +85,19 @@ class Basins:
 
     @property
     def status(self) -> Status:
-        """PERIODIC if every initial state leads to a stable periodic motion, and at least one such
-        motion has contact. Otherwise, the status of a motion for which this is not true."""
+        """PERIODIC if every initial state leads to a stable periodic motion, IDLE if no flank
+        touches in any of them. Otherwise, the status of a motion for which this is not true."""
         for status in _LOST:
             if self.lost.get(status.label):
                 return status
-        pushes = any(attractor.evaluation.usable for attractor in self.attractors)
-        for attractor in self.attractors:
-            one = attractor.evaluation
-            if not (one.usable or (pushes and closed(one))):
+        motions = [attractor.evaluation for attractor in self.attractors]
+        for one in motions:
+            if not closed(one):
                 return one.status
-        return Status.NOT_SETTLED if any(self.lost.values()) else Status.PERIODIC
+        if any(self.lost.values()):
+            return Status.NOT_SETTLED
+        apart = all(one.status is Status.IDLE for one in motions)
+        return Status.IDLE if apart and motions else Status.PERIODIC
 
     def records(self) -> list[dict[str, Any]]:
         """Return one record per attractor for the result file."""
@@ -175,8 +177,7 @@ def find(
 
 def closed(evaluation: Evaluation) -> bool:
     """Return whether the motion is a closed orbit, with contact or without (`idle`)."""
-    idle = evaluation.status is Status.IDLE and evaluation.state is not None
-    return evaluation.usable or idle
+    return evaluation.usable and evaluation.state is not None
 
 
 class _Sorter:
@@ -355,12 +356,11 @@ class Coexisting(Motions):
 
 def _of(evaluator: Evaluator, basins: Basins) -> Evaluation:
     """Return the evaluation that combines all motions as `objective.motion` specifies."""
-    usable = [a for a in basins.attractors if a.evaluation.usable]
-    if not usable:
-        return basins.rest
     orbits = [a for a in basins.attractors if closed(a.evaluation)]
-    chosen = max(usable, key=_badness(evaluator, usable)).evaluation
-    rivals = tuple(a.evaluation for a in usable if a.evaluation is not chosen)
+    if not orbits:
+        return basins.rest
+    chosen = max(orbits, key=_badness(evaluator, orbits)).evaluation
+    rivals = tuple(a.evaluation for a in orbits if a.evaluation is not chosen)
     if evaluator.config.objective.motion == "weighted":
         shares = [a.share for a in orbits]
         # On a coarse grid, the `known` states may be the only ones that lead to an orbit.

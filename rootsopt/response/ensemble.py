@@ -36,8 +36,8 @@ from rootsopt.response.evaluation import (
     Evaluation,
     Evaluator,
     Motions,
+    apart_message,
     geometry_record,
-    idle_hint,
     lyapunov_program,
     message_of,
     unsettled,
@@ -162,12 +162,16 @@ def _report(
     steady: dict[str, Any] = {"kind": "transient"}
     response: dict[str, float] = {}
     gradient: dict[str, dict[str, float]] = {}
-    series, last, hint = None, None, ""
+    series, last, said = None, None, ""
     if status is Status.AVERAGED:
         values = members.responses
         least = float(np.finfo(members.greatest.dtype).eps) * float(pair.force_scale)
         if np.max(members.greatest) <= least:
-            status, hint = Status.IDLE, idle_hint(evaluator.config, float(np.max(members.depth)))
+            status, said = (
+                Status.IDLE,
+                apart_message(evaluator.config, float(np.max(members.depth))),
+            )
+            gradient = {name: dict.fromkeys(evaluator.keys, 0.0) for name in RESPONSES}
         response = dict(zip(RESPONSES, map(float, values[:, 0]), strict=True))
         errors = dict(zip(ERRORS.values(), map(float, values[:, 1]), strict=True))
         greatest = float(np.max(members.greatest))
@@ -204,7 +208,7 @@ def _report(
         gradient=gradient,
         steady_state=steady,
         status=status,
-        message=message_of(evaluator.config, status) + hint,
+        message=said if status is Status.IDLE else message_of(evaluator.config, status),
         statistics={
             "settle_mesh_periods": settings.settle_periods,
             "neighbours": settings.designs // 2 * 2 if gradient else 0,

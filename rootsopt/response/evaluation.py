@@ -17,6 +17,7 @@ from rootsopt.dynamics.closed import Start, seen, steady_motion
 from rootsopt.dynamics.maxima import local_maxima, prepare_maxima
 from rootsopt.dynamics.measures import PEAK_NORM, line_name
 from rootsopt.dynamics.pair import RotorPair
+from rootsopt.dynamics.reserve import apart
 from rootsopt.dynamics.settle import BLOCK
 from rootsopt.dynamics.steady import CLOSED, OPEN, SAMPLES, Solver, Steady, window_status
 from rootsopt.dynamics.varied import varied
@@ -27,10 +28,11 @@ from rootsopt.pump.loads import orbit_loads
 from rootsopt.response.many import HERE, IN_TURN, Point, Runs, evaluate_many
 from rootsopt.response.records import (
     RESPONSES,
+    apart_message,
+    apart_record,
     bearing_record,
     fading_note,
     geometry_record,
-    idle_hint,
     message_of,
     orbit_record,
     orbit_statistics,
@@ -49,7 +51,7 @@ from rootsopt.response.series import (
 )
 from rootsopt.response.speeds import parts_at, shares
 from rootsopt.response.starts import Seed, Seeds, begun
-from rootsopt.response.terms import BEARING, terms_of, values_of
+from rootsopt.response.terms import BEARING, GEAR, OF_MOTION, RESERVES, terms_of, values_of
 from rootsopt.runtime.precision import check_precision
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene, check_geometry, design_keys, design_vector, fault_of
@@ -372,9 +374,11 @@ class Evaluator:
             orbit = varied(found)
             if self._loaded(series):
                 orbit_loads.prepare(self.scene, design, orbit)
+            if self._geared(series):
+                _apart.prepare(pair, tangents, orbit)
             rows = np.zeros((found.orbit.response.shape[0], 1))
             forces = solver.measures.named(rows, 1)
-            added = [name for name in self._names if name not in (*forces, *BEARING)]
+            added = [name for name in self._names if name not in (*forces, *OF_MOTION)]
             if added:
                 values, slopes = (jax.ShapeDtypeStruct((3, *d), float) for d in ((), design.shape))
                 values_of.prepare(self.scene, terms_of(added), design, values, slopes)
@@ -414,7 +418,7 @@ class Evaluator:
         `built`: rotor pair, its derivatives along the design, and geometry; `began`: time at the
         start of the evaluation (s, `perf_counter`); `series`: whether to compute the series."""
         seconds, design = time.perf_counter() - began, np.asarray(design, np.float64)
-        (pair, _, shape), status, orbit = built, Status.of(found.status), found.orbit
+        (pair, tangents, shape), status, orbit = built, Status.of(found.status), found.orbit
         period = int(found.period)
         statistics: dict[str, int | float] = {
             "transient_mesh_periods": int(found.used),
@@ -422,48 +426,43 @@ class Evaluator:
         }
         steady: dict[str, Any] = {"kind": "transient"}
         response: dict[str, float] = {}
-        known = status is Status.PERIODIC and pair.smooth
-        gradient = self._gradient(found) if known else {}
-        hint, motion, start = "", None, None
-        if status in CLOSED:
-            named = self.scene.solver.measures.named(orbit.response[:, None], period)
+        idle = status is Status.IDLE
+        held = bool(found.held)
+        forces = np.column_stack([orbit.response, orbit.sensitivity]) * (0.0 if idle else 1.0)
+        named = self.scene.solver.measures.named(np.nan_to_num(forces) if idle else forces, period)
+        known = (status is Status.PERIODIC and pair.smooth) or idle
+        gradient = self._named({name: row for name, (_, row) in named.items()}) if known else {}
+        said, hint, motion, start = message_of(self.config, status), "", None, None
+        if status in CLOSED or idle:
             response = {name: value for name, (value, _) in named.items()}
-            steady = {"kind": "periodic"} | orbit_record(orbit, period)
+        further: dict[str, tuple[float, Any]] = {}
+        if status in CLOSED or held:
+            steady = {"kind": "idle" if idle else "periodic"} | orbit_record(orbit, period)
             statistics |= orbit_statistics(found, self.solver)
             motion = orbit_series(pair, found) if series else None
             start = Seed.of(found, pair)
             if self._loaded(series):
                 whole = varied(found)
                 loads = jax.device_get(orbit_loads(self.scene, jnp.asarray(design), whole))
-                for name, (value, slope) in bearing_record(loads).items():
-                    response[name] = value
-                    if gradient:
-                        gradient[name] = dict(zip(self.keys, map(float, slope), strict=True))
+                further |= bearing_record(loads)
                 if motion is not None:
                     turns = len(motion.time) // len(loads.series.sizes), 1
                     each = np.tile(np.asarray(loads.series.sizes, np.float64), turns)
                     motion = dataclasses.replace(motion, bearing_loads=each)
-            terms, slopes = self._terms(design, response, gradient)
-            response |= terms
-            gradient |= slopes if gradient else {}
+            if self._geared(series):
+                reserve = jax.device_get(_apart(pair, tangents, varied(found)))
+                further |= apart_record(reserve, float(self.scene.pitch_radius))
+            response |= {name: value for name, (value, _) in further.items()}
+            if known:
+                gradient |= self._named({name: row for name, (_, row) in further.items()})
             hint = "" if pair.smooth else _NO_GRADIENT
             if status is Status.PERIODIC:
                 hint += fading_note(float(orbit.multiplier), period)
-        elif status is Status.IDLE:
+        elif idle:
             steady = {"kind": "idle"}
-            names = self.scene.solver.measures.named(np.zeros((len(orbit.response), 1)), 1)
-            response = dict.fromkeys(names, 0.0)
             if found.window is not None:
-                hint = idle_hint(self.config, float(found.window.depth))
                 steady |= window_record(found.window)
                 motion = window_series(pair, found.window) if series else None
-            else:
-                hint = idle_hint(self.config, float(orbit.depth))
-                if found.verdict.steady:
-                    # The timing gear holds the pair. A pair that floats can rest anywhere.
-                    steady |= orbit_record(orbit, period)
-                    start = Seed.of(found, pair)
-                    motion = orbit_series(pair, found) if series else None
         elif status is Status.UNSOUND and pair.soundness is not None:
             hint = f" Here, {fault_of(pair.soundness)}."
         elif found.window is not None:
@@ -471,6 +470,13 @@ class Evaluator:
         elif status is Status.SOLVER_FAILED and pair.timescales is not None:
             swings = pair.mesh_period / (2 * np.pi * pair.timescales.swing)
             statistics["swings_per_mesh_period"] = float(swings)
+        if status in CLOSED or idle:
+            terms, slopes = self._terms(design, response, gradient)
+            response |= terms
+            gradient |= slopes if known else {}
+        if idle:
+            depth = orbit.depth if found.window is None else found.window.depth
+            said = apart_message(self.config, float(depth), response.get(RESERVES[1]))
         return Evaluation(
             design=dict(zip(self.keys, map(float, design), strict=True)),
             geometry=geometry_record(self.scene, shape),
@@ -478,7 +484,7 @@ class Evaluator:
             gradient=gradient,
             steady_state=steady,
             status=status,
-            message=message_of(self.config, status) + hint,
+            message=said + hint,
             statistics=statistics | {"seconds": seconds},
             series=motion,
             start=start,
@@ -487,6 +493,11 @@ class Evaluator:
     def _loaded(self, series: bool) -> bool:
         """Return whether an evaluation computes loads on bearings; `series`: with a series."""
         return self.scene.bearings is not None and (series or bool({*BEARING} & {*self._names}))
+
+    def _geared(self, series: bool) -> bool:
+        """Return whether an evaluation computes the reserve; `series`: with a series."""
+        wanted = bool({*RESERVES, *GEAR} & {*self._names})
+        return self.scene.gear is not None and (series or wanted)
 
     @property
     def _names(self) -> tuple[str, ...]:
@@ -507,21 +518,15 @@ class Evaluator:
             slopes = np.array([list(gradient[name].values()) for name in RESPONSES])
         found = values_of(self.scene, terms_of(names), design, forces, slopes)
         values, rows = map(np.asarray, found)
-        named = zip(names, rows, strict=True)
-        return dict(zip(names, map(float, values), strict=True)), {
-            name: dict(zip(self.keys, map(float, row), strict=True)) for name, row in named
-        }
+        return dict(zip(names, map(float, values), strict=True)), self._named(
+            dict(zip(names, rows, strict=True))
+        )
 
-    def _gradient(self, found: Steady) -> dict[str, dict[str, float]]:
-        """Return the gradient of a closed orbit as a dict with the keys of the result file."""
-        if not self.keys:
-            return {}
-        rows = np.column_stack([found.orbit.response, found.orbit.sensitivity])
-        named = self.scene.solver.measures.named(rows, int(found.period))
-        return {
-            name: dict(zip(self.keys, map(float, slope), strict=True))
-            for name, (_, slope) in named.items()
-        }
+    def _named(self, rows: dict[str, Any]) -> dict[str, dict[str, float]]:
+        """Return derivatives (d,) by name with the keys of the result file; {} without keys."""
+        keys = self.keys
+        named = {name: dict(zip(keys, map(float, row), strict=True)) for name, row in rows.items()}
+        return named if keys else {}
 
 
 def at_speed(scene: Scene, speed_rpm: float) -> Scene:
@@ -544,6 +549,7 @@ def motion_from(pair: RotorPair, tangents: RotorPair, start: Start, radius, solv
 _build = CachedFunction(Scene.pair_and_tangents)
 _motion = CachedFunction(motion_from, gathered=0)
 _integrated = CachedFunction(integrated_difference)
+_apart = CachedFunction(apart)
 lyapunov_program = CachedFunction(lyapunov)
 unsettled_status = CachedFunction(window_status)
 _seen = CachedFunction(seen)

@@ -6,15 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rootsopt.config import Config
-from rootsopt.config.units import MM
+from rootsopt.config.units import MM, UM
 from rootsopt.dynamics.orbit import Orbit
 from rootsopt.dynamics.pair import RotorPair
+from rootsopt.dynamics.reserve import Apart
 from rootsopt.dynamics.steady import OPEN, Solver, Steady
 from rootsopt.dynamics.window import Window
 from rootsopt.profiles import Geometry
 from rootsopt.pump.loads import OrbitLoads
 from rootsopt.response.series import Series, window_series
-from rootsopt.response.terms import EQUIVALENT
+from rootsopt.response.terms import EQUIVALENT, GEAR, RESERVES
 from rootsopt.scene import Scene
 from rootsopt.status import Status
 
@@ -45,6 +46,20 @@ def bearing_record(loads: OrbitLoads) -> dict[str, tuple[float, NDArray[np.float
             worst = int(np.argmax(values))
             record[name] = float(values[worst]), np.asarray(rows[worst], np.float64)
     return record
+
+
+def apart_record(held: Apart, radius: float) -> dict[str, tuple[float, NDArray[np.float64]]]:
+    """Return the result file's entries for reserve and timing gear over an orbit.
+
+    Each is (value, its derivatives (d,)); `radius`: pitch radius (m)."""
+    unit = [1 / UM, 2 * radius / MM, *[1.0] * 3, *[1 / radius] * 3]
+    rows = np.column_stack([held.values, held.slopes])
+    rows = np.concatenate([rows, rows[2:]]) * np.array(unit)[:, None]
+    return {
+        name: (float(row[0]), row[1:])
+        for name, row in zip((*RESERVES, *GEAR), rows, strict=True)
+        if np.isfinite(row[0])
+    }
 
 
 def geometry_record(scene: Scene, shape: Geometry) -> dict[str, float]:
@@ -200,16 +215,6 @@ def _too_deep(config: Config) -> list[str]:
     return [*close, *coated, *tight, *stiffer, *_load(config)]
 
 
-def _idle(config: Config) -> list[str]:
-    error = max(config.scene.center_distance_error_mm or 0.0, 0.0)
-    return [
-        *_load(config, "raise"),
-        *_way("lower", "contact.clearance_mm", config.contact.clearance_mm),
-        *_way("lower", "scene.center_distance_error_mm", error),
-        *_backlash(config, "raise"),
-    ]
-
-
 def _stalled(config: Config) -> list[str]:
     motor = config.scene.motor
     torque = None if motor is None else motor.torque_N_m
@@ -256,7 +261,6 @@ def _solver_failed(config: Config) -> list[str]:
 _WAYS = {
     Status.PASSED_THROUGH: _passed_through,
     Status.TOO_DEEP: _too_deep,
-    Status.IDLE: _idle,
     Status.STALLED: _stalled,
     Status.CHAOTIC: _chaotic,
     Status.NOT_SETTLED: _not_settled,
@@ -267,22 +271,24 @@ _WAYS = {
 """Statuses whose advice depends on the scene, each with a function that returns it."""
 
 
-def idle_hint(config: Config, depth: float) -> str:
-    """Return advice for flanks that never touch: which clearance or backlash would let them touch.
+def apart_message(config: Config, depth: float, backlash: float | None = None) -> str:
+    """Return what it means that no flank touches, and how far the flanks are from it.
 
-    `depth` (m): greatest penetration, the negative of the least gap. The motion does not depend on
-    the clearance as long as nothing touches. Therefore, the flanks touch if the clearance is
-    reduced by more than the least gap. The advice is empty if the gap is not known or too large."""
+    `depth` (m): greatest penetration, the negative of the least gap; `backlash` (mm) by which that
+    of the timing gear may grow, `None` if it is not known. Without it, the clearance is named: the
+    motion does not depend on it as long as nothing touches."""
+    geared = config.scene.timing_gear is not None
+    said = Status.IDLE.value
+    if geared:
+        said = "The timing gear keeps the flanks apart: the contact force is zero."
     gap, clearance = -depth / MM, config.contact.clearance_mm
     if not (np.isfinite(gap) and 0 < gap < 0.9 * config.profile.pitch_radius_mm):
-        return ""
-    found = f" The least gap of the flanks is {gap:.4g} mm"
+        return said
+    said += f" Their least gap is {gap * MM / UM:.4g} µm"
+    if backlash is not None:
+        assert config.scene.timing_gear is not None
+        most = config.scene.timing_gear.backlash_mm + backlash
+        return f"{said}; they touch with scene.timing_gear.backlash_mm above {most:.4g}."
     if gap < clearance:
-        return f"{found}: they touch with contact.clearance_mm below {clearance - gap:.4g}."
-    if config.scene.timing_gear is not None:
-        backlash = config.scene.timing_gear.backlash_mm
-        return (
-            f"{found}, and the timing gear holds them apart: they touch only with "
-            f"scene.timing_gear.backlash_mm above {backlash + 2 * gap:.4g}."
-        )
-    return f"{found}."
+        return f"{said}; they touch with contact.clearance_mm below {clearance - gap:.4g}."
+    return f"{said}."

@@ -125,8 +125,7 @@ def overall(parts: Sequence[Part]) -> tuple[Status, str]:
 def mean(head: Evaluation, evaluations: Sequence[Evaluation], shares: ArrayLike) -> Evaluation:
     """Return `head` with response and gradient averaged over `evaluations`.
 
-    `shares` (n,): weights ≥ 0, scaled to add up to 1; all 0 count as equal. An evaluation that is
-    not usable has no contact: its force is 0 for all neighbouring designs, too."""
+    `shares` (n,): weights ≥ 0, scaled to add up to 1; all 0 count as equal."""
     weights = np.asarray(shares, np.float64)
     weights = weights if weights.sum() > 0 else np.ones(len(weights))
     weights = weights / weights.sum()
@@ -134,15 +133,12 @@ def mean(head: Evaluation, evaluations: Sequence[Evaluation], shares: ArrayLike)
     def average(values: list[float]) -> float:
         return float(weights @ values)
 
-    def slope(one: Evaluation, name: str, key: str) -> float:
-        return one.gradient[name][key] if one.usable else 0.0
-
     return dataclasses.replace(
         head,
         maxima=None,
         response={k: average([one.response[k] for one in evaluations]) for k in head.response},
         gradient={
-            name: {key: average([slope(one, name, key) for one in evaluations]) for key in row}
+            name: {key: average([one.gradient[name][key] for one in evaluations]) for key in row}
             for name, row in head.gradient.items()
         },
     )

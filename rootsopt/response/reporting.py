@@ -3,10 +3,15 @@
 import re
 from collections.abc import Sequence
 
+import jax.numpy as jnp
+import numpy as np
+
 from rootsopt.config import Config
 from rootsopt.dynamics.measures import PEAK_NORM, line_name
 from rootsopt.errors import InputError
 from rootsopt.response.records import RESPONSES
+from rootsopt.response.terms import needs_forces, terms_of
+from rootsopt.scene import Scene
 
 _LINE = re.compile(r"line_(\d+(?:\.\d+)?)_force_N")
 
@@ -33,6 +38,16 @@ def is_force(config: Config, name: str, key: str) -> bool:
     return True
 
 
+def depends_on_forces(config: Config, scene: Scene, name: str, key: str) -> bool:
+    """Return whether the quantity `name` is a force, or a term that reads forces.
+
+    `key`: config key that holds the name. Raises `InputError` if no quantity has this name."""
+    if is_force(config, name, key):
+        return True
+    (term,) = terms_of([name], key)
+    return needs_forces(scene, term, jnp.asarray(np.asarray(config.design, np.float64)))
+
+
 def reporting(config: Config, names: Sequence[str], key: str) -> Config:
     """Return a copy of a `config` whose evaluations report all quantities in `names`.
 
@@ -51,4 +66,4 @@ def reporting(config: Config, names: Sequence[str], key: str) -> Config:
     return config.model_copy(update={"response": response, "objective": objective})
 
 
-__all__ = ["is_force", "reporting"]
+__all__ = ["depends_on_forces", "is_force", "reporting"]

@@ -20,7 +20,9 @@ from numpy.typing import ArrayLike
 from rootsopt.dynamics.closed import Start, examined, steady_motion
 from rootsopt.dynamics.linear import eigenvalues
 from rootsopt.dynamics.pair import RotorPair
+from rootsopt.dynamics.reserve import reserve
 from rootsopt.dynamics.steady import CLOSED, OPEN, Solver, Steady, among
+from rootsopt.dynamics.varied import varied
 from rootsopt.profiles.validity import Soundness
 from rootsopt.runtime.precision import check_precision
 from rootsopt.runtime.programs import CachedFunction
@@ -40,14 +42,17 @@ class Response(NamedTuple):
     `state` (n,) at φ1 = 0 in SI units: ε (rad), dε/dt (rad/s), then the states of parts, such as
     the excess of a motor's speed over the scene's (rad/s); `margins`: margins of all checks of the
     design (m, rad or ratios, see `Soundness`). The status is unsound if one of them is negative;
-    `Response.margins.failed` names it. `start`: argument `start` for similar designs and scenes, a
-    pytree of arrays whose shapes depend only on the kind of scene. It can be mapped, carried by
-    `scan`, and pickled.
+    `Response.margins.failed` names it. `contact_reserve`: least gap of the flanks (m); negative:
+    greatest penetration; `backlash_reserve`: half the backlash (rad) by which that of the timing
+    gear may grow until the flanks touch, as `scene.gear.half_backlash`. Both are None unless the
+    scene has a gear and requests them (`response.reserve`), and NaN without an orbit. `start`:
+    argument `start` for similar designs and scenes, a pytree of arrays whose shapes depend only on
+    the kind of scene. It can be mapped, carried by `scan`, and pickled.
 
-    The forces are those of the orbit, or 0 without contact. If the motion does not settle, the
-    forces are those of a window of 128 mesh periods. In all other cases, the forces are NaN. If the
-    motion is not periodic, `period` is 0, and `multipliers` and `residual` are NaN. If the design
-    is unsound, `state` is NaN, too.
+    The forces are those of the orbit, or 0 without contact (status idle). If the motion does not
+    settle, the forces are those of a window of 128 mesh periods. In all other cases, the forces are
+    NaN. If the motion is not periodic, `period` is 0, and `multipliers` and `residual` are NaN. If
+    the design is unsound, `state` is NaN, too.
 
     >>> import jax
     >>> import rootsopt
@@ -70,6 +75,8 @@ class Response(NamedTuple):
     status: Int[Array, ""]
     state: Float[Array, " n"]
     margins: Soundness
+    contact_reserve: Float[Array, ""] | None
+    backlash_reserve: Float[Array, ""] | None
     start: Start
 
 
@@ -85,10 +92,10 @@ def steady_response(
 
     This is a pure function. It works under `jit`, `vmap`, `grad`, `jvp`, `jacfwd` and `jacrev`,
     with respect to the design and to every physical quantity of the scene. The derivatives of
-    forces and `state` are those of the orbit, by the implicit function theorem. They are NaN unless
-    the status is periodic. `multipliers`, `residual` and `margins` are constants to JAX, with
-    derivative 0. Only first derivatives are available. On a CPU, `vmap` computes one motion after
-    the other; on a GPU, all together.
+    forces, `state` and reserves are those of the orbit, by the implicit function theorem. They are
+    NaN unless the status is periodic, or idle on a stable orbit. `multipliers`, `residual` and
+    `margins` are constants to JAX, with derivative 0. Only first derivatives are available. On a
+    CPU, `vmap` computes one motion after the other; on a GPU, all together.
 
     `jax.jit` of a function that calls this one compiles twice as fast with the option
     `compiler_options=rootsopt.COMPILER_OPTIONS`.
@@ -141,11 +148,8 @@ def _response_jvp(primals, tangents):
     moved, without = _moved(*tangents[:2])
     response, slopes = _solved(scene, design, start, tuple(at for at, _ in moved))
     values = _change(slopes, [tangent for _, tangent in moved], without)
-    mean, peak, rms, lines, norm, state = _split(values, response)
-    constant: Any = None
-    same = [jax.tree.map(lambda _: None, part) for part in (response.margins, response.start)]
-    change = Response._make([mean, peak, rms, lines, norm, *[constant] * 4, state, *same])
-    return response, change
+    same: Any = {name: jax.tree.map(lambda _: None, getattr(response, name)) for name in _CONSTANT}
+    return response, response._replace(**same, **_split(values, response))
 
 
 @jax.jit
@@ -189,12 +193,19 @@ def _leaves(tree: Any) -> list[tuple[Any, Any]]:
     return jax.tree_util.tree_flatten_with_path(tree, is_leaf=lambda x: x is None)[0]
 
 
-def _split(values, response: Response):
-    """Split `values` into the differentiated fields of a `response`: mean, peak, RMS, lines,
-    p-norm, state."""
-    lines, states = response.lines.shape[0], response.state.shape[0]
-    norm = None if response.peak_norm is None else values[3 + lines]
-    return *values[:3], values[3 : 3 + lines], norm, values[-states:]
+_CONSTANT = "period", "multipliers", "residual", "status", "margins", "start"
+"""Fields of a response that are constant to JAX."""
+
+
+def _split(values, response: Response) -> dict[str, Any]:
+    """Split `values` into the differentiated fields of a `response`, by name."""
+    found, place = {}, 0
+    for name, old in response._asdict().items():
+        if name not in _CONSTANT:
+            end = place + jnp.size(old) if old is not None else place
+            found[name] = None if old is None else values[place:end].reshape(jnp.shape(old))
+            place = end
+    return found
 
 
 def _solved(scene: Scene, design, start, along: tuple[int, ...]) -> tuple[Response, Array]:
@@ -294,7 +305,8 @@ def _next_start(solver: Solver, pair: RotorPair, found: Steady, state: Float[Arr
     failed = (Status.UNSOUND, Status.PASSED_THROUGH, Status.STALLED, Status.NON_FINITE)
     failed = among(found.status, (*failed, Status.SOLVER_FAILED))
     rest = pair.in_si(jnp.zeros_like(state))
-    known = found.known._replace(sound=found.known.sound & among(found.status, CLOSED))
+    closed = among(found.status, CLOSED) | found.held
+    known = found.known._replace(sound=found.known.sound & closed)
     numbers = eqx.filter(pair, eqx.is_inexact_array)
     return Start(jnp.where(failed, rest, state), known, numbers)
 
@@ -303,7 +315,7 @@ def _named(solver: Solver, pair: RotorPair, tangents: RotorPair, found: Steady):
     """Return the response of a motion, and the derivatives of its differentiated fields."""
     measures = solver.measures
     orbit, period = found.orbit, found.period
-    closed = among(found.status, CLOSED)
+    closed = among(found.status, CLOSED) | found.held
     mean, square, peak, *others = found.forces
     by_mean, by_square, by_peak, *by_others = found.sensitivity
     rms = jnp.sqrt(jnp.maximum(square, 0.0))
@@ -311,12 +323,17 @@ def _named(solver: Solver, pair: RotorPair, tangents: RotorPair, found: Steady):
     sizes, slopes = measures.amplitudes(others, by_others, period)
     state, by_state = _state(pair, tangents, found)
     rows = [by_mean, by_peak, by_rms, *slopes]
+    reserves: list[Any] = [None, None]
+    by_reserves = jnp.zeros((0, by_mean.shape[0]))
+    if solver.variation and pair.gear is not None:
+        known, by_reserves = reserve(pair, tangents, varied(found))
+        reserves = [*jnp.where(closed, known, jnp.nan)]
     norm = None
     if measures.norm is not None:
         norm = others[-1]
         rows.append(by_others[-1])
-    periodic = found.status == Status.PERIODIC.code
-    rows = jnp.concatenate([jnp.stack(rows), by_state])
+    periodic = (found.status == Status.PERIODIC.code) | found.held
+    rows = jnp.concatenate([jnp.stack(rows), by_state, by_reserves])
     monodromy = jnp.where(closed, orbit.monodromy, jnp.nan)
     assert pair.soundness is not None
     response = Response(
@@ -331,6 +348,8 @@ def _named(solver: Solver, pair: RotorPair, tangents: RotorPair, found: Steady):
         status=found.status,
         state=state,
         margins=pair.soundness,
+        contact_reserve=reserves[0],
+        backlash_reserve=reserves[1],
         start=_next_start(solver, pair, found, state),
     )
     # Without weak types: a start that has them would be compiled for once more.

@@ -14,13 +14,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rootsopt.config.units import MM
+from rootsopt.config.units import MM, UM
 from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry, Profile, geometry
 from rootsopt.pump import flow
 from rootsopt.pump.leakage import leakage
 from rootsopt.pump.loads import still_loads
-from rootsopt.pump.sheet import MRAD, UM, play_of, ripple_of
+from rootsopt.pump.sheet import MRAD, play_of, ripple_of
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene
 from rootsopt.scene.medium import Medium
@@ -34,13 +34,13 @@ _LITRE_PER_MINUTE = 1e-3 / 60
 class Forces(NamedTuple):
     """Mean, peak and RMS of the contact force (N), in the fields `mean`, `peak`, `rms`.
 
-    `bearing`: loads of the bearings and axial forces, which an evaluation takes from the motion
-    itself, so that it is NaN here."""
+    `of_motion`: what an evaluation takes from the motion itself, such as loads of the bearings and
+    the torque of the timing gear, so that it is NaN here."""
 
     mean: Float[Array, ""]
     peak: Float[Array, ""]
     rms: Float[Array, ""]
-    bearing: Float[Array, ""] | float = float("nan")
+    of_motion: Float[Array, ""] | float = float("nan")
 
 
 class Term(eqx.Module):
@@ -210,7 +210,30 @@ class BearingTerm(Term):
                 "set `rotor.helix_deg`, or make the twist a design parameter with "
                 "`optimizer.bounds.helix_deg`"
             )
-        return forces.bearing
+        return forces.of_motion
+
+
+class GearTerm(Term):
+    """A term from the torque of the timing gear along the motion, under the `name` of a response.
+
+    The scene must have a section `scene.timing_gear`."""
+
+    name: str = eqx.field(static=True)
+
+    def value(self, scene, profile, shape, forces):
+        del profile, shape
+        if scene.gear is None:
+            raise InputError(
+                f"the term `{self.name}` needs the section `scene.timing_gear`; add it with "
+                "`scene.timing_gear.stiffness_N_m_per_rad` and `scene.timing_gear.backlash_mm`"
+            )
+        return forces.of_motion
+
+
+class ReserveTerm(GearTerm):
+    """A `GearTerm` for the distance of the flanks from touching, which is to be maximised."""
+
+    sense: ClassVar[Literal["min", "max"]] = "max"
 
 
 class StaticBearingTerm(Term):
@@ -241,6 +264,16 @@ EQUIVALENT = "bearing_load_equivalent_N"
 """Name of the greatest equivalent dynamic load of the bearings."""
 BEARING = (*(EQUIVALENT, "bearing_load_max_N", "axial_force_max_N", "tilting_moment_max_N_m"),)
 """Names of the terms that an evaluation takes from the bearing loads along the motion."""
+RESERVES = "contact_reserve_um", "backlash_reserve_mm"
+"""Names of the least gap of the flanks along the motion, and of the backlash that would use it up.
+"""
+GEAR = tuple(
+    f"{which}gear_{what}" for what in ("torque_N_m", "force_N") for which in ("mean_", "", "rms_")
+)
+"""Names of mean, greatest and RMS torque of the timing gear, and of its force at the pitch circle.
+"""
+OF_MOTION = (*BEARING, *RESERVES, *GEAR)
+"""Names of all terms that an evaluation takes from the motion itself."""
 _terms: dict[str, Term] = {}
 
 
@@ -371,6 +404,8 @@ def _own() -> dict[str, Any]:
         "static_bearing_load_max_N": StaticBearingTerm(equivalent=False),
         "static_bearing_load_equivalent_N": StaticBearingTerm(equivalent=True),
         **{name: BearingTerm(name, name in BEARING[2:]) for name in BEARING},
+        **{name: ReserveTerm(name) for name in RESERVES},
+        **{name: GearTerm(name) for name in GEAR},
     }
 
 

@@ -141,6 +141,7 @@ def solver_of(config: Config) -> Solver:
         max_periods=jnp.asarray(float(settings.max_mesh_periods)),
         probe_chaos=jnp.asarray(1.0),
         max_orbit=settings.max_orbit_periods,
+        variation=config.response.reserve,
     )
 
 

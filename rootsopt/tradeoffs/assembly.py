@@ -158,7 +158,7 @@ def _point(study: Study, node: Node, number: int, standing: Standing, scale: Sca
         end_of=names[node.end] if node.end >= 0 else "",
         point=node.sample.point,
         terms=study.term_values(node.sample.evaluation),
-        evaluation=study.completed(node.sample.evaluation),
+        evaluation=node.sample.evaluation,
         standing=standing,
         reason=node.reason,
         residual=node.certificate.residual,

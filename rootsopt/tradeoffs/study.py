@@ -2,9 +2,7 @@
 
 import dataclasses
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from rootsopt.config import Config
@@ -12,15 +10,12 @@ from rootsopt.design.space import Space
 from rootsopt.optimize.limits import force_limits, term_constraints
 from rootsopt.optimize.local import Group
 from rootsopt.optimize.problem import FEASIBLE, Problem
-from rootsopt.profiles import geometry
 from rootsopt.response.checkpoint import Checkpoint
-from rootsopt.response.evaluation import Evaluation, Evaluator, geometry_record
+from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.response.many import HERE, Point, Runs
 from rootsopt.response.starts import Seeds
-from rootsopt.response.terms import terms_of, values_of
-from rootsopt.runtime.programs import CachedFunction
-from rootsopt.scene import Scene, design_vector
-from rootsopt.status import Status
+from rootsopt.response.still import Still
+from rootsopt.scene import Scene
 from rootsopt.tradeoffs.aims import Aim, aims_of, freed, reported, simulated
 
 PEAK = "peak_force_N"
@@ -62,16 +57,16 @@ class Study:
     """Everything that is needed to evaluate designs of one trade-off.
 
     `config`: config of the study; `aims`: its k terms; `problem`: unit box and constraints, with
-    the evaluated baseline; `fast`, `sharp`, `exact`: evaluators for screening, search and report.
-    All three are `None` if no term depends on forces. `runs`: where they run; `checkpoint`: file
+    the evaluated baseline; `fast`, `sharp`, `exact`: evaluators for screening, search and report,
+    without a motion if no term depends on forces. `runs`: where they run; `checkpoint`: file
     that stores every evaluation and supplies those of an interrupted search."""
 
     config: Config
     aims: tuple[Aim, ...]
     problem: Problem
-    fast: Evaluator | None
-    sharp: Evaluator | None
-    exact: Evaluator | None
+    fast: Evaluator
+    sharp: Evaluator
+    exact: Evaluator
     runs: Runs = HERE
     checkpoint: Checkpoint | None = None
 
@@ -85,14 +80,12 @@ class Study:
         aims = aims_of(config)
         config = freed(config)
         scene = Scene.from_config(config)
-        if not simulated(config, scene):
-            baseline = geometry_of(scene, config, design_vector(config))
-            floor = baseline.geometry["area_efficiency"]
-            space = Space.of(config, scene, floor, term_constraints(config, scene))
-            return cls(config, aims, Problem(config, baseline, space), None, None, None, runs)
+        moves = simulated(config, scene)
         limits = force_limits(config, scene)
         maxima = any(_is_cornered(aim) for aim in aims) or any(one.cornered for one in limits)
         exact = Evaluator.of(reported(config))
+        if not moves:
+            exact = dataclasses.replace(exact, motions=Still())
         exact.prepare(maxima=maxima)
         baseline = exact()
         if maxima:
@@ -106,26 +99,16 @@ class Study:
     @property
     def usable(self) -> bool:
         """Whether all terms are known for the baseline."""
-        return self.exact is None or self.problem.baseline.usable
+        return self.problem.baseline.usable
 
     def term_values(self, evaluation: Evaluation) -> dict[str, float]:
         """Return the terms of an evaluated design by name, in their own units."""
         return {aim.name: evaluation.response[aim.name] for aim in self.aims}
 
-    def completed(self, evaluation: Evaluation) -> Evaluation:
-        """Return an `evaluation` with its geometry, which a search without forces leaves out."""
-        if evaluation.geometry:
-            return evaluation
-        design = jnp.asarray([*evaluation.design.values()])
-        return geometry_of(self.problem.space.scene, self.config, design)
-
     def screened(self, point: NDArray[np.float64]) -> Evaluation | None:
         """Return an evaluation of a `point` (d,) for a screening.
 
         Return `None` if the design has no usable steady state."""
-        if self.fast is None:
-            sample = self._still(point)
-            return None if sample is None else sample.evaluation
         found = self._simulated("screening", self.fast.without_gradient(), point)
         return found if found.usable else None
 
@@ -133,16 +116,12 @@ class Study:
         """Return the terms at a `point` (d,) during a search.
 
         `orbit`: first guess of the orbit. Return `None` without a usable steady state."""
-        if self.sharp is None:
-            return self._still(point)
         return self._moving(point, self._simulated("search", self.sharp, point, orbit))
 
     def verified(self, point: NDArray[np.float64]) -> Sample | None:
         """Return the terms at a `point` (d,), simulated from rest at the tight tolerance.
 
         Return `None` without a usable steady state."""
-        if self.exact is None:
-            return self._still(point)
         return self._moving(point, self._simulated("verification", self.exact, point))
 
     def _simulated(
@@ -177,22 +156,6 @@ class Study:
         limits = slack, normals, walls
         return _finite(Sample(np.array(point), evaluation, tuple(groups), cornered, *limits))
 
-    def _still(self, point: NDArray[np.float64]) -> Sample | None:
-        design, jacobian, slack, normals = self.problem.look(point)
-        scene = self.problem.space.scene
-        terms = terms_of([aim.name for aim in self.aims])
-        nothing = np.zeros(3), np.zeros((3, len(design)))
-        found = values_of(scene, terms, jnp.asarray(design), *map(jnp.asarray, nothing))
-        values, slopes = map(np.asarray, found)
-        rows = zip(self.aims, values, slopes @ jacobian, strict=True)
-        groups = tuple(
-            _single(k, aim, float(value), row) for k, (aim, value, row) in enumerate(rows)
-        )
-        response = {aim.name: float(value) for aim, value in zip(self.aims, values, strict=True)}
-        evaluation = still_evaluation(self.config, design, response)
-        cornered = (False,) * len(groups)
-        return _finite(Sample(np.array(point), evaluation, groups, cornered, slack, normals))
-
 
 def _is_cornered(aim: Aim) -> bool:
     """Return whether a term is a maximum over branches that is to be minimised."""
@@ -214,42 +177,4 @@ def _finite(sample: Sample) -> Sample | None:
     return sample if all(np.all(np.isfinite(array)) for array in arrays) else None
 
 
-@CachedFunction
-def _shape(scene: Scene, design):
-    """Return the geometry of a design (d,) in config units."""
-    return geometry(scene.profile(design))
-
-
-def geometry_of(scene: Scene, config: Config, design: Float[Array, " d"]) -> Evaluation:
-    """Return the evaluation of a `design` (d,), in config units, without a simulation.
-
-    Its response holds the terms of `config.pareto`, none of which may depend on forces."""
-    names = config.pareto.terms
-    nothing = jnp.zeros(3), jnp.zeros((3, len(config.design_keys)))
-    values, _ = values_of(scene, terms_of(names), design, *nothing)
-    response = dict(zip(names, map(float, np.asarray(values)), strict=True))
-    found = still_evaluation(config, np.asarray(design), response)
-    shape = geometry_record(scene, _shape(scene, design))
-    return dataclasses.replace(found, geometry=shape)
-
-
-def still_evaluation(
-    config: Config, design: NDArray[np.float64], response: dict[str, float]
-) -> Evaluation:
-    """Return the evaluation of a `design` (d,), in config units, without forces and geometry.
-
-    `response`: its terms by name."""
-    return Evaluation(
-        design=dict(zip(config.design_keys, map(float, design), strict=True)),
-        geometry={},
-        response=response,
-        gradient={},
-        steady_state={},
-        status=Status.GEOMETRY_ONLY,
-        message=Status.GEOMETRY_ONLY.value,
-        statistics={},
-        series=None,
-    )
-
-
-__all__ = ["PEAK", "Sample", "Study", "geometry_of"]
+__all__ = ["PEAK", "Sample", "Study"]

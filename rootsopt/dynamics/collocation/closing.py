@@ -470,7 +470,9 @@ def _differences(before: OrbitForces, after: OrbitForces):
     """Return two relative differences between the results on two meshes.
 
     The first is the largest difference in mean, RMS and peak force and in the further measures, the
-    second that in the derivatives of the first three. Spectral lines are relative to the mean."""
+    second that in the derivatives of the first three. Spectral lines are relative to the mean. For
+    an orbit without contact, they are those of the state at φ1 = 0 (scaled), and of its
+    derivatives."""
 
     def rms(values):
         return values.at[1].set(jnp.sqrt(jnp.maximum(values[1], 0.0)))
@@ -482,7 +484,10 @@ def _differences(before: OrbitForces, after: OrbitForces):
     slopes = jnp.max(jnp.abs(before.sensitivity - after.sensitivity), axis=1, initial=0.0)
     largest = jnp.max(jnp.abs(after.sensitivity), axis=1, initial=0.0)
     drift = jnp.max((slopes / jnp.where(largest > 0, largest, 1.0))[:3])
-    return error, drift
+    moved = jnp.max(jnp.abs(before.moved - after.moved), initial=0.0)
+    moved /= jnp.maximum(jnp.max(jnp.abs(after.moved), initial=0.0), 1e-30)
+    apart = jnp.max(jnp.abs(before.state - after.state))
+    return choose(other[2] > 0, (error, drift), (apart, moved))
 
 
 __all__ = ["FIRST", "Closed", "Closer", "Loop", "close", "corrected"]

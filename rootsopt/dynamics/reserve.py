@@ -1,0 +1,170 @@
+"""How far the flanks of an orbit are from touching, and the torque of its timing gear.
+
+The *contact reserve* of a motion is the least gap of its flanks. Where they touch, it is negative:
+the greatest penetration. The *backlash reserve* is the backlash by which that of the gear may grow
+until the flanks just touch. A gear with more backlash lets rotor 2 move further from the middle of
+its play. As long as the gear's torque stays the same, so does the rest of the motion. The reserve
+is therefore found by moving the motion outwards by s until the least gap is 0.
+
+Both are smooth through touching. Their derivatives are those at the instant of the least gap, which
+may move (envelope theorem), and of s by the implicit function theorem.
+"""
+
+import functools
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from rootsopt.dynamics.collocation.gauss import GAUSS
+from rootsopt.dynamics.flanks import FlankForce
+from rootsopt.dynamics.maxima import along_elements, around, located
+from rootsopt.dynamics.pair import RotorPair
+from rootsopt.dynamics.pieces import smooth_pieces
+from rootsopt.dynamics.varied import VariedOrbit
+
+_NEWTON = 6
+"""Number of positions of rotor 2 at which the least gap is computed. Newton's method leads from one
+to the next; the gap is nearly linear in the position."""
+
+
+_INWARDS = 0.9999
+"""Greatest move towards the middle of the backlash, as a share of the distance from it. Without
+clearance, flanks part only in the middle, where the other flanks touch."""
+
+
+class Apart(NamedTuple):
+    """Reserve and gear torque of an orbit, with derivatives along its d directions.
+
+    `values` (5,): contact reserve (m); backlash reserve, as half the backlash (rad), like
+    `TimingGear.half_backlash`; mean, greatest and RMS torque of the gear (N·m, magnitude). `slopes`
+    (5, d): their derivatives."""
+
+    values: Float[Array, "5"]
+    slopes: Float[Array, "5 d"]
+
+
+def apart(pair: RotorPair, tangents: RotorPair, orbit: VariedOrbit) -> Apart:
+    """Return reserve and gear torque of a closed `orbit` of a pair with a timing gear.
+
+    `tangents`: directions of the pair's parameters to which the variation of the orbit belongs."""
+    found = zip(reserve(pair, tangents, orbit), gear_torque(pair, tangents, orbit), strict=True)
+    return Apart(*(jnp.concatenate(pair) for pair in found))
+
+
+def _aside(pair: RotorPair, state: Float[Array, " n"]) -> tuple[Array, Array]:
+    """Return ε (rad) in the middle of the gear's backlash, and ε of the `state` minus this."""
+    assert pair.gear is not None
+    first, second = pair.gear.edges
+    middle = (first + second) / 2
+    return middle, pair.angle_scale * state[0] - middle
+
+
+def _contact(moved: Float[Array, ""], pair: RotorPair, tau, state) -> FlankForce:
+    """Return the contact at a state, with rotor 2 `moved` outwards (rad).
+
+    A negative number moves it towards the middle of the gear's backlash, but not beyond."""
+    middle, aside = _aside(pair, state)
+    side = jnp.where(aside < 0, -1.0, 1.0)
+    relative = middle + side * jnp.maximum(side * aside + moved, 0.0)
+    return pair.contact_at(tau, state.at[0].set(relative / pair.angle_scale))
+
+
+def reserve(
+    pair: RotorPair, tangents: RotorPair, orbit: VariedOrbit
+) -> tuple[Float[Array, "2"], Float[Array, "2 d"]]:
+    """Return contact and backlash reserve of an `orbit`, and their derivatives, as in `Apart`."""
+
+    def newton(moved, _):
+        """Return the next guess, then this one and where the flanks come closest with it."""
+
+        def gap(*at):
+            contact = _contact(moved, *at)
+            return contact.depth, contact.lever2, jnp.abs(_aside(pair, at[2])[1])
+
+        times, (depths, *further) = along_elements(gap, pair, orbit.elements)
+        places = around(orbit.elements.mesh, depths, times)
+        nearest = jnp.nonzero(times.ravel() == places[0], size=1)[0][0]
+        depth, lever, aside = (x.ravel()[nearest] for x in (depths, *further))
+        nearer = jnp.maximum(moved - depth / lever, -_INWARDS * aside)
+        return nearer, (moved, places)
+
+    def exact(at):
+        """Return the least gap, its derivatives, and the lever of the flank."""
+        moved, places = at
+        depth = functools.partial(_depth, moved)
+        (time,), (deepest,), (slope,) = located(depth, pair, tangents, orbit, places[:, None], 1)
+        # The contact's own lever is not exact enough for a derivative.
+        state = orbit.elements.motion(time)
+        lever = jax.grad(lambda moved: _depth(moved, pair, time, state))(moved)
+        return -deepest, -slope, lever
+
+    moves, places = lax.scan(newton, jnp.zeros_like(pair.angle_scale), length=_NEWTON)[1]
+    ends = np.array([0, _NEWTON - 1])
+    gaps, slopes, levers = lax.map(exact, (moves[ends], places[ends]))
+    half = moves[-1] + gaps[1] / levers[1]
+    return jnp.stack([gaps[0], half]), jnp.stack([slopes[0], slopes[1] / levers[1]])
+
+
+def _depth(moved: Float[Array, ""], *at) -> Float[Array, ""]:
+    """Return the penetration (m) of `_contact`."""
+    return _contact(moved, *at).depth
+
+
+def _torque(pair: RotorPair, tau, state) -> Float[Array, ""]:
+    """Return the torque of the timing gear (N·m) at a time (mesh periods) and scaled state."""
+    assert pair.gear is not None
+    torque = pair.gear.torque_on_1(pair.motion(tau, state), np.zeros(0))
+    assert torque is not None
+    return torque
+
+
+def gear_torque(
+    pair: RotorPair, tangents: RotorPair, orbit: VariedOrbit
+) -> tuple[Float[Array, "3"], Float[Array, "3 d"]]:
+    """Return mean, greatest and RMS torque of the gear over an `orbit`, and their derivatives.
+
+    Units: as in `Apart`. Averages are over time."""
+    dynamic, static = eqx.partition(pair, eqx.is_inexact_array)
+    directions = eqx.filter(tangents, eqx.is_inexact_array)
+
+    def integrands(tau, state, dynamic):
+        pair = eqx.combine(dynamic, static)
+        size = jnp.abs(_torque(pair, tau, state))
+        return pair.lapse(state) * jnp.stack([size, size**2, jnp.ones_like(size)])
+
+    def varied(tau):
+        state, _, changes = orbit.at(tau)
+
+        def push(change, along):
+            at = functools.partial(integrands, tau)
+            return jax.jvp(at, (state, dynamic), (change, along))
+
+        return jax.vmap(push, (1, 0), (None, -1))(changes, directions)
+
+    def flags(tau):
+        return (_torque(pair, tau, orbit.elements.motion(tau)) > 0)[None]
+
+    begins, ends, _ = smooth_pieces(orbit.elements, jnp.zeros(0), flags)
+    nodes = begins[:, None] + (ends - begins)[:, None] * GAUSS.nodes
+    found = jax.vmap(jax.vmap(varied))(nodes)
+    total, slope = (jnp.tensordot(ends - begins, GAUSS.whole(x), 1) for x in found)
+    mean, square = total[:2] / total[2]
+    by_mean, by_square = (slope[:2] - jnp.stack([mean, square])[:, None] * slope[2]) / total[2]
+    rms = jnp.sqrt(square)
+    by_rms = by_square / (2 * jnp.where(rms > 0, rms, jnp.inf))
+
+    def size(*at):
+        return jnp.abs(_torque(*at))
+
+    times, sizes = along_elements(size, pair, orbit.elements)
+    places = around(orbit.elements.mesh, sizes, times)[:, None]
+    _, (peak,), (by_peak,) = located(size, pair, tangents, orbit, places, 1)
+    return jnp.stack([mean, peak, rms]), jnp.stack([by_mean, by_peak, by_rms])
+
+
+__all__ = ["Apart", "apart", "gear_torque", "reserve"]
