@@ -21,8 +21,9 @@ _REASONS = REASONS | {
         "Set optimizer.method to auto."
     ),
     "verification": (
-        "The first-order conditions held in the search, but not when the design was simulated "
-        "again from rest. Tighten solver.accuracy."
+        "The search found nothing better nearby, but the first-order conditions do not hold at the "
+        "design: its gradients are less accurate than they ask for. If the objective depends on "
+        "forces, tighten solver.accuracy."
     ),
 }
 
