@@ -61,7 +61,7 @@ def _environment() -> jinja2.Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    made.filters["coded"] = _coded
+    made.filters |= {"coded": _coded, "command": _command}
     made.policies["json.dumps_kwargs"] = {}  # Bokeh reads its models in the order of writing.
     return made
 
@@ -69,14 +69,14 @@ def _environment() -> jinja2.Environment:
 def _coded(text: str) -> Markup:
     """Return a sentence with `commands` set as code, and numbers beside their units."""
     text = _UNIT.sub("\N{NO-BREAK SPACE}", text)
-    return Markup(_CODE.sub(_command, str(escape(text))))
+    return Markup(_CODE.sub(lambda found: _command(Markup(found[1])), str(escape(text))))
 
 
-def _command(found: re.Match[str]) -> str:
+def _command(text: str) -> Markup:
     """Return the HTML of a command, whose options are not divided at their hyphens."""
-    words = found[1].split(" ")
+    words = str(escape(text)).split(" ")
     kept = (f'<span class="word">{x}</span>' if x.startswith("-") else x for x in words)
-    return f"<code>{' '.join(kept)}</code>"
+    return Markup(f"<code>{' '.join(kept)}</code>")
 
 
 def table_html(table: Table | None) -> str:
@@ -128,8 +128,7 @@ def report_text(run: Run) -> str:
         status=status,
         good=run.usable and status.good is not False,
         asked=wording.asked(run),
-        came_out=wording.came_out(run),
-        what_next=wording.what_next(run),
+        end=run.end,
         conflict=tables.conflict_table(run.result),
         sections=tables.sections(run.result, run.rows),
         charts=[(title, note) for title, note, _ in drawn],
