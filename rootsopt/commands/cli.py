@@ -98,7 +98,8 @@ def _all_keys() -> str:
     listed = "\n".join(keys)
     return (
         f"profile families (profile.family):\n{describe_families()}\n\n"
-        f"config keys (for --set and the file), units in the name:\n{listed}"
+        f"config keys (for --set and the file), units in the name:\n{listed}\n\n"
+        "words of reports and messages: docs/glossary.md"
     )
 
 

@@ -27,6 +27,8 @@ _FACTS = {
 """What came out of a run, by command."""
 _SAID = *facts.STEADY, Status.GEOMETRY_ONLY.label
 """Statuses of a run that need no explanation."""
+_SENTENCES = re.compile(r"(?<=[.!?]) (?=[A-Z])(?!In conflict)")
+"""Blanks between the sentences of a message: what came out, and then advice."""
 _STOPPED = Status.INTERRUPTED.label, Status.NOT_SIMULATED.label
 _DRAW, _SIMULATE = ("Draw the rotor", "profile"), ("Simulate this design", "simulate")
 _SPEEDS = "Check it at other speeds", "sweep"
@@ -67,7 +69,7 @@ def ending(
     rows of a sweep, if the result does not hold them."""
     command, status = str(result["run"]["command"]), str(result.get("status", ""))
     told, again = _FACTS[command](result, rows), f"rootsopt {command} {source}"
-    first, *advice = re.split(r"(?<=[.!?]) (?=[A-Z])", str(result.get("message") or ""))
+    first, *advice = re.split(_SENTENCES, str(result.get("message") or ""))
     said = f"{in_words(status).capitalize()}: {first}"
     if status in _STOPPED:
         told.insert(0, ("Status", " ".join([said, *advice])))

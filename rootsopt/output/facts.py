@@ -124,7 +124,7 @@ def _prices(result: Record) -> Iterator[str]:
     shown = [f"{limit(row)} ({price(row)})" for row in found[:FEW]]
     if shown:
         rough = "" if (result.get("optimality") or {}).get("converged") else "rough "
-        yield f"limits that hold it back, with their {rough}prices in objective: {listed(shown)}"
+        yield f"{rough}price of a limit, in objective: {listed(shown)}"
 
 
 def _certified(result: Record) -> Iterator[str]:

@@ -257,7 +257,7 @@ def constraint_table(result: Record) -> Table | None:
             beyond = "violated" if own is None else f"> {value(own)}"
             before = Cell(f"{before.text} {beyond}", False)
         rows.append([limit(row), before, value(row["optimized"]), verdict, price(row)])
-    heads = "", "baseline", "optimised", "verdict", "price of the limit"
+    heads = "", "baseline", "optimised", "verdict", "price of a limit"
     note = (
         "Price: change of the objective if the limit is relaxed by the step, to first order. An "
         "empty price: the limit does not hold the optimum back."

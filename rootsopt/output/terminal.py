@@ -43,10 +43,10 @@ def shown(tables: Iterable[Table | None]) -> Group:
 def show_ending(out: Console, end: Ending) -> None:
     """Print the end of a run. Commands stand in lines of their own, as they are to be pasted."""
     for heading, sentences in end.facts:
-        out.print(Text.assemble((f"{heading}: ", "bold"), ascii_text(sentences)))
+        out.print(Text.assemble((f"{heading}: ", "bold"), ascii_text(sentences)), width=WIDTH)
     for purpose, command in end.steps:
         mark = ":" if command else ""
-        out.print(Text.assemble(("Next: ", "bold"), ascii_text(purpose), mark))
+        out.print(Text.assemble(("Next: ", "bold"), ascii_text(purpose), mark), width=WIDTH)
         if command:
             out.print(f"  {command}", soft_wrap=True, markup=False, highlight=False)
 

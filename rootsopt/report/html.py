@@ -26,6 +26,7 @@ from rootsopt.output.names import in_words
 from rootsopt.output.table import Table, status_cell
 from rootsopt.report import charts, wording
 from rootsopt.report.gather import Run
+from rootsopt.report.glossary import anchor, glossary, linked
 from rootsopt.report.meshing import animations
 from rootsopt.scene import outline_mm
 from rootsopt.tradeoffs.front import Front
@@ -61,7 +62,7 @@ def _environment() -> jinja2.Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    made.filters |= {"coded": _coded, "command": _command}
+    made.filters |= {"anchor": anchor, "coded": _coded, "command": _command, "linked": linked}
     made.policies["json.dumps_kwargs"] = {}  # Bokeh reads its models in the order of writing.
     return made
 
@@ -143,6 +144,7 @@ def report_text(run: Run) -> str:
         ],
         statuses=tables.status_table(run.result, run.config),
         effort=tables.effort_table(run.result),
+        glossary=glossary(),
     )
 
 

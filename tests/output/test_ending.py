@@ -59,9 +59,8 @@ def test_optimum_in_three_sentences():
         "Gained": "The objective is 15 % below the baseline's: mean force −40 %, leakage fraction "
         "−100 % and polar inertia −10 %; limits that the baseline violates are satisfied: outer "
         "radius.",
-        "Costs": "Seal width −50 % and peak force +10 %; limits that hold it back, with their "
-        "prices in objective: root radius ≥ 3 mm (−2 % for −0.1 mm) and seal width ≥ 3 mm (−0.5 % "
-        "for −0.1 mm).",
+        "Costs": "Seal width −50 % and peak force +10 %; price of a limit, in objective: root "
+        "radius ≥ 3 mm (−2 % for −0.1 mm) and seal width ≥ 3 mm (−0.5 % for −0.1 mm).",
         "How sure": "A certified optimum: first-order residual 2 × 10⁻⁹, at most 0.0001 required; "
         "2 of 3 local searches found it; simulated again from rest, its objective differs by 0.05 "
         "(relative).",
@@ -78,7 +77,7 @@ def test_optimum_that_is_none_says_so():
     }}  # fmt: skip
     facts = facts_of(given)
     assert facts["Gained"].startswith("The objective is 5 % above the baseline's: ")
-    assert "with their rough prices" in facts["Costs"]
+    assert "; rough price of a limit" in facts["Costs"]
     assert facts["How sure"].startswith("Not an optimum: first-order residual 2 × 10⁻⁹")
     assert "local searches" not in facts["How sure"]
     assert facts["How sure"].endswith(
@@ -127,6 +126,13 @@ def test_run_without_a_result_says_why_and_what_to_change(command, status):
         assert dict(first.facts)["How sure"] == (
             "The numbers are those of a window of 300 mesh periods."
         )
+
+
+def test_constraints_in_conflict_are_part_of_the_status():
+    told, advice = "No design does. In conflict: width >= 25 mm.", "Relax one of these."
+    given = run_of("optimize", status="infeasible", message=f"{told} {advice}")
+    assert facts_of(given) == {"Status": f"Infeasible: {told}"}
+    assert ending(given, Path("run"), "cic").steps[0] == (advice, "")
 
 
 def test_flanks_that_stay_apart_have_a_reserve():

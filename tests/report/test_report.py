@@ -21,6 +21,7 @@ from rootsopt.output import tables, terminal
 from rootsopt.output.files import ResultFolder, response_columns
 from rootsopt.report import charts
 from rootsopt.report.gather import Run
+from rootsopt.report.glossary import glossary, linked
 from rootsopt.report.html import report_text
 from rootsopt.report.meshing import animations
 from rootsopt.response.records import message_of
@@ -91,7 +92,7 @@ def page(simulated):
 def words_of(page):
     """Return the page's text, without scripts, styles and tags."""
     page = re.sub(r'<span class="word">(.*?)</span>', r"\1", page)
-    bare = re.sub(r"<(script|style).*?</\1>|</?code>", "", page, flags=re.S)
+    bare = re.sub(r"<(script|style).*?</\1>|</?(code|a)\b[^>]*>", "", page, flags=re.S)
     return " ".join(entities.unescape(re.sub(r"<[^>]*>", " ", bare)).split())
 
 
@@ -136,6 +137,22 @@ def test_page_says_what_came_out_and_what_every_status_means(page, simulated):
     for status in Status:
         assert status.label.replace("_", " ") in text
         assert message_of(load(CIC), status).replace("`", "") in text
+
+
+def test_words_lead_to_their_meaning(page):
+    """Mentions lead to the entry and show it; options, keys and other uses of a word do not."""
+    entries = dict(re.findall(r'<dt id="(.*?)">(.*?)</dt>', page))
+    assert {*entries.values()} == {*glossary()}
+    assert len(entries) == len(glossary()) > 30
+    links = re.findall(r'<a class="term" href="#(.*?)" title="(.*?)">(.*?)</a>', page)
+    assert {word for *_, word in links} >= {"backlash", "mesh period", "Floquet multiplier"}
+    for where, meaning, _ in links:
+        assert entities.unescape(meaning) == glossary()[entries[where]]
+    shown = linked("<th>order (°)</th><th>orders</th> in order, objective.motion <a>land</a> Land")
+    assert re.findall(r"#word-(\w+)", shown) == ["order", "land"]
+    assert (
+        linked("<code>backlash</code><i title='orbit'>") == "<code>backlash</code><i title='orbit'>"
+    )
 
 
 def test_notes_on_odd_values_are_in_the_summary(page):
