@@ -145,7 +145,7 @@ def _certified(result: Record) -> Iterator[str]:
         yield f"an independent ensemble gives the objective {brief(verified)} ± {error}"
     elif searched and verified is not None:
         away = brief(abs(verified / searched - 1), 2)
-        yield f"simulated again from rest, its objective differs by {away} (relative)"
+        yield f"simulated again from rest, its objective agrees to {away} (relative)"
     fresh: Mapping[str, Any] = (result.get("robustness") or {}).get("fresh") or {}
     if fresh:
         means = [f"{name} {quantity(x['objective'].get('mean'), '')}" for name, x in fresh.items()]

@@ -62,7 +62,7 @@ def test_optimum_in_three_sentences():
         "Costs": "Seal width −50 % and peak force +10 %; price of a limit, in objective: root "
         "radius ≥ 3 mm (−2 % for −0.1 mm) and seal width ≥ 3 mm (−0.5 % for −0.1 mm).",
         "How sure": "A certified optimum: first-order residual 2 × 10⁻⁹, at most 0.0001 required; "
-        "2 of 3 local searches found it; simulated again from rest, its objective differs by 0.05 "
+        "2 of 3 local searches found it; simulated again from rest, its objective agrees to 0.05 "
         "(relative).",
     }
 

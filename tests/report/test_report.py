@@ -134,6 +134,8 @@ def test_page_says_what_came_out_and_what_every_status_means(page, simulated):
         assert words in text
     for heading, sentences in simulated.end.facts:
         assert f"{heading}: {sentences}" in text
+    for purpose, command in simulated.end.steps:
+        assert f"{purpose}: {command}" in text
     for status in Status:
         assert status.label.replace("_", " ") in text
         assert message_of(load(CIC), status).replace("`", "") in text
