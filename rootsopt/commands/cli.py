@@ -270,12 +270,13 @@ def _in_folder(command: str, config: Config, options: argparse.Namespace) -> int
         # Write files first: importing the console takes half of the time, and stdout may fail.
         from rich.console import Console
 
-        from rootsopt.output import ending, terminal
+        from rootsopt.output.ending import ending
+        from rootsopt.output.terminal import show_ending
 
         out = Console()
         outcome.show(out)
         given = folder.path, shlex.join(options.given), options.imports, outcome.rows
-        terminal.show_ending(out, ending.ending(folder.result, *given))
+        show_ending(out, ending(folder.result, *given))
         for note in moved:
             out.print(note, soft_wrap=True, markup=False, highlight=False)
         out.print(f"results in {folder.path}", soft_wrap=True, markup=False, highlight=False)
