@@ -31,8 +31,8 @@ LATE = {
     # The work of a command is loaded once its help or its config has asked for it.
     "commands/table.py": {"rootsopt.commands", "rootsopt", "argparse"},
     "commands/cli.py": {
-        "rootsopt.output.runs", "rootsopt.report.gather", "rootsopt.report.html",
-        "rootsopt.runtime",
+        "rootsopt.output.ending", "rootsopt.output.runs", "rootsopt.output.terminal",
+        "rootsopt.report.gather", "rootsopt.report.html", "rootsopt.runtime",
     },
     "commands/console.py": {"rootsopt", "rootsopt.commands", "rootsopt.errors"},
     # Figures are imported in the background; exports, only if they are asked for.

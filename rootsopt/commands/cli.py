@@ -53,10 +53,12 @@ os.environ.setdefault("EQX_ON_ERROR", "off")
 class Outcome(NamedTuple):
     """The result of a command.
 
-    `code`: exit code; `show`: function that prints the result on a rich console."""
+    `code`: exit code; `show`: function that prints the result on a rich console; `rows`: rows of a
+    sweep that the result file does not hold."""
 
     code: int
     show: "Callable[[Console], None]"
+    rows: Sequence[dict[str, Any]] = ()
 
 
 Body = Callable[[Config, argparse.Namespace, "RunFolder"], Outcome]
@@ -96,7 +98,8 @@ def _all_keys() -> str:
     listed = "\n".join(keys)
     return (
         f"profile families (profile.family):\n{describe_families()}\n\n"
-        f"config keys (for --set and the file), units in the name:\n{listed}"
+        f"config keys (for --set and the file), units in the name:\n{listed}\n\n"
+        "words of reports and messages: docs/glossary.md"
     )
 
 
@@ -267,8 +270,13 @@ def _in_folder(command: str, config: Config, options: argparse.Namespace) -> int
         # Write files first: importing the console takes half of the time, and stdout may fail.
         from rich.console import Console
 
+        from rootsopt.output.ending import ending
+        from rootsopt.output.terminal import show_ending
+
         out = Console()
         outcome.show(out)
+        given = folder.path, shlex.join(options.given), options.imports, outcome.rows
+        show_ending(out, ending(folder.result, *given))
         for note in moved:
             out.print(note, soft_wrap=True, markup=False, highlight=False)
         out.print(f"results in {folder.path}", soft_wrap=True, markup=False, highlight=False)
@@ -283,7 +291,8 @@ def _report(folder: "RunFolder", options: argparse.Namespace, outcome: Outcome) 
     from rootsopt.report.html import report_text
 
     try:
-        run = Run.of(folder, folder.result, shlex.join(options.given), outcome.code == door.OK)
+        given = shlex.join(options.given), outcome.code == door.OK, options.imports
+        run = Run.of(folder, folder.result, *given)
         text = report_text(run)
     except Exception as error:
         words = f"{type(error).__name__}: {error}"

@@ -5,7 +5,7 @@ ASCII where a table is printed."""
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rootsopt.config import Config
@@ -127,6 +127,11 @@ def limit(row: Mapping[str, Any]) -> str:
     return f"{in_words(row['name'])} {sense} {quantity(row['limit'], row.get('unit') or '')}"
 
 
+def listed(parts: Sequence[str]) -> str:
+    """Return parts of a sentence with commas and a final "and" between them."""
+    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
+
+
 def _printed(shown: str) -> str:
     """Return a formatted number with minus signs and with its power of ten as an exponent."""
     mantissa, _, power = shown.partition("e")
@@ -142,6 +147,7 @@ __all__ = [
     "label",
     "last_part",
     "limit",
+    "listed",
     "name_and_unit",
     "percent",
     "quantity",

@@ -256,8 +256,8 @@ def constraint_table(result: Record) -> Table | None:
             own = row.get("baseline_limit")
             beyond = "violated" if own is None else f"> {value(own)}"
             before = Cell(f"{before.text} {beyond}", False)
-        rows.append([limit(row), before, value(row["optimized"]), verdict, _price(row)])
-    heads = "", "baseline", "optimised", "verdict", "price of the limit"
+        rows.append([limit(row), before, value(row["optimized"]), verdict, price(row)])
+    heads = "", "baseline", "optimised", "verdict", "price of a limit"
     note = (
         "Price: change of the objective if the limit is relaxed by the step, to first order. An "
         "empty price: the limit does not hold the optimum back."
@@ -268,7 +268,8 @@ def constraint_table(result: Record) -> Table | None:
     return table("Constraints", heads, [("", rows)], note)
 
 
-def _price(row: Record) -> str:
+def price(row: Record) -> str:
+    """Return the price of a limit in words: the change of the objective for a step of the limit."""
     change = row.get("relaxed_objective_percent")
     if change is None or not row.get("multiplier"):
         return ""

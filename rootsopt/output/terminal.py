@@ -5,9 +5,10 @@ from collections.abc import Iterable, Iterator, Mapping
 
 import rich.table
 from rich import box
-from rich.console import Group
+from rich.console import Console, Group
 from rich.text import Text
 
+from rootsopt.output.ending import Ending
 from rootsopt.output.table import Table
 
 WIDTH = 80
@@ -37,6 +38,17 @@ def ascii_text(text: str) -> str:
 def shown(tables: Iterable[Table | None]) -> Group:
     """Return tables and their notes for a rich console; None stands for a table without rows."""
     return Group(*(part for one in tables if one is not None for part in _parts(one)))
+
+
+def show_ending(out: Console, end: Ending) -> None:
+    """Print the end of a run. Commands stand in lines of their own, as they are to be pasted."""
+    for heading, sentences in end.facts:
+        out.print(Text.assemble((f"{heading}: ", "bold"), ascii_text(sentences)), width=WIDTH)
+    for purpose, command in end.steps:
+        mark = ":" if command else ""
+        out.print(Text.assemble(("Next: ", "bold"), ascii_text(purpose), mark), width=WIDTH)
+        if command:
+            out.print(f"  {command}", soft_wrap=True, markup=False, highlight=False)
 
 
 def _parts(table: Table) -> Iterator[rich.table.Table | Text]:
@@ -96,4 +108,4 @@ def _drawn(table: Table, widths: Mapping[int, int]) -> rich.table.Table:
     return made
 
 
-__all__ = ["WIDTH", "ascii_text", "shown"]
+__all__ = ["WIDTH", "ascii_text", "show_ending", "shown"]

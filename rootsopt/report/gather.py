@@ -3,13 +3,14 @@
 import csv
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rootsopt.config import Config, load
+from rootsopt.output.ending import Ending, ending
 from rootsopt.output.files import ResultFolder
 from rootsopt.output.fronts import design_file
 from rootsopt.output.tables import NAMES, records_of
@@ -50,7 +51,7 @@ class Run:
     path of the result folder; `config`: resolved config, with its YAML as `yaml`; `result`: content
     of the result file; `cases`: designs and motions; `rows`: rows of a sweep's table;
     `figures`: content of each PNG file by name; `usable`: whether the run ended with a usable
-    result (exit code 0)."""
+    result (exit code 0); `imports`: files and modules of `--import`."""
 
     command: str
     source: str
@@ -62,15 +63,26 @@ class Run:
     rows: tuple[dict[str, Any], ...]
     figures: Mapping[str, bytes]
     usable: bool
+    imports: Sequence[str] = ()
+
+    @property
+    def end(self) -> Ending:
+        """What came out and what to do next, as on the terminal."""
+        return ending(self.result, self.path, self.source, self.imports, self.rows)
 
     @classmethod
     def of(
-        cls, folder: ResultFolder, result: Mapping[str, Any], source: str, usable: bool
+        cls,
+        folder: ResultFolder,
+        result: Mapping[str, Any],
+        source: str,
+        usable: bool,
+        imports: Sequence[str] = (),
     ) -> "Run":
         """Read the run whose files lie in `folder`.
 
-        `result`: content of the result file, which may not be written yet; `source`, `usable`: as
-        in the class. Raises `InputError` if a config in the folder cannot be read."""
+        `result`: content of the result file, which may not be written yet; `source`, `usable`,
+        `imports`: as in the class. Raises `InputError` if a config in the folder cannot be read."""
         place = folder.place
         config = load(place / "config.yaml")
         pictures = sorted((place / "figures").glob("*.png"))
@@ -85,6 +97,7 @@ class Run:
             rows=tuple(_rows(place / "sweep.csv")),
             figures={path.name: path.read_bytes() for path in pictures},
             usable=usable,
+            imports=imports,
         )
 
 

@@ -26,6 +26,7 @@ from rootsopt.output.names import in_words
 from rootsopt.output.table import Table, status_cell
 from rootsopt.report import charts, wording
 from rootsopt.report.gather import Run
+from rootsopt.report.glossary import anchor, glossary, linked
 from rootsopt.report.meshing import animations
 from rootsopt.scene import outline_mm
 from rootsopt.tradeoffs.front import Front
@@ -61,7 +62,7 @@ def _environment() -> jinja2.Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    made.filters["coded"] = _coded
+    made.filters |= {"anchor": anchor, "coded": _coded, "command": _command, "linked": linked}
     made.policies["json.dumps_kwargs"] = {}  # Bokeh reads its models in the order of writing.
     return made
 
@@ -69,14 +70,14 @@ def _environment() -> jinja2.Environment:
 def _coded(text: str) -> Markup:
     """Return a sentence with `commands` set as code, and numbers beside their units."""
     text = _UNIT.sub("\N{NO-BREAK SPACE}", text)
-    return Markup(_CODE.sub(_command, str(escape(text))))
+    return Markup(_CODE.sub(lambda found: _command(Markup(found[1])), str(escape(text))))
 
 
-def _command(found: re.Match[str]) -> str:
+def _command(text: str) -> Markup:
     """Return the HTML of a command, whose options are not divided at their hyphens."""
-    words = found[1].split(" ")
+    words = str(escape(text)).split(" ")
     kept = (f'<span class="word">{x}</span>' if x.startswith("-") else x for x in words)
-    return f"<code>{' '.join(kept)}</code>"
+    return Markup(f"<code>{' '.join(kept)}</code>")
 
 
 def table_html(table: Table | None) -> str:
@@ -128,8 +129,7 @@ def report_text(run: Run) -> str:
         status=status,
         good=run.usable and status.good is not False,
         asked=wording.asked(run),
-        came_out=wording.came_out(run),
-        what_next=wording.what_next(run),
+        end=run.end,
         conflict=tables.conflict_table(run.result),
         sections=tables.sections(run.result, run.rows),
         charts=[(title, note) for title, note, _ in drawn],
@@ -144,6 +144,7 @@ def report_text(run: Run) -> str:
         ],
         statuses=tables.status_table(run.result, run.config),
         effort=tables.effort_table(run.result),
+        glossary=glossary(),
     )
 
 

@@ -126,6 +126,8 @@ def test_profile_writes_one_record(tmp_path):
     done = command("profile", EE, "-o", tmp_path / "p", "--set", "profile.lobes=2", *odd)
     assert done.returncode == 0, done.stderr
     record = json.loads((tmp_path / "p" / "result.json").read_text())
+    assert f"\n  rootsopt simulate {tmp_path / 'p' / 'config.yaml'}\n" in done.stdout
+    assert "rootsopt optimize" not in done.stdout  # EE has no design parameters.
     (note,) = record["notes"]  # A value that looks like another unit is told, not refused.
     assert done.stderr == f"rootsopt: {note}\n"
     assert "N·mm? write 4.775" in note

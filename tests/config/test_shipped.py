@@ -13,6 +13,7 @@ from rootsopt.config.shipped import shipped
 from rootsopt.errors import InputError
 
 ROOT = Path(__file__).parents[2]
+GLOSSARY = ROOT / "docs" / "glossary.md"
 _NAMES = sorted(path.stem for path in (ROOT / "configs").glob("*.yaml"))
 
 
@@ -55,6 +56,7 @@ def test_an_installed_package_has_its_configs_and_types(tmp_path):
     pages = tmp_path / "site" / "rootsopt" / "report" / "template"
     own = ROOT / "rootsopt" / "report" / "template"
     assert {file.name for file in pages.iterdir()} == {file.name for file in own.iterdir()}
+    assert (pages.parents[1] / "glossary.md").read_bytes() == GLOSSARY.read_bytes()
     empty = tmp_path / "empty"
     empty.mkdir()
     program = "import rootsopt; print(rootsopt.__file__, rootsopt.load_config('cic').design_keys)"

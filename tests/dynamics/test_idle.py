@@ -92,7 +92,7 @@ def test_optimize_says_why_there_is_nothing_to_optimise(tmp_path, capsys):
     arguments = [CIC, "-o", str(tmp_path / "out"), "--set", "contact.clearance_mm=0.3"]
     assert optimize.main([*arguments, "--no-figures"]) == 3
     said = " ".join(capsys.readouterr().out.split())
-    assert "idle: baseline: No flank touches" in said
+    assert "Idle: baseline: No flank touches" in said
     assert "contact.clearance_mm below 0.0" in said
 
 

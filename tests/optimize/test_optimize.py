@@ -409,7 +409,7 @@ def test_signals_to_the_command(tmp_path, after, number):
     assert done.returncode == 3, done.stderr
     assert "Traceback" not in done.stderr
     assert done.stderr.count("\n") == 1
-    assert "interrupted" in done.stdout
+    assert "Interrupted: " in done.stdout
     result = json.loads((tmp_path / "run" / "result.json").read_text())
     assert result["status"] == "interrupted"
     written = {p.name for p in (tmp_path / "run").iterdir()}

@@ -53,8 +53,6 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
 
     def show(out: Console) -> None:
         out.print(terminal.shown(tables.tables_of(data)))
-        if not found.status.usable:
-            out.print(f"{found.status.label}: {data['message']}", soft_wrap=True)
 
     usable = any(one.evaluation.usable for one in found.attractors)
     return cli.Outcome(cli.OK if usable else cli.NO_RESULT, show)

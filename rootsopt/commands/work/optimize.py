@@ -68,12 +68,8 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
 
     def show(out: Console) -> None:
         out.print(terminal.shown(tables.tables_of(data)))
-        if result.cost:
-            out.print(result.cost, soft_wrap=True)
         if result.beginning is not None:
             outline_report.say(config, out)
-        if result.interrupted or result.optimized is None:
-            out.print(_message(result))
         out.print(
             f"compile {clock.seconds:.1f} s, run {ran - clock.seconds:.1f} s, "
             f"reports {total - ran:.1f} s",
@@ -99,7 +95,6 @@ def _contradiction(config: Config, folder: RunFolder, result) -> cli.Outcome:
 
     def show(out):
         out.print(terminal.shown(tables.tables_of(data)))
-        out.print(f"{result.status.label}: {found.message}", soft_wrap=True)
 
     return cli.Outcome(cli.NO_RESULT, show)
 
@@ -137,11 +132,6 @@ def _searching(config: Config, result) -> Config:
 
     It is `config` itself, unless the baseline's profile is from a file."""
     return config if result.beginning is None else result.beginning.config
-
-
-def _message(result) -> str:
-    """Return the status and advice for a search that was interrupted or found no better design."""
-    return f"{result.status.label}: {_advice(result)}"
 
 
 def _advice(result) -> str:

@@ -74,12 +74,11 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
 
     def show(out: Console) -> None:
         out.print(terminal.shown(tables.tables_of(record, rows, _FEW)))
-        out.print(f"{record['status']}: {record['message']}", soft_wrap=True, markup=False)
         rate = statistics["points_per_second"]
         out.print(f"{len(records) - known} points in {seconds:.1f} s, {rate:.3g} per second")
 
     usable = done and any(Status[row["status"].upper()].usable for row in rows)
-    return cli.Outcome(cli.OK if usable else cli.NO_RESULT, show)
+    return cli.Outcome(cli.OK if usable else cli.NO_RESULT, show, rows)
 
 
 def _points(config: Config, options: argparse.Namespace) -> tuple[Config, Plan]:

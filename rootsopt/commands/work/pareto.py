@@ -68,7 +68,6 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
 
     def show(out: Console) -> None:
         out.print(terminal.shown(tables.tables_of(record)))
-        out.print(f"{front.status.label}: {front.message}", soft_wrap=True)
         out.print(
             f"{front.searches} searches, {front.evaluations} designs, compile "
             f"{clock.seconds:.1f} s, run {ran - clock.seconds:.1f} s",

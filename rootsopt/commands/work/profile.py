@@ -61,7 +61,6 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
 
     def show(out: Console) -> None:
         out.print(terminal.shown(tables.tables_of(record)))
-        out.print(record["message"], soft_wrap=True, highlight=False)
         outline_report.say(config, out)
         if projected is not None:
             out.print(projected, soft_wrap=True)

@@ -111,8 +111,7 @@ def nothing_known(
     data = {**empty, "status": status.label, "message": message}
     folder.write_json("result.json", data | {"versions": files.versions()})
     folder.overwrite = False  # An earlier result is more valuable than this one.
-    text = f"{status.label}: {message}"
-    return cli.Outcome(cli.NO_RESULT, lambda out: out.print(text, soft_wrap=True))
+    return cli.Outcome(cli.NO_RESULT, lambda out: None)
 
 
 @contextlib.contextmanager

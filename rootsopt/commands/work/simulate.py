@@ -46,7 +46,6 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     def show(out: Console) -> None:
         shown = [*tables.tables_of(data), tables.effort_table(data)]
         out.print(terminal.shown(shown))
-        out.print(evaluation.message, soft_wrap=True, markup=False, highlight=False)
         outline_report.say(config, out)
 
     return cli.Outcome(cli.OK if evaluation.usable else cli.NO_RESULT, show)

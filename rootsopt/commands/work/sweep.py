@@ -55,8 +55,6 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
 
     def show(out: Console) -> None:
         out.print(terminal.shown(tables.tables_of(data, most=len(rows))))
-        if not status.usable:
-            out.print(f"{status.label}: {message}", soft_wrap=True)
 
     usable = any(part.evaluation.usable for part in parts)
     return cli.Outcome(cli.OK if usable else cli.NO_RESULT, show)
