@@ -21,7 +21,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from rootsopt.dynamics.collocation.gauss import GAUSS
-from rootsopt.dynamics.flanks import FlankForce
+from rootsopt.dynamics.flanks import FlankForce, by_slice, touch_of
 from rootsopt.dynamics.maxima import along_elements, around, located
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.pieces import smooth_pieces
@@ -35,6 +35,10 @@ to the next; the gap is nearly linear in the position."""
 _INWARDS = 0.9999
 """Greatest move towards the middle of the backlash, as a share of the distance from it. Without
 clearance, flanks part only in the middle, where the other flanks touch."""
+
+
+INSTANTS = 96
+"""Number of instants over an orbit at which `gaps` are computed."""
 
 
 class Apart(NamedTuple):
@@ -115,6 +119,42 @@ def _depth(moved: Float[Array, ""], *at) -> Float[Array, ""]:
     return _contact(moved, *at).depth
 
 
+def gaps(
+    pair: RotorPair, tangents: RotorPair, orbit: VariedOrbit
+) -> tuple[Float[Array, " n"], Float[Array, "n d"]]:
+    """Return the gaps (m) of drive and coast flanks at `INSTANTS` of an `orbit`, and their
+    derivatives along the orbit's directions.
+
+    Each gap is smooth, while their least value has corners: it is that of another side, or at
+    another instant. The pair must be two-sided."""
+    assert pair.two_sided
+    dynamic, static = eqx.partition(pair, eqx.is_inexact_array)
+    directions = eqx.filter(tangents, eqx.is_inexact_array)
+    period = orbit.elements.mesh.period
+
+    def at(tau):
+        state, _, changes = orbit.at(tau)
+
+        def both(state, dynamic):
+            pair = eqx.combine(dynamic, static)
+
+            def of_section(pair, motion):
+                sides = jnp.array([1.0, -1.0])
+                return jax.vmap(lambda side: touch_of(pair, side, motion).depth)(sides)
+
+            found = by_slice(pair, of_section, pair.motion(tau, state))
+            return -jnp.max(found.reshape(-1, 2), axis=0)
+
+        def push(change, along):
+            return jax.jvp(both, (state, dynamic), (change, along))
+
+        values, slopes = jax.vmap(push, (1, 0), (None, 0))(changes, directions)
+        return values, slopes.T
+
+    values, slopes = lax.map(at, period * jnp.arange(INSTANTS) / INSTANTS, batch_size=INSTANTS // 2)
+    return values.ravel(), slopes.reshape(2 * INSTANTS, -1)
+
+
 def _torque(pair: RotorPair, tau, state) -> Float[Array, ""]:
     """Return the torque of the timing gear (N·m) at a time (mesh periods) and scaled state."""
     assert pair.gear is not None
@@ -167,4 +207,4 @@ def gear_torque(
     return jnp.stack([mean, peak, rms]), jnp.stack([by_mean, by_peak, by_rms])
 
 
-__all__ = ["Apart", "apart", "gear_torque", "reserve"]
+__all__ = ["INSTANTS", "Apart", "apart", "gaps", "gear_torque", "reserve"]

@@ -375,7 +375,7 @@ class Evaluator:
             if self._loaded(series):
                 orbit_loads.prepare(self.scene, design, orbit)
             if self._geared(series):
-                _apart.prepare(pair, tangents, orbit)
+                apart_program.prepare(pair, tangents, orbit)
             rows = np.zeros((found.orbit.response.shape[0], 1))
             forces = solver.measures.named(rows, 1)
             added = [name for name in self._names if name not in (*forces, *OF_MOTION)]
@@ -450,7 +450,7 @@ class Evaluator:
                     each = np.tile(np.asarray(loads.series.sizes, np.float64), turns)
                     motion = dataclasses.replace(motion, bearing_loads=each)
             if self._geared(series):
-                reserve = jax.device_get(_apart(pair, tangents, varied(found)))
+                reserve = jax.device_get(apart_program(pair, tangents, varied(found)))
                 further |= apart_record(reserve, float(self.scene.pitch_radius))
             response |= {name: value for name, (value, _) in further.items()}
             if known:
@@ -549,7 +549,7 @@ def motion_from(pair: RotorPair, tangents: RotorPair, start: Start, radius, solv
 _build = CachedFunction(Scene.pair_and_tangents)
 _motion = CachedFunction(motion_from, gathered=0)
 _integrated = CachedFunction(integrated_difference)
-_apart = CachedFunction(apart)
+apart_program = CachedFunction(apart)
 lyapunov_program = CachedFunction(lyapunov)
 unsettled_status = CachedFunction(window_status)
 _seen = CachedFunction(seen)

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import numpy as np
+from numpy.typing import NDArray
 
 from rootsopt.config import Config
 from rootsopt.dynamics.maxima import local_maxima
@@ -83,11 +84,19 @@ def quantities(config: Config) -> list[Quantity]:
     return found
 
 
-def _direction(config: Config, scene: Scene, quantity: Quantity) -> Scene:
-    """Return the derivatives of the scene's arrays with respect to a `quantity`, as a `Scene`."""
-    size = _STEP * (abs(quantity.value) or 1.0)
-    moved = Scene.from_config(config.moved({quantity.key: quantity.value + size}))
-    here = Scene.from_config(config)
+def direction(
+    config: Config, scene: Scene, key: str, value: float
+) -> tuple[Scene, NDArray[np.float64]]:
+    """Return the derivatives of the scene's arrays and of the design (d,) with respect to a key.
+
+    `key`: dotted config key of a number; `value`: this number in the `config`. The first result is
+    a `Scene`, the second in config units."""
+    size = _STEP * (abs(value) or 1.0)
+    other = config.moved({key: value + size})
+    if key.startswith("profile."):
+        still = jax.tree.map(np.zeros_like, eqx.filter(scene, eqx.is_inexact_array))
+        return still, (other.design - config.design) / size
+    moved, here = Scene.from_config(other), Scene.from_config(config)
 
     def change(path, before, after):
         if path[0].name in _SETTINGS:
@@ -95,20 +104,20 @@ def _direction(config: Config, scene: Scene, quantity: Quantity) -> Scene:
         return (np.asarray(after, np.float64) - np.asarray(before, np.float64)) / size
 
     arrays = [eqx.filter(one, eqx.is_inexact_array) for one in (here, moved)]
-    return jax.tree_util.tree_map_with_path(change, *arrays)
+    return jax.tree_util.tree_map_with_path(change, *arrays), np.zeros(len(config.design))
 
 
 @CachedFunction
-def _along(scene: Scene, design, directions: Scene):
-    """Return the rotor pair of a design, and its derivatives along several directions of the scene.
+def along_values(scene: Scene, design, directions: Scene, turns):
+    """Return the rotor pair of a design, and its derivatives along several directions.
 
-    `directions`: stacked along a leading axis."""
+    `directions`, `turns` (n, d): results of `direction`, stacked along a leading axis."""
     arrays, rest = eqx.partition(scene, eqx.is_inexact_array)
 
-    def build(arrays):
-        return eqx.combine(arrays, rest).pair_and_shape(design)
+    def build(values):
+        return eqx.combine(values[0], rest).pair_and_shape(values[1])
 
-    return along(build, arrays, directions)[:2]
+    return along(build, (arrays, design), (directions, turns))[:2]
 
 
 def by_scene(evaluator: Evaluator, evaluation: Evaluation) -> Evaluation | None:
@@ -121,7 +130,7 @@ def by_scene(evaluator: Evaluator, evaluation: Evaluation) -> Evaluation | None:
     design = np.array(list(evaluation.design.values()))
     wanted = quantities(config)
     size = max(1, len(evaluation.design))
-    directions = [_direction(config, evaluator.scene, one) for one in wanted]
+    directions = [direction(config, evaluator.scene, one.key, one.value) for one in wanted]
     blank = jax.tree.map(np.zeros_like, directions[0])
     gradient: dict[str, dict[str, float]] = {}
     slopes, maxima = [], evaluation.maxima
@@ -129,7 +138,7 @@ def by_scene(evaluator: Evaluator, evaluation: Evaluation) -> Evaluation | None:
         # Pad to as many directions as there are design parameters, to reuse the compiled program.
         some = directions[begin : begin + size]
         stacked = jax.tree.map(lambda *x: np.stack(x), *some, *[blank] * (size - len(some)))
-        pair, tangents = _along(evaluator.scene, design, stacked)
+        pair, tangents = along_values(evaluator.scene, design, *stacked)
         start = begun(pair, evaluation.start, solver.max_orbit)
         found = evaluator.motion(pair, tangents, start)
         if Status.of(found.status) is not Status.PERIODIC:
@@ -151,4 +160,4 @@ def by_scene(evaluator: Evaluator, evaluation: Evaluation) -> Evaluation | None:
     return dataclasses.replace(evaluation, gradient=gradient, maxima=maxima)
 
 
-__all__ = ["Quantity", "by_scene", "quantities"]
+__all__ = ["Quantity", "along_values", "by_scene", "direction", "quantities"]
