@@ -3,7 +3,7 @@
 import math
 import shlex
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import yaml
 from pydantic import Field
@@ -23,15 +23,11 @@ from rootsopt.config.stock import (
 )
 from rootsopt.config.units import RPM
 
-_BAR = 1e5
-"""One bar (Pa)."""
-_DEPTH, _RATIO = 1e-3, 0.1
-"""Penetration (mm) at which the damping of the flanks is full, and damping ratio of flanks and
-timing gear."""
-_COLUMN = 40
-"""Column in which comments start."""
-_DIGITS = 10
-"""Significant digits of design parameters: they keep the outer radius within 1e-6 mm."""
+_BAR, _DEPTH, _RATIO, _COLUMN = 1e5, 1e-3, 0.1, 40
+"""One bar (Pa); penetration (mm) at which the damping of the flanks is full; damping ratio of
+flanks and timing gear; column in which comments start."""
+_Entries = dict[str, tuple[Any, str]]
+"""Values by dotted key, each with a comment on where it is from."""
 _Length = Annotated[float, between(1, 2e4)]
 _Pressure = Annotated[float, between(1e-5, 1e3)]
 _Optional = Annotated[float, between(1e-6, 1e6)] | None
@@ -111,14 +107,13 @@ class Sheet(Section):
         verdict = "more than there is: check both" if needed > power else "the rest is for losses"
         return f"{text}, {needed / power:.0%} of the {power:g} kW of `--power-kW` ({verdict})"
 
-    def text(self, profile: ProfileConfig, efficiency: float, head: str = "") -> str:
+    def text(self, profile: ProfileConfig, efficiency: float = 0.5, head: str = "") -> str:
         """Return the config as YAML with comments.
 
-        `profile`: the profile that meets the sheet, with its area `efficiency`; `head`: lines of
-        the first comment."""
+        `profile`: a profile, with its area `efficiency`; `head`: lines of the first comment."""
         tree: dict[str, Any] = {}
         entries = self._pair(profile) | self._scene() | self._pump(efficiency)
-        limit = _Entry(self.outer_diameter_mm / 2, "half of --outer-diameter-mm, the housing")
+        limit = (self.outer_diameter_mm / 2, "half of --outer-diameter-mm, the housing")
         for key, entry in (*entries.items(), ("constraints.outer_radius_max_mm", limit)):
             put(tree, key, entry)
         lines = [f"# {line}" for line in head.splitlines()]
@@ -126,7 +121,7 @@ class Sheet(Section):
             lines += ["", *_lines({name: section}, "")]
         return "\n".join(lines) + "\n"
 
-    def _pair(self, profile: ProfileConfig) -> dict[str, "_Entry"]:
+    def _pair(self, profile: ProfileConfig) -> _Entries:
         """Return the entries of profile, rotor and contact by dotted key."""
         density, modulus, poisson, densities, moduli, source = MATERIALS[self.material]
         name = f"--material {self.material}"
@@ -137,74 +132,77 @@ class Sheet(Section):
         chosen = "--family" if self.family else "first of the table that meets the outer diameter"
         gap = "a thousandth of the outer diameter; usual: 0.0007 to 0.0015 of it"
         found = {
-            "profile.family": _Entry(profile.family, chosen),
-            "profile.lobes": _Entry(self.lobes, "--lobes"),
-            "profile.pitch_radius_mm": _Entry(
-                profile.pitch_radius_mm, "half of --centre-distance-mm"
-            ),
+            "profile.family": (profile.family, chosen),
+            "profile.lobes": (self.lobes, "--lobes"),
+            "profile.pitch_radius_mm": (profile.pitch_radius_mm, "half of --centre-distance-mm"),
         }
         for one in family_of(profile.family).parameters:
             value = getattr(profile, one.key)
             note = f"{one.help}; solved for --outer-diameter-mm {self.outer_diameter_mm:g}"
-            found[f"profile.{one.key}"] = _Entry(value, note)
+            found[f"profile.{one.key}"] = (value, note)
         return found | {
-            "rotor.length_mm": _Entry(self.length_mm, "--length-mm"),
-            "rotor.density_kg_m3": _Entry(density, f"{name}: {source}; usual: {densities}"),
-            "contact.stiffness_N_per_mm_e": _Entry(
+            "rotor.length_mm": (self.length_mm, "--length-mm"),
+            "rotor.density_kg_m3": (density, f"{name}: {source}; usual: {densities}"),
+            "contact.stiffness_N_per_mm_e": (
                 _short(stiffness),
                 f"Lundberg's line contact, {name}: E = {modulus} GPa ({moduli}), ν = {poisson}",
             ),
-            "contact.exponent": _Entry(_short(LINE, 5), "10/9, line contact"),
-            "contact.max_damping_N_s_per_mm": _Entry(
+            "contact.exponent": (_short(LINE, 5), "10/9, line contact"),
+            "contact.max_damping_N_s_per_mm": (
                 _short(damping * 1e-3),
                 f"damping ratio {_RATIO:g}: 73 % of the speed returns; usual: 60 to 90 %",
             ),
-            "contact.full_damping_depth_mm": _Entry(
-                _DEPTH, "roughness of ground flanks; usual: 0.0002 to 0.005"
+            "contact.full_damping_depth_mm": (
+                _DEPTH,
+                "roughness of ground flanks; usual: 0.0002 to 0.005",
             ),
-            "contact.clearance_mm": _Entry(
-                self._gap, gap if self.clearance_mm is None else "--clearance-mm, along the normal"
+            "contact.clearance_mm": (
+                self._gap,
+                gap if self.clearance_mm is None else "--clearance-mm, along the normal",
             ),
         }
 
-    def _scene(self) -> dict[str, "_Entry"]:
+    def _scene(self) -> _Entries:
         """Return the entries of the scene by dotted key."""
         across = self.centre_distance_mm
         backlash, why = gear_backlash(across), "least backlash of ISO/TR 10064-2"
         if 0 < self._gap < backlash:
             backlash, why = self._gap, "the clearance: up to twice of it, no flanks touch"
-        load = "torque_N_m", _Entry(_short(self.torque), "half of --power-kW at this speed")
+        load: _Entries = {
+            "scene.load.torque_N_m": (_short(self.torque), "half of --power-kW at this speed")
+        }
         if (pressure := self.pressure_difference_bar) is not None:
-            across_pa = _Entry(_short(pressure * _BAR), "--pressure-difference-bar")
-            load = "pressure_difference_Pa", across_pa
+            entry = _short(pressure * _BAR), "--pressure-difference-bar"
+            load = {"scene.load.pressure_difference_Pa": entry}
         return {
-            "scene.speed_rpm": _Entry(self.speed_rpm, "--speed-rpm"),
-            f"scene.load.{load[0]}": load[1],
-            "scene.timing_gear.stiffness_N_m_per_rad": _Entry(
+            "scene.speed_rpm": (self.speed_rpm, "--speed-rpm"),
+            **load,
+            "scene.timing_gear.stiffness_N_m_per_rad": (
                 _short(gear_stiffness(across)),
                 f"ISO 6336-1: 20 N/(mm µm) (14 to 25), width {FACE:g} (0.2 to 0.5) pitch diameters",
             ),
-            "scene.timing_gear.damping_ratio": _Entry(_RATIO, "usual: 0.03 to 0.17"),
-            "scene.timing_gear.backlash_mm": _Entry(
-                _short(backlash), f"{why}; module {across / TEETH:.3g}, {TEETH} teeth (35 to 80)"
+            "scene.timing_gear.damping_ratio": (_RATIO, "usual: 0.03 to 0.17"),
+            "scene.timing_gear.backlash_mm": (
+                _short(backlash),
+                f"{why}; module {across / TEETH:.3g}, {TEETH} teeth (35 to 80)",
             ),
         }
 
-    def _pump(self, efficiency: float) -> dict[str, "_Entry"]:
+    def _pump(self, efficiency: float) -> _Entries:
         """Return the entries of the pump by dotted key."""
         viscosity, constant, ratio, range_ = MEDIA[self.medium]
-        name, gap = f"--medium {self.medium}", _Entry(self._gap, "as between the flanks")
-        found = {"viscosity_mPa_s": _Entry(viscosity, f"{name}; {range_}")}
+        name, gap = f"--medium {self.medium}", (self._gap, "as between the flanks")
+        found = {"viscosity_mPa_s": (viscosity, f"{name}; {range_}")}
         if self.pressure_difference_bar is None:
             most = (self.power_kW or 0.0) / self.power_of(1.0, efficiency) * _BAR
             note = "what --power-kW pumps against without losses"
-            found["pressure_difference_Pa"] = _Entry(_short(most), note)
+            found["pressure_difference_Pa"] = (_short(most), note)
         found |= {"tip_clearance_mm": gap, "end_clearance_mm": gap}
         if constant is not None:
-            inlet = _Entry(_short(self.inlet_pressure_bar * _BAR), "--inlet-pressure-bar")
+            inlet = (_short(self.inlet_pressure_bar * _BAR), "--inlet-pressure-bar")
             found["gas.inlet_pressure_Pa"] = inlet
-            found["gas.gas_constant_J_per_kg_K"] = _Entry(constant, name)
-            found["gas.heat_ratio"] = _Entry(ratio, name)
+            found["gas.gas_constant_J_per_kg_K"] = (constant, name)
+            found["gas.heat_ratio"] = (ratio, name)
         return {f"pump.{key}": entry for key, entry in found.items()}
 
     @property
@@ -213,31 +211,19 @@ class Sheet(Section):
         return _short(self.outer_diameter_mm / 1000, 2) if given is None else given
 
 
-class _Entry(NamedTuple):
-    """The `value` of a config key, and a `comment` on where it is from."""
-
-    value: Any
-    comment: str
-
-
 def option(name: str) -> str:
     """Return the option of the command line for a field of `Sheet`."""
     return "--" + name.replace("_", "-")
 
 
-def rounded(profile: ProfileConfig) -> ProfileConfig:
-    """Return a profile whose parameters have as many digits as its text is to have."""
-    return profile.with_design([_short(value, _DIGITS) for value in profile.design])
-
-
 def _lines(tree: Mapping[str, Any], indent: str) -> Iterator[str]:
     """Yield the lines of a section of YAML."""
     for name, inner in tree.items():
-        if isinstance(inner, _Entry):
-            value = [*inner.value] if isinstance(inner.value, tuple) else inner.value
+        if isinstance(inner, tuple):
+            value = [*inner[0]] if isinstance(inner[0], tuple) else inner[0]
             word = yaml.safe_dump(value, default_flow_style=True, width=math.inf)
             line = f"{indent}{name}: {word.split('...')[0].strip()}"
-            yield f"{line:<{_COLUMN}} # {inner.comment}"
+            yield f"{line:<{_COLUMN}} # {inner[1]}"
         else:
             yield f"{indent}{name}:"
             yield from _lines(inner, f"{indent}  ")

@@ -23,8 +23,6 @@ from rootsopt.output import disk
 from rootsopt.runtime.environment import say
 from rootsopt.scene.check import shape_of
 
-_GUESS = 0.5
-"""Area efficiency of a profile that is not known yet; no geometry depends on it."""
 _POWERS = "power_kW", "pressure_difference_bar"
 
 
@@ -65,45 +63,43 @@ def _entries(options: argparse.Namespace) -> dict[str, Any]:
     """Return the entries of the sheet that are given, by option or at a terminal.
 
     Raises `InputError` if one is wrong, or if one that is needed is missing."""
-    given: dict[str, Any] = {}
     keys = keys_of(Sheet)
-    for key in keys:
-        if (text := getattr(options, key.name)) is not None:
-            _add(given, key, text)
+    given = {
+        key.name: _value(key, text)
+        for key in keys
+        if (text := getattr(options, key.name)) is not None
+    }
     if _missing(given, keys) and sys.stdin is not None and sys.stdin.isatty():
         for key in keys:
-            if key.name not in given and not (key.name == _POWERS[1] and _POWERS[0] in given):
-                _ask(given, key)
+            answered = key.name in given or (key.name == _POWERS[1] and _POWERS[0] in given)
+            while not answered and (text := _answer(key)):
+                try:
+                    given[key.name], answered = _value(key, text), True
+                except InputError as error:
+                    print(error, file=sys.stderr)
     if missing := _missing(given, keys):
         raise InputError(f"{', '.join(missing)} must be given; see `rootsopt new --help`")
     return given
 
 
-def _add(given: dict[str, Any], key: Key, text: str) -> None:
-    """Add the value of a `text` to what is `given`; raise `InputError` if it is not allowed."""
+def _value(key: Key, text: str) -> Any:
+    """Return the value of a `text`; raise `InputError` if the key cannot have it."""
     value = read_document(text, option(key.name))
     try:
         Sheet.model_validate({key.name: value})
     except ValidationError as error:
         if message := explain(error, Sheet, [[key.name]]):
             raise InputError(sentence(message.replace(key.name, option(key.name), 1))) from None
-    given[key.name] = value
+    return value
 
 
-def _ask(given: dict[str, Any], key: Key) -> None:
-    """Ask at the terminal for a value until it is allowed; an empty line takes the default."""
+def _answer(key: Key) -> str:
+    """Return the answer at the terminal, "" for the default."""
     unit = f" in {key.unit}" if key.unit else ""
-    inside = f" ({key.choices})" if key.choices else ""
+    choices = f" ({key.choices})" if key.choices else ""
     default = "" if key.required else f" [{key.default or 'none'}]"
-    while key.name not in given:
-        print(f"{key.meaning}{unit}{inside}{default}: ", end="", file=sys.stderr, flush=True)
-        line = sys.stdin.readline()
-        if not line or not (line.strip() or key.required):
-            return
-        try:
-            _add(given, key, line.strip())
-        except InputError as error:
-            print(error, file=sys.stderr)
+    print(f"{key.meaning}{unit}{choices}{default}: ", end="", file=sys.stderr, flush=True)
+    return sys.stdin.readline().strip()
 
 
 def _missing(given: dict[str, Any], keys: list[Key]) -> list[str]:
@@ -120,10 +116,10 @@ def _met(sheet: Sheet) -> Config:
         if family_of(name).maker is None:
             continue
         try:
-            text = sheet.text(sheet.begun(family_of(name)), _GUESS)
+            text = sheet.text(sheet.begun(family_of(name)))
         except ValidationError:  # A parameter that its key cannot have at this size.
             continue
-        reach = sized(parse(text, source="sheet"), sheet.outer_diameter_mm / 2)
+        reach = sized(parse(text, source="sheet"))
         if reach.config is not None:
             return reach.config
         radii += reach.radii
