@@ -114,7 +114,7 @@ def _options(parser: argparse.ArgumentParser, left_out: set[str]) -> nodes.table
     rows = []
     formatter = argparse.HelpFormatter(parser.prog)
     for action in parser._actions:
-        if action.dest in left_out or action.help == argparse.SUPPRESS:
+        if action.dest in left_out:
             continue
         value = "" if action.nargs == 0 else f" {action.metavar or action.dest.upper()}"
         names = [f"{name}{value}" for name in action.option_strings] or [action.dest.upper()]

@@ -153,8 +153,6 @@ def _port(text: str) -> int:
 
 
 def _new(parser: "ArgumentParser") -> None:
-    from argparse import SUPPRESS
-
     from rootsopt.config.explain import keys_of
     from rootsopt.config.sheet import Sheet, option
 
@@ -162,11 +160,12 @@ def _new(parser: "ArgumentParser") -> None:
     group = parser.add_argument_group("catalogue sheet (a terminal asks for what is missing)")
     for key in keys_of(Sheet):
         name, default = option(key.name), f" (default: {key.default})" if key.default else ""
-        words = f": {key.choices}" if default else ""  # The families stand below.
-        metavar = "NAME" if key.choices else "X"
-        group.add_argument(name, metavar=metavar, help=f"{key.meaning}{words}{default}")
-        if name != (american := name.replace("centre", "center")):
-            group.add_argument(american, dest=key.name, help=SUPPRESS)
+        group.add_argument(
+            *dict.fromkeys((name, name.replace("centre", "center"))),
+            metavar="NAME" if key.choices else "X",
+            # The families stand below.
+            help=key.meaning + (f": {key.choices}" if default and key.choices else "") + default,
+        )
 
 
 optimize = Command(

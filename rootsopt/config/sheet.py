@@ -101,11 +101,10 @@ class Sheet(Section):
                 f"losses it pumps against {most:.3g} bar"
             )
         needed = self.power_of(pressure, efficiency)
-        text = f"{pressure:g} bar, which takes {needed:.3g} kW without losses"
-        if not power:
-            return text
         verdict = "more than there is: check both" if needed > power else "the rest is for losses"
-        return f"{text}, {needed / power:.0%} of the {power:g} kW of `--power-kW` ({verdict})"
+        share = f", {needed / (power or 1):.0%} of the {power:g} kW of `--power-kW` ({verdict})"
+        text = f"{pressure:g} bar, which takes {needed:.3g} kW without losses"
+        return text + (share if power else "")
 
     def text(self, profile: ProfileConfig, efficiency: float = 0.5, head: str = "") -> str:
         """Return the config as YAML with comments.
@@ -131,16 +130,15 @@ class Sheet(Section):
         damping = 2 * _RATIO * math.sqrt(stiffness * LINE * _DEPTH ** (LINE - 1) * 1e3 * mass)
         chosen = "--family" if self.family else "first of the table that meets the outer diameter"
         gap = "a thousandth of the outer diameter; usual: 0.0007 to 0.0015 of it"
-        found = {
+        solved = f"solved for --outer-diameter-mm {self.outer_diameter_mm:g}"
+        return {
             "profile.family": (profile.family, chosen),
             "profile.lobes": (self.lobes, "--lobes"),
             "profile.pitch_radius_mm": (profile.pitch_radius_mm, "half of --centre-distance-mm"),
-        }
-        for one in family_of(profile.family).parameters:
-            value = getattr(profile, one.key)
-            note = f"{one.help}; solved for --outer-diameter-mm {self.outer_diameter_mm:g}"
-            found[f"profile.{one.key}"] = (value, note)
-        return found | {
+            **{
+                f"profile.{one.key}": (getattr(profile, one.key), f"{one.help}; {solved}")
+                for one in family_of(profile.family).parameters
+            },
             "rotor.length_mm": (self.length_mm, "--length-mm"),
             "rotor.density_kg_m3": (density, f"{name}: {source}; usual: {densities}"),
             "contact.stiffness_N_per_mm_e": (
@@ -168,15 +166,14 @@ class Sheet(Section):
         backlash, why = gear_backlash(across), "least backlash of ISO/TR 10064-2"
         if 0 < self._gap < backlash:
             backlash, why = self._gap, "the clearance: up to twice of it, no flanks touch"
-        load: _Entries = {
-            "scene.load.torque_N_m": (_short(self.torque), "half of --power-kW at this speed")
-        }
-        if (pressure := self.pressure_difference_bar) is not None:
-            entry = _short(pressure * _BAR), "--pressure-difference-bar"
-            load = {"scene.load.pressure_difference_Pa": entry}
+        pressure, across_bar = self.pressure_difference_bar, "--pressure-difference-bar"
         return {
             "scene.speed_rpm": (self.speed_rpm, "--speed-rpm"),
-            **load,
+            **(
+                {"scene.load.torque_N_m": (_short(self.torque), "half of --power-kW at this speed")}
+                if pressure is None
+                else {"scene.load.pressure_difference_Pa": (_short(pressure * _BAR), across_bar)}
+            ),
             "scene.timing_gear.stiffness_N_m_per_rad": (
                 _short(gear_stiffness(across)),
                 f"ISO 6336-1: 20 N/(mm µm) (14 to 25), width {FACE:g} (0.2 to 0.5) pitch diameters",
@@ -192,18 +189,26 @@ class Sheet(Section):
         """Return the entries of the pump by dotted key."""
         viscosity, constant, ratio, range_ = MEDIA[self.medium]
         name, gap = f"--medium {self.medium}", (self._gap, "as between the flanks")
-        found = {"viscosity_mPa_s": (viscosity, f"{name}; {range_}")}
+        across: _Entries = {}
         if self.pressure_difference_bar is None:
             most = (self.power_kW or 0.0) / self.power_of(1.0, efficiency) * _BAR
             note = "what --power-kW pumps against without losses"
-            found["pressure_difference_Pa"] = (_short(most), note)
-        found |= {"tip_clearance_mm": gap, "end_clearance_mm": gap}
-        if constant is not None:
-            inlet = (_short(self.inlet_pressure_bar * _BAR), "--inlet-pressure-bar")
-            found["gas.inlet_pressure_Pa"] = inlet
-            found["gas.gas_constant_J_per_kg_K"] = (constant, name)
-            found["gas.heat_ratio"] = (ratio, name)
-        return {f"pump.{key}": entry for key, entry in found.items()}
+            across = {"pump.pressure_difference_Pa": (_short(most), note)}
+        gas: _Entries = {
+            "pump.gas.inlet_pressure_Pa": (
+                _short(self.inlet_pressure_bar * _BAR),
+                "--inlet-pressure-bar",
+            ),
+            "pump.gas.gas_constant_J_per_kg_K": (constant, name),
+            "pump.gas.heat_ratio": (ratio, name),
+        }
+        return {
+            "pump.viscosity_mPa_s": (viscosity, f"{name}; {range_}"),
+            **across,
+            "pump.tip_clearance_mm": gap,
+            "pump.end_clearance_mm": gap,
+            **({} if constant is None else gas),
+        }
 
     @property
     def _gap(self) -> float:

@@ -5,7 +5,6 @@ design. The outer radius is an equality constraint; the margins of a sound profi
 room. Gradients are exact, and the searches (SciPy's SLSQP) begin at members of a Sobol sample."""
 
 import functools
-from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,55 +19,50 @@ from rootsopt.scene import Scene
 from rootsopt.scene.check import shape_of
 from rootsopt.scene.families import check
 
-_SAMPLE, _STARTS = 64, 3
-"""Number of sampled members, and of searches that begin at the best of them."""
-_ROOM, _SLACK = 0.02, 1e-6
-"""Least margin of a member, as a fraction of the greatest one in the sample, and its tolerance.
+_SAMPLE, _STARTS, _FAR = 64, 3, 1e3
+"""Number of sampled members, and of searches that begin at the best of them; magnitude (mm) that
+stands for values that are not finite."""
+_ROOM, _SLACK, _CLOSE = 0.02, 1e-6, 1e-6
+"""Least margin of a member, as a fraction of the greatest one in the sample, and its tolerance;
+deviation (mm) of the outer radius up to which it counts as met.
 
 A margin that is 0 in every member, such as the lever at the tip, needs no room."""
-_FAR = 1e3
-"""Magnitude (mm) that stands for values that are not finite."""
-_CLOSE = 1e-6
-"""Deviation (mm) of the outer radius up to which it counts as met."""
 
 
-class Reach(NamedTuple):
-    """What a family can do at a pitch radius.
-
-    `config`: with the member that has the wanted outer radius, `None` if there is none; `radii`:
-    outer radii (mm) of sound members, among them the least and the greatest."""
-
-    config: Config | None
-    radii: list[float]
-
-
-def sized(config: Config) -> Reach:
-    """Return the config with a member of its family that fills the housing, or what is possible.
+def sized(config: Config) -> Config | list[float]:
+    """Return the config with a member of its family that fills the housing.
 
     Its outer radius is `constraints.outer_radius_max_mm` to 1e-6 mm. Among such members, it is the
-    one nearest to the config's own profile, in the unit box of the family's default bounds."""
+    one nearest to the config's own profile, in the unit box of the family's default bounds. If none
+    is found, return outer radii (mm) of sound members, among them the least and the greatest."""
+    limit = config.constraints.outer_radius_max_mm or 0.0
     if not family_of(config.profile.family).keys:
-        return Reach(_met(config, config.design), [float(shape_of(config).outer_radius) / MM])
+        own = float(shape_of(config).outer_radius) / MM
+        return _met(config, config.design) or [own]
     space = _space(config)
     outer = np.array([row.quantity == "outer_radius" for row in space.constraints])
     home = np.asarray(space.point(jnp.asarray(config.design)))
-    seen = functools.partial(_seen, space)
+    at = functools.lru_cache(maxsize=4096)(lambda *point: _seen(space, point))
     sample = [*sobol(_SAMPLE, 0, len(home)), home]
-    sound = [point for point in sample if np.min(seen(point)[1][~outer]) >= 0]
+    sound = [point for point in sample if np.min(at(*point)[1][~outer]) >= 0]
     if not sound:
-        return Reach(None, [])
-    room = _ROOM * np.max([seen(point)[1] for point in sound], axis=0) - _SLACK
-    search = functools.partial(_searched, space, outer, room, home)
-    sound.sort(key=lambda point: abs(float(seen(point)[1][outer][0])))
-    found = [search(point, 0.0) for point in sound[:_STARTS]]
-    for point in sorted(found, key=lambda one: float(np.sum((one - home) ** 2))):
-        if (met := _met(config, seen(point)[0])) is not None:
-            return Reach(met, [])
-    sound.sort(key=lambda point: float(seen(point)[1][outer][0]))
-    ends = [search(point, side) for side in (-1.0, 1.0) for point in (sound[0], sound[-1])]
-    sound += [one for one in ends if np.all((seen(one)[1] - room)[~outer] >= -_SLACK)]
-    limit = config.constraints.outer_radius_max_mm or 0.0
-    return Reach(None, [limit - float(seen(point)[1][outer][0]) for point in sound])
+        return []
+    room = _ROOM * np.max([at(*point)[1] for point in sound], axis=0) - _SLACK
+    search = functools.partial(_searched, at, outer, room, home)
+    radius = lambda point: limit - float(at(*point)[1][outer][0])  # noqa: E731
+    sound.sort(key=radius)
+    if not radius(sound[0]) <= limit <= radius(sound[-1]):
+        # Without this, searches for what no member has would take long.
+        ends = [search(point, side) for side in (-1.0, 1.0) for point in (sound[0], sound[-1])]
+        sound += [one for one in ends if np.all((at(*one)[1] - room)[~outer] >= -_SLACK)]
+    radii = [radius(point) for point in sound]
+    if min(radii) <= limit <= max(radii):
+        sound.sort(key=lambda point: abs(radius(point) - limit))
+        found = [search(point, 0.0) for point in sound[:_STARTS]]
+        for point in sorted(found, key=lambda one: float(np.sum((one - home) ** 2))):
+            if (met := _met(config, at(*point)[0])) is not None:
+                return met
+    return radii
 
 
 def _met(config: Config, design) -> Config | None:
@@ -105,15 +99,16 @@ def _seen(space: Space, point) -> tuple[NDArray[np.float64], ...]:
     return np.asarray(design), *finite
 
 
-def _searched(space: Space, outer, room, home, start, side: float) -> NDArray[np.float64]:
+def _searched(at, outer, room, home, start, side: float) -> NDArray[np.float64]:
     """Return the point (d,) nearest to `home` whose outer radius is the limit.
 
-    With a `side` of -1 or 1, return that of the greatest or least outer radius instead. `outer`
-    (m,): whether a constraint is that of the outer radius; `room` (m,): least slacks of the others;
-    `start` (d,): where the search begins."""
+    With a `side` of -1 or 1, return that of the greatest or least outer radius instead. `at`:
+    function of the coordinates that returns what `_seen` does; `outer` (m,): whether a constraint
+    is that of the outer radius; `room` (m,): least slacks of the others; `start` (d,): where the
+    search begins."""
     from scipy.optimize import minimize
 
-    seen = functools.partial(_seen, space)
+    seen = lambda x: at(*x)  # noqa: E731
     rows = [
         {"type": "ineq", "fun": lambda x: (seen(x)[1] - room)[~outer],
          "jac": lambda x: seen(x)[2][~outer]},

@@ -135,7 +135,7 @@ def test_the_stated_range_can_be_met(tmp_path, capsys):
     """Both ends of the range in a refusal are diameters that the family has; beyond, none is."""
     path = tmp_path / "pump.yaml"
     assert made(path, family="hypo_epicycloid", outer_diameter_mm=201) == 2
-    low, high = capsys.readouterr().err.split(" must be from ")[1].split(" in ")[0].split(" to ")
+    low, high = capsys.readouterr().err.split(" must be from ")[1].split(" (by")[0].split(" to ")
     # EE, without a land, is the widest of this family; the land is at least 0.5 °, with room.
     assert 0.98 * 187.5 < float(high) < 187.5
     for number, diameter in enumerate((float(low) + 0.2, float(high) - 0.2)):

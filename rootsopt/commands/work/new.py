@@ -119,16 +119,16 @@ def _met(sheet: Sheet) -> Config:
             text = sheet.text(sheet.begun(family_of(name)))
         except ValidationError:  # A parameter that its key cannot have at this size.
             continue
-        reach = sized(parse(text, source="sheet"))
-        if reach.config is not None:
-            return reach.config
-        radii += reach.radii
+        found = sized(parse(text, source="sheet"))
+        if isinstance(found, Config):
+            return found
+        radii += found
     who = f"family {sheet.family}" if sheet.family else "all families"
     where = f"{who} at {sheet.lobes} lobes and {sheet.centre_distance_mm:g} mm between axes"
     if not radii:
         raise InputError(f"`--outer-diameter-mm`: no sound profile in {where}; change the lobes")
     low, high = 2 * min(radii), 2 * max(radii)
-    bound = f"{high:.6g}" if high - low < 1e-6 else f"from {low:.1f} to {high:.1f}"
+    bound = f"{high:.6g}" if high - low < 1e-6 else f"from {low:.1f} to {high:.1f} (by search)"
     rest = ", or leave out `--family`" if sheet.family else ""
     raise InputError(
         f"`--outer-diameter-mm` must be {bound} in {where}, but is {sheet.outer_diameter_mm:g}; "
