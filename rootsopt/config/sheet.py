@@ -33,13 +33,18 @@ _Pressure = Annotated[float, between(1e-5, 1e3)]
 _Optional = Annotated[float, between(1e-6, 1e6)] | None
 
 
+def made() -> list[str]:
+    """Return the names of the families whose profiles are not read from a file."""
+    return [name for name, family in families().items() if family.maker is not None]
+
+
 class Sheet(Section):
     """What a catalogue sheet states. Of power and pressure difference, one is needed."""
 
     centre_distance_mm: _Length = Field(description="distance of the rotors' axes")
     outer_diameter_mm: _Length = Field(description="diameter of a rotor over its tips")
     length_mm: _Length = Field(description="length of a rotor")
-    lobes: Annotated[int, Field(ge=2, le=6)] = Field(description="lobes of a rotor, 2 to 6")
+    lobes: Annotated[int, Field(ge=2, le=6)] = Field(description="lobes of a rotor: 2 to 6")
     speed_rpm: Annotated[float, between(1e-2, 1e6)] = Field(description="speed")
     power_kW: _Optional = Field(None, description="shaft power: half of it on each rotor")
     pressure_difference_bar: _Pressure | None = Field(
@@ -53,7 +58,7 @@ class Sheet(Section):
     material: Annotated[str, Among(lambda: MATERIALS)] = Field(
         "cast-iron", description="material of the rotors"
     )
-    family: Annotated[str, Among(families)] | None = Field(
+    family: Annotated[str, Among(made)] | None = Field(
         None, description="profile family; default: the first that meets the diameter"
     )
 

@@ -117,7 +117,7 @@ def test_stock_agrees_with_the_formulas_of_its_sources():
         ({"medium": "ari"}, "but is 'ari'; did you mean air?"),
         ({"family": "cci"}, "did you mean cic?"),
         ({"family": "ee"}, "`--outer-diameter-mm` must be 187.5 in family ee at 2 lobes"),
-        ({"family": "outline"}, "no sound profile in family outline"),
+        ({"family": "outline"}, "`--family` must be one of 'cic', 'ee'"),
         ({"family": "hypo_epicycloid", "outer_diameter_mm": 201}, "must be from 1"),
     ],
 )
@@ -155,7 +155,8 @@ def test_a_terminal_is_asked_for_what_is_missing(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("sys.stdin", _Terminal("\n".join(answers) + "\n"))
     assert main(["new", str(path), "--centre-distance-mm", "125", "--family", "cic"]) == 0
     told = capsys.readouterr().err
-    assert "length of a rotor in mm: " in told
+    assert "length of a rotor in mm: lobes of a rotor: " in told
+    assert "gap of flanks in mm [outer diameter / 1000]: " in told
     assert "`--lobes` must be a whole number, but is 'two'" in told
     assert "what is pumped (air | nitrogen" in told
     config = load(path)

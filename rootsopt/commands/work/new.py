@@ -2,6 +2,7 @@
 
 import argparse
 import os
+import re
 import sys
 import textwrap
 from typing import Any
@@ -13,8 +14,8 @@ from rootsopt.commands import cli
 from rootsopt.config import Config, notes, parse
 from rootsopt.config.document import read_document
 from rootsopt.config.explain import Key, explain, keys_of
-from rootsopt.config.families import families, family_of
-from rootsopt.config.sheet import Sheet, option
+from rootsopt.config.families import family_of
+from rootsopt.config.sheet import Sheet, made, option
 from rootsopt.config.sources import regular_file
 from rootsopt.config.words import placed, sentence
 from rootsopt.design.sizing import sized
@@ -95,10 +96,12 @@ def _value(key: Key, text: str) -> Any:
 
 def _answer(key: Key) -> str:
     """Return the answer at the terminal, "" for the default."""
+    name, _, implied = key.meaning.partition("; default: ")
     unit = f" in {key.unit}" if key.unit else ""
     choices = f" ({key.choices})" if key.choices else ""
-    default = "" if key.required else f" [{key.default or 'none'}]"
-    print(f"{key.meaning}{unit}{choices}{default}: ", end="", file=sys.stderr, flush=True)
+    default = "" if key.required else f" [{key.default or implied or 'none'}]"
+    name = re.split("[:;,]", name)[0]
+    print(f"{name}{unit}{choices}{default}: ", end="", file=sys.stderr, flush=True)
     return sys.stdin.readline().strip()
 
 
@@ -112,9 +115,7 @@ def _missing(given: dict[str, Any], keys: list[Key]) -> list[str]:
 def _met(sheet: Sheet) -> Config:
     """Return a config with a profile of the sheet's size; raise `InputError` if there is none."""
     radii: list[float] = []
-    for name in [sheet.family] if sheet.family else families():
-        if family_of(name).maker is None:
-            continue
+    for name in [sheet.family] if sheet.family else made():
         try:
             text = sheet.text(sheet.begun(family_of(name)))
         except ValidationError:  # A parameter that its key cannot have at this size.
