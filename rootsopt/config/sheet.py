@@ -191,7 +191,7 @@ class Sheet(Section):
         }
 
     def _pump(self, efficiency: float) -> _Entries:
-        """Return the entries of the pump by dotted key."""
+        """Return the entries of pump and objective by dotted key."""
         viscosity, constant, ratio, range_ = MEDIA[self.medium]
         name, gap = f"--medium {self.medium}", (self._gap, "as between the flanks")
         across: _Entries = {}
@@ -207,12 +207,19 @@ class Sheet(Section):
             "pump.gas.gas_constant_J_per_kg_K": (constant, name),
             "pump.gas.heat_ratio": (ratio, name),
         }
+        why = "the gear keeps the flanks apart, so that no contact force counts"
+        apart: _Entries = {
+            "objective.mean_weight": (0, why),
+            "objective.peak_weight": (0, why),
+            "objective.terms.leakage_fraction": (1, "what `rootsopt optimize` lowers instead"),
+        }
         return {
             "pump.viscosity_mPa_s": (viscosity, f"{name}; {range_}"),
             **across,
             "pump.tip_clearance_mm": gap,
             "pump.end_clearance_mm": gap,
             **({} if constant is None else gas),
+            **(apart if self._gap else {}),
         }
 
     @property

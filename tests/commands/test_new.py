@@ -87,6 +87,7 @@ def test_load_and_comments_are_those_of_the_sheet(tmp_path, capsys):
     assert gas.scene.load.pressure_difference_Pa == 3e4
     assert (gas.pump.gas, gas.pump.viscosity_mPa_s) == (None, 1.0)
     assert (gas.rotor.density_kg_m3, gas.scene.timing_gear.backlash_mm) == (7900, 0.05)
+    assert gas.objective.terms == {"leakage_fraction": 1}
     # The command in the first comment makes the same sheet.
     assert gas.contact.clearance_mm == 0.05
     head = path.read_text().split("# A comment")[0].replace("\n#", "").split("rootsopt new ")[1]
