@@ -29,7 +29,10 @@ OPTIONAL |= {"netCDF4", "shtab", "xarray", "zarr"}
 SLOW = {"PIL", "optax", "rich", "scipy"}
 LATE = {
     # The work of a command is loaded once its help or its config has asked for it.
-    "commands/table.py": {"rootsopt.commands", "rootsopt", "argparse"},
+    "commands/table.py": {
+        "rootsopt.commands", "rootsopt", "argparse", "rootsopt.config.explain",
+        "rootsopt.config.sheet",
+    },
     "commands/cli.py": {
         "rootsopt.output.ending", "rootsopt.output.runs", "rootsopt.output.terminal",
         "rootsopt.report.gather", "rootsopt.report.html", "rootsopt.runtime",

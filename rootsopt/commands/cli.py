@@ -123,7 +123,7 @@ def parser(command: Command) -> argparse.ArgumentParser:
     """Return the parser of a `command`: the arguments that every command takes, then its own."""
     result = _Parser(
         prog=f"rootsopt {command.name}",
-        usage=f"rootsopt {command.name} CONFIG [options]",
+        usage=f"rootsopt {command.name} {'CONFIG' if command.reads else 'FILE'} [options]",
         description=command.purpose,
         formatter_class=_Format,
         add_help=False,
@@ -131,8 +131,8 @@ def parser(command: Command) -> argparse.ArgumentParser:
     result.add_argument(
         "config",
         type=Path,
-        metavar="CONFIG",
-        help=f"YAML file or shipped: {', '.join(shipped())}",
+        metavar="CONFIG" if command.reads else "FILE",
+        help=f"YAML file or shipped: {', '.join(shipped())}" if command.reads else "YAML file",
     )
     result.add_argument(
         "-h",
@@ -144,14 +144,15 @@ def parser(command: Command) -> argparse.ArgumentParser:
     )
     if command.writes:
         _add_folder(result, command.name)
-    result.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        dest="overrides",
-        help="override a config key: --set scene.speed_rpm=1500; repeatable",
-    )
+    if command.reads:
+        result.add_argument(
+            "--set",
+            action="append",
+            default=[],
+            metavar="KEY=VALUE",
+            dest="overrides",
+            help="override a config key: --set scene.speed_rpm=1500; repeatable",
+        )
     _add_import(result)
     result.add_argument(
         "--no-cache",
@@ -215,7 +216,8 @@ def run(command: Command, argv: Sequence[str] | None) -> int:
     Parse the arguments, load the config and select double precision. Then call the function `body`
     of the module `rootsopt.commands.work.COMMAND` with a new result folder, move the folder to its
     final path and print the result. A command that writes nothing has a `body` without the folder,
-    which returns the exit code. `InputError` and `OSError` give exit code 2."""
+    which returns the exit code; that of a command that reads no config takes only the options.
+    `InputError` and `OSError` give exit code 2."""
     environment.own_process()
     try:
         _import_extensions(command.name, argv)
@@ -225,12 +227,14 @@ def run(command: Command, argv: Sequence[str] | None) -> int:
             import_named(name)
         if command.writes and options.output is None:
             options.output = os.path.join("results", f"{options.config.stem}-{command.name}")
-        config = load(options.config, options.overrides)
-        for note in notes(config):
+        config = load(options.config, options.overrides) if command.reads else None
+        for note in notes(config) if config else ():
             environment.say(note)
         use_float64()
         use_cache(wanted=not options.no_cache)
         with environment.explained():
+            if config is None:
+                return _work(command.name)(options)
             if not command.writes:
                 return _work(command.name)(config, options)
             return _in_folder(command.name, config, options)

@@ -19,13 +19,15 @@ class Command(NamedTuple):
     """A command, with the work in the module of its name in `rootsopt.commands.work`.
 
     `name`; `brief`: what it does, for the list of commands; `purpose`: the same, for its help;
-    `options`: adds its own options to a parser; `writes`: whether it writes a result folder."""
+    `options`: adds its own options to a parser; `writes`: whether it writes a result folder;
+    `reads`: whether it reads a config, rather than writing one."""
 
     name: str
     brief: str
     purpose: str
     options: "Callable[[ArgumentParser], None]" = _none
     writes: bool = True
+    reads: bool = True
 
     def main(self, argv: Sequence[str] | None = None) -> int:
         """Run the command with the arguments `argv` (`None`: those of the process).
@@ -150,6 +152,22 @@ def _port(text: str) -> int:
     return number
 
 
+def _new(parser: "ArgumentParser") -> None:
+    from rootsopt.config.explain import keys_of
+    from rootsopt.config.sheet import Sheet, option
+
+    parser.add_argument("--overwrite", action="store_true", help="replace FILE if it exists")
+    group = parser.add_argument_group("catalogue sheet (a terminal asks for what is missing)")
+    for key in keys_of(Sheet):
+        name, default = option(key.name), f" (default: {key.default})" if key.default else ""
+        group.add_argument(
+            *dict.fromkeys((name, name.replace("centre", "center"))),
+            metavar="NAME" if key.choices else "X",
+            # The families stand below.
+            help=key.meaning + (f": {key.choices}" if default and key.choices else "") + default,
+        )
+
+
 optimize = Command(
     "optimize",
     "optimise a design and compare it with the baseline",
@@ -192,8 +210,16 @@ explore = Command(
     _explore,
     writes=False,
 )
+new = Command(
+    "new",
+    "write a config from a catalogue sheet",
+    "Write a commented config from what a catalogue sheet states, with a profile of that size.",
+    _new,
+    writes=False,
+    reads=False,
+)
 COMMANDS = {
     command.name: command
-    for command in (optimize, simulate, pareto, sweep, attractors, profile, explore)
+    for command in (optimize, simulate, pareto, sweep, attractors, profile, explore, new)
 }
 """All commands by name."""

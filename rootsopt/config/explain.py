@@ -9,8 +9,8 @@ from annotated_types import Ge, Gt, Le, Lt
 from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 
-from rootsopt.config.section import UNMET, Section, choices
-from rootsopt.config.units import hint, unit_of
+from rootsopt.config.section import UNMET, Section, choices, number
+from rootsopt.config.units import RPM, hint, readings, unit_of, without_unit
 from rootsopt.config.words import named, near, shown
 
 _MOST_NAMES = 12
@@ -28,18 +28,37 @@ _WANTED = {
 """What a value must be, by the type of pydantic's error."""
 _UNKNOWN_WORD = "literal_error", ("[key]",)
 """Type and last part of the location of an unknown key of a dictionary with a choice of keys."""
+_TORQUE, _OUTER = "scene.load.torque_N_m", "profile.outer_radius_mm"
+_SYNONYMS = {
+    "center_distance": ("profile.pitch_radius_mm", 0.5),
+    "centre_distance": ("profile.pitch_radius_mm", 0.5),
+    "pitch_diameter": ("profile.pitch_radius_mm", 0.5),
+    "outer_diameter": (_OUTER, 0.5),
+    "tip_diameter": (_OUTER, 0.5),
+    "diameter": (_OUTER, 0.5),
+    "bore_diameter": ("rotor.bore_mm", 1.0),
+    "rpm": ("scene.speed_rpm", 1.0),
+    "pressure": ("scene.load.pressure_difference_Pa", 1.0),
+    "torque": (_TORQUE, 1.0),
+    "power": (_TORQUE, 1.0),
+}
+"""Keys and factors for names that catalogues use, without their units."""
 _SIGNS = {"gt": "greater than", "ge": "at least", "lt": "less than", "le": "at most"}
 _COUNTS = {"min_length": "at least", "max_length": "at most"}
 
 
 def explain(
-    error: ValidationError, model: type[Section], keys: Sequence[Sequence[str]] | None = None
+    error: ValidationError,
+    model: type[Section],
+    keys: Sequence[Sequence[str]] | None = None,
+    speed_rpm: Any = None,
 ) -> str:
     """Return one sentence on the problem that pydantic's `error` reports in a config.
 
     `model`: type of the config. If there are several problems, report the first unknown key. If no
     key is unknown, report the first problem. `keys`: keys, each as a list of its parts, inside
-    which problems count; the result is "" if there are none. By default, all problems count."""
+    which problems count; the result is "" if there are none. By default, all problems count.
+    `speed_rpm`: what the config states, if anything, to convert a power to a torque."""
     problems = error.errors(include_url=False)
     if keys is not None:
         problems = [p for p in problems if _inside(p, keys)]
@@ -49,7 +68,9 @@ def explain(
     first = next((p for p in problems if _is_unknown(p)), problems[0])
     if _is_unknown(first):
         words = re.findall("'(.+?)'", first.get("ctx", {}).get("expected", ""))
-        return _unknown(known, [part for part in first["loc"] if part != "[key]"], words)
+        place = [part for part in first["loc"] if part != "[key]"]
+        value = None if words else first.get("input")
+        return _unknown(known, place, words, value, speed_rpm)
     place, rest = _split(known, first["loc"])
     field, key = known.get(place), ".".join(map(named, place.split(".")))
     first = _branch(first, problems, len(first["loc"]) - len(rest))
@@ -147,20 +168,50 @@ def _advice(place: str, kind: str, value: Any, field: FieldInfo | None) -> str:
     return ""
 
 
-def _unknown(known: Mapping[str, FieldInfo], place: list, words: list[str]) -> str:
-    """Return the message on an unknown key, `place`.
+def _unknown(
+    known: Mapping[str, FieldInfo], place: list, words: list[str], value: Any, speed_rpm: Any
+) -> str:
+    """Return the message on an unknown key, `place`, that has a `value`.
 
-    `words`: keys that a dictionary may have, empty for a section."""
+    `words`: keys that a dictionary may have, empty for a section; `speed_rpm`: as in `explain`."""
     prefix, last = "".join(f"{part}." for part in place[:-1]), str(place[-1])[:80]
     text = f"`{'.'.join(map(named, place))}` is not a known key"
-    same = (key for key in known if key.rpartition(".")[2] == last)
+    same = next((key for key in known if key.rpartition(".")[2] == last), "")
+    told = "" if same or words else _translated(known, prefix, last, value, speed_rpm)
+    if told:
+        return f"{text}; did you mean {told}"
     names = [key.removeprefix(prefix) for key in known if key.startswith(prefix)]
     names = words or [name for name in names if "." not in name]
     close = difflib.get_close_matches(last, names, n=1, cutoff=0.5)
-    if meant := next(same, "") or "".join(f"{prefix}{name}" for name in close):
+    if meant := same or "".join(f"{prefix}{name}" for name in close):
         return f"{text}; did you mean `{meant}`?"
     more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
     return f"{text}; valid here: {', '.join(names[:_MOST_NAMES])}{more}"
+
+
+def _translated(
+    known: Mapping[str, FieldInfo], prefix: str, name: str, value: Any, speed_rpm: Any
+) -> str:
+    """Return the key, with the converted value, that a `name` of a catalogue stands for.
+
+    `prefix`: section of the unknown key. Return "" if there is none."""
+    value, speed = number(value), number(speed_rpm)
+    for stem, end, factor in readings(name):
+        exact = [key for key in known if unit_of(key) and without_unit(key).endswith(f".{stem}")]
+        exact.sort(key=lambda key: not key.startswith(prefix))
+        key, share = _SYNONYMS.get(stem) or (exact[0] if exact else "", 1.0)
+        if not key or not (key.endswith(end) or (stem, end) == ("power", "_kW")):
+            continue
+        if stem == "power":
+            if not (end and _is_number(value) and _is_number(speed) and speed > 0):
+                return f"`{key}`? it is half of the power over the speed (rad/s)"
+            torque = value * factor * 1e3 / (2 * speed * RPM)
+            return f"`{key}: {torque:.4g}`? it is half of that power at {speed:g} rpm"
+        shown_value = share * factor != 1.0 and _is_number(value) and end
+        found = f"`{key}: {value * factor * share:.6g}`" if shown_value else f"`{key}`"
+        other = "; in other families it follows from their keys, which `rootsopt new` finds"
+        return f"{found}?" + (f" it belongs to family five_arcs{other}" if key == _OUTER else "")
+    return ""
 
 
 def tree(model: type[Section], prefix: str = "") -> dict[str, FieldInfo]:

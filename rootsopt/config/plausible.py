@@ -25,8 +25,10 @@ def _sizes(config: "Config") -> dict[str, float]:
     Mass and inertia are those of a solid cylinder on the pitch circle. A load of the config may be
     0 or wrong itself, so that torques follow 1 bar; `force` at the pitch circle carries the load.
     `rolling`: speed at which the pitch circles roll at 1 m/s. `critical`: critical damping of a
-    rotor on its bearings."""
+    rotor on its bearings; `impact`: that of the flanks, where their damping is full."""
     radius, supports = config.profile.pitch_radius_mm, config.scene.supports
+    law = config.contact
+    steepness = law.exponent * law.full_damping_depth_mm ** (law.exponent - 1)
     disc, torque = math.pi * radius**2, config.gas_torque(_BAR)
     volume = disc * config.rotor.length_mm * 1e-3
     mass = volume * 1e-6 * config.rotor.density_kg_m3
@@ -41,6 +43,7 @@ def _sizes(config: "Config") -> dict[str, float]:
         "bar": torque,
         "slope": torque / (config.scene.speed_rpm * RPM),
         "critical": 2 * math.sqrt(stiffness * mass) * MM,
+        "impact": 2 * math.sqrt(law.stiffness_N_per_mm_e * steepness / MM * mass / 4) * MM,
         "force": config.load_torque / (radius * MM),
     }
 
@@ -78,7 +81,7 @@ USUAL: dict[str, Usual] = {
     "rotor.bore_mm": Usual(0.02, 2, "radius"),
     "rotor.helix_deg": _TWIST,
     "contact.stiffness_N_per_mm_e": Usual(1e3, 1e9),
-    "contact.max_damping_N_s_per_mm": Usual(1e-3, 50),
+    "contact.max_damping_N_s_per_mm": Usual(1e-3, 5, "impact"),
     "contact.full_damping_depth_mm": Usual(1e-4, 0.5),
     "contact.clearance_mm": _GAP,
     "contact.smoothing_mm": Usual(5e-7, 0.02),

@@ -361,7 +361,10 @@ def _checked(data: dict, prefix: str = "") -> Config:
     try:
         return Config.model_validate(data)
     except ValidationError as error:
-        raise InputError(sentence(f"{prefix}{explain(error, Config)}")) from None
+        scene = data.get("scene")
+        speed = scene.get("speed_rpm") if isinstance(scene, dict) else None
+        message = explain(error, Config, speed_rpm=speed)
+        raise InputError(sentence(f"{prefix}{message}")) from None
 
 
 def _find_family(data: dict) -> None:

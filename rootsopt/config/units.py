@@ -1,6 +1,7 @@
 """Units in the names of keys, and hints for values that seem to be given in another unit."""
 
 import math
+from collections.abc import Iterator
 
 MM = 1e-3
 """One millimetre (m)."""
@@ -34,11 +35,17 @@ _UNITS: dict[str, tuple[str, dict[str, float]]] = {
     "_per_K": ("1/K", {"1e-6/K": 1e-6}),
     "_K": ("K", {}),
     "_N": ("N", {"kN": 1e3}),
+    "_kW": ("kW", {"W": 1e-3, "MW": 1e3}),
+    "_bar": ("bar", {}),
     "_cm3": ("cm³", {"litres": 1e3, "mm³": 1e-3}),
     "_mm2": ("mm²", {"m²": 1e6, "cm²": 100.0}),
     "_l_min": ("l/min", {}),
     "_um": ("µm", {}),
 }
+
+_SPELT = str.maketrans({"·": "_", "/": "_per_", "³": "3", "²": "2", "µ": "u", "(": "", ")": ""})
+_SHORT = {"metres": "m", "centimetres": "cm", "micrometres": "um", "radians": "rad"}
+"""Units as they are spelt in names of keys."""
 
 
 def unit_of(key: str) -> str:
@@ -49,6 +56,21 @@ def unit_of(key: str) -> str:
 def without_unit(key: str) -> str:
     """Return a key without the unit at the end of its name."""
     return key.removesuffix(next((end for end in _UNITS if key.endswith(end)), ""))
+
+
+def readings(name: str) -> Iterator[tuple[str, str, float]]:
+    """Yield what a key's `name` may mean: (name without unit, ending of the unit, factor).
+
+    The ending is one of the config's units, or "" without a unit; the factor converts to it."""
+    yield name, "", 1.0
+    for end, (_, others) in _UNITS.items():
+        endings = {end: 1.0}
+        for other, by in others.items():
+            spelt = "_" + _SHORT.get(other, other).translate(_SPELT)
+            endings |= {spelt: by, spelt.replace("_per_", "_"): by}
+        for ending, factor in endings.items():
+            if name.endswith(ending):
+                yield name.removesuffix(ending), end, factor
 
 
 def si_unit(key: str) -> float:

@@ -46,7 +46,8 @@ def test_every_option_of_the_help_is_in_the_script(command, bash, capsys):
         main([command, "--help"])
     told = capsys.readouterr().out
     wanted = set(re.findall(r"^  (?:-\w[^,]*, )?(--[\w-]+)", told, re.M)) - {"--help"}
-    assert {"--set", "--port" if command == "explore" else "--report"} <= wanted
+    own = {"explore": {"--set", "--port"}, "new": {"--lobes"}}.get(command, {"--set", "--report"})
+    assert own <= wanted
     (line,) = re.findall(rf"^_shtab_rootsopt_{command}_option_strings=\((.*?)\)$", bash, re.M)
     assert wanted <= {word.strip("'") for word in line.split()}
 

@@ -168,6 +168,34 @@ def test_unknown_key_is_named_with_its_nearest_match(old, new, wrong, right):
     assert right in message.split("did you mean")[1]
 
 
+@pytest.mark.parametrize(
+    ("override", "answer"),
+    [
+        ("profile.center_distance_mm=125", "`profile.pitch_radius_mm: 62.5`?"),
+        ("profile.centre_distance_cm=12.5", "`profile.pitch_radius_mm: 62.5`?"),
+        ("profile.outer_diameter_mm=200", "`profile.outer_radius_mm: 100`? it belongs to"),
+        ("diameter_mm=200", "`profile.outer_radius_mm: 100`?"),
+        ("scene.rpm=1500", "`scene.speed_rpm`?"),
+        ("scene.speed=1500", "`scene.speed_rpm`?"),
+        ("scene.speed_Hz=50", "`scene.speed_rpm: 3000`?"),
+        ("scene.load.pressure_bar=0.3", "`scene.load.pressure_difference_Pa: 30000`?"),
+        ("scene.load.pressure_difference_kPa=40", "`scene.load.pressure_difference_Pa: 40000`?"),
+        ("pump.pressure_difference_mbar=300", "`pump.pressure_difference_Pa: 30000`?"),
+        ("rotor.length_m=0.3", "`rotor.length_mm: 300`?"),
+        ("rotor.density_g_cm3=7.2", "`rotor.density_kg_m3: 7200`?"),
+        ("rotor.length_m=long", "`rotor.length_mm`?"),
+        # 10 kW at the config's 3000 rpm is 31.83 N·m, half of it on rotor 2.
+        ("scene.power_kW=10", "`scene.load.torque_N_m: 15.92`? it is half of that power at 3000"),
+        ("scene.load.power_W=10000", "`scene.load.torque_N_m: 15.92`?"),
+        ("power=10", "`scene.load.torque_N_m`? it is half of the power over the speed"),
+    ],
+)
+def test_keys_of_catalogues_are_answered_with_the_right_key_and_value(override, answer):
+    message = refusal(MINIMAL, override)
+    assert message.startswith(f"config: `{override.split('=')[0]}` is not a known key; ")
+    assert f"did you mean {answer}" in message
+
+
 def test_unknown_key_without_a_match_lists_the_valid_ones():
     """If no key is similar, the message lists the valid keys of the section."""
     message = refusal(MINIMAL, "rotor.zzz=1")

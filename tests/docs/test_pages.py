@@ -12,7 +12,7 @@ from rootsopt.config import load
 from rootsopt.scene import check_geometry
 from tests.docs.blocks import DOCS, blocks_of, in_python, in_shell
 
-PAGES = ["index", "tutorial", "howto", "theory", "accuracy", "gallery", "limits"]
+PAGES = ["index", "tutorial", "design", "howto", "theory", "accuracy", "gallery", "limits"]
 NOTEBOOKS = sorted((DOCS / "notebooks").glob("*.md"))
 CELL = "{code-cell}"
 
@@ -55,6 +55,21 @@ def test_tutorial_begins(tmp_path):
     _tutorial(tmp_path, [b for b in blocks if b.language == "yaml" or b.words == "fails"])
     _tutorial(tmp_path, [b for b in blocks if "-o geometry" in b.text])
     assert (tmp_path / "geometry" / "rotor.dxf").is_file()
+
+
+def test_design_page_begins(tmp_path):
+    """The steps from the sheet to the geometry, and the answer that the page prints."""
+    text = (DOCS / "design.md").read_text()
+    for block in blocks_of(DOCS / "design.md"):
+        if block.words == "skip":
+            continue
+        done = in_shell(block.text, tmp_path)
+        assert done.returncode == (2 if block.words == "fails" else 0), done.stderr
+        if block.words == "fails":
+            assert done.stderr.strip().split("blower.yaml: ")[1] in " ".join(text.split())
+        elif "rootsopt new" in block.text:
+            assert "0.3 bar, which takes 15.6 kW without losses, 87% of the 18 kW" in done.stdout
+    assert (tmp_path / "geometry" / "profile_design.csv").is_file()
 
 
 @pytest.mark.long

@@ -1,0 +1,168 @@
+"""`rootsopt new`: a config from a catalogue sheet."""
+
+import io
+import math
+
+import numpy as np
+import pytest
+import yaml
+
+from experiments._common.polygons import pair_gap
+from rootsopt.commands.console import main
+from rootsopt.config import load, notes, parse
+from rootsopt.config.stock import MATERIALS, gear_backlash, gear_stiffness, line_stiffness
+from rootsopt.scene import outline_mm
+
+BOOSTER = {
+    "centre-distance-mm": 125,
+    "outer-diameter-mm": 200,
+    "length-mm": 300,
+    "lobes": 2,
+    "speed-rpm": 3000,
+    "power-kW": 10,
+}
+
+
+def made(path, **changes):
+    """Return the exit code of `rootsopt new` for the booster's sheet with `changes`."""
+    values = BOOSTER | {name.replace("_", "-"): value for name, value in changes.items()}
+    options = [f"--{name}={value}" for name, value in values.items() if value is not None]
+    return main(["new", str(path), *options])
+
+
+@pytest.mark.parametrize(
+    ("lobes", "across", "outer", "family"),
+    [
+        (2, 125.0, 200.0, None),
+        (3, 20.0, 29.0, "five_arcs"),
+        (5, 300.0, 353.0, "hypo_epicycloid"),
+        (6, 1000.0, 1180.0, "arc"),
+    ],
+)
+def test_rotors_have_the_diameter_and_mesh_at_the_centre_distance(
+    tmp_path, lobes, across, outer, family
+):
+    """Seen on polygons: the outer radius to 1e-6 mm, and no overlap beyond that of the polygons."""
+    path = tmp_path / "pump.yaml"
+    size = {"centre_distance_mm": across, "outer_diameter_mm": outer, "length_mm": across}
+    load_ = {"power_kW": None, "pressure_difference_bar": 0.3, "speed_rpm": 3e5 / across}
+    assert made(path, lobes=lobes, family=family, **size, **load_) == 0
+    config = load(path)
+    line = outline_mm(config)
+    assert config.profile.family == (family or "cic")
+    assert np.max(np.hypot(*line.T)) == pytest.approx(outer / 2, abs=1e-6)
+    assert len(np.unique(np.round(np.hypot(*line.T) / outer, 9))) > 100
+    for phi in np.linspace(0.0, math.pi / lobes, 7):
+        assert abs(pair_gap(line, lobes, across, phi, phi)) < 2e-5 * across
+    assert notes(config) == ()
+
+
+def test_load_and_comments_are_those_of_the_sheet(tmp_path, capsys):
+    """Power and pressure agree with the polygon's displacement; each key has a comment."""
+    path = tmp_path / "pump.yaml"
+    assert made(path) == 0
+    power = load(path)
+    told = capsys.readouterr().out
+    assert power.scene.load.torque_N_m * 2 * 2 * math.pi * 50 == pytest.approx(1e4, rel=1e-3)
+    x, y = outline_mm(power).T
+    area = np.sum(x[:-1] * np.diff(y) - y[:-1] * np.diff(x)) / 2
+    volume = 2 * (math.pi * 100**2 - area) * 300 * 1e-9
+    assert power.pump.pressure_difference_Pa == pytest.approx(1e4 / (volume * 50), rel=1e-3)
+    assert f"{volume * 1e3:.3f}"[:4] in told
+    words = yaml.safe_load(path.read_text())
+    assert words["profile"]["pitch_radius_mm"] == 62.5
+    lines = [line for line in path.read_text().splitlines() if not line.startswith("#") and line]
+    assert all(" # " in line for line in lines if not line.endswith(":"))
+    assert parse(path.read_text()) == power == parse(power.to_yaml())
+
+    assert made(path, pressure_difference_bar=0.3) == 2
+    assert "exists; give `--overwrite`" in capsys.readouterr().err
+    again = [f"--{name}={value}" for name, value in BOOSTER.items()]
+    more = ["--pressure-difference-bar=0.3", "--medium=water", "--material=Stainless Steel"]
+    assert main(["new", str(path), *again, *more, "--overwrite", "--clearance-mm=0.05"]) == 0
+    gas = load(path)
+    ideal = 0.3e5 * volume * 50 / 1e3
+    told = capsys.readouterr().out
+    assert f"takes {ideal:.3g} kW without losses, {ideal / 10:.0%} of the 10 kW" in told
+    assert gas.scene.load.pressure_difference_Pa == 3e4
+    assert (gas.pump.gas, gas.pump.viscosity_mPa_s) == (None, 1.0)
+    assert (gas.rotor.density_kg_m3, gas.scene.timing_gear.backlash_mm) == (7900, 0.05)
+    assert gas.objective.terms == {"leakage_fraction": 1}
+    # The command in the first comment makes the same sheet.
+    assert gas.contact.clearance_mm == 0.05
+    head = path.read_text().split("# A comment")[0].replace("\n#", "").split("rootsopt new ")[1]
+    assert "--medium water --material stainless-steel" in head
+
+
+def test_stock_agrees_with_the_formulas_of_its_sources():
+    """Steel rollers (Palmgren), a gear's compliance, a tabled backlash of ISO/TR 10064-2."""
+    _, modulus, poisson, *_ = MATERIALS["steel"]
+    for force, length in ((10.0, 50.0), (1e4, 800.0)):
+        depth = (force / line_stiffness(modulus, poisson, length)) ** 0.9
+        # Palmgren's 3.84e-5 is that of 206 GPa.
+        assert depth == pytest.approx(3.84e-5 * (206 / 210 * force) ** 0.9 / length**0.8, rel=0.01)
+    torque, radius, face = 100.0, 0.1, 60.0
+    slide = torque / (radius * math.cos(math.radians(20))) / (20.0 * face)  # µm
+    turn = slide * 1e-6 / (radius * math.cos(math.radians(20)))
+    assert torque / turn == pytest.approx(gear_stiffness(200.0), rel=1e-12)
+    assert gear_backlash(100.0) * math.cos(math.radians(20)) == pytest.approx(0.113, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"outer_diameter_mm": None}, "`--outer-diameter-mm` must be given"),
+        ({"power_kW": None}, "`--power-kW` or `--pressure-difference-bar` must be given"),
+        ({"lobes": 7}, "`--lobes` must be at most 6, but is 7"),
+        ({"length_mm": "long"}, "`--length-mm` must be a number, but is 'long'"),
+        ({"medium": "ari"}, "but is 'ari'; did you mean air?"),
+        ({"family": "cci"}, "did you mean cic?"),
+        ({"family": "ee"}, "`--outer-diameter-mm` must be 187.5 in family ee at 2 lobes"),
+        ({"family": "outline"}, "`--family` must be one of 'cic', 'ee'"),
+        ({"family": "hypo_epicycloid", "outer_diameter_mm": 201}, "must be from 1"),
+    ],
+)
+def test_refusals_are_one_sentence_that_names_the_option(tmp_path, capsys, changes, words):
+    path = tmp_path / "pump.yaml"
+    assert made(path, **changes) == 2
+    told = capsys.readouterr().err
+    assert told.startswith("rootsopt new: ")
+    assert told.count("\n") == 1
+    assert words in told
+    assert not path.exists()
+
+
+def test_the_stated_range_can_be_met(tmp_path, capsys):
+    """Both ends of the range in a refusal are diameters that the family has; beyond, none is."""
+    path = tmp_path / "pump.yaml"
+    assert made(path, family="hypo_epicycloid", outer_diameter_mm=201) == 2
+    low, high = capsys.readouterr().err.split(" must be from ")[1].split(" (by")[0].split(" to ")
+    # EE, without a land, is the widest of this family; the land is at least 0.5 °, with room.
+    assert 0.98 * 187.5 < float(high) < 187.5
+    for number, diameter in enumerate((float(low) + 0.2, float(high) - 0.2)):
+        at = tmp_path / f"{number}.yaml"
+        assert made(at, family="hypo_epicycloid", outer_diameter_mm=diameter) == 0
+
+
+class _Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_a_terminal_is_asked_for_what_is_missing(tmp_path, capsys, monkeypatch):
+    """An empty line takes the default; a value that is not allowed is asked for again."""
+    path = tmp_path / "pump.yaml"
+    answers = ["200", "300", "two", "2", "3000", "", "0.3", "", "", "argon", ""]
+    monkeypatch.setattr("sys.stdin", _Terminal("\n".join(answers) + "\n"))
+    assert main(["new", str(path), "--centre-distance-mm", "125", "--family", "cic"]) == 0
+    told = capsys.readouterr().err
+    assert "length of a rotor in mm: lobes of a rotor: " in told
+    assert "gap of flanks in mm [outer diameter / 1000]: " in told
+    assert "`--lobes` must be a whole number, but is 'two'" in told
+    assert "what is pumped (air | nitrogen" in told
+    config = load(path)
+    assert config.scene.load.pressure_difference_Pa == 3e4
+    assert config.pump.gas.heat_ratio == 1.667
+    monkeypatch.setattr("sys.stdin", _Terminal(""))
+    assert main(["new", str(tmp_path / "other.yaml")]) == 2
+    assert "must be given" in capsys.readouterr().err
