@@ -306,7 +306,7 @@ def _scattered(
     rows = np.full((len(found), len(COMPARED)), np.nan)
     for row, one in zip(rows, found, strict=True):
         if one.usable:
-            row[:] = problem.objective(one), *(one.response[name] for name in RESPONSES)
+            row[:] = problem.objective(one), *(one.response.get(name, np.nan) for name in RESPONSES)
     columns = rows.T
     values: dict[str, NDArray[np.float64]] = dict(zip(COMPARED, columns, strict=True))
     usable = np.isfinite(values[OBJECTIVE])

@@ -45,6 +45,13 @@ _NEXT = {
 """What to do after a run with a usable result: (purpose, command)."""
 
 
+_APART = {
+    known: f"objective={{mean_weight: 0, peak_weight: 0, terms: {{{term}: 1}}}}"
+    for known, term in ((True, "leakage_fraction"), (False, "flow_ripple"))
+}
+"""Objective for flanks that stay apart, by whether the leakage is known: they have no force."""
+
+
 class Ending(NamedTuple):
     """The end of a run in words.
 
@@ -119,11 +126,15 @@ def _steps(
         sets = "".join(f" --set {shlex.quote(text)}" for text in _settings(row))
     if command == "attractors" and len(records) > 1:
         where, sets = " over all motions, not only that from rest", " --set objective.motion=worst"
+    options = {"profile": " --export dxf"}
     for why, name in _NEXT[command]:
         if (command, name) == ("simulate", "optimize"):
-            why += _steepest(result)
+            apart = result.get("status") == Status.IDLE.label
+            why += "" if apart else _steepest(result)
+            known = "volumetric_efficiency" in (result.get("pump") or {})
+            options |= {name: f" --set {shlex.quote(_APART[known])}"} if apart else {}
         if not (name == "optimize" and fixed):
-            yield f"{why}{where}", name, file, {"profile": " --export dxf"}.get(name, sets)
+            yield f"{why}{where}", name, file, options.get(name, sets)
 
 
 def _settings(row: Record) -> Iterator[str]:

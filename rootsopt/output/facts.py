@@ -26,7 +26,7 @@ from rootsopt.status import Status
 
 Facts = list[tuple[str, str]]
 """Heading and sentences of each fact."""
-STEADY = Status.PERIODIC.label, Status.AVERAGED.label
+STEADY = Status.PERIODIC.label, Status.AVERAGED.label, Status.IDLE.label
 """Statuses of a motion with a steady state."""
 FEW = 6
 """Number of quantities above which a sentence leaves out the others."""
@@ -59,7 +59,12 @@ def optimised(result: Record, rows: Sequence[Record]) -> Facts:
     return [
         ("Gained", _sentence([*gained])),
         ("Costs", _sentence([*costs, *_prices(result)])),
-        ("How sure", " ".join([_sentence([*_certified(result)]), *_caveats(result, after)])),
+        (
+            "How sure",
+            " ".join(
+                [_sentence([*_certified(result)]), *_touching(result), *_caveats(result, after)]
+            ),
+        ),
     ]
 
 
@@ -169,11 +174,13 @@ def simulated(result: Record, rows: Sequence[Record]) -> Facts:
     del rows
     response, steady = result.get("response") or {}, result.get("steady_state") or {}
     mean, peak = response.get("mean_force_N"), response.get("peak_force_N")
-    force = []
-    if mean is not None and peak is not None:
+    force, apart = [], result.get("status") == Status.IDLE.label
+    if mean is not None and peak is not None and not apart:
         times = f", {peak / mean:.3g} times the mean" if mean > 0 else ""
         force.append(f"a mean of {brief(mean)} N and a peak of {brief(peak)} N{times}")
-    force += reserves(result)
+    force += [] if apart else reserves(result)
+    if (teeth := response.get("gear_force_N")) is not None:
+        force.append(f"the teeth of the timing gear carry up to {brief(teeth)} N")
     if steady.get("kind") == "periodic" and steady.get("period"):
         count = steady["period"]
         words = "every mesh period" if count == 1 else f"every {count} mesh periods"
@@ -181,8 +188,24 @@ def simulated(result: Record, rows: Sequence[Record]) -> Facts:
     sure = [*_trust(steady, result)]
     words = [_sentence(sure)] if sure else []
     facts = [("Contact force", _sentence(force))] if force else []
-    told = " ".join([*words, *_advice_of(result)])
+    if apart:
+        said = " ".join([str(result["message"]), *([_sentence(force)] if force else [])])
+        facts = [("Flanks", said)]
+    words += _touching(result)
+    told = " ".join([*words, *([] if apart else _advice_of(result))])
     return [*facts, *([("How sure", told)] if told else [])]
+
+
+def _touching(result: Record) -> list[str]:
+    """Return a sentence on how many machines touch under tolerances, if this is known."""
+    found = result.get("touching")
+    if not found:
+        return []
+    worst = found["keys"][0]["key"]
+    return [
+        f"Of {found['machines']} machines within tolerances, {100 * found['touching_share']:.3g} % "
+        f"touch; {name_and_unit(worst)[0]} costs most of the reserve."
+    ]
 
 
 def _trust(steady: Record, record: Record) -> Iterator[str]:

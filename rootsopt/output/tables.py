@@ -16,6 +16,7 @@ from rootsopt.output.names import (
     limit,
     name_and_unit,
     percent,
+    quantity,
     scalars,
     signed,
     stated,
@@ -68,7 +69,7 @@ def sections(
         ("scenes", "Scenes", scene_tables(result, rows, most)),
         ("certificate", "Certificate of the optimum",
          [constraint_table(result), *certificate_tables(result), rejected_table(result)]),
-        ("tolerances", "Tolerances", [tolerance_table(result)]),
+        ("tolerances", "Tolerances", [tolerance_table(result), touching_table(result)]),
         ("pump", "Pump sheet", [pump_table(result)]),
         ("likeness", "Resemblance", likeness_tables(result)),
     ]  # fmt: skip
@@ -392,6 +393,35 @@ def tolerance_table(result: Record) -> Table | None:
     groups.append(("scenes", [["without a usable motion", *shares]]))
     count = next(iter(fresh.values()))["scenes"]
     return table(f"Designs in {count} fresh scenes", ["", *fresh], groups)
+
+
+def touching_table(result: Record) -> Table | None:
+    """Return how the reserve of the flanks scatters, and which tolerance costs most, or None."""
+    found = result.get("touching")
+    if not found:
+        return None
+    lost = "reserve lost (µm)", "lost at most (µm)"
+    rows = [
+        [
+            label(one["key"]),
+            *(value(one[name]) for name in ("standard_deviation", "lost_um", "lost_at_most_um")),
+            f"{100 * one['share_of_variance']:.3g} %",
+        ]
+        for one in found["keys"]
+    ]
+    first, second = (
+        f"{100 * found[f'touching_share{order}']:.3g} %" for order in ("_first_order", "")
+    )
+    note = (
+        f"Contact reserve {brief(found['contact_reserve_um'], 4)} µm, standard deviation "
+        f"{brief(found['standard_deviation_um'], 3)} µm, worst case "
+        f"{brief(found['worst_case_um'], 4)} µm. Of {found['machines']} machines, {second} touch "
+        f"({first} to first order). Of {found['simulated']} simulated ones, "
+        f"{found['simulated_touching']} touch (model: {found['model_touching']}); their reserves "
+        f"differ from the model by at most {quantity(found['greatest_difference_um'], 'µm')}."
+    )
+    heads = ["", "standard deviation", *lost, "share of variance"]
+    return table("Reserve under tolerances", heads, [("", rows)], note)
 
 
 def pump_table(result: Record) -> Table | None:

@@ -26,6 +26,7 @@ from rootsopt.optimize.robust import search_of
 from rootsopt.output import files, tables, terminal
 from rootsopt.output.runs import RunFolder
 from rootsopt.pump.sheet import check_clearances, record_of
+from rootsopt.response.touching import touching
 from rootsopt.runtime.timing import CompileClock
 from rootsopt.scene import Scene, check_geometry, outline_mm
 
@@ -213,6 +214,9 @@ def _write(folder, config, options, result, alike, sheets, compiled, ran) -> dic
         data["optimality"] = result.optimality.record()
     if result.robustness is not None:
         data["robustness"] = result.robustness.record()
+        if result.optimized is not None:
+            scattered = touching(_designed(searching, result.optimized))
+            data["touching"] = None if scattered is None else scattered.record()
     data["verification"] = result.verification
     data["status"], data["message"] = result.status.label, _advice(result)
     data["statistics"] = {

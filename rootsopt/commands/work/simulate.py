@@ -13,6 +13,7 @@ from rootsopt.output.runs import RunFolder
 from rootsopt.pump.sheet import check_clearances, record_of
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.speeds import alone
+from rootsopt.response.touching import touching
 from rootsopt.scene import check_geometry, outline_mm
 
 
@@ -33,6 +34,8 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     data = evaluation.record() | outline_report.record(config)
     if config.pump is not None or config.scene.bearings is not None:
         data["pump"] = record_of(config, [*evaluation.design.values()])
+    if config.tolerances is not None and (scattered := touching(config)) is not None:
+        data["touching"] = scattered.record()
     folder.write_json("result.json", data | {"versions": files.versions()})
     if formats:
         from rootsopt.export.writing import write_simulated

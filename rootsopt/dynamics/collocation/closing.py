@@ -110,6 +110,11 @@ _ROUGH = 1e-7
 roots of the gap to 1e-6 rad, and the same rounding errors."""
 
 
+_LEAST = 1e-6
+"""Derivative of the states (scaled) below which errors of derivatives are relative to this number,
+for an orbit without contact."""
+
+
 class Closed(NamedTuple):
     """A closed orbit.
 
@@ -485,7 +490,8 @@ def _differences(before: OrbitForces, after: OrbitForces):
     largest = jnp.max(jnp.abs(after.sensitivity), axis=1, initial=0.0)
     drift = jnp.max((slopes / jnp.where(largest > 0, largest, 1.0))[:3])
     moved = jnp.max(jnp.abs(before.moved - after.moved), initial=0.0)
-    moved /= jnp.maximum(jnp.max(jnp.abs(after.moved), initial=0.0), 1e-30)
+    # Rounding counts where the motion hardly depends on the directions.
+    moved /= jnp.maximum(jnp.max(jnp.abs(after.moved), initial=0.0), _LEAST)
     apart = jnp.max(jnp.abs(before.state - after.state))
     return choose(other[2] > 0, (error, drift), (apart, moved))
 
