@@ -5,8 +5,8 @@ speed of rotor 1 as a third state. Every part appends its own states, in the ord
 
 The independent variable τ is the rotation of rotor 1 in mesh periods (lobe pitches), so the
 equation is periodic even if the speed varies. It repeats each mesh period, unless a part repeats
-only after a turn of rotor 1 (`RotorPair.repeats`). ε is measured in units of `angle_scale`, so that the
-solver works with numbers of order one.
+only after a turn of rotor 1 (`RotorPair.repeats`). ε is measured in units of `angle_scale`, so that
+the solver works with numbers of order one.
 """
 
 import dataclasses
@@ -60,8 +60,8 @@ class RotorPair(eqx.Module):
     `force_scale` (N): the solver's units; `timescales` of oscillation and free flight, None if
     unknown; `two_sided`: whether drive and coast flanks can touch at once (at the nominal centre
     distance, only with negative clearance); `parts`: all other parts; `soundness`: margins of the
-    design, None if it was not checked; `begins`: mesh periods from φ1 = 0 to the start of τ, None: 0
-    (see `later`). An absent part is None and costs nothing.
+    design, None if it was not checked; `begins`: mesh periods from φ1 = 0 to the start of τ, None:
+    0 (see `later`). An absent part is None and costs nothing.
 
     Raises InputError if two parts let the axes move; if one part does but `two_sided` is False; if
     the pair is two-sided but the contact is not (see `Contact.two_sided`).

@@ -73,8 +73,9 @@ def settle(  # 85 lines: its inner functions share the arguments.
     last k + 1 states differ from the states k periods earlier by less than `tolerance` (scaled).
     For large states, the noise of the steps replaces `tolerance` if it is greater. k is the
     smallest such period that the equation allows (`RotorPair.orders`), at most `max_orbit` ≤ 8,
-    rounded up where the equation repeats after several mesh periods. Steps become finer after `_PATIENCE`. The
-    transient ends unsettled after `max_periods` mesh periods. `pieces`: as for `strobe`."""
+    rounded up where the equation repeats after several mesh periods. Steps become finer after
+    `_PATIENCE`. The transient ends unsettled after `max_periods` mesh periods. `pieces`: as for
+    `strobe`."""
     orders, block = pair.orders(max_orbit), pair.whole(BLOCK)
     stored = max(_MEMORY, 2 * pair.whole(max_orbit) + _MORE)
     age = jnp.arange(stored)[::-1]

@@ -179,9 +179,7 @@ def member(
     start = *settled, jnp.zeros(3, dtype), none, none, low, memory
     end, solved, means, drift, greatest, depth, memory = lax.fori_loop(0, periods, count, start)
     orders = range(pair.repeats, longest + 1, pair.repeats)
-    apart = jnp.stack(
-        [jnp.max(jnp.abs(memory[k:] - memory[:-k])[-k - 1 :]) for k in orders]
-    )
+    apart = jnp.stack([jnp.max(jnp.abs(memory[k:] - memory[:-k])[-k - 1 :]) for k in orders])
     return Members(
         means=means / periods,
         drift=drift / jnp.maximum(half, 1),

@@ -87,8 +87,8 @@ def _repeats(
     """Return the least fraction of the orbit's `period` (mesh periods) after which it repeats, or
     0.
 
-    Only a fraction after which the equation of `pair` repeats counts. `longest`: longest period of an orbit (mesh periods); `tolerance`: that of the orbit's
-    integrator."""
+    Only a fraction after which the equation of `pair` repeats counts. `longest`: longest period of
+    an orbit (mesh periods); `tolerance`: that of the orbit's integrator."""
     shorter = pair.orders(max(longest // 2, 1))
     states = found.elements.motion(shorter.astype(found.state.dtype))
     limit = jnp.maximum(_REPEATS[0] * tolerance, _REPEATS[1])
