@@ -253,6 +253,9 @@ class _Attempts(eqx.Module):
         orbit = made.orbit
         verdict, status = judged(self.pair, self.solver, self.radius, orbit, start, limits)
         unsure = among(status, (Status.PERIODIC, Status.INACCURATE)) & ~made.verified
+        if self.pair.repeats > 1:
+            # Turns of a gear that rattles, while the flanks stay apart.
+            unsure |= (status == Status.IDLE.code) & (made.shorter > 0)
         status = jnp.where(unsure | ~made.sound, Status.NOT_SETTLED.code, status)
         found = found._replace(
             status=status,

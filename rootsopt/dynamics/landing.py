@@ -45,7 +45,7 @@ class LandingControl(diffrax.AbstractAdaptiveStepSizeController):
     the edges do not move.
     """
 
-    base: diffrax.PIDController
+    base: "diffrax.PIDController | LandingControl"
     edges: Float[Array, " edges"]
     inside: Float[Array, ""]
     first: Float[Array, ""]

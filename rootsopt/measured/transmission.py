@@ -38,27 +38,21 @@ def transmission_error(path: Path) -> tuple[NDArray[np.float64], NDArray[np.floa
             "path in a config is relative to the config's folder"
         ) from None
     turned, error = named_columns(data, path.name, _COLUMNS).T
-    if len(turned) > 1 and abs(turned[-1] - turned[0] - 360) < _SAME[0]:
-        apart = abs(error[-1] - error[0])
-        _require(
-            path, apart <= _SAME[1], "repeat its first error after 360°", f"differs by {apart:g} µm"
-        )
-        turned, error = turned[:-1], error[:-1]
-    _require(path, len(turned) >= _FEWEST, f"have at least {_FEWEST} rows", f"has {len(turned)}")
-    steps = np.diff(turned, append=turned[0] + 360)
-    row = int(np.argmin(steps)) + 1
-    _require(
-        path, steps.min() > 0, "go once round, with rising rotations", f"does not at row {row}"
-    )
-    widest = steps.max()
-    _require(
-        path,
-        widest <= _WIDEST,
-        f"have a row every {_WIDEST:g}° or less",
-        f"has a gap of {widest:g}°",
-    )
-    most = np.max(np.abs(error))
-    _require(path, most <= _MOST, f"have errors of at most {_MOST:g} µm", f"has one of {most:g} µm")
+    whole = len(turned) > 1 and abs(turned[-1] - turned[0] - 360) < _SAME[0]
+    apart = float(abs(error[-1] - error[0])) if whole else 0.0
+    turned, error = (x[: len(x) - whole] for x in (turned, error))
+    steps = np.diff(turned, append=turned[:1] + 360)
+    widest, most = (float(np.max(x, initial=0)) for x in (steps, np.abs(error)))
+    fall = int(np.argmin(steps)) + 1 if len(steps) and np.min(steps) <= 0 else 0
+    for holds, wanted, found in (
+        (apart <= _SAME[1], "repeat its first error after 360°", f"differs by {apart:g} µm"),
+        (len(turned) >= _FEWEST, f"have at least {_FEWEST} rows", f"has {len(turned)}"),
+        (not fall, "go once round, with rising rotations", f"does not at row {fall}"),
+        (widest <= _WIDEST, f"have a row every {_WIDEST:g}° or less", f"has a gap of {widest:g}°"),
+        (most <= _MOST, f"have errors of at most {_MOST:g} µm", f"has one of {most:g} µm"),
+    ):
+        if not holds:
+            raise InputError(f"{path.name}: must {wanted}, but {found}; correct the table")
     from scipy.interpolate import make_interp_spline  # Slow import.
 
     knots = turned * DEG
@@ -66,11 +60,6 @@ def transmission_error(path: Path) -> tuple[NDArray[np.float64], NDArray[np.floa
     spline = make_interp_spline(*around, k=_DEGREE, bc_type="periodic")
     orders = range(_DEGREE, -1, -1)
     return knots, np.array([spline(knots, order) / math.factorial(order) for order in orders])
-
-
-def _require(path: Path, holds: bool, wanted: str, found: str) -> None:
-    if not holds:
-        raise InputError(f"{path.name}: must {wanted}, but {found}; correct the table")
 
 
 __all__ = ["transmission_error"]

@@ -55,7 +55,7 @@ def rattle_record(pair: RotorPair, found: Steady) -> dict[str, dict[str, float]]
     held = status in CLOSED or (status is Status.IDLE and bool(found.verdict.steady))
     if held:
         elements = found.known.elements
-        used, turns = int(elements.mesh.used), float(elements.mesh.period) / pair.lobes
+        used, turns = int(elements.mesh.used), int(found.period) / pair.lobes
         teeth = [np.asarray(x)[:used].ravel() for x in _of_orbit(pair, elements)]
     elif status in (*OPEN, Status.IDLE) and window is not None:
         done, states = int(window.done), window.states

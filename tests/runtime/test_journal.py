@@ -276,7 +276,7 @@ def test_what_differs_is_named(path, tmp_path):
     with pytest.raises(InputError, match="there is no"):
         Journal({}, path.with_name("absent"), resume=True)
     with pytest.raises(InputError, match="cannot be read"):
-        header_of("sweep", CIC, outlines=[str(tmp_path / "absent.csv")])
+        header_of("sweep", CIC, others=[str(tmp_path / "absent.csv")])
 
 
 def test_sweep_goes_on_where_it_stopped(path, monkeypatch):
