@@ -89,8 +89,8 @@ def _teeth(pair: RotorPair, tau, states) -> tuple[Bool[Array, ""], Float[Array, 
     period."""
     assert pair.gear is not None
     motion = pair.motion(tau, states)
-    touches = pair.gear.margins(motion, None)[0] > 0
-    return touches, pair.gear.torque_on_1(motion, None), pair.lapse(states) * jnp.ones_like(tau)
+    own, lapse = np.zeros(0), pair.lapse(states) * jnp.ones_like(tau)
+    return pair.gear.margins(motion, own)[0] > 0, pair.gear.torque_on_1(motion, own), lapse
 
 
 @CachedFunction
@@ -177,7 +177,4 @@ def silent_eccentricity(
     return scene.pitch_radius * limit, relative
 
 
-__all__ = [
-    *("SILENT", "SilentLimit", "rattle_record"),
-    *("silent_eccentricity", "silent_limit", "silent_record"),
-]
+__all__ = ["SILENT", "SilentLimit", "rattle_record", "silent_limit", "silent_record"]

@@ -235,7 +235,7 @@ def test_tables_are_checked(tmp_path, rows, message):
         ("scene.timing_gear.eccentricity_um=[1, 2, 3]", "a number from 0 to 1000, or one for each"),
         ("scene.timing_gear.eccentricity_um=-1", "a number from 0 to 1000"),
         (
-            "scene.timing_gear={backlash_mm: 1, stiffness_N_m_per_rad: 9, eccentricity_angle_deg: 4}",
+            "scene.timing_gear={backlash_mm: 1,stiffness_N_m_per_rad: 9,eccentricity_angle_deg: 4}",
             "eccentricity_um` is missing",
         ),
         ("scene.timing_gear.transmission_error_file=nowhere.csv", "can be read"),
