@@ -27,8 +27,8 @@ def smooth_pieces(
     corners: Float[Array, " k"],
     flags: Callable[[Any], Any],
 ) -> tuple[Float[Array, " pieces"], Float[Array, " pieces"], Int[Array, ""]]:
-    """Return starts and ends (mesh periods) of pieces of an orbit of `pair` in which a quantity is smooth,
-    and the number of pieces in use. The others, which are empty, come last.
+    """Return starts and ends (mesh periods) of pieces of an orbit of `pair` in which a quantity is
+    smooth, and the number of pieces in use. The others, which are empty, come last.
 
     `corners` (k,): times from 0 to 1 at which the quantity is not smooth, in each mesh period;
     `flags`: function that returns, at a time, flags (s,) that change where it is not smooth. Pieces

@@ -52,7 +52,7 @@ def rattle_record(pair: RotorPair, found: Steady) -> dict[str, dict[str, float]]
     the greatest torque (N·m) between the teeth if there are impacts, else 0. There are no entries
     without a motion to report."""
     status, window = Status.of(found.status), found.window
-    held = status in CLOSED or (status is Status.IDLE and bool(found.verdict.steady))
+    held = status in CLOSED or bool(found.held)
     if held:
         elements = found.known.elements
         used, turns = int(elements.mesh.used), int(found.period) / pair.lobes
