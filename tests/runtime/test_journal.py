@@ -252,7 +252,7 @@ def test_what_differs_is_named(path, tmp_path):
     plan = plan_of({SPEED: "1,2"})
     rotor = tmp_path / "rotor.csv"
     rotor.write_text("1,2")
-    files = {"imports": [], "outlines": [str(rotor), None]}
+    files = {"imports": [], "others": [str(rotor), None]}
     head = header_of("sweep", CIC, **files, sweep=plan.record())
     journal = Journal(head, path)
     journal.add([(0, ROW)])
