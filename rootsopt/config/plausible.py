@@ -98,6 +98,8 @@ USUAL: dict[str, Usual] = {
     "scene.timing_gear.stiffness_N_m_per_rad": Usual(50, 1e6, "bar"),
     "scene.timing_gear.damping_ratio": Usual(1e-3, 1),
     "scene.timing_gear.backlash_mm": _GAP,
+    "scene.timing_gear.eccentricity_um": Usual(0.5, 500),
+    "scene.timing_gear.eccentricity_angle_deg": Usual(0.2, 360),
     "scene.supports.stiffness_N_per_mm": Usual(50, 2e5, "radius"),
     "scene.supports.damping_N_s_per_mm": Usual(1e-3, 5, "critical"),
     "scene.bearings.gear_pressure_angle_deg": Usual(5, 45),

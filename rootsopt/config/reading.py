@@ -25,7 +25,7 @@ from rootsopt.config.scene import (
 from rootsopt.config.section import Section, bare, put, require
 from rootsopt.config.shipped import advice, located
 from rootsopt.config.smoothing import following_mm
-from rootsopt.config.sources import regular_file
+from rootsopt.config.sources import FILES, regular_file
 from rootsopt.config.study import (
     NEAREST,
     TWIST,
@@ -378,12 +378,16 @@ def _find_family(data: dict) -> None:
 
 
 def _place_files(data: dict, folder: Path) -> None:
-    """Make a relative path of the outline file in `data` absolute, in place.
+    """Make relative paths of files in `data` absolute, in place.
 
-    `folder`: folder to which the path is relative."""
-    profile = data.get("profile")
-    if isinstance(profile, dict) and isinstance(profile.get("outline_file"), str):
-        profile["outline_file"] = str((folder / profile["outline_file"]).absolute())
+    `folder`: folder to which the paths are relative."""
+    for key in FILES:
+        *sections, name = key.split(".")
+        found: Any = data
+        for section in sections:
+            found = found.get(section) if isinstance(found, dict) else None
+        if isinstance(found, dict) and isinstance(found.get(name), str):
+            found[name] = str((folder / found[name]).absolute())
 
 
 def _read(path: Path) -> str:

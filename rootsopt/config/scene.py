@@ -1,6 +1,7 @@
 """Config sections that define what is simulated: profile, rotor, contact, scene."""
 
 import functools
+import math
 import shlex
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
@@ -61,7 +62,7 @@ _Center = Annotated[
         before=True,
     ),
 ]
-_Path = Annotated[str, such("a path of characters that can be printed", str.isprintable)]
+FilePath = Annotated[str, such("a path of characters that can be printed", str.isprintable)]
 
 
 class ProfileConfig(Section):
@@ -75,7 +76,7 @@ class ProfileConfig(Section):
     )
     lobes: Annotated[int, Field(ge=2, le=6)] = Field(description="number of lobes")
     pitch_radius_mm: Radius = Field(description="pitch radius, half the centre distance")
-    outline_file: _Path | None = Field(
+    outline_file: FilePath | None = Field(
         None, description="outline: CSV or DXF file, relative to the config's folder"
     )
     outline_smoothing_mm: Annotated[float, between(0, 10)] | None = Field(
@@ -424,8 +425,29 @@ class HeatConfig(Section):
         return housing - self.rotor_expansion_per_K * self.rotor_warming_K
 
 
+_MOST_EYE, _MOST_TURN = 1000.0, 360.0
+"""Greatest eccentricity (µm) of a gear, and greatest magnitude of its angle (°)."""
+
+
+def _each_gear(low: float, high: float) -> Any:
+    """Return the type of a number from `low` to `high` for the gear of rotor 1, or of one for each
+    gear."""
+
+    def fits(value: Any) -> bool:
+        listed = isinstance(value, list | tuple)
+        values = value if listed else [value]
+        plain = all(isinstance(x, int | float) and not isinstance(x, bool) for x in values)
+        return plain and len(values) == 1 + listed and all(low <= x <= high for x in values)
+
+    return Annotated[
+        Annotated[float, between(low, high)] | Annotated[tuple[float, float], Listed],
+        such(f"a number from {low:g} to {high:g}, or one for each gear", fits, before=True),
+    ]
+
+
 class TimingGearConfig(Section):
-    """The timing gear between the rotors: torsional stiffness, damping and backlash."""
+    """The timing gear between the rotors: torsional stiffness, damping, backlash, and its errors
+    over a turn."""
 
     stiffness_N_m_per_rad: Annotated[float, between(1e-2, 1e10)] = Field(
         description="torsional stiffness"
@@ -439,6 +461,42 @@ class TimingGearConfig(Section):
     backlash_mm: Annotated[float, between(0, 50)] = Field(
         description="total backlash at the pitch radius"
     )
+    eccentricity_um: _each_gear(0, _MOST_EYE) | None = Field(
+        None,
+        description="distance of the gear's centre from the axis of rotor 1, or a list of those of "
+        "both gears; absent: gears without errors",
+    )
+    eccentricity_angle_deg: _each_gear(-_MOST_TURN, _MOST_TURN) = Field(
+        0.0,
+        description="direction of the eccentricity where a lobe of rotor 1 points at rotor 2, from "
+        "the line to the other axis in the rotor's sense of rotation; or a list for both gears",
+    )
+    transmission_error_file: FilePath | None = Field(
+        None,
+        description="CSV file of the gear's measured transmission error over a turn of rotor 1, "
+        "relative to the config's folder, with the columns rotation_deg and error_um",
+    )
+
+    @model_validator(mode="after")
+    def _erring(self):
+        require(
+            self.eccentricity_um is not None or self.eccentricity_angle_deg == 0,
+            "`scene.timing_gear.eccentricity_um` is missing; `eccentricity_angle_deg` needs it: "
+            "add it, or remove the angle",
+        )
+        return self
+
+    @property
+    def errs(self) -> bool:
+        """Whether the gear has errors over a turn."""
+        return self.eccentricity_um is not None or self.transmission_error_file is not None
+
+    @property
+    def run_out(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Eccentricities (µm) of both gears, and their angles (°)."""
+        pair = self.eccentricity_um or 0.0, self.eccentricity_angle_deg
+        one, other = (one if isinstance(one, tuple) else (one, 0.0) for one in pair)
+        return one, other
 
 
 class SceneConfig(Section):
@@ -476,5 +534,17 @@ class SceneConfig(Section):
             self.phase_error_mrad is None or self.timing_gear is not None,
             "`scene.phase_error_mrad` is a mounting error of `scene.timing_gear`, which is "
             "missing; add the gear or remove the error",
+        )
+        gear, bearings = self.timing_gear, self.bearings
+        if gear is None or bearings is None:
+            return self
+        closes = (
+            2e-3 * sum(gear.run_out[0]) * math.tan(math.radians(bearings.gear_pressure_angle_deg))
+        )
+        require(
+            closes <= gear.backlash_mm,
+            "`scene.timing_gear.backlash_mm` must be at least what the eccentricities close, "
+            f"{closes:.4g}, but is {gear.backlash_mm:g}, so that the teeth bind; raise it, or "
+            "lower `scene.timing_gear.eccentricity_um`",
         )
         return self

@@ -6,6 +6,13 @@ from pathlib import Path
 
 from rootsopt.errors import InputError
 
+FILES = {
+    "profile.outline_file": ("outline", "an outline"),
+    "scene.timing_gear.transmission_error_file": ("transmission_error", "a table"),
+}
+"""Keys that hold the path of a file, each with the stem of its copy in a result folder and the name
+of its content in a message."""
+
 
 def reason(error: Exception) -> str:
     """Return an error's text with its first letter in lower case, for use within a sentence."""

@@ -85,7 +85,9 @@ class SolverConfig(Section):
         640, description="longest transient, in mesh periods"
     )
     max_orbit_periods: Annotated[int, Field(ge=1, le=8)] = Field(
-        8, description="longest periodic orbit to find, in mesh periods"
+        8,
+        description="longest periodic orbit to find, in mesh periods; with errors of the timing "
+        "gear, the next whole revolution",
     )
 
     @model_validator(mode="before")

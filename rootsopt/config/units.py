@@ -40,7 +40,7 @@ _UNITS: dict[str, tuple[str, dict[str, float]]] = {
     "_cm3": ("cm³", {"litres": 1e3, "mm³": 1e-3}),
     "_mm2": ("mm²", {"m²": 1e6, "cm²": 100.0}),
     "_l_min": ("l/min", {}),
-    "_um": ("µm", {}),
+    "_um": ("µm", {"millimetres": 1e3}),
 }
 
 _SPELT = str.maketrans({"·": "_", "/": "_per_", "³": "3", "²": "2", "µ": "u", "(": "", ")": ""})

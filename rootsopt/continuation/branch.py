@@ -18,8 +18,6 @@ from rootsopt.continuation.arclength import End, Spot, StepSizes, StoppedError, 
 from rootsopt.continuation.family import SPAN, BranchPoint, OrbitFamily
 from rootsopt.errors import InputError
 
-LONGEST = 8
-"""Longest orbit that can be followed (mesh periods)."""
 _HALVED = 0.004
 """Distance (unit of `StepSizes`) below which the states at the start and the middle of an orbit
 count as equal. A branch whose steps have become too small there ends at an orbit of half the period
@@ -110,9 +108,13 @@ def follow(config: Config, key: str, state: ArrayLike, period: int, limits: Step
     value, or that the config cannot have; if collocation does not close orbits of this config; and
     if no orbit is found for the first point.
     """
-    if not 1 <= period <= LONGEST:
-        raise InputError(f"Argument `period` must be 1 to {LONGEST}, but is {period}")
     family = OrbitFamily(config, key, period, limits)
+    if period not in family.periods:
+        first, step = family.periods[0], family.periods.step
+        raise InputError(
+            f"Argument `period` must be {first} to {family.periods[-1]}"
+            f"{f' in steps of {step}' if step > 1 else ''}, but is {period}"
+        )
     value, place = family.value(family.share), np.append(np.asarray(state) / SPAN, family.share)
     if not 0 <= family.share <= 1:
         raise InputError(
@@ -138,7 +140,7 @@ def follow_doubled(branch: Branch, bifurcation: Bifurcation, points: int = 400) 
 
     The search for its first orbit starts a little away from the bifurcation, displaced along the
     eigenvector of the multiplier -1. `points`: maximum number of points. The result is None if no
-    orbit of twice the period is found, or if twice the period exceeds 8 mesh periods.
+    orbit of twice the period is found, or if twice the period exceeds `OrbitFamily.periods`.
 
     Raises `ValueError` if `bifurcation` is not a period doubling."""
     if bifurcation.kind is not Kind.PERIOD_DOUBLING:
@@ -147,7 +149,7 @@ def follow_doubled(branch: Branch, bifurcation: Bifurcation, points: int = 400) 
             f"{bifurcation.kind.name.lower()}"
         )
     simple, place, line = branch.family, bifurcation.spot.place, bifurcation.point.made.line
-    if 2 * simple.period > LONGEST:
+    if 2 * simple.period not in simple.periods:
         return None
     limits = dataclasses.replace(simple.limits, points=points)
     family = OrbitFamily(simple.config, simple.key, 2 * simple.period, limits)
@@ -175,7 +177,7 @@ def _branch(family: OrbitFamily, start: Spot) -> Branch:
     """Return the branch that leads from `start` in the direction of its tangent."""
     steps = dataclasses.replace(family.limits, low=0.0, high=1.0)
     path = follow_curve(family, start, steps, _TESTS)
-    halved = family.period % 2 == 0 and path.spots[-1].data.half_way < _HALVED
+    halved = family.halves and path.spots[-1].data.half_way < _HALVED
     end = End.HALVED if halved and path.end is End.STEP_TOO_SMALL else path.end
     bifurcations = []
     for after, name, spot in path.crossings:

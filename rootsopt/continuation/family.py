@@ -29,6 +29,8 @@ from rootsopt.errors import InputError
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene, along, design_vector
 
+LONGEST = 8
+"""Longest orbit that can be followed (mesh periods), rounded up by `RotorPair.whole`."""
 SPAN = 20.0
 """Change of the scaled state that has the same length as the whole range of the parameter, when
 step lengths are measured."""
@@ -94,7 +96,8 @@ class OrbitFamily:
     The unknowns (n + 1,) are the scaled state at φ1 = 0 divided by `SPAN`, then the parameter as a
     fraction of its range. `config` of the first orbit; `key`: dotted key of the parameter, such as
     `scene.speed_rpm`; `period`: k; `limits`: range of the parameter (config's unit) and step sizes.
-    The attribute `share` is the config's own place in the range.
+    The attribute `share` is the config's own place in the range; `periods` are all periods that an
+    orbit of this config can have.
 
     Raises `InputError` for an unknown key, a value that the config cannot have, a key on which
     scene and design do not depend linearly, and a config whose orbits collocation does not close.
@@ -129,8 +132,14 @@ class OrbitFamily:
                 "to be followed, but is not; give its `switches`"
             )
         self.share = float((own - low)[most] / change[most])
+        self.periods = range(pair.repeats, pair.whole(LONGEST) + 1, pair.repeats)
         # A number that the scene sets later is NaN here.
         self.range = _Range(ends[1], tree(jnp.nan_to_num(change)), pair.angle_scale)
+
+    @property
+    def halves(self) -> bool:
+        """Whether orbits of half the period can exist."""
+        return self.period % (2 * self.periods.step) == 0
 
     def value(self, share: Any) -> float:
         """Return the parameter's value (config's unit) at a `share` of its range."""
@@ -169,7 +178,7 @@ class OrbitFamily:
             raise StoppedError(End.LOST_MESH)
         if made.found.depth > TOO_DEEP * scene.pitch_radius:
             raise StoppedError(End.TOO_DEEP)
-        if self.period % 2 == 0 and half_way < _HALF_ALIKE:
+        if self.halves and half_way < _HALF_ALIKE:
             raise StoppedError(End.HALVED)
         state, monodromy = np.asarray(made.found.state), np.asarray(line.monodromy)
         mean, square, peak = map(float, made.found.response[:3])

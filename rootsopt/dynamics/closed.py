@@ -128,7 +128,8 @@ class _Attempts(eqx.Module):
         directions = jax.tree.leaves(eqx.filter(self.tangents, eqx.is_inexact_array))[0].shape[0]
         no, zero = jnp.zeros((), bool), jnp.zeros((), int)
         unsound = ~pair.sound
-        pieces, known = no_pieces(state, solver.max_orbit, PIECES), unknown(pair, solver.max_orbit)
+        pieces = no_pieces(pair, state, solver.max_orbit, PIECES)
+        known = unknown(pair, solver.max_orbit)
         orbit = Orbit.empty(state, directions, solver.measures.count + 1)
         if solver.variation:
             orbit = orbit._replace(variation=unchanged(known.elements, directions))
@@ -252,6 +253,9 @@ class _Attempts(eqx.Module):
         orbit = made.orbit
         verdict, status = judged(self.pair, self.solver, self.radius, orbit, start, limits)
         unsure = among(status, (Status.PERIODIC, Status.INACCURATE)) & ~made.verified
+        if self.pair.repeats > 1:
+            # Turns of a gear that rattles, while the flanks stay apart.
+            unsure |= (status == Status.IDLE.code) & (made.shorter > 0)
         status = jnp.where(unsure | ~made.sound, Status.NOT_SETTLED.code, status)
         found = found._replace(
             status=status,

@@ -51,7 +51,8 @@ def strobe(
     integrator: Integrator,
     pieces: tuple[int, NDArray[np.float64]] | None = None,
 ) -> Strobe:
-    """Integrate the scaled `state` (n,) over `periods` mesh periods from φ1 = 0.
+    """Integrate the scaled `state` (n,) over `periods` mesh periods from φ1 = 0, or from where the
+    pair `begins`.
 
     `pieces`: number of pieces of each mesh period and instants inside a piece (fractions of its
     length) for `Strobe.pieces`; `None`: no pieces.
@@ -59,17 +60,21 @@ def strobe(
     A step ends exactly at the end of each mesh period. Interpolated states would have an error far
     above the tolerance, which could hide that the motion repeats.
     """
-    control = integrator.controller(pair)
     solver = integrator.solver()
     term = diffrax.ODETerm(lambda tau, y, pair: pair.derivative(tau, y)[0])
+    numbers = None if pair.repeats == 1 else jnp.arange(periods)
+    control = integrator.controller(pair)
 
-    def one_period(state, _):
-        recorded = pieces is not None
-        out = integrated(term, solver, control, state, pair, integrator.max_steps, recorded)
+    def one_period(state, number):
+        own, how, recorded = pair, control, pieces is not None
+        if number is not None:
+            own = pair.later(number)
+            how = integrator.controller(own)
+        out = integrated(term, solver, how, state, own, integrator.max_steps, recorded)
         made = None if pieces is None else _divided(out, solver, *pieces)
         return out.end, (out.end, out.steps, out.solved, made)
 
-    _, (states, steps, solved, made) = lax.scan(one_period, state, length=periods)
+    _, (states, steps, solved, made) = lax.scan(one_period, state, numbers, length=periods)
     return Strobe(states, jnp.sum(steps), jnp.all(solved), made)
 
 
@@ -108,7 +113,8 @@ class Period(NamedTuple):
 
 
 def one_period(pair: RotorPair, start: Float[Array, " n"], integrator: Integrator) -> Period:
-    """Integrate the scaled state `start` (n,) over one mesh period from φ1 = 0.
+    """Integrate the scaled state `start` (n,) over one mesh period from φ1 = 0, or from where the
+    pair `begins`.
 
     Mean and mean square of the force are integrated under the same error control as the motion."""
     count, dtype = start.shape[0], start.dtype

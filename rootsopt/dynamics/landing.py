@@ -9,6 +9,7 @@ value of ε at which contact may begin. The next step starts short. A step that 
 too much is repeated."""
 
 import diffrax
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
@@ -39,13 +40,16 @@ class LandingControl(diffrax.AbstractAdaptiveStepSizeController):
     """The step size control `base`, extended so that steps end where free flight may end.
 
     `edges`: scaled ε at which a flank or the gear may begin to touch; `inside`: scaled |ε| above
-    which a flank may touch at any time; `first`: length of the first step (mesh periods).
+    which a flank may touch at any time; `first`: length of the first step (mesh periods);
+    `moving`: pair whose parts have `edges`, which then are 0, relative to those of the parts; None:
+    the edges do not move.
     """
 
-    base: diffrax.PIDController
+    base: "diffrax.PIDController | LandingControl"
     edges: Float[Array, " edges"]
     inside: Float[Array, ""]
     first: Float[Array, ""]
+    moving: RotorPair | None = None
 
     @classmethod
     def of(cls, base: diffrax.PIDController, pair: RotorPair) -> "LandingControl":
@@ -53,8 +57,9 @@ class LandingControl(diffrax.AbstractAdaptiveStepSizeController):
         assert pair.timescales is not None
         scale = pair.angle_scale
         play = pair.timescales.free / scale
-        edges = [play, -play]
-        edges += [edge / scale for part in pair.all_parts for edge in part.edges]
+        edges, own = [play, -play], [edge for part in pair.all_parts for edge in part.edges]
+        if pair.repeats == 1:
+            edges += [edge / scale for edge in own]
         inside = jnp.where(play > 0, play, jnp.inf)
         if pair.two_sided:
             inside = jnp.zeros_like(play)
@@ -62,7 +67,11 @@ class LandingControl(diffrax.AbstractAdaptiveStepSizeController):
         swing = _FIRST[1] * pair.timescales.swing / pair.mesh_period
         swing = jnp.minimum(_FIRST[0], swing)
         numbers = lax.stop_gradient((jnp.stack(edges), inside, swing))
-        return cls(base, *(x.astype(dtype) for x in numbers))  # pyright: ignore
+        found = cls(base, *(x.astype(dtype) for x in numbers))  # pyright: ignore
+        if pair.repeats == 1 or not own:
+            return found
+        zeros, frozen = jnp.zeros(len(own), dtype), lax.stop_gradient(pair)
+        return cls(found, zeros, jnp.full_like(play, jnp.inf), found.first, frozen)  # pyright: ignore
 
     @property
     def rtol(self):  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -92,17 +101,34 @@ class LandingControl(diffrax.AbstractAdaptiveStepSizeController):
         )
         step = t1 - t0
         before, after = y0[:2], y1_candidate[:2]
+        if self.moving is not None:
+            before, after = self._relative(t0, before), self._relative(t1, after)
         away, late = self._passed(before, after, step)
         again = keep & (late > _LATE * _BEYOND)
         # Step to the edge, estimated by the secant, and a little beyond.
         shorter = jnp.maximum(step - late, 0.0) + _BEYOND
-        most = jnp.where(away, _AFTER * _BEYOND, self._ahead(before, after, step))
+        ahead = self._ahead(before, after, step)
+        ahead = ahead if self.moving is None else jnp.min(ahead)
+        most = jnp.where(away, _AFTER * _BEYOND, ahead)
         following = jnp.minimum(stop - start, most)
         following = jnp.where(again, shorter, jnp.where(keep, following, stop - start))
         keep &= ~again
         start = jnp.where(again, t0, start)
         new = tuple(jnp.where(again, old, x) for old, x in zip(state, new, strict=True))
         return keep, start, start + following, jump, new, result
+
+    def _relative(self, tau, state):
+        """Return ε and dε/dτ (2, edges) of a scaled `state` relative to each moving edge at `tau`
+        (mesh periods)."""
+        pair = self.moving
+        assert pair is not None
+
+        def edges(tau):
+            phi = pair.angle(tau)
+            own = [edge for part in pair.all_parts for edge in part.edges_at(phi)]
+            return jnp.stack(own) / pair.angle_scale
+
+        return state[:, None] - jnp.stack(jax.jvp(edges, (tau,), (jnp.ones_like(tau),)))
 
     def _passed(self, before, after, step):
         """Return whether a step has passed an edge, and the time since then (mesh periods).

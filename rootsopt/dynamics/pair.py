@@ -4,17 +4,19 @@ The simplest scene has two states: ε = φ2 - φ1 and its rate. A part that sets
 speed of rotor 1 as a third state. Every part appends its own states, in the order of the parts.
 
 The independent variable τ is the rotation of rotor 1 in mesh periods (lobe pitches), so the
-equation is periodic even if the speed varies. ε is measured in units of `angle_scale`, so that the
-solver works with numbers of order one.
+equation is periodic even if the speed varies. It repeats each mesh period, unless a part repeats
+only after a turn of rotor 1 (`RotorPair.repeats`). ε is measured in units of `angle_scale`, so that
+the solver works with numbers of order one.
 """
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.contact.gap import Contact
 from rootsopt.contact.impact import force_rounding
@@ -58,7 +60,8 @@ class RotorPair(eqx.Module):
     `force_scale` (N): the solver's units; `timescales` of oscillation and free flight, None if
     unknown; `two_sided`: whether drive and coast flanks can touch at once (at the nominal centre
     distance, only with negative clearance); `parts`: all other parts; `soundness`: margins of the
-    design, None if it was not checked. An absent part is None and costs nothing.
+    design, None if it was not checked; `begins`: mesh periods from φ1 = 0 to the start of τ, None:
+    0 (see `later`). An absent part is None and costs nothing.
 
     Raises InputError if two parts let the axes move; if one part does but `two_sided` is False; if
     the pair is two-sided but the contact is not (see `Contact.two_sided`).
@@ -80,6 +83,7 @@ class RotorPair(eqx.Module):
     two_sided: bool = eqx.field(static=True, default=False)
     parts: tuple[Part, ...] = ()
     soundness: Soundness | None = None
+    begins: Int[Array, ""] | None = None
 
     def __check_init__(self):
         displacing = [type(part).__name__ for part in self.all_parts if part.displaces]
@@ -115,6 +119,33 @@ class RotorPair(eqx.Module):
     def free(self) -> bool:
         """Whether the speed of rotor 1 is a state of the motion."""
         return any(part.free for part in self.all_parts)
+
+    @property
+    def repeats(self) -> int:
+        """Mesh periods after which the equation repeats: 1, or those of a turn of rotor 1."""
+        return self.lobes if any(part.whole_turns for part in self.all_parts) else 1
+
+    def whole(self, periods: int) -> int:
+        """Return the least multiple of `repeats` that is at least this number of mesh `periods`."""
+        return -(-periods // self.repeats) * self.repeats
+
+    def orders(self, longest: int) -> Int[Array, " k"]:
+        """Return the periods (k,) that an orbit of up to `whole(longest)` mesh periods can have."""
+        orders = jnp.arange(1, self.whole(longest) // self.repeats + 1)
+        return orders if self.repeats == 1 else self.repeats * orders
+
+    def later(self, periods: Int[Array, ""] | int) -> "RotorPair":
+        """Return the pair whose τ begins `periods` mesh periods later than that of this pair.
+
+        It is the pair itself if the equation repeats each mesh period."""
+        if self.repeats == 1:
+            return self
+        begins = periods if self.begins is None else self.begins + periods
+        return dataclasses.replace(self, begins=jnp.mod(begins, self.repeats))
+
+    def angle(self, tau: Float[Array, "*k"]) -> Float[Array, "*k"]:
+        """Return φ1 (rad) at rotation `tau` (mesh periods)."""
+        return 2 * jnp.pi / self.lobes * (tau if self.begins is None else tau + self.begins)
 
     @property
     def state_names(self) -> tuple[str, ...]:
@@ -218,7 +249,7 @@ class RotorPair(eqx.Module):
         tau, state = (jnp.asarray(x, self.angle_scale.dtype) for x in (tau, state))
         relative = self.angle_scale * state[..., 0]
         rate = self.angle_scale * state[..., 1] / self.mesh_period
-        motion = Motion(2 * jnp.pi / self.lobes * tau, relative, rate, self.speed(state))
+        motion = Motion(self.angle(tau), relative, rate, self.speed(state))
         acting = list(zip(self.all_parts, self.own_states(state), strict=True))
         for part, own in acting:
             if part.displaces:

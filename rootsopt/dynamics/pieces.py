@@ -9,9 +9,10 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from rootsopt.dynamics.collocation.elements import Elements
+from rootsopt.dynamics.pair import RotorPair
 
 LONGEST = 8
-"""Maximum length of an orbit (mesh periods)."""
+"""Maximum length of an orbit (mesh periods), rounded up by `RotorPair.whole`."""
 _EVEN = 128
 """Minimum number of pieces into which one mesh period is divided."""
 _FLAGS, _HALVED = 64, 40
@@ -21,10 +22,13 @@ _EMPTY = 1e-13
 
 
 def smooth_pieces(
-    elements: Elements, corners: Float[Array, " k"], flags: Callable[[Any], Any]
+    pair: RotorPair,
+    elements: Elements,
+    corners: Float[Array, " k"],
+    flags: Callable[[Any], Any],
 ) -> tuple[Float[Array, " pieces"], Float[Array, " pieces"], Int[Array, ""]]:
-    """Return starts and ends (mesh periods) of pieces of an orbit in which a quantity is smooth,
-    and the number of pieces in use. The others, which are empty, come last.
+    """Return starts and ends (mesh periods) of pieces of an orbit of `pair` in which a quantity is
+    smooth, and the number of pieces in use. The others, which are empty, come last.
 
     `corners` (k,): times from 0 to 1 at which the quantity is not smooth, in each mesh period;
     `flags`: function that returns, at a time, flags (s,) that change where it is not smooth. Pieces
@@ -32,7 +36,7 @@ def smooth_pieces(
     quantity needs shorter pieces than the motion."""
     mesh = elements.mesh
     period = mesh.period
-    turns = jnp.arange(LONGEST)[:, None]
+    turns = jnp.arange(pair.whole(LONGEST))[:, None]
     every = jnp.append(corners, jnp.arange(1, _EVEN + 1) / _EVEN)
     own = jnp.mod(mesh.ends[1], period)
     ends = jnp.append(own, jnp.minimum((every + turns).ravel(), period))

@@ -60,10 +60,10 @@ def apart(pair: RotorPair, tangents: RotorPair, orbit: VariedOrbit) -> Apart:
     return Apart(*(jnp.concatenate(pair) for pair in found))
 
 
-def _aside(pair: RotorPair, state: Float[Array, " n"]) -> tuple[Array, Array]:
+def _aside(pair: RotorPair, tau, state: Float[Array, " n"]) -> tuple[Array, Array]:
     """Return ε (rad) in the middle of the gear's backlash, and ε of the `state` minus this."""
     assert pair.gear is not None
-    first, second = pair.gear.edges
+    first, second = pair.gear.edges_at(pair.angle(tau))
     middle = (first + second) / 2
     return middle, pair.angle_scale * state[0] - middle
 
@@ -72,7 +72,7 @@ def _contact(moved: Float[Array, ""], pair: RotorPair, tau, state) -> FlankForce
     """Return the contact at a state, with rotor 2 `moved` outwards (rad).
 
     A negative number moves it towards the middle of the gear's backlash, but not beyond."""
-    middle, aside = _aside(pair, state)
+    middle, aside = _aside(pair, tau, state)
     side = jnp.where(aside < 0, -1.0, 1.0)
     relative = middle + side * jnp.maximum(side * aside + moved, 0.0)
     return pair.contact_at(tau, state.at[0].set(relative / pair.angle_scale))
@@ -88,7 +88,7 @@ def reserve(
 
         def gap(*at):
             contact = _contact(moved, *at)
-            return contact.depth, contact.lever2, jnp.abs(_aside(pair, at[2])[1])
+            return contact.depth, contact.lever2, jnp.abs(_aside(*at)[1])
 
         times, (depths, *further) = along_elements(gap, pair, orbit.elements)
         places = around(orbit.elements.mesh, depths, times)
@@ -189,7 +189,7 @@ def gear_torque(
     def flags(tau):
         return (_torque(pair, tau, orbit.elements.motion(tau)) > 0)[None]
 
-    begins, ends, _ = smooth_pieces(orbit.elements, jnp.zeros(0), flags)
+    begins, ends, _ = smooth_pieces(pair, orbit.elements, jnp.zeros(0), flags)
     nodes = begins[:, None] + (ends - begins)[:, None] * GAUSS.nodes
     found = jax.vmap(jax.vmap(varied))(nodes)
     total, slope = (jnp.tensordot(ends - begins, GAUSS.whole(x), 1) for x in found)

@@ -19,9 +19,9 @@ from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.pair import RotorPair
 
 BLOCK = 4
-"""Number of mesh periods integrated between two checks of whether the motion repeats."""
-_MEMORY = 20
-"""Number of stroboscopic states stored: more than twice the longest cycle that is recognised."""
+"""Least number of mesh periods integrated between two checks of whether the motion repeats."""
+_MEMORY, _MORE = 20, 4
+"""Least number of stroboscopic states stored, and least excess over twice the longest cycle."""
 _PATIENCE = (32, 1e-5), (128, 1e-7)
 """Numbers of mesh periods after which a transient continues with a finer tolerance, each with the
 greatest value of that tolerance. The noise of coarser steps can hide that the motion repeats."""
@@ -72,10 +72,13 @@ def settle(  # 85 lines: its inner functions share the arguments.
     `integrator`: method and steps, with the tolerance at the start. The motion has settled if the
     last k + 1 states differ from the states k periods earlier by less than `tolerance` (scaled).
     For large states, the noise of the steps replaces `tolerance` if it is greater. k is the
-    smallest such period, at most `max_orbit` ≤ 8. Steps become finer after `_PATIENCE`. The
-    transient ends unsettled after `max_periods` mesh periods. `pieces`: as for `strobe`."""
-    orders = jnp.arange(1, max_orbit + 1)
-    age = jnp.arange(_MEMORY)[::-1]
+    smallest such period that the equation allows (`RotorPair.orders`), at most `max_orbit` ≤ 8,
+    rounded up where the equation repeats after several mesh periods. Steps become finer after
+    `_PATIENCE`. The transient ends unsettled after `max_periods` mesh periods. `pieces`: as for
+    `strobe`."""
+    orders, block = pair.orders(max_orbit), pair.whole(BLOCK)
+    stored = max(_MEMORY, 2 * pair.whole(max_orbit) + _MORE)
+    age = jnp.arange(stored)[::-1]
 
     def cycle(states, rtol):
         # In large states, the noise of adaptive steps is proportional to the state.
@@ -105,8 +108,8 @@ def settle(  # 85 lines: its inner functions share the arguments.
         for longest, fine in _PATIENCE:
             rtol = jnp.where(carry.periods < longest, rtol, jnp.minimum(rtol, fine))
         how = dataclasses.replace(integrator, rtol=rtol)
-        part = strobe(pair, carry.state, BLOCK, how, pieces)
-        memory = jnp.concatenate([memory[BLOCK:], part.states])
+        part = strobe(pair, carry.state, block, how, pieces)
+        memory = jnp.concatenate([memory[block:], part.states])
         end = part.states[-1]
         lost = pair.lost(end)
         sound = part.solved & ~lost & jnp.all(jnp.isfinite(end))
@@ -116,12 +119,12 @@ def settle(  # 85 lines: its inner functions share the arguments.
             period=jnp.where(sound, period, 0),
             nearest=nearest,
             spread=spread,
-            periods=carry.periods + BLOCK,
+            periods=carry.periods + block,
             lost=lost,
             solved=part.solved,
             steps=carry.steps + part.steps,
             pieces=jax.tree.map(
-                lambda old, x: jnp.concatenate([old[BLOCK:], x]), carry.pieces, part.pieces
+                lambda old, x: jnp.concatenate([old[block:], x]), carry.pieces, part.pieces
             ),
         )
         return new, memory
@@ -135,20 +138,24 @@ def settle(  # 85 lines: its inner functions share the arguments.
         lost=jnp.zeros((), bool),
         solved=jnp.ones((), bool),
         steps=jnp.zeros((), int),
-        pieces=None if pieces is None else no_pieces(state, max_orbit, pieces),
+        pieces=None if pieces is None else no_pieces(pair, state, max_orbit, pieces),
     )
-    memory = jnp.full((_MEMORY, *state.shape), jnp.inf, state.dtype)
+    memory = jnp.full((stored, *state.shape), jnp.inf, state.dtype)
     return lax.while_loop(go_on, advance, (start, memory))[0]
 
 
 def no_pieces(
-    state: Float[Array, " n"], longest: int, pieces: tuple[int, NDArray[np.float64]]
+    pair: RotorPair,
+    state: Float[Array, " n"],
+    longest: int,
+    pieces: tuple[int, NDArray[np.float64]],
 ) -> Pieces:
-    """Return the placeholder for `Transient.pieces` of a motion with states like `state` (n,).
+    """Return the placeholder for `Transient.pieces` of `pair`, with states like `state` (n,).
 
     `longest`: longest period of an orbit (mesh periods); `pieces`: as for `strobe`."""
     count, inside = pieces
-    shape = -(-longest // BLOCK) * BLOCK, count
+    block = pair.whole(BLOCK)
+    shape = -(-pair.whole(longest) // block) * block, count
     nothing = jnp.zeros(shape, state.dtype)
     states = jnp.zeros((*shape, *state.shape), state.dtype)
     return Pieces(nothing, states, jnp.zeros((*shape, len(inside), *state.shape), state.dtype))

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.dynamics.collocation.known import KnownOrbit
@@ -87,7 +88,7 @@ class Steady(NamedTuple):
         return jnp.where(self.held, jnp.zeros_like(found), found)
 
     @property
-    def held(self) -> Bool[Array, ""]:
+    def held(self) -> Bool[Array, ""] | np.bool_:
         """Whether the timing gear keeps the flanks apart, on a stable orbit.
 
         Without a torque that brings it back, a pair without contact can rest anywhere."""

@@ -185,7 +185,7 @@ def lyapunov(
     `state`."""
 
     def step(window: Window) -> Window:
-        return window.after(one_period(pair, window.start, integrator))
+        return window.after(one_period(pair.later(window.done), window.start, integrator))
 
     def goes_on(window: Window) -> Bool[Array, ""]:
         alive = window.solved & jnp.all(jnp.isfinite(window.start))
@@ -209,9 +209,9 @@ def integrated_difference(
     the solver fails."""
     state, forces = orbit
 
-    def step(_: Any, carry):
+    def step(number: Any, carry):
         here, total, solved = carry
-        made = one_period(pair, here, integrator)
+        made = one_period(pair.later(number), here, integrator)
         rates = jnp.append(made.response[:2], jnp.ones_like(made.duration))
         return made.end, total + made.duration * rates, solved & made.solved
 

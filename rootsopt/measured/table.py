@@ -97,6 +97,28 @@ def from_csv(data: bytes, name: str, unit: str | None = None) -> list[Loop]:
     ]
 
 
+def named_columns(data: bytes, name: str, titles: tuple[str, str]) -> NDArray[np.float64]:
+    """Return the numbers (n, 2) in the columns of a table that its first line calls `titles`.
+
+    `data`: content of the file; `name`: name of the file in messages. Raises `InputError` if the
+    table lacks a column, or a line a number."""
+    what = " and ".join(titles)
+    lines = [one for one in enumerate(_text(data, name).splitlines(), 1) if one[1].strip()]
+    lines = [(number, line) for number, line in lines if not _comment(line)]
+    split = next((c for c in ";\t," if lines and c in lines[0][1]), None)
+    with guarded(name, "is not a table that can be read", f"save it with the columns {what}"):
+        rows = [(number, [cell.strip() for cell in _cells(line, split)]) for number, line in lines]
+    first = rows[0][1] if rows else []
+    if missing := [title for title in titles if title not in first]:
+        raise InputError(
+            f"{name}: must name the columns {what} in its first line, but has no {missing[0]}; add "
+            f"the line {','.join(titles)}"
+        )
+    places = first.index(titles[0]), first.index(titles[1])
+    found = [_values(row, places, what, f"{name}, line {number}") for number, row in rows[1:]]
+    return np.array(found).reshape(-1, 2)
+
+
 def _comment(line: str) -> bool:
     cell = re.split(r"[\s;,]", line.strip(), maxsplit=1)[0]
     return cell.startswith("#") and not _LACKING.fullmatch(cell)

@@ -181,21 +181,21 @@ def _cell(value: Any) -> str:
 
 
 def write_config(folder: ResultFolder, config: "Config") -> None:
-    """Write config.yaml into `folder`, with a copy of the outline file if the config names one.
+    """Write config.yaml into `folder`, with copies of the files that the config names.
 
-    The written config names the copy, so that the folder can be moved. Raises `InputError` if the
-    outline file cannot be read or a file cannot be written."""
-    profile = config.profile
-    if profile.outline_file is not None:
-        source = sources.regular_file(profile.outline_file, "an outline")
-        copy = f"outline{source.suffix.lower()}"
+    The written config names the copies, so that the folder can be moved. Raises `InputError` if
+    a file cannot be read or written."""
+    for key, (stem, what) in sources.FILES.items():
+        if config.value(key) is None:
+            continue
+        source = sources.regular_file(config.value(key), what)
+        copy = f"{stem}{source.suffix.lower()}"
         try:
             data = source.read_bytes()
         except OSError as error:
             raise InputError(f"{str(source)!r}: cannot be read: {sources.reason(error)}") from None
         folder.write_bytes(copy, data)
-        profile = profile.model_copy(update={"outline_file": copy})
-        config = config.model_copy(update={"profile": profile})
+        config = config.moved({key: copy})
     folder.write_text("config.yaml", config.to_yaml())
 
 

@@ -24,6 +24,10 @@ _NAMES = {
     "residual": ("orbit residual", ""),
     "peak_norm_force_N": ("p-norm of the force", "N"),
     "knudsen_number": ("Knudsen number", ""),
+    "time_apart": ("share of time with the gear's teeth apart", ""),
+    "impacts_per_revolution": ("impacts of the gear's teeth per revolution", ""),
+    "greatest_impact_N_m": ("greatest torque of these impacts", "N·m"),
+    "silent_eccentricity_um": ("eccentricity up to which the gear is silent", "µm"),
     "sigma": ("standard deviation", ""),
     "quantile_95": ("95 % quantile", ""),
 }

@@ -112,7 +112,8 @@ def numbers_table(result: Record) -> Table | None:
         return [name, *map(value, numbers), *further]
 
     def rows(part: str) -> list[Row]:
-        given = [scalars(one.get(part) or {}) for one in records.values()]
+        found = [one.get(part) or {} for one in records.values()]
+        given = [scalars({**one, **one.get("gear_rattle", {})}) for one in found]
         keys = dict.fromkeys(key for one in given for key in one)
         changes = part != "steady_state"
         return [row(label(key), [one.get(key) for one in given], changes) for key in keys]

@@ -226,7 +226,9 @@ def orbit_loads(scene: Scene, design: Float[Array, " d"], orbit: VariedOrbit) ->
         return bearings.loads.switches(motion, np.zeros(0))
 
     # The loads have corners that the motion does not have, as where the gear's torque changes sign.
-    begins, ends, count = smooth_pieces(orbit.elements, loads_corners(bearings), flags)
+    begins, ends, count = smooth_pieces(
+        bearings.pair, orbit.elements, loads_corners(bearings), flags
+    )
     leaps, moves = _leaps(scene, orbit, (dynamic, static, moved))
     sides = leaps[:, None] + _ASIDE * np.array([-1.0, 1.0])
     # All instants in one array, so that the derivatives are compiled once.
@@ -273,9 +275,10 @@ def _leaps(scene: Scene, orbit: VariedOrbit, bearings) -> tuple[Array, Array]:
     times, moves = [jnp.zeros(0)], [jnp.zeros((0, variation.times.shape[1]))]
     openings = _openings(dynamic, static, moved) if scene.twist_free else None
     if openings is not None:
-        opened = (openings[0] + jnp.arange(LONGEST)[:, None]).ravel()
+        longest = eqx.combine(dynamic, static).pair.whole(LONGEST)
+        opened = (openings[0] + jnp.arange(longest)[:, None]).ravel()
         times.append(opened)
-        moves.append((opened < mesh.period)[:, None] * jnp.tile(openings[1], (LONGEST, 1)))
+        moves.append((opened < mesh.period)[:, None] * jnp.tile(openings[1], (longest, 1)))
     if eqx.combine(dynamic, static).pair.jumps:
         times.append(mesh.times)
         moves.append(variation.times)

@@ -83,6 +83,7 @@ def scene(config: Config) -> str:
     gear, away = data.timing_gear, data.center_distance_error_mm
     parts = (
         gear and f"a timing gear with {brief(gear.backlash_mm)} mm backlash",
+        gear and gear.errs and "errors of the gear over a turn",
         data.motor and "a motor whose speed falls under load",
         config.rotor.helix_deg and f"rotors twisted by {quantity(config.rotor.helix_deg, '°')}",
         config.contact.friction and "friction between the flanks",

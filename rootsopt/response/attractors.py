@@ -31,7 +31,8 @@ from rootsopt.scene import design_vector
 from rootsopt.status import Status
 
 _LONGEST = 8
-"""Maximum length of a cycle (mesh periods) that the search recognises."""
+"""Maximum length of a cycle (mesh periods) that the search recognises, unless the equation repeats
+only after several mesh periods (`RotorPair.whole`)."""
 _APART = 0.3
 """Scaled distance above which two motions always count as different."""
 _TRIES = 24
@@ -53,7 +54,7 @@ class Attractor:
 
     `evaluation` of the motion; `share` of the grid's initial states that lead to this motion;
     `reached`: whether the start from rest leads to this motion; `cycle` (k, n): stroboscopic states
-    of the motion, scaled.
+    of the motion, scaled, once each time the equation repeats.
     """
 
     evaluation: Evaluation
@@ -207,7 +208,7 @@ class _Sorter:
         if closed(evaluation):
             pair = self.evaluator.pair(self.design)
             states = _cycle(pair, evaluation.state, self.evaluator.scene.solver.orbit)
-            cycle = np.asarray(states)[: evaluation.steady_state["period"]]
+            cycle = np.asarray(states)[: evaluation.steady_state["period"] : pair.repeats]
             number = self._same(cycle[0])
         else:
             number = self._like(evaluation.status)
@@ -327,9 +328,10 @@ def _together(pair, states, *settings):
 
 @CachedFunction
 def _cycle(pair: RotorPair, state, integrator: Integrator):
-    """Return the scaled states (`_LONGEST`, n) at the starts of successive mesh periods, from
-    `state` on."""
-    return jnp.concatenate([state[None], strobe(pair, state, _LONGEST - 1, integrator).states])
+    """Return the scaled states (k, n) at the starts of successive mesh periods, from `state` on, as
+    many as the longest cycle has."""
+    count = pair.whole(_LONGEST) - 1
+    return jnp.concatenate([state[None], strobe(pair, state, count, integrator).states])
 
 
 @dataclasses.dataclass(frozen=True)

@@ -228,7 +228,7 @@ def _kind(evaluator: Evaluator, pair, members: Members, with_series):
     every = np.all(members.repeats, axis=0)
     kind: dict[str, Any] = {"kind": "transient"}
     if every.any():
-        kind = {"kind": "periodic", "period": int(np.argmax(every)) + 1}
+        kind = {"kind": "periodic", "period": (int(np.argmax(every)) + 1) * pair.repeats}
     if evaluator.survey or (every.any() and not with_series):
         return kind, None
     typical = int(np.argmin(np.any(members.repeats, axis=1)))

@@ -25,6 +25,7 @@ from rootsopt.dynamics.window import PERIODS, integrated_difference, lyapunov
 from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry
 from rootsopt.pump.loads import orbit_loads
+from rootsopt.pump.rattle import rattle_record, silent_limit, silent_record
 from rootsopt.response.many import HERE, IN_TURN, Point, Runs, evaluate_many
 from rootsopt.response.records import (
     RESPONSES,
@@ -477,6 +478,13 @@ class Evaluator:
         if idle:
             depth = orbit.depth if found.window is None else found.window.depth
             said = apart_message(self.config, float(depth), response.get(RESERVES[1]))
+        if pair.gear is not None and pair.gear.errors is not None:
+            steady |= rattle_record(pair, found)
+            if series:
+                limit = jax.device_get(silent_limit(self.scene, jnp.asarray(design)))
+                for name, (value, slope) in silent_record(limit).items():
+                    response[name] = value
+                    gradient[name] = dict(zip(self.keys, map(float, slope), strict=True))
         return Evaluation(
             design=dict(zip(self.keys, map(float, design), strict=True)),
             geometry=geometry_record(self.scene, shape),

@@ -21,8 +21,8 @@ from rootsopt.status import Status
 
 _MEMBERS = 4
 """Number of members in one call of the compiled program."""
-_MEMORY = 17
-"""Number of stroboscopic states stored, to recognise a motion that repeats."""
+_LONGEST = 8
+"""Longest period (mesh periods) of a motion that is recognised as repeating."""
 _REPEATS = 1e-2
 """Scaled difference between states below which a motion counts as repeating."""
 
@@ -33,7 +33,8 @@ class Members(NamedTuple):
     `means` (m, 3): mean force (N), mean square (N²) and mean of the peaks of all mesh periods (N);
     `drift`: mean force in the second half of the window minus that in the first (N); `greatest`:
     greatest force (N); `depth`: greatest penetration (m; negative: least gap); `states` (m, n):
-    last scaled states; `repeats` (m, 8): whether the last states repeat after 1 … 8 mesh periods;
+    last scaled states; `repeats` (m, k): whether the last states repeat after each of k periods, 1
+    … 8 mesh periods or whole turns (`RotorPair.orders`);
     `lost`, `stalled`: see `RotorPair`; `solved`: whether the solver succeeded."""
 
     means: Float[Array, "m 3"]
@@ -41,7 +42,7 @@ class Members(NamedTuple):
     greatest: Float[Array, " m"]
     depth: Float[Array, " m"]
     states: Float[Array, "m n"]
-    repeats: Bool[Array, "m 8"]
+    repeats: Bool[Array, "m k"]
     lost: Bool[Array, " m"]
     stalled: Bool[Array, " m"]
     solved: Bool[Array, " m"]
@@ -152,16 +153,16 @@ def member(
     dtype = state.dtype
     none, low = jnp.zeros((), dtype), jnp.full((), -jnp.inf, dtype)
 
-    def pass_by(_, carry):
+    def pass_by(index, carry):
         state, solved = carry
-        out = strobe(pair, state, 1, integrator)
+        out = strobe(pair.later(index), state, 1, integrator)
         return out.states[-1], solved & out.solved
 
     half = periods // 2
 
     def count(index, carry):
         state, solved, means, drift, greatest, depth, memory = carry
-        out = one_period(pair, state, integrator)
+        out = one_period(pair.later(settle).later(index), state, integrator)
         return (
             out.end,
             solved & out.solved,
@@ -173,12 +174,12 @@ def member(
         )
 
     settled = lax.fori_loop(0, settle, pass_by, (state, jnp.ones((), bool)))
-    memory = jnp.full((_MEMORY, *state.shape), jnp.inf, dtype)
+    longest = pair.whole(_LONGEST)
+    memory = jnp.full((2 * longest + 1, *state.shape), jnp.inf, dtype)
     start = *settled, jnp.zeros(3, dtype), none, none, low, memory
     end, solved, means, drift, greatest, depth, memory = lax.fori_loop(0, periods, count, start)
-    apart = jnp.stack(
-        [jnp.max(jnp.abs(memory[k:] - memory[:-k])[-k - 1 :]) for k in range(1, _MEMORY // 2 + 1)]
-    )
+    orders = range(pair.repeats, longest + 1, pair.repeats)
+    apart = jnp.stack([jnp.max(jnp.abs(memory[k:] - memory[:-k])[-k - 1 :]) for k in orders])
     return Members(
         means=means / periods,
         drift=drift / jnp.maximum(half, 1),

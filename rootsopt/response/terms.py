@@ -20,6 +20,7 @@ from rootsopt.profiles import Geometry, Profile, geometry
 from rootsopt.pump import flow
 from rootsopt.pump.leakage import leakage
 from rootsopt.pump.loads import still_loads
+from rootsopt.pump.rattle import SILENT, silent_eccentricity
 from rootsopt.pump.sheet import MRAD, play_of, ripple_of
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene
@@ -173,6 +174,23 @@ def _medium(scene: Scene, name: str) -> Medium:
             "`pump.pressure_difference_Pa`"
         )
     return scene.medium
+
+
+class SilentTerm(Term):
+    """A term whose value is the eccentricity (µm) up to which the timing gear does not rattle.
+
+    The scene must have a timing gear with errors."""
+
+    sense: ClassVar[Literal["min", "max"]] = "max"
+
+    def value(self, scene, profile, shape, forces):
+        del forces
+        if scene.gear is None or scene.gear.errors is None:
+            raise InputError(
+                f"the term `{SILENT}` needs a timing gear with errors; set "
+                "`scene.timing_gear.eccentricity_um`, which may be 0"
+            )
+        return silent_eccentricity(scene, profile, shape)[0] / UM
 
 
 class InertiaTerm(Term):
@@ -399,6 +417,7 @@ def _own() -> dict[str, Any]:
         "gear_backlash_max_mm": BacklashTerm(),
         "leakage_fraction": LossTerm(),
         "angular_play_min_mrad": PlayTerm(),
+        SILENT: SilentTerm(),
         "flank_gap_min_um": GapTerm(mean=False),
         "flank_gap_mean_um": GapTerm(mean=True),
         "static_bearing_load_max_N": StaticBearingTerm(equivalent=False),

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from rootsopt.config import Config
-from rootsopt.config.sources import reason, regular_file
+from rootsopt.config.sources import FILES, reason, regular_file
 from rootsopt.config.words import shown
 from rootsopt.errors import InputError
 from rootsopt.runtime.versions import versions
@@ -144,15 +144,15 @@ def header_of(
     command: str,
     config: Config,
     imports: Sequence[str] = (),
-    outlines: Sequence[str | None] = (),
+    others: Sequence[str | None] = (),
     **more: Any,
 ) -> dict[str, Any]:
     """Return everything on which the results of a `command` depend, as plain values.
 
-    `imports`: names of the files and modules that were imported first; `outlines`: paths of outline
-    files beside the config's own; `more`: further entries. Raises `InputError` if a file cannot be
+    `imports`: names of the files and modules that were imported first; `others`: paths of files
+    that replace the config's own; `more`: further entries. Raises `InputError` if a file cannot be
     read."""
-    files = {path for path in (config.profile.outline_file, *outlines) if path is not None}
+    files = {path for path in (*map(config.value, FILES), *others) if path is not None}
     files |= {name for name in imports if os.path.isfile(name)}
     return {
         "command": command,

@@ -249,6 +249,15 @@ class Scene(eqx.Module):
         lobes = jnp.asarray(float(self.lobes))
         return WornContact(found, wear_series(profile, self.wear), lobes)
 
+    def gear_of(self, inertia: Float[Array, ""]) -> TimingGear | None:
+        """Return the timing gear between rotors of this `inertia` (kg·m²), with its damping."""
+        gear = self.gear
+        if gear is None:
+            return None
+        # I_r = I1 I2 / (I1 + I2) of two equal rotors.
+        damping = 2 * self.gear_damping_ratio * jnp.sqrt(gear.stiffness * inertia / 2)
+        return eqx.tree_at(lambda g: g.damping, gear, gear.damping + damping)
+
     def _drive(self, load: Load) -> Drive:
         """Return the drive of a pair under `load`.
 
@@ -318,11 +327,7 @@ class Scene(eqx.Module):
         shape = geometry(profile)
         inertia = self.inertia(shape)
         contact = self.contact(profile)
-        gear = self.gear
-        if gear is not None:
-            # I_r = I1 I2 / (I1 + I2) of two equal rotors.
-            damping = 2 * self.gear_damping_ratio * jnp.sqrt(gear.stiffness * inertia / 2)
-            gear = eqx.tree_at(lambda g: g.damping, gear, gear.damping + damping)
+        gear = self.gear_of(inertia)
         force = jnp.maximum(self.load_torque, 1e-3) / self.pitch_radius
         angle = self.law.depth_at(force) / self.pitch_radius
         for part in (gear, *self.extra):

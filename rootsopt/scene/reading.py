@@ -1,5 +1,6 @@
 """Converts a config into the parts of a scene: SI quantities, contact law, parts, solver."""
 
+from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
@@ -7,12 +8,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rootsopt.config import Config
-from rootsopt.config.units import DEG, MM, RPM
+from rootsopt.config.units import DEG, MM, RPM, UM
 from rootsopt.contact.impact import ImpactLaw
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.measures import Measures
-from rootsopt.dynamics.parts import Friction, MotorDrive, Supports, TimingGear
+from rootsopt.dynamics.parts import Friction, GearErrors, MotorDrive, Supports, TimingGear
 from rootsopt.dynamics.steady import Solver
+from rootsopt.measured.transmission import transmission_error
 
 _ORBIT_STEPS = 4
 """Limit on the number of solver steps for a whole orbit, as a multiple of the number that the
@@ -82,6 +84,28 @@ def gear_of(config: Config) -> TimingGear | None:
         half_backlash=jnp.asarray(gear.backlash_mm * MM / (2 * radius)),
         rounding=jnp.asarray(config.contact.rounding_mm * MM / radius),
         offset=_optional(config.scene.phase_error_mrad, 1e-3),
+        errors=_errors_of(config) if gear.errs else None,
+    )
+
+
+def _errors_of(config: Config) -> GearErrors:
+    """Return the errors of a config's timing gear.
+
+    Raises `InputError` if the table of the transmission error cannot be used."""
+    gear, bearings = config.scene.timing_gear, config.scene.bearings
+    assert gear is not None
+    radius = config.profile.pitch_radius_mm * MM
+    sizes, angles = gear.run_out
+    knots = measured = None
+    if gear.transmission_error_file is not None:
+        turned, powers = transmission_error(Path(gear.transmission_error_file))
+        knots, measured = jnp.asarray(turned), jnp.asarray(powers / radius)
+    return GearErrors(
+        eccentricity=jnp.asarray(sizes) * UM / radius,
+        angle=jnp.asarray(angles) * DEG,
+        tooth_angle=_optional(bearings and bearings.gear_pressure_angle_deg, DEG),
+        knots=knots,
+        measured=measured,
     )
 
 

@@ -9,6 +9,7 @@ from pydantic import BaseModel
 from rootsopt.config import Config
 from rootsopt.config.families import families, family_of, find_installed, parameters
 from rootsopt.config.section import bare
+from rootsopt.config.sources import FILES
 from rootsopt.config.words import sentence
 from rootsopt.errors import InputError
 from rootsopt.response.evaluation import Evaluation, Evaluator
@@ -19,17 +20,17 @@ from rootsopt.status import Status
 Row = dict[str, Any]
 """Record of one point as plain values: `status` (label), `message`, `response`, `gradient`,
 `steady_state`, `geometry`. Dictionaries are empty if nothing is known."""
-_FAMILY, _OUTLINE = "profile.family", "profile.outline_file"
+_FAMILY = "profile.family"
 
 
 def prepared(key: str, value: Any) -> Any:
     """Return a value of an axis in the form that a config on any worker needs.
 
-    The path of an outline file becomes absolute: workers may run in another folder. If the value is
+    The path of a file becomes absolute: workers may run in another folder. If the value is
     a family of an installed package, the package is loaded."""
     if not isinstance(value, str):
         return value
-    if key == _OUTLINE:
+    if key in FILES:
         return str(Path(value).absolute())
     if key == _FAMILY and bare(value) not in map(bare, families()):
         find_installed(value)

@@ -10,6 +10,7 @@ from typing import Any
 import xarray
 
 from rootsopt.config import Config
+from rootsopt.config.sources import FILES
 from rootsopt.runtime.journal import Journal, header_of
 from rootsopt.runtime.precision import check_precision
 from rootsopt.sweeps.local import in_process
@@ -155,9 +156,9 @@ class Points(Journal):
         resume: bool = False,
     ):
         self._count = plan.count
-        columns = (one.columns.get("profile.outline_file", ()) for one in plan.dimensions)
-        outlines = [path for column in columns for path in column]
-        header = header_of("sweep", config, imports, outlines, sweep=plan.record())
+        columns = [one.columns.get(key, ()) for one in plan.dimensions for key in FILES]
+        files = [path for column in columns for path in column]
+        header = header_of("sweep", config, imports, files, sweep=plan.record())
         super().__init__(header, path, resume)
 
     def read(self, key: Any, value: Any) -> Row:

@@ -25,6 +25,7 @@ from rootsopt.scene import Scene, design_vector
 from rootsopt.status import Status
 
 SPEED, BACKLASH = "scene.speed_rpm", "scene.timing_gear.backlash_mm"
+ECCENTRICITY = "scene.timing_gear.eccentricity_um"
 TORQUE, INVOLUTE = "scene.load.torque_N_m", "profile.involute_length_mm"
 SCENE = (
     "scene.load.torque_N_m=4.775",
@@ -217,6 +218,7 @@ MOTOR = (
         ("cic", (), TORQUE, (1, 10)),
         ("cic", (), BACKLASH, (0.05, 0.4)),
         ("cic", (), "scene.timing_gear.damping_ratio", (0.1, 0.6)),
+        ("cic", (f"{ECCENTRICITY}=5",), ECCENTRICITY, (1, 20)),
         ("cic", (), INVOLUTE, (5, 9)),
         ("free", (), "profile.coefficients_2", (0.2, 0.4)),
         ("ee", (), "contact.clearance_mm", (0.0, 0.01)),
@@ -228,7 +230,8 @@ MOTOR = (
 )
 def test_scenes_along_a_curve_are_those_of_the_configs(monkeypatch, name, changes, key, ends):
     """Scene and design at 30 % of the range are those of a config with this value."""
-    pair = types.SimpleNamespace(angle_scale=jnp.asarray(1e-3), smooth=True)
+    pair = types.SimpleNamespace(angle_scale=jnp.asarray(1e-3), smooth=True, repeats=1)
+    pair.whole = lambda periods: periods
     monkeypatch.setattr("rootsopt.continuation.family._pair", lambda *scene: pair)
     config = load(f"configs/{name}.yaml", list(changes))
     family = OrbitFamily(config, key, 1, StepSizes(*ends))

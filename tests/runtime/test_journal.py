@@ -252,7 +252,7 @@ def test_what_differs_is_named(path, tmp_path):
     plan = plan_of({SPEED: "1,2"})
     rotor = tmp_path / "rotor.csv"
     rotor.write_text("1,2")
-    files = {"imports": [], "outlines": [str(rotor), None]}
+    files = {"imports": [], "others": [str(rotor), None]}
     head = header_of("sweep", CIC, **files, sweep=plan.record())
     journal = Journal(head, path)
     journal.add([(0, ROW)])
@@ -276,7 +276,7 @@ def test_what_differs_is_named(path, tmp_path):
     with pytest.raises(InputError, match="there is no"):
         Journal({}, path.with_name("absent"), resume=True)
     with pytest.raises(InputError, match="cannot be read"):
-        header_of("sweep", CIC, outlines=[str(tmp_path / "absent.csv")])
+        header_of("sweep", CIC, others=[str(tmp_path / "absent.csv")])
 
 
 def test_sweep_goes_on_where_it_stopped(path, monkeypatch):

@@ -33,11 +33,12 @@ its own events."""
 
 
 def room_for(pair: RotorPair, periods: int) -> tuple[int, int]:
-    """Return the `sizes` for orbits of `pair` of up to this number of mesh periods."""
+    """Return the `sizes` for orbits of `pair` of up to this number of mesh periods, or the next
+    greater one after which the equation repeats."""
     contact = innermost(pair.contact)
     profile = contact.pair.profile if isinstance(contact, SearchContact) else None
     crowded = profile is not None and (profile.wavy or profile.forked)
-    return sizes(periods, pair.contact.sections, crowded)
+    return sizes(pair.whole(periods), pair.contact.sections, crowded)
 
 
 def sizes(periods: int, slices: int, crowded: bool) -> tuple[int, int]:

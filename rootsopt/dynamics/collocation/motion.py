@@ -70,7 +70,7 @@ def closed_orbit(
     verified = sound & (closed.error <= jnp.maximum(UNREFINED * ACCURACY * tolerance, _ROUNDED))
     period = jnp.round(found.elements.mesh.period).astype(int)
     # The transient may have mistaken several periods of the orbit for one.
-    shorter = _repeats(found, period, settings.max_orbit, tolerance) * sound
+    shorter = _repeats(pair, found, period, settings.max_orbit, tolerance) * sound
     verified &= shorter == 0
     residual = jnp.where(sound, found.correction, jnp.inf)
     orbit = _as_orbit(pair, found, residual, closed)
@@ -78,14 +78,18 @@ def closed_orbit(
 
 
 def _repeats(
-    found: OrbitForces, period: Int[Array, ""], longest: int, tolerance: Float[Array, ""]
+    pair: RotorPair,
+    found: OrbitForces,
+    period: Int[Array, ""],
+    longest: int,
+    tolerance: Float[Array, ""],
 ) -> Int[Array, ""]:
     """Return the least fraction of the orbit's `period` (mesh periods) after which it repeats, or
     0.
 
-    `longest`: longest period of an orbit (mesh periods); `tolerance`: that of the orbit's
-    integrator."""
-    shorter = jnp.arange(1, max(longest // 2, 1) + 1)
+    Only a fraction after which the equation of `pair` repeats counts. `longest`: longest period of
+    an orbit (mesh periods); `tolerance`: that of the orbit's integrator."""
+    shorter = pair.orders(max(longest // 2, 1))
     states = found.elements.motion(shorter.astype(found.state.dtype))
     limit = jnp.maximum(_REPEATS[0] * tolerance, _REPEATS[1])
     same = jnp.max(jnp.abs(states - found.state), axis=1) < limit

@@ -3,7 +3,7 @@
 from rootsopt.dynamics.parts.base import Context, Loads, Motion, Own, Part, Units
 from rootsopt.dynamics.parts.drive import Drive, MotorDrive, PrescribedDrive
 from rootsopt.dynamics.parts.friction import Friction
-from rootsopt.dynamics.parts.gear import TimingGear
+from rootsopt.dynamics.parts.gear import GearErrors, TimingGear
 from rootsopt.dynamics.parts.load import ConstantLoad, GasLoad, Load, TwistedLoad
 from rootsopt.dynamics.parts.resultants import AxisLoads, GasResultant
 from rootsopt.dynamics.parts.supports import Supports
@@ -16,6 +16,7 @@ __all__ = [
     "Friction",
     "GasLoad",
     "GasResultant",
+    "GearErrors",
     "Load",
     "Loads",
     "Motion",

@@ -104,6 +104,12 @@ class Part(eqx.Module):
         return False
 
     @property
+    def whole_turns(self) -> bool:
+        """Whether the part's loads repeat only after a whole turn of rotor 1, instead of each mesh
+        period."""
+        return False
+
+    @property
     def displaces(self) -> bool:
         """Whether the part lets the axes move (see `axes`). Only one part of a scene can do so."""
         return False
@@ -245,6 +251,11 @@ class Part(eqx.Module):
         these.
         """
         return ()
+
+    def edges_at(self, phi: Float[Array, ""]) -> tuple[Float[Array, ""], ...]:
+        """Return the `edges` at φ1 = `phi` (rad), for a part of `whole_turns` whose edges move."""
+        del phi
+        return self.edges
 
     @property
     def holding_stiffness(self) -> Float[Array, ""] | None:

@@ -150,7 +150,7 @@ class AxisLoads(Part):
         """Return the force (N) of the teeth on rotor 2, x and y; on rotor 1 it is the opposite."""
         if self.gear is None:
             return jnp.zeros(2, motion.relative.dtype)
-        across = -self.gear(motion.relative, motion.rate) / self.radius
+        across = -self.gear.torque_on_1(motion, np.zeros(0)) / self.radius
         return jnp.stack([jnp.abs(across) * jnp.tan(self.tooth_angle), across])
 
     def force_on_axes(self, motion, own) -> Float[Array, "2 2"]:
@@ -167,7 +167,7 @@ class AxisLoads(Part):
         del own
         flags = []
         if self.gear is not None:
-            flags.append((self.gear(motion.relative, motion.rate) > 0)[None])
+            flags.append((self.gear.torque_on_1(motion, np.zeros(0)) > 0)[None])
         if self.gas is not None:
             flags.append(self.gas.passed(motion.phi))
         return jnp.concatenate(flags) if flags else jnp.zeros(0, bool)

@@ -1,0 +1,204 @@
+"""Motions of a pair whose gear errs over a turn, against closed forms and SciPy."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import rootsopt
+from rootsopt.contact.impact import balanced_ramp, balanced_step
+from rootsopt.dynamics.closed import Start, steady_motion
+from rootsopt.dynamics.flow import one_period, strobe
+from rootsopt.dynamics.integrator import Integrator
+from rootsopt.dynamics.measures import Measures
+from rootsopt.dynamics.parts import GearErrors, Part
+from rootsopt.dynamics.steady import Solver
+from rootsopt.dynamics.timescales import Timescales
+from rootsopt.dynamics.window import lyapunov
+from rootsopt.scene import Scene, design_vector
+from rootsopt.status import Status
+from tests.standins import (
+    DAMPING,
+    HALF_BACKLASH,
+    INERTIA,
+    LOAD,
+    SCALE,
+    SPEED,
+    STIFFNESS,
+    oscillator,
+)
+
+HOW = Integrator("tsit5", jnp.asarray(1e-9), 4096)
+SIZE, ANGLE, TOOTH = np.array([4e-5, 3e-5]), np.array([0.3, -1.1]), 0.35
+
+
+def erring(lobes, size=SIZE):
+    """A pair whose gears are eccentric, and whose flanks never touch."""
+    pair = oscillator(lobes=lobes)
+    errors = GearErrors(*map(jnp.asarray, (size, ANGLE, TOOTH)))
+    pair = eqx.tree_at(lambda p: p.gear.errors, pair, errors, is_leaf=lambda x: x is None)
+    scales = (1e-3, 0.02, 1.0)  # Teeth swing fast, and the load closes the backlash slowly.
+    times = Timescales(*map(jnp.asarray, scales))
+    return eqx.tree_at(lambda p: p.timescales, pair, times, is_leaf=lambda x: x is None)
+
+
+def limits(time, size=SIZE):
+    """Return ε at both ends of the play, and their rates, from displacements of the centres."""
+    turn = SPEED * time + ANGLE
+    away, across = -np.sum(size * np.cos(turn)), size @ (np.sin(turn) * [1, -1])
+    moving = np.sum(size * np.sin(turn)), size @ (np.cos(turn) * [1, -1])
+    ends = [across + side * (HALF_BACKLASH + np.tan(TOOTH) * away) for side in (-1, 1)]
+    return ends, [SPEED * (moving[1] + side * np.tan(TOOTH) * moving[0]) for side in (-1, 1)]
+
+
+def slope(time, state, size=SIZE):
+    (low, high), rates = limits(time, size)
+    relative, rate = state
+    torque = 0.0
+    for end, moving, beyond in zip(
+        (low, high), rates, (relative < low, relative > high), strict=True
+    ):
+        if beyond:
+            torque += STIFFNESS * (relative - end) + DAMPING * (rate - moving)
+    return [rate, (-LOAD - torque) / INERTIA]
+
+
+@pytest.mark.parametrize(
+    "lobes", [2, 5, *(pytest.param(count, marks=pytest.mark.long) for count in (3, 4, 6))]
+)
+def test_orbit_is_closed_after_a_turn(lobes):
+    """The silent orbit is the linear motion at every number of lobes, and stops at one turn."""
+    pair = erring(lobes)
+    number = jnp.asarray(8.0)
+    solver = Solver(HOW, HOW, Measures(), 40 * number, 0 * number, 8)
+    tangents = jax.tree.map(
+        lambda x: jnp.zeros((0, *x.shape)), eqx.filter(pair, eqx.is_inexact_array)
+    )
+    tangents = eqx.combine(tangents, pair)
+    start = Start.at(pair, jnp.zeros(2), solver.max_orbit)
+    found = eqx.filter_jit(steady_motion)(pair, tangents, start, jnp.asarray(0.03), solver)
+    assert Status.of(int(found.status)) is Status.IDLE
+    assert int(found.period) == pair.repeats == lobes
+    assert found.known.elements.mesh.times.shape[0] >= 64 * 2
+    drive = np.array([limits(t)[0][0] for t in 2 * np.pi / SPEED * np.arange(8) / 8])
+    error = 2 * np.fft.fft(drive)[1] / 8
+    spring = STIFFNESS + 1j * SPEED * DAMPING
+    swing = -INERTIA * SPEED**2 * error / (spring - INERTIA * SPEED**2)
+    wanted = error.real - HALF_BACKLASH - LOAD / STIFFNESS - swing.real
+    assert float(found.orbit.state[0]) * SCALE == pytest.approx(wanted, rel=1e-7)
+
+
+def test_every_way_of_integrating_keeps_the_phase():
+    """Mesh periods in a row, one after the other, and in a window are one motion of SciPy's."""
+    size = 3 * SIZE
+    pair, period = erring(3, size), 2 * np.pi / (3 * SPEED)
+    ends = period * np.arange(1, 17)
+    how = {"rtol": 1e-11, "atol": 1e-14, "max_step": period / 500, "t_eval": ends}
+    wanted = solve_ivp(functools.partial(slope, size=size), (0, ends[-1]), [0, 0], **how).y.T
+    wanted = wanted * [1 / SCALE, period / SCALE]
+    states = eqx.filter_jit(strobe)(pair, jnp.zeros(2), 16, HOW).states
+    np.testing.assert_allclose(states, wanted, atol=2e-5)
+    later = eqx.filter_jit(strobe)(pair.later(5), states[4], 2, HOW).states
+    np.testing.assert_allclose(later, states[5:7], atol=1e-9)
+    once = eqx.filter_jit(one_period)(pair.later(4).later(1), states[4], HOW)
+    np.testing.assert_allclose(once.end, states[5], atol=1e-6)
+    window = eqx.filter_jit(lyapunov)(pair, jnp.zeros(2), 16, HOW)
+    np.testing.assert_allclose(window.end, states[15], atol=1e-4)
+
+
+class Plain(Part):
+    """A timing gear that knows of no errors."""
+
+    stiffness: jax.Array
+    damping: jax.Array
+    half_backlash: jax.Array
+    rounding: jax.Array
+
+    def torque(self, relative, rate):
+        excess = jnp.abs(relative) - self.half_backlash
+        engaged = jnp.where(
+            self.rounding > 0,
+            balanced_step(excess / jnp.where(self.rounding > 0, self.rounding, 1.0)),
+            jnp.where(excess > 0, 1.0, 0.0),
+        )
+        spring = self.stiffness * jnp.sign(relative) * balanced_ramp(excess, self.rounding)
+        return spring + self.damping * engaged * rate
+
+    def torque_on_2(self, motion, own):
+        del own
+        return -self.torque(motion.relative, motion.rate)
+
+    def margins(self, motion, own):
+        del own
+        excess = jnp.abs(motion.relative) - self.half_backlash
+        return excess - jnp.stack([jnp.zeros_like(self.rounding), self.rounding])
+
+    def switches(self, motion, own):
+        return self.margins(motion, own) > 0
+
+    @property
+    def edges(self):
+        return 0.0 + self.half_backlash, 0.0 - self.half_backlash
+
+
+def test_absent_errors_add_nothing():
+    """Without errors, programs are those of a gear that knows of none."""
+    scene = Scene.from_config(rootsopt.load_config("cic"))
+    pair = scene.pair(jnp.asarray(rootsopt.load_config("cic").design))
+    assert pair.later(2) is pair
+    assert pair.repeats == 1
+    gear = pair.gear
+    plain = Plain(gear.stiffness, gear.damping, gear.half_backlash, gear.rounding)
+    plain = eqx.tree_at(lambda p: p.gear, pair, plain)
+    programs = []
+    for own in (pair, plain):
+        numbers, static = eqx.partition(own, eqx.is_array)
+
+        def whole(numbers, static=static):
+            own = eqx.combine(numbers, static)
+            strobed = strobe(own, jnp.zeros(2), 4, HOW, (4, np.array([0.5])))
+            window = lyapunov(own, jnp.zeros(2), 16, HOW)
+            return strobed, window, own.derivative_and_margins(jnp.zeros(()), jnp.zeros(2))
+
+        programs.append(str(jax.make_jaxpr(whole)(numbers)))
+    assert programs[0] == programs[1]
+
+
+def _leaves(scene):
+    errors = scene.gear.errors
+    return errors.eccentricity, errors.angle, scene.gear.half_backlash
+
+
+def test_gradient_of_forces_is_that_of_differences():
+    """Flanks in contact: derivatives by eccentricities, angles, backlash and pressure angle."""
+    changes = ["eccentricity_um=[10, 4]", "eccentricity_angle_deg=[30, -50]"]
+    config = rootsopt.load_config("cic", [f"scene.timing_gear.{change}" for change in changes])
+    scene, design = Scene.from_config(config), design_vector(config)
+    units = np.array([1e-4, 1e-4, 0.3, 0.3, 1e-3, 1.0])
+
+    @eqx.filter_jit
+    def found(change, start):
+        def forces(change):
+            gear = scene.gear
+            errors = gear.errors
+            by = change * units
+            moved = errors.eccentricity + by[:2], errors.angle + by[2:4], gear.half_backlash + by[4]
+            response = rootsopt.steady_response(
+                eqx.tree_at(_leaves, scene, moved), design.at[0].add(by[5]), start
+            )
+            return jnp.stack([response.mean, response.peak, response.rms]), response
+
+        return jax.jacfwd(lambda x: (lambda v, r: (v, (v, r)))(*forces(x)), has_aux=True)(change)
+
+    slopes, (_, response) = found(jnp.zeros(6), None)
+    assert Status.of(int(response.status)) is Status.PERIODIC
+    assert int(response.period) == 3
+    for direction in np.random.default_rng(5).normal(size=(2, 6)):
+        step = 1e-3 * jnp.asarray(direction)
+        ahead, behind = (found(x, response.start)[1][0] for x in (step, -step))
+        differences = (ahead - behind) / 2e-3
+        np.testing.assert_allclose(slopes @ direction, differences, rtol=1e-4)
