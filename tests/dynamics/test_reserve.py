@@ -1,0 +1,212 @@
+"""Tests of the reserve of flanks that stay apart, of the torque of the gear that keeps them apart,
+and of searches that simulate nothing."""
+
+import functools
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from matplotlib.path import Path
+from scipy.spatial import cKDTree
+from scipy.stats import norm
+
+import rootsopt
+from rootsopt.config import load
+from rootsopt.pump.sheet import play_of
+from rootsopt import steady_response
+from rootsopt.response import evaluation
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.touching import touching
+from rootsopt.scene import Scene, outline_mm
+from rootsopt.status import Status
+
+APART = ["contact.clearance_mm=0.15", "scene.timing_gear.backlash_mm=0.04"]
+RESERVES = "contact_reserve_um", "backlash_reserve_mm"
+
+
+@functools.cache
+def evaluator():
+    """Return the evaluator of a pair of CIC rotors whose flanks stay apart."""
+    return Evaluator.of(load("cic", APART)).at_tolerance(1e-10)
+
+
+@functools.cache
+def held():
+    return evaluator()()
+
+
+def swing(config):
+    """Return |ε| (rad) at which the gear carries a constant load."""
+    gear = config.scene.timing_gear
+    half = gear.backlash_mm / (2 * config.profile.pitch_radius_mm)
+    return half + config.scene.load.torque_N_m / gear.stiffness_N_m_per_rad
+
+
+def test_reserve_is_the_distance_of_polygons():
+    """Without clearance, the outlines would overlap: the least gap is what the clearance leaves."""
+    config, outline = evaluator().config, outline_mm(evaluator().config)
+    points, lobes = outline[:, 0] + 1j * outline[:, 1], config.profile.lobes
+    tree, path = cKDTree(outline), Path(outline)
+    edges = np.roll(outline, -1, axis=0) - outline
+    lengths = np.hypot(*edges.T)
+    depths = []
+    for phi in np.linspace(0, 2 * np.pi / lobes, 90, endpoint=False):
+        # Rotor 2 turns against rotor 1, with a valley towards it at φ = 0, and lags by |ε|. It is
+        # seen from rotor 1.
+        other = points * np.exp(1j * (np.pi - np.pi / lobes - (phi - swing(config))))
+        seen = (other + 2 * config.profile.pitch_radius_mm) * np.exp(-1j * phi)
+        seen = np.column_stack([seen.real, seen.imag])
+        seen = seen[path.contains_points(seen)]
+        _, near = tree.query(seen)
+        across = []
+        for k in (near, (near - 1) % len(outline)):
+            x, y = (seen - outline[k]).T
+            across.append(np.abs(edges[k, 0] * y - edges[k, 1] * x) / lengths[k])
+        depths.append(np.max(np.min(across, axis=0), initial=0.0))
+    assert held().status is Status.IDLE
+    expected = 1e3 * (config.contact.clearance_mm - max(depths))
+    assert held().response["contact_reserve_um"] == pytest.approx(expected, abs=0.5)
+
+
+def test_backlash_reserve_is_that_of_the_play():
+    """The gear may have as much backlash as the play allows, less its deflection under the load."""
+    config, scene = evaluator().config, evaluator().scene
+    most = float(play_of(scene, scene.profile(jnp.asarray(config.design))).gear_backlash) / 1e-3
+    used = 2 * config.profile.pitch_radius_mm * swing(config)
+    assert held().response["backlash_reserve_mm"] == pytest.approx(most - used, rel=1e-4)
+
+
+@pytest.mark.parametrize("clearance", [0.15, 0.02])
+def test_gradients_are_those_of_differences(clearance):
+    """This holds for flanks that stay apart, and for flanks that touch."""
+    one = Evaluator.of(load("cic", [*APART, f"contact.clearance_mm={clearance}"]))
+    one = one.at_tolerance(1e-11)
+    here, way = one(), np.array([1.0, -0.7, 0.8])
+    assert here.status is (Status.IDLE if clearance > 0.1 else Status.PERIODIC)
+    assert (here.response["contact_reserve_um"] > 0) == (clearance > 0.1)
+    design, step = np.array([*here.design.values()]), 1e-3
+    ends = [one(design + sign * step * way, start=here.start) for sign in (1, -1)]
+    # The torque of a gear that carries a constant load does not depend on the design.
+    names = [*RESERVES] + ["gear_force_N", "rms_gear_torque_N_m"] * (clearance < 0.1)
+    for name in names:
+        slope = np.subtract(*(end.response[name] for end in ends)) / (2 * step)
+        row = np.array([*here.gradient[name].values()])
+        assert row @ way == pytest.approx(slope, abs=2e-5 * np.max(np.abs(row)))
+
+
+def test_reserve_is_continuous_where_the_flanks_begin_to_touch():
+    """It falls by the clearance until they touch, and is less than 0 there."""
+    first = held().response["contact_reserve_um"]
+    found = []
+    for left in (1.0, 0.01, -0.01):
+        clearance = 0.15 - 1e-3 * (first - left)
+        config = load("cic", [*APART, f"contact.clearance_mm={clearance}"])
+        found.append(Evaluator.of(config)().response["contact_reserve_um"])
+    assert found[:2] == pytest.approx([1.0, 0.01], abs=1e-3)
+    assert -0.1 < found[2] < 0
+
+
+def test_torque_of_a_gear_that_carries_a_constant_load():
+    response, config = held().response, evaluator().config
+    load_N_m = config.scene.load.torque_N_m
+    for name in ("gear_torque_N_m", "mean_gear_torque_N_m", "rms_gear_torque_N_m"):
+        assert response[name] == pytest.approx(load_N_m, rel=1e-6)
+    radius = config.profile.pitch_radius_mm / 1e3
+    assert response["gear_force_N"] == pytest.approx(load_N_m / radius, rel=1e-6)
+
+
+def test_torque_of_a_gear_of_flanks_that_strike():
+    """Mean, greatest and RMS torque are those of the formula of the gear along the series."""
+    found = Evaluator.of(load("cic", ["contact.clearance_mm=0.02"])).at_tolerance(1e-10)()
+    config = load("cic", ["contact.clearance_mm=0.02"])
+    gear, pair = config.scene.timing_gear, evaluator().pair(config.design)
+    half = gear.backlash_mm / (2 * config.profile.pitch_radius_mm)
+    inertia = float(pair.inertia) / 2
+    damping = 2 * gear.damping_ratio * np.sqrt(gear.stiffness_N_m_per_rad * inertia)
+    beyond = np.abs(found.series.relative) - half
+    spring = gear.stiffness_N_m_per_rad * np.sign(found.series.relative) * np.maximum(beyond, 0)
+    torque = np.abs(spring + damping * found.series.rate * (beyond > 0))
+    assert np.mean(beyond > 0) < 1
+    for name, value in (("mean_", torque.mean()), ("", torque.max()), ("rms_", torque.std(ddof=0))):
+        if name == "rms_":
+            value = np.sqrt(np.mean(torque**2))
+        assert found.response[f"{name}gear_torque_N_m"] == pytest.approx(value, rel=5e-3)
+
+
+def test_pure_response_has_a_reserve_with_derivatives():
+    """With a constant load, the motion only moves: all derivatives have closed forms."""
+    config = load("cic", [*APART, "response.reserve=true"])
+    scene, design = Scene.from_config(config), jnp.asarray(config.design)
+
+    @eqx.filter_jit
+    def both(scene):
+        found = steady_response(scene, design)
+        return jnp.stack([found.contact_reserve, found.backlash_reserve, found.peak]), found
+
+    slopes, found = eqx.filter_jacfwd(both, has_aux=True)(scene)
+    assert Status.of(found.status) is Status.IDLE
+    assert int(found.period) == 1
+    assert np.all(np.abs(found.multipliers) < 1)
+    expected = [held().response[name] for name in RESERVES]
+    assert found.contact_reserve * 1e6 == pytest.approx(expected[0], rel=1e-6)
+    radius = config.profile.pitch_radius_mm
+    assert found.backlash_reserve * 2 * radius == pytest.approx(expected[1], rel=1e-6)
+    gear = config.scene.timing_gear
+    assert slopes.clearance[::2] == pytest.approx([1, 0], abs=1e-9)
+    # Less stiffness or more load uses up the reserve as more backlash does.
+    assert slopes.gear.half_backlash[1:] == pytest.approx([-1, 0], abs=1e-6)
+    by_load = -1 / gear.stiffness_N_m_per_rad
+    assert slopes.load_torque[1] == pytest.approx(by_load, rel=1e-6)
+    lever = -slopes.gear.half_backlash[0]
+    assert slopes.load_torque[0] == pytest.approx(lever * by_load, rel=1e-6)
+
+
+def test_share_of_machines_that_touch_has_a_closed_form():
+    """If only clearance and backlash scatter, the reserve is nearly normal."""
+    over = "contact.clearance_mm: {normal: 0.03}, scene.timing_gear.backlash_mm: {normal: 0.01}"
+    config = load("cic", [*APART, f"tolerances={{over: {{{over}}}}}"])
+    found = touching(config)
+    record = found.record()
+    assert found.reserve == pytest.approx(held().response["contact_reserve_um"], rel=1e-4)
+    assert found.gradient[0] == pytest.approx(1e3, rel=1e-6)
+    spread = np.hypot(30.0, 0.01 * found.gradient[1])
+    share = norm.cdf(-found.reserve / spread)
+    error = np.sqrt(share * (1 - share) / record["machines"])
+    assert 0.001 < share < 0.2
+    for name in ("touching_share", "touching_share_first_order"):
+        assert record[name] == pytest.approx(share, abs=4 * error)
+    assert record["keys"][0]["key"] == "contact.clearance_mm"
+    assert record["simulated_touching"] == record["model_touching"]
+    apart = found.simulated > 0
+    assert found.simulated[apart] == pytest.approx(found.model[apart], abs=0.05)
+
+
+def test_a_search_without_forces_simulates_nothing(monkeypatch):
+    """It compiles no equation of motion, and finds a design with less ripple."""
+
+    def moved(*arguments, **named):
+        raise AssertionError("nothing may move")
+
+    for name in ("_motion", "_build", "apart_program"):
+        monkeypatch.setattr(evaluation, name, moved)
+    quick = ["optimizer.starts=1", "optimizer.screening=0", "optimizer.iterations=8"]
+    objective = "objective={mean_weight: 0, peak_weight: 0, terms: {flow_ripple: 1}}"
+    found = rootsopt.optimize_design(load("cic", [*APART, *quick, objective]))
+    assert found.optimized.status is Status.GEOMETRY_ONLY
+    assert found.optimized.response.keys() == {"flow_ripple"}
+    assert 0.01 < found.improvement["flow_ripple"] == pytest.approx(found.improvement["objective"])
+
+
+def test_a_reserve_limits_a_search():
+    """The limit holds at the optimum, where it has a price."""
+    quick = ["optimizer.starts=1", "optimizer.screening=0", "optimizer.iterations=12"]
+    least = held().response["contact_reserve_um"] + 1.0
+    objective = "objective={mean_weight: 0, peak_weight: 0, terms: {flow_ripple: 1}}"
+    limit = f"constraints.terms={{contact_reserve_um: {{min: {least}}}}}"
+    found = rootsopt.optimize_design(load("cic", [*APART, *quick, objective, limit]))
+    assert found.optimized is not None
+    assert found.optimized.response["contact_reserve_um"] > least - 1e-3
+    (row,) = [row for row in found.constraints if row["name"] == "contact reserve"]
+    assert row["satisfied"]
+    assert not row["baseline_satisfied"]
