@@ -123,7 +123,7 @@ def parser(command: Command) -> argparse.ArgumentParser:
     """Return the parser of a `command`: the arguments that every command takes, then its own."""
     result = _Parser(
         prog=f"rootsopt {command.name}",
-        usage=f"rootsopt {command.name} {'CONFIG' if command.reads else 'FILE'} [options]",
+        usage=f"rootsopt {command.name} {command.takes} [options]",
         description=command.purpose,
         formatter_class=_Format,
         add_help=False,
@@ -131,8 +131,11 @@ def parser(command: Command) -> argparse.ArgumentParser:
     result.add_argument(
         "config",
         type=Path,
-        metavar="CONFIG" if command.reads else "FILE",
-        help=f"YAML file or shipped: {', '.join(shipped())}" if command.reads else "YAML file",
+        metavar=command.takes,
+        help={
+            "CONFIG": f"YAML file or shipped: {', '.join(shipped())}",
+            "ROTOR": "CSV or DXF file with the outline of a rotor",
+        }.get(command.takes, "YAML file"),
     )
     result.add_argument(
         "-h",
@@ -227,14 +230,18 @@ def run(command: Command, argv: Sequence[str] | None) -> int:
             import_named(name)
         if command.writes and options.output is None:
             options.output = os.path.join("results", f"{options.config.stem}-{command.name}")
-        config = load(options.config, options.overrides) if command.reads else None
+        config = None
+        if command.takes == "CONFIG":
+            config = load(options.config, options.overrides)
         for note in notes(config) if config else ():
             environment.say(note)
         use_float64()
         use_cache(wanted=not options.no_cache)
         with environment.explained():
-            if config is None:
+            if not command.reads:
                 return _work(command.name)(options)
+            if config is None:
+                config = _work(command.name, "config_of")(options)
             if not command.writes:
                 return _work(command.name)(config, options)
             return _in_folder(command.name, config, options)
@@ -251,9 +258,9 @@ def run(command: Command, argv: Sequence[str] | None) -> int:
         return NO_RESULT
 
 
-def _work(command: str) -> Callable[..., Any]:
-    """Return the function `body` of the module with a command's work."""
-    return importlib.import_module(f"rootsopt.commands.work.{command}").body
+def _work(command: str, name: str = "body") -> Callable[..., Any]:
+    """Return the function `name` of the module with a command's work."""
+    return getattr(importlib.import_module(f"rootsopt.commands.work.{command}"), name)
 
 
 def _in_folder(command: str, config: Config, options: argparse.Namespace) -> int:

@@ -20,7 +20,8 @@ class Command(NamedTuple):
 
     `name`; `brief`: what it does, for the list of commands; `purpose`: the same, for its help;
     `options`: adds its own options to a parser; `writes`: whether it writes a result folder;
-    `reads`: whether it reads a config, rather than writing one."""
+    `reads`: whether it reads a config, rather than writing one;
+    `takes`: name of its argument in its help, CONFIG or what its work makes a config from."""
 
     name: str
     brief: str
@@ -28,6 +29,7 @@ class Command(NamedTuple):
     options: "Callable[[ArgumentParser], None]" = _none
     writes: bool = True
     reads: bool = True
+    takes: str = "CONFIG"
 
     def main(self, argv: Sequence[str] | None = None) -> int:
         """Run the command with the arguments `argv` (`None`: those of the process).
@@ -43,6 +45,34 @@ class Command(NamedTuple):
 
 def _optimize(parser: "ArgumentParser") -> None:
     _simulate(parser)
+    _shared(parser)
+
+
+def _improve(parser: "ArgumentParser") -> None:
+    from rootsopt import export
+
+    export.add_option(parser, "dxf")
+    parser.set_defaults(report=True)
+    group = parser.add_argument_group("what is better, and what the file does not say")
+    for aim, meaning in (
+        ("quieter", "less contact force (default if the flanks touch)"),
+        ("tighter", "less leakage (default otherwise)"),
+        ("smoother", "less ripple of the flow"),
+    ):
+        group.add_argument(
+            f"--{aim}", dest="aims", action="append_const", const=aim, default=[], help=meaning
+        )
+    group.add_argument("--config", dest="scene", metavar="FILE",
+                       help="YAML file or shipped config with the scene")  # fmt: skip
+    for name, kind, meaning in (
+        ("lobes", int, "number of lobes"),
+        ("unit", str, "unit of the file: mm, cm, m, um, inch"),
+        ("centre-distance-mm", float, "distance of the axes"),
+        ("length-mm", float, "axial length"),
+        ("speed-rpm", float, "speed"),
+        ("torque-N-m", float, "load on rotor 2"),
+    ):
+        group.add_argument(f"--{name}", type=kind, metavar="X", help=meaning)
     _shared(parser)
 
 
@@ -174,6 +204,14 @@ optimize = Command(
     "Optimise the design parameters for low contact force and compare with the baseline.",
     _optimize,
 )
+improve = Command(
+    "improve",
+    "find a better rotor than that of a CSV or DXF file",
+    "Find what rotor a file holds, and a better one of the same displacement, outer diameter and "
+    "clearance.",
+    _improve,
+    takes="ROTOR",
+)
 simulate = Command(
     "simulate",
     "simulate one design in one scene",
@@ -217,9 +255,10 @@ new = Command(
     _new,
     writes=False,
     reads=False,
+    takes="FILE",
 )
 COMMANDS = {
     command.name: command
-    for command in (optimize, simulate, pareto, sweep, attractors, profile, explore, new)
+    for command in (optimize, improve, simulate, pareto, sweep, attractors, profile, explore, new)
 }
 """All commands by name."""

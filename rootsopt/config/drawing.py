@@ -27,7 +27,7 @@ _Text = Annotated[
 
 
 class DrawingConfig(Section):
-    """What the title block of a drawing states, and how many points its table has.
+    """What the title block of a drawing states, its inset, and how many points its table has.
 
     Nothing here is simulated."""
 
@@ -42,6 +42,11 @@ class DrawingConfig(Section):
     )
     general_tolerance: _Text | None = Field(
         None, description="tolerances of all other dimensions, as ISO 2768-mK"
+    )
+    inset_mm: Annotated[float, Field(ge=0, le=5)] = Field(
+        0.0,
+        description="distance along the normal by which the drawn rotor is smaller than its "
+        "profile: half of contact.clearance_mm for rotors that are cut with their clearance",
     )
     points: Annotated[int, Field(ge=9, le=20_001)] = Field(
         361, description="number of points over one lobe in rotor_points.csv"

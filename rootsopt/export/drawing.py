@@ -1,13 +1,16 @@
 """Content of the drawing of one rotor, shared by all formats (mm)."""
 
 import dataclasses
+import math
 import textwrap
 
 import rootsopt
 from rootsopt.config import Config
 from rootsopt.config.drawing import DrawingConfig
+from rootsopt.errors import InputError
 from rootsopt.export.pieces import DrawnPiece, outline_pieces
 from rootsopt.profiles import Geometry, Profile, geometry
+from rootsopt.runtime.environment import say
 from rootsopt.runtime.programs import CachedFunction
 
 _MM = 1e3
@@ -46,8 +49,18 @@ class Drawing:
         `design`: values of the design parameters (config units), keyed by config key, for the
         notes."""
         shape: Geometry = _shape(profile)
-        outer, root = float(shape.outer_radius) * _MM, float(shape.root_radius) * _MM
+        inset = (config.drawing or DrawingConfig.model_validate({})).inset_mm
         rotor, radius = config.rotor, config.profile.pitch_radius_mm
+        try:
+            pieces = outline_pieces(profile, inset)
+        except InputError as error:
+            if not inset:
+                raise
+            say(f"the rotor is drawn without its inset of {inset:g} mm: {error}")
+            pieces, inset = outline_pieces(profile), 0.0
+        outer, root = (float(x) * _MM - inset for x in (shape.outer_radius, shape.root_radius))
+        # Steiner's formula for parallel curves.
+        lost = inset * sum(piece.length for piece in pieces) + math.pi * inset**2
         body = f"length {rotor.length_mm:g} mm"
         if rotor.bore_mm is not None:
             body += f", bore {rotor.bore_mm:g} mm"
@@ -58,12 +71,13 @@ class Drawing:
             *_wrapped([f"{key} = {value:.8g}" for key, value in design.items()]),
             f"centre distance {2 * radius:g} mm, pitch radius {radius:g} mm",
             f"outer radius {outer:.6f} mm, root radius {root:.6f} mm, "
-            f"area {float(shape.area) * _MM**2:.6f} mm2",
+            f"area {float(shape.area) * _MM**2 - lost:.6f} mm2",
             body,
-            f"dimensions in mm, flank clearance {config.contact.clearance_mm:g} mm not subtracted",
+            f"dimensions in mm, flank clearance {config.contact.clearance_mm:g} mm "
+            + (f"cut off by an inset of {inset:g} mm" if inset else "not subtracted"),
         ]
         return cls(
-            pieces=outline_pieces(profile),
+            pieces=pieces,
             pitch_radius=radius,
             outer_radius=outer,
             lobes=config.profile.lobes,

@@ -11,6 +11,7 @@ with a lobe tip on +x.
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex128, Float64
@@ -151,17 +152,19 @@ class Spline:
 DrawnPiece = Arc | Spline
 
 
-def outline_pieces(profile: Profile) -> list[DrawnPiece]:
+def outline_pieces(profile: Profile, inset: float = 0.0) -> list[DrawnPiece]:
     """Return the pieces (mm) of the closed counter-clockwise outline of a `profile`.
+
+    `inset`: distance (mm) along the normal by which the outline is smaller than the profile.
 
     Every piece starts at the end of the previous piece. The outline starts at the root before the
     lobe on +x. If the arcs on both sides of this root are joined, the outline starts at the start
     of the joined arc.
 
     Raises `InputError` if a segment of the flank needs too many nodes to come within `TOLERANCE` of
-    the true flank.
+    the true flank, or if its radius of curvature is less than the inset.
     """
-    flank = _flank(profile)
+    flank = _flank(profile, inset)
     lobe = [piece.mirrored() for piece in reversed(flank)] + flank
     pitch = 2 * np.pi / profile.lobes
     around = [piece.turned(pitch * k) for k in range(profile.lobes) for piece in lobe]
@@ -180,12 +183,12 @@ def polyline(pieces: list[DrawnPiece], chord: float) -> Complex128[np.ndarray, "
     return np.concatenate([*parts, parts[0][:1]])
 
 
-def _flank(profile: Profile) -> list[DrawnPiece]:
+def _flank(profile: Profile, inset: float) -> list[DrawnPiece]:
     """Return the pieces of one flank, from the centre of the tip to the centre of the root."""
     size = float(profile.pitch_radius) * _MM
     segments = [(float(s.start), float(s.stop)) for s in profile.segments()]
-    stretches = [_Stretch(profile, start, stop, False) for start, stop in segments]
-    stretches += [_Stretch(profile, stop, start, True) for start, stop in reversed(segments)]
+    stretches = [_Stretch(profile, start, stop, False, inset) for start, stop in segments]
+    stretches += [_Stretch(profile, stop, start, True, inset) for start, stop in reversed(segments)]
     whole = [stretch for stretch in stretches if stretch.start != stretch.stop]
     pieces = [piece for stretch in whole for piece in stretch.pieces(size)]
     # Leave out pieces without length, such as a tip land of zero width.
@@ -197,22 +200,29 @@ def _points(profile, nu):
     """Return the values on the addendum and on the dedendum at normal angles `nu` (rad).
 
     The values are (points (m), directions of the outward normal (rad), arc length per `nu`
-    (m/rad))."""
+    (m/rad), turn of the normal per `nu`)."""
     _, addendum, dedendum = profile.speeds(nu)
-    below = profile.dedendum(nu)
-    turned = below.beta + jnp.pi / 2 - below.psi
-    above = profile.position(profile.addendum(nu)), nu, addendum
-    return above, (profile.position(below), turned, dedendum)
+
+    def turned(nu):
+        below = profile.dedendum(nu)
+        return below.beta + jnp.pi / 2 - below.psi, below
+
+    direction, turn, below = jax.jvp(turned, (nu,), (jnp.ones_like(nu),), has_aux=True)
+    above = profile.position(profile.addendum(nu)), nu, addendum, jnp.ones_like(nu)
+    return above, (profile.position(below), direction, dedendum, turn)
 
 
 @dataclasses.dataclass(frozen=True)
 class _Stretch:
-    """One segment of the addendum or `dedendum`, from normal angle `start` to `stop` (rad)."""
+    """One segment of the addendum or `dedendum`, from normal angle `start` to `stop` (rad).
+
+    `inset`: as in `outline_pieces`."""
 
     profile: Profile
     start: float
     stop: float
     dedendum: bool
+    inset: float
 
     def look(self, share: NDArray[np.float64]):
         """Return (points (mm), unit normals, arc length per unit of share (mm)) at `share` (n,).
@@ -224,13 +234,20 @@ class _Stretch:
         inside = np.pad(inside, (0, -len(share) % _BLOCK), mode="edge")
         nu = self.start + (self.stop - self.start) * inside.reshape(-1, _BLOCK)
         blocks = [_points(self.profile, jnp.asarray(block))[int(self.dedendum)] for block in nu]
-        points, normal, speed = (
+        points, normal, speed, turn = (
             np.concatenate(part)[: len(share)] for part in zip(*blocks, strict=True)
         )
+        way, outward = -1 if self.dedendum else 1, np.exp(1j * normal)
+        length = speed * _MM - way * self.inset * turn
+        if self.inset and np.any(length * np.sign(speed) < 0):
+            raise InputError(
+                f"`drawing.inset_mm` must be less than the radius of curvature of the flank, but "
+                f"is {self.inset:g}, which cuts off a part of it; lower it"
+            )
         return (
-            points @ np.array([1, 1j]) * _MM,
-            np.exp(1j * normal),
-            np.abs(speed * (self.stop - self.start)) * _MM,
+            points @ np.array([1, 1j]) * _MM - self.inset * outward,
+            outward,
+            np.abs(length * (self.stop - self.start)),
         )
 
     def pieces(self, size: float) -> list[DrawnPiece]:

@@ -95,13 +95,14 @@ def inset_note(inset: float, clearance_mm: float) -> str:
     )
 
 
-def conjugacy(profile: Profile) -> Conjugacy:
+def conjugacy(profile: Profile, distance: float | None = None) -> Conjugacy:
     """Return the gap between the flanks of two equal rotors in pure rolling.
 
-    `profile`: profile of both rotors, at the centre distance of twice its pitch radius. Raises
-    `InputError` if the flanks never face each other."""
+    `profile`: profile of both rotors; `distance`: centre distance (m), by default twice the pitch
+    radius. Raises `InputError` if the flanks never face each other."""
     roll = float(profile.half_pitch) * (np.arange(_POSES) + 0.5) / _POSES
-    gap, found = map(np.asarray, _gaps(profile, jnp.asarray(roll)))
+    apart = 2 * profile.pitch_radius if distance is None else jnp.asarray(distance)
+    gap, found = map(np.asarray, _gaps(profile, apart, jnp.asarray(roll)))
     found = found & np.isfinite(gap)
     if not np.any(found):
         raise InputError(
@@ -112,8 +113,8 @@ def conjugacy(profile: Profile) -> Conjugacy:
 
 
 @CachedFunction
-def _gaps(profile, roll):
-    pair = FlankPair.of(profile, 2 * profile.pitch_radius, two_sided=True)
+def _gaps(profile, distance, roll):
+    pair = FlankPair.of(profile, distance, two_sided=True)
     sides = jnp.stack([roll, -roll])
     contact = lax.map(lambda x: pair(x, jnp.zeros_like(x)), sides.ravel())
     gap = jnp.where(contact.found, contact.gap, jnp.inf).reshape(sides.shape)

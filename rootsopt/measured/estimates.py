@@ -104,12 +104,17 @@ class Estimates:
         """Return advice if the scatter is large compared with the spacing; otherwise "".
 
         `spacing`: distance (mm) between successive points."""
-        if not spacing < _APART * self.scatter:
+        if (kept := self.stride(spacing)) == 1:
             return ""
         return (
             f"the points are scattered by about {_two(self.scatter)} um (RMS), but only "
-            f"{_two(spacing)} um apart: keep one in {math.ceil(_APART * self.scatter / spacing)}"
+            f"{_two(spacing)} um apart: keep one in {kept}"
         )
+
+    def stride(self, spacing: float) -> int:
+        """Return k if only every k-th point can be smoothed; `spacing`: as in `thinning`."""
+        dense = spacing < _APART * self.scatter
+        return math.ceil(_APART * self.scatter / spacing) if dense else 1
 
     def rough(self, smoothing: float) -> bool:
         """Return whether the points scatter by more than a `smoothing` (mm) can remove."""
@@ -121,10 +126,8 @@ class Estimates:
         `smoothing`: smoothing (mm) of the config. Any other value that the text states has been
         tried, unless none of those tried can be read."""
         known, key = self.scatter > SEEN, "`profile.outline_smoothing_mm`"
-        steps = [self.scatter * more for more in _FACTORS] if known else _STEPS
-        tried = (float(f"{step:.2g}") for step in steps)
         # From the greatest down, so that an outline that smoothing does not help costs one trial.
-        fitting = itertools.takewhile(lambda x: x > smoothing and self.reads(x), tried)
+        fitting = itertools.takewhile(lambda x: x > smoothing and self.reads(x), self.smoothings)
         value = min(fitting, default=None)
         offer = f"set {key} = {value:g}, with which it is read" if value else ""
         seen = f"the points are scattered by about {_two(self.scatter)} um (RMS): "
@@ -137,6 +140,12 @@ class Estimates:
             return f"{self.few}: add points" + (f", or {offer}" if offer else "")
         hardly = f"the points are hardly scattered (by about {self.scatter * 1e3:.1g} um): "
         return hardly + (offer or "correct the outline")
+
+    @property
+    def smoothings(self) -> list[float]:
+        """Values of the smoothing (mm) that are worth a trial, from the greatest down."""
+        steps = [self.scatter * x for x in _FACTORS] if self.scatter > SEEN else _STEPS
+        return [float(f"{step:.2g}") for step in steps]
 
     @property
     def few(self) -> str:

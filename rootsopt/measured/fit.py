@@ -140,12 +140,14 @@ def imported(
     pitch_radius_mm: float,
     smoothing_mm: float,
     center: Literal["fit"] | tuple[float, float] | None = None,
+    seen: Estimates | None = None,
 ) -> tuple[Outline, Checks]:
     """Return (profile, deviations) for the outline of a rotor with N = `lobes` lobes.
 
     `loop`: points of the outline; `pitch_radius_mm`: pitch radius; `smoothing_mm`: RMS scatter of
     the points (mm), 0 for a curve through them; `center`: x and y of the rotor's axis (mm), or
-    "fit" for the centre of the lobes' rotational symmetry. `None`: the origin.
+    "fit" for the centre of the lobes' rotational symmetry. `None`: the origin. `seen`: estimates
+    from its points, if they are known; messages then state no smoothing that has been tried.
 
     First, the loop is made counter-clockwise and turned to put a lobe's axis on +x. The phase of
     the N-th moment ∬ z^N dA gives this axis. Then the profile is made from one flank: the leading
@@ -162,7 +164,8 @@ def imported(
         )
     # Overflow and division by zero are detected in the result.
     with np.errstate(all="ignore"):
-        seen = estimates(loop.points, lobes)
+        tried = seen is None and len(loop.points) <= _TRIED
+        seen = estimates(loop.points, lobes) if seen is None else seen
         axis = seen.center if center == "fit" else complex(*(center or (0.0, 0.0)))
         if not np.isfinite(axis):
             raise InputError(
@@ -181,7 +184,7 @@ def imported(
                 return False
             return True
 
-        advising = seen if len(loop.points) > _TRIED else dataclasses.replace(seen, reads=reads)
+        advising = dataclasses.replace(seen, reads=reads) if tried else seen
         outline, checks = _imported(loop, lobes, pitch_radius_mm, smoothing_mm, advising)
     found = [x for x in vars(checks).values() if isinstance(x, float)]
     if not all(np.all(np.isfinite(x)) for x in (*jax.tree.leaves(outline), *found)):

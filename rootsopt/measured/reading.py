@@ -19,8 +19,10 @@ from rootsopt.measured.joining import JOIN, joined
 from rootsopt.measured.loop import Loop, moment, place, signed_area, tails
 from rootsopt.measured.table import from_csv
 
-__all__ = ["JOIN", "Loop", "Sought", "read", "signed_area"]
+__all__ = ["JOIN", "LOBES", "Loop", "Sought", "lobes_of", "read", "signed_area"]
 
+LOBES = range(2, 7)
+"""Numbers of lobes that a rotor may have."""
 _JOINS = 2e-3, 5e-3, 1e-2, 2e-2, 5e-2, 0.1, 0.2, 0.5, 1.0
 """Distances (mm) up to which ends are joined to find the value of the key that closes an outline.
 The last one is the greatest value of the key."""
@@ -36,7 +38,6 @@ swallow-tail is not cut off."""
 _RAYS, _UNLIKE = 720, 0.25
 """Number of polar angles at which the radius of a loop is compared with the lobes' symmetry, and
 norm of the harmonics that break the symmetry (harmonics of the lobes) above which it has none."""
-
 _WIDEST = 5.0
 """Distance between the last and the first point above which a loop is rejected as open. The unit is
 the longest step between successive points."""
@@ -62,17 +63,19 @@ _NOT_FILES = (
 class Sought:
     """The rotor that a file should contain.
 
-    `lobes`: number of lobes; `pitch_radius_mm`: pitch radius; `center`: its axis in the file, as in
-    `profile.outline_center`."""
+    `lobes`: number of lobes; `pitch_radius_mm`: pitch radius; both `None` if unknown. `center`: its
+    axis in the file, as in `profile.outline_center`."""
 
-    lobes: int
-    pitch_radius_mm: float
+    lobes: int | None = None
+    pitch_radius_mm: float | None = None
     center: Literal["fit"] | tuple[float, float] | None = None
 
 
 class _Shape(NamedTuple):
-    """A loop with lobes: centroid (mm, as x + iy), greatest radius, and its mean with the least."""
+    """A loop with lobes: their number, centroid (mm, as x + iy), greatest radius, and its mean with
+    the least."""
 
+    lobes: int
     center: complex
     most: float
     middle: float
@@ -149,19 +152,22 @@ def _rotor(loops: list[Loop], sought: Sought | None, name: str) -> Loop | None:
     Raises `InputError` if there are several such loops and none or more than one is at the axis."""
     if sought is None:
         return None
+    radius = sought.pitch_radius_mm
     found = [
         (loop, shape)
         for loop, shape in _lobed(loops, sought)
-        if abs(shape.middle / sought.pitch_radius_mm - 1) < SIZED
+        if radius is None or abs(shape.middle / radius - 1) < SIZED
     ]
     axis = complex(*sought.center) if isinstance(sought.center, tuple) else 0j
-    near = [one for one in found if abs(one[1].center - axis) < sought.pitch_radius_mm / 2]
-    if len(found) > 1 and len(near) != 1:
+    near = [one for one in found if abs(one[1].center - axis) < (radius or one[1].middle) / 2]
+    # The two rotors of a pair are equal, so that either will do.
+    same = radius is None and len({(s.lobes, round(s.most, 2)) for _, s in found}) == 1
+    if len(found) > 1 and len(near) != 1 and not same:
         raise InputError(_several([shape for _, shape in near or found], bool(near), name))
     if not found:
         return None
     loop, shape = (near or found)[0]
-    return _noted(loop, len(loops), f"the {sought.lobes}-lobed one at {written(shape.center)} mm")
+    return _noted(loop, len(loops), f"the {shape.lobes}-lobed one at {written(shape.center)} mm")
 
 
 def _several(shapes: list[_Shape], near: bool, name: str) -> str:
@@ -196,8 +202,8 @@ def _likely(loops: list[Loop], sought: Sought | None) -> Loop:
     its lobes, or the largest of all."""
     if sought is None or len(loops) == 1:
         return _noted(_largest(loops)[0], len(loops), "the largest")
-    lobed = _lobed(loops, sought)
-    sized = [one for one, s in lobed if unit_of_size(s.middle / one.unit, sought.pitch_radius_mm)]
+    lobed, radius = _lobed(loops, sought), sought.pitch_radius_mm
+    sized = [one for one, s in lobed if radius and unit_of_size(s.middle / one.unit, radius)]
     return [*sized, *(one for one, _ in lobed), *_largest(loops)][0]
 
 
@@ -207,8 +213,14 @@ def _largest(loops: list[Loop]) -> list[Loop]:
 
 def _lobed(loops: list[Loop], sought: Sought) -> list[tuple[Loop, _Shape]]:
     """Return the loops with the symmetry of the rotor's lobes and their shapes, largest first."""
-    shapes = ((loop, _shape(loop.points, sought.lobes)) for loop in _largest(loops))
+    counts = LOBES if sought.lobes is None else (sought.lobes,)
+    shapes = ((loop, _shape(loop.points, n)) for loop in _largest(loops) for n in counts)
     return [(loop, shape) for loop, shape in shapes if shape is not None]
+
+
+def lobes_of(loop: Loop) -> int | None:
+    """Return the number of lobes (`LOBES`) of a loop; `None` if it is not that of a rotor."""
+    return next((shape.lobes for _, shape in _lobed([loop], Sought())), None)
 
 
 def _shape(points: NDArray[np.complex128], lobes: int) -> _Shape | None:
@@ -235,7 +247,7 @@ def _shape(points: NDArray[np.complex128], lobes: int) -> _Shape | None:
     if own < np.max(harmonics) or np.linalg.norm(others) > _UNLIKE * own:
         return None
     least, most = float(np.min(radius)), float(np.max(radius))
-    return _Shape(complex(np.mean(points) + center), most, (least + most) / 2)
+    return _Shape(lobes, complex(np.mean(points) + center), most, (least + most) / 2)
 
 
 def _above(length: float) -> float:
@@ -354,7 +366,7 @@ def _unit(points, unit: str | None, sought: Sought | None) -> str | None:
     """Return advice on the unit in which the `points` would fit the pitch radius, or `None`.
 
     `unit`, `sought`: as in `read`."""
-    if unit is not None or sought is None:
+    if unit is not None or sought is None or sought.pitch_radius_mm is None:
         return None
     with np.errstate(all="ignore"):
         radius = np.abs(points - np.mean(points))

@@ -45,6 +45,8 @@ def outline_of(config: "ProfileConfig") -> tuple[Outline, Checks]:
 def _kept(path: Path, stamp, how: tuple[str | None, Sought, float], smoothing: float):
     del stamp
     loop, sought = read(path, *how), how[1]
+    assert sought.lobes is not None
+    assert sought.pitch_radius_mm is not None
     loop = untangled(loop, sought.lobes, sought.pitch_radius_mm)
     try:
         outline, checks = imported(

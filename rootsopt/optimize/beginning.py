@@ -91,7 +91,7 @@ def beginning(config: Config) -> Beginning | None:
     if given is None:
         return None
     wanted = config.optimizer.family
-    found = _fits(given, wanted)
+    found = fits(given, wanted)
     for one in found:
         try:
             profile = one.config(config.profile)
@@ -125,13 +125,18 @@ def _cut(config: Config, inset: float) -> tuple[Config, float]:
     return config, max(0.0, -gap)
 
 
-def _fits(given: Outline, family: str) -> list[Likeness]:
+def fits(given: Outline, family: str = NEAREST, enough: float = 0.0) -> list[Likeness]:
     """Return the members nearest to the outline `given`, nearest first.
 
-    `family`: name of a family, or `NEAREST` for all classical ones with parameters."""
+    `family`: name of a family, or `NEAREST` for all classical ones with parameters; `enough`:
+    distance (m) of a member at which no further families are compared."""
     named = [name for name in classical() if family_of(name).fitted]
     if family == NEAREST:
-        found = [likeness(given, name) for name in named]
+        found = []
+        for name in named:
+            found.append(likeness(given, name))
+            if found[-1] is not None and found[-1].departure <= enough:
+                break
     elif family in named:
         found = [likeness(given, family)]
     else:
@@ -140,4 +145,4 @@ def _fits(given: Outline, family: str) -> list[Likeness]:
     return sorted((one for one in found if one is not None), key=lambda one: one.departure)
 
 
-__all__ = ["Beginning", "beginning"]
+__all__ = ["Beginning", "beginning", "fits"]

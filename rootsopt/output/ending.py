@@ -25,6 +25,8 @@ _FACTS = {
     "profile": facts.drawn,
 }
 """What came out of a run, by command."""
+_ALIKE = {"improve": "optimize"}
+"""Commands whose runs end like those of another one."""
 _SAID = *facts.STEADY, Status.GEOMETRY_ONLY.label
 """Statuses of a run that need no explanation."""
 _SENTENCES = re.compile(r"(?<=[.!?]) (?=[A-Z])(?!In conflict)")
@@ -75,7 +77,8 @@ def ending(
     quoted for a shell; `imports`: values of `--import`, which the next commands need, too; `rows`:
     rows of a sweep, if the result does not hold them."""
     command, status = str(result["run"]["command"]), str(result.get("status", ""))
-    told, again = _FACTS[command](result, rows), f"rootsopt {command} {source}"
+    again, command = f"rootsopt {command} {source}", _ALIKE.get(command, command)
+    told = _FACTS[command](result, rows)
     first, *advice = re.split(_SENTENCES, str(result.get("message") or ""))
     said = f"{in_words(status).capitalize()}: {first}"
     if status in _STOPPED:

@@ -9,6 +9,7 @@ from typing import Any
 
 from rootsopt.config import Config
 from rootsopt.config.units import words
+from rootsopt.output.better import better_tables
 from rootsopt.output.names import (
     brief,
     in_words,
@@ -64,6 +65,7 @@ def sections(
     `result`: content of the result file; `rows`: those of a sweep, if the result does not hold
     them; `most`: number of scenes above which their table is truncated."""
     found = [
+        ("better", "A better rotor", [*better_tables(result)]),
         ("front", "Best compromises", front_tables(result)),
         ("numbers", "Numbers", [numbers_table(result), *gradient_tables(result)]),
         ("scenes", "Scenes", scene_tables(result, rows, most)),

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
 _ASKED = {
     "optimize": "Find the design with the lowest objective, and compare it with the baseline.",
+    "improve": "Find a better rotor than that of a file, in its place.",
     "simulate": "Simulate one design in one scene: steady state, contact force, gradient.",
     "pareto": "Trace the best compromises between two or three quantities.",
     "sweep": "Simulate one design in many scenes.",
@@ -21,6 +22,7 @@ _ASKED = {
 }
 _TITLES = {
     "optimize": "Optimisation of {pair}",
+    "improve": "A better rotor: {pair}",
     "simulate": "Simulation of {pair}",
     "pareto": "Best compromises for {pair}",
     "sweep": "Sweep of {pair}",
@@ -40,7 +42,8 @@ def title(run: "Run") -> str:
 def asked(run: "Run") -> list[str]:
     """Return sentences on the task of the run."""
     sentences = [_ASKED.get(run.command, f"Run the command {run.command}."), scene(run.config)]
-    if run.command == "optimize":
+    sentences += (run.result.get("improve") or {}).get("found", [])
+    if run.command in ("optimize", "improve"):
         sentences.append(_objective(run.config))
         keys = [one.key for one in run.config.scatters]
         if keys:

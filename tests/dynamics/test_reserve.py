@@ -12,9 +12,9 @@ from scipy.spatial import cKDTree
 from scipy.stats import norm
 
 import rootsopt
+from rootsopt import steady_response
 from rootsopt.config import load
 from rootsopt.pump.sheet import play_of
-from rootsopt import steady_response
 from rootsopt.response import evaluation
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.touching import touching

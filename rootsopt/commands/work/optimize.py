@@ -4,6 +4,7 @@ import argparse
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, closing
+from typing import Any
 
 import jax.numpy as jnp
 from rich.console import Console
@@ -22,6 +23,7 @@ from rootsopt.design.resemblance import likenesses
 from rootsopt.export import chosen
 from rootsopt.measured import report as outline_report
 from rootsopt.optimize import noise
+from rootsopt.optimize.outcome import Optimization
 from rootsopt.optimize.robust import search_of
 from rootsopt.output import files, tables, terminal
 from rootsopt.output.runs import RunFolder
@@ -35,6 +37,18 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     """Run `rootsopt optimize`: search for the best design, and write files into `folder`.
 
     Return the `Outcome`. Raises `InputError` if the config or an option is invalid."""
+    return searched_for(config, options, folder)
+
+
+def searched_for(
+    config: Config,
+    options: argparse.Namespace,
+    folder: RunFolder,
+    further: Callable[[Optimization], dict[str, Any]] = lambda result: {},
+) -> cli.Outcome:
+    """Search for the best design, and write the files of `rootsopt optimize` into `folder`.
+
+    `further`: returns further entries of the result file. For the rest, see `body`."""
     began = time.perf_counter()
     formats = chosen(options.export)
     cli.load_figures(options, "runs")
@@ -60,6 +74,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     ran = time.perf_counter() - began
     alike = {} if result.interrupted else _alike(config, result)
     sheets = _sheets(config, result)
+    alike |= further(result)
     data = _write(folder, config, options, result, alike, sheets, clock.seconds, ran)
     if result.optimized is not None and formats:
         from rootsopt.export.writing import write_simulated

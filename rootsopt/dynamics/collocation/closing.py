@@ -110,6 +110,8 @@ _ROUGH = 1e-7
 roots of the gap to 1e-6 rad, and the same rounding errors."""
 
 
+_WEAK = 1e-3
+"""Force, as a share of the pair's, below which errors are relative to this force."""
 _LEAST = 1e-6
 """Derivative of the states (scaled) below which errors of derivatives are relative to this number,
 for an orbit without contact."""
@@ -413,7 +415,7 @@ class Closer(eqx.Module):
         """Return the loop's state with the forces `found`, their derivatives and errors."""
         size = roughness(found.elements)
         first = now.meshes == 0
-        apart, turned = _differences(now.closed.found, found)
+        apart, turned = _differences(now.closed.found, found, self.equation.top)
         force, slope = gained(now.closed.found.elements.mesh.used, now.elements.mesh.used)
         compared = apart / force, turned / slope + _ROUGH
         error, drift = choose(first, self.uncompared(size), compared)
@@ -471,11 +473,13 @@ def close(
     return Closer(equation, frozen, tangents, known, neighbour, tolerance).run().closed
 
 
-def _differences(before: OrbitForces, after: OrbitForces):
+def _differences(before: OrbitForces, after: OrbitForces, scale: Float[Array, ""]):
     """Return two relative differences between the results on two meshes.
 
     The first is the largest difference in mean, RMS and peak force and in the further measures, the
-    second that in the derivatives of the first three. Spectral lines are relative to the mean. For
+    second that in the derivatives of the first three. Spectral lines are relative to the mean, and
+    weak forces to a share of the pair's `scale` (N): flanks that only just touch have forces of any
+    smallness, of which rounding is a large part. For
     an orbit without contact, they are those of the state at φ1 = 0 (scaled), and of its
     derivatives."""
 
@@ -484,11 +488,12 @@ def _differences(before: OrbitForces, after: OrbitForces):
 
     one, other = rms(before.response), rms(after.response)
     least = jnp.where(jnp.arange(other.shape[0]) < 3, 1e-30, jnp.abs(other[0]))
-    size = jnp.maximum(jnp.abs(other), jnp.maximum(least, 1e-30))
+    size = jnp.maximum(jnp.abs(other), jnp.maximum(least, _WEAK * scale))
     error = jnp.max(jnp.abs(one - other) / size)
     slopes = jnp.max(jnp.abs(before.sensitivity - after.sensitivity), axis=1, initial=0.0)
     largest = jnp.max(jnp.abs(after.sensitivity), axis=1, initial=0.0)
-    drift = jnp.max((slopes / jnp.where(largest > 0, largest, 1.0))[:3])
+    weak = jnp.abs(other) / size
+    drift = jnp.max((weak * slopes / jnp.where(largest > 0, largest, 1.0))[:3])
     moved = jnp.max(jnp.abs(before.moved - after.moved), initial=0.0)
     # Rounding counts where the motion hardly depends on the directions.
     moved /= jnp.maximum(jnp.max(jnp.abs(after.moved), initial=0.0), _LEAST)

@@ -1,0 +1,48 @@
+"""The tables of `rootsopt improve`: your rotor against a better one."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from rootsopt.output.names import DASH, in_words, label, percent, value
+from rootsopt.output.table import Row, Table, table
+
+_ROWS = (
+    ("response", ("mean_force_N", "peak_force_N")),
+    ("pump", ("volumetric_efficiency", "flow_ripple", "displaced_volume_cm3")),
+    ("geometry", ("seal_width_mm",)),
+)
+"""Quantities that are compared, by the entry of a record that holds them."""
+
+
+def better_tables(result: Mapping[str, Any]) -> Iterator[Table | None]:
+    """Yield the comparison of a rotor from a file with a better one, and what errors leave of it.
+
+    Yield nothing unless the run is one of `rootsopt improve` that has found a better rotor."""
+    told, pair = result.get("improve"), [result.get(key) or {} for key in ("baseline", "optimized")]
+    if not (told and pair[1]):
+        return
+    gain = (result.get("improvement") or {}).get("objective")
+    inset, numbers = told["inset_mm"], {}
+    numbers[f"objective ({', '.join(told['aims'])})"] = 1.0, None if gain is None else 1 - gain
+    for part, keys in _ROWS:
+        numbers |= {label(key): [(one.get(part) or {}).get(key) for one in pair] for key in keys}
+    outer = [2 * (one["geometry"]["outer_radius_mm"] - inset) for one in pair]
+    numbers |= {"outer diameter as cut (mm)": outer, "inset of the flanks (mm)": [inset, inset]}
+    designs = {label(key): [one["design"][key] for one in pair] for key in pair[0]["design"]}
+    groups: list[tuple[str, list[Row]]] = [
+        (name, [[key, *map(value, (a, b)), percent(a, b)] for key, (a, b) in given.items() if a])
+        for name, given in (("", numbers), (f"family {in_words(told['fit']['family'])}", designs))
+    ]
+    yield table("Your rotor against a better one", ("", "your rotor", "a better one", "change"),
+                groups)  # fmt: skip
+    rows: list[Row] = [
+        [one["case"], *map(value, (one["baseline"], one["optimized"])),
+         percent(one["baseline"], one["optimized"]),
+         DASH if one["share"] is None else f"{100 * one['share']:.3g} %"]
+        for one in told["cases"]
+    ]  # fmt: skip
+    heads = "both rotors", "your rotor", "a better one", "change", "share of the gain"
+    yield table("The objective with errors of manufacture", heads, [("", rows)], told["message"])
+
+
+__all__ = ["better_tables"]
