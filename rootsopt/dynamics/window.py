@@ -39,8 +39,9 @@ _ALIKE = float(np.log(3.0))
 not the motion, sets them."""
 _KEPT = 105
 """Number of states stored per mesh period."""
-_FAINT = 1e-9
-"""Force (in units of the pair's `force_scale`) below which a relative difference has no meaning."""
+_FAINT = 1e-3
+"""Force, in units of the pair's `force_scale`, below which differences are relative to this force.
+Flanks that only just touch push so little that the integration takes no account of it."""
 _Arrays = Array | np.ndarray
 """Array type of a window: JAX arrays, or NumPy arrays after a copy from the device."""
 

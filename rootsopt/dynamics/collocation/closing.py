@@ -478,9 +478,8 @@ def _differences(before: OrbitForces, after: OrbitForces, scale: Float[Array, ""
 
     The first is the largest difference in mean, RMS and peak force and in the further measures, the
     second that in the derivatives of the first three. Spectral lines are relative to the mean, and
-    weak forces to a share of the pair's `scale` (N): flanks that only just touch have forces of any
-    smallness, of which rounding is a large part. For
-    an orbit without contact, they are those of the state at φ1 = 0 (scaled), and of its
+    weak forces to a share of `scale` (N), since rounding counts for flanks that only just touch.
+    For an orbit without contact, they are those of the state at φ1 = 0 (scaled), and of its
     derivatives."""
 
     def rms(values):
