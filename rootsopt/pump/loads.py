@@ -5,7 +5,8 @@ the formulas.
 """
 
 import functools
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -89,6 +90,16 @@ class BearingSet(eqx.Module):
         loads = scene.axis_loads(found, pair.load, pair.gear, scene.mass(shape))
         ends = half + found.distance, half + found.gear_distance
         return cls(pair, loads, scene.length, scene.helix, *ends, found.exponent)
+
+    def flags(self, orbit: VariedOrbit) -> Callable[[Any], Any]:
+        """Return a function of time (mesh periods) whose result changes where the loads are not
+        smooth along an `orbit`."""
+
+        def flags(tau):
+            motion = self.pair.motion(tau, orbit.elements.motion(tau))
+            return self.loads.switches(motion, np.zeros(0))
+
+        return flags
 
     def at(self, tau: Float[Array, ""], state: Float[Array, " n"]) -> BearingLoads:
         """Return the loads at rotation `tau` (mesh periods) and scaled `state`.
@@ -221,13 +232,9 @@ def orbit_loads(scene: Scene, design: Float[Array, " d"], orbit: VariedOrbit) ->
 
         return jax.vmap(push, (1, 0), (None, -1))(changes, moved)
 
-    def flags(tau):
-        motion = bearings.pair.motion(tau, orbit.elements.motion(tau))
-        return bearings.loads.switches(motion, np.zeros(0))
-
     # The loads have corners that the motion does not have, as where the gear's torque changes sign.
     begins, ends, count = smooth_pieces(
-        bearings.pair, orbit.elements, loads_corners(bearings), flags
+        bearings.pair, orbit.elements, loads_corners(bearings), bearings.flags(orbit)
     )
     leaps, moves = _leaps(scene, orbit, (dynamic, static, moved))
     sides = leaps[:, None] + _ASIDE * np.array([-1.0, 1.0])

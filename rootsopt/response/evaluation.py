@@ -419,51 +419,34 @@ class Evaluator:
         `built`: rotor pair, its derivatives along the design, and geometry; `began`: time at the
         start of the evaluation (s, `perf_counter`); `series`: whether to compute the series."""
         seconds, design = time.perf_counter() - began, np.asarray(design, np.float64)
-        (pair, tangents, shape), status, orbit = built, Status.of(found.status), found.orbit
-        period = int(found.period)
+        (pair, tangents, shape), status = built, Status.of(found.status)
         statistics: dict[str, int | float] = {
             "transient_mesh_periods": int(found.used),
             "solver_steps": int(found.steps),
         }
-        steady: dict[str, Any] = {"kind": "transient"}
-        response: dict[str, float] = {}
-        idle = status is Status.IDLE
-        held = bool(found.held)
-        forces = np.column_stack([orbit.response, orbit.sensitivity]) * (0.0 if idle else 1.0)
-        named = self.scene.solver.measures.named(np.nan_to_num(forces) if idle else forces, period)
+        idle, held = status is Status.IDLE, bool(found.held)
         known = (status is Status.PERIODIC and pair.smooth) or idle
-        gradient = self._named({name: row for name, (_, row) in named.items()}) if known else {}
+        named = self._forces(found) if status in CLOSED or idle else {}
+        steady: dict[str, Any] = {"kind": "idle" if idle else "transient"}
         said, hint, motion, start = message_of(self.config, status), "", None, None
-        if status in CLOSED or idle:
-            response = {name: value for name, (value, _) in named.items()}
-        further: dict[str, tuple[float, Any]] = {}
         if status in CLOSED or held:
-            steady = {"kind": "idle" if idle else "periodic"} | orbit_record(orbit, period)
+            steady = {"kind": "idle" if idle else "periodic"}
+            steady |= orbit_record(found.orbit, int(found.period))
             statistics |= orbit_statistics(found, self.solver)
-            motion = orbit_series(pair, found) if series else None
-            start = Seed.of(found, pair)
-            if self._loaded(series):
-                whole = varied(found)
-                loads = jax.device_get(orbit_loads(self.scene, jnp.asarray(design), whole))
-                further |= bearing_record(loads)
-                if motion is not None:
-                    turns = len(motion.time) // len(loads.series.sizes), 1
-                    each = np.tile(np.asarray(loads.series.sizes, np.float64), turns)
-                    motion = dataclasses.replace(motion, bearing_loads=each)
-            if self._geared(series):
-                reserve = jax.device_get(apart_program(pair, tangents, varied(found)))
-                further |= apart_record(reserve, float(self.scene.pitch_radius))
-            response |= {name: value for name, (value, _) in further.items()}
-            if known:
-                gradient |= self._named({name: row for name, (_, row) in further.items()})
+            motion, further = self._along(design, (pair, tangents), found, series)
+            named, start = named | further, Seed.of(found, pair)
             hint = "" if pair.smooth else _NO_GRADIENT
             if status is Status.PERIODIC:
-                hint += fading_note(float(orbit.multiplier), period)
-        elif idle:
-            steady = {"kind": "idle"}
-            if found.window is not None:
-                steady |= window_record(found.window)
-                motion = window_series(pair, found.window) if series else None
+                hint += fading_note(float(found.orbit.multiplier), int(found.period))
+        elif idle and found.window is not None:
+            steady |= window_record(found.window)
+            motion = window_series(pair, found.window) if series else None
+        response = {name: value for name, (value, _) in named.items()}
+        gradient = self._named({name: row for name, (_, row) in named.items()}) if known else {}
+        if status in CLOSED or idle:
+            terms, slopes = self._terms(design, response, gradient)
+            response |= terms
+            gradient |= slopes if known else {}
         elif status is Status.UNSOUND and pair.soundness is not None:
             hint = f" Here, {fault_of(pair.soundness)}."
         elif found.window is not None:
@@ -471,20 +454,16 @@ class Evaluator:
         elif status is Status.SOLVER_FAILED and pair.timescales is not None:
             swings = pair.mesh_period / (2 * np.pi * pair.timescales.swing)
             statistics["swings_per_mesh_period"] = float(swings)
-        if status in CLOSED or idle:
-            terms, slopes = self._terms(design, response, gradient)
-            response |= terms
-            gradient |= slopes if known else {}
         if idle:
-            depth = orbit.depth if found.window is None else found.window.depth
+            depth = found.orbit.depth if found.window is None else found.window.depth
             said = apart_message(self.config, float(depth), response.get(RESERVES[1]))
         if pair.gear is not None and pair.gear.errors is not None:
             steady |= rattle_record(pair, found)
             if series:
                 limit = jax.device_get(silent_limit(self.scene, jnp.asarray(design)))
-                for name, (value, slope) in silent_record(limit).items():
-                    response[name] = value
-                    gradient[name] = dict(zip(self.keys, map(float, slope), strict=True))
+                silent = silent_record(limit)
+                response |= {name: value for name, (value, _) in silent.items()}
+                gradient |= self._named({name: row for name, (_, row) in silent.items()})
         return Evaluation(
             design=dict(zip(self.keys, map(float, design), strict=True)),
             geometry=geometry_record(self.scene, shape),
@@ -497,6 +476,35 @@ class Evaluator:
             series=motion,
             start=start,
         )
+
+    def _forces(self, found: Steady) -> dict[str, tuple[float, Any]]:
+        """Return the forces of an orbit and their derivatives (d,), by name; 0 without contact."""
+        rows = np.column_stack([found.orbit.response, found.orbit.sensitivity])
+        if Status.of(found.status) is Status.IDLE:
+            rows = np.zeros_like(rows)
+        return self.scene.solver.measures.named(rows, int(found.period))
+
+    def _along(
+        self, design, built, found: Steady, series: bool
+    ) -> tuple[Series | None, dict[str, tuple[float, Any]]]:
+        """Return the series of an orbit, and what else is computed along it: values and derivatives
+        (d,) by name.
+
+        `built`: rotor pair, and its derivatives along the `design`."""
+        pair, further = built[0], {}
+        motion = orbit_series(pair, found) if series else None
+        if self._loaded(series):
+            whole = varied(found)
+            loads = jax.device_get(orbit_loads(self.scene, jnp.asarray(design), whole))
+            further |= bearing_record(loads)
+            if motion is not None:
+                turns = len(motion.time) // len(loads.series.sizes), 1
+                each = np.tile(np.asarray(loads.series.sizes, np.float64), turns)
+                motion = dataclasses.replace(motion, bearing_loads=each)
+        if self._geared(series):
+            reserve = jax.device_get(apart_program(*built, varied(found)))
+            further |= apart_record(reserve, float(self.scene.pitch_radius))
+        return motion, further
 
     def _loaded(self, series: bool) -> bool:
         """Return whether an evaluation computes loads on bearings; `series`: with a series."""
