@@ -233,9 +233,8 @@ def orbit_loads(scene: Scene, design: Float[Array, " d"], orbit: VariedOrbit) ->
         return jax.vmap(push, (1, 0), (None, -1))(changes, moved)
 
     # The loads have corners that the motion does not have, as where the gear's torque changes sign.
-    begins, ends, count = smooth_pieces(
-        bearings.pair, orbit.elements, loads_corners(bearings), bearings.flags(orbit)
-    )
+    corners, flags = loads_corners(bearings), bearings.flags(orbit)
+    begins, ends, count = smooth_pieces(bearings.pair, orbit.elements, corners, flags)
     leaps, moves = _leaps(scene, orbit, (dynamic, static, moved))
     sides = leaps[:, None] + _ASIDE * np.array([-1.0, 1.0])
     # All instants in one array, so that the derivatives are compiled once.

@@ -322,7 +322,8 @@ def test_no_number_without_its_status(settled, name):
     evaluation = settled[name]
     status, steady = evaluation.status, evaluation.steady_state
     described = status in (Status.PERIODIC, Status.TOO_DEEP, Status.CHAOTIC, Status.NOT_SETTLED)
-    assert set(evaluation.response) == (set(RESPONSES) if described else set())
+    assert bool(evaluation.response) == described
+    assert not described or {*RESPONSES} <= evaluation.response.keys()
     assert (evaluation.series is not None) == described
     differentiable = status is Status.PERIODIC and bool(evaluation.design)
     assert set(evaluation.gradient) == (set(RESPONSES) if differentiable else set())
@@ -412,7 +413,7 @@ def test_epicycloid_has_responses_and_nothing_to_differentiate(settled):
     evaluation = settled["epicycloid"]
     assert evaluation.design == {}
     assert evaluation.gradient == {}
-    assert set(evaluation.response) == set(RESPONSES)
+    assert {*RESPONSES} <= evaluation.response.keys()
 
 
 def test_a_found_orbit_is_a_start_that_changes_nothing(sharp, orbits):
