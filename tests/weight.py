@@ -46,16 +46,16 @@ def measured() -> dict[str, int]:
     pages = sorted((ROOT / "docs").rglob("*.md"))
     words = sum(len(re.findall(r"\w[\w'’-]*", path.read_text("utf-8"))) for path in pages)
     return {
-        "statements of the package": 26_867statements(files),
-        "statements of the tests": 19_409statements((ROOT / "tests").rglob("*.py")),
-        "statements of the experiments": 6_109statements((ROOT / "experiments").rglob("*.py")),
+        "statements of the package": _statements(files),
+        "statements of the tests": _statements((ROOT / "tests").rglob("*.py")),
+        "statements of the experiments": _statements((ROOT / "experiments").rglob("*.py")),
         "packages": sum(path.is_dir() for path in (ROOT / "rootsopt").glob("[a-z]*")),
         "files of the package": len(files),
         "lines of the longest file": max(
             len(path.read_text("utf-8").splitlines()) for path in files
         ),
         "floors of packages": _depth(rooms),
-        "depth of imports": 41depth(imports),
+        "depth of imports": _depth(imports),
         "config keys": len(keys_of(Config)),
         "lines of the longest help": max(map(_help_lines, COMMANDS.values())),
         "pages of docs": len(pages),

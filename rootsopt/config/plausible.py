@@ -129,6 +129,7 @@ USUAL: dict[str, Usual] = {
     "pump.gas.temperature_K": Usual(200, 800),
     "pump.gas.gas_constant_J_per_kg_K": Usual(30, 4500),
     "drawing.tolerance_mm": _GAP,
+    "drawing.inset_mm": _GAP,
 }
 """Usual range of each key with a unit, other than design parameters."""
 _DESIGN = {"pressure_angle_deg": Usual(5, 85), "tip_arc_turn_deg": Usual(3, 180), TWIST: _TWIST}
