@@ -1,5 +1,6 @@
 """Tests of orbits closed from those of neighbouring pairs."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import equinox as eqx
@@ -304,7 +305,8 @@ def test_a_mesh_is_refined_only_if_the_finer_one_says_something_new(used, meshes
         "elements": finer.elements,
         "meshes": jnp.asarray(meshes),
     }
-    loop = _Crowded(nothing, nothing, nothing, start, nothing, jnp.asarray(1e-7))
+    equation: Any = SimpleNamespace(top=jnp.ones(()))
+    loop = _Crowded(equation, nothing, nothing, start, nothing, jnp.asarray(1e-7))
     assert bool(loop.keep(Loop(**now), finer).over) is ends
 
 
