@@ -97,7 +97,9 @@ def test_improvement_over_the_nominal_member():
         dataclasses.replace(blank, response={key: force * x for key, x in forces.items()})
         for force in (100.0, 75.0, 50.0)
     )
-    problem = SimpleNamespace(objective=lambda found: found.response["mean_force_N"] / 100)
+    problem = SimpleNamespace(
+        objective=lambda found: found.response["mean_force_N"] / 100, config=load(CIC)
+    )
     found = SimpleNamespace(problem=problem, optimized=best)
     gain = Optimization._gains(found, measured, 1.0)  # type: ignore[arg-type]
     over = Optimization._gains(found, member, 0.75)  # type: ignore[arg-type]
