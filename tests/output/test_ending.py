@@ -136,7 +136,8 @@ def test_flanks_that_stay_apart_are_a_result(pump, term):
     keys = [{"key": "contact.clearance_mm"}]
     given["touching"] = {"machines": 10000, "touching_share": 0.016, "keys": keys}
     assert facts_of(given)["Flanks"] == (
-        f"{said} The teeth of the timing gear carry up to 254.4 N."
+        f"{said} The teeth of the timing gear carry up to 254.4 N; the motion repeats every 2 mesh "
+        "periods."
     )
     assert facts_of(given)["How sure"].endswith(
         "Of 10000 machines within tolerances, 1.6 % touch; clearance costs most of the reserve."
