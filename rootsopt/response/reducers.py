@@ -133,13 +133,16 @@ def mean(head: Evaluation, evaluations: Sequence[Evaluation], shares: ArrayLike)
     def average(values: list[float]) -> float:
         return float(weights @ values)
 
+    # The reserve of a pair without a motion of its own is not known.
+    known = [k for k in head.response if all(k in one.response for one in evaluations)]
     return dataclasses.replace(
         head,
         maxima=None,
-        response={k: average([one.response[k] for one in evaluations]) for k in head.response},
+        response={k: average([one.response[k] for one in evaluations]) for k in known},
         gradient={
             name: {key: average([one.gradient[name][key] for one in evaluations]) for key in row}
             for name, row in head.gradient.items()
+            if name in known
         },
     )
 

@@ -154,14 +154,10 @@ def test_constraints_in_conflict_are_part_of_the_status():
     assert ending(given, Path("run"), "cic").steps[0] == (advice, "")
 
 
-def test_flanks_that_stay_apart_have_a_reserve():
+def test_the_reserve_is_part_of_what_was_gained():
     response = {"mean_force_N": 0.0, "peak_force_N": 0.0, "contact_reserve_um": 12.5}
-    given = run_of("simulate", **record(response=response, steady_state={"kind": "idle"}))
-    given |= {"status": "idle", "message": "The timing gear keeps the flanks apart."}
-    facts = facts_of(given)
-    assert facts["Status"] == "Idle: The timing gear keeps the flanks apart."
-    assert facts["Contact force"].endswith("0 N; the reserve against contact is 12.5 µm.")
-    assert steps_of(given)[0] == "rootsopt optimize run/config.yaml"
+    striking = run_of("simulate", **record(response=response | {"contact_reserve_um": -3.0}))
+    assert "the reserve against contact is −3 µm" in facts_of(striking)["Contact force"]
     closer = record(response=response | {"contact_reserve_um": 20.0})
     given = run_of("optimize", baseline=record(response=response), optimized=closer)
     assert "contact goes from 12.5 µm to 20 µm" in facts_of(given)["Gained"]

@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -184,7 +185,7 @@ def test_a_cycle_is_that_of_the_pair_last_evaluated(coexisting, monkeypatch):
 
     class Refitting(Evaluator):
         def pair(self, design):
-            built.append(object())
+            built.append(SimpleNamespace(repeats=1))
             return built[-1]
 
     def cycle(pair, state, how):
