@@ -99,7 +99,7 @@ def test_gradients_are_those_of_differences(clearance):
     slopes, _ = differentiated(values, 4e-3)
     for name, slope in zip(names, slopes, strict=True):
         row = np.array([*here.gradient[name].values()])
-        assert row @ way == pytest.approx(slope, abs=5e-5 * np.max(np.abs(row)))
+        assert row @ way == pytest.approx(slope, abs=2e-4 * np.max(np.abs(row)))
 
 
 def test_reserve_is_continuous_where_the_flanks_begin_to_touch():

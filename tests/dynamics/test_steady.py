@@ -326,7 +326,7 @@ def test_no_number_without_its_status(settled, name):
     assert not described or {*RESPONSES} <= evaluation.response.keys()
     assert (evaluation.series is not None) == described
     differentiable = status is Status.PERIODIC and bool(evaluation.design)
-    assert set(evaluation.gradient) == (set(RESPONSES) if differentiable else set())
+    assert evaluation.gradient.keys() == (evaluation.response.keys() if differentiable else set())
     for row in evaluation.gradient.values():
         assert set(row) == set(DESIGN_KEYS)
     kinds = {Status.PERIODIC: "periodic", Status.TOO_DEEP: "periodic", Status.CHAOTIC: "chaotic"}
