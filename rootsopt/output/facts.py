@@ -148,7 +148,7 @@ def _certified(result: Record) -> Iterator[str]:
     if verified is not None and "combined_standard_error" in check:
         error = brief(check["combined_standard_error"], 2)
         yield f"an independent ensemble gives the objective {brief(verified)} ± {error}"
-    elif searched and verified is not None:
+    elif searched and verified is not None and check.get("status") != Status.GEOMETRY_ONLY.label:
         away = brief(abs(verified / searched - 1), 2)
         yield f"simulated again from rest, its objective agrees to {away} (relative)"
     fresh: Mapping[str, Any] = (result.get("robustness") or {}).get("fresh") or {}
