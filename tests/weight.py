@@ -13,8 +13,8 @@ from unittest import mock
 
 ROOT = Path(__file__).parents[1]
 MOST = {
-    "statements of the package": 26_868,
-    "statements of the tests": 19_421,
+    "statements of the package": 26_885,
+    "statements of the tests": 19_433,
     "statements of the experiments": 6_109,
     "packages": 20,
     "files of the package": 294,

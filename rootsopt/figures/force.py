@@ -51,6 +51,28 @@ def plot_force(
     return axes
 
 
+def plot_gap(
+    axes: Sequence[Axes] | NDArray, series: Mapping[str, Series]
+) -> Sequence[Axes] | NDArray:
+    """Draw the gap of flanks that never touch over one revolution, one panel per design.
+
+    `axes`: one for each design; `series`: simulated motion of each design, keyed by its name.
+    Return `axes`."""
+    for ax, (name, run) in zip(axes, series.items(), strict=True):
+        turn = run.rotation <= run.rotation[0] + 2 * np.pi
+        time, gap = (run.time[turn] - run.time[0]) * 1e3, -1e6 * run.depth[turn]
+        ax.plot(time, gap, color=BLUE, linewidth=1.2, label="gap of the nearer flanks")
+        least = float(np.min(gap))
+        label = f"least gap {number(least)} µm"
+        ax.axhline(least, color="black", linestyle="--", linewidth=1.1, label=label)
+        # Between two lobes, the gap is as wide as the rotors: only its narrow part tells something.
+        high = min(1.12 * float(np.max(gap)), 4 * least)
+        ax.set(title=name, ylabel="gap (µm)", xlim=(0, time[-1]), ylim=(0, high))
+        beside(ax)
+    axes[-1].set_xlabel("time (ms)")
+    return axes
+
+
 def plot_flank_force(ax: Axes, time: NDArray, force: NDArray, color: str, label: str) -> None:
     """Draw the force on a flank over time or rotation, with a shade below it."""
     if not np.any(force > 0):

@@ -9,7 +9,7 @@ import numpy as np
 from rootsopt.config import FAMILY_KEYS, Config
 from rootsopt.config.families import is_list
 from rootsopt.figures.comparison import plot_departure, plot_forces_together
-from rootsopt.figures.force import plot_force, plot_spectrum
+from rootsopt.figures.force import plot_force, plot_gap, plot_spectrum
 from rootsopt.figures.history import plot_history
 from rootsopt.figures.optimum import plot_prices, plot_residual, plot_starts
 from rootsopt.figures.profiles import plot_conjugacy, plot_flank, plot_meshing, plot_profiles
@@ -137,6 +137,9 @@ def _force_figures(folder, designs, config) -> list[str]:
     responses, speed = {k: designs[k].response for k in series}, config.scene.speed_rpm
     count, shared = len(series), {"sharex": True, "sharey": True}
     made, axes = figure(10, 1.2 + 2.6 * count, count, 1, **shared)
+    if not any(np.any(one.force) for one in series.values()):
+        plot_gap(list(axes[:, 0]), series)
+        return [write(folder, "gap", made, f"Gap of flanks that stay apart at {speed:g} rpm")]
     plot_force(list(axes[:, 0]), series, responses)
     names = [write(folder, "force", made, f"Contact force over time at {speed:g} rpm")]
     made, axes = figure(10, 1.4 + 2.6 * count, count, 1, **shared)

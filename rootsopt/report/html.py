@@ -39,6 +39,7 @@ _CAPTIONS = {
     "conjugacy.png": "Gap between the flanks of the outline in perfect rolling",
     "force.png": "Contact force over time",
     "spectrum.png": "Spectrum of the contact force",
+    "gap.png": "Gap of the flanks over time",
     "comparison.png": "Forces together, and departure of the flanks",
     "history.png": "Objective and design over the search",
     "optimum.png": "Certificate: residual, prices of the limits, starts",

@@ -12,7 +12,7 @@ from rich.console import Console
 from rootsopt.config import parse
 from rootsopt.errors import InputError
 from rootsopt.figures import runs
-from rootsopt.figures.force import amplitude_spectrum, plot_force
+from rootsopt.figures.force import amplitude_spectrum, plot_force, plot_gap
 from rootsopt.figures.history import plot_history
 from rootsopt.figures.runs import optimization_figures, simulation_figures
 from rootsopt.figures.style import figure
@@ -403,6 +403,24 @@ def test_force_panels_show_each_peak_on_a_common_time_axis():
     assert drawn.get_ydata().max() == 500
     assert axes[0, 0].get_xlim() == pytest.approx((0, 20))
     assert drawn.get_xdata()[-1] < 20
+
+
+def test_gap_panel_shows_the_least_gap():
+    """One revolution is drawn; a gap as wide as the rotors does not set the scale."""
+    series = _series(periods=6)
+    gap = 1e-4 * (1 + (np.arange(len(series.time)) % 64 == 32) * 600.0)
+    gap[5] = 8e-5
+    _, axes = figure(6, 2, 1, 1)
+    plot_gap(axes[:, 0], {"a": dataclasses.replace(series, depth=-gap)})
+    curve, least = axes[0, 0].lines
+    assert least.get_ydata()[0] == pytest.approx(80)
+    assert least.get_label() == "least gap 80.00 µm"
+    assert axes[0, 0].get_ylim() == pytest.approx((0, 320))
+    assert (
+        np.ptp(series.rotation)
+        > 2 * np.pi
+        > 0.9 * np.ptp(series.rotation[: curve.get_xdata().size])
+    )
 
 
 def _png_size(path):
