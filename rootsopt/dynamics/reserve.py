@@ -30,13 +30,9 @@ from rootsopt.dynamics.varied import VariedOrbit
 _NEWTON = 6
 """Number of positions of rotor 2 at which the least gap is computed. Newton's method leads from one
 to the next; the gap is nearly linear in the position."""
-
-
 _INWARDS = 0.9999
 """Greatest move towards the middle of the backlash, as a share of the distance from it. Without
 clearance, flanks part only in the middle, where the other flanks touch."""
-
-
 INSTANTS = 96
 """Number of instants over an orbit at which `gaps` are computed."""
 
@@ -57,7 +53,7 @@ def apart(pair: RotorPair, tangents: RotorPair, orbit: VariedOrbit) -> Apart:
 
     `tangents`: directions of the pair's parameters to which the variation of the orbit belongs."""
     found = zip(reserve(pair, tangents, orbit), gear_torque(pair, tangents, orbit), strict=True)
-    return Apart(*(jnp.concatenate(pair) for pair in found))
+    return Apart(*map(jnp.concatenate, found))
 
 
 def _aside(pair: RotorPair, tau, state: Float[Array, " n"]) -> tuple[Array, Array]:
