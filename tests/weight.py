@@ -13,7 +13,7 @@ from unittest import mock
 
 ROOT = Path(__file__).parents[1]
 MOST = {
-    "statements of the package": 26_885,
+    "statements of the package": 26_887,
     "statements of the tests": 19_433,
     "statements of the experiments": 6_109,
     "packages": 20,

@@ -72,7 +72,7 @@ class Sheet(Section):
             for word in (option(name), f"{value:.10g}" if isinstance(value, float) else str(value))
         )
 
-    def begun(self, family: Family) -> ProfileConfig:
+    def first_profile(self, family: Family) -> ProfileConfig:
         """Return the example of a `family` in the size of this sheet.
 
         Raises `ValueError` if a parameter is out of its range."""

@@ -1,4 +1,4 @@
-"""Tables of materials and media, and of usual gears, for a rotor of which only a sheet is known.
+"""Tables of materials, media and usual gears, for a rotor that is known only from a sheet.
 
 All values are usual ones at 20 °C. A certificate or a data sheet replaces them."""
 

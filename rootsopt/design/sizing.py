@@ -49,7 +49,10 @@ def sized(config: Config) -> Config | list[float]:
         return []
     room = _ROOM * np.max([at(*point)[1] for point in sound], axis=0) - _SLACK
     search = functools.partial(_searched, at, outer, room, home)
-    radius = lambda point: limit - float(at(*point)[1][outer][0])  # noqa: E731
+
+    def radius(point):
+        return limit - float(at(*point)[1][outer][0])
+
     sound.sort(key=radius)
     if not radius(sound[0]) <= limit <= radius(sound[-1]):
         # Without this, searches for what no member has would take long.
@@ -108,7 +111,9 @@ def _searched(at, outer, room, home, start, side: float) -> NDArray[np.float64]:
     search begins."""
     from scipy.optimize import minimize
 
-    seen = lambda x: at(*x)  # noqa: E731
+    def seen(x):
+        return at(*x)
+
     rows = [
         {"type": "ineq", "fun": lambda x: (seen(x)[1] - room)[~outer],
          "jac": lambda x: seen(x)[2][~outer]},

@@ -37,7 +37,7 @@ _TOLD = "theoretical_flow_l_min", "area_mm2", "root_radius_mm", "contact_reserve
 
 
 def optimised(result: Record, rows: Sequence[Record]) -> Facts:
-    """Return facts on an optimum; none if there is none."""
+    """Return facts on an optimum; an empty list without one."""
     del rows
     before, after = result.get("baseline") or {}, result.get("optimized") or {}
     if not after:

@@ -117,7 +117,7 @@ def _met(sheet: Sheet) -> Config:
     radii: list[float] = []
     for name in [sheet.family] if sheet.family else made():
         try:
-            text = sheet.text(sheet.begun(family_of(name)))
+            text = sheet.text(sheet.first_profile(family_of(name)))
         except ValidationError:  # A parameter that its key cannot have at this size.
             continue
         found = sized(parse(text, source="sheet"))
