@@ -19,8 +19,9 @@ from rootsopt.commands.table import pareto
 from rootsopt.commands.work.searching import progress_bar
 from rootsopt.config import load
 from rootsopt.output.fronts import design_file
+from rootsopt.profiles import geometry
+from rootsopt.response.records import geometry_record
 from rootsopt.scene import Scene, design_vector
-from rootsopt.tradeoffs.study import geometry_of
 
 ROOT = Path(__file__).parents[2]
 CIC = str(ROOT / "configs" / "cic.yaml")
@@ -60,9 +61,12 @@ def test_config_of_a_point_is_its_design(folder):
     result = json.loads((folder / "result.json").read_text())
     for point in result["points"]:
         config = load(folder / design_file(point["point"]))
-        found = geometry_of(Scene.from_config(config), config, design_vector(config))
-        assert found.response == pytest.approx(point["terms"], rel=1e-12)
-        assert found.geometry == pytest.approx(point["geometry"], rel=1e-12)
+        scene = Scene.from_config(config)
+        found = geometry_record(scene, geometry(scene.profile(design_vector(config))))
+        assert found == pytest.approx(point["geometry"], rel=1e-12)
+        assert {name: found[name] for name in point["terms"]} == pytest.approx(
+            point["terms"], rel=1e-12
+        )
 
 
 def test_page_opens_without_a_network(folder):
