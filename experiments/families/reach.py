@@ -14,6 +14,7 @@ from scipy.optimize import minimize
 from experiments._common.simulation import profile_of
 from rootsopt.config import Config
 from rootsopt.config.families import family_of
+from rootsopt.config.study import limits_of
 from rootsopt.config.units import MM
 from rootsopt.design.space import Space, sobol
 from rootsopt.optimize.problem import Problem
@@ -85,7 +86,7 @@ def in_housing(config: Config, bore_radius_mm: float, area_efficiency: float) ->
 
 def problem_of(config: Config) -> Problem:
     """Return the design problem of a config for geometry alone, without an evaluated baseline."""
-    return Problem(config, cast(Any, None), Space.of(config, Scene.from_config(config), 0.0))
+    return Problem(config, cast(Any, None), Space.of(config, Scene.from_config(config)))
 
 
 def reach(config: Config, sample: int = SAMPLE) -> Reach | None:
@@ -116,9 +117,7 @@ def _only(config: Config) -> Reach | None:
     """Return the reach of a family without design parameters, or `None` if it does not fit."""
     shape = geometry(profile_of(config))
     limits = config.constraints
-    low, high = limits.outer_radius_min_mm, limits.outer_radius_max_mm
-    assert low is not None
-    assert high is not None
+    low, high = limits_of(limits.outer_radius_min_mm, limits.outer_radius_max_mm)
     if not low <= round(float(shape.outer_radius) / MM, 9) <= high:
         return None
     return Reach(np.zeros((1, 0)), np.array([float(shape.area_efficiency)]))

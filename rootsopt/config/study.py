@@ -312,9 +312,12 @@ class SweepConfig(Section):
     )
 
 
-_Floor = Annotated[float, between(0, 5000)]
-_Outer = Annotated[float, between(1, 1e4)]
-_Finite = Annotated[float, between(-1e12, 1e12)]
+BASELINE = "baseline"
+"""Value of a limit that stands for the baseline's own value of the quantity."""
+_Own = Literal["baseline"]
+_Floor = _Own | Annotated[float, between(0, 5000)]
+_Outer = _Own | Annotated[float, between(1, 1e4)]
+_Finite = _Own | Annotated[float, between(-1e12, 1e12)]
 
 
 _LINE = re.compile(r"line_.+_force_N")
@@ -346,10 +349,22 @@ def _above(name: str) -> list[tuple[str, float]]:
     return [(other, 1.0) for other in row[row.index(name) + 1 :]]
 
 
-class ConstraintsConfig(Section):
-    """Constraints that an optimised design must satisfy."""
+def limits_of(low: float | str | None, high: float | str | None) -> tuple[float, float]:
+    """Return a floor and a ceiling as numbers that two limits from the config can be compared by.
 
-    area_efficiency_min: Literal["baseline"] | Annotated[float, Field(ge=0, lt=1)] = Field(
+    An absent limit is infinite, and so is one that is the baseline's value, not yet known."""
+    return (
+        low if isinstance(low, float) else -math.inf,
+        high if isinstance(high, float) else math.inf,
+    )
+
+
+class ConstraintsConfig(Section):
+    """Constraints that an optimised design must satisfy.
+
+    Each limit is a number, or `baseline`: the value of the design that the search is to improve."""
+
+    area_efficiency_min: _Own | Annotated[float, Field(ge=0, lt=1)] = Field(
         "baseline", description="floor of the area efficiency"
     )
     undercut_margin_min_mm: _Floor = Field(0.0, description="floor of the undercut margin")
@@ -361,38 +376,49 @@ class ConstraintsConfig(Section):
     terms: dict[str, dict[Literal["min", "max"], _Finite]] = Field(
         default_factory=dict,
         description="limits of further quantities by name, as {peak_force_N: {max: 200}, "
-        "displaced_volume_cm3: {min: 900}}: mean_force_N, peak_force_N, rms_force_N, "
+        "displaced_volume_cm3: {min: baseline}}: mean_force_N, peak_force_N, rms_force_N, "
         "line_ORDER_force_N, built-in or registered terms; forces at every speed of the objective",
     )
 
     @model_validator(mode="after")
     def _ordered(self):
-        low, high = self.outer_radius_min_mm or 0.0, self.outer_radius_max_mm or math.inf
+        radii = self.outer_radius_min_mm, self.outer_radius_max_mm
+        low, high = limits_of(*radii)
         require(
             low < high,
             "`constraints.outer_radius_max_mm` must be greater than "
             f"`constraints.outer_radius_min_mm` = {low:g}, but is {high:g}",
         )
+        require(
+            radii != (BASELINE, BASELINE),
+            "`constraints.outer_radius_min_mm` and `constraints.outer_radius_max_mm` must not both "
+            "be baseline: no design meets both exactly; give one of them some room",
+        )
         for name, sides in self.terms.items():
             key = f"`constraints.terms.{named(name)}"
             require(bool(sides), f"{key}` must have `min`, `max` or both, as in {{max: 200}}, but "
                     "is empty")  # fmt: skip
-            low, high = sides.get("min", -math.inf), sides.get("max", math.inf)
+            low, high = limits_of(sides.get("min"), sides.get("max"))
             require(low < high, f"{key}.max` must be greater than its `min` = {low:g}, but is "
                     f"{high:g}")  # fmt: skip
+            require(
+                sides != {"min": BASELINE, "max": BASELINE},
+                f"{key}` must not have `min` and `max` both baseline: no design meets both "
+                "exactly; give one of them some room",
+            )
         return self
 
     @model_validator(mode="after")
     def _reachable(self):
         for name, sides in self.terms.items():
-            low, high = sides.get("min", -math.inf), sides.get("max", math.inf)
+            low, high = limits_of(sides.get("min"), sides.get("max"))
             require(
                 high >= 0 or not (name in _SIZES or _LINE.fullmatch(name)),
                 f"`constraints.terms.{name}.max` must be at least 0, but is {high:g}: the "
                 "quantity is never negative; raise or remove the limit",
             )
             for other, factor in _above(name):
-                ceiling = self.terms.get(other, {}).get("max", math.inf)
+                ceiling = limits_of(None, self.terms.get(other, {}).get("max"))[1]
                 require(
                     low <= factor * ceiling,
                     f"`constraints.terms.{name}.min` must be at most {factor * ceiling:.4g}, but "

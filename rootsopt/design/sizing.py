@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from rootsopt.config import Config
 from rootsopt.config.families import family_of
+from rootsopt.config.study import limits_of
 from rootsopt.config.units import MM
 from rootsopt.design.space import Space, slacks_and_slopes, sobol
 from rootsopt.errors import InputError
@@ -35,7 +36,7 @@ def sized(config: Config) -> Config | list[float]:
     Its outer radius is `constraints.outer_radius_max_mm` to 1e-6 mm. Among such members, it is the
     one nearest to the config's own profile, in the unit box of the family's default bounds. If none
     is found, return outer radii (mm) of sound members, among them the least and the greatest."""
-    limit = config.constraints.outer_radius_max_mm or 0.0
+    limit = limits_of(None, config.constraints.outer_radius_max_mm)[1]
     if not family_of(config.profile.family).keys:
         own = float(shape_of(config).outer_radius) / MM
         return _met(config, config.design) or [own]
@@ -76,7 +77,7 @@ def _met(config: Config, design) -> Config | None:
         check(config.profile)
     except InputError:
         return None
-    limit = config.constraints.outer_radius_max_mm or 0.0
+    limit = limits_of(None, config.constraints.outer_radius_max_mm)[1]
     return config if abs(float(shape_of(config).outer_radius) / MM - limit) <= _CLOSE else None
 
 
@@ -89,8 +90,8 @@ def _space(config: Config) -> Space:
             least, most = one.limits(profile.pitch_radius_mm) or one.bounds_range
             low, high = one.usually(profile.pitch_radius_mm, profile.lobes)
             bounds[f"optimizer.bounds.{one.key}"] = [max(low, least), min(high, most)]
-    free = config.replaced({**bounds, "constraints.area_efficiency_min": 0.0})
-    return Space.of(free, Scene.from_config(free), 0.0)
+    free = config.replaced(bounds)
+    return Space.of(free, Scene.from_config(free))
 
 
 def _seen(space: Space, point) -> tuple[NDArray[np.float64], ...]:

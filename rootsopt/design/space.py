@@ -19,12 +19,23 @@ from numpy.typing import NDArray
 
 from rootsopt.config import Config
 from rootsopt.config.families import Family, family_of
+from rootsopt.config.study import BASELINE
 from rootsopt.config.units import DEG, MM, si_unit, unit_of, words
 from rootsopt.design.bounds import bounds_of, floors_of
 from rootsopt.profiles import Geometry, Profile, geometry
 from rootsopt.profiles.validity import ProfileMargins, margins
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene
+
+_LIMITED = (
+    # key, name, quantity, unit, scale, factor
+    ("area_efficiency_min", "area efficiency", "area_efficiency", "", 0.01, 1.0),
+    ("undercut_margin_min_mm", "undercut margin", "undercut_margin", "mm", MM, MM),
+    ("seal_width_min_mm", "seal width", "seal_width", "mm", MM, MM),
+    ("outer_radius_max_mm", "outer radius", "outer_radius", "mm", MM, MM),
+    ("outer_radius_min_mm", "outer radius", "outer_radius", "mm", MM, MM),
+)
+"""Fixed keys of the section `constraints`, with what they limit (see `Constraint`)."""
 
 _SOUND = (
     # name, margin, unit, limit, scale, factor
@@ -119,37 +130,31 @@ class Space(eqx.Module):
         cls,
         config: Config,
         scene: Scene,
-        area_efficiency: float,
         further: tuple[Constraint, ...] = (),
     ) -> "Space":
         """Return the design space of a config.
 
-        `scene`: scene of the config; `area_efficiency`: area efficiency of the baseline design,
-        used if the config's limit is `baseline`; `further`: constraints in addition to those of
-        the family and of the fixed keys of `constraints`. Raises `InputError` if the config's
-        bounds are impossible."""
+        `scene`: scene of the config; `further`: constraints in addition to those of the family and
+        of the fixed keys of `constraints`. A limit that is `baseline` counts as 0: searches fill it
+        in first (`rootsopt.optimize.limits.settled`). Raises `InputError` if the config's bounds
+        are impossible."""
         limits, family = config.constraints, family_of(config.profile.family)
         rows = bounds_of(config)
-        floor = limits.area_efficiency_min
-        if floor == "baseline":
-            floor = area_efficiency
-        margin = limits.undercut_margin_min_mm * MM
         sound = not family.by_limits
-        # If undercut decides whether the profile is sound, use the margin that checks more points.
-        undercut = "undercut" if sound else "undercut_margin"
-        constraints = (
-            _constraint("area efficiency", "area_efficiency", "", floor, 0.01, 1.0),
-            _constraint("undercut margin", undercut, "mm", margin, MM, MM, sound),
-            _constraint("seal width", "seal_width", "mm", limits.seal_width_min_mm * MM, MM, MM),
-        )
+        constraints: tuple[Constraint, ...] = ()
+        for key, name, quantity, unit, scale, factor in _LIMITED:
+            limit = getattr(limits, key)
+            if limit is None:
+                continue
+            # If undercut decides whether the profile is sound, use the margin of more points.
+            margin = sound and quantity == "undercut_margin"
+            row = name, "undercut" if margin else quantity, unit
+            limit = 0.0 if limit == BASELINE else limit * factor
+            more = scale, factor, margin, key == "outer_radius_max_mm"
+            constraints += (_constraint(*row, limit, *more),)
         if scene.bore_radius is not None:
-            room = scene.bore_radius
-            constraints += (_constraint("root radius", "root_radius", "mm", room, MM, MM),)
-        radii = ((True, limits.outer_radius_max_mm), (False, limits.outer_radius_min_mm))
-        for ceiling, radius in radii:
-            if radius is not None:
-                row = "outer radius", "outer_radius", "mm", radius * MM, MM, MM
-                constraints += (_constraint(*row, ceiling=ceiling),)
+            row = "root radius", "root_radius", "mm", scene.bore_radius
+            constraints += (_constraint(*row, MM, MM),)
         if sound:
             rows_of = [row for row in _SOUND if row[1] not in family.inherent]
             constraints += tuple(_constraint(*row, margin=True) for row in rows_of)

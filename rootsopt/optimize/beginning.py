@@ -14,8 +14,11 @@ from rootsopt.config.units import MM
 from rootsopt.design.bounds import widened
 from rootsopt.design.resemblance import Likeness, free_likeness, likeness
 from rootsopt.errors import InputError
+from rootsopt.optimize.limits import settled
 from rootsopt.profiles import Outline
 from rootsopt.response.evaluation import Evaluation
+from rootsopt.response.records import geometry_record
+from rootsopt.scene import Scene
 from rootsopt.scene.check import shape_of
 from rootsopt.scene.families import classical, profile_from_file
 
@@ -112,17 +115,15 @@ def _cut(config: Config, inset: float) -> tuple[Config, float]:
     """Return (config of a member with the flank gap of an outline, gap in mm that is too much).
 
     An `inset` (m) of both rotors widens the gap by twice as much. The outline's area efficiency
-    includes the inset, which no member has: the limit `baseline` is that of the member."""
+    and its outer radius include the inset, which no member has: limits of the geometry that are
+    `baseline` are those of the member."""
     if not inset:
         return config, 0.0
     gap = round(config.contact.clearance_mm + 2 * inset / MM, 6)
     contact = config.contact.model_copy(update={"clearance_mm": max(0.0, gap)})
     config = config.model_copy(update={"contact": contact})
-    if config.constraints.area_efficiency_min == "baseline":
-        floor = float(shape_of(config).area_efficiency)
-        limits = config.constraints.model_copy(update={"area_efficiency_min": floor})
-        config = config.model_copy(update={"constraints": limits})
-    return config, max(0.0, -gap)
+    shape = geometry_record(Scene.from_config(config), shape_of(config))
+    return settled(config, shape), max(0.0, -gap)
 
 
 def fits(given: Outline, family: str = NEAREST, enough: float = 0.0) -> list[Likeness]:

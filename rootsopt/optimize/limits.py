@@ -4,12 +4,15 @@ A term that does not read forces becomes a `Constraint` of the design space. It 
 simulation, and designs are moved onto it. A force, or a term that reads forces, becomes a
 `ForceLimit`, which an evaluation satisfies or not."""
 
-from typing import NamedTuple
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 
 from rootsopt.config import Config
+from rootsopt.config.study import BASELINE
 from rootsopt.config.units import unit_of, words
 from rootsopt.design.space import Constraint
 from rootsopt.errors import InputError
@@ -92,6 +95,35 @@ def limited(config: Config) -> Config:
     return reporting(config, names, LIMITS) if names else config
 
 
+def settled(
+    config: Config, geometry: Mapping[str, float], found: Sequence[Mapping[str, float]] = ()
+) -> Config:
+    """Return a copy of a `config` in which limits that are `baseline` are the baseline's values.
+
+    `geometry`: geometry of the baseline, with the keys of the result file; `found`: its responses
+    in each scene and at each speed, of which the worst counts. Without these, limits of
+    `constraints.terms` stay as they are."""
+    own = [key for key, limit in config.constraints if limit == BASELINE]
+    values: dict[str, Any] = {key: geometry[quantity_of(key)] for key in own}
+    terms: dict[str, dict[str, Any]] = {}
+    for name, sides in config.constraints.terms.items():
+        terms[name] = sides = {**sides}
+        for side, worst in (("max", max), ("min", min)):
+            if sides.get(side) == BASELINE and found:
+                sides[side] = worst(one[name] for one in found)
+    limits = config.constraints.model_copy(update=values | {"terms": terms})
+    return config.model_copy(update={"constraints": limits})
+
+
+def quantity_of(key: str) -> str:
+    """Return the name, in the result file, of the quantity that a `key` of `constraints` limits.
+
+    >>> quantity_of("seal_width_min_mm")
+    'seal_width_mm'
+    """
+    return re.sub("_(min|max)", "", key)
+
+
 def term_constraints(config: Config, scene: Scene) -> tuple[TermConstraint, ...]:
     """Return the constraints on those quantities of `constraints.terms` that read no forces."""
     found = []
@@ -132,7 +164,9 @@ def _sides(config: Config):
     for name, one in config.constraints.terms.items():
         for side in ("max", "min"):
             if side in one:
-                yield name, side == "max", float(one[side])
+                # The baseline's value is filled in before a search; the number has no effect.
+                limit = 0.0 if one[side] == BASELINE else float(one[side])
+                yield name, side == "max", limit
 
 
 __all__ = [
@@ -142,6 +176,8 @@ __all__ = [
     "TermConstraint",
     "force_limits",
     "limited",
+    "quantity_of",
     "scale_of",
+    "settled",
     "term_constraints",
 ]

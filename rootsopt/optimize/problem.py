@@ -22,6 +22,7 @@ from rootsopt.optimize.limits import (
     ForceLimit,
     TermConstraint,
     force_limits,
+    settled,
     term_constraints,
 )
 from rootsopt.optimize.local import Group, Linearization
@@ -105,7 +106,7 @@ class Problem:
     def of(cls, config: Config, scene: Scene, baseline: Evaluation) -> "Problem":
         """Return the problem of a `config`, with its `scene` and the evaluated `baseline`.
 
-        Limits that the config does not give come from the `baseline`. Raises `InputError` if a
+        Limits that are `baseline` are those of the `baseline`. Raises `InputError` if a
         measure in the objective is 0 for the baseline, because the objective divides by this value.
         """
         check_senses(config)
@@ -137,8 +138,8 @@ class Problem:
                 f"the weights of `objective` must be on quantities of the baseline, but {said}; "
                 "set the weight to 0"
             )
-        floor = baseline.geometry["area_efficiency"]
-        space = Space.of(config, scene, floor, term_constraints(config, scene))
+        config = settled_by(config, baseline)
+        space = Space.of(config, scene, term_constraints(config, scene))
         return cls(config, baseline, space, force_limits(config, scene))
 
     def objective(self, evaluation: Evaluation) -> float:
@@ -241,7 +242,7 @@ class Problem:
         found = []
         for limit in self.limits:
             tags, values, slopes = [], [], []
-            for kind, one in self._limited(evaluation):
+            for kind, one in counting(evaluation):
                 maxima = one.maxima if limit.cornered else None
                 if maxima is None or not maxima.times.size:
                     tags.append((kind, 0.0))
@@ -263,7 +264,7 @@ class Problem:
         beyond it.
 
         `evaluation`: usable. Speeds, motions and scenes are those of `walls`."""
-        values = [one.response[limit.key] for _, one in self._limited(evaluation)]
+        values = [one.response[limit.key] for _, one in counting(evaluation)]
         return float(max(values, key=limit.excess))
 
     def excess(self, evaluation: Evaluation) -> float:
@@ -294,18 +295,6 @@ class Problem:
         for one in self.limits:
             if evaluation.usable and one.excess(self.worst(evaluation, one)) > FEASIBLE:
                 found.append(one.name)
-        return found
-
-    def _limited(self, evaluation: Evaluation) -> list[tuple[int, Evaluation]]:
-        """Return (kind, evaluation) of each scene, speed and motion in which `limits` must hold."""
-        scenes = [part.evaluation for part in evaluation.scenes] or [evaluation]
-        found = []
-        for scene, whole in enumerate(scenes):
-            for number, part in enumerate(whole.by_speed):
-                if part.share <= 0:
-                    continue
-                kind = SCENE_KINDS * scene + number
-                found += [(kind, one) for one in (part.evaluation, *part.evaluation.rivals)]
         return found
 
     def along_scene(self, moved: Evaluation, certificate: Certificate) -> dict[str, float]:
@@ -618,6 +607,25 @@ class Problem:
             for share, label in zip(shares, group, strict=True)
             if share > _HELD
         ]
+
+
+def counting(evaluation: Evaluation) -> list[tuple[int, Evaluation]]:
+    """Return (kind, evaluation) of each scene, speed and motion in which limits must hold."""
+    scenes = [part.evaluation for part in evaluation.scenes] or [evaluation]
+    found = []
+    for scene, whole in enumerate(scenes):
+        for number, part in enumerate(whole.by_speed):
+            if part.share <= 0:
+                continue
+            kind = SCENE_KINDS * scene + number
+            found += [(kind, one) for one in (part.evaluation, *part.evaluation.rivals)]
+    return found
+
+
+def settled_by(config: Config, baseline: Evaluation) -> Config:
+    """Return a copy of a `config` in which limits that are `baseline` are its evaluated values."""
+    found = [one.response for _, one in counting(baseline)] if baseline.usable else []
+    return settled(config, baseline.geometry, found)
 
 
 def check_senses(config: Config) -> None:

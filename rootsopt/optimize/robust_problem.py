@@ -13,7 +13,7 @@ from rootsopt.config import Config
 from rootsopt.optimize.certificate import Certificate
 from rootsopt.optimize.local import Group, Linearization
 from rootsopt.optimize.optimality import Holder
-from rootsopt.optimize.problem import SCENE_KINDS, Problem
+from rootsopt.optimize.problem import SCENE_KINDS, Problem, settled_by
 from rootsopt.response.evaluation import Evaluation
 from rootsopt.response.reducers import Combined, combine
 from rootsopt.scene import Scene
@@ -37,8 +37,8 @@ class RobustProblem(Problem):
         """Return the problem of a `config` with `tolerances`, as `Problem.of` does.
 
         `baseline`: a usable evaluation of the config's own design over the sample."""
-        problem = Problem.of(config, scene, baseline.nominal)
-        found = cls(config, problem.baseline, problem.space, problem.limits)
+        problem = Problem.of(settled_by(config, baseline), scene, baseline.nominal)
+        found = cls(problem.config, problem.baseline, problem.space, problem.limits)
         return dataclasses.replace(found, reference=found.combined(baseline).value)
 
     def values(self, evaluation: Evaluation) -> NDArray[np.float64]:

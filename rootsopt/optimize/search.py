@@ -167,7 +167,7 @@ class Search:
         maxima = needs_maxima(self.config, force_limits(self.config, self.exact.scene))
         exact = self.exact
         exact.prepare(maxima=maxima)
-        Space.of(self.config, exact.scene, 0.0).prepare()
+        Space.of(self.config, exact.scene).prepare()
         first = exact()
         baseline = first
         if self.beginning is not None:

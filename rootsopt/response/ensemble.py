@@ -264,7 +264,7 @@ def _slopes(
 
 def _space(evaluator: Evaluator, design) -> Space:
     """Return the unit box of the design parameters, extended if `design` lies outside."""
-    space = Space.of(evaluator.config, evaluator.scene, 0.0)
+    space = Space.of(evaluator.config, evaluator.scene)
     lower, upper = np.minimum(space.lower, design), np.maximum(space.upper, design)
     bounds = jnp.asarray(lower), jnp.asarray(upper)
     return eqx.tree_at(lambda s: (s.lower, s.upper), space, bounds)

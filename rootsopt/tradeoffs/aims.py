@@ -1,15 +1,18 @@
 """The terms of a trade-off: names, senses (`min` or `max`), and whether they need a simulation."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from rootsopt.config import Config
+from rootsopt.config.study import BASELINE
 from rootsopt.config.units import unit_of, words
 from rootsopt.errors import InputError
-from rootsopt.optimize.limits import LIMITS, depends_on_forces, limited
+from rootsopt.optimize.limits import LIMITS, depends_on_forces, limited, quantity_of
 from rootsopt.response.reporting import is_force, reporting
 from rootsopt.response.terms import terms_of
 from rootsopt.scene import Scene
 
+_OPTIONAL = "outer_radius_min_mm", "outer_radius_max_mm"
+"""Keys of `constraints` that may be absent; a floor of 0 has the same effect in the others."""
 _KEY = "pareto.terms"
 """Config key that names the terms."""
 
@@ -91,17 +94,26 @@ def reported(config: Config) -> Config:
     return reporting(limited(config), config.pareto.terms, _KEY)
 
 
-def freed(config: Config) -> Config:
-    """Return a copy of a `config` whose area efficiency may fall below the baseline's.
+def freed(config: Config) -> tuple[Config, tuple[str, ...]]:
+    """Return a copy of a `config` without those limits that would cut off a side of the front.
 
-    This applies only if area efficiency is a term of `config.pareto` and its floor is `baseline`,
-    the default. That floor would cut off one side of the front. If the floor is a number, it is
-    kept."""
+    They are limits that are `baseline`, of terms of `config.pareto`. A limit that is a number is
+    kept. Also return the names of the quantities that lost a limit."""
     limits = config.constraints
-    if "area_efficiency" not in config.pareto.terms or limits.area_efficiency_min != "baseline":
-        return config
-    limits = limits.model_copy(update={"area_efficiency_min": 0.0})
-    return config.model_copy(update={"constraints": limits})
+    keys = [key for key, limit in limits if limit == BASELINE]
+    keys = [key for key in keys if quantity_of(key) in config.pareto.terms]
+    values: dict[str, Any] = {key: None if key in _OPTIONAL else 0.0 for key in keys}
+    kept = {}
+    for name, sides in limits.terms.items():
+        lost = BASELINE if name in config.pareto.terms else None
+        if left := {side: limit for side, limit in sides.items() if limit != lost}:
+            kept[name] = left
+    names = {quantity_of(key) for key in keys}
+    names |= {name for name, sides in limits.terms.items() if sides != kept.get(name)}
+    if not names:
+        return config, ()
+    limits = limits.model_copy(update=values | {"terms": kept})
+    return config.model_copy(update={"constraints": limits}), tuple(sorted(names))
 
 
 __all__ = ["Aim", "aims_of", "freed", "reported", "simulated"]

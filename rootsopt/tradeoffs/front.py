@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rootsopt.config import Config
+from rootsopt.config.units import words
 from rootsopt.optimize.certificate import RESIDUAL
 from rootsopt.optimize.infeasible import Infeasible
 from rootsopt.response.evaluation import Evaluation
@@ -151,10 +152,10 @@ class Front:
     the best in the first term on. `dropped`: points that are dominated, repeated or not usable.
     `edges`: pairs of point numbers of neighbours without a gap between them; `gaps`: the gaps.
 
-    `floor_dropped`: whether the default floor of the area efficiency (the baseline's value) was
-    dropped because area efficiency is a term. `searches`, `evaluations`: effort. `interrupted`:
-    whether the search was stopped. `infeasible`: why no design satisfies all constraints, `None` if
-    one does.
+    `limits_dropped`: terms whose limits under `constraints`, the baseline's values, were dropped,
+    because they would cut off a side of the front. `searches`, `evaluations`: effort.
+    `interrupted`: whether the search was stopped. `infeasible`: why no design satisfies all
+    constraints, `None` if one does.
 
     >>> import jax
     >>> import rootsopt
@@ -174,7 +175,7 @@ class Front:
     dropped: tuple[FrontPoint, ...] = ()
     edges: tuple[tuple[int, int], ...] = ()
     gaps: tuple[Gap, ...] = ()
-    floor_dropped: bool = False
+    limits_dropped: tuple[str, ...] = ()
     searches: int = 0
     evaluations: int = 0
     interrupted: bool = False
@@ -223,10 +224,11 @@ class Front:
             parts.append("One design is the best in all terms: they are not in conflict.")
         if self.gaps:
             parts.append(f"The front has {len(self.gaps)} gap{'s' if len(self.gaps) > 1 else ''}.")
-        if self.floor_dropped:
+        if self.limits_dropped:
+            names = ", ".join(map(words, self.limits_dropped))
             parts.append(
-                "The floor of the area efficiency, the baseline's, was dropped, because area "
-                "efficiency is a term; a number in constraints.area_efficiency_min stays."
+                "Limits that are the baseline's own values were dropped, because they limit terms: "
+                f"{names}. A number under constraints stays."
             )
         return " ".join(parts)
 
@@ -245,7 +247,7 @@ class Front:
             "dropped": [one.record() for one in self.dropped],
             "edges": [[*pair] for pair in self.edges],
             "gaps": [one._asdict() for one in self.gaps],
-            "area_efficiency_floor_dropped": self.floor_dropped,
+            "limits_dropped": [*self.limits_dropped],
             "status": self.status.label,
             "message": self.message,
             "statistics": {"searches": self.searches, "evaluations": self.evaluations},

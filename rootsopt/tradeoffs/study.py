@@ -9,7 +9,7 @@ from rootsopt.config import Config
 from rootsopt.design.space import Space
 from rootsopt.optimize.limits import force_limits, term_constraints
 from rootsopt.optimize.local import Group
-from rootsopt.optimize.problem import FEASIBLE, Problem
+from rootsopt.optimize.problem import FEASIBLE, Problem, settled_by
 from rootsopt.response.checkpoint import Checkpoint
 from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.response.many import HERE, Point, Runs
@@ -59,7 +59,8 @@ class Study:
     `config`: config of the study; `aims`: its k terms; `problem`: unit box and constraints, with
     the evaluated baseline; `fast`, `sharp`, `exact`: evaluators for screening, search and report,
     without a motion if no term depends on forces. `runs`: where they run; `checkpoint`: file
-    that stores every evaluation and supplies those of an interrupted search."""
+    that stores every evaluation and supplies those of an interrupted search. `limits_dropped`:
+    quantities whose limits, the baseline's values, were dropped, because they are terms."""
 
     config: Config
     aims: tuple[Aim, ...]
@@ -69,6 +70,7 @@ class Study:
     exact: Evaluator
     runs: Runs = HERE
     checkpoint: Checkpoint | None = None
+    limits_dropped: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, config: Config, runs: Runs = HERE, checkpoint: Checkpoint | None = None) -> "Study":
@@ -78,7 +80,7 @@ class Study:
 
         Raises `InputError` for unknown terms, or for a scene that cannot be simulated."""
         aims = aims_of(config)
-        config = freed(config)
+        config, dropped = freed(config)
         scene = Scene.from_config(config)
         moves = simulated(config, scene)
         limits = force_limits(config, scene)
@@ -91,10 +93,11 @@ class Study:
         if maxima:
             exact = exact.with_maxima()
         fast = exact.at_tolerance(max(1e-6, config.solver.orbit_tolerance)).surveying()
-        floor = baseline.geometry["area_efficiency"]
-        space = Space.of(config, exact.scene, floor, term_constraints(config, exact.scene))
-        problem = Problem(config, baseline, space, limits)
-        return cls(config, aims, problem, fast, exact.surveying(), exact, runs, checkpoint)
+        config = settled_by(config, baseline)
+        space = Space.of(config, exact.scene, term_constraints(config, exact.scene))
+        problem = Problem(config, baseline, space, force_limits(config, exact.scene))
+        work = fast, exact.surveying(), exact, runs, checkpoint
+        return cls(config, aims, problem, *work, dropped)
 
     @property
     def usable(self) -> bool:

@@ -554,7 +554,7 @@ class Tracer:
             aims=study.aims,
             baseline=study.problem.baseline,
             baseline_terms=study.term_values(study.problem.baseline) if usable else {},
-            floor_dropped=study.config.constraints != config.constraints,
+            limits_dropped=study.limits_dropped,
             searches=self._searches,
             evaluations=self._evaluations,
             interrupted=self.stop.is_set(),

@@ -250,7 +250,7 @@ def designs_are_points_of_the_unit_box_and_back(family):
     if not row.parameters:
         return
     config = parse(text_of(family))
-    space = Space.of(config, Scene.from_config(config), 0.3)
+    space = Space.of(config, Scene.from_config(config))
     size = len(space.lower)
     there, back = jax.jit(jax.vmap(space.design)), jax.jit(jax.vmap(space.point))
     points = np.vstack([np.zeros(size), np.ones(size), sobol(16, 2, size)])

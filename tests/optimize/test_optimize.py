@@ -94,8 +94,8 @@ def test_involute_never_exceeds_its_longest(problem):
 
 
 def space_of(*overrides):
-    settings = config(*overrides)
-    return settings, Space.of(settings, Scene.from_config(settings), 0.3)
+    settings = config("constraints.area_efficiency_min=0.3", *overrides)
+    return settings, Space.of(settings, Scene.from_config(settings))
 
 
 def test_bounds_of_the_involute_replace_its_default_floor():

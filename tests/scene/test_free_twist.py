@@ -33,7 +33,7 @@ def test_twist_is_the_last_parameter(name):
     assert moved.rotor.helix_deg == 33.0
     assert fixed.with_design(fixed.design) == fixed
     assert bounds_of(free) == [*bounds_of(fixed), (0.0, 90.0)]
-    space = Space.of(free, Scene.from_config(free), 0.3)
+    space = Space.of(free, Scene.from_config(free))
     point = np.append(np.linspace(0.3, 0.6, len(fixed.design)), 0.25)
     design = space.design(jnp.asarray(point))
     assert float(design[-1]) == pytest.approx(22.5)

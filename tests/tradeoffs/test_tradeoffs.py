@@ -18,6 +18,7 @@ from standins import evaluation_of
 import rootsopt
 from rootsopt import register_term
 from rootsopt.config import parse
+from rootsopt.config.study import BASELINE
 from rootsopt.config.units import words
 from rootsopt.errors import InputError
 from rootsopt.optimize.certificate import certify
@@ -218,14 +219,24 @@ def test_rates_are_slopes_of_the_front(front):
 
 
 def test_floor_of_a_term_is_dropped_only_if_it_is_the_baselines(front):
-    assert front.floor_dropped
+    assert front.limits_dropped == ("area_efficiency",)
     least = min(point.terms["area_efficiency"] for point in front.points)
     assert least < front.baseline_terms["area_efficiency"] - 0.1
     number = config(RADIUS, "constraints.area_efficiency_min=0.4")
-    assert freed(number) is number
-    other = config("pareto.terms=[outer_radius_mm, mean_force_N]")
-    assert freed(other) is other
-    assert freed(config(RADIUS)).constraints.area_efficiency_min == 0
+    assert freed(number) == (number, ())
+    other = config("pareto.terms=[mean_force_N, flow_ripple]")
+    assert freed(other) == (other, ())
+    own = "{outer_radius_mm: {max: baseline, min: 30}, flow_ripple: {max: baseline}}"
+    free, names = freed(
+        config(RADIUS, "constraints.outer_radius_max_mm=baseline", f"constraints.terms={own}")
+    )
+    assert names == ("area_efficiency", "outer_radius_mm")
+    assert free.constraints.area_efficiency_min == 0
+    assert free.constraints.outer_radius_max_mm is None
+    assert free.constraints.terms == {
+        "outer_radius_mm": {"min": 30},
+        "flow_ripple": {"max": BASELINE},
+    }
 
 
 def test_concave_front_is_reached_evenly(registered):
