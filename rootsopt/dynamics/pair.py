@@ -340,15 +340,6 @@ class RotorPair(eqx.Module):
         slope, contact = self._slope(state, motion, acting, touches)
         return slope, contact, kink_margins(self, motion, acting, touches)
 
-    @eqx.filter_jit
-    def contact_and_margins(
-        self, tau: Float[Array, ""], state: Float[Array, " n"]
-    ) -> tuple[FlankForce, Margins]:
-        """Return the results of `contact_at` and `margins`, with one evaluation of the contact."""
-        motion, acting = self._moving(tau, state)
-        touches = touches_of(self, motion)
-        return force_of(self, motion, touches), kink_margins(self, motion, acting, touches)
-
     def _slope(self, state, motion: Motion, acting, touches: Any):
         """Return d(state)/dτ and the flank contact at the scaled `state`.
 

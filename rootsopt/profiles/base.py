@@ -361,13 +361,6 @@ class Profile(eqx.Module):
         """
         return self.speeds(nu)[2]
 
-    def dedendum_curvature_radius(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Return the signed radius of curvature of the dedendum (m), positive where convex.
-
-        `nu`: normal angle (rad) of the partner's addendum."""
-        turning = 2 * self.roll_rate(nu) - 1
-        return self.dedendum_speed(nu) / turning
-
 
 def _inverse(profile: Profile, roll_angle: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """Return the greatest normal angle (rad) of `profile` at a `roll_angle` (rad), by a search.

@@ -105,15 +105,6 @@ def beyond(flank: Float[np.ndarray, "n 2 *d"], lobes: int) -> NDArray[np.float64
     return np.concatenate([before, flank, after])
 
 
-def distances(
-    points: Float[np.ndarray, "n 2"], line: Float[np.ndarray, "m 2"]
-) -> NDArray[np.float64]:
-    """Return the distance (n,) of each of the `points` from a polygonal `line`.
-
-    Points, line and distances have the same unit of length."""
-    return np.abs(feet(points, line).away)
-
-
 def feet(
     points: Float[np.ndarray, "n 2"], line: Float[np.ndarray, "m 2"], smooth: bool = False
 ) -> Feet:

@@ -11,7 +11,7 @@ from rootsopt.commands.work import profile as work
 from rootsopt.design import resemblance
 from rootsopt.design.resemblance import free_likeness, likeness
 from rootsopt.profiles import CIC, EE, arc, ellipse, five_arcs, outline, project
-from rootsopt.profiles.departure import beyond, departure, departures, distances, feet
+from rootsopt.profiles.departure import beyond, departure, departures, feet
 from rootsopt.scene.families import profile_of
 
 R, DEG = 0.033, np.pi / 180
@@ -74,7 +74,7 @@ def test_smooth_feet_see_the_curve_and_not_its_chords():
         found = feet(points, line, smooth=True)
         assert found.away == pytest.approx(np.full(30, radius - 1), abs=2.5e-5)
         assert np.sum(found.toward * points, axis=1) == pytest.approx(np.full(30, radius), rel=2e-3)
-        assert np.max(np.abs(distances(points, line) - 0.02)) > 5e-4
+        assert np.max(np.abs(np.abs(feet(points, line).away) - 0.02)) > 5e-4
 
 
 def test_flanks_are_continued_by_their_mirror_images():

@@ -15,7 +15,7 @@ from rootsopt.errors import InputError
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.search import Search
 from rootsopt.profiles import CIC, EE, FreeForm, geometry, project
-from rootsopt.profiles.departure import departure, distances
+from rootsopt.profiles.departure import departure, feet
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.scene import Scene, design_vector
 from rootsopt.scene.families import check, free_form_of, keys_of, profile_of, with_design
@@ -116,7 +116,8 @@ def test_distance_of_points_from_a_line():
     """The distance is right from a corner, from an end and from the inside of a piece."""
     line = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0]])
     points = np.array([[1.0, 0.5], [3.0, -1.0], [-3.0, 4.0], [2.0, 1.0]])
-    np.testing.assert_allclose(distances(points, line), [0.5, np.sqrt(2), 5.0, 0.0], atol=1e-15)
+    away = np.abs(feet(points, line).away)
+    np.testing.assert_allclose(away, [0.5, np.sqrt(2), 5.0, 0.0], atol=1e-15)
 
 
 # In a config

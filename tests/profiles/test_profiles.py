@@ -143,7 +143,8 @@ def test_land_is_equation_1_and_its_mate_the_circle_that_touches_it(profile):
     turned = np.pi / profile.lobes - theta
     polar = np.stack([np.cos(turned), np.sin(turned)], -1)
     np.testing.assert_allclose(positions[1], (2 * R - outer) * polar, rtol=0, atol=1e-14)
-    bend = profile.dedendum_curvature_radius(jnp.asarray(theta))
+    turning = 2 * profile.roll_rate(jnp.asarray(theta)) - 1
+    bend = profile.dedendum_speed(jnp.asarray(theta)) / turning
     np.testing.assert_allclose(bend[theta < tip], 2 * R - outer, rtol=1e-12)
 
 
