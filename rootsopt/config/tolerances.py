@@ -87,6 +87,11 @@ class TolerancesConfig(Section):
     quantile: Annotated[float, Field(ge=0.5, lt=1)] = Field(
         0.95, description="share of the scenes whose objective lies below the quantile"
     )
+    limits: Literal["every", "combined"] = Field(
+        "every",
+        description="where limits of forces and reserves must hold: in every one of these scenes, "
+        "or as `combine` combines them, such as the mean plus k standard deviations",
+    )
     check_samples: Annotated[int, Field(ge=0, le=100_000)] = Field(
         1000,
         description="other random scenes in which baseline, nominal and robust optimum are "

@@ -5,12 +5,14 @@ rule (`rootsopt.response.reducers`) combines the scenes to one number, which is 
 for the baseline. The robust objective of the baseline is therefore 1, too."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rootsopt.config import Config
 from rootsopt.optimize.certificate import Certificate
+from rootsopt.optimize.limits import ForceLimit
 from rootsopt.optimize.local import Group, Linearization
 from rootsopt.optimize.optimality import Holder
 from rootsopt.optimize.problem import SCENE_KINDS, Problem, settled_by
@@ -108,6 +110,39 @@ class RobustProblem(Problem):
         scaled = tuple(self._scaled(group) for group in groups)
         limits = parts[0].slack, parts[0].normals, walls
         return Linearization(smooth / self.reference, slope / self.reference, scaled, *limits)
+
+    def walls(self, evaluation: Evaluation, jacobian: NDArray[np.float64]) -> tuple[Group, ...]:
+        """Return one wall for each of `limits`, as `Problem.walls` does.
+
+        If limits hold for the combination of the scenes, a wall has this combination as its only
+        branch, with the gradient of the greatest branch in each scene."""
+        if not (evaluation.scenes and self._combines_limits):
+            return super().walls(evaluation, jacobian)
+        found = [
+            super(RobustProblem, self).walls(part.evaluation, jacobian)
+            for part in evaluation.samples
+        ]
+        return tuple(map(self._combined_wall, zip(*found, strict=True)))
+
+    def _combined_wall(self, groups: Sequence[Group]) -> Group:
+        assert self.config.tolerances is not None
+        value, weights = combine(self.config.tolerances, [group.top for group in groups])
+        slopes = np.array([group.slopes[np.argmax(group.values)] for group in groups])
+        return Group(np.zeros((1, 2)), np.array([value]), (weights @ slopes)[None, :])
+
+    def worst(self, evaluation: Evaluation, limit: ForceLimit) -> float:
+        """Return the value of a limited quantity that must satisfy its `limit`.
+
+        It is the worst of all scenes, or their combination. `evaluation`: usable."""
+        if not (evaluation.scenes and self._combines_limits):
+            return super().worst(evaluation, limit)
+        assert self.config.tolerances is not None
+        every = [super(RobustProblem, self).worst(p.evaluation, limit) for p in evaluation.samples]
+        return limit.sign * combine(self.config.tolerances, limit.sign * np.array(every)).value
+
+    @property
+    def _combines_limits(self) -> bool:
+        return self.config.tolerances is not None and self.config.tolerances.limits == "combined"
 
     def shares(self, weights: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the shares (n,) with which the maxima of each scene become groups in `local`."""

@@ -188,6 +188,29 @@ def test_share_of_machines_that_touch_has_a_closed_form():
     assert found.simulated[apart] == pytest.approx(found.model[apart], abs=0.05)
 
 
+WARM = [
+    *APART,
+    "scene.heat={rotor_warming_K: 0, housing_warming_K: 0}",
+    "scene.center_distance_error_mm=0",
+    "contact.wear={offset_mm: 0, depth_mm: 0}",
+]
+
+
+def test_heat_and_wear_change_the_reserve_as_their_gaps():
+    """Wear by a of each rotor opens the gap by 2 a; a warmer rotor closes it as a housing does that
+    is closer by 2 r α ΔT, whose gap a config can state as an error of assembly."""
+    cold = held().response["contact_reserve_um"]
+
+    def reserve(change):
+        return Evaluator.of(load("cic", [*WARM, change]))().response["contact_reserve_um"]
+
+    assert reserve("contact.wear.offset_mm=0.01") == pytest.approx(cold + 20, abs=1e-3)
+    closer = 66 * 1.1e-5 * 40
+    same = reserve(f"scene.center_distance_error_mm={-closer}")
+    assert reserve("scene.heat.rotor_warming_K=40") == pytest.approx(same, abs=1e-3)
+    assert cold - 1e3 * closer < same < cold - 10
+
+
 def test_a_search_without_forces_simulates_nothing(monkeypatch):
     """It compiles no equation of motion, and finds a design with less ripple."""
 

@@ -84,6 +84,33 @@ def test_objective_combines_the_scenes(spread):
         )
 
 
+def test_limits_hold_in_every_scene_or_for_a_combination(spread):
+    """Value and gradient of a limit's wall; mean plus k standard deviations by hand."""
+    evaluator, baseline, moved = spread
+    limit = "constraints.terms={mean_force_N: {max: 60}, rms_force_N: {min: 70}}"
+    one, step = np.array([0.6, -0.5, 0.4]), 1e-4
+    every = problem_of(evaluator, baseline, limit)
+    scenes = [part.evaluation.response["mean_force_N"] for part in moved.scenes]
+    assert every.worst(moved, every.limits[0]) == max(scenes)
+    combined = problem_of(evaluator, baseline, limit, "tolerances.limits=combined")
+    means, squares = (
+        np.array([part.evaluation.response[key] for part in moved.samples])
+        for key in ("mean_force_N", "rms_force_N")
+    )
+    values = np.mean(means) + 2 * np.std(means), np.mean(squares) - 2 * np.std(squares)
+    ends = [
+        evaluator(combined.design(POINT + sign * step * one), moved.start, series=False)
+        for sign in (1, -1)
+    ]
+    walls = combined.walls(moved, combined.look(POINT)[1])
+    for bound, value, wall in zip(combined.limits, values, walls, strict=True):
+        assert combined.worst(moved, bound) == pytest.approx(value, rel=1e-12)
+        assert wall.values == pytest.approx([bound.excess(value)], abs=1e-12)
+        upper, lower = (bound.excess(combined.worst(end, bound)) for end in ends)
+        slope = float(wall.slopes[0] @ one)
+        assert slope == pytest.approx((upper - lower) / (2 * step), rel=1e-4)
+
+
 def test_gradient_agrees_with_central_differences(spread):
     """The gradient is right along one direction of the unit box, for every rule.
 
