@@ -12,10 +12,13 @@ from numpy.typing import NDArray
 from rootsopt.figures.speeds import LABELS, MARKERS, plot_line, status_entries
 from rootsopt.figures.style import COLORS, figure, looks, write
 from rootsopt.output.files import ResultFolder
+from rootsopt.output.names import label, name_and_unit
 from rootsopt.status import Status
 from rootsopt.sweeps.plan import Plan
-from rootsopt.sweeps.table import is_numeric, unit, written
+from rootsopt.sweeps.table import is_numeric, written
 
+_APART = "contact_reserve_um", "gear_force_N"
+"""What is drawn where no flanks touch."""
 _FEW = len(COLORS)
 """Number of values of the second key above which it is drawn as a map, not as lines."""
 
@@ -24,12 +27,11 @@ class _Axis:
     """A key on an axis of a figure: positions, label, and ticks for values that are not numbers."""
 
     def __init__(self, key: str, values: Sequence[Any]):
-        self.key, self.values = key, values
+        self.values = values
         self.numeric = is_numeric(values)
         self.at = np.array(values, float) if self.numeric else np.arange(len(values), dtype=float)
-        units = unit(key)
-        self.name = key.rpartition(".")[2]
-        self.label = key if units == "1" else f"{key} ({units})"
+        self.name, self.unit = name_and_unit(key)
+        self.label = label(key)
         positive = self.numeric and bool(np.all(self.at > 0)) and len({*values}) > 2
         steps = np.diff(np.sort(self.at))
         self.log = positive and bool(steps.max() > 30 * steps.min() and self._ratio() > 30)
@@ -39,7 +41,9 @@ class _Axis:
 
     def words(self, value: Any) -> str:
         """Return a value as text for a legend."""
-        return f"{self.name} = {value:g}" if self.numeric else _short(written(value))
+        if self.numeric:
+            return f"{self.name} {value:g} {self.unit}".rstrip()
+        return _short(written(value))
 
     def on(self, axis: Any) -> None:
         """Set scale and ticks of a matplotlib axis."""
@@ -76,20 +80,28 @@ def _lines(folder: ResultFolder, axes, plan: Plan, dataset: xarray.Dataset) -> s
         across, along = along, across
     names = [""] if along is None else [*map(along.words, along.values)]
     order = np.argsort(across.at, kind="stable")
-    made, panels = figure(9, 6.6, len(LABELS), 1, sharex=True)
-    for ax, (force, label) in zip(panels[:, 0], LABELS.items(), strict=True):
-        values, labels = (_table(dataset, key, swapped)[order] for key in (force, "status"))
+    drawn = _drawn(dataset)
+    made, panels = figure(9, 6.6, len(drawn), 1, sharex=True)
+    for ax, (name, text) in zip(panels[:, 0], drawn.items(), strict=True):
+        values, labels = (_table(dataset, key, swapped)[order] for key in (name, "status"))
         for column, look in enumerate(looks(names)):
             plot_line(ax, across.at[order], values[:, column], labels[:, column].astype(str), look,
                       across.numeric, column)  # fmt: skip
-        ax.set_ylabel(label)
+        ax.set_ylabel(text)
         if np.isfinite(values).any():
             ax.set_ylim(0, 1.05 * np.nanmax(values) or 1)
     across.on(panels[-1, 0].xaxis)
     panels[-1, 0].set_xlabel(across.label)
     entries = [] if along is None else [Line2D([], [], **look) for look in looks(names)]
     entries += status_entries(dataset.status.values.ravel().astype(str))
-    return write(folder, "sweep", made, f"Contact force over {across.key}", entries)
+    return write(folder, "sweep", made, _title(drawn, across), entries)
+
+
+def _drawn(dataset: xarray.Dataset) -> dict[str, str]:
+    """Return {variable: label} of two panels: forces, unless the flanks stay apart everywhere."""
+    if any(np.any(dataset[name].values > 0) for name in LABELS) or _APART[0] not in dataset:
+        return LABELS
+    return {name: label(name) for name in _APART}
 
 
 def _table(dataset: xarray.Dataset, name: str, swapped: bool) -> NDArray:
@@ -102,12 +114,13 @@ def _table(dataset: xarray.Dataset, name: str, swapped: bool) -> NDArray:
 def _map(folder: ResultFolder, axes, plan: Plan, dataset: xarray.Dataset) -> str:
     """Draw the forces over two keys as colours: a map of a grid, or points of a sample."""
     across, up = axes
-    made, panels = figure(12, 5.4, 1, len(LABELS), grid=False, sharex=True, sharey=True)
+    shown = _drawn(dataset)
+    made, panels = figure(12, 5.4, 1, len(shown), grid=False, sharex=True, sharey=True)
     labels = dataset.status.values.astype(str)
     lost = [one for one in dict.fromkeys(labels.ravel()) if not Status[one.upper()].usable]
     grid = len(plan.shape) == 2
-    for ax, (force, label) in zip(panels[0], LABELS.items(), strict=True):
-        values = dataset[force].values
+    for ax, (name, text) in zip(panels[0], shown.items(), strict=True):
+        values = dataset[name].values
         known = values[np.isfinite(values)]
         norm = Normalize(*((known.min(), known.max()) if known.size else (0, 1)))
         if grid:
@@ -120,7 +133,7 @@ def _map(folder: ResultFolder, axes, plan: Plan, dataset: xarray.Dataset) -> str
         else:
             places = [across.at, up.at]
             drawn = ax.scatter(*places, c=values, norm=norm, cmap="viridis", s=36)
-        made.colorbar(drawn, ax=ax, label=label)
+        made.colorbar(drawn, ax=ax, label=text)
         for status in lost:
             here = labels == status
             ax.plot(places[0][here], places[1][here], MARKERS[status], color="black",
@@ -129,8 +142,12 @@ def _map(folder: ResultFolder, axes, plan: Plan, dataset: xarray.Dataset) -> str
         up.on(ax.yaxis)
         ax.set_xlabel(across.label)
     panels[0, 0].set_ylabel(up.label)
-    title = f"Contact force over {across.key} and {up.key}"
-    return write(folder, "sweep", made, title, status_entries(lost, "none"), 5)
+    return write(folder, "sweep", made, _title(shown, across, up), status_entries(lost, "none"), 5)
+
+
+def _title(drawn: dict[str, str], *axes: _Axis) -> str:
+    what = "Contact force" if drawn is LABELS else "Flanks that stay apart,"
+    return f"{what} over {' and '.join(axis.name for axis in axes)}"
 
 
 __all__ = ["sweep_figure"]

@@ -124,8 +124,9 @@ def _steps(
         number, count = (len(result["points"]) + 1) // 2, len(result["points"])
         file, where = design_file(number), f" (here {number} of {count})"
     if command == "sweep":
-        row = max(facts.with_peak(result, rows), key=lambda one: one["peak_force_N"])
-        where = " in the scene with the highest peak force"
+        key, (row, *_) = facts.ranked(result, rows)
+        worst = "lowest" if key.endswith("_um") else "highest"
+        where = f" in the scene with the {worst} {name_and_unit(key)[0]}"
         sets = "".join(f" --set {shlex.quote(text)}" for text in _settings(row))
     if command == "attractors" and len(records) > 1:
         where, sets = " over all motions, not only that from rest", " --set objective.motion=worst"

@@ -21,7 +21,7 @@ from rootsopt.output.names import (
 )
 from rootsopt.output.tables import Record, price, varied
 from rootsopt.response.ensemble import ERRORS
-from rootsopt.response.terms import sense_of
+from rootsopt.response.terms import RESERVES, sense_of
 from rootsopt.status import Status
 
 Facts = list[tuple[str, str]]
@@ -30,9 +30,10 @@ STEADY = Status.PERIODIC.label, Status.AVERAGED.label, Status.IDLE.label
 """Statuses of a motion with a steady state."""
 FEW = 6
 """Number of quantities above which a sentence leaves out the others."""
+_PEAK, _RESERVE = "peak_force_N", RESERVES[0]
 _SMALL = 0.05
 """Absolute change (%) below which a quantity counts as unchanged."""
-_TOLD = "theoretical_flow_l_min", "area_mm2", "root_radius_mm", "contact_reserve_um"
+_TOLD = "theoretical_flow_l_min", "area_mm2", "root_radius_mm", _RESERVE
 """Quantities that other words tell: displaced volume, area efficiency, outer radius, reserve."""
 
 
@@ -258,27 +259,39 @@ def traced(result: Record, rows: Sequence[Record]) -> Facts:
     return [*facts, ("How sure", str(result["message"]))] if certified else facts
 
 
-def with_peak(result: Record, rows: Sequence[Record]) -> list[Record]:
-    """Return the rows of a sweep that have a peak force."""
-    given = [(row, row.get("peak_force_N")) for row in rows or result.get("speeds") or ()]
-    return [row for row, peak in given if peak is not None and math.isfinite(peak)]
+def ranked(result: Record, rows: Sequence[Record]) -> tuple[str, list[Record]]:
+    """Return the quantity that ranks the rows of a sweep, and the rows that have it, worst first.
+
+    It is the peak force, or where no flanks touch, the contact reserve."""
+
+    def known(key: str, falling: bool) -> list[Record]:
+        given = [(row, row.get(key)) for row in rows or result.get("speeds") or ()]
+        found = [row for row, x in given if x is not None and math.isfinite(x)]
+        return sorted(found, key=lambda row: row[key], reverse=falling)
+
+    peaks, reserves = known(_PEAK, True), known(_RESERVE, False)
+    if reserves and not (peaks and peaks[0][_PEAK]):
+        return _RESERVE, reserves
+    return _PEAK, peaks
 
 
 def swept(result: Record, rows: Sequence[Record]) -> Facts:
-    """Return facts on a sweep: where the force is least and greatest, how many are steady."""
-    given, known = rows or result.get("speeds") or (), with_peak(result, rows)
+    """Return facts on a sweep: where the force or the reserve is least and greatest, how many are
+    steady."""
+    given, (key, known) = rows or result.get("speeds") or (), ranked(result, rows)
     axes, ends = varied(given) if given else [], []
     for word, pick in (("lowest", min), ("highest", max)) if known and axes else ():
-        row = pick(known, key=lambda one: one["peak_force_N"])
-        where = [stated(key, row.get(key), named=True) for key in axes]
-        ends.append(f"{word}, {brief(row['peak_force_N'])} N, at {listed(where)}")
+        row = pick(known, key=lambda one: one[key])
+        where = [stated(axis, row.get(axis), named=True) for axis in axes]
+        ends.append(f"{word}, {stated(key, row[key])}, at {listed(where)}")
     statuses = [str(row.get("status")) for row in given]
     steady = sum(one in STEADY for one in statuses)
     others = [f"{statuses.count(one)} {in_words(one)}" for one in {*statuses} - {*STEADY}]
     rest = f" The others: {listed(sorted(others))}." if others else ""
     sure = f"{steady} of {len(given)} scenes have a steady state.{rest}"
-    peak = [("Peak force", f"It is {'; '.join(ends)}.")] if ends else []
-    return [*peak, ("How sure", sure)] if given else []
+    name = name_and_unit(key)[0].capitalize()
+    found = [(name, f"It is {'; '.join(ends)}.")] if ends else []
+    return [*found, ("How sure", sure)] if given else []
 
 
 def coexisting(result: Record, rows: Sequence[Record]) -> Facts:
@@ -317,9 +330,9 @@ __all__ = [
     "coexisting",
     "drawn",
     "optimised",
+    "ranked",
     "reserves",
     "simulated",
     "swept",
     "traced",
-    "with_peak",
 ]

@@ -501,7 +501,8 @@ class Evaluator:
                 turns = len(motion.time) // len(loads.series.sizes), 1
                 each = np.tile(np.asarray(loads.series.sizes, np.float64), turns)
                 motion = dataclasses.replace(motion, bearing_loads=each)
-        if self._geared(series):
+        # Without contact, the reserve is the result.
+        if self._geared(series or Status.of(found.status) is Status.IDLE):
             reserve = jax.device_get(apart_program(*built, varied(found)))
             further |= apart_record(reserve, float(self.scene.pitch_radius))
         return motion, further
@@ -511,7 +512,9 @@ class Evaluator:
         return self.scene.bearings is not None and (series or bool({*BEARING} & {*self._names}))
 
     def _geared(self, series: bool) -> bool:
-        """Return whether an evaluation computes the reserve; `series`: with a series."""
+        """Return whether an evaluation computes the reserve.
+
+        `series`: whether it has a series, or no contact."""
         wanted = bool({*RESERVES, *GEAR} & {*self._names})
         return self.scene.gear is not None and (series or wanted)
 

@@ -5,6 +5,7 @@ import pytest
 from rootsopt.config import load
 from rootsopt.figures import sweep as drawing
 from rootsopt.figures.speeds import MARKERS
+from rootsopt.output.facts import swept
 from rootsopt.output.files import ResultFolder
 from rootsopt.output.sweeps import outcome, rows_of, summary
 from rootsopt.output.tables import scene_tables
@@ -55,6 +56,31 @@ def test_statuses_are_in_every_figure(axes, options, panels, tmp_path, monkeypat
     entries = [text.get_text() for one in figure.legends for text in one.get_texts()]
     for label in found - ({"periodic"} if panels == 4 else set()):
         assert any(entry.startswith(label) for entry in entries)
+
+
+@pytest.mark.parametrize("touching", [False, True])
+def test_flanks_that_stay_apart_have_their_reserve_on_the_axes(touching, tmp_path, monkeypatch):
+    """Without any contact, a sweep shows the reserve and the gear's force, and tells its ends."""
+    kept = []
+    monkeypatch.setattr(ResultFolder, "write_figure", lambda _, name, figure: kept.append(figure))
+    plan, rows = plan_of({"contact.clearance_mm": "0.1:0.2:3"}), {}
+    for number in range(3):
+        force = 5.0 if touching and number == 0 else 0.0
+        response = {"mean_force_N": force / 2, "peak_force_N": force}
+        response |= {"contact_reserve_um": 10.0 * number + 1, "gear_force_N": 200.0}
+        rows[number] = lost(Status.IDLE) | {"response": response}
+    drawing.sweep_figure(ResultFolder(tmp_path), plan, dataset_of(load("cic"), plan, rows))
+    shown = [ax.get_ylabel() for ax in kept[0].axes]
+    (name, words), sure = swept({}, rows_of(plan, rows))
+    assert sure[0] == "How sure"
+    if touching:
+        assert shown == ["mean force (N)", "peak force (N)"]
+        assert (name, "lowest, 0 N, at clearance 0.15 mm" in words) == ("Peak force", True)
+        return
+    assert shown == ["contact reserve (µm)", "gear force (N)"]
+    assert kept[0].axes[1].get_xlabel() == "clearance (mm)"
+    assert name == "Contact reserve"
+    assert words == "It is lowest, 1 µm, at clearance 0.1 mm; highest, 21 µm, at clearance 0.2 mm."
 
 
 def test_every_status_has_a_marker_of_its_own():
