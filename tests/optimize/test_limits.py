@@ -180,6 +180,38 @@ def test_the_baseline_breaks_limits_of_any_key(key, name):
     assert sum(row["baseline_satisfied"] is False for row in rows.values()) == 1
 
 
+def test_every_limit_can_be_the_baselines_own_value():
+    """The baseline meets each of them exactly; the worst of several speeds counts."""
+    limits = (
+        "area_efficiency_min", "undercut_margin_min_mm", "seal_width_min_mm",
+        "outer_radius_max_mm", "terms.peak_force_N.max", "terms.displaced_volume_cm3.min",
+    )  # fmt: skip
+    settings = limited(config(*(f"constraints.{key}=baseline" for key in limits)))
+    scene = Scene.from_config(settings)
+    shape = geometry(scene.profile(jnp.asarray(settings.design)))
+    volume = 1e6 * float(flow.displaced_volume(shape, scene.length))
+    one = dataclasses.replace(evaluation(), geometry=geometry_record(scene, shape))
+    slow, fast = (
+        dataclasses.replace(one, response=one.response | {"peak_force_N": peak} | {
+            "displaced_volume_cm3": volume}) for peak in (150.0, 180.0)
+    )  # fmt: skip
+    speeds = tuple(Part({"speed_rpm": rpm}, e, 0.5) for rpm, e in ((2e3, slow), (3e3, fast)))
+    whole = dataclasses.replace(slow, speeds=speeds)
+    problem = Problem.of(settings, scene, whole)
+    assert problem.broken(whole) == []
+    rows = {row["name"]: row for row in problem.constraint_rows(whole)}
+    assert rows["peak force"]["limit"] == 180.0
+    assert rows["displaced volume"]["limit"] == pytest.approx(volume, rel=1e-12)
+    for name, key in (
+        ("area efficiency", "area_efficiency"),
+        ("undercut margin", "undercut_margin_mm"),
+        ("seal width", "seal_width_mm"),
+        ("outer radius", "outer_radius_mm"),
+    ):
+        assert rows[name]["limit"] == pytest.approx(one.geometry[key], rel=1e-12)
+        assert rows[name]["active"]
+
+
 def test_absent_limits_add_nothing():
     settings = config()
     assert limited(settings) is settings
@@ -193,6 +225,14 @@ def test_absent_limits_add_nothing():
         (["constraints.terms.peak_force.max=1"], r"constraints\.terms.*peak_force"),
         (["constraints.terms.mean_force_N={}"], "min.*max"),
         (["constraints.terms.mean_force_N={min: 3, max: 2}"], "greater than"),
+        (["constraints.terms.mean_force_N={min: baseline, max: baseline}"], "both baseline"),
+        (
+            [
+                "constraints.outer_radius_min_mm=baseline",
+                "constraints.outer_radius_max_mm=baseline",
+            ],
+            "both be baseline",
+        ),
         (["constraints.terms.line_02_force_N.max=1"], "line_ORDER"),
         ([PEAK + "1", "optimizer.method=adam"], r"optimizer\.method"),
         ([PEAK + "1", "objective.motion=ensemble"], "ensemble"),
