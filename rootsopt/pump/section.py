@@ -52,8 +52,8 @@ def half_valley(flank: Flank, lobes: int, radius: Float[Array, "*n"]) -> Float[A
 
     `lobes`: N. Beyond the tip there is no lobe: the result is infinite. Below the root it is
     negative."""
-    # A measured root or land is not quite round: its first point that rises to the radius counts.
     point, normal = flank.point[::-1], flank.normal[::-1]
+    # A measured root or land is not quite round: its first point that rises to the radius counts.
     away, across = lax.cummax(jnp.abs(point)), jnp.angle(point)
     # Cubics between the points: with chords, the play would ripple as points slide past each other.
     # Where the flank runs nearly along a circle about the axis, its slope is not finite: a chord.
