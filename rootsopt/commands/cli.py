@@ -147,15 +147,14 @@ def parser(command: Command) -> argparse.ArgumentParser:
     )
     if command.writes:
         _add_folder(result, command.name)
-    if command.reads:
-        result.add_argument(
-            "--set",
-            action="append",
-            default=[],
-            metavar="KEY=VALUE",
-            dest="overrides",
-            help="override a config key: --set scene.speed_rpm=1500; repeatable",
-        )
+    result.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        dest="overrides",
+        help="override a config key: --set scene.speed_rpm=1500; repeatable",
+    )
     _add_import(result)
     result.add_argument(
         "--no-cache",

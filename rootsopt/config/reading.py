@@ -350,7 +350,7 @@ def parse(
         )
     _place_files(data, Path(folder))
     for override in overrides:
-        _override(data, override)
+        override_in(data, override)
     _place_files(data, Path())
     _find_family(data)
     return _checked(data, f"{name}: ")
@@ -412,7 +412,10 @@ def _read(path: Path) -> str:
         ) from None
 
 
-def _override(data: dict, override: str) -> None:
+def override_in(data: dict, override: str) -> None:
+    """Set the value of an `override`, as for `--set`, in plain `data`.
+
+    Raises `InputError` if it is not of the form `dotted.key=value`."""
     key, equals, value = override.partition("=")
     parts = key.strip().split(".")
     name = f"--set {shown(override)}"

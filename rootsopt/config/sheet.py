@@ -2,13 +2,14 @@
 
 import math
 import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Annotated, Any
 
 import yaml
 from pydantic import Field
 
 from rootsopt.config.families import EXAMPLE_RADIUS, Family, families, family_of
+from rootsopt.config.reading import override_in
 from rootsopt.config.scene import ProfileConfig
 from rootsopt.config.section import Among, Section, between, put
 from rootsopt.config.stock import (
@@ -111,15 +112,32 @@ class Sheet(Section):
         text = f"{pressure:g} bar, which takes {needed:.3g} kW without losses"
         return text + (share if power else "")
 
-    def text(self, profile: ProfileConfig, efficiency: float = 0.5, head: str = "") -> str:
+    @property
+    def greatest(self) -> float:
+        """Outer diameter (mm) that no rotor reaches, E (1 + sin(π/2N)) at a centre distance E.
+
+        The flanks of a greater one would fold back, seen from its axis."""
+        return self.centre_distance_mm * (1 + math.sin(math.pi / (2 * self.lobes)))
+
+    def text(
+        self,
+        profile: ProfileConfig,
+        efficiency: float = 0.5,
+        head: str = "",
+        overrides: Iterable[str] = (),
+    ) -> str:
         """Return the config as YAML with comments.
 
-        `profile`: a profile, with its area `efficiency`; `head`: lines of the first comment."""
+        `profile`: a profile, with its area `efficiency`; `head`: lines of the first comment;
+        `overrides`: texts of the form `dotted.key=value`, as for `--set`. Raises `InputError` if
+        one is of another form."""
         tree: dict[str, Any] = {}
         entries = self._pair(profile) | self._scene() | self._pump(efficiency)
         limit = (self.outer_diameter_mm / 2, "half of --outer-diameter-mm, the housing")
         for key, entry in (*entries.items(), ("constraints.outer_radius_max_mm", limit)):
             put(tree, key, entry)
+        for override in overrides:
+            override_in(tree, override)
         lines = [f"# {line}" for line in head.splitlines()]
         for name, section in tree.items():
             lines += ["", *_lines({name: section}, "")]
@@ -236,11 +254,11 @@ def option(name: str) -> str:
 def _lines(tree: Mapping[str, Any], indent: str) -> Iterator[str]:
     """Yield the lines of a section of YAML."""
     for name, inner in tree.items():
-        if isinstance(inner, tuple):
-            value = [*inner[0]] if isinstance(inner[0], tuple) else inner[0]
+        if not (isinstance(inner, dict) and inner):
+            value, why = inner if isinstance(inner, tuple) else (inner, "--set")
             word = yaml.safe_dump(value, default_flow_style=True, width=math.inf)
             line = f"{indent}{name}: {word.split('...')[0].strip()}"
-            yield f"{line:<{_COLUMN}} # {inner[1]}"
+            yield f"{line:<{_COLUMN}} # {why}"
         else:
             yield f"{indent}{name}:"
             yield from _lines(inner, f"{indent}  ")

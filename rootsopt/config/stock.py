@@ -1,6 +1,7 @@
 """Tables of materials, media and usual gears, for a rotor that is known only from a sheet.
 
-All values are usual ones at 20 °C. A certificate or a data sheet replaces them."""
+All values are usual ones at 20 °C, unless they say otherwise. A certificate or a data sheet
+replaces them."""
 
 import math
 
@@ -11,17 +12,19 @@ MATERIALS = {
     "steel": (7850, 210, 0.30, "7800 to 7870", "200 to 212", "EN 1993-1-1"),
     "stainless-steel": (7900, 200, 0.30, "7700 to 8000", "193 to 200", "EN 10088-1"),
     "aluminium": (2700, 70, 0.30, "2650 to 2800", "68 to 73", "EN 1999-1-1"),
+    "pom": (1410, 2.8, 0.35, "1390 to 1430", "2.6 to 3.1", "unfilled, data sheets of makers"),
+    "peek": (1310, 3.7, 0.38, "1290 to 1320", "3.5 to 4.1", "unfilled, data sheets of makers"),
 }
 _GASES = "-10 to 150 °C: 0.9 to 1.4 times this"
 MEDIA = {
     # viscosity (mPa·s), gas constant (J/(kg·K)), ratio of specific heats, range of the viscosity.
-    # Gases: NIST Chemistry WebBook; water: IAPWS; oil: ISO 3448, with 870 kg/m³.
+    # Gases: NIST Chemistry WebBook at 1 bar, R / M; water: IAPWS; oil: ISO 3448, with 870 kg/m³.
     "air": (0.0182, 287.05, 1.40, _GASES),
     "nitrogen": (0.0176, 296.80, 1.40, _GASES),
     "oxygen": (0.0203, 259.84, 1.40, _GASES),
     "argon": (0.0223, 208.13, 1.667, _GASES),
-    "helium": (0.0196, 2077.1, 1.667, _GASES),
-    "hydrogen": (0.0088, 4124.2, 1.41, _GASES),
+    "helium": (0.0196, 2077.3, 1.667, _GASES),
+    "hydrogen": (0.0088, 4124.5, 1.41, _GASES),
     "carbon-dioxide": (0.0147, 188.92, 1.29, _GASES),
     "methane": (0.0110, 518.28, 1.31, _GASES),
     "water": (1.00, None, None, "5 to 80 °C: 1.52 to 0.35"),

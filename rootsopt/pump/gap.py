@@ -7,7 +7,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from rootsopt.contact.closest import FlankPair
-from rootsopt.profiles import Outline, Profile, RollPoint
+from rootsopt.profiles import Outline, Profile, RollPoint, Table
 from rootsopt.pump.section import Flank, both_flanks, sampled_flank, whole_valley
 
 POSES = 48
@@ -15,9 +15,10 @@ POSES = 48
 By symmetry, the other quarters have the same gap."""
 _POINTS = 400
 """Number of points per segment of a flank at which the gap's width is computed."""
-_TURNED = 0.2
-"""Cosine of the angle (between a flank's normal and that at the narrowest place) below which a
-point of the flank is no longer part of the gap."""
+_TURNED, _FACING = 0.1, 0.3
+"""Cosine of the angle between a flank's normal and that at the narrowest place: below the first, a
+point is not part of the gap; above the second, it fully is. A sharp limit would make the length
+jump when it passes a sampled point."""
 
 _NARROWEST = 1e-9
 """Gap (m) below which the shape of the gap is that of a gap of this height."""
@@ -97,26 +98,39 @@ def _lengths(profile: Profile, nu: Float[Array, " n"], gap: Float[Array, " n"]):
     step = jnp.abs(jnp.diff(lobe.point))
 
     def seen(curve: Flank, point: RollPoint):
-        """Return places along the tangent at the contact (m), depths behind it (m), and cosines of
-        the angles between the normals and the contact's normal."""
+        """Return places along the tangent at the contact (m), depths behind it (m), and directions
+        of the normals as complex numbers, with that of the contact's normal as real axis."""
         beta, psi, s = point
         turn = jnp.exp(1j * beta)
         place = turn * (profile.pitch_radius + s * (jnp.sin(psi) + 1j * jnp.cos(psi)))
         back = jnp.conj(turn * jnp.exp(1j * (jnp.pi / 2 - psi)))
         local = (curve.point - place) * back
-        return jnp.imag(local), -jnp.real(local), jnp.real(curve.normal * back)
+        return jnp.imag(local), -jnp.real(local), curve.normal * back
 
     def length(pose):
         nu, gap = pose
-        x1, depth1, cosine = seen(lobe, profile.addendum(nu))
+        x1, depth1, normal = seen(lobe, profile.addendum(nu))
+        cosine = jnp.real(normal)
         # Seen from rotor 1, the flank of rotor 2 runs the other way.
         x2, depth2, facing = (one[::-1] for one in seen(valley, profile.dedendum(nu)))
-        x2 = jnp.where(facing > _TURNED, -x2, jnp.nan)
+        faces = jnp.real(facing) > _TURNED
+        x2 = jnp.where(faces, -x2, jnp.nan)
         first, last = jnp.nanmin(x2), jnp.nanmax(x2)
         x2 = lax.cummax(jnp.where(jnp.isnan(x2), first, x2))
-        height = gap + cosine * (depth1 + jnp.interp(x1, x2, depth2))
         inside = (cosine > _TURNED) & (x1 > first) & (x1 < last)
-        inverse = jnp.where(inside, (gap / jnp.where(inside, height, 1.0)) ** 3, 0.0)
+        x1 = jnp.where(inside, x1, (first + last) / 2)
+        slope = jnp.where(faces, -jnp.imag(facing) / jnp.where(faces, jnp.real(facing), 1.0), 0.0)
+        # Linear interpolation would make the length ripple as points slide past each other.
+        (across,) = Table(x2, depth2[:, None], slope[:, None])(x1)
+        height = jnp.where(inside, gap + cosine * (depth1 + across), 1.0)
+        part = _part(cosine) * _part(jnp.interp(x1, x2, jnp.real(facing)))
+        inverse = jnp.where(inside, part * (gap / height) ** 3, 0.0)
         return jnp.sum((inverse[1:] + inverse[:-1]) / 2 * step)
 
     return lax.map(length, (nu, jnp.maximum(gap, _NARROWEST)))
+
+
+def _part(cosine):
+    """Return how much of a point counts as part of the gap, a smooth function of its `cosine`."""
+    share = jnp.clip((cosine - _TURNED) / (_FACING - _TURNED), 0.0, 1.0)
+    return share**2 * (3 - 2 * share)

@@ -87,7 +87,7 @@ def leakage(scene: Scene, medium: Medium, profile: Profile, shape: Geometry) -> 
         series, lobes = wear_series(profile, scene.wear), jnp.asarray(float(profile.lobes))
         normal = normal + jax.vmap(lambda x: series_at(series, lobes, x)[0])(rolls(profile))
     found = mesh_gap(profile, Allowances(normal, center, medium.radial_allowance))
-    mesh = jnp.mean(_per_width(medium, found.least, found.length, 1))
+    mesh = _per_width(medium, found.least, found.length, 1)
     tips, ends = zero, zero
     heights = [jnp.min(found.least)]
     if medium.tip_clearance is not None:
@@ -114,12 +114,13 @@ def leakage(scene: Scene, medium: Medium, profile: Profile, shape: Geometry) -> 
 def _per_width(medium: Medium, height, length, series: int):
     """Return the flow (m²/s) per width through `series` equal gaps in series.
 
-    `height`, `length` (m): of one of them. The flow of a gas is that at suction pressure."""
+    `height`, `length` (m): of one of them; with one of each per roll angle (n,), the flow is the
+    mean over the rotation. The flow of a gas is that at suction pressure."""
     across = medium.pressure_difference
     length = series * jnp.where(height > 0, length, 1.0)
     height = jnp.maximum(height, 0.0)
     if medium.gas is None:
-        return slot_flow(height, length, across, medium.viscosity)
+        return jnp.mean(slot_flow(height, length, across, medium.viscosity))
     down = medium.gas.inlet_pressure
     up = down + across
     slow = gas.laminar_mass_flow(height, length, up, down, medium.viscosity, medium.gas)
@@ -127,4 +128,21 @@ def _per_width(medium: Medium, height, length, series: int):
     stage = up * (down / up) ** (1 / series)
     fast = height * gas.nozzle_flux(up, stage, medium.gas)
     density = down / (medium.gas.gas_constant * medium.gas.temperature)
-    return jnp.minimum(slow, fast) / density
+    return _lesser(slow, fast) / density
+
+
+def _lesser(slow, fast):
+    """Return the lesser of two flows, or its mean over the rotation of flows (n,) at roll angles.
+
+    Between roll angles, the flows are linear. A mean over the angles alone would have a gradient
+    that jumps whenever one of them passes from one limit to the other."""
+    if not slow.ndim:
+        return jnp.minimum(slow, fast)
+    excess = slow - fast
+    low, high = (one(excess[1:], excess[:-1]) for one in (jnp.minimum, jnp.maximum))
+    cross = (low < 0) & (high > 0)
+    triangle = -(low**2) / (2 * jnp.where(cross, high - low, 1.0))
+    between = jnp.where(cross, triangle, jnp.minimum((low + high) / 2, 0.0))
+    # The first and the last angle stand for half a step each beyond them, too.
+    ends = jnp.minimum(excess[0], 0.0) / 2 + jnp.minimum(excess[-1], 0.0) / 2
+    return jnp.mean(fast) + (jnp.sum(between) + ends) / len(excess)

@@ -52,9 +52,21 @@ def half_valley(flank: Flank, lobes: int, radius: Float[Array, "*n"]) -> Float[A
 
     `lobes`: N. Beyond the tip there is no lobe: the result is infinite. Below the root it is
     negative."""
+    point, normal = flank.point[::-1], flank.normal[::-1]
     # A measured root or land is not quite round: its first point that rises to the radius counts.
-    away = lax.cummax(jnp.abs(flank.point[::-1]))
-    across = jnp.angle(flank.point[::-1])
-    free = jnp.pi / lobes - jnp.interp(radius, away, across)
+    away, across = lax.cummax(jnp.abs(point)), jnp.angle(point)
+    # Cubics between the points: with chords, the play would ripple as points slide past each other.
+    # Where the flank runs nearly along a circle about the axis, its slope is not finite: a chord.
+    chord = jnp.diff(across) / jnp.maximum(jnp.diff(away), 1e-12)
+    seen = normal * jnp.conj(point)
+    flat = jnp.abs(jnp.imag(seen)) < 0.02 * jnp.abs(point)
+    slope = -jnp.real(seen) / (away * jnp.where(flat, 1.0, jnp.imag(seen)))
+    k = jnp.clip(jnp.searchsorted(away, radius, side="right") - 1, 0, len(away) - 2)
+    width = jnp.maximum(away[k + 1] - away[k], 1e-12)
+    t = jnp.clip((radius - away[k]) / width, 0.0, 1.0)
+    straight = flat[k] | flat[k + 1]
+    first, last = (jnp.where(straight, 0.0, slope[j] - chord[k]) for j in (k, k + 1))
+    bend = width * t * (1 - t) * ((1 - t) * first - t * last)
+    free = jnp.pi / lobes - (across[k] + t * (across[k + 1] - across[k]) + bend)
     free = jnp.where(radius > away[-1], jnp.inf, free)
     return jnp.where(radius < away[0], (radius - away[0]) / away[0], free)

@@ -2,6 +2,7 @@
 
 import io
 import math
+import shlex
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import yaml
 from experiments._common.polygons import pair_gap
 from rootsopt.commands.console import main
 from rootsopt.config import load, notes, parse
-from rootsopt.config.stock import MATERIALS, gear_backlash, gear_stiffness, line_stiffness
+from rootsopt.config.stock import MATERIALS, MEDIA, gear_backlash, gear_stiffness, line_stiffness
 from rootsopt.scene import outline_mm
 
 BOOSTER = {
@@ -105,7 +106,63 @@ def test_stock_agrees_with_the_formulas_of_its_sources():
     slide = torque / (radius * math.cos(math.radians(20))) / (20.0 * face)  # µm
     turn = slide * 1e-6 / (radius * math.cos(math.radians(20)))
     assert torque / turn == pytest.approx(gear_stiffness(200.0), rel=1e-12)
+    # The approach of two cylinders by Hertz depends a little on their radius.
+    for _, modulus, poisson, *_ in MATERIALS.values():
+        length, radius, compliance = 300.0, 30.0, 2 * (1 - poisson**2) / (math.pi * modulus * 1e3)
+        for each in (10.0, 100.0):
+            half = math.sqrt(2 * each * radius * compliance)
+            depth = each * compliance * (2 * math.log(4 * radius / half) - 1)
+            found = (each * length / line_stiffness(modulus, poisson, length)) ** 0.9
+            assert 1.0 < found / depth < 1.4
     assert gear_backlash(100.0) * math.cos(math.radians(20)) == pytest.approx(0.113, abs=1e-3)
+
+
+GASES = {
+    # Molar mass (g/mol), collision diameter (Å) and energy over k (K) by Hirschfelder et al. 1954.
+    "air": (28.965, 3.711, 78.6),
+    "nitrogen": (28.013, 3.798, 71.4),
+    "oxygen": (31.998, 3.467, 106.7),
+    "argon": (39.948, 3.542, 93.3),
+    "helium": (4.0026, 2.551, 10.22),
+    "hydrogen": (2.01588, 2.827, 59.7),
+    "carbon-dioxide": (44.0095, 3.941, 195.2),
+    "methane": (16.0425, 3.758, 148.6),
+}
+
+
+def test_gases_agree_with_kinetic_theory():
+    """Viscosity by Chapman and Enskog, with the collision integral of Neufeld et al. 1972."""
+
+    def viscosity(mass, size, energy, kelvin):
+        t = kelvin / energy
+        integral = 1.16145 * t**-0.14874 + 0.52487 * math.exp(-0.7732 * t)
+        integral += 2.16178 * math.exp(-2.43787 * t)
+        return 2.6693e-3 * math.sqrt(mass * kelvin) / (size**2 * integral)
+
+    assert {*GASES} == {name for name, row in MEDIA.items() if row[1] is not None}
+    for name, (mass, *collision) in GASES.items():
+        found, constant, *_ = MEDIA[name]
+        cold, usual, hot = (viscosity(mass, *collision, x + 273.15) for x in (-10, 20, 150))
+        assert found == pytest.approx(usual, rel=0.02)
+        assert constant * mass == pytest.approx(8314.46, rel=1e-4)
+        assert 0.9 < cold / usual < hot / usual < 1.4
+
+
+def test_any_key_can_be_set(tmp_path, capsys):
+    """A plain value, and one in a section that the sheet has not."""
+    path = tmp_path / "pump.yaml"
+    words = [f"--{name}={value}" for name, value in BOOSTER.items()]
+    more = ["--set", "pump.viscosity_mPa_s=500", "--set", "objective.terms={flow_ripple: 2}"]
+    assert main(["new", str(path), *words, *more, "--clearance-mm=0"]) == 0
+    assert "may be chaotic" in capsys.readouterr().err
+    config, text = load(path), path.read_text()
+    assert (config.pump.viscosity_mPa_s, config.objective.terms) == (500, {"flow_ripple": 2})
+    assert text.count("# --set\n") == 2
+    head = text.split("# A comment")[0].replace("\n#", "")
+    assert shlex.join(more) in head
+    other = ["--set", "pump.viscosity_mPas=500"]
+    assert main(["new", str(tmp_path / "other.yaml"), *words, *other]) == 2
+    assert "did you mean `pump.viscosity_mPa_s`?" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -120,6 +177,8 @@ def test_stock_agrees_with_the_formulas_of_its_sources():
         ({"family": "ee"}, "`--outer-diameter-mm` must be 187.5 in family ee at 2 lobes"),
         ({"family": "outline"}, "`--family` must be one of 'cic', 'ee'"),
         ({"family": "hypo_epicycloid", "outer_diameter_mm": 201}, "must be from 1"),
+        # 125 (1 + sin 30°), the limit of three lobes.
+        ({"lobes": 3}, "`--outer-diameter-mm` must be below 187.5 at 3 lobes and 125 mm"),
     ],
 )
 def test_refusals_are_one_sentence_that_names_the_option(tmp_path, capsys, changes, words):

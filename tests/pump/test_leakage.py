@@ -234,6 +234,38 @@ def test_gas_leaks_less_than_friction_or_inertia_alone():
     assert float(found.knudsen) == pytest.approx(0.0662e-6 / 2e-5, rel=0.01)
 
 
+@eqx.filter_jit
+def mesh_slopes(scene, design):
+    """Return (mesh flow, its derivatives (d,), film lengths) of a design."""
+
+    def mesh(design):
+        profile = scene.profile(design)
+        found = leakage(scene, scene.medium, profile, geometry(profile))
+        return found.mesh, found.gap.length
+
+    (flow, length), slope = jax.value_and_grad(mesh, has_aux=True)(design)
+    return flow, slope, length
+
+
+def test_mesh_leakage_is_smooth_where_friction_takes_over_from_inertia():
+    """It is the mean of the lesser flow over the roll, by NumPy, and its slope that of differences:
+    the slope of a design that is moved by as little as a film's sampled points are apart."""
+    scene = dataclasses.replace(scene_of(*IN_SERIES), clearance=jnp.asarray(3e-5))
+    design = design_vector(load_config("configs/cic.yaml"))
+    rows = [mesh_slopes(scene, design + shift) for shift in np.outer(range(9), [2e-3, 2e-3, 0])]
+    flow, slope, length = (np.array(x) for x in zip(*rows, strict=True))
+    slow = (3e-5) ** 3 * (9e10 - 1e10) / (24 * 1.82e-5 * length[0] * 1e5)
+    fast = 3e-5 * float(gas.nozzle_flux(jnp.asarray(3e5), jnp.asarray(1e5), AIR)) * 287.05
+    fast *= 293.15 / 1e5
+    place = np.linspace(-0.5, 47.5, 480_001)
+    lesser = np.minimum(np.interp(place, range(48), slow), fast)
+    assert 3 < np.sum(slow < fast) < 43
+    assert flow[0] == pytest.approx(0.1 * np.mean(lesser), rel=1e-6)
+    along = slope[:, 0] + slope[:, 1]
+    middle = (flow[2:] - flow[:-2]) / 4e-3
+    np.testing.assert_allclose(middle, along[1:-1], rtol=1e-4)
+
+
 def test_tips_in_series_share_the_pressure_ratio():
     """Of wide tips, three nozzles with equal pressure ratios; by energy and isentrope.
 

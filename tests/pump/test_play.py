@@ -165,3 +165,21 @@ def test_measured_outline():
         phi = float(found.phi[k])
         for end in (float(found.behind[k]), float(found.ahead[k])):
             assert abs(pair_gap(outline, LOBES, 2 * R, phi, phi + end)) < 2e-7
+
+
+def test_play_is_smooth_in_the_design():
+    """Over moves as short as the sampled points are apart, slopes are those of differences."""
+
+    @jax.jit
+    def ends(angle):
+        def at(angle):
+            poses = jnp.asarray([0.1, 0.35, 0.8])
+            found = play(CIC(LOBES, R, angle, 8.5e-3, 0.07), jnp.asarray(C), phi=poses)
+            return jnp.stack([found.behind, found.ahead])
+
+        return jax.jvp(at, (angle,), (jnp.ones(()),))
+
+    angles = np.deg2rad(36.4) + 2e-6 * np.arange(12)
+    values, slopes = (np.array(x) for x in zip(*map(ends, angles), strict=True))
+    differences = (values[2:] - values[:-2]) / 4e-6
+    np.testing.assert_allclose(differences, slopes[1:-1], atol=1e-4 * np.max(np.abs(slopes)))

@@ -3,6 +3,7 @@
 import argparse
 import os
 import re
+import shlex
 import sys
 import textwrap
 from typing import Any
@@ -41,11 +42,17 @@ def body(options: argparse.Namespace) -> int:
     with cli.waiting(Console(stderr=True), "looking for a profile"):
         config = _met(sheet)
         efficiency = float(shape_of(config).area_efficiency)
-    head = textwrap.fill(f"Made by: rootsopt new {path.name} {sheet.command}", 98)
+    given = shlex.join(word for one in options.overrides for word in ("--set", one))
+    head = textwrap.fill(f"Made by: rootsopt new {path.name} {sheet.command} {given}", 98)
     head += "\nA comment names the option or table of a value, and usual values in its unit."
-    text = sheet.text(config.profile, efficiency, head)
-    for note in notes(parse(text, source=str(path))):
+    text = sheet.text(config.profile, efficiency, head, options.overrides)
+    for note in notes(parse(text, source="the config")):
         say(note)
+    if not sheet.clearance_mm and sheet.clearance_mm is not None:
+        say(
+            "without `--clearance-mm` of more than 0, the flanks hammer each other: the motion may "
+            "be chaotic, and `rootsopt simulate` end with exit code 3"
+        )
     new = path.with_name(f".{path.name}.{os.getpid()}") if options.overwrite else path
     disk.create(new, text.encode())
     disk.replace(new, path)
@@ -114,7 +121,13 @@ def _missing(given: dict[str, Any], keys: list[Key]) -> list[str]:
 
 def _met(sheet: Sheet) -> Config:
     """Return a config with a profile of the sheet's size; raise `InputError` if there is none."""
-    radii: list[float] = []
+    pair = f"{sheet.lobes} lobes and {sheet.centre_distance_mm:g} mm between axes"
+    if sheet.outer_diameter_mm >= sheet.greatest:
+        raise InputError(
+            f"`--outer-diameter-mm` must be below {sheet.greatest:.6g} at {pair}, but is "
+            f"{sheet.outer_diameter_mm:g}; lower it, or raise `--centre-distance-mm`"
+        )
+    radii: list[tuple[float, str]] = []
     for name in [sheet.family] if sheet.family else made():
         try:
             text = sheet.text(sheet.first_profile(family_of(name)))
@@ -123,13 +136,15 @@ def _met(sheet: Sheet) -> Config:
         found = sized(parse(text, source="sheet"))
         if isinstance(found, Config):
             return found
-        radii += found
+        radii += [(radius, name) for radius in found]
     who = f"family {sheet.family}" if sheet.family else "all families"
-    where = f"{who} at {sheet.lobes} lobes and {sheet.centre_distance_mm:g} mm between axes"
+    where = f"{who} at {pair}"
     if not radii:
         raise InputError(f"`--outer-diameter-mm`: no sound profile in {where}; change the lobes")
-    low, high = 2 * min(radii), 2 * max(radii)
-    bound = f"{high:.6g}" if high - low < 1e-6 else f"from {low:.1f} to {high:.1f} (by search)"
+    low, (high, widest) = 2 * min(radii)[0], max(radii)
+    bound = f"{2 * high:.6g}"
+    if 2 * high - low >= 1e-6:
+        bound = f"from {low:.1f} to {2 * high:.1f} (by search; the greatest in {widest})"
     rest = ", or leave out `--family`" if sheet.family else ""
     raise InputError(
         f"`--outer-diameter-mm` must be {bound} in {where}, but is {sheet.outer_diameter_mm:g}; "
