@@ -28,13 +28,20 @@ def better_tables(result: Mapping[str, Any]) -> Iterator[Table | None]:
         numbers |= {label(key): [(one.get(part) or {}).get(key) for one in pair] for key in keys}
     outer = [2 * (one["geometry"]["outer_radius_mm"] - inset) for one in pair]
     numbers |= {"outer diameter as cut (mm)": outer, "inset of the flanks (mm)": [inset, inset]}
-    designs = {label(key): [one["design"][key] for one in pair] for key in pair[0]["design"]}
+    designs = {label(key): [one["design"].get(key) for one in pair] for key in pair[1]["design"]}
+    fit, family = told["fit"], result.get("beginning") or told["fit"]
     groups: list[tuple[str, list[Row]]] = [
-        (name, [[key, *map(value, (a, b)), percent(a, b)] for key, (a, b) in given.items() if a])
-        for name, given in (("", numbers), (f"family {in_words(told['fit']['family'])}", designs))
+        (
+            name,
+            [[key, *map(value, (a, b)), percent(a, b)] for key, (a, b) in given.items() if a or b],
+        )
+        for name, given in (("", numbers), (f"family {in_words(family['family'])}", designs))
     ]
-    yield table("Your rotor against a better one", ("", "your rotor", "a better one", "change"),
-                groups)  # fmt: skip
+    heads = "", "your rotor", "a better one", "change"
+    yield table("Your rotor against a better one", heads, groups,
+                f'"Your rotor" is the {in_words(fit["family"])} profile that is nearest to the '
+                f"outline, at most {fit['departure_um']:.2g} µm from it, not the outline itself."
+                )  # fmt: skip
     rows: list[Row] = [
         [one["case"], *map(value, (one["baseline"], one["optimized"])),
          percent(one["baseline"], one["optimized"]),
