@@ -33,15 +33,15 @@ _COUNTS, _EXACT = (3, COEFFICIENTS // 2, COEFFICIENTS), 1e-6
 
 @dataclasses.dataclass(frozen=True)
 class Beginning:
-    """The design that begins the search for a better rotor than that of a file.
+    """The design that begins the search in another family than the baseline's.
 
     `config`: config of the search, with the fitted profile and with bounds that hold it.
     `likeness`: the fitted profile, and its distances from the outline. `considered`: the nearest
     members of all families that were compared, nearest first. `widened`: keys of the parameters
-    whose default bounds were widened. `file`: name of the outline's file, if
-    there is one. `evaluation`: simulation
-    of the fitted profile, `None` before it has been simulated. `oversize`: flank gap (mm) by which
-    the members exceed that of an outline whose flanks overlap, otherwise 0."""
+    whose default bounds were widened. `file`: name of the outline's file, "" without one.
+    `evaluation`: simulation of the fitted profile, `None` before it has been simulated. `oversize`:
+    flank gap (mm) by which the members exceed that of an outline whose flanks overlap, otherwise 0.
+    """
 
     config: Config
     likeness: Likeness

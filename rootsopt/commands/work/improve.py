@@ -130,7 +130,8 @@ def _asked(what: str, default: Any) -> Any:
     if not (sys.stdin.isatty() and sys.stderr.isatty()):
         return default
     print(f"{what} [{default}]: ", end="", file=sys.stderr, flush=True)
-    return read_document(sys.stdin.readline(), what) or default
+    answer = read_document(sys.stdin.readline(), what)
+    return default if answer is None else answer
 
 
 def _fitted(rotor: Found, name: str) -> Likeness:
