@@ -68,7 +68,7 @@ def config_of(options: argparse.Namespace) -> Config:
     inset = round(one.inset * 1e3, 4)
     gap = round(max(0.0, base.contact.clearance_mm + 2 * inset), 6)
     values = {"profile": profile.model_dump(mode="json", exclude_none=True)} | assumed
-    if len(one.design) <= _HELD:
+    if len(one.design) <= _HELD and "optimizer.family" not in own:
         values["optimizer.family"] = FREE_FORM
     values |= {"contact.clearance_mm": gap, "drawing.inset_mm": max(0.0, inset)}
     aims = _aims(options, base.replaced(values))
@@ -92,7 +92,7 @@ def config_of(options: argparse.Namespace) -> Config:
     design = ", ".join(stated(key, x, named=True) for key, x in one.design.items())
     lines = [
         f"{path.name}: {'; '.join(rotor.facts)}",
-        f"nearest profile: {one.family} ({design}), at most {one.departure * 1e6:.2g} um from it",
+        f"nearest profile: {one.family}{design and f' ({design})'}, at most {one.departure * 1e6:.2g} um from it",
         *([f"inset {inset:.4g} mm along the normal, kept"] if inset else []),
         "assumed (change with --set): " + ", ".join(f"{key}={x}" for key, x in assumed.items()),
     ]
