@@ -6,6 +6,8 @@ from typing import Any
 from rootsopt.output.names import DASH, in_words, label, percent, value
 from rootsopt.output.table import Row, Table, table
 
+WORTH = 1e-4
+"""Relative change of the objective below which no rotor counts as a better one."""
 _ROWS = (
     ("response", ("mean_force_N", "peak_force_N")),
     ("pump", ("volumetric_efficiency", "flow_ripple", "displaced_volume_cm3")),
@@ -37,11 +39,16 @@ def better_tables(result: Mapping[str, Any]) -> Iterator[Table | None]:
         )
         for name, given in (("", numbers), (f"family {in_words(family['family'])}", designs))
     ]
+    note = f'"Your rotor" is the {in_words(fit["family"])} profile that is nearest to the outline, '
+    note += f"at most {fit['departure_um']:.2g} µm from it, not the outline itself."
+    if gain is not None and abs(gain) < WORTH:
+        note += (
+            " With the same displacement, outer diameter and seal width, the family of the search "
+            "has no better rotor: try `--set optimizer.family=free_form`, or allow a narrower tip "
+            "land with `--set constraints.seal_width_min_mm`."
+        )
     heads = "", "your rotor", "a better one", "change"
-    yield table("Your rotor against a better one", heads, groups,
-                f'"Your rotor" is the {in_words(fit["family"])} profile that is nearest to the '
-                f"outline, at most {fit['departure_um']:.2g} µm from it, not the outline itself."
-                )  # fmt: skip
+    yield table("Your rotor against a better one", heads, groups, note)
     rows: list[Row] = [
         [one["case"], *map(value, (one["baseline"], one["optimized"])),
          percent(one["baseline"], one["optimized"]),
@@ -52,4 +59,4 @@ def better_tables(result: Mapping[str, Any]) -> Iterator[Table | None]:
     yield table("The objective with errors of manufacture", heads, [("", rows)], told["message"])
 
 
-__all__ = ["better_tables"]
+__all__ = ["WORTH", "better_tables"]

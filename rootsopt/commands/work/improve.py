@@ -19,7 +19,7 @@ from rootsopt.errors import InputError
 from rootsopt.measured.finding import Found, found
 from rootsopt.optimize.surviving import survives, surviving
 from rootsopt.output import terminal
-from rootsopt.output.better import better_tables
+from rootsopt.output.better import WORTH, better_tables
 from rootsopt.output.names import stated
 from rootsopt.output.runs import RunFolder
 from rootsopt.pump.sheet import record_of
@@ -90,9 +90,10 @@ def config_of(options: argparse.Namespace) -> Config:
         say(f"no report is written: it needs {lacking}")
         options.report = False
     design = ", ".join(stated(key, x, named=True) for key, x in one.design.items())
+    member = f"{one.family} ({design})" if design else one.family
     lines = [
         f"{path.name}: {'; '.join(rotor.facts)}",
-        f"nearest profile: {one.family}{design and f' ({design})'}, at most {one.departure * 1e6:.2g} um from it",
+        f"nearest profile: {member}, at most {one.departure * 1e6:.2g} um from it",
         *([f"inset {inset:.4g} mm along the normal, kept"] if inset else []),
         "assumed (change with --set): " + ", ".join(f"{key}={x}" for key, x in assumed.items()),
     ]
@@ -206,7 +207,8 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     is invalid."""
 
     def further(result) -> dict[str, Any]:
-        cases = surviving(result, config)
+        worth = abs(result.improvement.get("objective", 0.0)) >= WORTH
+        cases = surviving(result, config) if worth else []
         return {"improve": options.known | {"cases": cases, "message": survives(cases)}}
 
     outcome = optimize.searched_for(config, options, folder, further)
@@ -217,4 +219,5 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
             out.print(line, soft_wrap=True, markup=False, highlight=False)
         out.print(terminal.shown(better_tables(data)))
 
-    return cli.Outcome(outcome.code, show)
+    gain = (data.get("improvement") or {}).get("objective", 0.0)
+    return cli.Outcome(outcome.code if abs(gain) >= WORTH else cli.NO_RESULT, show)
