@@ -27,7 +27,6 @@ from rootsopt.config.shipped import advice, located
 from rootsopt.config.smoothing import following_mm
 from rootsopt.config.sources import FILES, regular_file
 from rootsopt.config.study import (
-    NEAREST,
     TWIST,
     AttractorsConfig,
     ConstraintsConfig,
@@ -232,7 +231,7 @@ class Config(Section):
 
     @model_validator(mode="after")
     def _fitting(self):
-        scene, profile, family = self.scene, self.profile, self.optimizer.family
+        scene, profile = self.scene, self.profile
         gas = scene.load.pressure_difference_Pa is not None
         require(
             None in (scene.supports, scene.bearings) or not (self.twist_free and gas),
@@ -240,12 +239,6 @@ class Config(Section):
             "`scene.bearings` and a load `pressure_difference_Pa`: the twist moves the instant "
             "at which a pocket opens and the axes are pushed, which gradients leave out; "
             "remove one of the four",
-        )
-        require(
-            profile.from_file or family in (NEAREST, profile.family),
-            f"`optimizer.family` must be {profile.family}, the family of the profile, or be left "
-            f"out, but is {family}: only for an outline from a file can the search vary another "
-            "family",
         )
         for parameter in family_of(profile.family).parameters:
             key, sized = parameter.key, parameter.limits(profile.pitch_radius_mm)

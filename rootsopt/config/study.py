@@ -474,8 +474,8 @@ class OptimizerConfig(Section):
     seed: Seed = Field(0, description="seed of the screening sample")
     family: Annotated[str, Among(_fitted)] = Field(
         NEAREST,
-        description="profile family outline: family whose parameters are varied, from the member "
-        "nearest to the outline; nearest: the named family that comes nearest",
+        description="family whose parameters are varied, from the member nearest to the profile; "
+        "nearest: the profile's own, for an outline the named family that comes nearest",
     )
     bounds: dict[Annotated[str, Among(_searched)], _Bounds] = Field(
         default_factory=dict,

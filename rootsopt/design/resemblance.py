@@ -128,8 +128,8 @@ def likeness(profile: Profile, family: str) -> Likeness | None:
     return _best(free, profile, [*found, *again])
 
 
-def free_likeness(profile: Profile, *near: Likeness) -> Likeness | None:
-    """Return the free form of `COEFFICIENTS` coefficients that is nearest to `profile`.
+def free_likeness(profile: Profile, *near: Likeness, count: int = COEFFICIENTS) -> Likeness | None:
+    """Return the free form of `count` coefficients that is nearest to `profile`.
 
     `near`: members of other families; searches also start from their projections. Return `None` if
     the searches find no sound free form."""
@@ -137,14 +137,14 @@ def free_likeness(profile: Profile, *near: Likeness) -> Likeness | None:
     parameters = family_of(FREE_FORM).parameters
     size = float(radius) / MM, profile.lobes
     usual = [parameter.usually(*size) for parameter in parameters]
-    width = np.array([high - low for low, high in [usual[0], *[usual[1]] * COEFFICIENTS]])
+    width = np.array([high - low for low, high in [usual[0], *[usual[1]] * count]])
     whole = [profile]
     for one in near:
         design = jnp.asarray(list(one.design.values()))
         whole.append(profile_of(one.family, profile.lobes, radius, design))
     starts = []
     for one in whole:
-        free = project(one, COEFFICIENTS)
+        free = project(one, count)
         land = float(free.tip_arc_angle)
         if isinstance(one, Outline):
             land = float(one.seal_width / (2 * one.outer_radius))

@@ -1,41 +1,47 @@
-"""Where the search begins if the baseline is a rotor from a file.
+"""Where the search begins if the baseline is a rotor from a file, or of another family.
 
-Such a rotor has no design parameters. It remains the baseline. The search varies the parameters of
-a family, and begins at the member of this family that is nearest to the outline."""
+Such a rotor does not have the parameters that the search varies. It remains the baseline. The
+search begins at the member of the family `optimizer.family` that is nearest to it."""
 
 import dataclasses
 from pathlib import Path
 from typing import Any
+
+import jax.numpy as jnp
 
 from rootsopt.config import Config
 from rootsopt.config.families import FREE_FORM, families, family_of
 from rootsopt.config.study import NEAREST
 from rootsopt.config.units import MM
 from rootsopt.design.bounds import widened
-from rootsopt.design.resemblance import Likeness, free_likeness, likeness
+from rootsopt.design.resemblance import COEFFICIENTS, Likeness, free_likeness, likeness
 from rootsopt.errors import InputError
 from rootsopt.optimize.limits import settled
-from rootsopt.profiles import Outline
+from rootsopt.profiles import Outline, Profile
 from rootsopt.response.evaluation import Evaluation
 from rootsopt.response.records import geometry_record
 from rootsopt.scene import Scene
 from rootsopt.scene.check import shape_of
-from rootsopt.scene.families import classical, profile_from_file
+from rootsopt.scene.families import classical, design_of, profile_from_file, profile_of
 
 _FAR = 20e-6
 """Distance (m) of the nearest named family above which the message recommends a free form."""
+_COUNTS, _EXACT = (3, COEFFICIENTS // 2, COEFFICIENTS), 1e-6
+"""Numbers of coefficients of a free form, tried in this order until it is as near as the distance
+(m): searches with few parameters compile and run faster."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Beginning:
-    """The design that begins the search for a better rotor than that of a file.
+    """The design that begins the search in another family than the baseline's.
 
     `config`: config of the search, with the fitted profile and with bounds that hold it.
     `likeness`: the fitted profile, and its distances from the outline. `considered`: the nearest
     members of all families that were compared, nearest first. `widened`: keys of the parameters
-    whose default bounds were widened. `file`: name of the outline's file. `evaluation`: simulation
-    of the fitted profile, `None` before it has been simulated. `oversize`: flank gap (mm) by which
-    the members exceed that of an outline whose flanks overlap, otherwise 0."""
+    whose default bounds were widened. `file`: name of the outline's file, "" without one.
+    `evaluation`: simulation of the fitted profile, `None` before it has been simulated. `oversize`:
+    flank gap (mm) by which the members exceed that of an outline whose flanks overlap, otherwise 0.
+    """
 
     config: Config
     likeness: Likeness
@@ -49,16 +55,15 @@ class Beginning:
     def message(self) -> str:
         """Sentences for the user: where the search begins, and how far from the outline."""
         one = self.likeness
-        text = (
-            f"The baseline is the rotor of {self.file} as it is. The search began at the nearest "
-            f"{one.family} profile, at most {one.departure * 1e6:.3g} um (RMS "
-            f"{one.rms * 1e6:.3g} um) from it."
+        text = f"The baseline is the rotor of {self.file} as it is. " if self.file else ""
+        text += (
+            f"The search began at the nearest {one.family} profile, at most "
+            f"{one.departure * 1e6:.3g} um (RMS {one.rms * 1e6:.3g} um) from it."
         )
         if one.inset:
             text += f" {self._inset}."
         if self.widened:
-            bounds = family_of(one.family).parameters
-            pairs = {p.key: getattr(self.config.optimizer.bounds, p.key) for p in bounds}
+            pairs = self.config.optimizer.bounds
             named = [f"{k} to [{pairs[k][0]:.4g}, {pairs[k][1]:.4g}]" for k in self.widened]
             text += f" Its bounds were widened to hold it: {', '.join(named)}."
         if one.departure > _FAR and one.family != FREE_FORM:
@@ -86,15 +91,18 @@ class Beginning:
 
 
 def beginning(config: Config) -> Beginning | None:
-    """Return where the search of a `config` begins; `None` unless its profile is from a file.
+    """Return where the search of a `config` begins; `None` if it varies the baseline's own family.
 
     Raises `InputError` if the file holds no usable outline, or if no profile of the family
     `optimizer.family` could be fitted to it."""
-    given = profile_from_file(config.profile)
+    wanted, own = config.optimizer.family, config.profile
+    given = profile_from_file(own)
     if given is None:
-        return None
-    wanted = config.optimizer.family
-    found = fits(given, wanted)
+        if wanted in (NEAREST, own.family):
+            return None
+        radius = jnp.asarray(own.pitch_radius_mm * MM)
+        given = profile_of(own.family, own.lobes, radius, design_of(own))
+    found = _fits(given, wanted)
     for one in found:
         try:
             profile = one.config(config.profile)
@@ -106,7 +114,7 @@ def beginning(config: Config) -> Beginning | None:
         return Beginning(other, one, found, keys, file, oversize=oversize)
     valid = ", ".join([NEAREST, *(name for name, one in families().items() if one.fitted)])
     raise InputError(
-        f"`optimizer.family` must be a family with a sound profile near the outline, but is "
+        f"`optimizer.family` must be a family with a sound profile near the baseline, but is "
         f"{wanted}, for which none was found; choose another one of {valid}"
     )
 
@@ -126,24 +134,24 @@ def _cut(config: Config, inset: float) -> tuple[Config, float]:
     return settled(config, shape), max(0.0, -gap)
 
 
-def fits(given: Outline, family: str = NEAREST, enough: float = 0.0) -> list[Likeness]:
-    """Return the members nearest to the outline `given`, nearest first.
+def _fits(given: Profile, family: str) -> list[Likeness]:
+    """Return the members nearest to the profile `given`, nearest first.
 
-    `family`: name of a family, or `NEAREST` for all classical ones with parameters; `enough`:
-    distance (m) of a member at which no further families are compared."""
+    `family`: name of a family, or `NEAREST` for all classical ones with parameters."""
     named = [name for name in classical() if family_of(name).fitted]
     if family == NEAREST:
-        found = []
-        for name in named:
-            found.append(likeness(given, name))
-            if found[-1] is not None and found[-1].departure <= enough:
-                break
+        found = [likeness(given, name) for name in named]
     elif family in named:
         found = [likeness(given, family)]
     else:
-        near = [likeness(given, name) for name in ("five_arcs", "cic")]
-        found = [free_likeness(given, *(one for one in near if one is not None))]
+        # Projections of smooth members are better starts than those of measured points.
+        smooth = ("five_arcs", "cic") if isinstance(given, Outline) else ()
+        near = [one for name in smooth if (one := likeness(given, name)) is not None]
+        for count in _COUNTS:
+            found = [free_likeness(given, *near, count=count)]
+            if found[0] is not None and found[0].departure <= _EXACT:
+                break
     return sorted((one for one in found if one is not None), key=lambda one: one.departure)
 
 
-__all__ = ["Beginning", "beginning", "fits"]
+__all__ = ["Beginning", "beginning"]

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from rootsopt.config import Config
 from rootsopt.optimize.outcome import Optimization
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.many import Point, evaluate_many
@@ -27,8 +28,10 @@ _CASES = {
 """Errors (mm) of profile and centre distance by the name of the case."""
 
 
-def surviving(result: Optimization) -> list[dict[str, Any]]:
+def surviving(result: Optimization, given: Config) -> list[dict[str, Any]]:
     """Return one row per case: the drawing first, then each error alone.
+
+    `given`: config of the baseline, whose family may be another than that of the search.
 
     A row holds the name of the `case`, the objectives `baseline` and `optimized` (relative to the
     baseline as drawn), the relative `gain` between them, its `share` of the gain as drawn, and
@@ -38,20 +41,27 @@ def surviving(result: Optimization) -> list[dict[str, Any]]:
     if problem is None or result.optimized is None:
         return []
     # With an error of 0 as well, so that one program serves all cases.
-    own = problem.config.scene.center_distance_error_mm or 0.0
-    config = problem.config.moved({"scene.center_distance_error_mm": own})
-    evaluator, tip = needed_motion(config), config.value("pump.tip_clearance_mm")
-    designs = [np.array([*one.design.values()]) for one in (result.baseline, result.optimized)]
+    own = given.scene.center_distance_error_mm or 0.0
+    known = {"scene.center_distance_error_mm": own}
+    pairs = (given, result.baseline), (problem.config, result.optimized)
+    configs = [config.moved(known) for config, _ in pairs]
+    evaluators = [needed_motion(config).without_gradient() for config in configs]
+    designs = [np.array([*one.design.values()]) for _, one in pairs]
 
-    def moved(full: float, away: float) -> Evaluator:
+    def moved(config: Config, evaluator: Evaluator, full: float, away: float) -> Evaluator:
         # Both flanks of a gap move. The scene takes a negative clearance, which no config may have.
+        tip = config.value("pump.tip_clearance_mm")
         values = {"contact.clearance_mm": config.contact.clearance_mm - 2 * full}
         values |= {"scene.center_distance_error_mm": own + away}
         values |= {} if tip is None else {"pump.tip_clearance_mm": max(0.0, tip - full)}
         return dataclasses.replace(evaluator, scene=evaluator.scene.renewed(config.moved(values)))
 
-    evaluators = [moved(*errors) for errors in _CASES.values()]
-    found = evaluate_many(Point(one, design) for one in evaluators for design in designs)
+    both = [*zip(configs, evaluators, designs, strict=True)]
+    found = evaluate_many(
+        Point(moved(config, evaluator, *errors), design)
+        for errors in _CASES.values()
+        for config, evaluator, design in both
+    )
     # Where an orbit does not close, as between jammed flanks, the window still has its forces.
     closed = {Status.NOT_CLOSED: Status.PERIODIC}
     numbers = [

@@ -6,6 +6,8 @@ from typing import Any
 from rootsopt.output.names import DASH, in_words, label, percent, value
 from rootsopt.output.table import Row, Table, table
 
+WORTH = 1e-4
+"""Relative change of the objective below which no rotor counts as a better one."""
 _ROWS = (
     ("response", ("mean_force_N", "peak_force_N")),
     ("pump", ("volumetric_efficiency", "flow_ripple", "displaced_volume_cm3")),
@@ -28,13 +30,25 @@ def better_tables(result: Mapping[str, Any]) -> Iterator[Table | None]:
         numbers |= {label(key): [(one.get(part) or {}).get(key) for one in pair] for key in keys}
     outer = [2 * (one["geometry"]["outer_radius_mm"] - inset) for one in pair]
     numbers |= {"outer diameter as cut (mm)": outer, "inset of the flanks (mm)": [inset, inset]}
-    designs = {label(key): [one["design"][key] for one in pair] for key in pair[0]["design"]}
+    designs = {label(key): [one["design"].get(key) for one in pair] for key in pair[1]["design"]}
+    fit, family = told["fit"], result.get("beginning") or told["fit"]
     groups: list[tuple[str, list[Row]]] = [
-        (name, [[key, *map(value, (a, b)), percent(a, b)] for key, (a, b) in given.items() if a])
-        for name, given in (("", numbers), (f"family {in_words(told['fit']['family'])}", designs))
+        (
+            name,
+            [[key, *map(value, (a, b)), percent(a, b)] for key, (a, b) in given.items() if a or b],
+        )
+        for name, given in (("", numbers), (f"family {in_words(family['family'])}", designs))
     ]
-    yield table("Your rotor against a better one", ("", "your rotor", "a better one", "change"),
-                groups)  # fmt: skip
+    note = f'"Your rotor" is the {in_words(fit["family"])} profile that is nearest to the outline, '
+    note += f"at most {fit['departure_um']:.2g} µm from it, not the outline itself."
+    if gain is not None and abs(gain) < WORTH:
+        note += (
+            " With the same displacement, outer diameter and seal width, the family of the search "
+            "has no better rotor: try `--set optimizer.family=free_form`, or allow a narrower tip "
+            "land with `--set constraints.seal_width_min_mm`."
+        )
+    heads = "", "your rotor", "a better one", "change"
+    yield table("Your rotor against a better one", heads, groups, note)
     rows: list[Row] = [
         [one["case"], *map(value, (one["baseline"], one["optimized"])),
          percent(one["baseline"], one["optimized"]),
@@ -45,4 +59,4 @@ def better_tables(result: Mapping[str, Any]) -> Iterator[Table | None]:
     yield table("The objective with errors of manufacture", heads, [("", rows)], told["message"])
 
 
-__all__ = ["better_tables"]
+__all__ = ["WORTH", "better_tables"]

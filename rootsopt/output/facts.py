@@ -77,7 +77,7 @@ def _sentence(parts: Sequence[str]) -> str:
 
 def _gains(result: Record) -> Iterator[str]:
     """Yield what is known of the objective."""
-    member = "that of the nominal member of the family, fitted to the measured baseline"
+    member = "that of the nominal member of the family, fitted to the baseline"
     for entry, whose in ("improvement", "the baseline's"), ("improvement_over_nominal", member):
         gain = (result.get(entry) or {}).get("objective")
         if gain is not None and math.isfinite(gain):

@@ -1,6 +1,9 @@
 """`rootsopt improve`: a rotor from a file, and a better one in its place."""
 
 import json
+import os
+import pty
+import tty
 
 import ezdxf
 import jax.numpy as jnp
@@ -8,7 +11,9 @@ import numpy as np
 import pytest
 
 from rootsopt.commands.table import improve
+from rootsopt.commands.work import improve as work
 from rootsopt.profiles import CIC, outline
+from tests.measured.test_finding import cycloids, write
 
 DESIGN = {"pressure_angle_deg": 36.43, "involute_length_mm": 8.5, "tip_arc_angle_deg": 4.0}
 QUICK = ("optimizer.iterations=2", "optimizer.starts=1", "optimizer.screening=0")
@@ -25,24 +30,30 @@ def file_of(folder, inset, unit=25.4):
     return str(folder / "rotor.csv")
 
 
-def test_a_better_rotor_takes_the_place_of_that_of_a_file(tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("aim", "least"), [("quieter", ("constraints.seal_width_min_mm=2",)), ("tighter", ())]
+)
+def test_a_better_rotor_takes_the_place_of_that_of_a_file(aim, least, tmp_path, capsys):
     file, folder = file_of(tmp_path, 0.02), tmp_path / "run"
-    scene = ["scene.timing_gear.backlash_mm=0.3", *QUICK]
+    scene = ["scene.timing_gear.backlash_mm=0.3", *QUICK, *least]
     sets = [word for one in scene for word in ("--set", one)]
-    assert improve.main([file, "--no-figures", "-o", str(folder), *sets, "--length-mm", "100"]) == 0
+    options = ["--no-figures", "-o", str(folder), *sets, "--length-mm", "100", f"--{aim}"]
+    assert improve.main([file, *options]) == 0
     shown = capsys.readouterr().out
     assert "Your rotor against a better one" in shown
     assert "inset 0.02 mm" in shown
     result = json.loads((folder / "result.json").read_text())
     before, after, told = result["baseline"], result["optimized"], result["improve"]
     assert told["inset_mm"] == pytest.approx(0.02, abs=1e-3)
-    assert told["aims"] == ["quieter"]
+    assert told["aims"] == [aim]
     assert before["design"] == pytest.approx(DESIGN, abs=5e-3)
     # The better rotor fits the housing, displaces as much, and is cut by the same clearance.
     radius = [one["geometry"]["outer_radius_mm"] for one in (before, after)]
     volume = [one["pump"]["displaced_volume_cm3"] for one in (before, after)]
     assert radius[1] <= radius[0] + 1e-5
     assert volume[1] >= volume[0] - 1e-3
+    seal = [one["geometry"]["seal_width_mm"] for one in (before, after)]
+    assert seal[1] >= (2 if least else seal[0]) - 1e-4
     assert result["improvement"]["objective"] > 0
     drawn = ezdxf.readfile(folder / "rotor.dxf").modelspace().query('ARC[layer=="OUTLINE"]')
     farthest = max(arc.start_point.magnitude for arc in drawn)
@@ -53,6 +64,37 @@ def test_a_better_rotor_takes_the_place_of_that_of_a_file(tmp_path, capsys):
     for one in told["cases"]:
         gain = 1 - one["optimized"] / one["baseline"]
         assert one["share"] == pytest.approx(gain / result["improvement"]["objective"], rel=1e-3)
+
+
+def test_a_rotor_without_parameters_is_improved_by_a_free_form(tmp_path):
+    """EE has no seal and no parameters. The ripple of its flow needs no simulation."""
+    file, folder = write(tmp_path / "ee.csv", cycloids(2, 40.0)), tmp_path / "run"
+    sets = [word for one in QUICK for word in ("--set", one)]
+    options = ["--smoother", "--no-figures", "--config", "cic", *sets, "-o", str(folder)]
+    assert improve.main([str(file), *options]) == 0
+    result = json.loads((folder / "result.json").read_text())
+    before, after, told = result["baseline"], result["optimized"], result["improve"]
+    assert (told["fit"]["family"], before["design"]) == ("ee", {})
+    # EE of N lobes is the free form with all coefficients N / (N + 1).
+    begun = [result["beginning"]["design"][f"coefficients_{k}"] for k in (1, 2, 3)]
+    assert begun == pytest.approx([2 / 3] * 3, abs=1e-6)
+    assert before["geometry"]["outer_radius_mm"] == pytest.approx(60)
+    assert after["geometry"]["outer_radius_mm"] <= 60 + 1e-5
+    volume = [one["pump"]["displaced_volume_cm3"] for one in (before, after)]
+    assert volume[1] >= volume[0] - 1e-3
+    assert after["pump"]["flow_ripple"] < before["pump"]["flow_ripple"]
+
+
+@pytest.mark.parametrize(("answer", "value"), [("1500", 1500), ("", 3000.0), ("0", 0)])
+def test_a_terminal_is_asked(answer, value, monkeypatch):
+    ours, theirs = pty.openpty()
+    tty.setraw(theirs)  # Without echo.
+    with open(ours, "r+b", 0) as user, open(theirs) as keys, open(os.dup(theirs), "w") as out:
+        monkeypatch.setattr("sys.stdin", keys)
+        monkeypatch.setattr("sys.stderr", out)
+        user.write(f"{answer}\n".encode())
+        assert work._asked("scene.speed_rpm", 3000.0) == value
+        assert user.read(100) == b"scene.speed_rpm [3000.0]: "
 
 
 REFUSED = {

@@ -12,19 +12,20 @@ from rootsopt.commands import cli
 from rootsopt.commands.work import optimize
 from rootsopt.config import Config, load
 from rootsopt.config.document import read_document
+from rootsopt.config.families import FREE_FORM
 from rootsopt.design.bounds import widened
-from rootsopt.design.resemblance import Likeness
+from rootsopt.design.resemblance import Likeness, free_likeness, likeness
 from rootsopt.errors import InputError
 from rootsopt.measured.finding import Found, found
-from rootsopt.optimize.beginning import fits
 from rootsopt.optimize.surviving import survives, surviving
 from rootsopt.output import terminal
-from rootsopt.output.better import better_tables
+from rootsopt.output.better import WORTH, better_tables
 from rootsopt.output.names import stated
 from rootsopt.output.runs import RunFolder
 from rootsopt.pump.sheet import record_of
 from rootsopt.runtime.environment import say
 from rootsopt.scene.check import shape_of
+from rootsopt.scene.families import classical
 
 _TERMS = {"tighter": "leakage_fraction", "smoother": "flow_ripple"}
 """Terms of the objective by aim; `quieter` has the mean and the peak force instead."""
@@ -37,13 +38,15 @@ _SCALED = {
 speed and gas pressure."""
 _AIR = {"viscosity_mPa_s": 0.018, "pressure_difference_Pa": 2e4, "gas": {"inlet_pressure_Pa": 1e5}}
 """The section `pump` that is assumed, without its clearances."""
+_COMMON = "ee", "arc", "cic"
+"""Families that are compared first, because they are common or fitted quickly."""
 _EXACT, _FAR = 1e-6, 20e-6
 """Distance (m) of a family's member at which no further families are compared, and above which
 the free form is compared, too. Three times the scatter of the points is added to both."""
-_HELD, _LOOSE, _SEAL, _GAP, _ROOM = 2, 0.01, 0.06, 3e-3, 1e-6
+_HELD, _LOOSE, _GAP, _ROOM = 2, 0.01, 3e-3, 1e-6
 """Number of parameters that the limits take from a family. In pitch radii: distance of the fitted
-profile from the outline above which it is rejected, least width of the tip land that is kept, and
-clearance that is assumed without a gap. Room (mm, cm³) that limits leave for rounding."""
+profile from the outline above which it is rejected, and clearance that is assumed without a gap.
+Room (mm, cm³) that limits leave for rounding."""
 
 
 def config_of(options: argparse.Namespace) -> Config:
@@ -65,6 +68,8 @@ def config_of(options: argparse.Namespace) -> Config:
     inset = round(one.inset * 1e3, 4)
     gap = round(max(0.0, base.contact.clearance_mm + 2 * inset), 6)
     values = {"profile": profile.model_dump(mode="json", exclude_none=True)} | assumed
+    if len(one.design) <= _HELD and "optimizer.family" not in own:
+        values["optimizer.family"] = FREE_FORM
     values |= {"contact.clearance_mm": gap, "drawing.inset_mm": max(0.0, inset)}
     aims = _aims(options, base.replaced(values))
     if base.pump is None and ("tighter" in aims or gap > 0):
@@ -77,7 +82,7 @@ def config_of(options: argparse.Namespace) -> Config:
     limits = {
         "constraints.area_efficiency_min": 0.0,
         "constraints.outer_radius_max_mm": round(float(shape.outer_radius) * 1e3 + _ROOM, 6),
-        "constraints.seal_width_min_mm": round(min(land, _SEAL * radius), 6),
+        "constraints.seal_width_min_mm": round(max(0.0, land - _ROOM), 6),
         "constraints.terms.displaced_volume_cm3": {"min": round(least, 6)},
     }
     config = config.replaced({key: value for key, value in limits.items() if key not in own})
@@ -85,9 +90,10 @@ def config_of(options: argparse.Namespace) -> Config:
         say(f"no report is written: it needs {lacking}")
         options.report = False
     design = ", ".join(stated(key, x, named=True) for key, x in one.design.items())
+    member = f"{one.family} ({design})" if design else one.family
     lines = [
         f"{path.name}: {'; '.join(rotor.facts)}",
-        f"nearest profile: {one.family} ({design}), at most {one.departure * 1e6:.2g} um from it",
+        f"nearest profile: {member}, at most {one.departure * 1e6:.2g} um from it",
         *([f"inset {inset:.4g} mm along the normal, kept"] if inset else []),
         "assumed (change with --set): " + ", ".join(f"{key}={x}" for key, x in assumed.items()),
     ]
@@ -125,19 +131,25 @@ def _asked(what: str, default: Any) -> Any:
     if not (sys.stdin.isatty() and sys.stderr.isatty()):
         return default
     print(f"{what} [{default}]: ", end="", file=sys.stderr, flush=True)
-    return read_document(sys.stdin.readline(), what) or default
+    answer = read_document(sys.stdin.readline(), what)
+    return default if answer is None else answer
 
 
 def _fitted(rotor: Found, name: str) -> Likeness:
     """Return the member of a family that is nearest to a rotor from the file `name`.
 
-    Displacement and outer radius are held, so that only families with more parameters can improve
-    it. Raises `InputError` if no member is near."""
+    Raises `InputError` if no member is near."""
     blur = float(np.nan_to_num(3e-3 * rotor.checks.seen.scatter))
-    near = fits(rotor.outline, enough=_EXACT + blur)
-    near = [one for one in near if len(one.design) > _HELD]
-    if not near or near[0].departure > _FAR + blur:
-        near += fits(rotor.outline, "free_form")
+    near: list[Likeness] = []
+    for family in dict.fromkeys((*_COMMON, *classical())):
+        one = likeness(rotor.outline, family)
+        near += [] if one is None else [one]
+        if near and near[-1].departure <= _EXACT + blur:
+            break
+    else:
+        if all(one.departure > _FAR + blur for one in near):
+            free = free_likeness(rotor.outline, *near)
+            near += [] if free is None else [free]
     best = min(near, key=lambda one: one.departure, default=None)
     if best is None or best.departure > _LOOSE * rotor.radius * 1e-3:
         raise InputError(
@@ -195,7 +207,8 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     is invalid."""
 
     def further(result) -> dict[str, Any]:
-        cases = surviving(result)
+        worth = abs(result.improvement.get("objective", 0.0)) >= WORTH
+        cases = surviving(result, config) if worth else []
         return {"improve": options.known | {"cases": cases, "message": survives(cases)}}
 
     outcome = optimize.searched_for(config, options, folder, further)
@@ -206,4 +219,5 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
             out.print(line, soft_wrap=True, markup=False, highlight=False)
         out.print(terminal.shown(better_tables(data)))
 
-    return cli.Outcome(outcome.code, show)
+    gain = (data.get("improvement") or {}).get("objective", 0.0)
+    return cli.Outcome(outcome.code if abs(gain) >= WORTH else cli.NO_RESULT, show)
