@@ -126,6 +126,7 @@ class RobustStage(Stage):
     `nominal`: outcome of the first stage, with a problem; `first`: see `Stage`."""
 
     apart = 0.03
+    bounded = False
 
     def __init__(self, nominal: Optimization, first: int):
         self.nominal, self.first = nominal, first
