@@ -228,11 +228,10 @@ class Bounding:
     def bound(self, reached: float) -> Bound:
         """Return what is known; `reached`: objective of the design that is reported."""
         boxes = [self._bounded(box)[0] for box in self._open] + self._left
-        loose = [box for box in boxes if box.bound < self.target]
         known = [box.bound for box in [*boxes, *self._closed] if box.bound > -math.inf]
-        lower = min([*known, self.best, reached]) if known else -math.inf
-        whole = all(box.bound > -math.inf for box in loose)
-        enough = reached - lower <= 1.1 * _GAP * max(abs(reached), _SMALL)
+        lower = float(min([*known, self.best, reached])) if known else -math.inf
+        near = reached - 1.1 * _GAP * max(abs(reached), _SMALL)
+        loose = [box for box in boxes if box.bound < near]
         return Bound(
             lower,
             reached - lower,
@@ -244,7 +243,7 @@ class Bounding:
             len(self.unusable),
             len(loose),
             float(sum(np.prod(2 * box.half) for box in loose)),
-            enough and whole,
+            lower >= near and not loose,
         )
 
     def _next(self, box: Box, least: NDArray[np.float64]) -> NDArray[np.float64] | None:

@@ -161,7 +161,9 @@ class Optimality:
     def record(self) -> dict[str, Any]:
         """Return the entry `optimality` of the result file."""
         optima = self.optima
-        whole = {} if self.bound is None else {"global": self.bound.record()}
+        whole: dict[str, Any] = {} if self.bound is None else {"global": self.bound.record()}
+        if self.bound is None or not self.bound.proven:
+            whole["unseen"] = unseen(sum(one.found for one in optima), len(optima))
         return whole | {
             "method": self.method,
             "converged": self.converged,
@@ -185,8 +187,6 @@ class Optimality:
             ],
             "optima": [one._asdict() for one in optima],
             "sensitivities": [*self.sensitivities],
-            # A bound tells more than an estimate.
-            **({} if self.bound else {"unseen": unseen(sum(o.found for o in optima), len(optima))}),
         }
 
 

@@ -140,6 +140,11 @@ class Search:
                 f"{config.profile.family}: it has no design parameter; use `simulate` for it, "
                 "or make the twist one with `optimizer.bounds.helix_deg`"
             )
+        if config.optimizer.prove is True and len(config.design_keys) > _PARAMETERS:
+            raise InputError(
+                f"`optimizer.prove` must be auto or false for {len(config.design_keys)} design "
+                f"parameters, but is true: a lower bound takes at most {_PARAMETERS}"
+            )
         evaluator = needed_motion(config)
         if isinstance(evaluator.motions, Still):
             # Nothing moves, so that no choice of motions matters.
@@ -246,7 +251,8 @@ class Search:
 
         `trials`: those of the search so far; `number`: index of its next local search. Return what
         is known of the bound, `None` if it is not asked for, and the trials of further searches."""
-        size, candidates = len(self.config.design_keys), [one for one in trials if one.candidate]
+        candidates = [one for one in trials if one.candidate]
+        size = len(trials[0].point) if trials else 0
         given = self.settings.prove
         quick = size <= _QUICK and FIRST * (size + 1) <= len(trials)
         asked = self.stage.bounded and not self.noisy and size <= _PARAMETERS and given is not False
