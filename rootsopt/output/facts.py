@@ -171,7 +171,7 @@ def _bounded(known: Record) -> Iterator[str]:
     if known["proven"]:
         yield (
             f"no design within the bounds is better by more than {gap} (objective; lower bound "
-            f"from {count} designs, if the objective bends no more than {brief(known['factor'], 2)} "
+            f"from {count} designs, if the objective bends at most {brief(known['factor'], 2)} "
             "times as much as between these)"
         )
     else:
