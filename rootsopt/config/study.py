@@ -472,6 +472,11 @@ class OptimizerConfig(Section):
         48, description="designs screened to place the starts; 0 starts at the baseline only"
     )
     seed: Seed = Field(0, description="seed of the screening sample")
+    prove: Literal["auto"] | bool = Field(
+        "auto",
+        description="whether the objective of all designs is bounded from below, for up to 4 "
+        "parameters: true, false, or auto: where this costs less than the search",
+    )
     family: Annotated[str, Among(_fitted)] = Field(
         NEAREST,
         description="family whose parameters are varied, from the member nearest to the profile; "

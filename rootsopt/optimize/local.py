@@ -59,6 +59,23 @@ class Linearization(NamedTuple):
         beyond = max((wall.top for wall in self.walls), default=0.0)
         return max(0.0, -float(np.min(self.slack, initial=0.0)), beyond)
 
+    @property
+    def minorants(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Values (k,) and gradients (k, d) of k branches of the objective, the greatest first.
+
+        The first sums up the greatest branch of each maximum. In each other one, one maximum has
+        another branch."""
+        first = [int(np.argmax(group.values)) for group in self.groups]
+        slope = self.slope + sum(
+            (g.slopes[k] for k, g in zip(first, self.groups, strict=True)), 0.0
+        )
+        values, slopes = [np.array([self.objective])], [slope[None]]
+        for top, group in zip(first, self.groups, strict=True):
+            others = np.arange(len(group.values)) != top
+            values.append(self.objective + group.values[others] - group.values[top])
+            slopes.append(slope + group.slopes[others] - group.slopes[top])
+        return np.concatenate(values), np.concatenate(slopes)
+
     def combined(self, shares: tuple[NDArray[np.float64], ...]) -> NDArray[np.float64]:
         """Return the gradient (d,) of the smooth part plus the weighted branches.
 

@@ -71,6 +71,47 @@ class Holder(NamedTuple):
         return {k: None if math.isnan(v) else v for k, v in given.items()}
 
 
+class Bound(NamedTuple):
+    """Lower bound of the objective over all feasible designs within the bounds.
+
+    `lower_bound`: the bound; `gap`: distance of the reported design from it; `evaluations`: number
+    of designs from which it follows. `factor`, `curvature` (d,): estimated curvature of the
+    objective along each parameter (unit box), already multiplied by the factor; `pairs`, `jumps`:
+    number of pairs of designs that support the estimate, and of those between which the motion
+    jumps. `unusable`: designs without a usable motion. `regions_left`, `volume_left`: number and
+    share of the unit box of the regions that may hold a better design. `proven`: whether no design
+    is better by more than 1e-4 (relative), if the estimate holds."""
+
+    lower_bound: float
+    gap: float
+    evaluations: int
+    factor: float
+    curvature: tuple[float, ...]
+    pairs: int
+    jumps: int
+    unusable: int
+    regions_left: int
+    volume_left: float
+    proven: bool
+
+    @property
+    def assumption(self) -> str:
+        """What the bound takes for granted, in a sentence."""
+        listed = ", ".join(f"{one:.3g}" for one in self.curvature)
+        return (
+            f"The objective bends downwards by at most {listed} along the parameters (second "
+            f"derivatives in the unit box): {self.factor:g} times the most seen in {self.pairs} "
+            "pairs of designs, whose motions were followed from one design to the next."
+        )
+
+    def record(self) -> dict[str, Any]:
+        """Return the entry `optimality.global` of the result file, with `None` for no bound."""
+        known = math.isfinite(self.lower_bound)
+        numbers = {k: v if known or k not in ("lower_bound", "gap") else None
+                   for k, v in self._asdict().items()}  # fmt: skip
+        return numbers | {"curvature": [*self.curvature], "assumption": self.assumption}
+
+
 class Optimum(NamedTuple):
     """One of the distinct optima that the local searches have found.
 
@@ -90,7 +131,8 @@ class Optimality:
     design. `reason`: "converged", or a word for why the search had not. `promised`: relative
     decrease of the objective that the search still expected nearby, NaN if not known. `holders`:
     branches of the objective that are active there. `starts`: outcomes of the local searches.
-    `sensitivities`: one row per quantity of the scene, with its effect on the forces."""
+    `sensitivities`: one row per quantity of the scene, with its effect on the forces. `bound`:
+    lower bound over all designs, `None` if it was not looked for."""
 
     method: str
     certificate: Certificate
@@ -99,6 +141,7 @@ class Optimality:
     holders: Sequence[Holder]
     starts: Sequence[StartOutcome]
     sensitivities: Sequence[dict[str, Any]] = ()
+    bound: Bound | None = None
 
     @property
     def converged(self) -> bool:
@@ -118,7 +161,10 @@ class Optimality:
     def record(self) -> dict[str, Any]:
         """Return the entry `optimality` of the result file."""
         optima = self.optima
-        return {
+        whole: dict[str, Any] = {} if self.bound is None else {"global": self.bound.record()}
+        if self.bound is None or not self.bound.proven:
+            whole["unseen"] = unseen(sum(one.found for one in optima), len(optima))
+        return whole | {
             "method": self.method,
             "converged": self.converged,
             "reason": self.reason,
@@ -140,7 +186,6 @@ class Optimality:
                 for one in self.starts
             ],
             "optima": [one._asdict() for one in optima],
-            "unseen": unseen(sum(one.found for one in optima), len(optima)),
             "sensitivities": [*self.sensitivities],
         }
 
@@ -193,6 +238,7 @@ def unseen(searches: int, optima: int) -> dict[str, float | None]:
 
 
 __all__ = [
+    "Bound",
     "Holder",
     "Optimality",
     "Optimum",

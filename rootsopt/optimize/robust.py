@@ -126,6 +126,7 @@ class RobustStage(Stage):
     `nominal`: outcome of the first stage, with a problem; `first`: see `Stage`."""
 
     apart = 0.03
+    bounded = False
 
     def __init__(self, nominal: Optimization, first: int):
         self.nominal, self.first = nominal, first
@@ -183,7 +184,11 @@ class TolerantSearch:
         self.stop = threading.Event() if stop is None else stop
         self._done, self._expected = 0, 0
         self._nominal: Optimization | None = None
-        self._stage: Search = Search(without(config), self._report, self.stop, checkpoint, runs)
+        nominal = without(config)
+        if config.optimizer.prove == "auto":
+            # A bound of the nominal objective says little about the robust one.
+            nominal = nominal.replaced({"optimizer.prove": False})
+        self._stage: Search = Search(nominal, self._report, self.stop, checkpoint, runs)
 
     def run(self) -> Optimization:
         """Run both stages and the comparison. Return the outcome of the second stage.

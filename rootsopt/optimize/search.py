@@ -23,11 +23,12 @@ from rootsopt.config.study import OptimizerConfig
 from rootsopt.design.space import Space, sobol
 from rootsopt.errors import InputError
 from rootsopt.optimize.beginning import beginning
+from rootsopt.optimize.bounding import FIRST, Bounding
 from rootsopt.optimize.descent import descended
 from rootsopt.optimize.infeasible import Infeasible, explain
 from rootsopt.optimize.limits import force_limits, limited
 from rootsopt.optimize.local import Linearization
-from rootsopt.optimize.outcome import Optimization, Trial, history_of, near, objective
+from rootsopt.optimize.outcome import Optimization, Trial, candidate, history_of, near, objective
 from rootsopt.optimize.problem import FEASIBLE, Problem, needs_maxima
 from rootsopt.optimize.sqp import Found, Stops, descend
 from rootsopt.optimize.verification import Verification
@@ -44,6 +45,17 @@ _EXPLAINED = 8
 """
 _SIMULATED = 3
 """Maximum number of these points if each must be simulated."""
+_BOUND = -2
+"""Start of the trials of a lower bound, in place of the index of a local search."""
+_PARAMETERS, _QUICK = 4, 3
+"""Greatest number of design parameters for which a lower bound is looked for: if it is asked for,
+and by default."""
+_MOST = 2000, 20_000
+"""Number of evaluations and of boxes of a lower bound that is asked for."""
+_TOGETHER = 8
+"""Number of points that it evaluates side by side."""
+_BETTER = 1e-5
+"""Relative gain from which a local search begins at a better design that it finds."""
 Progress = Callable[[int, int, float], None]
 """Type of a progress callback, with arguments (evaluations done, evaluations expected, best
 objective)."""
@@ -53,10 +65,11 @@ class Stage:
     """What one stage of a search does in its own way. The base class is the usual search.
 
     `first`: index of the first local search; `apart`: distance between their starts in the unit
-    box."""
+    box; `bounded`: whether a lower bound may be looked for."""
 
     first = 0
     apart = 0.15
+    bounded = True
 
     def settings(self, given: OptimizerConfig) -> OptimizerConfig:
         """Return the settings of the stage; `given`: those of the config."""
@@ -126,6 +139,11 @@ class Search:
                 f"`profile.family` must be one of {valid} to be optimised, but is "
                 f"{config.profile.family}: it has no design parameter; use `simulate` for it, "
                 "or make the twist one with `optimizer.bounds.helix_deg`"
+            )
+        if config.optimizer.prove is True and len(config.design_keys) > _PARAMETERS:
+            raise InputError(
+                f"`optimizer.prove` must be auto or false for {len(config.design_keys)} design "
+                f"parameters, but is true: a lower bound takes at most {_PARAMETERS}"
             )
         evaluator = needed_motion(config)
         if isinstance(evaluator.motions, Still):
@@ -200,6 +218,8 @@ class Search:
         starts = _apart(ranked, self.stage.apart, self.settings.starts) or points[:1]
         work = self._solve if self.method == "slsqp" else self._descend
         trials += self._side_by_side(work, list(enumerate(starts, self.stage.first)))
+        bounding, further = self._bounded(trials, self.stage.first + len(starts))
+        trials += further
         if self.stop.is_set():
             if self.noisy and (found := self.so_far()) is not None:
                 return found
@@ -221,7 +241,54 @@ class Search:
         optimized, record = verification.confirmed(trials)
         settled = self.problem, baseline, optimized, rows, record
         optimality = None if optimized is None else verification.optimality(optimized, trials)
+        if optimality is not None and optimized is not None and bounding is not None:
+            bound = bounding.bound(self.problem.objective(optimized))
+            optimality = dataclasses.replace(optimality, bound=bound)
         return Optimization(*settled, self.stop.is_set(), optimality)
+
+    def _bounded(self, trials: list[Trial], number: int) -> tuple[Bounding | None, list[Trial]]:
+        """Look for a lower bound of the objective, and search again from each better design.
+
+        `trials`: those of the search so far; `number`: index of its next local search. Return what
+        is known of the bound, `None` if it is not asked for, and the trials of further searches."""
+        candidates = [one for one in trials if one.candidate]
+        size = len(trials[0].point) if trials else 0
+        given = self.settings.prove
+        quick = size <= _QUICK and FIRST * (size + 1) <= len(trials)
+        asked = self.stage.bounded and not self.noisy and size <= _PARAMETERS and given is not False
+        if not (asked and candidates and (quick or given is True)):
+            return None, []
+        most, boxes = _MOST if given is True else (2 * len(trials), 25 * len(trials))
+        best = min(candidates, key=objective).objective
+        bounding = Bounding(self.problem.limits_at, size, best, boxes)
+        known, further, count = [], [], 0
+
+        def told(found: list[Trial]) -> None:
+            for one in found:
+                bounding.tell(one.point, self.problem.local(one.evaluation, one.point))
+            known.extend(one for one in found if one.evaluation.usable)
+
+        def evaluated(number: int, point: NDArray[np.float64], orbit: Any) -> list[Trial]:
+            return [self._evaluate(self.sharp, point, _BOUND, number, orbit)]
+
+        told(trials)
+        while count < most and (points := bounding.ask(_TOGETHER)):
+            tasks, best = [], bounding.best
+            for place, point in enumerate(points, count):
+                near = min(known, key=lambda one: float(np.linalg.norm(one.point - point)))
+                tasks.append((place, point, near.evaluation.start))
+            self.expected = max(self.expected, len(self._trials) + len(tasks))
+            found = self._side_by_side(evaluated, tasks)
+            told(found)
+            count += len(points)
+            if self.stop.is_set():
+                break
+            first = min(filter(candidate, found), key=objective, default=None)
+            if first is not None and first.objective < best - _BETTER * abs(best):
+                further += (again := self._side_by_side(self._solve, [(number, first.point)]))
+                told(again)
+                number += 1
+        return bounding, further
 
     def _verification(self) -> Verification:
         tolerance, asked = self.config.solver.orbit_tolerance, self.stop.is_set
@@ -266,7 +333,8 @@ class Search:
     def _in_order(self) -> list[Trial]:
         """Return all trials so far: those of the screening, then those of each local search."""
         with self._lock:
-            return sorted(self._trials, key=lambda trial: (trial.start, trial.iteration))
+            found = [trial for trial in self._trials if trial.start > _BOUND]
+        return sorted(found, key=lambda trial: (trial.start, trial.iteration))
 
     def _side_by_side(self, work: Callable[..., list[Trial]], tasks: Sequence) -> list[Trial]:
         """Run `work(*task)` for all tasks in parallel, and return all trials.

@@ -145,6 +145,7 @@ def _certified(result: Record) -> Iterator[str]:
         yield "the design has no certificate"
     if found.get("converged") and optima and not check.get("rejected"):
         yield f"{optima[0]['found']} of {len(found['starts'])} local searches found it"
+    yield from _bounded(found.get("global") or {})
     searched, verified = (check.get(f"{name}_objective") for name in ("searched", "verified"))
     if verified is not None and "combined_standard_error" in check:
         error = brief(check["combined_standard_error"], 2)
@@ -160,6 +161,22 @@ def _certified(result: Record) -> Iterator[str]:
             f"mean objective in {next(iter(fresh.values()))['scenes']} fresh scenes that scatter: "
             f"{listed(means)}, without a usable motion: {listed(lost)}"
         )
+
+
+def _bounded(known: Record) -> Iterator[str]:
+    """Yield what the lower bound `known` says of all designs within the bounds."""
+    if known.get("lower_bound") is None:
+        return
+    gap, count = brief(known["gap"], 2), known["evaluations"]
+    if known["proven"]:
+        yield (
+            f"no design within the bounds is better by more than {gap} (objective; lower bound "
+            f"from {count} designs, if the objective bends at most {brief(known['factor'], 2)} "
+            "times as much as between these)"
+        )
+    else:
+        left = f"{100 * known['volume_left']:.2g} %"
+        yield f"not proven to be the best: {left} of the bounds may hold a design better by {gap}"
 
 
 def _caveats(result: Record, after: Record) -> Iterator[str]:

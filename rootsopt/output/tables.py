@@ -312,11 +312,28 @@ def certificate_tables(result: Record) -> Iterator[Table | None]:
     ]  # fmt: skip
     heads = "", "why it ended", "designs", "objective"
     groups = [("starts", starts), ("distinct optima", optima)]
-    yield table("Local searches", heads, groups, _unseen(found))
+    whole = found.get("global")
+    proven = whole is not None and whole["proven"]
+    yield table("Local searches", heads, groups, "" if proven else _unseen(found))
+    yield _whole(whole) if whole else None
     rows = [_sensitive(one) for one in found.get("sensitivities") or ()]
     heads = "", "mean force (N)", "peak force (N)", "objective (%)"
     note = "What a small change of the scene does to the optimised design."
     yield table("Sensitivity to the scene", heads, [("", rows)], note)
+
+
+def _whole(found: Record) -> Table | None:
+    """Return the table on the lower bound `found` of all designs within the bounds."""
+    rows: list[Row] = [
+        ["lower bound of the objective", value(found["lower_bound"])],
+        ["distance of the optimum from it", Cell(value(found["gap"]), bool(found["proven"]))],
+        ["designs", str(found["evaluations"])],
+        ["designs without a usable motion", str(found["unusable"])],
+        ["jumps between motions", str(found["jumps"])],
+        ["regions left", str(found["regions_left"])],
+        ["their share of the bounds", f"{100 * found['volume_left']:.2g} %"],
+    ]
+    return table("All designs within the bounds", ("", "value"), [("", rows)], found["assumption"])
 
 
 def _held(one: Record) -> Row:

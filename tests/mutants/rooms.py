@@ -64,6 +64,7 @@ _OF = {
     "design/resemblance": "resemblance",
     "design/space": "search optimize freeform",
     "optimize/beginning": "beginning",
+    "optimize/bounding": "bounding",
     "optimize/surviving": "improve",
     "optimize/certificate": "sqp robust tradeoffs",
     "optimize/design": "optimize pareto",

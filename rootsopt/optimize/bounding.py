@@ -1,0 +1,359 @@
+"""Lower bound of an objective over all feasible points of the unit box, by branch and bound.
+
+Every evaluated point c gives minorants of the objective f. If f + ½ Σ κ_j x_j² is convex,
+
+    f(x) ≥ b + g·(x - c) - ½ Σ κ_j (x_j - c_j)²
+
+for each branch of f, with the value b and the gradient g at c. All minorants have the same
+quadratic part, so that the greatest of them is a maximum of affine functions minus one paraboloid.
+Source: Breiman and Cutler, A deterministic algorithm for global optimization, Mathematical
+Programming 58 (1993) 179-199. Limits of forces have minorants, too.
+
+A box is halved until a linear program shows that the objective is nowhere in it below the target,
+or that no point of it is feasible. Points are evaluated where the minorants are least. The
+curvatures κ are estimates: the least that agree with all pairs of evaluated points, times `FACTOR`.
+Constraints of the geometry cost little. In each box they are replaced by their tangents, plus
+`_DEVIATION` times the deviation from these that is found at the corners."""
+
+import heapq
+import itertools
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rootsopt.design.space import sobol
+from rootsopt.optimize.local import Linearization
+from rootsopt.optimize.models import Limits, Rows
+from rootsopt.optimize.optimality import Bound
+from rootsopt.optimize.problem import FEASIBLE
+
+FACTOR = 2.0
+"""Factor on the least curvatures that agree with all pairs."""
+FIRST = 6
+"""Number of points spread over the feasible set, per parameter and once more."""
+_DRAWN = 256
+"""Number of points from which these are chosen."""
+_DEVIATION = 1.5
+"""Factor on the deviations of constraints from their tangents."""
+_GAP, _SMALL = 1e-4, 0.1
+"""Relative distance below the best objective at which a box counts as bounded, and the least
+magnitude of the objective to which it is related."""
+_NOISE = 1e-6
+"""Difference of objectives that is not attributed to curvature."""
+_CLOSE = 1e-3
+"""Distance (unit box) of two points below which their pair says nothing about curvature. It is also
+the curvature before any pair is known."""
+_LEAST = 0.1
+"""Least curvature along a coordinate, relative to that which all coordinates would need alike."""
+_SLACK = 0.9
+"""Share of a rise that the curvatures must agree with, so that they do not change all the time."""
+_STEEP = 100.0
+"""Curvature, relative to the range of all values, above which a pair counts as a jump."""
+_ROWS = 3
+"""Number of minorants in a linear program for the middle of a box and for each of its corners."""
+_NARROW, _NARROWEST = 1 / 64, 1 / 2048
+"""Half width of a box below which it is left: one that has no bound, and any other."""
+_BESIDE = 0.01
+"""Scaled violation up to which a point of a small box is evaluated."""
+
+
+class Box(NamedTuple):
+    """A box of points: `middle` ± `half` (d,), with a lower `bound` of the objective.
+
+    `number`: order of creation; `bend` (m,): deviations of the constraints from their tangents, NaN
+    where not known; `age`: number of halvings since they were found."""
+
+    bound: float
+    number: int
+    middle: NDArray[np.float64]
+    half: NDArray[np.float64]
+    bend: NDArray[np.float64]
+    age: int
+
+
+class Surface:
+    """The minorants of one function of the points, and the curvatures that they need.
+
+    The function is the objective, or the amount by which a limit of a force is exceeded. `points`
+    (n, d): evaluated points; `curved` (d,): curvatures; `pairs`, `jumps`: number of pairs from
+    which they are estimated, and of pairs too steep for that. Beside a jump, minorants hold only
+    within half the distance to the other point."""
+
+    def __init__(self, size: int):
+        self.points, self.tops = np.zeros((0, size)), np.zeros(0)
+        self.values, self.slopes = np.zeros(0), np.zeros((0, size))
+        self.owner, self.reach = np.zeros(0, int), np.zeros(0)
+        self.rises, self.squares = np.zeros(0), np.zeros((0, size))
+        self.curved, self.pairs, self.jumps = np.full(size, _CLOSE), 0, 0
+
+    def add(self, point: NDArray[np.float64], rows: Rows) -> bool:
+        """Add an evaluated `point` (d,), and return whether the curvatures have changed.
+
+        `rows`: values (k,) and gradients (k, d) of the branches there."""
+        values, slopes = rows
+        away, count, top = self.points - point, len(self.points), np.max(values)
+        rises, distance = np.zeros(0), np.linalg.norm(away, axis=1)
+        if count:
+            ahead = np.max(values[:, None] + slopes @ away.T, axis=0) - self.tops
+            back = self.values - np.sum(self.slopes * away[self.owner], axis=1)
+            first = np.flatnonzero(np.diff(self.owner, prepend=-1))
+            rises = np.maximum(ahead, np.maximum.reduceat(back, first) - top) - _NOISE
+        self.points, self.tops = np.vstack([self.points, point]), np.append(self.tops, top)
+        steep = _STEEP * max(float(np.ptp(self.tops)), _GAP)
+        jump = (rises > _GAP) & (2 * rises > steep * distance**2)
+        told = (rises > 0) & (distance > _CLOSE) & ~jump
+        self.pairs += 2 * int(np.sum((distance > _CLOSE) & ~jump))
+        self.jumps += int(np.sum(jump))
+        own = np.min(distance[jump] / 2, initial=np.inf)
+        near = np.where(jump, np.minimum(self.reach, distance / 2), self.reach)
+        self.reach = np.append(near, own)
+        self.rises = np.append(self.rises, rises[told])
+        self.squares = np.vstack([self.squares, away[told] ** 2])
+        self.values, self.slopes = np.append(self.values, values), np.vstack([self.slopes, slopes])
+        self.owner = np.append(self.owner, np.full(len(values), count))
+        if np.all(_SLACK * self.rises <= 0.5 * self.squares @ self.curved / FACTOR):
+            return False
+        self._fit()
+        return True
+
+    def _fit(self) -> None:
+        """Fit the least curvatures that agree with all pairs."""
+        from scipy.optimize import linprog  # Slow import (0.3 s).
+
+        size = len(self.curved)
+        least = _LEAST * np.max(2 * self.rises / np.sum(self.squares, axis=1))
+        ends = [(least, None)] * size
+        found = linprog(np.ones(size), -0.5 * self.squares, -self.rises, bounds=ends)
+        self.curved = FACTOR * found.x
+
+    def within(self, box: Box) -> Rows:
+        """Return affine minorants in a `box`, without the paraboloid that they have in common.
+
+        They are values (n,) at the middle of the box, and gradients (n, d)."""
+        away = box.middle - self.points[self.owner]
+        values = self.values + np.sum((self.slopes - 0.5 * self.curved * away) * away, axis=1)
+        far = np.linalg.norm(np.abs(away) + box.half, axis=1)
+        held = far <= self.reach[self.owner]
+        return values[held], (self.slopes - self.curved * away)[held]
+
+    def room(self, box: Box) -> float:
+        """Return the greatest value of the common paraboloid in a `box`, 0 at its middle."""
+        return float(0.5 * box.half**2 @ self.curved)
+
+    def near(self, point: NDArray[np.float64], others: NDArray[np.float64]) -> float:
+        """Return the least value (of the paraboloid) by which a `point` (d,) differs from `others`
+        (n, d)."""
+        return float(np.min(0.5 * (others - point) ** 2 @ self.curved, initial=np.inf))
+
+
+class Bounding:
+    """The search for a lower bound. It asks for points, which the caller evaluates and tells.
+
+    `limits`: function that returns the slacks (m,) of the constraints of the geometry, and their
+    gradients (m, d); `size`: number d of coordinates; `best`: least known objective of a feasible
+    point; `boxes`: number of boxes after which it asks no more."""
+
+    def __init__(self, limits: Limits, size: int, best: float, boxes: int = 20_000):
+        self.limits, self.size, self.best, self.boxes = limits, size, best, boxes
+        self.surfaces: list[Surface] = []
+        self.unusable: list[NDArray[np.float64]] = []
+        self._open: list[Box] = []
+        self._closed: list[Box] = []
+        self._left: list[Box] = []
+        self._seen, self._told, self._first = 0, 0, FIRST * (size + 1)
+        self._known: dict[bytes, Rows] = {}
+        self._numbers = itertools.count()
+        self._corners = np.array([*itertools.product((-1.0, 1.0), repeat=size)])
+        middle = np.full(size, 0.5)
+        self._push(-math.inf, middle, middle, self._look(middle)[0] * math.nan, size)
+
+    @property
+    def target(self) -> float:
+        """Objective above which a box counts as bounded."""
+        return self.best - _GAP * max(abs(self.best), _SMALL)
+
+    def tell(self, point: NDArray[np.float64], local: Linearization | None) -> None:
+        """Add an evaluated `point` (d,): objective and limits there, `None` if it is not usable."""
+        self._told += 1
+        if local is None:
+            self.unusable.append(point)
+            return
+        if local.violation <= FEASIBLE:
+            self.best = min(self.best, local.objective)
+        rows = [local.minorants, *((wall.values, wall.slopes) for wall in local.walls)]
+        self.surfaces = self.surfaces or [Surface(self.size) for _ in rows]
+        if any([one.add(point, row) for one, row in zip(self.surfaces, rows, strict=True)]):
+            # Bounds were made with other curvatures.
+            boxes, self._open, self._closed = [*self._open, *self._closed], [], []
+            for box in boxes:
+                self._push(-math.inf, *box[2:])
+
+    def ask(self, most: int) -> list[NDArray[np.float64]]:
+        """Return up to `most` feasible points (d,) to evaluate next.
+
+        There is none if all boxes are bounded, left or too many."""
+        if self._first > 0:
+            spread = self._spread(min(most, self._first))
+            self._first -= len(spread) or self._first
+            if spread:
+                return spread
+        wanted: list[NDArray[np.float64]] = []
+        waiting: list[Box] = []
+        while self._open and len(wanted) < most and self._seen < self.boxes:
+            box, least = self._bounded(heapq.heappop(self._open))
+            if box.bound >= self.target:
+                # That no point is feasible depends on curvatures only if forces have limits.
+                if box.bound < math.inf or len(self.surfaces) > 1:
+                    self._closed.append(box)
+                continue
+            void = any(np.all(np.abs(bad - box.middle) <= box.half) for bad in self.unusable)
+            point = None if void or least is None else self._next(box, least)
+            lost = void or box.bound == -math.inf
+            if np.max(box.half) < (_NARROW if lost else _NARROWEST):
+                self._left.append(box._replace(bound=-math.inf) if lost else box)
+            elif point is None:
+                self._halve(box)
+            else:
+                if self.surfaces[0].near(point, np.array(wanted).reshape(-1, self.size)) > (
+                    self.surfaces[0].room(box)
+                ):
+                    wanted.append(point)
+                waiting.append(box)
+        for box in waiting:
+            heapq.heappush(self._open, box)
+        return wanted
+
+    def bound(self, reached: float) -> Bound:
+        """Return what is known; `reached`: objective of the design that is reported."""
+        boxes = [self._bounded(box)[0] for box in self._open] + self._left
+        known = [box.bound for box in [*boxes, *self._closed] if box.bound > -math.inf]
+        lower = float(min([*known, self.best, reached])) if known else -math.inf
+        near = reached - 1.1 * _GAP * max(abs(reached), _SMALL)
+        loose = [box for box in boxes if box.bound < near]
+        return Bound(
+            lower,
+            reached - lower,
+            self._told,
+            _SLACK * FACTOR,
+            tuple(float(x) for x in self.surfaces[0].curved),
+            sum(one.pairs for one in self.surfaces),
+            sum(one.jumps for one in self.surfaces),
+            len(self.unusable),
+            len(loose),
+            float(sum(np.prod(2 * box.half) for box in loose)),
+            lower >= near and not loose,
+        )
+
+    def _next(self, box: Box, least: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """Return a point (d,) of a `box` whose evaluation tells more than halving the box.
+
+        `least` (d,): where the minorants are least. Return `None` if there is no such point."""
+        room = self.surfaces[0].room(box)
+        worst = -_BESIDE if 2 * room <= self.best - self.target else -FEASIBLE
+        for point in (least, box.middle):
+            far = self.surfaces[0].near(point, self.surfaces[0].points) > room
+            if far and np.min(self._look(point)[0]) >= worst:
+                return point
+        return None
+
+    def _spread(self, most: int) -> list[NDArray[np.float64]]:
+        """Return up to `most` feasible points (d,), each far from the others and from all that are
+        evaluated."""
+        drawn = [x for x in sobol(_DRAWN, 0, self.size) if np.min(self._look(x)[0]) >= 0]
+        taken = [*self.unusable, *self.surfaces[0].points]
+        found: list[NDArray[np.float64]] = []
+        for _ in range(min(most, len(drawn))):
+            away = [min(np.linalg.norm(x - y) for y in [*taken, *found]) for x in drawn]
+            if max(away) > _CLOSE:
+                found.append(drawn[int(np.argmax(away))])
+        return found
+
+    def _bounded(self, box: Box) -> tuple[Box, NDArray[np.float64] | None]:
+        """Return a `box` with its bound, and the point (d,) where its minorants are least.
+
+        The bound is infinite if no point of the box is feasible. The point is `None` if the
+        minorants are above the target there."""
+        if box.bound >= self.target:
+            return box, None
+        self._seen += 1
+        nothing = box._replace(bound=math.inf), None
+        if (tangents := self._tangents(box)) is None:
+            return nothing
+        objective = self.surfaces[0]
+        values, slopes = objective.within(box)
+        room = objective.room(box)
+        low = float(np.max(values - np.abs(slopes) @ box.half, initial=-math.inf)) - room
+        if low >= self.target:
+            return box._replace(bound=low), None
+        if box.age >= self.size:
+            box = self._bent(box)
+            if (tangents := self._tangents(box)) is None:
+                return nothing
+        if not values.size:
+            return box, box.middle
+        # The greatest minorants at the middle and at each corner, for there are too many.
+        places = np.vstack([np.zeros(self.size), self._corners * box.half])
+        chosen = np.unique(np.argsort(-(values[:, None] + slopes @ places.T), axis=0)[:_ROWS])
+        rows = [(slopes[chosen], -values[chosen], -1.0), (-tangents[1], tangents[0], 0.0)]
+        for wall in self.surfaces[1:]:
+            above, normals = wall.within(box)
+            rows.append((normals, wall.room(box) - above, 0.0))
+        from scipy.optimize import linprog  # Slow import (0.3 s).
+
+        matrix = np.vstack([np.column_stack([a, np.full(len(a), c)]) for a, _, c in rows])
+        ends = [*zip(-box.half, box.half, strict=True), (None, None)]
+        aim, tops = np.arange(self.size + 1) == self.size, np.concatenate([b for _, b, _ in rows])
+        found = linprog(aim, matrix, tops, bounds=ends)
+        if found.status == 2:  # infeasible
+            return nothing
+        if found.status:
+            return box._replace(bound=low), box.middle
+        step, value = found.x[:-1], found.x[-1]
+        least = value - 0.5 * step**2 @ objective.curved
+        return box._replace(bound=value - room), (
+            box.middle + step if least < self.target else None
+        )
+
+    def _tangents(self, box: Box) -> Rows | None:
+        """Return upper bounds (m,) of the constraints at the middle of a `box`, and their gradients
+        (m, d), or `None` if no point of the box is feasible. Unknown ones are left out."""
+        slack, normals = self._look(box.middle)
+        tops = slack + box.bend
+        known = np.isfinite(tops) & np.all(np.isfinite(normals), axis=1)
+        tops, normals = tops[known], normals[known]
+        return None if np.any(tops + np.abs(normals) @ box.half < 0) else (tops, normals)
+
+    def _bent(self, box: Box) -> Box:
+        """Return a `box` with the deviations that are found at its corners."""
+        slack, normals = self._look(box.middle)
+        steps = self._corners * box.half
+        tops, turned = zip(*[self._look(box.middle + step) for step in steps], strict=True)
+        with np.errstate(invalid="ignore"):
+            rise = np.array(tops) - slack - steps @ normals.T
+            turn = (np.array(turned) - normals) * steps[:, None]
+            away = np.maximum(rise, 0.5 * np.sum(np.maximum(turn, 0.0), axis=2))
+        away[~np.isfinite(away)] = np.nan
+        return box._replace(bend=_DEVIATION * np.fmax.reduce(away, axis=0), age=0)
+
+    def _halve(self, box: Box) -> None:
+        curved = self.surfaces[0].curved
+        axis = int(np.argmax(box.half * np.sqrt(curved + np.mean(curved))))
+        step = np.where(np.arange(self.size) == axis, box.half / 2, 0.0)
+        # The deviations are quadratic in the sides.
+        bend = box.bend * (1 - 0.75 / self.size)
+        for side in (-step, step):
+            self._push(box.bound, box.middle + side, box.half - step, bend, box.age + 1)
+
+    def _push(self, bound: float, *rest: Any) -> None:
+        heapq.heappush(self._open, Box(bound, next(self._numbers), *rest))
+
+    def _look(self, point: NDArray[np.float64]) -> Rows:
+        key = point.tobytes()
+        if key not in self._known:
+            self._known[key] = self.limits(point)
+        return self._known[key]
+
+
+__all__ = ["FACTOR", "FIRST", "Bounding"]

@@ -1,0 +1,224 @@
+"""Tests of the lower bound of all designs: made-up problems of several basins, and real ones."""
+
+import dataclasses
+import functools
+import math
+import threading
+
+import numpy as np
+import pytest
+
+from rootsopt import load_config
+from rootsopt.optimize import bounding
+from rootsopt.optimize.local import Group, Linearization
+from rootsopt.optimize.problem import FEASIBLE, Problem
+from rootsopt.optimize.search import Search, Stage
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.many import HERE
+from rootsopt.status import Status
+from tests.standins import evaluation_of
+
+
+class Made:
+    """Objective max over branches of wells, and a ball that designs must keep within or out of.
+
+    A `jump` lowers the objective where the first coordinate is above it; designs within 0.1 of a
+    `hole` are not usable."""
+
+    def __init__(self, seed: int, jump: float = math.inf, hole: float = math.inf):
+        rng = np.random.default_rng(seed)
+        self.size, self.jump, self.hole = 1 + seed % 3, jump, hole
+        self.branches = [
+            (rng.random((count, self.size)), rng.uniform(0.12, 0.4, count),
+             rng.uniform(0.1, 0.5, count), 0.2 * rng.normal(size=self.size))
+            for count in rng.integers(2, 6, rng.integers(1, 4))
+        ]  # fmt: skip
+        self.sign, self.middle = rng.choice([-1.0, 0.0, 1.0]), rng.random(self.size)
+        self.square = (0.35 if self.sign < 0 else 0.08) * self.size
+
+    def values(self, points):
+        """Return the branches (k, n) and their gradients (k, n, d) at points (n, d)."""
+        values, slopes = [], []
+        for centers, widths, depths, tilt in self.branches:
+            away = points[:, None] - centers
+            wells = depths * np.exp(-0.5 * np.sum(away**2, axis=2) / widths**2)
+            values.append(1 - wells.sum(axis=1) + points @ tilt)
+            slopes.append(np.einsum("nk,nkd->nd", wells / widths**2, away) + tilt)
+        return np.array(values) - 0.1 * (points[:, 0] > self.jump), np.array(slopes)
+
+    def limits(self, point):
+        away = point - self.middle
+        slack = self.sign * (away @ away - self.square) + (self.sign == 0)
+        return np.array([slack]), 2 * self.sign * away[None]
+
+    def local(self, point):
+        values, slopes = (one[:, 0] for one in self.values(point[None]))
+        group = Group(np.zeros((len(values), 2)), values, slopes)
+        return Linearization(0.0, np.zeros(self.size), (group,), *self.limits(point))
+
+    @functools.cached_property
+    def least(self) -> float:
+        """Least feasible objective, on a grid and on finer ones around its best points."""
+
+        def best(points):
+            away = np.sum((points - self.middle) ** 2, axis=1) - self.square
+            points = points[(self.sign == 0) | (self.sign * away >= 0)]
+            top = np.max(self.values(points)[0], axis=0)
+            order = np.argsort(top)
+            return points[order[:20]], float(top[order[0]])
+
+        def grid(middle, half, count):
+            axis = np.linspace(-half, half, count)
+            steps = np.stack(np.meshgrid(*[axis] * self.size), axis=-1).reshape(-1, self.size)
+            return np.clip(middle + steps, 0.0, 1.0)
+
+        points, found = best(
+            grid(np.full(self.size, 0.5), 0.5, {1: 4001, 2: 201, 3: 45}[self.size])
+        )
+        for half in (0.03, 0.006, 1.2e-3, 2.4e-4, 5e-5):
+            points, found = best(np.concatenate([grid(one, half, 11) for one in points]))
+        return found
+
+
+@dataclasses.dataclass(frozen=True)
+class _Told(Evaluator):
+    """An evaluator that knows the objective of a made-up problem."""
+
+    made: Made | None = None
+
+    def __call__(self, design=None, start=None, series=True):
+        assert self.made is not None
+        point = np.asarray(design)
+        usable = np.max(np.abs(point - self.made.hole)) > 0.1
+        status = Status.PERIODIC if usable else Status.INACCURATE
+        return evaluation_of(self.made.local(point).objective, status, point)
+
+
+def bounded(made: Made, **settings):
+    """Return (bound, best objective found before it, and with it) of a made-up problem.
+
+    A search begins at one random feasible point, so that it often ends in a wrong basin."""
+    search = object.__new__(Search)
+    search.stop, search._lock, search._trials = threading.Event(), threading.Lock(), []
+    search._found, search._best, search.expected = {}, math.nan, 0
+    search.checkpoint, search.noisy, search.runs, search.stage = None, False, HERE, Stage()
+    search.progress, search.config = lambda *numbers: None, load_config("configs/cic.yaml")
+    given = {"prove": True, "iterations": 60} | settings
+    search.settings = search.config.optimizer.model_copy(update=given)
+    search.config = search.config.model_copy(update={"optimizer": search.settings})
+    search.problem = object.__new__(Problem)
+    vars(search.problem).update(
+        design=lambda point: point,
+        objective=lambda one: one.response.get("mean_force_N", math.nan),
+        feasible=lambda point: bool(made.limits(point)[0] >= -FEASIBLE),
+        excess=lambda one: 0.0,
+        limits_at=made.limits,
+        local=lambda one, point: made.local(point) if one.usable else None,
+    )
+    known = Evaluator.of(search.config)
+    told = {field.name: getattr(known, field.name) for field in dataclasses.fields(known)}
+    search.sharp = _Told(**told, made=made)
+    drawn = np.random.default_rng(1).random((100, made.size))
+    start = next(x for x in drawn if search.problem.feasible(x) and abs(x[0] - made.hole) > 0.2)
+    trials = search._solve(0, start)
+    before = min(one.objective for one in trials if one.candidate)
+    found, further = search._bounded(trials, 1)
+    best = min(one.objective for one in [*trials, *further] if one.candidate)
+    return (None if found is None else found.bound(best)), before, best
+
+
+def _checked(seeds) -> tuple[int, int]:
+    """Check bounds of made-up problems; return how many are proven, and how many begin wrong."""
+    proven = wrong = 0
+    for seed in seeds:
+        made = Made(seed)
+        bound, before, best = bounded(made)
+        assert best >= made.least - 1e-4
+        assert bound.lower_bound <= made.least + 1e-5, seed
+        if bound.proven:
+            assert best <= made.least + 1.2e-4 * max(1.0, abs(best)), seed
+        proven, wrong = proven + bound.proven, wrong + (before > made.least + 1e-3)
+    return proven, wrong
+
+
+def test_a_wrong_basin_is_never_proven():
+    """Problems of one to three parameters, with corners and limits, against grids."""
+    proven, wrong = _checked(range(9))
+    assert proven == 9
+    assert wrong >= 2
+
+
+@pytest.mark.long
+def test_a_wrong_basin_is_never_proven_in_fifty_problems():
+    proven, wrong = _checked(range(9, 59))
+    assert proven >= 45
+    assert wrong >= 10
+
+
+def test_jumps_and_holes_are_counted():
+    """A bound is not proven if the motion jumps, or if the best designs have no usable one."""
+    for jump in (0.3, 0.62):
+        made = Made(6, jump=jump)
+        bound, _, best = bounded(made)
+        assert bound.jumps > 0
+        assert not bound.proven or best <= made.least + 1.2e-4
+    points = np.linspace(0, 1, 1001)[:, None]
+    least = float(points[np.argmin(np.max(Made(6).values(points)[0], axis=0))][0])
+    bound, _, _ = bounded(Made(6, hole=least))
+    assert bound.unusable > 0
+    assert not bound.proven
+    assert 0.02 < bound.volume_left < 0.22
+
+
+def test_a_limited_force_is_bounded_too():
+    """Minorants of a limit exclude what violates it: least of x + y on a circle's outside.
+
+    The least is at the corner of the box and the circle that the limit cuts out."""
+
+    def local(point):
+        wall = Group(np.zeros((1, 2)), np.array([0.16 - point @ point]), -2 * point[None])
+        one = Linearization(float(point.sum()), np.ones(2), (), np.ones(1), np.zeros((1, 2)))
+        return one._replace(walls=(wall,))
+
+    found = bounding.Bounding(lambda point: (np.ones(1), np.zeros((1, 2))), 2, 0.4)
+    for point in np.array([[0.4, 0.0], [0.9, 0.9], [0.1, 0.6]]):
+        found.tell(point, local(point))
+    while points := found.ask(8):
+        for point in points:
+            found.tell(point, local(point))
+    bound = found.bound(0.4)
+    assert bound.proven
+    assert bound.lower_bound == pytest.approx(0.4, abs=1e-4)
+
+
+@functools.cache
+def _real(seed: int):
+    """Return a search of two parameters with its bound, and what it found."""
+    few = ["profile.tip_arc_angle_deg=2.0", "optimizer.bounds.tip_arc_angle_deg=[1.99, 2.01]"]
+    search = Search(load_config("cic", [*few, f"optimizer.seed={seed}", "optimizer.prove=true"]))
+    return search, search.run()
+
+
+def test_the_bound_of_a_real_problem_holds():
+    """No design of a sample, simulated from rest, is below the bound; a few touch the optimum."""
+    search, found = _real(0)
+    bound = found.optimality.bound
+    assert bound.proven
+    assert bound.record()["assumption"] == bound.assumption
+    assert "unseen" not in found.optimality.record()
+    rng, inside = np.random.default_rng(0), found.problem.point([*found.optimized.design.values()])
+    points = [*rng.random((12, 3)), *np.clip(inside + 0.05 * rng.normal(size=(12, 3)), 0, 1)]
+    values = []
+    for point in map(found.problem.project, points):
+        one = search.exact(found.problem.design(point), series=False)
+        assert found.problem.feasible(point)
+        values.append(found.problem.objective(one))
+    assert min(values) >= bound.lower_bound
+    assert min(values) < bound.lower_bound + 0.05
+
+
+@pytest.mark.long
+def test_seeds_agree():
+    found = [_real(seed)[1].optimality for seed in range(5)]
+    assert all(one.bound.proven for one in found)
+    assert np.ptp([one.optima[0].objective for one in found]) < 1e-6
