@@ -101,6 +101,7 @@ class Assumed:
                 "values": dict(self.scenes[names[worst]]),
             },
             "keys": rows,
+            "decides": max(rows, key=lambda row: abs(row["rank_correlation"] or 0.0))["key"],
             "not_compared": [
                 {"scene": name, "values": dict(self.scenes[name])}
                 | {f"status_{who}": self.statuses[who][k] for who in (BASELINE, OPTIMIZED)}

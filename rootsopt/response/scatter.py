@@ -127,8 +127,12 @@ def in_conditions(config: Config, scenes: Mapping[str, Mapping[str, float]], **r
 
 def _difference(before: Scene, after: Scene) -> Scene:
     """Return the change of a scene's arrays, as a `Scene` with None in place of all else."""
-    arrays = (eqx.filter(one, eqx.is_inexact_array) for one in (after, before))
-    return jax.tree.map(lambda x, y: np.asarray(x) - np.asarray(y), *arrays)
+
+    def change(x: Any, y: Any) -> NDArray[np.float64] | None:
+        found = np.asarray(x) - np.asarray(y)
+        return found if found.any() else None
+
+    return jax.tree.map(change, *(eqx.filter(x, eqx.is_inexact_array) for x in (after, before)))
 
 
 __all__: Sequence[str] = [
