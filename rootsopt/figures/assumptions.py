@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from rootsopt.figures.style import BLUE, GREY, VERMILION, figure, write
-from rootsopt.output.assumptions import named
+from rootsopt.output.assumptions import label_of, named
 from rootsopt.output.names import brief, name_and_unit
 
 if TYPE_CHECKING:
@@ -55,8 +55,7 @@ def plot_scenes(ax: Axes, key: str, columns: Mapping[str, Sequence[Any]]) -> Axe
                 values[drawn], np.array(columns[name], float)[drawn], mark, color=color, label=word
             )
     ax.axhline(1, color="black", linewidth=0.8)
-    unit = name_and_unit(key)[1]
-    ax.set(xlabel=f"{named(key)} ({unit}), all else random, too", ylabel=_OBJECTIVE)
+    ax.set(xlabel=f"{label_of(key)}, all else random, too", ylabel=_OBJECTIVE)
     return ax
 
 

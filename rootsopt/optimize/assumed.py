@@ -113,6 +113,7 @@ class Assumed:
     def _rival(self, name: str) -> dict[str, Any]:
         """Return the record of another design that is better than the optimum in some scenes."""
         lead = self.objectives[OPTIMIZED] - self.objectives[name]
+        known = lead[self.drawn & np.isfinite(lead)]
         ranks = {one.key: self._rank(lead, one.key) for one in self.spans}
         wins = {key: parts for key, parts in self.wins[name].items() if parts}
         leads = {one.key: max(self._ends(lead, k)) for k, one in enumerate(self.spans)}
@@ -121,8 +122,7 @@ class Assumed:
         return {
             "name": name,
             "design": self.designs[name],
-            "share_better": float(np.mean(lead[self.drawn] > WINS)),
-            "share_better_than_baseline": float(np.mean(self.objectives[name][self.drawn] < 1)),
+            "share_better": float(np.mean(known > WINS)) if known.size else None,
             "objective": float(self.objectives[name][0]),
             "key": key,
             "better": wins.get(key, []),

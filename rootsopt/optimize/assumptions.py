@@ -5,7 +5,8 @@ scenes. Where the optimum is worst, a local search looks for a design that is be
 design is simulated in all scenes, too.
 
 Motions begin at rest. Beginning on the orbit of the config's own scene took three times as long:
-the scenes are too far apart."""
+the scenes are too far apart. Motions that need more than a quarter of the allowed transient to
+settle are left out: one of these takes as long as a hundred others."""
 
 import dataclasses
 import itertools
@@ -54,6 +55,8 @@ _RTOL = 1e-6
 """Least tolerance of orbits in a first simulation."""
 _RIVALS = 2
 """Greatest number of other designs that are compared."""
+_HALVINGS = 4
+"""Number of values tried to find where the motion of a design is no longer usable."""
 _FINE = 0.02
 """Accuracy of the value at which a design becomes better or worse, as a share of its range."""
 
@@ -90,38 +93,29 @@ class _Comparison:
             for key, one in configs.items()
         }
         rtol = max(_RTOL, own.solver.orbit_tolerance)
-        self.fast = {key: one.at_tolerance(rtol).surveying() for key, one in self.exact.items()}
+        self.fast = {
+            key: one.at_tolerance(rtol).surveying(probe=True) for key, one in self.exact.items()
+        }
         self._known: dict[tuple[str, str], Evaluation] = {}
 
     def evaluations(self, names: Iterable[str], scenes: Scenes) -> list[list[Evaluation]]:
-        """Return the evaluations of some designs in `scenes`, from rest.
-
-        A motion that does not settle soon is simulated once more, with the whole transient."""
+        """Return the evaluations of some designs in `scenes`, from rest."""
         names = [*names]
         lacking = [(name, one) for name in names for one in scenes
                    if (name, one) not in self._known]  # fmt: skip
-        for surveying in (True, False):
-            self._simulate(lacking, scenes, surveying)
-            lacking = [one for one in lacking if not self._known[one].usable]
-        return [[self._known[name, one] for one in scenes] for name in names]
-
-    def _simulate(self, pairs: list[tuple[str, str]], scenes: Scenes, surveying: bool) -> None:
-        """Simulate designs in scenes, `pairs` of their names."""
         where: dict[tuple[bool, str], Shift] = {}
         for kind, exact in self.exact.items():
-            some = {one: scenes[one] for name, one in pairs if bool(self.designs[name]) == kind}
-            where |= {
-                (kind, one): x for one, x in zip(some, _shifts(exact.config, some), strict=True)
-            }
+            some = {one: scenes[one] for name, one in lacking if bool(self.designs[name]) == kind}
+            found = _shifts(exact.config, some)
+            where |= {(kind, one): shift for one, shift in zip(some, found, strict=True)}
         before, expected = len(self._known), (2 + _RIVALS) * len(self.scenes)
 
         def points() -> Iterator[Point]:
-            for name, one in pairs:
+            for name, one in lacking:
                 values = np.array([*self.designs[name].values()])
                 kind = bool(len(values))
-                evaluator = (self.fast if surveying else self.exact)[kind]
                 if not self.stop():
-                    yield from evaluator.in_scenes([where[kind, one]], values, [None])
+                    yield from self.fast[kind].in_scenes([where[kind, one]], values, [None])
 
         def progress(done: int) -> None:
             self.tick(before + done, max(expected, before + done))
@@ -129,7 +123,8 @@ class _Comparison:
         found = evaluate_many(points(), self.runs, progress)
         if self.stop():
             raise _StoppedError
-        self._known |= dict(zip(pairs, found, strict=True))
+        self._known |= dict(zip(lacking, found, strict=True))
+        return [[self._known[name, one] for one in scenes] for name in names]
 
     def objectives(self, names: Iterable[str], scenes: Scenes) -> list[NDArray[np.float64]]:
         """Return the objectives (n,) of designs, relative to the baseline in the same scene.
@@ -148,7 +143,8 @@ class _Comparison:
         """Return the parts of a range in which design `first` is worse than the `other` one.
 
         All else is as given. Both ends of the range and the config's own value are compared, and
-        changes between them are located."""
+        changes between them are located. In place of an end without a usable motion, the last value
+        before it that has one is compared."""
         key, own = span.key, self.config.value(span.key)
 
         def lead(value: float) -> float:
@@ -159,13 +155,14 @@ class _Comparison:
         found: list[Piece] = []
         middle = [own] if span.low < own < span.high else []
         for low, high in itertools.pairwise([span.low, *middle, span.high]):
-            one, two = lead(low), lead(high)
+            a, b = _known(lead, low, high), _known(lead, high, low)
+            one, two = lead(a), lead(b)
             if not max(one, two) > 0:
                 continue
-            change = _change(lead, low, high) if one * two < 0 else None
+            change = _change(lead, a, b) if one * two < 0 else None
             # Where a motion is not known, nothing is said beyond the end that is.
-            start = low if one > 0 else high if change is None else change
-            stop = high if two > 0 else low if change is None else change
+            start = a if one > 0 else b if change is None else change
+            stop = b if two > 0 else a if change is None else change
             joined = bool(found) and found[-1][1] == start
             found.append((found.pop()[0] if joined else start, stop))
         return found
@@ -231,6 +228,19 @@ class _Comparison:
             return []
         values = self.problem.look(found.point)[0].tolist()
         return [dict(zip(keys, values, strict=True))]
+
+
+def _known(lead: Callable[[float], float], end: float, other: float) -> float:
+    """Return the value nearest to `end`, seen from the `other` one, for which `lead` is known.
+
+    It is `end` itself if `lead` is known there, or nowhere."""
+    if not math.isnan(lead(end)) or math.isnan(lead(other)):
+        return end
+    inside = other
+    for _ in range(_HALVINGS):
+        middle = (inside + end) / 2
+        inside, end = (inside, middle) if math.isnan(lead(middle)) else (middle, end)
+    return inside
 
 
 def _change(lead: Callable[[float], float], low: float, high: float) -> float | None:

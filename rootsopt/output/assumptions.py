@@ -4,7 +4,16 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from rootsopt.output.names import brief, in_words, label, listed, name_and_unit, quantity, value
+from rootsopt.output.names import (
+    DASH,
+    brief,
+    in_words,
+    label,
+    listed,
+    name_and_unit,
+    quantity,
+    value,
+)
 from rootsopt.output.table import Cell, Table, table
 from rootsopt.response.sensitivity import NAMES
 
@@ -18,7 +27,7 @@ def assumption_tables(result: Mapping[str, Any]) -> Iterator[Table | None]:
     if not found:
         return
     rows = [
-        [_label(row["key"]), value(row["low"]), value(row["high"]),
+        [label_of(row["key"]), value(row["low"]), value(row["high"]),
          *(_cell(row[f"objective_{end}"]) for end in ("low", "high")),
          value(row["rank_correlation"])]
         for row in found["keys"]
@@ -29,11 +38,11 @@ def assumption_tables(result: Mapping[str, Any]) -> Iterator[Table | None]:
         "Rank: correlation of the objective with the quantity over the random scenes (Spearman)."
     )
     yield table("The optimum where the pump may run", heads, [("", rows)], note)
-    spread = {f"objective, {name_and_unit(k)[0]}": x for k, x in found["objective_quantiles"].items()}
+    levels = found["objective_quantiles"]
+    spread = {f"objective, {name_and_unit(level)[0]}": x for level, x in levels.items()}
     worst = found["worst"] or {}
     spread |= {"objective, worst of all scenes": worst.get("objective")}
-    share = found["share_better"]
-    rows = [["better than the baseline", "" if share is None else f"{100 * share:.3g} %"]]
+    rows = [["better than the baseline", _share(found)]]
     rows += [[name, _cell(x)] for name, x in spread.items()]
     counts = Counter(_status(row) for row in found["not_compared"])
     rows += [[f"not compared: {words}", str(count)] for words, count in counts.items()]
@@ -42,11 +51,16 @@ def assumption_tables(result: Mapping[str, Any]) -> Iterator[Table | None]:
     )
     rivals = [
         [", ".join(f"{label(key)} {value(x)}" for key, x in one["design"].items()),
-         _cell(one["objective"]), f"{100 * one['share_better']:.3g} %", _region(one, found)]
+         _cell(one["objective"]), _share(one), _region(one, found)]
         for one in found["rivals"]
     ]  # fmt: skip
     heads = "design", "objective as given", "better than the optimum", "all else as given"
     yield table("Designs that are better in some scenes", heads, [("", rivals)])
+
+
+def _share(row: Mapping[str, Any]) -> str:
+    share = row["share_better"]
+    return DASH if share is None else f"{100 * share:.3g} %"
 
 
 def _cell(objective: float | None) -> Cell:
@@ -81,15 +95,18 @@ def elsewhere(result: Mapping[str, Any]) -> Iterator[str]:
         yield f"All else as given, it is worse {listed(worse)}."
     elif compared and found["share_better"] < 1:
         row = _row(found["decides"], found)
-        yield f"It loses most with {_sense(row)}."
+        yield f"Its objective rises most with {_sense(row)}."
+    known = (result.get("robustness") or {}).get("nominal") or {}
+    nominal = (known.get("optimized") or {}).get("design")
     for one in found["rivals"]:
         shape = ", ".join(
             f"{name_and_unit(k)[0]} {_stated(k, x)}" for k, x in one["design"].items()
         )
         region = _region(one, found)
         where = f" and, all else as given, {region}" if region else f", mostly with {_sense(one)}"
-        share = f"{100 * one['share_better']:.3g} % of the random scenes"
-        yield f"Another design ({shape}) is better than the optimum in {share}{where}."
+        share = f"{_share(one)} of the random scenes"
+        name = "The nominal optimum" if one["design"] == nominal else "Another design"
+        yield f"{name} ({shape}) is better than the optimum in {share}{where}."
     if found["not_compared"]:
         counts = Counter(_status(row) for row in found["not_compared"])
         told = [f"{count} ({words})" for words, count in counts.items()]
@@ -138,9 +155,10 @@ def named(key: str) -> str:
     return NAMES.get(key) or name_and_unit(key)[0]
 
 
-def _label(key: str) -> str:
+def label_of(key: str) -> str:
+    """Return this name with the unit in parentheses."""
     unit = name_and_unit(key)[1]
     return f"{named(key)} ({unit})" if unit else named(key)
 
 
-__all__ = ["assumption_tables", "elsewhere", "named"]
+__all__ = ["assumption_tables", "elsewhere", "label_of", "named"]
