@@ -13,7 +13,7 @@ import itertools
 import math
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -310,6 +310,7 @@ def _compared(work: _Comparison) -> Assumed:
     )  # fmt: skip
 
 
+@runtime_checkable
 class _Search(Protocol):
     def run(self) -> Optimization: ...
 

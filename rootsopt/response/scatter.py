@@ -128,7 +128,7 @@ def in_conditions(config: Config, scenes: Mapping[str, Mapping[str, float]], **r
 def _difference(before: Scene, after: Scene) -> Scene:
     """Return the change of a scene's arrays, as a `Scene` with None in place of all else."""
 
-    def change(x: Any, y: Any) -> NDArray[np.float64] | None:
+    def change(x: Any, y: Any) -> Any:
         found = np.asarray(x) - np.asarray(y)
         return found if found.any() else None
 

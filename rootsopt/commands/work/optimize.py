@@ -251,7 +251,7 @@ def _write(folder, config, options, result, alike, sheets, compiled, ran) -> dic
 
 def _draw(folder, config: Config, result, data: dict) -> None:
     """Write the figures of a search; `data`: content of the result file."""
-    from rootsopt.figures import runs, speeds
+    from rootsopt.figures import assumptions, runs, speeds
 
     if result.optimized is not None:
         pair, rows = (result.baseline, result.optimized), result.history
@@ -266,9 +266,7 @@ def _draw(folder, config: Config, result, data: dict) -> None:
         designs = {name: one.speeds for name, one in names.items() if one is not None}
         speeds.speed_figure(folder, designs, "Contact force over the speeds of the objective")
     if result.assumptions is not None:
-        from rootsopt.figures.assumptions import spread_figure
-
-        spread_figure(folder, data["assumptions"], result.assumptions.columns())
+        assumptions.spread_figure(folder, data["assumptions"], result.assumptions.columns())
 
 
 def _designed(config: Config, evaluation) -> Config:
