@@ -76,7 +76,7 @@ class Assumed:
         Shares, quantiles and rank correlations are those of the random scenes."""
         values, drawn, names = self.objectives[OPTIMIZED], self.drawn, [*self.scenes]
         known = np.isfinite(values)
-        some, ends = values[drawn & known], values[~drawn & known][1:]
+        some, ends = values[drawn & known], [x for x in values[~drawn][1:] if math.isfinite(x)]
         worst = int(np.nanargmax(values)) if known.any() else None
         rows = []
         for k, span in enumerate(self.spans):
@@ -90,8 +90,8 @@ class Assumed:
             "compared": int(some.size),
             "share_better": float(np.mean(some < 1)) if some.size else None,
             "ends": int(np.sum(~drawn)) - 1,
-            "ends_compared": int(ends.size),
-            "ends_better": int(np.sum(ends < 1)),
+            "ends_compared": len(ends),
+            "ends_better": sum(x < 1 for x in ends),
             "objective_quantiles": {
                 name: float(np.quantile(some, level)) if some.size else None
                 for name, level in _LEVELS.items()
@@ -116,7 +116,8 @@ class Assumed:
         known = lead[self.drawn & np.isfinite(lead)]
         ranks = {one.key: self._rank(lead, one.key) for one in self.spans}
         wins = {key: parts for key, parts in self.wins[name].items() if parts}
-        leads = {one.key: max(self._ends(lead, k)) for k, one in enumerate(self.spans)}
+        leads = {one.key: np.nanmax([0.0, *self._ends(lead, k)])
+                 for k, one in enumerate(self.spans)}  # fmt: skip
         sizes = {key: leads[key] if wins else abs(ranks[key] or 0.0) for key in (wins or ranks)}
         key = max(sizes, key=lambda one: sizes[one])
         return {

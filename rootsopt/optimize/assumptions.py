@@ -13,7 +13,7 @@ import itertools
 import math
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -310,21 +310,14 @@ def _compared(work: _Comparison) -> Assumed:
     )  # fmt: skip
 
 
-@runtime_checkable
-class _Search(Protocol):
-    def run(self) -> Optimization: ...
-
-    def so_far(self) -> Optimization | None: ...
-
-
 class AssumedSearch:
     """A search, and the comparison of its optimum with the baseline over `assumptions`.
 
-    `search`: the search; `config`: its config. For the rest, see `Search`."""
+    `search`: a `Search` or `TolerantSearch`; `config`: its config. For the rest, see `Search`."""
 
     def __init__(
         self,
-        search: _Search,
+        search: Any,
         config: Config,
         progress: Callable[[int, int, float], None] | None,
         stop: threading.Event | None,

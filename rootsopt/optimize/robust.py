@@ -226,6 +226,8 @@ class TolerantSearch:
         if found is None:
             return None
         scenes, offsets = found.sample(self.config.assumptions.combine == "regret")
+        if not scenes:
+            return None
         worst = self.config.assumptions.combine != "mean"
         rule = {"combine": "worst" if worst else "mean_plus_k_sigma", "k": 0.0}
         config = in_conditions(without(self.config), scenes, **rule)

@@ -8,7 +8,6 @@ from rootsopt.output.names import (
     DASH,
     brief,
     in_words,
-    label,
     listed,
     name_and_unit,
     quantity,
@@ -22,7 +21,7 @@ _MICRO = 0.1
 
 
 def assumption_tables(result: Mapping[str, Any]) -> Iterator[Table | None]:
-    """Yield the objective at both ends of each range and in random scenes, and better designs."""
+    """Yield the objective at both ends of each range, and its statistics in random scenes."""
     found = result.get("assumptions")
     if not found:
         return
@@ -44,18 +43,8 @@ def assumption_tables(result: Mapping[str, Any]) -> Iterator[Table | None]:
     spread |= {"objective, worst of all scenes": worst.get("objective")}
     rows = [["better than the baseline", _share(found)]]
     rows += [[name, _cell(x)] for name, x in spread.items()]
-    counts = Counter(_status(row) for row in found["not_compared"])
-    rows += [[f"not compared: {words}", str(count)] for words, count in counts.items()]
-    yield table(
-        f"The optimum in {found['compared']} random scenes", ("", "optimised"), [("", rows)]
-    )
-    rivals = [
-        [", ".join(f"{label(key)} {value(x)}" for key, x in one["design"].items()),
-         _cell(one["objective"]), _share(one), _region(one, found)]
-        for one in found["rivals"]
-    ]  # fmt: skip
-    heads = "design", "objective as given", "better than the optimum", "all else as given"
-    yield table("Designs that are better in some scenes", heads, [("", rivals)])
+    title = f"The optimum in {found['compared']} random scenes"
+    yield table(title, ("", "optimised"), [("", rows)])
 
 
 def _share(row: Mapping[str, Any]) -> str:
@@ -65,10 +54,6 @@ def _share(row: Mapping[str, Any]) -> str:
 
 def _cell(objective: float | None) -> Cell:
     return Cell(value(objective), None if objective is None else objective < 1)
-
-
-def _status(row: Mapping[str, Any]) -> str:
-    return f"baseline {in_words(row['status_baseline'])}, {in_words(row['status_optimized'])}"
 
 
 def elsewhere(result: Mapping[str, Any]) -> Iterator[str]:
@@ -108,7 +93,9 @@ def elsewhere(result: Mapping[str, Any]) -> Iterator[str]:
         name = "The nominal optimum" if one["design"] == nominal else "Another design"
         yield f"{name} ({shape}) is better than the optimum in {share}{where}."
     if found["not_compared"]:
-        counts = Counter(_status(row) for row in found["not_compared"])
+        rows = [[in_words(row[f"status_{who}"]) for who in ("baseline", "optimized")]
+                for row in found["not_compared"]]  # fmt: skip
+        counts = Counter(f"baseline {first}, optimum {last}" for first, last in rows)
         told = [f"{count} ({words})" for words, count in counts.items()]
         yield f"Scenes that cannot be compared: {listed(told)}."
 

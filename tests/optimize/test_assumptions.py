@@ -168,13 +168,13 @@ def test_objective_over_assumptions_by_hand():
     """Mean, worst and regret of three scenes, each relative to the baseline in the same scene.
 
     Regret: its distance from that of the baseline is the distance of the objectives from 1."""
-    config = load("cic")
+    config = load("cic", ["constraints.area_efficiency_min=0.4"])
     spans, scenes = (Span("x", 0, 1),), {f"random {k}": {"x": float(k)} for k in range(4)}
     ratios = np.array([0.5, 0.75, 1.2, math.nan])
     rival = np.array([0.4, 0.7, 1.1, 1.0])
     given = {BASELINE: np.array([1, 1, 1, math.nan]), OPTIMIZED: ratios, "design 1": rival}
     found = Assumed(spans, scenes, {}, given, {}, {}, {})
-    space = Space.of(config, Scene.from_config(config), 0.4)
+    space = Space.of(config, Scene.from_config(config))
     base, moved = of([2.0, 4.0, 1.0]), of([1.0, 3.0, 1.2])
 
     def objective(combine, regret):

@@ -303,6 +303,7 @@ def test_optimize_command(tmp_path, capsys):
         "tolerances.over={contact.clearance_mm: {normal: 0.002}}",
         "tolerances.samples=2",
         "tolerances.check_samples=4",
+        "assumptions.scenes=0",
         "optimizer.screening=0",
         "optimizer.starts=1",
         "optimizer.iterations=3",

@@ -78,7 +78,7 @@ def test_optimum_in_other_scenes():
         "is above 23 µm and where the load is below 3.21 N·m and where the load is between 5 N·m "
         "and 6 N·m. Another design (pressure angle 44°) is better than the optimum in 37.5 % of "
         "the random scenes, mostly with more clearance of the flanks (rank correlation 0.5). "
-        "Scenes that cannot be compared: 2 (baseline idle, chaotic)."
+        "Scenes that cannot be compared: 2 (baseline idle, optimum chaotic)."
     )
     for row in keys:
         row["worse"] = []
