@@ -134,6 +134,7 @@ def test_where_it_is_worse_and_which_design_wins():
                         checked += 1
     assert checked
     problem = result.problem
+    assert problem is not None
     for one in rivals:
         assert problem.feasible(problem.point([*one["design"].values()]))
         best = int(np.nanargmax(found.objectives[OPTIMIZED] - found.objectives[one["name"]]))
