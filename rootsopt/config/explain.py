@@ -317,7 +317,7 @@ GROUPS = {
     "pump": ("pump",),
     "search": (
         "objective", "constraints", "optimizer", "sweep", "attractors", "pareto", "tolerances",
-        "response", "ensemble",
+        "assumptions", "response", "ensemble",
     ),
     "expert": ("solver",),
 }  # fmt: skip

@@ -1,7 +1,7 @@
 """The complete config, and the functions that read it from YAML."""
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +10,7 @@ import yaml
 from numpy.typing import NDArray
 from pydantic import Field, SerializeAsAny, ValidationError, model_validator
 
+from rootsopt.config.assumptions import AssumptionsConfig, Span
 from rootsopt.config.document import MOST_BYTES, read_document
 from rootsopt.config.drawing import DrawingConfig
 from rootsopt.config.explain import describe, explain, outline, tree
@@ -42,6 +43,7 @@ from rootsopt.config.units import hint
 from rootsopt.config.words import placed, sentence, shown
 from rootsopt.errors import InputError
 
+_SPEED = "scene.speed_rpm"
 _MOST_PARTS = 8
 """Number of dotted parts in a key above which an override is rejected. Config keys have at most
 three parts."""
@@ -74,6 +76,9 @@ class Config(Section):
     pareto: ParetoConfig = Field(default_factory=lambda: ParetoConfig.model_validate({}))
     optimizer: OptimizerConfig = Field(default_factory=lambda: OptimizerConfig.model_validate({}))
     pump: PumpConfig | None = Field(None, description="absent: no leakage is reported")
+    assumptions: AssumptionsConfig = Field(
+        default_factory=lambda: AssumptionsConfig.model_validate({})
+    )
     tolerances: TolerancesConfig | None = Field(None, description="absent: nothing scatters")
     drawing: DrawingConfig | None = Field(
         None, description="absent: the title block states only what follows from the other sections"
@@ -178,6 +183,35 @@ class Config(Section):
         """Distributions of the keys that scatter; empty without `tolerances`."""
         return () if self.tolerances is None else self.tolerances.scatters(scatterable(self))
 
+    @property
+    def spans(self) -> tuple[Span, ...]:
+        """Ranges of what is assumed about the scene, without usual ones that leave what is allowed.
+
+        Empty if `assumptions.scenes` is 0."""
+        if not self.assumptions.scenes:
+            return ()
+        own, listed = self.assumptions.over, bool(self.objective.speeds_rpm)
+        return tuple(
+            one
+            for one in self.assumptions.spans(scatterable(self, design=False))
+            if one.key in own
+            or not ((listed and one.key == _SPEED) or any(self._faults(one.key, one.ends)))
+        )
+
+    def _faults(self, key: str, values: Sequence[float]) -> Iterator[str]:
+        """Yield why the config is not valid with one of the `values` of a key."""
+        return filter(None, (self._fault({key: value}) for value in values))
+
+    def _fault(self, values: Mapping[str, Any]) -> str:
+        """Return why the config is not valid with other `values`, by dotted key; "" if it is."""
+        alone = {"tolerances": None, "assumptions": AssumptionsConfig.model_validate({})}
+        moved = self.model_copy(update=alone).moved(values)
+        try:
+            Config.model_validate(moved.model_dump(mode="json", exclude_none=True))
+        except ValidationError as error:
+            return explain(error, Config)
+        return ""
+
     def moved(self, values: Mapping[str, Any]) -> "Config":
         """Return a copy in which some values are replaced, without checking them.
 
@@ -254,7 +288,7 @@ class Config(Section):
 
     @model_validator(mode="after")
     def _scattering(self):
-        tolerances, alone = self.tolerances, self.model_copy(update={"tolerances": None})
+        tolerances = self.tolerances
         if tolerances is None:
             return self
         valid, known = scatterable(self), tree(Config)
@@ -265,17 +299,45 @@ class Config(Section):
             "`tolerances` must be absent for `objective.motion` ensemble, whose averages have "
             "noise; remove `tolerances`, or set `objective.motion` to reached, worst or weighted",
         )
-        require(
-            not self.objective.speeds_rpm or "scene.speed_rpm" not in tolerances.over,
-            "`tolerances.over` must not name `scene.speed_rpm` if `objective.speeds_rpm` lists "
-            "the speeds; remove one of them",
-        )
+        self._check_speed("tolerances", tolerances.over)
         for what, values, remedy in tolerances.extremes(valid):
-            data = alone.moved(values).model_dump(mode="json", exclude_none=True)
-            try:
-                Config.model_validate(data)
-            except ValidationError as error:
-                raise ValueError(f"{what}, but {explain(error, Config)}; {remedy}") from None
+            fault = self._fault(values)
+            require(not fault, f"{what}, but {fault}; {remedy}")
+        return self
+
+    def _check_speed(self, section: str, over: Mapping[str, Any]) -> None:
+        require(
+            not self.objective.speeds_rpm or _SPEED not in over,
+            f"`{section}.over` must not name `{_SPEED}` if `objective.speeds_rpm` lists the "
+            "speeds; remove one of them",
+        )
+
+    @model_validator(mode="after")
+    def _assuming(self):
+        assumptions, valid = self.assumptions, scatterable(self, design=False)
+        for key in assumptions.over:
+            require(key in valid, unknown_key(key, valid, tree(Config), "assumptions"))
+        self._check_speed("assumptions", assumptions.over)
+        for one in assumptions.spans(valid, every=False):
+            for fault in self._faults(one.key, one.ends):
+                low, high = (f"{end:.6g}" for end in one.ends)
+                raise ValueError(
+                    f"`assumptions.over.{one.key}` leads from {low} to {high}, but {fault}; "
+                    "narrow the range"
+                )
+        wanted = self.objective.over == "assumptions"
+        conflicts = {
+            "`assumptions.scenes` must be above 0": not assumptions.scenes,
+            "`tolerances` must be absent": self.tolerances is not None,
+            "`objective.motion` must not be ensemble": self.objective.motion == "ensemble",
+            "`profile.family` must not be outline": self.profile.from_file,
+        }
+        for words, met in conflicts.items():
+            require(
+                not (wanted and met),
+                f"{words} for `objective.over` assumptions; change it, or set `objective.over` to "
+                "nominal",
+            )
         return self
 
     def to_yaml(self) -> str:

@@ -169,6 +169,11 @@ class ObjectiveConfig(Section):
     over_speeds: Literal["weighted", "worst"] = Field(
         "weighted", description="how these speeds are combined: weighted mean, or worst speed"
     )
+    over: Literal["nominal", "assumptions"] = Field(
+        "nominal",
+        description="scenes that count: that of the config, or those of `assumptions`, combined as "
+        "`assumptions.combine` says",
+    )
 
     @model_validator(mode="before")
     @classmethod

@@ -1,7 +1,7 @@
 """Config section `tolerances`: how far values of scene and design scatter in manufacture."""
 
 import difflib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 from pydantic import Field, model_validator
@@ -105,7 +105,7 @@ class TolerancesConfig(Section):
         if not isinstance(data, dict):
             return data
         if isinstance(over := data.get("over"), dict):
-            data = data | {"over": _distributions(over)}
+            data = data | {"over": entries(over, DISTRIBUTIONS)}
         scenes = data.get("conditions")
         if not isinstance(scenes, dict) or not scenes:
             return data
@@ -179,11 +179,11 @@ class TolerancesConfig(Section):
                 yield what, {one.key: end}, remedy
 
 
-def scatterable(config: Any) -> dict[str, float]:
+def scatterable(config: Any, design: bool = True) -> dict[str, float]:
     """Return the values of a config that may scatter, by dotted key.
 
-    They are the numerical values in its sections `rotor`, `contact` and `scene`, and its design
-    parameters. An entry of a list is numbered from 1, as in `profile.coefficients_2`."""
+    They are the numerical values in its sections `rotor`, `contact` and `scene`, and with `design`
+    its design parameters. An entry of a list is numbered from 1, as in `profile.coefficients_2`."""
     found: dict[str, float] = {}
 
     def walk(section: Section, prefix: str) -> None:
@@ -197,6 +197,8 @@ def scatterable(config: Any) -> dict[str, float]:
     for name in _SECTIONS:
         walk(getattr(config, name), f"{name}.")
     profile = config.profile
+    if not design:
+        return found
     designs = zip(profile.design_keys, profile.design, strict=True)
     return found | {f"profile.{key}": float(value) for key, value in designs}
 
@@ -210,26 +212,27 @@ def mounted(data: Any) -> Any:
     over = parts[1].get("over") if parts and isinstance(parts[1], dict) else None
     if not isinstance(over, dict) or not isinstance(parts[0], dict):
         return data
-    scatter = [name for name in _MOUNTING if f"scene.{name}" in _distributions(over)]
+    scatter = [name for name in _MOUNTING if f"scene.{name}" in entries(over, DISTRIBUTIONS)]
     absent = {name: 0.0 for name in scatter if parts[0].get(name) is None}
     return data | {"scene": parts[0] | absent} if absent else data
 
 
-def unknown_key(key: str, valid: Mapping[str, float], known: Mapping[str, Any]) -> str:
-    """Return a message for a key of `tolerances.over` that cannot scatter.
+def unknown_key(
+    key: str, valid: Mapping[str, float], known: Mapping[str, Any], section: str = "tolerances"
+) -> str:
+    """Return a message for a key of the entry `over` of a `section` that cannot scatter.
 
     `valid`: result of `scatterable`; `known`: all keys of a config."""
-    text = f"`tolerances.over` must name numbers of this config's scene, but names `{named(key)}`"
+    text = f"`{section}.over` must name numbers of this config's scene, but names `{named(key)}`"
     if key in known and key.split(".")[0] in _SECTIONS and key not in _NOT_PHYSICAL:
         return (
             f"{text}, which the config does not have as a number; give `{key}` its nominal value "
             "first"
         )
     if key in known:
-        return (
-            f"{text}, which does not scatter; valid are numbers of rotor, contact and scene, and "
-            "the design parameters of profile"
-        )
+        designs = any(one.startswith("profile.") for one in valid)
+        more = ", and the design parameters of profile" if designs else ""
+        return f"{text}, which cannot vary; valid are numbers of rotor, contact and scene{more}"
     return text + (_near(key, valid) or f"; valid are {', '.join(valid)}")
 
 
@@ -258,12 +261,14 @@ def _dotted(data: dict, is_value: Callable[[dict], bool], prefix: str = "") -> d
     return found
 
 
-def _distributions(over: dict) -> dict[str, Any]:
-    """Return {dotted key: distribution}, from nested sections as overrides with dots make them."""
-    words = {bare(word): word for word in DISTRIBUTIONS}
+def entries(over: dict, kinds: Iterable[str]) -> dict[str, Any]:
+    """Return {dotted key: {kind: numbers}}, from nested sections as overrides with dots make them.
+
+    `kinds`: valid words for a kind; others, and values of another form, stay as they are."""
+    words = {bare(word): word for word in kinds}
 
     def is_value(given: dict) -> bool:
-        return not any(isinstance(one, dict) for one in given.values())
+        return not any(one is None or isinstance(one, dict) for one in given.values())
 
     def named_right(given: Any) -> Any:
         if not isinstance(given, dict):
@@ -273,4 +278,12 @@ def _distributions(over: dict) -> dict[str, Any]:
     return {key: named_right(given) for key, given in _dotted(over, is_value).items()}
 
 
-__all__ = ["DISTRIBUTIONS", "Scatter", "TolerancesConfig", "mounted", "scatterable", "unknown_key"]
+__all__ = [
+    "DISTRIBUTIONS",
+    "Scatter",
+    "TolerancesConfig",
+    "entries",
+    "mounted",
+    "scatterable",
+    "unknown_key",
+]

@@ -18,6 +18,7 @@ from rootsopt.response.evaluation import RESPONSES, Evaluation, objective_weight
 from rootsopt.status import Status
 
 if TYPE_CHECKING:
+    from rootsopt.optimize.assumptions import Assumed
     from rootsopt.optimize.robust import Robustness
 
 
@@ -73,6 +74,7 @@ class Optimization:
     is `None` without a verified design, or if the objective is an average over an ensemble.
     `infeasible`: why no design satisfies all constraints, `None` if a design does. `robustness`:
     the nominal optimum and the comparison with it, if scene or design scatter (`tolerances`).
+    `assumptions`: baseline and optimum over the spread of what is assumed about the scene.
     `beginning`: the fitted design that began the search; `None` unless the baseline's profile is
     from a file.
 
@@ -95,6 +97,7 @@ class Optimization:
     infeasible: Infeasible | None = None
     robustness: "Robustness | None" = None
     beginning: Beginning | None = None
+    assumptions: "Assumed | None" = None
 
     @property
     def status(self) -> Status:

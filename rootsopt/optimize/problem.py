@@ -142,6 +142,14 @@ class Problem:
         space = Space.of(config, scene, term_constraints(config, scene))
         return cls(config, baseline, space, force_limits(config, scene))
 
+    def beside(self, baseline: Evaluation) -> "Problem":
+        """Return the problem relative to another evaluation of the `baseline`, as in another scene.
+
+        Designs and constraints of the geometry are the same."""
+        found = Problem(self.config, baseline, self.space, self.limits)
+        found.__dict__["_look_at"] = self._look_at  # Its results are costly, and the same.
+        return found
+
     def objective(self, evaluation: Evaluation) -> float:
         """Return the objective of an `evaluation`, which is 1 for the baseline.
 

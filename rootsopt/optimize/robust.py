@@ -1,4 +1,5 @@
-"""The robust optimum: the best design if values of scene and design scatter (`tolerances`).
+"""The robust optimum: the best design if values of scene and design scatter (`tolerances`), or over
+the spread of what is assumed (`objective.over: assumptions`).
 
 The search has two stages. The first one finds the nominal optimum, as without `tolerances`. In the
 second one, local searches begin at the optima of the first stage. Each of their designs is
@@ -17,6 +18,8 @@ from numpy.typing import NDArray
 from rootsopt.config import Config
 from rootsopt.config.study import OptimizerConfig
 from rootsopt.errors import InputError
+from rootsopt.optimize.assumed import RIVAL
+from rootsopt.optimize.assumptions import AssumedSearch, compared
 from rootsopt.optimize.local import Linearization
 from rootsopt.optimize.outcome import Optimization
 from rootsopt.optimize.problem import Problem
@@ -26,7 +29,7 @@ from rootsopt.response.checkpoint import Checkpoint
 from rootsopt.response.evaluation import RESPONSES, Evaluation, Evaluator
 from rootsopt.response.many import HERE, Runs, evaluate_many
 from rootsopt.response.reducers import combine
-from rootsopt.response.scatter import Shift, draw, shifts
+from rootsopt.response.scatter import Shift, draw, in_conditions, shifts
 from rootsopt.scene import Scene
 
 OBJECTIVE = "objective"
@@ -123,13 +126,20 @@ class Robustness:
 class RobustStage(Stage):
     """The second stage: local searches from the optima of the first stage, over a sample.
 
-    `nominal`: outcome of the first stage, with a problem; `first`: see `Stage`."""
+    `nominal`: outcome of the first stage, with a problem; `first`: see `Stage`; `others`: further
+    designs from which searches begin; `offsets`: those of `RobustProblem`."""
 
     apart = 0.03
     bounded = False
 
-    def __init__(self, nominal: Optimization, first: int):
-        self.nominal, self.first = nominal, first
+    def __init__(
+        self,
+        nominal: Optimization,
+        first: int,
+        others: Sequence[Mapping[str, float]] = (),
+        offsets: tuple[float, ...] = (),
+    ):
+        self.nominal, self.first, self.others, self.offsets = nominal, first, others, offsets
         self._shares: dict[int, NDArray[np.float64]] = {}
 
     def settings(self, given: OptimizerConfig) -> OptimizerConfig:
@@ -139,15 +149,16 @@ class RobustStage(Stage):
         return exact.scattered(runs)
 
     def problem(self, config: Config, scene: Scene, baseline: Evaluation) -> Problem:
-        return RobustProblem.of(config, scene, baseline)
+        return RobustProblem.of(config, scene, baseline, self.offsets)
 
     def sample(self, problem: Problem, own, settings) -> list[NDArray[np.float64]]:
-        """Return the points of the nominal optimum and of the other optima of the first stage.
+        """Return the points of the nominal optimum, of `others` and of the other optima.
 
         Without an optimum, return the baseline's `own` point. All are moved onto the feasible
         set."""
         del settings
         found = [] if self.nominal.optimized is None else [self.nominal.optimized.design]
+        found += [dict(one) for one in self.others]
         if self.nominal.optimality is not None:
             found += [one.design for one in self.nominal.optimality.optima]
         points = [problem.point(list(design.values())) for design in found] or [own]
@@ -169,7 +180,7 @@ class RobustStage(Stage):
 class TolerantSearch:
     """Both stages of the search, and the comparison over fresh scenes.
 
-    Arguments: see `Search`. `config` must have `tolerances`."""
+    Arguments: see `Search`. `config` has `tolerances`, or its objective is over `assumptions`."""
 
     def __init__(
         self,
@@ -200,14 +211,33 @@ class TolerantSearch:
         if self.stop.is_set() or nominal.problem is None or nominal.infeasible is not None:
             return nominal
         self._done, self._expected = len(nominal.history), self._stage.expected
+        second = self._second(nominal)
+        if second is None:
+            return nominal
         self._nominal = nominal
         how = self._report, self.stop, self.checkpoint, self.runs
-        second = RobustStage(nominal, self.config.optimizer.starts)
-        self._stage = stage = Search(self.config, *how, second)
+        self._stage = stage = Search(second[0], *how, second[1])
         found = stage.run()
         if found.problem is None:
             return found
         return self._with(found, *self._compared(stage, found))
+
+    def _second(self, nominal: Optimization) -> tuple[Config, RobustStage] | None:
+        """Return config and stage of the second search; `None` if there is nothing to search."""
+        starts = self.config.optimizer.starts
+        if self.config.tolerances is not None:
+            return self.config, RobustStage(nominal, starts)
+        found = compared(self.config, nominal, self.runs, self.stop.is_set, self._tick)
+        if found is None:
+            return None
+        scenes, offsets = found.sample(self.config.assumptions.combine == "regret")
+        if not scenes:
+            return None
+        worst = self.config.assumptions.combine != "mean"
+        rule = {"combine": "worst" if worst else "mean_plus_k_sigma", "k": 0.0}
+        config = in_conditions(without(self.config), scenes, **rule)
+        others = [one for name, one in found.designs.items() if name.startswith(RIVAL)]
+        return config, RobustStage(nominal, starts, others, offsets)
 
     def so_far(self) -> Optimization | None:
         """Return what the search has found so far, as `Search.so_far` does."""
@@ -228,13 +258,15 @@ class TolerantSearch:
     def _report(self, done: int, expected: int, best: float) -> None:
         self.progress(self._done + done, self._expected + expected, best)
 
+    def _tick(self, done: int, expected: int) -> None:
+        self._report(done, expected, float("nan"))
+
     def _compared(self, stage: Search, found: Optimization) -> tuple[dict, dict]:
         """Return the fields `fresh` and `scenes` of `Robustness`."""
         tolerances = self.config.tolerances
-        assert tolerances is not None
         assert self._nominal is not None
         assert isinstance(found.problem, RobustProblem)
-        if not tolerances.check_samples or self.stop.is_set():
+        if tolerances is None or not tolerances.check_samples or self.stop.is_set():
             return {}, {}
         known = {
             "baseline": found.baseline,
@@ -328,8 +360,9 @@ def _same(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
 
 
 def without(config: Config) -> Config:
-    """Return `config` without `tolerances`."""
-    return config.model_copy(update={"tolerances": None})
+    """Return `config` for the nominal optimum: without `tolerances`, in its own scene."""
+    objective = config.objective.model_copy(update={"over": "nominal"})
+    return config.model_copy(update={"tolerances": None, "objective": objective})
 
 
 def search_of(
@@ -338,10 +371,11 @@ def search_of(
     stop: threading.Event | None = None,
     checkpoint: Checkpoint | None = None,
     runs: Runs = HERE,
-) -> Search | TolerantSearch:
-    """Return the search that a `config` needs: with `tolerances`, a `TolerantSearch`.
+) -> Search | TolerantSearch | AssumedSearch:
+    """Return the search that a `config` needs.
 
-    Arguments: see `Search`.
+    With `tolerances` or `objective.over: assumptions`, it is a `TolerantSearch`; unless
+    `assumptions.scenes` is 0, it is followed by a comparison. Arguments: see `Search`.
 
     Raises `InputError` for `tolerances` with a profile from a file, which has no design
     parameters."""
@@ -350,8 +384,9 @@ def search_of(
             "`tolerances` must be absent for `profile.family` outline; optimise it without them, "
             "then optimise the `optimized.yaml` of that run with `tolerances`"
         )
-    kind = Search if config.tolerances is None else TolerantSearch
-    return kind(config, progress, stop, checkpoint, runs)
+    nominal = config.tolerances is None and config.objective.over == "nominal"
+    found = (Search if nominal else TolerantSearch)(config, progress, stop, checkpoint, runs)
+    return AssumedSearch(found, config, progress, stop, runs) if config.spans else found
 
 
 __all__ = [

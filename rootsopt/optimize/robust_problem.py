@@ -1,11 +1,12 @@
 """The design problem over a sample of scenes with scattered values.
 
-The objective in each scene is that of `Problem`, relative to the baseline in the nominal scene. A
-rule (`rootsopt.response.reducers`) combines the scenes to one number, which is divided by its value
-for the baseline. The robust objective of the baseline is therefore 1, too."""
+The objective in each scene is that of `Problem`, relative to the baseline in the nominal scene, or
+over `assumptions` in the same scene. A rule (`rootsopt.response.reducers`) combines the scenes to
+one number, which is divided by its value for the baseline. The robust objective of the baseline is
+therefore 1, too."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,24 +31,39 @@ class RobustProblem(Problem):
 
     `reference`: the combination for the baseline, by which the objective is divided. The field
     `baseline` is the evaluation in the nominal scene. Methods also accept an evaluation in the
-    nominal scene alone, for which they return what `Problem` returns."""
+    nominal scene alone, for which they return what `Problem` returns. `offsets`: numbers added to
+    the objectives of the scenes, which are then relative to the baseline in the same scene, one of
+    `bases`."""
 
     reference: float = 1.0
+    offsets: tuple[float, ...] = ()
+    bases: tuple[Evaluation, ...] = ()
 
     @classmethod
-    def of(cls, config: Config, scene: Scene, baseline: Evaluation) -> "RobustProblem":
+    def of(
+        cls, config: Config, scene: Scene, baseline: Evaluation, offsets: tuple[float, ...] = ()
+    ) -> "RobustProblem":
         """Return the problem of a `config` with `tolerances`, as `Problem.of` does.
 
-        `baseline`: a usable evaluation of the config's own design over the sample."""
+        `baseline`: a usable evaluation of the config's own design over the sample; `offsets`: see
+        the class."""
         problem = Problem.of(settled_by(config, baseline), scene, baseline.nominal)
-        found = cls(problem.config, problem.baseline, problem.space, problem.limits)
+        bases = tuple(part.evaluation for part in baseline.samples) if offsets else ()
+        given = problem.config, problem.baseline, problem.space, problem.limits
+        found = cls(*given, offsets=offsets, bases=bases)
         return dataclasses.replace(found, reference=found.combined(baseline).value)
+
+    def _each(self, evaluation: Evaluation) -> Iterator[tuple[Problem, Evaluation, float]]:
+        """Yield (problem, evaluation, offset) of every scene of the sample."""
+        for k, part in enumerate(evaluation.samples):
+            if self.bases:
+                yield self.beside(self.bases[k]), part.evaluation, self.offsets[k]
+            else:
+                yield self, part.evaluation, 0.0
 
     def values(self, evaluation: Evaluation) -> NDArray[np.float64]:
         """Return the objective in each scene of the sample (n,), 1 for the nominal baseline."""
-        return np.array(
-            [super(RobustProblem, self).objective(p.evaluation) for p in evaluation.samples]
-        )
+        return np.array([one.objective(e) + add for one, e, add in self._each(evaluation)])
 
     def combined(self, evaluation: Evaluation) -> Combined:
         """Return the combination of the objectives in all scenes, with its weights.
@@ -71,7 +87,7 @@ class RobustProblem(Problem):
         if not evaluation.scenes:
             return super().slope(evaluation, point)
         weights = self.combined(evaluation).weights
-        rows = [super(RobustProblem, self).slope(p.evaluation, point) for p in evaluation.samples]
+        rows = [one.slope(e, point) for one, e, _ in self._each(evaluation)]
         return np.asarray(weights @ np.array(rows) / self.reference)
 
     def local(
@@ -90,8 +106,11 @@ class RobustProblem(Problem):
         if not evaluation.usable:
             return None
         assert self.config.tolerances is not None
-        every = [super(RobustProblem, self).local(p.evaluation, point) for p in evaluation.samples]
-        parts = [part for part in every if part is not None]
+        parts = [
+            found._replace(smooth=found.smooth + add)
+            for one, e, add in self._each(evaluation)
+            if (found := one.local(e, point)) is not None
+        ]
         walls = self.walls(evaluation, self.look(point)[1]) if self.limits else ()
         if self.config.tolerances.combine == "worst":
             return self._worst(parts)._replace(walls=walls)

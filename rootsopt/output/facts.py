@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from rootsopt.errors import InputError
+from rootsopt.output.assumptions import elsewhere
 from rootsopt.output.names import (
     brief,
     in_words,
@@ -57,6 +58,7 @@ def optimised(result: Record, rows: Sequence[Record]) -> Facts:
     costs = [f"no reported quantity is worse by {_SMALL} % or more"]
     if worse:
         costs = [listed([words for words, *_ in worse[:FEW]] + more)]
+    spread = " ".join(elsewhere(result))
     return [
         ("Gained", _sentence([*gained])),
         ("Costs", _sentence([*costs, *_prices(result)])),
@@ -66,6 +68,7 @@ def optimised(result: Record, rows: Sequence[Record]) -> Facts:
                 [_sentence([*_certified(result)]), *_touching(result), *_caveats(result, after)]
             ),
         ),
+        *([("Other scenes", spread)] if spread else []),
     ]
 
 

@@ -29,6 +29,7 @@ _NAMES = {
     "greatest_impact_N_m": ("greatest torque of these impacts", "N·m"),
     "silent_eccentricity_um": ("eccentricity up to which the gear is silent", "µm"),
     "sigma": ("standard deviation", ""),
+    "quantile_5": ("5 % quantile", ""),
     "quantile_95": ("95 % quantile", ""),
 }
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")

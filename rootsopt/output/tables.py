@@ -9,6 +9,7 @@ from typing import Any
 
 from rootsopt.config import Config
 from rootsopt.config.units import words
+from rootsopt.output.assumptions import assumption_tables
 from rootsopt.output.better import better_tables
 from rootsopt.output.names import (
     brief,
@@ -71,6 +72,7 @@ def sections(
         ("scenes", "Scenes", scene_tables(result, rows, most)),
         ("certificate", "Certificate of the optimum",
          [constraint_table(result), *certificate_tables(result), rejected_table(result)]),
+        ("assumptions", "Where the pump runs", [*assumption_tables(result)]),
         ("tolerances", "Tolerances", [tolerance_table(result), touching_table(result)]),
         ("pump", "Pump sheet", [pump_table(result)]),
         ("likeness", "Resemblance", likeness_tables(result)),

@@ -160,15 +160,15 @@ class Evaluator:
         """Return another evaluator with the orbit tolerance `rtol`."""
         return self._solving(lambda solver: solver.orbit.rtol, jnp.asarray(rtol))
 
-    def surveying(self) -> "Evaluator":
+    def surveying(self, probe: bool = False) -> "Evaluator":
         """Return another evaluator for a search over many designs.
 
         Motions have only a quarter of the allowed transient in which to settle, but at least 32
-        mesh periods. A design that does not settle is not examined further."""
+        mesh periods. With `probe`, a design that does not settle is examined for chaos."""
         least = max(self.config.solver.max_mesh_periods // 4, 8 * BLOCK)
         hasty = self._solving(
             lambda solver: (solver.max_periods, solver.probe_chaos),
-            (jnp.asarray(float(least)), jnp.asarray(0.0)),
+            (jnp.asarray(float(least)), jnp.asarray(float(probe))),
         )
         return dataclasses.replace(hasty, survey=True)
 

@@ -5,8 +5,8 @@ the distributions more evenly than random ones. Fresh samples are pseudo-random 
 that statistics over them have the usual standard errors.
 """
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,10 +15,12 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from rootsopt.config import Config
-from rootsopt.config.tolerances import Scatter
+from rootsopt.config.tolerances import Scatter, TolerancesConfig
 from rootsopt.design.space import sobol
 from rootsopt.scene import Scene
 
+NOMINAL, RANDOM = "as given", "random"
+"""Names of the config's own scene, and of random ones before their number, in `assumed`."""
 _FRESH = 1
 """Index of the random stream from which fresh samples are drawn."""
 
@@ -91,10 +93,56 @@ def shifts(config: Config, samples: Float[np.ndarray, "n q"]) -> tuple[Shift, ..
     return tuple(found)
 
 
+def assumed(config: Config) -> dict[str, dict[str, float]]:
+    """Return the scenes of a config's `assumptions`: their values by dotted key, by name.
+
+    They are the scene of the config (`as given`), both ends of each range alone, and the random
+    ones, a scrambled Sobol sample. Empty if nothing varies."""
+    spans = config.spans
+    if not spans:
+        return {}
+    ends = {scene_of(one.key, end): {one.key: end} for one in spans for end in one.ends}
+    keys, low, high = zip(*spans, strict=True)
+    levels = sobol(config.assumptions.scenes, config.assumptions.seed, len(spans))
+    rows = np.array(low) + levels * (np.array(high) - np.array(low))
+    drawn = {
+        f"{RANDOM} {number}": dict(zip(keys, row.tolist(), strict=True))
+        for number, row in enumerate(rows, start=1)
+    }
+    return {NOMINAL: {}, **ends, **drawn}
+
+
+def scene_of(key: str, value: float) -> str:
+    """Return the name of the scene in which only one value differs from the config's."""
+    return f"{key}={value:.6g}"
+
+
+def in_conditions(config: Config, scenes: Mapping[str, Mapping[str, float]], **rule: Any) -> Config:
+    """Return a config with `scenes` (values by key, by name) as its `tolerances.conditions`.
+
+    `rule`: further entries of `tolerances`. They are not checked."""
+    given = {"conditions": scenes, "samples": len(scenes), "check_samples": 0, **rule}
+    return config.model_copy(update={"tolerances": TolerancesConfig.model_construct(**given)})
+
+
 def _difference(before: Scene, after: Scene) -> Scene:
     """Return the change of a scene's arrays, as a `Scene` with None in place of all else."""
-    arrays = (eqx.filter(one, eqx.is_inexact_array) for one in (after, before))
-    return jax.tree.map(lambda x, y: np.asarray(x) - np.asarray(y), *arrays)
+
+    def change(x: Any, y: Any) -> Any:
+        found = np.asarray(x) - np.asarray(y)
+        return found if found.any() else None
+
+    return jax.tree.map(change, *(eqx.filter(x, eqx.is_inexact_array) for x in (after, before)))
 
 
-__all__: Sequence[str] = ["Shift", "draw", "quantiles", "shifts"]
+__all__: Sequence[str] = [
+    "NOMINAL",
+    "RANDOM",
+    "Shift",
+    "assumed",
+    "draw",
+    "in_conditions",
+    "quantiles",
+    "scene_of",
+    "shifts",
+]

@@ -66,6 +66,10 @@ _OTHERS = (
 )
 
 
+NAMES = {key: name for key, name, *_ in (*_LENGTHS, *_OTHERS)}
+"""Names in words of these quantities, by config key."""
+
+
 def quantities(config: Config) -> list[Quantity]:
     """Return the quantities that the sensitivity table lists for the scene of `config`.
 
@@ -160,4 +164,4 @@ def by_scene(evaluator: Evaluator, evaluation: Evaluation) -> Evaluation | None:
     return dataclasses.replace(evaluation, gradient=gradient, maxima=maxima)
 
 
-__all__ = ["Quantity", "along_values", "by_scene", "direction", "quantities"]
+__all__ = ["NAMES", "Quantity", "along_values", "by_scene", "direction", "quantities"]

@@ -63,6 +63,8 @@ _OF = {
     "design/bounds": "bounds families optimize freeform beginning",
     "design/resemblance": "resemblance",
     "design/space": "search optimize freeform",
+    "optimize/assumed": "assumptions",
+    "optimize/assumptions": "assumptions",
     "optimize/beginning": "beginning",
     "optimize/bounding": "bounding",
     "optimize/surviving": "improve",

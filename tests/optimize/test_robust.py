@@ -125,8 +125,11 @@ def test_gradient_agrees_with_central_differences(spread):
         for sign in (1, -1)
     ]
     slopes = []
-    for overrides in RULES.values():
-        problem = problem_of(evaluator, baseline, *overrides)
+    problems = [problem_of(evaluator, baseline, *overrides) for overrides in RULES.values()]
+    # Over assumptions, each scene is relative to its own baseline, and moved by an offset.
+    apart = 0.0, -0.3, 0.1, -0.1
+    problems.append(RobustProblem.of(problems[-1].config, evaluator.scene, baseline, apart))
+    for problem in problems:
         upper, lower = map(problem.objective, ends)
         slopes.append(float(problem.slope(moved, POINT) @ direction))
         assert slopes[-1] == pytest.approx((upper - lower) / (2 * step), rel=1e-4)
@@ -137,7 +140,7 @@ def test_gradient_agrees_with_central_differences(spread):
         # The slope of the highest maximum is computed apart from that of the peak.
         assert local.combined(tops) @ direction == pytest.approx(slopes[-1], rel=1e-5)
         np.testing.assert_array_equal(local.slack, problem.look(POINT)[2])
-    assert len(set(np.round(slopes, 4))) == 3
+    assert len(set(np.round(slopes, 4))) == 4
 
 
 def test_small_scatter_is_the_nominal_objective_and_its_sensitivity():
@@ -287,7 +290,7 @@ def test_fresh_scenes_from_the_neighbouring_orbit(spread):
 
 
 def test_without_tolerances_the_search_is_the_plain_one():
-    config = without(config_of())
+    config = without(config_of("assumptions.scenes=0"))
     assert type(search_of(config)) is Search
     assert config.tolerances is None
     assert "tolerances" not in config.to_yaml()
@@ -300,6 +303,7 @@ def test_optimize_command(tmp_path, capsys):
         "tolerances.over={contact.clearance_mm: {normal: 0.002}}",
         "tolerances.samples=2",
         "tolerances.check_samples=4",
+        "assumptions.scenes=0",
         "optimizer.screening=0",
         "optimizer.starts=1",
         "optimizer.iterations=3",

@@ -71,9 +71,9 @@ def test_config_names_distributions_in_two_ways():
             ["mean `scene.center_distance_error_mm`"],
         ),
         (["tolerances.over.friction.normal=0.01"], ["mean `contact.friction.kinetic`"]),
-        (["tolerances.over.solver.rtol.normal=1"], ["solver.rtol", "does not scatter"]),
+        (["tolerances.over.solver.rtol.normal=1"], ["solver.rtol", "cannot vary"]),
         (["tolerances.over.profile.lobes.normal=1"], ["profile.lobes", "design parameters"]),
-        (["tolerances.over.contact.smoothing_mm.normal=1"], ["does not scatter"]),
+        (["tolerances.over.contact.smoothing_mm.normal=1"], ["cannot vary"]),
         (["tolerances.over={}"], ["tolerances.over", "at least one"]),
         (["tolerances.over={contact.clearance_mm: 3}"], ["keys with values"]),
         (

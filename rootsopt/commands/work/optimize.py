@@ -229,9 +229,12 @@ def _write(folder, config, options, result, alike, sheets, compiled, ran) -> dic
         data["optimality"] = result.optimality.record()
     if result.robustness is not None:
         data["robustness"] = result.robustness.record()
-        if result.optimized is not None:
+        if result.optimized is not None and config.tolerances is not None:
             scattered = touching(_designed(searching, result.optimized))
             data["touching"] = None if scattered is None else scattered.record()
+    if result.assumptions is not None:
+        data["assumptions"] = result.assumptions.record()
+        folder.write_csv("assumptions.csv", result.assumptions.columns())
     data["verification"] = result.verification
     data["status"], data["message"] = result.status.label, _advice(result)
     data["statistics"] = {
@@ -248,7 +251,7 @@ def _write(folder, config, options, result, alike, sheets, compiled, ran) -> dic
 
 def _draw(folder, config: Config, result, data: dict) -> None:
     """Write the figures of a search; `data`: content of the result file."""
-    from rootsopt.figures import runs, speeds
+    from rootsopt.figures import assumptions, runs, speeds
 
     if result.optimized is not None:
         pair, rows = (result.baseline, result.optimized), result.history
@@ -262,6 +265,8 @@ def _draw(folder, config: Config, result, data: dict) -> None:
         names = {"baseline": result.baseline, "optimised": result.optimized}
         designs = {name: one.speeds for name, one in names.items() if one is not None}
         speeds.speed_figure(folder, designs, "Contact force over the speeds of the objective")
+    if result.assumptions is not None:
+        assumptions.spread_figure(folder, data["assumptions"], result.assumptions.columns())
 
 
 def _designed(config: Config, evaluation) -> Config:

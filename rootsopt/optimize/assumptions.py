@@ -1,0 +1,346 @@
+"""An optimum beside the baseline over the spread of what is assumed about the scene.
+
+Both are simulated in the scenes of `assumptions`: at the ends of each range alone, and in random
+scenes. Where the optimum is worst, a local search looks for a design that is better there, and this
+design is simulated in all scenes, too.
+
+Motions begin at rest. Beginning on the orbit of the config's own scene took three times as long:
+the scenes are too far apart. Motions that need more than a quarter of the allowed transient to
+settle are left out: one of these takes as long as a hundred others."""
+
+import dataclasses
+import itertools
+import math
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rootsopt.config import Config
+from rootsopt.config.assumptions import Span
+from rootsopt.optimize.assumed import (
+    BASELINE,
+    OPTIMIZED,
+    RIVAL,
+    WINS,
+    Assumed,
+    Piece,
+    Scenes,
+)
+from rootsopt.optimize.limits import limited
+from rootsopt.optimize.local import Linearization
+from rootsopt.optimize.outcome import Optimization
+from rootsopt.optimize.problem import FEASIBLE, Problem
+from rootsopt.optimize.sqp import Stops, descend
+from rootsopt.response.evaluation import Evaluation
+from rootsopt.response.many import HERE, Point, Runs, evaluate_many
+from rootsopt.response.scatter import (
+    NOMINAL,
+    Shift,
+    assumed,
+    draw,
+    in_conditions,
+    scene_of,
+    shifts,
+)
+from rootsopt.response.still import Still, needed_motion
+
+_TRIED = 4
+"""Number of designs of the search from which the best in the optimum's worst scene is taken."""
+_FAR, _NEAR = 0.15, 0.02
+"""Distance in the unit box below which two of these designs, or two optima, count as the same."""
+_RTOL = 1e-6
+"""Least tolerance of orbits in a first simulation."""
+_RIVALS = 2
+"""Greatest number of other designs that are compared."""
+_HALVINGS = 4
+"""Number of values tried to find where the motion of a design is no longer usable."""
+_FINE = 0.02
+"""Accuracy of the value at which a design becomes better or worse, as a share of its range."""
+
+
+class _StoppedError(Exception):
+    """Raised if the search is asked to end."""
+
+
+class _Comparison:
+    """Simulates designs in scenes, each of them once. Arguments: see `compared`."""
+
+    def __init__(
+        self,
+        given: Config,
+        result: Optimization,
+        runs: Runs,
+        stop: Callable[[], bool],
+        tick: Callable[[int, int], None],
+    ):
+        whole, optimized = result.problem, result.optimized
+        assert whole is not None
+        assert optimized is not None
+        own, given = (
+            one.model_copy(update={"tolerances": None}) for one in (whole.config, limited(given))
+        )
+        self.problem = Problem(own, result.baseline.nominal, whole.space, whole.limits)
+        self.config, self.scenes = own, assumed(own)
+        self.result, self.runs, self.stop, self.tick = result, runs, stop, tick
+        self.designs = {BASELINE: result.baseline.design, OPTIMIZED: optimized.design}
+        # A rotor from a file has no design parameters, and a config of its own.
+        configs = {bool(given.design_keys): given, True: own}
+        self.exact = {
+            key: needed_motion(one).relative_to(self.problem.baseline)
+            for key, one in configs.items()
+        }
+        rtol = max(_RTOL, own.solver.orbit_tolerance)
+        self.fast = {
+            key: one.at_tolerance(rtol).surveying(probe=True) for key, one in self.exact.items()
+        }
+        self._known: dict[tuple[str, str], Evaluation] = {}
+
+    def evaluations(self, names: Iterable[str], scenes: Scenes) -> list[list[Evaluation]]:
+        """Return the evaluations of some designs in `scenes`, from rest."""
+        names = [*names]
+        lacking = [(name, one) for name in names for one in scenes
+                   if (name, one) not in self._known]  # fmt: skip
+        where: dict[tuple[bool, str], Shift] = {}
+        for kind, exact in self.exact.items():
+            some = {one: scenes[one] for name, one in lacking if bool(self.designs[name]) == kind}
+            found = _shifts(exact.config, some)
+            where |= {(kind, one): shift for one, shift in zip(some, found, strict=True)}
+        before, expected = len(self._known), (2 + _RIVALS) * len(self.scenes)
+
+        def points() -> Iterator[Point]:
+            for name, one in lacking:
+                values = np.array([*self.designs[name].values()])
+                kind = bool(len(values))
+                if not self.stop():
+                    yield from self.fast[kind].in_scenes([where[kind, one]], values, [None])
+
+        def progress(done: int) -> None:
+            self.tick(before + done, max(expected, before + done))
+
+        found = evaluate_many(points(), self.runs, progress)
+        if self.stop():
+            raise _StoppedError
+        self._known |= dict(zip(lacking, found, strict=True))
+        return [[self._known[name, one] for one in scenes] for name in names]
+
+    def objectives(self, names: Iterable[str], scenes: Scenes) -> list[NDArray[np.float64]]:
+        """Return the objectives (n,) of designs, relative to the baseline in the same scene.
+
+        They are NaN unless both have a usable motion, and the baseline has a force."""
+        bases, *found = self.evaluations([BASELINE, *names], scenes)
+        return [
+            np.array([
+                self.problem.beside(base).objective(one) if base.usable else math.nan
+                for base, one in zip(bases, row, strict=True)
+            ])
+            for row in found
+        ]  # fmt: skip
+
+    def pieces(self, span: Span, first: str, other: str) -> list[Piece]:
+        """Return the parts of a range in which design `first` is worse than the `other` one.
+
+        All else is as given. Both ends of the range and the config's own value are compared, and
+        changes between them are located. In place of an end without a usable motion, the last value
+        before it that has one is compared."""
+        key, own = span.key, self.config.value(span.key)
+
+        def lead(value: float) -> float:
+            scenes = {NOMINAL: {}} if value == own else {scene_of(key, value): {key: value}}
+            (one,), (two,) = self.objectives((first, other), scenes)
+            return float(one - two) - (WINS if other != BASELINE else 0.0)
+
+        found: list[Piece] = []
+        middle = [own] if span.low < own < span.high else []
+        for low, high in itertools.pairwise([span.low, *middle, span.high]):
+            a, b = _known(lead, low, high), _known(lead, high, low)
+            one, two = lead(a), lead(b)
+            if not max(one, two) > 0:
+                continue
+            change = _change(lead, a, b) if one * two < 0 else None
+            # Where a motion is not known, nothing is said beyond the end that is.
+            start = a if one > 0 else b if change is None else change
+            stop = b if two > 0 else a if change is None else change
+            joined = bool(found) and found[-1][1] == start
+            found.append((found.pop()[0] if joined else start, stop))
+        return found
+
+    def others(self) -> list[dict[str, float]]:
+        """Return designs that may be better than the optimum in some of the scenes.
+
+        They are the optimum of its worst scene, the nominal one, and those of other searches."""
+        (values,), found = self.objectives([OPTIMIZED], self.scenes), []
+        if np.isfinite(values).any():
+            found += self._in_worst([*self.scenes][int(np.nanargmax(values))])
+        robustness, optimality = self.result.robustness, self.result.optimality
+        if robustness is not None and robustness.nominal.optimized is not None:
+            found.append(robustness.nominal.optimized.design)
+        found += [one.design for one in (optimality.optima if optimality else ())]
+        return self._apart(found, _RIVALS, _NEAR)
+
+    def _apart(
+        self, designs: Iterable[dict[str, float]], most: int, least: float
+    ) -> list[dict[str, float]]:
+        """Return the first of some `designs` that are farther than `least` from each other.
+
+        They are as far from the optimum; `most`: greatest number; lengths are in the unit box."""
+        kept, found = [self._point(self.designs[OPTIMIZED])], []
+        for one in designs:
+            point = self._point(one)
+            if len(found) < most and all(np.linalg.norm(point - x) > least for x in kept):
+                kept.append(point)
+                found.append(one)
+        return found
+
+    def _point(self, design: Mapping[str, float]) -> NDArray[np.float64]:
+        return self.problem.point([*design.values()])
+
+    def _in_worst(self, scene: str) -> list[dict[str, float]]:
+        """Return the optimum in one scene, as a list; empty if the search fails.
+
+        The search begins at the best there of other good designs of the config's own scene."""
+        ((base,),) = self.evaluations([BASELINE], one := {scene: self.scenes[scene]})
+        problem, keys = self.problem.beside(base), self.config.design_keys
+        rows = [x for x in self.result.history if x["feasible"] and math.isfinite(x["objective"])]
+        rows.sort(key=lambda row: row["objective"])
+        tried = self._apart(({key: row[key] for key in keys} for row in rows), _TRIED, _FAR)
+        (where,) = _shifts(self.config, one)
+        exact = self.exact[True].shifted(where.scene)
+        evaluator = (exact.with_maxima() if problem.with_maxima else exact).surveying()
+        starts: list[Any] = [None]
+
+        def look(point: NDArray[np.float64]) -> Linearization | None:
+            found = evaluator(problem.design(point), starts[-1], series=False)
+            if found.usable:
+                starts.append(found.start)
+            return problem.local(found, point)
+
+        begins = [(local.objective, k) for k, x in enumerate(tried)
+                  if (local := look(self._point(x))) is not None]  # fmt: skip
+        if not begins:
+            return []
+        best = self._point(tried[min(begins)[1]])
+        stops = Stops(evaluations=self.config.optimizer.iterations + 1, asked=self.stop)
+        found = descend(look, best, stops, problem.limits_at)
+        if found.local is None or found.local.violation > FEASIBLE:
+            return []
+        values = self.problem.look(found.point)[0].tolist()
+        return [dict(zip(keys, values, strict=True))]
+
+
+def _known(lead: Callable[[float], float], end: float, other: float) -> float:
+    """Return the value nearest to `end`, seen from the `other` one, for which `lead` is known.
+
+    It is `end` itself if `lead` is known there, or nowhere."""
+    if not math.isnan(lead(end)) or math.isnan(lead(other)):
+        return end
+    inside = other
+    for _ in range(_HALVINGS):
+        middle = (inside + end) / 2
+        inside, end = (inside, middle) if math.isnan(lead(middle)) else (middle, end)
+    return inside
+
+
+def _change(lead: Callable[[float], float], low: float, high: float) -> float | None:
+    """Return where `lead` changes its sign between two values; `None` if a motion is not known."""
+    from scipy.optimize import brentq  # Slow import (0.3 s).
+
+    try:
+        return float(brentq(lead, low, high, xtol=_FINE * (high - low)))  # pyright: ignore[reportArgumentType]
+    except ValueError:  # NaN.
+        return None
+
+
+def _shifts(config: Config, scenes: Scenes) -> tuple[Shift, ...]:
+    at = in_conditions(config, scenes)
+    return shifts(at, draw(at, len(scenes))) if scenes else ()
+
+
+def compared(
+    given: Config,
+    result: Optimization,
+    runs: Runs = HERE,
+    stop: Callable[[], bool] = lambda: False,
+    tick: Callable[[int, int], None] = lambda done, expected: None,
+) -> Assumed | None:
+    """Compare baseline and optimised design of a search in the scenes of `assumptions`.
+
+    `given`: config of the search; `result`: its outcome; `runs`: where motions are simulated;
+    `stop`: returns whether to end; `tick` is called with the numbers of motions done and expected.
+    Return `None` without an optimised design, without a motion (or with an average over many), if
+    nothing varies, or after `stop`."""
+    if result.problem is None or result.optimized is None or given.objective.motion == "ensemble":
+        return None
+    work = _Comparison(given, result, runs, stop, tick)
+    if not work.scenes or isinstance(work.exact[True].motions, Still):
+        return None
+    try:
+        return _compared(work)
+    except _StoppedError:
+        return None
+
+
+def _compared(work: _Comparison) -> Assumed:
+    scenes, spans = work.scenes, work.config.spans
+    objectives = dict(zip(work.designs, work.objectives(work.designs, scenes), strict=True))
+    others = {f"{RIVAL} {k}": one for k, one in enumerate(work.others(), start=1)}
+    work.designs |= others
+    for name, values in zip(others, work.objectives(others, scenes), strict=True):
+        ((own,),) = work.evaluations([name], {NOMINAL: {}})
+        better = np.any(objectives[OPTIMIZED] - values > WINS)
+        if better and work.problem.excess(own) <= FEASIBLE:
+            objectives[name] = values
+    found = work.evaluations(objectives, scenes)
+    return Assumed(
+        spans=spans,
+        scenes=scenes,
+        designs={name: work.designs[name] for name in objectives},
+        objectives=objectives,
+        statuses={
+            name: [one.status.label for one in row]
+            for name, row in zip(objectives, found, strict=True)
+        },
+        worse={one.key: work.pieces(one, OPTIMIZED, BASELINE) for one in spans},
+        wins={
+            name: {one.key: work.pieces(one, OPTIMIZED, name) for one in spans}
+            for name in objectives if name in others
+        },
+    )  # fmt: skip
+
+
+class AssumedSearch:
+    """A search, and the comparison of its optimum with the baseline over `assumptions`.
+
+    `search`: a `Search` or `TolerantSearch`; `config`: its config. For the rest, see `Search`."""
+
+    def __init__(
+        self,
+        search: Any,
+        config: Config,
+        progress: Callable[[int, int, float], None] | None,
+        stop: threading.Event | None,
+        runs: Runs,
+    ):
+        self.search, self.config, self.progress, self.runs = search, config, progress, runs
+        self.stop = threading.Event() if stop is None else stop
+        self.so_far = search.so_far
+
+    def run(self) -> Optimization:
+        """Run the search, then the comparison. Return the outcome with its `assumptions`.
+
+        If `stop` is set, there is no comparison."""
+        found = self.search.run()
+        best = 1 - found.improvement.get("objective", float("nan"))
+
+        def tick(done: int, expected: int) -> None:
+            before = len(found.history)
+            if self.progress is not None:
+                self.progress(before + done, before + expected, best)
+
+        spread = compared(self.config, found, self.runs, self.stop.is_set, tick)
+        return dataclasses.replace(found, assumptions=spread)
+
+
+__all__ = ["AssumedSearch", "compared"]

@@ -1,0 +1,238 @@
+"""An optimum over the spread of assumptions: scenes one by one, statistics, other designs."""
+
+import csv
+import functools
+import json
+import math
+
+import numpy as np
+import pytest
+import scipy.stats
+
+import rootsopt
+from rootsopt.commands.console import main
+from rootsopt.config import load
+from rootsopt.config.assumptions import Span
+from rootsopt.design.space import Space
+from rootsopt.optimize.assumed import BASELINE, OPTIMIZED, Assumed
+from rootsopt.optimize.assumptions import _change, _known, compared
+from rootsopt.optimize.robust import search_of
+from rootsopt.optimize.robust_problem import RobustProblem
+from rootsopt.optimize.search import Search
+from rootsopt.response.reducers import over_scenes
+from rootsopt.response.result import Part
+from rootsopt.response.scatter import assumed, in_conditions
+from rootsopt.scene import Scene
+from tests.standins import evaluation_of
+
+CLEARANCE, LOAD = "contact.clearance_mm", "scene.load.torque_N_m"
+HELD = (
+    "{scene.speed_rpm: null, scene.timing_gear.stiffness_N_m_per_rad: null, "
+    "scene.timing_gear.backlash_mm: null, scene.timing_gear.damping_ratio: null, "
+    "contact.stiffness_N_per_mm_e: null, contact.clearance_mm: {range: [0, 0.06]}}"
+)
+QUICK = (
+    "optimizer.screening=12",
+    "optimizer.starts=1",
+    "optimizer.iterations=8",
+    "assumptions.scenes=8",
+    f"assumptions.over={HELD}",
+)
+
+
+@functools.cache
+def spread():
+    """Return the config of a short search over clearance and load, its outcome, its spread."""
+    config = load("cic", QUICK)
+    result = search_of(config).run()
+    assert result.assumptions is not None
+    return config, result, result.assumptions
+
+
+@functools.cache
+def alone(scene, name):
+    """Return the evaluation of a design in one scene, given as a config of its own, from rest."""
+    config, _, found = spread()
+    values = dict(scene) if isinstance(scene, tuple) else found.scenes[scene]
+    return rootsopt.evaluate(config.replaced(values), [*found.designs[name].values()])
+
+
+def by_hand(scene, name):
+    """Return the objective of a design in a scene, NaN without forces of the baseline."""
+    base, one = alone(scene, BASELINE), alone(scene, name)
+    if not (base.usable and one.usable and base.response["peak_force_N"]):
+        return math.nan
+    keys = "mean_force_N", "peak_force_N"
+    return sum(0.5 * one.response[key] / base.response[key] for key in keys)
+
+
+def test_scenes_agree_with_configs_one_by_one():
+    """Every scene gives what `evaluate` gives for a config with these values, from rest.
+
+    With a clearance of 60 µm, the baseline's flanks never touch: there is nothing to compare."""
+    _, _, found = spread()
+    assert [*found.scenes][:5] == [
+        "as given", f"{LOAD}=2.865", f"{LOAD}=7.64", f"{CLEARANCE}=0", f"{CLEARANCE}=0.06"
+    ]  # fmt: skip
+    for k, scene in enumerate(found.scenes):
+        for name in (BASELINE, OPTIMIZED):
+            assert found.statuses[name][k] == alone(scene, name).status.label
+        # The length that smooths the contact follows load and stiffness in a config of its own.
+        hand = by_hand(scene, OPTIMIZED)
+        assert found.objectives[OPTIMIZED][k] == pytest.approx(hand, rel=2e-3, nan_ok=True)
+    assert found.statuses[BASELINE][4] == "idle"
+    assert math.isnan(found.objectives[OPTIMIZED][4])
+
+
+def test_record_counts_the_scenes():
+    """Shares, quantiles and ranks are those that SciPy finds; lost scenes are named."""
+    _, _, found = spread()
+    record, values = found.record(), found.objectives[OPTIMIZED]
+    drawn = values[5:]
+    some = drawn[np.isfinite(drawn)]
+    assert (record["scenes"], record["compared"]) == (8, len(some))
+    assert record["share_better"] == np.mean(some < 1)
+    assert record["objective_quantiles"]["quantile_95"] == pytest.approx(
+        scipy.stats.mstats.mquantiles(some, 0.95, alphap=1, betap=1)[0]
+    )
+    assert (record["ends"], record["ends_compared"]) == (4, 3)
+    assert record["worst"]["objective"] == np.nanmax(values)
+    lost = {one["scene"]: one["status_baseline"] for one in record["not_compared"]}
+    assert lost[f"{CLEARANCE}=0.06"] == "idle"
+    assert len(lost) == np.sum(~np.isfinite(values))
+    load_row = record["keys"][0]
+    x = [found.scenes[name][LOAD] for name in [*found.scenes][5:]]
+    known = np.isfinite(drawn)
+    ranks = [scipy.stats.rankdata(one) for one in (np.array(x)[known], some)]
+    assert load_row["rank_correlation"] == pytest.approx(np.corrcoef(*ranks)[0, 1])
+    columns = found.columns()
+    assert columns["objective_optimized"] == pytest.approx(values.tolist(), nan_ok=True)
+
+
+def test_where_it_is_worse_and_which_design_wins():
+    """Beside each reported change of sign, configs of their own agree on which design is better."""
+    _, result, found = spread()
+    rivals = found.record()["rivals"]
+    assert rivals
+    pieces = [(OPTIMIZED, None, found.worse)]
+    pieces += [(OPTIMIZED, one["name"], found.wins[one["name"]]) for one in rivals]
+    checked = 0
+    for name, other, parts in pieces:
+        for key, some in parts.items():
+            span = next(one for one in found.spans if one.key == key)
+            for start, stop in some:
+                inside = (start + stop) / 2
+                assert lead(key, inside, name, other) > 0
+                away = 0.05 * (span.high - span.low)
+                for end, sign in ((start, -1), (stop, 1)):
+                    outside = end + sign * away
+                    if span.low < outside < span.high:
+                        # Beyond an unknown motion nothing is claimed.
+                        value = lead(key, outside, name, other)
+                        assert math.isnan(value) or value < 1e-3
+                        checked += 1
+    assert checked
+    problem = result.problem
+    assert problem is not None
+    for one in rivals:
+        assert problem.feasible(problem.point([*one["design"].values()]))
+        best = int(np.nanargmax(found.objectives[OPTIMIZED] - found.objectives[one["name"]]))
+        scene = [*found.scenes][best]
+        assert by_hand(scene, one["name"]) < by_hand(scene, OPTIMIZED)
+
+
+def lead(key, value, name, other):
+    scene = ((key, value),)
+    return by_hand(scene, name) - (1.0 if other is None else by_hand(scene, other))
+
+
+def test_changes_of_sign_and_lost_motions():
+    """A line has its root, and a motion lost above 0.8 is found to a sixteenth of the range."""
+    assert _change(lambda x: x - 0.23, 0.0, 1.0) == pytest.approx(0.23, abs=0.02)
+    assert _change(lambda x: math.nan if 0 < x < 1 else x - 0.23, 0.0, 1.0) is None
+
+    def lost(x):
+        return math.nan if x > 0.8 else x
+
+    assert 0.8 - 1 / 16 < _known(lost, 1.0, 0.0) <= 0.8
+    assert _known(lost, 0.0, 1.0) == 0.0
+
+
+def of(forces):
+    """Return the evaluation of a design with these forces in scenes; in the nominal one, 1."""
+    parts = [Part({"x": 1.0}, evaluation_of(force)) for force in forces]
+    return over_scenes([Part({}, evaluation_of()), *parts])
+
+
+def test_objective_over_assumptions_by_hand():
+    """Mean, worst and regret of three scenes, each relative to the baseline in the same scene.
+
+    Regret: its distance from that of the baseline is the distance of the objectives from 1."""
+    config = load("cic", ["constraints.area_efficiency_min=0.4"])
+    spans, scenes = (Span("x", 0, 1),), {f"random {k}": {"x": float(k)} for k in range(4)}
+    ratios = np.array([0.5, 0.75, 1.2, math.nan])
+    rival = np.array([0.4, 0.7, 1.1, 1.0])
+    given = {BASELINE: np.array([1, 1, 1, math.nan]), OPTIMIZED: ratios, "design 1": rival}
+    found = Assumed(spans, scenes, {}, given, {}, {}, {})
+    space = Space.of(config, Scene.from_config(config))
+    base, moved = of([2.0, 4.0, 1.0]), of([1.0, 3.0, 1.2])
+
+    def objective(combine, regret):
+        kept, offsets = found.sample(regret)
+        assert [*kept] == ["random 0", "random 1", "random 2"]
+        at = in_conditions(config, kept, combine=combine, k=0.0)
+        bases = tuple(part.evaluation for part in base.samples)
+        problem = RobustProblem(at, base.nominal, space, (), 1.0, offsets, bases)
+        assert problem.combined(base).value == pytest.approx(1)
+        return problem.objective(moved)
+
+    assert objective("mean_plus_k_sigma", False) == pytest.approx(np.mean(ratios[:3]))
+    assert objective("worst", False) == pytest.approx(1.2)
+    regrets = [np.max(x - np.minimum(rival, 1)[:3]) for x in (ratios[:3], np.ones(3))]
+    assert objective("worst", True) == pytest.approx(1 + regrets[0] - regrets[1])
+
+
+def test_scenes_are_named_and_seeded():
+    config = load("cic", ["assumptions.scenes=4"])
+    found, other = assumed(config), assumed(load("cic", ["assumptions.scenes=4"]))
+    assert found == other
+    assert len(found) == 1 + 2 * len(config.spans) + 4
+    assert found != assumed(config.replaced({"assumptions.seed": 1}))
+    for span in config.spans:
+        drawn = [found[f"random {k}"][span.key] for k in range(1, 5)]
+        # A Sobol sample has one point in each quarter.
+        quarters = np.floor(4 * (np.array(drawn) - span.low) / (span.high - span.low))
+        assert sorted(quarters) == [0, 1, 2, 3]
+
+
+def test_nothing_without_a_motion_or_after_a_stop():
+    """Searches without a motion, averages over many, and stopped ones have no comparison."""
+    config, result, _ = spread()
+    assert compared(config, result, stop=lambda: True) is None
+    still = load("cic", ["objective={mean_weight: 0, peak_weight: 0, terms: {flow_ripple: 1}}"])
+    small = ("optimizer.screening=0", "optimizer.starts=1", "optimizer.iterations=2")
+    found = search_of(load("cic", [*small, f"objective={still.objective.model_dump_json()}"])).run()
+    assert found.assumptions is None
+    assert type(search_of(load("cic", [*QUICK, "assumptions.scenes=0"]))) is Search
+
+
+def test_command_optimises_over_assumptions(tmp_path, capsys):
+    """The command writes tables, figure and rows; its optimum has the least mean objective."""
+    sets = [f"--set={one}" for one in (*QUICK, "objective.over=assumptions")]
+    assert main(["optimize", "cic", "-o", str(tmp_path), *sets]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert "Other scenes: The optimum is better than the baseline in" in text
+    result = json.loads((tmp_path / "result.json").read_text())
+    record = result["assumptions"]
+    with open(tmp_path / "assumptions.csv", newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["scene"].startswith("random")]
+    columns = {key: [row[key] for row in rows] for key in rows[0] if key.startswith("objective")}
+    values = {key: np.array([float(x or "nan") for x in found]) for key, found in columns.items()}
+    known = np.all(np.isfinite([*values.values()]), axis=0)
+    means = {key: float(np.mean(found[known])) for key, found in values.items()}
+    assert record["share_better"] == np.mean(values["objective_optimized"][known] < 1)
+    assert means["objective_optimized"] <= min(means.values()) + 1e-3
+    assert means["objective_optimized"] == pytest.approx(
+        1 - result["improvement"]["objective"], abs=5e-3
+    )
+    assert (tmp_path / "figures" / "assumptions.png").read_bytes()[:4] == b"\x89PNG"
