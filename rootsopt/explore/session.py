@@ -246,7 +246,10 @@ class Session:
         found, values, words = None, {}, ""
         try:
             self.engine.ready.wait()
-            found = optimize_design(self.config(), progress, stop=stop)
+            config = self.config()
+            if config.objective.over == "nominal":  # The page shows nothing of other scenes.
+                config = config.replaced({"assumptions.scenes": 0})
+            found = optimize_design(config, progress, stop=stop)
             if found.optimized is not None:
                 values = {f"profile.{key}": x for key, x in found.optimized.design.items()}
         except InputError as error:

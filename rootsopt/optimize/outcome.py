@@ -82,6 +82,7 @@ class Optimization:
     >>> import rootsopt
     >>> jax.config.update("jax_enable_x64", True)
     >>> quick = ["optimizer.starts=1", "optimizer.screening=0", "optimizer.iterations=2"]
+    >>> quick += ["assumptions.scenes=0"]  # no comparison in other scenes
     >>> found = rootsopt.optimize_design(rootsopt.load_config("cic", quick))
     >>> sorted(found.improvement)
     ['mean_force_N', 'objective', 'peak_force_N', 'rms_force_N']

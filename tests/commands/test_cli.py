@@ -30,6 +30,7 @@ SMALL = [
     "--set", "optimizer.screening=2",
     "--set", "optimizer.starts=1",
     "--set", "optimizer.iterations=2",
+    "--set", "assumptions.scenes=0",
 ]  # fmt: skip
 
 

@@ -241,6 +241,7 @@ def test_optimiser_over_all_motions(tmp_path):
         "optimizer.starts=1",
         "attractors.relatives=8",
         "attractors.rates=6",
+        "assumptions.scenes=0",
     )
     overrides = [f"--set={key}" for key in (*COEXIST, *small)]
     assert main(["optimize", "configs/cic.yaml", *overrides, "-o", str(tmp_path)]) == 0

@@ -289,7 +289,7 @@ def test_optimize_over_speeds(tmp_path, capsys):
 
     Table, records and picture have each speed."""
     short = ["optimizer.screening=0", "optimizer.starts=1", "optimizer.iterations=2"]
-    short.append("optimizer.method=adam")
+    short += ["optimizer.method=adam", "assumptions.scenes=0"]
     assert run("optimize", tmp_path, SPEEDS, WEIGHTS, *short) == 0
     assert "Contact force over speed" in capsys.readouterr().out
     result = json.loads((tmp_path / "result.json").read_text())
