@@ -12,7 +12,16 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "rootsopt"
 FILES = sorted(PACKAGE.rglob("*.py"))
 FACE = {"__init__.py", "errors.py", "status.py", "py.typed"}
-DOORS = {"__main__.py", "attractors.py", "pareto.py", "profile.py", "simulate.py", "sweep.py"}
+DOORS = {
+    "__main__.py",
+    "attractors.py",
+    "pareto.py",
+    "improve.py",
+    "new.py",
+    "profile.py",
+    "simulate.py",
+    "sweep.py",
+}
 MOST_LINES, MOST_PARAMETERS = 80, 8
 
 OPTIONAL = {

@@ -13,18 +13,18 @@ from unittest import mock
 
 ROOT = Path(__file__).parents[1]
 MOST = {
-    "statements of the package": 26_887,
-    "statements of the tests": 19_433,
-    "statements of the experiments": 6_109,
+    "statements of the package": 28_004,
+    "statements of the tests": 20_022,
+    "statements of the experiments": 6_108,
     "packages": 20,
-    "files of the package": 294,
-    "lines of the longest file": 656,
+    "files of the package": 302,
+    "lines of the longest file": 672,
     "floors of packages": 18,
     "depth of imports": 41,
-    "config keys": 144,
+    "config keys": 151,
     "lines of the longest help": 60,
     "pages of docs": 44,
-    "words of docs": 32_290,
+    "words of docs": 33_181,
 }
 """Greatest values that are accepted. Lower them when the project becomes lighter. Whoever raises
 one gives the reason in the changelog: what users can do now that is worth the weight."""

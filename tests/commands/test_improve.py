@@ -16,7 +16,13 @@ from rootsopt.profiles import CIC, outline
 from tests.measured.test_finding import cycloids, write
 
 DESIGN = {"pressure_angle_deg": 36.43, "involute_length_mm": 8.5, "tip_arc_angle_deg": 4.0}
-QUICK = ("optimizer.iterations=2", "optimizer.starts=1", "optimizer.screening=0")
+QUICK = (
+    "optimizer.iterations=2",
+    "optimizer.starts=1",
+    "optimizer.screening=0",
+    "optimizer.prove=false",
+    "assumptions.scenes=0",
+)
 
 
 def file_of(folder, inset, unit=25.4):
@@ -31,7 +37,11 @@ def file_of(folder, inset, unit=25.4):
 
 
 @pytest.mark.parametrize(
-    ("aim", "least"), [("quieter", ("constraints.seal_width_min_mm=2",)), ("tighter", ())]
+    ("aim", "least"),
+    [
+        ("quieter", ("constraints.seal_width_min_mm=2",)),
+        pytest.param("tighter", (), marks=pytest.mark.long),
+    ],
 )
 def test_a_better_rotor_takes_the_place_of_that_of_a_file(aim, least, tmp_path, capsys):
     file, folder = file_of(tmp_path, 0.02), tmp_path / "run"
@@ -66,6 +76,7 @@ def test_a_better_rotor_takes_the_place_of_that_of_a_file(aim, least, tmp_path, 
         assert one["share"] == pytest.approx(gain / result["improvement"]["objective"], rel=1e-3)
 
 
+@pytest.mark.long
 def test_a_rotor_without_parameters_is_improved_by_a_free_form(tmp_path):
     """EE has no seal and no parameters. The ripple of its flow needs no simulation."""
     file, folder = write(tmp_path / "ee.csv", cycloids(2, 40.0)), tmp_path / "run"
