@@ -221,6 +221,7 @@ def test_help_is_short_and_its_groups_have_every_key(command, capsys, monkeypatc
     assert set(every) < set(printed("all").splitlines())
 
 
+@pytest.mark.long
 def test_simulate_in_an_odd_environment_with_the_programs_of_a_plain_one(tmp_path):
     """A second run finds every program in the cache, and gives the same numbers to the last bit.
 

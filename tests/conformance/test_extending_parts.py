@@ -165,6 +165,7 @@ def test_energy_balance_with_a_part_of_ones_own(page, model, design):
     assert abs(end[3]) < 10
 
 
+@pytest.mark.long
 def test_gradient_with_respect_to_numbers_of_ones_own(page, model, design):
     """Gradients of mean and RMS force agree with central differences of orbits by shooting.
 

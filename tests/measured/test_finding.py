@@ -55,6 +55,7 @@ def test_unit_axis_lobes_distance_and_inset_are_found(name, tmp_path):
     assert f"unit {unit}" in rotor.facts[0]
 
 
+@pytest.mark.long
 def test_scattered_and_dense_points_are_thinned_and_smoothed(tmp_path):
     noise = np.random.default_rng(0).normal(0, 0.004, (2, 20_000)).T @ [1, 1j]
     whole = cut_cic(0.1)

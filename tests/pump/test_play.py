@@ -102,7 +102,7 @@ def at_clearances(profile, clearances):
     return np.array(rows, float).T
 
 
-@pytest.mark.parametrize("family", ["ee", "cic"])
+@pytest.mark.parametrize("family", [pytest.param("ee", marks=pytest.mark.long), "cic"])
 def test_play_is_continuous_in_the_overlap(family):
     """Points with 2 µm of scatter: from overlap to clearance, the backlash changes by twice the
     clearance over the cosine of the least pressure angle, and the overlap is that of the gap."""
