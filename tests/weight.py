@@ -13,8 +13,8 @@ from unittest import mock
 
 ROOT = Path(__file__).parents[1]
 MOST = {
-    "statements of the package": 28_004,
-    "statements of the tests": 20_022,
+    "statements of the package": 28_008,
+    "statements of the tests": 20_031,
     "statements of the experiments": 6_108,
     "packages": 20,
     "files of the package": 302,

@@ -86,8 +86,9 @@ class _Comparison:
         self.config, self.scenes = own, assumed(own)
         self.result, self.runs, self.stop, self.tick = result, runs, stop, tick
         self.designs = {BASELINE: result.baseline.design, OPTIMIZED: optimized.design}
-        # A rotor from a file has no design parameters, and a config of its own.
-        configs = {bool(given.design_keys): given, True: own}
+        # A rotor from a file, or of another family, has a config of its own.
+        self.shared = given.design_keys == own.design_keys
+        configs = {self._varied(BASELINE): given, True: own}
         self.exact = {
             key: needed_motion(one).relative_to(self.problem.baseline)
             for key, one in configs.items()
@@ -98,6 +99,10 @@ class _Comparison:
         }
         self._known: dict[tuple[str, str], Evaluation] = {}
 
+    def _varied(self, name: str) -> bool:
+        """Return whether a design has the parameters that the search varies."""
+        return self.shared or name != BASELINE
+
     def evaluations(self, names: Iterable[str], scenes: Scenes) -> list[list[Evaluation]]:
         """Return the evaluations of some designs in `scenes`, from rest."""
         names = [*names]
@@ -105,7 +110,7 @@ class _Comparison:
                    if (name, one) not in self._known]  # fmt: skip
         where: dict[tuple[bool, str], Shift] = {}
         for kind, exact in self.exact.items():
-            some = {one: scenes[one] for name, one in lacking if bool(self.designs[name]) == kind}
+            some = {one: scenes[one] for name, one in lacking if self._varied(name) == kind}
             found = _shifts(exact.config, some)
             where |= {(kind, one): shift for one, shift in zip(some, found, strict=True)}
         before, expected = len(self._known), (2 + _RIVALS) * len(self.scenes)
@@ -113,7 +118,7 @@ class _Comparison:
         def points() -> Iterator[Point]:
             for name, one in lacking:
                 values = np.array([*self.designs[name].values()])
-                kind = bool(len(values))
+                kind = self._varied(name)
                 if not self.stop():
                     yield from self.fast[kind].in_scenes([where[kind, one]], values, [None])
 

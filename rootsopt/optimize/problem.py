@@ -487,14 +487,14 @@ class Problem:
     def _limited_value(self, evaluation: Evaluation, k: int) -> float:
         """Return the value that constraint `k` limits, in its unit, for an evaluated design.
 
-        Return NaN for a rotor from a file if the value needs design parameters."""
+        Return NaN for a rotor without the parameters of the search if the value needs these."""
         one = self.space.constraints[k]
         if isinstance(one, TermConstraint):
             return evaluation.response[one.quantity]
         if not (one.margin or isinstance(one, RangeConstraint)):
             key = f"{one.quantity}_{one.unit}" if one.unit else one.quantity
             return evaluation.geometry.get(key, math.nan)
-        if not evaluation.design:
+        if tuple(evaluation.design) != tuple(self.config.design_keys):
             return math.nan
         slack = float(self._slacks(evaluation)[k])
         return (float(one.limit) + one.sign * slack * one.scale) / one.factor

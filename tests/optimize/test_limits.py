@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from rootsopt.config import parse
+from rootsopt.design.space import RangeConstraint
 from rootsopt.dynamics.maxima import Maxima
 from rootsopt.errors import InputError
 from rootsopt.optimize.certificate import Certificate
@@ -210,6 +211,16 @@ def test_every_limit_can_be_the_baselines_own_value():
     ):
         assert rows[name]["limit"] == pytest.approx(one.geometry[key], rel=1e-12)
         assert rows[name]["active"]
+
+
+def test_a_baseline_of_another_family_breaks_no_limit_of_parameters_that_it_lacks():
+    settings = config("optimizer.bounds.involute_length_mm=[1, 8]")
+    scene = Scene.from_config(settings)
+    shape = geometry_record(scene, geometry(scene.profile(jnp.asarray(settings.design))))
+    one = dataclasses.replace(evaluation(), geometry=shape, design={"arc_center_mm": 29.0})
+    problem = Problem.of(settings, scene, one)
+    assert any(isinstance(row, RangeConstraint) for row in problem.space.constraints)
+    assert problem.broken(one) == []
 
 
 def test_absent_limits_add_nothing():
