@@ -24,7 +24,7 @@ MOST = {
     "config keys": 151,
     "lines of the longest help": 60,
     "pages of docs": 44,
-    "words of docs": 33_296,
+    "words of docs": 33_290,
 }
 """Greatest values that are accepted. Lower them when the project becomes lighter. Whoever raises
 one gives the reason in the changelog: what users can do now that is worth the weight."""

@@ -56,7 +56,7 @@ _RTOL = 1e-6
 _RIVALS = 2
 """Greatest number of other designs that are compared."""
 _HALVINGS = 4
-"""Number of values tried to find where the motion of a design is no longer usable."""
+"""Number of values tried to find the last one at which a design has a usable motion."""
 _FINE = 0.02
 """Accuracy of the value at which a design becomes better or worse, as a share of its range."""
 

@@ -193,7 +193,7 @@ class Bounding:
     def ask(self, most: int) -> list[NDArray[np.float64]]:
         """Return up to `most` feasible points (d,) to evaluate next.
 
-        There is none if all boxes are bounded, left or too many."""
+        Return none if every box is bounded or given up, or if there are too many boxes."""
         if self._first > 0:
             spread = self._spread(min(most, self._first))
             self._first -= len(spread) or self._first
@@ -249,7 +249,7 @@ class Bounding:
     def _next(self, box: Box, least: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Return a point (d,) of a `box` whose evaluation tells more than halving the box.
 
-        `least` (d,): where the minorants are least. Return `None` if there is no such point."""
+        `least` (d,): the point where the minorants are least. Return `None` if no point helps."""
         room = self.surfaces[0].room(box)
         worst = -_BESIDE if 2 * room <= self.best - self.target else -FEASIBLE
         for point in (least, box.middle):

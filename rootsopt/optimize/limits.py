@@ -100,8 +100,8 @@ def settled(
 ) -> Config:
     """Return a copy of a `config` in which limits that are `baseline` are the baseline's values.
 
-    `geometry`: geometry of the baseline, with the keys of the result file; `found`: its responses
-    in each scene and at each speed, of which the worst counts. Without these, limits of
+    `geometry`: geometry of the baseline, with the keys of the result file; `found`: its responses,
+    one for each scene and speed; the worst one becomes the limit. Without responses, limits of
     `constraints.terms` stay as they are."""
     own = [key for key, limit in config.constraints if limit == BASELINE]
     values: dict[str, Any] = {key: geometry[quantity_of(key)] for key in own}

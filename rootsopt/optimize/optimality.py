@@ -132,7 +132,7 @@ class Optimality:
     decrease of the objective that the search still expected nearby, NaN if not known. `holders`:
     branches of the objective that are active there. `starts`: outcomes of the local searches.
     `sensitivities`: one row per quantity of the scene, with its effect on the forces. `bound`:
-    lower bound over all designs, `None` if it was not looked for."""
+    lower bound over all designs, or `None`."""
 
     method: str
     certificate: Certificate
