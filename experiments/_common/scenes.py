@@ -2,8 +2,8 @@
 
 from rootsopt.config import Config, load
 
-CIC = "configs/cic.yaml"
-"""The shipped CIC pair, relative to the repository root."""
+CIC = "configs/cic_drawn.yaml"
+"""The shipped CIC pair with flanks as drawn, relative to the repository root."""
 FORCES = ("mean_force_N", "peak_force_N")
 """Names of the forces that most studies compare."""
 SHAKY = (
@@ -20,5 +20,5 @@ SHAKY = (
 
 
 def shipped(name: str, *overrides: str) -> Config:
-    """Load `configs/NAME.yaml` with overrides, each `dotted.key=value`."""
-    return load(f"configs/{name}.yaml", list(overrides))
+    """Load `configs/NAME.yaml` with overrides, each `dotted.key=value`; `cic`: flanks as drawn."""
+    return load(f"configs/{name}.yaml" if name != "cic" else CIC, list(overrides))

@@ -32,7 +32,7 @@ from rootsopt.response.evaluation import Evaluation
 from rootsopt.scene import check_geometry, design_vector, outline_mm
 from rootsopt.scene.families import classical, free_form_of, with_design
 
-REFERENCES = ("configs/ee.yaml", "configs/cic.yaml")
+REFERENCES = ("configs/ee.yaml", "configs/cic_drawn.yaml")
 LONG = ("design", "outline_mm", "config")
 """Entries of a row that the CSV file omits."""
 EQUAL = 5e-5

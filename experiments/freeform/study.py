@@ -1,7 +1,7 @@
 """Optimises a free form from the best CIC, and measures what it gains and where it departs.
 
 The baseline of the config is the projection of the best CIC. Both designs are measured by the
-objective of `configs/cic.yaml`, relative to the paper's CIC.
+objective of `configs/cic_drawn.yaml`, relative to the paper's CIC.
 """
 
 import jax.numpy as jnp

@@ -64,7 +64,7 @@ PATIENCE = 60
 
 
 def pairs(seed: int, kind: str) -> Iterator[list[str]]:
-    """Yield random pairs of one `kind` without end, each as overrides of configs/cic.yaml."""
+    """Yield random pairs of one `kind` without end, each as overrides of configs/cic_drawn.yaml."""
     family, fixed = KINDS[kind]
     draw = np.random.default_rng([seed, list(KINDS).index(kind)])
     lobes = 2 if "2 lobes" in kind else 3

@@ -58,20 +58,20 @@ class Task(NamedTuple):
 
 
 TASKS = (
-    Task("cic", "configs/cic.yaml"),
-    Task("cic, peak alone", "configs/cic.yaml", (_PEAK,)),
-    Task("cic, mean alone", "configs/cic.yaml", ("objective.peak_weight=0",)),
-    Task("cic, RMS alone", "configs/cic.yaml", (
+    Task("cic", "configs/cic_drawn.yaml"),
+    Task("cic, peak alone", "configs/cic_drawn.yaml", (_PEAK,)),
+    Task("cic, mean alone", "configs/cic_drawn.yaml", ("objective.peak_weight=0",)),
+    Task("cic, RMS alone", "configs/cic_drawn.yaml", (
         _PEAK, "objective.peak_weight=0", "objective.rms_weight=1")),
-    Task("cic, 2000 rpm", "configs/cic.yaml", ("scene.speed_rpm=2000",)),
-    Task("cic, 5000 rpm", "configs/cic.yaml", ("scene.speed_rpm=5000",)),
-    Task("cic, half the load", "configs/cic.yaml", ("scene.load.torque_N_m=2.4",)),
-    Task("cic, wide backlash", "configs/cic.yaml", ("scene.timing_gear.backlash_mm=0.2",)),
-    Task("cic, narrow bore of the housing", "configs/cic.yaml", (
+    Task("cic, 2000 rpm", "configs/cic_drawn.yaml", ("scene.speed_rpm=2000",)),
+    Task("cic, 5000 rpm", "configs/cic_drawn.yaml", ("scene.speed_rpm=5000",)),
+    Task("cic, half the load", "configs/cic_drawn.yaml", ("scene.load.torque_N_m=2.4",)),
+    Task("cic, wide backlash", "configs/cic_drawn.yaml", ("scene.timing_gear.backlash_mm=0.2",)),
+    Task("cic, narrow bore of the housing", "configs/cic_drawn.yaml", (
         "constraints.outer_radius_max_mm=44.8", "constraints.area_efficiency_min=0.43")),
-    Task("cic, wide seal", "configs/cic.yaml", ("constraints.seal_width_min_mm=5",)),
-    Task("cic, two speeds", "configs/cic.yaml", ("objective.speeds_rpm=[2500, 3500]",)),
-    Task("cic, worst of two speeds", "configs/cic.yaml", (
+    Task("cic, wide seal", "configs/cic_drawn.yaml", ("constraints.seal_width_min_mm=5",)),
+    Task("cic, two speeds", "configs/cic_drawn.yaml", ("objective.speeds_rpm=[2500, 3500]",)),
+    Task("cic, worst of two speeds", "configs/cic_drawn.yaml", (
         "objective.speeds_rpm=[2500, 3500]", "objective.over_speeds=worst")),
     Task("free form", "configs/free.yaml"),
 )  # fmt: skip

@@ -75,7 +75,7 @@ KINDS: dict[str, tuple[str, int, list[str]]] = {
 
 
 def pairs(seed: int, kind: str) -> Iterator[list[str]]:
-    """Yield overrides of configs/cic.yaml of one kind, without end."""
+    """Yield overrides of configs/cic_drawn.yaml of one kind, without end."""
     family, lobes, fixed = KINDS[kind]
     draw = np.random.default_rng([seed, list(KINDS).index(kind)])
     lively = "lively" in kind

@@ -35,7 +35,7 @@ class Limit(NamedTuple):
 
 
 class Case(NamedTuple):
-    """A config with active limits: title, overrides of configs/cic.yaml, and limits to move."""
+    """Hold a config with active limits: its title, overrides of `CIC`, and limits to move."""
 
     title: str
     overrides: tuple[str, ...]

@@ -43,7 +43,7 @@ OVER = (
     "scene.timing_gear.backlash_mm: {uniform: 0.02}, "
     "scene.load.torque_N_m: {relative_normal: 0.05}}",
 )
-"""Overrides of configs/cic.yaml: the values that scatter."""
+"""Overrides of configs/cic_drawn.yaml: the values that scatter."""
 QUICK = (
     "tolerances.over={contact.clearance_mm: {normal: 0.002}}",
     "tolerances.samples=2",

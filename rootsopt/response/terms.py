@@ -103,13 +103,20 @@ class DisplacementTerm(Term):
 
 
 class FlowTerm(Term):
-    """A term whose value is the flow without leakage (l/min) at the scene's speed."""
+    """A term whose value is the flow (l/min) at the scene's speed: without leakage, or `delivered`.
+
+    The flow delivered needs the section `pump`."""
 
     sense: ClassVar[Literal["min", "max"]] = "max"
+    delivered: bool = eqx.field(static=True)
 
     def value(self, scene, profile, shape, forces):
-        del profile, forces
-        return flow.theoretical_flow(shape, scene.length, scene.speed) / _LITRE_PER_MINUTE
+        del forces
+        found = flow.theoretical_flow(shape, scene.length, scene.speed) / _LITRE_PER_MINUTE
+        if not self.delivered:
+            return found
+        medium = _medium(scene, "delivered_flow_l_min")
+        return found * leakage(scene, medium, profile, shape).efficiency
 
 
 class RippleTerm(Term):
@@ -412,10 +419,11 @@ def _own() -> dict[str, Any]:
         "undercut_margin_mm": LargeTerm("undercut_margin", MM),
         "seal_width_mm": LargeTerm("seal_width", MM),
         "displaced_volume_cm3": DisplacementTerm(),
-        "theoretical_flow_l_min": FlowTerm(),
+        "theoretical_flow_l_min": FlowTerm(delivered=False),
         "flow_ripple": RippleTerm(),
         "gear_backlash_max_mm": BacklashTerm(),
         "leakage_fraction": LossTerm(),
+        "delivered_flow_l_min": FlowTerm(delivered=True),
         "angular_play_min_mrad": PlayTerm(),
         SILENT: SilentTerm(),
         "flank_gap_min_um": GapTerm(mean=False),

@@ -24,7 +24,7 @@ from rootsopt.scene import Scene, design_vector
 from tests.runtime.test_environment import HARMLESS, SET_ASIDE
 
 ROOT = Path(__file__).parents[2]
-CIC = str(ROOT / "configs" / "cic.yaml")
+CIC = str(ROOT / "configs" / "cic_drawn.yaml")
 EE = str(ROOT / "configs" / "ee.yaml")
 SMALL = [
     "--set", "optimizer.screening=2",

@@ -17,7 +17,7 @@ from rootsopt.config import load
 from rootsopt.errors import InputError
 
 ROOT = Path(__file__).parents[2]
-CIC = str(ROOT / "configs" / "cic.yaml")
+CIC = str(ROOT / "configs" / "cic_drawn.yaml")
 
 
 def python(code, *arguments, **options):

@@ -24,7 +24,7 @@ from rootsopt.response.records import geometry_record
 from rootsopt.scene import Scene, design_vector
 
 ROOT = Path(__file__).parents[2]
-CIC = str(ROOT / "configs" / "cic.yaml")
+CIC = str(ROOT / "configs" / "cic_drawn.yaml")
 RADIUS = ["--set", "pareto.terms=[outer_radius_mm, area_efficiency]"]
 FEW = [*RADIUS, "--set", "pareto.points=4"]
 

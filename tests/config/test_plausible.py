@@ -53,7 +53,7 @@ def test_values_of_the_pages_are_usual():
         for key, text in re.findall(r"--set '?([a-z_.]+)=([-\d.e]+)\b", page.read_text("utf-8")):
             if usual_of(key) is not None and "outline" not in key:
                 seen += 1
-                assert notes_on_swept(load("cic"), {key: [float(text)]}) == (), (page, key)
+                assert notes_on_swept(load("cic_drawn"), {key: [float(text)]}) == (), (page, key)
     assert seen > 10
 
 
@@ -75,7 +75,7 @@ def test_values_of_the_pages_are_usual():
     ],
 )
 def test_odd_value_has_a_note(override, words):
-    (note,) = notes(load("cic", [override]))
+    (note,) = notes(load("cic_drawn", [override]))
     assert words in note
     assert note.startswith("`")
     assert "unusual" in note
@@ -105,15 +105,15 @@ def test_values_in_another_unit_do_not_pass_in_silence():
 
 def test_zero_and_defaults_have_no_note():
     values = ("contact.clearance_mm=0", "rotor.helix_deg=0", "scene.load.torque_N_m=0")
-    assert notes(load("cic", values)) == ()
-    large = load("cic", ["profile.pitch_radius_mm=900", "rotor.length_mm=2000",
+    assert notes(load("cic_drawn", values)) == ()
+    large = load("cic_drawn", ["profile.pitch_radius_mm=900", "rotor.length_mm=2000",
                          "profile.involute_length_mm=200", "scene.bearings={}"])  # fmt: skip
     assert not [note for note in notes(large) if "distance" in note]
 
 
 def test_notes_on_swept_values_name_the_option():
     values = {"scene.speed_rpm": (1000.0, 3000.0), "scene.timing_gear.backlash_mm": (0.1, 9.0)}
-    (note,) = notes_on_swept(load("cic"), values)
+    (note,) = notes_on_swept(load("cic_drawn"), values)
     assert note.startswith("`--over scene.timing_gear.backlash_mm` is 9 mm")
 
 
@@ -133,15 +133,15 @@ def test_notes_on_swept_values_name_the_option():
 )
 def test_limits_that_no_force_can_meet_are_refused(terms, words):
     with pytest.raises(InputError, match=words):
-        load("cic", [f"constraints.terms={terms}"])
+        load("cic_drawn", [f"constraints.terms={terms}"])
 
 
 def test_limits_that_some_force_meets_are_accepted():
     """A constant force has equal mean and peak; pulses have lines of twice their mean."""
     for one in itertools.pairwise(("mean_force_N", "rms_force_N", "peak_force_N")):
-        load("cic", [f"constraints.terms={{{one[0]}: {{min: 20}}, {one[1]}: {{max: 20}}}}"])
-    load("cic", ["constraints.terms={line_1_force_N: {min: 20}, mean_force_N: {max: 10}}"])
-    load("cic", ["constraints.terms={peak_force_N: {max: 0}}"])
+        load("cic_drawn", [f"constraints.terms={{{one[0]}: {{min: 20}}, {one[1]}: {{max: 20}}}}"])
+    load("cic_drawn", ["constraints.terms={line_1_force_N: {min: 20}, mean_force_N: {max: 10}}"])
+    load("cic_drawn", ["constraints.terms={peak_force_N: {max: 0}}"])
 
 
 @pytest.mark.parametrize(

@@ -31,13 +31,13 @@ def test_a_file_comes_before_a_shipped_config(monkeypatch, tmp_path):
     text = (ROOT / "configs" / "ee.yaml").read_text()
     (tmp_path / "cic.yaml").write_text(text)
     assert load_config("cic.yaml").profile.family == "ee"
-    assert load_config("cic").profile.family == "cic"
+    assert load_config("cic_drawn").profile.family == "cic"
 
 
 @pytest.mark.parametrize("path", ["folder/cic", "cic.yml", "cics", "./other/ee.yaml"])
 def test_other_names_are_refused_with_those_that_exist(path):
     with pytest.raises(
-        InputError, match=r"no such file; give the path .*\(blower, cic, ee, "
+        InputError, match=r"no such file; give the path .*\(blower, cic, cic_drawn, ee, "
     ) as caught:
         load_config(path)
     if path == "cics":
@@ -59,7 +59,9 @@ def test_an_installed_package_has_its_configs_and_types(tmp_path):
     assert (pages.parents[1] / "glossary.md").read_bytes() == GLOSSARY.read_bytes()
     empty = tmp_path / "empty"
     empty.mkdir()
-    program = "import rootsopt; print(rootsopt.__file__, rootsopt.load_config('cic').design_keys)"
+    program = (
+        "import rootsopt; print(rootsopt.__file__, rootsopt.load_config('cic_drawn').design_keys)"
+    )
     done = subprocess.run(
         [sys.executable, "-c", program],
         cwd=empty,

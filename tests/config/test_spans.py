@@ -9,7 +9,7 @@ CLEARANCE, SPEED = "contact.clearance_mm", "scene.speed_rpm"
 OVER = "assumptions.over"
 
 
-def ranges(*overrides, name="cic"):
+def ranges(*overrides, name="cic_drawn"):
     return {one.key: one.ends for one in load(name, overrides).spans}
 
 
@@ -33,8 +33,8 @@ def test_usual_ranges_follow_the_scene():
 def test_own_ranges_replace_the_usual_ones():
     """Dots and a mapping mean the same; `null` holds a key; the resolved config reads the same."""
     texts = f"{OVER}.{CLEARANCE}.Range=[0, 0.04]", f"{OVER}.{SPEED}=null"
-    config = load("cic", texts)
-    other = load("cic", [f"{OVER}={{{CLEARANCE}: {{range: [0, 0.04]}}, {SPEED}: null}}"])
+    config = load("cic_drawn", texts)
+    other = load("cic_drawn", [f"{OVER}={{{CLEARANCE}: {{range: [0, 0.04]}}, {SPEED}: null}}"])
     assert config == other == parse(config.to_yaml())
     found = {one.key: one.ends for one in config.spans}
     assert found[CLEARANCE] == (0.0, 0.04)
@@ -66,5 +66,5 @@ def test_own_ranges_replace_the_usual_ones():
 )
 def test_refusals_name_the_remedy(overrides, words):
     with pytest.raises(InputError) as caught:
-        load("cic", overrides)
+        load("cic_drawn", overrides)
     assert all(word in str(caught.value) for word in words)

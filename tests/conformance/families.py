@@ -34,7 +34,7 @@ measure = jax.jit(geometry)
 
 def text_of(family, lobes=LOBES, **changes):
     """Return the text of a complete config with the family's example."""
-    with open("configs/cic.yaml", encoding="utf-8") as file:
+    with open("configs/cic_drawn.yaml", encoding="utf-8") as file:
         rest = file.read().split("\nrotor:")[1]
     keys = {"family": family, "lobes": lobes, "pitch_radius_mm": 33.0}
     keys |= {**family_of(family).example} | changes

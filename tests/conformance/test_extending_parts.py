@@ -69,7 +69,7 @@ def test_scripts_of_the_page_run(page, monkeypatch, capsys):
 @pytest.fixture(scope="module")
 def model():
     """Return a scene of the paper's pair with a part and a law from outside the package."""
-    return Scene.from_config(load("configs/cic.yaml", ["solver.accuracy=1e-7"]))
+    return Scene.from_config(load("configs/cic_drawn.yaml", ["solver.accuracy=1e-7"]))
 
 
 @pytest.fixture(scope="module")

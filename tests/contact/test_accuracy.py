@@ -208,7 +208,7 @@ def test_deeper_minimum_away_from_rolling_is_found(family, design):
 
 def test_ellipse_that_turns_back_is_refused():
     """An ellipse whose contact turns back, and whose gap has several minima, is not sound."""
-    with open("configs/cic.yaml", encoding="utf-8") as file:
+    with open("configs/cic_drawn.yaml", encoding="utf-8") as file:
         rest = file.read().split("\nrotor:")[1]
     keys = "family: ellipse, lobes: 3, pitch_radius_mm: 33.0, ellipse_center_mm: 30.55"
     settings = parse(f"profile: {{{keys}, ellipse_height_mm: 18.90}}\nrotor:{rest}")
@@ -251,7 +251,7 @@ def test_second_derivatives_are_those_of_the_gap(name):
 @pytest.fixture(scope="module")
 def default():
     """Return evaluator and evaluation of the shipped scene."""
-    evaluator = Evaluator.of(load("configs/cic.yaml"))
+    evaluator = Evaluator.of(load("configs/cic_drawn.yaml"))
     return evaluator, evaluator(series=False)
 
 

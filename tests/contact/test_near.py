@@ -25,11 +25,11 @@ FOUR_ARCS = (
     "tip_arc_radius_mm: 20.659, tip_arc_turn_deg: 34.22}"
 )
 SCENES = {
-    "cic": ("cic", []),
+    "cic_drawn": ("cic_drawn", []),
     "ee": ("ee", []),
-    "gas and friction": ("cic", GAS),
+    "gas and friction": ("cic_drawn", GAS),
     "pump": ("pump", []),
-    "four arcs": ("cic", [FOUR_ARCS, "optimizer.bounds={}"]),
+    "four arcs": ("cic_drawn", [FOUR_ARCS, "optimizer.bounds={}"]),
 }
 
 
@@ -78,7 +78,7 @@ def test_margins_have_the_sign_of_the_flags(name):
     assert seen > 100
 
 
-@pytest.mark.parametrize("name", ["cic", "ee", "pump"])
+@pytest.mark.parametrize("name", ["cic_drawn", "ee", "pump"])
 def test_equation_near_a_root_is_that_of_the_search(name):
     """From a root 1e-3 away, two evaluations reach the search's forces and derivatives."""
     pair = _pair(name)
@@ -172,7 +172,7 @@ def test_margin_of_a_jump_is_zero_where_both_minima_are_equally_deep():
     assert found == pytest.approx(jump, abs=1e-9)
 
 
-@pytest.mark.parametrize("name", ["cic", "pump"])
+@pytest.mark.parametrize("name", ["cic_drawn", "pump"])
 def test_force_and_margins_from_one_contact_are_those_of_two(name):
     pair = _pair(name)
     tau, state = (x[0] for x in _states(pair, 1))

@@ -19,10 +19,10 @@ STIFF = (
     "scene.timing_gear.backlash_mm=0.07",
 )
 SCENES = {
-    "shipped": ("cic", ()),
-    "period two": ("cic", SHAKY),
+    "shipped": ("cic_drawn", ()),
+    "period two": ("cic_drawn", SHAKY),
     "the paper's": ("paper_cic", ()),
-    "stiff gear, little load": ("cic", STIFF),
+    "stiff gear, little load": ("cic_drawn", STIFF),
 }
 
 
@@ -46,7 +46,7 @@ def test_default_smoothing_does_not_change_the_forces(name):
 
 
 def length_of(*changes):
-    return load("configs/cic.yaml", changes).contact.rounding_mm
+    return load("configs/cic_drawn.yaml", changes).contact.rounding_mm
 
 
 def test_smoothing_length_follows_the_scene():
@@ -65,4 +65,4 @@ def test_smoothing_length_follows_the_scene():
     assert length_of("scene.load.torque_N_m=0") == pytest.approx(1e-6)
     for given, found in (("auto", 1e-4), ("3e-5", 3e-5), ("0", 0.0)):
         assert length_of(f"contact.smoothing_mm={given}") == found
-    assert f"smoothing_mm: {length_of(*STIFF)!r}" in load("configs/cic.yaml", STIFF).to_yaml()
+    assert f"smoothing_mm: {length_of(*STIFF)!r}" in load("configs/cic_drawn.yaml", STIFF).to_yaml()

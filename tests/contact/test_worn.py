@@ -19,7 +19,7 @@ PUMP += "end_clearance_mm: 0.1}"
 
 
 def scene_of(*changes: str) -> tuple[rootsopt.Config, Scene]:
-    config = rootsopt.load_config("cic", [*BASE, *changes])
+    config = rootsopt.load_config("cic_drawn", [*BASE, *changes])
     return config, Scene.from_config(config)
 
 
@@ -93,7 +93,7 @@ def test_offset_and_heat_are_clearances():
     strain = 2.2e-5 * 20 - 1.1e-5 * 50
     assert float(new.center_distance_error) == 0
     assert float(other.center_distance_error) == pytest.approx(2e-5 + 0.066 * strain)
-    plain = Scene.from_config(rootsopt.load_config("cic"))
+    plain = Scene.from_config(rootsopt.load_config("cic_drawn"))
     assert plain.wear is None
     assert plain.center_distance_error is None
     assert not isinstance(plain.contact(made("cic")), WornContact)

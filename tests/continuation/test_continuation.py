@@ -36,7 +36,7 @@ START = (-0.235, -1.809)
 
 
 def config_at(speed):
-    return load("configs/cic.yaml", [*SCENE, f"scene.speed_rpm={speed!r}"])
+    return load("configs/cic_drawn.yaml", [*SCENE, f"scene.speed_rpm={speed!r}"])
 
 
 @pytest.fixture(scope="module")
@@ -214,16 +214,16 @@ MOTOR = (
 @pytest.mark.parametrize(
     ("name", "changes", "key", "ends"),
     [
-        ("cic", (), SPEED, (2000, 4000)),
-        ("cic", (), TORQUE, (1, 10)),
-        ("cic", (), BACKLASH, (0.05, 0.4)),
-        ("cic", (), "scene.timing_gear.damping_ratio", (0.1, 0.6)),
-        ("cic", (f"{ECCENTRICITY}=5",), ECCENTRICITY, (1, 20)),
-        ("cic", (), INVOLUTE, (5, 9)),
+        ("cic_drawn", (), SPEED, (2000, 4000)),
+        ("cic_drawn", (), TORQUE, (1, 10)),
+        ("cic_drawn", (), BACKLASH, (0.05, 0.4)),
+        ("cic_drawn", (), "scene.timing_gear.damping_ratio", (0.1, 0.6)),
+        ("cic_drawn", (f"{ECCENTRICITY}=5",), ECCENTRICITY, (1, 20)),
+        ("cic_drawn", (), INVOLUTE, (5, 9)),
         ("free", (), "profile.coefficients_2", (0.2, 0.4)),
         ("ee", (), "contact.clearance_mm", (0.0, 0.01)),
         ("pump", (), "scene.load.pressure_difference_Pa", (1e4, 4e4)),
-        ("cic", MOTOR, TORQUE, (1, 10)),
+        ("cic_drawn", MOTOR, TORQUE, (1, 10)),
         ("ee", TWISTED, "rotor.helix_deg", (5, 40)),
         ("ee", (*TWISTED, "optimizer.bounds.helix_deg=[0, 90]"), "rotor.helix_deg", (5, 40)),
     ],
@@ -344,11 +344,11 @@ def test_a_design_ends_where_no_profile_can_be_made(branch):
 @pytest.mark.parametrize(
     ("name", "changes", "key", "limits"),
     [
-        ("cic", (), SPEED, (2900, 3100)),
-        ("cic", (), INVOLUTE, (5, 9)),
+        ("cic_drawn", (), SPEED, (2900, 3100)),
+        ("cic_drawn", (), INVOLUTE, (5, 9)),
         ("ee", (), BACKLASH, (0.02, 0.4)),
         ("pump", (), "scene.load.pressure_difference_Pa", (3e4, 6e4)),
-        ("cic", MOTOR, TORQUE, (1, 10)),
+        ("cic_drawn", MOTOR, TORQUE, (1, 10)),
     ],
 )
 def test_orbits_are_those_by_shooting(name, changes, key, limits):

@@ -136,7 +136,7 @@ def test_profile_command_names_the_family(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(resemblance, "classical", lambda: ("arc",))
     monkeypatch.setattr(work, "free_likeness", lambda profile, *near: None)
     where = ["-o", str(tmp_path / "out"), "--no-figures", "--export", "none"]
-    assert command.main(["configs/cic.yaml", *where, "--resembles"]) == 0
+    assert command.main(["configs/cic_drawn.yaml", *where, "--resembles"]) == 0
     (row,) = json.loads((tmp_path / "out" / "result.json").read_text())["resembles"]
     assert row["family"] == "arc"
     assert 300 < row["departure_um"] < 450

@@ -123,4 +123,4 @@ def test_commands_of_the_howto_page_have_valid_overrides():
     for one in found:
         name, *words = shlex.split(one)[2:]
         sets = [value for flag, value in itertools.pairwise(words) if flag == "--set"]
-        check_geometry(load("cic" if name == "CONFIG" else name, sets))
+        check_geometry(load("cic_drawn" if name == "CONFIG" else name, sets))

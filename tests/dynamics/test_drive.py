@@ -67,7 +67,7 @@ def test_inertia_of_a_motor_turns_with_rotor_1():
 
 def test_motor_of_a_config_is_that_of_its_pair():
     motor = "{slope_N_m_s_per_rad: 0.3, torque_N_m: 6, inertia_kg_m2: 0.004}"
-    config = load("configs/cic.yaml", ["scene.drive=torque", f"scene.motor={motor}"])
+    config = load("configs/cic_drawn.yaml", ["scene.drive=torque", f"scene.motor={motor}"])
     drive = Scene.from_config(config)._drive(ConstantLoad(jnp.asarray(LOAD)))
     assert isinstance(drive, MotorDrive)
     numbers = [float(x) for x in (drive.speed, drive.torque, drive.slope, drive.inertia)]

@@ -239,7 +239,7 @@ class Reference:
 PERIODS = 10
 SCENES = {
     # No rounding of corners: the law as it stands.
-    "cic": ("configs/cic.yaml", ["contact.smoothing_mm=0"]),
+    "cic_drawn": ("configs/cic_drawn.yaml", ["contact.smoothing_mm=0"]),
     "ee": ("configs/ee.yaml", ["contact.smoothing_mm=0"]),
 }
 ADJOINT = diffrax.ForwardMode()
@@ -289,7 +289,7 @@ contacts_at = eqx.filter_jit(
 def references():
     """Return stroboscopic states and orbit statistics of the SciPy reference, by family."""
     found = {}
-    for family in ("cic", "ee"):
+    for family in ("cic_drawn", "ee"):
         config = load(f"configs/{family}.yaml", ["contact.smoothing_mm=0"])
         reference = Reference(config)
         found[family] = reference, *reference.run(PERIODS)
@@ -298,10 +298,10 @@ def references():
 
 # Between 200 and 400 columns the reference itself moves by 6e-5 (CIC: its gap has a corner
 # where the land begins, which a spline rounds) and 1e-6 (EE).
-REACH = {"cic": (2e-4, 1e-3, 1e-3), "ee": (1e-5, 1e-4, 2e-4)}
+REACH = {"cic_drawn": (2e-4, 1e-3, 1e-3), "ee": (1e-5, 1e-4, 2e-4)}
 
 
-@pytest.mark.parametrize("family", ["cic", pytest.param("ee", marks=pytest.mark.long)])
+@pytest.mark.parametrize("family", ["cic_drawn", pytest.param("ee", marks=pytest.mark.long)])
 def test_motion_and_force_are_those_of_an_independent_integration(family, references):
     """From ε = 0, stroboscopic states and mean, RMS and peak force agree with SciPy's."""
     pair, _ = pair_of(*SCENES[family])
@@ -320,7 +320,7 @@ def test_motion_and_force_are_those_of_an_independent_integration(family, refere
     np.testing.assert_allclose(got[1], peak, rtol=extreme)
 
 
-@pytest.mark.parametrize("family", ["cic", "ee"])
+@pytest.mark.parametrize("family", ["cic_drawn", "ee"])
 def test_reference_outline_and_inertia_are_those_of_the_package(family, references):
     """The reference's own outline passes through the exported one; its inertia agrees."""
     pair, config = pair_of(f"configs/{family}.yaml")
@@ -370,7 +370,7 @@ def powers(pair, state, how):
     return solution.ys[-1, :2], solution.ys[-1, 2:]
 
 
-@pytest.mark.parametrize("path", ["configs/cic.yaml", "configs/ee.yaml"])
+@pytest.mark.parametrize("path", ["configs/cic_drawn.yaml", "configs/ee.yaml"])
 def test_drive_work_is_load_work_plus_losses(path):
     """Over a period of the steady orbit, the drive's work is that of load and dampers."""
     pair, _ = pair_of(path)
@@ -399,7 +399,7 @@ rates = st.floats(-5.0, 5.0)
 @pytest.fixture(scope="module")
 def touching():
     """Return a CIC pair."""
-    return pair_of("configs/cic.yaml")[0]
+    return pair_of("configs/cic_drawn.yaml")[0]
 
 
 @given(phi=angles, side=sides, size=depths, rate=rates)
@@ -498,7 +498,7 @@ def equations(jaxpr):
 
 def test_an_absent_gear_costs_nothing():
     """Without a timing gear, the program has two states, fewer equations and no gear numbers."""
-    geared, config = pair_of("configs/cic.yaml")
+    geared, config = pair_of("configs/cic_drawn.yaml")
     bare = eqx.tree_at(lambda p: p.gear, geared, None)
     programs = []
     for pair in (geared, bare):
@@ -517,7 +517,7 @@ def test_an_absent_gear_costs_nothing():
         lambda: settle(bare, jnp.zeros(2), integrator(), jnp.asarray(1e-3), jnp.asarray(64), 8)
     )
     assert transient.state.shape == (2,)
-    free = load("configs/cic.yaml").model_dump(exclude_none=True)
+    free = load("configs/cic_drawn.yaml").model_dump(exclude_none=True)
     free["scene"].pop("timing_gear")
     model = Scene.from_config(type(config).model_validate(free))
     assert model.gear is None
@@ -530,7 +530,7 @@ def test_an_absent_gear_costs_nothing():
 @pytest.fixture(scope="module")
 def orbit_by():
     """Return a function (method, rtol) → mean, peak, RMS on the CIC orbit, and the solver steps."""
-    pair, _ = pair_of("configs/cic.yaml")
+    pair, _ = pair_of("configs/cic_drawn.yaml")
 
     def find(method, rtol):
         how, state = integrator(method, rtol), jnp.zeros(2)
@@ -582,7 +582,7 @@ def loose_pair(load_torque):
         f"scene.load.torque_N_m={load_torque}",
         f"scene.timing_gear={gear}",
     ]
-    return pair_of("configs/cic.yaml", overrides)[0]
+    return pair_of("configs/cic_drawn.yaml", overrides)[0]
 
 
 def test_gear_alone_carries_the_load_when_flanks_cannot_touch():
@@ -626,7 +626,7 @@ def test_rotor_falls_freely_inside_the_backlash():
 
 def test_a_pair_without_mesh_stands_still():
     """Beyond the angle limit the motion stops, so that the state stays finite."""
-    pair, _ = pair_of("configs/cic.yaml")
+    pair, _ = pair_of("configs/cic_drawn.yaml")
     for side in (-1, 1):
         state = jnp.array([side * 1.01 * pair.angle_limit / float(pair.angle_scale), 7.0])
         slope, _ = pair.derivative(jnp.asarray(0.3), state)

@@ -27,7 +27,9 @@ from rootsopt.status import Status
 
 def config_of(**changes):
     """Return the shipped CIC scene with changed keys, `__` for a dot."""
-    return load("configs/cic.yaml", [f"{k.replace('__', '.')}={v}" for k, v in changes.items()])
+    return load(
+        "configs/cic_drawn.yaml", [f"{k.replace('__', '.')}={v}" for k, v in changes.items()]
+    )
 
 
 pair_of = eqx.filter_jit(Scene.pair)

@@ -147,8 +147,8 @@ class Plain(Part):
 
 def test_absent_errors_add_nothing():
     """Without errors, programs are those of a gear that knows of none."""
-    scene = Scene.from_config(rootsopt.load_config("cic"))
-    pair = scene.pair(jnp.asarray(rootsopt.load_config("cic").design))
+    scene = Scene.from_config(rootsopt.load_config("cic_drawn"))
+    pair = scene.pair(jnp.asarray(rootsopt.load_config("cic_drawn").design))
     assert pair.later(2) is pair
     assert pair.repeats == 1
     gear = pair.gear
@@ -176,7 +176,9 @@ def _leaves(scene):
 def test_gradient_of_forces_is_that_of_differences():
     """Flanks in contact: derivatives by eccentricities, angles, backlash and pressure angle."""
     changes = ["eccentricity_um=[10, 4]", "eccentricity_angle_deg=[30, -50]"]
-    config = rootsopt.load_config("cic", [f"scene.timing_gear.{change}" for change in changes])
+    config = rootsopt.load_config(
+        "cic_drawn", [f"scene.timing_gear.{change}" for change in changes]
+    )
     scene, design = Scene.from_config(config), design_vector(config)
     units = np.array([1e-4, 1e-4, 0.3, 0.3, 1e-3, 1.0])
 

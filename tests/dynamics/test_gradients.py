@@ -66,7 +66,7 @@ def test_cic(scene, design):
     correct."""
     keys = [f"profile.{key}" for key in DESIGN_KEYS]
     changes = [f"{k}={v}" for k, v in zip(keys, design, strict=True)]
-    found = errors(load("configs/cic.yaml", [*SHARP, *SCENES[scene], *changes]))
+    found = errors(load("configs/cic_drawn.yaml", [*SHARP, *SCENES[scene], *changes]))
     assert max(found.values()) < 1e-6, found
 
 
@@ -121,7 +121,7 @@ def test_many_kinks_in_a_thousandth_of_a_mesh():
     1e-5 mesh periods."""
     design = ("profile.pressure_angle_deg=10.9", "profile.tip_arc_angle_deg=14.44")
     changes = [*NARROW, *design, "profile.involute_length_mm=1.146"]
-    evaluator = Evaluator.of(load("configs/cic.yaml", changes))
+    evaluator = Evaluator.of(load("configs/cic_drawn.yaml", changes))
     sharp = evaluator.at_tolerance(1e-12)(series=False)
     truth = slopes_of(sharp)
     for rtol, within in ((1e-7, 3e-2), (1e-9, 1e-4)):
@@ -140,7 +140,7 @@ def test_contact_jumps_beside_a_joint():
     arcs = "family: five_arcs, lobes: 3, pitch_radius_mm: 33.0, outer_radius_mm: 45.19"
     rest = "tip_arc_angle_deg: 1.9156, tip_arc_radius_mm: 15.912, tip_arc_turn_deg: 80"
     changes = [f"profile={{{arcs}, {rest}}}", "optimizer.bounds={}"]
-    found = errors(load("configs/cic.yaml", [*SHARP, *changes]), levels=6)
+    found = errors(load("configs/cic_drawn.yaml", [*SHARP, *changes]), levels=6)
     assert max(found.values()) < 1e-5, found
 
 
@@ -184,7 +184,7 @@ def test_a_short_touch_is_an_event():
     """A flank touches for a 300th of a mesh period with 6 mN when ε changes its sign.
 
     Without this touch, derivatives of the forces would be 6e-4 off."""
-    config = load("cic", BRIEF)
+    config = load("cic_drawn", BRIEF)
     near = Evaluator.of(config).at_tolerance(1e-9)(series=False)
     design, way = np.array(list(near.design.values())), np.array([1.0, -0.7, 0.8])
     assert near.steady_state["period"] == 6

@@ -25,7 +25,7 @@ from rootsopt.response.starts import Seed
 from rootsopt.scene import Scene, design_vector
 from rootsopt.status import Status
 
-CIC = "configs/cic.yaml"
+CIC = "configs/cic_drawn.yaml"
 FORCES = {"mean_force_N": 50.0, "peak_force_N": 200.0, "rms_force_N": 80.0}
 NONE = dict.fromkeys(FORCES, 0.0)
 

@@ -36,7 +36,7 @@ Steps in free flight would be twice as long, and some would pass over a touch.""
 @pytest.fixture(scope="module")
 def lively():
     """Return the lively scene at three tolerances."""
-    evaluator = Evaluator.of(load("configs/cic.yaml", LIVELY)).surveying()
+    evaluator = Evaluator.of(load("configs/cic_drawn.yaml", LIVELY)).surveying()
     return {rtol: evaluator.at_tolerance(rtol)(series=False) for rtol in (1e-8, 1e-9, 1e-10)}
 
 
@@ -70,7 +70,7 @@ def test_the_check_is_about_the_error_of_the_gradient(lively):
 def control(**over) -> LandingControl:
     given = {"clearance_mm": 0.0} | over
     config = load(
-        "configs/cic.yaml",
+        "configs/cic_drawn.yaml",
         [
             f"contact.clearance_mm={given['clearance_mm']}",
             "scene.timing_gear.backlash_mm=0.2",
@@ -85,7 +85,7 @@ def control(**over) -> LandingControl:
 
 
 def test_edges_are_those_of_clearance_and_backlash():
-    config = load("configs/cic.yaml", ["scene.timing_gear.backlash_mm=0.2"])
+    config = load("configs/cic_drawn.yaml", ["scene.timing_gear.backlash_mm=0.2"])
     pair = Scene.from_config(config).pair(design_vector(config))
     edges = np.sort(np.asarray(control().edges)) * float(pair.angle_scale)
     half = 0.1 / 33
@@ -207,7 +207,7 @@ def test_two_changes_at_one_instant():
         "profile.involute_length_mm=5.77",
         "profile.tip_arc_angle_deg=1.68",
     ]
-    evaluator = Evaluator.of(load("configs/cic.yaml", scene)).surveying()
+    evaluator = Evaluator.of(load("configs/cic_drawn.yaml", scene)).surveying()
     design, step, way = np.array([35.23, 5.77, 1.68]), 5e-5, np.array([1.0, -0.7, 0.8])
     found = evaluator(series=False)
     assert found.status is Status.PERIODIC
@@ -250,7 +250,7 @@ def test_the_check_bounds_the_error(scene, design):
         np.array([1.0, -0.7, 0.8]),
         ("mean_force_N", "peak_force_N", "rms_force_N"),
     )
-    evaluator = Evaluator.of(load("configs/cic.yaml", scene)).surveying()
+    evaluator = Evaluator.of(load("configs/cic_drawn.yaml", scene)).surveying()
 
     def terms(found):
         rows = np.array([list(found.gradient[name].values()) for name in names])

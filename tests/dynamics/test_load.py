@@ -17,7 +17,7 @@ LENGTH = 0.1
 
 @pytest.mark.parametrize(
     ("family", "overrides"),
-    [("cic", ["profile.involute_length_mm=7"]), ("ee", []), ("ee", ["profile.lobes=2"])],
+    [("cic_drawn", ["profile.involute_length_mm=7"]), ("ee", []), ("ee", ["profile.lobes=2"])],
 )
 def test_the_mean_gas_torque_is_the_displaced_volume(family, overrides):
     """Over a revolution, both rotors together take Δp times the displaced volume / 2π.
@@ -36,12 +36,14 @@ def test_the_mean_gas_torque_is_the_displaced_volume(family, overrides):
     np.testing.assert_allclose(means, float(pair.load.torque), rtol=1e-6)
 
 
-@pytest.mark.parametrize("family", ["cic", "ee"])
+@pytest.mark.parametrize("family", ["cic_drawn", "ee"])
 def test_gas_torque_follows_the_radius_of_contact(family):
     """The torque is that of a vane from the contact point to the tip, found on the outline.
 
     On the line of centres, the tip of one rotor seals and this rotor takes no torque."""
-    pair, config = pair_of([*GAS, *(["profile.involute_length_mm=7"] * (family == "cic"))], family)
+    pair, config = pair_of(
+        [*GAS, *(["profile.involute_length_mm=7"] * (family == "cic_drawn"))], family
+    )
     x, y = 1e-3 * outline_mm(config).T
     points, outer = x + 1j * y, np.max(np.hypot(x, y))
     radius, lobes = 0.033, 3
@@ -63,7 +65,7 @@ def test_gas_torque_follows_the_radius_of_contact(family):
 @pytest.mark.parametrize("length", [7.0, 8.893, 9.0])
 def test_gas_torque_has_no_jump_and_its_derivative_is_that_of_differences(length):
     """This also holds at and past the longest involute, where the whole tip arc meshes at once."""
-    config = load("configs/cic.yaml", [*GAS, f"profile.involute_length_mm={length}"])
+    config = load("configs/cic_drawn.yaml", [*GAS, f"profile.involute_length_mm={length}"])
     model, design = Scene.from_config(config), design_vector(config)
     phi = jnp.linspace(0.001, 1.04, 4001)
 
@@ -97,7 +99,7 @@ def test_gas_torque_has_no_jump_and_its_derivative_is_that_of_differences(length
 def test_steps_end_where_a_spread_jump_begins_and_ends(length):
     """Wherever the slope of the torque has a kink, a flag changes. The kinks are found in the
     torque."""
-    config = load("configs/cic.yaml", [*GAS, f"profile.involute_length_mm={length}"])
+    config = load("configs/cic_drawn.yaml", [*GAS, f"profile.involute_length_mm={length}"])
     pair = eqx.filter_jit(Scene.pair)(Scene.from_config(config), design_vector(config))
     phi = jnp.linspace(0.02, 1.02, 10001)
 

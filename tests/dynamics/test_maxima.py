@@ -19,7 +19,7 @@ _STEP = 2e-4
 @pytest.fixture(scope="module")
 def evaluator():
     """Return an evaluator of the smallest scene with a timing gear, at a tight tolerance."""
-    config = load_config("configs/cic.yaml", ["profile.involute_length_mm=8.0"])
+    config = load_config("configs/cic_drawn.yaml", ["profile.involute_length_mm=8.0"])
     return Evaluator.of(config).at_tolerance(1e-11).with_maxima()
 
 

@@ -23,7 +23,7 @@ LIVELY = (
 
 
 def evaluated(*overrides):
-    return Evaluator.of(load("configs/cic.yaml", list(overrides)))()
+    return Evaluator.of(load("configs/cic_drawn.yaml", list(overrides)))()
 
 
 @pytest.mark.parametrize("scene", [(), LIVELY])
@@ -69,7 +69,7 @@ def test_p_norm_tends_to_the_peak_as_stated():
 def test_what_is_not_asked_for_is_not_computed():
     """Without lines and norm, the program has no integrals for them."""
     plain, more = (
-        Evaluator.of(load("configs/cic.yaml", over)) for over in ([], ["response.lines=[1]"])
+        Evaluator.of(load("configs/cic_drawn.yaml", over)) for over in ([], ["response.lines=[1]"])
     )
     assert plain.scene.solver.measures.count == 2
     assert more.scene.solver.measures.count == 4
@@ -83,7 +83,7 @@ def test_what_is_not_asked_for_is_not_computed():
 
 def test_objective_takes_the_lines_and_the_norm_as_weighted():
     config = load(
-        "configs/cic.yaml",
+        "configs/cic_drawn.yaml",
         ["objective.line_weights={1: 1, 2: 2}", "objective.rms_weight=1", "objective.peak_norm=8"],
     )
     weights = objective_weights(config)
@@ -107,10 +107,10 @@ def test_objective_takes_the_lines_and_the_norm_as_weighted():
 
 
 def test_a_line_the_baseline_has_not_got_is_refused():
-    config = load("configs/cic.yaml", ["objective.line_weights={0.5: 1, 1: 1}"])
+    config = load("configs/cic_drawn.yaml", ["objective.line_weights={0.5: 1, 1: 1}"])
     # Of the same kind as in the test before: nothing is compiled for it.
     evaluator = Evaluator.of(
-        load("configs/cic.yaml", ["response.lines=[0.5, 1]", "objective.peak_norm=8"])
+        load("configs/cic_drawn.yaml", ["response.lines=[0.5, 1]", "objective.peak_norm=8"])
     )
     with pytest.raises(InputError, match=r"line_weights.*0\.5.*repeats every 1 mesh periods"):
         Problem.of(config, evaluator.scene, evaluator(series=False))

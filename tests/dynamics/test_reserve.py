@@ -29,7 +29,7 @@ RESERVES = "contact_reserve_um", "backlash_reserve_mm"
 @functools.cache
 def evaluator():
     """Return the evaluator of a pair of CIC rotors whose flanks stay apart."""
-    return Evaluator.of(load("cic", APART)).at_tolerance(1e-10)
+    return Evaluator.of(load("cic_drawn", APART)).at_tolerance(1e-10)
 
 
 @functools.cache
@@ -84,7 +84,7 @@ def test_gradients_are_those_of_differences(clearance):
 
     The instant of the least gap is known to the root of its rounding only, where the derivative
     with respect to the involute length changes quickly."""
-    one = Evaluator.of(load("cic", [*APART, f"contact.clearance_mm={clearance}"]))
+    one = Evaluator.of(load("cic_drawn", [*APART, f"contact.clearance_mm={clearance}"]))
     one = one.at_tolerance(1e-11)
     here, way = one(), np.array([1.0, -0.7, 0.8])
     assert here.status is (Status.IDLE if clearance > 0.1 else Status.PERIODIC)
@@ -109,7 +109,7 @@ def test_reserve_is_continuous_where_the_flanks_begin_to_touch():
     found = []
     for left in (1.0, 0.01, -0.01):
         clearance = 0.15 - 1e-3 * (first - left)
-        config = load("cic", [*APART, f"contact.clearance_mm={clearance}"])
+        config = load("cic_drawn", [*APART, f"contact.clearance_mm={clearance}"])
         found.append(Evaluator.of(config)().response["contact_reserve_um"])
     assert found[:2] == pytest.approx([1.0, 0.01], abs=1e-3)
     assert -0.1 < found[2] < 0
@@ -126,7 +126,7 @@ def test_torque_of_a_gear_that_carries_a_constant_load():
 
 def test_torque_of_a_gear_of_flanks_that_strike():
     """Mean, greatest and RMS torque are those of the formula of the gear along the series."""
-    config = load("cic")
+    config = load("cic_drawn")
     found = Evaluator.of(config).at_tolerance(1e-10)()
     gear, pair = config.scene.timing_gear, evaluator().pair(config.design)
     half = gear.backlash_mm / (2 * config.profile.pitch_radius_mm)
@@ -143,7 +143,7 @@ def test_torque_of_a_gear_of_flanks_that_strike():
 
 def test_pure_response_has_a_reserve_with_derivatives():
     """With a constant load, the motion only moves: all derivatives have closed forms."""
-    config = load("cic", [*APART, "response.reserve=true"])
+    config = load("cic_drawn", [*APART, "response.reserve=true"])
     scene, design = Scene.from_config(config), jnp.asarray(config.design)
 
     @eqx.filter_jit
@@ -172,7 +172,7 @@ def test_share_of_machines_that_touch_has_a_closed_form():
 
     The narrower of two uniform distributions does not change the share of the wider one's tail."""
     over = "contact.clearance_mm: {uniform: 0.14}, scene.timing_gear.backlash_mm: {uniform: 0.01}"
-    config = load("cic", [*APART, f"tolerances={{over: {{{over}}}}}"])
+    config = load("cic_drawn", [*APART, f"tolerances={{over: {{{over}}}}}"])
     found = touching(config)
     record = found.record()
     assert found.reserve == pytest.approx(held().response["contact_reserve_um"], rel=1e-4)
@@ -199,7 +199,7 @@ WARM = [
 
 def least_gap(*changes):
     """Return the least gap (µm) of a pair that the gear holds at a constant ε, at 400 instants."""
-    config = load("cic", [*WARM, *changes])
+    config = load("cic_drawn", [*WARM, *changes])
     pair = Scene.from_config(config).pair(jnp.asarray(config.design))
     state = jnp.zeros(2).at[0].set(-swing(config) / pair.angle_scale)
     times = jnp.linspace(0, 1, 400, endpoint=False)
@@ -229,7 +229,7 @@ def test_a_search_without_forces_simulates_nothing(monkeypatch):
         monkeypatch.setattr(evaluation, name, moved)
     quick = ["optimizer.starts=1", "optimizer.screening=0", "optimizer.iterations=8"]
     objective = "objective={mean_weight: 0, peak_weight: 0, terms: {flow_ripple: 1}}"
-    found = rootsopt.optimize_design(load("cic", [*APART, *quick, objective]))
+    found = rootsopt.optimize_design(load("cic_drawn", [*APART, *quick, objective]))
     assert found.optimized.status is Status.GEOMETRY_ONLY
     assert found.optimized.response.keys() == {"flow_ripple"}
     assert 0.01 < found.improvement["flow_ripple"] == pytest.approx(found.improvement["objective"])
@@ -241,7 +241,7 @@ def test_a_reserve_limits_a_search():
     least = held().response["contact_reserve_um"] + 1.0
     objective = "objective={mean_weight: 0, peak_weight: 0, terms: {flow_ripple: 1}}"
     limit = f"constraints.terms={{contact_reserve_um: {{min: {least}}}}}"
-    found = rootsopt.optimize_design(load("cic", [*APART, *quick, objective, limit]))
+    found = rootsopt.optimize_design(load("cic_drawn", [*APART, *quick, objective, limit]))
     assert found.optimized is not None
     assert found.optimized.response["contact_reserve_um"] > least - 1e-3
     (row,) = [row for row in found.constraints if row["name"] == "contact reserve"]

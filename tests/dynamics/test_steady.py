@@ -28,7 +28,7 @@ SHARP = ("solver.method=dopri8", "solver.rtol=1e-12")
 DESIGNS = {"paper": (36.43, 9.0, 4.0), "shorter involute": (36.43, 8.0, 4.0)}
 
 
-def config_of(*overrides, path="configs/cic.yaml"):
+def config_of(*overrides, path="configs/cic_drawn.yaml"):
     return load(path, [*SCENE, *overrides])
 
 
@@ -237,7 +237,7 @@ def test_peak_on_a_corner_has_its_gradient():
     """If the peak is on a corner of the force, its derivative is neither of the two beside it.
 
     The corner is where the contact moves from the involute to the tip arc."""
-    evaluator = Evaluator.of(load("configs/cic.yaml"))
+    evaluator = Evaluator.of(load("configs/cic_drawn.yaml"))
     design, step = jnp.array([35.0, 5.602843, 3.5]), 1e-3
 
     def peak(at):
@@ -256,7 +256,7 @@ def test_gradient_at_the_default_tolerance(design):
     smooth.
 
     Otherwise, gradients would be wrong by 1e-3 to 6e-3."""
-    evaluator = Evaluator.of(load("configs/cic.yaml"))
+    evaluator = Evaluator.of(load("configs/cic_drawn.yaml"))
     usual, tight = (
         gradients(one(jnp.array(design), series=False))
         for one in (evaluator, evaluator.at_tolerance(1e-11))

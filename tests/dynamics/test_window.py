@@ -89,7 +89,7 @@ def test_chaos_is_told_from_stable_orbits():
     found = []
     for values in STABLE + WILD:
         pairs = zip(_KEYS, values, strict=True)
-        config = load("configs/cic.yaml", [f"{key}={x}" for key, x in pairs])
+        config = load("configs/cic_drawn.yaml", [f"{key}={x}" for key, x in pairs])
         evaluator = Evaluator.of(config)
         pair, how = evaluator.pair(config.design), evaluator.scene.solver.transient
         state = _later(pair, np.zeros(2, pair.angle_scale.dtype), how)

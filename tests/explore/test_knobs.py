@@ -49,17 +49,17 @@ def test_every_family_has_a_knob_per_design_parameter(family):
 
 
 def test_only_parts_of_the_scene_have_knobs():
-    cic, pump = by_key(load("cic")), by_key(load("pump"))
+    cic, pump = by_key(load("cic_drawn")), by_key(load("pump"))
     assert "scene.timing_gear.backlash_mm" in cic
     assert not [key for key in cic if "motor" in key or "friction" in key]
     assert {"scene.motor.slope_N_m_s_per_rad", "contact.friction.static"} <= pump.keys()
     assert "scene.load.torque_N_m" not in pump
-    bare = by_key(load("cic", ["scene.timing_gear=null"]))
+    bare = by_key(load("cic_drawn", ["scene.timing_gear=null"]))
     assert not [key for key in bare if "timing_gear" in key]
 
 
 def test_spans_units_and_texts():
-    knobs = by_key(load("cic"))
+    knobs = by_key(load("cic_drawn"))
     speed = knobs["scene.speed_rpm"]
     assert (speed.low, speed.high, speed.step, speed.unit) == (600, 6000, 20, "rpm")
     assert (speed.least, speed.most) == (1e-2, 1e6)
@@ -70,20 +70,20 @@ def test_spans_units_and_texts():
     assert clearance.low == clearance.value == 0 < clearance.high
     assert knobs["rotor.helix_deg"].low == -knobs["rotor.helix_deg"].high
     assert knobs["profile.lobes"].whole
-    far = by_key(load("cic", ["profile.tip_arc_angle_deg=12"]))["profile.tip_arc_angle_deg"]
+    far = by_key(load("cic_drawn", ["profile.tip_arc_angle_deg=12"]))["profile.tip_arc_angle_deg"]
     assert far.high == 12  # beyond its bounds
 
 
 def test_the_span_of_an_unbounded_parameter_ends_at_its_limit():
     long = ["profile.pitch_radius_mm=5000", "profile.involute_length_mm=6000"]
-    knob = by_key(load("cic", long))["profile.involute_length_mm"]
+    knob = by_key(load("cic_drawn", long))["profile.involute_length_mm"]
     assert knob.high == knob.most == 10_000
 
 
 def test_smoothing_has_a_knob_only_if_it_is_given():
     key = "contact.smoothing_mm"
-    assert key not in by_key(load("cic"))
-    assert key in by_key(load("cic", [f"{key}=1e-4"]))
+    assert key not in by_key(load("cic_drawn"))
+    assert key in by_key(load("cic_drawn", [f"{key}=1e-4"]))
 
 
 @pytest.mark.parametrize("width", [1e-4, 0.3, 1.0, 4.0, 20.0, 5400.0, 1e6])

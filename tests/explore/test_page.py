@@ -32,7 +32,7 @@ from tests.standins import evaluation_of
 
 pytest.importorskip("bokeh")
 ROOT = Path(__file__).parents[2]
-CIC = ROOT / "configs" / "cic.yaml"
+CIC = ROOT / "configs" / "cic_drawn.yaml"
 SPEED, TIP, LOAD = "scene.speed_rpm", "profile.tip_arc_angle_deg", "scene.load.torque_N_m"
 
 

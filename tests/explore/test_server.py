@@ -20,7 +20,7 @@ from rootsopt.commands.table import explore as command
 
 pytest.importorskip("bokeh")
 ROOT = Path(__file__).parents[2]
-CIC = str(ROOT / "configs" / "cic.yaml")
+CIC = str(ROOT / "configs" / "cic_drawn.yaml")
 REFUSED = (
     "This address lacks the secret token, or its name is not that of this machine. Open the "
     "address that `rootsopt explore` has printed.\n"

@@ -20,7 +20,7 @@ from rootsopt.profiles import CIC, EE, geometry
 from rootsopt.scene import Scene, design_keys, design_vector
 
 ROOT = Path(__file__).parents[2]
-CONFIG = ROOT / "configs/cic.yaml"
+CONFIG = ROOT / "configs/cic_drawn.yaml"
 R = 0.033
 PROFILES = {
     "cic 2, no land": CIC(2, R, 0.85, 5e-3, 0.0),

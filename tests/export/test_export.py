@@ -312,7 +312,13 @@ def test_solids_without_a_kernel(tmp_path, monkeypatch, capsys):
     written."""
     monkeypatch.setitem(sys.modules, "build123d", None)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    arguments = [str(ROOT / "configs/cic.yaml"), "-o", str(tmp_path / "x"), "--export", "dxf,step"]
+    arguments = [
+        str(ROOT / "configs/cic_drawn.yaml"),
+        "-o",
+        str(tmp_path / "x"),
+        "--export",
+        "dxf,step",
+    ]
     assert profile.main(arguments) == 2
     message = capsys.readouterr().err
     assert "rootsopt[cad]" in message
@@ -334,7 +340,7 @@ def few_frames(monkeypatch):
 
 def test_profile_writes_drawings_and_animation(tmp_path, few_frames):
     """DXF and SVG are written by default; the GIF has one frame per step and moves."""
-    folder, config = tmp_path / "out", str(ROOT / "configs/cic.yaml")
+    folder, config = tmp_path / "out", str(ROOT / "configs/cic_drawn.yaml")
     assert profile.main([config, "-o", str(folder), "--no-figures"]) == 0
     assert {"rotor.dxf", "rotor.svg"} <= {path.name for path in folder.iterdir()}
     assert "outer radius 45.102855 mm" in (folder / "rotor.dxf").read_text()
@@ -394,7 +400,9 @@ def test_bore_takes_mass_and_inertia():
     """A bore removes π ρ L r² and π/2 ρ L r⁴; derivatives with respect to the design do not change.
 
     An optimisation keeps the root circle outside the bore."""
-    plain, bored = (load(ROOT / "configs/cic.yaml", sets) for sets in ([], ["rotor.bore_mm=20"]))
+    plain, bored = (
+        load(ROOT / "configs/cic_drawn.yaml", sets) for sets in ([], ["rotor.bore_mm=20"])
+    )
     shape = geometry(Scene.from_config(plain).profile(design_vector(plain)))
     one, other = Scene.from_config(plain), Scene.from_config(bored)
     cylinder = 7800.0 * 0.1 * np.pi * 0.01**2

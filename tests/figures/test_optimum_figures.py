@@ -16,7 +16,7 @@ from rootsopt.output.files import ResultFolder
 from rootsopt.response.series import Series
 from rootsopt.scene import outline_mm
 
-CIC = load("configs/cic.yaml")
+CIC = load("configs/cic_drawn.yaml")
 
 
 def drawn(ax, number):

@@ -27,7 +27,7 @@ def made(axes, **options):
         known = status in (Status.PERIODIC, Status.CHAOTIC)
         forces = {"mean_force_N": 10.0 + number, "peak_force_N": 30.0 + number}
         rows[number] = lost(status) | {"response": forces if known else {}}
-    return plan, rows, dataset_of(load("cic"), plan, rows)
+    return plan, rows, dataset_of(load("cic_drawn"), plan, rows)
 
 
 @pytest.mark.parametrize(
@@ -69,7 +69,7 @@ def test_flanks_that_stay_apart_have_their_reserve_on_the_axes(touching, tmp_pat
         response = {"mean_force_N": force / 2, "peak_force_N": force}
         response |= {"contact_reserve_um": 10.0 * number + 1, "gear_force_N": 200.0}
         rows[number] = lost(Status.IDLE) | {"response": response}
-    drawing.sweep_figure(ResultFolder(tmp_path), plan, dataset_of(load("cic"), plan, rows))
+    drawing.sweep_figure(ResultFolder(tmp_path), plan, dataset_of(load("cic_drawn"), plan, rows))
     shown = [ax.get_ylabel() for ax in kept[0].axes]
     (name, words), sure = swept({}, rows_of(plan, rows))
     assert sure[0] == "How sure"

@@ -43,7 +43,7 @@ QUICK = (
 @functools.cache
 def spread():
     """Return the config of a short search over clearance and load, its outcome, its spread."""
-    config = load("cic", QUICK)
+    config = load("cic_drawn", QUICK)
     result = search_of(config).run()
     assert result.assumptions is not None
     return config, result, result.assumptions
@@ -168,7 +168,7 @@ def test_objective_over_assumptions_by_hand():
     """Mean, worst and regret of three scenes, each relative to the baseline in the same scene.
 
     Regret: its distance from that of the baseline is the distance of the objectives from 1."""
-    config = load("cic", ["constraints.area_efficiency_min=0.4"])
+    config = load("cic_drawn", ["constraints.area_efficiency_min=0.4"])
     spans, scenes = (Span("x", 0, 1),), {f"random {k}": {"x": float(k)} for k in range(4)}
     ratios = np.array([0.5, 0.75, 1.2, math.nan])
     rival = np.array([0.4, 0.7, 1.1, 1.0])
@@ -193,8 +193,8 @@ def test_objective_over_assumptions_by_hand():
 
 
 def test_scenes_are_named_and_seeded():
-    config = load("cic", ["assumptions.scenes=4"])
-    found, other = assumed(config), assumed(load("cic", ["assumptions.scenes=4"]))
+    config = load("cic_drawn", ["assumptions.scenes=4"])
+    found, other = assumed(config), assumed(load("cic_drawn", ["assumptions.scenes=4"]))
     assert found == other
     assert len(found) == 1 + 2 * len(config.spans) + 4
     assert found != assumed(config.replaced({"assumptions.seed": 1}))
@@ -209,11 +209,15 @@ def test_nothing_without_a_motion_or_after_a_stop():
     """Searches without a motion, averages over many, and stopped ones have no comparison."""
     config, result, _ = spread()
     assert compared(config, result, stop=lambda: True) is None
-    still = load("cic", ["objective={mean_weight: 0, peak_weight: 0, terms: {flow_ripple: 1}}"])
+    still = load(
+        "cic_drawn", ["objective={mean_weight: 0, peak_weight: 0, terms: {flow_ripple: 1}}"]
+    )
     small = ("optimizer.screening=0", "optimizer.starts=1", "optimizer.iterations=2")
-    found = search_of(load("cic", [*small, f"objective={still.objective.model_dump_json()}"])).run()
+    found = search_of(
+        load("cic_drawn", [*small, f"objective={still.objective.model_dump_json()}"])
+    ).run()
     assert found.assumptions is None
-    assert type(search_of(load("cic", [*QUICK, "assumptions.scenes=0"]))) is Search
+    assert type(search_of(load("cic_drawn", [*QUICK, "assumptions.scenes=0"]))) is Search
 
 
 def test_command_optimises_over_assumptions(tmp_path, capsys):

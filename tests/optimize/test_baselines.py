@@ -32,7 +32,7 @@ from experiments._common.engines.numba_pair import (
     NumbaPair,
 )
 
-CONFIG = load("configs/cic.yaml", ["solver.method=dopri8", "solver.rtol=1e-12"])
+CONFIG = load("configs/cic_drawn.yaml", ["solver.method=dopri8", "solver.rtol=1e-12"])
 SCENE = engines.Scene.of(CONFIG)
 BASELINE = (36.43, 9.0, 4.0)
 DESIGNS = [BASELINE, (33.0, 6.0, 3.0), (40.0, 8.0, 6.0), (37.0, 8.5, 0.5)]

@@ -26,7 +26,7 @@ from rootsopt.scene.check import shape_of
 from tests.measured.test_outline import cut
 from tests.standins import evaluation_of
 
-CIC = "configs/cic.yaml"
+CIC = "configs/cic_drawn.yaml"
 BASE = load(CIC)
 
 

@@ -102,7 +102,7 @@ def bounded(made: Made, **settings):
     search.stop, search._lock, search._trials = threading.Event(), threading.Lock(), []
     search._found, search._best, search.expected = {}, math.nan, 0
     search.checkpoint, search.noisy, search.runs, search.stage = None, False, HERE, Stage()
-    search.progress, search.config = lambda *numbers: None, load_config("configs/cic.yaml")
+    search.progress, search.config = lambda *numbers: None, load_config("configs/cic_drawn.yaml")
     given = {"prove": True, "iterations": 60} | settings
     search.settings = search.config.optimizer.model_copy(update=given)
     search.config = search.config.model_copy(update={"optimizer": search.settings})
@@ -195,7 +195,9 @@ def test_a_limited_force_is_bounded_too():
 def _real(seed: int):
     """Return a search of two parameters with its bound, and what it found."""
     few = ["profile.tip_arc_angle_deg=2.0", "optimizer.bounds.tip_arc_angle_deg=[1.99, 2.01]"]
-    search = Search(load_config("cic", [*few, f"optimizer.seed={seed}", "optimizer.prove=true"]))
+    search = Search(
+        load_config("cic_drawn", [*few, f"optimizer.seed={seed}", "optimizer.prove=true"])
+    )
     return search, search.run()
 
 

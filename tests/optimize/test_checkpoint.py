@@ -66,7 +66,7 @@ def test_the_command_keeps_its_checkpoint_until_the_run_is_in_place(tmp_path, mo
     put = RunFolder.put_in_place
     monkeypatch.setattr(work, "search_of", search_of)
     monkeypatch.setattr(RunFolder, "put_in_place", given_up)
-    arguments = ["configs/cic.yaml", "-o", str(tmp_path / "run")]
+    arguments = ["configs/cic_drawn.yaml", "-o", str(tmp_path / "run")]
     assert command.main(arguments) == 2
     assert older.read_text() == "of an earlier run"
     assert kept.exists()

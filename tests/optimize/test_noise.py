@@ -38,7 +38,7 @@ def trial(point, objective, error=0.02):
 
 @pytest.fixture(scope="module")
 def problem():
-    settings = load("configs/cic.yaml", ["objective.motion=ensemble"])
+    settings = load("configs/cic_drawn.yaml", ["objective.motion=ensemble"])
     return Problem.of(settings, Evaluator.of(settings).scene, made_up(1.0))
 
 

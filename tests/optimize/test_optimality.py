@@ -56,8 +56,8 @@ def test_too_few_searches_tell_nothing():
 
 def test_method_follows_the_objective():
     """`auto` is slsqp, except for averages, whose gradients have noise."""
-    assert method_of(load_config("configs/cic.yaml", ["optimizer.method=auto"])) == "slsqp"
+    assert method_of(load_config("configs/cic_drawn.yaml", ["optimizer.method=auto"])) == "slsqp"
     noisy = ["objective.motion=ensemble", "optimizer.method=auto"]
-    assert method_of(load_config("configs/cic.yaml", noisy)) == "adam"
+    assert method_of(load_config("configs/cic_drawn.yaml", noisy)) == "adam"
     with pytest.raises(InputError, match=r"optimizer\.method"):
-        method_of(load_config("configs/cic.yaml", [noisy[0], "optimizer.method=slsqp"]))
+        method_of(load_config("configs/cic_drawn.yaml", [noisy[0], "optimizer.method=slsqp"]))

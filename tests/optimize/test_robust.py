@@ -23,7 +23,7 @@ from rootsopt.response.scatter import draw, shifts
 from rootsopt.response.sensitivity import by_scene
 from tests.standins import evaluation_of
 
-CIC = "configs/cic.yaml"
+CIC = "configs/cic_drawn.yaml"
 PLAY = "contact.clearance_mm=0.01"
 CLEARANCE = "tolerances.over.contact.clearance_mm.normal={}"
 LOAD = "tolerances.over.scene.load.torque_N_m.relative_normal=0.05"

@@ -50,7 +50,7 @@ def searching(truth=lambda point: 1.0, tight=None, **settings) -> Search:
     search = object.__new__(Search)
     search.stop, search._refuted, search._trials = threading.Event(), [], []
     search._found, search.checkpoint, search.noisy, search.runs = {}, None, True, HERE
-    search.config = load("configs/cic.yaml")
+    search.config = load("configs/cic_drawn.yaml")
     given = {"screening": 0, "seed": 0, "starts": 2} | settings
     search.settings = search.config.optimizer.model_copy(update=given)
     search.method = search.settings.method
@@ -197,7 +197,7 @@ def test_a_descent_goes_half_way_back_from_where_there_is_no_steady_state():
     search._lock, search._done, search._best = threading.Lock(), 0, float("nan")
     progress = []
     search.progress = lambda *numbers: progress.append(numbers)
-    search.fast = evaluator = Told.of(load("configs/cic.yaml"))
+    search.fast = evaluator = Told.of(load("configs/cic_drawn.yaml"))
     trials = search._descend(4, np.array([0.2, 0.3]))
     points = np.array([trial.point for trial in trials])
     assert len(trials) == 7

@@ -14,7 +14,7 @@ from rootsopt.output import terminal
 from rootsopt.output.ending import ending
 from rootsopt.status import Status
 
-DESIGN = dict(zip(load("cic").design_keys, (36.0, 9.0, 4.0), strict=True))
+DESIGN = dict(zip(load("cic_drawn").design_keys, (36.0, 9.0, 4.0), strict=True))
 STEADY = {"kind": "periodic", "period": 2, "floquet_multiplier": -0.25, "residual": 3e-12}
 
 

@@ -242,7 +242,7 @@ def test_threads_that_want_one_folder_never_mix(tmp_path):
 
 
 def _profile(folder, *more):
-    return main(["profile", "configs/cic.yaml", "-o", str(folder), "--no-figures", *more])
+    return main(["profile", "configs/cic_drawn.yaml", "-o", str(folder), "--no-figures", *more])
 
 
 @pytest.fixture
@@ -261,7 +261,7 @@ def test_a_command_on_a_full_disk(quick, capsys, monkeypatch):
     target = quick / "run"
     assert _profile(target, "--export", "none") == 0
     before, failed = digest(target), 0
-    monkeypatch.setattr("rootsopt.commands.cli.load", _loaded_once("configs/cic.yaml"))
+    monkeypatch.setattr("rootsopt.commands.cli.load", _loaded_once("configs/cic_drawn.yaml"))
     for at in range(1, 200, 2):
         capsys.readouterr()
         with faulty(WRITING, at, full_disk) as system:
@@ -312,7 +312,7 @@ def test_what_a_command_leaves_when_it_fails(tmp_path, capsys, monkeypatch):
 
 def test_each_command_has_a_folder_of_its_own(tmp_path, monkeypatch):
     """Each command has its own default folder, and the result names the command."""
-    config = str(ROOT / "configs" / "cic.yaml")
+    config = str(ROOT / "configs" / "cic_drawn.yaml")
     monkeypatch.chdir(tmp_path)
     assert main(["profile", config, "--no-figures"]) == 0
     record = json.loads((tmp_path / "results" / "cic-profile" / "result.json").read_text())
@@ -391,7 +391,14 @@ def test_nothing_is_written_outside_of_the_runs_own_folder(tmp_path, formats):
     others = {name: str(tmp_path / name) for name in ("MPLCONFIGDIR", "XDG_CACHE_HOME")}
     for folder in others.values():
         os.mkdir(folder)
-    arguments = ["profile", "configs/cic.yaml", "-o", str(parent / "run"), "--export", formats]
+    arguments = [
+        "profile",
+        "configs/cic_drawn.yaml",
+        "-o",
+        str(parent / "run"),
+        "--export",
+        formats,
+    ]
     done = subprocess.run(
         [sys.executable, "-B", "-c", AUDIT, str(parent), *arguments],
         cwd=ROOT, env=os.environ | others | {"ROOTSOPT_CACHE": "off"}, capture_output=True,

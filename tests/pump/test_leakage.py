@@ -130,7 +130,7 @@ def test_film_is_that_of_polygons(family):
 
 @functools.cache
 def scene_of(*changes):
-    return Scene.from_config(load_config("configs/cic.yaml", changes))
+    return Scene.from_config(load_config("configs/cic_drawn.yaml", changes))
 
 
 LIQUID = (
@@ -153,7 +153,7 @@ def leaks(scene, design):
 
 def test_liquid_leaks_like_slots():
     scene = scene_of(*COLD)
-    design = design_vector(load_config("configs/cic.yaml"))
+    design = design_vector(load_config("configs/cic_drawn.yaml"))
     found = leaks(scene, design)
     shape = jax.jit(geometry)(scene.profile(design))
     tips = 2 * 0.1 * 8e-5**3 * 2e5 / (12 * 0.05)
@@ -178,7 +178,7 @@ def test_heat_opens_the_gaps_at_tips_and_ends():
     """The clearances are those between a housing and rotors whose lengths have grown.
 
     The housing's length is shared between two ends, the radius of its bore is not."""
-    scene, design = scene_of(*WARM), design_vector(load_config("configs/cic.yaml"))
+    scene, design = scene_of(*WARM), design_vector(load_config("configs/cic_drawn.yaml"))
     found, cold = leaks(scene, design), leaks(scene_of(*COLD), design)
     length, outer = 0.1, float(jax.jit(geometry)(scene.profile(design)).outer_radius)
     housing, rotor = 1.1e-5 * 40, 1.1e-5 * 10
@@ -212,14 +212,14 @@ def test_tip_gap_by_polygon(family):
 def test_overlapping_flanks_let_nothing_through():
     """A search may pass through such designs. A negative flow would draw it there."""
     scene = dataclasses.replace(scene_of(*COLD), clearance=jnp.asarray(-1e-4))
-    found = leaks(scene, design_vector(load_config("configs/cic.yaml")))
+    found = leaks(scene, design_vector(load_config("configs/cic_drawn.yaml")))
     assert float(jnp.max(found.gap.least)) < 0
     assert float(found.mesh) == 0
 
 
 def test_gas_leaks_less_than_friction_or_inertia_alone():
     scene = scene_of(*IN_SERIES)
-    design = design_vector(load_config("configs/cic.yaml"))
+    design = design_vector(load_config("configs/cic_drawn.yaml"))
     found = leaks(scene, design)
     flux = gas.nozzle_flux(jnp.asarray(3e5), jnp.asarray(1e5), AIR)
     density = 1e5 / (287.05 * 293.15)
@@ -230,7 +230,7 @@ def test_gas_leaks_less_than_friction_or_inertia_alone():
     assert 0 < float(found.efficiency) < 1
     # The least gap counts, wherever it is.
     tight = eqx.tree_at(lambda s: s.medium.tip_clearance, scene, jnp.asarray(2e-5))
-    found = leaks(tight, design_vector(load_config("configs/cic.yaml")))
+    found = leaks(tight, design_vector(load_config("configs/cic_drawn.yaml")))
     assert float(found.knudsen) == pytest.approx(0.0662e-6 / 2e-5, rel=0.01)
 
 
@@ -251,7 +251,7 @@ def test_mesh_leakage_is_smooth_where_friction_takes_over_from_inertia():
     """It is the mean of the lesser flow over the roll, by NumPy, and its slope that of differences:
     the slope of a design that is moved by as little as a film's sampled points are apart."""
     scene = dataclasses.replace(scene_of(*IN_SERIES), clearance=jnp.asarray(3e-5))
-    design = design_vector(load_config("configs/cic.yaml"))
+    design = design_vector(load_config("configs/cic_drawn.yaml"))
     rows = [mesh_slopes(scene, design + shift) for shift in np.outer(range(9), [2e-3, 2e-3, 0])]
     flow, slope, length = (np.array(x) for x in zip(*rows, strict=True))
     slow = (3e-5) ** 3 * (9e10 - 1e10) / (24 * 1.82e-5 * length[0] * 1e5)
@@ -270,7 +270,7 @@ def test_tips_in_series_share_the_pressure_ratio():
     """Of wide tips, three nozzles with equal pressure ratios; by energy and isentrope.
 
     Three nozzles that pass the same mass, solved by SciPy, pass up to a tenth less."""
-    scene, design = scene_of(*IN_SERIES), design_vector(load_config("configs/cic.yaml"))
+    scene, design = scene_of(*IN_SERIES), design_vector(load_config("configs/cic_drawn.yaml"))
     up, down, height = 1.3e5, 1e5, 5e-4
     wide = eqx.tree_at(
         lambda s: (s.medium.pressure_difference, s.medium.tip_clearance),
@@ -303,7 +303,7 @@ def test_curvature_of_circles():
 
 def test_section_adds_nothing_to_the_simulation():
     """The program of the equations of motion is the same with it."""
-    design = design_vector(load_config("configs/cic.yaml"))
+    design = design_vector(load_config("configs/cic_drawn.yaml"))
 
     def forces(scene, design):
         return scene.pair(design).contact_force(*jnp.zeros(3)).total
@@ -318,7 +318,7 @@ def test_section_adds_nothing_to_the_simulation():
 
 
 def test_sheet_has_the_rows_of_its_inputs():
-    config = load_config("configs/cic.yaml")
+    config = load_config("configs/cic_drawn.yaml")
     design = design_vector(config)
     small = sheet(scene_of(), design)
     assert len(small) == 5
@@ -350,7 +350,7 @@ def test_sheet_says_what_it_lacks_and_what_does_not_hold():
     assert "delivers nothing" in warnings({"volumetric_efficiency": -1.0})[0]
     # Closed flanks: the number is that of the gap at the end faces.
     scene = scene_of(BLOWER[0], *BLOWER[2:])
-    rows = sheet(scene, jnp.asarray(load_config("configs/cic.yaml").design))
+    rows = sheet(scene, jnp.asarray(load_config("configs/cic_drawn.yaml").design))
     path = gas.mean_free_path(scene.medium.gas.inlet_pressure, scene.medium.viscosity, AIR)
     assert rows["knudsen_number"] == pytest.approx(float(path) / 5e-5, rel=1e-9)
 
@@ -363,23 +363,23 @@ def test_sheet_says_what_it_lacks_and_what_does_not_hold():
     ],
 )
 def test_interference_is_an_error(change):
-    design = design_vector(load_config("configs/cic.yaml"))
+    design = design_vector(load_config("configs/cic_drawn.yaml"))
     with pytest.raises(InputError, match=r"overlap by .*raise `contact.clearance_mm`"):
         sheet(scene_of(*LIQUID, change), design)
 
 
 def test_pressure_is_asked_for():
     with pytest.raises(InputError, match=r"`pump.pressure_difference_Pa` must be given"):
-        load_config("configs/cic.yaml", ["pump.viscosity_mPa_s=50"])
+        load_config("configs/cic_drawn.yaml", ["pump.viscosity_mPa_s=50"])
     gas_load = "scene.load={pressure_difference_Pa: 3.0e4}"
-    config = load_config("configs/cic.yaml", ["pump.viscosity_mPa_s=50", gas_load])
+    config = load_config("configs/cic_drawn.yaml", ["pump.viscosity_mPa_s=50", gas_load])
     assert config.pump is not None
     assert config.pump.pressure_difference_Pa == 3e4
 
 
 def test_terms_are_those_of_the_sheet():
     """The share that leaks needs a section `pump`; the backlash does not."""
-    design = design_vector(load_config("configs/cic.yaml"))
+    design = design_vector(load_config("configs/cic_drawn.yaml"))
     loss, backlash = terms_of(["leakage_fraction", "gear_backlash_max_mm"])
 
     def value(term, scene):

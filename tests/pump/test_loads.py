@@ -28,7 +28,7 @@ SUPPORTS = "scene.supports={stiffness_N_per_mm: 2e4, damping_N_s_per_mm: 5}"
 
 
 def scene_of(*changes: str) -> tuple[Scene, jnp.ndarray]:
-    config = rootsopt.load_config("cic", changes)
+    config = rootsopt.load_config("cic_drawn", changes)
     return Scene.from_config(config), jnp.asarray(config.design)
 
 
@@ -185,7 +185,7 @@ def test_term_needs_bearings():
 
 @pytest.mark.long
 def test_gradient_of_the_equivalent_load():
-    config = rootsopt.load_config("cic", [GAS, BEARINGS, "solver.rtol=1e-10"])
+    config = rootsopt.load_config("cic_drawn", [GAS, BEARINGS, "solver.rtol=1e-10"])
     design, step = config.design, np.array([1e-3, 0, 0])
     ahead, here, behind = (rootsopt.evaluate(config, design + k * step) for k in (1, 0, -1))
     name = "bearing_load_equivalent_N"
@@ -204,7 +204,7 @@ def test_gradient_of_the_equivalent_load():
 def test_work_and_momentum_of_elastic_bearings():
     """Over a closed orbit no work is left, and the axes gain no momentum."""
     scene, design = scene_of(GAS, BEARINGS, SUPPORTS)
-    evaluator = Evaluator(rootsopt.load_config("cic", [GAS, BEARINGS, SUPPORTS]), scene)
+    evaluator = Evaluator(rootsopt.load_config("cic_drawn", [GAS, BEARINGS, SUPPORTS]), scene)
     pair, tangents, _ = scene.pair_and_tangents(design)
     start = begun(pair, None, scene.solver.max_orbit)
     found = evaluator.motion(pair, tangents, start)

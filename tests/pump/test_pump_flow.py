@@ -90,7 +90,7 @@ def test_ee_has_one_line(lobes):
 
 def test_ripple_of_the_paper():
     """CIC as printed: 16.6 %."""
-    config = load_config("configs/cic.yaml")
+    config = load_config("configs/cic_drawn.yaml")
     scene = Scene.from_config(config)
     _, ripple, _, share = describe(scene.profile(design_vector(config)))
     assert 100 * float(ripple) == pytest.approx(16.6, abs=0.05)

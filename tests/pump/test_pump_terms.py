@@ -25,7 +25,7 @@ PUMP = (
 
 @pytest.mark.long
 def test_terms_are_the_rows_of_the_sheet_and_have_gradients():
-    config = load_config("cic", PUMP)
+    config = load_config("cic_drawn", PUMP)
     scene, design = Scene.from_config(config), jnp.asarray(config.design)
     nothing = jnp.zeros(3), jnp.zeros((3, 3))
     terms = terms_of(NAMES)
@@ -50,14 +50,14 @@ def test_terms_are_the_rows_of_the_sheet_and_have_gradients():
     ],
 )
 def test_terms_name_the_section_they_need(name, words):
-    config = load_config("cic")
+    config = load_config("cic_drawn")
     scene, design = Scene.from_config(config), jnp.asarray(config.design)
     with pytest.raises(InputError, match=words):
         values_of(scene, terms_of([name]), design, jnp.zeros(3), jnp.zeros((3, 3)))
 
 
 def test_axial_force_needs_a_twist():
-    config = load_config("cic", ["scene.bearings={}"])
+    config = load_config("cic_drawn", ["scene.bearings={}"])
     scene, design = Scene.from_config(config), jnp.asarray(config.design)
     terms = terms_of(["tilting_moment_max_N_m"])
     with pytest.raises(InputError, match=r"needs twisted rotors.*optimizer.bounds.helix_deg"):

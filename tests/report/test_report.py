@@ -30,7 +30,7 @@ from rootsopt.status import Status
 
 pytest.importorskip("bokeh")
 ROOT = Path(__file__).parents[2]
-CIC = str(ROOT / "configs" / "cic.yaml")
+CIC = str(ROOT / "configs" / "cic_drawn.yaml")
 HOSTILE = '</script><script>document.title = "taken"</script><b>&amp;'
 NOTE = "`rotor.helix_deg` is 1 °, which is unusual"
 SAMPLES, PITCHES = 240, 3

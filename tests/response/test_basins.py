@@ -28,7 +28,7 @@ FORCES = ("mean_force_N", "peak_force_N", "rms_force_N")
 
 
 def config_of(*overrides):
-    return load("configs/cic.yaml", [*GRID, *overrides])
+    return load("configs/cic_drawn.yaml", [*GRID, *overrides])
 
 
 @pytest.fixture(scope="module")
@@ -214,7 +214,7 @@ def test_command(tmp_path, capsys):
 
     The exit codes are checked too."""
     overrides = [f"--set={key}" for key in (*GRID, *COEXIST)]
-    assert main(["attractors", "configs/cic.yaml", *overrides, "-o", str(tmp_path)]) == 0
+    assert main(["attractors", "configs/cic_drawn.yaml", *overrides, "-o", str(tmp_path)]) == 0
     assert "Coexisting motions" in capsys.readouterr().out
     record = json.loads((tmp_path / "result.json").read_text())
     shares = [one["share"] for one in record["attractors"]]
@@ -226,7 +226,7 @@ def test_command(tmp_path, capsys):
     assert [numbers.count(k + 1) / 108 for k in range(len(shares))] == pytest.approx(shares)
     assert (tmp_path / "figures" / "basins.png").read_bytes()[:4] == b"\x89PNG"
     assert (tmp_path / "response_2.csv").exists()
-    lost = ["attractors", "configs/cic.yaml", "--set=scene.timing_gear=null", *overrides[:2]]
+    lost = ["attractors", "configs/cic_drawn.yaml", "--set=scene.timing_gear=null", *overrides[:2]]
     assert main([*lost, "-o", str(tmp_path / "lost"), "--no-figures"]) == 3
 
 
@@ -244,7 +244,7 @@ def test_optimiser_over_all_motions(tmp_path):
         "assumptions.scenes=0",
     )
     overrides = [f"--set={key}" for key in (*COEXIST, *small)]
-    assert main(["optimize", "configs/cic.yaml", *overrides, "-o", str(tmp_path)]) == 0
+    assert main(["optimize", "configs/cic_drawn.yaml", *overrides, "-o", str(tmp_path)]) == 0
     record = json.loads((tmp_path / "result.json").read_text())
     assert record["improvement"]["objective"] > 0
     for name in ("baseline", "optimized"):

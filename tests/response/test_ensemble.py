@@ -36,7 +36,7 @@ INSIDE = (30.0, 4.0, 3.0)
 
 
 def config_of(*overrides):
-    return load("configs/cic.yaml", overrides)
+    return load("configs/cic_drawn.yaml", overrides)
 
 
 def ensemble(config, survey=True):
@@ -350,7 +350,7 @@ def test_optimize_a_chaotic_scene(tmp_path, capsys):
     options = itertools.chain.from_iterable(
         ("--set", key) for key in (*CHAOTIC, *size, *window, *search)
     )
-    code = optimize.main(["configs/cic.yaml", "-o", str(tmp_path), "--no-figures", *options])
+    code = optimize.main(["configs/cic_drawn.yaml", "-o", str(tmp_path), "--no-figures", *options])
     result = json.loads((tmp_path / "result.json").read_text())
     verification, text = result["verification"], capsys.readouterr().out
     assert result["baseline"]["status"] == "averaged"
@@ -375,7 +375,7 @@ def test_reached_refuses_chaos_and_names_the_option(tmp_path):
     options = itertools.chain.from_iterable(
         ("--set", key) for key in (*CHAOTIC, "objective.motion=reached")
     )
-    command = [sys.executable, "-m", "rootsopt.optimize", "configs/cic.yaml", "--no-figures"]
+    command = [sys.executable, "-m", "rootsopt.optimize", "configs/cic_drawn.yaml", "--no-figures"]
     command += ["-o", str(tmp_path), *options]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 3, done.stderr
@@ -389,7 +389,7 @@ def test_simulate_an_ensemble(tmp_path):
     """The exit code is 0, and the run has averages, the series of one member, and figures."""
     size = "ensemble.members=4", "ensemble.designs=12", "ensemble.periods=16"
     options = itertools.chain.from_iterable(("--set", key) for key in (*CHAOTIC, *size))
-    assert simulate.main(["configs/cic.yaml", "-o", str(tmp_path), *options]) == 0
+    assert simulate.main(["configs/cic_drawn.yaml", "-o", str(tmp_path), *options]) == 0
     result = json.loads((tmp_path / "result.json").read_text())
     assert result["status"] == "averaged"
     assert set(result["steady_state"]["gradient_standard_error"]) == set(RESPONSES)

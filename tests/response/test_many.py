@@ -97,7 +97,7 @@ class Away:
 
 def test_the_scenes_of_a_sample_travel():
     """They are evaluated where `runs` says, at all speeds, and as in this process."""
-    config = load("cic", ["objective.speeds_rpm=[2000, 3000]"]).replaced(
+    config = load("cic_drawn", ["objective.speeds_rpm=[2000, 3000]"]).replaced(
         {"tolerances": {"over": {"scene.load.torque_N_m": {"uniform": 0.1}}, "samples": 3}}
     )
     runs, evaluator = Away(), Told.of_objective(config).surveying()

@@ -41,7 +41,7 @@ DESIGN = np.array([36.43, 9.0, 4.0])
 
 
 def scene_of(*overrides: str) -> tuple[rootsopt.Config, Scene]:
-    config = rootsopt.load_config("configs/cic.yaml", [*TIGHT, *overrides])
+    config = rootsopt.load_config("configs/cic_drawn.yaml", [*TIGHT, *overrides])
     return config, Scene.from_config(config)
 
 
@@ -442,7 +442,7 @@ def test_every_public_name_is_there():
 def test_precision_is_asked_for_in_words():
     code = (
         "import rootsopt\n"
-        "try: rootsopt.Scene.from_config(rootsopt.load_config('configs/cic.yaml'))\n"
+        "try: rootsopt.Scene.from_config(rootsopt.load_config('configs/cic_drawn.yaml'))\n"
         "except RuntimeError as error: print(error)"
     )
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

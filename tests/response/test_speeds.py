@@ -20,7 +20,7 @@ from rootsopt.scene import design_vector
 from rootsopt.status import Status
 from tests.standins import evaluation_of
 
-CIC = "configs/cic.yaml"
+CIC = "configs/cic_drawn.yaml"
 SPEEDS = "objective.speeds_rpm=[4000, 2000]"
 WEIGHTS = "objective.speed_weights=[3, 1]"
 WORST = "objective.over_speeds=worst"
@@ -334,7 +334,7 @@ def test_every_speed_simulated_counts_in_the_status(monkeypatch, failing):
     """A failure at the scene's own 3000 rpm fails the result.
 
     That speed has no share in the objective."""
-    config = load("configs/cic.yaml", ["objective.speeds_rpm=[4000, 2000]"])
+    config = load("configs/cic_drawn.yaml", ["objective.speeds_rpm=[4000, 2000]"])
     evaluator = Evaluator.of_objective(config)
 
     def single(self, design, start, series):

@@ -13,7 +13,7 @@ from rootsopt import Scene, Status, steady_response
 from rootsopt.dynamics.window import integrated_difference
 from rootsopt.response.evaluation import Evaluator
 
-CONFIG = rootsopt.load_config("configs/cic.yaml")
+CONFIG = rootsopt.load_config("configs/cic_drawn.yaml")
 DESIGN = np.asarray(CONFIG.design, float)
 NEAR = DESIGN * np.array([1.002, 0.999, 1.001])
 SPEEDS = np.array([1.0, 1.01, 1.02])

@@ -15,7 +15,7 @@ from rootsopt.response.evaluation import RESPONSES, Evaluator
 from rootsopt.response.terms import values_of
 
 PAGE = Path(__file__).parents[2] / "docs" / "extending.md"
-CIC = "configs/cic.yaml"
+CIC = "configs/cic_drawn.yaml"
 OUTSIDE = "revolutions_per_litre"
 
 

@@ -19,7 +19,7 @@ POINTS = [{SPEED: 2000.0}, {ANGLE: 5.0}, {SPEED: 3000.0}, {LOAD: 3000.0}]
 
 @pytest.fixture(scope="module")
 def config() -> rootsopt.Config:
-    return rootsopt.load_config("cic")
+    return rootsopt.load_config("cic_drawn")
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from rootsopt.scene import Scene
 from rootsopt.status import Status
 from tests.standins import evaluation_of
 
-CIC = "configs/cic.yaml"
+CIC = "configs/cic_drawn.yaml"
 PLAY = "contact.clearance_mm=0.01"
 CLEARANCE = "tolerances.over.contact.clearance_mm.normal=0.002"
 BACKLASH = "tolerances.over.scene.timing_gear.backlash_mm.uniform=0.02"

@@ -26,7 +26,7 @@ from tests.optimize.test_checkpoint import evaluation
 ROW = lost(Status.INVALID) | {"response": {"mean_force_N": 0.1 + 0.2, "peak_force_N": float("nan")}}
 SPEED = "scene.speed_rpm"
 PLAN = plan_of({SPEED: "1,2,3,4,5,6,7,8"})
-CIC = load("cic")
+CIC = load("cic_drawn")
 
 
 @pytest.fixture

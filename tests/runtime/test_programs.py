@@ -499,7 +499,7 @@ def test_programs_follow_the_files_of_families_from_outside(folder, monkeypatch,
 
 def test_host_arithmetic_compiles_nothing():
     """Outside of programs, JAX would compile a small program for each operation on its arrays."""
-    config = load("cic")
+    config = load("cic_drawn")
     scene = Scene.from_config(config)
     jax.config.update("jax_no_execution", True)  # Any operation on arrays raises an error.
     try:

@@ -111,7 +111,7 @@ def test_searches_from_python_use_one_thread_and_restore_the_others(monkeypatch,
     monkeypatch.setattr(room, search, made)
     with threadpool_limits(2):
         with pytest.raises(InputError, match="enough"):
-            run(load("cic"))
+            run(load("cic_drawn"))
         assert [*seen, counts()] == [{1}, {2}]
 
 
@@ -153,7 +153,7 @@ def test_a_run_has_the_same_bits_on_1_2_and_16_cores(tmp_path, command):
     files = []
     for cores in ("1", "2", "16"):
         out = tmp_path / cores
-        arguments = [command, "cic", "-o", str(out), "--no-figures", "--no-cache"]
+        arguments = [command, "cic_drawn", "-o", str(out), "--no-figures", "--no-cache"]
         arguments += [part for text in RUNS[command] for part in ("--set", text)]
         own = {"NPROC": cores, "OPENBLAS_NUM_THREADS": cores, "OMP_NUM_THREADS": cores}
         faked = [sys.executable, "-c", FAKED, cores, *arguments]

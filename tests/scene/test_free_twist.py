@@ -22,7 +22,7 @@ def scene_of(name: str, *changes: str) -> tuple[Scene, jnp.ndarray]:
     return Scene.from_config(config), jnp.asarray(config.design)
 
 
-@pytest.mark.parametrize("name", ["cic", "ee", "free"])
+@pytest.mark.parametrize("name", ["cic_drawn", "ee", "free"])
 def test_twist_is_the_last_parameter(name):
     """Behind those of any family: none, single numbers, or a list."""
     fixed, free = rootsopt.load_config(name), rootsopt.load_config(name, FREE)
@@ -73,12 +73,12 @@ def test_slices_suffice_for_the_greatest_twist():
 
 def test_a_fixed_twist_costs_nothing():
     for changes in ((), FREE[1:]):
-        scene, design = scene_of("cic", *changes)
+        scene, design = scene_of("cic_drawn", *changes)
         assert scene.at(design) is scene
         assert not scene.twist_free
     # A rotor from a file has no design parameters.
     outline = "profile={family: outline, lobes: 3, pitch_radius_mm: 33, outline_file: x.csv}"
-    assert not rootsopt.load_config("cic", [outline, FREE[0]]).twist_free
+    assert not rootsopt.load_config("cic_drawn", [outline, FREE[0]]).twist_free
 
 
 @pytest.mark.parametrize(
@@ -91,7 +91,7 @@ def test_a_fixed_twist_costs_nothing():
 )
 def test_impossible_bounds_are_refused(change, words):
     with pytest.raises(InputError, match=words):
-        rootsopt.load_config("cic", [change])
+        rootsopt.load_config("cic_drawn", [change])
 
 
 def test_no_parameters_are_refused():
@@ -103,7 +103,7 @@ def test_no_parameters_are_refused():
 def test_gradients_against_differences():
     """Forces and loads of the bearings, greatest ones included, of twisted CIC rotors."""
     changes = (*GAS, *FREE, "rotor.helix_deg=40", "solver.rtol=1e-10")
-    config = rootsopt.load_config("cic", changes)
+    config = rootsopt.load_config("cic_drawn", changes)
     evaluator = rootsopt.response.evaluation.Evaluator.of(config)
     here = evaluator()
     assert here.status is rootsopt.Status.PERIODIC

@@ -42,7 +42,7 @@ def build(model, design):
     return model.pair_and_shape(design)
 
 
-def pair_of(overrides, family="cic"):
+def pair_of(overrides, family="cic_drawn"):
     config = load(f"configs/{family}.yaml", list(overrides))
     return build(Scene.from_config(config), design_vector(config))[0], config
 
@@ -70,7 +70,7 @@ def contacts(pair, tau, states):
     return jax.lax.map(lambda at: pair.contact_at(*at), (tau, states))
 
 
-@pytest.mark.parametrize("family", ["cic", "ee"])
+@pytest.mark.parametrize("family", ["cic_drawn", "ee"])
 def test_forces_of_all_parts_are_newtons(family):
     """Forces and torques agree with `planar` at random states with displaced axes.
 
@@ -78,7 +78,7 @@ def test_forces_of_all_parts_are_newtons(family):
     and closer than nominal, and flanks, tips and roots touch."""
     # Rounding of the geometry is some 1e-17 m of a depth of 1e-6 m.
     for error in (0.02, -0.02):
-        more = [f"scene.center_distance_error_mm={error}", *([WITHIN] * (family == "cic"))]
+        more = [f"scene.center_distance_error_mm={error}", *([WITHIN] * (family == "cic_drawn"))]
         pair, config = pair_of([*ALL, *more], family)
         reference = planar_of(pair, config)
         rng = np.random.default_rng(3)
@@ -216,7 +216,7 @@ def equations(jaxpr):
 
 def size(overrides):
     """Return the numbers of states, equations and constants of a scene's right-hand side."""
-    config = load("configs/cic.yaml", overrides)
+    config = load("configs/cic_drawn.yaml", overrides)
     pair = eqx.filter_eval_shape(Scene.pair, Scene.from_config(config), design_vector(config))
     numbers, static = eqx.partition(pair, lambda x: isinstance(x, jax.ShapeDtypeStruct))
     program = jax.make_jaxpr(lambda tau, y, n: eqx.combine(n, static).derivative(tau, y)[0])(
@@ -250,7 +250,7 @@ def test_an_absent_part_costs_nothing(part):
 
 def test_orbit_and_gradient_of_all_parts():
     """With all parts, eleven states, the orbit closes, and its gradient is that of differences."""
-    config = load("configs/cic.yaml", [*ALL, WITHIN, "solver.rtol=1e-10"])
+    config = load("configs/cic_drawn.yaml", [*ALL, WITHIN, "solver.rtol=1e-10"])
     evaluator = Evaluator.of(config)
     found = evaluator(series=True)
     assert found.status is Status.PERIODIC
@@ -289,11 +289,11 @@ def test_orbit_and_gradient_of_all_parts():
 )  # fmt: skip
 def test_parts_that_do_not_go_together_are_refused(overrides, words):
     with pytest.raises(InputError, match=words):
-        load("configs/cic.yaml", overrides)
+        load("configs/cic_drawn.yaml", overrides)
 
 
 def test_a_motor_too_weak_for_its_load_is_said_to_stall():
     weak = "scene.motor={slope_N_m_s_per_rad: 0.001, torque_N_m: 0.5}"
-    found = Evaluator.of(load("configs/cic.yaml", ["scene.drive=torque", weak]))(series=False)
+    found = Evaluator.of(load("configs/cic_drawn.yaml", ["scene.drive=torque", weak]))(series=False)
     assert found.status is Status.STALLED
     assert not found.usable

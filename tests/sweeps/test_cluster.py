@@ -31,7 +31,7 @@ def kill_a_worker() -> None:
 
 def swept(path, plan, after=0, cluster=None):
     """Sweep with two workers, and kill one after the first `after` points; return the journal."""
-    config, killed = load("cic"), []
+    config, killed = load("cic_drawn"), []
 
     def progress(done, expected):
         if after and done >= after and not killed:
@@ -76,7 +76,7 @@ def test_a_point_that_kills_its_process_is_a_status(tmp_path, monkeypatch):
 def test_simulated_points_are_those_of_one_process(tmp_path, monkeypatch):
     """A worker is killed in mid-run; forces agree to rounding, as compiler options differ here."""
     monkeypatch.delenv("TEST_SECONDS", raising=False)
-    config, plan = load("cic"), plan_of({SPEED: "1000:4000:24"})
+    config, plan = load("cic_drawn"), plan_of({SPEED: "1000:4000:24"})
     swept(tmp_path / "points", plan, after=3)
     axes = {SPEED: "1000:4000:24"}
     found = rootsopt.sweep_scenes(config, axes, checkpoint=tmp_path / "points", resume=True)
@@ -98,7 +98,7 @@ def test_missing_package_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     for options in ({"workers": 2}, {"scheduler": "tcp://127.0.0.1:1"}):
         with pytest.raises(InputError, match=r"pip install 'rootsopt\[cluster\]'"):
-            rootsopt.sweep_scenes(load("cic"), {SPEED: "1,2"}, **options)
+            rootsopt.sweep_scenes(load("cic_drawn"), {SPEED: "1,2"}, **options)
 
 
 @pytest.mark.parametrize(
@@ -114,5 +114,5 @@ def test_scheduler_that_is_none(monkeypatch):
     monkeypatch.setattr("rootsopt.sweeps.cluster._ANSWER", 0.3)
     for address in ("tcp://127.0.0.1:9", "nonsense://x"):
         with pytest.raises(InputError, match=rf"'{address}' cannot be used"):
-            rootsopt.sweep_scenes(load("cic"), {SPEED: "1,2"}, scheduler=address)
+            rootsopt.sweep_scenes(load("cic_drawn"), {SPEED: "1,2"}, scheduler=address)
     assert os.getpid()

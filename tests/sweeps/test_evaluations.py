@@ -27,7 +27,7 @@ from tests.sweeps.workers import DEADLY, force
 
 def test_a_killed_worker_loses_and_duplicates_no_design(monkeypatch):
     monkeypatch.setenv("TEST_SECONDS", "0.1")
-    evaluator = Evaluator.of(load("cic"))
+    evaluator = Evaluator.of(load("cic_drawn"))
     designs = np.random.default_rng(0).uniform(1.0, 40.0, (40, 3))
     ended, killed, lock = [], [], threading.Lock()
 
@@ -57,7 +57,7 @@ def test_a_killed_worker_loses_and_duplicates_no_design(monkeypatch):
 @pytest.mark.long
 def test_a_design_that_kills_its_process_ends_the_search(monkeypatch):
     monkeypatch.setenv("TEST_SECONDS", "0.01")
-    evaluator = Evaluator.of(load("cic", [f"scene.speed_rpm={DEADLY}"]))
+    evaluator = Evaluator.of(load("cic_drawn", [f"scene.speed_rpm={DEADLY}"]))
     with (
         Cluster(1, imports=(IMPORT,)).evaluations() as runs,
         pytest.raises(InputError, match=r"several times.*--resume"),
@@ -66,7 +66,7 @@ def test_a_design_that_kills_its_process_ends_the_search(monkeypatch):
 
 
 def point():
-    return Point(Evaluator.of(load("cic")), np.ones(3))
+    return Point(Evaluator.of(load("cic_drawn")), np.ones(3))
 
 
 class Client:
@@ -132,7 +132,7 @@ def test_a_scheduler_without_workers_is_given_up(monkeypatch):
 
 @pytest.mark.parametrize("motion", ["reached", "worst", "ensemble"])
 def test_every_evaluator_travels(motion):
-    config = load("cic", [f"objective.motion={motion}"])
+    config = load("cic_drawn", [f"objective.motion={motion}"])
     sent = Evaluator.of_objective(config)
     found = pickle.loads(pickle.dumps(sent))
     assert type(found) is type(sent)
@@ -155,7 +155,7 @@ def test_classes_of_a_script_travel(tmp_path):
         "from rootsopt.sweeps.worker import Settings\n"
         "class Own(Evaluator):\n"
         "    answer = 42\n"
-        "config = load('cic')\n"
+        "config = load('cic_drawn')\n"
         "own = Own(config, Evaluator.of(config).scene)\n"
         "class Client:\n"
         "    status = 'running'\n"
@@ -185,7 +185,7 @@ def test_the_price_of_workers_is_said_before_they_start(capsys):
 @pytest.mark.parametrize("command", [optimize, pareto])
 def test_commands_refuse_both_kinds_of_workers(command, tmp_path, capsys):
     options = ["--workers", "2", "--scheduler", "tcp://127.0.0.1:1", "-o", str(tmp_path / "run")]
-    assert command.main(["configs/cic.yaml", *options]) == 2
+    assert command.main(["configs/cic_drawn.yaml", *options]) == 2
     assert "exclude each other" in capsys.readouterr().err
     assert [*tmp_path.iterdir()] == []
 
@@ -211,7 +211,7 @@ def test_commands_refuse_both_kinds_of_workers(command, tmp_path, capsys):
 def test_workers_find_the_same_to_the_last_bit(command, options, file, tmp_path):
     sets = [part for option in options for part in ("--set", option)]
     for name, more in (("here", []), ("there", ["--workers", "2"])):
-        run = [sys.executable, "-m", "rootsopt", command, "configs/cic.yaml", *sets, *more]
+        run = [sys.executable, "-m", "rootsopt", command, "configs/cic_drawn.yaml", *sets, *more]
         subprocess.run([*run, "--no-figures", "-o", str(tmp_path / name)], check=True)
     here, there = ((tmp_path / name / file).read_bytes() for name in ("here", "there"))
     assert here == there

@@ -22,7 +22,7 @@ ANGLE, FAMILY = "profile.pressure_angle_deg", "profile.family"
 
 @pytest.fixture(scope="module")
 def config() -> rootsopt.Config:
-    return rootsopt.load_config("cic", ["objective.terms={outer_radius_mm: 0.5}"])
+    return rootsopt.load_config("cic_drawn", ["objective.terms={outer_radius_mm: 0.5}"])
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +89,7 @@ def test_family_takes_its_own_parameters(config):
 def from_file(path, more="") -> rootsopt.Config:
     """Return a config whose rotor is read from the file `path`, which need not exist."""
     profile = f"{{family: outline, lobes: 3, pitch_radius_mm: 33, outline_file: '{path}'{more}}}"
-    return rootsopt.load_config("cic", [f"profile={profile}"])
+    return rootsopt.load_config("cic_drawn", [f"profile={profile}"])
 
 
 def test_family_leaves_the_file_of_an_outline():
@@ -175,7 +175,7 @@ def test_points_of_two_families_have_all_parameters():
     # The number of mesh periods belongs to a periodic motion, not to one that is given up.
     rows[0] |= {"steady_state": {"period": 3}}
     rows[2] |= {"steady_state": {"period": 4}, "status": Status.CHAOTIC.label}
-    found = dataset_of(rootsopt.load_config("cic"), plan, rows)
+    found = dataset_of(rootsopt.load_config("cic_drawn"), plan, rows)
     slope = found.gradient_mean_force_N
     assert slope.design_key.values.tolist() == ["pressure_angle_deg", "arc_center_mm"]
     np.testing.assert_array_equal(slope.values[:, 0], [[1.0, np.nan], [np.nan, 2.0]])

@@ -45,7 +45,8 @@ for law in (ramp, smooth_step, balanced_ramp, balanced_step, impact):
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(24)
 
 # The cheapest settings that reach a relative error of 1e-3 in mean, peak and RMS force (the last
-# one also in their gradients). They were found in configs/cic.yaml on designs around the baseline.
+# one also in their gradients). They were found in configs/cic_drawn.yaml on designs around the
+# baseline.
 # A map needs `NumbaPair.fitted` first.
 SEARCH_1E3: dict[str, Any] = {"contact": "search", "rtol": 1e-5, "settle": 1}
 MAP_1E3: dict[str, Any] = {

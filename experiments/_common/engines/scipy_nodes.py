@@ -36,7 +36,7 @@ from experiments._common.engines import (
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(24)
 
 # The cheapest settings with a relative error of 1e-3 in mean, peak and RMS force. They were found
-# in configs/cic.yaml on designs around the baseline.
+# in configs/cic_drawn.yaml on designs around the baseline.
 NODES_1E3: dict[str, Any] = {"method": "LSODA", "nodes": 800, "rtol": 3e-5, "settle": 1}
 
 # Rotor geometry

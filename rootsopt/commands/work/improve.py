@@ -34,8 +34,8 @@ _SCALED = {
     "scene.speed_rpm": -1, "scene.load.torque_N_m": 3, "scene.timing_gear.stiffness_N_m_per_rad": 3,
     "scene.timing_gear.backlash_mm": 1,
 }  # fmt: skip
-"""Values of `configs/cic.yaml` that follow the pitch radius, each with its power: the same tip
-speed and gas pressure."""
+"""Values of `configs/cic_drawn.yaml` that follow the pitch radius, each with its power: the same
+tip speed and gas pressure."""
 _AIR = {"viscosity_mPa_s": 0.018, "pressure_difference_Pa": 2e4, "gas": {"inlet_pressure_Pa": 1e5}}
 """The section `pump` that is assumed, without its clearances."""
 _COMMON = "ee", "arc", "cic"
@@ -56,7 +56,7 @@ def config_of(options: argparse.Namespace) -> Config:
     the file does not hold a rotor, or if an option does not suit it."""
     path, scene = options.config, options.scene
     given, rest = _given(options)
-    base = load(scene or "cic", rest)
+    base = load(scene or "cic_drawn", rest)
     if base.profile.from_file:
         given = base.profile.model_dump(exclude_none=True) | given
     rotor = found(path, given, _asked)

@@ -205,7 +205,9 @@ def test_a_jump_of_the_contact_is_an_event():
     instants."""
     arcs = "family: four_arcs, lobes: 3, pitch_radius_mm: 33.0, arc_center_mm: 23.964"
     rest = "tip_arc_radius_mm: 20.659, tip_arc_turn_deg: 34.22"
-    config = rootsopt.load_config("cic", [f"profile={{{arcs}, {rest}}}", "optimizer.bounds={}"])
+    config = rootsopt.load_config(
+        "cic_drawn", [f"profile={{{arcs}, {rest}}}", "optimizer.bounds={}"]
+    )
     scene = Scene.from_config(config)
     pair = eqx.filter_jit(lambda s, d: s.pair(d))(scene, jnp.asarray(config.design, float))
     count, times = 240, 40
@@ -342,7 +344,7 @@ def _assert_shot(evaluator, found, within):
     np.testing.assert_allclose([found.response[n] for n in FORCES], truth.forces, rtol=within)
 
 
-@pytest.mark.parametrize("name", ["cic", pytest.param("ee", marks=pytest.mark.long)])
+@pytest.mark.parametrize("name", ["cic_drawn", pytest.param("ee", marks=pytest.mark.long)])
 def test_orbit_from_a_neighbour_is_that_from_rest(name):
     """At half the speed, other events occur."""
     config = rootsopt.load_config(f"configs/{name}.yaml")
@@ -371,7 +373,9 @@ def test_maxima_near_a_neighbour_are_those_from_rest():
     """At this speed, some of the local maxima follow events."""
     # An orbit is refined for mean, RMS and peak; at 1e-8, lower maxima err by some 1e-6.
     overrides = ["scene.speed_rpm=1000", "solver.rtol=1e-9"]
-    evaluator = Evaluator.of(rootsopt.load_config("configs/cic.yaml", overrides)).with_maxima()
+    evaluator = Evaluator.of(
+        rootsopt.load_config("configs/cic_drawn.yaml", overrides)
+    ).with_maxima()
     base = evaluator(series=False)
     for factor in (0.998, 0.999, 1.003):
         design = factor * np.array(list(base.design.values()))
@@ -389,7 +393,7 @@ def test_maxima_near_a_neighbour_are_those_from_rest():
 
 
 def test_a_coarser_accuracy_saves_work_and_bounds_the_error():
-    config, work = rootsopt.load_config("configs/cic.yaml"), []
+    config, work = rootsopt.load_config("configs/cic_drawn.yaml"), []
     truth = Evaluator.of(config).at_tolerance(1e-11)(series=False)
     for accuracy in (1e-2, 1e-5, 1e-7):
         tool = Evaluator.of(config.replaced({"solver.accuracy": accuracy}))

@@ -52,19 +52,19 @@ ARCS = [
 @pytest.mark.parametrize(
     ("name", "overrides", "period"),
     [
-        ("cic", [], 1),
+        ("cic_drawn", [], 1),
         ("ee", [], 1),
         ("ee", STIFF, 1),
-        ("cic", FOUR, 1),
-        ("cic", LIVELY, 2),
+        ("cic_drawn", FOUR, 1),
+        ("cic_drawn", LIVELY, 2),
         ("pump", [], 1),
-        ("cic", TWISTED, 1),
-        ("cic", ["contact.wear.depth_mm=0.02"], 1),
-        ("cic", ARCS, 1),
-        ("cic", ["scene.center_distance_error_mm=0.03"], 1),
+        ("cic_drawn", TWISTED, 1),
+        ("cic_drawn", ["contact.wear.depth_mm=0.02"], 1),
+        ("cic_drawn", ARCS, 1),
+        ("cic_drawn", ["scene.center_distance_error_mm=0.03"], 1),
     ],
     ids=[
-        *("cic", "ee", "steps down to rounding", "four lobes", "lively", "pump", "twisted"),
+        *("cic_drawn", "ee", "steps down to rounding", "four lobes", "lively", "pump", "twisted"),
         *("worn", "contact jumps over a joint", "centre distance"),
     ],
 )
@@ -90,7 +90,7 @@ def test_orbit_closed_over_too_many_periods_is_closed_again(monkeypatch):
         taken.append(1)
         return found._replace(period=2 * found.period)
 
-    config = rootsopt.load_config("configs/cic.yaml")
+    config = rootsopt.load_config("configs/cic_drawn.yaml")
     scene = Scene.from_config(config)
     solver = scene.solver
     pair, tangents, _ = scene.pair_and_tangents(jnp.asarray(config.design, float))
@@ -135,7 +135,7 @@ class _Untold(_Stop):
 @pytest.mark.long
 def test_flags_without_margins():
     """Events that only a flag tells are located by it; forces and gradients are the same."""
-    config = rootsopt.load_config("configs/cic.yaml")
+    config = rootsopt.load_config("configs/cic_drawn.yaml")
     scene, design = Scene.from_config(config), jnp.asarray(config.design, float)
     relative = rootsopt.evaluate(config).series.relative
     stop = -0.5 * (relative.min() + relative[relative < 0].mean())
