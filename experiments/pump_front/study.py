@@ -1,6 +1,6 @@
 """Fronts of contact force, leakage and flow ripple, for every profile family in the same pump.
 
-The pump has pitch radius, length and gear of the shipped CIC pair, and delivers air against 0.5 bar.
+The pump has pitch radius, length and gear of the shipped CIC pair; it delivers air against 0.5 bar.
 The load is the mean torque of the gas, which is the same for all rotors of one displacement. Every
 design displaces at least the volume of the EE rotor. Area efficiency and seal width have no limits:
 displacement and leakage take their place.

@@ -11,7 +11,7 @@ from rootsopt.config.families import is_list
 from rootsopt.figures.comparison import plot_departure, plot_forces_together
 from rootsopt.figures.force import plot_force, plot_gap, plot_spectrum
 from rootsopt.figures.history import plot_history
-from rootsopt.figures.optimum import plot_prices, plot_residual, plot_starts
+from rootsopt.figures.optimum import plot_feasible, plot_prices, plot_residual, plot_starts
 from rootsopt.figures.profiles import plot_conjugacy, plot_flank, plot_meshing, plot_profiles
 from rootsopt.figures.style import figure, write
 from rootsopt.measured.conjugacy import conjugacy, gaps_um
@@ -92,6 +92,22 @@ def certificate_figure(
     plot_prices(axes[0, 1], constraints, optimality["converged"])
     plot_starts(axes[0, 2], optimality["starts"], optimality["optima"])
     return write(folder, "optimum", made, "Certificate of the optimum")
+
+
+def feasible_figure(
+    folder: ResultFolder,
+    columns: Mapping[str, Sequence[float]],
+    design: Mapping[str, float],
+    vertex: Mapping[str, Any],
+) -> str:
+    """Write feasible.png, the designs that the limits leave; return its name.
+
+    `columns`: those of `feasible.csv`; `design`: the optimum; `vertex`: entry of the result
+    file."""
+    made, axes = figure(7.5, 5, 1, 1)
+    plot_feasible(axes[0, 0], columns, design, vertex["others"])
+    entries = axes[0, 0].get_legend_handles_labels()[0]
+    return write(folder, "feasible", made, "Designs that satisfy all limits", entries, 3)
 
 
 def _outline(config, design):

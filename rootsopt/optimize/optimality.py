@@ -3,13 +3,16 @@
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rootsopt.optimize.certificate import RESIDUAL, Certificate
 from rootsopt.optimize.sqp import REASONS
+
+if TYPE_CHECKING:
+    from rootsopt.optimize.vertices import VertexOptimum
 
 _SAME = 1e-4, 0.03
 """Differences above which the optima of two local searches count as distinct: relative difference
@@ -132,7 +135,8 @@ class Optimality:
     decrease of the objective that the search still expected nearby, NaN if not known. `holders`:
     branches of the objective that are active there. `starts`: outcomes of the local searches.
     `sensitivities`: one row per quantity of the scene, with its effect on the forces. `bound`:
-    lower bound over all designs, or `None`."""
+    lower bound over all designs, or `None`. `vertex`: other vertices of the limits if the optimum
+    is at one, else `None`."""
 
     method: str
     certificate: Certificate
@@ -142,6 +146,7 @@ class Optimality:
     starts: Sequence[StartOutcome]
     sensitivities: Sequence[dict[str, Any]] = ()
     bound: Bound | None = None
+    vertex: "VertexOptimum | None" = None
 
     @property
     def converged(self) -> bool:
@@ -162,6 +167,8 @@ class Optimality:
         """Return the entry `optimality` of the result file."""
         optima = self.optima
         whole: dict[str, Any] = {} if self.bound is None else {"global": self.bound.record()}
+        if self.vertex is not None:
+            whole["vertex"] = self.vertex.record()
         if self.bound is None or not self.bound.proven:
             whole["unseen"] = unseen(sum(one.found for one in optima), len(optima))
         return whole | {

@@ -10,6 +10,7 @@ are checked there (`rootsopt.optimize.verification`). A search can be stopped at
 It then verifies the best design so far, unless the objective is an average over an ensemble."""
 
 import dataclasses
+import math
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
@@ -32,6 +33,7 @@ from rootsopt.optimize.outcome import Optimization, Trial, candidate, history_of
 from rootsopt.optimize.problem import FEASIBLE, Problem, needs_maxima
 from rootsopt.optimize.sqp import Found, Stops, descend
 from rootsopt.optimize.verification import Verification
+from rootsopt.optimize.vertices import VertexOptimum, vertex_optimum
 from rootsopt.response.checkpoint import Checkpoint
 from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.response.many import HERE, Point, Runs
@@ -54,6 +56,8 @@ _MOST = 2000, 20_000
 """Number of evaluations and of boxes of a lower bound that is asked for."""
 _TOGETHER = 8
 """Number of points that it evaluates side by side."""
+_AT_VERTEX, _DRAWN = 100_000, 40
+"""Number of the first trial beside an optimum at a vertex, and greatest number of these trials."""
 _BETTER = 1e-5
 """Relative gain from which a local search begins at a better design that it finds."""
 Progress = Callable[[int, int, float], None]
@@ -244,6 +248,9 @@ class Search:
         if optimality is not None and optimized is not None and bounding is not None:
             bound = bounding.bound(self.problem.objective(optimized))
             optimality = dataclasses.replace(optimality, bound=bound)
+        if optimality is not None and optimized is not None and optimality.converged:
+            vertex = self._vertex(optimized, trials)
+            optimality = dataclasses.replace(optimality, vertex=vertex)
         return Optimization(*settled, self.stop.is_set(), optimality)
 
     def _bounded(self, trials: list[Trial], number: int) -> tuple[Bounding | None, list[Trial]]:
@@ -268,17 +275,9 @@ class Search:
                 bounding.tell(one.point, self.problem.local(one.evaluation, one.point))
             known.extend(one for one in found if one.evaluation.usable)
 
-        def evaluated(number: int, point: NDArray[np.float64], orbit: Any) -> list[Trial]:
-            return [self._evaluate(self.sharp, point, _BOUND, number, orbit)]
-
         told(trials)
         while count < most and (points := bounding.ask(_TOGETHER)):
-            tasks, best = [], bounding.best
-            for place, point in enumerate(points, count):
-                near = min(known, key=lambda one: float(np.linalg.norm(one.point - point)))
-                tasks.append((place, point, near.evaluation.start))
-            self.expected = max(self.expected, len(self._trials) + len(tasks))
-            found = self._side_by_side(evaluated, tasks)
+            best, found = bounding.best, self._beside(known, points, count)
             told(found)
             count += len(points)
             if self.stop.is_set():
@@ -289,6 +288,38 @@ class Search:
                 told(again)
                 number += 1
         return bounding, further
+
+    def _vertex(self, optimized: Evaluation, trials: list[Trial]) -> VertexOptimum | None:
+        """Return what is known of an optimum at a vertex of the limits, from as many designs as the
+        search had `trials`; `None` elsewhere, or where the objective is one over a sample."""
+        if not self.stage.bounded or len(optimized.design) > _PARAMETERS:
+            return None
+        known = [one for one in trials if one.evaluation.usable]
+
+        def simulated(points: list[NDArray[np.float64]]) -> list[float]:
+            found = self._beside(known, points, _AT_VERTEX)
+            values = [x.objective if x.excess <= FEASIBLE else math.nan for x in found]
+            return values or [math.nan] * len(points)
+
+        point = self.problem.point([*optimized.design.values()])
+        return vertex_optimum(self.problem, point, simulated, min(len(trials), _DRAWN))
+
+    def _beside(
+        self, known: list[Trial], points: list[NDArray[np.float64]], number: int
+    ) -> list[Trial]:
+        """Evaluate `points` (d,), each from the nearest of the `known` orbits.
+
+        `number`: that of the first trial. Return none if the search is stopped."""
+
+        def evaluated(number: int, point: NDArray[np.float64], orbit: Any) -> list[Trial]:
+            return [self._evaluate(self.sharp, point, _BOUND, number, orbit)]
+
+        tasks = []
+        for place, point in enumerate(points, number):
+            near = min(known, key=lambda one: float(np.linalg.norm(one.point - point)))
+            tasks.append((place, point, near.evaluation.start))
+        self.expected = max(self.expected, len(self._trials) + len(tasks))
+        return self._side_by_side(evaluated, tasks)
 
     def _verification(self) -> Verification:
         tolerance, asked = self.config.solver.orbit_tolerance, self.stop.is_set

@@ -148,6 +148,7 @@ def _certified(result: Record) -> Iterator[str]:
         yield "the design has no certificate"
     if found.get("converged") and optima and not check.get("rejected"):
         yield f"{optima[0]['found']} of {len(found['starts'])} local searches found it"
+    yield from _at_vertex(found.get("vertex") or {})
     yield from _bounded(found.get("global") or {})
     searched, verified = (check.get(f"{name}_objective") for name in ("searched", "verified"))
     if verified is not None and "combined_standard_error" in check:
@@ -164,6 +165,23 @@ def _certified(result: Record) -> Iterator[str]:
             f"mean objective in {next(iter(fresh.values()))['scenes']} fresh scenes that scatter: "
             f"{listed(means)}, without a usable motion: {listed(lost)}"
         )
+
+
+def _at_vertex(known: Record) -> Iterator[str]:
+    """Yield that limits alone hold an optimum, and which vertex comes next; `known`: the entry."""
+    if not known:
+        return
+    usable = [one for one in known["others"] if one["objective"] is not None]
+    next_best = ""
+    if usable:
+        which = f"with {listed(usable[0]['limits'])}"
+        next_best = (
+            f": of {len(usable)} others, the next has {brief(usable[0]['objective'])}, {which}"
+        )
+    yield (
+        f"{listed(known['limits'])} alone hold it, so that forces only choose between vertices of "
+        f"the limits{next_best}"
+    )
 
 
 def _bounded(known: Record) -> Iterator[str]:

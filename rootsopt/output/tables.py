@@ -318,10 +318,24 @@ def certificate_tables(result: Record) -> Iterator[Table | None]:
     proven = whole is not None and whole["proven"]
     yield table("Local searches", heads, groups, "" if proven else _unseen(found))
     yield _whole(whole) if whole else None
+    yield _vertices(result) if "vertex" in found else None
     rows = [_sensitive(one) for one in found.get("sensitivities") or ()]
     heads = "", "mean force (N)", "peak force (N)", "objective (%)"
     note = "What a small change of the scene does to the optimised design."
     yield table("Sensitivity to the scene", heads, [("", rows)], note)
+
+
+def _vertices(result: Record) -> Table | None:
+    """Return the table on the vertices of the limits, the best first."""
+    known, own = result["optimality"]["vertex"], result["optimized"]["design"]
+    rows: list[Row] = [
+        [*map(value, one["design"].values()), value(one["objective"]), ", ".join(one["limits"])]
+        for one in known["others"]
+    ]
+    rows.insert(0, [*map(value, own.values()), "optimum", ", ".join(known["limits"])])
+    heads = [*map(label, own), "objective", "held by"]
+    note = "Where as many limits meet as there are parameters, forces only choose between vertices."
+    return table("Vertices of the limits", heads, [("", rows)], note)
 
 
 def _whole(found: Record) -> Table | None:

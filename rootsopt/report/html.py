@@ -47,6 +47,7 @@ _CAPTIONS = {
     "basins.png": "Initial states and the motion that each leads to",
     "front.png": "Best compromises",
     "tolerances.png": "Forces in fresh scenes that scatter",
+    "feasible.png": "Designs that satisfy all limits",
     "assumptions.png": "Objective over what is assumed about the scene",
 }
 """Captions of the figures by file name; other figures are named after their file."""

@@ -227,6 +227,8 @@ def _write(folder, config, options, result, alike, sheets, compiled, ran) -> dic
         data["objective_by_speed"] = result.objective_by_speed
     if result.optimality is not None:
         data["optimality"] = result.optimality.record()
+        if (vertex := result.optimality.vertex) is not None and vertex.keys:
+            folder.write_csv("feasible.csv", vertex.columns())
     if result.robustness is not None:
         data["robustness"] = result.robustness.record()
         if result.optimized is not None and config.tolerances is not None:
@@ -259,6 +261,9 @@ def _draw(folder, config: Config, result, data: dict) -> None:
         runs.optimization_figures(folder, *pair, rows, _searching(config, result), given)
         if result.optimality is not None:
             runs.certificate_figure(folder, rows, data["constraints"], data["optimality"])
+            if (vertex := result.optimality.vertex) is not None and vertex.keys:
+                design = data["optimized"]["design"]
+                runs.feasible_figure(folder, vertex.columns(), design, data["optimality"]["vertex"])
     else:
         runs.simulation_figures(folder, result.baseline, config)
     if config.objective.speeds_rpm:

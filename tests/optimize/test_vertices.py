@@ -1,0 +1,90 @@
+"""Vertices of the feasible set, against half-space intersections and against the geometry."""
+
+import csv
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial import HalfspaceIntersection
+
+from rootsopt.commands.console import main
+from rootsopt.config import load
+from rootsopt.optimize.vertices import FeasibleSet
+from rootsopt.profiles import geometry
+from rootsopt.scene import Scene
+
+OBJECTIVE = "objective={mean_weight: 0, peak_weight: 0, terms: {outer_radius_mm: 1}}"
+
+
+@pytest.mark.parametrize("size", [2, 3, 4])
+def test_all_vertices_of_a_polytope_are_found(size):
+    """Random planes cut the unit box; SciPy (Qhull) intersects the half spaces."""
+    rng = np.random.default_rng(size)
+    normals = rng.normal(size=(3, size))
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    depth = rng.uniform(0.2, 0.4, 3)
+    middle = np.full(size, 0.5)
+
+    def limits(point):
+        return depth - normals @ (point - middle), -normals
+
+    box = np.vstack([np.eye(size), -np.eye(size)])
+    ends = np.concatenate([-np.ones(size), np.zeros(size)])
+    planes = np.vstack([
+        np.column_stack([normals, -depth - normals @ middle]), np.column_stack([box, ends])
+    ])  # fmt: skip
+    expected = np.unique(HalfspaceIntersection(planes, middle).intersections.round(9), axis=0)
+    feasible = FeasibleSet(limits, size)
+    first = feasible.vertex(expected[0])
+    assert first is not None
+    found = [first.point, *(one.point for one in feasible.vertices(first, 100))]
+    np.testing.assert_allclose(np.unique(np.round(found, 9), axis=0), expected, atol=2e-9)
+    assert feasible.vertex(middle) is None
+
+
+def test_edges_may_be_curved():
+    """Within a circle and right of a line through it, each end of an arc is a vertex."""
+    feasible = FeasibleSet(
+        lambda x: (np.array([0.16 - np.sum((x - 0.5) ** 2), x[0] - 0.5]),
+                   np.array([-2 * (x - 0.5), [1.0, 0.0]])),
+        2,
+    )  # fmt: skip
+    first = feasible.vertex(np.array([0.5, 0.9]))
+    assert first is not None
+    (other,) = feasible.vertices(first, 5)
+    np.testing.assert_allclose(other.point, [0.5, 0.1], atol=1e-9)
+
+
+def test_an_optimum_at_a_vertex_says_so(tmp_path, capsys):
+    """The other vertices meet the limits that hold them, and their objective is that of the
+    geometry. No simulated design of the figure is better than the optimum."""
+    out = tmp_path / "run"
+    assert main(["optimize", "cic_drawn", "-o", str(out), "--set", OBJECTIVE]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    result = json.loads((out / "result.json").read_text())
+    vertex, best = result["optimality"]["vertex"], result["optimized"]
+    assert f"of {len(vertex['others'])} others, the next has" in said
+    assert len(vertex["limits"]) == 3
+    assert (out / "figures" / "feasible.png").stat().st_size > 10_000
+    config = load("cic_drawn", [OBJECTIVE])
+    scene = Scene.from_config(config)
+    objectives = [one["objective"] for one in vertex["others"]]
+    assert objectives == sorted(objectives)
+    assert len(objectives) >= 3
+    base = result["baseline"]["geometry"]
+    for one in vertex["others"]:
+        shape = geometry(scene.profile(jnp.array([*one["design"].values()])))
+        radius = float(shape.outer_radius) * 1e3
+        assert one["objective"] == pytest.approx(radius / base["outer_radius_mm"], rel=1e-9)
+        if "seal width" in one["limits"]:
+            assert float(shape.seal_width) * 1e3 == pytest.approx(2.0, abs=1e-6)
+        if "area efficiency" in one["limits"]:
+            assert float(shape.area_efficiency) == pytest.approx(base["area_efficiency"], abs=1e-7)
+        if "lower bound of pressure angle" in one["limits"]:
+            assert one["design"]["pressure_angle_deg"] == pytest.approx(25.0, abs=1e-9)
+    with (out / "feasible.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["objective"] not in ("", "nan")]
+    values = np.array([float(row["objective"]) for row in rows])
+    assert len(rows) >= 4
+    assert values.min() > best["geometry"]["outer_radius_mm"] / base["outer_radius_mm"] - 1e-9
