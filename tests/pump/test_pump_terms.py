@@ -13,6 +13,7 @@ NAMES = (
     *("displaced_volume_cm3", "theoretical_flow_l_min", "flow_ripple", "gear_backlash_max_mm"),
     *("angular_play_min_mrad", "flank_gap_min_um", "flank_gap_mean_um"),
     *("static_bearing_load_max_N", "static_bearing_load_equivalent_N", "leakage_fraction"),
+    "delivered_flow_l_min",
 )
 PUMP = (
     "pump={viscosity_mPa_s: 0.018, tip_clearance_mm: 0.08, radial_allowance_mm: 0.01}",
@@ -32,6 +33,7 @@ def test_terms_are_the_rows_of_the_sheet_and_have_gradients():
     values, slopes = map(np.asarray, values_of(scene, terms, design, *nothing))
     rows = sheet(scene, design)
     rows["leakage_fraction"] = 1 - rows["volumetric_efficiency"]
+    rows["delivered_flow_l_min"] = rows["theoretical_flow_l_min"] * rows["volumetric_efficiency"]
     np.testing.assert_allclose(values, [rows[name] for name in NAMES], rtol=1e-9)
     steps = np.diag([1e-4, 1e-4, 1e-4])
     ends = [[values_of(scene, terms, design + k * s, *nothing)[0] for k in (1, -1)] for s in steps]
