@@ -23,16 +23,16 @@ class ParetoConfig(Section):
         description="two or three quantities: forces and lines as in `response`, geometry as in "
         "`geometry`, displaced_volume_cm3, theoretical_flow_l_min, flow_ripple, "
         "gear_backlash_max_mm, angular_play_min_mrad, leakage_fraction, delivered_flow_l_min, "
-        "flank_gap_min_um, flank_gap_mean_um, bearing_load_equivalent_N, bearing_load_max_N, axial_force_max_N, "
-        "tilting_moment_max_N_m, static_bearing_load_equivalent_N, static_bearing_load_max_N, or "
+        "flank_gap_min_um, flank_gap_mean_um, bearing_load_equivalent_N, bearing_load_max_N, "
+        "axial_force_max_N, tilting_moment_max_N_m, static_bearing_load_equivalent_N, static_bearing_load_max_N, or "
         "registered terms",
     )
     senses: dict[str, Literal["min", "max"]] = Field(
         default_factory=dict,
         description="sense of a term, as {seal_width_mm: min}, where it should differ from the "
         "term's own: max for area_efficiency, displaced_volume_cm3, theoretical_flow_l_min, "
-        "delivered_flow_l_min, gear_backlash_max_mm, flank_gap_min_um, flank_gap_mean_um, seal_width_mm, "
-        "root_radius_mm and undercut_margin_mm, min for all others",
+        "delivered_flow_l_min, gear_backlash_max_mm, flank_gap_min_um, flank_gap_mean_um, "
+        "seal_width_mm, root_radius_mm and undercut_margin_mm, min for all others",
     )
     points: Annotated[int, Field(ge=3, le=101)] = Field(
         11, description="points along the front of two terms, its ends included"
