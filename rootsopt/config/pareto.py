@@ -24,8 +24,8 @@ class ParetoConfig(Section):
         "`geometry`, displaced_volume_cm3, theoretical_flow_l_min, flow_ripple, "
         "gear_backlash_max_mm, angular_play_min_mrad, leakage_fraction, delivered_flow_l_min, "
         "flank_gap_min_um, flank_gap_mean_um, bearing_load_equivalent_N, bearing_load_max_N, "
-        "axial_force_max_N, tilting_moment_max_N_m, static_bearing_load_equivalent_N, static_bearing_load_max_N, or "
-        "registered terms",
+        "axial_force_max_N, tilting_moment_max_N_m, static_bearing_load_equivalent_N, "
+        "static_bearing_load_max_N, or registered terms",
     )
     senses: dict[str, Literal["min", "max"]] = Field(
         default_factory=dict,
