@@ -76,6 +76,18 @@ def test_a_better_rotor_takes_the_place_of_that_of_a_file(aim, least, tmp_path, 
         assert one["share"] == pytest.approx(gain / result["improvement"]["objective"], rel=1e-3)
 
 
+def test_a_gain_too_small_to_count_is_none(tmp_path, monkeypatch):
+    """Status, message and exit code agree; the design is reported all the same."""
+    monkeypatch.setattr(work, "WORTH", 2.0)
+    file, folder = file_of(tmp_path, 0.0), tmp_path / "run"
+    sets = [word for one in QUICK for word in ("--set", one)]
+    assert improve.main([file, "--smoother", "--no-figures", *sets, "-o", str(folder)]) == 3
+    result = json.loads((folder / "result.json").read_text())
+    assert result["status"] == "not_improved"
+    assert "no better rotor" in result["message"]
+    assert result["optimized"]["status"] == "geometry_only"
+
+
 @pytest.mark.long
 def test_a_rotor_without_parameters_is_improved_by_a_free_form(tmp_path):
     """EE has no seal and no parameters. The ripple of its flow needs no simulation."""

@@ -19,13 +19,14 @@ from rootsopt.errors import InputError
 from rootsopt.measured.finding import Found, found
 from rootsopt.optimize.surviving import survives, surviving
 from rootsopt.output import terminal
-from rootsopt.output.better import WORTH, better_tables
+from rootsopt.output.better import NOTHING_BETTER, WORTH, better_tables
 from rootsopt.output.names import stated
 from rootsopt.output.runs import RunFolder
 from rootsopt.pump.sheet import record_of
 from rootsopt.runtime.environment import say
 from rootsopt.scene.check import shape_of
 from rootsopt.scene.families import classical
+from rootsopt.status import Status
 
 _TERMS = {"tighter": "leakage_fraction", "smoother": "flow_ripple"}
 """Terms of the objective by aim; `quieter` has the mean and the peak force instead."""
@@ -209,7 +210,9 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     def further(result) -> dict[str, Any]:
         worth = abs(result.improvement.get("objective", 0.0)) >= WORTH
         cases = surviving(result, config) if worth else []
-        return {"improve": options.known | {"cases": cases, "message": survives(cases)}}
+        lost = {"status": Status.NOT_IMPROVED.label, "message": NOTHING_BETTER}
+        told = {} if worth or result.interrupted or result.optimized is None else lost
+        return told | {"improve": options.known | {"cases": cases, "message": survives(cases)}}
 
     outcome = optimize.searched_for(config, options, folder, further)
     data = folder.result

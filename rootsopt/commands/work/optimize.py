@@ -238,7 +238,8 @@ def _write(folder, config, options, result, alike, sheets, compiled, ran) -> dic
         data["assumptions"] = result.assumptions.record()
         folder.write_csv("assumptions.csv", result.assumptions.columns())
     data["verification"] = result.verification
-    data["status"], data["message"] = result.status.label, _advice(result)
+    # `improve` has asked for more than the search.
+    data = {"status": result.status.label, "message": _advice(result)} | data
     data["statistics"] = {
         "evaluations": len(rows),
         "compile_seconds": compiled,
