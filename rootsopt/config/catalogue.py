@@ -115,19 +115,19 @@ _OWN = (
         parameters=(PRESSURE_ANGLE, INVOLUTE_LENGTH, TIP_ARC_ANGLE),
         example={"pressure_angle_deg": 36.43, "involute_length_mm": 8.0, "tip_arc_angle_deg": 4.0},
         inherent=_OVERLONG,
-        limits="rootsopt.profiles.involute:check",
+        limits="rootsopt.profiles.cic:check",
         by_limits=True,
-        ranges="rootsopt.profiles.involute:ranges",
+        ranges="rootsopt.profiles.cic:ranges",
     ),
     Family(
         name="ee",
         help="epicycloid on hypocycloid, without design parameters",
-        maker="rootsopt.profiles.ee:EE",
+        maker="rootsopt.profiles.epicycloid:EE",
     ),
     Family(
         name="arc",
         help="one circular arc through both pitch crossings",
-        maker="rootsopt.profiles.arc_families:arc",
+        maker="rootsopt.profiles.arcs:arc",
         parameters=(ARC_CENTER,),
         example={"arc_center_mm": 29.7},
         remedy="move the centre: it must lie inside the pitch circle, and undercut starts if it "
@@ -136,14 +136,14 @@ _OWN = (
     Family(
         name="arcs_epicycloid",
         help="a single arc cut off by a tip land, with a rounded edge between them",
-        maker="rootsopt.profiles.arc_families:arcs_epicycloid",
+        maker="rootsopt.profiles.arcs:arcs_epicycloid",
         parameters=(ARC_CENTER, TIP_ARC_ANGLE, EDGE_RADIUS),
         example={"arc_center_mm": 27.0, "tip_arc_angle_deg": 8.0, "edge_radius_mm": 1.0},
         remedy="widen the land, move the arc's centre inwards, or round the edge more (its radius "
         "must be smaller than the arc's)",
         # An edge outside the pitch circle meshes twice.
         inherent=frozenset({"rolling"}),
-        limits="rootsopt.profiles.edge:check",
+        limits="rootsopt.profiles.arcs:check",
     ),
     Family(
         name="arc_involute",
@@ -152,14 +152,14 @@ _OWN = (
         parameters=(PRESSURE_ANGLE, INVOLUTE_LENGTH),
         example={"pressure_angle_deg": 36.0, "involute_length_mm": 6.0},
         inherent=_OVERLONG,
-        limits="rootsopt.profiles.involute:check",
+        limits="rootsopt.profiles.cic:check",
         by_limits=True,
-        ranges="rootsopt.profiles.involute:ranges",
+        ranges="rootsopt.profiles.cic:ranges",
     ),
     Family(
         name="four_arcs",
         help="tip arc and flank arc, tangent to each other",
-        maker="rootsopt.profiles.arc_families:four_arcs",
+        maker="rootsopt.profiles.arcs:four_arcs",
         parameters=(ARC_CENTER, TIP_ARC_RADIUS, TIP_ARC_TURN),
         example={"arc_center_mm": 30.0, "tip_arc_radius_mm": 13.0, "tip_arc_turn_deg": 40.0},
         remedy="move the tip arc's centre inwards, or change where it ends or its radius",
@@ -167,7 +167,7 @@ _OWN = (
     Family(
         name="five_arcs",
         help="tip land, tip arc and flank arc, tangent to each other",
-        maker="rootsopt.profiles.arc_families:five_arcs",
+        maker="rootsopt.profiles.arcs:five_arcs",
         parameters=(OUTER_RADIUS, TIP_ARC_ANGLE, TIP_ARC_RADIUS, TIP_ARC_TURN),
         example={
             "outer_radius_mm": 45.0,
@@ -196,7 +196,7 @@ _OWN = (
     Family(
         name="extended_cycloid",
         help="epicycloid with a trochoid ratio that varies from tip to pitch crossing",
-        maker="rootsopt.profiles.trochoid:extended_cycloid",
+        maker="rootsopt.profiles.curve:extended_cycloid",
         parameters=(TROCHOID_RATIO,),
         example={"trochoid_ratio": 1.3},
         remedy="bring the trochoid ratio closer to 1",
@@ -204,7 +204,7 @@ _OWN = (
     Family(
         name="ellipse",
         help="an arc of an ellipse through both pitch crossings",
-        maker="rootsopt.profiles.ellipse:ellipse",
+        maker="rootsopt.profiles.curve:ellipse",
         parameters=(ELLIPSE_CENTER, ELLIPSE_HEIGHT),
         example={"ellipse_center_mm": 27.0, "ellipse_height_mm": 18.0},
         remedy="move the centre, or change the height",

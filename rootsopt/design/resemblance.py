@@ -31,7 +31,7 @@ from rootsopt.errors import InputError
 from rootsopt.measured.conjugacy import conjugacy
 from rootsopt.profiles import Outline, Profile, project
 from rootsopt.profiles.departure import beyond, departures, feet, flank_points
-from rootsopt.profiles.validity import PURE, margins
+from rootsopt.profiles.geometry import PURE, margins
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene.families import check, classical, profile_of
 

@@ -45,7 +45,7 @@ from rootsopt.dynamics.parts import (
 )
 from rootsopt.dynamics.timescales import Timescales
 from rootsopt.errors import InputError
-from rootsopt.profiles.validity import Soundness
+from rootsopt.profiles.geometry import Soundness
 
 STALLED = 0.05
 """Speed of rotor 1, as a fraction of the drive's speed, below which the motor counts as stalled."""

@@ -9,7 +9,7 @@ from rootsopt.config import Config
 from rootsopt.config.explain import is_whole, limits_of, tree
 from rootsopt.config.families import family_of
 from rootsopt.config.units import unit_of, words
-from rootsopt.design.bounds import bounds_of
+from rootsopt.design.space import bounds_of
 
 _SECTIONS = ("profile", "rotor", "contact", "scene")
 """Sections of the config that hold the design and its scene."""

@@ -13,8 +13,8 @@ from rootsopt.config import Config
 from rootsopt.config.families import FREE_FORM, families, family_of
 from rootsopt.config.study import NEAREST
 from rootsopt.config.units import MM
-from rootsopt.design.bounds import widened
 from rootsopt.design.resemblance import COEFFICIENTS, Likeness, free_likeness, likeness
+from rootsopt.design.space import widened
 from rootsopt.errors import InputError
 from rootsopt.optimize.limits import settled
 from rootsopt.profiles import Outline, Profile

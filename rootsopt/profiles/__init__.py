@@ -1,13 +1,10 @@
 """Rotor profiles: a base class that describes a flank by its roll angle, and the families."""
 
-from rootsopt.profiles.arc_families import arc, arcs_epicycloid, five_arcs, four_arcs
-from rootsopt.profiles.arcs import Arcs
+from rootsopt.profiles.arcs import Arcs, arc, arcs_epicycloid, five_arcs, four_arcs
 from rootsopt.profiles.base import Profile, RollPoint, Segment
 from rootsopt.profiles.cic import CIC
-from rootsopt.profiles.curve import Curve, Piece, RollPiece
-from rootsopt.profiles.ee import EE
-from rootsopt.profiles.ellipse import ellipse
-from rootsopt.profiles.epicycloid import TippedEpicycloid, circle_epicycloid, hypo_epicycloid
+from rootsopt.profiles.curve import Curve, Piece, RollPiece, ellipse, extended_cycloid
+from rootsopt.profiles.epicycloid import EE, TippedEpicycloid, circle_epicycloid, hypo_epicycloid
 from rootsopt.profiles.freeform import FreeForm, project
 from rootsopt.profiles.geometry import (
     Geometry,
@@ -19,7 +16,6 @@ from rootsopt.profiles.geometry import (
     quadrature_nodes,
 )
 from rootsopt.profiles.outline import Outline, Table
-from rootsopt.profiles.trochoid import extended_cycloid
 
 __all__ = [
     "CIC",

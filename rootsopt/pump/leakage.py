@@ -1,10 +1,6 @@
 """Leakage of a pump: mesh, tips, end faces, and the volumetric efficiency.
 
-The mesh leaks along the rotor's whole length, with a gap that changes over the rotation. Both tips
-leak along the same length, and the four end faces leak across the rotors. A liquid flows by
-Reynolds' equation. A gas flows at the lesser of two limits, friction (compressible laminar flow)
-and inertia (an ideal nozzle of the gap's height).
-"""
+The flow through a gap is laminar, of a liquid or of an ideal gas up to its critical ratio."""
 
 from typing import NamedTuple
 
@@ -15,11 +11,69 @@ from jaxtyping import Array, Float
 
 from rootsopt.contact.worn import series_at, wear_series
 from rootsopt.profiles import Geometry, Profile
-from rootsopt.pump import flow, gas
+from rootsopt.pump import flow
 from rootsopt.pump.gap import Allowances, MeshGap, mesh_gap, rolls
-from rootsopt.pump.laminar import slot_flow
 from rootsopt.scene import Scene
-from rootsopt.scene.medium import Medium
+from rootsopt.scene.medium import Gas, Medium
+
+CONTINUUM = 0.01
+"""Knudsen number above which gas slips at the walls, so that it leaks more than the laminar formula
+states.
+"""
+MOLECULAR = 1.0
+"""Knudsen number above which molecules meet the walls more often than each other. The formulas of
+this module do not hold there."""
+
+
+def critical_ratio(heat_ratio: Float[Array, ""]) -> Float[Array, ""]:
+    """Return the pressure ratio below which a nozzle is choked, (2 / (κ + 1))^(κ / (κ - 1)).
+
+    `heat_ratio`: κ."""
+    return (2 / (heat_ratio + 1)) ** (heat_ratio / (heat_ratio - 1))
+
+
+def nozzle_flux(
+    upstream: Float[Array, "*n"], downstream: Float[Array, "*n"], gas: Gas
+) -> Float[Array, "*n"]:
+    """Return the mass flow (kg/(s·m²)) per area of an ideal nozzle (Saint-Venant and Wantzel).
+
+    `upstream`, `downstream`: pressures (Pa), the former greater; `gas`: its temperature is the one
+    upstream."""
+    k = gas.heat_ratio
+    ratio = jnp.maximum(downstream / upstream, critical_ratio(k))
+    expansion = jnp.maximum(ratio ** (2 / k) - ratio ** ((k + 1) / k), 0.0)
+    # The slope of a root is infinite where there is no pressure difference.
+    moving = expansion > 0
+    speed = jnp.sqrt(2 * k / (k - 1) * jnp.where(moving, expansion, 1.0))
+    density = upstream / jnp.sqrt(gas.gas_constant * gas.temperature)
+    return jnp.where(moving, density * speed, 0.0)
+
+
+def laminar_mass_flow(
+    height: Float[Array, "*n"],
+    length: Float[Array, "*n"],
+    upstream: Float[Array, ""],
+    downstream: Float[Array, ""],
+    viscosity: Float[Array, ""],
+    gas: Gas,
+) -> Float[Array, "*n"]:
+    """Return the isothermal laminar mass flow (kg/(s·m)) per width of slots.
+
+    h³ (p1² - p2²) / (24 μ R T L): the slot's flow with the density at the mean pressure.
+    `height`: h (m); `length`: L (m); `upstream`, `downstream`: p1, p2 (Pa); `viscosity`: μ (Pa·s);
+    `gas`: gives R T."""
+    driven = (upstream**2 - downstream**2) / (gas.gas_constant * gas.temperature)
+    return height**3 * driven / (24 * viscosity * length)
+
+
+def mean_free_path(
+    pressure: Float[Array, ""], viscosity: Float[Array, ""], gas: Gas
+) -> Float[Array, ""]:
+    """Return the mean free path (m) of the molecules, (μ/p) √(π R T / 2) (Maxwell).
+
+    `pressure`: p (Pa); `viscosity`: μ (Pa·s)."""
+    return viscosity / pressure * jnp.sqrt(jnp.pi / 2 * gas.gas_constant * gas.temperature)
+
 
 FACES = 4
 """Number of end faces of the two rotors."""
@@ -146,3 +200,15 @@ def _lesser(slow, fast):
     # The first and the last angle stand for half a step each beyond them, too.
     ends = jnp.minimum(excess[0], 0.0) / 2 + jnp.minimum(excess[-1], 0.0) / 2
     return jnp.mean(fast) + (jnp.sum(between) + ends) / len(excess)
+
+
+def slot_flow(
+    height: Float[Array, "*n"],
+    length: Float[Array, "*n"],
+    pressure: Float[Array, ""],
+    viscosity: Float[Array, ""],
+) -> Float[Array, "*n"]:
+    """Return the flow (m²/s) per width through slots, h³ Δp / (12 μ L).
+
+    `height`: h (m); `length`: L (m) along the flow; `pressure`: Δp (Pa); `viscosity`: μ (Pa·s)."""
+    return height**3 * pressure / (12 * viscosity * length)

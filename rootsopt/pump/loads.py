@@ -1,8 +1,4 @@
-"""Loads on the bearings along a motion: of flanks, gas, timing gear and weight.
-
-A rotor's bearings sit at z = ±(L/2 + a), the timing gear at z = L/2 + g. `docs/bearings.md` derives
-the formulas.
-"""
+"""Loads on the bearings along a motion: of flanks, gas, timing gear and weight."""
 
 import functools
 from collections.abc import Callable
@@ -13,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Complex, Float, Inexact
 
 from rootsopt.dynamics.collocation.blocks import BLOCK, in_blocks, whole_blocks
 from rootsopt.dynamics.collocation.gauss import GAUSS, POINTS
@@ -24,10 +20,32 @@ from rootsopt.dynamics.pieces import LONGEST, smooth_pieces
 from rootsopt.dynamics.steady import SAMPLES
 from rootsopt.dynamics.varied import VariedOrbit
 from rootsopt.profiles import Geometry, Profile, geometry
-from rootsopt.pump.bearings import equivalent_load
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene
 from rootsopt.scene.build import along
+
+BALL, ROLLER = 3.0, 10 / 3
+"""Exponents of the life of ball and roller bearings (ISO 281)."""
+
+
+def gear_force(
+    torque: Float[Array, "*n"], radius: Float[Array, ""], pressure_angle: Float[Array, ""]
+) -> Complex[Array, "*n"]:
+    """Return the force (N) of the timing gear's teeth on rotor 2; on rotor 1 it is the opposite.
+
+    `torque` (N·m): torque that the gear passes on to rotor 2, in its sense of rotation; `radius`
+    (m): pitch radius; `pressure_angle` (rad): of the teeth. The teeth press along their common
+    normal: torque / radius upwards at the pitch point, and away from rotor 1."""
+    across = torque / radius
+    return 1j * across + jnp.abs(across) * jnp.tan(pressure_angle)
+
+
+def equivalent_load(force: Inexact[Array, "*k n"], exponent: float = ROLLER) -> Float[Array, "*k"]:
+    """Return the constant load (N) with the same bearing life, (mean |F|^p)^(1/p).
+
+    `force` (…, n): loads (N) at equal steps of rotation; `exponent`: p."""
+    return jnp.mean(jnp.abs(force) ** exponent, axis=-1) ** (1 / exponent)
+
 
 _INTEGRANDS = 5
 """Number of quantities that are averaged: a power of each bearing's load, and 1."""
@@ -347,6 +365,3 @@ def still_loads(scene: Scene, profile: Profile, shape: Geometry) -> tuple[Array,
     phi = 2 * jnp.pi / scene.lobes * (jnp.arange(POSES) + 0.5) / POSES
     sizes = jax.vmap(size)(phi)
     return equivalent_load(sizes.T, found.exponent), jnp.max(sizes, axis=0)
-
-
-__all__ = ["BearingLoads", "BearingSet", "OrbitLoads", "orbit_loads", "static_loads", "still_loads"]

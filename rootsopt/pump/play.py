@@ -11,7 +11,7 @@ from jax import lax
 from jaxtyping import Array, Complex, Float
 
 from rootsopt.profiles import Profile
-from rootsopt.pump.section import Flank, both_flanks, half_valley, sampled_flank
+from rootsopt.pump.gap import Flank, both_flanks, half_valley, sampled_flank
 
 POINTS = 1000
 """Number of points per segment of a flank. The angles are then accurate to about 1e-6 rad, and

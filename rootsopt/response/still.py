@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from rootsopt.config import Config
 from rootsopt.profiles import Geometry, geometry
-from rootsopt.profiles.validity import Soundness
+from rootsopt.profiles.geometry import Soundness
 from rootsopt.response.evaluation import Evaluation, Evaluator, Motions, objective_weights
 from rootsopt.response.records import geometry_record, message_of
 from rootsopt.response.reporting import depends_on_forces

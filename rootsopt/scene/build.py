@@ -43,7 +43,7 @@ from rootsopt.dynamics.parts import (
 from rootsopt.dynamics.steady import Solver
 from rootsopt.dynamics.timescales import Timescales
 from rootsopt.profiles import Geometry, Outline, Profile, geometry
-from rootsopt.profiles.validity import Soundness, soundness
+from rootsopt.profiles.geometry import Soundness, soundness
 from rootsopt.runtime.precision import check_precision
 from rootsopt.scene import families, reading
 from rootsopt.scene.bearings import GRAVITY, Bearings, bearings_of

@@ -14,7 +14,7 @@ from rootsopt.errors import InputError
 from rootsopt.measured.conjugacy import conjugacy
 from rootsopt.profiles import Outline, Profile, project
 from rootsopt.profiles.departure import departure
-from rootsopt.profiles.validity import Soundness, margins, soundness
+from rootsopt.profiles.geometry import Soundness, margins, soundness
 from rootsopt.runtime.environment import say
 from rootsopt.runtime.programs import CachedFunction
 

@@ -21,7 +21,7 @@ from rootsopt.contact.closest import FlankPair
 from rootsopt.design.space import Space, sobol
 from rootsopt.errors import InputError
 from rootsopt.profiles import geometry
-from rootsopt.profiles.validity import margins
+from rootsopt.profiles.geometry import margins
 from rootsopt.scene import Scene
 from rootsopt.scene.families import check, design_of, profile_of, with_design
 

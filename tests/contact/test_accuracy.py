@@ -16,7 +16,7 @@ from rootsopt.config import load, parse
 from rootsopt.contact.closest import FlankPair
 from rootsopt.errors import InputError
 from rootsopt.profiles import CIC, EE, FreeForm
-from rootsopt.profiles.validity import margins
+from rootsopt.profiles.geometry import margins
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.scene.families import check, profile_of
 from rootsopt.status import Status

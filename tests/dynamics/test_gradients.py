@@ -10,7 +10,7 @@ import pytest
 from experiments._common.shooting import closed, differentiated
 from rootsopt.config import DESIGN_KEYS, load
 from rootsopt.contact.closest import FlankPair
-from rootsopt.profiles.ee import EE
+from rootsopt.profiles.epicycloid import EE
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.sensitivity import by_scene
 from rootsopt.status import Status

@@ -13,8 +13,8 @@ import yaml
 from rootsopt.commands.table import optimize
 from rootsopt.commands.work.searching import checkpoint_of
 from rootsopt.config import load, parse
-from rootsopt.design.bounds import bounds_of, widened
 from rootsopt.design.resemblance import Likeness
+from rootsopt.design.space import bounds_of, widened
 from rootsopt.errors import InputError
 from rootsopt.optimize import beginning as module
 from rootsopt.optimize.beginning import beginning

@@ -23,7 +23,7 @@ from rootsopt.optimize.infeasible import explain
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.search import Search, Stage
 from rootsopt.profiles import geometry
-from rootsopt.profiles.validity import margins
+from rootsopt.profiles.geometry import margins
 from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.runtime.threads import until_stopped
 from rootsopt.scene import Scene

@@ -14,7 +14,7 @@ from rootsopt.config.units import DEG
 from rootsopt.dynamics.varied import varied
 from rootsopt.output.files import response_columns
 from rootsopt.profiles import geometry
-from rootsopt.pump import bearings as formulas
+from rootsopt.pump import loads as formulas
 from rootsopt.pump.loads import BearingSet, orbit_loads, static_loads
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.series import sampled

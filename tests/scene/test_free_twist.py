@@ -7,8 +7,7 @@ import pytest
 import rootsopt
 from rootsopt import InputError, Scene
 from rootsopt.config.units import DEG
-from rootsopt.design.bounds import bounds_of
-from rootsopt.design.space import Space
+from rootsopt.design.space import Space, bounds_of
 from rootsopt.optimize.search import Search
 from rootsopt.pump.sheet import sheet
 from rootsopt.response.terms import terms_of, values_of

@@ -13,8 +13,8 @@ from rootsopt.commands.work import optimize
 from rootsopt.config import Config, load
 from rootsopt.config.document import read_document
 from rootsopt.config.families import FREE_FORM
-from rootsopt.design.bounds import widened
 from rootsopt.design.resemblance import Likeness, free_likeness, likeness
+from rootsopt.design.space import widened
 from rootsopt.errors import InputError
 from rootsopt.measured.finding import Found, found
 from rootsopt.optimize.surviving import survives, surviving
