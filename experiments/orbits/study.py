@@ -27,7 +27,7 @@ from experiments._common.shooting import closed, differentiated
 from experiments._common.tables import Row, show
 from rootsopt import steady_response
 from rootsopt.config import Config, load
-from rootsopt.config.scene import ProfileConfig
+from rootsopt.config.rotor import ProfileConfig
 from rootsopt.errors import InputError
 from rootsopt.scene import Scene, check_geometry, design_vector
 from rootsopt.scene.families import free_form_of

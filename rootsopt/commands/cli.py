@@ -33,7 +33,7 @@ from rootsopt.config import (
 )
 from rootsopt.config.explain import GROUPS
 from rootsopt.config.families import families, import_named
-from rootsopt.config.shipped import shipped
+from rootsopt.config.sources import shipped
 from rootsopt.errors import InputError
 from rootsopt.report import REPORT
 from rootsopt.runtime import environment

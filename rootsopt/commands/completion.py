@@ -8,7 +8,7 @@ from rootsopt.commands import cli
 from rootsopt.commands.table import COMMANDS
 from rootsopt.config import Config
 from rootsopt.config.explain import tree
-from rootsopt.config.shipped import shipped
+from rootsopt.config.sources import shipped
 from rootsopt.errors import InputError
 
 SHELLS = "bash", "zsh"

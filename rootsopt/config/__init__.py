@@ -14,7 +14,7 @@ from rootsopt.config.reading import (
     outline_keys,
     parse,
 )
-from rootsopt.config.scene import ProfileConfig
+from rootsopt.config.rotor import ProfileConfig
 from rootsopt.config.study import TWIST, EnsembleConfig, SolverConfig
 from rootsopt.config.units import hint
 

@@ -8,7 +8,7 @@ from rootsopt.config.families import Family, Pair, Parameter, register_family
 from rootsopt.errors import InputError
 
 if TYPE_CHECKING:
-    from rootsopt.config.scene import ProfileConfig
+    from rootsopt.config.rotor import ProfileConfig
 
 _LONGEST = 5e4
 """Length (mm) in a profile above which a config is rejected, whatever the pitch radius."""

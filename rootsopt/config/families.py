@@ -29,7 +29,7 @@ from rootsopt.config.words import placed, sentence
 from rootsopt.errors import InputError
 
 if TYPE_CHECKING:
-    from rootsopt.config.scene import ProfileConfig
+    from rootsopt.config.rotor import ProfileConfig
 
 MARGINS = (
     *("turning", "convexity", "reach", "fall", "rolling", "order", "undercut", "star", "root"),

@@ -10,23 +10,14 @@ import yaml
 from numpy.typing import NDArray
 from pydantic import Field, SerializeAsAny, ValidationError, model_validator
 
-from rootsopt.config.assumptions import AssumptionsConfig, Span
 from rootsopt.config.document import MOST_BYTES, read_document
-from rootsopt.config.drawing import DrawingConfig
 from rootsopt.config.explain import describe, explain, outline, tree
 from rootsopt.config.families import families, family_of, find_installed, is_list
 from rootsopt.config.pareto import ParetoConfig
-from rootsopt.config.pump import PumpConfig
-from rootsopt.config.scene import (
-    ContactConfig,
-    ProfileConfig,
-    RotorConfig,
-    SceneConfig,
-)
+from rootsopt.config.rotor import DrawingConfig, ProfileConfig, RotorConfig
+from rootsopt.config.scene import ContactConfig, PumpConfig, SceneConfig, following_mm
 from rootsopt.config.section import Section, bare, put, require
-from rootsopt.config.shipped import advice, located
-from rootsopt.config.smoothing import following_mm
-from rootsopt.config.sources import FILES, regular_file
+from rootsopt.config.sources import FILES, advice, located, regular_file
 from rootsopt.config.study import (
     TWIST,
     AttractorsConfig,
@@ -38,7 +29,15 @@ from rootsopt.config.study import (
     SolverConfig,
     SweepConfig,
 )
-from rootsopt.config.tolerances import Scatter, TolerancesConfig, mounted, scatterable, unknown_key
+from rootsopt.config.tolerances import (
+    AssumptionsConfig,
+    Scatter,
+    Span,
+    TolerancesConfig,
+    mounted,
+    scatterable,
+    unknown_key,
+)
 from rootsopt.config.units import hint
 from rootsopt.config.words import placed, sentence, shown
 from rootsopt.errors import InputError

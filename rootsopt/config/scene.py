@@ -1,258 +1,23 @@
-"""Config sections that define what is simulated: profile, rotor, contact, scene."""
+"""Config sections that define what is simulated beside the rotor: contact, scene, pump.
 
-import functools
+The smoothing length of a scene follows from its values if the config gives none (`following_mm`).
+"""
+
 import math
-import shlex
-from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 
-import numpy as np
-from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field, create_model, model_validator
-from pydantic.fields import FieldInfo
+from pydantic import BeforeValidator, Field, model_validator
 
-from rootsopt.config import catalogue as _catalogue  # noqa: F401  (fills the table)
-from rootsopt.config.families import (
-    EXAMPLE_RADIUS,
-    Family,
-    families,
-    family_of,
-    parameters,
-    users_of,
-)
+from rootsopt.config.rotor import FilePath
 from rootsopt.config.section import (
-    Among,
     Listed,
-    Radius,
     Section,
     Speed,
     Torque,
-    bare,
     between,
     require,
     such,
 )
-from rootsopt.config.units import hint
-
-_USUAL = 0.01, 2.0
-"""Usual range (pitch radii) of a profile's lengths.
-
-If a length is outside its limits but would lie in this range in another unit, the message suggests
-this unit."""
-
-
-_FARTHEST = 1e5
-"""Absolute value (mm) above which a coordinate of a rotor's axis is rejected."""
-_Coordinate = Annotated[float, between(-_FARTHEST, _FARTHEST)]
-
-
-def _is_center(value: Any) -> bool:
-    """Return whether a value is the word `fit`, or two coordinates (mm)."""
-    if not isinstance(value, list | tuple):
-        return value == "fit"
-    numbers = [x for x in value if isinstance(x, int | float) and not isinstance(x, bool)]
-    return len(numbers) == len(value) == 2 and all(abs(x) <= _FARTHEST for x in numbers)
-
-
-_Center = Annotated[
-    Literal["fit"] | Annotated[tuple[_Coordinate, _Coordinate], Listed],
-    such(
-        f"fit, or x and y of the axis in mm, as in [0.1, 0.2], each at most {_FARTHEST:g}",
-        _is_center,
-        before=True,
-    ),
-]
-FilePath = Annotated[str, such("a path of characters that can be printed", str.isprintable)]
-
-
-class ProfileConfig(Section):
-    """The rotor profile.
-
-    An instance belongs to the subclass that `model_of` makes for its `family`, whose further keys
-    are the family's parameters."""
-
-    family: Annotated[str, Among(families)] = Field(
-        description="profile family; outline: read from a file"
-    )
-    lobes: Annotated[int, Field(ge=2, le=6)] = Field(description="number of lobes")
-    pitch_radius_mm: Radius = Field(description="pitch radius, half the centre distance")
-    outline_file: FilePath | None = Field(
-        None, description="outline: CSV or DXF file, relative to the config's folder"
-    )
-    outline_smoothing_mm: Annotated[float, between(0, 10)] | None = Field(
-        None,
-        description="outline: scatter (RMS) of measured points; absent: 0, the curve passes "
-        "through them",
-    )
-
-    outline_center: _Center | None = Field(
-        None,
-        description="outline: x and y (mm) of the rotor's axis in the file, or fit: the centre of "
-        "the lobes' rotational symmetry; absent: the origin",
-    )
-    outline_unit: Literal["mm", "cm", "m", "um", "inch"] | None = Field(
-        None,
-        description="outline: unit of the numbers in the file; absent: mm, or the unit that a "
-        "drawing or a header states",
-    )
-    outline_join_mm: Annotated[float, between(1e-6, 1)] | None = Field(
-        None,
-        description="outline: distance (mm) between ends of a drawing's entities up to which they "
-        "are joined; absent: 0.001",
-    )
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        # A class that is made at run time cannot be found by its name in another process.
-        return _restored, (self.family, self.__getstate__())
-
-    @property
-    def parameters(self) -> dict[str, float | tuple[float, ...]]:
-        """Design parameters of the config's family by key, in the units of the keys."""
-        return {key: getattr(self, key) for key in family_of(self.family).keys}
-
-    @property
-    def design(self) -> NDArray[np.float64]:
-        """Design parameters as an array (d,), in the units of `design_keys`."""
-        return np.hstack([*self.parameters.values(), ()]).astype(float)
-
-    @property
-    def design_keys(self) -> tuple[str, ...]:
-        """Names of the entries of `design`; the entries of a list are numbered from 1."""
-        names: list[str] = []
-        for key, value in self.parameters.items():
-            numbers = range(1, 1 + len(value)) if isinstance(value, tuple) else ()
-            names += [f"{key}_{number}" for number in numbers] or [key]
-        return tuple(names)
-
-    def with_design(self, design: Sequence[float]) -> "ProfileConfig":
-        """Return a copy with other design parameters (d,), in the units of `design_keys`."""
-        family = family_of(self.family)
-        values = zip(family.parameters, family.split([*design]), strict=True)
-        return self.model_copy(
-            update={one.key: tuple(v) if one.count is not None else v for one, v in values}
-        )
-
-    def alone(self, key: str, value: Any) -> dict[str, Any]:
-        """Return the plain section of a rotor of this size that has a parameter `key`.
-
-        It is one of another family if the section's own does not have the key."""
-        data = self.model_dump(mode="json", exclude_none=True) | {key: value}
-        names = users_of(key) or ["outline"] * (key in _OUTLINE)
-        if not names or self.family in names or value is None:
-            return data
-        size = {name: data[name] for name in ("lobes", "pitch_radius_mm")}
-        example = family_of(names[0]).example or {_OUTLINE[0]: "rotor.csv"}
-        return {"family": names[0], **size, **example, key: value}
-
-    @property
-    def from_file(self) -> bool:
-        """Whether the profile is read from a file rather than made from parameters."""
-        return family_of(self.family).maker is None
-
-    @classmethod
-    def fields(cls) -> Mapping[str, FieldInfo]:
-        """Return all keys, with the parameters of all registered families before `outline_file`."""
-        model = model_of(*families().values())
-        names = [*cls.model_fields]
-        place = names.index(_OUTLINE[0])
-        order = *names[:place], *parameters(), *names[place:]
-        return {name: model.model_fields[name] for name in order}
-
-    @model_validator(mode="wrap")
-    @classmethod
-    def _of_family(cls, data, handler):
-        """Choose the model by the family, and report keys that are missing or not its own."""
-        if cls is not ProfileConfig or not isinstance(data, dict):
-            return handler(data)
-        known = {*parameters(), *_OUTLINE}
-        data = {key: v for key, v in data.items() if v is not None or key not in known}
-        name = bare(str(data.get("family")))
-        family = next((one for key, one in families().items() if bare(key) == name), None)
-        if family is None:
-            return handler({key: value for key, value in data.items() if key not in known})
-        if known | cls.model_fields.keys() >= data.keys():
-            _require_own(family, data, known & data.keys())
-        return model_of(family).model_validate(data)
-
-    @model_validator(mode="after")
-    def _sized(self):
-        for parameter in family_of(self.family).parameters:
-            key, limits = parameter.key, parameter.limits(self.pitch_radius_mm)
-            value = getattr(self, key)
-            if limits is None or limits[0] <= value <= limits[1]:
-                continue
-            low, high = limits
-            word = f"at least {low:.4g}" if value < low else f"at most {high:.4g}"
-            share = (low if value < low else high) / self.pitch_radius_mm
-            raise ValueError(
-                f"`profile.{key}` must be {word} ({share:g} pitch radii), but is {value:g}"
-                + hint(key, value, *(share * self.pitch_radius_mm for share in _USUAL))
-            )
-        return self
-
-
-_OUTLINE = tuple(key for key in ProfileConfig.model_fields if key.startswith("outline_"))
-
-
-@functools.cache
-def model_of(*owners: Family) -> type[ProfileConfig]:
-    """Return the section's model for a registered family, or for several at once."""
-    fields: Any = {
-        one.key: one.field(family.name for family in owners if one.key in family.keys)
-        for owner in owners
-        for one in owner.parameters
-    }
-    return create_model("ProfileConfig", __base__=ProfileConfig, **fields)
-
-
-def _restored(family: str, state: dict[str, Any]) -> ProfileConfig:
-    """Return a pickled section."""
-    model = model_of(family_of(family))
-    section = model.__new__(model)
-    section.__setstate__(state)
-    return section
-
-
-def _require_own(family: Family, data: Mapping[str, Any], given: set[str]) -> None:
-    """Raise `ValueError` if `given` keys are foreign to a family, or if keys of it are missing.
-
-    The message lists the overrides that complete the section `data`. Missing keys get the values of
-    the family's example at this pitch radius, and so do keys that another family shares: its values
-    may not fit."""
-    from_file = family.maker is None
-    own, required = (_OUTLINE, _OUTLINE[:1]) if from_file else (family.keys, family.keys)
-    foreign = [key for key in (*parameters(), *_OUTLINE) if key in given and key not in own]
-    missing = [key for key in required if key not in given]
-    if not foreign and not missing:
-        return
-    radius = data.get("pitch_radius_mm")
-    values: dict[str, Any] = {key: "null" for key in foreign}
-    scale = radius / EXAMPLE_RADIUS if isinstance(radius, int | float) else 1.0
-    for key in family.keys if foreign and missing and family.keys else missing:
-        value = family.example.get(key, "FILE")
-        value = f"{value * scale:.4g}" if key.endswith("_mm") else value
-        values[key] = [*value] if isinstance(value, tuple) else value
-    first = f"`profile.{[*foreign, *missing][0]}` " + (
-        f"does not belong to family {family.name}; for this family, add"
-        if foreign
-        else f"is required for family {family.name}; add, for example,"
-    )
-    sets = [shlex.quote(f"profile.{key}={value}") for key, value in values.items()]
-    raise ValueError(" --set ".join((first, *sets)))
-
-
-class RotorConfig(Section):
-    """The rotor as a rigid body: length, density, bore, helix."""
-
-    length_mm: Annotated[float, between(1, 2e4)] = Field(description="axial length")
-    density_kg_m3: Annotated[float, between(50, 3e4)] = Field(description="density")
-    bore_mm: Annotated[float, between(0.1, 1e4)] | None = Field(
-        None, description="diameter of the bore; absent: none"
-    )
-    helix_deg: Annotated[float, Field(ge=-360, le=360)] = Field(
-        0.0,
-        description="twist over the length, positive in the rotor's own sense of rotation",
-    )
 
 
 class FrictionConfig(Section):
@@ -548,3 +313,99 @@ class SceneConfig(Section):
             "lower `scene.timing_gear.eccentricity_um`",
         )
         return self
+
+
+_Clearance = Annotated[float, between(0, 10)]
+
+
+class GasConfig(Section):
+    """An ideal gas, compressed by the pump."""
+
+    inlet_pressure_Pa: Annotated[float, between(1e-3, 1e8)] = Field(description="suction pressure")
+    temperature_K: Annotated[float, between(50, 2000)] = Field(
+        293.15, description="temperature of the gas that leaks"
+    )
+    gas_constant_J_per_kg_K: Annotated[float, between(10, 5000)] = Field(
+        287.05, description="specific gas constant; default: air"
+    )
+    heat_ratio: Annotated[float, between(1.01, 1.7)] = Field(
+        1.4, description="ratio of specific heats"
+    )
+
+
+class PumpConfig(Section):
+    """Fluid, pressures and clearances of the pump, for its leakage. Nothing here is simulated."""
+
+    viscosity_mPa_s: Annotated[float, between(1e-4, 1e6)] = Field(
+        description="dynamic viscosity of the fluid"
+    )
+    pressure_difference_Pa: Annotated[float, between(0, 1e8)] | None = Field(
+        None, description="discharge minus suction pressure; absent: that of scene.load"
+    )
+    tip_clearance_mm: _Clearance | None = Field(
+        None, description="gap between rotor tip and housing; absent: no leakage there"
+    )
+    tips_in_series: Annotated[int, Field(ge=1, le=3)] = Field(
+        1, description="number of tips of a rotor that seal in series"
+    )
+    end_clearance_mm: _Clearance | None = Field(
+        None, description="gap between each end face and its cover; absent: no leakage there"
+    )
+    radial_allowance_mm: Annotated[float, between(-1, 10)] = Field(
+        0.0, description="radius by which both rotors are smaller than their profile everywhere"
+    )
+    gas: GasConfig | None = Field(None, description="absent: the fluid is a liquid")
+
+    @model_validator(mode="after")
+    def _driven(self):
+        if self.gas is not None and self.pressure_difference_Pa == 0:
+            raise ValueError(
+                "`pump.pressure_difference_Pa` must be greater than 0 with `pump.gas`, but is 0"
+            )
+        return self
+
+
+_MOST_SMOOTHING = 1e-4
+"""Maximum default smoothing length (mm). A limit from `_SMOOTHING_SHARES` can be smaller."""
+_SMOOTHING_SHARES = {"twist": 0.05, "depth": 0.02, "damping": 0.1}
+"""Maximum default smoothing length, as a fraction of each of three lengths.
+
+`twist`: deflection of the timing gear under the full load, at the pitch radius. With a longer
+smoothing length, the gear would work in the rounded edge of its backlash, where its stiffness
+differs. `depth`: penetration of the flanks under the full load. `damping`: penetration at which the
+damping is full."""
+_LEAST_SMOOTHING = 1e-6
+"""Minimum default smoothing length (mm).
+
+A shorter length would need more solver steps and make the gradient less accurate."""
+_LEAST_TORQUE = 1e-3
+"""Load torque (N·m) below which the smoothing length does not depend on the load."""
+
+
+def following_mm(
+    load_torque: float,
+    pitch_radius_mm: float,
+    gear_stiffness: float | None,
+    contact: tuple[float, float, float],
+) -> float:
+    """Return the default smoothing length (mm) of a scene, with two significant digits.
+
+    `load_torque`: torque on rotor 2 (N·m). `pitch_radius_mm`: pitch radius (mm). `gear_stiffness`:
+    stiffness of the timing gear (N·m/rad), `None` without a gear. `contact`: stiffness (N/mm^e),
+    exponent e and depth of full damping (mm) of the flanks.
+
+    This smoothing changes the forces by less than 1e-4 of their values. The command `python -m
+    experiments smoothing` measures this."""
+    torque = max(load_torque, _LEAST_TORQUE)
+    stiffness, exponent, full = contact
+    force = torque / (pitch_radius_mm * 1e-3)
+    lengths = [
+        _MOST_SMOOTHING,
+        _SMOOTHING_SHARES["depth"] * (force / stiffness) ** (1 / exponent),
+        _SMOOTHING_SHARES["damping"] * full,
+    ]
+    if gear_stiffness is not None:
+        lengths.append(_SMOOTHING_SHARES["twist"] * torque / gear_stiffness * pitch_radius_mm)
+    shortest = max(min(lengths), _LEAST_SMOOTHING)
+    # Two digits keep the written config readable.
+    return float(f"{shortest:.1e}") if math.isfinite(shortest) else _MOST_SMOOTHING

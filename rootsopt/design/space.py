@@ -1,4 +1,10 @@
-"""Bounds of the design parameters, their unit box, and the constraints in it."""
+"""Bounds of the design parameters, the unit box of these bounds, and the constraints in it.
+
+Each design parameter is mapped linearly from its bounds to the range 0 … 1. If its range depends on
+the other parameters, the part of this range within the bounds is mapped instead. Constraints depend
+on the geometry alone and are cheap. For families whose closed-form limits do not ensure a sound
+profile, the margins of `rootsopt.profiles.geometry` are further constraints.
+"""
 
 import importlib
 import threading

@@ -6,7 +6,7 @@ import textwrap
 
 import rootsopt
 from rootsopt.config import Config
-from rootsopt.config.drawing import DrawingConfig
+from rootsopt.config.rotor import DrawingConfig
 from rootsopt.errors import InputError
 from rootsopt.export.pieces import DrawnPiece, outline_pieces
 from rootsopt.profiles import Geometry, Profile, geometry

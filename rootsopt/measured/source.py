@@ -13,7 +13,7 @@ from rootsopt.measured.reading import JOIN, Sought, read, untangled
 from rootsopt.profiles.outline import Outline
 
 if TYPE_CHECKING:
-    from rootsopt.config.scene import ProfileConfig
+    from rootsopt.config.rotor import ProfileConfig
 
 _NOTABLE = 1.0
 """Deviation between flanks (µm) at or above which the user gets a note."""

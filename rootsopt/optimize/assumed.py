@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.config.assumptions import Span
+from rootsopt.config.tolerances import Span
 from rootsopt.response.scatter import RANDOM
 
 BASELINE, OPTIMIZED, RIVAL = "baseline", "optimized", "design"

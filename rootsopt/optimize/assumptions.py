@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rootsopt.config import Config
-from rootsopt.config.assumptions import Span
+from rootsopt.config.tolerances import Span
 from rootsopt.optimize.assumed import (
     BASELINE,
     OPTIMIZED,

@@ -1,4 +1,8 @@
-"""Addenda of tangent circular arcs, and the families made of them."""
+"""Addenda of tangent circular arcs, and the families made of them.
+
+Except for the single arc, the sources' own formulas were not available. Each construction is
+derived from the family's name and description, as its docstring states.
+"""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -15,7 +19,7 @@ from rootsopt.profiles import trigonometry as trig
 from rootsopt.profiles.base import Profile, Segment
 
 if TYPE_CHECKING:
-    from rootsopt.config.scene import ProfileConfig
+    from rootsopt.config.rotor import ProfileConfig
 
 SHARPEST = 0.002
 """Edge radius (pitch radii) below which a config is rejected. On a sharper edge, nodes of the

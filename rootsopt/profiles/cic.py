@@ -14,7 +14,7 @@ from rootsopt.profiles import trigonometry as trig
 from rootsopt.profiles.base import Profile, Segment
 
 if TYPE_CHECKING:
-    from rootsopt.config.scene import ProfileConfig
+    from rootsopt.config.rotor import ProfileConfig
 
 _ANGLE, _LENGTH, _TIP = "pressure_angle_deg", "involute_length_mm", "tip_arc_angle_deg"
 OVERLENGTH = 0.02

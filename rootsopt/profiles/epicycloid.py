@@ -1,4 +1,4 @@
-"""EE, and epicycloids with a circular tip."""
+"""EE (epicycloid addendum, hypocycloid dedendum), and epicycloids with a circular tip."""
 
 import equinox as eqx
 import jax.numpy as jnp

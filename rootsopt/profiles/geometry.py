@@ -1,4 +1,6 @@
-"""Integral and extreme properties of a profile: area, inertia, radii, margins, outline."""
+"""Integral and extreme properties of a profile: area, inertia, radii, outline, margins.
+
+Margins measure how far a profile, or a design, is from being unsound."""
 
 import functools
 from typing import NamedTuple

@@ -1,4 +1,6 @@
-"""The gap between the rotors over the mesh, and the shape of its narrowest place."""
+"""The gap between the rotors over the mesh, and the shape of its narrowest place.
+
+A rotor's section is sampled as points with normals, for measures that do not use the roll angle."""
 
 from typing import NamedTuple
 

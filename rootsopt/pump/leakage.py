@@ -1,6 +1,10 @@
 """Leakage of a pump: mesh, tips, end faces, and the volumetric efficiency.
 
-The flow through a gap is laminar, of a liquid or of an ideal gas up to its critical ratio."""
+The mesh leaks along the rotor's whole length, with a gap that changes over the rotation. Both tips
+leak along the same length, and the four end faces leak across the rotors. A liquid flows by
+Reynolds' equation. A gas flows at the lesser of two limits, friction (compressible laminar flow)
+and inertia (an ideal nozzle of the gap's height).
+"""
 
 from typing import NamedTuple
 
@@ -158,7 +162,7 @@ def leakage(scene: Scene, medium: Medium, profile: Profile, shape: Geometry) -> 
     ideal = flow.theoretical_flow(shape, scene.length, scene.speed)
     knudsen = zero
     if medium.gas is not None:
-        path = gas.mean_free_path(medium.gas.inlet_pressure, medium.viscosity, medium.gas)
+        path = mean_free_path(medium.gas.inlet_pressure, medium.viscosity, medium.gas)
         each = jnp.stack(heights)
         # Nothing flows through a closed gap.
         knudsen = path / jnp.min(jnp.where(each > 0, each, jnp.inf))
@@ -177,10 +181,10 @@ def _per_width(medium: Medium, height, length, series: int):
         return jnp.mean(slot_flow(height, length, across, medium.viscosity))
     down = medium.gas.inlet_pressure
     up = down + across
-    slow = gas.laminar_mass_flow(height, length, up, down, medium.viscosity, medium.gas)
+    slow = laminar_mass_flow(height, length, up, down, medium.viscosity, medium.gas)
     # Nozzles in series share the pressure ratio.
     stage = up * (down / up) ** (1 / series)
-    fast = height * gas.nozzle_flux(up, stage, medium.gas)
+    fast = height * nozzle_flux(up, stage, medium.gas)
     density = down / (medium.gas.gas_constant * medium.gas.temperature)
     return _lesser(slow, fast) / density
 

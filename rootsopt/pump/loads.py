@@ -1,4 +1,8 @@
-"""Loads on the bearings along a motion: of flanks, gas, timing gear and weight."""
+"""Loads on the bearings along a motion: of flanks, gas, timing gear and weight.
+
+A rotor's bearings sit at z = ±(L/2 + a), the timing gear at z = L/2 + g. Forces are complex
+numbers, x + iy, in the fixed frame: rotor 1 at the origin, rotor 2 at (2r, 0). Rotor 1 turns
+counter-clockwise. `docs/bearings.md` derives the formulas."""
 
 import functools
 from collections.abc import Callable

@@ -11,7 +11,7 @@ import yaml
 from experiments._common.polygons import pair_gap
 from rootsopt.commands.console import main
 from rootsopt.config import load, notes, parse
-from rootsopt.config.stock import MATERIALS, MEDIA, gear_backlash, gear_stiffness, line_stiffness
+from rootsopt.config.sheet import MATERIALS, MEDIA, gear_backlash, gear_stiffness, line_stiffness
 from rootsopt.scene import outline_mm
 
 BOOSTER = {

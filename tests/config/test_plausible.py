@@ -10,7 +10,7 @@ import pytest
 from rootsopt.config import Config, load, notes, parse
 from rootsopt.config.explain import keys_of
 from rootsopt.config.plausible import USUAL, notes_on_swept, usual_of
-from rootsopt.config.shipped import shipped
+from rootsopt.config.sources import shipped
 from rootsopt.config.units import _UNITS, unit_of
 from rootsopt.errors import InputError
 

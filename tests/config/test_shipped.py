@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from rootsopt.config import load_config
-from rootsopt.config.shipped import shipped
+from rootsopt.config.sources import shipped
 from rootsopt.errors import InputError
 
 ROOT = Path(__file__).parents[2]

@@ -12,7 +12,7 @@ import scipy.stats
 import rootsopt
 from rootsopt.commands.console import main
 from rootsopt.config import load
-from rootsopt.config.assumptions import Span
+from rootsopt.config.tolerances import Span
 from rootsopt.design.space import Space
 from rootsopt.optimize.assumed import BASELINE, OPTIMIZED, Assumed
 from rootsopt.optimize.assumptions import _change, _known, compared

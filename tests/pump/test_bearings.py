@@ -79,6 +79,6 @@ def test_gear_and_equivalent_load():
     back = complex(loads.gear_force(*map(jnp.asarray, (-3.3, R, np.radians(20)))))
     assert back == pytest.approx(force.conjugate())
     assert back.real > 0
-    loads = jnp.asarray([[10.0 + 0j, 10.0j], [20.0, 0.0]])
-    found = loads.equivalent_load(loads, loads.BALL)
+    given = jnp.asarray([[10.0 + 0j, 10.0j], [20.0, 0.0]])
+    found = loads.equivalent_load(given, loads.BALL)
     np.testing.assert_allclose(found, [10.0, 20 * 0.5 ** (1 / 3)])

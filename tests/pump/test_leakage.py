@@ -16,9 +16,16 @@ from rootsopt import load_config
 from rootsopt.errors import InputError
 from rootsopt.profiles import geometry, place_pair
 from rootsopt.profiles.epicycloid import circle_epicycloid
-from rootsopt.pump import leakage
 from rootsopt.pump.gap import Allowances, mesh_gap, relative_curvature
-from rootsopt.pump.leakage import leakage, slot_flow, tip_length
+from rootsopt.pump.leakage import (
+    critical_ratio,
+    laminar_mass_flow,
+    leakage,
+    mean_free_path,
+    nozzle_flux,
+    slot_flow,
+    tip_length,
+)
 from rootsopt.pump.sheet import KEYS, missing, sheet, warnings
 from rootsopt.response.terms import terms_of
 from rootsopt.scene import Scene, design_vector
@@ -58,10 +65,10 @@ def test_parabolic_gap_by_quadrature():
 def test_nozzle_of_air():
     """150 → 100 kPa at 293.15 K: 338.706 kg/(s·m²); choked below 0.52828, where the flow is the
     greatest over all pressures in the throat."""
-    flux = functools.partial(leakage.nozzle_flux, leakage=AIR)
+    flux = functools.partial(nozzle_flux, gas=AIR)
     up = jnp.asarray(1.5e5)
     assert float(flux(up, jnp.asarray(1e5))) == pytest.approx(338.706, abs=1e-3)
-    assert float(leakage.critical_ratio(AIR.heat_ratio)) == pytest.approx(0.52828, abs=5e-6)
+    assert float(critical_ratio(AIR.heat_ratio)) == pytest.approx(0.52828, abs=5e-6)
 
     def by_energy(throat):
         """Density times speed, from enthalpy and isentrope."""
@@ -81,11 +88,11 @@ def test_laminar_gas_by_quadrature_of_its_pressure():
     pressure difference it is the liquid's."""
     up, down, h, length, mu = 3e5, 1e5, 5e-5, 4e-3, 1.8e-5
     gap, depth, inlet, outlet, viscosity = map(jnp.asarray, (h, length, up, down, mu))
-    found = float(leakage.laminar_mass_flow(gap, depth, inlet, outlet, viscosity, AIR))
+    found = float(laminar_mass_flow(gap, depth, inlet, outlet, viscosity, AIR))
     driven, _ = integrate.quad(lambda p: p / (287.05 * 293.15), down, up)
     assert found == pytest.approx(h**3 * driven / (12 * mu * length), rel=1e-12)
     # Air at 1 bar and 20 °C: 0.066 µm.
-    path = leakage.mean_free_path(jnp.asarray(1e5), jnp.asarray(1.82e-5), AIR)
+    path = mean_free_path(jnp.asarray(1e5), jnp.asarray(1.82e-5), AIR)
     assert float(path) == pytest.approx(0.0662e-6, rel=0.01)
 
 
@@ -220,7 +227,7 @@ def test_gas_leaks_less_than_friction_or_inertia_alone():
     scene = scene_of(*IN_SERIES)
     design = design_vector(load_config("configs/cic_drawn.yaml"))
     found = leaks(scene, design)
-    flux = leakage.nozzle_flux(jnp.asarray(3e5), jnp.asarray(1e5), AIR)
+    flux = nozzle_flux(jnp.asarray(3e5), jnp.asarray(1e5), AIR)
     density = 1e5 / (287.05 * 293.15)
     fastest = float(flux) / density
     assert 0 < float(found.mesh) <= 0.1 * 6e-5 * fastest * (1 + 1e-12)
@@ -254,7 +261,7 @@ def test_mesh_leakage_is_smooth_where_friction_takes_over_from_inertia():
     rows = [mesh_slopes(scene, design + shift) for shift in np.outer(range(9), [2e-3, 2e-3, 0])]
     flow, slope, length = (np.array(x) for x in zip(*rows, strict=True))
     slow = (3e-5) ** 3 * (9e10 - 1e10) / (24 * 1.82e-5 * length[0] * 1e5)
-    fast = 3e-5 * float(leakage.nozzle_flux(jnp.asarray(3e5), jnp.asarray(1e5), AIR)) * 287.05
+    fast = 3e-5 * float(nozzle_flux(jnp.asarray(3e5), jnp.asarray(1e5), AIR)) * 287.05
     fast *= 293.15 / 1e5
     place = np.linspace(-0.5, 47.5, 480_001)
     lesser = np.minimum(np.interp(place, range(48), slow), fast)
@@ -350,7 +357,7 @@ def test_sheet_says_what_it_lacks_and_what_does_not_hold():
     # Closed flanks: the number is that of the gap at the end faces.
     scene = scene_of(BLOWER[0], *BLOWER[2:])
     rows = sheet(scene, jnp.asarray(load_config("configs/cic.yaml").design))
-    path = leakage.mean_free_path(scene.medium.gas.inlet_pressure, scene.medium.viscosity, AIR)
+    path = mean_free_path(scene.medium.gas.inlet_pressure, scene.medium.viscosity, AIR)
     assert rows["knudsen_number"] == pytest.approx(float(path) / 5e-5, rel=1e-9)
 
 
