@@ -15,7 +15,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from rootsopt.errors import InputError
-from rootsopt.output import disk, lock
+from rootsopt.output import disk
 from rootsopt.output.runs import RunFolder
 
 WRITING = ("open", "write", "fsync", "mkdir", "rename", "replace", "ftruncate", "pwrite")
@@ -54,8 +54,8 @@ class faulty:  # noqa: N801
         self.exchanges = exchanges
 
     def __enter__(self) -> _System:
-        self.before = disk.os, lock.os, disk._exchanged, disk._renameat2, disk.shutil
-        disk.os = lock.os = self.system  # type: ignore[assignment]
+        self.before = disk.os, disk._exchanged, disk._renameat2, disk.shutil
+        disk.os = self.system  # type: ignore[assignment]
         if not self.exchanges:
             disk._renameat2 = lambda: None  # type: ignore[assignment]
         if "rename" in self.system.operations:
@@ -74,7 +74,7 @@ class faulty:  # noqa: N801
         return self.system
 
     def __exit__(self, *_) -> None:
-        disk.os, lock.os, disk._exchanged, disk._renameat2, disk.shutil = self.before
+        disk.os, disk._exchanged, disk._renameat2, disk.shutil = self.before
 
 
 def full_disk(name: str, do: Callable[[], Any]) -> None:

@@ -54,10 +54,10 @@ LATE = {
         "rootsopt.figures", "rootsopt.figures.front", "rootsopt.report.html",
     },
     "commands/work/optimize.py": {
-        "rootsopt.export.writing", "rootsopt.figures", "rootsopt.figures.tolerances",
+        "rootsopt.export.writing", "rootsopt.figures", "rootsopt.figures.spread",
     },
     "commands/work/simulate.py": {"rootsopt.export.writing", "rootsopt.figures"},
-    "commands/work/sweep.py": {"rootsopt.commands.work", "rootsopt.figures.speeds"},
+    "commands/work/sweep.py": {"rootsopt.commands.work", "rootsopt.figures.sweep"},
     "export/writing.py": {"rootsopt.export.animation"},
     "optimize/__init__.py": {"rootsopt.commands.table"},
     # Modules that import optional or slow libraries.
@@ -65,7 +65,7 @@ LATE = {
     "export/command.py": {"rootsopt.export.solid"},
     "figures/runs.py": {"rootsopt.measured.source"},
     "measured/reading.py": {"rootsopt.measured.dxf"},
-    "measured/report.py": {"rootsopt.measured.source"},
+    "measured/source.py": {"rootsopt.measured.source"},
     # Only an objective over several motions needs these.
     "response/evaluation.py": {"rootsopt.response.attractors", "rootsopt.response.ensemble"},
     "response/result.py": {"rootsopt.response.dataset"},

@@ -23,7 +23,7 @@ from experiments._common.simulation import evaluator_of
 from experiments._common.tables import Row, print_record
 from rootsopt.config import Config
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.figures.speeds import LABELS
+from rootsopt.figures.sweep import LABELS
 from rootsopt.optimize.search import Search
 from rootsopt.response.evaluation import Evaluation, objective_weights
 from rootsopt.response.result import Part

@@ -18,7 +18,7 @@ from experiments._common.style import sheet
 from experiments._common.tables import show
 from rootsopt.config import Config
 from rootsopt.config.tolerances import Scatter
-from rootsopt.figures.tolerances import PANELS, plot_distribution
+from rootsopt.figures.spread import PANELS, plot_distribution
 from rootsopt.optimize.design import optimize_design
 from rootsopt.optimize.outcome import Optimization
 from rootsopt.optimize.robust import Robustness

@@ -16,10 +16,9 @@ from bokeh.document import Document
 from bokeh.models import Button, CustomJS, Div, NumericInput, Row, Slider
 from bokeh.models.layouts import Column, LayoutDOM
 
-from rootsopt.explore import texts
+from rootsopt.explore import shown
 from rootsopt.explore.engine import Engine, cut
 from rootsopt.explore.knobs import Knob, knobs_of
-from rootsopt.explore.pictures import ForcePicture, ProfilePicture
 from rootsopt.explore.session import (
     FromRest,
     Message,
@@ -31,6 +30,7 @@ from rootsopt.explore.session import (
     Searched,
     Session,
 )
+from rootsopt.explore.shown import ForcePicture, ProfilePicture
 from rootsopt.report.charts import THEME
 from rootsopt.report.html import TEMPLATE as PAGES
 
@@ -148,7 +148,7 @@ class Page:
             pair=_file("pair.html", PAGES),
             script=_file("pair.js", PAGES),
         )
-        self.status.text = texts.status_line("preparing", "wait", "Computing the first profile …")
+        self.status.text = shown.status_line("preparing", "wait", "Computing the first profile …")
         self._show_numbers()
 
     def _buttons(self) -> Row:
@@ -194,7 +194,7 @@ class Page:
             one.js_on_change("value", keep)
         field.on_change("value", functools.partial(self._moved, knob.key))
         self.sliders[knob.key], self.fields[knob.key] = slider, field
-        label = text(texts.knob_label(knob), width=132, sizing_mode=None, align="center")
+        label = text(shown.knob_label(knob), width=132, sizing_mode=None, align="center")
         return Row(label, slider, field, sizing_mode="stretch_width", margin=(0, 0, 1, 0))
 
     # What the user does
@@ -217,14 +217,14 @@ class Page:
 
     def _optimize(self) -> None:
         self.progress, self.cancelled = None, False
-        self.search.text = texts.progress_line(None, False)
+        self.search.text = shown.progress_line(None, False)
         self.search.visible = True
         self._lock(True)
         self.session.optimize()
 
     def _cancel(self) -> None:
         self.cancelled = True
-        self.search.text = texts.progress_line(self.progress, True)
+        self.search.text = shown.progress_line(self.progress, True)
         self.session.cancel()
 
     def _lock(self, locked: bool) -> None:
@@ -251,10 +251,10 @@ class Page:
             case Progress():
                 self.progress = message
                 if not self.cancelled:
-                    self.search.text = texts.progress_line(message, False)
+                    self.search.text = shown.progress_line(message, False)
             case Searched():
                 self._lock(False)
-                self.search.text = texts.searched_line(message)
+                self.search.text = shown.searched_line(message)
                 if message.values:
                     self._set(dict(message.values))
             case Saved():
@@ -270,7 +270,7 @@ class Page:
                 self.rest = message
                 self.from_rest.disabled = message.same
                 if self.motion is not None and self.motion.number == message.number:
-                    self.status.text = texts.motion_line(self.motion, message)
+                    self.status.text = shown.motion_line(self.motion, message)
 
     def _take_problem(self, problem: Problem) -> None:
         self.problem, self.motion, self.rest = problem, None, None
@@ -281,12 +281,12 @@ class Page:
         self.notes.text = ""
         self.force.clear("no motion")
         self._show_numbers()
-        self.status.text = texts.status_line("not valid", "bad", problem.words)
+        self.status.text = shown.status_line("not valid", "bad", problem.words)
         self.mark.text = f"problem {problem.number}"
 
     def _take_shape(self, message: NewShape) -> None:
         self.shape, self.problem = message, None
-        self.notes.text = texts.notes_lines(message.notes)
+        self.notes.text = shown.notes_lines(message.notes)
         self.start.setdefault("geometry", message.shape.record)
         fade([self.profile.figure], False)
         self.profile.draw(message.shape)
@@ -311,7 +311,7 @@ class Page:
             self.force.draw(cut(found.series), found.response, first)
         self._show_numbers()
         self.from_rest.disabled = True
-        self.status.text = texts.motion_line(motion, self.rest)
+        self.status.text = shown.motion_line(motion, self.rest)
         self.mark.text = f"motion {motion.number}"
 
     # What is shown
@@ -325,8 +325,8 @@ class Page:
         now = None if self.motion is None else self.motion.evaluation
         record = {} if now is None else now.record()
         record |= {} if self.shape is None else {"geometry": self.shape.shape.record}
-        self.numbers.text = texts.numbers_table(record, self.start)
-        self.gradient.text = texts.gradient_table(self.config, now)
+        self.numbers.text = shown.numbers_table(record, self.start)
+        self.gradient.text = shown.gradient_table(self.config, now)
         fade([self.numbers, self.gradient, self.force.figure], faded)
 
     def _tick(self) -> None:
@@ -344,13 +344,13 @@ class Page:
                 "Compiling the programs for this kind of pair. The first time takes one to several "
                 f"minutes, later starts some seconds ({seconds:.0f} s so far)."
             )
-            self.status.text = texts.status_line("preparing", "wait", words)
+            self.status.text = shown.status_line("preparing", "wait", words)
         else:
             words = (
                 f"Computing for {seconds:.0f} s. A new number of lobes, or a twist where there was "
                 "none, needs other programs, which are compiled first."
             )
-            self.status.text = texts.status_line("computing", "wait", words)
+            self.status.text = shown.status_line("computing", "wait", words)
 
 
 __all__ = ["Page"]

@@ -9,8 +9,7 @@ import numpy as np
 from rootsopt.config import Config
 from rootsopt.export import solid
 from rootsopt.export.command import SOLID
-from rootsopt.export.coordinates import coordinates
-from rootsopt.export.drawing import Drawing
+from rootsopt.export.drawing import Drawing, coordinates
 from rootsopt.export.dxf import dxf_bytes
 from rootsopt.export.svg import svg_text
 from rootsopt.output.files import ResultFolder

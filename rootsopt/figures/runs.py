@@ -8,11 +8,16 @@ import numpy as np
 
 from rootsopt.config import FAMILY_KEYS, Config
 from rootsopt.config.families import is_list
-from rootsopt.figures.comparison import plot_departure, plot_forces_together
 from rootsopt.figures.force import plot_force, plot_gap, plot_spectrum
-from rootsopt.figures.history import plot_history
-from rootsopt.figures.optimum import plot_feasible, plot_prices, plot_residual, plot_starts
-from rootsopt.figures.profiles import plot_conjugacy, plot_flank, plot_meshing, plot_profiles
+from rootsopt.figures.history import plot_history, plot_prices, plot_residual, plot_starts
+from rootsopt.figures.profiles import (
+    plot_conjugacy,
+    plot_departure,
+    plot_flank,
+    plot_forces_together,
+    plot_meshing,
+    plot_profiles,
+)
 from rootsopt.figures.style import figure, write
 from rootsopt.measured.conjugacy import conjugacy, gaps_um
 from rootsopt.output.files import ResultFolder
@@ -83,7 +88,7 @@ def certificate_figure(
     constraints: Sequence[Mapping[str, Any]],
     optimality: Mapping[str, Any],
 ) -> str:
-    """Write optimum.png, the figures of `rootsopt.figures.optimum`; return its name.
+    """Write optimum.png, the figures of `rootsopt.figures.history`; return its name.
 
     `history`: as in `plot_residual`; `constraints`: as in `plot_prices`; `optimality`: entry of the
     result file."""

@@ -1,4 +1,8 @@
-"""The points of a closed outline, and the small loops in which it crosses itself."""
+"""Closed outlines: joined from a drawing's entities, and the small loops in which they cross.
+
+A chain is the points on one entity. A vertex is a place where ends of chains meet. A link is a
+chain whose two ends are at different vertices.
+"""
 
 import dataclasses
 import itertools
@@ -6,6 +10,11 @@ import itertools
 import numpy as np
 from jaxtyping import Bool, Complex128, Float64
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
+
+from rootsopt.errors import InputError
 
 _CUSP = 2.0
 """Turn (rad) at a point above which the outline runs back there."""
@@ -116,3 +125,217 @@ def _tail(z: NDArray[np.complex128], index: NDArray[np.intp], i: int, j: int) ->
 def place(z: complex) -> str:
     """Format a point `z` = x + iy (mm) as text for a message."""
     return f"({z.real:.5g}, {z.imag:.5g}) mm"
+
+
+JOIN = 1e-3
+"""Default distance (mm) below which two ends of entities share a vertex."""
+_ALONE = "draw the outline alone on a layer OUTLINE"
+_CROWDED = 50
+"""Number of other points within the joining distance of a point, on average, above which a drawing
+is rejected. The points are the ends of all chains, or those of `_distinct`. Points at the same
+place count once."""
+
+
+def joined(
+    chains: list[Loop], name: str, join: float = JOIN
+) -> tuple[list[Loop], InputError | None]:
+    """Join `chains` of points at their ends; return (closed loops, fault of the drawing).
+
+    A chain may run in either direction. A chain given twice counts once. Chains that lead to a dead
+    end, such as centre lines, belong to no loop. `name`: name of the drawing in messages; `join`:
+    distance (mm) below which ends meet.
+
+    The fault applies if none of the loops is the rotor. It is not `None` in three cases: there is
+    no closed loop; open chains, if closed, would enclose a larger area than any loop; more than two
+    ends meet at a vertex of a possible outline. Raises `InputError` if too many ends are close
+    together.
+
+    The library's `edgeminer` finds chains, too, but its time grows with the square of the number of
+    ends at a place (the lines of a dial), and it keeps dead ends."""
+    ends = np.array([chain.points[[0, -1]] for chain in chains]).reshape(-1, 2)
+    vertex = _clusters(ends.ravel(), name, join).reshape(-1, 2)
+    single = vertex[:, 0] == vertex[:, 1]
+    loops = [
+        _connected([chains[k]])
+        for k in np.flatnonzero(single)
+        if len(chains[k].points) > 2 and lengths_along(chains[k].points)[-1] > 2 * join
+    ]
+    links = _distinct(chains, vertex, np.flatnonzero(~single), name, join)
+    inner = _in_loops(vertex, links)
+    branched = []
+    for members in _groups(vertex, inner):
+        if np.max(np.bincount(vertex[members].ravel())) > 2:
+            branched.append(members)
+        else:
+            loops.append(_connected(_walked(chains, members, vertex)))
+    best = max((loop.points for loop in loops), key=lambda z: abs(signed_area(z)), default=None)
+    for members in branched:
+        whole = np.concatenate([chains[k].points for k in members])
+        if best is None or _extent(whole) >= _extent(best):
+            degree = np.bincount(vertex[members].ravel())
+            branch = int(np.argmax(degree > 2))
+            at = complex(ends[vertex == branch][0])
+            return loops, InputError(
+                f"{name}: an outline must not branch, but {degree[branch]} ends meet at "
+                f"{place(at)}; remove the entities that do not belong to it, or {_ALONE}"
+            )
+    must = f"{name}: the outline must be closed within {join:g} mm (`profile.outline_join_mm`), but"
+    if best is None:
+        gap, at = _widest_gap(ends, vertex, links if len(links) else np.arange(len(chains)))
+        return loops, InputError(
+            f"{must} the entities form no closed loop (widest gap {gap:.4g} mm, at {place(at)}); "
+            f"join them in the drawing, or {_ALONE}"
+        )
+    for members in _groups(vertex, np.setdiff1d(links, inner)):
+        if len(members) < 3 or np.max(np.bincount(vertex[members].ravel())) > 2:
+            continue
+        around = np.concatenate([part.points for part in _walked(chains, members, vertex)])
+        if abs(signed_area(around)) > abs(signed_area(best)):
+            gap, at = _widest_gap(ends, vertex, members)
+            return loops, InputError(
+                f"{must} {len(members)} entities that enclose more than any closed loop have a gap "
+                f"of {gap:.4g} mm at {place(at)}; join them in the drawing, or {_ALONE}"
+            )
+    return loops, None
+
+
+def _extent(points: NDArray[np.complex128]) -> float:
+    return float(np.hypot(np.ptp(points.real), np.ptp(points.imag)))
+
+
+def _clusters(points: NDArray[np.complex128], name: str, join: float) -> NDArray[np.intp]:
+    """Return the index of the cluster of each point. Points closer than `join` share a cluster.
+
+    Raises `InputError` if too many points are close together."""
+    unique, which = np.unique(points, return_inverse=True)
+    tree = KDTree(np.stack([unique.real, unique.imag], axis=1))
+    # Count the pairs before listing them: there may be n².
+    if tree.count_neighbors(tree, join) > (1 + _CROWDED) * len(unique):
+        raise InputError(
+            f"{name}: ends of entities must be farther apart than {join:g} mm, but many are "
+            "closer; check the drawing's units, or draw longer entities"
+        )
+    return _components(tree.query_pairs(join, output_type="ndarray"), len(unique))[which]
+
+
+def _components(pairs: NDArray[np.intp], count: int) -> NDArray[np.intp]:
+    graph = coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(count, count))
+    return connected_components(graph, directed=False)[1].astype(np.intp)
+
+
+def _distinct(
+    chains: list[Loop], vertex: NDArray[np.intp], links: NDArray[np.intp], name: str, join: float
+) -> NDArray[np.intp]:
+    """Return the `links` without those that repeat an earlier one.
+
+    `vertex` (n, 2): indices of the vertices at each chain's ends; `name`, `join`: as in `joined`. A
+    link repeats another if the ends and the points at quarters of the length of both coincide."""
+    if not len(links):
+        return links
+    quarters = []
+    for link in links:
+        z = chains[link].points[:: 1 if vertex[link, 0] < vertex[link, 1] else -1]
+        way = lengths_along(z)
+        quarters.append(np.interp(way[-1] * np.array([0.25, 0.5, 0.75]), way, z))
+    between = _clusters(np.ravel(quarters), name, join).reshape(len(links), -1)
+    rows = np.concatenate([np.sort(vertex[links], axis=1), between], axis=1)
+    return links[np.sort(np.unique(rows, axis=0, return_index=True)[1])]
+
+
+def _in_loops(vertex: NDArray[np.intp], links: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return the `links` that remain after repeatedly removing links at dead ends.
+
+    `vertex` (n, 2): indices of the vertices at each chain's ends."""
+    degree = np.bincount(vertex[links].ravel(), minlength=1)
+    # The exclusive or of the links at a vertex: at a dead end it is the only link.
+    met = np.zeros(len(degree), np.intp)
+    np.bitwise_xor.at(met, vertex[links], links[:, None])
+    dead = set()
+    for end in np.flatnonzero(degree == 1).tolist():
+        while degree[end] == 1:
+            link = met[end]
+            dead.add(int(link))
+            degree[vertex[link]] -= 1
+            met[vertex[link]] ^= link
+            end = vertex[link].sum() - end
+    return np.array([link for link in links.tolist() if link not in dead], np.intp)
+
+
+def _groups(vertex: NDArray[np.intp], links: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+    """Return the `links` in each connected group, groups in order of their first link.
+
+    `vertex` (n, 2): indices of the vertices at each chain's ends."""
+    if not len(links):
+        return []
+    part = _components(vertex[links], int(np.max(vertex)) + 1)[vertex[links, 0]]
+    order = np.argsort(part, kind="stable")
+    groups = np.split(links[order], np.flatnonzero(np.diff(part[order])) + 1)
+    return sorted(groups, key=lambda group: group[0])
+
+
+def _walked(chains: list[Loop], members: NDArray[np.intp], vertex: NDArray[np.intp]) -> list[Loop]:
+    """Return the chains along a loop or an open path, turned into its direction.
+
+    `members`: indices of the links, in any order; `vertex` (n, 2): indices of the vertices at each
+    chain's ends."""
+    met: dict[int, int] = {}  # Exclusive or of the links at each vertex, as in `_in_loops`.
+    open_ends: set[int] = set()
+    for link in members.tolist():
+        for end in vertex[link].tolist():
+            met[end] = met.get(end, 0) ^ link
+            open_ends ^= {end}
+    start = min(open_ends, default=int(vertex[members[0], 0]))
+    link = met[start] if open_ends else int(members[0])
+    parts = []
+    for _ in members:
+        own, way = chains[link], 1 if vertex[link, 0] == start else -1
+        parts.append(Loop(own.points[::way], own.joints[::way], own.unit))
+        start = int(vertex[link].sum()) - start
+        link ^= met[start]
+    return parts
+
+
+def _connected(parts: list[Loop]) -> Loop:
+    """Return successive chains as a loop, as the last one ends where the first begins.
+
+    Each gap between ends is closed from both sides in equal shares. Both chains are shifted by an
+    amount that varies linearly along their length, as surveyors do, because moving the end points
+    alone would bend the curve there. The point that two chains share is kept once, as a joint if
+    either chain has it as a joint."""
+    ahead = parts[1:] + parts[:1]
+    gaps = np.array([b.points[0] - a.points[-1] for a, b in zip(parts, ahead, strict=True)])
+    points, joints = [], []
+    for k, part in enumerate(parts):
+        points.append(_shifted(part.points, -gaps[k - 1] / 2, gaps[k] / 2)[:-1])
+        joints.append(part.joints[:-1].copy())
+        joints[-1][0] |= parts[k - 1].joints[-1]
+    widest = int(np.argmax(np.abs(gaps)))
+    gap = float(abs(gaps[widest])), complex(parts[widest].points[-1])
+    return Loop(np.concatenate(points), np.concatenate(joints), parts[0].unit, gap)
+
+
+def _shifted(points: NDArray[np.complex128], first: complex, last: complex) -> NDArray:
+    """Return points along a chain, shifted by `first` at its start and by `last` at its end."""
+    if first == last == 0:
+        return points
+    way = lengths_along(points)
+    return points + first + (last - first) * way / way[-1]
+
+
+def _widest_gap(
+    ends: NDArray[np.complex128], vertex: NDArray[np.intp], links: NDArray[np.intp]
+) -> tuple[float, complex]:
+    """Return the widest gap (mm) between dead ends, and the dead end (mm) where it begins.
+
+    `ends`, `vertex` (n, 2): points (mm) and vertices at each chain's ends; `links`: indices of the
+    chains that count. A dead end is an end of these chains that shares its vertex with no other.
+    Its gap is the distance to the nearest other dead end. With fewer than two dead ends, the gap is
+    0 and the point is the first of `ends`."""
+    numbers = vertex[links].ravel()
+    places = ends[links].ravel()[np.bincount(numbers)[numbers] == 1]
+    if len(places) < 2:
+        return 0.0, complex(ends[0, 0])
+    tree = KDTree(np.stack([places.real, places.imag], axis=1))
+    away = tree.query(tree.data, k=2)[0][:, 1]
+    widest = int(np.argmax(away))
+    return float(away[widest]), complex(places[widest])

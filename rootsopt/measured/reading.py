@@ -15,8 +15,7 @@ from scipy.spatial import ConvexHull
 from rootsopt.errors import InputError
 from rootsopt.measured.estimates import SEEN, SIZED, unit_of_size, written
 from rootsopt.measured.guard import short
-from rootsopt.measured.joining import JOIN, joined
-from rootsopt.measured.loop import Loop, moment, place, signed_area, tails
+from rootsopt.measured.loop import JOIN, Loop, joined, moment, place, signed_area, tails
 from rootsopt.measured.table import from_csv
 
 __all__ = ["JOIN", "LOBES", "Loop", "Sought", "lobes_of", "read", "signed_area"]

@@ -6,14 +6,16 @@ from typing import Any
 
 from rootsopt.output.names import (
     DASH,
+    Cell,
+    Table,
     brief,
     in_words,
     listed,
     name_and_unit,
     quantity,
+    table,
     value,
 )
-from rootsopt.output.table import Cell, Table, table
 from rootsopt.response.sensitivity import NAMES
 
 _MICRO = 0.1

@@ -3,8 +3,7 @@
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from rootsopt.output.names import DASH, in_words, label, percent, value
-from rootsopt.output.table import Row, Table, table
+from rootsopt.output.names import DASH, Row, Table, in_words, label, percent, table, value
 
 WORTH = 1e-4
 """Relative change of the objective below which no rotor counts as a better one."""

@@ -34,8 +34,8 @@ from typing import Any, Literal
 from rootsopt.config import sources
 from rootsopt.errors import InputError
 from rootsopt.output import disk
+from rootsopt.output.disk import Lock, TakenError
 from rootsopt.output.files import ResultFolder, plain
-from rootsopt.output.lock import Lock, TakenError
 from rootsopt.runtime.journal import aside
 
 RESULT = "result.json"

@@ -12,6 +12,9 @@ from rootsopt.config.units import words
 from rootsopt.output.assumptions import assumption_tables
 from rootsopt.output.better import better_tables
 from rootsopt.output.names import (
+    Cell,
+    Row,
+    Table,
     brief,
     in_words,
     label,
@@ -22,9 +25,10 @@ from rootsopt.output.names import (
     scalars,
     signed,
     stated,
+    status_cell,
+    table,
     value,
 )
-from rootsopt.output.table import Cell, Row, Table, status_cell, table
 from rootsopt.pump.sheet import NOTE, missing, warnings
 from rootsopt.response.records import RESPONSES, message_of
 from rootsopt.response.sensitivity import MICROMETRE

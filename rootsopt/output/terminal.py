@@ -9,7 +9,7 @@ from rich.console import Console, Group
 from rich.text import Text
 
 from rootsopt.output.ending import Ending
-from rootsopt.output.table import Table
+from rootsopt.output.names import Table
 
 WIDTH = 80
 """Width (characters) above which the columns of a table go to several tables."""

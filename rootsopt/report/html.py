@@ -22,12 +22,11 @@ from markupsafe import Markup, escape
 import rootsopt
 from rootsopt.output import tables
 from rootsopt.output.fronts import design_file
-from rootsopt.output.names import in_words
-from rootsopt.output.table import Table, status_cell
-from rootsopt.report import charts, wording
+from rootsopt.output.names import Table, in_words, status_cell
+from rootsopt.report import charts, words
+from rootsopt.report.charts import animations
 from rootsopt.report.gather import Run
-from rootsopt.report.glossary import anchor, glossary, linked
-from rootsopt.report.meshing import animations
+from rootsopt.report.words import anchor, glossary, linked
 from rootsopt.scene import outline_mm
 from rootsopt.tradeoffs.front import Front
 
@@ -124,14 +123,14 @@ def report_text(run: Run) -> str:
         "page.html.j2",
         [chart for *_, chart in drawn],
         {"animation": animation},
-        title=wording.title(run),
+        title=words.title(run),
         run=run,
         command_line=f"rootsopt {run.command} {run.source}",
         version=rootsopt.__version__,
         day=datetime.date.today().isoformat(),
         status=status,
         good=run.usable and status.good is not False,
-        asked=wording.asked(run),
+        asked=words.asked(run),
         end=run.end,
         conflict=tables.conflict_table(run.result),
         sections=tables.sections(run.result, run.rows),

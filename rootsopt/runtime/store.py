@@ -11,16 +11,11 @@ import hmac
 import os
 import secrets
 import stat
+import tempfile
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import platformdirs
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None
 
 MOST_BYTES = 200 * 2**20
 """Total size (bytes) of all entries above which the least recently used entries are removed."""
@@ -29,160 +24,22 @@ SUFFIX = ".program"
 
 _KEY_NAME = "programs.key"
 _KEY_BYTES = 32
+_ATTEMPTS = 3
 _HEADER = b"rootsopt program 1\n"
 _MAC_BYTES = hashlib.sha256().digest_size
 _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 _OTHERS_AT_ALL = stat.S_IRWXG | stat.S_IRWXO
-_NEW_SECONDS = 2.0
-"""Age (s) of an unfinished file below which it is kept: its process may not have locked it yet."""
+_LEFT_SECONDS = 600.0
+"""Age (s) of an unfinished file above which it is removed: its process has ended."""
 # With these flags, a symbolic link is not followed and a named pipe does not block.
 _SAFELY = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 _HAS_OWNERS = hasattr(os, "geteuid")
-_IN_FOLDER = {os.open, os.unlink, os.stat, os.rename} <= os.supports_dir_fd
 
 
 class UnsafeFolderError(Exception):
     """Raised if other users can change or replace a folder.
 
     The message names the folder and the remedy."""
-
-
-class Folder:
-    """A folder that belongs to the user, created if it does not exist, and kept open.
-
-    Files are opened through the folder's descriptor, because its path may lead to another folder
-    later. Raises `UnsafeFolderError` if other users own the folder, or could write to it or replace
-    it. Raises `OSError` if the folder cannot be created or opened."""
-
-    def __init__(self, path: Path):
-        try:
-            self.path = path.expanduser().resolve()
-        except RuntimeError as error:  # no home, or links in a circle
-            raise OSError(str(error)) from None
-        _make(self.path)
-        self._open: int | None = None
-        if _IN_FOLDER:
-            self._open = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
-        try:
-            _check(self.path, os.stat(self.path) if self._open is None else os.fstat(self._open))
-        except BaseException:
-            self.close()
-            raise
-
-    def close(self) -> None:
-        """Close the folder."""
-        if self._open is not None:
-            os.close(self._open)
-            self._open = None
-
-    def __del__(self) -> None:
-        with contextlib.suppress(Exception):
-            self.close()
-
-    def _at(self, name: str) -> str:
-        return name if self._open is not None else os.fspath(self.path / name)
-
-    def open(self, name: str, flags: int) -> int:
-        """Open a file in the folder with the `flags` of `os.open`, and return its descriptor.
-
-        A new file is accessible only to the user. Raises `OSError` if the file cannot be opened."""
-        return os.open(self._at(name), flags | _SAFELY, 0o600, dir_fd=self._open)
-
-    def stat(self, name: str) -> os.stat_result:
-        """Return the `os.stat` result of the file `name`, or of the link itself if it is a link.
-
-        Raises `OSError` if there is no such file."""
-        return os.stat(self._at(name), dir_fd=self._open, follow_symlinks=False)
-
-    def exists(self, name: str) -> bool:
-        """Return whether the folder contains a regular file called `name`."""
-        try:
-            return stat.S_ISREG(self.stat(name).st_mode)
-        except OSError:
-            return False
-
-    def unlink(self, name: str) -> None:
-        """Remove the file `name`; do nothing if it cannot be removed."""
-        with contextlib.suppress(OSError):
-            os.unlink(self._at(name), dir_fd=self._open)
-
-    def link(self, name: str, other: str) -> None:
-        """Give the file `name` a second name, `other`.
-
-        Raises `FileExistsError` if a file called `other` exists."""
-        os.link(self._at(name), self._at(other), src_dir_fd=self._open, dst_dir_fd=self._open)
-
-    def replace(self, name: str, other: str) -> None:
-        """Rename the file `name` to `other` in one step, replacing an existing file."""
-        os.replace(self._at(name), self._at(other), src_dir_fd=self._open, dst_dir_fd=self._open)
-
-    def names(self) -> list[str]:
-        """Return the names of all entries of the folder."""
-        return os.listdir(self.path if self._open is None else self._open)
-
-    def read(self, name: str, most: int, forbidden: int = _OTHERS_WRITE) -> bytes | None:
-        """Return the content of the regular file `name`, or `None` if it cannot be trusted.
-
-        `None` is returned if the file does not exist, belongs to another user, or is larger than
-        `most` bytes. It is also returned if the file has one of the `forbidden` permission bits."""
-        try:
-            file = self.open(name, os.O_RDONLY)
-        except OSError:
-            return None
-        try:
-            found = os.fstat(file)
-            if not stat.S_ISREG(found.st_mode) or found.st_size > most:
-                return None
-            if _HAS_OWNERS and (found.st_uid != os.geteuid() or found.st_mode & forbidden):
-                return None
-            with open(file, "rb", closefd=False) as stream:
-                data = stream.read(most + 1)
-            with contextlib.suppress(OSError):
-                os.utime(file if os.utime in os.supports_fd else self._at(name))
-            return data if len(data) <= most else None
-        except OSError:
-            return None
-        finally:
-            os.close(file)
-
-    @contextlib.contextmanager
-    def unfinished(self, name: str, data: bytes) -> Iterator[str]:
-        """Create a file with `data`, and yield its temporary name, which contains `name`.
-
-        The file is locked during the `with` block, so that `sweep` can distinguish it from a file
-        left by an ended process. On exit, it is removed unless it has been renamed."""
-        own = f".{name}.{secrets.token_hex(8)}"
-        file = self.open(own, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
-        try:
-            if fcntl is not None:
-                with contextlib.suppress(OSError):
-                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            with open(file, "wb", closefd=fcntl is None) as stream:
-                stream.write(data)
-            yield own
-        finally:
-            self.unlink(own)
-            if fcntl is not None:
-                os.close(file)
-
-    def sweep(self, middle: str) -> None:
-        """Remove unfinished files that ended processes have left.
-
-        `middle`: only files whose names contain this text are removed."""
-        for name in self.names():
-            if not (name.startswith(".") and middle in name):
-                continue
-            with contextlib.suppress(OSError):
-                if abs(time.time() - self.stat(name).st_mtime) < _NEW_SECONDS:
-                    continue
-                file = self.open(name, os.O_RDWR)
-                try:
-                    if fcntl is not None:
-                        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                        self.unlink(name)
-                finally:
-                    os.close(file)
-                self.unlink(name)  # On Windows this fails while a process has it open.
 
 
 class Store:
@@ -192,16 +49,20 @@ class Store:
     `OSError` if the folder cannot be used."""
 
     def __init__(self, path: Path):
-        self._folder = Folder(path)
+        self._folder = _own_folder(path)
         self._key = _key()
-        self._folder.sweep(f"{SUFFIX}.")
+        _sweep(self._folder, SUFFIX)
+
+    def _file(self, name: str) -> Path:
+        return self._folder / (name + SUFFIX)
 
     def __contains__(self, name: str) -> bool:
-        return self._folder.exists(name + SUFFIX)
+        file = self._file(name)
+        return file.is_file() and not file.is_symlink()
 
     def read(self, name: str, purpose: str) -> bytes | None:
         """Return the data of the entry `name`, or `None` if no valid entry has this `purpose`."""
-        found = self._folder.read(name + SUFFIX, MOST_BYTES)
+        found = _read(self._file(name), MOST_BYTES)
         if found is None:
             return None
         start = len(_HEADER) + _MAC_BYTES
@@ -214,10 +75,7 @@ class Store:
         """Write `data` as the entry `name`, completely or not at all.
 
         The entry is signed together with its `purpose`. Raises `OSError` if writing fails."""
-        signed = _HEADER + self._mac(name, purpose, data) + data
-        target = name + SUFFIX
-        with self._folder.unfinished(target, signed) as made:
-            self._folder.replace(made, target)
+        _write(self._file(name), _HEADER + self._mac(name, purpose, data) + data)
         self._prune()
 
     def _mac(self, name: str, purpose: str, data: bytes) -> bytes:
@@ -230,19 +88,20 @@ class Store:
     def _prune(self) -> None:
         """Remove the least recently used entries until the rest has at most `MOST_BYTES`."""
         kept = []
-        for name in self._folder.names():
+        for name in os.listdir(self._folder):
             # Only our own files: the folder may hold others.
             if name.endswith(SUFFIX) and not name.startswith("."):
+                file = self._folder / name
                 with contextlib.suppress(OSError):  # removed by another process
-                    found = self._folder.stat(name)
+                    found = file.lstat()
                     if stat.S_ISREG(found.st_mode):
-                        kept.append((found.st_mtime_ns, found.st_size, name))
+                        kept.append((found.st_mtime_ns, found.st_size, file))
         total = 0
-        for _, size, name in sorted(kept, reverse=True):
+        for _, size, file in sorted(kept, reverse=True):
             total += size
             if total > MOST_BYTES:
-                self._folder.unlink(name)
-        self._folder.sweep(f"{SUFFIX}.")
+                with contextlib.suppress(OSError):
+                    file.unlink()
 
 
 def key_folder() -> Path:
@@ -259,25 +118,16 @@ def _key() -> bytes:
     try:
         if not path.is_absolute():
             raise OSError("it is not an absolute path")
-        folder = Folder(path)
-        folder.sweep(f"{_KEY_NAME}.")
+        file = _own_folder(path) / _KEY_NAME
+        _sweep(file.parent, _KEY_NAME)
         for _ in range(_ATTEMPTS):
-            there = _there(folder)  # Check this first: a key that appears later is valid.
-            key = folder.read(_KEY_NAME, _KEY_BYTES, _OTHERS_AT_ALL)
+            there = os.path.lexists(file)  # Check this first: a key that appears later is valid.
+            key = _read(file, _KEY_BYTES, _OTHERS_AT_ALL)
             if key is not None and len(key) == _KEY_BYTES:
                 return key
             # Replace a key that is damaged or that others may have read. Programs signed with it
             # are compiled again.
-            with folder.unfinished(_KEY_NAME, secrets.token_bytes(_KEY_BYTES)) as made:
-                if there:
-                    folder.replace(made, _KEY_NAME)
-                    continue
-                try:
-                    folder.link(made, _KEY_NAME)
-                except FileExistsError:
-                    pass  # Another process was faster; use its key.
-                except (OSError, NotImplementedError):  # a file system without links
-                    folder.replace(made, _KEY_NAME)
+            _write(file, secrets.token_bytes(_KEY_BYTES), new=not there)
         raise OSError("it cannot be read back")
     except (OSError, UnsafeFolderError) as error:
         said = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
@@ -287,35 +137,73 @@ def _key() -> bytes:
         ) from None
 
 
-_ATTEMPTS = 3
+def _read(file: Path, most: int, forbidden: int = _OTHERS_WRITE) -> bytes | None:
+    """Return the content of a regular file, or `None` if it cannot be trusted.
 
-
-def _there(folder: Folder) -> bool:
+    `None` is returned if the file does not exist, belongs to another user, or is larger than `most`
+    bytes. It is also returned if the file has one of the `forbidden` permission bits."""
     try:
-        folder.stat(_KEY_NAME)
-    except FileNotFoundError:
-        return False
-    return True
+        with open(os.open(file, os.O_RDONLY | _SAFELY), "rb") as stream:
+            found = os.fstat(stream.fileno())
+            if not stat.S_ISREG(found.st_mode) or found.st_size > most:
+                return None
+            if _HAS_OWNERS and (found.st_uid != os.geteuid() or found.st_mode & forbidden):
+                return None
+            data = stream.read(most + 1)
+        os.utime(file)
+    except OSError:
+        return None
+    return data if len(data) <= most else None
 
 
-def _make(path: Path) -> None:
-    """Create a folder and the missing folders above it, accessible only to the user."""
-    missing = []
-    while not os.path.lexists(path):
-        missing.append(path)
-        path = path.parent
-    for folder in reversed(missing):
-        with contextlib.suppress(FileExistsError):
-            os.mkdir(folder, 0o700)
+def _write(file: Path, data: bytes, new: bool = False) -> None:
+    """Write `data` to a file that only the user can access, completely or not at all.
+
+    `new`: whether a file that another process has made in the meantime stays. Raises `OSError` if
+    writing fails."""
+    handle, name = tempfile.mkstemp(prefix=f".{file.name}.", dir=file.parent)
+    try:
+        with open(handle, "wb") as stream:
+            stream.write(data)
+        if new:
+            with contextlib.suppress(FileExistsError):
+                os.link(name, file)
+        else:
+            os.replace(name, file)
+    except (NotImplementedError, OSError):
+        if not new:
+            raise
+        os.replace(name, file)  # a file system without links
+    finally:
+        with contextlib.suppress(OSError):
+            os.unlink(name)
 
 
-def _check(path: Path, found: os.stat_result) -> None:
-    """Raise `UnsafeFolderError` if other users own a folder, or could change or replace it.
+def _sweep(folder: Path, name: str) -> None:
+    """Remove unfinished files, with this `name` in theirs, that ended processes have left."""
+    for file in folder.glob(f".*{name}.*"):
+        with contextlib.suppress(OSError):
+            if abs(time.time() - file.lstat().st_mtime) > _LEFT_SECONDS:
+                file.unlink()
 
-    `path`: the folder; `found`: its `os.stat` result."""
+
+def _own_folder(path: Path) -> Path:
+    """Return the real path of a folder that belongs to the user, created if it does not exist.
+
+    New folders are accessible only to the user. Raises `UnsafeFolderError` if other users own the
+    folder, or could write to it or replace it. Raises `OSError` if it cannot be used."""
+    try:
+        path = path.expanduser().resolve()
+    except RuntimeError as error:  # no home, or links in a circle
+        raise OSError(str(error)) from None
+    for folder in reversed([path, *path.parents]):
+        if not os.path.lexists(folder):
+            with contextlib.suppress(FileExistsError):
+                os.mkdir(folder, 0o700)
+    os.listdir(path)  # An `OSError` unless it is a folder that can be read.
     if not _HAS_OWNERS:
-        return  # On such systems, folders below the user's home are the user's by default.
-    me = os.geteuid()
+        return path  # On such systems, folders below the user's home are the user's by default.
+    me, found = os.geteuid(), os.stat(path)
     if found.st_uid != me:
         raise UnsafeFolderError(
             f"{os.fspath(path)!r} belongs to another user (number {found.st_uid}); choose a "
@@ -339,3 +227,4 @@ def _check(path: Path, found: os.stat_result) -> None:
                 f"others may write to {os.fspath(parent)!r}, and so replace the folder in it; "
                 "remove that permission with chmod go-w, or choose another folder"
             )
+    return path

@@ -14,7 +14,7 @@ from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.parts import Friction, GearErrors, MotorDrive, Supports, TimingGear
 from rootsopt.dynamics.steady import Solver
-from rootsopt.measured.transmission import transmission_error
+from rootsopt.measured.table import transmission_error
 
 _ORBIT_STEPS = 4
 """Limit on the number of solver steps for a whole orbit, as a multiple of the number that the

@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from rootsopt.explore.latest import Latest
+from rootsopt.explore.session import Latest
 
 
 @pytest.fixture

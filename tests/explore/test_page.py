@@ -13,7 +13,7 @@ from browser import Browser
 
 from rootsopt.config import load, parse
 from rootsopt.explore import session as sessions
-from rootsopt.explore import texts
+from rootsopt.explore import shown as texts
 from rootsopt.explore.engine import Engine, Shape, same_motion
 from rootsopt.explore.session import (
     FromRest,

@@ -12,8 +12,7 @@ import pytest
 from rootsopt.commands.table import profile as command
 from rootsopt.config import load
 from rootsopt.errors import InputError
-from rootsopt.export.coordinates import coordinates, widest
-from rootsopt.export.drawing import Drawing
+from rootsopt.export.drawing import Drawing, coordinates, widest
 from rootsopt.export.dxf import dxf_bytes
 from rootsopt.export.pieces import Arc, outline_pieces, polyline
 from rootsopt.profiles import CIC, EE, geometry

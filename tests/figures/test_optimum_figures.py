@@ -9,8 +9,8 @@ import pytest
 
 from rootsopt.config import load
 from rootsopt.figures import runs
-from rootsopt.figures.comparison import plot_departure, plot_forces_together
-from rootsopt.figures.optimum import plot_prices, plot_residual, plot_starts
+from rootsopt.figures.history import plot_prices, plot_residual, plot_starts
+from rootsopt.figures.profiles import plot_departure, plot_forces_together
 from rootsopt.figures.style import figure, write
 from rootsopt.output.files import ResultFolder
 from rootsopt.response.series import Series

@@ -4,7 +4,7 @@ import pytest
 
 from rootsopt.config import load
 from rootsopt.figures import sweep as drawing
-from rootsopt.figures.speeds import MARKERS
+from rootsopt.figures.sweep import MARKERS
 from rootsopt.output.facts import swept
 from rootsopt.output.files import ResultFolder
 from rootsopt.output.sweeps import outcome, rows_of, summary

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rootsopt.errors import InputError
-from rootsopt.measured import joining
+from rootsopt.measured import loop as loops
 from rootsopt.measured.conjugacy import conjugacy
 from rootsopt.measured.fit import imported
 from rootsopt.measured.loop import Loop, signed_area
@@ -369,9 +369,9 @@ def test_many_loose_lines_are_joined_in_order(tmp_path, monkeypatch):
         for k in order
     ]
     trees = []
-    tree = joining.KDTree
-    monkeypatch.setattr(joining, "KDTree", lambda data: trees.append(len(data)) or tree(data))
-    (loop,), fault = joining.joined(chains, "lines.dxf")
+    tree = loops.KDTree
+    monkeypatch.setattr(loops, "KDTree", lambda data: trees.append(len(data)) or tree(data))
+    (loop,), fault = loops.joined(chains, "lines.dxf")
     assert fault is None
     assert trees == [len(z), 3 * len(z)]
     assert sorted(loop.points, key=np.angle) == pytest.approx(sorted(z, key=np.angle))

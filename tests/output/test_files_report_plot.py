@@ -17,7 +17,7 @@ from rootsopt.figures.history import plot_history
 from rootsopt.figures.runs import optimization_figures, simulation_figures
 from rootsopt.figures.style import figure
 from rootsopt.output import files, names, tables, terminal
-from rootsopt.output.table import table
+from rootsopt.output.names import table
 from rootsopt.response.evaluation import Evaluation
 from rootsopt.response.series import Series
 from rootsopt.status import Status

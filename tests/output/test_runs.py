@@ -13,7 +13,7 @@ import pytest
 
 from rootsopt.commands.console import main
 from rootsopt.errors import InputError
-from rootsopt.output import lock, runs
+from rootsopt.output import disk, runs
 from rootsopt.output.runs import RunFolder
 from tests.deaths import WRITING, digest, digest_of, faulty, full_disk, scratch, write_run
 
@@ -177,7 +177,7 @@ def test_a_second_process_is_kept_out(tmp_path):
 
 def test_a_lock_on_a_file_that_is_gone_is_none(tmp_path, monkeypatch):
     """A lock is void if the last holder removes the file between opening and locking."""
-    real, calls = lock.fcntl.flock, []
+    real, calls = disk.fcntl.flock, []
 
     def late(*arguments):
         calls.append(arguments)
@@ -185,11 +185,11 @@ def test_a_lock_on_a_file_that_is_gone_is_none(tmp_path, monkeypatch):
             os.unlink(tmp_path / "lock")
         return real(*arguments)
 
-    monkeypatch.setattr(lock.fcntl, "flock", late)
-    held = lock.Lock(tmp_path / "lock")
+    monkeypatch.setattr(disk.fcntl, "flock", late)
+    held = disk.Lock(tmp_path / "lock")
     assert len(calls) == 2
-    with pytest.raises(lock.TakenError):
-        lock.Lock(tmp_path / "lock")
+    with pytest.raises(disk.TakenError):
+        disk.Lock(tmp_path / "lock")
     held.release()
     assert os.listdir(tmp_path) == []
 
@@ -215,7 +215,7 @@ def test_without_locks_nothing_of_others_is_removed(tmp_path, monkeypatch):
     def refuse(*_):
         raise OSError(37, "No locks available")
 
-    monkeypatch.setattr(lock.fcntl, "flock", refuse)
+    monkeypatch.setattr(disk.fcntl, "flock", refuse)
     write_run(tmp_path / "run", "new")
     assert sorted(os.listdir(tmp_path)) == [stage.name, "run"]
 

@@ -20,10 +20,10 @@ from rootsopt.config import load
 from rootsopt.output import tables, terminal
 from rootsopt.output.files import ResultFolder, response_columns
 from rootsopt.report import charts
+from rootsopt.report.charts import animations
 from rootsopt.report.gather import Run
-from rootsopt.report.glossary import glossary, linked
 from rootsopt.report.html import report_text
-from rootsopt.report.meshing import animations
+from rootsopt.report.words import glossary, linked
 from rootsopt.response.records import message_of
 from rootsopt.response.series import Series
 from rootsopt.status import Status

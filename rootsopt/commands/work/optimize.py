@@ -21,7 +21,7 @@ from rootsopt.config import Config
 from rootsopt.config.families import family_of
 from rootsopt.design.resemblance import likenesses
 from rootsopt.export import chosen
-from rootsopt.measured import report as outline_report
+from rootsopt.measured import source
 from rootsopt.optimize import noise
 from rootsopt.optimize.outcome import Optimization
 from rootsopt.optimize.robust import search_of
@@ -85,7 +85,7 @@ def searched_for(
     def show(out: Console) -> None:
         out.print(terminal.shown(tables.tables_of(data)))
         if result.beginning is not None:
-            outline_report.say(config, out)
+            source.say(config, out)
         out.print(
             f"compile {clock.seconds:.1f} s, run {ran - clock.seconds:.1f} s, "
             f"reports {total - ran:.1f} s",
@@ -218,7 +218,7 @@ def _write(folder, config, options, result, alike, sheets, compiled, ran) -> dic
     data |= alike
     if result.beginning is not None:
         data["beginning"] = result.beginning.record()
-        data |= outline_report.record(config)
+        data |= source.record(config)
     data["improvement"] = result.improvement
     if result.nominal is not None:
         data["improvement_over_nominal"] = result.improvement_over_nominal
@@ -254,7 +254,7 @@ def _write(folder, config, options, result, alike, sheets, compiled, ran) -> dic
 
 def _draw(folder, config: Config, result, data: dict) -> None:
     """Write the figures of a search; `data`: content of the result file."""
-    from rootsopt.figures import assumptions, runs, speeds
+    from rootsopt.figures import runs, spread, sweep
 
     if result.optimized is not None:
         pair, rows = (result.baseline, result.optimized), result.history
@@ -270,9 +270,9 @@ def _draw(folder, config: Config, result, data: dict) -> None:
     if config.objective.speeds_rpm:
         names = {"baseline": result.baseline, "optimised": result.optimized}
         designs = {name: one.speeds for name, one in names.items() if one is not None}
-        speeds.speed_figure(folder, designs, "Contact force over the speeds of the objective")
+        sweep.speed_figure(folder, designs, "Contact force over the speeds of the objective")
     if result.assumptions is not None:
-        assumptions.spread_figure(folder, data["assumptions"], result.assumptions.columns())
+        spread.spread_figure(folder, data["assumptions"], result.assumptions.columns())
 
 
 def _designed(config: Config, evaluation) -> Config:
@@ -292,7 +292,7 @@ def _write_robustness(folder, config, options, robustness) -> None:
         columns |= {f"{name}_{key}": values for key, values in one.values.items()}
     folder.write_csv("tolerances.csv", columns)
     if not options.no_figures:
-        from rootsopt.figures.tolerances import distributions
+        from rootsopt.figures.spread import distributions
 
         designs = {name: one.values for name, one in robustness.fresh.items()}
         count = len(next(iter(robustness.scenes.values())))

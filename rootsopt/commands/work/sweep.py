@@ -48,7 +48,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     }
     folder.write_json("result.json", data)
     if not options.no_figures:
-        from rootsopt.figures.speeds import speed_figure
+        from rootsopt.figures.sweep import speed_figure
 
         name = config.profile.family.upper()
         speed_figure(folder, {name: parts}, f"Contact force of the {name} pair over speed")
