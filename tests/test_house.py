@@ -49,7 +49,7 @@ LATE = {
     "commands/console.py": {"rootsopt", "rootsopt.commands", "rootsopt.errors"},
     # Figures are imported in the background; exports, only if they are asked for.
     **{f"commands/work/{name}.py": {"rootsopt.figures", f"rootsopt.figures.{module}"}
-       for name, module in (("attractors", "basins"), ("over", "sweep"), ("profile", "runs"))},
+       for name, module in (("attractors", "basins"), ("profile", "runs"))},
     "commands/work/pareto.py": {
         "rootsopt.figures", "rootsopt.figures.front", "rootsopt.report.html",
     },
@@ -57,15 +57,15 @@ LATE = {
         "rootsopt.export.writing", "rootsopt.figures", "rootsopt.figures.spread",
     },
     "commands/work/simulate.py": {"rootsopt.export.writing", "rootsopt.figures"},
-    "commands/work/sweep.py": {"rootsopt.commands.work", "rootsopt.figures.sweep"},
+    "commands/work/sweep.py": {"rootsopt.figures.sweep"},
     "export/writing.py": {"rootsopt.export.animation"},
     "optimize/__init__.py": {"rootsopt.commands.table"},
     # Modules that import optional or slow libraries.
     "commands/work/explore.py": {"rootsopt.explore.engine", "rootsopt.explore.server"},
-    "export/command.py": {"rootsopt.export.solid"},
+    "export/__init__.py": {"rootsopt.export.solid"},
     "figures/runs.py": {"rootsopt.measured.source"},
     "measured/reading.py": {"rootsopt.measured.dxf"},
-    "measured/source.py": {"rootsopt.measured.source"},
+    "measured/conjugacy.py": {"rootsopt.measured.source"},
     # Only an objective over several motions needs these.
     "response/evaluation.py": {"rootsopt.response.attractors", "rootsopt.response.ensemble"},
     "response/result.py": {"rootsopt.response.dataset"},

@@ -32,10 +32,10 @@ from experiments.benchmark.job import (
     slopes_of,
     value_error,
 )
+from rootsopt.commands.work.searching import CompileClock
 from rootsopt.config import load
 from rootsopt.dynamics.flow import one_period, strobe
 from rootsopt.dynamics.integrator import Integrator
-from rootsopt.runtime.timing import CompileClock
 from rootsopt.scene import Scene, integrators
 
 REFERENCE_RTOL = 1e-11

@@ -7,8 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rootsopt.config import Config
-from rootsopt.export import solid
-from rootsopt.export.command import SOLID
+from rootsopt.export import SOLID, solid
 from rootsopt.export.drawing import Drawing, coordinates
 from rootsopt.export.dxf import dxf_bytes
 from rootsopt.export.svg import svg_text

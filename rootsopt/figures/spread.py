@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from rootsopt.figures.style import BLUE, GREEN, GREY, VERMILION, figure, write
-from rootsopt.output.assumptions import label_of, named
+from rootsopt.output.comparison import label_of, named
 from rootsopt.output.names import brief, name_and_unit
 
 if TYPE_CHECKING:

@@ -1,10 +1,9 @@
 """Figures of a sweep: forces over speed, over any key, or over two."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray
 from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
 from matplotlib.lines import Line2D
@@ -17,6 +16,9 @@ from rootsopt.response.result import Part
 from rootsopt.status import Status
 from rootsopt.sweeps.plan import Plan
 from rootsopt.sweeps.table import is_numeric, written
+
+if TYPE_CHECKING:
+    import xarray
 
 _KNOWN = {"periodic": "o", "averaged": "s", "chaotic": "x", "not_settled": "+", "idle": "1"}
 _OTHERS = (status.label for status in Status if status.label not in _KNOWN)
@@ -147,7 +149,7 @@ def _short(text: str) -> str:
     return text if len(text) <= 24 else f"{text[:21]}..."
 
 
-def sweep_figure(folder: ResultFolder, plan: Plan, dataset: xarray.Dataset) -> list[str]:
+def sweep_figure(folder: ResultFolder, plan: Plan, dataset: "xarray.Dataset") -> list[str]:
     """Write sweep.png, mean and peak force over one key or two; return the files written.
 
     A sweep over more keys has no figure."""
@@ -158,7 +160,7 @@ def sweep_figure(folder: ResultFolder, plan: Plan, dataset: xarray.Dataset) -> l
     return [(_lines if lines else _map)(folder, axes, plan, dataset)]
 
 
-def _lines(folder: ResultFolder, axes, plan: Plan, dataset: xarray.Dataset) -> str:
+def _lines(folder: ResultFolder, axes, plan: Plan, dataset: "xarray.Dataset") -> str:
     """Draw the forces over one key, with a line for each value of the other key, if there is one.
 
     The first key is on the axis, unless the second one has too many values, or only the second one
@@ -187,21 +189,21 @@ def _lines(folder: ResultFolder, axes, plan: Plan, dataset: xarray.Dataset) -> s
     return write(folder, "sweep", made, _title(drawn, across), entries)
 
 
-def _drawn(dataset: xarray.Dataset) -> dict[str, str]:
+def _drawn(dataset: "xarray.Dataset") -> dict[str, str]:
     """Return {variable: label} of two panels: forces, unless the flanks stay apart everywhere."""
     if any(np.any(dataset[name].values > 0) for name in LABELS) or _APART[0] not in dataset:
         return LABELS
     return {name: label(name) for name in _APART}
 
 
-def _table(dataset: xarray.Dataset, name: str, swapped: bool) -> NDArray:
+def _table(dataset: "xarray.Dataset", name: str, swapped: bool) -> NDArray:
     """Return a variable as an array (n, m); m is 1 for a sweep over one key."""
     values = dataset[name].values
     values = values.reshape(len(values), -1)
     return values.T if swapped else values
 
 
-def _map(folder: ResultFolder, axes, plan: Plan, dataset: xarray.Dataset) -> str:
+def _map(folder: ResultFolder, axes, plan: Plan, dataset: "xarray.Dataset") -> str:
     """Draw the forces over two keys as colours: a map of a grid, or points of a sample."""
     across, up = axes
     shown = _drawn(dataset)

@@ -1,6 +1,9 @@
-"""Measures how far the flanks of a profile are from being conjugate: their gap in pure rolling."""
+"""Measures how far flanks are from being conjugate, and reports it of an imported outline.
+
+The measure is the gap of the flanks in pure rolling."""
 
 import dataclasses
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,10 +11,14 @@ from jax import lax
 from jaxtyping import Float64
 from numpy.typing import NDArray
 
+from rootsopt.config import Config
 from rootsopt.contact.closest import FlankPair
 from rootsopt.errors import InputError
 from rootsopt.profiles import Profile
 from rootsopt.runtime.programs import CachedFunction
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 _MICRON = 1e-6
 _CERTAIN = 1e-6, 1.5
@@ -124,3 +131,32 @@ def _gaps(profile, distance, roll):
 def gaps_um(found: Conjugacy) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return (roll angles (n,) in degrees, gaps (n,) in µm) of a `Conjugacy`, for a figure."""
     return np.degrees(found.roll), found.gap / _MICRON
+
+
+def record(config: Config) -> dict[str, Any]:
+    """Return {"outline": {...}} for the result file: the records of `Checks` and `Conjugacy`.
+
+    Return {} if the config names no outline file."""
+    if not config.profile.from_file:
+        return {}
+    from rootsopt.measured.source import outline_of  # For outlines only: it takes 0.5 s.
+
+    profile, checks = outline_of(config.profile)
+    return {"outline": checks.record() | conjugacy(profile).record()}
+
+
+def say(config: Config, out: "Console") -> None:
+    """Print notes to `out` on an imported outline.
+
+    They say whether its flanks differ by 1 µm or more, whether its points scatter, and whether its
+    centre is not the rotor's axis. They also say whether a clearance was drawn into it."""
+    if not config.profile.from_file:
+        return
+    from rootsopt.measured.source import advice, outline_of  # As in `record`.
+
+    profile, checks = outline_of(config.profile)
+    found = advice(config.profile, checks)
+    if not checks.seen.off_center:
+        found += filter(None, [inset_note(conjugacy(profile).inset, config.contact.clearance_mm)])
+    for message in found:
+        out.print(message, soft_wrap=True, markup=False, highlight=False)

@@ -10,9 +10,6 @@ import itertools
 import numpy as np
 from jaxtyping import Bool, Complex128, Float64
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import KDTree
 
 from rootsopt.errors import InputError
 
@@ -208,6 +205,8 @@ def _clusters(points: NDArray[np.complex128], name: str, join: float) -> NDArray
 
     Raises `InputError` if too many points are close together."""
     unique, which = np.unique(points, return_inverse=True)
+    from scipy.spatial import KDTree  # Slow import.
+
     tree = KDTree(np.stack([unique.real, unique.imag], axis=1))
     # Count the pairs before listing them: there may be n².
     if tree.count_neighbors(tree, join) > (1 + _CROWDED) * len(unique):
@@ -219,8 +218,10 @@ def _clusters(points: NDArray[np.complex128], name: str, join: float) -> NDArray
 
 
 def _components(pairs: NDArray[np.intp], count: int) -> NDArray[np.intp]:
+    from scipy.sparse import coo_array, csgraph  # Slow import.
+
     graph = coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(count, count))
-    return connected_components(graph, directed=False)[1].astype(np.intp)
+    return csgraph.connected_components(graph, directed=False)[1].astype(np.intp)
 
 
 def _distinct(
@@ -335,6 +336,8 @@ def _widest_gap(
     places = ends[links].ravel()[np.bincount(numbers)[numbers] == 1]
     if len(places) < 2:
         return 0.0, complex(ends[0, 0])
+    from scipy.spatial import KDTree  # Slow import.
+
     tree = KDTree(np.stack([places.real, places.imag], axis=1))
     away = tree.query(tree.data, k=2)[0][:, 1]
     widest = int(np.argmax(away))

@@ -4,11 +4,9 @@ import dataclasses
 import functools
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from rootsopt.config import Config
 from rootsopt.errors import InputError
-from rootsopt.measured.conjugacy import conjugacy, inset_note
 from rootsopt.measured.estimates import written
 from rootsopt.measured.fit import Checks, imported
 from rootsopt.measured.reading import JOIN, Sought, read, untangled
@@ -16,8 +14,6 @@ from rootsopt.profiles.outline import Outline
 
 if TYPE_CHECKING:
     from rootsopt.config.rotor import ProfileConfig
-if TYPE_CHECKING:
-    from rich.console import Console
 
 _NOTABLE = 1.0
 """Deviation between flanks (µm) at or above which the user gets a note."""
@@ -104,32 +100,3 @@ def advice(config: "ProfileConfig", checks: Checks) -> list[str]:
         unsmooth = ""
     found += filter(None, (seen.centering(), unsmooth))
     return [f"outline: {text}" for text in found]
-
-
-def record(config: Config) -> dict[str, Any]:
-    """Return {"outline": {...}} for the result file: the records of `Checks` and `Conjugacy`.
-
-    Return {} if the config names no outline file."""
-    if not config.profile.from_file:
-        return {}
-    from rootsopt.measured.source import outline_of  # For outlines only: it takes 0.5 s.
-
-    profile, checks = outline_of(config.profile)
-    return {"outline": checks.record() | conjugacy(profile).record()}
-
-
-def say(config: Config, out: "Console") -> None:
-    """Print notes to `out` on an imported outline.
-
-    They say whether its flanks differ by 1 µm or more, whether its points scatter, and whether its
-    centre is not the rotor's axis. They also say whether a clearance was drawn into it."""
-    if not config.profile.from_file:
-        return
-    from rootsopt.measured.source import advice, outline_of  # As in `record`.
-
-    profile, checks = outline_of(config.profile)
-    found = advice(config.profile, checks)
-    if not checks.seen.off_center:
-        found += filter(None, [inset_note(conjugacy(profile).inset, config.contact.clearance_mm)])
-    for message in found:
-        out.print(message, soft_wrap=True, markup=False, highlight=False)

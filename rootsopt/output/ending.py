@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rootsopt.output import facts
-from rootsopt.output.fronts import design_file
+from rootsopt.output.files import design_file
 from rootsopt.output.names import brief, in_words, name_and_unit, stated
 from rootsopt.output.tables import Record, records_of
 from rootsopt.status import Status

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from rootsopt.errors import InputError
-from rootsopt.output.assumptions import elsewhere
+from rootsopt.output.comparison import elsewhere
 from rootsopt.output.names import (
     brief,
     in_words,

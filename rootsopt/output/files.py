@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from rootsopt.config import sources
 from rootsopt.errors import InputError
 from rootsopt.output import disk
-from rootsopt.runtime.versions import versions as versions
+from rootsopt.runtime.environment import versions as versions
 
 if TYPE_CHECKING:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -227,6 +227,11 @@ def response_columns(series: "Series") -> dict[str, NDArray[np.float64]]:
 
 _BEARINGS = tuple(f"bearing_{rotor}_{end}_end_N" for rotor in (1, 2) for end in ("gear", "far"))
 """Columns of the loads on the bearings."""
+
+
+def design_file(point: int) -> str:
+    """Return the name of the file with the config of the point of a front with this number."""
+    return f"designs/point_{point:02d}.yaml"
 
 
 def row_columns(

@@ -12,8 +12,6 @@ from typing import Any
 
 from rootsopt.config import Config
 from rootsopt.config.units import unit_of, words
-from rootsopt.status import Status
-from rootsopt.tradeoffs.front import Standing
 
 DASH = "–"
 """Text in place of an unknown number."""
@@ -189,10 +187,3 @@ def table(
         if cells:
             found.append((heading, cells))
     return Table(title, tuple(heads), tuple(found), note) if found else None
-
-
-def status_cell(word: str) -> Cell:
-    """Return the cell of a status: its label in words, marked favourable or not."""
-    known = {status.label: status.usable for status in Status}
-    known |= {one.label: one is Standing.CERTIFIED for one in Standing}
-    return Cell(in_words(word), known.get(word))

@@ -9,8 +9,7 @@ from typing import Any
 
 from rootsopt.config import Config
 from rootsopt.config.units import words
-from rootsopt.output.assumptions import assumption_tables
-from rootsopt.output.better import better_tables
+from rootsopt.output.comparison import assumption_tables, better_tables
 from rootsopt.output.names import (
     Cell,
     Row,
@@ -25,7 +24,6 @@ from rootsopt.output.names import (
     scalars,
     signed,
     stated,
-    status_cell,
     table,
     value,
 )
@@ -619,3 +617,10 @@ def _statuses_in(data: Any) -> dict[str, None]:
         return {}
     own = {data[key]: None for key in ("status", "evaluation_status") if key in data}
     return {word: None for word in own if isinstance(word, str)} | _statuses_in([*data.values()])
+
+
+def status_cell(word: str) -> Cell:
+    """Return the cell of a status: its label in words, marked favourable or not."""
+    known = {status.label: status.usable for status in Status}
+    known |= {one.label: one is Standing.CERTIFIED for one in Standing}
+    return Cell(in_words(word), known.get(word))

@@ -11,8 +11,7 @@ import numpy as np
 
 from rootsopt.config import Config, load
 from rootsopt.output.ending import Ending, ending
-from rootsopt.output.files import ResultFolder
-from rootsopt.output.fronts import design_file
+from rootsopt.output.files import ResultFolder, design_file
 from rootsopt.output.tables import NAMES, records_of
 from rootsopt.response.series import Series
 

@@ -21,8 +21,8 @@ from markupsafe import Markup, escape
 
 import rootsopt
 from rootsopt.output import tables
-from rootsopt.output.fronts import design_file
-from rootsopt.output.names import Table, in_words, status_cell
+from rootsopt.output.files import design_file
+from rootsopt.output.names import Table, in_words
 from rootsopt.report import charts, words
 from rootsopt.report.charts import animations
 from rootsopt.report.gather import Run
@@ -117,7 +117,7 @@ def _page(template: str, drawn: Iterable[Any], data: Mapping[str, Any], **facts:
 def report_text(run: Run) -> str:
     """Return the HTML of the report of a `run`."""
     drawn = _charts(run)
-    status = status_cell(str(run.result.get("status", "")))
+    status = tables.status_cell(str(run.result.get("status", "")))
     animation = animations(run.cases)
     return _page(
         "page.html.j2",

@@ -53,7 +53,7 @@ from rootsopt.response.series import (
 from rootsopt.response.speeds import parts_at, shares
 from rootsopt.response.starts import Seed, Seeds, begun
 from rootsopt.response.terms import BEARING, GEAR, OF_MOTION, RESERVES, terms_of, values_of
-from rootsopt.runtime.precision import check_precision
+from rootsopt.runtime.environment import check_precision
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene, check_geometry, design_keys, design_vector, fault_of
 from rootsopt.status import Status

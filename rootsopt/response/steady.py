@@ -24,7 +24,7 @@ from rootsopt.dynamics.reserve import reserve
 from rootsopt.dynamics.steady import CLOSED, OPEN, Solver, Steady, among
 from rootsopt.dynamics.varied import varied
 from rootsopt.profiles.geometry import Soundness
-from rootsopt.runtime.precision import check_precision
+from rootsopt.runtime.environment import check_precision
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene, along
 from rootsopt.status import Status

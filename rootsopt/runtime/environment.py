@@ -7,8 +7,10 @@ before anything is computed. This matters because XLA ends the whole process if 
 flag."""
 
 import contextlib
+import importlib.metadata
 import logging
 import os
+import platform
 import re
 import subprocess
 import sys
@@ -17,6 +19,7 @@ from collections.abc import Iterator
 
 from threadpoolctl import threadpool_limits
 
+import rootsopt
 from rootsopt.errors import InputError
 
 _RESPECTED = (
@@ -355,3 +358,23 @@ def _complaint(log: str) -> str:
     options = [line for line in lines if line.startswith("xla: ")]
     line = (marked or options or lines[-1:] or ["XLA does not start with it"])[0]
     return _reason(ValueError(_LOG_PREFIX.sub("", line)))
+
+
+def check_precision() -> None:
+    """Raise `RuntimeError` unless JAX is set to double precision."""
+    import jax
+
+    if not jax.config.read("jax_enable_x64"):
+        raise RuntimeError(
+            "JAX computes in single precision here, but rootsopt needs double precision: call "
+            'jax.config.update("jax_enable_x64", True) before anything else'
+        )
+
+
+_LIBRARIES = ("jax", "jaxlib", "diffrax", "optax", "equinox", "numpy")
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python, this package and the libraries that affect its results."""
+    found = {"python": platform.python_version(), "rootsopt": rootsopt.__version__}
+    return found | {name: importlib.metadata.version(name) for name in _LIBRARIES}

@@ -18,7 +18,7 @@ from rootsopt.config import Config
 from rootsopt.config.sources import FILES, reason, regular_file
 from rootsopt.config.words import shown
 from rootsopt.errors import InputError
-from rootsopt.runtime.versions import versions
+from rootsopt.runtime.environment import versions
 
 _SHOWN = 5
 """Maximum number of differences that an error message lists."""

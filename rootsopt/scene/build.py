@@ -44,7 +44,7 @@ from rootsopt.dynamics.steady import Solver
 from rootsopt.dynamics.timescales import Timescales
 from rootsopt.profiles import Geometry, Outline, Profile, geometry
 from rootsopt.profiles.geometry import Soundness, soundness
-from rootsopt.runtime.precision import check_precision
+from rootsopt.runtime.environment import check_precision
 from rootsopt.scene import families, reading
 from rootsopt.scene.bearings import GRAVITY, Bearings, bearings_of
 from rootsopt.scene.medium import Medium, medium_of

@@ -19,7 +19,7 @@ from typing import Any
 from rootsopt.config import Config
 from rootsopt.config.words import shown
 from rootsopt.errors import InputError
-from rootsopt.runtime.versions import versions
+from rootsopt.runtime.environment import versions
 from rootsopt.status import Status
 from rootsopt.sweeps.evaluations import DaskRunner, Watch, gone, refusal
 from rootsopt.sweeps.local import divided

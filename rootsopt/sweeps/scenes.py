@@ -5,18 +5,19 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Any
-
-import xarray
+from typing import TYPE_CHECKING, Any
 
 from rootsopt.config import Config
 from rootsopt.config.sources import FILES
+from rootsopt.runtime.environment import check_precision
 from rootsopt.runtime.journal import Journal, header_of
-from rootsopt.runtime.precision import check_precision
 from rootsopt.sweeps.local import in_process
 from rootsopt.sweeps.plan import Plan, check_values, plan_of
 from rootsopt.sweeps.points import Row, check_row, prepared
 from rootsopt.sweeps.table import dataset_of
+
+if TYPE_CHECKING:
+    import xarray
 
 Run = Callable[[Config, Plan, Sequence[int], threading.Event], Any]
 """A function that simulates points of a plan and yields lists of (number, record) as they are
@@ -36,7 +37,7 @@ def sweep_scenes(  # Keywords of the public interface, each independent of the o
     scheduler: str | None = None,
     checkpoint: str | Path | None = None,
     resume: bool = False,
-) -> xarray.Dataset:
+) -> "xarray.Dataset":
     """Simulate a `config` at every combination of the values of some of its keys.
 
     `axes`: dotted keys with their values, such as {"scene.speed_rpm": [1000, 2000]}, or with a text

@@ -1,10 +1,9 @@
 """The points of a sweep as an `xarray.Dataset`, with units and long names."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray
 import yaml
 
 import rootsopt
@@ -15,6 +14,9 @@ from rootsopt.response.records import RESPONSES
 from rootsopt.status import Status
 from rootsopt.sweeps.plan import Plan
 from rootsopt.sweeps.points import Row, lost
+
+if TYPE_CHECKING:
+    import xarray
 
 _LONG = {
     "mean_force_N": "mean contact force",
@@ -42,7 +44,7 @@ def dataset_of(
     plan: Plan,
     rows: Mapping[int, Row],
     attributes: Mapping[str, Any] | None = None,
-) -> xarray.Dataset:
+) -> "xarray.Dataset":
     """Return the dataset of a sweep.
 
     `config`: config of the sweep; `plan`: the points; `rows`: record of each point by its number,
@@ -81,6 +83,8 @@ def dataset_of(
         "method": plan.method,
     }
     made |= {} if plan.seed is None else {"seed": plan.seed}
+    import xarray  # Slow import.
+
     return xarray.Dataset(columns, coordinates, made | dict(attributes or {}))
 
 

@@ -12,7 +12,7 @@ from rootsopt.config.families import import_named
 from rootsopt.errors import InputError
 from rootsopt.response.many import HERE
 from rootsopt.runtime import environment, programs
-from rootsopt.runtime.versions import versions
+from rootsopt.runtime.environment import versions
 from rootsopt.sweeps.local import at_once
 from rootsopt.sweeps.points import Row
 

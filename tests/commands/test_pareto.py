@@ -18,7 +18,7 @@ from rootsopt import report
 from rootsopt.commands.table import pareto
 from rootsopt.commands.work.searching import progress_bar
 from rootsopt.config import load
-from rootsopt.output.fronts import design_file
+from rootsopt.output.files import design_file
 from rootsopt.profiles import geometry
 from rootsopt.response.records import geometry_record
 from rootsopt.scene import Scene, design_vector

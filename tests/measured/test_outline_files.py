@@ -10,6 +10,7 @@ import signal
 import ezdxf
 import numpy as np
 import pytest
+import scipy.spatial
 from ezdxf import units
 from hypothesis import given
 from hypothesis import strategies as st
@@ -369,8 +370,8 @@ def test_many_loose_lines_are_joined_in_order(tmp_path, monkeypatch):
         for k in order
     ]
     trees = []
-    tree = loops.KDTree
-    monkeypatch.setattr(loops, "KDTree", lambda data: trees.append(len(data)) or tree(data))
+    tree = scipy.spatial.KDTree
+    monkeypatch.setattr(scipy.spatial, "KDTree", lambda data: trees.append(len(data)) or tree(data))
     (loop,), fault = loops.joined(chains, "lines.dxf")
     assert fault is None
     assert trees == [len(z), 3 * len(z)]

@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 
 from rootsopt.commands import cli
+from rootsopt.commands.work.searching import CompileClock
 from rootsopt.config import load
 from rootsopt.config.families import for_a_time, import_named
 from rootsopt.design import space
@@ -28,7 +29,6 @@ from rootsopt.dynamics.collocation.known import KnownOrbit
 from rootsopt.pump import sheet
 from rootsopt.runtime import environment, programs, store
 from rootsopt.runtime.programs import CachedFunction
-from rootsopt.runtime.timing import CompileClock
 from rootsopt.scene import Scene
 
 

@@ -11,6 +11,7 @@ from rich.console import Console
 
 from rootsopt.commands import cli, door
 from rootsopt.commands.work.searching import (
+    CompileClock,
     checkpoint_of,
     nothing_known,
     progress_bar,
@@ -21,7 +22,7 @@ from rootsopt.config import Config
 from rootsopt.config.families import family_of
 from rootsopt.design.resemblance import likenesses
 from rootsopt.export import chosen
-from rootsopt.measured import source
+from rootsopt.measured import conjugacy
 from rootsopt.optimize import noise
 from rootsopt.optimize.outcome import Optimization
 from rootsopt.optimize.robust import search_of
@@ -29,7 +30,6 @@ from rootsopt.output import files, tables, terminal
 from rootsopt.output.runs import RunFolder
 from rootsopt.pump.sheet import check_clearances, record_of
 from rootsopt.response.touching import touching
-from rootsopt.runtime.timing import CompileClock
 from rootsopt.scene import Scene, check_geometry, outline_mm
 
 
@@ -85,7 +85,7 @@ def searched_for(
     def show(out: Console) -> None:
         out.print(terminal.shown(tables.tables_of(data)))
         if result.beginning is not None:
-            source.say(config, out)
+            conjugacy.say(config, out)
         out.print(
             f"compile {clock.seconds:.1f} s, run {ran - clock.seconds:.1f} s, "
             f"reports {total - ran:.1f} s",
@@ -218,7 +218,7 @@ def _write(folder, config, options, result, alike, sheets, compiled, ran) -> dic
     data |= alike
     if result.beginning is not None:
         data["beginning"] = result.beginning.record()
-        data |= source.record(config)
+        data |= conjugacy.record(config)
     data["improvement"] = result.improvement
     if result.nominal is not None:
         data["improvement_over_nominal"] = result.improvement_over_nominal

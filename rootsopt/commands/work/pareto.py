@@ -10,6 +10,7 @@ from rich.console import Console
 from rootsopt import report
 from rootsopt.commands import cli, door
 from rootsopt.commands.work.searching import (
+    CompileClock,
     checkpoint_of,
     nothing_known,
     progress_bar,
@@ -17,10 +18,9 @@ from rootsopt.commands.work.searching import (
     searched,
 )
 from rootsopt.config import Config
-from rootsopt.output import files, fronts, tables, terminal
+from rootsopt.output import files, tables, terminal
 from rootsopt.output.runs import RunFolder
 from rootsopt.runtime.environment import say
-from rootsopt.runtime.timing import CompileClock
 from rootsopt.scene import check_geometry
 from rootsopt.tradeoffs.trace import Tracer
 
@@ -51,7 +51,11 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     seconds = {"compile_seconds": clock.seconds, "run_seconds": ran - clock.seconds}
     record["statistics"] |= seconds
     files.write_config(folder, config)
-    fronts.write_front(folder, front)
+    if front.points:
+        folder.write_csv("front.csv", files.row_columns([point.row() for point in front.points]))
+    for point in front.points:
+        text = front.config_of(point).to_yaml()
+        folder.write_text(files.design_file(point.number), text)
     folder.write_json("result.json", record | {"versions": files.versions()})
     if front.points and not options.no_figures:
         from rootsopt.figures.front import front_figure

@@ -11,7 +11,7 @@ from rootsopt.design.resemblance import free_likeness, likenesses
 from rootsopt.errors import InputError
 from rootsopt.export import chosen
 from rootsopt.export.writing import write
-from rootsopt.measured import source
+from rootsopt.measured import conjugacy
 from rootsopt.output import files, tables, terminal
 from rootsopt.output.runs import RunFolder
 from rootsopt.profiles import Profile, geometry
@@ -44,7 +44,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     }
     if margins := margins_of(config.profile):
         record["margins"] = margins
-    record |= source.record(config)
+    record |= conjugacy.record(config)
     record["pump"] = sheet(scene, design)
     files.write_config(folder, config)
     folder.write_csv("profile_design.csv", files.profile_columns(outline_mm(config)))
@@ -61,7 +61,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
 
     def show(out: Console) -> None:
         out.print(terminal.shown(tables.tables_of(record)))
-        source.say(config, out)
+        conjugacy.say(config, out)
         if projected is not None:
             out.print(projected, soft_wrap=True)
 

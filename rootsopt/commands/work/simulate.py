@@ -7,7 +7,7 @@ from rich.console import Console
 from rootsopt.commands import cli
 from rootsopt.config import Config
 from rootsopt.export import chosen
-from rootsopt.measured import source
+from rootsopt.measured import conjugacy
 from rootsopt.output import files, tables, terminal
 from rootsopt.output.runs import RunFolder
 from rootsopt.pump.sheet import check_clearances, record_of
@@ -31,7 +31,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     folder.write_csv("profile_design.csv", files.profile_columns(outline_mm(config)))
     if evaluation.series is not None:
         folder.write_csv("response_design.csv", files.response_columns(evaluation.series))
-    data = evaluation.record() | source.record(config)
+    data = evaluation.record() | conjugacy.record(config)
     if config.pump is not None or config.scene.bearings is not None:
         data["pump"] = record_of(config, [*evaluation.design.values()])
     if config.tolerances is not None and (scattered := touching(config)) is not None:
@@ -49,6 +49,6 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     def show(out: Console) -> None:
         shown = [*tables.tables_of(data), tables.effort_table(data)]
         out.print(terminal.shown(shown))
-        source.say(config, out)
+        conjugacy.say(config, out)
 
     return cli.Outcome(cli.OK if evaluation.usable else cli.NO_RESULT, show)

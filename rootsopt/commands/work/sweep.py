@@ -1,21 +1,36 @@
-"""The work of `rootsopt sweep`."""
+"""The work of `rootsopt sweep`: at speeds, or with `--over` and `--tolerances` over any keys."""
 
 import argparse
-import contextlib
-from collections.abc import Callable, Iterator
+import time
+from contextlib import closing
+from functools import partial
+from typing import Any
 
 from rich.console import Console
-from rich.progress import Progress
 
-from rootsopt.commands import cli
+from rootsopt.commands import cli, door
+from rootsopt.commands.work.searching import opened, progress_bar
 from rootsopt.config import Config
+from rootsopt.config.plausible import notes_on_swept
 from rootsopt.errors import InputError
-from rootsopt.output import files, tables, terminal
+from rootsopt.output import files, sweeps, tables, terminal
 from rootsopt.output.runs import RunFolder
 from rootsopt.response import speeds
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.reducers import overall
+from rootsopt.runtime.environment import say
 from rootsopt.scene import check_geometry, design_keys, design_vector
+from rootsopt.status import Status
+from rootsopt.sweeps.axes import parse_over
+from rootsopt.sweeps.plan import Plan, plan_of, scattered
+from rootsopt.sweeps.scenes import Points, checked, complete, runner
+from rootsopt.sweeps.table import dataset_of
+
+_DATA = "sweep.nc"
+_FEW = 40
+"""Number of points above which the terminal shows only the first."""
+_FIRST = "compiling and simulating"
+_PROMISE = "keeping the points that are done and writing the files"
 
 
 def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.Outcome:
@@ -24,16 +39,15 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     With `--over` or `--tolerances`, sweep any keys instead. Return the `Outcome`. Raises
     `InputError` if the config is invalid."""
     if options.over or options.tolerances is not None:
-        from rootsopt.commands.work import over  # xarray and its figures take time to import.
-
-        return over.body(config, options, folder)
+        return _over_keys(config, options, folder)
     refuse_options(options)
     check_geometry(config)
-    cli.load_figures(options, "speeds")
+    cli.load_figures(options, "sweep")
     swept = speeds.swept_speeds(config)
-    with _progress(Console(stderr=True), len(swept)) as progress:
+    with progress_bar(Console(stderr=True), _FIRST, "simulating", "speeds") as progress:
         evaluator = Evaluator.of_objective(speeds.alone(config)).without_gradient()
-        parts = evaluator.swept(swept, progress=progress)
+        count = partial(progress or _silent, expected=len(swept))
+        parts = evaluator.swept(swept, progress=count)
     rows = [part.row(whole=True) for part in parts]
     status, message = overall(parts)
     files.write_config(folder, config)
@@ -60,6 +74,92 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     return cli.Outcome(cli.OK if usable else cli.NO_RESULT, show)
 
 
+def _over_keys(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.Outcome:
+    """Run a sweep over any keys: simulate all points, and write files into `folder`.
+
+    Return the `Outcome`. Raises `InputError` if a key, a value or an option is not valid."""
+    began = time.perf_counter()
+    cli.load_figures(options, "sweep")
+    name = _DATA if options.data is None else options.data
+    sweeps.check_name(name)
+    config, plan = _points(config, options)
+    plan = checked(config, plan)
+    columns = {key: values for one in plan.dimensions for key, values in one.columns.items()}
+    found = notes_on_swept(config, columns)
+    for note in found:
+        say(note)
+    folder.add_notes(found)
+    run = runner(options.workers, options.scheduler, options.imports, not options.no_cache)
+    with (
+        closing(opened(partial(Points, config, plan, options.imports), options, folder)) as journal,
+        door.patience(_PROMISE) as stop,
+        progress_bar(Console(stderr=True), _FIRST, "simulating", "points") as progress,
+    ):
+        known = len(journal.resumed)
+        records = complete(config, plan, run, journal, progress or _silent, stop)
+    done = len(records) == plan.count
+    seconds = time.perf_counter() - began
+    dataset = dataset_of(config, plan, records)
+    files.write_config(folder, config)
+    rows = sweeps.rows_of(plan, records)
+    folder.write_csv("sweep.csv", files.row_columns(rows))
+    sweeps.write_dataset(folder, name, dataset)
+    statistics: dict[str, Any] = {"seconds": seconds, "resumed_points": known}
+    statistics["points_per_second"] = (len(records) - known) / seconds
+    record = sweeps.summary(plan, records) | {"data": name, "statistics": statistics}
+    folder.write_json("result.json", record | {"versions": files.versions()})
+    if not options.no_figures:
+        from rootsopt.figures.sweep import sweep_figure
+
+        sweep_figure(folder, plan, dataset)
+    if done:
+        folder.remove_afterwards(folder.checkpoint)
+    else:
+        folder.overwrite = False  # An earlier result is more valuable than this one.
+
+    def show(out: Console) -> None:
+        out.print(terminal.shown(tables.tables_of(record, rows, _FEW)))
+        rate = statistics["points_per_second"]
+        out.print(f"{len(records) - known} points in {seconds:.1f} s, {rate:.3g} per second")
+
+    usable = done and any(Status[row["status"].upper()].usable for row in rows)
+    return cli.Outcome(cli.OK if usable else cli.NO_RESULT, show, rows)
+
+
+def _points(config: Config, options: argparse.Namespace) -> tuple[Config, Plan]:
+    """Return the config without the sweep's own values, and the points of the sweep."""
+    if options.tolerances is not None:
+        for name in ("over", "zip", "zip_keys", "sample", "sobol", "seed"):
+            if getattr(options, name) not in (None, False, []):
+                raise InputError(
+                    f"`--tolerances` draws all points, so that `--{name.replace('_', '-')}` has no "
+                    "effect; remove one of them"
+                )
+        return scattered(config, options.tolerances)
+    return config, _plan(options)
+
+
+def _plan(options: argparse.Namespace) -> Plan:
+    axes = {}
+    for text in options.over:
+        key, axis = parse_over(text)
+        if key in axes:
+            raise InputError(f"`--over {key}=...` is given twice; write all its values in one list")
+        axes[key] = axis
+    groups = [[key.strip() for key in text.split(",")] for text in options.zip_keys]
+    if options.zip and groups:
+        raise InputError("`--zip` zips all keys, so that `--zip-keys` has no effect; remove one")
+    seeded = options.sample is not None or options.sobol is not None
+    if options.seed is not None and not seeded:
+        raise InputError("`--seed` is for samples; add `--sample N` or `--sobol N`, or remove it")
+    seed = 0 if options.seed is None else options.seed
+    return plan_of(axes, options.zip or groups, options.sample, options.sobol, seed)
+
+
+def _silent(done: int, expected: int) -> None:
+    """Do nothing, in place of a progress bar."""
+
+
 def refuse_options(options: argparse.Namespace) -> None:
     """Raise `InputError` if an option that needs `--over` is given without `--over`."""
     names = "zip", "zip_keys", "sample", "sobol", "seed", "data", "workers", "scheduler", "resume"
@@ -69,17 +169,3 @@ def refuse_options(options: argparse.Namespace) -> None:
                 f"`--{name.replace('_', '-')}` needs keys to sweep; add `--over KEY=VALUES`, as in "
                 "--over scene.speed_rpm=300:6000:39"
             )
-
-
-@contextlib.contextmanager
-def _progress(console, expected: int) -> Iterator[Callable[[int], None]]:
-    """Yield a function (done) that updates a progress bar.
-
-    If the console is not a terminal, there is no progress bar and the function does nothing."""
-    if not console.is_terminal:
-        yield lambda done: None
-        return
-
-    with Progress(console=console, transient=True) as bar:
-        task = bar.add_task("compiling and simulating", total=None)
-        yield lambda done: bar.update(task, completed=done, total=expected)
