@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -24,12 +24,8 @@ from rootsopt.report.gather import Case
 from rootsopt.response.series import Series
 from rootsopt.scene import Scene
 
-if TYPE_CHECKING:
-    from rootsopt.report.gather import Case
-
 # The models of Bokeh accept more than their annotations say.
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
-
 
 _INK = "#1a1a1a"
 _TEXT = {"text_font_size": "12px", "text_color": _INK, "text_font_style": "normal"}
@@ -261,7 +257,7 @@ def _thinned(force: NDArray[np.float64], most: int = _MOST_SAMPLES) -> NDArray[n
     return np.array(sorted(found))
 
 
-def animations(cases: Sequence["Case"]) -> dict[str, Any]:
+def animations(cases: Sequence[Case]) -> dict[str, Any]:
     """Return the data of the animation of all `cases`.
 
     Cases with the same design share a rotor. A case without a motion is shown in perfect rolling.
