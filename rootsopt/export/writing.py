@@ -8,9 +8,8 @@ import numpy as np
 
 from rootsopt.config import Config
 from rootsopt.export import SOLID, solid
-from rootsopt.export.drawing import Drawing, coordinates
+from rootsopt.export.drawing import Drawing, coordinates, svg_text
 from rootsopt.export.dxf import dxf_bytes
-from rootsopt.export.svg import svg_text
 from rootsopt.output.files import ResultFolder
 from rootsopt.response.evaluation import Evaluation
 from rootsopt.response.series import Series

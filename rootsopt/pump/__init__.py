@@ -14,9 +14,8 @@ from rootsopt.pump.flow import (
     twisted_lines,
     twisted_ripple,
 )
-from rootsopt.pump.gap import Allowances, MeshGap, mesh_gap, relative_curvature
+from rootsopt.pump.gap import Allowances, MeshGap, Play, mesh_gap, play, relative_curvature
 from rootsopt.pump.leakage import Leakage, leakage
-from rootsopt.pump.play import Play, play
 
 __all__ = [
     "Allowances",

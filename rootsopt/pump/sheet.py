@@ -12,9 +12,9 @@ from rootsopt.config.units import DEG, MM, UM
 from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry, Profile, geometry
 from rootsopt.pump import flow
+from rootsopt.pump.gap import Play, play
 from rootsopt.pump.leakage import leakage
 from rootsopt.pump.loads import static_loads
-from rootsopt.pump.play import Play, play
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene, design_vector
 from rootsopt.scene.medium import Medium

@@ -19,9 +19,9 @@ from rootsopt.commands.table import profile
 from rootsopt.config import load
 from rootsopt.design.space import Space
 from rootsopt.errors import InputError
-from rootsopt.export import chosen, solid, svg
+from rootsopt.export import chosen, solid
 from rootsopt.export.animation import meshing_gif, rolling_contacts
-from rootsopt.export.drawing import Drawing
+from rootsopt.export.drawing import Drawing, svg_text
 from rootsopt.export.dxf import dxf_bytes
 from rootsopt.export.pieces import Arc, Spline, outline_pieces, polyline
 from rootsopt.profiles import CIC, EE, geometry, outline, place_pair
@@ -214,7 +214,7 @@ def test_any_family_is_drawn(family, tmp_path):
 def test_svg_read_back(name):
     """The drawing has true size, and its own curves enclose the area to 1e-6."""
     shape = PROFILES[name]
-    text = svg.svg_text(drawing(shape))
+    text = svg_text(drawing(shape))
     size, unit = re.search(r'<svg [^>]*width="([\d.]+)(\w+)"', text).groups()
     assert unit == "mm"
     assert re.search(r'viewBox="(\S+) (\S+) (\S+) (\S+)"', text).group(3) == size

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from rootsopt.errors import InputError
-from rootsopt.measured.finding import found
+from rootsopt.measured.source import found
 from rootsopt.profiles import CIC, outline
 
 LENGTHS = {"mm": 1.0, "inch": 25.4, "um": 1e-3, "m": 1e3}

@@ -97,7 +97,6 @@ _OF = {
     "pump/gap": "leakage play",
     "pump/leakage": "leakage",
     "pump/loads": "loads free_twist bearings",
-    "pump/play": "play",
     "pump/rattle": "rattle",
     "pump/sheet": "pump_flow play leakage",
     "response/checkpoint": "checkpoint journal",

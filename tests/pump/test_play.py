@@ -11,8 +11,7 @@ from matplotlib.path import Path
 from experiments._common.polygons import pair_gap
 from rootsopt.measured.conjugacy import conjugacy
 from rootsopt.profiles import CIC, EE, place_pair
-from rootsopt.pump.gap import Allowances, mesh_gap
-from rootsopt.pump.play import play
+from rootsopt.pump.gap import Allowances, mesh_gap, play
 from tests.conformance.families import LOBES, R, made, outline_of
 from tests.measured.test_outline import bulged, points_of, profile_of
 

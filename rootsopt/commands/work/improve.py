@@ -16,7 +16,7 @@ from rootsopt.config.families import FREE_FORM
 from rootsopt.design.resemblance import Likeness, free_likeness, likeness
 from rootsopt.design.space import widened
 from rootsopt.errors import InputError
-from rootsopt.measured.finding import Found, found
+from rootsopt.measured.source import Found, found
 from rootsopt.optimize.surviving import survives, surviving
 from rootsopt.output import terminal
 from rootsopt.output.comparison import WORTH, better_tables
