@@ -15,6 +15,7 @@ FACE = {"__init__.py", "errors.py", "status.py", "py.typed"}
 DOORS = {
     "__main__.py",
     "attractors.py",
+    "explore.py",
     "pareto.py",
     "improve.py",
     "new.py",
@@ -44,25 +45,25 @@ LATE = {
     },
     "commands/cli.py": {
         "rootsopt.output.ending", "rootsopt.output.runs", "rootsopt.output.terminal",
-        "rootsopt.report.gather", "rootsopt.report.html", "rootsopt.runtime",
+        "rootsopt.pages.gather", "rootsopt.pages.html", "rootsopt.runtime",
     },
     "commands/console.py": {"rootsopt", "rootsopt.commands", "rootsopt.errors"},
     # Figures are imported in the background; exports, only if they are asked for.
     **{f"commands/work/{name}.py": {"rootsopt.figures", f"rootsopt.figures.{module}"}
        for name, module in (("attractors", "basins"), ("profile", "runs"))},
     "commands/work/pareto.py": {
-        "rootsopt.figures", "rootsopt.figures.front", "rootsopt.report.html",
+        "rootsopt.figures", "rootsopt.figures.front", "rootsopt.pages.html",
     },
     "commands/work/optimize.py": {
-        "rootsopt.export.writing", "rootsopt.figures", "rootsopt.figures.spread",
+        "rootsopt.figures.writing", "rootsopt.figures", "rootsopt.figures.spread",
     },
-    "commands/work/simulate.py": {"rootsopt.export.writing", "rootsopt.figures"},
+    "commands/work/simulate.py": {"rootsopt.figures.writing", "rootsopt.figures"},
     "commands/work/sweep.py": {"rootsopt.figures.sweep"},
-    "export/writing.py": {"rootsopt.export.animation"},
+    "figures/writing.py": {"rootsopt.figures.animation"},
     "optimize/__init__.py": {"rootsopt.commands.table"},
     # Modules that import optional or slow libraries.
-    "commands/work/explore.py": {"rootsopt.explore.engine", "rootsopt.explore.server"},
-    "export/__init__.py": {"rootsopt.export.solid"},
+    "commands/work/explore.py": {"rootsopt.pages.engine", "rootsopt.pages.server"},
+    "figures/__init__.py": {"rootsopt.figures.solid"},
     "figures/runs.py": {"rootsopt.measured.source"},
     "measured/reading.py": {"rootsopt.measured.dxf"},
     "measured/conjugacy.py": {"rootsopt.measured.source"},

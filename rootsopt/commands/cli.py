@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
-from rootsopt import report
+from rootsopt import pages
 from rootsopt.commands import door
 from rootsopt.commands.door import BAD_INPUT, NO_RESULT
 from rootsopt.commands.door import OK as OK
@@ -35,7 +35,7 @@ from rootsopt.config.explain import GROUPS
 from rootsopt.config.families import families, import_named
 from rootsopt.config.sources import shipped
 from rootsopt.errors import InputError
-from rootsopt.report import REPORT
+from rootsopt.pages import REPORT
 from rootsopt.runtime import environment
 from rootsopt.runtime.environment import use_float64
 
@@ -266,7 +266,7 @@ def _in_folder(command: str, config: Config, options: argparse.Namespace) -> int
     from rootsopt.output.runs import RunFolder
 
     if options.report:
-        report.require("`--report`")
+        pages.require("`--report`")
     body: Body = _work(command)
     with (
         RunFolder(options.output, command, options.overwrite) as folder,
@@ -297,8 +297,8 @@ def _report(folder: "RunFolder", options: argparse.Namespace, outcome: Outcome) 
     """Write the report of a run that has written all its other files.
 
     If it cannot be made, say so on stderr: the result of a long run must not be lost with it."""
-    from rootsopt.report.gather import Run
-    from rootsopt.report.html import report_text
+    from rootsopt.pages.gather import Run
+    from rootsopt.pages.html import report_text
 
     try:
         given = shlex.join(options.given), outcome.code == door.OK, options.imports

@@ -49,9 +49,9 @@ def _optimize(parser: "ArgumentParser") -> None:
 
 
 def _improve(parser: "ArgumentParser") -> None:
-    from rootsopt import export
+    from rootsopt import figures
 
-    export.add_option(parser, "dxf")
+    figures.add_option(parser, "dxf")
     parser.set_defaults(report=True)
     group = parser.add_argument_group("what is better, and what the file does not say")
     for aim, meaning in (
@@ -77,16 +77,16 @@ def _improve(parser: "ArgumentParser") -> None:
 
 
 def _simulate(parser: "ArgumentParser") -> None:
-    from rootsopt import export
+    from rootsopt import figures
 
-    export.add_option(parser, "none")
+    figures.add_option(parser, "none")
 
 
 def _profile(parser: "ArgumentParser") -> None:
-    from rootsopt import export
+    from rootsopt import figures
 
     # Drawings take less than 1 s, a solid takes 10 s.
-    export.add_option(parser, "dxf,svg")
+    figures.add_option(parser, "dxf,svg")
     parser.add_argument(
         "--project",
         metavar="N",

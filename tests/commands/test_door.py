@@ -255,7 +255,7 @@ def test_commands_import_late_what_a_run_may_not_need():
         "xarray",
         "jinja2",
         "bokeh",
-        "rootsopt.report.html",
+        "rootsopt.pages.html",
     )
     code = "import sys; from rootsopt.commands import cli, table; cli.parser(table.profile)"
     code += f"\nimport {work}; print([n for n in {slow} if n in sys.modules])"

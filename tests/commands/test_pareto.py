@@ -14,7 +14,7 @@ from browser import Browser
 from rich.console import Console
 
 import rootsopt
-from rootsopt import report
+from rootsopt import pages
 from rootsopt.commands.table import pareto
 from rootsopt.commands.work.searching import progress_bar
 from rootsopt.config import load
@@ -71,7 +71,7 @@ def test_config_of_a_point_is_its_design(folder):
 
 def test_page_opens_without_a_network(folder):
     pytest.importorskip("bokeh")
-    text = (folder / report.FRONT).read_text("utf-8")
+    text = (folder / pages.FRONT).read_text("utf-8")
     assert not re.search(r"<(script|link|img)[^>]*(src|href)=", text)
     (data,) = re.findall(r'<script type="application/json" id="data">(.*?)</script>', text, re.S)
     points = json.loads(data)["points"]
@@ -84,7 +84,7 @@ def test_page_opens_without_a_network(folder):
 def test_click_on_a_point_shows_its_config(folder, tmp_path):
     """A click on the chart, and one on a row, choose a point; the console stays silent."""
     with contextlib.closing(Browser(tmp_path)) as page:
-        page.open((folder / report.FRONT).as_uri())
+        page.open((folder / pages.FRONT).as_uri())
         place = """
         if (!window.Bokeh || !Bokeh.documents.length) return false;
         const plot = Bokeh.documents[0].roots()[0], view = Bokeh.index.find_one_by_id(plot.id);
@@ -104,10 +104,10 @@ def test_click_on_a_point_shows_its_config(folder, tmp_path):
 
 
 def test_page_is_left_out_without_its_library(tmp_path, monkeypatch, capfd):
-    monkeypatch.setattr(report.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(pages.importlib.util, "find_spec", lambda name: None)
     assert pareto.main([CIC, "-o", str(tmp_path / "run"), *FEW, "--set", "pareto.points=3"]) == 0
     assert "rootsopt[pages]" in capfd.readouterr().err
-    assert not (tmp_path / "run" / report.FRONT).exists()
+    assert not (tmp_path / "run" / pages.FRONT).exists()
 
 
 @pytest.mark.parametrize(
@@ -155,7 +155,7 @@ def test_the_bar_has_words_while_compiling_and_ends_full():
 _STOPPED = """
 import contextlib, os, signal, sys
 from rootsopt.commands import door
-from rootsopt import report
+from rootsopt import pages
 from rootsopt.commands.table import pareto
 from rootsopt.commands.work import pareto as work
 

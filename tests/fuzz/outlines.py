@@ -13,8 +13,8 @@ import ezdxf
 import numpy as np
 
 from rootsopt.config import load
-from rootsopt.export.drawing import Drawing
-from rootsopt.export.dxf import dxf_bytes
+from rootsopt.figures.drawing import Drawing
+from rootsopt.figures.dxf import dxf_bytes
 from rootsopt.measured.conjugacy import conjugacy
 from rootsopt.measured.fit import imported
 from rootsopt.measured.reading import read

@@ -392,7 +392,7 @@ def test_a_program_follows_the_code_that_it_imports(package):
         return programs._sources({"rootsopt.response.evaluation"})
 
     first = replaced("status.py", "a", "a")
-    assert replaced("report/html.py", "def ", "x = 1\n\n\ndef ") == first
+    assert replaced("pages/html.py", "def ", "x = 1\n\n\ndef ") == first
     assert replaced("commands/cli.py", "import", "import time  # or not\nimport") == first
     for name in ("dynamics/pair.py", "contact/search.py", "profiles/cic.py", "runtime/programs.py"):
         assert replaced(name, '"""', '"""Comparable to nothing.\n\n') == first

@@ -9,7 +9,7 @@ import threading
 import webbrowser
 from pathlib import Path
 
-from rootsopt import report
+from rootsopt import pages
 from rootsopt.commands import door
 from rootsopt.config import Config
 from rootsopt.output import disk
@@ -21,10 +21,10 @@ def body(config: Config, options: argparse.Namespace) -> int:
     """Run `rootsopt explore`: serve the page until the user stops it. Return the exit code.
 
     Raises `InputError` if the config or an option is invalid, or if a library is missing."""
-    report.require("`explore`", "explore")
+    pages.require("`explore`", "explore")
     check_geometry(config)
-    from rootsopt.explore.engine import Engine
-    from rootsopt.explore.server import PageServer
+    from rootsopt.pages.engine import Engine
+    from rootsopt.pages.server import PageServer
 
     engine = Engine(config)
     server = PageServer(engine, str(options.config), options.port)

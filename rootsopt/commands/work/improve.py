@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from rootsopt import report
+from rootsopt import pages
 from rootsopt.commands import cli
 from rootsopt.commands.work import optimize
 from rootsopt.config import Config, load
@@ -87,7 +87,7 @@ def config_of(options: argparse.Namespace) -> Config:
         "constraints.terms.displaced_volume_cm3": {"min": round(least, 6)},
     }
     config = config.replaced({key: value for key, value in limits.items() if key not in own})
-    if options.report and (lacking := report.missing()):
+    if options.report and (lacking := pages.missing()):
         say(f"no report is written: it needs {lacking}")
         options.report = False
     design = ", ".join(stated(key, x, named=True) for key, x in one.design.items())

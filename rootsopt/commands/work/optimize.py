@@ -21,7 +21,7 @@ from rootsopt.commands.work.searching import (
 from rootsopt.config import Config
 from rootsopt.config.families import family_of
 from rootsopt.design.resemblance import likenesses
-from rootsopt.export import chosen
+from rootsopt.figures import chosen
 from rootsopt.measured import conjugacy
 from rootsopt.optimize import noise
 from rootsopt.optimize.outcome import Optimization
@@ -77,7 +77,7 @@ def searched_for(
     alike |= further(result)
     data = _write(folder, config, options, result, alike, sheets, clock.seconds, ran)
     if result.optimized is not None and formats:
-        from rootsopt.export.writing import write_simulated
+        from rootsopt.figures.writing import write_simulated
 
         write_simulated(folder, _searching(config, result), formats, result.optimized)
     total = time.perf_counter() - began

@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager, closing
 
 from rich.console import Console
 
-from rootsopt import report
+from rootsopt import pages
 from rootsopt.commands import cli, door
 from rootsopt.commands.work.searching import (
     CompileClock,
@@ -61,12 +61,12 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
         from rootsopt.figures.front import front_figure
 
         front_figure(folder, front)
-        if words := report.missing():
-            say(f"{report.FRONT} is not written, because it needs {words}")
+        if words := pages.missing():
+            say(f"{pages.FRONT} is not written, because it needs {words}")
         else:
-            from rootsopt.report.html import front_text
+            from rootsopt.pages.html import front_text
 
-            folder.write_text(report.FRONT, front_text(front))
+            folder.write_text(pages.FRONT, front_text(front))
     if front.interrupted and not front.points:
         folder.overwrite = False  # An earlier result is more valuable than this one.
 

@@ -9,8 +9,8 @@ from rootsopt.commands import cli
 from rootsopt.config import Config
 from rootsopt.design.resemblance import free_likeness, likenesses
 from rootsopt.errors import InputError
-from rootsopt.export import chosen
-from rootsopt.export.writing import write
+from rootsopt.figures import chosen
+from rootsopt.figures.writing import write
 from rootsopt.measured import conjugacy
 from rootsopt.output import files, tables, terminal
 from rootsopt.output.runs import RunFolder

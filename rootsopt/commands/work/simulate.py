@@ -6,7 +6,7 @@ from rich.console import Console
 
 from rootsopt.commands import cli
 from rootsopt.config import Config
-from rootsopt.export import chosen
+from rootsopt.figures import chosen
 from rootsopt.measured import conjugacy
 from rootsopt.output import files, tables, terminal
 from rootsopt.output.runs import RunFolder
@@ -38,7 +38,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
         data["touching"] = scattered.record()
     folder.write_json("result.json", data | {"versions": files.versions()})
     if formats:
-        from rootsopt.export.writing import write_simulated
+        from rootsopt.figures.writing import write_simulated
 
         write_simulated(folder, config, formats, evaluation)
     if not options.no_figures:

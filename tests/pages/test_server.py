@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from rootsopt import report
+from rootsopt import pages
 from rootsopt.commands.table import explore as command
 
 pytest.importorskip("bokeh")
@@ -32,8 +32,8 @@ def address():
     """Return the address of a running server."""
     from rootsopt.config import load
     from rootsopt.errors import InputError
-    from rootsopt.explore.engine import Engine
-    from rootsopt.explore.server import PageServer
+    from rootsopt.pages.engine import Engine
+    from rootsopt.pages.server import PageServer
 
     class Idle(Engine):
         """An engine that never gets ready: the server is tested, not what it shows."""
@@ -182,8 +182,8 @@ def test_browser_is_given_no_secret(monkeypatch):
         opened.extend((address, file, file.read_text(), file.parent.stat().st_mode & 0o777))
         ready.set()
 
-    monkeypatch.setattr("rootsopt.explore.server.PageServer", Serving)
-    monkeypatch.setattr("rootsopt.explore.engine.Engine.prepare", lambda self: None)
+    monkeypatch.setattr("rootsopt.pages.server.PageServer", Serving)
+    monkeypatch.setattr("rootsopt.pages.engine.Engine.prepare", lambda self: None)
     monkeypatch.setattr(webbrowser, "open", browse)
     assert command.main([CIC]) == 0
     address, file, text, mode = opened
@@ -202,7 +202,7 @@ def test_server_listens_on_the_loopback_address_only(address):
 
 
 def test_library_is_named_if_it_is_missing(monkeypatch, capsys):
-    monkeypatch.setattr(report.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(pages.importlib.util, "find_spec", lambda name: None)
     assert command.main([CIC]) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert "pip install 'rootsopt[explore]'" in line

@@ -7,7 +7,7 @@ import pytest
 
 from rootsopt.config import load, parse
 from rootsopt.config.families import families
-from rootsopt.explore.knobs import _step, knobs_of
+from rootsopt.pages.knobs import _step, knobs_of
 
 ROOT = Path(__file__).parents[2]
 CONFIGS = sorted(path.stem for path in (ROOT / "configs").glob("*.yaml"))

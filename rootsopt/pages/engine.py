@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from rootsopt.config import Config
 from rootsopt.config.units import MM
+from rootsopt.pages.charts import motion, rotor
 from rootsopt.profiles import Geometry, Profile, geometry, outline
-from rootsopt.report.charts import motion, rotor
 from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.response.records import geometry_record
 from rootsopt.response.series import Series
@@ -31,7 +31,7 @@ class Shape(NamedTuple):
     """Geometry of a config.
 
     `outline` (n, 2): closed outline (mm); `record`: the entry `geometry` of the result file;
-    `pair`: the rotor, and its frames in perfect rolling, as in `rootsopt.report.charts`;
+    `pair`: the rotor, and its frames in perfect rolling, as in `rootsopt.pages.charts`;
     `profile`: the profile itself."""
 
     outline: NDArray[np.float64]

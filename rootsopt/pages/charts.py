@@ -13,14 +13,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from rootsopt.config import Config
 from rootsopt.config.units import MM
-from rootsopt.export.animation import Contacts, frames_of
+from rootsopt.figures.animation import Contacts, frames_of
 from rootsopt.figures.force import amplitude_spectrum
 from rootsopt.figures.front import kinds
 from rootsopt.figures.style import BLUE, COLORS, GREY, ORANGE, VERMILION
 from rootsopt.output.names import brief, in_words, label, stated, value
 from rootsopt.output.tables import varied
+from rootsopt.pages.gather import Case
 from rootsopt.profiles import Profile, outline
-from rootsopt.report.gather import Case
 from rootsopt.response.series import Series
 from rootsopt.scene import Scene
 

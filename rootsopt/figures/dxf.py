@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from rootsopt.export.drawing import Drawing, coordinates, widest
-from rootsopt.export.pieces import Arc
+from rootsopt.figures.drawing import Drawing, coordinates, widest
+from rootsopt.figures.pieces import Arc
 
 OUTLINE, BORE, PITCH, CENTER, TEXT = "OUTLINE", "BORE", "PITCH_CIRCLE", "CENTER_LINES", "TEXT"
 """Names of the DXF layers: outline, bore, pitch circle, centre lines and notes."""

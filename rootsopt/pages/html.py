@@ -23,14 +23,14 @@ import rootsopt
 from rootsopt.output import tables
 from rootsopt.output.files import design_file
 from rootsopt.output.names import Table, in_words
-from rootsopt.report import charts, words
-from rootsopt.report.charts import animations
-from rootsopt.report.gather import Run
-from rootsopt.report.words import anchor, glossary, linked
+from rootsopt.pages import charts, words
+from rootsopt.pages.charts import animations
+from rootsopt.pages.gather import Run
+from rootsopt.pages.words import anchor, glossary, linked
 from rootsopt.scene import outline_mm
 from rootsopt.tradeoffs.front import Front
 
-TEMPLATE = Path(__file__).with_name("template")
+TEMPLATE = Path(__file__).with_name("report")
 """Folder of the templates, styles and scripts."""
 _CAPTIONS = {
     "profiles.png": "Rotor profile, and its flank",

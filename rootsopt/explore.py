@@ -3,5 +3,7 @@
 from rootsopt.commands.door import leave
 from rootsopt.commands.table import explore
 
+main = explore.main
+
 if __name__ == "__main__":
-    leave(explore.main())
+    leave(main())

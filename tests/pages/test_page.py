@@ -12,10 +12,11 @@ import pytest
 from browser import Browser
 
 from rootsopt.config import load, parse
-from rootsopt.explore import session as sessions
-from rootsopt.explore import shown as texts
-from rootsopt.explore.engine import Engine, Shape, same_motion
-from rootsopt.explore.session import (
+from rootsopt.optimize.outcome import Optimization
+from rootsopt.pages import session as sessions
+from rootsopt.pages import shown as texts
+from rootsopt.pages.engine import Engine, Shape, same_motion
+from rootsopt.pages.session import (
     FromRest,
     NewMotion,
     NewShape,
@@ -24,7 +25,6 @@ from rootsopt.explore.session import (
     Searched,
     Session,
 )
-from rootsopt.optimize.outcome import Optimization
 from rootsopt.profiles import EE
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.status import Status
@@ -288,7 +288,7 @@ def test_search_without_design_parameters_says_why(engine):
 
 @pytest.fixture(scope="module")
 def address(engine):
-    from rootsopt.explore.server import PageServer
+    from rootsopt.pages.server import PageServer
 
     found, up, stop = [], threading.Event(), threading.Event()
 

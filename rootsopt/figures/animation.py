@@ -14,9 +14,9 @@ from matplotlib.patches import Circle
 from numpy.typing import NDArray
 from PIL import Image
 
-from rootsopt.export.drawing import Drawing
-from rootsopt.export.pieces import polyline
+from rootsopt.figures.drawing import Drawing
 from rootsopt.figures.force import plot_flank_force
+from rootsopt.figures.pieces import polyline
 from rootsopt.figures.profiles import draw_rotor
 from rootsopt.figures.style import BLUE, ORANGE, SKY, VERMILION, beside, figure
 from rootsopt.profiles import Profile, place_pair

@@ -14,16 +14,16 @@ import pytest
 from browser import FLAGS, chromium
 from rich.console import Console
 
-from rootsopt import report
+from rootsopt import pages
 from rootsopt.commands.table import pareto, profile
 from rootsopt.config import load
 from rootsopt.output import tables, terminal
 from rootsopt.output.files import ResultFolder, response_columns
-from rootsopt.report import charts
-from rootsopt.report.charts import animations
-from rootsopt.report.gather import Run
-from rootsopt.report.html import report_text
-from rootsopt.report.words import glossary, linked
+from rootsopt.pages import charts
+from rootsopt.pages.charts import animations
+from rootsopt.pages.gather import Run
+from rootsopt.pages.html import report_text
+from rootsopt.pages.words import glossary, linked
 from rootsopt.response.records import message_of
 from rootsopt.response.series import Series
 from rootsopt.status import Status
@@ -414,8 +414,8 @@ def front(tmp_path_factory):
 
 def test_command_writes_a_report_of_a_run_without_a_result(front):
     result = json.loads((front / "result.json").read_text())
-    assert report.REPORT in result["run"]["files"]
-    text = words_of((front / report.REPORT).read_text("utf-8"))
+    assert pages.REPORT in result["run"]["files"]
+    text = words_of((front / pages.REPORT).read_text("utf-8"))
     assert "Infeasible: " in text
     assert "Constraints in conflict" in text
     assert "seal width ≥ 25 mm" in text
@@ -423,7 +423,7 @@ def test_command_writes_a_report_of_a_run_without_a_result(front):
 
 def test_report_needs_its_libraries(tmp_path, monkeypatch, capsys):
     """Without its libraries, the command ends before it computes, and says what to install."""
-    monkeypatch.setattr(report.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(pages.importlib.util, "find_spec", lambda name: None)
     assert profile.main([CIC, "-o", str(tmp_path / "run"), "--report"]) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert "rootsopt[pages]" in line
@@ -431,7 +431,7 @@ def test_report_needs_its_libraries(tmp_path, monkeypatch, capsys):
 
 
 def test_failing_report_does_not_lose_the_run(tmp_path, monkeypatch, capfd):
-    from rootsopt.report import html
+    from rootsopt.pages import html
 
     def fail(run):
         raise RuntimeError("no idea")
@@ -441,7 +441,7 @@ def test_failing_report_does_not_lose_the_run(tmp_path, monkeypatch, capfd):
     assert profile.main(given) == 0
     assert "no idea" in capfd.readouterr().err
     assert (tmp_path / "run" / "result.json").exists()
-    assert not (tmp_path / "run" / report.REPORT).exists()
+    assert not (tmp_path / "run" / pages.REPORT).exists()
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from rootsopt.explore.session import Latest
+from rootsopt.pages.session import Latest
 
 
 @pytest.fixture

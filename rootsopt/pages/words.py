@@ -14,7 +14,7 @@ from rootsopt.output.names import brief, in_words, listed, name_and_unit, quanti
 from rootsopt.output.tables import varied
 
 if TYPE_CHECKING:
-    from rootsopt.report.gather import Run
+    from rootsopt.pages.gather import Run
 
 _ASKED = {
     "optimize": "Find the design with the lowest objective, and compare it with the baseline.",

@@ -11,9 +11,9 @@ from typing import Any
 
 from rootsopt.config import Config, notes
 from rootsopt.errors import InputError
-from rootsopt.explore.engine import Engine, Shape, frames, same_motion
 from rootsopt.optimize.design import optimize_design
 from rootsopt.optimize.outcome import Optimization
+from rootsopt.pages.engine import Engine, Shape, frames, same_motion
 from rootsopt.response.evaluation import Evaluation
 
 
@@ -109,7 +109,7 @@ class NewShape(Message):
 
 @dataclasses.dataclass(frozen=True)
 class NewMotion(Message):
-    """The `evaluation`, and the `frames` of its motion, as in `rootsopt.report.charts`.
+    """The `evaluation`, and the `frames` of its motion, as in `rootsopt.pages.charts`.
 
     `near`: whether the motion was reached from that of other values, and not from rest; `final`:
     whether the status is final. If not, a computation from rest follows."""

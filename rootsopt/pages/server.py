@@ -22,8 +22,8 @@ from tornado.web import Application as Handlers
 from tornado.web import RequestHandler
 
 from rootsopt.errors import InputError
-from rootsopt.explore.engine import Engine
-from rootsopt.explore.page import Page
+from rootsopt.pages.engine import Engine
+from rootsopt.pages.page import Page
 from rootsopt.runtime.environment import say, shortened
 
 ADDRESS = "127.0.0.1"

@@ -16,10 +16,12 @@ from bokeh.document import Document
 from bokeh.models import Button, CustomJS, Div, NumericInput, Row, Slider
 from bokeh.models.layouts import Column, LayoutDOM
 
-from rootsopt.explore import shown
-from rootsopt.explore.engine import Engine, cut
-from rootsopt.explore.knobs import Knob, knobs_of
-from rootsopt.explore.session import (
+from rootsopt.pages import shown
+from rootsopt.pages.charts import THEME
+from rootsopt.pages.engine import Engine, cut
+from rootsopt.pages.html import TEMPLATE as PAGES
+from rootsopt.pages.knobs import Knob, knobs_of
+from rootsopt.pages.session import (
     FromRest,
     Message,
     NewMotion,
@@ -30,11 +32,9 @@ from rootsopt.explore.session import (
     Searched,
     Session,
 )
-from rootsopt.explore.shown import ForcePicture, ProfilePicture
-from rootsopt.report.charts import THEME
-from rootsopt.report.html import TEMPLATE as PAGES
+from rootsopt.pages.shown import ForcePicture, ProfilePicture
 
-_TEMPLATE = Path(__file__).with_name("template")
+_TEMPLATE = Path(__file__).with_name("explore")
 _SLOW = 1.0
 """Time (s) of a computation above which the page says how long it has been running."""
 _TICK = 250

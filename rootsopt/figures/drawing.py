@@ -15,7 +15,7 @@ import rootsopt
 from rootsopt.config import Config
 from rootsopt.config.rotor import DrawingConfig
 from rootsopt.errors import InputError
-from rootsopt.export.pieces import Arc, DrawnPiece, outline_pieces
+from rootsopt.figures.pieces import Arc, DrawnPiece, outline_pieces
 from rootsopt.profiles import Geometry, Profile, geometry
 from rootsopt.runtime.environment import say
 from rootsopt.runtime.programs import CachedFunction

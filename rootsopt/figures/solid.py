@@ -18,7 +18,7 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 
 from rootsopt.errors import InputError
-from rootsopt.export.pieces import Arc, DrawnPiece
+from rootsopt.figures.pieces import Arc, DrawnPiece
 
 if TYPE_CHECKING:
     from build123d import Compound, Edge, Face, Solid

@@ -19,11 +19,11 @@ from rootsopt.commands.table import profile
 from rootsopt.config import load
 from rootsopt.design.space import Space
 from rootsopt.errors import InputError
-from rootsopt.export import chosen, solid
-from rootsopt.export.animation import meshing_gif, rolling_contacts
-from rootsopt.export.drawing import Drawing, svg_text
-from rootsopt.export.dxf import dxf_bytes
-from rootsopt.export.pieces import Arc, Spline, outline_pieces, polyline
+from rootsopt.figures import chosen, solid
+from rootsopt.figures.animation import meshing_gif, rolling_contacts
+from rootsopt.figures.drawing import Drawing, svg_text
+from rootsopt.figures.dxf import dxf_bytes
+from rootsopt.figures.pieces import Arc, Spline, outline_pieces, polyline
 from rootsopt.profiles import CIC, EE, geometry, outline, place_pair
 from rootsopt.response.series import Series
 from rootsopt.scene import Scene, check_geometry, design_vector
@@ -335,7 +335,7 @@ def test_formats_that_are_not_known(text):
 @pytest.fixture
 def few_frames(monkeypatch):
     """Use eight frames per mesh period, a fifth of the usual number."""
-    monkeypatch.setattr("rootsopt.export.animation._FRAMES", 8)
+    monkeypatch.setattr("rootsopt.figures.animation._FRAMES", 8)
 
 
 def test_profile_writes_drawings_and_animation(tmp_path, few_frames):

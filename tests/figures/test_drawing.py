@@ -12,9 +12,9 @@ import pytest
 from rootsopt.commands.table import profile as command
 from rootsopt.config import load
 from rootsopt.errors import InputError
-from rootsopt.export.drawing import Drawing, coordinates, widest
-from rootsopt.export.dxf import dxf_bytes
-from rootsopt.export.pieces import Arc, outline_pieces, polyline
+from rootsopt.figures.drawing import Drawing, coordinates, widest
+from rootsopt.figures.dxf import dxf_bytes
+from rootsopt.figures.pieces import Arc, outline_pieces, polyline
 from rootsopt.profiles import CIC, EE, geometry
 from rootsopt.scene import Scene, design_keys, design_vector
 

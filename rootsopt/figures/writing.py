@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from rootsopt.config import Config
-from rootsopt.export import SOLID, solid
-from rootsopt.export.drawing import Drawing, coordinates, svg_text
-from rootsopt.export.dxf import dxf_bytes
+from rootsopt.figures import SOLID, solid
+from rootsopt.figures.drawing import Drawing, coordinates, svg_text
+from rootsopt.figures.dxf import dxf_bytes
 from rootsopt.output.files import ResultFolder
 from rootsopt.response.evaluation import Evaluation
 from rootsopt.response.series import Series
@@ -48,7 +48,7 @@ def write(
     if set(formats) & set(SOLID):
         files |= _solids(drawing, formats, folder.place)
     if "gif" in formats:
-        from rootsopt.export.animation import meshing_gif
+        from rootsopt.figures.animation import meshing_gif
 
         files["figures/meshing.gif"] = meshing_gif(drawing, profile, series, periods)
     for name, data in files.items():

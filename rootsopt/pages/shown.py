@@ -10,15 +10,15 @@ from bokeh.models import ColumnDataSource, DataRange1d, Range1d, Span
 from numpy.typing import NDArray
 
 from rootsopt.config import Config
-from rootsopt.explore.engine import Shape
-from rootsopt.explore.knobs import Knob
-from rootsopt.explore.session import FromRest, NewMotion, Progress, Searched
 from rootsopt.figures.style import BLUE, GREY, SKY, VERMILION
 from rootsopt.optimize.outcome import Optimization
 from rootsopt.output import tables
 from rootsopt.output.names import brief, in_words, name_and_unit, percent
-from rootsopt.report.charts import chart, hover
-from rootsopt.report.html import table_html
+from rootsopt.pages.charts import chart, hover
+from rootsopt.pages.engine import Shape
+from rootsopt.pages.html import table_html
+from rootsopt.pages.knobs import Knob
+from rootsopt.pages.session import FromRest, NewMotion, Progress, Searched
 from rootsopt.response.evaluation import RESPONSES, Evaluation, Series
 from rootsopt.status import Status
 
