@@ -24,14 +24,11 @@ from rootsopt.commands.door import OK as OK
 from rootsopt.commands.table import Command
 from rootsopt.config import (
     Config,
-    describe_families,
-    describe_keys,
     load,
     notes,
-    outline_keys,
     sources,
 )
-from rootsopt.config.explain import GROUPS
+from rootsopt.config.explain import GROUPS, describe, outline
 from rootsopt.config.families import families, import_named
 from rootsopt.config.sources import shipped
 from rootsopt.errors import InputError
@@ -85,7 +82,7 @@ class _Help(argparse.Action):
     def __call__(self, parser, namespace, values, option_string=None):
         del namespace, option_string
         if values in GROUPS:
-            print(describe_keys(str(values)))
+            print(describe(Config, str(values)))
         else:
             parser.epilog = _all_keys() if values == "all" else _few_keys()
             parser.print_help()
@@ -94,10 +91,11 @@ class _Help(argparse.Action):
 
 def _all_keys() -> str:
     """Return the end of a long help."""
-    keys = (f" {group}\n{describe_keys(group)}" for group in GROUPS)
+    keys = (f" {group}\n{describe(Config, group)}" for group in GROUPS)
     listed = "\n".join(keys)
+    curves = "\n".join(f"  {name:<18} {one.help}" for name, one in families().items())
     return (
-        f"profile families (profile.family):\n{describe_families()}\n\n"
+        f"profile families (profile.family):\n{curves}\n\n"
         f"config keys (for --set and the file), units in the name:\n{listed}\n\n"
         "words of reports and messages: docs/glossary.md"
     )
@@ -108,7 +106,7 @@ def _few_keys() -> str:
     names = textwrap.fill(", ".join(families()), 98, initial_indent="  ", subsequent_indent="  ")
     return (
         f"profile families (profile.family):\n{names}\n"
-        f"config keys used most (for --set and the file), units in the name:\n{outline_keys()}\n"
+        f"config keys used most (for --set and the file), units in the name:\n{outline(Config)}\n"
         f"all keys with ranges and defaults: --help all, or --help {' | '.join(GROUPS)}"
     )
 

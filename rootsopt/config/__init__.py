@@ -8,10 +8,7 @@ from rootsopt.config.families import FAMILY_KEYS
 from rootsopt.config.plausible import notes
 from rootsopt.config.reading import (
     Config,
-    describe_families,
-    describe_keys,
     load,
-    outline_keys,
     parse,
 )
 from rootsopt.config.rotor import ProfileConfig
@@ -31,12 +28,9 @@ __all__ = [
     "EnsembleConfig",
     "ProfileConfig",
     "SolverConfig",
-    "describe_families",
-    "describe_keys",
     "hint",
     "load",
     "load_config",
     "notes",
-    "outline_keys",
     "parse",
 ]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field, SerializeAsAny, ValidationError, model_validator
 
 from rootsopt.config.document import MOST_BYTES, read_document
-from rootsopt.config.explain import describe, explain, outline, tree
+from rootsopt.config.explain import explain, tree
 from rootsopt.config.families import families, family_of, find_installed, is_list
 from rootsopt.config.pareto import ParetoConfig
 from rootsopt.config.rotor import DrawingConfig, ProfileConfig, RotorConfig
@@ -478,18 +478,3 @@ def override_in(data: dict, override: str) -> None:
     if len(parts) > _MOST_PARTS:
         raise InputError(f"{name}: has more than {_MOST_PARTS} dotted keys; no key is that deep")
     put(data, ".".join(parts), read_document(value, name))
-
-
-def describe_keys(group: str = "") -> str:
-    """Return one line per key of a `group` (all keys if it is ""), as `--help` prints it."""
-    return describe(Config, group)
-
-
-def outline_keys() -> str:
-    """Return one short line per key that is used most, as `--help` prints it."""
-    return outline(Config)
-
-
-def describe_families() -> str:
-    """Return one line per registered family for `--help`: its name and its curves."""
-    return "\n".join(f"  {name:<18} {family.help}" for name, family in families().items())

@@ -105,8 +105,8 @@ def _pale(color: str) -> str:
     return to_hex((red, green, blue))
 
 
-def basin_figures(folder: ResultFolder, basins: Basins, config: Config) -> list[str]:
-    """Write basins.png into `folder`; return the names of the files written.
+def basin_figures(folder: ResultFolder, basins: Basins, config: Config) -> None:
+    """Write basins.png into `folder`.
 
     The contact force is shown only for the motions to which the most initial states lead."""
     pairs = list(zip(basins.attractors, _colors(basins), strict=True))
@@ -123,4 +123,4 @@ def basin_figures(folder: ResultFolder, basins: Basins, config: Config) -> list[
         plot_motions(list(axes), attractors, colors, config.profile.lobes)
         axes[0].set_ylim(0, None)
     title = f"{config.profile.family.upper()} at {config.scene.speed_rpm:g} rpm: coexisting motions"
-    return [write(folder, "basins", made, title, entries, 2)]
+    write(folder, "basins", made, title, entries, 2)

@@ -74,8 +74,8 @@ def _axis(aim) -> str:
     return f"{aim.label}, {better}"
 
 
-def front_figure(folder: ResultFolder, front: Front) -> list[str]:
-    """Write front.png, the front in one panel for each pair of terms; return its name.
+def front_figure(folder: ResultFolder, front: Front) -> None:
+    """Write front.png, the front in one panel for each pair of terms.
 
     With two terms, a panel below shows the designs along the front, in units of their bounds."""
     names = [aim.name for aim in front.aims]
@@ -91,7 +91,7 @@ def front_figure(folder: ResultFolder, front: Front) -> list[str]:
     words = [aim.words for aim in front.aims]
     title = f"trade-off of {', '.join(words[:-1])} against {words[-1]}"
     title = f"{front.config.profile.family.upper()}: {title}"
-    return [write(folder, "front", made, title, axes[0, 0].get_legend_handles_labels()[0], 6)]
+    write(folder, "front", made, title, axes[0, 0].get_legend_handles_labels()[0], 6)
 
 
 def plot_designs(ax: Axes, front: Front, x: str) -> Axes:

@@ -25,16 +25,14 @@ from rootsopt.response.evaluation import Evaluation
 from rootsopt.scene import design_keys, outline_mm
 
 
-def profile_figures(folder: ResultFolder, config: Config, record: Mapping[str, Any]) -> list[str]:
-    """Write the figures of one design's profile into `folder`; return the file names.
+def profile_figures(folder: ResultFolder, config: Config, record: Mapping[str, Any]) -> None:
+    """Write the figures of one design's profile into `folder`.
 
     `record`: the design's record in the result file. The figures are profiles.png, meshing.png and,
     for a profile read from a file, conjugacy.png."""
     points = _outline(config, record.get("design", {}))
-    names = [
-        _profiles(folder, {config.profile.family.upper(): points}, config),
-        _meshing(folder, points, config),
-    ]
+    _profiles(folder, {config.profile.family.upper(): points}, config)
+    _meshing(folder, points, config)
     if config.profile.from_file:
         from rootsopt.measured.source import outline_of  # For outlines only: it takes 0.5 s.
 
@@ -42,14 +40,13 @@ def profile_figures(folder: ResultFolder, config: Config, record: Mapping[str, A
         gaps = gaps_um(conjugacy(outline_of(config.profile)[0]))
         plot_conjugacy(axes[0, 0], {Path(config.profile.outline_file or "").name: gaps})
         axes[0, 0].legend(frameon=False)
-        names.append(write(folder, "conjugacy", made, ""))
-    return names
+        write(folder, "conjugacy", made, "")
 
 
-def simulation_figures(folder: ResultFolder, evaluation: Evaluation, config: Config) -> list[str]:
-    """Write the profile and force figures of an evaluation into `folder`; return the file names."""
-    names = profile_figures(folder, config, evaluation.record())
-    return names + _force_figures(folder, {config.profile.family.upper(): evaluation}, config)
+def simulation_figures(folder: ResultFolder, evaluation: Evaluation, config: Config) -> None:
+    """Write the profile and force figures of an evaluation into `folder`."""
+    profile_figures(folder, config, evaluation.record())
+    _force_figures(folder, {config.profile.family.upper(): evaluation}, config)
 
 
 def optimization_figures(
@@ -59,8 +56,8 @@ def optimization_figures(
     history: Sequence[Mapping[str, Any]],
     config: Config,
     given: Config | None = None,
-) -> list[str]:
-    """Write the figures of an optimisation into `folder`; return the file names.
+) -> None:
+    """Write the figures of an optimisation into `folder`.
 
     `baseline`, `optimized`: evaluations of the design before and after the optimisation. `history`:
     one row per evaluation, as in `plot_history`; if empty, its figure is omitted. `config`: config
@@ -70,16 +67,13 @@ def optimization_figures(
         "baseline": _outline(given or config, baseline.design),
         "optimised": _outline(config, optimized.design),
     }
-    names = [
-        _profiles(folder, outlines, config),
-        _meshing(folder, outlines["optimised"], config, "optimised rotors"),
-    ]
-    names += _force_figures(folder, designs, config)
-    names.append(_comparison(folder, designs, outlines, config))
+    _profiles(folder, outlines, config)
+    _meshing(folder, outlines["optimised"], config, "optimised rotors")
+    _force_figures(folder, designs, config)
+    _comparison(folder, designs, outlines, config)
     if history:
         keys = FAMILY_KEYS[config.profile.family]
-        names.append(write(folder, "history", _history(history, keys), "Optimisation history"))
-    return names
+        write(folder, "history", _history(history, keys), "Optimisation history")
 
 
 def certificate_figure(
@@ -87,8 +81,8 @@ def certificate_figure(
     history: Sequence[Mapping[str, Any]],
     constraints: Sequence[Mapping[str, Any]],
     optimality: Mapping[str, Any],
-) -> str:
-    """Write optimum.png, the figures of `rootsopt.figures.history`; return its name.
+) -> None:
+    """Write optimum.png, the figures of `rootsopt.figures.history`.
 
     `history`: as in `plot_residual`; `constraints`: as in `plot_prices`; `optimality`: entry of the
     result file."""
@@ -96,7 +90,7 @@ def certificate_figure(
     plot_residual(axes[0, 0], history, optimality["required_residual"])
     plot_prices(axes[0, 1], constraints, optimality["converged"])
     plot_starts(axes[0, 2], optimality["starts"], optimality["optima"])
-    return write(folder, "optimum", made, "Certificate of the optimum")
+    write(folder, "optimum", made, "Certificate of the optimum")
 
 
 def feasible_figure(
@@ -125,7 +119,7 @@ def _profiles(folder, outlines, config):
     plot_profiles(axes[0, 0], outlines, radius)
     plot_flank(axes[0, 1], outlines, config.profile.lobes, radius)
     title = f"Rotor profile{'s' if len(outlines) > 1 else ''}: {' and '.join(outlines)}"
-    return write(folder, "profiles", made, title, axes[0, 0].get_legend_handles_labels()[0])
+    write(folder, "profiles", made, title, axes[0, 0].get_legend_handles_labels()[0])
 
 
 def _comparison(folder, designs, outlines, config):
@@ -137,7 +131,7 @@ def _comparison(folder, designs, outlines, config):
     if series:
         periods = [one.steady_state.get("period") or lobes for one in designs.values()]
         plot_forces_together(axes[0, 0], series, 2 * np.pi / lobes * min(max(periods), lobes))
-    return write(folder, "comparison", made, "Optimised design and baseline")
+    write(folder, "comparison", made, "Optimised design and baseline")
 
 
 def _meshing(folder, points, config, what="rotors"):
@@ -148,25 +142,25 @@ def _meshing(folder, points, config, what="rotors"):
     made.supxlabel("x (mm)")
     made.supylabel("y (mm)")
     title = f"Meshing of the {what} over one lobe pitch ({360 / lobes:g}°)"
-    return write(folder, "meshing", made, title)
+    write(folder, "meshing", made, title)
 
 
-def _force_figures(folder, designs, config) -> list[str]:
+def _force_figures(folder, designs, config) -> None:
     series = {name: one.series for name, one in designs.items() if one.series is not None}
     if not series:
-        return []
+        return
     responses, speed = {k: designs[k].response for k in series}, config.scene.speed_rpm
     count, shared = len(series), {"sharex": True, "sharey": True}
     made, axes = figure(10, 1.2 + 2.6 * count, count, 1, **shared)
     if not any(np.any(one.force) for one in series.values()):
         plot_gap(list(axes[:, 0]), series)
-        return [write(folder, "gap", made, f"Gap of flanks that stay apart at {speed:g} rpm")]
+        write(folder, "gap", made, f"Gap of flanks that stay apart at {speed:g} rpm")
+        return
     plot_force(list(axes[:, 0]), series, responses)
-    names = [write(folder, "force", made, f"Contact force over time at {speed:g} rpm")]
+    write(folder, "force", made, f"Contact force over time at {speed:g} rpm")
     made, axes = figure(10, 1.4 + 2.6 * count, count, 1, **shared)
     plot_spectrum(list(axes[:, 0]), series, config.profile.lobes * speed / 60)
-    title = f"Spectrum of the contact force at {speed:g} rpm"
-    return [*names, write(folder, "spectrum", made, title)]
+    write(folder, "spectrum", made, f"Spectrum of the contact force at {speed:g} rpm")
 
 
 def _history(history, keys):

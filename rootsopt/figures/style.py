@@ -53,8 +53,8 @@ def looks(names: Iterable[str]) -> Iterator[dict[str, Any]]:
 def write(
     folder: "ResultFolder", name: str, made: Figure, title: str,
     entries: Sequence[Any] = (), columns: int = 4,
-) -> str:  # fmt: skip
-    """Write a figure with its `title` and a legend below all panels; return the file's name.
+) -> None:  # fmt: skip
+    """Write a figure with its `title` and a legend below all panels as figures/NAME.png.
 
     `entries`: entries of the legend, in at most so many `columns`."""
     for count in range(min(len(entries), columns), 0, -1):
@@ -64,9 +64,7 @@ def write(
             break
         legend.remove()
     made.suptitle(title)
-    file = f"figures/{name}.png"
-    folder.write_figure(file, made)
-    return file
+    folder.write_figure(f"figures/{name}.png", made)
 
 
 def beside(ax: Axes) -> None:

@@ -96,17 +96,15 @@ def legend_entries(designs: Mapping[str, Sequence[Part]]) -> list[Line2D]:
     return lines + (status_entries(found) if {*found} != {"periodic"} else [])
 
 
-def speed_figure(
-    folder: ResultFolder, designs: Mapping[str, Sequence[Part]], title: str
-) -> list[str]:
-    """Write speeds.png, mean and peak force over speed; return the names of the files written.
+def speed_figure(folder: ResultFolder, designs: Mapping[str, Sequence[Part]], title: str) -> None:
+    """Write speeds.png, mean and peak force over speed.
 
     `designs`: as in `plot_speeds`; `title`: title of the figure."""
     made, axes = figure(9, 6.6, 2, 1, sharex=True)
     for ax, force in zip(axes[:, 0], LABELS, strict=True):
         plot_speeds(ax, designs, force).set_ylim(0, None)
     axes[-1, 0].set_xlabel("speed (rpm)")
-    return [write(folder, "speeds", made, title, legend_entries(designs))]
+    write(folder, "speeds", made, title, legend_entries(designs))
 
 
 _APART = "contact_reserve_um", "gear_force_N"
@@ -149,18 +147,18 @@ def _short(text: str) -> str:
     return text if len(text) <= 24 else f"{text[:21]}..."
 
 
-def sweep_figure(folder: ResultFolder, plan: Plan, dataset: "xarray.Dataset") -> list[str]:
-    """Write sweep.png, mean and peak force over one key or two; return the files written.
+def sweep_figure(folder: ResultFolder, plan: Plan, dataset: "xarray.Dataset") -> None:
+    """Write sweep.png, mean and peak force over one key or two.
 
     A sweep over more keys has no figure."""
     if len(plan.keys) > 2:
-        return []
+        return
     axes = [_Axis(key, values) for one in plan.dimensions for key, values in one.columns.items()]
     lines = len(axes) == 1 or (len(plan.shape) == 2 and min(plan.shape) <= _FEW)
-    return [(_lines if lines else _map)(folder, axes, plan, dataset)]
+    (_lines if lines else _map)(folder, axes, plan, dataset)
 
 
-def _lines(folder: ResultFolder, axes, plan: Plan, dataset: "xarray.Dataset") -> str:
+def _lines(folder: ResultFolder, axes, plan: Plan, dataset: "xarray.Dataset") -> None:
     """Draw the forces over one key, with a line for each value of the other key, if there is one.
 
     The first key is on the axis, unless the second one has too many values, or only the second one
@@ -186,7 +184,7 @@ def _lines(folder: ResultFolder, axes, plan: Plan, dataset: "xarray.Dataset") ->
     panels[-1, 0].set_xlabel(across.label)
     entries = [] if along is None else [Line2D([], [], **look) for look in looks(names)]
     entries += status_entries(dataset.status.values.ravel().astype(str))
-    return write(folder, "sweep", made, _title(drawn, across), entries)
+    write(folder, "sweep", made, _title(drawn, across), entries)
 
 
 def _drawn(dataset: "xarray.Dataset") -> dict[str, str]:
@@ -203,7 +201,7 @@ def _table(dataset: "xarray.Dataset", name: str, swapped: bool) -> NDArray:
     return values.T if swapped else values
 
 
-def _map(folder: ResultFolder, axes, plan: Plan, dataset: "xarray.Dataset") -> str:
+def _map(folder: ResultFolder, axes, plan: Plan, dataset: "xarray.Dataset") -> None:
     """Draw the forces over two keys as colours: a map of a grid, or points of a sample."""
     across, up = axes
     shown = _drawn(dataset)
@@ -234,7 +232,7 @@ def _map(folder: ResultFolder, axes, plan: Plan, dataset: "xarray.Dataset") -> s
         up.on(ax.yaxis)
         ax.set_xlabel(across.label)
     panels[0, 0].set_ylabel(up.label)
-    return write(folder, "sweep", made, _title(shown, across, up), status_entries(lost, "none"), 5)
+    write(folder, "sweep", made, _title(shown, across, up), status_entries(lost, "none"), 5)
 
 
 def _title(drawn: dict[str, str], *axes: _Axis) -> str:

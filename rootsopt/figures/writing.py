@@ -26,15 +26,15 @@ def write(
     design: dict[str, float],
     series: Series | None = None,
     periods: int = 1,
-) -> list[str]:
-    """Write drawings of a `design` into `folder`; return the names of the files.
+) -> None:
+    """Write drawings of a `design` into `folder`.
 
     `config`: config of the rotor; `formats`: keys of `FORMATS`; `design`: values of the design
     parameters (config units), keyed by config key. If `series` holds a simulated motion, the GIF
     shows `periods` mesh periods of it. Otherwise the GIF shows perfect rolling.
     """
     if not formats:
-        return []
+        return
     values = jnp.asarray(np.array(list(design.values()), dtype=float))
     profile = Scene.from_config(config).profile(values)
     drawing = Drawing.of(config, profile, design)
@@ -53,13 +53,12 @@ def write(
         files["figures/meshing.gif"] = meshing_gif(drawing, profile, series, periods)
     for name, data in files.items():
         folder.write_bytes(name, data)
-    return [*files, *([POINTS] if "dxf" in formats else [])]
 
 
 def write_simulated(
     folder: ResultFolder, config: Config, formats: Sequence[str], evaluation: Evaluation
-) -> list[str]:
-    """Write drawings of a simulated design and return the names of the files.
+) -> None:
+    """Write drawings of a simulated design.
 
     `folder`, `config`, `formats`: as in `write`; `evaluation`: result of the simulation. The GIF
     shows the simulated motion. If `evaluation` has no motion, no GIF is written."""
@@ -67,7 +66,7 @@ def write_simulated(
     if series is None:
         formats = tuple(name for name in formats if name != "gif")
     periods = evaluation.steady_state.get("period") or config.profile.lobes
-    return write(folder, config, formats, evaluation.design, series, periods)
+    write(folder, config, formats, evaluation.design, series, periods)
 
 
 def _solids(drawing, formats, place) -> dict[str, bytes]:

@@ -16,8 +16,8 @@ import yaml
 from rootsopt import profiles
 from rootsopt.commands import console
 from rootsopt.commands.table import COMMANDS, profile
-from rootsopt.config import describe_keys, load
-from rootsopt.config.explain import GROUPS
+from rootsopt.config import Config, load
+from rootsopt.config.explain import GROUPS, describe
 from rootsopt.measured.reading import read, signed_area
 from rootsopt.runtime import programs
 from rootsopt.scene import Scene, design_vector
@@ -217,7 +217,7 @@ def test_help_is_short_and_its_groups_have_every_key(command, capsys, monkeypatc
     assert len(short.splitlines()) <= 60
     assert set(re.findall("--help ([a-z |]+)$", short, re.M)[-1].split(" | ")) == set(GROUPS)
     every = [line for group in GROUPS for line in printed(group).splitlines()]
-    assert sorted(every) == sorted(describe_keys().splitlines())
+    assert sorted(every) == sorted(describe(Config).splitlines())
     assert set(every) < set(printed("all").splitlines())
 
 

@@ -9,7 +9,8 @@ from typing import Literal, get_args, get_origin
 import pytest
 import yaml
 
-from rootsopt.config import Config, describe_keys, load, parse
+from rootsopt.config import Config, load, parse
+from rootsopt.config.explain import describe
 from rootsopt.config.families import families, family_of
 from rootsopt.config.section import Section
 from rootsopt.config.units import unit_of
@@ -140,7 +141,7 @@ def test_load_reads_a_file_and_applies_overrides(tmp_path):
 
 def test_every_key_is_described():
     """The help lists every key once."""
-    lines = describe_keys().splitlines()
+    lines = describe(Config).splitlines()
     names = [line.split()[0] for line in lines]
     assert len(names) == len(set(names))
     assert "scene.timing_gear.backlash_mm" in names
@@ -450,14 +451,14 @@ def test_every_number_has_two_ends(key):
         assert f"`{key}" in refusal(text, f"{key}={number}")
     for value in ("[1.0e300, 2.0e300]", "{1: 1.0e300, from: 1.0e300}"):
         assert f"`{key}" in refusal(text, f"{key}={value}")
-    line = next(line for line in describe_keys().splitlines() if line.split()[0] == key)
+    line = next(line for line in describe(Config).splitlines() if line.split()[0] == key)
     assert "from" in line or "above" in line
     assert " to " in line or "below" in line
 
 
 def test_help_has_unit_default_range_and_choices():
     """The help has one line for each key."""
-    lines = {line.split()[0]: line for line in describe_keys().splitlines()}
+    lines = {line.split()[0]: line for line in describe(Config).splitlines()}
     assert lines["profile.pitch_radius_mm"].endswith("[mm, from 1 to 5000, required]")
     assert lines["scene.timing_gear.damping_ratio"].endswith("[from 0 to 100, default 0.0]")
     assert lines["scene.drive"].endswith("[prescribed | torque, default prescribed]")

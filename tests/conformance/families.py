@@ -15,7 +15,9 @@ import numpy as np
 import pytest
 
 from experiments._common.polygons import pair_gap
-from rootsopt.config import describe_families, describe_keys, parse
+from rootsopt.commands import cli
+from rootsopt.config import Config, parse
+from rootsopt.config.explain import describe
 from rootsopt.config.families import families, family_of
 from rootsopt.contact.closest import FlankPair
 from rootsopt.design.space import Space, sobol
@@ -308,9 +310,9 @@ def config_wants_the_keys_of_the_family(family):
 def help_mentions_it(family):
     """Check that the help lists the family, its curves, its keys with their families, and their
     bounds."""
-    lines = {line.split()[0]: line for line in describe_keys().splitlines()}
+    lines = {line.split()[0]: line for line in describe(Config).splitlines()}
     assert family in re.findall(r"\w+", lines["profile.family"])
-    about = {line.split()[0]: line for line in describe_families().splitlines()}
+    about = {line.split()[0]: line for line in cli._all_keys().split("\n\n")[0].splitlines()}
     assert family_of(family).help in about[family]
     for parameter in family_of(family).parameters:
         line = lines[f"profile.{parameter.key}"]

@@ -432,23 +432,20 @@ def _png_size(path):
 def test_optimization_figures(tmp_path):
     folder = files.ResultFolder(tmp_path)
     better = _evaluation(design=DESIGN | {"involute_length_mm": 8.0})
-    names = optimization_figures(folder, _evaluation(), better, _history(), parse(CONFIG))
-    assert names == [
-        f"figures/{name}.png"
-        for name in ("profiles", "meshing", "force", "spectrum", "comparison", "history")
-    ]
-    assert sorted(os.listdir(tmp_path / "figures")) == sorted(n.split("/")[1] for n in names)
-    for name in names:
-        width, height = _png_size(tmp_path / name)
+    optimization_figures(folder, _evaluation(), better, _history(), parse(CONFIG))
+    names = "comparison", "force", "history", "meshing", "profiles", "spectrum"
+    assert sorted(os.listdir(tmp_path / "figures")) == [f"{name}.png" for name in names]
+    for file in (tmp_path / "figures").iterdir():
+        width, height = _png_size(file)
         assert width >= 1400
         assert height >= 700
-        assert (tmp_path / name).stat().st_size > 20_000
+        assert file.stat().st_size > 20_000
 
 
 def test_simulation_figures_without_a_series(tmp_path):
     folder = files.ResultFolder(tmp_path)
-    names = simulation_figures(folder, _failed(), parse(CONFIG))
-    assert names == ["figures/profiles.png", "figures/meshing.png"]
+    simulation_figures(folder, _failed(), parse(CONFIG))
+    assert sorted(os.listdir(tmp_path / "figures")) == ["meshing.png", "profiles.png"]
     assert "pyplot" not in vars(runs)
 
 
