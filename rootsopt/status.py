@@ -128,3 +128,36 @@ class Status(enum.Enum):
     def label(self) -> str:
         """Name of the status in result files and tables."""
         return self.name.lower()
+
+
+class Standing(enum.Enum):
+    """Status of one point of a front. Each value explains it and advises the user."""
+
+    CERTIFIED = (
+        "No compromise nearby is better, and the first-order conditions hold. The search for the "
+        "point had converged."
+    )
+    NOT_CERTIFIED = (
+        "The design is the best that was found for this compromise, but its search had not "
+        "converged, or the first-order conditions do not hold. Raise optimizer.iterations or "
+        "tighten solver.accuracy."
+    )
+    NOT_VERIFIED = (
+        "The search was stopped before the design was simulated again from rest. Run it again."
+    )
+    DOMINATED = "Another point is at least as good in every term and better in one."
+    REPEATED = "Another point is the same design."
+    NOT_HELD_UP = (
+        "Simulated from rest at the tight tolerance, the design has no usable steady state, or "
+        "forces other than in the search. Tighten solver.accuracy."
+    )
+
+    @property
+    def label(self) -> str:
+        """Name of the status in result files and tables."""
+        return self.name.lower()
+
+    @property
+    def kept(self) -> bool:
+        """Whether a point with this status stays on the front."""
+        return self in (Standing.CERTIFIED, Standing.NOT_CERTIFIED, Standing.NOT_VERIFIED)

@@ -11,7 +11,8 @@ from matplotlib.axes import Axes
 from rootsopt.config.units import words
 from rootsopt.figures.style import BLUE, COLORS, DASHES, GREY, ORANGE, VERMILION, figure, write
 from rootsopt.output.files import ResultFolder
-from rootsopt.tradeoffs.front import Front, Standing
+from rootsopt.status import Standing
+from rootsopt.tradeoffs.front import Front
 
 _LOOKS: dict[str, dict[str, Any]] = {
     "certified": {"marker": "o", "color": BLUE, "markersize": 6.5},

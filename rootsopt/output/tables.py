@@ -30,8 +30,7 @@ from rootsopt.output.names import (
 from rootsopt.pump.sheet import NOTE, missing, warnings
 from rootsopt.response.records import RESPONSES, message_of
 from rootsopt.response.sensitivity import MICROMETRE
-from rootsopt.status import Status
-from rootsopt.tradeoffs.front import Standing
+from rootsopt.status import Standing, Status
 
 Record = Mapping[str, Any]
 """The result file, or an entry of it."""

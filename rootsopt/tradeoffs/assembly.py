@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from rootsopt.config.units import words
 from rootsopt.optimize.certificate import Certificate
-from rootsopt.tradeoffs.front import FrontPoint, Gap, Standing, dominated, ordered, repeated
+from rootsopt.status import Standing
+from rootsopt.tradeoffs.front import FrontPoint, Gap, dominated, ordered, repeated
 from rootsopt.tradeoffs.gaps import Bisections, Edge, Pair, Spacing, along, among, measured
 from rootsopt.tradeoffs.scalar import Scalar, Scale, rates
 from rootsopt.tradeoffs.study import Sample, Study

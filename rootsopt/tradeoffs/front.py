@@ -1,7 +1,6 @@
 """The front of a trade-off as a result: points, what was dropped, gaps, status."""
 
 import dataclasses
-import enum
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -14,45 +13,12 @@ from rootsopt.config.units import words
 from rootsopt.optimize.certificate import RESIDUAL
 from rootsopt.optimize.infeasible import Infeasible
 from rootsopt.response.evaluation import Evaluation
-from rootsopt.status import Status
+from rootsopt.status import Standing, Status
 from rootsopt.tradeoffs.aims import Aim
 
 EQUAL = 1e-6
 """Difference between two designs in a term (fraction of its range along the front) below which the
 term counts as equal when designs are compared."""
-
-
-class Standing(enum.Enum):
-    """Status of one point of a front. Each value explains it and advises the user."""
-
-    CERTIFIED = (
-        "No compromise nearby is better, and the first-order conditions hold. The search for the "
-        "point had converged."
-    )
-    NOT_CERTIFIED = (
-        "The design is the best that was found for this compromise, but its search had not "
-        "converged, or the first-order conditions do not hold. Raise optimizer.iterations or "
-        "tighten solver.accuracy."
-    )
-    NOT_VERIFIED = (
-        "The search was stopped before the design was simulated again from rest. Run it again."
-    )
-    DOMINATED = "Another point is at least as good in every term and better in one."
-    REPEATED = "Another point is the same design."
-    NOT_HELD_UP = (
-        "Simulated from rest at the tight tolerance, the design has no usable steady state, or "
-        "forces other than in the search. Tighten solver.accuracy."
-    )
-
-    @property
-    def label(self) -> str:
-        """Name of the status in result files and tables."""
-        return self.name.lower()
-
-    @property
-    def kept(self) -> bool:
-        """Whether a point with this status stays on the front."""
-        return self in (Standing.CERTIFIED, Standing.NOT_CERTIFIED, Standing.NOT_VERIFIED)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -296,4 +262,4 @@ def ordered(values: NDArray[np.float64]) -> Sequence[int]:
     return [int(k) for k in np.lexsort(values.T[::-1])]
 
 
-__all__ = ["Front", "FrontPoint", "Gap", "Standing", "dominated", "ordered", "repeated"]
+__all__ = ["Front", "FrontPoint", "Gap", "dominated", "ordered", "repeated"]

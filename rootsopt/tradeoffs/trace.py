@@ -38,10 +38,11 @@ from rootsopt.response.many import HERE, Runs, as_done
 from rootsopt.response.starts import Seeds
 from rootsopt.runtime.threads import one_thread
 from rootsopt.scene import check_geometry
+from rootsopt.status import Standing
 from rootsopt.sweeps.evaluations import evaluating
 from rootsopt.tradeoffs.assembly import Node, gaps_of, points_of, selected, spacing_of
 from rootsopt.tradeoffs.course import Course, Seen
-from rootsopt.tradeoffs.front import Front, Standing
+from rootsopt.tradeoffs.front import Front
 from rootsopt.tradeoffs.gaps import Bisections, Edge, Pair, Spacing, divides
 from rootsopt.tradeoffs.lattice import Key, corners, directions, keys, links
 from rootsopt.tradeoffs.scalar import Scalar, Scale, end_scale

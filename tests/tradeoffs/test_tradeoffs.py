@@ -28,11 +28,11 @@ from rootsopt.profiles import geometry
 from rootsopt.response import terms
 from rootsopt.response.terms import needs_forces
 from rootsopt.scene import Scene
-from rootsopt.status import Status
+from rootsopt.status import Standing, Status
 from rootsopt.tradeoffs import gaps, lattice, trace
 from rootsopt.tradeoffs.aims import Aim, aims_of, freed
 from rootsopt.tradeoffs.assembly import Node, points_of, selected
-from rootsopt.tradeoffs.front import Standing, dominated
+from rootsopt.tradeoffs.front import dominated
 from rootsopt.tradeoffs.scalar import RHO, Scalar, Scale
 from rootsopt.tradeoffs.study import Sample, Study
 from rootsopt.tradeoffs.trace import Tracer, pareto_front
