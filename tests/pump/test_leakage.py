@@ -356,7 +356,7 @@ def test_sheet_says_what_it_lacks_and_what_does_not_hold():
     assert "delivers nothing" in warnings({"volumetric_efficiency": -1.0})[0]
     # Closed flanks: the number is that of the gap at the end faces.
     scene = scene_of(BLOWER[0], *BLOWER[2:])
-    rows = sheet(scene, jnp.asarray(load_config("configs/cic.yaml").design))
+    rows = sheet(scene, jnp.asarray(load_config("configs/cic_drawn.yaml").design))
     path = mean_free_path(scene.medium.gas.inlet_pressure, scene.medium.viscosity, AIR)
     assert rows["knudsen_number"] == pytest.approx(float(path) / 5e-5, rel=1e-9)
 
