@@ -332,11 +332,11 @@ class Page:
     def _tick(self) -> None:
         """Fade late numbers, and say how long a slow computation has been running."""
         seconds = self.session.seconds
-        shown = self.motion.number if self.motion is not None else -1
-        late = self.shape is not None and self.problem is None and shown < self.shape.number
-        faded = late and self.late and shown == self.before
+        number = self.motion.number if self.motion is not None else -1
+        late = self.shape is not None and self.problem is None and number < self.shape.number
+        faded = late and self.late and number == self.before
         fade([self.numbers, self.gradient, self.force.figure], faded)
-        self.late, self.before = late, shown
+        self.late, self.before = late, number
         if self.closed or seconds < _SLOW:
             return
         if not self.engine.ready.is_set():
