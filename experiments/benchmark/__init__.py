@@ -1,6 +1,6 @@
 """How fast is rootsopt compared with SciPy and Numba, and how much memory does it need?
 
-Writes benchmark.csv, benchmark.json and benchmark.png, and ends with the table of targets.
+Writes benchmark.csv, benchmark.json and benchmark.png.
 """
 
 from experiments._common.driver import Study

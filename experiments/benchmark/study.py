@@ -35,7 +35,7 @@ from experiments._common.scenes import CIC
 from experiments._common.style import BLUE, ORANGE, grid_below, sheet
 from experiments._common.tables import print_record, show
 from experiments._common.timing import MB, peak_memory
-from experiments.benchmark.job import ACCURACY, BATCH_SECONDS, GRADIENT_ACCURACY, Job, Row, row
+from experiments.benchmark.job import ACCURACY, BATCH_SECONDS, Job, Row, row
 
 SIZES = (16, 256, 1024)
 COMPETITORS = "scipy", "numba"
@@ -51,46 +51,18 @@ def exponent(points: Sequence[tuple[float, float]]) -> float | None:
     return float(np.polyfit(x, y, 1)[0])
 
 
-@dataclasses.dataclass(frozen=True)
-class Lookup:
-    """Looks up measured times of a finished run by tool and task."""
-
-    rows: list[Row]
-
-    def best(self, tool: str, what: str) -> Row | None:
-        """Return the fastest row with sufficient accuracy for the task `what`, or `None`.
-
-        Rows of all tools whose names start with `tool` are considered."""
-        rows = [r for r in self.rows if r["tool"].startswith(tool) and r["what"] == what]
-        fine = [
-            r
-            for r in rows
-            if (r.get("value_error") or 0.0) <= ACCURACY
-            and (r.get("gradient_error") or 0.0) <= GRADIENT_ACCURACY
-        ]
-        return min(fine, key=lambda r: r["per_design_ms"], default=None)
-
-    def ratio(self, slow: tuple[str, str], fast: tuple[str, str]) -> float | None:
-        """Return the time per design of `slow` divided by that of `fast`, each a (tool, task)."""
-        one, other = self.best(*slow), self.best(*fast)
-        return one["per_design_ms"] / other["per_design_ms"] if one and other else None
-
-    def seconds(self, what: str) -> float | None:
-        """Return the time (s) of the first task whose name ends with `what`."""
-        found = [r["run_s"] for r in self.rows if r["what"].endswith(what)]
-        return found[0] if found else None
-
-    def points(self, part: str, what: str, size: str = "designs") -> list[tuple[float, float]]:
-        """Return (size, seconds) of the rows of a part with the task `what`, or with any."""
-        rows = [r for r in self.rows if r["part"].startswith(part) and what in ("", r["what"])]
-        return [(r[size], r["run_s"]) for r in rows]
+def points_of(
+    rows: Sequence[Row], part: str, what: str, size: str = "designs"
+) -> list[tuple[float, float]]:
+    """Return (size, seconds) of the rows of a part with the task `what`, or with any."""
+    found = [r for r in rows if r["part"].startswith(part) and what in ("", r["what"])]
+    return [(r[size], r["run_s"]) for r in found]
 
 
 def figure_of(rows: list[Row]) -> Figure:
     """Draw the time per design by tool, and the times over revolutions and over batch size."""
     figure, axes = sheet(15, 5.6, 1, 3, width_ratios=(1.5, 1, 1))
     bars, turns, batches = axes[0]
-    look = Lookup(rows)
     timed = [r for r in rows if r["what"] in ("value", "value+gradient")]
     names = list(dict.fromkeys(r["tool"] for r in timed))
     for shift, (what, color) in enumerate((("value", ORANGE), ("value+gradient", BLUE))):
@@ -108,12 +80,11 @@ def figure_of(rows: list[Row]) -> Figure:
     bars.margins(x=0.15)
     bars.set(xscale="log", xlabel="time per design, warm (ms)")
     bars.legend(fontsize=8, loc="lower right")
-    draw_power(
-        turns, look.points("revolutions", "", "revolutions"), "from rest, no statistics", BLUE, "o"
-    )
+    turned = points_of(rows, "revolutions", "", "revolutions")
+    draw_power(turns, turned, "from rest, no statistics", BLUE, "o")
     turns.set(xlabel="revolutions", ylabel="time (s)")
     for what, color, mark in (("value", ORANGE, "s"), ("value+gradient", BLUE, "o")):
-        draw_power(batches, look.points("batch ", what), what.replace("+", " + "), color, mark)
+        draw_power(batches, points_of(rows, "batch ", what), what.replace("+", " + "), color, mark)
     batches.set(xlabel="designs in a batch", ylabel="time of the batch (s)")
     for ax in (turns, batches):
         ax.set(xscale="log", yscale="log")
@@ -151,46 +122,6 @@ COLUMNS = (
     *("value_error", "gradient_error", "peak_memory_MB", "settings", "note"),
 )
 """Columns of the table, in order."""
-
-
-def targets(rows: list[Row]) -> list[Row]:
-    """Return a row per target, with the measured value; `reached` is `None` if not measured."""
-    look = Lookup(rows)
-    both, value, one, many = "value+gradient", "value", "rootsopt, ", "rootsopt, batch of 256"
-    single = Lookup([r for r in rows if r["part"] == "single" or r["tool"].startswith("(")])
-    orbit = [1e3 * r["run_s"] for r in rows if r["tool"] == "orbit"]
-    limits = (
-        ("value + gradient, speed-up over (a)", ">=", 200.0,
-         single.ratio(("(a)", both), (one, both)), "one design"),
-        ("the same in a batch of 256", ">=", 200.0,
-         look.ratio(("(a)", both), (many, both)), "per design"),
-        ("value + gradient, speed-up over (b)", ">=", 1.0,
-         single.ratio(("(b)", both), (one, both)), "one design"),
-        ("the same in a batch of 256", ">=", 1.0,
-         look.ratio(("(b)", both), (many, both)), "per design"),
-        ("one value, in units of (b)'s time", "<=", 3.0,
-         single.ratio((one, value), ("(b)", value)), "one design"),
-        ("a value in a batch of 256, in units of (b)'s time", "<=", 1.0,
-         look.ratio((many, value), ("(b)", value)), "per design"),
-        ("value + gradient on the orbit (ms)", "<=", 50.0,
-         orbit[0] if orbit else None, "to 1e-6, one core"),
-        ("exponent of cost over revolutions", "<=", 1.1,
-         exponent(look.points("revolutions", "", "revolutions")), "1 is linear"),
-        ("exponent of cost over batch size", "<=", 1.1,
-         exponent(look.points("batch ", both)), "value + gradient"),
-        ("main job, cold process (s)", "<=", 20.0, look.seconds(", cold"), "no cache"),
-        ("main job, programs cached (s)", "<=", 8.0, look.seconds(", cached"), "second run"),
-    )  # fmt: skip
-    return [
-        {
-            "target": name,
-            "limit": f"{sign} {limit:g}",
-            "figure": figure,
-            "reached": None if figure is None else (figure >= limit) == (sign == ">="),
-            "note": note,
-        }
-        for name, sign, limit, figure, note in limits
-    ]
 
 
 def measured(part: Job) -> tuple[dict[str, Any], float]:
@@ -268,7 +199,7 @@ class Parts:
 
 
 def run(job: Run) -> None:
-    """Run all parts; write and print their rows and the targets.
+    """Run all parts; write and print their rows.
 
     A reduced run uses small sizes, and omits the longest part. Raises `NoResultError` if the
     reference cannot be computed.
@@ -283,12 +214,11 @@ def run(job: Run) -> None:
         parts.part(name)
     with tempfile.TemporaryDirectory() as scratch:
         parts.main_job(Path(scratch))
-    rows, goals = parts.rows, targets(parts.rows)
+    rows = parts.rows
     # Columns in their usual order; those that only some rows have come last.
     job.csv("benchmark.csv", rows, dict.fromkeys([*COLUMNS, *(key for one in rows for key in one)]))
-    record = {"rows": rows, "targets": goals, "not_measured": parts.failed}
+    record = {"rows": rows, "not_measured": parts.failed}
     job.json("benchmark.json", record | {"reference": parts.known, "processors": os.cpu_count()})
     job.figure("benchmark.png", figure_of(rows))
     show("Benchmark", rows, COLUMNS)
     print_record({f"not measured: {name}": reason for name, reason in parts.failed.items()})
-    show("Targets", goals)
