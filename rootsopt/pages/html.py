@@ -77,8 +77,8 @@ def _coded(text: str) -> Markup:
 
 def _command(text: str) -> Markup:
     """Return the HTML of a command, whose options are not divided at their hyphens."""
-    words = str(escape(text)).split(" ")
-    kept = (f'<span class="word">{x}</span>' if x.startswith("-") else x for x in words)
+    parts = str(escape(text)).split(" ")
+    kept = (f'<span class="word">{x}</span>' if x.startswith("-") else x for x in parts)
     return Markup(f"<code>{' '.join(kept)}</code>")
 
 
@@ -164,12 +164,12 @@ def front_text(front: Front) -> str:
             "status": f"{in_words(one.standing.label)}: {one.standing.value}",
             "terms": one.terms,
         }
-    words = [aim.words for aim in front.aims]
+    names = [aim.words for aim in front.aims]
     return _page(
         "front.html.j2",
         drawn.values(),
         {"points": points},
-        title=f"Trade-off of {', '.join(words[:-1])} against {words[-1]}",
+        title=f"Trade-off of {', '.join(names[:-1])} against {names[-1]}",
         message=front.message,
         charts=[*drawn],
         tables=[*tables.front_tables(result)],
