@@ -313,6 +313,7 @@ class Evaluator:
 
         It has derivatives along `tangents`; `start`: result of `starts.begun`."""
         found = _motion(pair, tangents, start, self.scene.pitch_radius, self.solver)
+        found = jax.device_get(found)  # To fetch a hundred arrays one by one takes a millisecond.
         return self._examined(pair, found)
 
     def _examined(self, pair: RotorPair, found: Steady) -> Steady:
@@ -566,7 +567,7 @@ def motion_from(pair: RotorPair, tangents: RotorPair, start: Start, radius, solv
 
 
 _build = CachedFunction(Scene.pair_and_tangents)
-_motion = CachedFunction(motion_from, gathered=0)
+_motion = CachedFunction(motion_from)
 _integrated = CachedFunction(integrated_difference)
 apart_program = CachedFunction(apart)
 lyapunov_program = CachedFunction(lyapunov)

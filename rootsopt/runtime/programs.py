@@ -10,7 +10,6 @@ import ctypes
 import functools
 import gc
 import hashlib
-import math
 import os
 import pickle
 import platform
@@ -26,7 +25,6 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import platformdirs
 from jax.core import Tracer
@@ -138,50 +136,27 @@ class _Kind(NamedTuple):
 class _Made(NamedTuple):
     """A compiled program.
 
-    `call`: function that takes the arrays among the arguments and returns those of the result, with
-    one array for each type of those that are gathered; `result_shape`: the result with
-    `jax.ShapeDtypeStruct` in place of arrays; `result`: function that takes what `call` returns,
-    and returns the result."""
+    `call`: function that takes the arrays among the arguments and returns those of the result;
+    `result_shape`: the result with `jax.ShapeDtypeStruct` in place of arrays."""
 
     call: Callable[..., Any]
     result_shape: Any
-    result: Callable[[list], Any]
 
-    @classmethod
-    def of(cls, call: Callable[..., Any], result_shape: Any, gathered: int | None) -> "_Made":
-        """Return the program `call` with a result like `result_shape`; `gathered`: as in
-        `CachedFunction`."""
-        leaves, tree = jax.tree.flatten(result_shape)
-        spots = [number for number, leaf in enumerate(leaves) if _is_array(leaf)]
-        alone, parts = _parts(result_shape, gathered)
-        shapes = [leaves[spot].shape for spot in spots]
-
-        def result(found: list) -> Any:
-            filled = list(leaves)
-            for spot, array in zip(spots, found[:alone], strict=False):
-                filled[spot] = array
-            for places, whole in zip(parts.values(), jax.device_get(found[alone:]), strict=True):
-                for number, begin, end in places:
-                    filled[spots[number]] = whole[begin:end].reshape(shapes[number])
-            return jax.tree.unflatten(tree, filled)
-
-        return cls(call, result_shape, result)
+    def result(self, leaves: list) -> Any:
+        """Return the result for the arrays among the arguments."""
+        found = iter(self.call(*leaves))
+        return jax.tree.map(lambda x: next(found) if _is_array(x) else x, self.result_shape)
 
 
 class CachedFunction:
     """A function whose arguments are JAX pytrees, compiled once for each kind of arguments.
 
     As with `equinox.filter_jit`, arrays are traced. All other leaves are static and must be
-    hashable: with new values, the function is compiled again.
+    hashable: with new values, the function is compiled again."""
 
-    `gathered`: index of an entry of the result, which must be a tuple. This entry and those after
-    it have NumPy arrays, all of which are fetched at once. To fetch a hundred small arrays one by
-    one takes about a millisecond."""
-
-    def __init__(self, function: Callable[..., Any], gathered: int | None = None):
+    def __init__(self, function: Callable[..., Any]):
         functools.update_wrapper(self, function)
         self.function = function
-        self.gathered = gathered
         self._made: dict[_Kind, Future[_Made]] = {}
         self._lock = threading.Lock()
 
@@ -194,7 +169,7 @@ class CachedFunction:
         if new:
             self._make(future, kind)
         made = future.result()
-        return made.result(made.call(*leaves))
+        return made.result(leaves)
 
     def prepare(self, *args: Any, then: Callable[[Any], None] | None = None) -> None:
         """Compile the function in the background for arguments of the same kind as `args`.
@@ -241,7 +216,7 @@ class CachedFunction:
 
         try:
             place = self._place(kind)
-            made = _loaded(place, self.gathered)
+            made = _loaded(place)
             if made is not None:
                 future.set_result(made)
                 outlined(made.result_shape)
@@ -260,19 +235,14 @@ class CachedFunction:
         def flat(*arrays):
             out = self.function(*_joined(kind, iter(arrays)))
             outlines.append(jax.tree.map(_outline, out))
-            found = [x for x in jax.tree.leaves(out) if _is_array(x)]
-            alone, parts = _parts(out, self.gathered)
-            return found[:alone] + [
-                jnp.concatenate([jnp.ravel(found[number]) for number, *_ in places])
-                for places in parts.values()
-            ]
+            return [x for x in jax.tree.leaves(out) if _is_array(x)]
 
         flat.__name__ = flat.__qualname__ = self.function.__name__
         structs = [jax.ShapeDtypeStruct(s[0], np.dtype(s[1])) for s in kind.shapes if s]
         with _tracing, _without_collection():
             lowered = jax.jit(flat).lower(*structs)
         outlined(outlines[-1])
-        made = _Made.of(_finished(lowered), outlines[-1], self.gathered)
+        made = _Made(_finished(lowered), outlines[-1])
         if place is not None:
             # A program that cannot be cached can still be used.
             with contextlib.suppress(Exception):
@@ -293,7 +263,7 @@ class CachedFunction:
         sources = _sources({self.function.__module__, *_modules(kind), *outside})
         if sources is None:
             return None
-        name = f"{self.function.__module__}.{self.function.__qualname__} {self.gathered}"
+        name = f"{self.function.__module__}.{self.function.__qualname__}"
         words = [name, *map(repr, kind), *sources, *_machine(), *_versions(), *_settings()]
         if any(" at 0x" in word for word in words):
             return None  # The text contains a memory address, which differs in the next process.
@@ -325,25 +295,6 @@ def _is_array(leaf: Any) -> bool:
 
 def _outline(leaf: Any) -> Any:
     return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) if _is_array(leaf) else leaf
-
-
-def _parts(
-    result: Any, gathered: int | None
-) -> tuple[int, dict[np.dtype, list[tuple[int, int, int]]]]:
-    """Return how many arrays of a `result` are not gathered, and how the others are joined.
-
-    There is one vector for each type of array. For each type, there is a list of its arrays: number
-    in the result, begin and end in the vector. `gathered`: as in `CachedFunction`."""
-    arrays = [x for x in jax.tree.leaves(result) if _is_array(x)]
-    if gathered is None:
-        return len(arrays), {}
-    alone = sum(map(_is_array, jax.tree.leaves(result[:gathered])))
-    found: dict[np.dtype, list[tuple[int, int, int]]] = {}
-    for number, array in enumerate(arrays[alone:], alone):
-        places = found.setdefault(np.dtype(array.dtype), [])
-        begin = places[-1][2] if places else 0
-        places.append((number, begin, begin + math.prod(array.shape)))
-    return alone, found
 
 
 def _split(args: tuple) -> tuple[list, _Kind]:
@@ -413,10 +364,8 @@ def _save(place: _Place, made: _Made, number: int) -> None:
     place.store.write(place.name, place.purpose, data)
 
 
-def _loaded(place: _Place | None, gathered: int | None) -> _Made | None:
-    """Return the cached program at `place`, or `None` if no program can be loaded from it.
-
-    `gathered`: as for `CachedFunction`."""
+def _loaded(place: _Place | None) -> _Made | None:
+    """Return the cached program at `place`, or `None` if no program can be loaded from it."""
     if place is None:
         return None
     try:
@@ -424,15 +373,14 @@ def _loaded(place: _Place | None, gathered: int | None) -> _Made | None:
         if data is None:
             return None
         payload, number, result_shape = pickle.loads(zlib.decompress(data))
-        alone, parts = _parts(result_shape, gathered)
-        results = alone + len(parts)
+        results = sum(map(_is_array, jax.tree.leaves(result_shape)))
         takes = jax.tree.structure(((0,) * number, {}))
         call = serialize_executable.deserialize_and_load(
             payload, takes, jax.tree.structure([0] * results)
         )
     except Exception:
         return None
-    return _Made.of(call, result_shape, gathered)
+    return _Made(call, result_shape)
 
 
 def _modules(kind: _Kind) -> set[str]:
