@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from rootsopt.config import DESIGN_KEYS
 from rootsopt.config.families import is_list
 from rootsopt.figures.force import number
-from rootsopt.figures.style import BLUE, COLORS, GREY, beside
-from rootsopt.output.names import label
+from rootsopt.figures.style import BLUE, COLORS, GREY, VERMILION, beside
+from rootsopt.output.names import brief, label
 
 _MARKERS = "os^Dvp"
 
@@ -144,6 +144,8 @@ def _outside(ax, history):
 _WIDEST = 40
 """Number of characters above which the name of a limit is shortened."""
 
+_FEASIBLE = "slack", "objective"
+"""Columns of `feasible.csv` after the two parameters."""
 _RANGE = 0.01
 """Minimum range of the axis of objectives, so that differences by rounding do not show."""
 
@@ -183,6 +185,45 @@ def _leading(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
         if not found or rank <= (not found[-1]["feasible"], found[-1]["objective"]):
             found.append(row)
     return found
+
+
+def plot_feasible(
+    ax: Axes,
+    columns: Mapping[str, Sequence[float]],
+    design: Mapping[str, float],
+    others: Sequence[Mapping[str, Any]],
+) -> Axes:
+    """Draw the objective where all limits of the geometry are met, over two parameters.
+
+    `columns`: those of `feasible.csv`, the two parameters first; `design`: the optimum, whose other
+    parameters hold in the whole figure; `others`: designs at other vertices of the limits, drawn
+    where their projection lies. Return `ax`."""
+    from scipy.interpolate import RBFInterpolator  # Slow import (0.3 s).
+
+    one, two = [*columns][:2]
+    x, y, slack, objective = (np.asarray(columns[k], float) for k in (one, two, *_FEASIBLE))
+    places, known = np.column_stack([x, y]), np.isfinite(objective)
+    sides, shape = np.ptp(places, axis=0), (-1, len(np.unique(x)))
+    slack = np.where(np.isnan(slack), np.nanmin(slack), slack)  # No sound profile.
+    at = places[known]
+    if np.linalg.matrix_rank((at - at.mean(axis=0)) / sides, tol=1e-6) == 2:
+        between = RBFInterpolator(at / sides, objective[known])(places / sides)
+        low, high = np.min(objective[known]), np.max(objective[known])
+        grid = [column.reshape(shape) for column in (x, y, np.clip(between, low, high))]
+        shades = ax.pcolormesh(*grid, shading="gouraud", cmap="viridis")
+        ax.figure.colorbar(shades, ax=ax, label="objective (baseline = 1)")
+    grid = [column.reshape(shape) for column in (x, y, slack)]
+    ax.contourf(*grid, levels=[-np.inf, 0], colors="white")
+    ax.contour(*grid, levels=[0], colors="black", linewidths=1)
+    ax.plot(*at.T, ".", color=GREY, markersize=3, label="simulated")
+    ax.plot(design[one], design[two], "*", color=VERMILION, markersize=14, label="optimum")
+    ax.set(xlim=(np.min(x), np.max(x)), ylim=(np.min(y), np.max(y)))
+    for place, row in enumerate(others):
+        name = None if place else "other vertices (projected)"
+        ax.plot(row["design"][one], row["design"][two], "s", mfc="none", color="black", label=name)
+    rest = [f"{label(key)} = {brief(x)}" for key, x in design.items() if key not in (one, two)]
+    ax.set(xlabel=label(one), ylabel=label(two), title=", ".join(rest))
+    return ax
 
 
 def plot_prices(ax: Axes, constraints: Sequence[Mapping[str, Any]], converged: bool = True) -> Axes:

@@ -9,7 +9,13 @@ import numpy as np
 from rootsopt.config import FAMILY_KEYS, Config
 from rootsopt.config.families import is_list
 from rootsopt.figures.force import plot_force, plot_gap, plot_spectrum
-from rootsopt.figures.history import plot_history, plot_prices, plot_residual, plot_starts
+from rootsopt.figures.history import (
+    plot_feasible,
+    plot_history,
+    plot_prices,
+    plot_residual,
+    plot_starts,
+)
 from rootsopt.figures.profiles import (
     plot_conjugacy,
     plot_departure,
@@ -98,15 +104,15 @@ def feasible_figure(
     columns: Mapping[str, Sequence[float]],
     design: Mapping[str, float],
     vertex: Mapping[str, Any],
-) -> str:
-    """Write feasible.png, the designs that the limits leave; return its name.
+) -> None:
+    """Write feasible.png, the designs that the limits leave.
 
     `columns`: those of `feasible.csv`; `design`: the optimum; `vertex`: entry of the result
     file."""
     made, axes = figure(7.5, 5, 1, 1)
     plot_feasible(axes[0, 0], columns, design, vertex["others"])
     entries = axes[0, 0].get_legend_handles_labels()[0]
-    return write(folder, "feasible", made, "Designs that satisfy all limits", entries, 3)
+    write(folder, "feasible", made, "Designs that satisfy all limits", entries, 3)
 
 
 def _outline(config, design):
