@@ -82,6 +82,7 @@ _OF = {
     "optimize/outcome": "search optimize",
     "optimize/search": "search optimize speeds",
     "optimize/verification": "search optimize",
+    "optimize/vertices": "vertices",
     "optimize/sqp": "sqp robust",
     "profiles/arcs": "families conjugacy",
     "profiles/base": "profiles extending contact conjugacy families",
