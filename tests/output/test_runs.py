@@ -315,9 +315,9 @@ def test_each_command_has_a_folder_of_its_own(tmp_path, monkeypatch):
     config = str(ROOT / "configs" / "cic_drawn.yaml")
     monkeypatch.chdir(tmp_path)
     assert main(["profile", config, "--no-figures"]) == 0
-    record = json.loads((tmp_path / "results" / "cic-profile" / "result.json").read_text())
+    record = json.loads((tmp_path / "results" / "cic_drawn-profile" / "result.json").read_text())
     assert record["run"]["command"] == "profile"
-    written = {p.name for p in (tmp_path / "results" / "cic-profile").iterdir()}
+    written = {p.name for p in (tmp_path / "results" / "cic_drawn-profile").iterdir()}
     assert set(record["run"]["files"]) == written
 
 
