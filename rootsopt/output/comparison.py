@@ -157,6 +157,12 @@ def label_of(key: str) -> str:
 
 WORTH = 1e-4
 """Relative change of the objective below which no rotor counts as a better one."""
+NOTHING_BETTER = (
+    "With the same displacement, outer diameter and seal width, the family of the search has no "
+    "better rotor: try `--set optimizer.family=free_form`, or allow a narrower tip land with "
+    "`--set constraints.seal_width_min_mm`."
+)
+"""Message if there is none."""
 _ROWS = (
     ("response", ("mean_force_N", "peak_force_N")),
     ("pump", ("volumetric_efficiency", "flow_ripple", "displaced_volume_cm3")),
@@ -191,11 +197,7 @@ def better_tables(result: Mapping[str, Any]) -> Iterator[Table | None]:
     note = f'"Your rotor" is the {in_words(fit["family"])} profile that is nearest to the outline, '
     note += f"at most {fit['departure_um']:.2g} µm from it, not the outline itself."
     if gain is not None and abs(gain) < WORTH:
-        note += (
-            " With the same displacement, outer diameter and seal width, the family of the search "
-            "has no better rotor: try `--set optimizer.family=free_form`, or allow a narrower tip "
-            "land with `--set constraints.seal_width_min_mm`."
-        )
+        note += f" {NOTHING_BETTER}"
     heads = "", "your rotor", "a better one", "change"
     yield table("Your rotor against a better one", heads, groups, note)
     rows: list[Row] = [

@@ -19,7 +19,7 @@ from rootsopt.errors import InputError
 from rootsopt.measured.source import Found, found
 from rootsopt.optimize.surviving import survives, surviving
 from rootsopt.output import terminal
-from rootsopt.output.comparison import WORTH, better_tables
+from rootsopt.output.comparison import NOTHING_BETTER, WORTH, better_tables
 from rootsopt.output.names import stated
 from rootsopt.output.runs import RunFolder
 from rootsopt.pump.sheet import record_of
