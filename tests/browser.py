@@ -1,6 +1,5 @@
 """A headless Chromium for tests: its flags, and a driver that runs scripts on a page."""
 
-import base64
 import contextlib
 import json
 import shutil
@@ -118,10 +117,6 @@ class Browser:
         """Return the messages on the console since the last call."""
         told = self._call("POST", "/se/log", {"type": "browser"})
         return [f"{one['level']}: {one['message']}" for one in told]
-
-    def picture(self, file: Path) -> None:
-        """Write a picture of the page into a PNG `file`."""
-        file.write_bytes(base64.b64decode(self._call("GET", "/screenshot")))
 
     def _call(self, method: str, path: str, data: Any = None) -> Any:
         body = None if method == "GET" else json.dumps(data or {}).encode()

@@ -59,13 +59,12 @@ _OPTIMISED = (
     "speeds",
     "experiments",
     "gradients",
+    "measures",
     "optimize",
-    "response",
+    "steady",
 )
-"""Test files that compute longer than they compile."""
-_PRECISE = ("steady",)
-"""Test files whose own functions are optimised too, because they test the rounding of optimised
-code."""
+"""Test files that compute longer than they compile. They share their programs, also with commands
+in processes of their own."""
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -75,18 +74,33 @@ def compiled(request):
     In the others, the arithmetic is the same except for rounding, and compiling takes half the
     time."""
     name = request.path.stem.removeprefix("test_")
-    options = programs.COMPILER_OPTIONS | {
-        "xla_backend_optimization_level": 3 if name in _OPTIMISED else 0
-    }
+    if name in _OPTIMISED:
+        yield
+        return
+    options = programs.COMPILER_OPTIONS | {"xla_backend_optimization_level": 0}
     # The package's programs take the options; functions that a test compiles itself take the flag.
-    jax.config.update("jax_disable_most_optimizations", name not in _OPTIMISED + _PRECISE)
+    jax.config.update("jax_disable_most_optimizations", True)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(programs, "COMPILER_OPTIONS", options)
         yield
     jax.config.update("jax_disable_most_optimizations", False)
 
 
-_LONGEST_FIRST = ("steady", "experiments", "accuracy", "ensemble", "measures", "gradients", "cli")
+_LONGEST_FIRST = (
+    "steady",
+    "cli",
+    "response",
+    "improve",
+    "ensemble",
+    "reserve",
+    "continuation",
+    "basins",
+    "landing",
+    "gear_errors",
+    "export",
+    "near",
+)
+"""The first two compile with different options: neither process repeats what the other compiles."""
 
 
 def pytest_collection_modifyitems(items):

@@ -2,21 +2,16 @@
 
 import contextlib
 import csv
-import io
 import json
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 from browser import Browser
-from rich.console import Console
 
 import rootsopt
 from rootsopt import pages
 from rootsopt.commands.table import pareto
-from rootsopt.commands.work.searching import progress_bar
 from rootsopt.config import load
 from rootsopt.output.files import design_file
 from rootsopt.profiles import geometry
@@ -135,58 +130,6 @@ def test_contradicting_constraints_end_with_advice(tmp_path, capsys):
     result = json.loads((tmp_path / "run" / "result.json").read_text())
     assert result["points"] == []
     assert {row["name"] for row in result["infeasible"]["conflicts"]} >= {"seal width"}
-
-
-def test_the_bar_has_words_while_compiling_and_ends_full():
-    """No count stands beside an unknown total, and no bar stops at a part of one."""
-    out = io.StringIO()
-    console = Console(file=out, force_terminal=True, width=120)
-    with progress_bar(console, "compiling", "optimising", "designs", field="best") as update:
-        update(3, 100, 0.9)
-        update(62, 100, 0.8)
-    text = out.getvalue()
-    assert "compiling" in text
-    assert "None" not in text
-    last = text[text.rindex("optimising") :]
-    assert "ended after 62 designs" in last
-    assert "62/100" not in last
-
-
-_STOPPED = """
-import contextlib, os, signal, sys
-from rootsopt.commands import door
-from rootsopt import pages
-from rootsopt.commands.table import pareto
-from rootsopt.commands.work import pareto as work
-
-@contextlib.contextmanager
-def progress(console):
-    yield lambda done, expected: done == 20 and os.kill(os.getpid(), signal.SIGINT)
-
-work._progress = progress
-door.leave(pareto.main())
-"""
-"""Python script of a command that receives Ctrl-C after 20 searches."""
-
-
-@pytest.mark.long
-def test_stopped_run_is_whole(tmp_path):
-    """After Ctrl-C, a complete folder contains the points found so far; the exit code is 3."""
-    place = tmp_path / "run"
-    given = [CIC, "-o", str(place), *RADIUS, "--set", "pareto.points=101"]
-    command = [sys.executable, "-c", _STOPPED, *given]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 3, done.stderr
-    assert "keeping the points found so far" in done.stderr
-    result = json.loads((place / "result.json").read_text())
-    assert result["status"] == "interrupted"
-    points = result["points"]
-    assert 5 <= len(points) < 30
-    assert {point["status"] for point in points} == {"not_verified"}
-    files = {str(p.relative_to(place)) for p in place.rglob("*") if p.is_file()}
-    assert files == set(result["run"]["files"])
-    assert {design_file(1), "front.csv", "figures/front.png"} <= files
-    assert [point["point"] for point in points] == [*range(1, len(points) + 1)]
 
 
 @pytest.mark.long

@@ -50,7 +50,6 @@ TESTS = (
 LEFT = (
     "tests/config/test_shipped.py::test_an_installed_package_has_its_configs_and_types",
     "tests/pages/test_server.py::test_ctrl_c_ends_with_success",
-    "tests/output/test_runs.py::test_all_commands_write_through_one_layer",
     "tests/output/test_runs.py::test_nothing_is_written_outside_of_the_runs_own_folder",
 )
 """Tests that need the package's source, compiled programs or the extra `cad`."""

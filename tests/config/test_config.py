@@ -69,32 +69,10 @@ def test_units_of_names():
     assert {name: unit_of(name) for name in known} == known
 
 
-def test_minimal_config_loads_with_its_values_and_defaults():
-    """Required keys are enough. Values are read as written, and absent parts stay absent."""
-    config = parse(MINIMAL)
-    assert config.profile.pressure_angle_deg == 36.43
-    assert config.profile.lobes == 3
-    assert config.scene.load.torque_N_m == 1.0
-    assert config.scene.timing_gear is None
-    assert config.contact.clearance_mm == 0.0
-    assert config.solver.method == "tsit5"
-
-
-def test_whole_numbers_serve_as_numbers():
-    """A quantity may be written as `3000` or `3000.0`."""
-    config = parse(with_line("speed_rpm: 3000.0", "speed_rpm: 3000"))
-    assert config.scene.speed_rpm == 3000.0
-
-
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.name)
 def test_shipped_configs_load_and_mesh(path):
     """Every config in configs/ is valid, and its profile can be made."""
     check_geometry(load(path))
-
-
-def test_there_are_shipped_configs():
-    """There are shipped configs for the test above."""
-    assert any(path.name == "cic.yaml" for path in SHIPPED)
 
 
 @pytest.mark.parametrize(
@@ -139,34 +117,71 @@ def test_load_reads_a_file_and_applies_overrides(tmp_path):
     assert load(str(path), ["scene.speed_rpm=1500"]).scene.speed_rpm == 1500.0
 
 
-def test_every_key_is_described():
-    """The help lists every key once."""
-    lines = describe(Config).splitlines()
-    names = [line.split()[0] for line in lines]
-    assert len(names) == len(set(names))
-    assert "scene.timing_gear.backlash_mm" in names
-    assert "profile.pressure_angle_deg" in names
-    assert all(len(line.split()) > 1 for line in lines if "bounds" not in line)
+# What is refused
 
 
-# Unknown, missing, misplaced
+ARC = EE_PROFILE.replace("ee", "arc", 1).replace("33.0", "33.0, arc_center_mm: 29.7", 1)
+MANY = ", ".join(f"{k}: 1" for k in range(1, 40))
+REFUSED = [
+    # Unknown, missing, misplaced.
+    (MINIMAL, "scene.sped_rpm=1", ["`scene.sped_rpm`", "did you mean `scene.speed_rpm`"]),
+    (MINIMAL, "profile.tip_arc_angle=1", ["`profile.tip_arc_angle`", "tip_arc_angle_deg"]),
+    (with_line("rotor:", "rotors:"), None, ["`rotors`", "did you mean `rotor`"]),
+    (MINIMAL, "rotor.zzz=1", ["`rotor.zzz`", "length_mm", "density_kg_m3"]),
+    (MINIMAL, "rotor.speed_rpm=1000", ["`rotor.speed_rpm`", "`scene.speed_rpm`"]),
+    (with_line("  speed_rpm: 3000.0\n", ""), None, ["`scene.speed_rpm`"]),
+    (with_line("    torque_N_m: 1.0\n", ""), None, ["`scene.load"]),
+    (with_line("  family: cic\n", ""), None, ["`profile.family`"]),
+    (MINIMAL, "scene=null", ["`scene"]),
+    ("---\n", None, ["`profile` is missing"]),
+    ("- profile\n- scene\n", None, ["sections"]),
+    ("just words", None, ["sections"]),
+    (MINIMAL + "rotor: {length_mm: 1.0}\n", None, ["'rotor'", "twice"]),
+    (with_line("  lobes: 3\n", "  lobes: 3\n  lobes: 4\n"), None, ["'lobes'", "twice"]),
+    (MINIMAL, "float=1", ["`float` is not a known key"]),
+    (MINIMAL, "'a[b'=1", ["is not a known key"]),
+    # Values of another kind.
+    (MINIMAL, "scene.speed_rpm=fast", ["`scene.speed_rpm` must be a number", "'fast'"]),
+    (MINIMAL, "scene.speed_rpm=true", ["`scene.speed_rpm` must be a number", "True"]),
+    (MINIMAL, "scene.speed_rpm=[1, 2]", ["`scene.speed_rpm` must be a number", "[1, 2]"]),
+    (MINIMAL, "profile.lobes=2.5", ["`profile.lobes` must be a whole number", "2.5"]),
+    (MINIMAL, "scene.timing_gear=text", ["`scene.timing_gear`", "section"]),
+    (MINIMAL, "profile.family=nonsense", ["`profile.family`", "'nonsense'", "cic", "ee"]),
+    (MINIMAL, "scene.drive=Torqe", ["did you mean torque?"]),
+    (MINIMAL, "constraints.area_efficiency_min=much", ["one of 'baseline' or a number"]),
+    (MINIMAL, "optimizer.bounds.involute_length_mm=[1, 2, 3]", ["two numbers"]),
+    (MINIMAL, "optimizer.bounds.involute_length_mm=[a, b]", ["bounds.involute_length_mm"]),
+    # Values out of range.
+    (MINIMAL, "profile.lobes=7", ["`profile.lobes` must be at most 6", "but is 7"]),
+    (MINIMAL, "profile.pressure_angle_deg=90", ["must be less than 90"]),
+    (MINIMAL, "scene.speed_rpm=0", ["`scene.speed_rpm` must be greater than 0"]),
+    (MINIMAL, "solver.rtol=1e-13", ["`solver.rtol` must be at least 1e-12"]),
+    (MINIMAL, "constraints.area_efficiency_min=2", ["less than 1"]),
+    (MINIMAL, "optimizer.bounds.involute_length_mm=[9, 4]", ["bounds.involute_length_mm"]),
+    (MINIMAL, "optimizer.bounds.tip_arc_angle_deg=[4, 4]", ["such as [4, 4.004]"]),
+    (MINIMAL, "objective={mean_weight: 0, peak_weight: 0}", ["must not all be 0"]),
+    (MINIMAL, "objective.line_weights={1: 2e6}", ["at most 1e+06"]),
+    (MINIMAL, "objective.line_weights={0: 1}", ["greater than 0"]),
+    (MINIMAL, "objective.line_weights={1: 1, '1': 2}", ["line_weights"]),
+    (MINIMAL, f"objective.line_weights={{{MANY}}}", ["most 32"]),
+    (MINIMAL, f"response.lines={list(range(1, 40))}", ["at most 32"]),
+    (MINIMAL, "attractors.relative_range_mrad=[-.inf, .inf]", ["finite"]),
+    (MINIMAL, "scene.speed_rpm=" + "9" * 399, ["ordinary size"]),
+    (MINIMAL, "profile.outline_file='a\tb\u0007'", ["outline_file"]),
+    (ARC, "optimizer.bounds.arc_center_mm=[0.02, 0.03]", ["metres? write 30"]),
+    # Overrides.
+    *((MINIMAL, one, ["--set", repr(one), "dotted.key=value"]) for one in ("x", "=5", "a..b=5")),
+    (MINIMAL, "scene.speed_rpm.deep=5", ["scene.speed_rpm"]),
+    (MINIMAL, "scene.speed_rpm=[1", ["not valid YAML"]),
+    (MINIMAL, "nothing.at.all=1", ["`nothing`"]),
+]
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "wrong", "right"),
-    [
-        ("speed_rpm", "sped_rpm", "scene.sped_rpm", "scene.speed_rpm"),
-        ("tip_arc_angle_deg", "tip_arc_angle", "profile.tip_arc_angle", "tip_arc_angle_deg"),
-        ("    torque_N_m", "    torque_Nm", "scene.load.torque_Nm", "scene.load.torque_N_m"),
-        ("rotor:", "rotors:", "rotors", "rotor"),
-    ],
-)
-def test_unknown_key_is_named_with_its_nearest_match(old, new, wrong, right):
-    """A misspelt key is rejected under its full name, with the key that was probably meant."""
-    message = refusal(with_line(old, new))
-    assert f"`{wrong}`" in message
-    assert "did you mean" in message
-    assert right in message.split("did you mean")[1]
+@pytest.mark.parametrize(("text", "override", "words"), REFUSED)
+def test_refusals_name_key_value_and_remedy(text, override, words):
+    message = refusal(text, *([] if override is None else [override]))
+    assert [word for word in words if word not in message] == []
+    assert len(message) <= 500
 
 
 @pytest.mark.parametrize(
@@ -197,62 +212,10 @@ def test_keys_of_catalogues_are_answered_with_the_right_key_and_value(override, 
     assert f"did you mean {answer}" in message
 
 
-def test_unknown_key_without_a_match_lists_the_valid_ones():
-    """If no key is similar, the message lists the valid keys of the section."""
-    message = refusal(MINIMAL, "rotor.zzz=1")
-    assert "`rotor.zzz`" in message
-    assert "length_mm" in message
-    assert "density_kg_m3" in message
-
-
-def test_key_in_the_wrong_section_is_sent_to_the_right_one():
-    """For a key in the wrong section, the message names the right section."""
-    message = refusal(MINIMAL, "rotor.speed_rpm=1000")
-    assert "`rotor.speed_rpm`" in message
-    assert "`scene.speed_rpm`" in message
-
-
-@pytest.mark.parametrize(
-    ("line", "key"),
-    [
-        ("  speed_rpm: 3000.0\n", "scene.speed_rpm"),
-        ("    torque_N_m: 1.0\n", "scene.load"),
-        ("  length_mm: 100.0\n", "rotor.length_mm"),
-        ("  exponent: 2.2\n", "contact.exponent"),
-        ("  lobes: 3\n", "profile.lobes"),
-        ("  family: cic\n", "profile.family"),
-        ("  tip_arc_angle_deg: 4.0\n", "profile.tip_arc_angle_deg"),
-    ],
-)
-def test_missing_key_is_named(line, key):
-    """The message for a missing key contains its full name."""
-    assert f"`{key}" in refusal(with_line(line, ""))
-
-
-@pytest.mark.parametrize("section", ["profile", "rotor", "contact", "scene"])
-def test_missing_section_is_named(section):
-    """The message for a missing section names it."""
-    data = yaml.safe_load(MINIMAL)
-    del data[section]
-    message = refusal(yaml.safe_dump(data))
-    assert f"`{section}`" in message
-    assert "missing" in message
-
-
-@pytest.mark.parametrize("key", ["pressure_angle_deg", "involute_length_mm", "tip_arc_angle_deg"])
-def test_keys_must_belong_to_the_family(key):
-    """The family `cic` needs its three keys; `ee` rejects them."""
-    line = next(line for line in MINIMAL.splitlines(keepends=True) if key in line)
-    message = refusal(with_line(line, ""))
-    assert f"`profile.{key}`" in message
-    assert "cic" in message
-    message = refusal(EE_PROFILE, f"profile.{key}=5.0")
-    assert f"`profile.{key}`" in message
-    assert "ee" in message
-
-
 PAIRS = [
-    pair for pair in itertools.permutations(families(), 2) if family_of(pair[0]).maker is not None
+    pair
+    for pair in itertools.permutations(families(), 2)
+    if "cic" in pair and family_of(pair[0]).maker is not None
 ]
 
 
@@ -274,135 +237,6 @@ def test_change_of_family_is_answered_by_the_overrides_that_it_needs(old, new):
     config = parse(text, [change, *overrides])
     assert config.profile.family == new
     assert config.profile.parameters.keys() == {*family_of(new).keys}
-
-
-def test_overrides_of_a_family_suit_the_size_of_the_rotor():
-    """`arc` instead of CIC needs three keys less, and one more of the rotor's own size."""
-    less = [f"--set profile.{key}=null" for key in family_of("cic").keys]
-    message = refusal(MINIMAL, "profile.family=arc", "profile.arc_center_mm=29.7")
-    assert message.endswith(f"for this family, add {' '.join(less)}")
-    sized = refusal(MINIMAL, "profile.family=arc", "profile.pitch_radius_mm=66")
-    assert sized.endswith(f"{' '.join(less)} --set profile.arc_center_mm=59.4")
-
-
-# Wrong values
-
-
-@pytest.mark.parametrize("value", ["fast", "'3000'", "true", "[1, 2]", "{a: 1}", "null", "~", ""])
-def test_what_is_no_number_is_refused(value):
-    """Text, booleans, lists, sections and an empty value are not a speed."""
-    message = refusal(with_line("speed_rpm: 3000.0", f"speed_rpm: {value}"))
-    assert "`scene.speed_rpm` must be a number" in message
-    assert repr(yaml.safe_load(value)) in message
-
-
-@pytest.mark.parametrize("value", ["2.5", "three", "true", "null", "[3]"])
-def test_number_of_lobes_is_a_whole_number(value):
-    """A fraction, a text or a boolean is rejected as number of lobes."""
-    message = refusal(with_line("lobes: 3", f"lobes: {value}"))
-    assert "`profile.lobes` must be a whole number" in message
-    assert repr(yaml.safe_load(value)) in message
-
-
-@pytest.mark.parametrize(
-    ("override", "limit"),
-    [
-        ("profile.lobes=1", "at least 2"),
-        ("profile.lobes=7", "at most 6"),
-        ("profile.pitch_radius_mm=0", "greater than 0"),
-        ("profile.pitch_radius_mm=-33", "greater than 0"),
-        ("profile.pressure_angle_deg=90", "less than 90"),
-        ("profile.pressure_angle_deg=0", "greater than 0"),
-        ("profile.tip_arc_angle_deg=-1", "at least 0"),
-        ("rotor.density_kg_m3=0", "greater than 0"),
-        ("contact.exponent=0.5", "at least 1"),
-        ("contact.clearance_mm=-0.1", "at least 0"),
-        ("contact.smoothing_mm=-1e-4", "at least 0"),
-        ("scene.speed_rpm=0", "greater than 0"),
-        ("scene.load.torque_N_m=-1", "at least 0"),
-        ("solver.rtol=1", "at most 0.01"),
-        ("solver.rtol=1e-13", "at least 1e-12"),
-        ("optimizer.iterations=0", "at least 1"),
-        ("optimizer.seed=-1", "at least 0"),
-        ("constraints.undercut_margin_min_mm=-1", "at least 0"),
-    ],
-)
-def test_value_out_of_range_is_refused_with_the_range(override, limit):
-    """The message contains key, limit and value."""
-    key, value = override.split("=")
-    message = refusal(MINIMAL, override)
-    assert f"`{key}` must be {limit}" in message
-    number = message.split("but is ")[1]
-    assert float(number) == float(value)
-
-
-@pytest.mark.parametrize("value", [".nan", ".inf", "-.inf"])
-@pytest.mark.parametrize(
-    "key",
-    [
-        "profile.pitch_radius_mm",
-        "profile.pressure_angle_deg",
-        "profile.tip_arc_angle_deg",
-        "contact.exponent",
-        "contact.smoothing_mm",
-        "scene.speed_rpm",
-        "scene.load.torque_N_m",
-        "solver.rtol",
-        "constraints.area_efficiency_min",
-    ],
-)
-def test_nan_and_infinity_are_refused(key, value):
-    """No quantity may be NaN or infinite."""
-    message = refusal(MINIMAL, f"{key}={value}")
-    assert f"`{key}`" in message
-    assert value.strip("-.") in message
-
-
-@pytest.mark.parametrize(
-    ("key", "choices"),
-    [
-        ("profile.family", ("cic", "ee")),
-        ("solver.method", ("tsit5", "dopri8")),
-        ("scene.drive", ("prescribed",)),
-        ("optimizer.method", ("adam",)),
-    ],
-)
-def test_word_outside_the_choice_is_refused_with_the_choices(key, choices):
-    """The message for a wrong word lists the valid words."""
-    message = refusal(MINIMAL, f"{key}=nonsense")
-    assert f"`{key}`" in message
-    assert "'nonsense'" in message
-    assert all(choice in message for choice in choices)
-
-
-@pytest.mark.parametrize("value", ["1", "text", "[1]", "true"])
-def test_section_must_be_a_section(value):
-    """A plain value is rejected where a section belongs."""
-    message = refusal(MINIMAL, f"scene.timing_gear={value}")
-    assert "`scene.timing_gear`" in message
-    assert "section" in message
-
-
-def test_objective_needs_a_weight():
-    """An objective whose weights are all zero is rejected."""
-    message = refusal(MINIMAL, "objective.mean_weight=0", "objective.peak_weight=0")
-    assert "objective.mean_weight" in message
-    assert "objective.peak_weight" in message
-
-
-@pytest.mark.parametrize(
-    "value", ["[9, 4]", "[4, 4]", "[1]", "[1, 2, 3]", "[a, b]", "5", "[1, .nan]"]
-)
-def test_bounds_are_two_increasing_numbers(value):
-    """Bounds of the search must be (low, high)."""
-    message = refusal(MINIMAL, f"optimizer.bounds.involute_length_mm={value}")
-    assert "optimizer.bounds.involute_length_mm" in message
-
-
-def test_equal_bounds_are_refused_with_a_narrow_range():
-    """A parameter is held by a narrow range, which the message suggests."""
-    message = refusal(MINIMAL, "optimizer.bounds.tip_arc_angle_deg=[4, 4]")
-    assert "to hold it, give a narrow range, such as [4, 4.004]" in message
 
 
 # Ranges, units, choices
@@ -502,12 +336,6 @@ def test_number_in_another_unit_is_recognised(text, override, words):
     assert f"`{override.partition('=')[0]}" in message
 
 
-@pytest.mark.parametrize("value", ["0", "-33", "1e-300", "1e300", "0.0005"])
-def test_hint_is_given_only_where_it_fits(value):
-    """If a value fits in no unit, the message states only the range."""
-    assert "is that" not in refusal(MINIMAL, f"profile.pitch_radius_mm={value}")
-
-
 CHOICES = [
     ("solver.method", "dopri8", ("Dopri8", "DOPRI-8", "dopri 8")),
     ("optimizer.method", "rmsprop", ("RMSprop", "RMS prop", "rms-prop")),
@@ -559,87 +387,7 @@ def test_keys_that_are_choices_are_taken_in_any_case():
     assert "From" in message
 
 
-@pytest.mark.parametrize(
-    ("override", "word"),
-    [
-        ("profile.family=cid", "cic"),
-        ("solver.method=tsitt5", "tsit5"),
-        ("scene.drive=Torqe", "torque"),
-    ],
-)
-def test_near_miss_of_a_choice_names_what_was_meant(override, word):
-    """The message for a misspelt word suggests a valid one, as for keys."""
-    assert f"did you mean {word}?" in refusal(MINIMAL, override)
-
-
-@pytest.mark.parametrize(
-    ("override", "words"),
-    [
-        ("constraints.area_efficiency_min=2", "less than 1"),
-        ("constraints.area_efficiency_min=much", "one of 'baseline' or a number"),
-        ("optimizer.bounds.involute_length_mm=[1]", "two numbers"),
-        ("optimizer.bounds.involute_length_mm=[1, 2, 3]", "two numbers"),
-        ("objective.line_weights={1: 2e6}", "at most 1e+06"),
-        ("objective.line_weights={0: 1}", "greater than 0"),
-        ("objective.line_weights={1: 1, '1': 2}", "line_weights"),
-        ("objective.line_weights={" + ", ".join(f"{k}: 1" for k in range(1, 40)) + "}", "most 32"),
-        ("response.lines=[" + ", ".join(f"{k}" for k in range(1, 40)) + "]", "at most 32"),
-        ("attractors.relative_range_mrad=[-.inf, .inf]", "finite"),
-        ("attractors.rate_range_rad_s=[-1, 1e9]", "at most 1e+06"),
-        ("optimizer.seed=99999999999", "at most"),
-        ("objective={mean_weight: 1e-300, peak_weight: 0}", "must not all be 0"),
-        ("scene.speed_rpm=" + "9" * 399, "ordinary size"),
-        ("profile.outline_file='a\tb\u0007'", "outline_file"),
-        ("profile={family: outline, lobes: 3, pitch_radius_mm: 33, outline_file: \"a\\0b\"}",
-         "printed"),
-        ("float=1", "`float` is not a known key"),
-        ("profile.int=1", "`profile.int` is not a known key"),
-        ("'a[b'=1", "is not a known key"),
-        ("optimizer.bounds.arc_center_mm=[0.02, 0.03]", "metres? write 30"),
-    ],
-    ids=lambda text: text[:30],
-)  # fmt: skip
-def test_odd_values_have_their_words(override, words):
-    """Messages of pydantic about lists, unions and dictionaries are expressed in the words of a
-    config."""
-    text = MINIMAL
-    if "arc_center" in override:
-        arc = "profile: {family: arc, lobes: 3, pitch_radius_mm: 33, arc_center_mm: 29.7}\n"
-        text = arc + EE_PROFILE.partition("\n")[2]
-    message = refusal(text, override)
-    assert words in message
-    assert len(message) <= 500
-
-
 # Files and YAML
-
-
-def test_file_that_cannot_be_read_is_refused(tmp_path):
-    """The message names the path if it is missing, a folder, or not UTF-8 text."""
-    binary = tmp_path / "binary.yaml"
-    binary.write_bytes(MINIMAL.encode() + b"# \xff\xfe\n")
-    for path, words in (
-        (tmp_path / "absent.yaml", "no such file"),
-        (tmp_path, "folder"),
-        (binary, "UTF-8"),
-    ):
-        with pytest.raises(InputError) as caught:
-            load(path)
-        assert str(path) in str(caught.value)
-        assert words in str(caught.value)
-        assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("text", ["", "\n# only a comment\n", "---\n", "{}"])
-def test_empty_config_names_what_is_missing(text):
-    """The message for an empty file names the first required section."""
-    assert "`profile` is missing" in refusal(text)
-
-
-@pytest.mark.parametrize("text", ["- profile\n- scene\n", "just words", "42", "true"])
-def test_config_must_be_sections(text):
-    """A list or a plain value at top level is rejected."""
-    assert "sections" in refusal(text)
 
 
 @pytest.mark.parametrize(
@@ -658,20 +406,6 @@ def test_broken_yaml_is_refused_with_its_line(text, line):
     message = refusal(text)
     assert "not valid YAML" in message
     assert f"line {line}" in message or f"line {line + 1}" in message
-
-
-@pytest.mark.parametrize(
-    ("text", "key"),
-    [
-        (MINIMAL + "rotor: {length_mm: 1.0, density_kg_m3: 1.0}\n", "rotor"),
-        (MINIMAL.replace("  lobes: 3\n", "  lobes: 3\n  lobes: 4\n"), "lobes"),
-    ],
-)
-def test_key_given_twice_is_refused(text, key):
-    """A key given twice is rejected; the last one does not replace the first."""
-    message = refusal(text)
-    assert f"'{key}'" in message
-    assert "twice" in message
 
 
 # Keys and values of former versions
@@ -728,94 +462,29 @@ def test_overrides_replace_and_create_nested_keys():
     assert config.solver.method == "dopri8"
 
 
-def test_override_can_take_a_part_away():
-    """`=null` removes an optional part."""
-    text = MINIMAL + "  timing_gear: {stiffness_N_m_per_rad: 1.0e4, backlash_mm: 0.1}\n"
-    assert parse(text).scene.timing_gear is not None
-    assert parse(text, ["scene.timing_gear=null"]).scene.timing_gear is None
-
-
-@pytest.mark.parametrize("override", ["scene.speed_rpm", "=5", "scene..speed_rpm=5", ".=5", ""])
-def test_override_of_wrong_form_is_refused(override):
-    """The message asks for the form dotted.key=value and shows what was given."""
-    message = refusal(MINIMAL, override)
-    assert "--set" in message
-    assert repr(override) in message
-    assert "dotted.key=value" in message
-
-
-@pytest.mark.parametrize(
-    ("override", "words"),
-    [
-        ("scene.speed_rpm.deep=5", "scene.speed_rpm"),
-        ("scene.speed_rpm=[1", "not valid YAML"),
-        ("scene.speed_rpm=quick", "`scene.speed_rpm` must be a number, but is 'quick'"),
-        ("scene.sped_rpm=1000", "`scene.speed_rpm`"),
-        ("nothing.at.all=1", "`nothing`"),
-    ],
-)
-def test_override_with_a_bad_key_or_value_is_refused(override, words):
-    """An override is checked in the same way as the file."""
-    assert words in refusal(MINIMAL, override)
-
-
 # Geometry
 
 
-def geometry_refusal(*overrides):
+@pytest.mark.parametrize(
+    ("design", "words"),
+    [
+        ({"involute_length_mm": 9.2}, ["`profile.involute_length_mm`", "8.893", "9.2"]),
+        (
+            {"pressure_angle_deg": 89.78, "tip_arc_angle_deg": 0.475, "involute_length_mm": 17.3},
+            ["`profile.involute_length_mm` must be less than 17", "no radius"],
+        ),
+        (
+            {"pressure_angle_deg": 25, "tip_arc_angle_deg": 0, "involute_length_mm": 7.2},
+            ["`profile.involute_length_mm`", "undercut", "7.2", "25"],
+        ),
+        ({"tip_arc_angle_deg": 30}, ["`profile.tip_arc_angle_deg`", "less than 30", "but is 30"]),
+    ],
+)
+def test_geometry_that_cannot_be_made_is_refused(design, words):
     with pytest.raises(InputError) as caught:
-        check_geometry(parse(MINIMAL, overrides))
+        check_geometry(parse(MINIMAL, [f"profile.{key}={value}" for key, value in design.items()]))
     assert "\n" not in str(caught.value)
-    return str(caught.value)
-
-
-def test_sound_geometry_is_accepted():
-    """The minimal design, the paper's (1.2 % past u_max) and any EE are accepted."""
-    check_geometry(parse(MINIMAL))
-    check_geometry(parse(MINIMAL, ["profile.involute_length_mm=9.0"]))
-    for lobes in (2, 6):
-        check_geometry(parse(EE_PROFILE, [f"profile.lobes={lobes}"]))
-
-
-def test_involute_past_its_longest_is_refused():
-    """For u > u_max, the message contains key, value and the longest length (8.893 mm here)."""
-    message = geometry_refusal("profile.involute_length_mm=9.2")
-    assert "`profile.involute_length_mm`" in message
-    assert "8.893" in message
-    assert "9.2" in message
-
-
-def test_tip_arc_without_radius_is_refused():
-    """Near 90°, an involute only 1.8 % longer than the longest leaves no tip arc."""
-    message = geometry_refusal(
-        "profile.pressure_angle_deg=89.78",
-        "profile.tip_arc_angle_deg=0.475",
-        "profile.involute_length_mm=17.3",
-    )
-    assert "`profile.involute_length_mm` must be less than 17" in message
-    assert "no radius" in message
-
-
-def test_undercut_is_refused():
-    """For α below the canonical 27.64° and nearly the longest involute, the root is undercut."""
-    message = geometry_refusal(
-        "profile.pressure_angle_deg=25",
-        "profile.tip_arc_angle_deg=0",
-        "profile.involute_length_mm=7.2",
-    )
-    assert "`profile.involute_length_mm`" in message
-    assert "undercut" in message
-    assert "7.2" in message
-    assert "25" in message
-
-
-@pytest.mark.parametrize(("lobes", "limit"), [(3, 30), (6, 15)])
-def test_tip_wider_than_its_lobe_is_refused(lobes, limit):
-    """θ1 must be less than π/2N."""
-    message = geometry_refusal(f"profile.lobes={lobes}", f"profile.tip_arc_angle_deg={limit}")
-    assert "`profile.tip_arc_angle_deg`" in message
-    assert f"less than {limit}" in message
-    assert f"but is {limit}" in message
+    assert [word for word in words if word not in str(caught.value)] == []
 
 
 def test_replaced_values_take_following_defaults_along():

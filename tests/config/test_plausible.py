@@ -1,7 +1,6 @@
 """Notes on values that look as if given in another unit."""
 
 import functools
-import itertools
 import re
 from pathlib import Path
 
@@ -103,14 +102,6 @@ def test_values_in_another_unit_do_not_pass_in_silence():
     assert told > 40
 
 
-def test_zero_and_defaults_have_no_note():
-    values = ("contact.clearance_mm=0", "rotor.helix_deg=0", "scene.load.torque_N_m=0")
-    assert notes(load("cic_drawn", values)) == ()
-    large = load("cic_drawn", ["profile.pitch_radius_mm=900", "rotor.length_mm=2000",
-                         "profile.involute_length_mm=200", "scene.bearings={}"])  # fmt: skip
-    assert not [note for note in notes(large) if "distance" in note]
-
-
 def test_notes_on_swept_values_name_the_option():
     values = {"scene.speed_rpm": (1000.0, 3000.0), "scene.timing_gear.backlash_mm": (0.1, 9.0)}
     (note,) = notes_on_swept(load("cic_drawn"), values)
@@ -134,14 +125,6 @@ def test_notes_on_swept_values_name_the_option():
 def test_limits_that_no_force_can_meet_are_refused(terms, words):
     with pytest.raises(InputError, match=words):
         load("cic_drawn", [f"constraints.terms={terms}"])
-
-
-def test_limits_that_some_force_meets_are_accepted():
-    """A constant force has equal mean and peak; pulses have lines of twice their mean."""
-    for one in itertools.pairwise(("mean_force_N", "rms_force_N", "peak_force_N")):
-        load("cic_drawn", [f"constraints.terms={{{one[0]}: {{min: 20}}, {one[1]}: {{max: 20}}}}"])
-    load("cic_drawn", ["constraints.terms={line_1_force_N: {min: 20}, mean_force_N: {max: 10}}"])
-    load("cic_drawn", ["constraints.terms={peak_force_N: {max: 0}}"])
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rootsopt.commands.table import optimize
 from rootsopt.config import load
 from rootsopt.config.families import (
     Family,
@@ -25,8 +24,6 @@ from rootsopt.config.families import (
     register_family,
 )
 from rootsopt.errors import InputError
-from rootsopt.profiles import Profile
-from rootsopt.scene import Scene
 from rootsopt.scene.families import profile_of
 from tests.conformance import families as suite
 
@@ -89,36 +86,10 @@ def test_family_given_by_its_law_conforms(early_fall, holds):
     holds(early_fall.stem)
 
 
-def test_family_with_an_unrolled_iteration_has_a_note(blunt_cycloid, tmp_path, capsys):
-    text = blunt_cycloid.read_text(encoding="utf-8").replace("blunt_cycloid", "unrolled_cycloid")
-    turn = "        beyond = nu - self.tip_arc_angle\n"
-    slow = (
-        f"{turn}        for _ in range(300):\n            beyond = beyond + 0 * jnp.sin(beyond)\n"
-    )
-    assert turn in text
-    (tmp_path / "unrolled.py").write_text(text.replace(turn, slow), encoding="utf-8")
-    with for_a_time():
-        import_named(str(tmp_path / "unrolled.py"))
-        for name, notes in (("blunt_cycloid", 0), ("unrolled_cycloid", 1)):
-            Scene.from_config(load("configs/ee.yaml", [*DESIGN[1::2], f"profile.family={name}"]))
-            assert capsys.readouterr().err.count("operations for a point of a flank") == notes
-
-
 @pytest.mark.parametrize("holds", suite.CHECKS, ids=lambda one: one.__name__)
 def test_family_conforms(blunt_cycloid, holds):
     """A family from outside passes the checks of the package's own families."""
     holds(blunt_cycloid.stem)
-
-
-def test_family_without_crossing_angle_is_another(blunt_cycloid):
-    """With α = 0 it is the hypocycloid with an epicycloid and a land."""
-    shapes = [
-        suite.measure(profile_of(name, 3, jnp.asarray(suite.R), jnp.asarray(design)))
-        for name, design in ((blunt_cycloid.stem, [4.0, 0.0]), ("hypo_epicycloid", [4.0]))
-    ]
-    for key in ("outer_radius", "area", "polar_area_moment", "seal_width"):
-        one, two = (float(getattr(shape, key)) for shape in shapes)
-        assert one == pytest.approx(two, rel=1e-12)
 
 
 DESIGN = (
@@ -140,27 +111,6 @@ def test_family_is_known_to_a_command_by_its_file(blunt_cycloid, tmp_path):
     done = run(call)
     assert done.returncode == 2
     assert "crossing_angle_deg" in done.stderr
-
-
-@pytest.mark.long
-def test_family_is_optimised(blunt_cycloid, tmp_path):
-    """The optimum is better than the baseline, within the bounds of the parameters."""
-    budget = ("screening=4", "starts=1", "iterations=40")
-    given = [word for setting in budget for word in ("--set", f"optimizer.{setting}")]
-    given += ["--no-figures", "-o", str(tmp_path / "out")]
-    assert optimize.main(["configs/ee.yaml", *DESIGN, *given]) == 0
-    result = json.loads((tmp_path / "out" / "result.json").read_text(encoding="utf-8"))
-    assert result["improvement"]["objective"] > 0
-    best = load(tmp_path / "out" / "optimized.yaml").profile
-    assert best.parameters == pytest.approx(result["optimized"]["design"])
-
-
-def test_help_of_a_command_has_the_family(blunt_cycloid):
-    call = [sys.executable, "-m", "rootsopt.profile", "--import", str(blunt_cycloid)]
-    call += ["--help", "all"]
-    done = subprocess.run(call, capture_output=True, text=True, cwd=ROOT, check=True)
-    assert "parallel curve of an epicycloid" in done.stdout
-    assert "profile.crossing_angle_deg" in done.stdout
 
 
 @pytest.mark.parametrize(
@@ -247,27 +197,3 @@ def test_family_may_be_taken_back():
         load("configs/ee.yaml", text)
     with pytest.raises(InputError, match=r"'mine'; if that is a family of your own.*--import"):
         load("configs/ee.yaml", ["profile.family=mine"])
-
-
-@pytest.mark.parametrize("family", ["cic", "four_arcs", "free_form", "extended_cycloid"])
-def test_searched_normal_is_that_of_the_closed_form(family):
-    """The searched normal angle equals the closed form, and so do its derivatives."""
-    row = families()[family]
-    values = [np.atleast_1d(row.example[key]) for key in row.keys]
-    design = jnp.asarray(np.concatenate(values))
-
-    def at(design, beta, search):
-        profile = profile_of(family, 3, jnp.asarray(suite.R), design)
-        return search(profile, beta)
-
-    stop = float(suite.made(family).half_pitch)
-    beta = jnp.linspace(0.05, 0.999, 101) * stop
-    ways = (design, jnp.ones_like(beta))
-    found, wanted = (
-        jax.jit(lambda d, b, search=search: jax.jvp(lambda *x: at(*x, search), (d, b), ways))(
-            design, beta
-        )
-        for search in (Profile.normal_at, lambda profile, beta: profile.normal_at(beta))
-    )
-    for one, two in zip(found, wanted, strict=True):
-        np.testing.assert_allclose(one, two, rtol=1e-9, atol=1e-9)

@@ -8,7 +8,6 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -18,7 +17,6 @@ import pytest
 from experiments._common.shooting import closed, differentiated
 from rootsopt import steady_response
 from rootsopt.config import load
-from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.parts import Context
 from rootsopt.scene import Scene
 from rootsopt.status import Status
@@ -109,60 +107,6 @@ def test_the_coupling_conforms(page, model, design):
 def test_the_law_conforms(page, model):
     law = model.with_law(page.law.HuntCrossley(**LAW)).law
     check_law(law, 2e-5, 3.0)
-
-
-@eqx.filter_jit
-def balance(pair, start, how):
-    """Return the change of the energy (J) over a mesh period, and the work of all loads.
-
-    The work is that of drive, load, dampers and contact."""
-    (coupling,), gear = pair.parts, pair.gear
-
-    def energy(tau, state):
-        motion, own = pair.motion(tau, state), pair.own_states(state)[-1]
-        other = motion.speed + motion.rate
-        kinetic = pair.inertia * (motion.speed**2 + other**2) / 2
-        return kinetic + stored(coupling, motion, own)
-
-    def slope(tau, y, _):
-        state = y[:-4]
-        change, contact = pair.derivative(tau, state)
-        motion, own = pair.motion(tau, state), pair.own_states(state)[-1]
-        other = motion.speed + motion.rate
-        hold = gear(motion.relative, motion.rate)
-        powers = [
-            transmitted(coupling, motion, own),
-            -pair.load.torque * other,
-            -damped(coupling, motion, own),
-            # Work that gear and contact take; their springs return part of it.
-            contact.torque1 * motion.speed + contact.torque2 * other - hold * motion.rate,
-        ]
-        lapse = pair.lapse(state) * pair.mesh_period
-        return jnp.concatenate([change, lapse * jnp.stack(powers)])
-
-    solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(slope), how.solver(), 0.0, 1.0, None, jnp.pad(start, (0, 4)),
-        stepsize_controller=diffrax.PIDController(how.rtol, how.rtol), max_steps=how.max_steps,
-        adjoint=diffrax.ForwardMode(),
-    )  # fmt: skip
-    end = solution.ys[-1]
-    change = energy(jnp.ones(()), end[:-4]) - energy(jnp.zeros(()), start)
-    return change, end[-4:], end[:-4]
-
-
-def test_energy_balance_with_a_part_of_ones_own(page, model, design):
-    """Kinetic energy and energy of the coupling change by the work of all other loads, to 1e-8."""
-    scene = model.with_parts(page.coupling.FlexibleCoupling(**COUPLING))
-    scene = scene.with_law(page.law.HuntCrossley(**LAW))
-    pair = built(scene, design)
-    assert pair.states == 4
-    start = jnp.asarray([-0.6, 0.3, 0.4, 0.3])
-    change, work, end = balance(pair, start, Integrator("dopri8", jnp.asarray(1e-11), 20000))
-    work = np.asarray(work)
-    assert np.all(np.abs(work) > 1e-4)
-    assert work[2] < 0
-    assert float(change) == pytest.approx(work.sum(), abs=1e-8 * np.abs(work).max())
-    assert abs(end[3]) < 10
 
 
 @pytest.mark.long

@@ -1,25 +1,17 @@
 """Tests of the exactness of the search, and of batches."""
 
-import dataclasses
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from experiments._common.batch import coarse, respond_many
-from experiments._common.polygons import pair_gap
-from rootsopt.config import load, parse
+from rootsopt.config import parse
 from rootsopt.contact.closest import FlankPair
 from rootsopt.errors import InputError
 from rootsopt.profiles import CIC, EE, FreeForm
 from rootsopt.profiles.geometry import margins
-from rootsopt.response.evaluation import Evaluator
 from rootsopt.scene.families import check, profile_of
-from rootsopt.status import Status
 
 R = 0.033
 DEG = np.pi / 180
@@ -45,7 +37,7 @@ def poses(count, half, seed=0):
 
 
 @every_profile
-@pytest.mark.parametrize("error_mm", [-0.3, 0.0, 0.3])
+@pytest.mark.parametrize("error_mm", [-0.3, 0.3])
 def test_root_is_found_to_twelve_digits(name, error_mm):
     """T vanishes to 1e-12 of the pitch radius over ±20 mrad and ±0.3 mm of centre distance.
 
@@ -60,82 +52,6 @@ def test_root_is_found_to_twelve_digits(name, error_mm):
     assert np.quantile(offset[touching], 0.995) < 1e-12
     # At a kink inside the bracket, the error of the gap is T² divided by the curvature.
     assert np.max(offset[touching]) < 1e-6
-
-
-gap_of = eqx.filter_jit(lambda pair, roll, relative: pair(roll, relative).gap)
-
-
-@pytest.mark.parametrize(
-    "name", ["paper", *(pytest.param(n, marks=pytest.mark.long) for n in ("short", "epicycloid"))]
-)
-@pytest.mark.parametrize("error_mm", [0.0, pytest.param(0.3, marks=pytest.mark.long)])
-def test_gap_is_that_of_nodes_far_out(graded_outline, name, error_mm):
-    """The gap agrees with node search, which uses no flanks: ±20 mrad, wrong centre distance."""
-    profile, distance = PROFILES[name], 2 * R + error_mm * 1e-3
-    pair = FlankPair.of(profile, jnp.asarray(distance))
-    outline = graded_outline(profile, 6000)
-    rng = np.random.default_rng(1)
-    checked = 0
-    for _ in range(40):
-        mean, relative = rng.uniform(0, 2 * np.pi), rng.uniform(-0.02, 0.02)
-        drive = float(gap_of(pair, jnp.asarray(-mean), jnp.asarray(relative)))
-        coast = float(gap_of(pair, jnp.asarray(mean), jnp.asarray(-relative)))
-        flank = min(drive, coast)
-        # With a centre distance error, lands may touch too; only greater depths belong to flanks.
-        if flank > -2e-5:
-            continue
-        phi1, phi2 = mean - relative / 2, mean + relative / 2
-        nodes = pair_gap(outline, 3, distance, phi1, phi2, reach=2e-3)
-        # Nodes, and the parabola through three of them, are inaccurate where the epicycloid's
-        # radius of curvature vanishes; the search is the deeper one there.
-        resolution = 2e-4 * abs(nodes) if name == "epicycloid" else 0.0
-        assert flank == pytest.approx(nodes, rel=0, abs=max(2e-8, resolution))
-        checked += 1
-    assert checked > 5
-
-
-@eqx.filter_jit
-def both_searches(pair, roll, relative):
-    """Return whether Newton's method is reliable, and the results of Newton and of nodes, at many
-    poses."""
-
-    def one(roll, relative):
-        attempts, best = pair._search(roll, relative)
-        return attempts == 1, best, pair._search(roll, relative, attempt=1)[1]
-
-    return jax.vmap(one)(roll, relative)
-
-
-@pytest.mark.long
-@given(
-    lobes=st.integers(2, 4),
-    above=st.floats(0.1, 20.0),
-    share=st.floats(0.02, 1.0),
-    tip=st.floats(0.0, 0.4),
-    cycloid=st.booleans(),
-    seed=st.integers(0, 10**6),
-)
-def test_newton_finds_what_the_nodes_find(lobes, above, share, tip, cycloid, seed):
-    """Newton's method finds the closest approach wherever it is reliable, and never misses a
-    contact.
-
-    `above`: pressure angle (°) at which the longest involute undercuts; lobes that cut into each
-    other touch everywhere."""
-    half = np.pi / (2 * lobes)
-    angle = np.degrees(np.arctan(half)) + above
-    longest = R * np.sin(angle * DEG) * half * (1 - tip)
-    profile = EE(lobes, R) if cycloid else CIC(lobes, R, angle * DEG, share * longest, tip * half)
-    rng = np.random.default_rng(seed)
-    roll = jnp.asarray(rng.uniform(-half, half, 4000))
-    relative = jnp.asarray(-(10 ** rng.uniform(-7, np.log10(5e-3), 4000)))
-    found = both_searches(FlankPair.of(profile), roll, relative)
-    certain, best, of_nodes = jax.tree.map(np.asarray, found)
-    assert np.mean(certain) > 0.5
-    both = certain & best.found & of_nodes.found
-    assert np.max(np.abs(best.gap - of_nodes.gap), where=both, initial=0.0) < 1e-13
-    touching = of_nodes.found & (of_nodes.gap < 0)
-    assert not np.any(touching & certain & ~best.found)
-    assert not np.any(certain & best.found & ~of_nodes.found & (best.gap < 0))
 
 
 WAVY = (1.0, 0.9463, 0.666, 0.8701, 1.0, 0.7063, 0.503, 0.5937, 0.7152, 0.847, 0.9257, 0.2332)
@@ -157,7 +73,7 @@ def _sampled(pair, roll, relative):
     return jax.lax.map(one, (roll, relative))
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_deepest_of_several_minima_is_found_on_a_wavy_flank(seed):
     """The search finds the deepest of several minima, and the rank tells which one it is.
 
@@ -243,42 +159,3 @@ def test_second_derivatives_are_those_of_the_gap(name):
             differences * R / np.outer(scale, scale),
             atol=1e-5 * size,
         )
-
-
-# Batches
-
-
-@pytest.fixture(scope="module")
-def default():
-    """Return evaluator and evaluation of the shipped scene."""
-    evaluator = Evaluator.of(load("configs/cic_drawn.yaml"))
-    return evaluator, evaluator(series=False)
-
-
-DESIGNS = jnp.array([[36.43, 9.0, 4.0], [28.0, 3.0, 1.5], [30.0, 4.0, 2.0]])
-
-
-@pytest.mark.long
-def test_batch_is_the_designs_one_by_one(default):
-    """Responses and gradients of a batch equal those of its designs alone.
-
-    A design that has no time to settle is marked, and does not affect the others."""
-    evaluator, _ = default
-    designs = DESIGNS
-    given = evaluator.scene.solver
-    solver = coarse(evaluator.scene, given.transient, given.orbit)
-    batch = respond_many(evaluator.scene, designs, jnp.zeros((3, 2)), solver)
-    assert [Status.of(code) for code in batch.status] == [Status.PERIODIC] * 3
-    for row, design in enumerate(designs):
-        single = evaluator(design, series=False)
-        np.testing.assert_allclose(batch.response[row], list(single.response.values()), rtol=1e-5)
-        for line, values in zip(batch.gradient[row], single.gradient.values(), strict=True):
-            expected = np.array(list(values.values()))
-            np.testing.assert_allclose(line, expected, atol=0.01 * np.max(np.abs(expected)))
-    lost = dataclasses.replace(evaluator.scene, load_torque=jnp.asarray(3000.0))
-    failed = respond_many(lost, designs, jnp.zeros((3, 2)), solver)
-    assert not np.any(failed.usable)
-    assert np.all(np.isnan(failed.response))
-    apart = dataclasses.replace(evaluator.scene, clearance=jnp.asarray(3e-4))
-    idle = respond_many(apart, designs, jnp.zeros((3, 2)), solver)
-    assert [Status.of(code) for code in idle.status] == [Status.IDLE] * 3

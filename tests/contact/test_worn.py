@@ -8,14 +8,11 @@ import pytest
 import rootsopt
 from rootsopt import InputError, Scene
 from rootsopt.contact.worn import WornContact, series_at, wear_series, wear_shape
-from rootsopt.profiles import EE, geometry
-from rootsopt.pump.leakage import leakage
+from rootsopt.profiles import EE
 from rootsopt.response.scatter import draw, shifts
 from tests.conformance.families import LOBES, R, made
 
 BASE = ("contact.clearance_mm=0.05", "contact.wear={}", "scene.heat={}")
-PUMP = "pump={viscosity_mPa_s: 1, pressure_difference_Pa: 1e4, tip_clearance_mm: 0.1, "
-PUMP += "end_clearance_mm: 0.1}"
 
 
 def scene_of(*changes: str) -> tuple[rootsopt.Config, Scene]:
@@ -97,33 +94,6 @@ def test_offset_and_heat_are_clearances():
     assert plain.wear is None
     assert plain.center_distance_error is None
     assert not isinstance(plain.contact(made("cic")), WornContact)
-
-
-def test_hot_rotors_leak_less_and_worn_ones_more():
-    design = jnp.array([36.43, 9.0, 4.0])
-
-    def found(*changes):
-        _, scene = scene_of(PUMP, *changes)
-        profile = scene.profile(design)
-        return leakage(scene, scene.medium, profile, geometry(profile))
-
-    new = found()
-    hot, worn, less = (
-        found("scene.heat.rotor_warming_K=40"),
-        found("contact.wear.depth_mm=0.03"),
-        found("contact.wear.offset_mm=0.01"),
-    )
-    for name in ("mesh", "tips", "ends"):
-        assert getattr(hot, name) < getattr(new, name)
-    # To the third power of the gaps at the end faces: 100 mm · 4.4e-4 / 2 less of 0.1 mm.
-    ends = float(hot.ends / new.ends)
-    assert ends == pytest.approx((1 - 1.1e-5 * 40 * 100 / 2 / 0.1) ** 3, rel=1e-9)
-    assert worn.mesh > new.mesh
-    assert worn.tips == new.tips
-    assert less.mesh > new.mesh
-    assert less.tips > new.tips
-    assert float(jnp.max(worn.gap.least - new.gap.least)) == pytest.approx(3e-5, rel=0.05)
-    np.testing.assert_allclose(less.gap.least - new.gap.least, 2e-5, rtol=1e-9)
 
 
 CONDITIONS = (

@@ -1,10 +1,5 @@
 """Tests of periodic orbits of the rotor pair, followed through folds and period doublings."""
 
-import csv
-import json
-import os
-import subprocess
-import sys
 import types
 
 import diffrax
@@ -14,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments._common.shooting import closed
 from rootsopt.config import load
 from rootsopt.continuation import End, Kind, StepSizes, follow, follow_doubled
 from rootsopt.continuation.arclength import StoppedError
@@ -164,16 +158,6 @@ def test_plane_holds_the_place(branch):
         assert spot.along(start.tangent).orientation == start.orientation
 
 
-def test_tangent_is_the_derivative_along_the_curve(branch):
-    start = start_of(branch)
-    ends = [
-        branch.family(start.place + step * start.tangent, start.tangent, start).place
-        for step in (1e-4, -1e-4)
-    ]
-    chord = ends[0] - ends[1]
-    np.testing.assert_allclose(chord / np.linalg.norm(chord), start.tangent, atol=1e-5)
-
-
 @pytest.mark.parametrize("wrong", [True, False])
 def test_orbit_to_which_its_neighbour_does_not_lead(branch, monkeypatch, wrong):
     """It is closed from an integration, whether its neighbour leads to none or to a wrong one.
@@ -215,16 +199,13 @@ MOTOR = (
     ("name", "changes", "key", "ends"),
     [
         ("cic_drawn", (), SPEED, (2000, 4000)),
-        ("cic_drawn", (), TORQUE, (1, 10)),
         ("cic_drawn", (), BACKLASH, (0.05, 0.4)),
-        ("cic_drawn", (), "scene.timing_gear.damping_ratio", (0.1, 0.6)),
         ("cic_drawn", (f"{ECCENTRICITY}=5",), ECCENTRICITY, (1, 20)),
         ("cic_drawn", (), INVOLUTE, (5, 9)),
         ("free", (), "profile.coefficients_2", (0.2, 0.4)),
         ("ee", (), "contact.clearance_mm", (0.0, 0.01)),
         ("pump", (), "scene.load.pressure_difference_Pa", (1e4, 4e4)),
         ("cic_drawn", MOTOR, TORQUE, (1, 10)),
-        ("ee", TWISTED, "rotor.helix_deg", (5, 40)),
         ("ee", (*TWISTED, "optimizer.bounds.helix_deg=[0, 90]"), "rotor.helix_deg", (5, 40)),
     ],
 )
@@ -338,56 +319,3 @@ def test_a_design_ends_where_no_profile_can_be_made(branch):
     assert path.ends[1] is End.NO_GEOMETRY
     assert path.points[-1].value == pytest.approx(9.071, abs=2e-3)
     assert max(point.residual for point in path.points) < 1e-9
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("name", "changes", "key", "limits"),
-    [
-        ("cic_drawn", (), SPEED, (2900, 3100)),
-        ("cic_drawn", (), INVOLUTE, (5, 9)),
-        ("ee", (), BACKLASH, (0.02, 0.4)),
-        ("pump", (), "scene.load.pressure_difference_Pa", (3e4, 6e4)),
-        ("cic_drawn", MOTOR, TORQUE, (1, 10)),
-    ],
-)
-def test_orbits_are_those_by_shooting(name, changes, key, limits):
-    config = load(f"configs/{name}.yaml", list(changes))
-    start = Evaluator.of(config)(series=False)
-    assert start.usable
-    period = start.steady_state["period"]
-    path = follow(config, key, start.state, period, StepSizes(*limits, points=3))
-    for point in path.points[::2]:
-        moved = config.moved({key: point.value})
-        other = closed(Evaluator.of(moved).pair(moved.design), point.state, period)
-        np.testing.assert_allclose([point.mean, point.peak, point.rms], other.forces, rtol=2e-6)
-        np.testing.assert_allclose(other.state, point.state, rtol=1e-5, atol=1e-6)
-        assert np.max(np.abs(point.multipliers)) == pytest.approx(other.multiplier, abs=2e-5)
-
-
-@pytest.mark.long
-def test_experiment(tmp_path):
-    """The reduced run finds a fold with two stable orbits beside it, and writes its files."""
-    command = [sys.executable, "-m", "experiments", "bifurcation", "--quick", "-o", str(tmp_path)]
-    environment = os.environ | {"JAX_PLATFORMS": "cpu"}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    with open(tmp_path / "bifurcation.csv", newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert {row["stable"] for row in rows} == {"true", "false"}
-    assert all(float(row["residual"]) < 1e-9 for row in rows)
-    assert all(
-        (np.hypot(float(row["multiplier_1_real"]), float(row["multiplier_1_imag"])) < 1)
-        for row in rows
-        if row["stable"] == "true"
-    )
-    with open(tmp_path / "special_points.csv", newline="") as file:
-        kinds = {row["kind"] for row in csv.DictReader(file)}
-    assert "fold" in kinds
-    result = json.loads((tmp_path / "bifurcation.json").read_text())
-    (diagram,) = result["diagrams"]
-    assert diagram["stable"]["noisy"]
-    assert diagram["stable"]["several"]
-    assert "rootsopt" in result["versions"]
-    for name in ("speed", "ranges"):
-        assert (tmp_path / f"bifurcation_{name}.png").read_bytes()[:4] == b"\x89PNG"

@@ -94,6 +94,7 @@ def test_members_of_a_family_are_found_again():
     assert found.record()["departure_um"] == found.departure * 1e6
 
 
+@pytest.mark.long
 def test_no_optimiser_finds_a_nearer_member():
     """Nelder and Mead's search, from the found member and beside it, finds no nearer one.
 

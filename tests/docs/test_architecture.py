@@ -4,11 +4,9 @@ import ast
 import functools
 import re
 import tomllib
-from pathlib import Path
 
 import pytest
 
-from rootsopt.config.families import families
 from tests.docs.blocks import DOCS, ROOT
 
 PAGE = (DOCS / "architecture.md").read_text(encoding="utf-8")
@@ -72,34 +70,3 @@ def test_modules_of_a_row_exist(row):
         inside = any(name in names_of(path) for path in folder.rglob("*.py"))
         below = any(is_module(path / name) for path in [folder, *folder.iterdir()])
         assert inside or below, f"rootsopt/{package} has no {name}"
-
-
-def test_paths_exist():
-    """A path is inside the package or the repository; one without a folder is beside the last."""
-    folder, found = PACKAGE, 0
-    for path in code_in(PAGE):
-        if not re.fullmatch(r"[\w/]+(\.py|\.toml|/)|docs/\w+|\w+/__main__", path):
-            continue
-        places = [base / path for base in (PACKAGE, ROOT, folder)]
-        there = [one for one in places if one.exists() or one.with_suffix(".py").is_file()]
-        assert there, path
-        folder, found = there[0].parent, found + 1
-    assert found > 15
-
-
-def test_calls_and_attributes_exist():
-    """`Scene.profile(design)` is a method of a class; `config.design` is a property."""
-    defined = set().union(*(names_of(path) for path in PACKAGE.rglob("*.py")))
-    keys = {f"profile.{key}" for one in families().values() for key in one.keys}
-    outside = {"jax.jvp", "scipy.stats", "constraints.terms", "pyproject.toml", "certificate.py"}
-    for text in {*code_in(PAGE)} - keys - outside:
-        if "/" in text or not re.match(r"\w+[.(]|[A-Z]\w+$", text):
-            continue
-        words = re.findall(r"[A-Za-z_]\w+", text.split("(...)")[0])
-        for word in {*words} - {"scene", "config"}:
-            assert word in defined, text
-
-
-def test_pages_of_the_table_exist():
-    for target in re.findall(r"\]\(([^)]+)\)", PAGE):
-        assert (DOCS / target).resolve().exists() or Path(target).is_absolute(), target

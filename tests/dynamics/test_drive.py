@@ -13,13 +13,6 @@ from tests.scene.test_scene import MOTOR, pair_of
 from tests.standins import INERTIA, LOAD, LOBES, SCALE, SPEED, oscillator
 
 
-def test_a_motor_follows_its_line():
-    motor = MotorDrive(*(jnp.asarray(x) for x in (300.0, 5.0, 0.1, 0.0)))
-    assert float(motor.torque_at(jnp.asarray(300.0))) == 5.0
-    assert float(motor.torque_at(jnp.asarray(290.0))) == pytest.approx(6.0)
-    assert float(motor.torque_at(jnp.asarray(380.0))) == pytest.approx(-3.0)
-
-
 def test_a_motor_without_torque_of_its_own_balances_the_load():
     """A constant load acts on rotor 2 alone, gas on both rotors."""
     pair, config = pair_of(MOTOR)

@@ -10,12 +10,11 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import rootsopt
-from rootsopt.contact.impact import balanced_ramp, balanced_step
 from rootsopt.dynamics.closed import Start, steady_motion
 from rootsopt.dynamics.flow import one_period, strobe
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.measures import Measures
-from rootsopt.dynamics.parts import GearErrors, Part
+from rootsopt.dynamics.parts import GearErrors
 from rootsopt.dynamics.steady import Solver
 from rootsopt.dynamics.timescales import Timescales
 from rootsopt.dynamics.window import lyapunov
@@ -110,69 +109,12 @@ def test_every_way_of_integrating_keeps_the_phase():
     np.testing.assert_allclose(window.end, states[15], atol=1e-4)
 
 
-class Plain(Part):
-    """A timing gear that knows of no errors."""
-
-    stiffness: jax.Array
-    damping: jax.Array
-    half_backlash: jax.Array
-    rounding: jax.Array
-
-    def torque(self, relative, rate):
-        excess = jnp.abs(relative) - self.half_backlash
-        engaged = jnp.where(
-            self.rounding > 0,
-            balanced_step(excess / jnp.where(self.rounding > 0, self.rounding, 1.0)),
-            jnp.where(excess > 0, 1.0, 0.0),
-        )
-        spring = self.stiffness * jnp.sign(relative) * balanced_ramp(excess, self.rounding)
-        return spring + self.damping * engaged * rate
-
-    def torque_on_2(self, motion, own):
-        del own
-        return -self.torque(motion.relative, motion.rate)
-
-    def margins(self, motion, own):
-        del own
-        excess = jnp.abs(motion.relative) - self.half_backlash
-        return excess - jnp.stack([jnp.zeros_like(self.rounding), self.rounding])
-
-    def switches(self, motion, own):
-        return self.margins(motion, own) > 0
-
-    @property
-    def edges(self):
-        return 0.0 + self.half_backlash, 0.0 - self.half_backlash
-
-
-def test_absent_errors_add_nothing():
-    """Without errors, programs are those of a gear that knows of none."""
-    scene = Scene.from_config(rootsopt.load_config("cic_drawn"))
-    pair = scene.pair(jnp.asarray(rootsopt.load_config("cic_drawn").design))
-    assert pair.later(2) is pair
-    assert pair.repeats == 1
-    gear = pair.gear
-    plain = Plain(gear.stiffness, gear.damping, gear.half_backlash, gear.rounding)
-    plain = eqx.tree_at(lambda p: p.gear, pair, plain)
-    programs = []
-    for own in (pair, plain):
-        numbers, static = eqx.partition(own, eqx.is_array)
-
-        def whole(numbers, static=static):
-            own = eqx.combine(numbers, static)
-            strobed = strobe(own, jnp.zeros(2), 4, HOW, (4, np.array([0.5])))
-            window = lyapunov(own, jnp.zeros(2), 16, HOW)
-            return strobed, window, own.derivative_and_margins(jnp.zeros(()), jnp.zeros(2))
-
-        programs.append(str(jax.make_jaxpr(whole)(numbers)))
-    assert programs[0] == programs[1]
-
-
 def _leaves(scene):
     errors = scene.gear.errors
     return errors.eccentricity, errors.angle, scene.gear.half_backlash
 
 
+@pytest.mark.long
 def test_gradient_of_forces_is_that_of_differences():
     """Flanks in contact: derivatives by eccentricities, angles, backlash and pressure angle."""
     changes = ["eccentricity_um=[10, 4]", "eccentricity_angle_deg=[30, -50]"]

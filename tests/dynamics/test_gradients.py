@@ -14,9 +14,10 @@ from rootsopt.profiles.epicycloid import EE
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.sensitivity import by_scene
 from rootsopt.status import Status
+from tests.dynamics.test_measures import ALL
 
 FORCES = ("mean_force_N", "peak_force_N", "rms_force_N")
-SHARP = ("solver.rtol=1e-12", "response.lines=[1, 2]", "objective.peak_norm=16")
+SHARP = ("solver.rtol=1e-12", *ALL)
 SCENES = {
     "shipped": (),
     "slow, loaded": ("scene.speed_rpm=1500", "scene.load.torque_N_m=10"),
@@ -27,9 +28,6 @@ SCENES = {
     ),
 }
 CIC = [(36.43, 9.0, 4.0), (36.43, 8.0, 4.0), (30.0, 5.0, 2.0)]
-# Lobes of EE. The deeper of two contacts beside the cusp at the pitch point changes, and the force
-# jumps: without that in the derivative it is 4e-6 off with three lobes, 4e-5 with four.
-EE_LOBES = [*(pytest.param(n, marks=pytest.mark.long) for n in (2, 3)), 4]
 OF_SCENE = ("scene.speed_rpm", "scene.load.torque_N_m", "scene.timing_gear.backlash_mm")
 STEP = 1e-3
 """Greatest relative step. Extrapolated differences agree from 2e-3 down to 2e-4; below, they show
@@ -54,8 +52,9 @@ def errors(config, levels=3):
     found = {}
     for name, truth in zip(here.response, np.stack(columns, axis=1), strict=True):
         slope = design * list(here.gradient[name].values())
-        found[name] = np.max(np.abs(slope - truth)) / np.max(np.abs(truth))
-    assert len(found) == 6
+        if np.any(truth):  # not a line between those of an orbit that repeats every mesh period
+            found[name] = np.max(np.abs(slope - truth)) / np.max(np.abs(truth))
+    assert len(found) == 7
     return found
 
 
@@ -70,11 +69,15 @@ def test_cic(scene, design):
     assert max(found.values()) < 1e-6, found
 
 
-@pytest.mark.parametrize("lobes", EE_LOBES)
+@pytest.mark.long
+@pytest.mark.parametrize("lobes", [2, 3, 4])
 @pytest.mark.parametrize("scene", SCENES)
 def test_ee(scene, lobes):
     """Derivatives with respect to speed, load and backlash are correct for a profile without
-    parameters."""
+    parameters.
+
+    The deeper of two contacts beside the cusp at the pitch point changes, and the force jumps:
+    without that in the derivative it is 4e-6 off with three lobes, 4e-5 with four."""
     config = load("configs/ee.yaml", [*SCENES[scene], f"profile.lobes={lobes}"])
     evaluator = Evaluator.of(config).at_tolerance(1e-11)
     here = evaluator(series=False)

@@ -4,13 +4,9 @@ import numpy as np
 import pytest
 
 from rootsopt import load_config
-from rootsopt.dynamics import maxima
 from rootsopt.dynamics.maxima import candidates, shoulders
 from rootsopt.dynamics.steady import SAMPLES
-from rootsopt.dynamics.varied import VariedOrbit
-from rootsopt.response import evaluation
 from rootsopt.response.evaluation import Evaluator
-from rootsopt.response.starts import begun
 
 _STEP = 2e-4
 """Step of the differences, in config units."""
@@ -56,27 +52,6 @@ def test_gradients_are_those_of_differences(evaluator, found):
             above, below = (one.forces[np.argmin(np.abs(one.times - time))] for one in sides)
             scale = np.abs(maxima.slopes).max()
             assert slope[k] == pytest.approx((above - below) / (2 * _STEP), abs=1e-4 * scale)
-
-
-def test_without_request_there_are_none(evaluator):
-    """Without a request, no maxima are computed and no further program is compiled."""
-    plain = Evaluator.of(evaluator.config)
-    assert not plain.maxima
-    assert plain.with_maxima().maxima
-
-
-def test_prepared_programs_are_those_that_are_called(evaluator, found):
-    """Programs prepared from shapes alone, before there is an orbit, are the ones used later."""
-    scene = evaluator.scene
-    pair, tangents, _ = evaluator.assembled()
-    begin = begun(pair, found.start, scene.solver.max_orbit)
-    start = pair, tangents, begin, scene.pitch_radius, evaluator.solver
-    shape = evaluation._motion.result_shape(*start)
-    programs = maxima._forces, maxima._located
-    called = [set(program._made) for program in programs]
-    orbit = VariedOrbit(shape.known.elements, shape.orbit.variation)
-    maxima.prepare_maxima(pair, tangents, orbit)
-    assert [set(program._made) for program in programs] == called
 
 
 def test_candidates_are_told_apart():

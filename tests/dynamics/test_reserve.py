@@ -4,7 +4,6 @@ and of searches that simulate nothing."""
 import functools
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -141,6 +140,7 @@ def test_torque_of_a_gear_of_flanks_that_strike():
         assert found.response[f"{name}gear_torque_N_m"] == pytest.approx(value, rel=5e-3)
 
 
+@pytest.mark.long
 def test_pure_response_has_a_reserve_with_derivatives():
     """With a constant load, the motion only moves: all derivatives have closed forms."""
     config = load("cic_drawn", [*APART, "response.reserve=true"])
@@ -187,36 +187,6 @@ def test_share_of_machines_that_touch_has_a_closed_form():
     assert record["simulated_touching"] == record["model_touching"]
     apart = found.simulated > 0
     assert found.simulated[apart] == pytest.approx(found.model[apart], abs=0.05)
-
-
-WARM = [
-    *APART,
-    "scene.heat={rotor_warming_K: 0, housing_warming_K: 0}",
-    "scene.center_distance_error_mm=0",
-    "contact.wear={offset_mm: 0, depth_mm: 0}",
-]
-
-
-def least_gap(*changes):
-    """Return the least gap (µm) of a pair that the gear holds at a constant ε, at 400 instants."""
-    config = load("cic_drawn", [*WARM, *changes])
-    pair = Scene.from_config(config).pair(jnp.asarray(config.design))
-    state = jnp.zeros(2).at[0].set(-swing(config) / pair.angle_scale)
-    times = jnp.linspace(0, 1, 400, endpoint=False)
-    depths = eqx.filter_jit(jax.vmap(lambda tau: pair.contact_at(tau, state).depth))(times)
-    return -1e6 * float(jnp.max(depths))
-
-
-def test_heat_and_wear_change_the_reserve_as_their_gaps():
-    """Wear by a of each rotor opens the gap by 2 a; a warmer rotor closes it as a housing does that
-    is closer by 2 r α ΔT, whose gap a config can state as an error of assembly."""
-    cold, closer = held().response["contact_reserve_um"], 66 * 1.1e-5 * 40
-    assert least_gap() == pytest.approx(cold, abs=0.01)
-    assert least_gap("contact.wear.offset_mm=0.01") == pytest.approx(cold + 20, abs=0.01)
-    hot = least_gap("scene.heat.rotor_warming_K=40")
-    same = least_gap(f"scene.center_distance_error_mm={-closer}")
-    assert hot == pytest.approx(same, abs=1e-3)
-    assert cold - 1e3 * closer < same < cold - 10
 
 
 def test_a_search_without_forces_simulates_nothing(monkeypatch):

@@ -23,8 +23,7 @@ SCENE = (
     "scene.load.torque_N_m=4.775",
     "scene.timing_gear={stiffness_N_m_per_rad: 2.0e4, damping_ratio: 0.3, backlash_mm: 0.1}",
 )
-# The reference settings: a solver of order eight near rounding.
-SHARP = ("solver.method=dopri8", "solver.rtol=1e-12")
+SHARP = ("solver.rtol=1e-12",)
 DESIGNS = {"paper": (36.43, 9.0, 4.0), "shorter involute": (36.43, 8.0, 4.0)}
 
 
@@ -197,42 +196,6 @@ def test_series_is_the_motion_over_one_revolution(orbits):
 # Gradients
 
 
-def central(evaluator, design, key, step):
-    """Return the central difference of the three responses in one design parameter."""
-    ends = []
-    for sign in (1, -1):
-        moved = np.array(design)
-        moved[key] += sign * step
-        evaluation = evaluator(jnp.array(moved), series=False)
-        assert evaluation.status is Status.PERIODIC
-        ends.append(numbers(evaluation))
-    return (ends[0] - ends[1]) / (2 * step)
-
-
-def test_finite_differences_approach_the_gradient_with_the_square_of_the_step(sharp, orbits):
-    """The error of a central difference falls fourfold per halving: the gradient is the limit."""
-    design = DESIGNS["shorter involute"]
-    exact = gradients(orbits["shorter involute"][1])[:, 1]
-    steps = 0.08, 0.04, 0.02
-    errors = np.array([central(sharp, design, 1, step)[0] - exact[0] for step in steps])
-    ratio = errors[:-1] / errors[1:]
-    assert np.all((ratio > 3) & (ratio < 6))
-    # Extrapolated to 0.01, half of what the next test allows.
-    assert abs(errors[-1]) / 4 < 5e-5 * abs(exact[0])
-
-
-@pytest.mark.parametrize("name", DESIGNS)
-def test_gradient_is_that_of_finite_differences(sharp, orbits, name):
-    """Gradients of mean, peak and RMS agree with central differences to 1e-4.
-
-    The step is 0.01 (degree, mm), between the h² error above and the noise of the orbit, 1e-10 of
-    the response, divided by h. At looser settings, the error of automatic differentiation is
-    larger: adaptive steps control the error of the motion, not that of its derivative."""
-    exact = gradients(orbits[name][1])
-    found = np.stack([central(sharp, DESIGNS[name], key, 0.01) for key in range(3)], axis=1)
-    np.testing.assert_allclose(exact, found, rtol=1e-4)
-
-
 def test_peak_on_a_corner_has_its_gradient():
     """If the peak is on a corner of the force, its derivative is neither of the two beside it.
 
@@ -283,8 +246,7 @@ SCENES = {
     "impatient": config_of(
         *gear(backlash=0.2, damping=0.05, load=2.0, speed=4000), "solver.max_mesh_periods=16"
     ),
-    "no gear": config_of("scene.timing_gear=null", "scene.load.torque_N_m=30"),
-    "few steps": config_of("solver.max_steps_per_period=64"),
+    "weak gear": config_of(*gear(load=40.0), "scene.timing_gear.stiffness_N_m_per_rad=1.0"),
     "soft": config_of(*gear(backlash=2.0, load=300.0), "contact.stiffness_N_per_mm_e=200"),
 }
 OUTCOMES = {
@@ -295,8 +257,7 @@ OUTCOMES = {
     "noisy": {Status.PERIODIC},
     "chaotic": {Status.CHAOTIC},
     "impatient": {Status.NOT_SETTLED},
-    "no gear": {Status.PASSED_THROUGH},
-    "few steps": {Status.SOLVER_FAILED},
+    "weak gear": {Status.PASSED_THROUGH},
     "soft": {Status.TOO_DEEP},
 }
 
@@ -347,11 +308,6 @@ def test_derivatives_are_those_before_a_negligible_correction(settled, name):
     assert settled["periodic"].statistics["newton_steps"] <= 5
 
 
-def test_status_does_not_depend_on_the_series():
-    """Without a series, a motion that is too deep is still not usable."""
-    assert Evaluator.of(SCENES["soft"])(series=False).status is Status.TOO_DEEP
-
-
 def test_chaos_has_a_positive_exponent_and_no_gradient(settled):
     """A chaotic scene has an exponent that exceeds its own error."""
     evaluation = settled["chaotic"]
@@ -399,25 +355,3 @@ def test_period_doubled_orbit_agrees_with_plain_motion(settled):
     states = run_strobe(pair, jnp.zeros((1, 2)), 200, integrator(1e-10))[0][-2:]
     nearest = np.min(np.max(np.abs(states - evaluation.state), axis=1))
     assert nearest < 1e-3
-
-
-def test_more_time_settles_an_impatient_scene():
-    """A motion that does not settle within 16 mesh periods is periodic within the default time."""
-    patient = evaluate(config_of(*gear(backlash=0.2, damping=0.05, load=2.0, speed=4000)))
-    assert patient.status is Status.PERIODIC
-    assert patient.statistics["transient_mesh_periods"] > 16
-
-
-def test_epicycloid_has_responses_and_nothing_to_differentiate(settled):
-    """EE is evaluated like any other family, with an empty design and gradient."""
-    evaluation = settled["epicycloid"]
-    assert evaluation.design == {}
-    assert evaluation.gradient == {}
-    assert {*RESPONSES} <= evaluation.response.keys()
-
-
-def test_a_found_orbit_is_a_start_that_changes_nothing(sharp, orbits):
-    """Started on the design's orbit, the evaluation gives the same numbers."""
-    _, evaluation = orbits["paper"]
-    again = sharp(jnp.array(DESIGNS["paper"]), start=evaluation.state)
-    np.testing.assert_allclose(numbers(again), numbers(evaluation), rtol=1e-9)

@@ -9,13 +9,10 @@ import numpy as np
 import pytest
 
 import rootsopt
-from rootsopt import Scene, Status
+from rootsopt import Scene
 from rootsopt.contact.search import SearchContact
 from rootsopt.contact.twisted import TwistedContact, slices_of
-from rootsopt.dynamics.closed import Start, steady_motion
 from rootsopt.dynamics.parts import TwistedLoad
-from rootsopt.runtime.programs import CachedFunction
-from rootsopt.scene.build import along
 from rootsopt.scene.slicing import MOST, sliced_mean, slices_needed
 
 TIGHT = "solver.rtol=1e-11", "solver.transient_rtol=1e-8"
@@ -135,29 +132,3 @@ def test_number_of_slices_follows_the_error():
     assert slices_needed(*fixed, np.radians(10), 1e-2) <= counts[1]
     assert scene_of("ee", "rotor.helix_deg=60")[0].slices == counts[1]
     assert scene_of("ee", "rotor.helix_deg=60", "solver.slices=5")[0].slices == 5
-
-
-@pytest.mark.long
-def test_gradients_against_differences():
-    """EE at 25°: the contact jumps between two minima, one slice after the other."""
-    scene, design = scene_of("ee", *TIGHT, "rotor.helix_deg=25", "solver.slices=3")
-    motion = CachedFunction(steady_motion)
-
-    def found(helix):
-        def build(helix):
-            return dataclasses.replace(scene, helix=helix).pair_and_shape(jnp.asarray(design))
-
-        pair, tangents, _ = along(build, jnp.asarray(helix), jnp.ones(1))
-        start = Start.at(pair, jnp.zeros(2), scene.solver.max_orbit)
-        made = motion(pair, tangents, start, scene.pitch_radius, scene.solver)
-        assert Status.of(made.status) is Status.PERIODIC
-        return np.asarray(made.orbit.response), np.asarray(made.orbit.sensitivity)[:, 0]
-
-    def difference(step):
-        ahead, behind = (found(float(scene.helix) + sign * step)[0] for sign in (1, -1))
-        return (ahead - behind) / (2 * step)
-
-    # The error of a difference falls with the square of the step: combine two. Such combinations
-    # of other steps differ from this one by up to 4e-5.
-    expected = (4 * difference(5e-4) - difference(1e-3)) / 3
-    np.testing.assert_allclose(found(float(scene.helix))[1], expected, rtol=5e-5)

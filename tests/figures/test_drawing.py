@@ -5,18 +5,17 @@ import io
 from pathlib import Path
 
 import ezdxf
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from tests.export.test_export import drawing
 
 from rootsopt.commands.table import profile as command
 from rootsopt.config import load
 from rootsopt.errors import InputError
-from rootsopt.figures.drawing import Drawing, coordinates, widest
+from rootsopt.figures.drawing import coordinates
 from rootsopt.figures.dxf import dxf_bytes
 from rootsopt.figures.pieces import Arc, outline_pieces, polyline
 from rootsopt.profiles import CIC, EE, geometry
-from rootsopt.scene import Scene, design_keys, design_vector
 
 ROOT = Path(__file__).parents[2]
 CONFIG = ROOT / "configs/cic_drawn.yaml"
@@ -27,23 +26,6 @@ PROFILES = {
     "cic 3, past the longest": CIC(3, R, 0.6358, 9.0e-3, 0.07),
     "ee 3": EE(3, R),
 }
-
-
-def drawing(shape, bore=None):
-    sizes = geometry(shape)
-    return Drawing(
-        pieces=outline_pieces(shape),
-        pitch_radius=R * 1e3,
-        outer_radius=float(sizes.outer_radius) * 1e3,
-        lobes=shape.lobes,
-        length=100.0,
-        helix_deg=0.0,
-        bore=bore,
-        notes=("one", "two"),
-        root_radius=float(sizes.root_radius) * 1e3,
-        block=(("Title", "Rotor"), ("Material", "iron")),
-        points=181,
-    )
 
 
 def parsed(drawn):
@@ -80,16 +62,6 @@ def test_dimensions_measure_the_rotor(name):
     # From the tip on, y rises to the widest place; without one, the flank is cut at the pitch line.
     width = 2 * upper.imag[rising[0]] if len(rising) else 66 * np.sin(np.pi / (2 * shape.lobes))
     assert measured["lobe"] == pytest.approx(width, abs=2e-5)
-
-
-def test_every_dimension_is_drawn():
-    """Each dimension has a block, for programs that do not draw dimensions themselves."""
-    document = parsed(drawing(PROFILES["cic 3"]))
-    for entity in document.modelspace().query("DIMENSION"):
-        block = document.blocks.get(entity.dxf.geometry)
-        kinds = {part.dxftype() for part in block}
-        assert "LINE" in kinds
-        assert kinds & {"MTEXT", "TEXT"}
 
 
 @pytest.mark.parametrize("name", PROFILES)
@@ -130,16 +102,6 @@ def test_ends_of_pieces_are_among_the_coordinates():
     assert len(np.unique(np.round(found.along, 9))) == len(found.along)
 
 
-def test_flank_without_a_waist_is_measured_at_the_pitch_circle():
-    """A lobe without a greatest width is measured at the pitch circle.
-
-    A circle is such a lobe."""
-    circle = [Arc(0j, 2.0, -np.pi / 4, np.pi / 2)]
-    circle += [circle[0].turned(np.pi / 2 * k) for k in (1, 2, 3)]
-    point = widest(circle, 2)
-    assert abs(point - 2 * np.exp(1j * np.pi / 4)) < 1e-9
-
-
 STATED = {
     "drawing.title": "Blower rotor",
     "drawing.material": "EN-GJS-500-7",
@@ -170,26 +132,6 @@ def test_title_block_states_the_config(tmp_path):
     assert len(points) >= 91
     assert np.max(np.hypot(*points.T)) == pytest.approx(45.102855, abs=1e-6)
     assert float(rows[0]["angle_deg"]) == pytest.approx(-60, abs=1e-6)
-
-
-def test_title_block_without_a_section():
-    """A field without a value shows a dash."""
-    config = load(CONFIG)
-    values = design_vector(config)
-    design = dict(zip(design_keys(config), map(float, values), strict=True))
-    shape = Scene.from_config(config).profile(jnp.asarray(values))
-    block = dict(Drawing.of(config, shape, design).block)
-    assert block["Material"] == "density 7800 kg/m3"
-    assert block["Drawing number"] == block["Date"] == block["Flank, profile of a line"] == "-"
-
-
-def test_many_design_parameters_take_several_lines():
-    given = {f"coefficients_{k}": 0.12345678 for k in range(1, 25)}
-    config = load(CONFIG)
-    shape = Scene.from_config(config).profile(jnp.asarray(design_vector(config)))
-    notes = Drawing.of(config, shape, given).notes
-    assert max(map(len, notes)) < 110
-    assert sum("coefficients_" in note for note in notes) > 3
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,7 @@ from rootsopt.config import load
 from rootsopt.figures import runs
 from rootsopt.figures.history import plot_prices, plot_residual, plot_starts
 from rootsopt.figures.profiles import plot_departure, plot_forces_together
-from rootsopt.figures.style import figure, write
-from rootsopt.output.files import ResultFolder
+from rootsopt.figures.style import figure
 from rootsopt.response.series import Series
 from rootsopt.scene import outline_mm
 
@@ -147,20 +146,3 @@ def test_long_labels_have_room():
     assert overlaps(made) == []
     keys = [f"radius_of_arc_{k}_mm" for k in range(5)]
     assert overlaps(runs._history(histories(keys), keys)) == []
-
-
-def test_legends_and_common_labels_have_room(tmp_path):
-    """A legend wider than its figure gets fewer columns."""
-    for common in (False, True):
-        made, axes = figure(5, 4, 2, 2, sharex=True, sharey=True)
-        for ax in axes.ravel():
-            ax.plot([0, 1], [-1e6, 1e6], label="not settled, average of a window")
-            ax.set_title("a title")
-        if common:
-            made.supxlabel("x (mm)")
-            made.supylabel("y (mm)")
-        lines = [] if common else [*axes[0, 0].lines] * 3
-        write(ResultFolder(tmp_path), "wide", made, "title", lines)
-        assert (tmp_path / "figures" / "wide.png").is_file()
-        assert [legend._ncols for legend in made.legends] == [1] * (not common)
-        assert overlaps(made) == []

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from rootsopt.config import parse
 from rootsopt.errors import InputError
-from rootsopt.measured.estimates import Estimates, center, estimates, scatter, unit_of_size
+from rootsopt.measured.estimates import Estimates, estimates, scatter, unit_of_size
 from rootsopt.measured.source import advice, outline_of
 from rootsopt.profiles import CIC, EE, outline
 from tests.fuzz import outlines
@@ -72,14 +72,6 @@ def test_scatter_and_centre_are_those_put_in(name, size):
     assert found.middle == pytest.approx(33, abs=5 * size + 1e-6)
 
 
-def test_standard_error_of_the_centre_is_that_of_repetitions():
-    points = rotor()[::3]
-    found = [center(scattered(points, 5e-3, seed), 3) for seed in range(60)]
-    places = np.array([place for place, _ in found])
-    spread = np.sqrt((np.var(places.real) + np.var(places.imag)) / 2)
-    assert np.mean([error for _, error in found]) == pytest.approx(spread, rel=0.25)
-
-
 @pytest.mark.parametrize("size", [5e-3, 20e-3])
 def test_scatter_of_points_closer_than_they_scatter(size):
     """Scatter is found for points a few micrometres apart, whose order along the outline is
@@ -87,13 +79,6 @@ def test_scatter_of_points_closer_than_they_scatter(size):
     t = np.linspace(0, 2 * np.pi, 60_000, endpoint=False)
     dense = (33 + 10 * np.cos(3 * t)) * np.exp(1j * t)
     assert scatter(scattered(dense, size))[0] == pytest.approx(size, rel=0.15)
-
-
-def test_few_points_have_no_known_scatter():
-    """With 20 points per flank, the error of a polynomial is not taken for scatter."""
-    found = estimates(rotor()[::24], 3)
-    assert np.isnan(found.scatter)
-    assert "too few" in found.remedy(0.0)
 
 
 @settings(max_examples=25, deadline=None)
@@ -206,7 +191,7 @@ def test_points_closer_than_they_scatter_are_to_be_thinned(tmp_path):
 
 
 @pytest.mark.parametrize("lobes", [2, 3, 4, 6])
-@pytest.mark.parametrize("count", [40, 60, 79, 89, 119, 150, 240, 600])
+@pytest.mark.parametrize("count", [40, 89, 150, 600])
 def test_no_scatter_is_invented_for_exact_points(lobes, count):
     """However few the points are, scatter is 0 or unknown, and then the rest is stated."""
     found = estimates(outlines.epicycloid(lobes, 33.0, count), lobes)
@@ -218,7 +203,7 @@ def test_no_scatter_is_invented_for_exact_points(lobes, count):
         )
 
 
-@pytest.mark.parametrize("lobes", [2, 3, 4])
+@pytest.mark.parametrize("lobes", [2, 4])
 @pytest.mark.parametrize(
     ("count", "size"), [(200, 20), (300, 5), (300, 20), (500, 1), (1000, 1), (1000, 5), (3000, 20)]
 )
@@ -227,13 +212,6 @@ def test_scatter_of_few_points_is_found(lobes, count, size):
     exact = outlines.epicycloid(lobes, 33.0, count)
     found = [scatter(scattered(exact, 1e-3 * size, seed))[0] for seed in range(5)]
     assert np.mean(found) == pytest.approx(1e-3 * size, rel=0.15)
-
-
-def test_scatter_that_cannot_be_told_from_shape_is_bounded():
-    """With 1 µm on 200 points of EE, the message states both together."""
-    found, between = scatter(scattered(outlines.epicycloid(3, 33.0, 200), 1e-3))
-    assert np.isnan(found)
-    assert between == pytest.approx(1e-3, rel=0.5)
 
 
 def test_a_smoothing_is_offered_only_if_it_reads():

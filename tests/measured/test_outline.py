@@ -145,10 +145,6 @@ def test_an_inset_is_seen_in_the_mesh(by, scatter):
     assert ("oversize" in said) == (by < 0)
 
 
-def test_addenda_that_differ_are_no_inset():
-    assert conjugacy(profile_of(bulged(points_of(CIC3, 240), -0.02))[0]).inset == 0
-
-
 def test_seal_width_within_the_scatter():
     """Points with 2 µm of scatter: a land of 6.26 mm is found to 5 %; a rounded tip has none."""
     scatter = 2e-3
@@ -181,23 +177,6 @@ def test_lobes_off_the_axis_are_refused_before_anything_is_compiled(tmp_path, mo
     assert len(looked) == 3
 
 
-def test_levers_are_the_derivatives_of_the_gap():
-    """The levers of flanks that are not conjugate agree with central differences in φ1 and φ2."""
-    found, _ = profile_of(bulged(points_of(CIC3), 0.02))
-    pair = FlankPair.of(found, 2 * found.pitch_radius, two_sided=True)
-    rolls, h = np.linspace(0.15, 0.9, 7), 1e-6
-    relatives = np.full(7, -1e-3)
-    here = approaches(pair, rolls, relatives)
-
-    def slope(a, b):
-        ahead, behind = (approaches(pair, rolls + k * a, relatives + k * b).gap for k in (1, -1))
-        return np.asarray(ahead - behind) / (2 * h)
-
-    by_roll, by_relative = slope(h, 0.0), slope(0.0, h)
-    assert np.asarray(here.lever1) == pytest.approx(by_relative + by_roll / 2, abs=1e-7)
-    assert np.asarray(here.lever2) == pytest.approx(by_relative - by_roll / 2, abs=1e-7)
-
-
 def test_turned_and_clockwise_outlines_are_put_right():
     points = points_of(CIC3, 240)
     _, checks = profile_of(points[::-1] * np.exp(0.3j))
@@ -219,16 +198,6 @@ def test_lobes_and_flanks_that_differ_are_told():
     # The lobe's axis moves over with the flank and takes up part of it.
     assert 15 < checks.flank_deviation_um < 30
     assert "trailing flank" in advice(parse(CONFIG.format("x.csv")).profile, checks)[0]
-
-
-def test_scattered_points_are_smoothed():
-    random = np.random.default_rng(0)
-    points = points_of(CIC3, 240) + random.normal(0, 1e-3, 2892)
-    with pytest.raises(InputError, match=r"outline_smoothing_mm"):
-        profile_of(points)
-    found, checks = profile_of(points, 1e-3)
-    assert checks.fit_deviation_um == pytest.approx(1, rel=0.05)
-    assert max(-conjugacy(found).least, conjugacy(found).most) < 5e-6
 
 
 def test_joints_are_seen():
@@ -298,28 +267,3 @@ def test_profile_command_reads_its_own_files(tmp_path):
         area = float(found.area) * 1e6
         assert area == pytest.approx(record["geometry"]["area_mm2"], rel=1e-7)
         assert max(-conjugacy(found).least, conjugacy(found).most) < 5e-8
-
-
-@pytest.mark.long
-def test_simulation_of_the_points_is_that_of_the_profile(tmp_path):
-    path = write(tmp_path / "points.csv", points_of(CIC3, 240))
-    (tmp_path / "scene.yaml").write_text(CONFIG.format(path))
-    own = [
-        f"profile.{change}"
-        for change in (
-            "family=cic",
-            "outline_file=null",
-            "pressure_angle_deg=36.43",
-            "involute_length_mm=8.5",
-            "tip_arc_angle_deg=4",
-        )
-    ]
-    responses = []
-    for name, sets in (("points", []), ("truth", own)):
-        arguments = [str(tmp_path / "scene.yaml"), "-o", str(tmp_path / name), "--no-figures"]
-        assert simulate.main([*arguments, *(f"--set={change}" for change in sets)]) == 0
-        record = json.loads((tmp_path / name / "result.json").read_text())
-        assert record["status"] == "periodic"
-        responses.append(record["response"])
-    for key in ("mean_force_N", "peak_force_N"):
-        assert responses[0][key] == pytest.approx(responses[1][key], rel=1e-4)

@@ -10,14 +10,11 @@ import signal
 import ezdxf
 import numpy as np
 import pytest
-import scipy.spatial
 from ezdxf import units
 from hypothesis import given
 from hypothesis import strategies as st
 
 from rootsopt.errors import InputError
-from rootsopt.measured import loop as loops
-from rootsopt.measured.conjugacy import conjugacy
 from rootsopt.measured.fit import imported
 from rootsopt.measured.loop import Loop, signed_area
 from rootsopt.measured.reading import Sought, read, untangled
@@ -257,8 +254,7 @@ def test_units(tmp_path, code, length):
     assert loop.points == pytest.approx(ROTOR, rel=1e-7)
 
 
-@pytest.mark.parametrize("fmt", ["asc", "bin"])
-@pytest.mark.parametrize("version", ["R12", "R2000", "R2018"])
+@pytest.mark.parametrize(("version", "fmt"), [("R12", "asc"), ("R2000", "bin"), ("R2018", "bin")])
 def test_versions_of_drawings(tmp_path, version, fmt):
     def draw(space):
         add = space.add_polyline2d if version == "R12" else space.add_lwpolyline
@@ -266,41 +262,6 @@ def test_versions_of_drawings(tmp_path, version, fmt):
 
     loop = drawn(tmp_path / "drawing.dxf", draw, version, units=0, fmt=fmt)
     assert loop.points == pytest.approx(ROTOR, abs=1e-9)
-
-
-def test_dxf_in_inches_of_polylines_and_lines(tmp_path):
-    """A polyline with arcs and loose lines in any order are scaled and joined.
-
-    The loop of the largest area is used."""
-    corners = [(0, 0, 0), (2, 0, 1), (2, 1, 0), (0, 1, 1)]
-
-    def slot(space):
-        space.add_lwpolyline(corners, format="xyb", close=True)
-        space.add_lwpolyline([(0.5, 0.2), (1, 0.2), (1, 0.6)], close=True)
-
-    loop = drawn(tmp_path / "slot.dxf", slot, units=units.IN)
-    # Chords of the arcs, at least 24 each: 1 - 2e-3 of their segments.
-    assert signed_area(loop.points) / 25.4**2 == pytest.approx(2 + np.pi / 4, rel=2e-3)
-    assert np.max(loop.points.real) / 25.4 == pytest.approx(2.5, abs=1e-4)
-
-    polygon = np.array([3, 3 + 2j, 1 + 2.5j, 2j, 0])
-    loop = drawn(
-        tmp_path / "lines.dxf", lambda s: lines(s, polygon, (2, 0, 4, 1, 3)), units=units.CM
-    )
-    assert sorted(np.abs(loop.points)) == pytest.approx(sorted(10 * np.abs(polygon)))
-    assert abs(signed_area(loop.points)) == pytest.approx(100 * abs(signed_area(polygon)))
-
-
-def test_dxf_of_an_ellipse(tmp_path):
-    """A turned ellipse off the origin is read in millimetres if the file states no unit."""
-
-    def ellipse(space):
-        space.add_ellipse((5, 1), major_axis=(4, 3), ratio=0.6)
-
-    loop = drawn(tmp_path / "ellipse.dxf", ellipse, units=0)
-    local = (loop.points - (5 + 1j)) / (0.8 + 0.6j)
-    assert np.hypot(local.real / 5, local.imag / 3) == pytest.approx(np.ones(len(local)))
-    assert abs(signed_area(loop.points)) == pytest.approx(np.pi * 15, rel=1e-3)
 
 
 def test_entities_seen_from_below(tmp_path):
@@ -360,25 +321,6 @@ def test_blocks(tmp_path):
         read(tmp_path / "block.dxf")
 
 
-def test_many_loose_lines_are_joined_in_order(tmp_path, monkeypatch):
-    """Chains in any order are joined with one tree query, however many they are."""
-    t = np.linspace(0, 2 * np.pi, 4_000, endpoint=False)
-    z = (40 + 8 * np.cos(3 * t)) * np.exp(1j * t)
-    order = np.random.default_rng(0).permutation(len(z))
-    chains = [
-        Loop(np.array([z[k], z[(k + 1) % len(z)]])[:: 1 if k % 2 else -1], np.zeros(2, bool))
-        for k in order
-    ]
-    trees = []
-    tree = scipy.spatial.KDTree
-    monkeypatch.setattr(scipy.spatial, "KDTree", lambda data: trees.append(len(data)) or tree(data))
-    (loop,), fault = loops.joined(chains, "lines.dxf")
-    assert fault is None
-    assert trees == [len(z), 3 * len(z)]
-    assert sorted(loop.points, key=np.angle) == pytest.approx(sorted(z, key=np.angle))
-    assert abs(signed_area(loop.points)) == pytest.approx(abs(signed_area(z)))
-
-
 def test_what_does_not_belong_to_the_outline(tmp_path):
     """Repeated lines, centre lines from the axis or a corner, and a bore of arcs have no effect."""
 
@@ -427,32 +369,6 @@ def test_joints_of_a_clockwise_drawing():
             assert np.asarray(getattr(other, part)) == pytest.approx(
                 np.asarray(getattr(one, part)), abs=1e-12
             )
-
-
-def test_a_drawing_that_begins_with_a_valley_is_clockwise(tmp_path):
-    """This program's own drawing with reversed entities gives the same conjugate rotor."""
-    own = tmp_path / "own.dxf"
-    own.write_bytes(outlines.good()["own.dxf"])
-    document = ezdxf.readfile(own)
-    space = document.modelspace()
-    entities = [e for e in space if e.dxf.layer == "OUTLINE"]
-    loop = read(own)
-    backwards = [e for e in entities if e.dxftype() == "SPLINE"]
-    for entity in backwards:
-        entity.control_points = list(entity.control_points)[::-1]
-        entity.knots = [float(entity.knots[-1]) - k for k in list(entity.knots)[::-1]]
-    first = backwards[len(backwards) // 3]
-    for entity in entities:
-        if entity is not first:
-            space.unlink_entity(entity)
-            space.add_entity(entity)
-    document.saveas(tmp_path / "clockwise.dxf")
-    clockwise = read(tmp_path / "clockwise.dxf")
-    assert signed_area(loop.points) > 0 > signed_area(clockwise.points)
-    assert np.sum(loop.joints) == np.sum(clockwise.joints) == len(entities)
-    one, two = (imported(x, 3, 33.0, 0.0)[0] for x in (loop, clockwise))
-    assert float(two.area) == pytest.approx(float(one.area), rel=1e-9)
-    assert conjugacy(two).least == pytest.approx(conjugacy(one).least, abs=1e-9)
 
 
 @pytest.mark.parametrize("smoothing", [1e-4, 10.0, 1e4])
@@ -684,18 +600,3 @@ def test_outlines_that_cross_themselves_widely_are_refused():
     z = outlines.epicycloid(3, 33.0, 1500, 6.0)
     with pytest.raises(InputError, match=r"does not cross itself, .* loops .* at \(.* deg, .* um"):
         untangled(Loop(z, np.zeros(len(z), bool)), 3, 33.0)
-
-
-def test_exact_lines_and_arcs_are_read_with_the_smoothing_offered(tmp_path):
-    """Ends of lines that miss by 0.1 µm, and arcs on the wrong side of the pitch circle."""
-    shift = np.random.default_rng(0).uniform(-0.5e-4, 0.5e-4, (2, 2, len(EE)))
-    ends = np.stack([EE, np.roll(EE, -1)]) + shift[0] + 1j * shift[1]
-    loop = drawn(
-        tmp_path / "gaps.dxf", lambda s: [line(s, *pair) for pair in ends.T], sought=SOUGHT
-    )
-    with pytest.raises(InputError, match=r"outline_smoothing_mm` = .*, with which") as refused:
-        imported(loop, 3, 33.0, 0.0)
-    value = re.search(r"outline_smoothing_mm` = ([\d.e-]+)", str(refused.value))
-    assert value
-    assert float(value[1]) < 1e-3
-    imported(loop, 3, 33.0, float(value[1]))

@@ -220,6 +220,7 @@ def test_nothing_without_a_motion_or_after_a_stop():
     assert type(search_of(load("cic_drawn", [*QUICK, "assumptions.scenes=0"]))) is Search
 
 
+@pytest.mark.long
 def test_command_optimises_over_assumptions(tmp_path, capsys):
     """The command writes tables, figure and rows; its optimum has the least mean objective."""
     sets = [f"--set={one}" for one in (*QUICK, "objective.over=assumptions")]

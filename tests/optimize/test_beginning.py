@@ -2,7 +2,6 @@
 
 import argparse
 import dataclasses
-import json
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,7 +9,6 @@ import numpy as np
 import pytest
 import yaml
 
-from rootsopt.commands.table import optimize
 from rootsopt.commands.work.searching import checkpoint_of
 from rootsopt.config import load, parse
 from rootsopt.design.resemblance import Likeness
@@ -167,48 +165,3 @@ def test_a_search_is_not_resumed_with_other_points(tmp_path):
     rotor.write_text(rotor.read_text().replace("0", "1", 1))
     with pytest.raises(InputError, match=r"files: .*rotor\.csv \(then .*, now "):
         checkpoint_of("optimize", config, options, folder)
-
-
-@pytest.mark.long
-def test_a_measured_rotor_leads_to_the_optimum_of_its_family(tmp_path, capsys):
-    """The optimum of the noisy file is that of the family, for the same weights per newton."""
-    path = measured(tmp_path, 1e-3, family="cic")
-    out = tmp_path / "out"
-    assert optimize.main([str(path), "-o", str(out), "--no-figures"]) == 0
-    said = capsys.readouterr().out
-    result = json.loads((out / "result.json").read_text())
-    assert "rotor.csv as it is" in said
-    assert result["beginning"]["message"] in " ".join(said.split())
-    assert result["baseline"]["design"] == {}
-    nominal, seal = result["nominal"], "seal_width_mm"
-    assert nominal["design"] == pytest.approx(result["beginning"]["design"])
-    assert nominal["geometry"][seal] == pytest.approx(result["baseline"]["geometry"][seal], rel=0.1)
-    ratio = result["optimized"]["response"]["peak_force_N"] / nominal["response"]["peak_force_N"]
-    over = result["improvement_over_nominal"]
-    assert over["peak_force_N"] == pytest.approx(1 - ratio, rel=1e-9)
-    assert "from nominal" in said
-    assert result["optimality"]["residual"] < 1e-4
-    before, after = (result[name]["response"] for name in ("baseline", "optimized"))
-    expected = 0.5 * sum(after[k] / before[k] for k in ("mean_force_N", "peak_force_N"))
-    assert 1 - result["improvement"]["objective"] == pytest.approx(expected, rel=1e-9)
-    floor = result["baseline"]["geometry"]["area_efficiency"]
-    (row,) = (row for row in result["constraints"] if row["name"] == "area efficiency")
-    assert row["limit"] == pytest.approx(floor, rel=1e-12)
-    # The same problem, posed from the family's own config.
-    base = Search(BASE).exact()
-    weights = {
-        f"objective.{name}_weight": 0.5
-        * base.response[f"{name}_force_N"]
-        / before[f"{name}_force_N"]
-        for name in ("mean", "peak")
-    }
-    same = BASE.replaced(weights | {"constraints.area_efficiency_min": floor})
-    found = Search(same).run()
-    assert found.optimized is not None
-    for key in ("mean_force_N", "peak_force_N"):
-        assert after[key] == pytest.approx(found.optimized.response[key], rel=1e-4)
-    for key, value in found.optimized.design.items():
-        assert result["optimized"]["design"][key] == pytest.approx(value, rel=1e-2)
-    best = load(out / "optimized.yaml")
-    assert best.profile.family == "cic"
-    assert load(out / "config.yaml").profile.outline_file == str(out / "outline.csv")

@@ -201,6 +201,7 @@ def _real(seed: int):
     return search, search.run()
 
 
+@pytest.mark.long
 def test_the_bound_of_a_real_problem_holds():
     """No design of a sample, simulated from rest, is below the bound; a few touch the optimum."""
     search, found = _real(0)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from rootsopt.commands.table import optimize as command
-from rootsopt.commands.table import pareto
 from rootsopt.commands.work import optimize as work
 from rootsopt.config import parse
 from rootsopt.errors import InputError
@@ -104,37 +103,3 @@ def test_a_resumed_search_equals_one_that_was_not_interrupted(tmp_path, more):
         assert resumed.damage
         resumed.close()
         assert found == expected
-
-
-@pytest.mark.long
-def test_a_resumed_front_equals_one_that_was_not_interrupted(tmp_path, monkeypatch, capfd):
-    """The run is stopped by an error, and lines of its checkpoint are damaged."""
-    few = ["pareto.points=4", "optimizer.screening=4", "optimizer.iterations=6"]
-    arguments = ["cic", "--no-figures", *(part for text in few for part in ("--set", text))]
-    whole, run, kept = tmp_path / "whole", tmp_path / "run", tmp_path / ".run.checkpoint"
-    code = pareto.main([*arguments, "-o", str(whole)])
-    ended, keep = [], Checkpoint.keep
-
-    def stopping(self, *given):
-        keep(self, *given)
-        ended.append(given)
-        if len(ended) > 30:
-            raise InputError("enough")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Checkpoint, "keep", stopping)
-        assert pareto.main([*arguments, "-o", str(run)]) == 2
-    data = bytearray(kept.read_bytes())
-    for place in np.random.default_rng(1).integers(len(data), size=3):
-        data[place] ^= 1
-    kept.write_bytes(data)
-    capfd.readouterr()
-    assert pareto.main([*arguments, "-o", str(run), "--resume"]) == code
-    assert "damaged or of another run, and dropped" in capfd.readouterr().err
-    assert (run / "front.csv").read_bytes() == (whole / "front.csv").read_bytes()
-    found = [json.loads((one / "result.json").read_bytes())["points"] for one in (whole, run)]
-    for point in found[0] + found[1]:
-        del point["statistics"]["seconds"]
-    assert found[0]
-    assert found[0] == found[1]
-    assert not kept.exists()

@@ -99,15 +99,6 @@ def test_only_a_significant_difference_holds_up(problem, truth, accepted):
     assert noise.message({"holds_up": False, "rejected": []}) == ""
 
 
-def test_nothing_promised(problem):
-    """Without a trial below the baseline, there is no verdict, and the message says what to
-    raise."""
-    judge = Judge(problem.config, problem.space.scene, truth=1.0)
-    verdict = noise.verify(problem, judge, [trial([0.5, 0.5, 0.5], 1.4)])
-    assert verdict.optimized is None
-    assert "ensemble.members" in noise.message(verdict.record)
-
-
 class Particular(Judge):
     """A judge for which designs with a first angle above 35° have no average."""
 

@@ -45,15 +45,6 @@ def test_unseen_optima_by_simulation():
     assert hidden / hits == pytest.approx(unseen(10, 2)["share_of_starts"], rel=0.2)
 
 
-def test_too_few_searches_tell_nothing():
-    assert unseen(1, 1)["share_of_starts"] is None
-    assert unseen(3, 1)["expected_optima"] is None
-    assert unseen(2, 2)["share_of_starts"] is None
-    assert unseen(2, 1)["share_of_starts"] is None
-    assert unseen(4, 4)["share_of_starts"] is None
-    assert unseen(3, 1)["share_of_starts"] == pytest.approx(1 / 3)
-
-
 def test_method_follows_the_objective():
     """`auto` is slsqp, except for averages, whose gradients have noise."""
     assert method_of(load_config("configs/cic_drawn.yaml", ["optimizer.method=auto"])) == "slsqp"

@@ -37,23 +37,6 @@ def corner(x, lift=0.0):
     return Linearization(0.0, np.zeros(2), (group(values, slopes),), np.zeros(0), np.zeros((0, 2)))
 
 
-def bounded(x):
-    """Return the problem 2 x - 3 y, whose minimum is a corner of the box."""
-    return Linearization(
-        2 * x[0] - 3 * x[1], np.array([2.0, -3.0]), (), np.zeros(0), np.zeros((0, 2))
-    )
-
-
-def ended(x):
-    """Return the problem -x + (y - 0.4)² with x ≤ 0.69, without an objective beyond x = 0.7."""
-    if x[0] > 0.7:
-        return None
-    slope = np.array([-1.0, 2 * (x[1] - 0.4)])
-    return Linearization(
-        -x[0] + (x[1] - 0.4) ** 2, slope, (), np.array([0.69 - x[0]]), np.array([[-1.0, 0.0]])
-    )
-
-
 def lowest_corner(count=801):
     """Return the least value of `corner` on a fine grid, from its formulas."""
     x, y = np.meshgrid(*[np.linspace(0, 1, count)] * 2)
@@ -91,22 +74,6 @@ def test_converges_to_a_corner_of_the_objective(start):
         descend(lambda x, s=s: corner(x, s), np.array(start)).local.objective for s in (1e-4, -1e-4)
     )
     assert (up - down) / 2e-4 == pytest.approx(shares[0], abs=1e-3)
-
-
-def test_bounds_have_multipliers():
-    found = descend(bounded, np.array([0.5, 0.5]))
-    np.testing.assert_allclose(found.point, [0, 1], atol=1e-12)
-    assert found.converged
-    np.testing.assert_allclose(found.certificate.lower, [2, 0], atol=1e-9)
-    np.testing.assert_allclose(found.certificate.upper, [0, 3], atol=1e-9)
-
-
-def test_steps_into_unusable_designs_are_shortened():
-    """The result is next to unusable designs, but is never one of them."""
-    found = descend(ended, np.array([0.1, 0.9]))
-    assert found.converged
-    np.testing.assert_allclose(found.point, [0.69, 0.4], atol=1e-6)
-    assert descend(lambda x: None, np.array([0.1, 0.9])).reason == "unusable"
 
 
 def test_a_stationary_point_that_is_worse_is_not_the_result():
@@ -161,17 +128,6 @@ def test_contradicting_constraints_are_infeasible():
     assert found.local.violation >= 0.3 - 1e-9
 
 
-def test_certificate_is_zero_only_at_an_optimum():
-    """The residual does not depend on the search: at other points it is the remaining gradient."""
-    assert certify(corner(np.array([0.2, 0.3])), np.array([0.2, 0.3])).residual > 0.5
-    point = np.array([0.9 - 7 / 15, 0.8 - 7 / 30])
-    assert certify(smooth(point), point).residual < 1e-12
-    beside = point + np.array([0.1, -0.1])
-    assert certify(smooth(beside), beside).residual == pytest.approx(
-        np.linalg.norm([0.2 + 0.4, -0.2 - 0.4]) / 2, rel=1e-9
-    )
-
-
 def beside(kind, gap):
     """Return a linear problem and a point at a distance `gap` from the limit that stops it.
 
@@ -204,25 +160,6 @@ def test_residual_counts_what_a_step_onto_the_limit_would_gain(kind):
     # A limit that is far away stops nothing: the whole gradient is left.
     away, point = beside(kind, 0.1)
     assert certify(away, point).residual == pytest.approx(2, rel=1e-9)
-
-
-def test_constraint_that_cannot_move_has_no_multiplier():
-    """Every design meets such a constraint with equality: its gradient is zero."""
-
-    def look(x):
-        found = smooth(x)
-        return found._replace(
-            slack=np.append(found.slack, 0.0), normals=np.vstack([found.normals, [[1e-12, 0]]])
-        )
-
-    found = descend(look, np.array([0.1, 0.1]))
-    assert found.converged
-    assert found.certificate.multipliers[1] == 0
-
-
-def test_search_is_reproducible():
-    first, second = (descend(corner, np.array([0.1, 0.9])) for _ in range(2))
-    assert first.point.tobytes() == second.point.tobytes()
 
 
 def curved(seed, count=6, branches=3):
@@ -265,18 +202,6 @@ def test_models_of_quadratic_functions_are_exact(seed):
     value, slope = models.values(step)
     np.testing.assert_allclose(value[1:4], expected.groups[0].values, atol=1e-9)
     np.testing.assert_allclose(slope[4:], expected.normals, atol=1e-8)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_exact_models_take_a_few_steps(seed):
-    """Quadratic functions are known after one measurement, in 6 designs, wherever it is made."""
-    look, _ = curved(seed)
-    first, other = (descend(look, np.full(6, at)) for at in (0.5, 0.3))
-    assert first.converged
-    assert other.converged
-    assert max(first.evaluations, other.evaluations) <= 30
-    assert first.certificate.residual < 1e-5
-    assert first.local.objective == pytest.approx(other.local.objective, abs=1e-8)
 
 
 def sampled(look, point, limit, reach=0.05, count=1000):
@@ -332,7 +257,7 @@ def waves(seed):
     ("look", "start"),
     [(valley, [0.9, 0.1]), (stiff, [0.9, 0.1]), (stiff, [0.41, 0.37]),
      (saddle, [0.9, 0.5]), (saddle, [0.5, 0.5]),
-     *((waves(seed), [0.4, 0.5, 0.6, 0.5]) for seed in range(6))],
+     *((waves(seed), [0.4, 0.5, 0.6, 0.5]) for seed in range(2))],
 )  # fmt: skip
 @pytest.mark.parametrize("known", [False, True])
 def test_a_converged_search_has_the_value(look, start, known):
@@ -363,22 +288,6 @@ def test_constraints_of_the_geometry_are_met_exactly():
     assert found.converged
     assert max(found.certificate.multipliers) > 0
     assert sum(one.violation > 1e-9 for one in seen) <= 4
-
-
-def test_branches_of_higher_order_are_followed():
-    """Rank-one updates correct the models where the curvature changes along the way."""
-
-    def look(x):
-        values = [np.exp(2 * x[0]) + x[1] ** 4, np.exp(-3 * (x[0] - 0.5)) + (1 - x[1]) ** 2]
-        slopes = [[2 * np.exp(2 * x[0]), 4 * x[1] ** 3],
-                  [-3 * np.exp(-3 * (x[0] - 0.5)), -2 * (1 - x[1])]]  # fmt: skip
-        return Linearization(
-            0.0, np.zeros(2), (group(values, slopes),), np.zeros(0), np.zeros((0, 2))
-        )
-
-    one, other = (descend(look, np.array(start)) for start in ([0.9, 0.1], [0.2, 0.9]))
-    assert one.converged
-    np.testing.assert_allclose(one.point, other.point, atol=1e-4)
 
 
 def walled(x, limit=0.35, lift=0.0):

@@ -13,7 +13,6 @@ from rootsopt.config import parse
 from rootsopt.errors import InputError
 from rootsopt.figures import runs
 from rootsopt.figures.force import amplitude_spectrum, plot_force, plot_gap
-from rootsopt.figures.history import plot_history
 from rootsopt.figures.runs import optimization_figures, simulation_figures
 from rootsopt.figures.style import figure
 from rootsopt.output import files, names, tables, terminal
@@ -236,19 +235,6 @@ def test_numbers_of_two_designs_are_compared():
     assert "undercut margin >= 0 mm" in text
 
 
-def test_numbers_of_a_nominal_member_stand_between():
-    """Changes are in % of the baseline and of the nominal member."""
-    forces = (100.0, 75.0, 50.0)
-    measured, member, best = (_evaluation(force, force).record() for force in forces)
-    result = {"baseline": measured, "nominal": member, "optimized": best}
-    result |= {"improvement": {"objective": 0.5}, "improvement_over_nominal": {"objective": 1 / 3}}
-    made = tables.numbers_table(result)
-    cells = ["1", "0.75000", "0.50000", "−50.00 %", "−33.33 %"]
-    assert _row(made, "relative to the baseline") == cells
-    assert _row(made, "mean force (N)")[3:] == ["−50.00 %", "−33.33 %"]
-    _render(made)
-
-
 def test_numbers_without_a_usable_result():
     result = _compared(_evaluation(), _failed(), objective=float("nan"))
     made = tables.numbers_table(result)
@@ -447,10 +433,3 @@ def test_simulation_figures_without_a_series(tmp_path):
     simulation_figures(folder, _failed(), parse(CONFIG))
     assert sorted(os.listdir(tmp_path / "figures")) == ["meshing.png", "profiles.png"]
     assert "pyplot" not in vars(runs)
-
-
-def test_history_of_nothing_but_failures():
-    rows = [row | {"objective": None, "best_objective": float("nan")} for row in _history()]
-    _, axes = figure(6, 6, 4, 1)
-    plot_history(axes[:, 0], rows)
-    assert "unusable design" in axes[0, 0].get_legend_handles_labels()[1]

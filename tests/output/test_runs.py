@@ -1,12 +1,9 @@
 """Tests of result folders: complete, of one run, locked, rejected where they cannot be used."""
 
-import ast
 import json
 import os
-import shutil
 import subprocess
 import sys
-import threading
 from pathlib import Path
 
 import pytest
@@ -15,7 +12,7 @@ from rootsopt.commands.console import main
 from rootsopt.errors import InputError
 from rootsopt.output import disk, runs
 from rootsopt.output.runs import RunFolder
-from tests.deaths import WRITING, digest, digest_of, faulty, full_disk, scratch, write_run
+from tests.deaths import digest, digest_of, write_run
 
 ROOT = Path(__file__).parents[2]
 
@@ -220,73 +217,8 @@ def test_without_locks_nothing_of_others_is_removed(tmp_path, monkeypatch):
     assert sorted(os.listdir(tmp_path)) == [stage.name, "run"]
 
 
-def test_threads_that_want_one_folder_never_mix(tmp_path):
-    outcomes, refusals = [], []
-
-    def work(number):
-        for turn in range(10):
-            try:
-                write_run(tmp_path / "run", f"{number} {turn}")
-                outcomes.append(f"{number} {turn}")
-            except InputError as error:
-                refusals.append(str(error))
-
-    threads = [threading.Thread(target=work, args=(number,)) for number in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    found = [digest(path) for path in tmp_path.iterdir()]
-    assert all("is writing into" in told for told in refusals)
-    assert sorted(found) == sorted(digest_of(text) for text in outcomes)
-
-
 def _profile(folder, *more):
     return main(["profile", "configs/cic_drawn.yaml", "-o", str(folder), "--no-figures", *more])
-
-
-@pytest.fixture
-def quick():
-    """Return a folder in memory, where synchronising files takes no time."""
-    folder = scratch()
-    yield folder
-    shutil.rmtree(folder)
-
-
-def test_a_command_on_a_full_disk(quick, capsys, monkeypatch):
-    """If every other file operation of `profile` fails, the exit code is 2, with one line.
-
-    The earlier run is unchanged."""
-    monkeypatch.chdir(ROOT)
-    target = quick / "run"
-    assert _profile(target, "--export", "none") == 0
-    before, failed = digest(target), 0
-    monkeypatch.setattr("rootsopt.commands.cli.load", _loaded_once("configs/cic_drawn.yaml"))
-    for at in range(1, 200, 2):
-        capsys.readouterr()
-        with faulty(WRITING, at, full_disk) as system:
-            code = _profile(target, "--export", "svg")
-        if system.count < at:
-            break
-        told = capsys.readouterr().err
-        if code == 0:  # What fails once the folder is in place, or writing the lock's number.
-            shutil.rmtree(target)
-            (quick / "run.1").rename(target)
-        else:
-            failed += 1
-            assert code == 2
-            assert told.count("\n") == 1
-            assert "no space left on device" in told
-        assert os.listdir(quick) == ["run"]
-        assert digest(target) == before
-    assert failed > 9
-
-
-def _loaded_once(path):
-    from rootsopt.config import load
-
-    config = load(path)
-    return lambda *_: config
 
 
 def test_what_a_command_leaves_when_it_fails(tmp_path, capsys, monkeypatch):
@@ -319,44 +251,6 @@ def test_each_command_has_a_folder_of_its_own(tmp_path, monkeypatch):
     assert record["run"]["command"] == "profile"
     written = {p.name for p in (tmp_path / "results" / "cic_drawn-profile").iterdir()}
     assert set(record["run"]["files"]) == written
-
-
-def test_all_commands_write_through_one_layer():
-    """Every command gets its folder from `cli.run`.
-
-    No other module writes, makes, renames or removes files, except for the cache's folder and the
-    checkpoint beside a folder."""
-    source = (ROOT / "rootsopt" / "commands" / "table.py").read_text()
-    assert source.count("cli.run(self, argv)") == 1
-    allowed = {"disk.py", "lock.py", "door.py", "programs.py", "store.py", "journal.py"}
-    names = {"write_text", "write_bytes", "mkdir", "makedirs", "rename", "replace", "unlink"}
-    names |= {"rmdir", "rmtree", "remove", "touch", "symlink_to", "move", "copyfile", "copy2"}
-    seen = []
-    for path in (ROOT / "rootsopt").rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
-            if not isinstance(node, ast.Call):
-                continue
-            called = node.func
-            opens = isinstance(called, ast.Name) and called.id == "open"
-            reads = len(node.args) == 2 and ast.unparse(node.args[1]) in ("'r'", "'rb'")
-            if opens and not reads and path.name not in allowed:
-                seen.append(f"{path.name}: open")
-            if not isinstance(called, ast.Attribute) or called.attr not in names:
-                continue
-            owner = ast.unparse(called.value)
-            fine = owner in (
-                "folder",
-                "self",
-                "super()",
-                "disk",
-                "dataclasses",
-                "models",
-                "strings",
-            )
-            system = owner in ("os", "shutil") or "path" in owner.lower() or "file" in owner.lower()
-            if path.name not in allowed and system and not fine:
-                seen.append(f"{path.name}: {ast.unparse(called)}")
-    assert seen == []
 
 
 AUDIT = """

@@ -222,16 +222,6 @@ def test_motion_without_a_result_is_final_only_after_rest(session):
     assert session.next(NewMotion, number).evaluation.usable
 
 
-def test_bursts_are_coalesced(session):
-    """Of many values within a moment, few are computed, and the last of them is."""
-    for k in range(200):
-        number = session.move({SPEED: 3000.0 + k})
-    assert session.next(NewMotion, number).evaluation.usable
-    rest = session.next(FromRest, number)
-    assert rest.same
-    assert session.messages.empty()
-
-
 def test_yaml_reproduces_the_numbers(session):
     number = session.move({SPEED: 2900.0})
     shown = session.next(NewMotion, number).evaluation
@@ -240,17 +230,6 @@ def test_yaml_reproduces_the_numbers(session):
     config = parse(saved.text)
     assert config.scene.speed_rpm == 2900
     assert Evaluator.of(config)().response == pytest.approx(shown.response, rel=1e-5)
-
-
-def test_sessions_do_not_disturb_each_other(session, engine):
-    other = Told(engine)
-    other.next(NewMotion, 0)
-    one, two = session.move({SPEED: 3100.0}), other.move({SPEED: 2800.0})
-    first, second = session.next(NewMotion, one), other.next(NewMotion, two)
-    assert first.evaluation.response != second.evaluation.response
-    assert session.config().scene.speed_rpm == 3100
-    assert other.config().scene.speed_rpm == 2800
-    other.close()
 
 
 def test_search_can_be_cancelled_and_its_design_is_taken(session, monkeypatch):

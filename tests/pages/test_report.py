@@ -157,10 +157,6 @@ def test_words_lead_to_their_meaning(page):
     )
 
 
-def test_notes_on_odd_values_are_in_the_summary(page):
-    assert NOTE.replace("`", "") + "." in words_of(page)
-
-
 def test_spectrum_has_the_lines_of_the_motion(simulated):
     """The spectrum has 30 N and 20 N at 2 and 5 times the mesh frequency, 150 Hz."""
     stems, marks = drawn(charts.spectrum_chart(simulated.cases))
@@ -192,31 +188,6 @@ def test_animation_shows_forces_and_turns_one_period(page):
     assert max(case["forces"][0]) == pytest.approx(100, rel=1e-3)
     assert set(case["forces"][1]) == {0}
     assert case["relative"][0] == pytest.approx(-1)
-
-
-def test_contacts_lie_on_both_outlines(page):
-    """Contacts of the drive flank lie within the outline's range of radii, up to rounding.
-
-    Their normals are unit vectors."""
-    animation = data_of(page)["animation"]
-    contact = animation["cases"][0]["contacts"][0]
-    outer, pitch = animation["rotors"][0]["outer"], 33.0
-    for k in np.flatnonzero(contact["present"]):
-        point = complex(contact["x"][k], contact["y"][k])
-        assert 2 * pitch - outer - 1e-3 <= abs(point) <= outer + 1e-3
-        assert abs(complex(contact["nx"][k], contact["ny"][k])) == pytest.approx(1, abs=1e-4)
-
-
-def test_long_motions_keep_their_peak():
-    series = motion()
-    force = np.tile(series.drive_force, 100)
-    force[12345] = 1e4
-    shown = charts._thinned(force, 600)
-    assert len(shown) <= 602
-    assert 12345 in shown
-    assert shown[0] == 0
-    assert shown[-1] == len(force) - 1
-    assert force[shown].min() == force.min()
 
 
 def test_run_without_a_result_says_why(tmp_path):
@@ -351,24 +322,6 @@ def test_advice_names_the_config_of_the_result(command, tmp_path):
     expected = after if command == "optimize" else load(CIC)
     for file in named:
         np.testing.assert_array_equal(load(file).design, expected.design)
-
-
-def test_robust_optimum_is_compared_in_fresh_scenes(tmp_path):
-    numbers = {"mean": 0.8, "sigma": 0.1}
-    one = {"scenes": 100, "failed_share": 0.02, "objective": numbers, "mean_force_N": numbers}
-    one |= {"peak_force_N": {"mean": None, "sigma": 3.0}}
-    other = one | {"objective": {"mean": 1.0, "sigma": 0.2}}
-    given = {"baseline": result_of(), "optimized": result_of(), "status": "periodic",
-             "robustness": {"fresh": {"baseline": other, "robust": one}},
-             "run": {"command": "optimize"}}  # fmt: skip
-    over = "tolerances.over={contact.clearance_mm: {normal: 0.002}}"
-    folder = ResultFolder(tmp_path)
-    folder.write_text("config.yaml", load(CIC, ["contact.clearance_mm=0.01", over]).to_yaml())
-    text = words_of(report_text(Run.of(folder, given, "cic", True)))
-    assert "best while these scatter: contact.clearance_mm." in text
-    assert "100 fresh scenes that scatter: baseline 1 and robust 0.8, without" in text
-    assert "mean – –" in text
-    assert "without a usable motion 2 % 2 %" in text
 
 
 def test_sweep_over_two_quantities(tmp_path):
@@ -531,12 +484,6 @@ def test_slider_moves_the_rotors_in_a_browser(browser, page, tmp_path, width):
     assert "<title>taken</title>" not in out
 
 
-def test_console_messages_are_noticed(browser, tmp_path):
-    file = tmp_path / "bad.html"
-    file.write_text("<script>undefined_name()</script>", "utf-8")
-    assert "undefined_name" in "".join(browser(file, "--dump-dom")[1])
-
-
 def test_page_prints(browser, page, tmp_path):
     """The page prints as a PDF of several pages, with charts."""
     file, printed = tmp_path / "page.html", tmp_path / "page.pdf"
@@ -546,15 +493,6 @@ def test_page_prints(browser, page, tmp_path):
     content = printed.read_bytes()
     assert content.startswith(b"%PDF")
     assert len(re.findall(rb"/Type\s*/Page\b", content)) >= 4
-
-
-def test_cases_share_a_rotor(simulated):
-    """Two motions of one design are drawn with one outline."""
-    other = dataclasses.replace(simulated.cases[0], name="motion 2", series=None)
-    found = animations([simulated.cases[0], other])
-    assert len(found["rotors"]) == 1
-    assert [case["rotor"] for case in found["cases"]] == [0, 0]
-    assert found["cases"][1]["forces"] is None
 
 
 def test_axes_are_drawn_where_they_are(simulated):

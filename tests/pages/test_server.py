@@ -105,10 +105,6 @@ def test_requests_without_the_token_are_refused(address, path):
     assert "token" in text
 
 
-def test_scripts_lie_behind_the_token_too(address):
-    assert get(f"{address}static/js/bokeh.min.js")[0] == 200
-
-
 @pytest.mark.parametrize(("origin", "status"), [("http://example.org", 403), (None, 101)])
 def test_foreign_pages_may_not_connect(address, origin, status):
     """A web page of another origin that knows the address cannot open the connection."""
@@ -230,13 +226,3 @@ def test_ctrl_c_ends_with_success():
         "rootsopt explore: Ctrl-C: the page closes (once more to stop at once)"
     )
     assert "Traceback" not in rest
-
-
-def test_nothing_is_loaded_for_other_commands():
-    code = (
-        "import sys; from rootsopt.commands import cli, table; cli.parser(table.profile);"
-        "import rootsopt.commands.work.profile; print([name for name in sys.modules"
-        " if name.split('.')[0] in ('bokeh', 'tornado') or name.startswith('rootsopt.explore')])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"

@@ -1,12 +1,7 @@
 """Area and polar moment of every family are those of polygons of its own outline.
 
-The polygons use positions alone. Derivatives of both with respect to the design are compared with
-differences of the polygons."""
+The polygons use positions alone."""
 
-import functools
-
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -14,9 +9,6 @@ from hypothesis import strategies as st
 
 from experiments.geometry import study
 from rootsopt.config import FAMILY_KEYS
-from rootsopt.config.units import MM
-from rootsopt.profiles import geometry
-from rootsopt.scene.families import profile_of
 
 ERROR = 1e-11
 """Relative error allowed; the study in experiments/geometry finds 1e-13."""
@@ -63,43 +55,3 @@ def test_random_designs(family, seed):
     """Area and moment agree over the whole range of designs that a config allows."""
     _, found = study.errors(family, 5, DRAWN, np.random.default_rng(seed))
     assert np.max(found, initial=0.0) < ERROR
-
-
-@pytest.mark.long
-def test_study():
-    """The study's run over all families and numbers of lobes agrees for many sound designs."""
-    rows = study.study(100, 1)
-    assert sum(row["sound"] for row in rows) > 2000
-    assert {row["family"].split()[0] for row in rows if row["sound"]} == set(HARD)
-    for row in rows:
-        if row["sound"]:
-            assert max(row["area_error"], row["polar_moment_error"]) < ERROR, row
-
-
-@functools.partial(jax.jit, static_argnums=(0, 1))
-def slopes(family, lobes, design, way, step):
-    """Return derivatives along a `way` (d,), and differences of those of polygons.
-
-    Both are of area and moment."""
-    make = functools.partial(profile_of, family, lobes, jnp.asarray(33.0 * MM))
-
-    def integrals(design):
-        shape = geometry(make(design))
-        return jnp.stack([shape.area, shape.polar_area_moment])
-
-    ends = jax.lax.map(lambda x: study.by_polygons(make(design + x * step * way))[0], _STEPS)
-    near, far = (ends[1] - ends[0]) / 2, (ends[3] - ends[2]) / 4
-    return jax.jvp(integrals, (design,), (way,))[1], (4 * near - far) / (3 * step)
-
-
-_STEPS = jnp.array([-1.0, 1.0, -2.0, 2.0])
-
-
-@pytest.mark.parametrize("family", ["cic", "extended_cycloid"])
-def test_slopes_are_those_of_the_outline(family):
-    lobes, designs = HARD[family]
-    for design in map(np.array, designs):
-        ways = np.diag(design)
-        rows = [slopes(family, lobes, design, way, 1e-4) for way in ways]
-        found, expected = (np.array(each) for each in zip(*rows, strict=True))
-        assert np.all(np.abs(found - expected) < 1e-6 * np.max(np.abs(expected), axis=0)), design

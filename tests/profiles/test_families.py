@@ -131,33 +131,6 @@ def test_ranges_of_the_arc_and_involute_patent():
     assert radius == pytest.approx(0.35587, abs=5e-6)
 
 
-@pytest.mark.parametrize(
-    ("base", "wanted"),
-    [(0.353554, 0.27769), (0.353554, 0.343), (0.39, 0.3075), (0.39, 0.352), (0.424264, 0.35587)],
-)
-def test_patented_rotors_are_sound(base, wanted):
-    """Rotors with the radii that US 7,320,579 claims exist and mesh.
-
-    With centre distance L and base radii from L / 2√2 to 0.3 √2 L, some length of the involute
-    gives arcs of the radii claimed, 0.27768 L to 0.35587 L."""
-    r, distance = 33.0, 66.0
-    angle = np.degrees(np.arccos(base * distance / r))
-    longest = r * np.sin(angle * DEG) * np.pi / 4
-
-    def made(length):
-        design = jnp.asarray([angle, length])
-        return profile_of("arc_involute", 2, jnp.asarray(r * 1e-3), design)
-
-    def beyond(length):
-        return float(made(length).arc_radius) / (distance * 1e-3) - wanted
-
-    length = brentq(beyond, longest / 2, longest)
-    keys = {"pressure_angle_deg": angle, "involute_length_mm": length}
-    check(config_of("arc_involute", lobes=2, **keys))
-    assert float(made(length).base_radius) == pytest.approx(base * distance * 1e-3, rel=1e-12)
-    assert min(float(margin) for margin in margins(made(length))) > -1e-9
-
-
 def test_families_that_become_another():
     """Families with special parameters equal a simpler family.
 

@@ -9,14 +9,11 @@ import pytest
 from scipy.interpolate import BSpline
 
 from rootsopt.config import parse
-from rootsopt.design.resemblance import likenesses
 from rootsopt.design.space import sobol
 from rootsopt.errors import InputError
 from rootsopt.optimize.problem import Problem
-from rootsopt.optimize.search import Search
 from rootsopt.profiles import CIC, EE, FreeForm, geometry, project
-from rootsopt.profiles.departure import departure, feet
-from rootsopt.response.evaluation import Evaluator
+from rootsopt.profiles.departure import departure
 from rootsopt.scene import Scene, design_vector
 from rootsopt.scene.families import check, free_form_of, keys_of, profile_of, with_design
 from tests.optimize.test_optimize import SCENE
@@ -112,14 +109,6 @@ def test_projections_come_closer_with_more_coefficients(other, within):
         assert away[2] < away[1] / 2 < away[0] / 4
 
 
-def test_distance_of_points_from_a_line():
-    """The distance is right from a corner, from an end and from the inside of a piece."""
-    line = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0]])
-    points = np.array([[1.0, 0.5], [3.0, -1.0], [-3.0, 4.0], [2.0, 1.0]])
-    away = np.abs(feet(points, line).away)
-    np.testing.assert_allclose(away, [0.5, np.sqrt(2), 5.0, 0.0], atol=1e-15)
-
-
 # In a config
 
 
@@ -195,74 +184,6 @@ def test_profile_command_projects(tmp_path, capsys):
 # Optimised
 
 
-@pytest.mark.long
-def test_gradient_of_the_force_agrees_with_central_differences():
-    """Reverse mode agrees with differences along a direction in all coefficients.
-
-    With a step of 1e-4, differences of second order are good to some 1e-6 of the greatest slope."""
-    evaluator = Evaluator.of(free("solver.rtol=1e-10"))
-    design = np.asarray(design_vector(evaluator.config))
-    direction = np.random.default_rng(2).normal(size=len(design))
-    here = evaluator(jnp.asarray(design), series=False)
-    assert here.usable
-    step = 1e-4
-    sides = [
-        evaluator(jnp.asarray(design + s * step * direction), here.start, series=False).response
-        for s in (1, -1)
-    ]
-    for name, slope in here.gradient.items():
-        along = np.array(list(slope.values())) @ direction
-        wanted = (sides[0][name] - sides[1][name]) / (2 * step)
-        assert along == pytest.approx(wanted, rel=1e-4)
-
-
-@pytest.mark.long
-def test_free_form_is_improved_by_a_search():
-    """A few steps of descent improve on the baseline within the constraints.
-
-    The result is still a sound profile."""
-    settings = free(
-        "optimizer.screening=0",
-        "optimizer.starts=1",
-        "optimizer.iterations=4",
-        "optimizer.method=adam",
-        "optimizer.learning_rate=0.01",
-    )
-    result = Search(settings).run()
-    assert result.optimized is not None
-    assert result.improvement["objective"] > 0.005
-    assert all(row["satisfied"] for row in result.constraints)
-    names = {row["name"] for row in result.constraints}
-    assert {
-        "addendum radius of curvature",
-        "tangents clear of the axis",
-        "undercut margin",
-    } <= names
-    check(with_design(settings.profile, list(result.optimized.design.values())))
-
-
-@pytest.mark.long
-def test_single_arc_is_improved_by_a_search():
-    """A family of one parameter, with margins as constraints, is improved.
-
-    The displacement is smaller, and so is the force."""
-    settings = scene(
-        "arc",
-        "arc_center_mm: 30.5",
-        "constraints.seal_width_min_mm=0",
-        "constraints.area_efficiency_min=0.44",
-        "optimizer.screening=4",
-        "optimizer.starts=1",
-        "optimizer.iterations=3",
-        "optimizer.method=adam",
-    )
-    result = Search(settings).run()
-    assert result.optimized is not None
-    assert result.improvement["objective"] > 0.01
-    assert all(row["satisfied"] for row in result.constraints)
-    assert {row["feasible"] for row in result.history} == {True}
-
-
 @pytest.mark.parametrize(
     ("family", "inside"),
     [
@@ -301,16 +222,3 @@ def _geometry_alone(model, design):
     shape = measure(model.profile(design))
     made = baseline(parse(SCENE))
     return dataclasses.replace(made, geometry={"area_efficiency": float(shape.area_efficiency)})
-
-
-@pytest.mark.long
-def test_likeness_finds_the_family_it_came_from(monkeypatch):
-    """A projected member of a family resembles that family, with the same parameters."""
-    from rootsopt.design import resemblance
-
-    monkeypatch.setattr(resemblance, "classical", lambda: ("ee", "arc"))
-    nearest, other = likenesses(project(made("arc", 29.7), 12))
-    assert (nearest.family, other.family) == ("arc", "ee")
-    assert nearest.design["arc_center_mm"] == pytest.approx(29.7, abs=1e-3)
-    assert nearest.departure < 0.05e-6
-    assert other.departure == pytest.approx(departure(EE(3, R), made("arc", 29.7)), rel=1e-3)

@@ -307,22 +307,6 @@ def test_curvature_of_circles():
     assert found == pytest.approx(1 / outer + 1 / (2 * R - outer), rel=1e-9)
 
 
-def test_section_adds_nothing_to_the_simulation():
-    """The program of the equations of motion is the same with it."""
-    design = design_vector(load_config("configs/cic_drawn.yaml"))
-
-    def forces(scene, design):
-        return scene.pair(design).contact_force(*jnp.zeros(3)).total
-
-    texts = []
-    for changes in ((), LIQUID[:1]):
-        dynamic, static = eqx.partition(scene_of(*changes), eqx.is_array)
-        program = jax.make_jaxpr(lambda d, x, s=static: forces(eqx.combine(d, s), x))
-        texts.append([str(one.primitive) for one in program(dynamic, design).eqns])
-    assert len(texts[0]) > 20
-    assert texts[0] == texts[1]
-
-
 def test_sheet_has_the_rows_of_its_inputs():
     config = load_config("configs/cic_drawn.yaml")
     design = design_vector(config)

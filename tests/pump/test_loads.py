@@ -11,20 +11,13 @@ import pytest
 import rootsopt
 from rootsopt import InputError, Scene
 from rootsopt.config.units import DEG
-from rootsopt.dynamics.varied import varied
-from rootsopt.output.files import response_columns
 from rootsopt.profiles import geometry
 from rootsopt.pump import loads as formulas
-from rootsopt.pump.loads import BearingSet, orbit_loads, static_loads
-from rootsopt.response.evaluation import Evaluator
-from rootsopt.response.series import sampled
-from rootsopt.response.starts import begun
+from rootsopt.pump.loads import BearingSet, static_loads
 from rootsopt.response.terms import Forces, needs_forces, terms_of
 from rootsopt.scene.bearings import GRAVITY
-from rootsopt.status import Status
 
 GAS, BEARINGS = "scene.load={pressure_difference_Pa: 5e4}", "scene.bearings={weight: true}"
-SUPPORTS = "scene.supports={stiffness_N_per_mm: 2e4, damping_N_s_per_mm: 5}"
 
 
 def scene_of(*changes: str) -> tuple[Scene, jnp.ndarray]:
@@ -181,61 +174,3 @@ def test_term_needs_bearings():
     with pytest.raises(InputError, match=r"needs the section `scene.bearings`"):
         term.value(scene, *values)
     assert needs_forces(scene_of(BEARINGS)[0], term, design)
-
-
-@pytest.mark.long
-def test_gradient_of_the_equivalent_load():
-    config = rootsopt.load_config("cic_drawn", [GAS, BEARINGS, "solver.rtol=1e-10"])
-    design, step = config.design, np.array([1e-3, 0, 0])
-    ahead, here, behind = (rootsopt.evaluate(config, design + k * step) for k in (1, 0, -1))
-    name = "bearing_load_equivalent_N"
-    slope = here.gradient[name]["pressure_angle_deg"]
-    assert slope == pytest.approx((ahead.response[name] - behind.response[name]) / 2e-3, rel=1e-5)
-    # The integral against the samples of the series.
-    columns = response_columns(here.series)
-    each = [x for key, x in columns.items() if key.startswith("bearing_")]
-    assert len(each) == 4
-    means = [np.mean(x ** (10 / 3)) ** 0.3 for x in each]
-    assert here.response[name] == pytest.approx(max(means), rel=1e-3)
-    assert here.response["bearing_load_max_N"] == np.max(each)
-
-
-@pytest.mark.long
-def test_work_and_momentum_of_elastic_bearings():
-    """Over a closed orbit no work is left, and the axes gain no momentum."""
-    scene, design = scene_of(GAS, BEARINGS, SUPPORTS)
-    evaluator = Evaluator(rootsopt.load_config("cic_drawn", [GAS, BEARINGS, SUPPORTS]), scene)
-    pair, tangents, _ = scene.pair_and_tangents(design)
-    start = begun(pair, None, scene.solver.max_orbit)
-    found = evaluator.motion(pair, tangents, start)
-    assert Status.of(found.status) is Status.PERIODIC
-    orbit = varied(found)
-    loads, states = orbit_loads(scene, design, orbit), sampled(orbit.elements)
-    tau = int(found.period) * np.arange(len(states)) / len(states)
-
-    @jax.jit
-    def seen(tau, state):
-        motion, contact = pair.motion(tau, state), pair.contact_at(tau, state)
-        gear, gas = pair.gear(motion.relative, motion.rate), pair.load.torque2(motion.phi)
-        others = pair.parts[-1].force_on_axes(motion, np.zeros(0))
-        pushed = jnp.stack([-contact.push, contact.push]) + others
-        speed2 = motion.speed + motion.rate
-        return pushed, motion.drift, contact.torque2 * speed2, -gear * speed2, -gas * speed2
-
-    pushed, drift, *powers = map(np.asarray, jax.lax.map(lambda x: seen(*x), (tau, states)))
-    carried = np.asarray(loads.series.radial).sum(2)
-    # A sum over samples misplaces a jump, where a pocket opens, by up to a sample.
-    jump = np.max(np.abs(np.diff(pushed, axis=0))) / len(states)
-    assert jump < 2e-3 * np.mean(np.abs(pushed))
-    np.testing.assert_allclose(carried.mean(0), pushed.mean(0), rtol=0, atol=jump)
-    powers.append(np.sum((pushed - carried) * drift, axis=(1, 2)))
-    gross = np.mean(np.abs(powers), axis=1)
-    # Evenly spaced samples resolve short impacts, and jumps, to some 1e-4 of the greatest power.
-    assert abs(np.mean(np.sum(powers, axis=0))) < 3e-4 * np.max(gross)
-    assert gross[-1] > 1e-3 * np.max(gross)
-
-
-@pytest.mark.long
-def test_a_profile_without_parameters_has_loads():
-    found = rootsopt.evaluate(rootsopt.load_config("ee", [GAS, BEARINGS]))
-    assert found.response["bearing_load_max_N"] > found.response["bearing_load_equivalent_N"] > 0

@@ -13,7 +13,7 @@ from rootsopt.measured.conjugacy import conjugacy
 from rootsopt.profiles import CIC, EE, place_pair
 from rootsopt.pump.gap import Allowances, mesh_gap, play
 from tests.conformance.families import LOBES, R, made, outline_of
-from tests.measured.test_outline import bulged, points_of, profile_of
+from tests.measured.test_outline import points_of, profile_of
 
 C = 5e-5
 
@@ -121,15 +121,6 @@ def test_play_is_continuous_in_the_overlap(family):
     assert np.all(np.abs(np.diff(play)) < 5)
 
 
-def test_play_does_not_depend_on_the_number_of_points():
-    """120 points interpolate EE to 8 µm, 12,000 to 1 nm: the backlash differs by no more."""
-    found = [profile_of(points_of(EE(LOBES, R), count))[0] for count in (10, 1000)]
-    (coarse, *_), (fine, overlap, _) = (at_clearances(one, [0.0])[:, 0] for one in found)
-    assert abs(fine) < 0.05
-    assert overlap < 0.02
-    assert -16 < coarse < 0
-
-
 def test_smaller_rotors_have_the_play_of_their_gap():
     """A radius that is smaller everywhere: the gap of the flanks, over the lever r cos ψ."""
     profile, nothing = made("cic"), jnp.zeros(())
@@ -139,31 +130,6 @@ def test_smaller_rotors_have_the_play_of_their_gap():
     expected = 2 * R * np.min(np.asarray(gap.least) / lever)
     assert float(found.gear_backlash) == pytest.approx(expected, rel=2e-2)
     assert expected > C
-
-
-def test_slope_is_that_of_differences():
-    def backlash(clearance):
-        poses = jnp.asarray([-np.pi / 6, 0.3])
-        return play(EE(LOBES, R), clearance, jnp.asarray(2 * R), poses).gear_backlash
-
-    value, slope = jax.jit(jax.value_and_grad(backlash))(jnp.asarray(C))
-    assert float(slope) == pytest.approx(2.0, rel=1e-2)
-    assert float(value) == pytest.approx(2 * C, rel=1e-4)
-
-
-def test_measured_outline():
-    """Points of a CIC rotor whose addenda are 20 µm too thin: not conjugate, no clearance."""
-    points = bulged(
-        points_of(CIC(LOBES, R, *np.deg2rad([36.43]), 8.5e-3, np.deg2rad(4.0)), 240), -0.02
-    )
-    found = played(profile_of(points)[0], jnp.asarray(0.0), jnp.asarray(2 * R))
-    outline = np.stack([points.real, points.imag], axis=1) / 1e3
-    outline = np.concatenate([outline, outline[:1]])
-    assert float(found.gear_backlash) == pytest.approx(0.0, abs=1e-7)
-    for k in (3, 41, 75):
-        phi = float(found.phi[k])
-        for end in (float(found.behind[k]), float(found.ahead[k])):
-            assert abs(pair_gap(outline, LOBES, 2 * R, phi, phi + end)) < 2e-7
 
 
 def test_play_is_smooth_in_the_design():

@@ -6,13 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.spatial import KDTree
 
 from rootsopt import load_config
 from rootsopt.config.families import families
-from rootsopt.profiles import CIC, EE, geometry, place_pair
+from rootsopt.profiles import EE, geometry, place_pair
 from rootsopt.pump import flow
 from rootsopt.pump.sheet import sheet
 from rootsopt.scene import Scene, design_vector
@@ -156,18 +154,6 @@ def test_radius_ratio_stays_below_its_limit(lobes, centre):
         half = s + step / 2 * np.sqrt(1 - s**2 / 4)
         s += step * np.sqrt(1 - half**2 / 4)
     assert 1 + s == pytest.approx(limit, rel=1e-9)
-
-
-@given(st.floats(25, 45), st.floats(0, 1), st.floats(0.5, 8))
-def test_no_cic_comes_near_the_limit(angle, share, land):
-    alpha, land = np.radians([angle, land])
-    longest = R * np.sin(alpha) * (np.pi / (2 * LOBES) - land)
-    profile = CIC(
-        LOBES, R, pressure_angle=alpha, involute_length=share * longest, tip_arc_angle=land
-    )
-    _, ripple, _, height = describe(profile)
-    assert 0 < float(height) < 1
-    assert 0 < float(ripple) < 0.35
 
 
 def test_twist_evens_the_flow():

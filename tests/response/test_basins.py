@@ -3,7 +3,6 @@
 import csv
 import dataclasses
 import json
-from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +12,7 @@ from rootsopt.commands.console import main
 from rootsopt.config import load
 from rootsopt.dynamics.flow import strobe
 from rootsopt.dynamics.integrator import Integrator
-from rootsopt.response.attractors import _Sorter, find
+from rootsopt.response.attractors import find
 from rootsopt.response.evaluation import Evaluator, evaluate
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.status import Status
@@ -23,6 +22,7 @@ COEXIST = (
     "scene.timing_gear.damping_ratio=0.2",
     "scene.speed_rpm=6000",
 )
+WEAK = "scene.timing_gear.stiffness_N_m_per_rad=1", "scene.load.torque_N_m=40"
 GRID = "attractors.relatives=12", "attractors.rates=9"
 FORCES = ("mean_force_N", "peak_force_N", "rms_force_N")
 
@@ -139,12 +139,6 @@ def test_the_reference_decides_which_is_worst(coexisting):
     assert found.response["peak_force_N"] < max(r["peak_force_N"] for r in responses)
 
 
-def test_a_scene_without_coexistence_has_one_motion():
-    basins = find(Evaluator.of(config_of()))
-    assert [one.share for one in basins.attractors] == [1.0]
-    assert basins.attractors[0].reached
-
-
 def test_a_chaotic_basin_is_no_steady_state():
     """Some initial states lead to chaos: the objective over all motions has no gradient."""
     scene = (
@@ -178,31 +172,9 @@ def test_a_motion_that_is_not_told_is_no_steady_state(coexisting):
     assert dataclasses.replace(basins, attractors=mixed).status is Status.CHAOTIC
 
 
-def test_a_cycle_is_that_of_the_pair_last_evaluated(coexisting, monkeypatch):
-    """The cycle uses the contact map of the evaluation, which may be fitted to the motion."""
-    evaluator, found = coexisting
-    built, used = [], []
-
-    class Refitting(Evaluator):
-        def pair(self, design):
-            built.append(SimpleNamespace(repeats=1))
-            return built[-1]
-
-    def cycle(pair, state, how):
-        used.append(pair)
-        return np.tile(state, (8, 1))
-
-    monkeypatch.setattr("rootsopt.response.attractors._cycle", cycle)
-    sorter = _Sorter(Refitting.of(evaluator.config), jnp.array([36.43, 9.0, 4.0]), False)
-    for one in found.attractors:
-        sorter.add(one.evaluation, one.cycle[0])
-    assert used == built
-    assert len({id(pair) for pair in used}) == len(found.attractors) >= 2
-
-
 def test_lost_motions_are_counted():
-    """Without a timing gear all motions are lost, and no motion is reported."""
-    basins = find(Evaluator.of(config_of("scene.timing_gear=null")))
+    """Behind a weak timing gear all motions are lost, and no motion is reported."""
+    basins = find(Evaluator.of(config_of(*WEAK)))
     assert basins.attractors == ()
     assert basins.lost == {"passed_through": 1.0}
     assert np.all(basins.leads_to == -1)
@@ -226,28 +198,6 @@ def test_command(tmp_path, capsys):
     assert [numbers.count(k + 1) / 108 for k in range(len(shares))] == pytest.approx(shares)
     assert (tmp_path / "figures" / "basins.png").read_bytes()[:4] == b"\x89PNG"
     assert (tmp_path / "response_2.csv").exists()
-    lost = ["attractors", "configs/cic_drawn.yaml", "--set=scene.timing_gear=null", *overrides[:2]]
+    weak = (f"--set={key}" for key in WEAK)
+    lost = ["attractors", "configs/cic_drawn.yaml", *weak, *overrides[:2]]
     assert main([*lost, "-o", str(tmp_path / "lost"), "--no-figures"]) == 3
-
-
-@pytest.mark.long
-def test_optimiser_over_all_motions(tmp_path):
-    """`worst` improves the baseline's worst motion and reports all motions."""
-    small = (
-        "objective.motion=worst",
-        "optimizer.iterations=3",
-        "optimizer.method=adam",
-        "optimizer.screening=2",
-        "optimizer.starts=1",
-        "attractors.relatives=8",
-        "attractors.rates=6",
-        "assumptions.scenes=0",
-    )
-    overrides = [f"--set={key}" for key in (*COEXIST, *small)]
-    assert main(["optimize", "configs/cic_drawn.yaml", *overrides, "-o", str(tmp_path)]) == 0
-    record = json.loads((tmp_path / "result.json").read_text())
-    assert record["improvement"]["objective"] > 0
-    for name in ("baseline", "optimized"):
-        motions = record[name]["steady_state"]["attractors"]
-        assert len(motions) >= 1
-        assert {row["status"] for row in motions} == {"periodic"}

@@ -5,9 +5,6 @@ import dataclasses
 import functools
 import itertools
 import json
-import re
-import subprocess
-import sys
 
 import jax.numpy as jnp
 import numpy as np
@@ -177,26 +174,13 @@ def test_chaos_is_averaged_and_named():
 
 def test_standard_errors_are_honest():
     """Independent ensembles differ by as much as their standard errors state."""
-    found = [numbers(chaotic(seed=seed)) for seed in range(4)]
+    found = [numbers(chaotic(seed=seed, members=16)) for seed in range(3)]
     apart = []
     for (first, by_first), (second, by_second) in itertools.combinations(found, 2):
         apart.append(np.abs(first - second) / np.hypot(by_first, by_second))
     assert np.max(apart) < 4
     # Neither are they far too large.
     assert np.max(apart) > 0.3
-
-
-@pytest.mark.long
-def test_peak_does_not_grow_with_the_window():
-    """The mean of the periods' peaks is the same over long and short windows.
-
-    The greatest of all forces is not."""
-    short, long = ([chaotic(seed=s, periods=n) for s in range(3)] for n in (8, 96))
-    (a, by_a), (b, by_b) = numbers(short[0]), numbers(long[0])
-    assert np.all(np.abs(a - b) < 4 * np.hypot(by_a, by_b))
-    # A single seed may have its greatest force in a short window.
-    greatest = [[one.steady_state["greatest_force_N"] for one in some] for some in (short, long)]
-    assert np.mean(greatest[1]) > np.mean(greatest[0])
 
 
 def test_gradient_of_chaos_has_its_standard_error():
@@ -239,10 +223,10 @@ def test_start_is_continued():
 
 def test_no_number_without_its_status():
     """If a member fails, the ensemble fails, and has neither averages nor gradient."""
-    free = "scene.timing_gear=null", "scene.load.torque_N_m=4.775"
+    free = "scene.timing_gear.stiffness_N_m_per_rad=1", "scene.load.torque_N_m=40"
     evaluation = averaged(*free, *PERIODIC, gradient=True)
     assert evaluation.status is Status.PASSED_THROUGH
-    assert evaluation.message.startswith(evaluation.status.meaning + " Add a scene.timing_gear, or")
+    assert evaluation.message.startswith(evaluation.status.meaning + " Raise scene.timing_gear")
     assert (evaluation.response, evaluation.gradient) == ({}, {})
     assert evaluation.steady_state == {"kind": "transient"}
     assert evaluation.series is None
@@ -346,7 +330,7 @@ def test_optimize_a_chaotic_scene(tmp_path, capsys):
     """A small run says whether its gain is significant; the history has standard errors."""
     size = "ensemble.members=4", "ensemble.designs=12", "ensemble.spread=0.1"
     window = "ensemble.settle_periods=8", "ensemble.periods=8"
-    search = "optimizer.screening=2", "optimizer.starts=1", "optimizer.iterations=2"
+    search = "optimizer.screening=0", "optimizer.starts=1", "optimizer.iterations=1"
     options = itertools.chain.from_iterable(
         ("--set", key) for key in (*CHAOTIC, *size, *window, *search)
     )
@@ -357,7 +341,7 @@ def test_optimize_a_chaotic_scene(tmp_path, capsys):
     assert result["baseline"]["gradient"]
     with open(tmp_path / "history.csv", newline="") as file:
         history = list(csv.DictReader(file))
-    assert len(history) >= 3
+    assert len(history) >= 2
     assert all(0 < float(row["objective_standard_error"]) < 10 for row in history)
     assert code == (0 if verification["holds_up"] else 3)
     if code == 0:
@@ -367,22 +351,6 @@ def test_optimize_a_chaotic_scene(tmp_path, capsys):
     else:
         assert "noise" in text
         assert result["optimized"] is None
-
-
-@pytest.mark.long
-def test_reached_refuses_chaos_and_names_the_option(tmp_path):
-    """A single chaotic motion is refused, and the message names the option that helps."""
-    options = itertools.chain.from_iterable(
-        ("--set", key) for key in (*CHAOTIC, "objective.motion=reached")
-    )
-    command = [sys.executable, "-m", "rootsopt.optimize", "configs/cic_drawn.yaml", "--no-figures"]
-    command += ["-o", str(tmp_path), *options]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 3, done.stderr
-    result = json.loads((tmp_path / "result.json").read_text())
-    assert result["baseline"]["status"] == "chaotic"
-    assert result["baseline"]["gradient"] == {}
-    assert re.search(r"objective\.motion\s+to\s+ensemble", done.stdout)
 
 
 def test_simulate_an_ensemble(tmp_path):
@@ -397,18 +365,3 @@ def test_simulate_an_ensemble(tmp_path):
         force = [float(row["contact_force_N"]) for row in csv.DictReader(file)]
     assert 0 < np.mean(force) < max(force)
     assert (tmp_path / "figures" / "force.png").exists()
-
-
-@pytest.mark.long
-def test_experiment(tmp_path):
-    """The study runs, and writes its tables and its figure."""
-    command = [sys.executable, "-m", "experiments", "chaos", "--quick", "-o", str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    data = json.loads((tmp_path / "chaos.json").read_text())
-    assert data["versions"]["rootsopt"]
-    assert data["baseline"]["lyapunov_exponent_per_mesh_period"] > 0
-    assert (tmp_path / "chaos.png").read_bytes()[:4] == b"\x89PNG"
-    for name in ("line", "pathwise", "history", "members"):
-        with open(tmp_path / f"chaos_{name}.csv", newline="") as file:
-            assert len(list(csv.DictReader(file))) >= 2

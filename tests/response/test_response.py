@@ -11,10 +11,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 
 import rootsopt
+from experiments._common.shooting import differentiated
 from rootsopt import Scene, Status, steady_response
 from rootsopt.config.families import for_a_time
 from rootsopt.response import terms
@@ -168,25 +168,6 @@ PARTS = {
 """Scenes with single parts, and the quantities of those parts."""
 
 
-def ridders(function, step: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the derivative at 0 and its error.
-
-    Central differences are extrapolated over six steps."""
-    table = [[(function(step) - function(-step)) / (2 * step)]]
-    best, error = table[0][0], np.full(table[0][0].shape, np.inf)
-    for row in range(1, 6):
-        h = step / 1.6**row
-        entries = [(function(h) - function(-h)) / (2 * h)]
-        for order, before in enumerate(table[-1], start=1):
-            factor = 1.6 ** (2 * order)
-            entries.append((factor * entries[-1] - before) / (factor - 1))
-            off = np.maximum(abs(entries[-1] - entries[-2]), abs(entries[-1] - before))
-            best = np.where(off < error, entries[-1], best)
-            error = np.minimum(off, error)
-        table.append(entries)
-    return best, error
-
-
 @pytest.mark.long
 @pytest.mark.parametrize("kind", PARTS)
 def test_derivatives_with_respect_to_quantities_of_parts(kind):
@@ -214,7 +195,7 @@ def test_derivatives_with_respect_to_quantities_of_parts(kind):
             entries[k] = value * (1 + step)
             return np.asarray(found(entries, response.state)[0])
 
-        slope, error = ridders(moved, 8e-3)
+        slope, error = differentiated(moved, 8e-3, 6)
         allowed = np.maximum(1e-6 * np.maximum(abs(slope), 1e-2 * known), error)
         assert np.all(error < 1e-4 * abs(known)), name
         assert np.all(abs(jacobian[k] * value - slope) <= allowed), name
@@ -332,25 +313,6 @@ def test_function_compiled_with_the_options_of_programs(scene):
     assert float(response) == pytest.approx(np.sin(1.0), rel=1e-15)
 
 
-@pytest.mark.long
-def test_within_an_optimiser(scene):
-    """A function that calls `steady_response` twice works in an optax loop."""
-    faster = eqx.tree_at(lambda s: s.speed, scene, 1.2 * scene.speed)
-
-    def both(design):
-        return steady_response(scene, design).mean + steady_response(faster, design).mean
-
-    rule = optax.sgd(2e-2)
-    design, state = jnp.asarray(DESIGN), rule.init(jnp.asarray(DESIGN))
-    values = []
-    for _ in range(3):
-        value, slope = jax.value_and_grad(both)(design)
-        update, state = rule.update(slope, state)
-        design = optax.apply_updates(design, update)
-        values.append(float(value))
-    assert values[2] < values[1] < values[0]
-
-
 def test_unknown_derivatives_are_not_numbers(scene):
     """Without an orbit, all derivatives are NaN.
 
@@ -418,19 +380,6 @@ def test_example_in_the_docstring_runs(name, monkeypatch):
     finally:
         jax.config.update("jax_enable_x64", True)
     assert result.failed == 0, "".join(told)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", rootsopt.__all__)
-def test_example_in_the_docstring_runs_in_a_fresh_process(name):
-    code = "; ".join((
-        "import doctest, sys", "parser = doctest.DocTestParser()",
-        "test = parser.get_doctest(sys.argv[1], {}, 'example', None, 0)",
-        "sys.exit(doctest.DocTestRunner().run(test).failed)",
-    ))  # fmt: skip
-    text = example_of(name).docstring
-    done = subprocess.run([sys.executable, "-c", code, text], capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_every_public_name_is_there():

@@ -6,7 +6,6 @@ import json
 import numpy as np
 import pytest
 
-from experiments.speed.study import equilibria
 from rootsopt.commands.console import main
 from rootsopt.config import load, parse
 from rootsopt.errors import InputError
@@ -16,7 +15,6 @@ from rootsopt.response.attractors import Coexisting
 from rootsopt.response.evaluation import Evaluator, _build, _motion
 from rootsopt.response.reducers import overall
 from rootsopt.response.result import Part
-from rootsopt.scene import design_vector
 from rootsopt.status import Status
 from tests.standins import evaluation_of
 
@@ -152,20 +150,6 @@ def test_each_speed_begins_on_its_own_orbit(baseline, moved, monkeypatch):
         assert periods[0] <= periods[1]
 
 
-def test_without_speeds_all_is_as_before(baseline):
-    """Without speeds, evaluator, record and objective are those of one speed to the last bit."""
-    assert Evaluator.of_objective(config_of()).single
-    evaluator = Evaluator.of_objective(config_of(TIGHT))
-    found = evaluator(series=False)
-    assert "speeds" not in found.record()
-    head = baseline[1].speeds[1].evaluation
-    assert found.response == head.response
-    problem = Problem.of(evaluator.config, evaluator.scene, found)
-    weights = {key: 0.5 / found.response[key] for key in ("mean_force_N", "peak_force_N")}
-    assert problem.objective(head) == sum(w * head.response[k] for k, w in weights.items())
-    assert problem.by_speed(found) == []
-
-
 def test_a_speed_without_steady_state_is_a_status():
     """If one of two speeds does not settle, the status names that speed.
 
@@ -274,7 +258,8 @@ def test_sweep_command(tmp_path, capsys, singles):
             assert float(row[key]) == pytest.approx(value, rel=1e-9)
             assert record[key] == pytest.approx(value, rel=1e-12)
     assert (tmp_path / "figures" / "speeds.png").read_bytes()[:4] == b"\x89PNG"
-    lost = "scene.timing_gear=null", "sweep.speed_rpm={from: 2000, to: 4000, points: 2}"
+    lost = "scene.timing_gear.stiffness_N_m_per_rad=1", "scene.load.torque_N_m=40"
+    lost = *lost, "sweep.speed_rpm={from: 2000, to: 4000, points: 2}"
     assert run("sweep", tmp_path / "lost", *lost, options=["--no-figures"]) == 3
     record = json.loads((tmp_path / "lost" / "result.json").read_text())
     assert record["status"] == "passed_through"
@@ -311,22 +296,6 @@ def test_simulate_stays_at_the_scene(tmp_path, baseline):
     record = json.loads((tmp_path / "result.json").read_text())
     assert "speeds" not in record
     assert record["response"]["mean_force_N"] == baseline[1].response["mean_force_N"]
-
-
-def test_linearised_pair_has_the_closed_form_stiffness():
-    """The stiffness is e F/δ · (r cos α)² in the half of the mesh on involutes.
-
-    In the other half it is the gear's."""
-    config = config_of("scene.timing_gear.backlash_mm=0.4", "contact.smoothing_mm=0")
-    pair = Evaluator.of(config).pair(design_vector(config))
-    total, flank, torque, force = (np.asarray(x) for x in equilibria(pair, np.array([0.25, 0.75])))
-    lever = 33.0e-3 * np.cos(np.radians(36.43))
-    normal = 4.775 / lever
-    depth = 1e-3 * (normal / 2.0e5) ** (1 / 2.2)
-    assert total == pytest.approx([2.0e4, 2.2 * normal / depth * lever**2], rel=1e-6)
-    assert flank == pytest.approx([0, total[1]], rel=1e-9)
-    assert torque == pytest.approx([0, 4.775], abs=1e-9)
-    assert force == pytest.approx([0, normal], rel=1e-6)
 
 
 @pytest.mark.parametrize("failing", [2000.0, 3000.0, 4000.0])

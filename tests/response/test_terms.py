@@ -41,11 +41,8 @@ def scene() -> Scene:
 @pytest.mark.parametrize(
     "name",
     [
-        "mean_force_N",
         "rms_force_N",
         "polar_inertia_kg_m2",
-        "outer_radius_mm",
-        "area_mm2",
         "flow_ripple",
         OUTSIDE,
     ],

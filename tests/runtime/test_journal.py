@@ -7,7 +7,6 @@ import random
 import numpy as np
 import pytest
 
-import rootsopt
 from rootsopt.config import load
 from rootsopt.dynamics.maxima import Maxima
 from rootsopt.errors import InputError
@@ -15,9 +14,8 @@ from rootsopt.response.checkpoint import Checkpoint, plain_evaluation
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.many import Point
 from rootsopt.response.result import Part
-from rootsopt.runtime.journal import Journal, _content, _line, header_of, set_aside
+from rootsopt.runtime.journal import Journal, _line, header_of, set_aside
 from rootsopt.status import Status
-from rootsopt.sweeps import points
 from rootsopt.sweeps.plan import plan_of
 from rootsopt.sweeps.points import lost
 from rootsopt.sweeps.scenes import Points
@@ -81,20 +79,6 @@ def test_results_come_back_exactly(path, kind):
     journal.add([(rows[0][0], rows[1][1])])  # The first result of a key counts.
     journal.close()
     assert path.read_bytes() == data
-
-
-def test_every_cut_leaves_a_file_to_go_on_with(path):
-    """As a kill at any byte would."""
-    data = filled(path)
-    ends = [k + 1 for k, byte in enumerate(data) if byte == ord("\n")]
-    for size in (0, 3, *(end + d for end in ends for d in (-1, 0, 1) if end + d <= len(data))):
-        path.write_bytes(data[:size])
-        journal = sweep(path, resume=True)
-        # A line without its end is whole if nothing else is missing.
-        assert len(journal.rows) == max(0, sum(end - 1 <= size for end in ends) - 1)
-        journal.add([(2, ROW)])
-        journal.close()
-        assert 2 in sweep(path, resume=True).rows
 
 
 def damaged(data, chance):
@@ -277,33 +261,3 @@ def test_what_differs_is_named(path, tmp_path):
         Journal({}, path.with_name("absent"), resume=True)
     with pytest.raises(InputError, match="cannot be read"):
         header_of("sweep", CIC, others=[str(tmp_path / "absent.csv")])
-
-
-def test_sweep_goes_on_where_it_stopped(path, monkeypatch):
-    """Each point is simulated once, except for a damaged one, which is named in a warning.
-
-    The dataset is that of an uninterrupted sweep."""
-    asked = []
-
-    def check(config):
-        asked.append(config.scene.speed_rpm)
-        if len(asked) == 4:
-            raise KeyboardInterrupt
-        raise InputError("no")
-
-    monkeypatch.setattr(points, "check_geometry", check)
-    monkeypatch.setattr("os.cpu_count", lambda: 1)
-    axes = {SPEED: "1,2,3,4,5"}
-    with pytest.raises(KeyboardInterrupt):
-        rootsopt.sweep_scenes(CIC, axes, checkpoint=path)
-    head, first, *lines = path.read_bytes().splitlines(keepends=True)
-    assert 1 <= len(lines) <= 3
-    path.write_bytes(b"".join([head, first.replace(b"no", b"on"), *lines]))
-    with pytest.warns(UserWarning, match="1 line is damaged"):
-        found = rootsopt.sweep_scenes(CIC, axes, checkpoint=path, resume=True)
-    assert found.identical(rootsopt.sweep_scenes(CIC, axes))
-    head, *lines = path.read_bytes().split(b"\n")[:-1]
-    numbers = [_content(line, head.split(b" ")[0])[0] for line in lines]
-    assert sorted(numbers) == [0, 1, 2, 3, 4]
-    with pytest.raises(InputError, match="`resume` needs `checkpoint`"):
-        rootsopt.sweep_scenes(CIC, axes, resume=True)

@@ -160,18 +160,6 @@ def test_a_folder_of_another_user_is_refused(tmp_path, monkeypatch):
     assert "belongs to another user" in refusal(tmp_path / "cache")
 
 
-@posix
-@pytest.mark.skipif(os.name == "posix" and os.geteuid() != 0, reason="only root gives files away")
-def test_a_folder_in_one_of_another_user_is_refused(tmp_path):
-    """A folder inside another user's is refused, because its owner can replace it."""
-    above = tmp_path / "above"
-    (above / "cache").mkdir(parents=True)
-    os.chown(above, 12345, 12345)
-    assert "12345" in refusal(above / "cache")
-    os.chown(tmp_path / "above" / "cache", 12345, 12345)
-    assert "belongs to another user" in refusal(above / "cache")
-
-
 def test_a_folder_that_cannot_be_used_is_an_os_error(tmp_path):
     (tmp_path / "file").write_text("")
     for path in (tmp_path / "file", tmp_path / "file" / "below"):
@@ -256,13 +244,6 @@ def at_once(number, work):
     for thread in threads:
         thread.join()
     return results
-
-
-def test_those_who_make_the_key_at_once_share_it(key_folder, monkeypatch):
-    for attempt in range(20):
-        monkeypatch.setattr(store, "key_folder", lambda k=attempt: key_folder / str(k))
-        assert len(set(at_once(8, lambda _: store._key()))) == 1
-        assert [path.name for path in (key_folder / str(attempt)).iterdir()] == ["programs.key"]
 
 
 def test_an_entry_written_by_many_is_whole(tmp_path):

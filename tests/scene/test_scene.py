@@ -78,7 +78,8 @@ def test_forces_of_all_parts_are_newtons(family):
     and closer than nominal, and flanks, tips and roots touch."""
     # Rounding of the geometry is some 1e-17 m of a depth of 1e-6 m.
     for error in (0.02, -0.02):
-        more = [f"scene.center_distance_error_mm={error}", *([WITHIN] * (family == "cic_drawn"))]
+        more = [f"scene.center_distance_error_mm={error}", "contact.clearance_mm=0.002"]
+        more += [WITHIN] * (family == "cic_drawn")
         pair, config = pair_of([*ALL, *more], family)
         reference = planar_of(pair, config)
         rng = np.random.default_rng(3)
@@ -248,6 +249,15 @@ def test_an_absent_part_costs_nothing(part):
         assert rest[2] < whole[2]
 
 
+def test_an_absent_gear_costs_nothing():
+    """A gear without errors adds four numbers: stiffness, damping, backlash, rounding."""
+    (states, length, numbers), (least, shorter, fewer) = size([]), size(["scene.timing_gear=null"])
+    assert states == least == 2
+    assert shorter < length
+    assert numbers - fewer == 4
+
+
+@pytest.mark.long
 def test_orbit_and_gradient_of_all_parts():
     """With all parts, eleven states, the orbit closes, and its gradient is that of differences."""
     config = load("configs/cic_drawn.yaml", [*ALL, WITHIN, "solver.rtol=1e-10"])

@@ -16,42 +16,13 @@ from rootsopt.commands.work.searching import runs_of
 from rootsopt.config import load
 from rootsopt.errors import InputError
 from rootsopt.response.evaluation import Evaluator
-from rootsopt.response.many import HERE, Point, Runs
+from rootsopt.response.many import HERE, Point
 from rootsopt.sweeps import evaluations
 from rootsopt.sweeps.cluster import Cluster
 from rootsopt.sweeps.evaluations import ClosedError, DaskRunner, evaluating
 from rootsopt.sweeps.worker import Settings
-from tests.sweeps.test_cluster import IMPORT, kill_a_worker, no_workers
-from tests.sweeps.workers import DEADLY, force
-
-
-def test_a_killed_worker_loses_and_duplicates_no_design(monkeypatch):
-    monkeypatch.setenv("TEST_SECONDS", "0.1")
-    evaluator = Evaluator.of(load("cic_drawn"))
-    designs = np.random.default_rng(0).uniform(1.0, 40.0, (40, 3))
-    ended, killed, lock = [], [], threading.Lock()
-
-    def evaluated(number):
-        found = runs.evaluated(Point(evaluator, designs[number]))
-        with lock:
-            ended.append(number)
-            if len(ended) >= 4 and not killed:
-                killed.append(number)
-                kill_a_worker()
-        return found
-
-    with (
-        Cluster(2, imports=(IMPORT,)).evaluations() as runs,
-        ThreadPoolExecutor(runs.slots) as pool,
-    ):
-        assert isinstance(runs, Runs)
-        found = list(pool.map(evaluated, range(40)))
-    assert killed
-    assert sorted(ended) == [*range(40)]
-    for design, one in zip(designs, found, strict=True):
-        assert one.response["mean_force_N"] == force(design)
-        assert one.start.tobytes() == design.tobytes()
-    assert no_workers()
+from tests.sweeps.test_cluster import IMPORT
+from tests.sweeps.workers import DEADLY
 
 
 @pytest.mark.long

@@ -343,18 +343,6 @@ def test_senses():
     assert [aim.sense for aim in aims_of(turned)] == ["max", "min", "min"]
 
 
-def test_displaced_volume_is_that_of_its_pockets():
-    """Per revolution, a pair displaces what both sections leave of their circles."""
-    scene, design = Scene.from_config(config()), jnp.asarray(config().design)
-    profile = eqx.filter_jit(Scene.profile)(scene, design)
-    shape = eqx.filter_jit(geometry)(profile)
-    (term,) = terms.terms_of(["displaced_volume_cm3"])
-    nothing = terms.Forces(*jnp.zeros(3))
-    pockets = np.pi * float(shape.outer_radius) ** 2 - float(shape.area)
-    volume = float(term.value(scene, profile, shape, nothing))
-    assert volume == pytest.approx(2 * pockets * 0.1 * 1e6, rel=1e-9)
-
-
 def test_interrupted_front_keeps_its_points():
     stop = threading.Event()
 

@@ -31,7 +31,6 @@ from rootsopt.dynamics.collocation.peak import Rivals, peak_of, rivals_of
 from rootsopt.dynamics.collocation.system import Step, moved_at, unchanged
 from rootsopt.dynamics.varied import VariedOrbit
 from rootsopt.response.evaluation import Evaluator
-from rootsopt.response.series import sampled
 from rootsopt.scene import Scene
 from rootsopt.status import Status
 
@@ -66,13 +65,6 @@ def _known(room=(48, 51)):
     one = jnp.ones(())
     yes = jnp.ones((), bool)
     return KnownOrbit(motion, one, one, one, yes, yes)
-
-
-def test_samples_of_an_orbit():
-    """They begin at φ1 = 0 even if the mesh does not."""
-    states = sampled(_known().elements)
-    share = np.arange(len(states)) / len(states)
-    np.testing.assert_allclose(states[:, 0], np.sin(TURN * PERIOD * share), atol=1e-5)
 
 
 def test_orbit_varies_at_constant_time():

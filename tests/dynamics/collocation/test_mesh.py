@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from rootsopt.dynamics.collocation.elements import Elements, Mesh
 from rootsopt.dynamics.collocation.events import zero_of
 from rootsopt.dynamics.collocation.gauss import GAUSS, POINTS
-from rootsopt.dynamics.collocation.mesh import aligned, counted, moved, needed, ordered, shared
+from rootsopt.dynamics.collocation.mesh import aligned, counted, moved, needed, ordered
 
 ROOM = 32
 EVENT = 0.3071
@@ -54,14 +54,6 @@ def test_rule_integrates_polynomials():
         np.testing.assert_allclose(GAUSS.weights @ GAUSS.nodes**degree, 1 / (degree + 1))
 
 
-def test_integrals_of_arrays_are_those_of_the_matrices():
-    slopes = jnp.asarray(np.random.default_rng(0).normal(size=(5, POINTS, 3, 2)))
-    inside = np.einsum("ij,ej...->ei...", GAUSS.integral, slopes)
-    np.testing.assert_allclose(GAUSS.inside(slopes), inside, atol=1e-15)
-    whole = np.einsum("j,ej...->e...", GAUSS.weights, slopes)
-    np.testing.assert_allclose(GAUSS.whole(slopes), whole, atol=1e-15)
-
-
 def test_motion_is_that_of_the_polynomials():
     elements = _wave(np.linspace(0, 1, 13))
     for tau in (0.0, 0.111, 0.5, 0.99, 1.3):
@@ -99,16 +91,6 @@ def _times(times, which):
     return mesh._replace(times=times, which=jnp.asarray([*which, *[-1] * count]))
 
 
-def test_events_that_passed_each_other_meet():
-    """Fixed times stay; ascending times are left alone."""
-    mesh, rising = ordered(_times([0.0, 0.4, 0.3, 0.5, 0.62, 0.6, 1.0], [-1, 3, 2, 1, 5, -1, -1]))
-    assert not rising
-    np.testing.assert_allclose(mesh.times[:7], [0.0, 0.35, 0.35, 0.5, 0.6, 0.6, 1.0])
-    same, rising = ordered(_times([0.0, 0.3, 0.4, 0.6, 1.0], [-1, 3, 2, -1, -1]))
-    assert rising
-    np.testing.assert_array_equal(same.times[:5], [0.0, 0.3, 0.4, 0.6, 1.0])
-
-
 @given(st.lists(st.floats(0, 1), min_size=1, max_size=6))
 def test_order_of_events_is_mended(events):
     times = _times([0.0, *events, 1.0], [-1, *[2] * len(events), -1])
@@ -142,23 +124,6 @@ def test_elements_of_the_right_length_have_equal_errors():
     assert np.ptp(np.log(before)) > 8
     assert np.max(after) < np.max(before) / 20
     assert np.max(after) < 1.5 * np.min(after)
-
-
-def test_elements_crowd_where_they_are_needed():
-    """If a motion changes only in a tenth of the period, most elements are there."""
-
-    def function(t):
-        return jnp.tanh(60 * (t - 0.45))
-
-    def slope(t):
-        return 60 / jnp.cosh(60 * (t - 0.45)) ** 2
-
-    elements = _elements(function, slope, np.linspace(0, 1, 25))
-    times = jnp.full(8, 1.0).at[0].set(0.0)
-    mesh = shared(times, jnp.full(8, -1), jnp.asarray(0), needed(elements), jnp.asarray(24), ROOM)
-    begin = np.asarray(mesh.ends[0])[:24]
-    assert np.sum((begin > 0.4) & (begin < 0.5)) >= 10
-    assert np.max(np.diff(begin)) < 0.4
 
 
 @pytest.mark.parametrize(

@@ -8,10 +8,8 @@ from jaxtyping import Array
 
 import rootsopt
 from experiments.orbits.study import compared
-from rootsopt.dynamics import closed
 from rootsopt.dynamics.collocation.events import kinds
 from rootsopt.dynamics.parts.base import Part
-from rootsopt.dynamics.settle import settle
 from rootsopt.scene import Scene
 from rootsopt.status import Status
 
@@ -78,30 +76,6 @@ def test_orbit_is_that_by_shooting(name, overrides, period):
         assert row[f"{force}_gradient_difference"] < slack < 1e-3
     # Kinks within 1e-5 of the state leave some 1e-5 in the differences of the reference.
     assert row["multiplier_difference"] < 5e-5
-
-
-@pytest.mark.long
-def test_orbit_closed_over_too_many_periods_is_closed_again(monkeypatch):
-    """Where the transient takes twice the period for the period, the result has the true one."""
-    taken = []
-
-    def twice(*args):
-        found = settle(*args)
-        taken.append(1)
-        return found._replace(period=2 * found.period)
-
-    config = rootsopt.load_config("configs/cic_drawn.yaml")
-    scene = Scene.from_config(config)
-    solver = scene.solver
-    pair, tangents, _ = scene.pair_and_tangents(jnp.asarray(config.design, float))
-    monkeypatch.setattr(closed, "settle", twice)
-    start = closed.Start.at(pair, pair.in_si(jnp.zeros(pair.states)), solver.max_orbit)
-    found = eqx.filter_jit(closed.steady_motion)(pair, tangents, start, scene.pitch_radius, solver)
-    assert taken
-    assert Status.of(int(found.status)) is Status.PERIODIC
-    assert int(found.period) == 1
-    alone = rootsopt.evaluate(config)
-    np.testing.assert_allclose(found.forces[0], alone.response["mean_force_N"], rtol=1e-6)
 
 
 class _Stop(Part):
