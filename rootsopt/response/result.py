@@ -48,7 +48,7 @@ class Evaluation:
     >>> found = rootsopt.evaluate(config)
     >>> slope = found.gradient["peak_force_N"]["pressure_angle_deg"]
     >>> print(f"{found.status.label}, {slope:.2f} N per degree")
-    periodic, -6.90 N per degree
+    periodic, -2.93 N per degree
     """
 
     design: dict[str, float]
