@@ -7,7 +7,6 @@ from pathlib import Path
 import ezdxf
 import numpy as np
 import pytest
-from tests.export.test_export import drawing
 
 from rootsopt.commands.table import profile as command
 from rootsopt.config import load
@@ -16,6 +15,7 @@ from rootsopt.figures.drawing import coordinates
 from rootsopt.figures.dxf import dxf_bytes
 from rootsopt.figures.pieces import Arc, outline_pieces, polyline
 from rootsopt.profiles import CIC, EE, geometry
+from tests.figures.test_export import drawing
 
 ROOT = Path(__file__).parents[2]
 CONFIG = ROOT / "configs/cic_drawn.yaml"
