@@ -1,6 +1,7 @@
 """Tests of the motion of a rotor pair against closed forms, and of the solvers.
 
-Forces, motion and energy are compared with an independent model in `tests/scene`."""
+Forces and motion are compared with independent models in `test_independent` and `tests/scene`,
+which also has the energy balance."""
 
 import equinox as eqx
 import jax.numpy as jnp
