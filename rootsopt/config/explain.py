@@ -323,14 +323,14 @@ GROUPS = {
 }  # fmt: skip
 """Sections of the config in each group of keys in `--help`. The longest name counts."""
 _USED_MOST = {
-    "profile.family", "profile.lobes", "profile.pitch_radius_mm",
+    "profile.lobes", "profile.pitch_radius_mm",
     "scene.speed_rpm", "scene.drive", "scene.load.torque_N_m",
     "scene.load.pressure_difference_Pa", "scene.timing_gear.stiffness_N_m_per_rad",
     "scene.timing_gear.backlash_mm", "contact.clearance_mm", "contact.stiffness_N_per_mm_e",
     "pump.viscosity_mPa_s", "objective.mean_weight", "objective.peak_weight",
     "constraints.area_efficiency_min", "optimizer.starts", "solver.accuracy",
 }  # fmt: skip
-"""Keys that a short help lists."""
+"""Keys that a short help lists; the choices of `profile.family` stand above them."""
 
 
 def describe(model: type[Section], group: str = "") -> str:
