@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from rootsopt.contact.law import ContactLaw as ContactLaw
     from rootsopt.dynamics.parts.base import Part as Part
     from rootsopt.errors import InputError as InputError
+    from rootsopt.identification.answer import Identification as Identification
+    from rootsopt.identification.fit import identify as identify
     from rootsopt.optimize.design import optimize_design as optimize_design
     from rootsopt.optimize.outcome import Optimization as Optimization
     from rootsopt.profiles.base import Profile as Profile
@@ -49,6 +51,7 @@ _PUBLIC = {
     "Evaluation": "rootsopt.response.evaluation:Evaluation",
     "Family": "rootsopt.config.families:Family",
     "Front": "rootsopt.tradeoffs.front:Front",
+    "Identification": "rootsopt.identification.answer:Identification",
     "InputError": "rootsopt.errors:InputError",
     "Optimization": "rootsopt.optimize.outcome:Optimization",
     "Parameter": "rootsopt.config.families:Parameter",
@@ -60,6 +63,7 @@ _PUBLIC = {
     "Status": "rootsopt.status:Status",
     "Term": "rootsopt.response.terms:Term",
     "evaluate": "rootsopt.response.evaluation:evaluate",
+    "identify": "rootsopt.identification.fit:identify",
     "load_config": "rootsopt.config:load_config",
     "optimize_design": "rootsopt.optimize.design:optimize_design",
     "pareto_front": "rootsopt.tradeoffs.trace:pareto_front",

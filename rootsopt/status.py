@@ -97,6 +97,12 @@ class Status(enum.Enum):
         "the scene a little."
     )
 
+    IDENTIFIED = "The quantities are those of the scene that fits the record best."
+    NOT_IDENTIFIED = (
+        "No scene within the bounds fits the record. Widen the bounds, fit further quantities, or "
+        "check units and signs of the columns."
+    )
+
     @property
     def code(self) -> int:
         """Number that represents the status in arrays."""
@@ -122,7 +128,8 @@ class Status(enum.Enum):
     @property
     def usable(self) -> bool:
         """Whether a result with this status is what was asked for, with a gradient."""
-        return self in (Status.PERIODIC, Status.AVERAGED, Status.IDLE, Status.GEOMETRY_ONLY)
+        found = Status.PERIODIC, Status.AVERAGED, Status.IDLE, Status.GEOMETRY_ONLY
+        return self in (*found, Status.IDENTIFIED)
 
     @property
     def label(self) -> str:

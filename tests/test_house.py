@@ -17,6 +17,7 @@ DOORS = {
     "attractors.py",
     "explore.py",
     "pareto.py",
+    "identify.py",
     "improve.py",
     "new.py",
     "profile.py",
@@ -50,7 +51,8 @@ LATE = {
     "commands/console.py": {"rootsopt", "rootsopt.commands", "rootsopt.errors"},
     # Figures are imported in the background; exports, only if they are asked for.
     **{f"commands/work/{name}.py": {"rootsopt.figures", f"rootsopt.figures.{module}"}
-       for name, module in (("attractors", "basins"), ("profile", "runs"))},
+       for name, module in (("attractors", "basins"), ("identify", "identified"),
+                            ("profile", "runs"))},
     "commands/work/pareto.py": {
         "rootsopt.figures", "rootsopt.figures.front", "rootsopt.pages.html",
     },

@@ -1,18 +1,12 @@
-"""Figures of the paper's scene: forces, how far they determine it, and the search."""
-
-from typing import TYPE_CHECKING
+"""Figures of the paper's scene: forces, and how far they determine it."""
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
 
-from experiments._common.style import BLUE, COLORS, grid_below, sheet
+from experiments._common.style import COLORS, grid_below, sheet
 from experiments.paper.scene import FAMILIES, PAPER, QUANTITIES, Response, config_of
 from experiments.paper.study import Row
 from rootsopt.figures.force import plot_force, plot_spectrum
-
-if TYPE_CHECKING:
-    from experiments.paper.search import Samples
 
 LOWEST, HIGHEST = 0.1, 300.0
 """Range of misfits (%) shown. Larger misfits and non-periodic motions are at the upper edge."""
@@ -58,28 +52,4 @@ def uniqueness_figure(alone: list[Row], solved: list[Row]) -> Figure:
         grid_below(ax)
     axes[0, 0].set_ylabel("largest error of the four forces (%)")
     axes[0, -1].legend(loc="upper left", bbox_to_anchor=(1.01, 1), frameon=False)
-    return made
-
-
-def search_figure(found: "Samples") -> Figure:
-    """Draw the misfit of the searched scenes over each quantity; mark periodic ones."""
-    made, axes = sheet(11, 6.4, 2, 3, sharey=True)
-    misfit = 100 * found.misfits
-    for number, (ax, quantity) in enumerate(zip(axes.flat, QUANTITIES, strict=True)):
-        for chosen, color, label in (
-            (~found.periodic, "0.75", "a motion does not repeat"),
-            (found.periodic, BLUE, "both motions periodic"),
-        ):
-            ax.plot(found.values[chosen, number], misfit[chosen], ".", color=color, ms=2.5,
-                    label=label, rasterized=True)  # fmt: skip
-        ax.axhline(10, color="black", linestyle="--", linewidth=1)
-        ax.set(xlabel=quantity.label, yscale="log", ylim=(1, 300))
-        ax.yaxis.set_major_formatter("{x:g}")
-        if quantity.logarithmic:
-            ax.set_xscale("log")
-            ax.xaxis.set_minor_formatter(NullFormatter())
-        grid_below(ax)
-    for ax in axes[:, 0]:
-        ax.set_ylabel("largest error of the four forces (%)")
-    axes[0, 0].legend(loc="lower left", frameon=False, markerscale=4, fontsize=8)
     return made

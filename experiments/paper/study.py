@@ -7,7 +7,6 @@ and applies other definitions of mean and maximum. It changes each quantity alon
 others solved for again. `search` searches for other values in the box of plausible ones.
 """
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -31,6 +30,7 @@ from experiments.paper.scene import (
     values_of,
 )
 from rootsopt.dynamics.window import PERIODS
+from rootsopt.identification.fit import identify
 from rootsopt.response import attractors
 from rootsopt.response.evaluation import lyapunov_program, unsettled_status
 from rootsopt.response.records import unsettled
@@ -59,13 +59,10 @@ each direction."""
 WITHIN, LIMIT = 5e-3, 0.03
 """Misfit below which a point of the profile is accepted, and misfit above which the profile
 ends."""
-GENERATIONS, POPULATION = 70, 16
-QUICK_SEARCH = 1, 2
-"""Generations, and scenes per quantity in a generation, of a reduced search."""
 TARGET = 0.1
 """Relative error of a force above which a search has no result."""
-POLISHED = 4
-"""Number of regimes whose best scene is solved for the paper's forces."""
+STARTS = 8
+"""Number of local fits of a search."""
 Say = Callable[[str], None]
 
 
@@ -204,31 +201,27 @@ def reproduce(job: Run) -> bool:
 
 
 def search(job: Run) -> bool:
-    """Search for other values of the quantities; write and print the best.
+    """Search for other values of the quantities by `identify`; write and print the best.
 
-    A reduced run takes one generation, and does not solve for the paper's forces. Returns whether
-    some values give all four forces within the relative error `TARGET`."""
-    # Numba is optional.
-    from experiments.paper import figures
-    from experiments.paper.search import explore, regimes
-
-    *others, clearance = QUANTITIES
+    It begins at the shipped values. A reduced run makes one local fit. Returns whether some values
+    give all four forces within the relative error `TARGET`."""
     seed, least = job.options.seed, job.options.least_clearance
-    box = [*others, dataclasses.replace(clearance, low=least or clearance.low)]
-    size = QUICK_SEARCH if job.quick else (GENERATIONS, POPULATION)
-    found = explore(seed, *size, box)
-    job.say(f"{len(found.values)} scenes, least misfit {found.misfits.min():.1%}")
-    columns: dict[str, Any] = {q.key: found.values[:, k] for k, q in enumerate(QUANTITIES)}
-    for k, family in enumerate(FAMILIES):
-        columns |= {f"{family}_{name}": found.forces[:, k, j] for j, name in enumerate(FORCES)}
-        columns[f"{family}_period"] = found.periods[:, k]
-    job.folder.write_csv("paper_search.csv", columns | {"misfit": found.misfits})
-    job.figure("paper_search.png", figures.search_figure(found))
-    pairs, rows = Pairs(give_up_early=True), []
-    for place in [] if job.quick else regimes(found, 0.3)[:POLISHED]:
-        response = polished(pairs, found.values[place])
-        rows.append({"searched_misfit": found.misfits[place]} | row_of(response))
-    record = {"scenes": len(found.values), "seed": seed, "solved": rows}
-    job.json("paper_search.json", record)
-    show("Best values, solved for the paper's forces", rows)
-    return job.quick or any(row["misfit"] <= TARGET for row in rows)
+    bounds = {q.key: (q.low, q.high) for q in QUANTITIES}
+    clearance = QUANTITIES[-1].key
+    bounds[clearance] = least or bounds[clearance][0], bounds[clearance][1]
+    config = config_of("cic")
+    parameters = config.profile.parameters
+    record: dict[str, Any] = {"profile.family": [*FAMILIES]}
+    record |= {f"profile.{key}": [x, None] for key, x in parameters.items()}
+    record |= {name: PAPER[:, k] for k, name in enumerate(FORCES)}
+    found = identify(
+        config, record, bounds, starts=1 if job.quick else STARTS, seed=seed, progress=job.say
+    )
+    rows: list[Row] = []
+    if found.parameters:
+        best = {key: one["value"] for key, one in found.parameters.items()}
+        rows = [{"misfit": found.fit["relative_misfit"]} | best]
+        rows += [{"misfit": one["relative_misfit"]} | one["values"] for one in found.optima]
+    job.json("paper_search.json", {"seed": seed, "solved": rows} | found.record())
+    show("Values that give the paper's forces", rows)
+    return any(row["misfit"] <= TARGET for row in rows)

@@ -320,13 +320,15 @@ def load_figures(options: argparse.Namespace, module: str) -> None:
 
 
 @contextlib.contextmanager
-def waiting(console: "Console", what: str) -> Iterator[None]:
-    """Show the text `what` during a `with` block, if `console` is a terminal."""
+def waiting(console: "Console", what: str) -> Iterator[Callable[[str], None]]:
+    """Show the text `what` during a `with` block, if `console` is a terminal.
+
+    Yield a function that shows another text."""
     if not console.is_terminal:
-        yield
+        yield lambda other: None
         return
-    with console.status(what):
-        yield
+    with console.status(what) as shown:
+        yield shown.update
 
 
 def use_cache(wanted: bool = True) -> None:

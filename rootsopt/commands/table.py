@@ -140,6 +140,31 @@ def _sweep(parser: "ArgumentParser") -> None:
     _shared(group)
 
 
+def _identify(parser: "ArgumentParser") -> None:
+    group = parser.add_argument_group("record, and what to fit to it")
+    for name, form, meaning in (
+        ("data", "FILE", "CSV of samples over rotation_deg or time_s, or of averages; config keys "
+         "as columns are operating points, NAME_std standard deviations; repeatable"),
+        ("fit", "KEY[=LOW:HIGH]", "config key to fit, and its bounds (default: all that the key "
+         "allows); rotation_offset_deg: the reading where a lobe points at rotor 2; repeatable"),
+        ("gain", "NAME[,NAME]", "columns that share an unknown gain; repeatable"),
+        ("constant", "NAME", "column with an unknown constant added; repeatable"),
+        ("profile", "KEY", "fit all others at several values of this key, too; repeatable"),
+    ):  # fmt: skip
+        group.add_argument(f"--{name}", action="append", default=[], metavar=form, help=meaning)
+    group.add_argument("--starts", type=_starts, default=4, metavar="N",
+                       help="local fits, from the best of many scenes (default: 4)")  # fmt: skip
+    group.add_argument("--seed", type=int, default=0, metavar="N", help="seed of these scenes")
+
+
+def _starts(text: str) -> int:
+    import argparse
+
+    if not text.isdecimal() or not 1 <= int(text) <= 1000:
+        raise argparse.ArgumentTypeError(f"must be a whole number from 1 to 1000, but is {text}")
+    return int(text)
+
+
 def _shared(parser: "ArgumentParser | _ArgumentGroup") -> None:
     """Add the options of commands whose evaluations may run elsewhere."""
     parser.add_argument(
@@ -235,6 +260,12 @@ attractors = Command(
     "find the coexisting motions of one scene",
     "Find the coexisting motions of a scene and the initial states that lead to each.",
 )
+identify = Command(
+    "identify",
+    "fit quantities of a scene to a measured record",
+    "Find the values of scene and design that fit a measured record best, and how sure they are.",
+    _identify,
+)
 profile = Command(
     "profile",
     "compute the geometry of one design",
@@ -259,6 +290,17 @@ new = Command(
 )
 COMMANDS = {
     command.name: command
-    for command in (optimize, improve, simulate, pareto, sweep, attractors, profile, explore, new)
+    for command in (
+        optimize,
+        improve,
+        simulate,
+        pareto,
+        sweep,
+        attractors,
+        identify,
+        profile,
+        explore,
+        new,
+    )
 }
 """All commands by name."""

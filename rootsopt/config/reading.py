@@ -315,7 +315,7 @@ class Config(Section):
     def _assuming(self):
         assumptions, valid = self.assumptions, scatterable(self, design=False)
         for key in assumptions.over:
-            require(key in valid, unknown_key(key, valid, tree(Config), "assumptions"))
+            require(key in valid, unknown_key(key, valid, tree(Config), "assumptions.over"))
         self._check_speed("assumptions", assumptions.over)
         for one in assumptions.spans(valid, every=False):
             for fault in self._faults(one.key, one.ends):

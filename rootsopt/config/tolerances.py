@@ -221,12 +221,12 @@ def mounted(data: Any) -> Any:
 
 
 def unknown_key(
-    key: str, valid: Mapping[str, float], known: Mapping[str, Any], section: str = "tolerances"
+    key: str, valid: Mapping[str, float], known: Mapping[str, Any], place: str = "tolerances.over"
 ) -> str:
-    """Return a message for a key of the entry `over` of a `section` that cannot scatter.
+    """Return a message for a key at a `place`, such as an entry of a section, that cannot vary.
 
     `valid`: result of `scatterable`; `known`: all keys of a config."""
-    text = f"`{section}.over` must name numbers of this config's scene, but names `{named(key)}`"
+    text = f"`{place}` must name numbers of this config's scene, but names `{named(key)}`"
     if key in known and key.split(".")[0] in _SECTIONS and key not in _NOT_PHYSICAL:
         return (
             f"{text}, which the config does not have as a number; give `{key}` its nominal value "

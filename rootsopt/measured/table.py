@@ -106,20 +106,38 @@ def named_columns(data: bytes, name: str, titles: tuple[str, str]) -> NDArray[np
     `data`: content of the file; `name`: name of the file in messages. Raises `InputError` if the
     table lacks a column, or a line a number."""
     what = " and ".join(titles)
-    lines = [one for one in enumerate(_text(data, name).splitlines(), 1) if one[1].strip()]
-    lines = [(number, line) for number, line in lines if not _comment(line)]
-    split = next((c for c in ";\t," if lines and c in lines[0][1]), None)
-    with guarded(name, "is not a table that can be read", f"save it with the columns {what}"):
-        rows = [(number, [cell.strip() for cell in _cells(line, split)]) for number, line in lines]
-    first = rows[0][1] if rows else []
+    first, rows = titled(data, name, what)
     if missing := [title for title in titles if title not in first]:
         raise InputError(
             f"{name}: must name the columns {what} in its first line, but has no {missing[0]}; add "
             f"the line {','.join(titles)}"
         )
     places = first.index(titles[0]), first.index(titles[1])
-    found = [_values(row, places, what, f"{name}, line {number}") for number, row in rows[1:]]
+    found = [_values(row, places, what, f"{name}, line {number}") for number, row in rows.items()]
     return np.array(found).reshape(-1, 2)
+
+
+def titled(data: bytes, name: str, what: str) -> tuple[list[str], dict[int, list[str]]]:
+    """Return (titles in the first line of a table, cells of each further line by its number).
+
+    `data`: content of the file; `name`: name of the file, and `what`: names of its columns, for
+    messages. Raises `InputError` if the table cannot be read."""
+    lines = [one for one in enumerate(_text(data, name).splitlines(), 1) if one[1].strip()]
+    lines = [(number, line) for number, line in lines if not _comment(line)]
+    split = next((c for c in ";\t," if lines and c in lines[0][1]), None)
+    with guarded(name, "is not a table that can be read", f"save it with the columns {what}"):
+        rows = {number: [cell.strip() for cell in _cells(line, split)] for number, line in lines}
+    first = next(iter(rows), 0)
+    return rows.pop(first, []), rows
+
+
+def measured_number(cell: str) -> float | None:
+    """Return the number in a cell, NaN if it is empty or says that there is none.
+
+    Return `None` for any other text."""
+    if not cell.strip() or _LACKING.fullmatch(cell.strip()):
+        return math.nan
+    return _number(cell)
 
 
 def _comment(line: str) -> bool:

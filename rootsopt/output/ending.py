@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 from rootsopt.output import facts
 from rootsopt.output.files import design_file
+from rootsopt.output.identified import identified
 from rootsopt.output.names import brief, in_words, name_and_unit, stated
 from rootsopt.output.tables import Record, records_of
 from rootsopt.status import Status
@@ -22,12 +23,13 @@ _FACTS = {
     "pareto": facts.traced,
     "sweep": facts.swept,
     "attractors": facts.coexisting,
+    "identify": identified,
     "profile": facts.drawn,
 }
 """What came out of a run, by command."""
 _ALIKE = {"improve": "optimize"}
 """Commands whose runs end like those of another one."""
-_SAID = *facts.STEADY, Status.GEOMETRY_ONLY.label
+_SAID = *facts.STEADY, Status.GEOMETRY_ONLY.label, Status.IDENTIFIED.label
 """Statuses of a run that need no explanation."""
 _SENTENCES = re.compile(r"(?<=[.!?]) (?=[A-Z])(?!In conflict)")
 """Blanks between the sentences of a message: what came out, and then advice."""
@@ -41,6 +43,7 @@ _NEXT = {
     "simulate": (_OPTIMISE, _SPEEDS, _MOTIONS),
     "profile": (_SIMULATE, _OPTIMISE),
     "attractors": (_OPTIMISE,),
+    "identify": (("Simulate the scene that was found", "simulate"), _MOTIONS),
     "pareto": (("Simulate one point", "simulate"), ("Draw its rotor", "profile")),
     "sweep": (_SIMULATE, _MOTIONS),
 }
@@ -119,7 +122,8 @@ def _steps(
     A config without design parameters cannot be optimised."""
     records = [*records_of(result).values()]
     fixed = not any(one.get("design") for one in records)
-    file, where, sets = {"optimize": "optimized.yaml"}.get(command, "config.yaml"), "", ""
+    names = {"optimize": "optimized.yaml", "identify": "identified.yaml"}
+    file, where, sets = names.get(command, "config.yaml"), "", ""
     if command == "pareto":
         number, count = (len(result["points"]) + 1) // 2, len(result["points"])
         file, where = design_file(number), f" (here {number} of {count})"

@@ -10,6 +10,7 @@ from typing import Any
 from rootsopt.config import Config
 from rootsopt.config.units import words
 from rootsopt.output.comparison import assumption_tables, better_tables
+from rootsopt.output.identified import identified_tables
 from rootsopt.output.names import (
     Cell,
     Row,
@@ -68,6 +69,7 @@ def sections(
     them; `most`: number of scenes above which their table is truncated."""
     found = [
         ("better", "A better rotor", [*better_tables(result)]),
+        ("identified", "What the record tells", [*identified_tables(result)]),
         ("front", "Best compromises", front_tables(result)),
         ("numbers", "Numbers", [numbers_table(result), *gradient_tables(result)]),
         ("scenes", "Scenes", scene_tables(result, rows, most)),

@@ -45,6 +45,7 @@ _CAPTIONS = {
     "speeds.png": "Contact force over speed",
     "basins.png": "Initial states and the motion that each leads to",
     "front.png": "Best compromises",
+    "identified.png": "Record and fit, orders, and regions of the quantities",
     "tolerances.png": "Forces in fresh scenes that scatter",
     "feasible.png": "Designs that satisfy all limits",
     "assumptions.png": "Objective over what is assumed about the scene",

@@ -23,6 +23,7 @@ _ASKED = {
     "pareto": "Trace the best compromises between two or three quantities.",
     "sweep": "Simulate one design in many scenes.",
     "attractors": "Find the coexisting motions of a scene.",
+    "identify": "Fit quantities of a scene to a measured record.",
     "profile": "Compute the geometry of one design.",
 }
 _TITLES = {
@@ -32,6 +33,7 @@ _TITLES = {
     "pareto": "Best compromises for {pair}",
     "sweep": "Sweep of {pair}",
     "attractors": "Coexisting motions of {pair}",
+    "identify": "What a record tells of {pair}",
     "profile": "Geometry of {pair}",
 }
 _FEW = 6

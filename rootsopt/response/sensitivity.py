@@ -6,6 +6,7 @@ the same compiled program as the derivatives with respect to the design.
 """
 
 import dataclasses
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -15,9 +16,11 @@ from numpy.typing import NDArray
 
 from rootsopt.config import Config
 from rootsopt.dynamics.maxima import local_maxima
+from rootsopt.dynamics.pair import RotorPair
+from rootsopt.dynamics.steady import Steady
 from rootsopt.dynamics.varied import varied
 from rootsopt.response.evaluation import Evaluation, Evaluator
-from rootsopt.response.starts import begun
+from rootsopt.response.starts import Seed, Seeds, begun
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene, along
 from rootsopt.status import Status
@@ -26,8 +29,6 @@ _STEP = 1e-6
 """Relative step of the difference quotients that approximate the derivatives of the scene with
 respect to a quantity. Their error is small, since the scene depends almost linearly on its
 quantities."""
-_SETTINGS = ("solver",)
-"""Fields of a scene on which the response does not depend. Their derivatives are set to zero."""
 MICROMETRE = 1e-3
 """One micrometre (mm): change of clearance, backlash and centre distance error for which the table
 states the effect."""
@@ -100,15 +101,13 @@ def direction(
     if key.startswith("profile."):
         still = jax.tree.map(np.zeros_like, eqx.filter(scene, eqx.is_inexact_array))
         return still, (other.design - config.design) / size
-    moved, here = Scene.from_config(other), Scene.from_config(config)
 
-    def change(path, before, after):
-        if path[0].name in _SETTINGS:
-            return np.zeros(np.shape(before))
+    def change(before, after):
         return (np.asarray(after, np.float64) - np.asarray(before, np.float64)) / size
 
-    arrays = [eqx.filter(one, eqx.is_inexact_array) for one in (here, moved)]
-    return jax.tree_util.tree_map_with_path(change, *arrays), np.zeros(len(config.design))
+    # Outline and solver stay the same, so that their derivatives are 0.
+    arrays = (eqx.filter(scene.renewed(one), eqx.is_inexact_array) for one in (config, other))
+    return jax.tree.map(change, *arrays), np.zeros(len(config.design))
 
 
 @CachedFunction
@@ -124,44 +123,62 @@ def along_values(scene: Scene, design, directions: Scene, turns):
     return along(build, (arrays, design), (directions, turns))[:2]
 
 
+def motions_along(
+    evaluator: Evaluator,
+    design: NDArray[np.float64],
+    directions: Sequence[tuple[Scene, NDArray[np.float64]]],
+    start: Seeds = None,
+) -> Iterator[tuple[int, RotorPair, RotorPair, Steady]]:
+    """Yield the steady motion of a `design` (d,) in config units, with its derivatives along some
+    of the `directions` at a time, as (number of these, pair, its derivatives, motion).
+
+    `directions`: results of `direction`; `start`: where the first search begins. There are as many
+    directions at a time as design parameters, to reuse the compiled programs; the last ones may be
+    padded."""
+    size, longest = max(1, len(design)), evaluator.scene.solver.max_orbit
+    for begin in range(0, len(directions), size):
+        some = directions[begin : begin + size]
+        blank = [jax.tree.map(np.zeros_like, some[0])] * (size - len(some))
+        stacked = jax.tree.map(lambda *x: np.stack(x), *some, *blank)
+        pair, tangents = along_values(evaluator.scene, design, *stacked)
+        found = evaluator.motion(pair, tangents, begun(pair, start, longest))
+        yield len(some), pair, tangents, found
+        if begin + size < len(directions):
+            start = Seed.of(found, pair)
+
+
 def by_scene(evaluator: Evaluator, evaluation: Evaluation) -> Evaluation | None:
     """Return `evaluation` with gradients with respect to the quantities of the scene.
 
     They replace the gradients with respect to the design: in `gradient` (N per config unit, keyed
     by config key), and in `maxima`. The result is None if the steady motion from the evaluation's
     start is not periodic, or does not have the same number of maxima."""
-    config, solver = evaluator.config, evaluator.scene.solver
+    config, measures = evaluator.config, evaluator.scene.solver.measures
     design = np.array(list(evaluation.design.values()))
     wanted = quantities(config)
-    size = max(1, len(evaluation.design))
     directions = [direction(config, evaluator.scene, one.key, one.value) for one in wanted]
-    blank = jax.tree.map(np.zeros_like, directions[0])
     gradient: dict[str, dict[str, float]] = {}
-    slopes, maxima = [], evaluation.maxima
-    for begin in range(0, len(wanted), size):
-        # Pad to as many directions as there are design parameters, to reuse the compiled program.
-        some = directions[begin : begin + size]
-        stacked = jax.tree.map(lambda *x: np.stack(x), *some, *[blank] * (size - len(some)))
-        pair, tangents = along_values(evaluator.scene, design, *stacked)
-        start = begun(pair, evaluation.start, solver.max_orbit)
-        found = evaluator.motion(pair, tangents, start)
+    slopes, maxima, done = [], evaluation.maxima, 0
+    for count, pair, tangents, found in motions_along(
+        evaluator, design, directions, evaluation.start
+    ):
         if Status.of(found.status) is not Status.PERIODIC:
             return None
         rows = np.column_stack([found.orbit.response, found.orbit.sensitivity])
-        named = solver.measures.named(rows, int(found.period))
+        named = measures.named(rows, int(found.period))
         for name in evaluation.response.keys() & named.keys():
-            values = named[name][1][: len(some)]
-            keys = [one.key for one in wanted[begin : begin + size]]
+            slope = map(float, named[name][1][:count])
             row = gradient.setdefault(name, {})
-            row |= dict(zip(keys, map(float, values), strict=True))
+            row |= {one.key: x for one, x in zip(wanted[done:], slope, strict=False)}
+        done += count
         if maxima is not None:
             again = local_maxima(pair, tangents, varied(found))
             if again.times.shape != maxima.times.shape:
                 return None
-            slopes.append(again.slopes[:, : len(some)])
+            slopes.append(again.slopes[:, :count])
     if maxima is not None:
         maxima = maxima._replace(slopes=np.concatenate(slopes, axis=1))
     return dataclasses.replace(evaluation, gradient=gradient, maxima=maxima)
 
 
-__all__ = ["NAMES", "Quantity", "along_values", "by_scene", "direction", "quantities"]
+__all__ = ["NAMES", "Quantity", "by_scene", "direction", "motions_along", "quantities"]

@@ -20,8 +20,7 @@ from rootsopt.dynamics.reserve import INSTANTS, gaps
 from rootsopt.dynamics.varied import varied
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.scatter import draw, shifts
-from rootsopt.response.sensitivity import along_values, direction
-from rootsopt.response.starts import begun
+from rootsopt.response.sensitivity import direction, motions_along
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.status import Status
 
@@ -145,16 +144,8 @@ class _Look:
         All are NaN if the motion is not known."""
         (shift,) = shifts(self.config, row[None])
         evaluator, design = self.evaluator.shifted(shift.scene), self.design + shift.design
-        longest, count, found = evaluator.solver.max_orbit, len(self.directions), []
-        values = np.full(2 * INSTANTS, math.nan)
-        # As many directions as there are design parameters, to use the same program.
-        size = max(1, len(design))
-        for begin in range(0, count, size):
-            some = self.directions[begin : begin + size]
-            some += [jax.tree.map(np.zeros_like, some[0])] * (size - len(some))
-            stacked = jax.tree.map(lambda *x: np.stack(x), *some)
-            pair, tangents = along_values(evaluator.scene, design, *stacked)
-            motion = evaluator.motion(pair, tangents, begun(pair, None, longest))
+        count, found, values = len(self.directions), [], np.full(2 * INSTANTS, math.nan)
+        for _, pair, tangents, motion in motions_along(evaluator, design, self.directions):
             if not (Status.of(motion.status) is Status.PERIODIC or bool(motion.held)):
                 return values, np.full((len(values), count), math.nan)
             values, slopes = jax.device_get(_gaps(pair, tangents, varied(motion)))

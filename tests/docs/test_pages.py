@@ -12,7 +12,17 @@ from rootsopt.config import load
 from rootsopt.scene import check_geometry
 from tests.docs.blocks import DOCS, blocks_of, in_python, in_shell
 
-PAGES = ["index", "tutorial", "design", "howto", "theory", "accuracy", "gallery", "limits"]
+PAGES = [
+    "index",
+    "tutorial",
+    "design",
+    "howto",
+    "theory",
+    "accuracy",
+    "gallery",
+    "limits",
+    "identify",
+]
 NOTEBOOKS = sorted((DOCS / "notebooks").glob("*.md"))
 CELL = "{code-cell}"
 
@@ -91,6 +101,20 @@ def test_tutorial(folder):
         assert (folder / "drawing" / file).is_file()
     assert (folder / "geometry" / "profile_design.csv").is_file()
     assert (folder / "speeds" / "sweep.nc").is_file()
+
+
+@pytest.mark.long
+def test_identify_page(tmp_path):
+    """The record that the page makes leads to the pump that the page names."""
+    for block in blocks_of(DOCS / "identify.md"):
+        if block.words == "run":
+            run = in_python if block.language == "python" else in_shell
+            done = run(block.text, tmp_path)
+            assert done.returncode == 0, done.stderr
+    known = json.loads((tmp_path / "found" / "result.json").read_text())["parameters"]
+    for key, true in (("backlash_mm", 0.14), ("damping_ratio", 0.3)):
+        low, high = known[f"scene.timing_gear.{key}"]["interval_95"]
+        assert low < true < high
 
 
 @pytest.mark.long

@@ -1,0 +1,46 @@
+"""The work of `rootsopt identify`."""
+
+import argparse
+
+from rich.console import Console
+
+from rootsopt.commands import cli
+from rootsopt.config import Config
+from rootsopt.errors import InputError
+from rootsopt.identification.fit import identify
+from rootsopt.output import files, tables, terminal
+from rootsopt.output.runs import RunFolder
+
+
+def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.Outcome:
+    """Run `rootsopt identify`: fit quantities to the record, and write files into `folder`.
+
+    Return the `Outcome`. Raises `InputError` if the config, the record or an option is invalid."""
+    for name, example in (
+        ("data", "record.csv"),
+        ("fit", "scene.timing_gear.backlash_mm=0.02:0.4"),
+    ):
+        if not getattr(options, name):
+            raise InputError(f"`--{name}` is missing; add it, as in --{name} {example}")
+    cli.load_figures(options, "identified")
+    with cli.waiting(Console(stderr=True), "compiling and simulating") as progress:
+        found = identify(
+            config, options.data, options.fit, gains=[text.split(",") for text in options.gain],
+            constants=options.constant, profiles=options.profile, starts=options.starts,
+            seed=options.seed, progress=progress,
+        )  # fmt: skip
+    files.write_config(folder, config)
+    data = found.record()
+    if found.parameters:
+        folder.write_text("identified.yaml", found.config.to_yaml())
+        folder.write_csv("residuals.csv", found.residuals)
+    folder.write_json("result.json", data | {"versions": files.versions()})
+    if found.parameters and not options.no_figures:
+        from rootsopt.figures.identified import identified_figure
+
+        identified_figure(folder, found)
+
+    def show(out: Console) -> None:
+        out.print(terminal.shown(tables.tables_of(data)))
+
+    return cli.Outcome(cli.OK if found.status.usable else cli.NO_RESULT, show)

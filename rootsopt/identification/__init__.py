@@ -1,0 +1,1 @@
+"""Quantities of a scene from a measured record: the scene whose motion fits the record best."""

@@ -1,0 +1,197 @@
+"""A measured record: what was measured, at which operating points.
+
+A record is one table or several. Columns named after config keys, such as `scene.speed_rpm`, say at
+which operating point a row was measured. A table with rotations or times holds samples of a motion.
+Any other one holds averages, a row per operating point."""
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas
+from numpy.typing import NDArray
+
+from rootsopt.config import Config
+from rootsopt.config.document import read_document
+from rootsopt.config.explain import tree
+from rootsopt.config.sources import reason, regular_file
+from rootsopt.config.words import named, near, shown
+from rootsopt.errors import InputError
+from rootsopt.identification.channels import CHANNELS
+from rootsopt.measured.guard import short
+from rootsopt.measured.table import measured_number, titled
+from rootsopt.response.reporting import is_force
+from rootsopt.response.terms import GEAR, RESERVES
+
+_ROTATION, _TIME = "rotation_deg", "time_s"
+"""Columns of a table of samples, as in `response_*.csv`; the time counts only without rotation."""
+_SPREAD = "_std"
+"""Ending of the names of columns with standard deviations, which `_sd` stands for, too."""
+_MOST = 4096
+"""Number of samples at an operating point above which only every second, third … one is used."""
+_DEGREES_PER_RPM = 6.0
+"""Rotation (°) in 1 s at 1 rpm."""
+_AVERAGES = *RESERVES, *GEAR
+"""Averages other than those of the force."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Observed:
+    """What was measured at one operating point.
+
+    `source`: name of the table; `values`: config keys that differ from the config; `table`: numbers
+    by line, with the columns `names` and their standard deviations; `sampled`: whether the lines
+    are samples, with a column for the rotation (°) of rotor 1, rather than averages."""
+
+    source: str
+    values: dict[str, Any]
+    table: pandas.DataFrame
+    names: tuple[str, ...]
+    sampled: bool
+
+    def column(self, name: str = _ROTATION) -> NDArray[np.float64]:
+        """Return a column (n,), by default the rotation; NaN where nothing was measured."""
+        return np.array(self.table.get(name, np.full(len(self.table), np.nan)), float)
+
+    @property
+    def timed(self) -> bool:
+        """Whether the rotation follows from the time."""
+        return _TIME in self.table
+
+    @property
+    def measured(self) -> NDArray[np.float64]:
+        """The measured values (n, c)."""
+        return np.stack([self.column(name) for name in self.names], axis=1)
+
+    @property
+    def deviations(self) -> NDArray[np.float64]:
+        """The standard deviations (n, c) of the measured values, NaN where they are not known."""
+        return np.stack([self.column(name + _SPREAD) for name in self.names], axis=1)
+
+    def state(self, lobes: int, turns: int, speed: float) -> NDArray[np.float64] | None:
+        """Return ε (rad) and dε/dt (rad/s) at a φ1 that is a multiple of `turns` mesh periods.
+
+        They are those of the sample that is nearest to it; None unless ε was measured. `lobes` of a
+        rotor; `speed` of rotor 1 (rpm), by which a missing rate follows from ε."""
+        turned, relative, rate = map(self.column, (_ROTATION, *CHANNELS[:2]))
+        known = np.isfinite(turned) & np.isfinite(relative)
+        if np.isnan(rate).all() and np.count_nonzero(known) > 1:
+            rate[known] = np.gradient(relative[known]) / np.gradient(turned[known])
+            rate *= _DEGREES_PER_RPM * speed
+        known &= np.isfinite(rate)
+        if not (self.sampled and known.any()):
+            return None
+        share = turned * lobes / (360 * turns)
+        nearest = np.argmin(np.where(known, np.abs(share - np.round(share)), np.inf))
+        return np.array([relative[nearest], rate[nearest]])
+
+
+def observed(config: Config, data: Any) -> list[Observed]:
+    """Return what was measured at each operating point.
+
+    `data`: path of a CSV file, columns by name (a mapping or an `xarray.Dataset`), or a list of
+    these. Raises `InputError` if a table cannot be read, or if a column or a value is wrong."""
+    tables = data if isinstance(data, list | tuple) else [data]
+    found = []
+    for number, one in enumerate(tables, 1):
+        found += _points(config, *_table(one, f"table {number} of the record"))
+    if not found:
+        raise InputError("the record must hold measured values, but has none; add rows")
+    return found
+
+
+def _table(data: Any, name: str) -> tuple[str, pandas.DataFrame]:
+    """Return the name and the cells of a table, as text with line numbers."""
+    if not isinstance(data, str | Path):
+        columns = data.variables if hasattr(data, "variables") else data
+        cells = {str(key): np.atleast_1d(np.asarray(data[key])).tolist() for key in columns}
+        if len({len(column) for column in cells.values()}) > 1:
+            raise InputError(f"{name}: must have columns of one length; correct them")
+        return name, pandas.DataFrame(cells, dtype=object).map(
+            lambda x: "" if x is None else str(x)
+        )
+    path = Path(data)
+    try:
+        content = regular_file(path, "a table").read_bytes()
+    except (OSError, ValueError) as error:
+        why = reason(error)
+        raise InputError(
+            f"{named(str(path))}: must be a file that can be read: {why}; give the path of a CSV "
+            "file"
+        ) from None
+    titles, rows = titled(content, path.name, "of the record")
+    if len({*titles}) < len(titles):
+        twice = next(title for title in titles if titles.count(title) > 1)
+        raise InputError(f"{path.name}: must name each column once, but has {twice!r} twice")
+    rows = {n: (cells + [""] * len(titles))[: len(titles)] for n, cells in rows.items()}
+    return path.name, pandas.DataFrame.from_dict(rows, orient="index", columns=titles)
+
+
+def _points(config: Config, name: str, cells: pandas.DataFrame) -> Iterator[Observed]:
+    """Yield the operating points of a table in the order of their first rows."""
+    cells = cells.rename(
+        columns=lambda x: x.removesuffix("_sd") + _SPREAD if x.endswith("_sd") else x
+    )
+    sampled, titles = bool({_ROTATION, _TIME} & {*cells}), [*cells]
+    keys = [title for title in titles if title in tree(Config)]
+    known = {_ROTATION, _TIME, *keys, *(title + _SPREAD for title in titles)}
+    names = tuple(title for title in titles if title not in known)
+    for title in names:
+        _check(config, name, title, sampled)
+    if not names:
+        some = CHANNELS[0] if sampled else "mean_force_N"
+        raise InputError(f"{name}: must have a measured column, such as {some}; add one")
+    table = cells.drop(columns=keys).map(_number).astype(float)
+    for title, column in table.items():
+        wrong, what = column.abs() == np.inf, "a number"
+        if str(title).endswith(_SPREAD):
+            measured = table[str(title).removesuffix(_SPREAD)].notna()
+            wrong, what = wrong | measured & ~(column > 0), "a number greater than 0"
+        if wrong.any():
+            line = wrong.idxmax()
+            raise InputError(
+                f"{name}, line {line}: {title} must be {what}, but is "
+                f"{shown(cells.at[line, title])}; correct it, or remove the row"
+            )
+    groups = cells.groupby(keys or (lambda _: 0), sort=False) if sampled else cells.groupby(level=0)
+    for _, rows in groups:
+        values = {key: read_document(rows[key].iloc[0], name) for key in keys}
+        config.check_values({key: x for key, x in values.items() if x is not None})
+        part = table.loc[rows.index].dropna(how="all", subset=names)
+        part = part.drop(columns=_TIME, errors="ignore") if _ROTATION in part else part
+        if sampled and _ROTATION not in part:
+            if config.scene.motor is not None:
+                raise InputError(f"{name}: must have the column {_ROTATION}, because the speed of "
+                                 "a motor varies; add it")  # fmt: skip
+            speed = values.get("scene.speed_rpm") or config.scene.speed_rpm
+            part = part.assign(**{_ROTATION: _DEGREES_PER_RPM * speed * part[_TIME]})
+        part = part.dropna(subset=[_ROTATION]) if sampled else part
+        if len(part):
+            some = part.iloc[:: -(-len(part) // _MOST)]
+            yield Observed(name, values, some, names, sampled)
+
+
+def _number(cell: str) -> float:
+    """Return the number in a cell, NaN if it is empty, infinity for another text."""
+    found = measured_number(cell)
+    return np.inf if found is None else found
+
+
+def _check(config: Config, name: str, title: str, sampled: bool) -> None:
+    """Raise `InputError` unless `title` is that of a measured column."""
+    if title in (CHANNELS if sampled else _AVERAGES) or (
+        not sampled and is_force(config, title, name)
+    ):
+        return
+    told = CHANNELS if sampled else ("mean_force_N", "peak_force_N", "rms_force_N", *_AVERAGES)
+    meant = near(title, [*tree(Config)] if "." in title else [*told])
+    raise InputError(
+        f"{name}: the column {short(title)!r} must be {'a sample' if sampled else 'an average'} "
+        f"({', '.join(told)}), a config key, or one of these with {_SPREAD} for its standard "
+        f"deviations; {f'did you mean {meant}?' if meant else 'rename or remove it'}"
+    )
+
+
+__all__ = ["Observed", "observed"]

@@ -1,0 +1,227 @@
+"""Records of simulated scenes, whose values are known: `identify` finds them."""
+
+import csv
+import dataclasses
+import functools
+import importlib
+import json
+
+import numpy as np
+import pytest
+
+import rootsopt
+from rootsopt import InputError, Status, load_config
+from rootsopt.commands.table import identify as command
+from rootsopt.identification import model
+from rootsopt.identification.channels import CHANNELS
+from rootsopt.identification.model import Point
+from rootsopt.identification.quantities import fitted
+from rootsopt.identification.record import observed
+
+BACKLASH, LOAD = "scene.timing_gear.backlash_mm", "scene.load.torque_N_m"
+DAMPING = "scene.timing_gear.damping_ratio"
+TRUE = {BACKLASH: 0.14, LOAD: 5.5}
+BOUNDS = {BACKLASH: (0.05, 0.3), LOAD: (3.0, 9.0)}
+CIC = load_config("cic")
+
+
+@functools.cache
+def simulated(**moved):
+    """Return the evaluation of the true scene, with some keys of `scene` moved."""
+    values = TRUE | {f"scene.{key}": x for key, x in moved.items()}
+    return rootsopt.evaluate(CIC.replaced(values))
+
+
+@functools.cache
+def series():
+    return simulated().to_dataset()
+
+
+def sampled(noise, *names, step=10, seed=0):
+    """Return a record of every `step`-th sample of the second turn, with noise."""
+    data, rng = series(), np.random.default_rng(seed)
+    record = {"rotation_deg": data.rotation_deg.values[3::step] + 360}
+    for name in names:
+        values = data[name].values[3::step]
+        size = noise * np.std(values)
+        record[name] = values + size * rng.standard_normal(len(values))
+    return record
+
+
+def test_samples_lead_to_the_true_values_with_their_errors():
+    record = sampled(0.03, "relative_rotation_rad", "contact_force_N")
+    config = CIC.replaced({LOAD: 5.5, DAMPING: 0.7})
+    keys, true = {BACKLASH: (0.05, 0.3), DAMPING: (0.2, 0.9)}, {BACKLASH: 0.14, DAMPING: 0.5}
+    found = rootsopt.identify(config, record, keys, profiles=[DAMPING], starts=2)
+    assert found.status is Status.IDENTIFIED
+    for key, value in true.items():
+        one = found.parameters[key]
+        low, high = one["interval_95"]
+        assert low < value < high
+        assert high - low < 0.1 * value
+        assert one["standard_error"] == pytest.approx((high - low) / 3.92, rel=0.3)
+    assert found.fit["relative_errors"]["contact_force_N"] == pytest.approx(0.03, rel=0.2)
+    assert found.config.value(BACKLASH) == found.parameters[BACKLASH]["value"]
+    assert -1 < found.increase(true) < 9.2
+    assert all(one["determined"] for one in found.combinations)
+    rises = [one["increase"] for one in found.profiles[DAMPING]["points"]]
+    assert min(rises) == 0
+    assert min(rises[0], rises[-1]) > 3.5
+    next_, error = found.further[0]["standard_errors"], found.parameters[DAMPING]["standard_error"]
+    assert next_[DAMPING] < error
+
+
+def test_an_interval_follows_the_valley_of_quantities_that_act_together():
+    """The gear stays on one flank, where load and backlash act together: T - k b / (2 r)."""
+    record = sampled(0.03, "relative_rotation_rad", "contact_force_N", step=20)
+    found = rootsopt.identify(CIC, record, BOUNDS, starts=1)
+    load, backlash = (found.parameters[key]["interval_95"] for key in (LOAD, BACKLASH))
+    assert load[1] == pytest.approx(9.0)
+    assert load[0] < 5.5
+    assert backlash[0] < 0.14 - 33e-3 * 2 * (8.0 - 5.5) / 20_000 * 1e3
+
+
+def test_channels_have_the_slopes_of_difference_quotients_and_the_torque_of_the_law():
+    """The gear's torque is stiffness times what ε exceeds half the backlash by, plus damping."""
+    config = CIC.replaced(TRUE)
+    record = sampled(0.0, *(name for name in CHANNELS if "torque" not in name), step=90)
+    record |= {name: 0.0 * record["rotation_deg"] for name in CHANNELS if "torque" in name}
+    _, quantities = fitted(config, [BACKLASH, LOAD, "rotation_offset_deg"], [])
+    (seen,) = observed(config, record)
+    point, values = Point.of(config, seen), np.array([*TRUE.values(), 0.0])
+    found = point.predicted(quantities, values, None)
+    column = dict(zip(seen.names, found.values.T, strict=True))
+    for name in seen.names:
+        if "torque" not in name:
+            close = 2e-5 * np.max(np.abs(record[name]))
+            np.testing.assert_allclose(column[name], record[name], atol=close)
+    steps = 1e-4 * np.array([0.14, 5.5, 100.0])
+    for k, step in enumerate(steps):
+        ends = [point.predicted(quantities, values + side * step * np.eye(3)[k], found.begin).values
+                for side in (-1, 1)]  # fmt: skip
+        slopes, size = (ends[1] - ends[0]) / (2 * step), np.abs(found.slopes[..., k])
+        # Where a flank begins or ceases to touch, the difference quotient goes across a kink.
+        away = np.abs(slopes - found.slopes[..., k]) / np.maximum(np.max(size, axis=0), 1e-9)
+        assert np.median(away) < 1e-5
+        assert np.mean(away < 3e-3) > 0.9
+    shape, radius = simulated().geometry, 33e-3
+    gear = config.scene.timing_gear
+    damping = 2 * gear.damping_ratio
+    damping *= np.sqrt(gear.stiffness_N_m_per_rad * shape["polar_inertia_kg_m2"] / 2)
+    half = 0.14e-3 / (2 * radius)
+    relative, rate = (column[name] for name in CHANNELS[:2])
+    beyond = relative - np.clip(relative, -half, half)
+    torque = gear.stiffness_N_m_per_rad * beyond + damping * rate * (beyond != 0)
+    clear = np.abs(np.abs(relative) - half) * radius > 1e-6
+    np.testing.assert_allclose(column["gear_torque_N_m"][clear], torque[clear], atol=1e-3)
+    # Equal rotors: what the shaft gives, the load and the losses of gear and flanks take.
+    assert 5.5 < np.mean(column["shaft_torque_N_m"]) < 1.6 * 5.5
+
+
+def test_averages_over_speeds_lead_to_the_true_values_with_outlier_and_gaps(tmp_path):
+    rng, rows = np.random.default_rng(1), []
+    for speed in (1500.0, 2000.0, 2500.0, 3000.0):
+        response = simulated(speed_rpm=speed).response
+        rows.append([speed, *(response[key] * (1 + 0.01 * rng.standard_normal())
+                              for key in ("peak_force_N", "mean_force_N"))])  # fmt: skip
+    rows[1][2] = ""
+    with open(tmp_path / "record.csv", "w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerows([["scene.speed_rpm", "peak_force_N", "mean_force_N"], *rows])
+    keys = [f"{BACKLASH}=0.05:0.3", f"{LOAD}=3:9"]
+    found = rootsopt.identify(CIC, str(tmp_path / "record.csv"), keys, starts=2)
+    assert found.fit["measured_values"] == 7
+    for key, true in TRUE.items():
+        low, high = found.parameters[key]["interval_95"]
+        assert low < true < high
+
+
+def test_gain_offset_and_rotation_of_a_record_are_found():
+    record = sampled(0.01, "contact_force_N", "relative_rotation_rad")
+    record["rotation_deg"] = record["rotation_deg"] + 17.0
+    record["contact_force_N"] = 0.3 * record["contact_force_N"] + 5
+    keys = {LOAD: (3.0, 9.0), "rotation_offset_deg": None}
+    found = rootsopt.identify(
+        CIC.replaced({BACKLASH: 0.14}), record, keys,
+        gains=[["contact_force_N"]], constants=["contact_force_N"], starts=2,
+    )  # fmt: skip
+    low, high = found.parameters[LOAD]["interval_95"]
+    assert low < 5.5 < high
+    assert found.parameters["rotation_offset_deg"]["value"] == pytest.approx(17.0, abs=0.1)
+    gain, constant = found.fit["gains"].values()
+    assert (gain, constant) == (pytest.approx(0.3, rel=0.02), pytest.approx(5, abs=1))
+
+
+def test_more_quantities_than_values_are_not_determined():
+    keys = {**BOUNDS, "contact.stiffness_N_per_mm_e": (1e5, 4e5)}
+    record = {name: simulated().response[name] for name in ("mean_force_N", "peak_force_N")}
+    found = rootsopt.identify(CIC, record, keys, starts=1)
+    assert found.status is Status.IDENTIFIED
+    assert found.fit["relative_misfit"] < 1e-4
+    assert not found.combinations[0]["determined"]
+    assert "leave nothing to estimate errors from" in found.message
+    assert found.record()["parameters"][LOAD]["interval_95"] == [3.0, 9.0]
+
+
+def test_averages_of_chaos_are_fitted_over_an_ensemble(monkeypatch):
+    """Averages that are linear in the quantity: the slope through neighbours is theirs."""
+
+    def evaluated(self, evaluator, design, start, series):
+        load = evaluator.config.scene.load.torque_N_m
+        response = {"mean_force_N": 20 * load, "peak_force_N": 50 + load, "rms_force_N": load}
+        errors = {name.replace("_N", "_standard_error_N"): 0.1 for name in response}
+        found = {"response": response, "steady_state": errors, "start": np.zeros((16, 2))}
+        return dataclasses.replace(simulated(), status=Status.AVERAGED, **found)
+
+    monkeypatch.setattr(model.Ensemble, "evaluated", evaluated)
+    config = CIC.replaced({"objective.motion": "ensemble"})
+    record = {"mean_force_N": 110.3, "peak_force_N": 55.4}
+    _, quantities = fitted(config, {LOAD: (3.0, 9.0)}, [])
+    (seen,) = observed(config, record)
+    found = Point.of(config, seen).predicted(quantities, np.array([5.0]), None)
+    np.testing.assert_allclose(found.slopes[0, :, 0], [20, 1], rtol=1e-6)
+    np.testing.assert_allclose((found.values, found.errors), ([[100, 55]], [[0.1, 0.1]]))
+    with pytest.raises(InputError, match="must have columns among mean_force_N"):
+        Point.of(config, observed(config, sampled(0.0, "contact_force_N"))[0])
+
+
+def test_command_writes_the_fit_and_says_what_is_wrong(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    record = sampled(0.03, "relative_rotation_rad", "contact_force_N", step=20)
+    table = np.column_stack([*record.values()])
+    np.savetxt("record.csv", table, delimiter=",", header=",".join(record), comments="")
+    options = ["cic", "--data", "record.csv", "--starts", "1", "-o", "run", "--set", f"{LOAD}=5.5"]
+    assert command.main([*options, "--fit", f"{BACKLASH}=0.05:0.3"]) == 0
+    out = capsys.readouterr().out
+    assert "Quantities that fit the record" in out
+    assert "rootsopt simulate run/identified.yaml" in out
+    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert result["status"] == "identified"
+    low, high = result["parameters"][BACKLASH]["interval_95"]
+    assert low < 0.14 < high
+    assert load_config("run/identified.yaml").value(BACKLASH) == pytest.approx(0.14, rel=0.01)
+    names = {path.name for path in (tmp_path / "run").rglob("*") if path.is_file()}
+    assert {"config.yaml", "residuals.csv", "identified.png"} <= names
+    (tmp_path / "other.csv").write_text("rotation_deg,contact_force\n0,1\n")
+    for wrong, said in (
+        (["--data", "other.csv", "--fit", f"{BACKLASH}=0:1"], "did you mean contact_force_N?"),
+        (["--data", "record.csv"], "`--fit` is missing"),
+        (["--data", "record.csv", "--fit", "backlash=0:1"], "did you mean"),
+        (["--data", "record.csv", "--fit", f"{BACKLASH}=0:1", "--gain", "x"], "is that of x"),
+        (["--data", "record.csv", "--fit", f"{BACKLASH}=0:1", "--profile", "x"], "a fitted key"),
+    ):
+        assert command.main(["cic", "-o", "wrong", *wrong]) == 2
+        message = capsys.readouterr().err
+        assert said in message
+        assert len(message.splitlines()) == 1
+    # A load of no use for a record of another size ends without a usable fit.
+    (tmp_path / "other.csv").write_text("mean_force_N,mean_force_N_std\n1e6,1\n")
+    options = ["cic", "--data", "other.csv", "--starts", "1", "-o", "none", "--no-figures"]
+    assert command.main([*options, "--fit", f"{BACKLASH}=0.1:0.12"]) == 3
+    assert json.loads((tmp_path / "none" / "result.json").read_text())["status"] == "not_identified"
+
+
+def test_function_and_door_share_a_name():
+    function = rootsopt.identify
+    assert importlib.import_module("rootsopt.identify") is function
+    assert rootsopt.identify is function
