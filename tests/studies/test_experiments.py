@@ -68,7 +68,16 @@ def test_gradients(tmp_path, programs):
 
 OTHERS = sorted(
     KNOWN.keys()
-    - {"gradients", "smoothing", "tolerances", "extremes", "benchmark", "twist", "paper"}
+    - {
+        "gradients",
+        "smoothing",
+        "tolerances",
+        "extremes",
+        "benchmark",
+        "twist",
+        "paper",
+        "identify",
+    }
 )
 """Studies whose reduced run is only seen to end and to draw its figures."""
 
