@@ -341,7 +341,7 @@ class Identification:
     >>> import jax
     >>> import rootsopt
     >>> jax.config.update("jax_enable_x64", True)
-    >>> config = rootsopt.load_config("cic")
+    >>> config = rootsopt.load_config("cic_drawn")
     >>> record = {"scene.speed_rpm": [2000.0, 3000.0], "mean_force_N": [87.95, 76.25]}
     >>> key = "scene.load.torque_N_m"
     >>> found = rootsopt.identify(config, record, {key: (3.0, 8.0)})

@@ -90,7 +90,17 @@ def identify(  # Keywords of the public interface, each independent of the other
 
     The status of the result is `identified`, or `not_identified` if no scene within the bounds has
     a motion that explains the record. Raises `InputError` for a column or key that cannot be used,
-    RuntimeError if JAX is not set to double precision. `Identification` shows an example."""
+    RuntimeError if JAX is not set to double precision.
+
+    >>> import jax
+    >>> import rootsopt
+    >>> jax.config.update("jax_enable_x64", True)
+    >>> config = rootsopt.load_config("cic_drawn")
+    >>> record = {"scene.speed_rpm": [2000.0, 3000.0], "mean_force_N": [87.95, 76.25]}
+    >>> found = rootsopt.identify(config, record, {"scene.load.torque_N_m": (3.0, 8.0)})
+    >>> list(found.parameters["scene.load.torque_N_m"])[:3]
+    ['value', 'standard_error', 'interval_95']
+    """
     check_precision()
     began, seen = time.perf_counter(), observed(config, data)
     config, quantities = fitted(config, keys, [key for one in seen for key in one.values])

@@ -608,7 +608,7 @@ def evaluate(config: Config, design: ArrayLike | Sequence[float] | None = None) 
     >>> config = rootsopt.load_config("cic")
     >>> found = rootsopt.evaluate(config)
     >>> print(f"{found.response['mean_force_N']:.1f} N")
-    76.2 N
+    26.8 N
     """
     check_precision()
     check_geometry(config, design)

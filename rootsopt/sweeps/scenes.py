@@ -81,7 +81,7 @@ def sweep_scenes(  # Keywords of the public interface, each independent of the o
     >>> config = rootsopt.load_config("cic")
     >>> data = rootsopt.sweep_scenes(config, {"scene.speed_rpm": [2900.0, 3000.0]})
     >>> data.mean_force_N.dims, data.mean_force_N.round(1).values.tolist()
-    (('scene.speed_rpm',), [76.4, 76.2])
+    (('scene.speed_rpm',), [26.7, 26.8])
     """
     check_precision()
     plan = checked(config, plan_of(axes, zip, sample, sobol, seed))

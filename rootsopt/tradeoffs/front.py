@@ -128,7 +128,7 @@ class Front:
     >>> jax.config.update("jax_enable_x64", True)
     >>> terms = "pareto.terms=[outer_radius_mm, area_efficiency]"
     >>> quick = [terms, "pareto.points=3", "pareto.refinements=0"]
-    >>> front = rootsopt.pareto_front(rootsopt.load_config("cic", quick))
+    >>> front = rootsopt.pareto_front(rootsopt.load_config("cic_drawn", quick))
     >>> front.status.label, len(front.points)
     ('geometry_only', 3)
     """

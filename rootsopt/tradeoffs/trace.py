@@ -600,7 +600,7 @@ def pareto_front(
     >>> jax.config.update("jax_enable_x64", True)
     >>> terms = "pareto.terms=[outer_radius_mm, area_efficiency]"
     >>> quick = [terms, "pareto.points=3", "pareto.refinements=0"]
-    >>> front = rootsopt.pareto_front(rootsopt.load_config("cic", quick))
+    >>> front = rootsopt.pareto_front(rootsopt.load_config("cic_drawn", quick))
     >>> [round(point.terms["outer_radius_mm"], 1) for point in front.points]
     [39.0, 43.1, 47.8]
     """
