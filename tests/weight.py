@@ -13,18 +13,18 @@ from unittest import mock
 
 ROOT = Path(__file__).parents[1]
 MOST = {
-    "statements of the package": 28_008,
-    "statements of the tests": 20_031,
-    "statements of the experiments": 6_108,
-    "packages": 20,
-    "files of the package": 302,
+    "statements of the package": 29_118,
+    "statements of the tests": 17_649,
+    "statements of the experiments": 5_996,
+    "packages": 19,
+    "files of the package": 270,
     "lines of the longest file": 672,
-    "floors of packages": 18,
-    "depth of imports": 41,
+    "floors of packages": 16,
+    "depth of imports": 40,
     "config keys": 151,
     "lines of the longest help": 60,
-    "pages of docs": 44,
-    "words of docs": 33_290,
+    "pages of docs": 45,
+    "words of docs": 34_673,
 }
 """Greatest values that are accepted. Lower them when the project becomes lighter. Whoever raises
 one gives the reason in the changelog: what users can do now that is worth the weight."""
