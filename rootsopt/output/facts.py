@@ -171,17 +171,14 @@ def _at_vertex(known: Record) -> Iterator[str]:
     """Yield that limits alone hold an optimum, and which vertex comes next; `known`: the entry."""
     if not known:
         return
-    usable = [one for one in known["others"] if one["objective"] is not None]
-    next_best = ""
-    if usable:
-        which = f"with {listed(usable[0]['limits'])}"
-        next_best = (
-            f": of {len(usable)} others, the next has {brief(usable[0]['objective'])}, {which}"
-        )
     yield (
-        f"{listed(known['limits'])} alone hold it, so that forces only choose between vertices of "
-        f"the limits{next_best}"
+        f"it is held by {listed(known['limits'])} alone, so that the objective only chooses "
+        "between vertices of the limits"
     )
+    usable = [one for one in known["others"] if one["objective"] is not None]
+    if usable:
+        which = listed(usable[0]["limits"])
+        yield f"the next best vertex has {brief(usable[0]['objective'])} ({which})"
 
 
 def _bounded(known: Record) -> Iterator[str]:

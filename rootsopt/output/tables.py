@@ -337,7 +337,7 @@ def _vertices(result: Record) -> Table | None:
     ]
     rows.insert(0, [*map(value, own.values()), "optimum", ", ".join(known["limits"])])
     heads = [*map(label, own), "objective", "held by"]
-    note = "Where as many limits meet as there are parameters, forces only choose between vertices."
+    note = "Where as many limits meet as there are parameters, the objective only chooses a vertex."
     return table("Vertices of the limits", heads, [("", rows)], note)
 
 

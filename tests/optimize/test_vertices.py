@@ -11,6 +11,7 @@ from scipy.spatial import HalfspaceIntersection
 from rootsopt.commands.console import main
 from rootsopt.config import load
 from rootsopt.optimize.vertices import FeasibleSet
+from rootsopt.output.names import brief
 from rootsopt.profiles import geometry
 from rootsopt.scene import Scene
 
@@ -64,7 +65,8 @@ def test_an_optimum_at_a_vertex_says_so(tmp_path, capsys):
     said = " ".join(capsys.readouterr().out.split())
     result = json.loads((out / "result.json").read_text())
     vertex, best = result["optimality"]["vertex"], result["optimized"]
-    assert f"of {len(vertex['others'])} others, the next has" in said
+    assert f"held by {vertex['limits'][0]}, {vertex['limits'][1]} and" in said
+    assert f"the next best vertex has {brief(vertex['others'][0]['objective'])}" in said
     assert len(vertex["limits"]) == 3
     assert (out / "figures" / "feasible.png").stat().st_size > 10_000
     config = load("cic_drawn", [OBJECTIVE])
