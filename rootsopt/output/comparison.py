@@ -121,7 +121,8 @@ def _sense(row: Mapping[str, Any]) -> str:
 def _region(row: Mapping[str, Any], found: Mapping[str, Any]) -> str:
     """Return where a design is better (`row`: key and parts of its range), in words."""
     key, span = row["key"], _row(row["key"], found)
-    return listed([_part(key, piece, span) for piece in row["better"]]) if row["better"] else ""
+    parts = [_part(key, piece, span) for piece in row["better"]]
+    return f"where the {named(key)} {' or '.join(parts)}" if parts else ""
 
 
 def _part(key: str, piece: Sequence[float], span: Mapping[str, Any]) -> str:
@@ -134,7 +135,7 @@ def _part(key: str, piece: Sequence[float], span: Mapping[str, Any]) -> str:
         found = f"is above {start}" if above else f"is below {stop}"
     if start == stop:
         found = f"is {start}"
-    return f"where the {named(key)} {found}"
+    return found
 
 
 def _stated(key: str, given: float) -> str:

@@ -75,9 +75,9 @@ def test_optimum_in_other_scenes():
         "The optimum is better than the baseline in 30 of 31 random scenes within the assumptions "
         "and at 2 of 4 ends of their ranges: objective 0.7 to 0.95 (5 % to 95 % of the random "
         "scenes), at worst 1.17. All else as given, it is worse where the clearance of the flanks "
-        "is above 23 µm and where the load is below 3.21 N·m and where the load is between 5 N·m "
-        "and 6 N·m. Another design (pressure angle 44°) is better than the optimum in 37.5 % of "
-        "the random scenes, mostly with more clearance of the flanks (rank correlation 0.5). "
+        "is above 23 µm and where the load is below 3.21 N·m or is between 5 N·m and 6 N·m. "
+        "Another design (pressure angle 44°) is better than the optimum in 37.5 % of the random "
+        "scenes, mostly with more clearance of the flanks (rank correlation 0.5). "
         "Scenes that cannot be compared: 2 (baseline idle, optimum chaotic)."
     )
     for row in keys:
