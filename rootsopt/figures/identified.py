@@ -63,6 +63,7 @@ def plot_region(ax: Axes, found: "Identification", first: int, second: int) -> A
     ax.plot(*middle, "+", color=VERMILION)
     ax.autoscale_view()
     ax.locator_params(nbins=4)
+    ax.ticklabel_format(useOffset=False, style="plain")
     ax.set(xlabel=label_of(keys[first]), ylabel=label_of(keys[second]))
     return ax
 
