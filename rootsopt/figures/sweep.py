@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 _KNOWN = {"periodic": "o", "averaged": "s", "chaotic": "x", "not_settled": "+", "idle": "1"}
 _OTHERS = (status.label for status in Status if status.label not in _KNOWN)
-MARKERS = _KNOWN | dict(zip(_OTHERS, "v^<>d*phP2H3D4|X_81", strict=False))
+MARKERS = _KNOWN | dict(zip(_OTHERS, "v^<>d*phP2H3D4|X_8.", strict=False))
 """Marker of each status, by its label."""
 _DENSE = 24
 """Number of points above which a line has no markers at its steady motions, except at isolated
