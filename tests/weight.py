@@ -13,7 +13,7 @@ from unittest import mock
 
 ROOT = Path(__file__).parents[1]
 MOST = {
-    "statements of the package": 29_119,
+    "statements of the package": 29_130,
     "statements of the tests": 17_651,
     "statements of the experiments": 5_996,
     "packages": 19,
@@ -24,7 +24,7 @@ MOST = {
     "config keys": 151,
     "lines of the longest help": 60,
     "pages of docs": 45,
-    "words of docs": 34_695,
+    "words of docs": 34_706,
 }
 """Greatest values that are accepted. Lower them when the project becomes lighter. Whoever raises
 one gives the reason in the changelog: what users can do now that is worth the weight."""

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from rootsopt.output.files import ResultFolder
 
 _OBJECTIVE = "objective (baseline in the same scene = 1)"
+_WIDE = 1.5
+"""Multiple of the 90 % quantile of the objectives at which their axis ends."""
 
 
 def plot_ranges(ax: Axes, keys: Sequence[Mapping[str, Any]], own: float) -> Axes:
@@ -56,7 +58,17 @@ def plot_scenes(ax: Axes, key: str, columns: Mapping[str, Sequence[Any]]) -> Axe
             ax.plot(
                 values[drawn], np.array(columns[name], float)[drawn], mark, color=color, label=word
             )
-    ax.axhline(1, color="black", linewidth=0.8)
+    ax.axhline(1, color="black", linewidth=0.8, label="baseline")
+    places = np.concatenate([np.column_stack(line.get_data()) for line in ax.get_lines()[:-1]])
+    places = places[np.isfinite(places).all(axis=1)].reshape(-1, 2)
+    # A baseline nearly without force would leave no room for the other scenes.
+    high = _WIDE * max(1.0, np.quantile(places[:, 1], 0.9)) if len(places) else np.inf
+    beyond = places[places[:, 1] > high]
+    if len(beyond):
+        low = np.min(places[:, 1])
+        ax.set_ylim(low - 0.05 * (high - low), high)
+        at = {"transform": ax.get_xaxis_transform(), "clip_on": False, "label": "above the axis"}
+        ax.plot(beyond[:, 0], np.full(len(beyond), 0.98), "^", color=GREY, **at)
     ax.set(xlabel=f"{label_of(key)}, all else random, too", ylabel=_OBJECTIVE)
     return ax
 

@@ -122,8 +122,8 @@ def parameters(
 ) -> dict[str, dict[str, Any]]:
     """Return the entry `parameters` of the result file: value, errors and bounds by key.
 
-    `profiles`: results of `profile` by key; `optima`: other scenes, of which those that the record
-    does not tell from the best lie in the intervals, too."""
+    `profiles`: results of `profile` by key; `optima`: other scenes. The intervals include those
+    that fit as well as the best."""
     found, box = {}, zip(*problem.box, strict=True)
     near = [row for row in optima if row["increase"] < spread.width**2]
     for k, (one, (low, high)) in enumerate(zip(problem.quantities, box, strict=True)):

@@ -43,8 +43,8 @@ _POOR = 0.3
 _NO_FIT = 0.7
 """Relative misfit above which a scene does not explain the record."""
 _APART, _AGAIN = 0.15, 4
-"""Distance between places from which local fits begin, and times as many fits that are made as long
-as none leaves residuals that look random."""
+"""Distance between places from which local fits begin. Greatest multiple of the given number of
+fits: more are made while residuals do not look random."""
 _SAME = 0.01
 """Distance on the scales of the quantities up to which two optima are the same."""
 _NEARLY = 2.0
