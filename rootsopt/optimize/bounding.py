@@ -49,11 +49,13 @@ _LEAST = 0.1
 """Least curvature along a coordinate, relative to that which all coordinates would need alike."""
 _SLACK = 0.9
 """Share of a rise that the curvatures must agree with, so that they do not change all the time."""
-_STEEP = 100.0
-"""Curvature, relative to the range of all values, above which a pair counts as a jump."""
+_STEEP, _SHARP = 100.0, 10.0
+"""Curvature and slope above which a pair counts as a corner, and as a jump. They are relative to
+the range of all values over the square of the greatest extent of the points, and over this extent:
+limits may leave only a small part of the bounds, in which values hardly differ."""
 _ROWS = 3
 """Number of minorants in a linear program for the middle of a box and for each of its corners."""
-_NARROW, _NARROWEST = 1 / 64, 1 / 2048
+_NARROW, _NARROWEST = 1 / 64, 1 / 8192
 """Half width of a box below which it is left: one that has no bound, and any other."""
 _BESIDE = 0.01
 """Scaled violation up to which a point of a small box is evaluated."""
@@ -78,13 +80,15 @@ class Surface:
 
     The function is the objective, or the amount by which a limit of a force is exceeded. `points`
     (n, d): evaluated points; `curved` (d,): curvatures; `pairs`, `jumps`: number of pairs from
-    which they are estimated, and of pairs too steep for that. Beside a jump, minorants hold only
-    within half the distance to the other point."""
+    which they are estimated, and of pairs too steep for that. A minorant too high at another
+    point because of a jump ends at half the distance to it. At a corner that bends downwards (as
+    where the peak force moves to another place of the profile) it goes on as a cone, lower by
+    `lean` times the distance. `ends` (2, rows): where paraboloids and cones end."""
 
     def __init__(self, size: int):
         self.points, self.tops = np.zeros((0, size)), np.zeros(0)
         self.values, self.slopes = np.zeros(0), np.zeros((0, size))
-        self.owner, self.reach = np.zeros(0, int), np.zeros(0)
+        self.owner, self.ends, self.lean = np.zeros(0, int), np.zeros((2, 0)), 0.0
         self.rises, self.squares = np.zeros(0), np.zeros((0, size))
         self.curved, self.pairs, self.jumps = np.full(size, _CLOSE), 0, 0
 
@@ -94,29 +98,51 @@ class Surface:
         `rows`: values (k,) and gradients (k, d) of the branches there."""
         values, slopes = rows
         away, count, top = self.points - point, len(self.points), np.max(values)
-        rises, distance = np.zeros(0), np.linalg.norm(away, axis=1)
-        if count:
-            ahead = np.max(values[:, None] + slopes @ away.T, axis=0) - self.tops
-            back = self.values - np.sum(self.slopes * away[self.owner], axis=1)
-            first = np.flatnonzero(np.diff(self.owner, prepend=-1))
-            rises = np.maximum(ahead, np.maximum.reduceat(back, first) - top) - _NOISE
+        distance, rises, turned = np.linalg.norm(away, axis=1), np.zeros(0), False
         self.points, self.tops = np.vstack([self.points, point]), np.append(self.tops, top)
-        steep = _STEEP * max(float(np.ptp(self.tops)), _GAP)
-        jump = (rises > _GAP) & (2 * rises > steep * distance**2)
-        told = (rises > 0) & (distance > _CLOSE) & ~jump
-        self.pairs += 2 * int(np.sum((distance > _CLOSE) & ~jump))
-        self.jumps += int(np.sum(jump))
-        own = np.min(distance[jump] / 2, initial=np.inf)
-        near = np.where(jump, np.minimum(self.reach, distance / 2), self.reach)
-        self.reach = np.append(near, own)
+        ends = np.full((2, len(values)), np.inf)
+        if count:
+            # By how much each minorant of this point is too high at the others, and each of theirs
+            # at this one.
+            ahead = values[:, None] + slopes @ away.T - self.tops[:-1]
+            back = self.values - np.sum(self.slopes * away[self.owner], axis=1) - top
+            over, bent, reach, lean = self._told(np.broadcast_to(distance, ahead.shape), ahead)
+            ends = np.min(reach, axis=2)
+            under, turns, reach, rise = self._told(distance[self.owner], back)
+            self.ends = np.minimum(self.ends, reach)
+            first = np.flatnonzero(np.diff(self.owner, prepend=-1))
+            rises = np.maximum(np.max(over, axis=0), np.maximum.reduceat(under, first))
+            self.jumps += int(np.sum(np.any(bent, axis=0) | np.logical_or.reduceat(turns, first)))
+            turned = _SLACK * max(lean, rise) > self.lean / FACTOR
+            self.lean = FACTOR * max(lean, rise) if turned else self.lean
+        self.ends = np.hstack([self.ends, ends])
+        self.pairs += 2 * int(np.sum(distance > _CLOSE))
+        told = (rises > 0) & (distance > _CLOSE)
         self.rises = np.append(self.rises, rises[told])
         self.squares = np.vstack([self.squares, away[told] ** 2])
         self.values, self.slopes = np.append(self.values, values), np.vstack([self.slopes, slopes])
         self.owner = np.append(self.owner, np.full(len(values), count))
         if np.all(_SLACK * self.rises <= 0.5 * self.squares @ self.curved / FACTOR):
-            return False
+            return turned
         self._fit()
         return True
+
+    def _told(self, far: NDArray[np.float64], rises: NDArray[np.float64]):
+        """Return what pairs at the distances `far` tell, given the `rises` by which minorants are
+        too high there (arrays of one shape).
+
+        (rises that curvature explains, 0 for others; whether a pair is too steep for that; where
+        minorants end: in half its distance, (2, ...): the paraboloid's, and the cone's; the
+        greatest rise per distance that only a corner explains)"""
+        extent = max(float(np.max(np.ptp(self.points, axis=0))), _CLOSE)
+        steep = max(float(np.ptp(self.tops)), _GAP) / extent
+        rises = rises - _NOISE
+        bent = (rises > _GAP) & (2 * rises > _STEEP * steep / extent * far**2)
+        jump = bent & (rises > _SHARP * steep * far)
+        ends = np.where(np.array([bent, jump]), far / 2, np.inf)
+        corner = bent & ~jump
+        lean = float(np.max(rises[corner] / far[corner], initial=0.0))
+        return np.where(bent, 0.0, rises), bent, ends, lean
 
     def _fit(self) -> None:
         """Fit the least curvatures that agree with all pairs."""
@@ -135,7 +161,8 @@ class Surface:
         away = box.middle - self.points[self.owner]
         values = self.values + np.sum((self.slopes - 0.5 * self.curved * away) * away, axis=1)
         far = np.linalg.norm(np.abs(away) + box.half, axis=1)
-        held = far <= self.reach[self.owner]
+        values -= np.where(far > self.ends[0], self.lean * far, 0.0)
+        held = far <= self.ends[1]
         return values[held], (self.slopes - self.curved * away)[held]
 
     def room(self, box: Box) -> float:
@@ -251,7 +278,7 @@ class Bounding:
 
         `least` (d,): the point where the minorants are least. Return `None` if no point helps."""
         room = self.surfaces[0].room(box)
-        worst = -_BESIDE if 2 * room <= self.best - self.target else -FEASIBLE
+        worst = -_BESIDE if np.max(box.half) < _NARROW else -FEASIBLE
         for point in (least, box.middle):
             far = self.surfaces[0].near(point, self.surfaces[0].points) > room
             if far and np.min(self._look(point)[0]) >= worst:
