@@ -16,8 +16,8 @@ import numpy as np
 from experiments._common.scenes import shipped
 from rootsopt.config import DESIGN_KEYS, Config
 
+# Longest involute that a config accepts, in units of u_max.
 _OVERLENGTH = 1.02
-"""Longest involute that a config accepts, in units of u_max."""
 SPANS: dict[str, tuple[float, float]] = {
     "contact.stiffness_N_per_mm_e": (1e3, 1e9),
     "contact.max_damping_N_s_per_mm": (1e-4, 10.0),

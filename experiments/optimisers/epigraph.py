@@ -18,13 +18,16 @@ SCALE = 0.1
 shortens the first step, because some methods start with a unit Hessian."""
 RESIDUAL = 1e-9
 """First-order residual at which a method may stop."""
+
+# Number of constraints reserved for new branches of a maximum that appear during a search. They
+# add to twice the number of branches at the start.
 _SLOTS = 4
-"""Number of constraints reserved for new branches of a maximum that appear during a search. They
-add to twice the number of branches at the start."""
+
+# Difference between phases above which branches at neighbouring points count as different.
 _SAME = 0.1
-"""Difference between phases above which branches at neighbouring points count as different."""
+
+# Amount by which the value of a point without an objective exceeds the best objective.
 _UNUSABLE = 1e3
-"""Amount by which the value of a point without an objective exceeds the best objective."""
 
 
 class Epigraph:

@@ -57,8 +57,9 @@ ranges."""
 FAMILIES = ("cic", "ee")
 PAPER = np.array([[102.4, 1973.3], [1047.1, 5661.4]])
 """Mean and maximum contact force (N), a row per pair (`FAMILIES`), from the paper's section 4."""
+
+# Maximum step of `polished`, in logarithms of the quantities.
 _NEAR = 0.1
-"""Maximum step of `polished`, in logarithms of the quantities."""
 
 
 def config_of(family: str, values: ArrayLike | None = None, *overrides: str) -> Config:

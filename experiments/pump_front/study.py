@@ -49,8 +49,9 @@ _PUMP = (
     f"pareto.terms=[{', '.join(TERMS)}]",
     "pareto.refinements=0",
 )
+
+# Number of angles of rotor 1 at which the flow is sampled.
 _POSES = 4096
-"""Number of angles of rotor 1 at which the flow is sampled."""
 
 
 def config_of(family: str, divisions: int = DIVISIONS) -> Config:

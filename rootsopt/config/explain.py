@@ -13,8 +13,10 @@ from rootsopt.config.section import UNMET, Section, choices, number
 from rootsopt.config.units import RPM, hint, readings, unit_of, without_unit
 from rootsopt.config.words import named, near, shown
 
+# Maximum number of valid keys that a message lists.
 _MOST_NAMES = 12
-"""Maximum number of valid keys that a message lists."""
+
+# What a value must be, by the type of pydantic's error.
 _WANTED = {
     "float_type": "a number",
     "int_type": "a whole number",
@@ -25,10 +27,12 @@ _WANTED = {
     "dict_type": "keys with values, as in {a: 1, b: 2}",
     "tuple_type": "a list of numbers, as in [1, 2]",
 }
-"""What a value must be, by the type of pydantic's error."""
+
+# Type and last part of the location of an unknown key of a dictionary with a choice of keys.
 _UNKNOWN_WORD = "literal_error", ("[key]",)
-"""Type and last part of the location of an unknown key of a dictionary with a choice of keys."""
 _TORQUE, _OUTER = "scene.load.torque_N_m", "profile.outer_radius_mm"
+
+# Keys and factors for names that catalogues use, without their units.
 _SYNONYMS = {
     "center_distance": ("profile.pitch_radius_mm", 0.5),
     "centre_distance": ("profile.pitch_radius_mm", 0.5),
@@ -42,7 +46,6 @@ _SYNONYMS = {
     "torque": (_TORQUE, 1.0),
     "power": (_TORQUE, 1.0),
 }
-"""Keys and factors for names that catalogues use, without their units."""
 _SIGNS = {"gt": "greater than", "ge": "at least", "lt": "less than", "le": "at most"}
 _COUNTS = {"min_length": "at least", "max_length": "at most"}
 
@@ -322,6 +325,8 @@ GROUPS = {
     "expert": ("solver",),
 }  # fmt: skip
 """Sections of the config in each group of keys in `--help`. The longest name counts."""
+
+# Keys that a short help lists; the choices of `profile.family` stand above them.
 _USED_MOST = {
     "profile.lobes", "profile.pitch_radius_mm",
     "scene.speed_rpm", "scene.drive", "scene.load.torque_N_m",
@@ -330,7 +335,6 @@ _USED_MOST = {
     "pump.viscosity_mPa_s", "objective.mean_weight", "objective.peak_weight",
     "constraints.area_efficiency_min", "optimizer.starts", "solver.accuracy",
 }  # fmt: skip
-"""Keys that a short help lists; the choices of `profile.family` stand above them."""
 
 
 def describe(model: type[Section], group: str = "") -> str:

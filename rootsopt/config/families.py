@@ -43,12 +43,14 @@ ENTRY_POINTS = "rootsopt.families"
 The name of each entry point is that of its family."""
 EXAMPLE_RADIUS = 33.0
 """Pitch radius (mm) of the rotors in `Family.example`."""
-_ANY_LENGTH, _ANY_ANGLE, _ANY_NUMBER = (0.01, 1.5), (0.0, 90.0), (0.0, 2.0)
-"""Usual range of a length (pitch radii), of an angle (°) and of a plain number.
 
-They apply to parameters that specify no usual range."""
+# Usual range of a length (pitch radii), of an angle (°) and of a plain number.
+#
+# They apply to parameters that specify no usual range.
+_ANY_LENGTH, _ANY_ANGLE, _ANY_NUMBER = (0.01, 1.5), (0.0, 90.0), (0.0, 2.0)
+
+# Default bounds of a parameter without a usual range, as multiples of the config's own value.
 _AROUND = (0.5, 1.5)
-"""Default bounds of a parameter without a usual range, as multiples of the config's own value."""
 _WORD = re.compile(r"[a-z][a-z0-9_]*")
 
 Pair = tuple[float, float]

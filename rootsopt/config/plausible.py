@@ -15,8 +15,8 @@ from rootsopt.config.units import MM, RPM, hint, unit_of
 if TYPE_CHECKING:
     from rootsopt.config.reading import Config
 
+# One bar (Pa).
 _BAR = 1e5
-"""One bar (Pa)."""
 
 
 def _sizes(config: "Config") -> dict[str, float]:
@@ -132,10 +132,14 @@ USUAL: dict[str, Usual] = {
     "drawing.inset_mm": _GAP,
 }
 """Usual range of each key with a unit, other than design parameters."""
+
+# Usual ranges of design parameters that differ from those of their unit.
 _DESIGN = {"pressure_angle_deg": Usual(5, 85), "tip_arc_turn_deg": Usual(3, 180), TWIST: _TWIST}
-"""Usual ranges of design parameters that differ from those of their unit."""
+
+# Usual range of a design parameter, by unit.
 _UNITS = {"mm": _LENGTH, "°": _ANGLE}
-"""Usual range of a design parameter, by unit."""
+
+# Usual ranges of limited quantities, by the ends of their names.
 _TERMS = {
     "_force_N": Usual(1e-2, 1e3, "force"),
     "_radius_mm": Usual(0.02, 2, "radius"),
@@ -143,7 +147,6 @@ _TERMS = {
     "displaced_volume_cm3": Usual(0.2, 5, "volume"),
     "polar_inertia_kg_m2": Usual(0.1, 5, "inertia"),
 }
-"""Usual ranges of limited quantities, by the ends of their names."""
 
 
 def usual_of(key: str) -> Usual | None:

@@ -43,9 +43,10 @@ from rootsopt.config.words import placed, sentence, shown
 from rootsopt.errors import InputError
 
 _SPEED = "scene.speed_rpm"
+
+# Number of dotted parts in a key above which an override is rejected. Config keys have at most
+# three parts.
 _MOST_PARTS = 8
-"""Number of dotted parts in a key above which an override is rejected. Config keys have at most
-three parts."""
 
 
 class Config(Section):
@@ -345,8 +346,8 @@ class Config(Section):
         return yaml.safe_dump(data, sort_keys=False, allow_unicode=True)
 
 
+# Keys whose default follows other keys, each as (section, key).
 _FOLLOWING = (("contact", "smoothing_mm"), ("pump", "pressure_difference_Pa"))
-"""Keys whose default follows other keys, each as (section, key)."""
 
 
 def _followed(section: Any, key: str, value: Any) -> Any:

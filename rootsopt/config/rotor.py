@@ -30,15 +30,15 @@ from rootsopt.config.section import (
 )
 from rootsopt.config.units import hint
 
+# Usual range (pitch radii) of a profile's lengths.
+#
+# If a length is outside its limits but would lie in this range in another unit, the message
+# suggests this unit.
 _USUAL = 0.01, 2.0
-"""Usual range (pitch radii) of a profile's lengths.
-
-If a length is outside its limits but would lie in this range in another unit, the message suggests
-this unit."""
 
 
+# Absolute value (mm) above which a coordinate of a rotor's axis is rejected.
 _FARTHEST = 1e5
-"""Absolute value (mm) above which a coordinate of a rotor's axis is rejected."""
 _Coordinate = Annotated[float, between(-_FARTHEST, _FARTHEST)]
 
 
@@ -251,8 +251,8 @@ class RotorConfig(Section):
     )
 
 
+# Length (characters) above which a text of the title block is rejected.
 _LONGEST = 60
-"""Length (characters) above which a text of the title block is rejected."""
 
 
 def _is_line(value: object) -> bool:

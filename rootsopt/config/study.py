@@ -27,13 +27,18 @@ from rootsopt.config.words import named, shown
 
 NEAREST = "nearest"
 """Word in `optimizer.family` for the named family that is nearest to an outline."""
+
+# Sum of all weights below which an objective is rejected as empty.
 _LEAST_WEIGHT = 1e-6
-"""Sum of all weights below which an objective is rejected as empty."""
+
+# Number of spectral lines above which an objective is rejected.
 _MOST_LINES = 32
-"""Number of spectral lines above which an objective is rejected."""
 
 
 _SEARCHED = "contact is always found by the search, the most accurate of the former models"
+
+# Keys of former versions: (values that are still true, among them the default, which a resolved
+# config holds; why the key was removed).
 _REMOVED: dict[str, tuple[tuple[Any, ...], str]] = {
     "fidelity": (("search",), _SEARCHED),
     "nodes": ((400,), _SEARCHED),
@@ -44,10 +49,9 @@ _REMOVED: dict[str, tuple[tuple[Any, ...], str]] = {
     "orbit": (("auto", "collocation"), "collocation closes orbits; an integration confirms them"),
     "precision": (("float64",), "motions are integrated in double precision"),
 }
-"""Keys of former versions: (values that are still true, among them the default, which a resolved
-config holds; why the key was removed)."""
+
+# Values of `solver.method` of former versions.
 _REMOVED_METHODS = ("dopri5", "kvaerno3", "kvaerno5")
-"""Values of `solver.method` of former versions."""
 
 
 class SolverConfig(Section):
@@ -326,6 +330,8 @@ _Finite = _Own | Annotated[float, between(-1e12, 1e12)]
 
 
 _LINE = re.compile(r"line_.+_force_N")
+
+# Quantities that are never above the next one of their row.
 _CHAINS = (
     ("mean_force_N", "rms_force_N", "peak_norm_force_N", "peak_force_N"),
     ("bearing_load_equivalent_N", "bearing_load_max_N"),
@@ -333,17 +339,18 @@ _CHAINS = (
     ("flank_gap_min_um", "flank_gap_mean_um"),
     ("root_radius_mm", "outer_radius_mm"),
 )
-"""Quantities that are never above the next one of their row."""
+
+# Amplitude of a spectral line above which no force without a negative value comes, as multiples
+# of these. The first is that of short pulses, the last that of a square wave. The second follows
+# from the first: mean² + amplitude² / 2 ≤ RMS².
 _LINE_SHARES = {
     "mean_force_N": 2.0,
     "rms_force_N": 2 / math.sqrt(3),
     "peak_force_N": 2 / math.pi,
 }
-"""Amplitude of a spectral line above which no force without a negative value comes, as multiples of
-these. The first is that of short pulses, the last that of a square wave. The second follows from
-the first: mean² + amplitude² / 2 ≤ RMS²."""
+
+# Quantities that are magnitudes of forces, and never negative, like spectral lines.
 _SIZES = {*_CHAINS[0], *_CHAINS[1], *_CHAINS[2], "axial_force_max_N", "tilting_moment_max_N_m"}
-"""Quantities that are magnitudes of forces, and never negative, like spectral lines."""
 
 
 def _above(name: str) -> list[tuple[str, float]]:

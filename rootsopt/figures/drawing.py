@@ -20,11 +20,12 @@ from rootsopt.profiles import Geometry, Profile, geometry
 from rootsopt.runtime.environment import say
 from rootsopt.runtime.programs import CachedFunction
 
+# Distance along the outline (fraction of the outline's length) below which two points count as
+# one.
 _SAME = 1e-9
-"""Distance along the outline (fraction of the outline's length) below which two points count as
-one."""
+
+# Number of points of a piece between which crossings are sought.
 _SAMPLES = 65
-"""Number of points of a piece between which crossings are sought."""
 
 
 class Coordinates(NamedTuple):
@@ -111,8 +112,9 @@ def _falls(function: Callable[[Any], Any]) -> Iterator[float]:
 
 
 _MM = 1e3
+
+# Length (characters) above which a line of design parameters is broken.
 _LINE = 72
-"""Length (characters) above which a line of design parameters is broken."""
 _shape = CachedFunction(geometry)
 
 
@@ -236,12 +238,12 @@ def _scene(config: Config) -> str:
     return ", ".join(words)
 
 
+# Style sheet of the drawing. Line widths and dash lengths are in mm.
 _STYLE = (
     ".outline{fill:#dbe9f4;fill-rule:evenodd;stroke:#000;stroke-width:.5}"
     ".pitch{fill:none;stroke:#0072b2;stroke-width:.25;stroke-dasharray:6 1.5 .5 1.5}"
     ".center{fill:none;stroke:#808080;stroke-width:.25;stroke-dasharray:9 1.5 2 1.5}"
 )
-"""Style sheet of the drawing. Line widths and dash lengths are in mm."""
 
 
 def svg_text(drawing: Drawing) -> str:

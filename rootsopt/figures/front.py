@@ -14,6 +14,7 @@ from rootsopt.output.files import ResultFolder
 from rootsopt.status import Standing
 from rootsopt.tradeoffs.front import Front
 
+# Look of each kind of point.
 _LOOKS: dict[str, dict[str, Any]] = {
     "certified": {"marker": "o", "color": BLUE, "markersize": 6.5},
     "not certified": {"marker": "o", "color": BLUE, "markersize": 6.5, "markerfacecolor": "white"},
@@ -22,7 +23,6 @@ _LOOKS: dict[str, dict[str, Any]] = {
     "side of a gap": {"marker": "o", "color": ORANGE, "markersize": 13, "markerfacecolor": "none"},
     "baseline": {"marker": "*", "color": VERMILION, "markersize": 13},
 }
-"""Look of each kind of point."""
 
 
 def kinds(result: Mapping[str, Any]) -> dict[str, list[Mapping[str, Any]]]:

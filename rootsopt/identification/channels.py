@@ -22,8 +22,9 @@ CHANNELS = (
 )  # fmt: skip
 """Names of the sampled quantities: the columns of a response, then the torque of the timing gear on
 rotor 1 and that of the shaft that drives rotor 1."""
+
+# Number of samples computed by one call of the program: a record of any length needs one only.
 _TOGETHER = 8 * BLOCK
-"""Number of samples computed by one call of the program: a record of any length needs one only."""
 
 
 def channels_at(

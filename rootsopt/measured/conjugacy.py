@@ -21,14 +21,16 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 _MICRON = 1e-6
+
+# Limits above which flanks count as cut by an inset; both must be exceeded. First: the inset (m).
+# Second: its ratio to the standard deviation of the gap over the mesh, a robust estimate.
 _CERTAIN = 1e-6, 1.5
-"""Limits above which flanks count as cut by an inset; both must be exceeded. First: the inset (m).
-Second: its ratio to the standard deviation of the gap over the mesh, a robust estimate."""
+
+# Ratio of the standard deviation to the median of the absolute values, for a normal distribution.
 _SPREAD = 1.4826
-"""Ratio of the standard deviation to the median of the absolute values, for a normal distribution.
-"""
+
+# Number of roll angles at which the gap is measured.
 _POSES = 361
-"""Number of roll angles at which the gap is measured."""
 
 
 @dataclasses.dataclass(frozen=True)

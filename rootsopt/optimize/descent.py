@@ -13,13 +13,14 @@ from rootsopt.optimize.outcome import Trial
 from rootsopt.optimize.problem import Problem
 from rootsopt.runtime.programs import CachedFunction
 
+# Number of successive steps without a gain above which a descent ends.
 _PATIENCE = 4
-"""Number of successive steps without a gain above which a descent ends."""
+
+# Relative decrease of the best objective below which a step does not count as a gain.
 _GAIN = 1e-4
-"""Relative decrease of the best objective below which a step does not count as a gain."""
+
+# Norm of the projected gradient (objective per side of the unit box) below which a descent ends.
 _STATIONARY = 1e-3
-"""Norm of the projected gradient (objective per side of the unit box) below which a descent ends.
-"""
 
 
 def descended(

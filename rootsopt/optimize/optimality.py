@@ -14,9 +14,9 @@ from rootsopt.optimize.sqp import REASONS
 if TYPE_CHECKING:
     from rootsopt.optimize.vertices import VertexOptimum
 
+# Differences above which the optima of two local searches count as distinct: relative difference
+# between objectives, and difference in one coordinate of the unit box.
 _SAME = 1e-4, 0.03
-"""Differences above which the optima of two local searches count as distinct: relative difference
-between objectives, and difference in one coordinate of the unit box."""
 
 _REASONS = REASONS | {
     "descent": (

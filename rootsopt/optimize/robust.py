@@ -37,10 +37,12 @@ OBJECTIVE = "objective"
 COMPARED: tuple[str, ...] = (OBJECTIVE, *RESPONSES)
 """Quantities that are compared over fresh scenes: the objective (1 for the baseline in the nominal
 scene), and mean, peak and RMS force (N)."""
+
+# Level of the quantile that the comparison reports.
 _LEVEL = 0.95
-"""Level of the quantile that the comparison reports."""
+
+# Distance in the unit box below which two designs count as the same.
 _APART = 1e-6
-"""Distance in the unit box below which two designs count as the same."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -21,8 +21,8 @@ from rootsopt.response.evaluation import Evaluation
 from rootsopt.response.reducers import Combined, combine
 from rootsopt.scene import Scene
 
+# Share of a scene below which the scene does not count as active at the optimum.
 _HELD = 1e-6
-"""Share of a scene below which the scene does not count as active at the optimum."""
 
 
 @dataclasses.dataclass(frozen=True)

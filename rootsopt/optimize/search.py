@@ -42,24 +42,30 @@ from rootsopt.response.still import Still, needed_motion
 from rootsopt.runtime.threads import POLL
 from rootsopt.scene import Scene
 
+# Maximum number of points at which the search for the least violation of the constraints starts.
 _EXPLAINED = 8
-"""Maximum number of points at which the search for the least violation of the constraints starts.
-"""
+
+# Maximum number of these points if each must be simulated.
 _SIMULATED = 3
-"""Maximum number of these points if each must be simulated."""
+
+# Start of the trials of a lower bound, in place of the index of a local search.
 _BOUND = -2
-"""Start of the trials of a lower bound, in place of the index of a local search."""
+
+# Greatest number of design parameters for which a lower bound is looked for: if it is asked for,
+# and by default.
 _PARAMETERS, _QUICK = 4, 3
-"""Greatest number of design parameters for which a lower bound is looked for: if it is asked for,
-and by default."""
+
+# Number of evaluations and of boxes of a lower bound that is asked for.
 _MOST = 2000, 20_000
-"""Number of evaluations and of boxes of a lower bound that is asked for."""
+
+# Number of points that it evaluates side by side.
 _TOGETHER = 8
-"""Number of points that it evaluates side by side."""
+
+# Number of the first trial beside an optimum at a vertex, and greatest number of these trials.
 _AT_VERTEX, _DRAWN = 100_000, 40
-"""Number of the first trial beside an optimum at a vertex, and greatest number of these trials."""
+
+# Relative gain from which a local search begins at a better design that it finds.
 _BETTER = 1e-5
-"""Relative gain from which a local search begins at a better design that it finds."""
 Progress = Callable[[int, int, float], None]
 """Type of a progress callback, with arguments (evaluations done, evaluations expected, best
 objective)."""

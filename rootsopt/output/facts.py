@@ -32,10 +32,12 @@ STEADY = Status.PERIODIC.label, Status.AVERAGED.label, Status.IDLE.label
 FEW = 6
 """Number of quantities above which a sentence leaves out the others."""
 _PEAK, _RESERVE = "peak_force_N", RESERVES[0]
+
+# Absolute change (%) below which a quantity counts as unchanged.
 _SMALL = 0.05
-"""Absolute change (%) below which a quantity counts as unchanged."""
+
+# Quantities that other words tell: displaced volume, area efficiency, outer radius, reserve.
 _TOLD = "theoretical_flow_l_min", "area_mm2", "root_radius_mm", _RESERVE
-"""Quantities that other words tell: displaced volume, area efficiency, outer radius, reserve."""
 
 
 def optimised(result: Record, rows: Sequence[Record]) -> Facts:

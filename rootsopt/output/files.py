@@ -225,8 +225,8 @@ def response_columns(series: "Series") -> dict[str, NDArray[np.float64]]:
     } | more
 
 
+# Columns of the loads on the bearings.
 _BEARINGS = tuple(f"bearing_{rotor}_{end}_end_N" for rotor in (1, 2) for end in ("gear", "far"))
-"""Columns of the loads on the bearings."""
 
 
 def design_file(point: int) -> str:

@@ -43,12 +43,14 @@ RESULT = "result.json"
 _CONFIG = "config.yaml"
 _SUFFIX = ".rootsopt"
 _STAGE = re.compile(r"(\..+)\.\d+-[0-9a-f]{8}" + re.escape(_SUFFIX))
+
+# Length (bytes) of a folder's name above which temporary names contain a digest of the name
+# instead of the name itself.
 _LONGEST = 150
-"""Length (bytes) of a folder's name above which temporary names contain a digest of the name
-instead of the name itself."""
+
+# Time (s) after a request to stop above which the temporary folder is left behind. This happens
+# if a write is still in progress.
 _PATIENCE = 10.0
-"""Time (s) after a request to stop above which the temporary folder is left behind. This happens if
-a write is still in progress."""
 _State = Literal["absent", "empty", "ours", "more", "foreign"]
 
 

@@ -78,11 +78,11 @@ class _Format(NamedTuple):
     extra: str
 
 
+# Formats by the suffix of the file's name.
 _FORMATS = {
     ".nc": _Format("netCDF", ("h5netcdf", "h5py"), ""),
     ".zarr": _Format("Zarr", ("zarr",), "[zarr]"),
 }
-"""Formats by the suffix of the file's name."""
 SUFFIXES = tuple(_FORMATS)
 """Suffixes of the names that a dataset can have."""
 

@@ -41,20 +41,28 @@ THEME = Theme(json={"attrs": {
     "Toolbar": {"logo": None},
 }})  # fmt: skip
 """Style of all charts on pages, for a Bokeh document."""
+
+# Number of revolutions above which the chart of a motion shows only a part at first.
 _MOST_TURNS = 4
-"""Number of revolutions above which the chart of a motion shows only a part at first."""
+
+# Number of samples above which a chart of a motion shows only the extremes of each interval.
 _MOST_SAMPLES = 20_000
-"""Number of samples above which a chart of a motion shows only the extremes of each interval."""
+
+# Highest multiple of the mesh frequency in a spectrum.
 _HARMONICS = 40
-"""Highest multiple of the mesh frequency in a spectrum."""
+
+# Number of spectral lines above which a spectrum is drawn as a curve.
 _LINES = 400
-"""Number of spectral lines above which a spectrum is drawn as a curve."""
+
+# Smallest amplitude in a spectrum, as a fraction of the largest.
 _FLOOR = 1e-4
-"""Smallest amplitude in a spectrum, as a fraction of the largest."""
+
+# Number of lines above which a chart of a sweep shows single points instead.
 _MOST_CURVES = 8
-"""Number of lines above which a chart of a sweep shows single points instead."""
 _MARKS = "circle", "diamond", "square", "triangle"
 _HOLLOW: dict[str, Any] = {"fill_color": None, "line_width": 2}
+
+# Look of each kind of point of a front.
 _LOOKS: dict[str, dict[str, Any]] = {
     "certified": {"size": 11, "color": BLUE},
     "not certified": {"size": 11, "line_color": BLUE} | _HOLLOW,
@@ -63,7 +71,6 @@ _LOOKS: dict[str, dict[str, Any]] = {
     "side of a gap": {"size": 19, "line_color": ORANGE} | _HOLLOW,
     "baseline": {"size": 15, "marker": "star", "color": VERMILION},
 }
-"""Look of each kind of point of a front."""
 _DASHES = "solid", "dashed", "dotted", "dashdot"
 
 

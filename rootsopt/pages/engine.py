@@ -19,12 +19,14 @@ from rootsopt.response.starts import Seeds
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene, check_geometry, design_vector
 
+# Number of points of a drawn outline, as in the CSV files of the other commands.
 _POINTS = 240
-"""Number of points of a drawn outline, as in the CSV files of the other commands."""
+
+# Greatest number of revolutions shown of a motion.
 _TURNS = 4
-"""Greatest number of revolutions shown of a motion."""
+
+# Relative difference of mean, peak and RMS force below which two motions count as the same.
 _AGREES = 1e-3
-"""Relative difference of mean, peak and RMS force below which two motions count as the same."""
 
 
 class Shape(NamedTuple):

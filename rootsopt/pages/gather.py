@@ -15,6 +15,7 @@ from rootsopt.output.files import ResultFolder, design_file
 from rootsopt.output.tables import NAMES, records_of
 from rootsopt.response.series import Series
 
+# Columns of `response_*.csv`, by field of `Series`.
 _COLUMNS = {
     "time": "time_s",
     "rotation": "rotation_deg",
@@ -23,7 +24,6 @@ _COLUMNS = {
     "drive_force": "drive_flank_force_N",
     "coast_force": "coast_flank_force_N",
 }
-"""Columns of `response_*.csv`, by field of `Series`."""
 
 
 @dataclasses.dataclass(frozen=True)

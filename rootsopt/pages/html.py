@@ -32,6 +32,8 @@ from rootsopt.tradeoffs.front import Front
 
 TEMPLATE = Path(__file__).with_name("report")
 """Folder of the templates, styles and scripts."""
+
+# Captions of the figures by file name; other figures are named after their file.
 _CAPTIONS = {
     "profiles.png": "Rotor profile, and its flank",
     "meshing.png": "The pair at six rotations of one lobe pitch",
@@ -50,10 +52,10 @@ _CAPTIONS = {
     "feasible.png": "Designs that satisfy all limits",
     "assumptions.png": "Objective over what is assumed about the scene",
 }
-"""Captions of the figures by file name; other figures are named after their file."""
 _CODE = re.compile(r"`([^`]*)`")
+
+# Spaces between a number and its unit, where a line must not break.
 _UNIT = re.compile(r"(?<=\d) (?=(?:N·m|N|%|mm|µm|ms|rpm|bar|Pa|kPa|mrad|l/min)(?![\w/]))")
-"""Spaces between a number and its unit, where a line must not break."""
 
 
 @functools.cache

@@ -28,16 +28,20 @@ from rootsopt.runtime.environment import say, shortened
 
 ADDRESS = "127.0.0.1"
 """The only address on which the page is served."""
-_TOKEN = 24
-"""Bytes of the secret in the page's address."""
-_POLL = 100
-"""Interval (ms) at which the server looks whether it is to end."""
-_LIFETIME = 30_000
-"""Time (ms) for which a session is kept whose tab is closed or out of reach."""
-_NAMES = ADDRESS, "localhost", "[::1]"
-"""Names of this machine under which a browser may ask for the page.
 
-A web page elsewhere can let its own name lead to this machine (DNS rebinding). It is refused."""
+# Bytes of the secret in the page's address.
+_TOKEN = 24
+
+# Interval (ms) at which the server looks whether it is to end.
+_POLL = 100
+
+# Time (ms) for which a session is kept whose tab is closed or out of reach.
+_LIFETIME = 30_000
+
+# Names of this machine under which a browser may ask for the page.
+#
+# A web page elsewhere can let its own name lead to this machine (DNS rebinding). It is refused.
+_NAMES = ADDRESS, "localhost", "[::1]"
 _REFUSED = (
     "This address lacks the secret token, or its name is not that of this machine. Open the "
     "address that `rootsopt explore` has printed.\n"

@@ -20,8 +20,8 @@ from rootsopt.config.words import shown
 from rootsopt.errors import InputError
 from rootsopt.runtime.environment import versions
 
+# Maximum number of differences that an error message lists.
 _SHOWN = 5
-"""Maximum number of differences that an error message lists."""
 _ABSENT = "absent"
 
 

@@ -15,8 +15,9 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 
 T = TypeVar("T")
+
+# Number of values from which they are kept. It costs more to keep fewer than to repeat them.
 _MANY = 32
-"""Number of values from which they are kept. It costs more to keep fewer than to repeat them."""
 
 
 def kept(tree: T) -> T:

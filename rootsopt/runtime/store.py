@@ -29,8 +29,9 @@ _HEADER = b"rootsopt program 1\n"
 _MAC_BYTES = hashlib.sha256().digest_size
 _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 _OTHERS_AT_ALL = stat.S_IRWXG | stat.S_IRWXO
+
+# Age (s) of an unfinished file above which it is removed: its process has ended.
 _LEFT_SECONDS = 600.0
-"""Age (s) of an unfinished file above which it is removed: its process has ended."""
 # With these flags, a symbolic link is not followed and a named pipe does not block.
 _SAFELY = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 _HAS_OWNERS = hasattr(os, "geteuid")

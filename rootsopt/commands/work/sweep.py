@@ -27,8 +27,9 @@ from rootsopt.sweeps.scenes import Points, checked, complete, runner
 from rootsopt.sweeps.table import dataset_of
 
 _DATA = "sweep.nc"
+
+# Number of points above which the terminal shows only the first.
 _FEW = 40
-"""Number of points above which the terminal shows only the first."""
 _FIRST = "compiling and simulating"
 _PROMISE = "keeping the points that are done and writing the files"
 
