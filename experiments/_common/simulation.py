@@ -15,8 +15,8 @@ from rootsopt.profiles import Profile
 from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.scene import Scene, design_vector
 
+# Compiled `Scene.pair`: returns the rotor pair of a scene and a design.
 pair_of_model = eqx.filter_jit(Scene.pair)
-"""Compiled `Scene.pair`: returns the rotor pair of a scene and a design."""
 
 
 def evaluator_of(config: Config, give_up_early: bool = False) -> Evaluator:

@@ -20,24 +20,30 @@ from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene, design_vector
 from rootsopt.status import Status
 
+# Longest transient (mesh periods) of most scenes.
 HORIZON = 24
-"""Longest transient (mesh periods) of most scenes."""
+
+# Maximum number of solver steps in a mesh period.
 STEPS = 1024
-"""Maximum number of solver steps in a mesh period."""
+
+# Deviation of a force (tolerances, relative to the larger of true and static force) above which a
+# promise is broken.
 ALLOWED = 100.0
-"""Deviation of a force (tolerances, relative to the larger of true and static force) above which a
-promise is broken."""
+
+# Tolerance below which the limit on the deviation no longer falls. A peak on a corner of the
+# force is known only to about 1e-8 (docs/accuracy.md).
 CORNER = 1e-9
-"""Tolerance below which the limit on the deviation no longer falls. A peak on a corner of the force
-is known only to about 1e-8 (docs/accuracy.md)."""
+
+# Distance between start and end (scaled) above which a reference is not closed.
 CLOSED = 1e-9
-"""Distance between start and end (scaled) above which a reference is not closed."""
+
+# Contact oscillations per mesh period above which SciPy (explicit, in Python) is not used.
 FEW = 50
-"""Contact oscillations per mesh period above which SciPy (explicit, in Python) is not used."""
 DEPTHS = np.concatenate([[-1e-3, 0.0], np.geomspace(1e-36, 1e-2, 39)])
 RATES = np.concatenate([-np.geomspace(1e-9, 1e3, 7), [0.0], np.geomspace(1e-9, 1e3, 4)])
+
+# Number of random states of each scene at which the equation of motion is evaluated.
 POSES = 4
-"""Number of random states of each scene at which the equation of motion is evaluated."""
 
 
 @dataclasses.dataclass

@@ -18,6 +18,8 @@ from rootsopt.config import DESIGN_KEYS, Config
 
 # Longest involute that a config accepts, in units of u_max.
 _OVERLENGTH = 1.02
+
+# Ranges of the random values by config key, uniform in the logarithm.
 SPANS: dict[str, tuple[float, float]] = {
     "contact.stiffness_N_per_mm_e": (1e3, 1e9),
     "contact.max_damping_N_s_per_mm": (1e-4, 10.0),
@@ -31,7 +33,9 @@ SPANS: dict[str, tuple[float, float]] = {
     "solver.rtol": (1e-12, 1e-2),
     "solver.transient_rtol": (1e-12, 1e-2),
 }
-"""Ranges of the random values by config key, uniform in the logarithm."""
+
+# Ranges by config key for scenes of the kind `pump`: gas load and motor replace the constant
+# load.
 PUMP_SPANS: dict[str, tuple[float, float]] = {
     "scene.load.pressure_difference_Pa": (1.0, 1e7),
     "scene.motor.slope_N_m_s_per_rad": (1e-3, 10.0),
@@ -42,10 +46,9 @@ PUMP_SPANS: dict[str, tuple[float, float]] = {
     "contact.friction.stiction_speed_mm_s": (1.0, 1e4),
     "contact.clearance_mm": (1e-4, 0.1),
 }
-"""Ranges by config key for scenes of the kind `pump`: gas load and motor replace the constant load.
-"""
+
+# Largest assembly errors by config key, of either sign; drawn over four decades.
 SIGNED = {"scene.center_distance_error_mm": 1.0, "scene.phase_error_mrad": 100.0}
-"""Largest assembly errors by config key, of either sign; drawn over four decades."""
 EXPONENT = 1.0, 3.0
 MAY_VANISH = (
     "contact.max_damping_N_s_per_mm",
@@ -57,6 +60,9 @@ MAY_VANISH = (
     "contact.friction.kinetic",
     "contact.clearance_mm",
 )
+
+# Values of the grid by config key: ends and middle of the ranges. All other values are those of
+# the shipped CIC scene.
 GRID: dict[str, tuple[float, ...]] = {
     "contact.stiffness_N_per_mm_e": (1e3, 1e6, 1e9),
     "contact.exponent": (1.0, 2.0, 3.0),
@@ -66,8 +72,6 @@ GRID: dict[str, tuple[float, ...]] = {
     "scene.timing_gear.backlash_mm": (0.0, 0.03, 1.0),
     "contact.full_damping_depth_mm": (1e-5, 1e-2, 1.0),
 }
-"""Values of the grid by config key: ends and middle of the ranges. All other values are those of
-the shipped CIC scene."""
 
 
 @dataclasses.dataclass(frozen=True)

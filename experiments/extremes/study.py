@@ -89,8 +89,9 @@ COLOURS = {
     "solver_failed": VERMILION,
     "non_finite": BLACK,
 }
+
+# Maximum number of solvers shown; those with most scenes come first.
 MOST = 7
-"""Maximum number of solvers shown; those with most scenes come first."""
 _EDGES = np.logspace(-2, 8, 11)
 MARKS = "os^vD<>"
 

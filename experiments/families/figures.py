@@ -27,8 +27,9 @@ from rootsopt.profiles import Profile, geometry
 from rootsopt.profiles.geometry import outline
 
 _COLUMNS = 4
+
+# Number of lobes and pitch radius of the families' examples.
 LOBES, RADIUS_MM = 3, 33.0
-"""Number of lobes and pitch radius of the families' examples."""
 
 # Panels in a row of the overview.
 _PANELS = 4

@@ -28,12 +28,15 @@ from rootsopt.scene.families import profile_of
 RADIUS_MM = 33.0
 LOBES = (2, 3, 4, 5, 6)
 FAMILIES = tuple(family for family in FAMILY_KEYS if family != "outline")
+
+# Numbers of coefficients for which free forms are drawn.
 COEFFICIENTS = (3, 8, 24)
-"""Numbers of coefficients for which free forms are drawn."""
+
+# Families and lobes of a reduced run.
 QUICK = ("cic", "ee", "arc"), (2, 3)
-"""Families and lobes of a reduced run."""
+
+# Number of designs drawn per family and number of lobes: in a full and in a reduced run.
 DRAWS, QUICK_DRAWS = 2000, 50
-"""Number of designs drawn per family and number of lobes: in a full and in a reduced run."""
 _LEVELS = 4
 
 # Number of sides of the finest polygon: per interval of a curve, per knot span of a free form,

@@ -13,11 +13,12 @@ from rootsopt.optimize.certificate import certify
 from rootsopt.optimize.local import Group, Linearization, Look
 from rootsopt.optimize.sqp import EndError, Stops
 
+# Factor from the variables z of a method to the point x of the unit box: x = `SCALE` · z. It
+# shortens the first step, because some methods start with a unit Hessian.
 SCALE = 0.1
-"""Factor from the variables z of a method to the point x of the unit box: x = `SCALE` · z. It
-shortens the first step, because some methods start with a unit Hessian."""
+
+# First-order residual at which a method may stop.
 RESIDUAL = 1e-9
-"""First-order residual at which a method may stop."""
 
 # Number of constraints reserved for new branches of a maximum that appear during a search. They
 # add to twice the number of branches at the start.

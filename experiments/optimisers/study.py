@@ -31,10 +31,11 @@ from rootsopt.optimize.problem import FEASIBLE, Problem
 from rootsopt.optimize.sqp import EndError, Stops, descend
 from rootsopt.response.evaluation import Evaluator
 
+# Distance of the objective from the optimum below which a method has reached the optimum.
 REACHED = 1e-6
-"""Distance of the objective from the optimum below which a method has reached the optimum."""
+
+# Number of designs that each method may simulate: in a full run, and in a reduced run.
 EVALUATIONS, QUICK = 150, 15
-"""Number of designs that each method may simulate: in a full run, and in a reduced run."""
 _PEAK = "objective.mean_weight=0"
 Method = Callable[[Any, NDArray[np.float64], Stops], None]
 
@@ -79,8 +80,9 @@ TASKS = (
         "objective.speeds_rpm=[2500, 3500]", "objective.over_speeds=worst")),
     Task("free form", "configs/free.yaml"),
 )  # fmt: skip
+
+# Number of problems in a reduced run.
 QUICK_TASKS = 2
-"""Number of problems in a reduced run."""
 
 
 def sqp(look: "Recorder", start: NDArray[np.float64], stops: Stops) -> None:

@@ -22,8 +22,8 @@ from rootsopt import Scene
 from rootsopt.config import load
 from rootsopt.status import Status
 
+# Usual numbers of designs in a batch.
 SIZES = 256, 1024, 4096, 16384, 65536
-"""Usual numbers of designs in a batch."""
 
 # Number of designs that are compared with single evaluations.
 _CHECKED = 8

@@ -14,13 +14,14 @@ from rootsopt.optimize.optimality import RESIDUAL
 from rootsopt.optimize.outcome import Optimization
 from rootsopt.optimize.search import Search
 
+# Relative difference of price and difference quotient below which they agree.
 AGREES = 0.02
-"""Relative difference of price and difference quotient below which they agree."""
+
+# Overrides of a reduced run.
 QUICK = (
     "optimizer.screening=4",
     "optimizer.starts=1",
 )
-"""Overrides of a reduced run."""
 
 
 class Limit(NamedTuple):

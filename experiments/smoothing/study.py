@@ -35,29 +35,38 @@ from rootsopt.scene import Scene, check_geometry, design_vector
 from rootsopt.status import Status
 
 Say = Callable[[str], None]
+
+# Value that stands for the default of `contact.smoothing_mm` among the smoothing lengths (mm).
 DEFAULT = 0.0
-"""Value that stands for the default of `contact.smoothing_mm` among the smoothing lengths (mm)."""
+
+# Smoothing lengths (mm) at which orbits are closed. The first length is the reference.
 WIDTHS = (1e-6, 1e-5, 3e-5, 1e-4, 1e-3, DEFAULT)
-"""Smoothing lengths (mm) at which orbits are closed. The first length is the reference."""
+
+# Smoothing lengths (mm) at which gradients are compared.
 COMPARED = (1e-6, 1e-5, DEFAULT)
-"""Smoothing lengths (mm) at which gradients are compared."""
+
+# Relative bias above which the default is too wide.
 LIMIT = 1e-4
-"""Relative bias above which the default is too wide."""
+
+# Tolerances (transient, orbit): first for finding an orbit, then for measuring its forces.
 USUAL, TIGHT = (1e-6, 1e-8), (1e-8, 1e-10)
-"""Tolerances (transient, orbit): first for finding an orbit, then for measuring its forces."""
+
+# Longest transients (mesh periods): first for finding an orbit, then for measuring its forces.
 PERIODS = 200, 100
-"""Longest transients (mesh periods): first for finding an orbit, then for measuring its forces."""
+
+# Scaled distance at φ1 = 0 above which two orbits count as different motions.
 SAME = 0.02
-"""Scaled distance at φ1 = 0 above which two orbits count as different motions."""
+
+# Size of the steps of central differences, as a fraction of `FD_STEPS`.
 FD_SHARE = 0.05
-"""Size of the steps of central differences, as a fraction of `FD_STEPS`."""
 KNOWN: dict[str, tuple[tuple[str, tuple[str, ...]], ...]] = {
     "cic": (("cic", ()), ("cic", SHAKY), ("paper_cic", ())),
     "ee": (("ee", ()), ("paper_ee", ())),
     "pump": (("pump", ()),),
 }
+
+# Number of random scenes of each kind.
 COUNTS = {"cic": 60, "ee": 30, "pump": 5}
-"""Number of random scenes of each kind."""
 
 
 def drawn(kind: str) -> Iterator[Config]:

@@ -28,13 +28,15 @@ from rootsopt.sweeps.points import simulated_together
 from rootsopt.sweeps.scenes import Points, complete, runner
 from rootsopt.sweeps.scenes import Run as Way
 
+# Number of times that everything is measured; the fastest round counts.
 ROUNDS = 2
-"""Number of times that everything is measured; the fastest round counts."""
 SPEED, ANGLE = "scene.speed_rpm", "profile.pressure_angle_deg"
+
+# Number of points that are stepped together as arrays (`vmap`), to compare with one by one.
 TOGETHER = 16
-"""Number of points that are stepped together as arrays (`vmap`), to compare with one by one."""
+
+# Pressure angles (°) with which the shipped CIC profile is not sound.
 INVALID = (5.0, 10.0)
-"""Pressure angles (°) with which the shipped CIC profile is not sound."""
 
 
 def _name(workers: int | None) -> str:
