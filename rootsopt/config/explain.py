@@ -9,7 +9,7 @@ from annotated_types import Ge, Gt, Le, Lt
 from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 
-from rootsopt.config.section import UNMET, Section, choices, number
+from rootsopt.config.section import UNMET, Section, bare, choices, number, require
 from rootsopt.config.units import RPM, hint, readings, unit_of, without_unit
 from rootsopt.config.words import named, near, shown
 
@@ -45,6 +45,45 @@ _SYNONYMS = {
     "pressure": ("scene.load.pressure_difference_Pa", 1.0),
     "torque": (_TORQUE, 1.0),
     "power": (_TORQUE, 1.0),
+}
+_SEARCHED = "contact is always found by the search, the most accurate of the former models"
+_IN_BLOCK = "write it as {heading: text} under `drawing.title_block`"
+_BY_ACCURACY = "set `solver.accuracy` to trade accuracy for time"
+
+# Keys of former versions: (values that are still true, among them the default, which a resolved
+# config holds; what to do instead).
+_REMOVED: dict[str, tuple[tuple[Any, ...], str]] = {
+    "solver.fidelity": (("search",), f"{_SEARCHED}; {_BY_ACCURACY}"),
+    "solver.nodes": ((400,), f"{_SEARCHED}; {_BY_ACCURACY}"),
+    "solver.map_error": ((1e-4,), f"{_SEARCHED}; {_BY_ACCURACY}"),
+    "solver.map_rolls": ((), f"{_SEARCHED}; {_BY_ACCURACY}"),
+    "solver.map_relatives": ((), f"{_SEARCHED}; {_BY_ACCURACY}"),
+    "solver.gradient": (("forward",), "both modes of differentiation gave the same gradient"),
+    "solver.orbit": (
+        ("auto", "collocation"),
+        f"collocation closes orbits, and an integration confirms them; {_BY_ACCURACY}",
+    ),
+    "solver.precision": (
+        ("float64",),
+        f"motions are integrated in double precision; {_BY_ACCURACY}",
+    ),
+    "solver.transient_rtol": ((), "it is `solver.accuracy` / 100; set that"),
+    "solver.slice_error": ((1e-2,), "set `solver.slices`"),
+    "attractors.relative_range_mrad": ((), "the grid follows from backlash and contact"),
+    "attractors.rate_range_rad_s": ((), "the grid follows from the speed of impacts"),
+    "sweep.speed_rpm": (
+        (),
+        "give `rootsopt sweep` the option `--over scene.speed_rpm=300:6000:39`",
+    ),
+    "optimizer.method": (("auto", "slsqp"), "it follows from `objective.motion`"),
+    "optimizer.learning_rate": ((0.05,), "set `optimizer.iterations`"),
+    "tolerances.normal_limit": ((4.0,), "normal distributions are cut off at 4 deviations"),
+    "drawing.number": ((), _IN_BLOCK),
+    "drawing.revision": ((), _IN_BLOCK),
+    "drawing.drawn_by": ((), _IN_BLOCK),
+    "drawing.date": ((), _IN_BLOCK),
+    "drawing.general_tolerance": ((), _IN_BLOCK),
+    "drawing.points": ((361,), "rotor_points.csv has 361 points, and all ends of pieces"),
 }
 _SIGNS = {"gt": "greater than", "ge": "at least", "lt": "less than", "le": "at most"}
 _COUNTS = {"min_length": "at least", "max_length": "at most"}
@@ -89,6 +128,26 @@ def explain(
     key = ".".join((key, *map(named, within)))
     wanted = _wanted(kind, value, context, first["msg"], field)
     return f"`{key}` must be {wanted}, but is {shown(value)}{_advice(place, kind, value, field)}"
+
+
+def without_removed(data: Any) -> Any:
+    """Return a config's plain values without keys of former versions.
+
+    Raises `ValueError` if one of them has a value that would now have no effect."""
+    if not isinstance(data, dict):
+        return data
+    for key, (accepted, instead) in _REMOVED.items():
+        section, _, name = key.partition(".")
+        inner = data.get(section)
+        if not isinstance(inner, dict) or name not in inner:
+            continue
+        value = inner[name]
+        require(
+            value is None or value in accepted or bare(str(value)) in accepted,
+            f"`{key}` must be left out, but is {shown(value)}: {instead}",
+        )
+        data = data | {section: {one: x for one, x in inner.items() if one != name}}
+    return {key: value for key, value in data.items() if (key, value) != ("sweep", {})}
 
 
 def _is_unknown(problem: Any) -> bool:
@@ -319,7 +378,7 @@ GROUPS = {
     "scene": ("scene", "contact"),
     "pump": ("pump",),
     "search": (
-        "objective", "constraints", "optimizer", "sweep", "attractors", "pareto", "tolerances",
+        "objective", "constraints", "optimizer", "attractors", "pareto", "tolerances",
         "assumptions", "response", "ensemble",
     ),
     "expert": ("solver",),

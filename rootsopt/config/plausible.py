@@ -117,9 +117,6 @@ USUAL: dict[str, Usual] = {
     "constraints.seal_width_min_mm": _MARGIN,
     "constraints.outer_radius_min_mm": _RADIUS,
     "constraints.outer_radius_max_mm": _RADIUS,
-    "attractors.relative_range_mrad": Usual(1e-2, 300),
-    "attractors.rate_range_rad_s": Usual(1e-3, 1e4),
-    "sweep.speed_rpm": _SPEED,
     "pump.viscosity_mPa_s": Usual(5e-3, 2e5),
     "pump.pressure_difference_Pa": _PRESSURE,
     "pump.tip_clearance_mm": _GAP,
@@ -216,8 +213,7 @@ def _numbers(section: Any, prefix: str = "") -> Iterator[tuple[str, float]]:
 
 def _greatest(value: Any) -> float:
     """Return the number of the greatest magnitude in a value, 0 without a number."""
-    if isinstance(value, dict):  # The number of points of a range has no unit.
-        value = [one for key, one in value.items() if key != "points"]
+    value = [*value.values()] if isinstance(value, dict) else value
     many = value if isinstance(value, list | tuple) else [value]
     numbers = [one for one in many if isinstance(one, int | float) and not isinstance(one, bool)]
     return max(numbers, key=abs, default=0.0)

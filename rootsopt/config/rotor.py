@@ -272,27 +272,22 @@ _Text = Annotated[
 
 
 class DrawingConfig(Section):
-    """What the title block of a drawing states, its inset, and how many points its table has.
+    """What the title block of a drawing states, and its inset.
 
     Nothing here is simulated."""
 
     title: _Text = Field("Roots rotor", description="title of the drawing")
-    number: _Text | None = Field(None, description="drawing number")
-    revision: _Text | None = Field(None, description="revision of the drawing")
-    drawn_by: _Text | None = Field(None, description="author of the drawing")
-    date: _Text | None = Field(None, description="date of the drawing, as text")
     material: _Text | None = Field(None, description="material, in quotes if it is a number")
     tolerance_mm: Annotated[float, between(1e-4, 10)] | None = Field(
         None, description="width of the tolerance zone of the flank (profile of a line, ISO 1101)"
     )
-    general_tolerance: _Text | None = Field(
-        None, description="tolerances of all other dimensions, as ISO 2768-mK"
+    title_block: dict[_Text, _Text] = Field(
+        default_factory=dict,
+        description="further fields of the title block by heading, as {Revision: A, Drawn by: J. "
+        "Doe}",
     )
     inset_mm: Annotated[float, Field(ge=0, le=5)] = Field(
         0.0,
         description="distance along the normal by which the drawn rotor is smaller than its "
         "profile: half of contact.clearance_mm for rotors that are cut with their clearance",
-    )
-    points: Annotated[int, Field(ge=9, le=20_001)] = Field(
-        361, description="number of points over one lobe in rotor_points.csv"
     )

@@ -397,8 +397,7 @@ def following_mm(
     stiffness of the timing gear (N·m/rad), `None` without a gear. `contact`: stiffness (N/mm^e),
     exponent e and depth of full damping (mm) of the flanks.
 
-    This smoothing changes the forces by less than 1e-4 of their values. The command `python -m
-    experiments smoothing` measures this."""
+    This smoothing changes the forces by less than 1e-4 of their values."""
     torque = max(load_torque, _LEAST_TORQUE)
     stiffness, exponent, full = contact
     force = torque / (pitch_radius_mm * 1e-3)

@@ -63,6 +63,10 @@ class Scatter(NamedTuple):
     half: float
 
 
+# Standard deviations at which normal distributions are cut off.
+_CUT = 4.0
+
+
 class TolerancesConfig(Section):
     """Scatter of scene and design, for a robust optimum. Without this section, nothing scatters."""
 
@@ -76,9 +80,6 @@ class TolerancesConfig(Section):
         default_factory=dict,
         description="scenes by name, instead of `over` and a sample: values of keys, as "
         "{new: {}, worn: {contact.wear.depth_mm: 0.03}}",
-    )
-    normal_limit: Annotated[float, between(0.5, 8)] = Field(
-        4.0, description="standard deviations at which normal distributions are cut off"
     )
     samples: Annotated[int, Field(ge=2, le=1024)] = Field(
         16, description="scenes simulated for each design of the search: a fixed Sobol sample"
@@ -167,7 +168,7 @@ class TolerancesConfig(Section):
                     f"`{key}` is 0; give the width in the key's unit"
                 )
             size = width * abs(nominal) if kind != name else width
-            half = self.normal_limit * size if kind == "normal" else size
+            half = _CUT * size if kind == "normal" else size
             found.append(Scatter(key, kind, nominal, size, half))
         return tuple(found)
 

@@ -125,8 +125,7 @@ class Drawing:
     `pieces`: closed outline (mm); `pitch_radius`, `outer_radius`: radii (mm); `lobes`: number of
     lobes; `length`: axial length (mm); `helix_deg`: twist over the length (°); `bore`: bore
     diameter (mm), `None` for a rotor without a bore; `notes`: lines of text with the dimensions.
-    `root_radius`: radius (mm); `block`: (heading, text) of each field of the title block; `points`:
-    number of points over a lobe in the table of coordinates.
+    `root_radius`: radius (mm); `block`: (heading, text) of each field of the title block.
     """
 
     pieces: list[DrawnPiece]
@@ -139,7 +138,6 @@ class Drawing:
     notes: tuple[str, ...]
     root_radius: float
     block: tuple[tuple[str, str], ...]
-    points: int
 
     @classmethod
     def of(cls, config: Config, profile: Profile, design: dict[str, float]) -> "Drawing":
@@ -186,7 +184,6 @@ class Drawing:
             notes=tuple(note for note in notes if note),
             root_radius=root,
             block=_block(config),
-            points=(config.drawing or DrawingConfig.model_validate({})).points,
         )
 
     @property
@@ -208,16 +205,12 @@ def _block(config: Config) -> tuple[tuple[str, str], ...]:
     tolerance = stated.tolerance_mm
     texts = {
         "Title": stated.title,
-        "Drawing number": stated.number,
-        "Revision": stated.revision,
         "Material": stated.material or f"density {config.rotor.density_kg_m3:g} kg/m3",
         "Flank, profile of a line": None if tolerance is None else f"{tolerance:g} mm (ISO 1101)",
-        "General tolerances": stated.general_tolerance,
         "Rotor": f"{profile.family}, {profile.lobes} lobes, length {config.rotor.length_mm:g} mm",
         "Centre distance": f"{2 * profile.pitch_radius_mm:g} mm",
         "Designed for": _scene(config),
-        "Drawn by": stated.drawn_by,
-        "Date": stated.date,
+        **stated.title_block,
         "Scale, unit": "1:1, mm",
         "Program": f"rootsopt {rootsopt.__version__}",
     }

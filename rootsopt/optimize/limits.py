@@ -151,11 +151,6 @@ def force_limits(config: Config, scene: Scene) -> tuple[ForceLimit, ...]:
             f"{found[0].key}: averages have noise; give it a weight in `objective`, or choose "
             "another motion"
         )
-    if found and config.optimizer.method not in ("auto", "slsqp"):
-        raise InputError(
-            f"`optimizer.method` must be auto or slsqp to limit {found[0].key} under `{LIMITS}`, "
-            f"but is {config.optimizer.method}; set it to auto"
-        )
     return found
 
 

@@ -20,8 +20,7 @@ _SAME = 1e-4, 0.03
 
 _REASONS = REASONS | {
     "descent": (
-        "The descent has a step size and no test for an optimum: the design may be short of it. "
-        "Set optimizer.method to auto."
+        "The descent has a step size and no test for an optimum: the design may be short of it."
     ),
     "verification": (
         "The search found nothing better nearby, but the first-order conditions do not hold at the "

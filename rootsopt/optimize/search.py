@@ -121,8 +121,7 @@ class Search:
     `runs`: where screening and local searches evaluate designs; `stage`: what differs from the
     usual search.
 
-    Raises `InputError` if there is no design parameter, or if the optimisation
-    method does not suit the objective."""
+    Raises `InputError` if there is no design parameter."""
 
     def __init__(
         self,
@@ -226,7 +225,7 @@ class Search:
             trials = self._side_by_side(self._screen, list(enumerate(points)))
         ranked = _ranked(trials) if self.settings.screening else points
         starts = _apart(ranked, self.stage.apart, self.settings.starts) or points[:1]
-        work = self._solve if self.method == "slsqp" else self._descend
+        work = self._descend if self.noisy else self._solve
         trials += self._side_by_side(work, list(enumerate(starts, self.stage.first)))
         bounding, further = self._bounded(trials, self.stage.first + len(starts))
         trials += further
@@ -438,16 +437,15 @@ class Search:
         return trials
 
     def _descend(self, number: int, point: NDArray[np.float64]) -> list[Trial]:
-        """Descend from `point` (d,) by an update rule, and return the trials.
+        """Descend from `point` (d,) by Adam's rule, and return the trials.
 
         `number`: index of the local search."""
-        rule = self.method, self.settings.learning_rate, self.settings.iterations
 
         def evaluate(point: NDArray[np.float64], iteration: int, orbit: Any) -> Trial:
             return self._evaluate(self.fast, point, number, iteration, orbit)
 
-        noisy, asked = self.noisy, self.stop.is_set
-        return descended(self.problem, evaluate, point, rule, noisy, asked)
+        iterations, asked = self.settings.iterations, self.stop.is_set
+        return descended(self.problem, evaluate, point, iterations, asked)
 
     def _evaluate(
         self, evaluator: Evaluator, point, start, iteration, orbit=None, key=None
@@ -482,19 +480,8 @@ class Search:
 
 
 def method_of(config: Config) -> str:
-    """Return the method of the local searches, with `auto` replaced by the method it stands for.
-
-    Raises `InputError` if the search needs exact gradients but there are none: the objective is an
-    average over an ensemble, or the contact is not smooth."""
-    method, noisy = config.optimizer.method, config.objective.motion == "ensemble"
-    if method == "auto":
-        return "adam" if noisy else "slsqp"
-    if method == "slsqp" and noisy:
-        raise InputError(
-            "`optimizer.method` must be adam, rmsprop or sgd for `objective.motion` ensemble, but "
-            "is slsqp: gradients of averages have noise; set it to auto"
-        )
-    return method
+    """Return the method of the local searches: Adam's rule for averages, which have noise."""
+    return "adam" if config.objective.motion == "ensemble" else "slsqp"
 
 
 def _ranked(trials: list[Trial]) -> list[NDArray[np.float64]]:
