@@ -134,9 +134,6 @@ def _sweep(parser: "ArgumentParser") -> None:
     )
     group.add_argument("--seed", type=int, metavar="N", help="seed of the samples (default: 0)")
     group = parser.add_argument_group("how a sweep runs (with --over or --tolerances)")
-    group.add_argument(
-        "--data", metavar="NAME", help="name of the dataset: *.nc or *.zarr (default: sweep.nc)"
-    )
     _shared(group)
 
 

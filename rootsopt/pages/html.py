@@ -21,14 +21,11 @@ from markupsafe import Markup, escape
 
 import rootsopt
 from rootsopt.output import tables
-from rootsopt.output.files import design_file
 from rootsopt.output.names import Table, in_words
 from rootsopt.pages import charts, words
 from rootsopt.pages.charts import animations
 from rootsopt.pages.gather import Run
 from rootsopt.pages.words import anchor, glossary, linked
-from rootsopt.scene import outline_mm
-from rootsopt.tradeoffs.front import Front
 
 TEMPLATE = Path(__file__).with_name("report")
 """Folder of the templates, styles and scripts."""
@@ -153,32 +150,6 @@ def report_text(run: Run) -> str:
     )
 
 
-def front_text(front: Front) -> str:
-    """Return the HTML of the page of a `front`: a click on a point shows its rotor and config."""
-    result = front.record()
-    drawn = charts.front_charts(result)
-    points = {}
-    for one in front.points:
-        config = front.config_of(one)
-        points[str(one.number)] = {
-            "file": design_file(one.number).rpartition("/")[2],
-            "yaml": config.to_yaml(),
-            "outline": outline_mm(config, [*one.design.values()]).round(3).tolist(),
-            "status": f"{in_words(one.standing.label)}: {one.standing.value}",
-            "terms": one.terms,
-        }
-    names = [aim.words for aim in front.aims]
-    return _page(
-        "front.html.j2",
-        drawn.values(),
-        {"points": points},
-        title=f"Trade-off of {', '.join(names[:-1])} against {names[-1]}",
-        message=front.message,
-        charts=[*drawn],
-        tables=[*tables.front_tables(result)],
-    )
-
-
 def _charts(run: Run) -> list[tuple[str, str, Any]]:
     """Return (title, explanation, chart) of each interactive chart of a run."""
     hover = "Hover over a point to see its design."
@@ -204,4 +175,4 @@ def _charts(run: Run) -> list[tuple[str, str, Any]]:
     return [one for one in found if one[2] is not None]
 
 
-__all__ = ["TEMPLATE", "front_text", "report_text", "table_html"]
+__all__ = ["TEMPLATE", "report_text", "table_html"]

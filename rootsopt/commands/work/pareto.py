@@ -7,7 +7,6 @@ from contextlib import AbstractContextManager, closing
 
 from rich.console import Console
 
-from rootsopt import pages
 from rootsopt.commands import cli, door
 from rootsopt.commands.work.searching import (
     CompileClock,
@@ -20,7 +19,6 @@ from rootsopt.commands.work.searching import (
 from rootsopt.config import Config
 from rootsopt.output import files, tables, terminal
 from rootsopt.output.runs import RunFolder
-from rootsopt.runtime.environment import say
 from rootsopt.scene import check_geometry
 from rootsopt.tradeoffs.trace import Tracer
 
@@ -61,12 +59,6 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
         from rootsopt.figures.front import front_figure
 
         front_figure(folder, front)
-        if words := pages.missing():
-            say(f"{pages.FRONT} is not written, because it needs {words}")
-        else:
-            from rootsopt.pages.html import front_text
-
-            folder.write_text(pages.FRONT, front_text(front))
     if front.interrupted and not front.points:
         folder.overwrite = False  # An earlier result is more valuable than this one.
 

@@ -81,8 +81,6 @@ def _over_keys(config: Config, options: argparse.Namespace, folder: RunFolder) -
     Return the `Outcome`. Raises `InputError` if a key, a value or an option is not valid."""
     began = time.perf_counter()
     cli.load_figures(options, "sweep")
-    name = _DATA if options.data is None else options.data
-    sweeps.check_name(name)
     config, plan = _points(config, options)
     plan = checked(config, plan)
     columns = {key: values for one in plan.dimensions for key, values in one.columns.items()}
@@ -104,10 +102,10 @@ def _over_keys(config: Config, options: argparse.Namespace, folder: RunFolder) -
     files.write_config(folder, config)
     rows = sweeps.rows_of(plan, records)
     folder.write_csv("sweep.csv", files.row_columns(rows))
-    sweeps.write_dataset(folder, name, dataset)
+    sweeps.write_dataset(folder, _DATA, dataset)
     statistics: dict[str, Any] = {"seconds": seconds, "resumed_points": known}
     statistics["points_per_second"] = (len(records) - known) / seconds
-    record = sweeps.summary(plan, records) | {"data": name, "statistics": statistics}
+    record = sweeps.summary(plan, records) | {"data": _DATA, "statistics": statistics}
     folder.write_json("result.json", record | {"versions": files.versions()})
     if not options.no_figures:
         from rootsopt.figures.sweep import sweep_figure
@@ -163,7 +161,7 @@ def _silent(done: int, expected: int) -> None:
 
 def refuse_options(options: argparse.Namespace) -> None:
     """Raise `InputError` if an option that needs `--over` is given without `--over`."""
-    names = "zip", "zip_keys", "sample", "sobol", "seed", "data", "workers", "scheduler", "resume"
+    names = "zip", "zip_keys", "sample", "sobol", "seed", "workers", "scheduler", "resume"
     for name in names:
         if getattr(options, name) not in (None, False, []):
             raise InputError(
