@@ -80,7 +80,6 @@ class _Help(argparse.Action):
     """The option `--help [GROUP]`: options and the keys used most, or all keys of a group."""
 
     def __call__(self, parser, namespace, values, option_string=None):
-        del namespace, option_string
         if values in GROUPS:
             print(describe(Config, str(values)))
         else:

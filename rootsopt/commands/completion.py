@@ -88,6 +88,3 @@ def _preamble() -> dict[str, str]:
 }}
 """
     }
-
-
-__all__ = ["SHELLS", "script"]

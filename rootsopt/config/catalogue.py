@@ -44,7 +44,6 @@ class _Dependent(Parameter):
     A search takes the limits from the `ranges` of the family."""
 
     def bounds(self, profile: "ProfileConfig") -> Pair:
-        del profile
         return 0.0, math.inf
 
 

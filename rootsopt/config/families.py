@@ -117,7 +117,6 @@ class Parameter:
         """Return the usual range (low, high), in the key's unit.
 
         `pitch_radius_mm`, `lobes`: pitch radius (mm) and number of lobes of the rotor."""
-        del lobes
         if self.usual is not None and self.radii is None:
             return self.usual
         if self.usual is not None or self.key.endswith("_mm"):

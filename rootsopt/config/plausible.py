@@ -217,6 +217,3 @@ def _greatest(value: Any) -> float:
     many = value if isinstance(value, list | tuple) else [value]
     numbers = [one for one in many if isinstance(one, int | float) and not isinstance(one, bool)]
     return max(numbers, key=abs, default=0.0)
-
-
-__all__ = ["USUAL", "Usual", "notes", "notes_on_swept", "usual_of"]

@@ -289,7 +289,6 @@ def kink_margins(pair: "RotorPair", motion: Motion, acting, touches: Any) -> Mar
         return values, pair.law(touch.depth, touch.closing) > 0, touch.approach.place
 
     def of_section(section, motion, side, touch):
-        del motion
         if pair.two_sided:
             return jax.vmap(functools.partial(of_flank, section.contact))(side, touch)
         found = of_flank(section.contact, side, touch)

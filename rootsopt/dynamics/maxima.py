@@ -278,16 +278,3 @@ def located(
     nothing = jnp.zeros_like(places[0])
     rows = jnp.zeros((nothing.shape[0], orbit.variation.state.shape[-1]))
     return lax.fori_loop(0, count, one, (nothing, nothing, rows))
-
-
-__all__ = [
-    "MOST",
-    "Maxima",
-    "along_elements",
-    "around",
-    "candidates",
-    "local_maxima",
-    "located",
-    "prepare_maxima",
-    "shoulders",
-]

@@ -62,6 +62,3 @@ def smooth_pieces(
     empty = ends - begins < _EMPTY
     order = jnp.argsort(empty)
     return begins[order], ends[order], jnp.sum(~empty)
-
-
-__all__ = ["LONGEST", "smooth_pieces"]

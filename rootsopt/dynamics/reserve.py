@@ -202,6 +202,3 @@ def gear_torque(
     places = around(orbit.elements.mesh, sizes, times)[:, None]
     _, (peak,), (by_peak,) = located(size, pair, tangents, orbit, places, 1)
     return jnp.stack([mean, peak, rms]), jnp.stack([by_mean, by_peak, by_rms])
-
-
-__all__ = ["INSTANTS", "Apart", "apart", "gaps", "gear_torque", "reserve"]

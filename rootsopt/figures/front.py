@@ -113,6 +113,3 @@ def plot_designs(ax: Axes, front: Front, x: str) -> Axes:
     ax.set(xlabel=_axis(aim), ylabel="design (0: lower, 1: upper bound)", ylim=(-0.05, 1.05))
     ax.legend(frameon=False, fontsize=8, ncols=math.ceil(len(keys[:12]) / 4))
     return ax
-
-
-__all__ = ["front_figure", "kinds", "plot_designs", "plot_front"]

@@ -102,6 +102,3 @@ def drawn(found: "Identification") -> Figure:
 def identified_figure(folder: "ResultFolder", found: "Identification") -> None:
     """Write `figures/identified.png` into `folder`."""
     write(folder, "identified", drawn(found), "Record and fit")
-
-
-__all__ = ["drawn", "identified_figure", "plot_orders", "plot_record", "plot_region"]

@@ -432,20 +432,3 @@ def adopted(config: Config, problem: Problem, best: Local) -> Config:
     values = {one.key: float(x) for one, x in zip(problem.quantities, best.values, strict=True)}
     values.pop(OFFSET, None)
     return config.replaced(values) if values else config
-
-
-__all__ = [
-    "STRUCTURED",
-    "Identification",
-    "Spread",
-    "adopted",
-    "caveats",
-    "combinations",
-    "further",
-    "parameters",
-    "profile",
-    "quality",
-    "relative_misfit",
-    "residuals",
-    "structure",
-]

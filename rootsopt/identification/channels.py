@@ -80,6 +80,3 @@ def _values(pair: RotorPair, tau, state) -> Float[Array, " c"]:
     assert shaft is not None
     forces = contact.drive, contact.coast, contact.total
     return jnp.stack([motion.relative, motion.rate, *forces, contact.depth, gear, shaft])
-
-
-__all__ = ["CHANNELS", "channels_at"]

@@ -268,6 +268,3 @@ class _Search:
         """Return the entry `statistics` of the result file; `began`: start (s, `perf_counter`)."""
         seconds = time.perf_counter() - began
         return {"scenes_tried": self.tried, "fits": len(self.ends), "seconds": seconds}
-
-
-__all__ = ["identify"]

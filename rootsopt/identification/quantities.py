@@ -158,6 +158,3 @@ def _allowed(config: Config, key: str) -> tuple[float, float]:
 def values_at(quantities: Sequence[Fitted], place: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the values (p,) of the quantities at a `place` (p,) on their scales."""
     return np.array([one.value(x) for one, x in zip(quantities, place, strict=True)])
-
-
-__all__ = ["OFFSET", "Fitted", "fitted", "values_at"]

@@ -196,6 +196,3 @@ def _check(config: Config, name: str, title: str, sampled: bool) -> None:
         f"({', '.join(told)}), a config key, or one of these with {_SPREAD} for its standard "
         f"deviations; {f'did you mean {meant}?' if meant else 'rename or remove it'}"
     )
-
-
-__all__ = ["Observed", "observed"]

@@ -251,6 +251,3 @@ class Problem:
             xtol=1e-8, ftol=1e-10, gtol=1e-12, max_nfev=_STEPS,
         )  # fmt: skip
         return at(done.x)
-
-
-__all__ = ["TURN", "Local", "Problem"]

@@ -134,7 +134,6 @@ def _plain(points: Iterable[Any], scale: float) -> NDArray[np.complex128]:
 
 
 def _line(entity: Any, scale: float, fault) -> list[Stroke]:
-    del fault
     ends = _plain([entity.dxf.start, entity.dxf.end], scale)
     return [Stroke(ends)] if ends[0] != ends[1] else []
 
@@ -214,7 +213,6 @@ def _polyline(entity: Any, scale: float, fault) -> list[Stroke]:
     """Return the straight runs and arcs of a polyline.
 
     A side with a bulge is an arc; its bulge is the tangent of a quarter of the arc's angle."""
-    del fault
     if entity.dxftype() == "LWPOLYLINE":
         corners = entity.vertices_in_wcs()
         bulges = [bulge for (bulge,) in entity.get_points("b")]

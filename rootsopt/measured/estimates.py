@@ -311,6 +311,3 @@ def center(points: Complex128[np.ndarray, " n"], lobes: int) -> tuple[complex, f
         if not abs(move) > _STILL * np.max(radius):
             break
     return complex(place), error
-
-
-__all__ = ["UNITS", "Estimates", "center", "estimates", "scatter", "unit_of_size"]

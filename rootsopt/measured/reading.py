@@ -18,8 +18,6 @@ from rootsopt.measured.guard import short
 from rootsopt.measured.loop import JOIN, Loop, joined, moment, place, signed_area, tails
 from rootsopt.measured.table import from_csv
 
-__all__ = ["JOIN", "LOBES", "Loop", "Sought", "lobes_of", "read", "signed_area"]
-
 LOBES = range(2, 7)
 """Numbers of lobes that a rotor may have."""
 

@@ -57,7 +57,6 @@ def outline_of(config: "ProfileConfig") -> tuple[Outline, Checks]:
 
 @functools.lru_cache(maxsize=16)
 def _kept(path: Path, stamp, how: tuple[str | None, Sought, float], smoothing: float):
-    del stamp
     loop, sought = read(path, *how), how[1]
     assert sought.lobes is not None
     assert sought.pitch_radius_mm is not None

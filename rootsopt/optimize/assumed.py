@@ -147,6 +147,3 @@ class Assumed:
         if np.sum(kept) < 3 or np.ptp(values[kept]) == 0:
             return None
         return float(spearmanr(mine[kept], values[kept]).statistic)  # pyright: ignore
-
-
-__all__ = ["BASELINE", "OPTIMIZED", "RIVAL", "WINS", "Assumed", "Piece", "Scenes"]

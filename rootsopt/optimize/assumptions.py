@@ -351,6 +351,3 @@ class AssumedSearch:
 
         spread = compared(self.config, found, self.runs, self.stop.is_set, tick)
         return dataclasses.replace(found, assumptions=spread)
-
-
-__all__ = ["AssumedSearch", "compared"]

@@ -153,6 +153,3 @@ def _fits(given: Profile, family: str) -> list[Likeness]:
             if found[0] is not None and found[0].departure <= _EXACT:
                 break
     return sorted((one for one in found if one is not None), key=lambda one: one.departure)
-
-
-__all__ = ["Beginning", "beginning"]

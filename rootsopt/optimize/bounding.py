@@ -365,6 +365,3 @@ class Bounding:
         if key not in self._known:
             self._known[key] = self.limits(point)
         return self._known[key]
-
-
-__all__ = ["FACTOR", "FIRST", "Bounding"]

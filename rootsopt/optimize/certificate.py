@@ -123,6 +123,3 @@ def certify(local: Linearization, point: NDArray[np.float64], near: float = NEAR
     residual = float(np.linalg.norm(np.concatenate([left, *apart])))
     held = multipliers, lower, upper, tuple(shares), tuple(walls)
     return Certificate(residual, local.violation, *held)
-
-
-__all__ = ["NEAR", "RESIDUAL", "Certificate", "certify"]

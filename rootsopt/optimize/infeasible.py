@@ -197,6 +197,3 @@ def _conflict(one: Constraint | ForceLimit, excess: float, alone: float | None) 
 def _best(found: Sequence[Found]) -> Found | None:
     usable = [(one.local.objective, one) for one in found if one.local is not None]
     return min(usable, key=lambda pair: pair[0], default=(0.0, None))[1]
-
-
-__all__ = ["Conflict", "Infeasible", "explain"]

@@ -230,6 +230,3 @@ def _alike(group: Group, other: Group) -> NDArray[np.int64]:
         if cost[branch, place] < 10.0:
             found[branch] = place
     return found
-
-
-__all__ = ["Limits", "Models"]

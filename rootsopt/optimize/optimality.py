@@ -241,15 +241,3 @@ def unseen(searches: int, optima: int) -> dict[str, float | None]:
     share = count * (count + 1) / (n * (n - 1)) if n > 1 else 1.0
     share = share if share < 1.0 else None
     return {"searches": n, "optima": count, "expected_optima": expected, "share_of_starts": share}
-
-
-__all__ = [
-    "Bound",
-    "Holder",
-    "Optimality",
-    "Optimum",
-    "StartOutcome",
-    "distinct",
-    "judged",
-    "unseen",
-]

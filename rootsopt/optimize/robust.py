@@ -158,7 +158,6 @@ class RobustStage(Stage):
 
         Without an optimum, return the baseline's `own` point. All are moved onto the feasible
         set."""
-        del settings
         found = [] if self.nominal.optimized is None else [self.nominal.optimized.design]
         found += [dict(one) for one in self.others]
         if self.nominal.optimality is not None:
@@ -389,16 +388,3 @@ def search_of(
     nominal = config.tolerances is None and config.objective.over == "nominal"
     found = (Search if nominal else TolerantSearch)(config, progress, stop, checkpoint, runs)
     return AssumedSearch(found, config, progress, stop, runs) if config.spans else found
-
-
-__all__ = [
-    "COMPARED",
-    "OBJECTIVE",
-    "RobustStage",
-    "Robustness",
-    "Scattered",
-    "TolerantSearch",
-    "compare",
-    "search_of",
-    "without",
-]

@@ -218,6 +218,3 @@ def _branches(local: Linearization, kind: int) -> Group:
         return Group(tags, local.smooth + group.values, local.slope + group.slopes)
     tags = np.array([[float(kind), 0.0]])
     return Group(tags, np.array([local.objective]), top_slope(local)[None, :])
-
-
-__all__ = ["RobustProblem", "top_slope"]

@@ -87,7 +87,6 @@ class Stage:
 
     def evaluator(self, exact: Evaluator, runs: Runs) -> Evaluator:
         """Return the evaluator of the stage; `exact`: that of the config's objective."""
-        del runs
         return exact
 
     def problem(self, config: Config, scene: Scene, baseline: Evaluation) -> Problem:
@@ -108,7 +107,6 @@ class Stage:
         self, problem: Problem, start: int, evaluation: Evaluation, point: NDArray[np.float64]
     ) -> Linearization | None:
         """Return objective and constraints at a `point` (d,) of the local search `start`."""
-        del start
         return problem.local(evaluation, point)
 
 

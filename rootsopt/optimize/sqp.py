@@ -252,6 +252,3 @@ def descend(
     best = search.models
     ended = reason, search.evaluations, search.promised
     return Found(best.point, best.local, search.certificate, *ended)
-
-
-__all__ = ["REASONS", "EndError", "Found", "Stops", "descend"]

@@ -91,6 +91,3 @@ def survives(rows: list[dict[str, Any]]) -> str:
         f"With errors of ±{1e3 * ERROR:g} µm, at least {100 * worst['share']:.3g} % of the gain "
         f"is left (worst: {worst['case']})."
     )
-
-
-__all__ = ["ERROR", "survives", "surviving"]

@@ -263,6 +263,3 @@ def _independent(normals: NDArray[np.float64]) -> bool:
     if not np.all(np.isfinite(normals)):
         return False
     return not len(normals) or float(np.linalg.svd(normals, compute_uv=False)[-1]) > _FLAT
-
-
-__all__ = ["FeasibleSet", "Plane", "Vertex", "VertexOptimum", "vertex_optimum"]

@@ -168,6 +168,3 @@ def _steepest(record: Record) -> str:
     word = "raises" if known[key] > 0 else "lowers"
     much = f"{word} the peak force by {brief(abs(known[key]))} N"
     return f" ({stated(key, 1)} more of {name_and_unit(key)[0]} {much})"
-
-
-__all__ = ["Ending", "ending"]

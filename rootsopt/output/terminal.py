@@ -109,6 +109,3 @@ def _drawn(table: Table, widths: Mapping[int, int]) -> rich.table.Table:
             label, *cells = (Text(ascii_text(x.text), _STYLES[x.good]) for x in chosen)
             made.add_row(Text(" " * _INDENT if heading else "") + label, *cells)
     return made
-
-
-__all__ = ["WIDTH", "ascii_text", "show_ending", "shown"]

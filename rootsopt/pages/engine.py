@@ -123,6 +123,3 @@ def same_motion(one: Evaluation, other: Evaluation) -> bool:
         return False
     pairs = ((value, other.response[name]) for name, value in one.response.items())
     return all(abs(a - b) <= _AGREES * max(abs(a), abs(b), 1e-12) for a, b in pairs)
-
-
-__all__ = ["Engine", "Shape", "cut", "frames", "same_motion"]

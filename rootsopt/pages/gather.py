@@ -145,6 +145,3 @@ def _series(place: Path, name: str) -> Series | None:
     values = {field: table[:, heads.index(column)] for field, column in _COLUMNS.items()}
     values["rotation"] = np.radians(values["rotation"])
     return Series(**values, depth=np.full(len(table), np.nan))
-
-
-__all__ = ["Case", "Run"]

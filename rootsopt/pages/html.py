@@ -173,6 +173,3 @@ def _charts(run: Run) -> list[tuple[str, str, Any]]:
         ),
     ]
     return [one for one in found if one[2] is not None]
-
-
-__all__ = ["TEMPLATE", "report_text", "table_html"]

@@ -168,6 +168,3 @@ def _step(width: float) -> float:
         return 1.0
     power = 10.0 ** math.floor(math.log10(width / _STEPS))
     return max(one * power for one in (1, 2, 5) if one * power * _STEPS <= width * (1 + 1e-9))
-
-
-__all__ = ["Knob", "knobs_of"]

@@ -354,6 +354,3 @@ class Page:
                 "none, needs other programs, which are compiled first."
             )
             self.status.text = shown.status_line("computing", "wait", words)
-
-
-__all__ = ["Page"]

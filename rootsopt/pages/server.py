@@ -108,6 +108,3 @@ class PageServer:
         finally:
             watch.stop()
             self.server.stop()
-
-
-__all__ = ["ADDRESS", "PageServer"]

@@ -299,7 +299,6 @@ class Profile(eqx.Module):
         """Return the lever (m) at the normal angle `nu` (rad), given two trigonometric functions.
 
         `cos`, `sin`: cosine and sine of κν, with the factor κ = `turn_ratio`."""
-        del cos, sin
         return self.lever(nu)
 
     @property

@@ -52,7 +52,6 @@ def ranges(
     pressure angle `pressure_angle_deg` and half the tip land's angle, `tip_arc_angle_deg`.
     `involute_length_mm` is not used. The longest involute is `CIC.longest_involute`, so that u ≤
     u_max holds by construction."""
-    del involute_length_mm
     half = jnp.pi / (2 * lobes)
     base = pitch_radius_mm * jnp.sin(pressure_angle_deg * DEG)
     longest = base * (half - tip_arc_angle_deg * DEG)

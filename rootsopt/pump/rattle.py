@@ -178,6 +178,3 @@ def silent_eccentricity(
     relative = measured + limit * swings - gear.half_backlash - (rest + limit * swing)
     relative = relative if gear.offset is None else relative + gear.offset
     return scene.pitch_radius * limit, relative
-
-
-__all__ = ["SILENT", "SilentLimit", "rattle_record", "silent_limit", "silent_record"]

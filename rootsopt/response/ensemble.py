@@ -362,16 +362,3 @@ def _around(space: Space, design, points):
     """Return the designs at `points` of the unit box, and the Jacobian of the design with respect
     to the point."""
     return jax.vmap(space.design)(points), jax.jacfwd(space.design)(space.point(design))
-
-
-__all__ = [
-    "ERRORS",
-    "SIGNIFICANT",
-    "VERIFYING",
-    "Ensemble",
-    "fitted_slope",
-    "independent",
-    "integrator",
-    "neighbours",
-    "per_config_unit",
-]

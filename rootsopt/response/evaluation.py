@@ -617,6 +617,3 @@ def evaluate(config: Config, design: ArrayLike | Sequence[float] | None = None) 
     if found.status is Status.UNSOUND:
         raise InputError(found.message)
     return found
-
-
-__all__ = ["RESPONSES", "Evaluation", "Evaluator", "Series", "evaluate"]

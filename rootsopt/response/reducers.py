@@ -145,14 +145,3 @@ def mean(head: Evaluation, evaluations: Sequence[Evaluation], shares: ArrayLike)
             if name in known
         },
     )
-
-
-__all__ = [
-    "Combined",
-    "combine",
-    "mean",
-    "order_weights",
-    "over_scenes",
-    "over_speeds",
-    "overall",
-]

@@ -154,6 +154,3 @@ class Part(NamedTuple):
             **{name: steady.get(name) for name in kind},
             "status": self.evaluation.status.label,
         }
-
-
-__all__ = ["Evaluation", "Part"]

@@ -377,7 +377,6 @@ def _once(scene, design, start, numbers):
 
 @_once.def_jvp
 def _once_jvp(primals, tangents):
-    del primals, tangents
     raise NotImplementedError(
         "The steady response has first derivatives only: differentiate it once, and use a method "
         "that needs no second derivatives (BFGS, Gauss-Newton)"

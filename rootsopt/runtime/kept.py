@@ -60,8 +60,4 @@ def _kept(leaves):
 
 @_kept.def_vmap
 def _(size, batched, leaves):
-    del size
     return _kept(leaves), batched[0]
-
-
-__all__ = ["kept", "kept_along"]

@@ -313,7 +313,6 @@ def _split(args: tuple) -> tuple[list, _Kind]:
 @functools.cache
 def _precision(dtype: Any, wide: bool) -> str:
     """Return the name of the type that JAX uses for `dtype`; `wide`: whether it allows 64 bits."""
-    del wide
     return str(jax.dtypes.canonicalize_dtype(dtype))
 
 
@@ -428,7 +427,6 @@ def _source(file: Path, *state: int) -> tuple[str, list[str]]:
 
     `state`: numbers that differ after a change of the file. What it imports are names of this
     package, of modules or in them, also those in texts, such as the maker of a family."""
-    del state
     text = _WORDS.sub(lambda match: match[1] or match[2] or b"", file.read_bytes())
     text = re.sub(rb"\n(?:[ \t]*\n)+", b"\n", text).strip()
     names = set()

@@ -213,6 +213,3 @@ class _Collection:
             why = "the process that simulated it ended, several times; it may need more memory"
             return None if len(chunk) > 1 else [(chunk[0], lost(Status.FAILED, why))]
         raise refusal(error)
-
-
-__all__ = ["Cluster"]

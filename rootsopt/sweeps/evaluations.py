@@ -154,6 +154,3 @@ def evaluating(
 
     with Cluster(workers, scheduler, tuple(imports), cache).evaluations() as found:
         yield found
-
-
-__all__ = ["ClosedError", "DaskRunner", "Watch", "evaluating", "gone", "refusal"]

@@ -54,6 +54,3 @@ def divided(numbers: Sequence[int], size: int) -> Iterator[list[int]]:
     """Yield the numbers in chunks of at most `size`."""
     for begin in range(0, len(numbers), size):
         yield [*numbers[begin : begin + size]]
-
-
-__all__ = ["at_once", "divided", "in_process"]

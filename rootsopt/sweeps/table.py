@@ -199,6 +199,3 @@ def written(value: Any) -> str:
 def unit(name: str) -> str:
     """Return the unit with which a name ends, as UDUNITS reads it; "1" for a name without one."""
     return unit_of(name).translate(_PLAIN) or "1"
-
-
-__all__ = ["dataset_of", "is_numeric", "unit", "written"]

@@ -115,6 +115,3 @@ def freed(config: Config) -> tuple[Config, tuple[str, ...]]:
         return config, ()
     limits = limits.model_copy(update=values | {"terms": kept})
     return config.model_copy(update={"constraints": limits}), tuple(sorted(names))
-
-
-__all__ = ["Aim", "aims_of", "freed", "reported", "simulated"]

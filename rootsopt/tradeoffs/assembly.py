@@ -185,6 +185,3 @@ def _limits(study: Study, certificate: Certificate) -> dict[str, float]:
             if multiplier > _HELD:
                 found[f"{side} bound of {words(key)}"] = float(multiplier)
     return found
-
-
-__all__ = ["Node", "Selection", "gaps_of", "points_of", "selected", "spacing_of"]

@@ -121,6 +121,3 @@ class Bisections:
             self.pairs.append(new)
         if pair in self.pairs:
             self.pairs.remove(pair)
-
-
-__all__ = ["Bisections", "Edge", "Pair", "Spacing", "along", "among", "divides", "measured"]

@@ -614,6 +614,3 @@ def pareto_front(
     check_geometry(config)
     with evaluating(workers, scheduler) as runs:
         return Tracer(config, progress, runs=runs).run()
-
-
-__all__ = ["Tracer", "pareto_front"]

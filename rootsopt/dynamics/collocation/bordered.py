@@ -148,7 +148,6 @@ class _Follower(Closer):
         return lax.stop_gradient(self.family(now.line.share)[0])
 
     def limit(self, now: Loop) -> Float[Array, ""]:
-        del now
         return jnp.asarray(_SMALL)
 
     def judged(self, now: Loop, after: Loop, size: Float[Array, ""], found: Any) -> Loop:
@@ -247,6 +246,3 @@ def followed(
     return Followed(
         closed.found, loop.line, KnownOrbit(closed.found.elements, *errors, closed.sound, yes)
     )
-
-
-__all__ = ["Family", "Followed", "Line", "Plane", "followed"]

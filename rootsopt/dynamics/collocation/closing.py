@@ -257,12 +257,10 @@ class Closer(eqx.Module):
 
     def frozen_at(self, now: Loop) -> RotorPair:
         """Return the pair whose flags are evaluated, treated as constant by JAX."""
-        del now
         return self.frozen
 
     def limit(self, now: Loop) -> Float[Array, ""]:
         """Return the size of a step (scaled) at which Newton's method stops."""
-        del now
         return jnp.minimum(jnp.sqrt(self.tolerance), _LARGEST)
 
     def step(self, now: Loop) -> tuple[CollocatedEquation, Points, Array, Step, Any]:
@@ -513,6 +511,3 @@ def _differences(before: OrbitForces, after: OrbitForces, scale: Float[Array, ""
     moved /= jnp.maximum(jnp.max(jnp.abs(after.moved), initial=0.0), _LEAST)
     apart = jnp.max(jnp.abs(before.state - after.state))
     return choose(other[2] > 0, (error, drift), (apart, moved))
-
-
-__all__ = ["FIRST", "Closed", "Closer", "Loop", "close", "corrected"]
