@@ -45,7 +45,8 @@ LATE = {
         "rootsopt.config.sheet",
     },
     "commands/cli.py": {
-        "rootsopt.output.ending", "rootsopt.output.runs", "rootsopt.output.terminal",
+        "rootsopt.output.ending", "rootsopt.output.runs", "rootsopt.output.tables",
+        "rootsopt.output.terminal",
         "rootsopt.pages.gather", "rootsopt.pages.html", "rootsopt.runtime",
     },
     "commands/console.py": {"rootsopt", "rootsopt.commands", "rootsopt.errors"},

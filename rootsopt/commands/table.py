@@ -37,6 +37,11 @@ class Command(NamedTuple):
         Return the exit code."""
         return door.through(self.name, lambda: self._run(argv), own=argv is None)
 
+    def begin(self, module: str) -> None:
+        """Run the command, and end the process, if `module` is the name of its main program."""
+        if module == "__main__":
+            door.leave(self.main())
+
     def _run(self, argv: Sequence[str] | None) -> int:
         from rootsopt.commands import cli
 

@@ -154,22 +154,11 @@ def _charts(run: Run) -> list[tuple[str, str, Any]]:
     """Return (title, explanation, chart) of each interactive chart of a run."""
     hover = "Hover over a point to see its design."
     found = [(title, hover, made) for title, made in charts.front_charts(run.result).items()]
-    found += [
-        (
-            "Contact force over time",
-            "Hover for values, drag to zoom; a button at the right zooms out. A click moves the "
-            "rotors below to that time.",
-            charts.force_chart(run.cases),
-        ),
-        (
-            "Spectrum of the contact force",
-            "The mean is left out. A click on a name hides or shows its lines.",
-            charts.spectrum_chart(run.cases),
-        ),
-        (
-            "Contact force in each scene",
-            "A cross: no steady state.",
-            charts.scenes_chart(tables.scene_rows(run.result, run.rows)),
-        ),
-    ]
+    force = (
+        "Contact force over time",
+        "Hover for values, drag to zoom; a button at the right zooms out. A click moves the rotors "
+        "below to that time.",
+        charts.force_chart(run.cases),
+    )
+    found.append(force)
     return [one for one in found if one[2] is not None]

@@ -5,7 +5,6 @@ import sys
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 
 from rootsopt import pages
 from rootsopt.commands import cli
@@ -18,7 +17,6 @@ from rootsopt.design.space import widened
 from rootsopt.errors import InputError
 from rootsopt.measured.source import Found, found
 from rootsopt.optimize.surviving import survives, surviving
-from rootsopt.output import terminal
 from rootsopt.output.comparison import NOTHING_BETTER, WORTH, better_tables
 from rootsopt.output.names import stated
 from rootsopt.output.runs import RunFolder
@@ -220,12 +218,6 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
         return told | {"improve": options.known | {"cases": cases, "message": survives(cases)}}
 
     outcome = optimize.searched_for(config, options, folder, further)
-    data = folder.result
-
-    def show(out: Console) -> None:
-        for line in options.known["found"]:
-            out.print(line, soft_wrap=True, markup=False, highlight=False)
-        out.print(terminal.shown(better_tables(data)))
-
-    gain = (data.get("improvement") or {}).get("objective", 0.0)
-    return cli.Outcome(outcome.code if abs(gain) >= WORTH else cli.NO_RESULT, show)
+    gain = (folder.result.get("improvement") or {}).get("objective", 0.0)
+    code = outcome.code if abs(gain) >= WORTH else cli.NO_RESULT
+    return cli.Outcome(code, options.known["found"], tables=[*better_tables(folder.result)])

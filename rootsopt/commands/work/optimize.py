@@ -26,7 +26,7 @@ from rootsopt.measured import conjugacy
 from rootsopt.optimize import noise
 from rootsopt.optimize.outcome import Optimization
 from rootsopt.optimize.robust import search_of
-from rootsopt.output import files, tables, terminal
+from rootsopt.output import files
 from rootsopt.output.runs import RunFolder
 from rootsopt.pump.sheet import check_clearances, record_of
 from rootsopt.response.touching import touching
@@ -75,25 +75,19 @@ def searched_for(
     alike = {} if result.interrupted else _alike(config, result)
     sheets = _sheets(config, result)
     alike |= further(result)
-    data = _write(folder, config, options, result, alike, sheets, clock.seconds, ran)
+    _write(folder, config, options, result, alike, sheets, clock.seconds, ran)
     if result.optimized is not None and formats:
         from rootsopt.figures.writing import write_simulated
 
         write_simulated(folder, _searching(config, result), formats, result.optimized)
     total = time.perf_counter() - began
-
-    def show(out: Console) -> None:
-        out.print(terminal.shown(tables.tables_of(data)))
-        if result.beginning is not None:
-            conjugacy.say(config, out)
-        out.print(
-            f"compile {clock.seconds:.1f} s, run {ran - clock.seconds:.1f} s, "
-            f"reports {total - ran:.1f} s",
-            soft_wrap=True,
-        )
-
+    lines = [] if result.beginning is None else conjugacy.notes(config)
+    lines.append(
+        f"compile {clock.seconds:.1f} s, run {ran - clock.seconds:.1f} s, "
+        f"reports {total - ran:.1f} s"
+    )
     found = result.optimized is not None and not result.interrupted
-    return cli.Outcome(cli.OK if found else cli.NO_RESULT, show)
+    return cli.Outcome(cli.OK if found else cli.NO_RESULT, lines)
 
 
 def _contradiction(config: Config, folder: RunFolder, result) -> cli.Outcome:
@@ -108,11 +102,7 @@ def _contradiction(config: Config, folder: RunFolder, result) -> cli.Outcome:
     if result.beginning is not None:
         data["beginning"] = result.beginning.record()
     folder.write_json("result.json", data)
-
-    def show(out):
-        out.print(terminal.shown(tables.tables_of(data)))
-
-    return cli.Outcome(cli.NO_RESULT, show)
+    return cli.Outcome(cli.NO_RESULT)
 
 
 def _alike(config: Config, result) -> dict:
@@ -191,8 +181,8 @@ def _interrupted(result) -> str:
     )
 
 
-def _write(folder, config, options, result, alike, sheets, compiled, ran) -> dict:
-    """Write the files of a search; return the content of the result file."""
+def _write(folder, config, options, result, alike, sheets, compiled, ran) -> None:
+    """Write the files of a search."""
     records = {"baseline": result.baseline, "optimized": result.optimized}
     if result.nominal is not None:
         records["nominal"] = result.nominal
@@ -249,7 +239,6 @@ def _write(folder, config, options, result, alike, sheets, compiled, ran) -> dic
     folder.write_json("result.json", data)
     if not options.no_figures:
         _draw(folder, config, result, data)
-    return files.plain(data)
 
 
 def _draw(folder, config: Config, result, data: dict) -> None:

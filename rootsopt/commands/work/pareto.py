@@ -17,7 +17,7 @@ from rootsopt.commands.work.searching import (
     searched,
 )
 from rootsopt.config import Config
-from rootsopt.output import files, tables, terminal
+from rootsopt.output import files
 from rootsopt.output.runs import RunFolder
 from rootsopt.scene import check_geometry
 from rootsopt.tradeoffs.trace import Tracer
@@ -61,17 +61,12 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
         front_figure(folder, front)
     if front.interrupted and not front.points:
         folder.overwrite = False  # An earlier result is more valuable than this one.
-
-    def show(out: Console) -> None:
-        out.print(terminal.shown(tables.tables_of(record)))
-        out.print(
-            f"{front.searches} searches, {front.evaluations} designs, compile "
-            f"{clock.seconds:.1f} s, run {ran - clock.seconds:.1f} s",
-            soft_wrap=True,
-        )
-
+    line = (
+        f"{front.searches} searches, {front.evaluations} designs, compile "
+        f"{clock.seconds:.1f} s, run {ran - clock.seconds:.1f} s"
+    )
     found = front.certified > 0 and not front.interrupted
-    return cli.Outcome(cli.OK if found else cli.NO_RESULT, show)
+    return cli.Outcome(cli.OK if found else cli.NO_RESULT, [line])
 
 
 def _progress(console) -> "AbstractContextManager[Callable[..., None] | None]":

@@ -114,7 +114,7 @@ def nothing_known(
     data = {**empty, "status": status.label, "message": message}
     folder.write_json("result.json", data | {"versions": files.versions()})
     folder.overwrite = False  # An earlier result is more valuable than this one.
-    return cli.Outcome(cli.NO_RESULT, lambda out: None)
+    return cli.Outcome(cli.NO_RESULT)
 
 
 @contextlib.contextmanager

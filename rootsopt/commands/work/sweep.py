@@ -13,7 +13,7 @@ from rootsopt.commands.work.searching import opened, progress_bar
 from rootsopt.config import Config
 from rootsopt.config.plausible import notes_on_swept
 from rootsopt.errors import InputError
-from rootsopt.output import files, sweeps, tables, terminal
+from rootsopt.output import files, sweeps
 from rootsopt.output.runs import RunFolder
 from rootsopt.response import speeds
 from rootsopt.response.evaluation import Evaluator
@@ -67,12 +67,8 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
 
         name = config.profile.family.upper()
         speed_figure(folder, {name: parts}, f"Contact force of the {name} pair over speed")
-
-    def show(out: Console) -> None:
-        out.print(terminal.shown(tables.tables_of(data, most=len(rows))))
-
     usable = any(part.evaluation.usable for part in parts)
-    return cli.Outcome(cli.OK if usable else cli.NO_RESULT, show)
+    return cli.Outcome(cli.OK if usable else cli.NO_RESULT, most=len(rows))
 
 
 def _over_keys(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.Outcome:
@@ -115,14 +111,10 @@ def _over_keys(config: Config, options: argparse.Namespace, folder: RunFolder) -
         folder.remove_afterwards(folder.checkpoint)
     else:
         folder.overwrite = False  # An earlier result is more valuable than this one.
-
-    def show(out: Console) -> None:
-        out.print(terminal.shown(tables.tables_of(record, rows, _FEW)))
-        rate = statistics["points_per_second"]
-        out.print(f"{len(records) - known} points in {seconds:.1f} s, {rate:.3g} per second")
-
+    rate = statistics["points_per_second"]
+    line = f"{len(records) - known} points in {seconds:.1f} s, {rate:.3g} per second"
     usable = done and any(Status[row["status"].upper()].usable for row in rows)
-    return cli.Outcome(cli.OK if usable else cli.NO_RESULT, show, rows)
+    return cli.Outcome(cli.OK if usable else cli.NO_RESULT, [line], rows, _FEW)
 
 
 def _points(config: Config, options: argparse.Namespace) -> tuple[Config, Plan]:
