@@ -319,23 +319,6 @@ def users_of(key: str) -> list[str]:
     return [family.name for family in _families.values() if key in family.keys]
 
 
-@contextlib.contextmanager
-def for_a_time() -> Iterator[None]:
-    """Return a context manager that removes the families registered in its `with` block at its end.
-
-    It serves tests. Programs compiled for these families stay in memory: do not reuse the families'
-    names."""
-    before = dict(_families)
-    try:
-        yield
-    finally:
-        _families.clear()
-        _families.update(before)
-        for name in _origins.keys() - before.keys():
-            del _origins[name]
-        _follow()
-
-
 def find_installed(name: str) -> None:
     """Load the installed packages that offer a family with this `name`, if there are any.
 

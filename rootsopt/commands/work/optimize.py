@@ -3,19 +3,15 @@
 import argparse
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager, closing
+from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
-from rich.console import Console
 
-from rootsopt.commands import cli, door
+from rootsopt.commands import cli
 from rootsopt.commands.work.searching import (
-    CompileClock,
-    checkpoint_of,
     nothing_known,
     progress_bar,
-    runs_of,
     searched,
 )
 from rootsopt.config import Config
@@ -54,18 +50,12 @@ def searched_for(
     cli.load_figures(options, "runs")
     check_geometry(config)
     check_clearances(config)
-    clock = CompileClock()
-    promise = "keeping the best design so far and writing the files"
-    with (
-        clock,
-        door.patience(promise) as stop,
-        runs_of(options) as runs,
-        _progress(Console(stderr=True)) as progress,
-        closing(checkpoint_of("optimize", config, options, folder)) as checkpoint,
-    ):
-        result = searched(lambda: search_of(config, progress, stop, checkpoint, runs), stop)
-    if not stop.is_set():  # A stopped search can go on later.
-        folder.remove_afterwards(folder.checkpoint)
+    bar = partial(
+        progress_bar, first="baseline, compiling", then="optimising", counted="designs",
+        field="best objective",
+    )  # fmt: skip
+    given = "optimize", config, options, folder, search_of, bar, "the best design so far"
+    result, compiled = searched(*given)
     if result is None:
         empty = {"baseline": None, "optimized": None}
         return nothing_known(config, folder, "simulated", empty)
@@ -75,7 +65,7 @@ def searched_for(
     alike = {} if result.interrupted else _alike(config, result)
     sheets = _sheets(config, result)
     alike |= further(result)
-    _write(folder, config, options, result, alike, sheets, clock.seconds, ran)
+    _write(folder, config, options, result, alike, sheets, compiled, ran)
     if result.optimized is not None and formats:
         from rootsopt.figures.writing import write_simulated
 
@@ -83,8 +73,7 @@ def searched_for(
     total = time.perf_counter() - began
     lines = [] if result.beginning is None else conjugacy.notes(config)
     lines.append(
-        f"compile {clock.seconds:.1f} s, run {ran - clock.seconds:.1f} s, "
-        f"reports {total - ran:.1f} s"
+        f"compile {compiled:.1f} s, run {ran - compiled:.1f} s, reports {total - ran:.1f} s"
     )
     found = result.optimized is not None and not result.interrupted
     return cli.Outcome(cli.OK if found else cli.NO_RESULT, lines)
@@ -287,9 +276,3 @@ def _write_robustness(folder, config, options, robustness) -> None:
         count = len(next(iter(robustness.scenes.values())))
         made = distributions(designs, f"Contact force in {count} fresh scenes")
         folder.write_figure("figures/tolerances.png", made)
-
-
-def _progress(console) -> "AbstractContextManager[Callable[..., None] | None]":
-    """Return a context manager for a function (done, expected, best objective): `progress_bar`."""
-    texts = "baseline, compiling", "optimising", "designs"
-    return progress_bar(console, *texts, field="best objective")
