@@ -51,15 +51,16 @@ os.environ.setdefault("EQX_ON_ERROR", "off")
 class Outcome(NamedTuple):
     """The result of a command.
 
-    `code`: exit code; `lines`: what the terminal says below the tables; `rows`: rows of a sweep
-    that the result file does not hold; `most`: number of them above which their table is truncated;
-    `tables`: tables for the terminal, by default all of the result."""
+    `code`: exit code; `lines`: what the terminal says below the tables, `head`: above them; `rows`:
+    rows of a sweep that the result file does not hold; `most`: number of them above which their
+    table is truncated; `tables`: tables for the terminal, by default all of the result."""
 
     code: int
     lines: Sequence[str] = ()
     rows: Sequence[dict[str, Any]] = ()
     most: int = 200
     tables: "Sequence[Table | None] | None" = None
+    head: Sequence[str] = ()
 
 
 Body = Callable[[Config, argparse.Namespace, "RunFolder"], Outcome]
@@ -287,7 +288,9 @@ def _in_folder(command: str, config: Config, options: argparse.Namespace) -> int
 
         out = Console()
         result, rows = folder.result, outcome.rows
-        out.print(shown(outcome.tables or tables_of(result, rows, outcome.most)))
+        _say(out, outcome.head)
+        every = tables_of(result, rows, outcome.most)
+        out.print(shown(every if outcome.tables is None else outcome.tables))
         _say(out, outcome.lines)
         given = folder.path, shlex.join(options.given), options.imports, rows
         show_ending(out, ending(result, *given))

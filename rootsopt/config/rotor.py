@@ -283,8 +283,8 @@ class DrawingConfig(Section):
     )
     title_block: dict[_Text, _Text] = Field(
         default_factory=dict,
-        description="further fields of the title block by heading, as {Revision: A, Drawn by: J. "
-        "Doe}",
+        description="fields of the title block by heading, as {Drawing number: '4711', Revision: "
+        "A, Drawn by: J. Doe}",
     )
     inset_mm: Annotated[float, Field(ge=0, le=5)] = Field(
         0.0,

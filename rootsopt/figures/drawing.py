@@ -205,15 +205,19 @@ def _block(config: Config) -> tuple[tuple[str, str], ...]:
     tolerance = stated.tolerance_mm
     texts = {
         "Title": stated.title,
+        "Drawing number": None,
+        "Revision": None,
         "Material": stated.material or f"density {config.rotor.density_kg_m3:g} kg/m3",
         "Flank, profile of a line": None if tolerance is None else f"{tolerance:g} mm (ISO 1101)",
+        "General tolerances": None,
         "Rotor": f"{profile.family}, {profile.lobes} lobes, length {config.rotor.length_mm:g} mm",
         "Centre distance": f"{2 * profile.pitch_radius_mm:g} mm",
         "Designed for": _scene(config),
-        **stated.title_block,
+        "Drawn by": None,
+        "Date": None,
         "Scale, unit": "1:1, mm",
         "Program": f"rootsopt {rootsopt.__version__}",
-    }
+    } | stated.title_block
     return tuple((name, text or "-") for name, text in texts.items())
 
 

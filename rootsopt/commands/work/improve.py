@@ -220,4 +220,5 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     outcome = optimize.searched_for(config, options, folder, further)
     gain = (folder.result.get("improvement") or {}).get("objective", 0.0)
     code = outcome.code if abs(gain) >= WORTH else cli.NO_RESULT
-    return cli.Outcome(code, options.known["found"], tables=[*better_tables(folder.result)])
+    tables = [*better_tables(folder.result)]
+    return cli.Outcome(code, tables=tables, head=options.known["found"])
