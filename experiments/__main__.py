@@ -18,8 +18,9 @@ from rootsopt.errors import InputError
 from rootsopt.runtime import environment
 
 COMMAND = "python -m experiments"
+
+# Folder of the result folders, relative to the repository root.
 RESULTS = Path("results/experiments")
-"""Folder of the result folders, relative to the repository root."""
 
 
 def studies() -> dict[str, tuple[str, Study]]:

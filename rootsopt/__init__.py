@@ -43,6 +43,7 @@ if TYPE_CHECKING:
 
 __version__ = "0.2.0"
 
+# Public names, each with the "module:attribute" from which it is imported.
 _PUBLIC = {
     "COMPILER_OPTIONS": "rootsopt.runtime.programs:COMPILER_OPTIONS",
     "Config": "rootsopt.config:Config",
@@ -72,7 +73,6 @@ _PUBLIC = {
     "steady_response": "rootsopt.response.steady:steady_response",
     "sweep_scenes": "rootsopt.sweeps.scenes:sweep_scenes",
 }
-"""Public names, each with the "module:attribute" from which it is imported."""
 __all__ = ["__version__", *_PUBLIC]  # pyright: ignore[reportUnsupportedDunderAll]
 
 

@@ -3,12 +3,9 @@
 import sys
 
 import rootsopt
-from rootsopt.commands.door import leave
 from rootsopt.commands.table import identify
 
 main = identify.main
-
-if __name__ == "__main__":
-    leave(main())
-else:  # This import, too, leaves `rootsopt.identify` the public function of that name.
-    sys.modules[__name__] = rootsopt.__getattr__("identify")
+identify.begin(__name__)
+# This import, too, leaves `rootsopt.identify` the public function of that name.
+sys.modules[__name__] = rootsopt.__getattr__("identify")

@@ -21,8 +21,6 @@ gc.set_threshold(100_000, 50, 100)
 # One folder of compiled programs for all processes of a session, new for every session.
 os.environ.setdefault("ROOTSOPT_TEST_CACHE", tempfile.mkdtemp(prefix="rootsopt-"))
 os.environ["ROOTSOPT_CACHE"] = os.path.join(os.environ["ROOTSOPT_TEST_CACHE"], "programs")
-# Their signing key is stored there too, apart from the user's own.
-os.environ["XDG_STATE_HOME"] = os.path.join(os.environ["ROOTSOPT_TEST_CACHE"], "state")
 
 from rootsopt.commands.cli import use_cache  # noqa: E402
 from rootsopt.errors import InputError  # noqa: E402

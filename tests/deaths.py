@@ -49,32 +49,19 @@ class _System:
 class faulty:  # noqa: N801
     """Pass operation number `at` of the file layer to `fail(name, operation)` in a `with` block."""
 
-    def __init__(self, operations, at: int, fail, exchanges: bool = True):
+    def __init__(self, operations, at: int, fail):
         self.system = _System(operations, at, fail)
-        self.exchanges = exchanges
 
     def __enter__(self) -> _System:
-        self.before = disk.os, disk._exchanged, disk._renameat2, disk.shutil
+        self.before = disk.os, disk.shutil
         disk.os = self.system  # type: ignore[assignment]
-        if not self.exchanges:
-            disk._renameat2 = lambda: None  # type: ignore[assignment]
-        if "rename" in self.system.operations:
-            real = disk._exchanged
-
-            def exchanged(*arguments):
-                try:
-                    return self.system.counted("exchange", real)(*arguments)
-                except OSError as error:
-                    return error.errno
-
-            disk._exchanged = exchanged
         if "unlink" in self.system.operations:
             removed = self.system.counted("rmtree", shutil.rmtree)
             disk.shutil = SimpleNamespace(rmtree=removed)  # type: ignore[assignment]
         return self.system
 
     def __exit__(self, *_) -> None:
-        disk.os, disk._exchanged, disk._renameat2, disk.shutil = self.before
+        disk.os, disk.shutil = self.before
 
 
 def full_disk(name: str, do: Callable[[], Any]) -> None:
@@ -132,7 +119,7 @@ def scratch() -> Path:
     return Path(tempfile.mkdtemp(prefix="deaths-", dir=memory if usable else None))
 
 
-def failures(place: Path, kind: str, before: str, exchanges: bool, at: int):
+def failures(place: Path, kind: str, before: str, at: int):
     """Let operation number `at` of a run fail (`full`), or the process end before or after it.
 
     Return whether there was such an operation, and what is wrong afterwards."""
@@ -141,9 +128,9 @@ def failures(place: Path, kind: str, before: str, exchanges: bool, at: int):
     target = prepared(place / "parent", before)
     old, listing = digest(target), sorted(os.listdir(target.parent))
     wrong: list[str] = []
-    hit, reported = _tried(target, kind, before, exchanges, at)
+    hit, reported = _tried(target, kind, before, at)
     now = digest(target)
-    if now not in (old, new) and not (now is None and not exchanges):
+    if now not in (old, new, None):
         wrong.append("the folder is neither the old run nor the new one")
     if kind == "full":
         names = sorted(os.listdir(target.parent))
@@ -167,11 +154,11 @@ def failures(place: Path, kind: str, before: str, exchanges: bool, at: int):
     return hit, wrong + [fault for fault, is_so in faults.items() if is_so]
 
 
-def _tried(target: Path, kind: str, before: str, exchanges: bool, at: int):
+def _tried(target: Path, kind: str, before: str, at: int):
     """Return whether the operation was reached, and the message of the run that failed."""
     overwrite = before == "overwritten"
     if kind == "full":
-        with faulty(WRITING, at, full_disk, exchanges) as system:
+        with faulty(WRITING, at, full_disk) as system:
             try:
                 write_run(target, "new", overwrite)
             except InputError as error:
@@ -181,7 +168,7 @@ def _tried(target: Path, kind: str, before: str, exchanges: bool, at: int):
     if not child:
         try:
             die = die_before if kind == "before" else die_after
-            with faulty((*WRITING, *REMOVING), at, die, exchanges):
+            with faulty((*WRITING, *REMOVING), at, die):
                 write_run(target, "new", overwrite)
         finally:
             os._exit(0)
@@ -202,12 +189,12 @@ def digest_of(text: str) -> str | None:
 def every_operation(kind: str) -> tuple[int, list[str]]:
     """Try each operation of each kind of run; return the number of tries, and what went wrong."""
     tried, wrong = 0, []
-    for before, exchanges in itertools.product(BEFORE, (True, False)):
+    for before in BEFORE:
         for at in itertools.count(1):
             place = scratch()
-            hit, found = failures(place, kind, before, exchanges, at)
+            hit, found = failures(place, kind, before, at)
             shutil.rmtree(place)
-            where = f"{kind} at operation {at}, target {before}, exchange {exchanges}"
+            where = f"{kind} at operation {at}, target {before}"
             wrong += [f"{where}: {text}" for text in found]
             if not hit:
                 break

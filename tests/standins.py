@@ -2,9 +2,12 @@
 
 A pair whose flanks never touch is a damped oscillator."""
 
+import contextlib
+
 import jax.numpy as jnp
 import numpy as np
 
+from rootsopt.config import families
 from rootsopt.contact.gap import Contact
 from rootsopt.contact.impact import ImpactLaw
 from rootsopt.dynamics.pair import RotorPair
@@ -62,3 +65,19 @@ def evaluation_of(force=1.0, status=Status.PERIODIC, design=(), start=None) -> E
         series=None,
         start=np.zeros(2) if start is None else start,
     )
+
+
+@contextlib.contextmanager
+def for_a_time():
+    """Remove the families that are registered in a `with` block at its end.
+
+    Compiled programs stay in memory, so that names of families must not be used again."""
+    before = dict(families._families)
+    try:
+        yield
+    finally:
+        families._families.clear()
+        families._families.update(before)
+        for name in families._origins.keys() - before.keys():
+            del families._origins[name]
+        families._follow()

@@ -36,7 +36,7 @@ OPTIONAL = {
     "jinja2",
     "markupsafe",
 }
-OPTIONAL |= {"netCDF4", "shtab", "xarray", "zarr"}
+OPTIONAL |= {"netCDF4", "shtab", "xarray"}
 SLOW = {"PIL", "optax", "rich", "scipy"}
 LATE = {
     # The work of a command is loaded once its help or its config has asked for it.
@@ -45,7 +45,8 @@ LATE = {
         "rootsopt.config.sheet",
     },
     "commands/cli.py": {
-        "rootsopt.output.ending", "rootsopt.output.runs", "rootsopt.output.terminal",
+        "rootsopt.output.ending", "rootsopt.output.runs", "rootsopt.output.tables",
+        "rootsopt.output.terminal",
         "rootsopt.pages.gather", "rootsopt.pages.html", "rootsopt.runtime",
     },
     "commands/console.py": {"rootsopt", "rootsopt.commands", "rootsopt.errors"},
@@ -54,7 +55,7 @@ LATE = {
        for name, module in (("attractors", "basins"), ("identify", "identified"),
                             ("profile", "runs"))},
     "commands/work/pareto.py": {
-        "rootsopt.figures", "rootsopt.figures.front", "rootsopt.pages.html",
+        "rootsopt.figures", "rootsopt.figures.front",
     },
     "commands/work/optimize.py": {
         "rootsopt.figures.writing", "rootsopt.figures", "rootsopt.figures.spread",

@@ -20,8 +20,8 @@ from rootsopt.runtime.environment import use_float64
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+# Folder of the published figures, relative to the repository root.
 DOCS = Path("docs")
-"""Folder of the published figures, relative to the repository root."""
 
 
 class NoResultError(Exception):

@@ -2,10 +2,13 @@
 
 from rootsopt.config import Config, load
 
+# The shipped CIC pair with flanks as drawn, relative to the repository root.
 CIC = "configs/cic_drawn.yaml"
-"""The shipped CIC pair with flanks as drawn, relative to the repository root."""
+
+# Names of the forces that most studies compare.
 FORCES = ("mean_force_N", "peak_force_N")
-"""Names of the forces that most studies compare."""
+
+# Overrides that give a stable orbit of two mesh periods which is sensitive to changes.
 SHAKY = (
     "scene.speed_rpm=1700",
     "scene.load.torque_N_m=3",
@@ -16,7 +19,6 @@ SHAKY = (
     "profile.involute_length_mm=4",
     "profile.tip_arc_angle_deg=1.5",
 )
-"""Overrides that give a stable orbit of two mesh periods which is sensitive to changes."""
 
 
 def shipped(name: str, *overrides: str) -> Config:

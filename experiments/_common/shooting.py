@@ -16,19 +16,23 @@ from numpy.typing import NDArray
 
 from rootsopt.dynamics.pair import RotorPair
 
+# Tolerance and longest step (mesh periods) of the integration.
 _TOLERANCE, _LONGEST = 1e-12, 1 / 256
-"""Tolerance and longest step (mesh periods) of the integration."""
+
+# Maximum number of steps of an integration.
 _STEPS = 2**16
-"""Maximum number of steps of an integration."""
+
+# Distance between start and end (scaled) of a closed orbit, and maximum number of Newton steps.
 _CLOSED, _NEWTON = 1e-11, 8
-"""Distance between start and end (scaled) of a closed orbit, and maximum number of Newton steps."""
+
+# Change of a state (scaled) for the central differences that give the monodromy matrix, and
+# factor on the distance between start and end in one Newton step above which it is computed
+# again.
 _AWAY, _SLOW = 1e-5, 0.01
-"""Change of a state (scaled) for the central differences that give the monodromy matrix, and factor
-on the distance between start and end in one Newton step above which it is computed again.
-"""
 _GOLDEN = (5**0.5 - 1) / 2
+
+# Number of sections of the interval in which the peak lies.
 _CUTS = 40
-"""Number of sections of the interval in which the peak lies."""
 
 
 class Shot(NamedTuple):

@@ -1,10 +1,8 @@
 """Calls into rootsopt's evaluators and models that several studies make."""
 
 import dataclasses
-from collections.abc import Sequence
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,8 +13,8 @@ from rootsopt.profiles import Profile
 from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.scene import Scene, design_vector
 
+# Compiled `Scene.pair`: returns the rotor pair of a scene and a design.
 pair_of_model = eqx.filter_jit(Scene.pair)
-"""Compiled `Scene.pair`: returns the rotor pair of a scene and a design."""
 
 
 def evaluator_of(config: Config, give_up_early: bool = False) -> Evaluator:
@@ -47,14 +45,6 @@ def profile_of(config: Config, design: ArrayLike | None = None) -> Profile:
     """Return the profile of a design (d,) in config units; default: the config's design."""
     chosen = design_vector(config) if design is None else jnp.asarray(design)
     return Scene.from_config(config).profile(chosen)
-
-
-def stacked(configs: Sequence[Config]) -> Scene:
-    """Return n scenes of one kind, their numbers stacked along a leading axis (n,).
-
-    All `configs` must lead to the same compiled program."""
-    models = [jax.tree.map(np.asarray, Scene.from_config(config)) for config in configs]
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *models)
 
 
 def objective(evaluation: Evaluation, reference: dict[str, float]) -> float:

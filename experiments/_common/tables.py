@@ -4,8 +4,8 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+# A line of a table: values by column.
 Row = dict[str, Any]
-"""A line of a table: values by column."""
 
 
 def show(

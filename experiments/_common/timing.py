@@ -7,8 +7,8 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+# Megabytes in a byte.
 MB = 1e-6
-"""Megabytes in a byte."""
 
 
 def ready(result: Any) -> Any:

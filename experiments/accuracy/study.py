@@ -27,13 +27,15 @@ from rootsopt.errors import InputError
 from rootsopt.response.evaluation import Evaluation
 from rootsopt.status import Status
 
+# Values of `solver.accuracy`.
 REQUESTS = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7)
-"""Values of `solver.accuracy`."""
+
+# Setting of the reference, and relative difference from the forces by shooting above which it is
+# no reference.
 SHARP, CHECKED = "solver.rtol=1e-12", 1e-7
-"""Setting of the reference, and relative difference from the forces by shooting above which it is
-no reference."""
+
+# Number of scenes of a full and of a reduced run, and number of timed evaluations.
 COUNT, QUICK_COUNT, REPEATS = 60, 1, 5
-"""Number of scenes of a full and of a reduced run, and number of timed evaluations."""
 NAMES = ("mean_force_N", "peak_force_N", "rms_force_N")
 
 

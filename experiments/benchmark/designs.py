@@ -39,12 +39,15 @@ from rootsopt.dynamics.integrator import Integrator
 from rootsopt.scene import Scene, integrators
 
 REFERENCE_RTOL = 1e-11
+
+# Steps (deg, mm, deg) of the reference's central differences; their truncation error is 1e-5.
 REFERENCE_STEPS = tuple(step / 5 for step in FD_STEPS)
-"""Steps (deg, mm, deg) of the reference's central differences; their truncation error is 1e-5."""
+
+# Number of designs of a batch that are compared with a reference.
 CHECKED = 8
-"""Number of designs of a batch that are compared with a reference."""
+
+# Tolerances (orbit, transient) to choose from, in the order in which they are tried.
 TOLERANCES = ((1e-4, 1e-4), (1e-5, 1e-5), (1e-6, 1e-6), (1e-5, 1e-6), (1e-7, 1e-7))
-"""Tolerances (orbit, transient) to choose from, in the order in which they are tried."""
 
 
 def part_reference(job: Job) -> dict[str, Any]:
@@ -221,10 +224,12 @@ class _Batch:
 
 
 REVOLUTIONS = (1, 4, 15, 55, 200)
+
+# Mesh periods per revolution, for three lobes.
 MESH_PERIODS = 3
-"""Mesh periods per revolution, for three lobes."""
+
+# Relative error of mean and peak force at which orbit and transient are compared.
 ORBIT_ACCURACY = 1e-6
-"""Relative error of mean and peak force at which orbit and transient are compared."""
 ORBIT_TOLERANCES = (1e-6, 1e-7, 1e-8, 1e-9)
 ORBIT_SETTLES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
 ORBIT_SCENES = {

@@ -9,13 +9,16 @@ import numpy as np
 from experiments._common.scenes import FORCES
 
 BASELINE = (36.43, 9.0, 4.0)
+
+# Relative error of mean and peak force above which a setting is rejected.
 ACCURACY = 1e-3
-"""Relative error of mean and peak force above which a setting is rejected."""
+
+# Relative error of a requested gradient above which a setting is rejected. The competitors'
+# central differences reach about 0.05 at settings with forces accurate to `ACCURACY`.
 GRADIENT_ACCURACY = 0.1
-"""Relative error of a requested gradient above which a setting is rejected. The competitors'
-central differences reach about 0.05 at settings with forces accurate to `ACCURACY`."""
+
+# Expected time (s) of all runs of a batch above which the batch is skipped.
 BATCH_SECONDS = 150.0
-"""Expected time (s) of all runs of a batch above which the batch is skipped."""
 Row = dict[str, Any]
 
 

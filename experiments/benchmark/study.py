@@ -38,8 +38,9 @@ from experiments._common.timing import MB, peak_memory
 from experiments.benchmark.job import ACCURACY, BATCH_SECONDS, Job, Row, row
 
 SIZES = (16, 256, 1024)
+
+# Parts without rootsopt.
 COMPETITORS = "scipy", "numba"
-"""Parts without rootsopt."""
 
 
 def exponent(points: Sequence[tuple[float, float]]) -> float | None:
@@ -117,11 +118,11 @@ def draw_power(
     ax.plot(*zip(*points, strict=True), marker=mark, color=color, lw=1.4, label=name)
 
 
+# Columns of the table, in order.
 COLUMNS = (
     *("part", "tool", "what", "designs", "per_design_ms", "run_s", "build_s", "compile_s"),
     *("value_error", "gradient_error", "peak_memory_MB", "settings", "note"),
 )
-"""Columns of the table, in order."""
 
 
 def measured(part: Job) -> tuple[dict[str, Any], float]:

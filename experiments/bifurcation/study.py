@@ -22,26 +22,31 @@ from rootsopt.errors import InputError
 
 Row = dict[str, Any]
 Say = Callable[[str], None]
+
+# Scaled initial states (ε, dε/dt) tried at every value of the parameter.
 STARTS = ((0.0, 0.0), (-0.2, -1.8), (-1.0, 0.0), (-3.0, 0.0), (0.8, 5.0), (-0.5, -8.0))
-"""Scaled initial states (ε, dε/dt) tried at every value of the parameter."""
 LIVELY = ("scene.timing_gear.backlash_mm=0.2", "scene.timing_gear.damping_ratio=0.2")
 SPEED, TORQUE = "scene.speed_rpm", "scene.load.torque_N_m"
 SCENES = {"shipped": (), "livelier": LIVELY}
+
+# Lowest speed (rpm) studied, by pair. At lower speeds the livelier pair bounces so often per mesh
+# period that its orbits can hardly be followed.
 SLOWEST = {"shipped": 300, "livelier": 3500}
-"""Lowest speed (rpm) studied, by pair. At lower speeds the livelier pair bounces so often per mesh
-period that its orbits can hardly be followed."""
+
+# Peak force (units of the static force that carries the load at the pitch radius) above which an
+# orbit counts as noisy: the flanks hammer.
 QUIET = 4.0
-"""Peak force (units of the static force that carries the load at the pitch radius) above which an
-orbit counts as noisy: the flanks hammer."""
+
+# Sum of the periods (mesh periods) of all points above which a branch ends. The second number is
+# the number of points that every branch may have.
 POINTS, FEWEST = 200, 25
-"""Sum of the periods (mesh periods) of all points above which a branch ends. The second number is
-the number of points that every branch may have."""
+
+# Longest orbits followed (mesh periods): if found by a simulation, and if born at a period
+# doubling.
 LONGEST, DOUBLED = 4, 2
-"""Longest orbits followed (mesh periods): if found by a simulation, and if born at a period
-doubling.
-"""
+
+# Number of cells into which a parameter's range is divided to find quiet and noisy orbits.
 CELLS = 570
-"""Number of cells into which a parameter's range is divided to find quiet and noisy orbits."""
 
 
 @dataclasses.dataclass

@@ -75,8 +75,8 @@ class Size:
     slopes: tuple[tuple[int, int], ...]
 
 
+# Sizes (designs, members) of the gradients: first more members, then more designs.
 SLOPES = (16, 4), (16, 8), (16, 16), (16, 32), (32, 4), (64, 4), (128, 4)
-"""Sizes (designs, members) of the gradients: first more members, then more designs."""
 SIZES = {
     False: Size(25, 32, 128, 96, 512, (4, 8, 16, 32, 64), SLOPES),
     True: Size(3, 4, 8, 8, 16, (4, 8), ((8, 4),)),

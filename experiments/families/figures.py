@@ -27,13 +27,16 @@ from rootsopt.profiles import Profile, geometry
 from rootsopt.profiles.geometry import outline
 
 _COLUMNS = 4
+
+# Number of lobes and pitch radius of the families' examples.
 LOBES, RADIUS_MM = 3, 33.0
-"""Number of lobes and pitch radius of the families' examples."""
+
+# Panels in a row of the overview.
 _PANELS = 4
-"""Panels in a row of the overview."""
 _COLORS = BLUE, ORANGE, PURPLE, GREEN, SKY, VERMILION, "#7a5c00", "#888888"
+
+# Points drawn on a piece of an addendum.
 _POINTS = 60
-"""Points drawn on a piece of an addendum."""
 
 
 def ranking_figure(data: dict[str, Any]) -> Figure:

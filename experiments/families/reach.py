@@ -21,15 +21,18 @@ from rootsopt.optimize.problem import Problem
 from rootsopt.profiles import geometry
 from rootsopt.scene import Scene, design_keys
 
+# Clearance (mm) between tip and bore above which a rotor does not fill the bore.
 BAND_MM = 1e-3
-"""Clearance (mm) between tip and bore above which a rotor does not fill the bore."""
+
+# Number of points of a family's unit box from which starting designs are chosen.
 SAMPLE = 256
-"""Number of points of a family's unit box from which starting designs are chosen."""
 STARTS = 4
+
+# Smallest value (fraction of the upper bound) of a parameter that must not be 0.
 _LEAST_SHARE = 1e-3
-"""Smallest value (fraction of the upper bound) of a parameter that must not be 0."""
+
+# Margin by which constraints must hold in the search for the extremes of area efficiency.
 _CLOSE = 1e-7
-"""Margin by which constraints must hold in the search for the extremes of area efficiency."""
 
 
 class Reach(NamedTuple):

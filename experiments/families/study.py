@@ -33,27 +33,33 @@ from rootsopt.scene import check_geometry, design_vector, outline_mm
 from rootsopt.scene.families import classical, free_form_of, with_design
 
 REFERENCES = ("configs/ee.yaml", "configs/cic_drawn.yaml")
+
+# Entries of a row that the CSV file omits.
 LONG = ("design", "outline_mm", "config")
-"""Entries of a row that the CSV file omits."""
+
+# Difference of area efficiency below which two values count as equal.
 EQUAL = 5e-5
-"""Difference of area efficiency below which two values count as equal."""
+
+# Number of designs of different area efficiency that are simulated to find the start of a search.
 TRIED = 6
-"""Number of designs of different area efficiency that are simulated to find the start of a
-search."""
+
+# Number of coefficients of the free form.
 COEFFICIENTS = 12
-"""Number of coefficients of the free form."""
+
+# Number of families from which a free form is optimised. The best result is kept.
 STARTS = 2
-"""Number of families from which a free form is optimised. The best result is kept."""
+
+# Further scenes by name, as changes of the section `scene` of the optimisation.
 SCENES: dict[str, dict[str, Any]] = {
     "1000 rpm": {"speed_rpm": 1000.0},
     "6000 rpm": {"speed_rpm": 6000.0},
     "20 N m": {"load": {"torque_N_m": 20.0}},
 }
-"""Further scenes by name, as changes of the section `scene` of the optimisation."""
-SEARCH = {"screening": 24, "starts": 4, "iterations": 40, "learning_rate": 0.06}
-SEARCH_FREE = {"screening": 0, "starts": 1, "iterations": 100, "learning_rate": 0.005}
+SEARCH = {"screening": 24, "starts": 4, "iterations": 40}
+SEARCH_FREE = {"screening": 0, "starts": 1, "iterations": 100}
+
+# Families of a reduced run.
 QUICK = ("cic", "arc")
-"""Families of a reduced run."""
 
 
 def weighed(config: Config, response: dict[str, float], reference: dict[str, float]) -> Config:

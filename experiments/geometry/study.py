@@ -28,24 +28,30 @@ from rootsopt.scene.families import profile_of
 RADIUS_MM = 33.0
 LOBES = (2, 3, 4, 5, 6)
 FAMILIES = tuple(family for family in FAMILY_KEYS if family != "outline")
+
+# Numbers of coefficients for which free forms are drawn.
 COEFFICIENTS = (3, 8, 24)
-"""Numbers of coefficients for which free forms are drawn."""
+
+# Families and lobes of a reduced run.
 QUICK = ("cic", "ee", "arc"), (2, 3)
-"""Families and lobes of a reduced run."""
+
+# Number of designs drawn per family and number of lobes: in a full and in a reduced run.
 DRAWS, QUICK_DRAWS = 2000, 50
-"""Number of designs drawn per family and number of lobes: in a full and in a reduced run."""
 _LEVELS = 4
+
+# Number of sides of the finest polygon: per interval of a curve, per knot span of a free form,
+# and per segment.
 _SHORT, _SPAN, _WHOLE = 64, 512, 2048
-"""Number of sides of the finest polygon: per interval of a curve, per knot span of a free form, and
-per segment."""
+
+# Exponent with which points are concentrated at both ends of a segment, where the outline may
+# behave like a square root.
 _GRADED = 5
-"""Exponent with which points are concentrated at both ends of a segment, where the outline may
-behave like a square root."""
+
+# Longest involute that a config accepts, as a fraction of the longest possible.
 _LONGEST_INVOLUTE = 1.02
-"""Longest involute that a config accepts, as a fraction of the longest possible."""
+
+# Violation of a limit (relative to the limit's scale) below which a design still counts as valid.
 _ROUNDING = 1e-9
-"""Violation of a limit (relative to the limit's scale) below which a design still counts as
-valid."""
 
 
 def by_polygons(profile):

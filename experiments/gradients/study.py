@@ -26,20 +26,26 @@ from rootsopt.dynamics.verdict import agreement
 from rootsopt.response.evaluation import Evaluation, Evaluator
 
 TOLERANCES = (1e-8, 1e-9, 1e-10)
+
+# Names of the forces whose gradients are compared.
 MEASURES = (*FORCES, "rms_force_N")
-"""Names of the forces whose gradients are compared."""
+
+# Greatest relative step of the central differences, and number of steps, each half of the one
+# before. Longer steps pass the grazing of orbits that almost touch once more.
 STEP, LEVELS = 4e-5, 6
-"""Greatest relative step of the central differences, and number of steps, each half of the one
-before. Longer steps pass the grazing of orbits that almost touch once more."""
+
+# Changes of the design parameters, relative to their values, along the direction of the
+# differences.
 WAY = np.array([1.0, -0.7, 0.8])
-"""Changes of the design parameters, relative to their values, along the direction of the
-differences."""
+
+# Share of gradients that may err by more than their check states.
 BEYOND = 0.01
-"""Share of gradients that may err by more than their check states."""
+
+# Share of pairs with a period above one below which pairs of period one are discarded.
 SHARE = 0.6
-"""Share of pairs with a period above one below which pairs of period one are discarded."""
+
+# Number of pairs of a reduced run.
 QUICK_COUNT = 4
-"""Number of pairs of a reduced run."""
 KINDS: dict[str, tuple[str, list[str]]] = {
     "cic, 3 lobes": ("cic", []),
     "cic, 2 lobes": ("cic", ["profile.lobes=2"]),
@@ -54,13 +60,16 @@ KINDS: dict[str, tuple[str, list[str]]] = {
     "arc and involute": ("arc_involute", []),
     "cic, long periods": ("cic", []),
 }
+
+# Kind of pairs with random friction, motor and gas. Half of all pairs are of this kind.
 FULL = "cic, friction, motor and gas"
-"""Kind of pairs with random friction, motor and gas. Half of all pairs are of this kind."""
+
+# Kind of pairs of which only orbits of five mesh periods or more are kept. About one scene in
+# twenty of this kind has such an orbit.
 LONG = "cic, long periods"
-"""Kind of pairs of which only orbits of five mesh periods or more are kept. About one scene in
-twenty of this kind has such an orbit."""
+
+# Maximum number of scenes of the kind `LONG` drawn for each pair wanted.
 PATIENCE = 60
-"""Maximum number of scenes of the kind `LONG` drawn for each pair wanted."""
 
 
 def pairs(seed: int, kind: str) -> Iterator[list[str]]:

@@ -22,20 +22,22 @@ from rootsopt.identification.fit import identify
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.status import Status
 
+# Ranges of the values by key, which are the bounds of the fits, too.
 RANGES = {
     "scene.timing_gear.backlash_mm": (0.05, 0.3),
     "scene.load.torque_N_m": (2.0, 10.0),
     "scene.timing_gear.stiffness_N_m_per_rad": (5e3, 5e4),
 }
-"""Ranges of the values by key, which are the bounds of the fits, too."""
 SPEEDS = 1500.0, 3500.0
 COLUMNS = "relative_rotation_rad", "contact_force_N"
+
+# Standard deviation of the noise, as a share of the RMS of the column.
 NOISES = 0.01, 0.03, 0.1
-"""Standard deviation of the noise, as a share of the RMS of the column."""
 SAMPLES = 180
 SCENES, STARTS = 100, 2
+
+# Share of regions that must hold the true values.
 PROMISED = 0.9
-"""Share of regions that must hold the true values."""
 
 
 def scene(rng: np.random.Generator) -> tuple[Config, np.ndarray, Any]:

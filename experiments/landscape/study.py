@@ -29,28 +29,36 @@ from rootsopt.optimize.outcome import Optimization
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.search import Search
 
+# Number of points along each axis of the coarsest grid.
 GRID = 6
-"""Number of points along each axis of the coarsest grid."""
+
+# Number of points along each axis in a reduced run.
 QUICK_GRID = 5
-"""Number of points along each axis in a reduced run."""
+
+# Minimum number of designs of the first grid.
 DESIGNS = 400
-"""Minimum number of designs of the first grid."""
+
+# Number of seeds of the screening: in a full run, and in a reduced run.
 SEEDS, QUICK_SEEDS = 10, 2
-"""Number of seeds of the screening: in a full run, and in a reduced run."""
+
+# Overrides for a reduced run.
 QUICK = (
     "optimizer.screening=4",
     "optimizer.starts=1",
     "optimizer.iterations=15",
 )
-"""Overrides for a reduced run."""
+
+# Distance in the unit box between the designs that finer grids surround, and their number.
 APART, CENTERS = 0.15, 3
-"""Distance in the unit box between the designs that finer grids surround, and their number."""
+
+# Number of finer grids around each of them. Each has half the spacing of the one before.
 LEVELS, QUICK_LEVELS = 5, 1
-"""Number of finer grids around each of them. Each has half the spacing of the one before."""
+
+# Relative difference of the objectives below which optimum and grid agree.
 AGREES = 1e-3
-"""Relative difference of the objectives below which optimum and grid agree."""
+
+# Relative range of the objectives below which runs with different seeds agree.
 SAME = 1e-5
-"""Relative range of the objectives below which runs with different seeds agree."""
 
 
 def feasible_grid(problem: Problem, wanted: int, first: int = GRID) -> tuple[np.ndarray, float]:
@@ -118,6 +126,8 @@ NAMES = {
     "involute_length_mm": "involute length (mm)",
     "tip_arc_angle_deg": "tip arc angle (°)",
 }
+
+# Overrides of the config by scene. A reduced run has the first scene only.
 CASES: dict[str, tuple[str, ...]] = {
     "3000 rpm": (),
     "5000 rpm": ("scene.speed_rpm=5000",),
@@ -129,13 +139,13 @@ CASES: dict[str, tuple[str, ...]] = {
     "worst of two speeds": (
         "objective.speeds_rpm=[2500, 3500]", "objective.over_speeds=worst"),
 }  # fmt: skip
-"""Overrides of the config by scene. A reduced run has the first scene only."""
+
+# Columns of the printed table.
 SHOWN = (
     *("scene", "grid_designs", "finer_designs", "without_steady_state", "first_grid_best"),
     *("grid_best", "optimizer", "optimizer_over_grid_best", "optimizer_designs", "certified"),
     "optima",
 )
-"""Columns of the printed table."""
 
 
 def searched(quick: bool, *overrides: str) -> tuple[Search, Optimization]:

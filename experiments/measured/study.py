@@ -25,10 +25,11 @@ from rootsopt.measured.source import outline_of
 from rootsopt.profiles import Profile, outline
 from rootsopt.scene import check_geometry, design_keys
 
+# Form error of the addenda, differences between lobes, and RMS noise of the points (mm).
 FORM, LOBES, NOISE = 20e-3, 3e-3, 1e-3
-"""Form error of the addenda, differences between lobes, and RMS noise of the points (mm)."""
+
+# Angle (deg) by which the measured points are turned.
 TURN = 17.0
-"""Angle (deg) by which the measured points are turned."""
 MM = 1e-3
 
 

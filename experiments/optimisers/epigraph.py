@@ -13,18 +13,22 @@ from rootsopt.optimize.certificate import certify
 from rootsopt.optimize.local import Group, Linearization, Look
 from rootsopt.optimize.sqp import EndError, Stops
 
+# Factor from the variables z of a method to the point x of the unit box: x = `SCALE` · z. It
+# shortens the first step, because some methods start with a unit Hessian.
 SCALE = 0.1
-"""Factor from the variables z of a method to the point x of the unit box: x = `SCALE` · z. It
-shortens the first step, because some methods start with a unit Hessian."""
+
+# First-order residual at which a method may stop.
 RESIDUAL = 1e-9
-"""First-order residual at which a method may stop."""
+
+# Number of constraints reserved for new branches of a maximum that appear during a search. They
+# add to twice the number of branches at the start.
 _SLOTS = 4
-"""Number of constraints reserved for new branches of a maximum that appear during a search. They
-add to twice the number of branches at the start."""
+
+# Difference between phases above which branches at neighbouring points count as different.
 _SAME = 0.1
-"""Difference between phases above which branches at neighbouring points count as different."""
+
+# Amount by which the value of a point without an objective exceeds the best objective.
 _UNUSABLE = 1e3
-"""Amount by which the value of a point without an objective exceeds the best objective."""
 
 
 class Epigraph:

@@ -31,22 +31,27 @@ from rootsopt.optimize.problem import FEASIBLE, Problem
 from rootsopt.optimize.sqp import EndError, Stops, descend
 from rootsopt.response.evaluation import Evaluator
 
+# Distance of the objective from the optimum below which a method has reached the optimum.
 REACHED = 1e-6
-"""Distance of the objective from the optimum below which a method has reached the optimum."""
+
+# Number of designs that each method may simulate: in a full run, and in a reduced run.
 EVALUATIONS, QUICK = 150, 15
-"""Number of designs that each method may simulate: in a full run, and in a reduced run."""
 _PEAK = "objective.mean_weight=0"
 Method = Callable[[Any, NDArray[np.float64], Stops], None]
+
+# Number of rounds of the augmented Lagrangian, and of iterations of L-BFGS in each round.
 _OUTER, _INNER = 30, 25
-"""Number of rounds of the augmented Lagrangian, and of iterations of L-BFGS in each round."""
+
+# Weight of the penalty: first value, factor where the violation does not fall by half, and
+# maximum.
 _PENALTY, _GROWTH, _MOST = 10.0, 4.0, 1e6
-"""Weight of the penalty: first value, factor where the violation does not fall by half, and
-maximum."""
+
+# Share of the predicted decrease that a step must reach, share of a step that is tried last, and
+# decrease below which L-BFGS ends.
 _ARMIJO, _SHORTEST, _FLAT = 1e-4, 1e-6, 1e-11
-"""Share of the predicted decrease that a step must reach, share of a step that is tried last, and
-decrease below which L-BFGS ends."""
+
+# Greatest sine at the start of L-BFGS: at 1, on a bound, its gradient would be zero.
 _INSIDE = 0.98
-"""Greatest sine at the start of L-BFGS: at 1, on a bound, its gradient would be zero."""
 
 
 class Task(NamedTuple):
@@ -75,8 +80,9 @@ TASKS = (
         "objective.speeds_rpm=[2500, 3500]", "objective.over_speeds=worst")),
     Task("free form", "configs/free.yaml"),
 )  # fmt: skip
+
+# Number of problems in a reduced run.
 QUICK_TASKS = 2
-"""Number of problems in a reduced run."""
 
 
 def sqp(look: "Recorder", start: NDArray[np.float64], stops: Stops) -> None:
@@ -297,8 +303,8 @@ def _met(row: dict[str, Any]) -> bool:
     return bool(np.isfinite(row["objective"]) and row["violation"] <= FEASIBLE)
 
 
+# Names of methods in the legend; others are written as words.
 _NAMES = {"slsqp": "SQP (default)", "mma": "MMA"}
-"""Names of methods in the legend; others are written as words."""
 
 
 def solved(rows: list[dict[str, Any]]) -> Figure:

@@ -22,16 +22,20 @@ from rootsopt import Scene
 from rootsopt.config import load
 from rootsopt.status import Status
 
+# Usual numbers of designs in a batch.
 SIZES = 256, 1024, 4096, 16384, 65536
-"""Usual numbers of designs in a batch."""
+
+# Number of designs that are compared with single evaluations.
 _CHECKED = 8
-"""Number of designs that are compared with single evaluations."""
+
+# Number of designs that a thread of a CPU computes in one call.
 _PART = 32
-"""Number of designs that a thread of a CPU computes in one call."""
+
+# Memory (bytes) for each design that is computed on a GPU.
 _NEEDED = 3.5e6
-"""Memory (bytes) for each design that is computed on a GPU."""
+
+# Maximum number of timed calls, and time (s) after which no further call is made.
 _REPEATS, _SECONDS = 5, 10.0
-"""Maximum number of timed calls, and time (s) after which no further call is made."""
 
 
 def rows_of(sizes: Sequence[int], say: Callable[[str], None] = lambda text: None) -> Iterator[Row]:

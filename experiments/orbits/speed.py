@@ -23,10 +23,12 @@ from rootsopt.config import load
 from rootsopt.response.evaluation import Evaluator
 
 Row = dict[str, Any]
+
+# Relative difference between the parameters of a design and those of its neighbour.
 AWAY = 2e-3
-"""Relative difference between the parameters of a design and those of its neighbour."""
+
+# Orbit tolerance of the reference.
 EXACT = 1e-10
-"""Orbit tolerance of the reference."""
 
 
 def _numbers(evaluation) -> tuple[np.ndarray, np.ndarray]:

@@ -34,18 +34,24 @@ from rootsopt.scene.families import free_form_of
 from rootsopt.status import Status
 
 FORCES = "mean", "peak", "rms"
+
+# Statuses of motions that repeat, but whose orbit or gradient is not known.
 LEFT = "not_closed", "inaccurate"
-"""Statuses of motions that repeat, but whose orbit or gradient is not known."""
+
+# Number of scenes drawn for each pair wanted, above which a kind ends early.
 PATIENCE = 12
-"""Number of scenes drawn for each pair wanted, above which a kind ends early."""
+
+# Number of coefficients of the free form.
 COEFFICIENTS = 12
-"""Number of coefficients of the free form."""
+
+# Relative step of the differences. Orbits by shooting are accurate to about 1e-11.
 STEP = 1e-5
-"""Relative step of the differences. Orbits by shooting are accurate to about 1e-11."""
+
+# Relative difference of forces above which the two solvers disagree.
 AGREE = 1e-4
-"""Relative difference of forces above which the two solvers disagree."""
+
+# Number of pairs of a reduced run.
 QUICK_COUNT = 2
-"""Number of pairs of a reduced run."""
 GAS = [
     "scene.load={pressure_difference_Pa: 2.0e4}",
     "contact.friction={static: 0.2, kinetic: 0.1, stiction_speed_mm_s: 100, "
@@ -53,6 +59,8 @@ GAS = [
 ]
 TWIST = ["rotor.helix_deg=45", "solver.slices=4"]
 MOTOR = ["scene.drive=torque", "scene.motor={slope_N_m_s_per_rad: 0.1, inertia_kg_m2: 1.0e-3}"]
+
+# Family, lobes and further overrides of each kind.
 KINDS: dict[str, tuple[str, int, list[str]]] = {
     "cic, 3 lobes": ("cic", 3, []),
     "cic, lively": ("cic", 3, []),
@@ -71,7 +79,6 @@ KINDS: dict[str, tuple[str, int, list[str]]] = {
     "four arcs": ("four_arcs", 3, []),
     "cic, centre distance": ("cic", 3, ["scene.center_distance_error_mm=0.03"]),
 }
-"""Family, lobes and further overrides of each kind."""
 
 
 def pairs(seed: int, kind: str) -> Iterator[list[str]]:

@@ -8,8 +8,8 @@ from experiments.paper.scene import FAMILIES, PAPER, QUANTITIES, Response, confi
 from experiments.paper.study import Row
 from rootsopt.figures.force import plot_force, plot_spectrum
 
+# Range of misfits (%) shown. Larger misfits and non-periodic motions are at the upper edge.
 LOWEST, HIGHEST = 0.1, 300.0
-"""Range of misfits (%) shown. Larger misfits and non-periodic motions are at the upper edge."""
 MARKS = "os^Dvp"
 
 

@@ -44,6 +44,7 @@ class Quantity:
     label: str
 
 
+# The p quantities, in the order of all vectors of values (p,). docs/paper.md explains the ranges.
 QUANTITIES = (
     Quantity("rotor.length_mm", 30.0, 400.0, False, "rotor length (mm)"),
     Quantity("scene.load.torque_N_m", 0.2, 9.55, False, "load torque (N·m)"),
@@ -52,13 +53,13 @@ QUANTITIES = (
     Quantity("scene.timing_gear.backlash_mm", 0.02, 1.5, True, "gear backlash (mm)"),
     Quantity("contact.clearance_mm", 0.005, 0.5, True, "flank clearance (mm)"),
 )
-"""The p quantities, in the order of all vectors of values (p,). docs/paper.md explains the
-ranges."""
 FAMILIES = ("cic", "ee")
+
+# Mean and maximum contact force (N), a row per pair (`FAMILIES`), from the paper's section 4.
 PAPER = np.array([[102.4, 1973.3], [1047.1, 5661.4]])
-"""Mean and maximum contact force (N), a row per pair (`FAMILIES`), from the paper's section 4."""
+
+# Maximum step of `polished`, in logarithms of the quantities.
 _NEAR = 0.1
-"""Maximum step of `polished`, in logarithms of the quantities."""
 
 
 def config_of(family: str, values: ArrayLike | None = None, *overrides: str) -> Config:

@@ -37,32 +37,39 @@ from rootsopt.response.records import unsettled
 from rootsopt.scene import design_vector
 from rootsopt.status import Status
 
+# Windows (start, end in s) over which the paper may have taken mean and maximum.
 WINDOWS = ((0.0, 0.1), (0.0, 0.2), (0.05, 0.2), (0.1, 0.2), (0.1, 0.8))
-"""Windows (start, end in s) over which the paper may have taken mean and maximum."""
+
+# Sampling rates the paper may have used: every n-th sample of the window.
 THINNINGS = (1, 3, 15)
-"""Sampling rates the paper may have used: every n-th sample of the window."""
+
+# Overrides that set the grid of initial states in the search for coexisting motions.
 GRID = ("attractors.relatives=24", "attractors.rates=18")
-"""Overrides that set the grid of initial states in the search for coexisting motions."""
+
+# Other values of the quantities, found by searches. The study solves them for the paper's forces
+# again.
 OTHERS = {
     "tight play": (330.0, 5.6142, 7252.4, 0.77, 0.41829, 0.076577),
     "low gear damping": (361.942, 6.5715, 27871.46, 0.6085, 0.8734, 0.225),
     "short rotor": (253.46, 5.6804, 16489.5, 0.9866, 1.0063, 0.2879),
     "light load": (300.23, 0.21735, 31959.0, 0.93524, 0.99737, 0.29273),
 }
-"""Other values of the quantities, found by searches. The study solves them for the paper's forces
-again."""
+
+# Relative changes of each quantity alone. Keys: whether the run is reduced.
 CHANGES = {False: (-0.1, -0.05, -0.02, -0.01, 0.01, 0.02, 0.05, 0.1), True: (-1e-3, 1e-3)}
-"""Relative changes of each quantity alone. Keys: whether the run is reduced."""
+
+# Relative step of a quantity along its profile (see `profile`), and maximum number of steps in
+# each direction.
 STEP, COUNT = 0.04, 6
-"""Relative step of a quantity along its profile (see `profile`), and maximum number of steps in
-each direction."""
+
+# Misfit below which a point of the profile is accepted, and misfit above which the profile ends.
 WITHIN, LIMIT = 5e-3, 0.03
-"""Misfit below which a point of the profile is accepted, and misfit above which the profile
-ends."""
+
+# Relative error of a force above which a search has no result.
 TARGET = 0.1
-"""Relative error of a force above which a search has no result."""
+
+# Number of local fits of a search.
 STARTS = 8
-"""Number of local fits of a search."""
 Say = Callable[[str], None]
 
 

@@ -30,15 +30,18 @@ from rootsopt.response.evaluation import Evaluator
 from rootsopt.scene import Scene, design_vector
 from rootsopt.tradeoffs.trace import pareto_front
 
+# Terms of the trade-off; less of each is better.
 TERMS = "mean_force_N", "leakage_fraction", "flow_ripple"
-"""Terms of the trade-off; less of each is better."""
+
+# Family without design parameters, whose volume all designs displace.
 REFERENCE = "ee"
-"""Family without design parameters, whose volume all designs displace."""
+
+# Steps between two ends of a front: 10 points.
 DIVISIONS = 3
-"""Steps between two ends of a front: 10 points."""
 FAMILIES = "cic", "arc_involute", "five_arcs"
+
+# Families of a reduced run.
 QUICK = ("arc_involute",)
-"""Families of a reduced run."""
 _PUMP = (
     "contact.clearance_mm=0.02",
     "scene.load={torque_N_m: 2.0}",
@@ -49,8 +52,9 @@ _PUMP = (
     f"pareto.terms=[{', '.join(TERMS)}]",
     "pareto.refinements=0",
 )
+
+# Number of angles of rotor 1 at which the flow is sampled.
 _POSES = 4096
-"""Number of angles of rotor 1 at which the flow is sampled."""
 
 
 def config_of(family: str, divisions: int = DIVISIONS) -> Config:
@@ -182,11 +186,11 @@ def _iso_efficiency(ax: Axes) -> None:
     ax.set(xlim=(low, high), ylim=(bottom, top))
 
 
+# Columns of the printed table.
 SHOWN = (
     *("family", "point", "mean_force_N", "peak_force_N", "leakage_fraction", "flow_ripple"),
     *("radius_ratio", "area_efficiency", "displaced_volume_cm3", "status", "best_of_all"),
 )
-"""Columns of the printed table."""
 
 
 def run(job: Run) -> None:

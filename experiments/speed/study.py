@@ -31,23 +31,27 @@ from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import design_vector
 
 SCENES = {"shipped": (), "light": ("scene.timing_gear.damping_ratio=0.1",)}
+
+# Overrides of each optimisation, by its name.
 OPTIMISED = {
     "at 3000 rpm": (),
     "over the range, mean": ("objective.over_speeds=weighted",),
     "over the range, worst": ("objective.over_speeds=worst",),
 }
-"""Overrides of each optimisation, by its name."""
 QUICK = ("optimizer.screening=0", "optimizer.starts=1", "optimizer.iterations=1")
+
+# Number of phases of a mesh period at which the pair is linearised.
 PHASES = 240
-"""Number of phases of a mesh period at which the pair is linearised."""
+
+# Number of harmonics of the mesh frequency considered.
 ORDERS = 6
-"""Number of harmonics of the mesh frequency considered."""
+
+# Prominence of a point of a force curve (relative to the force) above which it counts as a
+# maximum.
 PROMINENCE = 0.02
-"""Prominence of a point of a force curve (relative to the force) above which it counts as a
-maximum.
-"""
+
+# Relative difference of speed above which a maximum does not belong to a crossing.
 NEAR = 0.03
-"""Relative difference of speed above which a maximum does not belong to a crossing."""
 
 
 def settings(scene: str, family: str, *more: str) -> Config:

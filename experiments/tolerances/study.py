@@ -23,10 +23,11 @@ from rootsopt.optimize.design import optimize_design
 from rootsopt.optimize.outcome import Optimization
 from rootsopt.optimize.robust import Robustness
 
+# Forces whose distributions are reported.
 FORCES = ("mean_force_N", "peak_force_N")
-"""Forces whose distributions are reported."""
+
+# Statistics that are reported, as `rootsopt.optimize.robust.Scattered` names them.
 STATISTICS = ("mean", "sigma", "quantile_95", "worst")
-"""Statistics that are reported, as `rootsopt.optimize.robust.Scattered` names them."""
 
 
 def deviation(scatter: Scatter) -> float:
@@ -38,12 +39,15 @@ def deviation(scatter: Scatter) -> float:
 
 
 _PLAY = "contact.clearance_mm=0.01"
+
+# Overrides of configs/cic_drawn.yaml: the values that scatter.
 OVER = (
     "tolerances.over={contact.clearance_mm: {normal: 0.002}, "
     "scene.timing_gear.backlash_mm: {uniform: 0.02}, "
     "scene.load.torque_N_m: {relative_normal: 0.05}}",
 )
-"""Overrides of configs/cic_drawn.yaml: the values that scatter."""
+
+# Overrides of a reduced run.
 QUICK = (
     "tolerances.over={contact.clearance_mm: {normal: 0.002}}",
     "tolerances.samples=2",
@@ -52,7 +56,6 @@ QUICK = (
     "optimizer.starts=1",
     "optimizer.iterations=3",
 )
-"""Overrides of a reduced run."""
 
 
 def rows_of(result: Optimization, robustness: Robustness) -> list[dict[str, Any]]:

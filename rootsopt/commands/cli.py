@@ -39,6 +39,7 @@ from rootsopt.runtime.environment import use_float64
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from rootsopt.output.names import Table
     from rootsopt.output.runs import RunFolder
 
 # Equinox's checks of traced values call back to Python, and a program with callbacks cannot be
@@ -50,12 +51,16 @@ os.environ.setdefault("EQX_ON_ERROR", "off")
 class Outcome(NamedTuple):
     """The result of a command.
 
-    `code`: exit code; `show`: function that prints the result on a rich console; `rows`: rows of a
-    sweep that the result file does not hold."""
+    `code`: exit code; `lines`: what the terminal says below the tables, `head`: above them; `rows`:
+    rows of a sweep that the result file does not hold; `most`: number of them above which their
+    table is truncated; `tables`: tables for the terminal, by default all of the result."""
 
     code: int
-    show: "Callable[[Console], None]"
+    lines: Sequence[str] = ()
     rows: Sequence[dict[str, Any]] = ()
+    most: int = 200
+    tables: "Sequence[Table | None] | None" = None
+    head: Sequence[str] = ()
 
 
 Body = Callable[[Config, argparse.Namespace, "RunFolder"], Outcome]
@@ -80,7 +85,6 @@ class _Help(argparse.Action):
     """The option `--help [GROUP]`: options and the keys used most, or all keys of a group."""
 
     def __call__(self, parser, namespace, values, option_string=None):
-        del namespace, option_string
         if values in GROUPS:
             print(describe(Config, str(values)))
         else:
@@ -279,16 +283,24 @@ def _in_folder(command: str, config: Config, options: argparse.Namespace) -> int
         from rich.console import Console
 
         from rootsopt.output.ending import ending
-        from rootsopt.output.terminal import show_ending
+        from rootsopt.output.tables import tables_of
+        from rootsopt.output.terminal import show_ending, shown
 
         out = Console()
-        outcome.show(out)
-        given = folder.path, shlex.join(options.given), options.imports, outcome.rows
-        show_ending(out, ending(folder.result, *given))
-        for note in moved:
-            out.print(note, soft_wrap=True, markup=False, highlight=False)
-        out.print(f"results in {folder.path}", soft_wrap=True, markup=False, highlight=False)
+        result, rows = folder.result, outcome.rows
+        _say(out, outcome.head)
+        every = tables_of(result, rows, outcome.most)
+        out.print(shown(every if outcome.tables is None else outcome.tables))
+        _say(out, outcome.lines)
+        given = folder.path, shlex.join(options.given), options.imports, rows
+        show_ending(out, ending(result, *given))
+        _say(out, [*moved, f"results in {folder.path}"])
     return outcome.code
+
+
+def _say(out: "Console", lines: Sequence[str]) -> None:
+    for line in lines:
+        out.print(line, soft_wrap=True, markup=False, highlight=False)
 
 
 def _report(folder: "RunFolder", options: argparse.Namespace, outcome: Outcome) -> None:

@@ -14,6 +14,8 @@ from rootsopt.errors import InputError
 SHELLS = "bash", "zsh"
 """Shells for which there is a script."""
 _KEYS, _CONFIGS = "_rootsopt_keys", "_rootsopt_configs"
+
+# End of the bash script: no blank after a key, because its value follows.
 _NO_SPACE = """
 _rootsopt() {
   _shtab_rootsopt "$@"
@@ -21,7 +23,6 @@ _rootsopt() {
   return 0
 }
 complete -o bashdefault -F _rootsopt rootsopt"""
-"""End of the bash script: no blank after a key, because its value follows."""
 
 
 def script(shell: str) -> str:
@@ -87,6 +88,3 @@ def _preamble() -> dict[str, str]:
 }}
 """
     }
-
-
-__all__ = ["SHELLS", "script"]

@@ -17,8 +17,9 @@ from typing import Any
 
 OK, BAD_INPUT, NO_RESULT = 0, 2, 3
 _NAMES = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
+
+# Error numbers (errno) that mean that nobody reads a stream. They do not change the exit code.
 _GONE = (errno.EPIPE, errno.EBADF, errno.ESHUTDOWN)
-"""Error numbers (errno) that mean that nobody reads a stream. They do not change the exit code."""
 _WAITING = "rootsopt signals"
 _SHOW_CURSOR = "\x1b[?25h"
 

@@ -37,6 +37,11 @@ class Command(NamedTuple):
         Return the exit code."""
         return door.through(self.name, lambda: self._run(argv), own=argv is None)
 
+    def begin(self, module: str) -> None:
+        """Run the command, and end the process, if `module` is the name of its main program."""
+        if module == "__main__":
+            door.leave(self.main())
+
     def _run(self, argv: Sequence[str] | None) -> int:
         from rootsopt.commands import cli
 
@@ -134,9 +139,6 @@ def _sweep(parser: "ArgumentParser") -> None:
     )
     group.add_argument("--seed", type=int, metavar="N", help="seed of the samples (default: 0)")
     group = parser.add_argument_group("how a sweep runs (with --over or --tolerances)")
-    group.add_argument(
-        "--data", metavar="NAME", help="name of the dataset: *.nc or *.zarr (default: sweep.nc)"
-    )
     _shared(group)
 
 

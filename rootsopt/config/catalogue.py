@@ -10,12 +10,14 @@ from rootsopt.errors import InputError
 if TYPE_CHECKING:
     from rootsopt.config.rotor import ProfileConfig
 
+# Length (mm) in a profile above which a config is rejected, whatever the pitch radius.
 _LONGEST = 5e4
-"""Length (mm) in a profile above which a config is rejected, whatever the pitch radius."""
+
+# Range (pitch radii) outside which a length in a profile is rejected.
 _SHARES = 0.002, 10.0
-"""Range (pitch radii) outside which a length in a profile is rejected."""
+
+# Range (pitch radii) that replaces `_SHARES` where the key or the family sets the lower limit.
 _NO_FLOOR = 0.0, 10.0
-"""Range (pitch radii) that replaces `_SHARES` where the key or the family sets the lower limit."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,7 +44,6 @@ class _Dependent(Parameter):
     A search takes the limits from the `ranges` of the family."""
 
     def bounds(self, profile: "ProfileConfig") -> Pair:
-        del profile
         return 0.0, math.inf
 
 
@@ -105,8 +106,8 @@ COEFFICIENTS = Parameter(
     count=(3, 64),
 )
 
+# Margins that are negative with the longest involutes that `limits` tolerates.
 _OVERLONG = frozenset({"rolling", "order"})
-"""Margins that are negative with the longest involutes that `limits` tolerates."""
 _OWN = (
     Family(
         name="cic",

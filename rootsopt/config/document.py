@@ -18,17 +18,21 @@ from rootsopt.errors import InputError
 
 MOST_BYTES = 128 * 1024
 """Text size (bytes) above which a document is rejected. A typical config has about 2000 bytes."""
-_MOST_NODES = 5000
-"""Number of keys, values, lists and sections above which a document is rejected.
 
-Each use of an alias counts as a copy."""
+# Number of keys, values, lists and sections above which a document is rejected.
+#
+# Each use of an alias counts as a copy.
+_MOST_NODES = 5000
+
+# Number of nested levels (sections and lists) above which a document is rejected.
 _DEEPEST = 32
-"""Number of nested levels (sections and lists) above which a document is rejected."""
+
+# Length of a scalar (characters) above which a document is rejected.
 _LONGEST_VALUE = 4096
-"""Length of a scalar (characters) above which a document is rejected."""
+
+# Length of a number (characters) above which a document is rejected. A double has at most 309
+# digits before its decimal point.
 _MOST_DIGITS = 400
-"""Length of a number (characters) above which a document is rejected. A double has at most 309
-digits before its decimal point."""
 
 _TAG = "tag:yaml.org,2002:"
 _MERGE = _TAG + "merge"

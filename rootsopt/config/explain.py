@@ -9,12 +9,14 @@ from annotated_types import Ge, Gt, Le, Lt
 from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 
-from rootsopt.config.section import UNMET, Section, choices, number
+from rootsopt.config.section import UNMET, Section, bare, choices, number, require
 from rootsopt.config.units import RPM, hint, readings, unit_of, without_unit
 from rootsopt.config.words import named, near, shown
 
+# Maximum number of valid keys that a message lists.
 _MOST_NAMES = 12
-"""Maximum number of valid keys that a message lists."""
+
+# What a value must be, by the type of pydantic's error.
 _WANTED = {
     "float_type": "a number",
     "int_type": "a whole number",
@@ -25,10 +27,12 @@ _WANTED = {
     "dict_type": "keys with values, as in {a: 1, b: 2}",
     "tuple_type": "a list of numbers, as in [1, 2]",
 }
-"""What a value must be, by the type of pydantic's error."""
+
+# Type and last part of the location of an unknown key of a dictionary with a choice of keys.
 _UNKNOWN_WORD = "literal_error", ("[key]",)
-"""Type and last part of the location of an unknown key of a dictionary with a choice of keys."""
 _TORQUE, _OUTER = "scene.load.torque_N_m", "profile.outer_radius_mm"
+
+# Keys and factors for names that catalogues use, without their units.
 _SYNONYMS = {
     "center_distance": ("profile.pitch_radius_mm", 0.5),
     "centre_distance": ("profile.pitch_radius_mm", 0.5),
@@ -42,7 +46,45 @@ _SYNONYMS = {
     "torque": (_TORQUE, 1.0),
     "power": (_TORQUE, 1.0),
 }
-"""Keys and factors for names that catalogues use, without their units."""
+_SEARCHED = "contact is always found by the search, the most accurate of the former models"
+_IN_BLOCK = "write it as {heading: text} under `drawing.title_block`"
+_BY_ACCURACY = "set `solver.accuracy` to trade accuracy for time"
+
+# Keys of former versions: (values that are still true, among them the default, which a resolved
+# config holds; what to do instead).
+_REMOVED: dict[str, tuple[tuple[Any, ...], str]] = {
+    "solver.fidelity": (("search",), f"{_SEARCHED}; {_BY_ACCURACY}"),
+    "solver.nodes": ((400,), f"{_SEARCHED}; {_BY_ACCURACY}"),
+    "solver.map_error": ((1e-4,), f"{_SEARCHED}; {_BY_ACCURACY}"),
+    "solver.map_rolls": ((), f"{_SEARCHED}; {_BY_ACCURACY}"),
+    "solver.map_relatives": ((), f"{_SEARCHED}; {_BY_ACCURACY}"),
+    "solver.gradient": (("forward",), "both modes of differentiation gave the same gradient"),
+    "solver.orbit": (
+        ("auto", "collocation"),
+        f"collocation closes orbits, and an integration confirms them; {_BY_ACCURACY}",
+    ),
+    "solver.precision": (
+        ("float64",),
+        f"motions are integrated in double precision; {_BY_ACCURACY}",
+    ),
+    "solver.transient_rtol": ((), "it is `solver.accuracy` / 100; set that"),
+    "solver.slice_error": ((1e-2,), "set `solver.slices`"),
+    "attractors.relative_range_mrad": ((), "the grid follows from backlash and contact"),
+    "attractors.rate_range_rad_s": ((), "the grid follows from the speed of impacts"),
+    "sweep.speed_rpm": (
+        (),
+        "give `rootsopt sweep` the option `--over scene.speed_rpm=300:6000:39`",
+    ),
+    "optimizer.method": (("auto", "slsqp"), "it follows from `objective.motion`"),
+    "optimizer.learning_rate": ((0.05,), "set `optimizer.iterations`"),
+    "tolerances.normal_limit": ((4.0,), "normal distributions are cut off at 4 deviations"),
+    "drawing.number": ((), _IN_BLOCK),
+    "drawing.revision": ((), _IN_BLOCK),
+    "drawing.drawn_by": ((), _IN_BLOCK),
+    "drawing.date": ((), _IN_BLOCK),
+    "drawing.general_tolerance": ((), _IN_BLOCK),
+    "drawing.points": ((361,), "rotor_points.csv has 361 points, and all ends of pieces"),
+}
 _SIGNS = {"gt": "greater than", "ge": "at least", "lt": "less than", "le": "at most"}
 _COUNTS = {"min_length": "at least", "max_length": "at most"}
 
@@ -86,6 +128,26 @@ def explain(
     key = ".".join((key, *map(named, within)))
     wanted = _wanted(kind, value, context, first["msg"], field)
     return f"`{key}` must be {wanted}, but is {shown(value)}{_advice(place, kind, value, field)}"
+
+
+def without_removed(data: Any) -> Any:
+    """Return a config's plain values without keys of former versions.
+
+    Raises `ValueError` if one of them has a value that would now have no effect."""
+    if not isinstance(data, dict):
+        return data
+    for key, (accepted, instead) in _REMOVED.items():
+        section, _, name = key.partition(".")
+        inner = data.get(section)
+        if not isinstance(inner, dict) or name not in inner:
+            continue
+        value = inner[name]
+        require(
+            value is None or value in accepted or bare(str(value)) in accepted,
+            f"`{key}` must be left out, but is {shown(value)}: {instead}",
+        )
+        data = data | {section: {one: x for one, x in inner.items() if one != name}}
+    return {key: value for key, value in data.items() if (key, value) != ("sweep", {})}
 
 
 def _is_unknown(problem: Any) -> bool:
@@ -316,12 +378,14 @@ GROUPS = {
     "scene": ("scene", "contact"),
     "pump": ("pump",),
     "search": (
-        "objective", "constraints", "optimizer", "sweep", "attractors", "pareto", "tolerances",
+        "objective", "constraints", "optimizer", "attractors", "pareto", "tolerances",
         "assumptions", "response", "ensemble",
     ),
     "expert": ("solver",),
 }  # fmt: skip
 """Sections of the config in each group of keys in `--help`. The longest name counts."""
+
+# Keys that a short help lists; the choices of `profile.family` stand above them.
 _USED_MOST = {
     "profile.lobes", "profile.pitch_radius_mm",
     "scene.speed_rpm", "scene.drive", "scene.load.torque_N_m",
@@ -330,7 +394,6 @@ _USED_MOST = {
     "pump.viscosity_mPa_s", "objective.mean_weight", "objective.peak_weight",
     "constraints.area_efficiency_min", "optimizer.starts", "solver.accuracy",
 }  # fmt: skip
-"""Keys that a short help lists; the choices of `profile.family` stand above them."""
 
 
 def describe(model: type[Section], group: str = "") -> str:

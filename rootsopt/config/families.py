@@ -43,12 +43,14 @@ ENTRY_POINTS = "rootsopt.families"
 The name of each entry point is that of its family."""
 EXAMPLE_RADIUS = 33.0
 """Pitch radius (mm) of the rotors in `Family.example`."""
-_ANY_LENGTH, _ANY_ANGLE, _ANY_NUMBER = (0.01, 1.5), (0.0, 90.0), (0.0, 2.0)
-"""Usual range of a length (pitch radii), of an angle (°) and of a plain number.
 
-They apply to parameters that specify no usual range."""
+# Usual range of a length (pitch radii), of an angle (°) and of a plain number.
+#
+# They apply to parameters that specify no usual range.
+_ANY_LENGTH, _ANY_ANGLE, _ANY_NUMBER = (0.01, 1.5), (0.0, 90.0), (0.0, 2.0)
+
+# Default bounds of a parameter without a usual range, as multiples of the config's own value.
 _AROUND = (0.5, 1.5)
-"""Default bounds of a parameter without a usual range, as multiples of the config's own value."""
 _WORD = re.compile(r"[a-z][a-z0-9_]*")
 
 Pair = tuple[float, float]
@@ -115,7 +117,6 @@ class Parameter:
         """Return the usual range (low, high), in the key's unit.
 
         `pitch_radius_mm`, `lobes`: pitch radius (mm) and number of lobes of the rotor."""
-        del lobes
         if self.usual is not None and self.radii is None:
             return self.usual
         if self.usual is not None or self.key.endswith("_mm"):
@@ -316,23 +317,6 @@ def is_list(key: str) -> bool:
 def users_of(key: str) -> list[str]:
     """Return the names of the families that have a parameter with this key."""
     return [family.name for family in _families.values() if key in family.keys]
-
-
-@contextlib.contextmanager
-def for_a_time() -> Iterator[None]:
-    """Return a context manager that removes the families registered in its `with` block at its end.
-
-    It serves tests. Programs compiled for these families stay in memory: do not reuse the families'
-    names."""
-    before = dict(_families)
-    try:
-        yield
-    finally:
-        _families.clear()
-        _families.update(before)
-        for name in _origins.keys() - before.keys():
-            del _origins[name]
-        _follow()
 
 
 def find_installed(name: str) -> None:

@@ -15,8 +15,8 @@ from rootsopt.config.units import MM, RPM, hint, unit_of
 if TYPE_CHECKING:
     from rootsopt.config.reading import Config
 
+# One bar (Pa).
 _BAR = 1e5
-"""One bar (Pa)."""
 
 
 def _sizes(config: "Config") -> dict[str, float]:
@@ -117,9 +117,6 @@ USUAL: dict[str, Usual] = {
     "constraints.seal_width_min_mm": _MARGIN,
     "constraints.outer_radius_min_mm": _RADIUS,
     "constraints.outer_radius_max_mm": _RADIUS,
-    "attractors.relative_range_mrad": Usual(1e-2, 300),
-    "attractors.rate_range_rad_s": Usual(1e-3, 1e4),
-    "sweep.speed_rpm": _SPEED,
     "pump.viscosity_mPa_s": Usual(5e-3, 2e5),
     "pump.pressure_difference_Pa": _PRESSURE,
     "pump.tip_clearance_mm": _GAP,
@@ -132,10 +129,14 @@ USUAL: dict[str, Usual] = {
     "drawing.inset_mm": _GAP,
 }
 """Usual range of each key with a unit, other than design parameters."""
+
+# Usual ranges of design parameters that differ from those of their unit.
 _DESIGN = {"pressure_angle_deg": Usual(5, 85), "tip_arc_turn_deg": Usual(3, 180), TWIST: _TWIST}
-"""Usual ranges of design parameters that differ from those of their unit."""
+
+# Usual range of a design parameter, by unit.
 _UNITS = {"mm": _LENGTH, "°": _ANGLE}
-"""Usual range of a design parameter, by unit."""
+
+# Usual ranges of limited quantities, by the ends of their names.
 _TERMS = {
     "_force_N": Usual(1e-2, 1e3, "force"),
     "_radius_mm": Usual(0.02, 2, "radius"),
@@ -143,7 +144,6 @@ _TERMS = {
     "displaced_volume_cm3": Usual(0.2, 5, "volume"),
     "polar_inertia_kg_m2": Usual(0.1, 5, "inertia"),
 }
-"""Usual ranges of limited quantities, by the ends of their names."""
 
 
 def usual_of(key: str) -> Usual | None:
@@ -213,11 +213,7 @@ def _numbers(section: Any, prefix: str = "") -> Iterator[tuple[str, float]]:
 
 def _greatest(value: Any) -> float:
     """Return the number of the greatest magnitude in a value, 0 without a number."""
-    if isinstance(value, dict):  # The number of points of a range has no unit.
-        value = [one for key, one in value.items() if key != "points"]
+    value = [*value.values()] if isinstance(value, dict) else value
     many = value if isinstance(value, list | tuple) else [value]
     numbers = [one for one in many if isinstance(one, int | float) and not isinstance(one, bool)]
     return max(numbers, key=abs, default=0.0)
-
-
-__all__ = ["USUAL", "Usual", "notes", "notes_on_swept", "usual_of"]

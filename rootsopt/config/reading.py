@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field, SerializeAsAny, ValidationError, model_validator
 
 from rootsopt.config.document import MOST_BYTES, read_document
-from rootsopt.config.explain import explain, tree
+from rootsopt.config.explain import explain, tree, without_removed
 from rootsopt.config.families import families, family_of, find_installed, is_list
 from rootsopt.config.pareto import ParetoConfig
 from rootsopt.config.rotor import DrawingConfig, ProfileConfig, RotorConfig
@@ -27,7 +27,6 @@ from rootsopt.config.study import (
     OptimizerConfig,
     ResponseConfig,
     SolverConfig,
-    SweepConfig,
 )
 from rootsopt.config.tolerances import (
     AssumptionsConfig,
@@ -43,9 +42,10 @@ from rootsopt.config.words import placed, sentence, shown
 from rootsopt.errors import InputError
 
 _SPEED = "scene.speed_rpm"
+
+# Number of dotted parts in a key above which an override is rejected. Config keys have at most
+# three parts.
 _MOST_PARTS = 8
-"""Number of dotted parts in a key above which an override is rejected. Config keys have at most
-three parts."""
 
 
 class Config(Section):
@@ -71,7 +71,6 @@ class Config(Section):
         default_factory=lambda: AttractorsConfig.model_validate({})
     )
     ensemble: EnsembleConfig = Field(default_factory=lambda: EnsembleConfig.model_validate({}))
-    sweep: SweepConfig = Field(default_factory=lambda: SweepConfig.model_validate({}))
     pareto: ParetoConfig = Field(default_factory=lambda: ParetoConfig.model_validate({}))
     optimizer: OptimizerConfig = Field(default_factory=lambda: OptimizerConfig.model_validate({}))
     pump: PumpConfig | None = Field(None, description="absent: no leakage is reported")
@@ -86,7 +85,7 @@ class Config(Section):
     @model_validator(mode="before")
     @classmethod
     def _mounted(cls, data):
-        return mounted(data)
+        return mounted(without_removed(data))
 
     @property
     def design(self) -> NDArray[np.float64]:
@@ -345,8 +344,8 @@ class Config(Section):
         return yaml.safe_dump(data, sort_keys=False, allow_unicode=True)
 
 
+# Keys whose default follows other keys, each as (section, key).
 _FOLLOWING = (("contact", "smoothing_mm"), ("pump", "pressure_difference_Pa"))
-"""Keys whose default follows other keys, each as (section, key)."""
 
 
 def _followed(section: Any, key: str, value: Any) -> Any:

@@ -30,15 +30,15 @@ from rootsopt.config.section import (
 )
 from rootsopt.config.units import hint
 
+# Usual range (pitch radii) of a profile's lengths.
+#
+# If a length is outside its limits but would lie in this range in another unit, the message
+# suggests this unit.
 _USUAL = 0.01, 2.0
-"""Usual range (pitch radii) of a profile's lengths.
-
-If a length is outside its limits but would lie in this range in another unit, the message suggests
-this unit."""
 
 
+# Absolute value (mm) above which a coordinate of a rotor's axis is rejected.
 _FARTHEST = 1e5
-"""Absolute value (mm) above which a coordinate of a rotor's axis is rejected."""
 _Coordinate = Annotated[float, between(-_FARTHEST, _FARTHEST)]
 
 
@@ -251,8 +251,8 @@ class RotorConfig(Section):
     )
 
 
+# Length (characters) above which a text of the title block is rejected.
 _LONGEST = 60
-"""Length (characters) above which a text of the title block is rejected."""
 
 
 def _is_line(value: object) -> bool:
@@ -272,27 +272,22 @@ _Text = Annotated[
 
 
 class DrawingConfig(Section):
-    """What the title block of a drawing states, its inset, and how many points its table has.
+    """What the title block of a drawing states, and its inset.
 
     Nothing here is simulated."""
 
     title: _Text = Field("Roots rotor", description="title of the drawing")
-    number: _Text | None = Field(None, description="drawing number")
-    revision: _Text | None = Field(None, description="revision of the drawing")
-    drawn_by: _Text | None = Field(None, description="author of the drawing")
-    date: _Text | None = Field(None, description="date of the drawing, as text")
     material: _Text | None = Field(None, description="material, in quotes if it is a number")
     tolerance_mm: Annotated[float, between(1e-4, 10)] | None = Field(
         None, description="width of the tolerance zone of the flank (profile of a line, ISO 1101)"
     )
-    general_tolerance: _Text | None = Field(
-        None, description="tolerances of all other dimensions, as ISO 2768-mK"
+    title_block: dict[_Text, _Text] = Field(
+        default_factory=dict,
+        description="fields of the title block by heading, as {Drawing number: '4711', Revision: "
+        "A, Drawn by: J. Doe}",
     )
     inset_mm: Annotated[float, Field(ge=0, le=5)] = Field(
         0.0,
         description="distance along the normal by which the drawn rotor is smaller than its "
         "profile: half of contact.clearance_mm for rotors that are cut with their clearance",
-    )
-    points: Annotated[int, Field(ge=9, le=20_001)] = Field(
-        361, description="number of points over one lobe in rotor_points.csv"
     )

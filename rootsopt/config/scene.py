@@ -190,8 +190,8 @@ class HeatConfig(Section):
         return housing - self.rotor_expansion_per_K * self.rotor_warming_K
 
 
+# Greatest eccentricity (µm) of a gear, and greatest magnitude of its angle (°).
 _MOST_EYE, _MOST_TURN = 1000.0, 360.0
-"""Greatest eccentricity (µm) of a gear, and greatest magnitude of its angle (°)."""
 
 
 def _each_gear(low: float, high: float) -> Any:
@@ -365,21 +365,24 @@ class PumpConfig(Section):
         return self
 
 
+# Maximum default smoothing length (mm). A limit from `_SMOOTHING_SHARES` can be smaller.
 _MOST_SMOOTHING = 1e-4
-"""Maximum default smoothing length (mm). A limit from `_SMOOTHING_SHARES` can be smaller."""
+
+# Maximum default smoothing length, as a fraction of each of three lengths.
+#
+# `twist`: deflection of the timing gear under the full load, at the pitch radius. With a longer
+# smoothing length, the gear would work in the rounded edge of its backlash, where its stiffness
+# differs. `depth`: penetration of the flanks under the full load. `damping`: penetration at which
+# the damping is full.
 _SMOOTHING_SHARES = {"twist": 0.05, "depth": 0.02, "damping": 0.1}
-"""Maximum default smoothing length, as a fraction of each of three lengths.
 
-`twist`: deflection of the timing gear under the full load, at the pitch radius. With a longer
-smoothing length, the gear would work in the rounded edge of its backlash, where its stiffness
-differs. `depth`: penetration of the flanks under the full load. `damping`: penetration at which the
-damping is full."""
+# Minimum default smoothing length (mm).
+#
+# A shorter length would need more solver steps and make the gradient less accurate.
 _LEAST_SMOOTHING = 1e-6
-"""Minimum default smoothing length (mm).
 
-A shorter length would need more solver steps and make the gradient less accurate."""
+# Load torque (N·m) below which the smoothing length does not depend on the load.
 _LEAST_TORQUE = 1e-3
-"""Load torque (N·m) below which the smoothing length does not depend on the load."""
 
 
 def following_mm(
@@ -394,8 +397,7 @@ def following_mm(
     stiffness of the timing gear (N·m/rad), `None` without a gear. `contact`: stiffness (N/mm^e),
     exponent e and depth of full damping (mm) of the flanks.
 
-    This smoothing changes the forces by less than 1e-4 of their values. The command `python -m
-    experiments smoothing` measures this."""
+    This smoothing changes the forces by less than 1e-4 of their values."""
     torque = max(load_torque, _LEAST_TORQUE)
     stiffness, exponent, full = contact
     force = torque / (pitch_radius_mm * 1e-3)

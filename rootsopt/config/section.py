@@ -99,14 +99,9 @@ class Section(BaseModel):
         found = dict(data)
         for name, value in data.items():
             field = cls.model_fields.get(name)
-            if field is None or not isinstance(value, str | dict):
-                continue
-            words = {bare(word): word for word in choices(field)}
-            if isinstance(value, str):
+            if field is not None and isinstance(value, str):
+                words = {bare(word): word for word in choices(field)}
                 found[name] = words.get(bare(value), value)
-                continue
-            right = {words.get(bare(str(key)), key): inner for key, inner in value.items()}
-            found[name] = right if len(right) == len(value) else value
         return found
 
 

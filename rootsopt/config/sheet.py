@@ -75,11 +75,12 @@ def line_stiffness(modulus: float, poisson: float, length: float) -> float:
     return (length**0.8 / 1.36) ** LINE * modulus * 1e3 / (2 * (1 - poisson**2))
 
 
+# One bar (Pa); penetration (mm) at which the damping of the flanks is full; damping ratio of
+# flanks and timing gear; column in which comments start.
 _BAR, _DEPTH, _RATIO, _COLUMN = 1e5, 1e-3, 0.1, 40
-"""One bar (Pa); penetration (mm) at which the damping of the flanks is full; damping ratio of
-flanks and timing gear; column in which comments start."""
+
+# Values by dotted key, each with a comment on where it is from.
 _Entries = dict[str, tuple[Any, str]]
-"""Values by dotted key, each with a comment on where it is from."""
 _Length = Annotated[float, between(1, 2e4)]
 _Pressure = Annotated[float, between(1e-5, 1e3)]
 _Optional = Annotated[float, between(1e-6, 1e6)] | None

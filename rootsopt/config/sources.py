@@ -47,8 +47,9 @@ def regular_file(path: str | os.PathLike, what: str) -> Path:
 
 
 _PACKAGE = Path(__file__).parents[1]
+
+# Folders of the configs: in an installed package, and in the source tree.
 _PLACES = _PACKAGE / "configs", _PACKAGE.parent / "configs"
-"""Folders of the configs: in an installed package, and in the source tree."""
 _SUFFIX = ".yaml"
 
 

@@ -9,14 +9,12 @@ from pydantic import Field, model_validator
 from rootsopt.config.families import Parameter, families, parameters
 from rootsopt.config.section import (
     Among,
-    Increasing,
     Listed,
     Order,
     Section,
     Seed,
     Speed,
     Weight,
-    bare,
     between,
     number,
     require,
@@ -27,31 +25,16 @@ from rootsopt.config.words import named, shown
 
 NEAREST = "nearest"
 """Word in `optimizer.family` for the named family that is nearest to an outline."""
+
+# Sum of all weights below which an objective is rejected as empty.
 _LEAST_WEIGHT = 1e-6
-"""Sum of all weights below which an objective is rejected as empty."""
+
+# Number of spectral lines above which an objective is rejected.
 _MOST_LINES = 32
-"""Number of spectral lines above which an objective is rejected."""
-
-
-_SEARCHED = "contact is always found by the search, the most accurate of the former models"
-_REMOVED: dict[str, tuple[tuple[Any, ...], str]] = {
-    "fidelity": (("search",), _SEARCHED),
-    "nodes": ((400,), _SEARCHED),
-    "map_error": ((1e-4,), _SEARCHED),
-    "map_rolls": ((None,), _SEARCHED),
-    "map_relatives": ((None,), _SEARCHED),
-    "gradient": (("forward",), "both modes of differentiation gave the same gradient"),
-    "orbit": (("auto", "collocation"), "collocation closes orbits; an integration confirms them"),
-    "precision": (("float64",), "motions are integrated in double precision"),
-}
-"""Keys of former versions: (values that are still true, among them the default, which a resolved
-config holds; why the key was removed)."""
-_REMOVED_METHODS = ("dopri5", "kvaerno3", "kvaerno5")
-"""Values of `solver.method` of former versions."""
 
 
 class SolverConfig(Section):
-    """Settings of the simulation: accuracy, integration method, tolerances and limits."""
+    """Settings of the simulation: accuracy, integration method, tolerance and limits."""
 
     accuracy: Annotated[float, Field(ge=1e-9, le=0.1)] = Field(
         1e-5,
@@ -60,12 +43,8 @@ class SolverConfig(Section):
     )
     slices: Annotated[int, Field(ge=1, le=64)] | None = Field(
         None,
-        description="slices (Gauss points) along twisted rotors; absent: as many as slice_error "
-        "needs",
-    )
-    slice_error: Annotated[float, Field(ge=1e-6, le=0.1)] = Field(
-        1e-2,
-        description="mean error of the contact torque of twisted rotors, relative to its maximum",
+        description="slices (Gauss points) along twisted rotors; absent: as many as a mean error "
+        "of 1 % in the contact torque allows",
     )
     method: Literal["tsit5", "dopri8"] = Field(
         "tsit5", description="Runge-Kutta method, of order 5 or 8 (cheaper below an rtol of 1e-10)"
@@ -74,9 +53,6 @@ class SolverConfig(Section):
         None,
         description="tolerance on the orbit and its statistics, refined where the orbit does not "
         "close; absent: accuracy / 1000",
-    )
-    transient_rtol: Annotated[float, Field(ge=1e-12, le=1e-2)] | None = Field(
-        None, description="tolerance during the transient; absent: accuracy / 100"
     )
     max_steps_per_period: Annotated[int, Field(ge=64, le=10**6)] = Field(
         4096, description="solver steps allowed per mesh period"
@@ -90,27 +66,6 @@ class SolverConfig(Section):
         "gear, the next whole revolution",
     )
 
-    @model_validator(mode="before")
-    @classmethod
-    def _former(cls, data):
-        """Drop keys of former versions. Reject values that would now have no effect."""
-        if not isinstance(data, dict):
-            return data
-        for key in _REMOVED.keys() & data.keys():
-            (accepted, reason), value = _REMOVED[key], data[key]
-            if value not in accepted and bare(str(value)) not in accepted:
-                raise ValueError(
-                    f"`solver.{key}` must be left out, but is {shown(value)}: {reason}; remove it, "
-                    "and set `solver.accuracy` to trade accuracy for time"
-                )
-        method = data.get("method")
-        if isinstance(method, str) and bare(method) in _REMOVED_METHODS:
-            raise ValueError(
-                f"`solver.method` must be tsit5 or dopri8, but is {shown(method)}, which was "
-                "removed: it was rarely faster; leave the key out"
-            )
-        return {key: value for key, value in data.items() if key not in _REMOVED}
-
     @property
     def orbit_tolerance(self) -> float:
         """Relative tolerance on the orbit and its statistics."""
@@ -119,7 +74,7 @@ class SolverConfig(Section):
     @property
     def transient_tolerance(self) -> float:
         """Relative tolerance during the transient."""
-        return self.transient_rtol or self.accuracy / 100
+        return self.accuracy / 100
 
 
 _Share = Annotated[float, between(1e-6, 1e6)]
@@ -247,10 +202,6 @@ class ResponseConfig(Section):
     )
 
 
-_Milliradians = Annotated[tuple[Annotated[float, between(-1e3, 1e3)], ...], Listed, Increasing]
-_Rates = Annotated[tuple[Annotated[float, between(-1e6, 1e6)], ...], Listed, Increasing]
-
-
 class AttractorsConfig(Section):
     """Grid of initial states for `rootsopt attractors`, which finds coexisting motions."""
 
@@ -259,13 +210,6 @@ class AttractorsConfig(Section):
     )
     rates: Annotated[int, Field(ge=1, le=1000)] = Field(
         9, description="number of initial relative speeds"
-    )
-    relative_range_mrad: _Milliradians | None = Field(
-        None, description="(low, high) of the relative rotation; absent: backlash and contact"
-    )
-    rate_range_rad_s: _Rates | None = Field(
-        None,
-        description="(low, high) of the relative speed; absent: up to twice the speed of impacts",
     )
 
 
@@ -292,31 +236,6 @@ class EnsembleConfig(Section):
     seed: Seed = Field(0, description="seed of states and designs")
 
 
-def _is_range(wanted: dict[str, float]) -> bool:
-    """Return whether a range has ends in ascending order and a whole number of points."""
-    low, high, points = (wanted.get(key, -1) for key in ("from", "to", "points"))
-    return 0 <= low < high and points == int(points) and 2 <= points <= 10_000
-
-
-_Range = Annotated[
-    dict[Literal["from", "to", "points"], Annotated[float, between(1e-2, 1e6)]],
-    such(
-        "{from: .., to: .., points: ..} with from below to and 2 to 10000 points",
-        _is_range,
-    ),
-]
-
-
-class SweepConfig(Section):
-    """The speeds of `rootsopt sweep`."""
-
-    speed_rpm: _Range | None = Field(
-        None,
-        description="{from: 300, to: 6000, points: 39}; absent: `objective.speeds_rpm`, or if "
-        "empty 39 speeds from 0.1 to 2 times `scene.speed_rpm`",
-    )
-
-
 BASELINE = "baseline"
 """Value of a limit that stands for the baseline's own value of the quantity."""
 _Own = Literal["baseline"]
@@ -326,6 +245,8 @@ _Finite = _Own | Annotated[float, between(-1e12, 1e12)]
 
 
 _LINE = re.compile(r"line_.+_force_N")
+
+# Quantities that are never above the next one of their row.
 _CHAINS = (
     ("mean_force_N", "rms_force_N", "peak_norm_force_N", "peak_force_N"),
     ("bearing_load_equivalent_N", "bearing_load_max_N"),
@@ -333,17 +254,18 @@ _CHAINS = (
     ("flank_gap_min_um", "flank_gap_mean_um"),
     ("root_radius_mm", "outer_radius_mm"),
 )
-"""Quantities that are never above the next one of their row."""
+
+# Amplitude of a spectral line above which no force without a negative value comes, as multiples
+# of these. The first is that of short pulses, the last that of a square wave. The second follows
+# from the first: mean² + amplitude² / 2 ≤ RMS².
 _LINE_SHARES = {
     "mean_force_N": 2.0,
     "rms_force_N": 2 / math.sqrt(3),
     "peak_force_N": 2 / math.pi,
 }
-"""Amplitude of a spectral line above which no force without a negative value comes, as multiples of
-these. The first is that of short pulses, the last that of a square wave. The second follows from
-the first: mean² + amplitude² / 2 ≤ RMS²."""
+
+# Quantities that are magnitudes of forces, and never negative, like spectral lines.
 _SIZES = {*_CHAINS[0], *_CHAINS[1], *_CHAINS[2], "axial_force_max_N", "tilting_moment_max_N_m"}
-"""Quantities that are magnitudes of forces, and never negative, like spectral lines."""
 
 
 def _above(name: str) -> list[tuple[str, float]]:
@@ -459,18 +381,10 @@ _Bounds = Annotated[
 
 
 class OptimizerConfig(Section):
-    """Method, starts and bounds of the optimisation."""
+    """Starts, family and bounds of the optimisation."""
 
-    method: Literal["auto", "slsqp", "adam", "rmsprop", "sgd"] = Field(
-        "auto",
-        description="slsqp: sequential quadratic programming, converges to a certified optimum; "
-        "adam, rmsprop, sgd: optax update rules; auto: slsqp, or adam for an ensemble",
-    )
-    learning_rate: Annotated[float, between(1e-6, 10)] = Field(
-        0.05, description="step of an optax update rule, in bounds scaled to the unit box"
-    )
     iterations: Annotated[int, Field(ge=1, le=10000)] = Field(
-        40, description="iterations per start; for slsqp, designs simulated per start"
+        40, description="designs simulated per start; for an ensemble, iterations"
     )
     starts: Annotated[int, Field(ge=1, le=64)] = Field(2, description="number of local searches")
     screening: Annotated[int, Field(ge=0, le=4096)] = Field(

@@ -23,12 +23,17 @@ _Distribution = Annotated[
     such("one distribution, as in {normal: 0.002}", lambda given: len(given) == 1),
 ]
 _SECTIONS = ("rotor", "contact", "scene")
+
+# Keys in `_SECTIONS` that cannot scatter: they are not quantities of the simulated pair.
 _NOT_PHYSICAL = ("rotor.helix_deg", "contact.smoothing_mm")
-"""Keys in `_SECTIONS` that cannot scatter: they are not quantities of the simulated pair."""
+
+# Name of the kind of `Scatter` for keys whose values `conditions` list.
 _LISTED = "listed"
-"""Name of the kind of `Scatter` for keys whose values `conditions` list."""
+
+# Mounting errors in the section `scene`. Their nominal value is 0 unless a config gives it.
 _MOUNTING = "center_distance_error_mm", "phase_error_mrad"
-"""Mounting errors in the section `scene`. Their nominal value is 0 unless a config gives it."""
+
+# Common words for quantities, each with the key that the user probably means.
 _PLAIN = {
     "profile_offset": "contact.clearance_mm",
     "clearance": "contact.clearance_mm",
@@ -40,7 +45,6 @@ _PLAIN = {
     "speed": "scene.speed_rpm",
     "friction": "contact.friction.kinetic",
 }
-"""Common words for quantities, each with the key that the user probably means."""
 
 
 class Scatter(NamedTuple):
@@ -59,6 +63,10 @@ class Scatter(NamedTuple):
     half: float
 
 
+# Standard deviations at which normal distributions are cut off.
+_CUT = 4.0
+
+
 class TolerancesConfig(Section):
     """Scatter of scene and design, for a robust optimum. Without this section, nothing scatters."""
 
@@ -72,9 +80,6 @@ class TolerancesConfig(Section):
         default_factory=dict,
         description="scenes by name, instead of `over` and a sample: values of keys, as "
         "{new: {}, worn: {contact.wear.depth_mm: 0.03}}",
-    )
-    normal_limit: Annotated[float, between(0.5, 8)] = Field(
-        4.0, description="standard deviations at which normal distributions are cut off"
     )
     samples: Annotated[int, Field(ge=2, le=1024)] = Field(
         16, description="scenes simulated for each design of the search: a fixed Sobol sample"
@@ -163,7 +168,7 @@ class TolerancesConfig(Section):
                     f"`{key}` is 0; give the width in the key's unit"
                 )
             size = width * abs(nominal) if kind != name else width
-            half = self.normal_limit * size if kind == "normal" else size
+            half = _CUT * size if kind == "normal" else size
             found.append(Scatter(key, kind, nominal, size, half))
         return tuple(found)
 
@@ -287,6 +292,8 @@ _Spread = Annotated[
     such("one range, as in {factor: [0.8, 1.2]}", lambda given: len(given) == 1),
 ]
 _CLEARANCE = "contact.clearance_mm"
+
+# Usual ranges, as multiples of the config's value, of what a designer seldom knows.
 _FACTORS = {
     "scene.speed_rpm": (0.8, 1.2),
     "scene.load.torque_N_m": (0.6, 1.6),
@@ -296,10 +303,10 @@ _FACTORS = {
     "scene.timing_gear.damping_ratio": (0.6, 1.4),
     "contact.stiffness_N_per_mm_e": (0.7, 1.4),
 }
-"""Usual ranges, as multiples of the config's value, of what a designer seldom knows."""
+
+# Half of the usual range of the clearance: the first number (mm), or the second one as a fraction
+# of the config's value, whichever is more.
 _CLEARANCES = 0.015, 0.5
-"""Half of the usual range of the clearance: the first number (mm), or the second one as a fraction
-of the config's value, whichever is more."""
 
 
 class Span(NamedTuple):

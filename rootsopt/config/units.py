@@ -44,8 +44,9 @@ _UNITS: dict[str, tuple[str, dict[str, float]]] = {
 }
 
 _SPELT = str.maketrans({"·": "_", "/": "_per_", "³": "3", "²": "2", "µ": "u", "(": "", ")": ""})
+
+# Units as they are spelt in names of keys.
 _SHORT = {"metres": "m", "centimetres": "cm", "micrometres": "um", "radians": "rad"}
-"""Units as they are spelt in names of keys."""
 
 
 def unit_of(key: str) -> str:

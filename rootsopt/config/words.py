@@ -7,8 +7,9 @@ from typing import Any
 
 LONGEST = 500
 """Length (characters) above which a message about a config is shortened."""
+
+# Lengths (characters) of a string value, a key and a path above which a message shortens them.
 _VALUE, _NAME, _PATH = 80, 60, 160
-"""Lengths (characters) of a string value, a key and a path above which a message shortens them."""
 
 
 class _Bounded(reprlib.Repr):

@@ -105,7 +105,6 @@ class Contact(eqx.Module):
     def in_slice(self, number: Int[Array, ""]) -> "Contact":
         """Return the contact in the slice with the index `number`; by default, this contact
         itself."""
-        del number
         return self
 
     @property
@@ -127,7 +126,6 @@ class Contact(eqx.Module):
         """Return the contact of the same flanks at another centre `distance` (m).
 
         Raises `InputError` if the contact supports only the nominal distance."""
-        del distance
         raise self._lacks("another centre distance", "displaced axes need")
 
     def approach(self, roll: Float[Array, ""], relative: Float[Array, ""]) -> Approach:
@@ -143,7 +141,6 @@ class Contact(eqx.Module):
 
         `roll`, `relative`: x and ε (rad). Raises `InputError` if the contact cannot compute the
         point."""
-        del roll, relative, approach
         raise self._lacks("the point of contact", "friction and supports need")
 
     def switches(self, roll: Float[Array, ""], approach: Approach) -> Bool[Array, " s"]:
@@ -151,7 +148,6 @@ class Contact(eqx.Module):
 
         `approach`: result of `approach` at the same pose. A flag changes wherever a derivative of
         the gap jumps."""
-        del roll, approach
         return jnp.zeros(0, bool)
 
     def margins(self, roll: Float[Array, ""], approach: Approach) -> Float[Array, " s"]:
@@ -165,7 +161,6 @@ class Contact(eqx.Module):
         """Return the contact for one side of the flanks; by default, this contact itself.
 
         `side`: 1 for the drive flanks, -1 for the coast flanks."""
-        del side
         return self
 
     def _lacks(self, what: str, why: str) -> InputError:

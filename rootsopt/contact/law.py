@@ -52,7 +52,6 @@ class ContactLaw(eqx.Module):
 
         `depth`: penetration (m); `rate`: its rate (m/s). By default, the only flag says whether
         there is penetration."""
-        del rate
         return jnp.stack([depth > 0])
 
     def margins(self, depth: Float[Array, ""], rate: Float[Array, ""]) -> Float[Array, " s"]:
@@ -61,7 +60,6 @@ class ContactLaw(eqx.Module):
         `depth`, `rate`: as in `switches`. Each number passes smoothly through zero where its flag
         changes. Margins of a class that overrides only `switches` are not used (see
         `flanks.margins_of`)."""
-        del rate
         return jnp.stack([depth])
 
     def stiffness_at(self, depth: Float[Array, ""]) -> Float[Array, ""]:

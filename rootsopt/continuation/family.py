@@ -34,12 +34,13 @@ LONGEST = 8
 SPAN = 20.0
 """Change of the scaled state that has the same length as the whole range of the parameter, when
 step lengths are measured."""
+
+# Number of uniform instants on an orbit at which it is checked whether the rotors run as a pair.
 _LOOKS = 504
-"""Number of uniform instants on an orbit at which it is checked whether the rotors run as a
-pair."""
+
+# Distance (unit of `StepSizes`) between the states at the start and the middle of an orbit below
+# which the orbit has half the period.
 _HALF_ALIKE = 1e-5
-"""Distance (unit of `StepSizes`) between the states at the start and the middle of an orbit below
-which the orbit has half the period."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -235,6 +236,3 @@ def _follow(over: _Range, start: Any, guess: Float[Array, " m"], across: Float[A
     half_way = jnp.max(jnp.abs(states[_LOOKS // 2] - made.found.state)) / SPAN
     sound = pair.sound & over.at(guess[-1])[0].sound
     return made, (half_way, unit, jnp.any(jax.vmap(pair.lost)(states)), sound)
-
-
-__all__ = ["SPAN", "BranchPoint", "OrbitFamily"]

@@ -289,7 +289,6 @@ def kink_margins(pair: "RotorPair", motion: Motion, acting, touches: Any) -> Mar
         return values, pair.law(touch.depth, touch.closing) > 0, touch.approach.place
 
     def of_section(section, motion, side, touch):
-        del motion
         if pair.two_sided:
             return jax.vmap(functools.partial(of_flank, section.contact))(side, touch)
         found = of_flank(section.contact, side, touch)
@@ -331,8 +330,8 @@ def has_margins(kind: type, flags: str = "switches") -> bool:
     return places[0] <= places[1]
 
 
+# Methods that return margins, keyed by those that return flags.
 _MARGINS = {"switches": "margins", "drag_switches": "drag_margins"}
-"""Methods that return margins, keyed by those that return flags."""
 
 
 def pushes_of(pair: "RotorPair", motion: Motion) -> Pushes:

@@ -13,12 +13,15 @@ from rootsopt.dynamics.pair import RotorPair
 
 LONGEST = 8
 """Maximum length of an orbit (mesh periods), rounded up by `RotorPair.whole`."""
+
+# Minimum number of pieces into which one mesh period is divided.
 _EVEN = 128
-"""Minimum number of pieces into which one mesh period is divided."""
+
+# Maximum number of instants at which flags change, and number of bisections that locate them.
 _FLAGS, _HALVED = 64, 40
-"""Maximum number of instants at which flags change, and number of bisections that locate them."""
+
+# Length (mesh periods) below which a piece counts as empty. Many corners coincide.
 _EMPTY = 1e-13
-"""Length (mesh periods) below which a piece counts as empty. Many corners coincide."""
 
 
 def smooth_pieces(
@@ -59,6 +62,3 @@ def smooth_pieces(
     empty = ends - begins < _EMPTY
     order = jnp.argsort(empty)
     return begins[order], ends[order], jnp.sum(~empty)
-
-
-__all__ = ["LONGEST", "smooth_pieces"]

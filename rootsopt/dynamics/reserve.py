@@ -27,12 +27,13 @@ from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.pieces import smooth_pieces
 from rootsopt.dynamics.varied import VariedOrbit
 
+# Number of positions of rotor 2 at which the least gap is computed. Newton's method leads from
+# one to the next; the gap is nearly linear in the position.
 _NEWTON = 6
-"""Number of positions of rotor 2 at which the least gap is computed. Newton's method leads from one
-to the next; the gap is nearly linear in the position."""
+
+# Greatest move towards the middle of the backlash, as a share of the distance from it. Without
+# clearance, flanks part only in the middle, where the other flanks touch.
 _INWARDS = 0.9999
-"""Greatest move towards the middle of the backlash, as a share of the distance from it. Without
-clearance, flanks part only in the middle, where the other flanks touch."""
 INSTANTS = 96
 """Number of instants over an orbit at which `gaps` are computed."""
 
@@ -201,6 +202,3 @@ def gear_torque(
     places = around(orbit.elements.mesh, sizes, times)[:, None]
     _, (peak,), (by_peak,) = located(size, pair, tangents, orbit, places, 1)
     return jnp.stack([mean, peak, rms]), jnp.stack([by_mean, by_peak, by_rms])
-
-
-__all__ = ["INSTANTS", "Apart", "apart", "gaps", "gear_torque", "reserve"]

@@ -44,6 +44,3 @@ def varied(found: Steady) -> VariedOrbit:
     The motion must have been found with `Solver.variation`."""
     assert found.orbit.variation is not None
     return VariedOrbit(found.known.elements, found.orbit.variation)
-
-
-__all__ = ["VariedOrbit", "varied"]

@@ -20,11 +20,12 @@ from rootsopt.profiles import Geometry, Profile, geometry
 from rootsopt.runtime.environment import say
 from rootsopt.runtime.programs import CachedFunction
 
+# Distance along the outline (fraction of the outline's length) below which two points count as
+# one.
 _SAME = 1e-9
-"""Distance along the outline (fraction of the outline's length) below which two points count as
-one."""
+
+# Number of points of a piece between which crossings are sought.
 _SAMPLES = 65
-"""Number of points of a piece between which crossings are sought."""
 
 
 class Coordinates(NamedTuple):
@@ -111,8 +112,9 @@ def _falls(function: Callable[[Any], Any]) -> Iterator[float]:
 
 
 _MM = 1e3
+
+# Length (characters) above which a line of design parameters is broken.
 _LINE = 72
-"""Length (characters) above which a line of design parameters is broken."""
 _shape = CachedFunction(geometry)
 
 
@@ -123,8 +125,7 @@ class Drawing:
     `pieces`: closed outline (mm); `pitch_radius`, `outer_radius`: radii (mm); `lobes`: number of
     lobes; `length`: axial length (mm); `helix_deg`: twist over the length (°); `bore`: bore
     diameter (mm), `None` for a rotor without a bore; `notes`: lines of text with the dimensions.
-    `root_radius`: radius (mm); `block`: (heading, text) of each field of the title block; `points`:
-    number of points over a lobe in the table of coordinates.
+    `root_radius`: radius (mm); `block`: (heading, text) of each field of the title block.
     """
 
     pieces: list[DrawnPiece]
@@ -137,7 +138,6 @@ class Drawing:
     notes: tuple[str, ...]
     root_radius: float
     block: tuple[tuple[str, str], ...]
-    points: int
 
     @classmethod
     def of(cls, config: Config, profile: Profile, design: dict[str, float]) -> "Drawing":
@@ -184,7 +184,6 @@ class Drawing:
             notes=tuple(note for note in notes if note),
             root_radius=root,
             block=_block(config),
-            points=(config.drawing or DrawingConfig.model_validate({})).points,
         )
 
     @property
@@ -206,19 +205,19 @@ def _block(config: Config) -> tuple[tuple[str, str], ...]:
     tolerance = stated.tolerance_mm
     texts = {
         "Title": stated.title,
-        "Drawing number": stated.number,
-        "Revision": stated.revision,
+        "Drawing number": None,
+        "Revision": None,
         "Material": stated.material or f"density {config.rotor.density_kg_m3:g} kg/m3",
         "Flank, profile of a line": None if tolerance is None else f"{tolerance:g} mm (ISO 1101)",
-        "General tolerances": stated.general_tolerance,
+        "General tolerances": None,
         "Rotor": f"{profile.family}, {profile.lobes} lobes, length {config.rotor.length_mm:g} mm",
         "Centre distance": f"{2 * profile.pitch_radius_mm:g} mm",
         "Designed for": _scene(config),
-        "Drawn by": stated.drawn_by,
-        "Date": stated.date,
+        "Drawn by": None,
+        "Date": None,
         "Scale, unit": "1:1, mm",
         "Program": f"rootsopt {rootsopt.__version__}",
-    }
+    } | stated.title_block
     return tuple((name, text or "-") for name, text in texts.items())
 
 
@@ -236,12 +235,12 @@ def _scene(config: Config) -> str:
     return ", ".join(words)
 
 
+# Style sheet of the drawing. Line widths and dash lengths are in mm.
 _STYLE = (
     ".outline{fill:#dbe9f4;fill-rule:evenodd;stroke:#000;stroke-width:.5}"
     ".pitch{fill:none;stroke:#0072b2;stroke-width:.25;stroke-dasharray:6 1.5 .5 1.5}"
     ".center{fill:none;stroke:#808080;stroke-width:.25;stroke-dasharray:9 1.5 2 1.5}"
 )
-"""Style sheet of the drawing. Line widths and dash lengths are in mm."""
 
 
 def svg_text(drawing: Drawing) -> str:

@@ -14,6 +14,8 @@ OUTLINE, BORE, PITCH, CENTER, TEXT = "OUTLINE", "BORE", "PITCH_CIRCLE", "CENTER_
 """Names of the DXF layers: outline, bore, pitch circle, centre lines and notes."""
 CIRCLES, DIMENSIONS, TITLE, TABLE = "CIRCLES", "DIMENSIONS", "TITLE_BLOCK", "TABLE"
 """Names of the DXF layers: outer and root circle, dimensions, title block, coordinates."""
+
+# Colour index of AutoCAD (7 is black on white), line type, line width (1/100 mm) of each layer.
 _STYLES = {
     OUTLINE: (7, "CONTINUOUS", 50),
     BORE: (7, "CONTINUOUS", 50),
@@ -25,16 +27,18 @@ _STYLES = {
     TITLE: (7, "CONTINUOUS", 25),
     TABLE: (8, "CONTINUOUS", 13),
 }
-"""Colour index of AutoCAD (7 is black on white), line type, line width (1/100 mm) of each layer."""
 _MILLIMETRES = 4
 STYLE = "ROTOR"
 """Name of the dimension style."""
+
+# Number of points from tip to root in the table of the drawing.
 _ROWS = 19
-"""Number of points from tip to root in the table of the drawing."""
+
+# Width of a letter as a fraction of its height, with room to spare.
 _LETTER = 0.9
-"""Width of a letter as a fraction of its height, with room to spare."""
+
+# Colour index of lines that have the colour of their layer.
 _BY_LAYER = 256
-"""Colour index of lines that have the colour of their layer."""
 
 
 def add_style(document: Any, drawing: Drawing) -> None:

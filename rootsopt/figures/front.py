@@ -3,7 +3,7 @@
 import itertools
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,8 +12,11 @@ from rootsopt.config.units import words
 from rootsopt.figures.style import BLUE, COLORS, DASHES, GREY, ORANGE, VERMILION, figure, write
 from rootsopt.output.files import ResultFolder
 from rootsopt.status import Standing
-from rootsopt.tradeoffs.front import Front
 
+if TYPE_CHECKING:
+    from rootsopt.tradeoffs.front import Front
+
+# Look of each kind of point.
 _LOOKS: dict[str, dict[str, Any]] = {
     "certified": {"marker": "o", "color": BLUE, "markersize": 6.5},
     "not certified": {"marker": "o", "color": BLUE, "markersize": 6.5, "markerfacecolor": "white"},
@@ -22,7 +25,6 @@ _LOOKS: dict[str, dict[str, Any]] = {
     "side of a gap": {"marker": "o", "color": ORANGE, "markersize": 13, "markerfacecolor": "none"},
     "baseline": {"marker": "*", "color": VERMILION, "markersize": 13},
 }
-"""Look of each kind of point."""
 
 
 def kinds(result: Mapping[str, Any]) -> dict[str, list[Mapping[str, Any]]]:
@@ -45,7 +47,7 @@ def kinds(result: Mapping[str, Any]) -> dict[str, list[Mapping[str, Any]]]:
     return {kind: group for kind, group in found.items() if group}
 
 
-def plot_front(ax: Axes, front: Front, x: str, y: str) -> Axes:
+def plot_front(ax: Axes, front: "Front", x: str, y: str) -> Axes:
     """Draw the points of a front with the term `x` across and the term `y` up.
 
     Lines connect neighbours, but not across a gap. For three terms, colours show the third. Return
@@ -75,7 +77,7 @@ def _axis(aim) -> str:
     return f"{aim.label}, {better}"
 
 
-def front_figure(folder: ResultFolder, front: Front) -> None:
+def front_figure(folder: ResultFolder, front: "Front") -> None:
     """Write front.png, the front in one panel for each pair of terms.
 
     With two terms, a panel below shows the designs along the front, in units of their bounds."""
@@ -95,7 +97,7 @@ def front_figure(folder: ResultFolder, front: Front) -> None:
     write(folder, "front", made, title, axes[0, 0].get_legend_handles_labels()[0], 6)
 
 
-def plot_designs(ax: Axes, front: Front, x: str) -> Axes:
+def plot_designs(ax: Axes, front: "Front", x: str) -> Axes:
     """Draw the design parameters along a front over the term `x`, each in units of its bounds.
 
     Lines are interrupted at gaps. Return `ax`."""
@@ -113,6 +115,3 @@ def plot_designs(ax: Axes, front: Front, x: str) -> Axes:
     ax.set(xlabel=_axis(aim), ylabel="design (0: lower, 1: upper bound)", ylim=(-0.05, 1.05))
     ax.legend(frameon=False, fontsize=8, ncols=math.ceil(len(keys[:12]) / 4))
     return ax
-
-
-__all__ = ["front_figure", "kinds", "plot_designs", "plot_front"]

@@ -141,13 +141,14 @@ def _outside(ax, history):
         ax.plot([], [], "o", color=GREY, markerfacecolor="white", label="constraint not met")
 
 
+# Number of characters above which the name of a limit is shortened.
 _WIDEST = 40
-"""Number of characters above which the name of a limit is shortened."""
 
+# Columns of `feasible.csv` after the two parameters.
 _FEASIBLE = "slack", "objective"
-"""Columns of `feasible.csv` after the two parameters."""
+
+# Minimum range of the axis of objectives, so that differences by rounding do not show.
 _RANGE = 0.01
-"""Minimum range of the axis of objectives, so that differences by rounding do not show."""
 
 
 def plot_residual(ax: Axes, history: Sequence[Mapping[str, Any]], required: float) -> Axes:

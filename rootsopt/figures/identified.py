@@ -16,15 +16,18 @@ if TYPE_CHECKING:
     from rootsopt.identification.answer import Identification
     from rootsopt.output.files import ResultFolder
 
+# Maximum number of measured columns that are drawn.
 _MOST = 3
-"""Maximum number of measured columns that are drawn."""
+
+# Highest order of the rotation that is drawn.
 _ORDERS = 24
-"""Highest order of the rotation that is drawn."""
+
+# Least amplitude that is drawn, as a share of the greatest sample.
 _FLOOR = 1e-5
-"""Least amplitude that is drawn, as a share of the greatest sample."""
+
+# Half axes of the region of two quantities that holds the true ones with 95 %, in standard
+# deviations: root of the quantile of χ².
 _INSIDE = 2.448
-"""Half axes of the region of two quantities that holds the true ones with 95 %, in standard
-deviations: root of the quantile of χ²."""
 
 
 def plot_record(ax: Axes, place: NDArray, measured: NDArray, fitted: NDArray) -> Axes:
@@ -99,6 +102,3 @@ def drawn(found: "Identification") -> Figure:
 def identified_figure(folder: "ResultFolder", found: "Identification") -> None:
     """Write `figures/identified.png` into `folder`."""
     write(folder, "identified", drawn(found), "Record and fit")
-
-
-__all__ = ["drawn", "identified_figure", "plot_orders", "plot_record", "plot_region"]

@@ -30,19 +30,23 @@ ROUND = 1e-9
 """Deviation (pitch radii) of a segment from a circle above which the segment is drawn as a spline,
 not as an arc."""
 _MM = 1e3
+
+# Number of points at which a segment is compared with a circle.
 _SAMPLES = 65
-"""Number of points at which a segment is compared with a circle."""
+
+# Positions between two nodes (fractions of their distance) at which a spline is compared with the
+# true flank.
 _BETWEEN = np.array([0.1, 0.3, 0.5, 0.7, 0.9])
-"""Positions between two nodes (fractions of their distance) at which a spline is compared with the
-true flank."""
 _MOST_NODES = 4096
+
+# Ratio of a spline's longest to its shortest knot span above which the spline is split in two.
+# Spans shrink towards a cusp. At a higher ratio, some programs make relative errors above 1e-6,
+# because they integrate over a whole edge with a fixed quadrature rule.
 _UNEVEN = 100
-"""Ratio of a spline's longest to its shortest knot span above which the spline is split in two.
-Spans shrink towards a cusp. At a higher ratio, some programs make relative errors above 1e-6,
-because they integrate over a whole edge with a fixed quadrature rule."""
+
+# Number of points evaluated at once. It is constant, so that one compiled program serves any
+# number of points.
 _BLOCK = 512
-"""Number of points evaluated at once. It is constant, so that one compiled program serves any
-number of points."""
 _GAUSS = np.polynomial.legendre.leggauss(8)
 
 

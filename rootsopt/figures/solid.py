@@ -28,14 +28,16 @@ CHORD = 0.005
 """Maximum distance (mm) between a facet of an STL file and the solid."""
 TURN = 0.05
 """Maximum angle (rad) between neighbouring facets of a curved face of an STL file."""
+
+# Maximum twist (rad) between adjacent knots of a helical face. With this step, a cubic spline
+# deviates from the rotation by 5e-8 of the radius.
 _STEP = np.pi / 48
-"""Maximum twist (rad) between adjacent knots of a helical face. With this step, a cubic spline
-deviates from the rotation by 5e-8 of the radius."""
+
+# Minimum number of knot spans of a face along the rotor's axis. A straight rotor would need only
+# one span. However, most programs compute the volume by the kernel's Gauss quadrature, which uses
+# more points with more spans. With one span, the computed volume has a relative error of 2e-4
+# next to a cusp, although the solid itself is exact to 1e-8.
 _SPANS = 8
-"""Minimum number of knot spans of a face along the rotor's axis. A straight rotor would need only
-one span. However, most programs compute the volume by the kernel's Gauss quadrature, which uses
-more points with more spans. With one span, the computed volume has a relative error of 2e-4 next to
-a cusp, although the solid itself is exact to 1e-8."""
 
 
 def require_kernel() -> None:

@@ -16,8 +16,9 @@ if TYPE_CHECKING:
     from rootsopt.output.files import ResultFolder
 
 _OBJECTIVE = "objective (baseline in the same scene = 1)"
+
+# Multiple of the 90 % quantile of the objectives at which their axis ends.
 _WIDE = 1.5
-"""Multiple of the 90 % quantile of the objectives at which their axis ends."""
 
 
 def plot_ranges(ax: Axes, keys: Sequence[Mapping[str, Any]], own: float) -> Axes:
@@ -94,10 +95,12 @@ _STYLES = {
     "nominal": (BLUE, "-"),
     "robust": (GREEN, (0, (4, 1.5))),
 }
+
+# Maximum number of bins of a histogram.
 _BINS = 50
-"""Maximum number of bins of a histogram."""
+
+# Least average number of scenes per bin, if there are few scenes.
 _PER_BIN = 6
-"""Least average number of scenes per bin, if there are few scenes."""
 PANELS = {"mean_force_N": "mean force (N)", "peak_force_N": "peak force (N)"}
 """Forces that `distributions` draws, with the labels of their axes."""
 

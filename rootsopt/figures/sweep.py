@@ -24,9 +24,10 @@ _KNOWN = {"periodic": "o", "averaged": "s", "chaotic": "x", "not_settled": "+", 
 _OTHERS = (status.label for status in Status if status.label not in _KNOWN)
 MARKERS = _KNOWN | dict(zip(_OTHERS, "v^<>d*phP2H3D4|X_8.", strict=False))
 """Marker of each status, by its label."""
+
+# Number of points above which a line has no markers at its steady motions, except at isolated
+# ones.
 _DENSE = 24
-"""Number of points above which a line has no markers at its steady motions, except at isolated
-ones."""
 LABELS = {key: label(key) for key in ("mean_force_N", "peak_force_N")}
 
 
@@ -107,10 +108,11 @@ def speed_figure(folder: ResultFolder, designs: Mapping[str, Sequence[Part]], ti
     write(folder, "speeds", made, title, legend_entries(designs))
 
 
+# What is drawn where no flanks touch.
 _APART = "contact_reserve_um", "gear_force_N"
-"""What is drawn where no flanks touch."""
+
+# Number of values of the second key above which it is drawn as a map, not as lines.
 _FEW = len(COLORS)
-"""Number of values of the second key above which it is drawn as a map, not as lines."""
 
 
 class _Axis:

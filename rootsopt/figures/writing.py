@@ -18,6 +18,9 @@ from rootsopt.scene import Scene
 POINTS = "rotor_points.csv"
 """Name of the table of coordinates, which is written beside the DXF drawing."""
 
+# Number of points over one lobe in this table, beside the ends of all pieces.
+_COUNT = 361
+
 
 def write(
     folder: ResultFolder,
@@ -41,7 +44,7 @@ def write(
     files: dict[str, bytes] = {}
     if "dxf" in formats:
         files["rotor.dxf"] = dxf_bytes(drawing)
-        found = coordinates(drawing.pieces, drawing.lobes, drawing.points)
+        found = coordinates(drawing.pieces, drawing.lobes, _COUNT)
         folder.write_csv(POINTS, found.columns())
     if "svg" in formats:
         files["rotor.svg"] = svg_text(drawing).encode()

@@ -22,36 +22,47 @@ from rootsopt.identification.record import Observed
 from rootsopt.identification.squares import TURN, Local, Problem
 from rootsopt.status import Status
 
+# Standard deviation of a combination, as a share of the range in which the search begins, above
+# which the record does not determine it.
 _LOOSE = 0.3
-"""Standard deviation of a combination, as a share of the range in which the search begins, above
-which the record does not determine it."""
+
+# Distance from a bound, as a share of this range, up to which a quantity lies at it.
 _NEAR = 1e-4
-"""Distance from a bound, as a share of this range, up to which a quantity lies at it."""
+
+# Share of a quantity in a combination below which it does not count.
 _PART = 0.1
-"""Share of a quantity in a combination below which it does not count."""
 STRUCTURED = 4.0
 """Value of `structure` above which residuals are not independent."""
+
+# Relative misfit below which residuals are errors of the simulation.
 _NUMERICAL = 1e-4
-"""Relative misfit below which residuals are errors of the simulation."""
+
+# Singular value of the derivatives, as a share of the greatest, below which it is an error of the
+# derivatives.
 _SINGULAR = 1e-5
-"""Singular value of the derivatives, as a share of the greatest, below which it is an error of the
-derivatives."""
+
+# Maximum number of fits that look for an end of an interval, and relative difference from the
+# quantile that ends the search.
 _LOOKS, _CLOSE = 6, 0.1
-"""Maximum number of fits that look for an end of an interval, and relative difference from the
-quantile that ends the search."""
+
+# Degrees of freedom from which on the errors may differ between samples (HC3).
 _ENOUGH = 50
-"""Degrees of freedom from which on the errors may differ between samples (HC3)."""
+
+# Probability of residuals this large, with the given standard deviations, below which these are
+# taken for too small.
 _UNLIKELY = 0.01
-"""Probability of residuals this large, with the given standard deviations, below which these are
-taken for too small."""
+
+# Relative error of a simulated orbit, which is the same in all samples.
 _EXACT = 1e-5
-"""Relative error of a simulated orbit, which is the same in all samples."""
+
+# Speeds of further measurements, as multiples of the config's.
 _SPEEDS = 0.5, 1.0, 2.0
-"""Speeds of further measurements, as multiples of the config's."""
+
+# Columns of further measurements.
 _FURTHER = CHANNELS[0], CHANNELS[1], CHANNELS[4], *CHANNELS[6:]
-"""Columns of further measurements."""
+
+# Relative error of a further measurement if the record has none.
 _USUAL = 0.01
-"""Relative error of a further measurement if the record has none."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -421,20 +432,3 @@ def adopted(config: Config, problem: Problem, best: Local) -> Config:
     values = {one.key: float(x) for one, x in zip(problem.quantities, best.values, strict=True)}
     values.pop(OFFSET, None)
     return config.replaced(values) if values else config
-
-
-__all__ = [
-    "STRUCTURED",
-    "Identification",
-    "Spread",
-    "adopted",
-    "caveats",
-    "combinations",
-    "further",
-    "parameters",
-    "profile",
-    "quality",
-    "relative_misfit",
-    "residuals",
-    "structure",
-]

@@ -22,8 +22,9 @@ CHANNELS = (
 )  # fmt: skip
 """Names of the sampled quantities: the columns of a response, then the torque of the timing gear on
 rotor 1 and that of the shaft that drives rotor 1."""
+
+# Number of samples computed by one call of the program: a record of any length needs one only.
 _TOGETHER = 8 * BLOCK
-"""Number of samples computed by one call of the program: a record of any length needs one only."""
 
 
 def channels_at(
@@ -79,6 +80,3 @@ def _values(pair: RotorPair, tau, state) -> Float[Array, " c"]:
     assert shaft is not None
     forces = contact.drive, contact.coast, contact.total
     return jnp.stack([motion.relative, motion.rate, *forces, contact.depth, gear, shaft])
-
-
-__all__ = ["CHANNELS", "channels_at"]

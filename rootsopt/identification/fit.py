@@ -36,25 +36,33 @@ from rootsopt.response.reporting import reporting
 from rootsopt.runtime.environment import check_precision
 from rootsopt.status import Status
 
+# Scenes that are tried for each quantity before local fits, and maximum number of simulations.
 _TRIED, _MOST = 16, 256
-"""Scenes that are tried for each quantity before local fits, and maximum number of simulations."""
+
+# Relative misfit above which other coexisting motions are tried.
 _POOR = 0.3
-"""Relative misfit above which other coexisting motions are tried."""
+
+# Relative misfit above which a scene does not explain the record.
 _NO_FIT = 0.7
-"""Relative misfit above which a scene does not explain the record."""
+
+# Distance between places from which local fits begin. Greatest multiple of the given number of
+# fits: more are made while residuals do not look random.
 _APART, _AGAIN = 0.15, 4
-"""Distance between places from which local fits begin. Greatest multiple of the given number of
-fits: more are made while residuals do not look random."""
+
+# Distance on the scales of the quantities up to which two optima are the same.
 _SAME = 0.01
-"""Distance on the scales of the quantities up to which two optima are the same."""
+
+# Ratio of losses up to which another optimum fits nearly as well.
 _NEARLY = 2.0
-"""Ratio of losses up to which another optimum fits nearly as well."""
+
+# Relative misfit up to which all optima fit as well as the best.
 _EQUAL = 1e-3
-"""Relative misfit up to which all optima fit as well as the best."""
+
+# Probability of the residuals, with given standard deviations, above which any misfit is noise.
 _CHANCE = 1e-3
-"""Probability of the residuals, with given standard deviations, above which any misfit is noise."""
+
+# Number of local fits in which standard deviations are estimated from the residuals.
 _PASSES = 3
-"""Number of local fits in which standard deviations are estimated from the residuals."""
 
 
 def identify(  # Keywords of the public interface, each independent of the others.
@@ -260,6 +268,3 @@ class _Search:
         """Return the entry `statistics` of the result file; `began`: start (s, `perf_counter`)."""
         seconds = time.perf_counter() - began
         return {"scenes_tried": self.tried, "fits": len(self.ends), "seconds": seconds}
-
-
-__all__ = ["identify"]

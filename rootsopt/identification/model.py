@@ -192,6 +192,3 @@ def predict(
 
     found = dict(as_done(work, range(len(points)), min(HERE.slots, len(points))))
     return [found[number] for number in range(len(points))]
-
-
-__all__ = ["Begin", "Point", "Predicted", "predict"]

@@ -19,11 +19,13 @@ from rootsopt.sweeps.points import configured
 OFFSET = "rotation_offset_deg"
 """The quantity of a record whose rotation is measured from an unknown angle: its reading minus the
 rotation of rotor 1 (°)."""
+
+# Ratio of bounds above which a search moves on a logarithmic scale.
 _WIDE = 30.0
-"""Ratio of bounds above which a search moves on a logarithmic scale."""
+
+# Without bounds, a search begins between the config's value over and times the first number. For
+# a value of 0, it begins within this share (the second) of the allowed range.
 _AROUND, _SMALL = 5.0, 0.02
-"""Without bounds, a search begins between the config's value over and times the first number. For a
-value of 0, it begins within this share (the second) of the allowed range."""
 
 
 class Fitted(NamedTuple):
@@ -156,6 +158,3 @@ def _allowed(config: Config, key: str) -> tuple[float, float]:
 def values_at(quantities: Sequence[Fitted], place: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the values (p,) of the quantities at a `place` (p,) on their scales."""
     return np.array([one.value(x) for one, x in zip(quantities, place, strict=True)])
-
-
-__all__ = ["OFFSET", "Fitted", "fitted", "values_at"]

@@ -25,16 +25,20 @@ from rootsopt.measured.table import measured_number, titled
 from rootsopt.response.reporting import is_force
 from rootsopt.response.terms import GEAR, RESERVES
 
+# Columns of a table of samples, as in `response_*.csv`; the time counts only without rotation.
 _ROTATION, _TIME = "rotation_deg", "time_s"
-"""Columns of a table of samples, as in `response_*.csv`; the time counts only without rotation."""
+
+# Ending of the names of columns with standard deviations, which `_sd` stands for, too.
 _SPREAD = "_std"
-"""Ending of the names of columns with standard deviations, which `_sd` stands for, too."""
+
+# Number of samples at an operating point above which only every second, third … one is used.
 _MOST = 4096
-"""Number of samples at an operating point above which only every second, third … one is used."""
+
+# Rotation (°) in 1 s at 1 rpm.
 _DEGREES_PER_RPM = 6.0
-"""Rotation (°) in 1 s at 1 rpm."""
+
+# Averages other than those of the force.
 _AVERAGES = *RESERVES, *GEAR
-"""Averages other than those of the force."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -192,6 +196,3 @@ def _check(config: Config, name: str, title: str, sampled: bool) -> None:
         f"({', '.join(told)}), a config key, or one of these with {_SPREAD} for its standard "
         f"deviations; {f'did you mean {meant}?' if meant else 'rename or remove it'}"
     )
-
-
-__all__ = ["Observed", "observed"]

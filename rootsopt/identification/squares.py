@@ -19,18 +19,24 @@ from rootsopt.identification.quantities import Fitted, values_at
 
 TURN = 3.0
 """Residual, in standard deviations, above which the loss grows linearly."""
+
+# Least size of an average that its relative error refers to, as a share of its column's RMS.
 _LEAST = 0.1
-"""Least size of an average that its relative error refers to, as a share of its column's RMS."""
+
+# Maximum number of scenes in a local fit.
 _STEPS = 40
-"""Maximum number of scenes in a local fit."""
+
+# Number of times that residuals beyond `TURN` standard deviations are clipped to estimate one.
 _CLIPS = 8
-"""Number of times that residuals beyond `TURN` standard deviations are clipped to estimate one."""
+
+# Number of values of a column from which on it has a standard deviation of its own.
 _MANY = 30
-"""Number of values of a column from which on it has a standard deviation of its own."""
+
+# Least variation of samples, as a share of their RMS, that their errors refer to.
 _STILL = 1e-4
-"""Least variation of samples, as a share of their RMS, that their errors refer to."""
+
+# Least standard deviation, as a share of the scale.
 _FINEST = 1e-6
-"""Least standard deviation, as a share of the scale."""
 
 
 class Local(NamedTuple):
@@ -245,6 +251,3 @@ class Problem:
             xtol=1e-8, ftol=1e-10, gtol=1e-12, max_nfev=_STEPS,
         )  # fmt: skip
         return at(done.x)
-
-
-__all__ = ["TURN", "Local", "Problem"]

@@ -3,7 +3,7 @@
 The measure is the gap of the flanks in pure rolling."""
 
 import dataclasses
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,18 +17,17 @@ from rootsopt.errors import InputError
 from rootsopt.profiles import Profile
 from rootsopt.runtime.programs import CachedFunction
 
-if TYPE_CHECKING:
-    from rich.console import Console
-
 _MICRON = 1e-6
+
+# Limits above which flanks count as cut by an inset; both must be exceeded. First: the inset (m).
+# Second: its ratio to the standard deviation of the gap over the mesh, a robust estimate.
 _CERTAIN = 1e-6, 1.5
-"""Limits above which flanks count as cut by an inset; both must be exceeded. First: the inset (m).
-Second: its ratio to the standard deviation of the gap over the mesh, a robust estimate."""
+
+# Ratio of the standard deviation to the median of the absolute values, for a normal distribution.
 _SPREAD = 1.4826
-"""Ratio of the standard deviation to the median of the absolute values, for a normal distribution.
-"""
+
+# Number of roll angles at which the gap is measured.
 _POSES = 361
-"""Number of roll angles at which the gap is measured."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,18 +144,17 @@ def record(config: Config) -> dict[str, Any]:
     return {"outline": checks.record() | conjugacy(profile).record()}
 
 
-def say(config: Config, out: "Console") -> None:
-    """Print notes to `out` on an imported outline.
+def notes(config: Config) -> list[str]:
+    """Return notes on an imported outline; none without one.
 
     They say whether its flanks differ by 1 µm or more, whether its points scatter, and whether its
     centre is not the rotor's axis. They also say whether a clearance was drawn into it."""
     if not config.profile.from_file:
-        return
+        return []
     from rootsopt.measured.source import advice, outline_of  # As in `record`.
 
     profile, checks = outline_of(config.profile)
     found = advice(config.profile, checks)
     if not checks.seen.off_center:
         found += filter(None, [inset_note(conjugacy(profile).inset, config.contact.clearance_mm)])
-    for message in found:
-        out.print(message, soft_wrap=True, markup=False, highlight=False)
+    return found

@@ -20,31 +20,37 @@ from rootsopt.measured.estimates import Estimates
 from rootsopt.measured.guard import guarded
 from rootsopt.measured.loop import lengths_along
 
+# Length (pitch radii) that contributes as much to a curve's parameter as a turn of 1 rad.
 _TURNING = 0.3
-"""Length (pitch radii) that contributes as much to a curve's parameter as a turn of 1 rad."""
+
+# Limits above which a change of curvature at a point makes this point a joint. Both must be
+# exceeded. `_JUMP` is a fraction of the sum of the curvatures (absolute values) on both sides.
+# `_ABOVE` is a multiple of the median change at the surrounding points.
 _JUMP, _ABOVE = 0.02, 20.0
-"""Limits above which a change of curvature at a point makes this point a joint. Both must be
-exceeded. `_JUMP` is a fraction of the sum of the curvatures (absolute values) on both sides.
-`_ABOVE` is a multiple of the median change at the surrounding points."""
+
+# Numbers of points on each side of a joint. A joint affects the change of curvature at the
+# nearest `_BESIDE` points. The median for `_ABOVE` is taken over the nearest `_AROUND` points,
+# without these.
 _BESIDE, _AROUND = 3, 12
-"""Numbers of points on each side of a joint. A joint affects the change of curvature at the nearest
-`_BESIDE` points. The median for `_ABOVE` is taken over the nearest `_AROUND` points, without these.
-"""
+
+# Sum of the polygon's turns (rad, absolute values) along a flank above which the points are
+# rejected as scattered. With smoothing, there is no limit.
 _WINDING = 7.0
-"""Sum of the polygon's turns (rad, absolute values) along a flank above which the points are
-rejected as scattered. With smoothing, there is no limit."""
+
+# Number of intervals between points below which a piece is not split off, because it is too
+# short.
 _SHORTEST = 4
-"""Number of intervals between points below which a piece is not split off, because it is too short.
-"""
+
+# `_MOST_KNOTS`: number of knots above which a smoothing spline is rejected because it follows the
+# noise. `_NO_ROOM`: flag that FITPACK returns in this case.
 _MOST_KNOTS, _NO_ROOM = 500, 1
-"""`_MOST_KNOTS`: number of knots above which a smoothing spline is rejected because it follows the
-noise. `_NO_ROOM`: flag that FITPACK returns in this case."""
 _KEY = "`profile.outline_file`"
 _UNEVEN = "remove points that are much closer together than others"
+
+# `_CUSP`: speed |z′| (fraction of the mean speed) below which the end of a piece is a cusp.
+# `_SPARED`: number of knot intervals next to a cusp that are not sampled. Beyond these, points
+# are not sampled either until the speed exceeds the limit.
 _CUSP, _SPARED = 2e-2, 2
-"""`_CUSP`: speed |z′| (fraction of the mean speed) below which the end of a piece is a cusp.
-`_SPARED`: number of knot intervals next to a cusp that are not sampled. Beyond these, points are
-not sampled either until the speed exceeds the limit."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -18,27 +18,34 @@ with silenced():  # Importing ezdxf writes to its log.
     from ezdxf.lldxf import types
     from ezdxf.lldxf.tagger import binary_tags_loader
 
+# Approximate distance between points on arcs and splines, as a fraction of the drawing's size.
 _SPACING = 1 / 400
-"""Approximate distance between points on arcs and splines, as a fraction of the drawing's size."""
 _LAYER = "OUTLINE"
 _KINDS = ("LINE", "ARC", "SPLINE", "ELLIPSE", "LWPOLYLINE", "POLYLINE")
 _CURVES = ("LINE", "ARC", "SPLINE", "ELLIPSE")
 _PARTS = ("VERTEX", "INSERT")
+
+# Number of entities (including block inserts and the vertices of a POLYLINE) above which a
+# drawing is rejected.
 _ENTITIES = 100_000
-"""Number of entities (including block inserts and the vertices of a POLYLINE) above which a drawing
-is rejected."""
+
+# Total number of points on all entities above which a drawing is rejected.
 _POINTS = 500_000
-"""Total number of points on all entities above which a drawing is rejected."""
+
+# Number of levels of nested blocks above which a drawing is rejected.
 _DEEPEST = 8
-"""Number of levels of nested blocks above which a drawing is rejected."""
+
+# Absolute value of a number in an entity (drawing units) above which a drawing is rejected as
+# damaged. A drawing whose diagonal (mm) reaches this value is also rejected.
 _LARGEST = 1e9
-"""Absolute value of a number in an entity (drawing units) above which a drawing is rejected as
-damaged. A drawing whose diagonal (mm) reaches this value is also rejected."""
 _BINARY = b"AutoCAD Binary DXF\r\n\x1a\x00"
 _NOT = "is not a DXF file that can be read"
 _AGAIN = "export it again (DXF R2000 or newer) or save the outline as CSV"
 _INCH, _SURVEY_FOOT = 25.4, 1200 / 3937 * 1e3
 _METRE = 1e3
+
+# Length (mm) of each drawing unit, keyed by its code in $INSUNITS. Other codes, such as those of
+# astronomical units (17 to 20), are rejected.
 _UNITS = {
     0: 1.0,
     1: _INCH,
@@ -62,8 +69,6 @@ _UNITS = {
     23: 3 * _SURVEY_FOOT,
     24: 5280 * _SURVEY_FOOT,
 }
-"""Length (mm) of each drawing unit, keyed by its code in $INSUNITS. Other codes, such as those of
-astronomical units (17 to 20), are rejected."""
 
 
 def from_dxf(data: bytes, name: str, unit: str | None = None) -> list[Loop]:

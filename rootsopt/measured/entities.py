@@ -20,31 +20,41 @@ from rootsopt.errors import InputError
 from rootsopt.measured.guard import guarded, short
 from rootsopt.measured.loop import Loop
 
+# Minimum number of sampling intervals on an arc or spline.
 _FEWEST = 24
-"""Minimum number of sampling intervals on an arc or spline."""
+
+# Maximum number of sampling intervals derived from the length of an arc or spline.
 _MOST = 100_000
-"""Maximum number of sampling intervals derived from the length of an arc or spline."""
+
+# Minimum number of sampling intervals between two adjacent knots of a spline, and number of
+# intervals on a spline when its extent is measured.
 _PER_SPAN, _ROUGH = 4, 64
-"""Minimum number of sampling intervals between two adjacent knots of a spline, and number of
-intervals on a spline when its extent is measured."""
+
+# Degree above which a spline is rejected.
 _DEGREES = 25
-"""Degree above which a spline is rejected."""
+
+# Number of fit points above which a spline without control points is rejected.
 _FITTED = 5_000
-"""Number of fit points above which a spline without control points is rejected."""
+
+# Difference between adjacent knots (fraction of their range) below which they become one knot.
 _SAME_KNOT = 1e-9
-"""Difference between adjacent knots (fraction of their range) below which they become one knot."""
+
+# Sweep (rad) below which an arc is read as a full circle or ellipse.
 _FULL = 1e-9
-"""Sweep (rad) below which an arc is read as a full circle or ellipse."""
+
+# Absolute value of the bulge below which a side of a polyline is read as a straight line.
 _STRAIGHT = 1e-12
-"""Absolute value of the bulge below which a side of a polyline is read as a straight line."""
+
+# DXF flag of a vertex that is a control point of a spline-fitted polyline, not a point on it.
 _FRAME = 16
-"""DXF flag of a vertex that is a control point of a spline-fitted polyline, not a point on it."""
+
+# Angle (rad) between an entity's plane and the drawing's plane above which the entity is
+# rejected.
 _TILT = 1e-6
-"""Angle (rad) between an entity's plane and the drawing's plane above which the entity is rejected.
-"""
+
+# Kinds of entities whose points are in the drawing's coordinates, so that their stated plane is
+# ignored.
 _SPATIAL = ("LINE", "SPLINE")
-"""Kinds of entities whose points are in the drawing's coordinates, so that their stated plane is
-ignored."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -124,7 +134,6 @@ def _plain(points: Iterable[Any], scale: float) -> NDArray[np.complex128]:
 
 
 def _line(entity: Any, scale: float, fault) -> list[Stroke]:
-    del fault
     ends = _plain([entity.dxf.start, entity.dxf.end], scale)
     return [Stroke(ends)] if ends[0] != ends[1] else []
 
@@ -204,7 +213,6 @@ def _polyline(entity: Any, scale: float, fault) -> list[Stroke]:
     """Return the straight runs and arcs of a polyline.
 
     A side with a bulge is an arc; its bulge is the tangent of a quarter of the arc's angle."""
-    del fault
     if entity.dxftype() == "LWPOLYLINE":
         corners = entity.vertices_in_wcs()
         bulges = [bulge for (bulge,) in entity.get_points("b")]
@@ -232,6 +240,8 @@ def _polyline(entity: Any, scale: float, fault) -> list[Stroke]:
     return made
 
 
+# Function for each kind of entity that returns its strokes, from the library's object, the mm per
+# drawing unit, and a function that makes the error for an entity that is not valid.
 _KINDS = {
     "LINE": _line,
     "ARC": _arc,
@@ -240,5 +250,3 @@ _KINDS = {
     "LWPOLYLINE": _polyline,
     "POLYLINE": _polyline,
 }
-"""Function for each kind of entity that returns its strokes, from the library's object, the mm per
-drawing unit, and a function that makes the error for an entity that is not valid."""

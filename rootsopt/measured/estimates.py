@@ -16,56 +16,71 @@ from rootsopt.measured.loop import moment, signed_area
 
 UNITS = {"mm": 1.0, "cm": 10.0, "m": 1e3, "um": 1e-3, "inch": 25.4}
 """Length (mm) of each unit that the points of a file may have."""
+
+# Numbers of neighbours on each side from which the scatter is estimated (see `scatter`). The
+# least of the three estimates counts. The others may be larger, because the error of a polynomial
+# through few points depends on its degree.
 _NEIGHBOURS = 2, 3, 4
-"""Numbers of neighbours on each side from which the scatter is estimated (see `scatter`). The least
-of the three estimates counts. The others may be larger, because the error of a polynomial through
-few points depends on its degree."""
+
+# Ratio of the estimates from neighbours twice as far apart and from next neighbours above which
+# the scatter is unknown. Scatter does not depend on the distance. The error of a polynomial
+# through points on a smooth curve grows at least with its square; for exact points of EE (2 to 6
+# lobes) and CIC it was found to grow by 6 or more.
 _GROWTH = 4.0
-"""Ratio of the estimates from neighbours twice as far apart and from next neighbours above which
-the scatter is unknown. Scatter does not depend on the distance. The error of a polynomial through
-points on a smooth curve grows at least with its square; for exact points of EE (2 to 6 lobes) and
-CIC it was found to grow by 6 or more."""
+
+# Typical growth of the error of coarse points, with which it is separated from the scatter.
 _GROWN = 9.0
-"""Typical growth of the error of coarse points, with which it is separated from the scatter."""
+
+# Ratio of the distance between neighbours to the scatter below which farther neighbours are used.
+# Points that are closer together do not lie in order along the curve.
 _CLEAR = 8.0
-"""Ratio of the distance between neighbours to the scatter below which farther neighbours are used.
-Points that are closer together do not lie in order along the curve."""
+
+# Number of points left around the outline below which the stride between neighbours is not
+# doubled again.
 _FEWEST = 48
-"""Number of points left around the outline below which the stride between neighbours is not doubled
-again."""
+
+# Number of points above which estimates use only every second, third ... point.
 _MOST = 20_000
-"""Number of points above which estimates use only every second, third ... point."""
+
+# Ratio of the standard deviation to the median of the absolute values, for a normal distribution.
 _MEDIAN = 1.4826
-"""Ratio of the standard deviation to the median of the absolute values, for a normal
-distribution."""
+
+# Maximum number of harmonics of the lobes in the outline that is fitted to find the centre.
 _HARMONICS = 48
-"""Maximum number of harmonics of the lobes in the outline that is fitted to find the centre."""
+
+# Maximum number of Gauss-Newton steps in the search for the centre, and step (fraction of the
+# outline's greatest radius) below which the search ends.
 _PASSES, _STILL = 12, 1e-12
-"""Maximum number of Gauss-Newton steps in the search for the centre, and step (fraction of the
-outline's greatest radius) below which the search ends."""
 SIZED = 0.06
 """Relative difference between the pitch radius and the mean of outer and root radius above which an
 outline counts as the wrong size. Both are equal for conjugate rotors."""
 SEEN = 1e-4
 """Scatter (mm) below which messages do not mention it."""
+
+# Ratio of the smoothing to the scatter below which the points count as not smoothed enough.
 _ENOUGH = 0.7
-"""Ratio of the smoothing to the scatter below which the points count as not smoothed enough."""
+
+# Ratio of the distance between points to the scatter below which smoothing fails. Most of the
+# length along the points is then scatter.
 _APART = 6.0
-"""Ratio of the distance between points to the scatter below which smoothing fails. Most of the
-length along the points is then scatter."""
+
+# Factor by which a message raises a smoothing that did not suffice.
 _MORE = 1.25
-"""Factor by which a message raises a smoothing that did not suffice."""
+
+# Values of the smoothing (multiples of the scatter) that are tried for a message.
 _FACTORS = 2.0, 1.6, 1.25, 1.0
-"""Values of the smoothing (multiples of the scatter) that are tried for a message."""
+
+# Values of the smoothing (mm) that are tried for points without scatter, for example ends of arcs
+# or lines that are rounded, or on the wrong side of the pitch circle.
 _STEPS = 2e-3, 1e-3, 5e-4, 2e-4, 1e-4, 5e-5, 2e-5, 1e-5
-"""Values of the smoothing (mm) that are tried for points without scatter, for example ends of arcs
-or lines that are rounded, or on the wrong side of the pitch circle."""
+
+# Number of points per flank below which the scatter is unknown: the error of a polynomial through
+# them no longer grows with their distance.
 _PER_FLANK = 8
-"""Number of points per flank below which the scatter is unknown: the error of a polynomial through
-them no longer grows with their distance."""
+
+# Distances of the centre from the origin (standard errors; mm) above which a message proposes to
+# move it there. Both must be exceeded.
 _SURE, _LEAST = 5.0, 1e-3
-"""Distances of the centre from the origin (standard errors; mm) above which a message proposes to
-move it there. Both must be exceeded."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -296,6 +311,3 @@ def center(points: Complex128[np.ndarray, " n"], lobes: int) -> tuple[complex, f
         if not abs(move) > _STILL * np.max(radius):
             break
     return complex(place), error
-
-
-__all__ = ["UNITS", "Estimates", "center", "estimates", "scatter", "unit_of_size"]

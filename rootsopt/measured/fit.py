@@ -19,44 +19,56 @@ _MM = 1e-3
 NODES = 1536
 """Number of nodes in the table of the addendum, and in that of the dedendum. The number is fixed,
 so that one compiled program serves all outlines."""
+
+# Number of smooth pieces of an addendum or dedendum above which an outline is rejected.
 _PIECES = NODES // 4
-"""Number of smooth pieces of an addendum or dedendum above which an outline is rejected."""
+
+# Polar angle (fraction of the angle from tip to root) by which the fitted points extend beyond a
+# flank's tip and root.
 _BEYOND = 0.3
-"""Polar angle (fraction of the angle from tip to root) by which the fitted points extend beyond a
-flank's tip and root."""
+
+# Number of points at which two flanks are compared.
 _SHARES = 400
-"""Number of points at which two flanks are compared."""
+
+# Polar angle (rad) covered by a backward run of the outline above which the outline is rejected.
+# Smaller runs are noise and rounding. An outline is also rejected if a tangent passes the axis on
+# the wrong side by more than this distance (pitch radii).
 _FOLD = 1e-3
-"""Polar angle (rad) covered by a backward run of the outline above which the outline is rejected.
-Smaller runs are noise and rounding. An outline is also rejected if a tangent passes the axis on the
-wrong side by more than this distance (pitch radii)."""
+
+# Deviation between flanks (pitch radii) above which an outline is rejected. This is also the
+# value (pitch radii) above which `profile.outline_smoothing_mm` is rejected.
 _OFF = 0.02
-"""Deviation between flanks (pitch radii) above which an outline is rejected. This is also the value
-(pitch radii) above which `profile.outline_smoothing_mm` is rejected."""
+
+# Angle (rad) of half a tip land below which the land is ignored.
 _LAND = 0.5 * np.pi / 180
-"""Angle (rad) of half a tip land below which the land is ignored."""
+
+# Radii beside a tip land from which its end is extrapolated. They lie below the greatest radius
+# by `_DROP` (pitch radii) or `_SCATTERED` times the scatter, whichever is more, and by up to
+# `_WIDE` times as much.
 _DROP, _SCATTERED, _WIDE = 1e-4, 8.0, 8.0
-"""Radii beside a tip land from which its end is extrapolated. They lie below the greatest radius by
-`_DROP` (pitch radii) or `_SCATTERED` times the scatter, whichever is more, and by up to `_WIDE`
-times as much."""
+
+# Change of the normal's direction (rad) at a joint below which both sides get the mean direction.
+# A joint with a larger change is a corner.
 _CORNER = 1e-2
-"""Change of the normal's direction (rad) at a joint below which both sides get the mean direction.
-A joint with a larger change is a corner."""
+
+# Distance (pitch radii) from the pitch circle below which a joint is taken as the point where the
+# flank crosses the circle.
 _AT = 1e-4
-"""Distance (pitch radii) from the pitch circle below which a joint is taken as the point where the
-flank crosses the circle."""
+
+# Ratio of an outline's greatest radius to the pitch radius, or its inverse, above which an
+# outline is rejected because its units must be wrong.
 _FAR = 1e3
-"""Ratio of an outline's greatest radius to the pitch radius, or its inverse, above which an outline
-is rejected because its units must be wrong."""
+
+# Backward run of the outline (multiples of the scatter) above which an outline to be smoothed is
+# rejected, in addition to `_FOLD`.
 _WANDER = 8.0
-"""Backward run of the outline (multiples of the scatter) above which an outline to be smoothed is
-rejected, in addition to `_FOLD`."""
+
+# Ratio of the flanks' deviation to the scatter below which a message names scatter as the cause.
 _MANY = 20.0
-"""Ratio of the flanks' deviation to the scatter below which a message names scatter as the cause.
-"""
+
+# Number of points above which no values of the smoothing are tried for a message. A trial takes
+# 20 µs per point.
 _TRIED = 100_000
-"""Number of points above which no values of the smoothing are tried for a message. A trial takes
-20 µs per point."""
 _GAUSS = np.polynomial.legendre.leggauss(12)
 
 

@@ -15,8 +15,9 @@ import numpy as np
 from rootsopt.errors import InputError
 
 _LOGGER = "ezdxf"
+
+# Number of characters above which a library's own message is shortened.
 _REASON = 120
-"""Number of characters above which a library's own message is shortened."""
 
 
 def short(value: object, width: int = 60) -> str:

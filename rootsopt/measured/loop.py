@@ -13,13 +13,15 @@ from numpy.typing import NDArray
 
 from rootsopt.errors import InputError
 
+# Turn (rad) at a point above which the outline runs back there.
 _CUSP = 2.0
-"""Turn (rad) at a point above which the outline runs back there."""
+
+# Distance between the two cusps of a tail (length of the path between them) below which they do
+# not belong together.
 _STRAIGHT = 0.8
-"""Distance between the two cusps of a tail (length of the path between them) below which they do
-not belong together."""
+
+# Number of points on each side of a tail that are searched for its crossing.
 _BESIDE = 1000
-"""Number of points on each side of a tail that are searched for its crossing."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,10 +129,11 @@ def place(z: complex) -> str:
 JOIN = 1e-3
 """Default distance (mm) below which two ends of entities share a vertex."""
 _ALONE = "draw the outline alone on a layer OUTLINE"
+
+# Number of other points within the joining distance of a point, on average, above which a drawing
+# is rejected. The points are the ends of all chains, or those of `_distinct`. Points at the same
+# place count once.
 _CROWDED = 50
-"""Number of other points within the joining distance of a point, on average, above which a drawing
-is rejected. The points are the ends of all chains, or those of `_distinct`. Points at the same
-place count once."""
 
 
 def joined(

@@ -18,39 +18,47 @@ from rootsopt.measured.guard import short
 from rootsopt.measured.loop import JOIN, Loop, joined, moment, place, signed_area, tails
 from rootsopt.measured.table import from_csv
 
-__all__ = ["JOIN", "LOBES", "Loop", "Sought", "lobes_of", "read", "signed_area"]
-
 LOBES = range(2, 7)
 """Numbers of lobes that a rotor may have."""
+
+# Distances (mm) up to which ends are joined to find the value of the key that closes an outline.
+# The last one is the greatest value of the key.
 _JOINS = 2e-3, 5e-3, 1e-2, 2e-2, 5e-2, 0.1, 0.2, 0.5, 1.0
-"""Distances (mm) up to which ends are joined to find the value of the key that closes an outline.
-The last one is the greatest value of the key."""
+
+# Number of loops, the largest first, among which the rotor is looked for; number of rotors that a
+# message names.
 _LOOPS, _NAMED = 500, 4
-"""Number of loops, the largest first, among which the rotor is looked for; number of rotors that a
-message names."""
+
+# Area (squared extents) below which a loop is a sliver, and area (areas of the convex hull) above
+# which it counts as convex.
 _THIN, _CONVEX = 1e-2, 0.98
-"""Area (squared extents) below which a loop is a sliver, and area (areas of the convex hull) above
-which it counts as convex."""
+
+# Number of cusps per lobe above which they are scatter, and size (pitch radii) above which a
+# swallow-tail is not cut off.
 _CUSPS, _TAIL = 16, 0.02
-"""Number of cusps per lobe above which they are scatter, and size (pitch radii) above which a
-swallow-tail is not cut off."""
+
+# Number of polar angles at which the radius of a loop is compared with the lobes' symmetry, and
+# norm of the harmonics that break the symmetry (harmonics of the lobes) above which it has none.
 _RAYS, _UNLIKE = 720, 0.25
-"""Number of polar angles at which the radius of a loop is compared with the lobes' symmetry, and
-norm of the harmonics that break the symmetry (harmonics of the lobes) above which it has none."""
+
+# Distance between the last and the first point above which a loop is rejected as open. The unit
+# is the longest step between successive points.
 _WIDEST = 5.0
-"""Distance between the last and the first point above which a loop is rejected as open. The unit is
-the longest step between successive points."""
+
+# Size (bytes) above which a file is rejected.
 _BYTES = 50_000_000
-"""Size (bytes) above which a file is rejected."""
+
+# Number of points above which an outline is rejected. Reading and fitting take about 20 µs per
+# point.
 _POINTS = 500_000
-"""Number of points above which an outline is rejected. Reading and fitting take about 20 µs per
-point."""
+
+# Least and greatest size (mm) of an outline. Outside this range it is rejected, because its units
+# must be wrong.
 _SIZES = 0.1, 1e5
-"""Least and greatest size (mm) of an outline. Outside this range it is rejected, because its units
-must be wrong."""
+
+# Distance (fraction of the outline's greatest coordinate) below which successive points are
+# merged into one.
 _SAME = 1e-9
-"""Distance (fraction of the outline's greatest coordinate) below which successive points are merged
-into one."""
 _NOT_FILES = (
     (stat.S_ISDIR, "a folder"),
     (stat.S_ISFIFO, "a pipe"),

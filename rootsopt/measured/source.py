@@ -27,13 +27,15 @@ from rootsopt.profiles import Outline
 if TYPE_CHECKING:
     from rootsopt.config.rotor import ProfileConfig
 
+# Deviation between flanks (µm) at or above which the user gets a note.
 _NOTABLE = 1.0
-"""Deviation between flanks (µm) at or above which the user gets a note."""
+
+# Distance of the lobes' centre of symmetry from the origin (pitch radii) above which simulations
+# are refused.
 _ECCENTRIC = 1e-3
-"""Distance of the lobes' centre of symmetry from the origin (pitch radii) above which simulations
-are refused."""
+
+# Scatter (mm) of points that are not smoothed above which the user gets a note.
 _ROUGH = 5e-4
-"""Scatter (mm) of points that are not smoothed above which the user gets a note."""
 
 
 def outline_of(config: "ProfileConfig") -> tuple[Outline, Checks]:
@@ -55,7 +57,6 @@ def outline_of(config: "ProfileConfig") -> tuple[Outline, Checks]:
 
 @functools.lru_cache(maxsize=16)
 def _kept(path: Path, stamp, how: tuple[str | None, Sought, float], smoothing: float):
-    del stamp
     loop, sought = read(path, *how), how[1]
     assert sought.lobes is not None
     assert sought.pitch_radius_mm is not None
@@ -114,20 +115,25 @@ def advice(config: "ProfileConfig", checks: Checks) -> list[str]:
     return [f"outline: {text}" for text in found]
 
 
+# Range (mm) in which the pitch radius of a rotor usually lies. Outside it, the unit is another.
 _USUAL = USUAL["profile.pitch_radius_mm"]
-"""Range (mm) in which the pitch radius of a rotor usually lies. Outside it, the unit is another."""
+
+# Units in the order in which they are tried.
 _UNITS = "mm", "inch", "m", "um", "cm"
-"""Units in the order in which they are tried."""
+
+# Distances (mm) up to which the ends of a drawing's entities are joined, in the order of trial.
 _JOINS = JOIN, 0.01, 0.1
-"""Distances (mm) up to which the ends of a drawing's entities are joined, in the order of trial."""
+
+# Excesses of the pitch radius over the mean of outer and root radius (fractions of it) that are
+# tried until the addendum is convex. For rotors cut by an inset, the excess is the inset.
 _SCAN = 0.0, 1e-3, 2e-3, 4e-3, 7e-3, 0.011, 0.016, 0.023, 0.03
-"""Excesses of the pitch radius over the mean of outer and root radius (fractions of it) that are
-tried until the addendum is convex. For rotors cut by an inset, the excess is the inset."""
+
+# Relative distance from that radius within which the centre distance is sought.
 _REACH = 0.02
-"""Relative distance from that radius within which the centre distance is sought."""
+
+# Mean deviation of the gap over the mesh (pitch radii) above which a rotor does not roll on
+# another one like it.
 _UNEVEN = 2e-3
-"""Mean deviation of the gap over the mesh (pitch radii) above which a rotor does not roll on
-another one like it."""
 _MM = 1e-3
 
 

@@ -17,23 +17,26 @@ from rootsopt.measured.estimates import UNITS
 from rootsopt.measured.guard import guarded, short
 from rootsopt.measured.loop import Loop
 
+# Number of characters in a line above which a table is rejected.
 _LONGEST = 100_000
-"""Number of characters in a line above which a table is rejected."""
+
+# Number of lines from which the character that separates the columns is found.
 _TRIED = 100
-"""Number of lines from which the character that separates the columns is found."""
 _REMEDY = "save the points as x,y in mm, one pair per line, as UTF-8 text"
+
+# Cells in which a spreadsheet or an instrument says that there is no number.
 _LACKING = re.compile(
     r"#(?:n/?a|nv|div/0!|value!|wert!|ref!|bezug!|name\?|num!|zahl!|null!)|n/?a|nan|null|none|-+",
     re.IGNORECASE,
 )
-"""Cells in which a spreadsheet or an instrument says that there is no number."""
+
+# Names of a column by axis, as regular expressions.
 _AXES = {
     "x": "x",
     "y": "y",
     "r": "r|rho|ρ|radius",
     "theta": r"theta|θ|ϑ|phi|φ|ϕ|angle|winkel|polar[\s_]?angle",
 }
-"""Names of a column by axis, as regular expressions."""
 _LENGTHS = {
     "mm": r"mm|millimet(?:er|re)s?",
     "cm": r"cm|centimet(?:er|re)s?",
@@ -42,15 +45,18 @@ _LENGTHS = {
     "inch": r"in|inch(?:es)?|zoll",
 }
 _ANGLES = {"deg": "deg|degrees?|°", "rad": "rad|radians?"}
+
+# Units that a header may state but that are not supported.
 _OTHERS = r"ft|foot|feet|yd|yards?|mils?|thou|nm|dm|km|px|pixels?|grad|gon"
-"""Units that a header may state but that are not supported."""
 _UNIT = "|".join([*_LENGTHS.values(), *_ANGLES.values(), _OTHERS])
 _TURN = {"deg": 360.0, "rad": 2 * math.pi}
+
+# Range of the angles in a column (turns) in which its unit can be told from the numbers.
 _WHOLE = 0.8, 1.01
-"""Range of the angles in a column (turns) in which its unit can be told from the numbers."""
+
+# Step between successive points (median of all steps) above which another outline may begin, and
+# least number of points of an outline in a table that holds several.
 _APART, _FEWEST = 5.0, 8
-"""Step between successive points (median of all steps) above which another outline may begin, and
-least number of points of an outline in a table that holds several."""
 
 
 def from_csv(data: bytes, name: str, unit: str | None = None) -> list[Loop]:
@@ -287,12 +293,15 @@ def _number(cell: str) -> float | None:
 KEY = "scene.timing_gear.transmission_error_file"
 """Key that names the file."""
 _COLUMNS = "rotation_deg", "error_um"
+
+# Least number of rows of a table, greatest step between them (°), greatest error (µm).
 _FEWEST_ROWS, _WIDEST, _MOST = 8, 60.0, 1000.0
-"""Least number of rows of a table, greatest step between them (°), greatest error (µm)."""
+
+# Differences of rotation (°) and error (µm) up to which the last row repeats the first.
 _SAME = 1e-6, 1e-3
-"""Differences of rotation (°) and error (µm) up to which the last row repeats the first."""
+
+# Degree of the spline. A lower one would have kinks that slow the closing of orbits.
 _DEGREE = 5
-"""Degree of the spline. A lower one would have kinks that slow the closing of orbits."""
 
 
 def transmission_error(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -16,8 +16,9 @@ BASELINE, OPTIMIZED, RIVAL = "baseline", "optimized", "design"
 """Names of the compared designs; that of another one ends with its number."""
 WINS = 1e-3
 """Difference of two objectives below which neither design counts as better."""
+
+# Levels of the quantiles that are reported, by name.
 _LEVELS = {"quantile_5": 0.05, "median": 0.5, "quantile_95": 0.95}
-"""Levels of the quantiles that are reported, by name."""
 Scenes = Mapping[str, Mapping[str, float]]
 """Values by config key of each scene, by the scene's name; other values are those of the config."""
 Piece = tuple[float, float]
@@ -146,6 +147,3 @@ class Assumed:
         if np.sum(kept) < 3 or np.ptp(values[kept]) == 0:
             return None
         return float(spearmanr(mine[kept], values[kept]).statistic)  # pyright: ignore
-
-
-__all__ = ["BASELINE", "OPTIMIZED", "RIVAL", "WINS", "Assumed", "Piece", "Scenes"]

@@ -47,18 +47,23 @@ from rootsopt.response.scatter import (
 )
 from rootsopt.response.still import Still, needed_motion
 
+# Number of designs of the search from which the best in the optimum's worst scene is taken.
 _TRIED = 4
-"""Number of designs of the search from which the best in the optimum's worst scene is taken."""
+
+# Distance in the unit box below which two of these designs, or two optima, count as the same.
 _FAR, _NEAR = 0.15, 0.02
-"""Distance in the unit box below which two of these designs, or two optima, count as the same."""
+
+# Least tolerance of orbits in a first simulation.
 _RTOL = 1e-6
-"""Least tolerance of orbits in a first simulation."""
+
+# Greatest number of other designs that are compared.
 _RIVALS = 2
-"""Greatest number of other designs that are compared."""
+
+# Number of values tried to find the last one at which a design has a usable motion.
 _HALVINGS = 4
-"""Number of values tried to find the last one at which a design has a usable motion."""
+
+# Accuracy of the value at which a design becomes better or worse, as a share of its range.
 _FINE = 0.02
-"""Accuracy of the value at which a design becomes better or worse, as a share of its range."""
 
 
 class _StoppedError(Exception):
@@ -346,6 +351,3 @@ class AssumedSearch:
 
         spread = compared(self.config, found, self.runs, self.stop.is_set, tick)
         return dataclasses.replace(found, assumptions=spread)
-
-
-__all__ = ["AssumedSearch", "compared"]

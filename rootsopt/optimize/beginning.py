@@ -24,11 +24,12 @@ from rootsopt.scene import Scene
 from rootsopt.scene.check import shape_of
 from rootsopt.scene.families import classical, design_of, profile_from_file, profile_of
 
+# Distance (m) of the nearest named family above which the message recommends a free form.
 _FAR = 20e-6
-"""Distance (m) of the nearest named family above which the message recommends a free form."""
+
+# Numbers of coefficients of a free form, tried in this order until it is as near as the distance
+# (m): searches with few parameters compile and run faster.
 _COUNTS, _EXACT = (3, COEFFICIENTS // 2, COEFFICIENTS), 1e-6
-"""Numbers of coefficients of a free form, tried in this order until it is as near as the distance
-(m): searches with few parameters compile and run faster."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -152,6 +153,3 @@ def _fits(given: Profile, family: str) -> list[Likeness]:
             if found[0] is not None and found[0].departure <= _EXACT:
                 break
     return sorted((one for one in found if one is not None), key=lambda one: one.departure)
-
-
-__all__ = ["Beginning", "beginning"]

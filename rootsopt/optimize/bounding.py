@@ -33,32 +33,41 @@ FACTOR = 2.0
 """Factor on the least curvatures that agree with all pairs."""
 FIRST = 6
 """Number of points spread over the feasible set, per parameter and once more."""
+
+# Number of points from which these are chosen.
 _DRAWN = 256
-"""Number of points from which these are chosen."""
+
+# Factor on the deviations of constraints from their tangents.
 _DEVIATION = 1.5
-"""Factor on the deviations of constraints from their tangents."""
+
+# Relative distance below the best objective at which a box counts as bounded, and the least
+# magnitude of the objective to which it is related.
 _GAP, _SMALL = 1e-4, 0.1
-"""Relative distance below the best objective at which a box counts as bounded, and the least
-magnitude of the objective to which it is related."""
+
+# Difference of objectives that is not attributed to curvature.
 _NOISE = 1e-6
-"""Difference of objectives that is not attributed to curvature."""
+
+# Distance (unit box) of two points below which their pair says nothing about curvature. It is
+# also the curvature before any pair is known.
 _CLOSE = 1e-3
-"""Distance (unit box) of two points below which their pair says nothing about curvature. It is also
-the curvature before any pair is known."""
+
+# Least curvature along a coordinate, relative to that which all coordinates would need alike.
 _LEAST = 0.1
-"""Least curvature along a coordinate, relative to that which all coordinates would need alike."""
+
+# Share of a rise that the curvatures must agree with, so that they do not change all the time.
 _SLACK = 0.9
-"""Share of a rise that the curvatures must agree with, so that they do not change all the time."""
+
+# Curvature and slope above which a pair counts as a corner, and as a jump. They are relative to the
+# range of all values over the square of the greatest extent of the points, and over this extent:
+# limits may leave only a small part of the bounds, in which values hardly differ.
 _STEEP, _SHARP = 100.0, 10.0
-"""Curvature and slope above which a pair counts as a corner, and as a jump. They are relative to
-the range of all values over the square of the greatest extent of the points, and over this extent:
-limits may leave only a small part of the bounds, in which values hardly differ."""
+
+# Number of minorants in a linear program for the middle of a box and for each of its corners.
 _ROWS = 3
-"""Number of minorants in a linear program for the middle of a box and for each of its corners."""
+
+# Half width of a box below which it is left: one that has no bound, and any other.
 _NARROW, _NARROWEST = 1 / 64, 1 / 8192
-"""Half width of a box below which it is left: one that has no bound, and any other."""
 _BESIDE = 0.01
-"""Scaled violation up to which a point of a small box is evaluated."""
 
 
 class Box(NamedTuple):
@@ -381,6 +390,3 @@ class Bounding:
         if key not in self._known:
             self._known[key] = self.limits(point)
         return self._known[key]
-
-
-__all__ = ["FACTOR", "FIRST", "Bounding"]

@@ -24,10 +24,12 @@ NEAR = 1e-4
 
 For a constraint, the distance is its scaled slack. For a bound, it is measured in the unit box. For
 a branch, it is the difference from the greatest branch."""
+
+# Weight, in the least-squares problem, of the condition that the shares of a maximum sum to 1.
 _WEIGHT = 1e4
-"""Weight, in the least-squares problem, of the condition that the shares of a maximum sum to 1."""
+
+# Norm of a constraint's scaled gradient below which the constraint counts as inactive.
 _NEGLIGIBLE = 1e-6
-"""Norm of a constraint's scaled gradient below which the constraint counts as inactive."""
 
 
 class Certificate(NamedTuple):
@@ -121,6 +123,3 @@ def certify(local: Linearization, point: NDArray[np.float64], near: float = NEAR
     residual = float(np.linalg.norm(np.concatenate([left, *apart])))
     held = multipliers, lower, upper, tuple(shares), tuple(walls)
     return Certificate(residual, local.violation, *held)
-
-
-__all__ = ["NEAR", "RESIDUAL", "Certificate", "certify"]

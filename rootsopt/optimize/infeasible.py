@@ -17,13 +17,16 @@ from rootsopt.optimize.problem import FEASIBLE, Problem
 from rootsopt.optimize.sqp import Found, Stops, descend
 
 _STOPS = Stops(feasibility=1e-9, evaluations=300)
+
+# Criteria for the end of each local search if every point must be simulated.
 _SIMULATED = Stops(feasibility=FEASIBLE, evaluations=60)
-"""Criteria for the end of each local search if every point must be simulated."""
+
+# Difference between the phases that `_groups` gives the branches at successive speeds.
 _GOLDEN = 0.6180339887
-"""Difference between the phases that `_groups` gives the branches at successive speeds."""
+
+# Share of a constraint in the least violation above which the constraint counts as in conflict.
+# The shares of all constraints add up to 1.
 _PART = 1e-3
-"""Share of a constraint in the least violation above which the constraint counts as in conflict.
-The shares of all constraints add up to 1."""
 
 
 class Conflict(NamedTuple):
@@ -194,6 +197,3 @@ def _conflict(one: Constraint | ForceLimit, excess: float, alone: float | None) 
 def _best(found: Sequence[Found]) -> Found | None:
     usable = [(one.local.objective, one) for one in found if one.local is not None]
     return min(usable, key=lambda pair: pair[0], default=(0.0, None))[1]
-
-
-__all__ = ["Conflict", "Infeasible", "explain"]

@@ -32,7 +32,6 @@ class TermConstraint(Constraint):
     term: Term = eqx.field(kw_only=True)
 
     def slack_of(self, space, design, profile, shape, found):
-        del found
         nothing = Forces(*[jnp.asarray(jnp.nan)] * 3)
         return self.scaled(self.term.value(space.scene.at(design), profile, shape, nothing))
 
@@ -151,11 +150,6 @@ def force_limits(config: Config, scene: Scene) -> tuple[ForceLimit, ...]:
             f"{found[0].key}: averages have noise; give it a weight in `objective`, or choose "
             "another motion"
         )
-    if found and config.optimizer.method not in ("auto", "slsqp"):
-        raise InputError(
-            f"`optimizer.method` must be auto or slsqp to limit {found[0].key} under `{LIMITS}`, "
-            f"but is {config.optimizer.method}; set it to auto"
-        )
     return found
 
 
@@ -167,17 +161,3 @@ def _sides(config: Config):
                 # The baseline's value is filled in before a search; the number has no effect.
                 limit = 0.0 if one[side] == BASELINE else float(one[side])
                 yield name, side == "max", limit
-
-
-__all__ = [
-    "LIMITS",
-    "PEAK",
-    "ForceLimit",
-    "TermConstraint",
-    "force_limits",
-    "limited",
-    "quantity_of",
-    "scale_of",
-    "settled",
-    "term_constraints",
-]

@@ -87,5 +87,3 @@ class Linearization(NamedTuple):
 Look = Callable[[NDArray[np.float64]], Linearization | None]
 """Function that returns the problem at a point (d,), or `None` if there is no objective at this
 point."""
-
-__all__ = ["Group", "Linearization", "Look"]

@@ -17,14 +17,17 @@ from numpy.typing import NDArray
 
 from rootsopt.optimize.local import Group, Linearization, Look
 
+# Step (unit box) of the difference quotients that give the Hessians.
 _STEP = 1e-3
-"""Step (unit box) of the difference quotients that give the Hessians."""
+
+# Difference between phases above which branches at two points count as different.
 _SAME = 0.1
-"""Difference between phases above which branches at two points count as different."""
+
+# Slack of every constraint at a point where no profile exists.
 _ABSENT = -10.0
-"""Slack of every constraint at a point where no profile exists."""
+
+# Maximum number of iterations of SLSQP for one step. It needs about 15.
 _ROUNDS = 60
-"""Maximum number of iterations of SLSQP for one step. It needs about 15."""
 
 Rows = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Values (n,) and gradients (n, d) of the functions of a problem."""
@@ -227,6 +230,3 @@ def _alike(group: Group, other: Group) -> NDArray[np.int64]:
         if cost[branch, place] < 10.0:
             found[branch] = place
     return found
-
-
-__all__ = ["Limits", "Models"]

@@ -18,10 +18,11 @@ from rootsopt.optimize.problem import Problem
 from rootsopt.response.ensemble import ERRORS, SIGNIFICANT, independent
 from rootsopt.response.evaluation import Evaluation, Evaluator
 
+# Distance between trials in the unit box below which they count as the same candidate.
 _NEAR = 0.1
-"""Distance between trials in the unit box below which they count as the same candidate."""
+
+# Maximum number of candidates that are averaged again.
 _CANDIDATES = 3
-"""Maximum number of candidates that are averaged again."""
 
 
 class Verification(NamedTuple):

@@ -14,14 +14,13 @@ from rootsopt.optimize.sqp import REASONS
 if TYPE_CHECKING:
     from rootsopt.optimize.vertices import VertexOptimum
 
+# Differences above which the optima of two local searches count as distinct: relative difference
+# between objectives, and difference in one coordinate of the unit box.
 _SAME = 1e-4, 0.03
-"""Differences above which the optima of two local searches count as distinct: relative difference
-between objectives, and difference in one coordinate of the unit box."""
 
 _REASONS = REASONS | {
     "descent": (
-        "The descent has a step size and no test for an optimum: the design may be short of it. "
-        "Set optimizer.method to auto."
+        "The descent has a step size and no test for an optimum: the design may be short of it."
     ),
     "verification": (
         "The search found nothing better nearby, but the first-order conditions do not hold at the "
@@ -242,15 +241,3 @@ def unseen(searches: int, optima: int) -> dict[str, float | None]:
     share = count * (count + 1) / (n * (n - 1)) if n > 1 else 1.0
     share = share if share < 1.0 else None
     return {"searches": n, "optima": count, "expected_optima": expected, "share_of_starts": share}
-
-
-__all__ = [
-    "Bound",
-    "Holder",
-    "Optimality",
-    "Optimum",
-    "StartOutcome",
-    "distinct",
-    "judged",
-    "unseen",
-]

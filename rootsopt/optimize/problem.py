@@ -34,23 +34,23 @@ from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene
 from rootsopt.status import Status
 
+# Amplitude of the baseline's line (relative to its mean force) below which it can be no objective.
 _NO_LINE = 1e-9
-"""Amplitude of the baseline's spectral line (relative to its mean force) below which an objective
-that contains this line is rejected."""
+
+# Slack and slope (both scaled) below which every design counts as meeting a limit with equality.
 _SAME = 1e-6
-"""Slack and slope of a constraint (both scaled) below which the constraint counts as met with
-equality by every design."""
+
+# Multiplier of a bound, or share of a branch, below which the bound or branch counts as inactive.
 _HELD = 1e-6
-"""Multiplier of a bound, or share of a branch, below which the bound or branch counts as inactive.
-"""
+
+# Change of a limit, by the unit of the limit, for which the report states the effect on the
+# objective. In other units, it is the power of ten nearest to 1 % of the limit.
 _STEPS = {"mm": 0.1, "deg": 1.0, "°": 1.0, "": 0.01}
-"""Change of a limit, by the unit of the limit, for which the report states the effect on the
-objective. In other units, it is the power of ten nearest to 1 % of the limit."""
 SCENE_KINDS = 64
-"""Number of branch kinds reserved for each scene. Each speed is a kind, and there are at most 33
-speeds."""
+"""Number of branch kinds reserved for each scene: one per speed, of which there are at most 33."""
+
+# Maximum number of times that an infeasible point is moved halfway towards a feasible point.
 _DRAWN = 5
-"""Maximum number of times that an infeasible point is moved halfway towards a feasible point."""
 FEASIBLE = 1e-6
 """Scaled violation of a constraint above which a point counts as infeasible. It is also the
 distance from a bound of the unit box above which the bound counts as inactive."""

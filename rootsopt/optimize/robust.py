@@ -37,10 +37,12 @@ OBJECTIVE = "objective"
 COMPARED: tuple[str, ...] = (OBJECTIVE, *RESPONSES)
 """Quantities that are compared over fresh scenes: the objective (1 for the baseline in the nominal
 scene), and mean, peak and RMS force (N)."""
+
+# Level of the quantile that the comparison reports.
 _LEVEL = 0.95
-"""Level of the quantile that the comparison reports."""
+
+# Distance in the unit box below which two designs count as the same.
 _APART = 1e-6
-"""Distance in the unit box below which two designs count as the same."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -156,7 +158,6 @@ class RobustStage(Stage):
 
         Without an optimum, return the baseline's `own` point. All are moved onto the feasible
         set."""
-        del settings
         found = [] if self.nominal.optimized is None else [self.nominal.optimized.design]
         found += [dict(one) for one in self.others]
         if self.nominal.optimality is not None:
@@ -387,16 +388,3 @@ def search_of(
     nominal = config.tolerances is None and config.objective.over == "nominal"
     found = (Search if nominal else TolerantSearch)(config, progress, stop, checkpoint, runs)
     return AssumedSearch(found, config, progress, stop, runs) if config.spans else found
-
-
-__all__ = [
-    "COMPARED",
-    "OBJECTIVE",
-    "RobustStage",
-    "Robustness",
-    "Scattered",
-    "TolerantSearch",
-    "compare",
-    "search_of",
-    "without",
-]

@@ -21,8 +21,8 @@ from rootsopt.response.evaluation import Evaluation
 from rootsopt.response.reducers import Combined, combine
 from rootsopt.scene import Scene
 
+# Share of a scene below which the scene does not count as active at the optimum.
 _HELD = 1e-6
-"""Share of a scene below which the scene does not count as active at the optimum."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -218,6 +218,3 @@ def _branches(local: Linearization, kind: int) -> Group:
         return Group(tags, local.smooth + group.values, local.slope + group.slopes)
     tags = np.array([[float(kind), 0.0]])
     return Group(tags, np.array([local.objective]), top_slope(local)[None, :])
-
-
-__all__ = ["RobustProblem", "top_slope"]

@@ -42,24 +42,30 @@ from rootsopt.response.still import Still, needed_motion
 from rootsopt.runtime.threads import POLL
 from rootsopt.scene import Scene
 
+# Maximum number of points at which the search for the least violation of the constraints starts.
 _EXPLAINED = 8
-"""Maximum number of points at which the search for the least violation of the constraints starts.
-"""
+
+# Maximum number of these points if each must be simulated.
 _SIMULATED = 3
-"""Maximum number of these points if each must be simulated."""
+
+# Start of the trials of a lower bound, in place of the index of a local search.
 _BOUND = -2
-"""Start of the trials of a lower bound, in place of the index of a local search."""
+
+# Greatest number of design parameters for which a lower bound is looked for: if it is asked for,
+# and by default.
 _PARAMETERS, _QUICK = 4, 3
-"""Greatest number of design parameters for which a lower bound is looked for: if it is asked for,
-and by default."""
+
+# Number of evaluations and of boxes of a lower bound that is asked for.
 _MOST = 2000, 20_000
-"""Number of evaluations and of boxes of a lower bound that is asked for."""
+
+# Number of points that it evaluates side by side.
 _TOGETHER = 8
-"""Number of points that it evaluates side by side."""
+
+# Number of the first trial beside an optimum at a vertex, and greatest number of these trials.
 _AT_VERTEX, _DRAWN = 100_000, 40
-"""Number of the first trial beside an optimum at a vertex, and greatest number of these trials."""
+
+# Relative gain from which a local search begins at a better design that it finds.
 _BETTER = 1e-5
-"""Relative gain from which a local search begins at a better design that it finds."""
 Progress = Callable[[int, int, float], None]
 """Type of a progress callback, with arguments (evaluations done, evaluations expected, best
 objective)."""
@@ -81,7 +87,6 @@ class Stage:
 
     def evaluator(self, exact: Evaluator, runs: Runs) -> Evaluator:
         """Return the evaluator of the stage; `exact`: that of the config's objective."""
-        del runs
         return exact
 
     def problem(self, config: Config, scene: Scene, baseline: Evaluation) -> Problem:
@@ -102,7 +107,6 @@ class Stage:
         self, problem: Problem, start: int, evaluation: Evaluation, point: NDArray[np.float64]
     ) -> Linearization | None:
         """Return objective and constraints at a `point` (d,) of the local search `start`."""
-        del start
         return problem.local(evaluation, point)
 
 
@@ -115,8 +119,7 @@ class Search:
     `runs`: where screening and local searches evaluate designs; `stage`: what differs from the
     usual search.
 
-    Raises `InputError` if there is no design parameter, or if the optimisation
-    method does not suit the objective."""
+    Raises `InputError` if there is no design parameter."""
 
     def __init__(
         self,
@@ -220,7 +223,7 @@ class Search:
             trials = self._side_by_side(self._screen, list(enumerate(points)))
         ranked = _ranked(trials) if self.settings.screening else points
         starts = _apart(ranked, self.stage.apart, self.settings.starts) or points[:1]
-        work = self._solve if self.method == "slsqp" else self._descend
+        work = self._descend if self.noisy else self._solve
         trials += self._side_by_side(work, list(enumerate(starts, self.stage.first)))
         bounding, further = self._bounded(trials, self.stage.first + len(starts))
         trials += further
@@ -432,16 +435,15 @@ class Search:
         return trials
 
     def _descend(self, number: int, point: NDArray[np.float64]) -> list[Trial]:
-        """Descend from `point` (d,) by an update rule, and return the trials.
+        """Descend from `point` (d,) by Adam's rule, and return the trials.
 
         `number`: index of the local search."""
-        rule = self.method, self.settings.learning_rate, self.settings.iterations
 
         def evaluate(point: NDArray[np.float64], iteration: int, orbit: Any) -> Trial:
             return self._evaluate(self.fast, point, number, iteration, orbit)
 
-        noisy, asked = self.noisy, self.stop.is_set
-        return descended(self.problem, evaluate, point, rule, noisy, asked)
+        iterations, asked = self.settings.iterations, self.stop.is_set
+        return descended(self.problem, evaluate, point, iterations, asked)
 
     def _evaluate(
         self, evaluator: Evaluator, point, start, iteration, orbit=None, key=None
@@ -476,19 +478,8 @@ class Search:
 
 
 def method_of(config: Config) -> str:
-    """Return the method of the local searches, with `auto` replaced by the method it stands for.
-
-    Raises `InputError` if the search needs exact gradients but there are none: the objective is an
-    average over an ensemble, or the contact is not smooth."""
-    method, noisy = config.optimizer.method, config.objective.motion == "ensemble"
-    if method == "auto":
-        return "adam" if noisy else "slsqp"
-    if method == "slsqp" and noisy:
-        raise InputError(
-            "`optimizer.method` must be adam, rmsprop or sgd for `objective.motion` ensemble, but "
-            "is slsqp: gradients of averages have noise; set it to auto"
-        )
-    return method
+    """Return the method of the local searches: Adam's rule for averages, which have noise."""
+    return "adam" if config.objective.motion == "ensemble" else "slsqp"
 
 
 def _ranked(trials: list[Trial]) -> list[NDArray[np.float64]]:

@@ -24,27 +24,34 @@ from rootsopt.optimize.certificate import RESIDUAL, Certificate, certify
 from rootsopt.optimize.local import Linearization, Look
 from rootsopt.optimize.models import Limits, Models
 
+# Half width of the trust region (unit box): at the start, greatest, and that below which the
+# search ends.
 _FIRST, _GREATEST, _LEAST = 0.1, 0.5, 1e-5
-"""Half width of the trust region (unit box): at the start, greatest, and that below which the
-search ends."""
+
+# Half width (unit box) of the neighbourhood in which a converged search promises no decrease.
 _WIDE = 0.05
-"""Half width (unit box) of the neighbourhood in which a converged search promises no decrease."""
+
+# Distance (unit box) from the point where the Hessians were measured above which they are
+# measured again before a search has converged.
 _FRESH = 0.02
-"""Distance (unit box) from the point where the Hessians were measured above which they are measured
-again before a search has converged."""
+
+# First-order residual above which a search goes on, although its models promise no decrease.
 _FLAT = RESIDUAL / 2
-"""First-order residual above which a search goes on, although its models promise no decrease."""
+
+# Number of steps tried in order to lower this residual.
 _TRIES = 3
-"""Number of steps tried in order to lower this residual."""
+
+# Difference of two objectives below which the smaller residual decides which point is better.
+# Evaluations of the same design differ by up to this amount if their first guesses of the orbit
+# differ (3e-8 on CIC rotors, 1e-7 on five arcs).
 _NOISE = 1e-7
-"""Difference of two objectives below which the smaller residual decides which point is better.
-Evaluations of the same design differ by up to this amount if their first guesses of the orbit
-differ (3e-8 on CIC rotors, 1e-7 on five arcs)."""
+
+# Least magnitude of the objective to which decreases are related.
 _SMALL = 0.1
-"""Least magnitude of the objective to which decreases are related."""
+
+# Price of a violation: its first value, plus twice the sum of all multipliers; and its greatest
+# value.
 _PRICE, _MOST = 2.0, 1e5
-"""Price of a violation: its first value, plus twice the sum of all multipliers; and its greatest
-value."""
 
 
 class Stops(NamedTuple):
@@ -245,6 +252,3 @@ def descend(
     best = search.models
     ended = reason, search.evaluations, search.promised
     return Found(best.point, best.local, search.certificate, *ended)
-
-
-__all__ = ["REASONS", "EndError", "Found", "Stops", "descend"]

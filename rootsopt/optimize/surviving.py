@@ -18,6 +18,8 @@ from rootsopt.status import Status
 
 ERROR = 0.01
 """Error (mm) of the profile along its normal, and of the centre distance."""
+
+# Errors (mm) of profile and centre distance by the name of the case.
 _CASES = {
     "as drawn": (0.0, 0.0),
     f"flanks {1e3 * ERROR:g} µm fuller": (ERROR, 0.0),
@@ -25,7 +27,6 @@ _CASES = {
     f"axes {1e3 * ERROR:g} µm nearer": (0.0, -ERROR),
     f"axes {1e3 * ERROR:g} µm farther": (0.0, ERROR),
 }
-"""Errors (mm) of profile and centre distance by the name of the case."""
 
 
 def surviving(result: Optimization, given: Config) -> list[dict[str, Any]]:
@@ -90,6 +91,3 @@ def survives(rows: list[dict[str, Any]]) -> str:
         f"With errors of ±{1e3 * ERROR:g} µm, at least {100 * worst['share']:.3g} % of the gain "
         f"is left (worst: {worst['case']})."
     )
-
-
-__all__ = ["ERROR", "survives", "surviving"]

@@ -15,16 +15,19 @@ from rootsopt.optimize.sqp import Found
 from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.response.sensitivity import by_scene, quantities
 
+# Relative difference between a design's objectives in search and verification above which the
+# design is rejected.
 _HOLDS_UP = 0.01
-"""Relative difference between a design's objectives in search and verification above which the
-design is rejected."""
+
+# Factor on the tolerance of orbits for a second evaluation, if the first-order conditions do not
+# hold.
 _SHARPER = 0.01
-"""Factor on the tolerance of orbits for a second evaluation, if the first-order conditions do not
-hold."""
+
+# Distances (unit box, per coordinate) from a design at which its verification is repeated.
 _BESIDE = 1e-6, 1e-5, 3e-5, 1e-4
-"""Distances (unit box, per coordinate) from a design at which its verification is repeated."""
+
+# Scaled excess over a force limit above which the verification rejects a design.
 _MEETS = 1e-4
-"""Scaled excess over a force limit above which the verification rejects a design."""
 
 
 @dataclasses.dataclass(frozen=True)

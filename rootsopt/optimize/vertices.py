@@ -17,20 +17,26 @@ from rootsopt.optimize.certificate import NEAR
 from rootsopt.optimize.models import Limits
 from rootsopt.optimize.problem import Problem
 
+# Length (unit box) of a step along an edge.
 _STEP = 1 / 24
-"""Length (unit box) of a step along an edge."""
+
+# Greatest number of steps along an edge.
 _STEPS = 60
-"""Greatest number of steps along an edge."""
+
+# Greatest number of Newton steps, and slack at which they end.
 _NEWTON, _EXACT = 12, 1e-10
-"""Greatest number of Newton steps, and slack at which they end."""
+
+# Smallest singular value of the gradients of limits that meet at a point.
 _FLAT = 1e-6
-"""Smallest singular value of the gradients of limits that meet at a point."""
+
+# Nodes per axis of a plane: to find the feasible part of the box, and in this part.
 _COARSE, _NODES = 25, 33
-"""Nodes per axis of a plane: to find the feasible part of the box, and in this part."""
+
+# Least number of designs between which an objective is drawn.
 _CORNERS = 4
-"""Least number of designs between which an objective is drawn."""
+
+# Greatest number of other vertices that are simulated.
 _VERTICES = 8
-"""Greatest number of other vertices that are simulated."""
 
 
 class Vertex(NamedTuple):
@@ -257,6 +263,3 @@ def _independent(normals: NDArray[np.float64]) -> bool:
     if not np.all(np.isfinite(normals)):
         return False
     return not len(normals) or float(np.linalg.svd(normals, compute_uv=False)[-1]) > _FLAT
-
-
-__all__ = ["FeasibleSet", "Plane", "Vertex", "VertexOptimum", "vertex_optimum"]

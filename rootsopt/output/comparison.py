@@ -23,8 +23,8 @@ from rootsopt.output.names import (
 )
 from rootsopt.response.sensitivity import NAMES
 
+# Length (mm) below which sentences state it in µm.
 _MICRO = 0.1
-"""Length (mm) below which sentences state it in µm."""
 
 
 def assumption_tables(result: Mapping[str, Any]) -> Iterator[Table | None]:
@@ -164,12 +164,13 @@ NOTHING_BETTER = (
     "`--set constraints.seal_width_min_mm`."
 )
 """Message if there is none."""
+
+# Quantities that are compared, by the entry of a record that holds them.
 _ROWS = (
     ("response", ("mean_force_N", "peak_force_N")),
     ("pump", ("volumetric_efficiency", "flow_ripple", "displaced_volume_cm3")),
     ("geometry", ("seal_width_mm",)),
 )
-"""Quantities that are compared, by the entry of a record that holds them."""
 
 
 def better_tables(result: Mapping[str, Any]) -> Iterator[Table | None]:

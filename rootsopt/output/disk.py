@@ -6,9 +6,7 @@ call. Only the standard library is used.
 The lock can be held by one process at a time, and the system releases it when that process ends."""
 
 import contextlib
-import ctypes
 import errno
-import functools
 import os
 import shutil
 import stat
@@ -16,8 +14,6 @@ from pathlib import Path
 
 from rootsopt.errors import InputError
 
-_AT_FDCWD = -100
-_RENAME_EXCHANGE = 2
 _UNSUPPORTED = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)
 
 
@@ -96,53 +92,6 @@ def replace(source: Path, target: Path) -> None:
 
     Raises `OSError` if renaming fails."""
     os.replace(source, target)
-
-
-def exchange(first: Path, second: Path) -> bool:
-    """Exchange the names of two folders in one step; return `False` if the system cannot do this.
-
-    Raises `OSError` if the exchange fails for another reason."""
-    call = _renameat2()
-    if call is None:
-        return False
-    error = _exchanged(call, os.fsencode(first), os.fsencode(second))
-    if error in _UNSUPPORTED:
-        return False
-    if error:
-        raise OSError(error, os.strerror(error), str(first))
-    return True
-
-
-def can_exchange(folder: Path) -> bool:
-    """Return whether the file system of `folder` can exchange the names of two folders.
-
-    Raises `OSError` if the folders for this test cannot be created."""
-    pair = [folder / name for name in (".first", ".second")]
-    for one in pair:
-        os.mkdir(one)
-    try:
-        return exchange(*pair)
-    finally:
-        for one in pair:
-            discard(one)
-
-
-def _exchanged(call, first: bytes, second: bytes) -> int:
-    """Exchange two folders with the C function `call`; return its error number, or 0."""
-    done = call(_AT_FDCWD, first, _AT_FDCWD, second, _RENAME_EXCHANGE)
-    return ctypes.get_errno() if done else 0
-
-
-@functools.cache
-def _renameat2():
-    """Return the C library's function `renameat2`, or `None` if it does not exist."""
-    try:
-        call = ctypes.CDLL(None, use_errno=True).renameat2
-    except (OSError, AttributeError, TypeError):
-        return None
-    path = ctypes.c_char_p
-    call.argtypes = ctypes.c_int, path, ctypes.c_int, path, ctypes.c_uint
-    return call
 
 
 def adopt_mode(path: Path, model: Path) -> None:

@@ -17,6 +17,7 @@ from rootsopt.output.names import brief, in_words, name_and_unit, stated
 from rootsopt.output.tables import Record, records_of
 from rootsopt.status import Status
 
+# What came out of a run, by command.
 _FACTS = {
     "optimize": facts.optimised,
     "simulate": facts.simulated,
@@ -26,18 +27,22 @@ _FACTS = {
     "identify": identified,
     "profile": facts.drawn,
 }
-"""What came out of a run, by command."""
+
+# Commands whose runs end like those of another one.
 _ALIKE = {"improve": "optimize"}
-"""Commands whose runs end like those of another one."""
+
+# Statuses of a run that need no explanation.
 _SAID = *facts.STEADY, Status.GEOMETRY_ONLY.label, Status.IDENTIFIED.label
-"""Statuses of a run that need no explanation."""
+
+# Blanks between the sentences of a message: what came out, and then advice.
 _SENTENCES = re.compile(r"(?<=[.!?]) (?=[A-Z])(?!In conflict)")
-"""Blanks between the sentences of a message: what came out, and then advice."""
 _STOPPED = Status.INTERRUPTED.label, Status.NOT_SIMULATED.label
 _DRAW, _SIMULATE = ("Draw the rotor", "profile"), ("Simulate this design", "simulate")
 _SPEEDS = "Check it at other speeds", "sweep"
 _MOTIONS = "Check whether other motions coexist", "attractors"
 _OPTIMISE = "Optimise the design", "optimize"
+
+# What to do after a run with a usable result: (purpose, command).
 _NEXT = {
     "optimize": (_DRAW, _SPEEDS, _MOTIONS),
     "simulate": (_OPTIMISE, _SPEEDS, _MOTIONS),
@@ -47,14 +52,13 @@ _NEXT = {
     "pareto": (("Simulate one point", "simulate"), ("Draw its rotor", "profile")),
     "sweep": (_SIMULATE, _MOTIONS),
 }
-"""What to do after a run with a usable result: (purpose, command)."""
 
 
+# Objective for flanks that stay apart, by whether the leakage is known: they have no force.
 _APART = {
     known: f"objective={{mean_weight: 0, peak_weight: 0, terms: {{{term}: 1}}}}"
     for known, term in ((True, "leakage_fraction"), (False, "flow_ripple"))
 }
-"""Objective for flanks that stay apart, by whether the leakage is known: they have no force."""
 
 
 class Ending(NamedTuple):
@@ -164,6 +168,3 @@ def _steepest(record: Record) -> str:
     word = "raises" if known[key] > 0 else "lowers"
     much = f"{word} the peak force by {brief(abs(known[key]))} N"
     return f" ({stated(key, 1)} more of {name_and_unit(key)[0]} {much})"
-
-
-__all__ = ["Ending", "ending"]

@@ -32,15 +32,16 @@ STEADY = Status.PERIODIC.label, Status.AVERAGED.label, Status.IDLE.label
 FEW = 6
 """Number of quantities above which a sentence leaves out the others."""
 _PEAK, _RESERVE = "peak_force_N", RESERVES[0]
+
+# Absolute change (%) below which a quantity counts as unchanged.
 _SMALL = 0.05
-"""Absolute change (%) below which a quantity counts as unchanged."""
+
+# Quantities that other words tell: displaced volume, area efficiency, outer radius, reserve.
 _TOLD = "theoretical_flow_l_min", "area_mm2", "root_radius_mm", _RESERVE
-"""Quantities that other words tell: displaced volume, area efficiency, outer radius, reserve."""
 
 
 def optimised(result: Record, rows: Sequence[Record]) -> Facts:
     """Return facts on an optimum; an empty list without one."""
-    del rows
     before, after = result.get("baseline") or {}, result.get("optimized") or {}
     if not after:
         return []
@@ -207,7 +208,6 @@ def _caveats(result: Record, after: Record) -> Iterator[str]:
 
 def simulated(result: Record, rows: Sequence[Record]) -> Facts:
     """Return facts on one simulated design."""
-    del rows
     response, steady = result.get("response") or {}, result.get("steady_state") or {}
     mean, peak = response.get("mean_force_N"), response.get("peak_force_N")
     force, apart = [], result.get("status") == Status.IDLE.label
@@ -269,7 +269,6 @@ def _advice_of(record: Record) -> list[str]:
 
 def traced(result: Record, rows: Sequence[Record]) -> Facts:
     """Return facts on a front."""
-    del rows
     points, aims = result.get("points") or [], result.get("terms") or []
     if not points:
         return []
@@ -331,7 +330,6 @@ def swept(result: Record, rows: Sequence[Record]) -> Facts:
 
 def coexisting(result: Record, rows: Sequence[Record]) -> Facts:
     """Return facts on coexisting motions."""
-    del rows
     found, words = result.get("attractors") or [], []
     for number, row in enumerate(found[:FEW], start=1):
         peak = (row.get("response") or {}).get("peak_force_N")
@@ -349,25 +347,9 @@ def coexisting(result: Record, rows: Sequence[Record]) -> Facts:
 
 def drawn(result: Record, rows: Sequence[Record]) -> Facts:
     """Return facts on a geometry."""
-    del rows
     shape, sheet = result["geometry"], result.get("pump") or {}
     keys = "displaced_volume_cm3", "flow_ripple"
     pumped = [stated(key, sheet[key], named=True) for key in keys if key in sheet]
     share = f"{100 * shape['area_efficiency']:.4g} % of the circle of this radius pumps"
     words = [stated("outer_radius_mm", shape["outer_radius_mm"], named=True), share, *pumped]
     return [("Rotor", _sentence(words)), ("How sure", str(result["message"]))]
-
-
-__all__ = [
-    "FEW",
-    "STEADY",
-    "Facts",
-    "coexisting",
-    "drawn",
-    "optimised",
-    "ranked",
-    "reserves",
-    "simulated",
-    "swept",
-    "traced",
-]

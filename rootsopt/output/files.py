@@ -1,8 +1,6 @@
-"""Result files, each written completely or not at all, in a folder that is checked beforehand.
+"""Result files, in a folder that is checked beforehand.
 
-Every file is written under a temporary name in its folder, then renamed in one step. A reader
-therefore sees either the old file or the complete new file, even after a killed run. Commands write
-whole folders in the same way (`rootsopt.output.runs`)."""
+Commands write whole folders in one step (`rootsopt.output.runs`)."""
 
 import csv
 import enum
@@ -10,7 +8,6 @@ import io
 import json
 import math
 import os
-import secrets
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -20,7 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from rootsopt.config import sources
 from rootsopt.errors import InputError
-from rootsopt.output import disk
 from rootsopt.runtime.environment import versions as versions
 
 if TYPE_CHECKING:
@@ -37,22 +33,15 @@ DPI = 150
 class ResultFolder:
     """The folder `path` for result files, created with its parents if it does not exist.
 
-    Raises `InputError` if the folder cannot be created or written to. Folders created in the
-    attempt are then removed."""
+    Raises `InputError` if the folder cannot be created."""
 
     def __init__(self, path: str | os.PathLike):
         if not str(path):
             raise InputError("the output folder must have a name, but is empty; give a path")
         self.path = Path(path)
-        made: list[Path] = []
         try:
-            disk.make_folders(self.path, made)
-            probe = self.path / _temporary("probe")
-            disk.create(probe, b"probe")
-            disk.discard(probe)
+            self.path.mkdir(parents=True, exist_ok=True)
         except (OSError, ValueError) as error:
-            for folder in reversed(made):
-                disk.discard(folder)
             raise InputError(
                 f"{str(path)!r}: cannot be used as output folder: {sources.reason(error)}; choose "
                 "another folder or make this one writable"
@@ -68,15 +57,9 @@ class ResultFolder:
 
         Return the file's path. Raises `InputError` if the file cannot be written."""
         target = self.path / name
-        temporary = target.with_name(_temporary(target.name))
         try:
-            disk.make_folders(target.parent, [])
-            disk.create(temporary, data)
-            try:
-                disk.replace(temporary, target)
-            except BaseException:
-                disk.discard(temporary)
-                raise
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_bytes(data)
         except OSError as error:
             raise InputError(
                 f"{str(target)!r}: cannot be written: {sources.reason(error)}; make room there or "
@@ -129,10 +112,6 @@ class ResultFolder:
         # in half the time.
         picture.save(file, "png", compress_level=1, dpi=(DPI, DPI))
         return self.write_bytes(name, file.getvalue())
-
-
-def _temporary(name: str) -> str:
-    return f".{name[:100]}.{os.getpid()}-{secrets.token_hex(4)}.tmp"
 
 
 def plain(data: Any) -> Any:
@@ -225,8 +204,8 @@ def response_columns(series: "Series") -> dict[str, NDArray[np.float64]]:
     } | more
 
 
+# Columns of the loads on the bearings.
 _BEARINGS = tuple(f"bearing_{rotor}_{end}_end_N" for rotor in (1, 2) for end in ("gear", "far"))
-"""Columns of the loads on the bearings."""
 
 
 def design_file(point: int) -> str:

@@ -40,7 +40,6 @@ def identified(
     result: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]
 ) -> list[tuple[str, str]]:
     """Return facts on a fit to a record."""
-    del rows
     found = []
     for key, one in (result.get("parameters") or {}).items():
         (name, unit), error = name_and_unit(key), one["standard_error"]
@@ -48,6 +47,3 @@ def identified(
         found.append(f"{name} {brief(one['value'])} {sure} {unit}".strip())
     said = str(result["message"]).partition(". ")[2]
     return [("Found", f"{listed(found)}."), ("How sure", said)] if found else []
-
-
-__all__ = ["identified", "identified_tables"]

@@ -2,10 +2,9 @@
 
 The target is the folder that the user names. A run writes into its own temporary folder beside the
 target, `.NAME.PROCESS-XXXXXXXX.rootsopt`. When all files are written, this folder takes the
-target's name in one step. The target therefore contains either the earlier run or the new run,
-never a mixture. A lock file beside the target, `.NAME.rootsopt`, keeps other processes out. The
-temporary folder and the lock file disappear when the run ends. If a run is killed, the next run
-removes what it left behind.
+target's name in one step. The target therefore never contains a mixture of two runs. A lock file
+beside the target, `.NAME.rootsopt`, keeps other processes out. The temporary folder and the lock
+file disappear when the run ends. If a run is killed, the next run removes what it left behind.
 
 What happens depends on the content of the target:
 
@@ -14,12 +13,10 @@ What happens depends on the content of the target:
   contains files that are not its own;
 - anything else: the target is refused.
 
-If the file system can exchange two folders (Linux), the target exists at all times. Otherwise the
-earlier run is moved away first. If the process is killed at that moment, the next run moves the
+The earlier run is moved away first. If the process is killed at that moment, the next run moves the
 finished folder to the target."""
 
 import contextlib
-import errno
 import hashlib
 import json
 import os
@@ -43,12 +40,14 @@ RESULT = "result.json"
 _CONFIG = "config.yaml"
 _SUFFIX = ".rootsopt"
 _STAGE = re.compile(r"(\..+)\.\d+-[0-9a-f]{8}" + re.escape(_SUFFIX))
+
+# Length (bytes) of a folder's name above which temporary names contain a digest of the name
+# instead of the name itself.
 _LONGEST = 150
-"""Length (bytes) of a folder's name above which temporary names contain a digest of the name
-instead of the name itself."""
+
+# Time (s) after a request to stop above which the temporary folder is left behind. This happens
+# if a write is still in progress.
 _PATIENCE = 10.0
-"""Time (s) after a request to stop above which the temporary folder is left behind. This happens if
-a write is still in progress."""
 _State = Literal["absent", "empty", "ours", "more", "foreign"]
 
 
@@ -275,38 +274,17 @@ class RunFolder(ResultFolder):
             return [f"the requested folder now holds other files; this run is in {self.path}"]
         disk.adopt_mode(self.stage, self.target)
         if self.overwrite and state == "ours":
-            self._replace()
+            older = self._temporary()
+            self._swap_by(older)
+            disk.discard_tree(older)
             return []
         aside = self._free()
-        self._push_aside(aside)
+        self._swap_by(aside)
         shown = self.path.with_name(aside.name)
         note = f"the earlier run is now in {shown}"
         if self.overwrite:
             note += ", because it holds files that are not its own"
         return [note]
-
-    def _replace(self) -> None:
-        """Move this run to the target's path, and remove the earlier run."""
-        if disk.exchange(self.stage, self.target):
-            older = self.stage
-        else:
-            older = self._temporary()
-            self._swap_by(older)
-        disk.discard_tree(older)
-
-    def _push_aside(self, aside: Path) -> None:
-        """Move this run to the target's path, and the earlier run to `aside`."""
-        if not disk.can_exchange(self.stage):
-            self._swap_by(aside)
-            return
-        # The run is complete under that name, so nothing is lost if the process ends in between.
-        disk.move(self.stage, aside)
-        try:
-            if not disk.exchange(aside, self.target):
-                raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
-        except BaseException:
-            disk.move(aside, self.stage)
-            raise
 
     def _swap_by(self, older: Path) -> None:
         """Move the earlier run to `older`, then this run to the target's path.

@@ -37,6 +37,8 @@ Record = Mapping[str, Any]
 """The result file, or an entry of it."""
 NAMES = {"baseline": "baseline", "nominal": "nominal member", "optimized": "optimised"}
 """Names of the designs in the result file of an optimisation, by their key there."""
+
+# Headings of a record's entries.
 _GROUPS = {
     "response": "contact force",
     "geometry": "geometry",
@@ -44,7 +46,8 @@ _GROUPS = {
     "outline": "outline from a file",
     "steady_state": "motion and status",
 }
-"""Headings of a record's entries."""
+
+# Keys of the forces that the pump sheet shows.
 _SHEET_FORCES = (
     "mean_force_N",
     "peak_force_N",
@@ -53,11 +56,12 @@ _SHEET_FORCES = (
     "axial_force_max_N",
     "tilting_moment_max_N_m",
 )
-"""Keys of the forces that the pump sheet shows."""
+
+# Number of motions above which the numbers that all of them share are omitted.
 _WIDEST = 6
-"""Number of motions above which the numbers that all of them share are omitted."""
+
+# Estimated share of further starts with a new optimum above which more starts are recommended.
 _UNSURE = 0.5
-"""Estimated share of further starts with a new optimum above which more starts are recommended."""
 
 
 def sections(

@@ -13,12 +13,15 @@ from rootsopt.output.names import Table
 
 WIDTH = 80
 """Width (characters) above which the columns of a table go to several tables."""
+
+# Length (characters) above which a text may be folded inside its column.
 _LONGEST = 20
-"""Length (characters) above which a text may be folded inside its column."""
+
+# Width (characters) of the frame and the blanks beside a column.
 _BETWEEN = 3
-"""Width (characters) of the frame and the blanks beside a column."""
+
+# Blanks before the rows of a group with a heading.
 _INDENT = 2
-"""Blanks before the rows of a group with a heading."""
 _ASCII = str.maketrans(
     {"µ": "u", "×": "x", "−": "-", "–": "-", "≥": ">=", "≤": "<=", "±": "+-", "→": "->", "·": " ",
      "²": "^2", "³": "^3", "Δ": "d", "…": "...", "’": "'"}
@@ -106,6 +109,3 @@ def _drawn(table: Table, widths: Mapping[int, int]) -> rich.table.Table:
             label, *cells = (Text(ascii_text(x.text), _STYLES[x.good]) for x in chosen)
             made.add_row(Text(" " * _INDENT if heading else "") + label, *cells)
     return made
-
-
-__all__ = ["WIDTH", "ascii_text", "show_ending", "shown"]

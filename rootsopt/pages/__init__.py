@@ -1,4 +1,4 @@
-"""Pages that open without a network: the option `--report`, and the front of `rootsopt pareto`."""
+"""Pages in a browser: the report of a run, and the explorer."""
 
 import importlib.util
 
@@ -6,8 +6,6 @@ from rootsopt.errors import InputError
 
 REPORT = "report.html"
 """Name of the report in the result folder."""
-FRONT = "front.html"
-"""Name of the interactive page of a front in the result folder."""
 _LIBRARIES = "bokeh", "jinja2"
 
 
@@ -23,4 +21,4 @@ def require(what: str, extra: str = "pages") -> None:
         raise InputError(f"{what} needs {words}")
 
 
-__all__ = ["FRONT", "REPORT", "missing", "require"]
+__all__ = ["REPORT", "missing", "require"]

@@ -14,11 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 from rootsopt.config import Config
 from rootsopt.config.units import MM
 from rootsopt.figures.animation import Contacts, frames_of
-from rootsopt.figures.force import amplitude_spectrum
 from rootsopt.figures.front import kinds
 from rootsopt.figures.style import BLUE, COLORS, GREY, ORANGE, VERMILION
-from rootsopt.output.names import brief, in_words, label, stated, value
-from rootsopt.output.tables import varied
+from rootsopt.output.names import in_words, label, value
 from rootsopt.pages.gather import Case
 from rootsopt.profiles import Profile, outline
 from rootsopt.response.series import Series
@@ -41,20 +39,16 @@ THEME = Theme(json={"attrs": {
     "Toolbar": {"logo": None},
 }})  # fmt: skip
 """Style of all charts on pages, for a Bokeh document."""
+
+# Number of revolutions above which the chart of a motion shows only a part at first.
 _MOST_TURNS = 4
-"""Number of revolutions above which the chart of a motion shows only a part at first."""
+
+# Number of samples above which a chart of a motion shows only the extremes of each interval.
 _MOST_SAMPLES = 20_000
-"""Number of samples above which a chart of a motion shows only the extremes of each interval."""
-_HARMONICS = 40
-"""Highest multiple of the mesh frequency in a spectrum."""
-_LINES = 400
-"""Number of spectral lines above which a spectrum is drawn as a curve."""
-_FLOOR = 1e-4
-"""Smallest amplitude in a spectrum, as a fraction of the largest."""
-_MOST_CURVES = 8
-"""Number of lines above which a chart of a sweep shows single points instead."""
-_MARKS = "circle", "diamond", "square", "triangle"
+
 _HOLLOW: dict[str, Any] = {"fill_color": None, "line_width": 2}
+
+# Look of each kind of point of a front.
 _LOOKS: dict[str, dict[str, Any]] = {
     "certified": {"size": 11, "color": BLUE},
     "not certified": {"size": 11, "line_color": BLUE} | _HOLLOW,
@@ -63,7 +57,6 @@ _LOOKS: dict[str, dict[str, Any]] = {
     "side of a gap": {"size": 19, "line_color": ORANGE} | _HOLLOW,
     "baseline": {"size": 15, "marker": "star", "color": VERMILION},
 }
-"""Look of each kind of point of a front."""
 _DASHES = "solid", "dashed", "dotted", "dashdot"
 
 
@@ -121,102 +114,6 @@ def force_chart(cases: Sequence[Case]) -> Any | None:
 def _moving(cases: Sequence[Case]) -> list[tuple[Case, Series]]:
     """Return the cases that have a motion, each with its series."""
     return [(case, case.series) for case in cases if case.series is not None]
-
-
-def spectrum_chart(cases: Sequence[Case]) -> Any | None:
-    """Return the chart of the force's spectrum, or None if no case has a force that varies.
-
-    The samples are uniform in rotation, so that the lines are multiples of the mesh frequency even
-    if the speed varies."""
-    spectra = []
-    for case, series in _moving(cases):
-        pitches = series.rotation * case.config.profile.lobes / (2 * np.pi)
-        step = float(pitches[1] - pitches[0])
-        order, amplitude = amplitude_spectrum(series.force, step)
-        shown = order <= _HARMONICS + 0.5
-        frequency = step / float(np.mean(np.diff(series.time)))
-        spectra.append((case.name, order[shown], amplitude[shown], frequency))
-    top = max((float(np.max(one[2], initial=0.0)) for one in spectra), default=0.0)
-    if top <= 0:
-        return None
-    ends, axes = (_FLOOR * top, 2 * top), ("multiple of the mesh frequency", "force amplitude (N)")
-    made = chart(*axes, y_axis_type="log", y_range=ends)
-    tips = {"force": "@y{%.4g} N", "at": "@x{%.4g} × mesh frequency, @hertz Hz"}
-    looks = zip(itertools.cycle(COLORS), itertools.cycle(_MARKS))
-    for (name, order, amplitude, frequency), (color, mark) in zip(spectra, looks, strict=False):
-        hertz = [brief(x) for x in order * frequency]
-        data = {"x": order, "y": amplitude, "hertz": hertz}
-        style: dict[str, Any] = {"source": data, "color": color, "legend_label": name}
-        if len(order) > _LINES:
-            drawn = made.line("x", "y", **style)
-        else:
-            made.segment("x", _FLOOR * top, "x", "y", line_width=1.5, **style)
-            drawn = made.scatter("x", "y", size=7, marker=mark, **style)
-        hover(made, [drawn], {"": name} | tips, formatters={"@x": "printf", "@y": "printf"})
-    return made
-
-
-def scenes_chart(groups: Mapping[str, Sequence[Mapping[str, Any]]]) -> Any | None:
-    """Return a chart of mean and peak force over the first quantity that varies between scenes.
-
-    `groups`: rows of each design, one per scene, by its name. Each combination of the other
-    quantities is a line of its own. Scenes without a steady state are marked by a cross. The result
-    is None if there is nothing to draw."""
-    curves = [one for name, rows in groups.items() for one in _curves(name, rows)]
-    known = [(title, key, place, joined, drawn) for place, (title, joined, rows) in
-             enumerate(curves) for key in ("mean_force_N", "peak_force_N")
-             if (drawn := [row for row in rows if row.get(key) is not None])]  # fmt: skip
-    if not known:
-        return None
-    across = next(varied(rows)[0] for rows in groups.values() if varied(rows))
-    found = {row[across]: None for *_, rows in known for row in rows if across in row}
-    numeric = all(isinstance(one, int | float) for one in found)
-    names: dict[str, Any] = {} if numeric else {"x_range": [*map(str, found)]}
-    made = chart(label(across), "contact force (N)", **names)
-    made.y_range.start = 0
-    for title, key, place, joined, rows in known:
-        _scenes(made, [row for row in rows if row.get(across) is not None], across, key,
-                (title, place, joined, numeric))  # fmt: skip
-    return made
-
-
-def _curves(name: str, rows: Sequence[Mapping[str, Any]]) -> list[tuple[str, bool, list]]:
-    """Return (title, whether a line joins its points, rows) of each curve of a design."""
-    axes = varied(rows)
-    lines: dict[tuple, list[Mapping[str, Any]]] = {}
-    for row in rows if axes else ():
-        lines.setdefault(tuple(row.get(key) for key in axes[1:]), []).append(row)
-    if len(lines) > _MOST_CURVES:  # A sample without a grid: single points.
-        lines = {(): list(rows)}
-    found = []
-    for others, scenes in lines.items():
-        words = [stated(key, x, named=True) for key, x in zip(axes[1:], others, strict=False)]
-        title = ", ".join(filter(None, [name, *words]))
-        found.append((title, bool(others) or len(axes) == 1, scenes))
-    return found
-
-
-def _scenes(made: Any, rows: list, across: str, key: str, curve: tuple[str, int, bool, bool]):
-    """Draw the force `key` over the quantity `across`; `curve`: as in `scenes_chart`."""
-    title, place, joined, numeric = curve
-    if numeric and joined:
-        rows = sorted(rows, key=lambda row: row[across])
-    steady = [row.get("status") in ("periodic", "averaged", None) for row in rows]
-    data = {
-        "x": [row[across] if numeric else str(row[across]) for row in rows],
-        "y": [row[key] for row in rows],
-        "mark": ["circle" if one else "x" for one in steady],
-        "status": [in_words(str(row.get("status", ""))) for row in rows],
-        "at": [stated(across, row[across]) for row in rows],
-    }
-    name = f"{title}: {label(key)}" if title else label(key)
-    style: dict[str, Any] = {"color": COLORS[place % len(COLORS)], "legend_label": name}
-    if joined:
-        dash = "dotted" if key == "mean_force_N" else "solid"
-        made.line("x", "y", source=data, line_width=1.5, line_dash=dash, **style)
-    points = made.scatter("x", "y", source=data, size=8, marker="mark", **style)
-    tips = {name: "@y{%.5g} N", label(across): "@at", "status": "@status"}
-    hover(made, [points], tips, formatters={"@y": "printf"})
 
 
 def front_charts(result: Mapping[str, Any]) -> dict[str, Any]:

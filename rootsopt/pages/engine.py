@@ -19,12 +19,14 @@ from rootsopt.response.starts import Seeds
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene, check_geometry, design_vector
 
+# Number of points of a drawn outline, as in the CSV files of the other commands.
 _POINTS = 240
-"""Number of points of a drawn outline, as in the CSV files of the other commands."""
+
+# Greatest number of revolutions shown of a motion.
 _TURNS = 4
-"""Greatest number of revolutions shown of a motion."""
+
+# Relative difference of mean, peak and RMS force below which two motions count as the same.
 _AGREES = 1e-3
-"""Relative difference of mean, peak and RMS force below which two motions count as the same."""
 
 
 class Shape(NamedTuple):
@@ -121,6 +123,3 @@ def same_motion(one: Evaluation, other: Evaluation) -> bool:
         return False
     pairs = ((value, other.response[name]) for name, value in one.response.items())
     return all(abs(a - b) <= _AGREES * max(abs(a), abs(b), 1e-12) for a, b in pairs)
-
-
-__all__ = ["Engine", "Shape", "cut", "frames", "same_motion"]

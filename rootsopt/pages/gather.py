@@ -15,6 +15,7 @@ from rootsopt.output.files import ResultFolder, design_file
 from rootsopt.output.tables import NAMES, records_of
 from rootsopt.response.series import Series
 
+# Columns of `response_*.csv`, by field of `Series`.
 _COLUMNS = {
     "time": "time_s",
     "rotation": "rotation_deg",
@@ -23,7 +24,6 @@ _COLUMNS = {
     "drive_force": "drive_flank_force_N",
     "coast_force": "coast_flank_force_N",
 }
-"""Columns of `response_*.csv`, by field of `Series`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,6 +145,3 @@ def _series(place: Path, name: str) -> Series | None:
     values = {field: table[:, heads.index(column)] for field, column in _COLUMNS.items()}
     values["rotation"] = np.radians(values["rotation"])
     return Series(**values, depth=np.full(len(table), np.nan))
-
-
-__all__ = ["Case", "Run"]

@@ -21,17 +21,16 @@ from markupsafe import Markup, escape
 
 import rootsopt
 from rootsopt.output import tables
-from rootsopt.output.files import design_file
 from rootsopt.output.names import Table, in_words
 from rootsopt.pages import charts, words
 from rootsopt.pages.charts import animations
 from rootsopt.pages.gather import Run
 from rootsopt.pages.words import anchor, glossary, linked
-from rootsopt.scene import outline_mm
-from rootsopt.tradeoffs.front import Front
 
 TEMPLATE = Path(__file__).with_name("report")
 """Folder of the templates, styles and scripts."""
+
+# Captions of the figures by file name; other figures are named after their file.
 _CAPTIONS = {
     "profiles.png": "Rotor profile, and its flank",
     "meshing.png": "The pair at six rotations of one lobe pitch",
@@ -50,10 +49,10 @@ _CAPTIONS = {
     "feasible.png": "Designs that satisfy all limits",
     "assumptions.png": "Objective over what is assumed about the scene",
 }
-"""Captions of the figures by file name; other figures are named after their file."""
 _CODE = re.compile(r"`([^`]*)`")
+
+# Spaces between a number and its unit, where a line must not break.
 _UNIT = re.compile(r"(?<=\d) (?=(?:N·m|N|%|mm|µm|ms|rpm|bar|Pa|kPa|mrad|l/min)(?![\w/]))")
-"""Spaces between a number and its unit, where a line must not break."""
 
 
 @functools.cache
@@ -151,55 +150,15 @@ def report_text(run: Run) -> str:
     )
 
 
-def front_text(front: Front) -> str:
-    """Return the HTML of the page of a `front`: a click on a point shows its rotor and config."""
-    result = front.record()
-    drawn = charts.front_charts(result)
-    points = {}
-    for one in front.points:
-        config = front.config_of(one)
-        points[str(one.number)] = {
-            "file": design_file(one.number).rpartition("/")[2],
-            "yaml": config.to_yaml(),
-            "outline": outline_mm(config, [*one.design.values()]).round(3).tolist(),
-            "status": f"{in_words(one.standing.label)}: {one.standing.value}",
-            "terms": one.terms,
-        }
-    names = [aim.words for aim in front.aims]
-    return _page(
-        "front.html.j2",
-        drawn.values(),
-        {"points": points},
-        title=f"Trade-off of {', '.join(names[:-1])} against {names[-1]}",
-        message=front.message,
-        charts=[*drawn],
-        tables=[*tables.front_tables(result)],
-    )
-
-
 def _charts(run: Run) -> list[tuple[str, str, Any]]:
     """Return (title, explanation, chart) of each interactive chart of a run."""
     hover = "Hover over a point to see its design."
     found = [(title, hover, made) for title, made in charts.front_charts(run.result).items()]
-    found += [
-        (
-            "Contact force over time",
-            "Hover for values, drag to zoom; a button at the right zooms out. A click moves the "
-            "rotors below to that time.",
-            charts.force_chart(run.cases),
-        ),
-        (
-            "Spectrum of the contact force",
-            "The mean is left out. A click on a name hides or shows its lines.",
-            charts.spectrum_chart(run.cases),
-        ),
-        (
-            "Contact force in each scene",
-            "A cross: no steady state.",
-            charts.scenes_chart(tables.scene_rows(run.result, run.rows)),
-        ),
-    ]
+    force = (
+        "Contact force over time",
+        "Hover for values, drag to zoom; a button at the right zooms out. A click moves the rotors "
+        "below to that time.",
+        charts.force_chart(run.cases),
+    )
+    found.append(force)
     return [one for one in found if one[2] is not None]
-
-
-__all__ = ["TEMPLATE", "front_text", "report_text", "table_html"]

@@ -11,8 +11,8 @@ from rootsopt.config.families import family_of
 from rootsopt.config.units import unit_of, words
 from rootsopt.design.space import bounds_of
 
+# Sections of the config that hold the design and its scene.
 _SECTIONS = ("profile", "rotor", "contact", "scene")
-"""Sections of the config that hold the design and its scene."""
 _GROUPS = {
     "profile": "Profile",
     "rotor": "Rotor",
@@ -28,15 +28,21 @@ _GROUPS = {
     "scene.heat": "Heat",
 }
 _DESIGN = "Design"
+
+# Groups at the top of the page; the others follow in the order of the config.
 _ORDER = (_DESIGN, "Speed and mounting", "Load", "Motor", "Timing gear", "Contact")
-"""Groups at the top of the page; the others follow in the order of the config."""
+
+# Keys whose default follows other keys. They have a slider only if the config sets them.
 _FOLLOWS = ("contact.smoothing_mm",)
-"""Keys whose default follows other keys. They have a slider only if the config sets them."""
+
+# Span of a slider as multiples of the config's own value.
 _AROUND = 0.2, 2.0
-"""Span of a slider as multiples of the config's own value."""
+
+# Half of the span of a slider, by unit, for a value of 0; `_ELSE` for other units.
 _ZERO = {"mm": 0.2, "mrad": 1.0, "°": 60.0, "K": 60.0}
-"""Half of the span of a slider, by unit, for a value of 0; `_ELSE` for other units."""
 _ELSE = 1.0
+
+# Keys whose slider reaches as far below 0 as above.
 _SIGNED = (
     "rotor.helix_deg",
     "contact.wear.offset_mm",
@@ -46,9 +52,9 @@ _SIGNED = (
     "scene.heat.housing_warming_K",
     "scene.bearings.port_deg",
 )
-"""Keys whose slider reaches as far below 0 as above."""
+
+# Least number of steps of a slider that is not whole.
 _STEPS = 200
-"""Least number of steps of a slider that is not whole."""
 
 
 class Knob(NamedTuple):
@@ -162,6 +168,3 @@ def _step(width: float) -> float:
         return 1.0
     power = 10.0 ** math.floor(math.log10(width / _STEPS))
     return max(one * power for one in (1, 2, 5) if one * power * _STEPS <= width * (1 + 1e-9))
-
-
-__all__ = ["Knob", "knobs_of"]

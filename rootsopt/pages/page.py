@@ -35,14 +35,17 @@ from rootsopt.pages.session import (
 from rootsopt.pages.shown import ForcePicture, ProfilePicture
 
 _TEMPLATE = Path(__file__).with_name("explore")
+
+# Time (s) of a computation above which the page says how long it has been running.
 _SLOW = 1.0
-"""Time (s) of a computation above which the page says how long it has been running."""
+
+# Interval (ms) at which the page looks for slow computations, and fades numbers that are late.
 _TICK = 250
-"""Interval (ms) at which the page looks for slow computations, and fades numbers that are late."""
 _FIELD = ":host { font-size: 13px; } .bk-input { padding: 1px 6px; height: 24px; min-height: 0; }"
 _BUTTON = ".bk-btn { padding: 3px 9px; font-size: 13px; }"
+
+# Significant digits of a value that a slider sets.
 _DIGITS = 12
-"""Significant digits of a value that a slider sets."""
 
 
 def _file(name: str, folder: Path = _TEMPLATE) -> str:
@@ -351,6 +354,3 @@ class Page:
                 "none, needs other programs, which are compiled first."
             )
             self.status.text = shown.status_line("computing", "wait", words)
-
-
-__all__ = ["Page"]

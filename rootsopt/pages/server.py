@@ -14,12 +14,8 @@ from bokeh.document import Document
 from bokeh.server.server import BaseServer
 from bokeh.server.tornado import BokehTornado
 from tornado.httpserver import HTTPServer
-from tornado.httputil import HTTPServerRequest
 from tornado.ioloop import IOLoop, PeriodicCallback
 from tornado.netutil import bind_sockets
-from tornado.routing import AnyMatches, Matcher, Rule, RuleRouter
-from tornado.web import Application as Handlers
-from tornado.web import RequestHandler
 
 from rootsopt.errors import InputError
 from rootsopt.pages.engine import Engine
@@ -28,41 +24,15 @@ from rootsopt.runtime.environment import say, shortened
 
 ADDRESS = "127.0.0.1"
 """The only address on which the page is served."""
+
+# Bytes of the secret in the page's address.
 _TOKEN = 24
-"""Bytes of the secret in the page's address."""
+
+# Interval (ms) at which the server looks whether it is to end.
 _POLL = 100
-"""Interval (ms) at which the server looks whether it is to end."""
+
+# Time (ms) for which a session is kept whose tab is closed or out of reach.
 _LIFETIME = 30_000
-"""Time (ms) for which a session is kept whose tab is closed or out of reach."""
-_NAMES = ADDRESS, "localhost", "[::1]"
-"""Names of this machine under which a browser may ask for the page.
-
-A web page elsewhere can let its own name lead to this machine (DNS rebinding). It is refused."""
-_REFUSED = (
-    "This address lacks the secret token, or its name is not that of this machine. Open the "
-    "address that `rootsopt explore` has printed.\n"
-)
-
-
-class _Own(Matcher):
-    """Matches requests to one of `hosts`, name and port, whose path lies below `prefix`."""
-
-    def __init__(self, hosts: set[str], prefix: str):
-        self.hosts, self.prefix = hosts, prefix
-
-    def match(self, request: HTTPServerRequest) -> dict[str, str] | None:
-        names = request.headers.get_list("Host")
-        own = len(names) == 1 and names[0].lower() in self.hosts
-        return {} if own and request.path.startswith(self.prefix + "/") else None
-
-
-class _Refusal(RequestHandler):
-    """Answers all requests that are not for the page."""
-
-    def prepare(self) -> None:
-        self.set_status(403)
-        self.set_header("Content-Type", "text/plain; charset=utf-8")
-        self.finish(_REFUSED)
 
 
 class _OneLine(logging.Handler):
@@ -90,7 +60,8 @@ class PageServer:
 
     `engine`: computes what the pages show; `source`: name of the config; `port`: of the server, 0
     for any free one. `url` is the address of the page, with its token: all paths of the server
-    begin with the token, and any other request is refused.
+    begin with the token. A page elsewhere, even one whose name leads to this machine (DNS
+    rebinding), does not know it.
 
     Raises `InputError` if the port cannot be used."""
 
@@ -107,21 +78,16 @@ class PageServer:
                 f"({error.strerror or error}); choose another one, or leave `--port` out"
             ) from error
         self.port = sockets[0].getsockname()[1]
-        # Browsers leave out the standard port.
-        ports = (f":{self.port}", "") if self.port == 80 else (f":{self.port}",)
-        hosts = {name + end for name in _NAMES for end in ports}
         pages = BokehTornado(
             {"/": Application(FunctionHandler(self._open))},
             prefix=prefix,
             # Only the page's own scripts may connect.
-            extra_websocket_origins=[*hosts],
+            extra_websocket_origins=[f"{name}:{self.port}" for name in (ADDRESS, "localhost")],
             ico_path="none",
             unused_session_lifetime_milliseconds=_LIFETIME,
             check_unused_sessions_milliseconds=_LIFETIME // 3,
         )
-        refusals = Handlers([], default_handler_class=_Refusal)
-        router = RuleRouter([Rule(_Own(hosts, prefix), pages), Rule(AnyMatches(), refusals)])
-        web = HTTPServer(router)
+        web = HTTPServer(pages)
         web.add_sockets(sockets)
         self.server = BaseServer(loop, pages, web)
         self.url = f"http://{ADDRESS}:{self.port}{prefix}/"
@@ -142,6 +108,3 @@ class PageServer:
         finally:
             watch.stop()
             self.server.stop()
-
-
-__all__ = ["ADDRESS", "PageServer"]

@@ -81,8 +81,8 @@ class Latest:
             return None
 
 
+# Time (s) without a new value after which the motion is computed from rest.
 _IDLE = 0.4
-"""Time (s) without a new value after which the motion is computed from rest."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -119,8 +119,8 @@ class ForcePicture:
         self.figure.title.text = f"Contact force over time: {words}"
 
 
+# Numbers of the kind of motion that the page has room for.
 _STEADY = "period", "floquet_multiplier", "lyapunov_exponent_per_mesh_period"
-"""Numbers of the kind of motion that the page has room for."""
 
 
 def numbers_table(now: Mapping[str, Any], first: Mapping[str, Any]) -> str:

@@ -36,8 +36,9 @@ _TITLES = {
     "identify": "What a record tells of {pair}",
     "profile": "Geometry of {pair}",
 }
+
+# Number of design parameters above which sentences do not list them.
 _FEW = 6
-"""Number of design parameters above which sentences do not list them."""
 
 
 def title(run: "Run") -> str:
@@ -141,10 +142,12 @@ def _sense(word: str) -> str:
 
 
 _PACKAGE = Path(__file__).parents[1]
+
+# The page of the glossary: in an installed package, and in the source tree.
 _PLACES = _PACKAGE / "glossary.md", _PACKAGE.parent / "docs" / "glossary.md"
-"""The page of the glossary: in an installed package, and in the source tree."""
+
+# Ending of a common word that is linked only where it is the label of a margin.
 _MARGIN = " (margin)"
-"""Ending of a common word that is linked only where it is the label of a margin."""
 
 
 @functools.cache

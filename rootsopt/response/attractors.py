@@ -30,21 +30,25 @@ from rootsopt.runtime.threads import on_all_cores
 from rootsopt.scene import design_vector
 from rootsopt.status import Status
 
+# Maximum length of a cycle (mesh periods) that the search recognises, unless the equation repeats
+# only after several mesh periods (`RotorPair.whole`).
 _LONGEST = 8
-"""Maximum length of a cycle (mesh periods) that the search recognises, unless the equation repeats
-only after several mesh periods (`RotorPair.whole`)."""
+
+# Scaled distance above which two motions always count as different.
 _APART = 0.3
-"""Scaled distance above which two motions always count as different."""
+
+# Maximum number of motions that are evaluated, in addition to the motion from rest.
 _TRIES = 24
-"""Maximum number of motions that are evaluated, in addition to the motion from rest."""
+
+# Penetration of the flanks (multiples of the static penetration) up to which the grid extends.
 _DEPTHS = 3.0
-"""Penetration of the flanks (multiples of the static penetration) up to which the grid extends."""
+
+# Statuses of motions that do not count as attractors: there is no such pair, the mesh was lost,
+# or the simulation failed.
 _LOST = (
     *(Status.UNSOUND, Status.PASSED_THROUGH, Status.STALLED),
     *(Status.SOLVER_FAILED, Status.NON_FINITE),
 )
-"""Statuses of motions that do not count as attractors: there is no such pair, the mesh was lost, or
-the simulation failed."""
 _GONE = tuple(status.code for status in _LOST)
 
 
@@ -266,7 +270,7 @@ class _Sorter:
 def _axes(config: Config, pair: RotorPair) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the axes of the grid: the initial ε (rad) and dε/dt (rad/s).
 
-    By default, ε covers the clearance and the backlash, and `_DEPTHS` static penetrations beyond.
+    ε covers the clearance and the backlash, and `_DEPTHS` static penetrations beyond.
     |dε/dt| ranges up to twice the greater of two speeds. The first is the speed that the load
     causes across the range of ε. The second is the speed that crosses this range within a mesh
     period."""
@@ -277,19 +281,14 @@ def _axes(config: Config, pair: RotorPair) -> tuple[NDArray[np.float64], NDArray
     play = (float(pair.clearance) + _DEPTHS * depth) / radius
     if pair.gear is not None:
         play += float(pair.gear.half_backlash)
-    reach = wanted.relative_range_mrad
-    low, high = (-play, play) if reach is None else (1e-3 * reach[0], 1e-3 * reach[1])
     fall = np.sqrt(4 * play * load / float(pair.inertia))
     most = 2 * max(fall, 2 * play / float(pair.mesh_period))
-    slow, fast = wanted.rate_range_rad_s or (-most, most)
-    return _spread(low, high, wanted.relatives), _spread(slow, fast, wanted.rates)
+    return _spread(play, wanted.relatives), _spread(most, wanted.rates)
 
 
-def _spread(low: float, high: float, count: int) -> NDArray[np.float64]:
-    """Return `count` equidistant numbers from `low` to `high`.
-
-    If `count` is 1, the number is in the middle."""
-    return np.linspace(low, high, count) if count > 1 else np.array([(low + high) / 2])
+def _spread(most: float, count: int) -> NDArray[np.float64]:
+    """Return `count` equidistant numbers from -`most` to `most`; 0 if `count` is 1."""
+    return np.linspace(-most, most, count) if count > 1 else np.zeros(1)
 
 
 def _settled(evaluator: Evaluator, pair: RotorPair, starts) -> tuple[Transient, Any]:
@@ -300,7 +299,7 @@ def _settled(evaluator: Evaluator, pair: RotorPair, starts) -> tuple[Transient, 
     dtype = pair.angle_scale.dtype
     limit = np.asarray(max(evaluator.config.solver.max_mesh_periods // 4, 8 * BLOCK))
     tolerance = np.asarray(settled_within(integrator.rtol), dtype)
-    most = evaluator.config.solver.max_orbit_periods
+    most = evaluator.scene.solver.max_orbit
     states = np.asarray(starts, dtype)
     settings = integrator, tolerance, limit, most
     if jax.default_backend() == "cpu":

@@ -23,6 +23,8 @@ from rootsopt.status import Status
 
 _POINT = TypeAdapter(list[float])
 _NUMBERS = TypeAdapter(dict[str, float])
+
+# Types of the fields of an evaluation that are plain values.
 _KINDS = {
     "design": _NUMBERS,
     "geometry": _NUMBERS,
@@ -32,7 +34,6 @@ _KINDS = {
     "statistics": TypeAdapter(dict[str, Any]),
     "message": TypeAdapter(str),
 }
-"""Types of the fields of an evaluation that are plain values."""
 
 
 class Checkpoint(Journal):
@@ -124,6 +125,3 @@ def read_evaluation(found: Mapping[str, Any]) -> Evaluation:
     speeds = (Part({"speed_rpm": rpm}, read_evaluation(one), share) for rpm, share, one in parts)
     values["speeds"] = values["scenes"][0].evaluation.speeds if scenes else tuple(speeds)
     return Evaluation(**values)
-
-
-__all__ = ["Checkpoint", "plain_evaluation", "read_evaluation"]

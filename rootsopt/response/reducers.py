@@ -27,8 +27,8 @@ from rootsopt.config.tolerances import TolerancesConfig
 from rootsopt.response.result import Evaluation, Part
 from rootsopt.status import Status
 
+# Standard deviation, relative to the mean, below which all values count as equal.
 _EQUAL = 1e-14
-"""Standard deviation, relative to the mean, below which all values count as equal."""
 
 
 class Combined(NamedTuple):
@@ -145,14 +145,3 @@ def mean(head: Evaluation, evaluations: Sequence[Evaluation], shares: ArrayLike)
             if name in known
         },
     )
-
-
-__all__ = [
-    "Combined",
-    "combine",
-    "mean",
-    "order_weights",
-    "over_scenes",
-    "over_speeds",
-    "overall",
-]

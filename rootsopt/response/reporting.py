@@ -64,6 +64,3 @@ def reporting(config: Config, names: Sequence[str], key: str) -> Config:
     response = config.response.model_copy(update={"lines": tuple(lines)})
     objective = config.objective.model_copy(update={"terms": terms})
     return config.model_copy(update={"response": response, "objective": objective})
-
-
-__all__ = ["depends_on_forces", "is_force", "reporting"]

@@ -48,14 +48,11 @@ def counted(
 
 
 def swept_speeds(config: Config) -> list[float]:
-    """Return the speeds (rpm) of the config's sweep, ascending."""
-    wanted = config.sweep.speed_rpm
-    if wanted is None and config.objective.speeds_rpm:
-        return sorted(config.objective.speeds_rpm)
-    if wanted is None:
-        own = config.scene.speed_rpm
-        wanted = {"from": 0.1 * own, "to": 2 * own, "points": 39}
-    return np.linspace(wanted["from"], wanted["to"], int(wanted["points"])).tolist()
+    """Return the speeds (rpm) of a sweep without keys, ascending.
+
+    They are those of the objective, or from 0.1 to 2 times that of the scene."""
+    own = config.scene.speed_rpm
+    return sorted(config.objective.speeds_rpm) or np.linspace(0.1 * own, 2 * own, 39).tolist()
 
 
 def parts_at(

@@ -79,6 +79,3 @@ def needed_motion(config: Config) -> Evaluator:
     if any(depends_on_forces(config, found.scene, name, "objective.terms") for name in names):
         return found
     return dataclasses.replace(found, motions=Still())
-
-
-__all__ = ["Still", "needed_motion"]

@@ -26,10 +26,11 @@ from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene
 from rootsopt.scene.medium import Medium
 
+# Length of a centimetre (m).
 _CM = 1e-2
-"""Length of a centimetre (m)."""
+
+# One litre per minute (m³/s).
 _LITRE_PER_MINUTE = 1e-3 / 60
-"""One litre per minute (m³/s)."""
 
 
 class Forces(NamedTuple):
@@ -82,7 +83,6 @@ class GeometryTerm(Term):
     unit: float = eqx.field(static=True)
 
     def value(self, scene, profile, shape, forces):
-        del scene, profile, forces
         return getattr(shape, self.field) / self.unit
 
 
@@ -98,7 +98,6 @@ class DisplacementTerm(Term):
     sense: ClassVar[Literal["min", "max"]] = "max"
 
     def value(self, scene, profile, shape, forces):
-        del profile, forces
         return flow.displaced_volume(shape, scene.length) / _CM**3
 
 
@@ -111,7 +110,6 @@ class FlowTerm(Term):
     delivered: bool = eqx.field(static=True)
 
     def value(self, scene, profile, shape, forces):
-        del forces
         found = flow.theoretical_flow(shape, scene.length, scene.speed) / _LITRE_PER_MINUTE
         if not self.delivered:
             return found
@@ -123,7 +121,6 @@ class RippleTerm(Term):
     """A term whose value is the peak-to-peak ripple of the flow, as a fraction of the mean flow."""
 
     def value(self, scene, profile, shape, forces):
-        del forces
         return ripple_of(scene, profile, shape)
 
 
@@ -135,7 +132,6 @@ class BacklashTerm(Term):
     sense: ClassVar[Literal["min", "max"]] = "max"
 
     def value(self, scene, profile, shape, forces):
-        del shape, forces
         return play_of(scene, profile).gear_backlash / MM
 
 
@@ -143,7 +139,6 @@ class PlayTerm(Term):
     """A term whose value is the least angular play (mrad) of rotor 2 over the rotation."""
 
     def value(self, scene, profile, shape, forces):
-        del shape, forces
         return jnp.min(play_of(scene, profile).total) / MRAD
 
 
@@ -156,7 +151,6 @@ class GapTerm(Term):
     mean: bool = eqx.field(static=True)
 
     def value(self, scene, profile, shape, forces):
-        del forces
         name = "mean" if self.mean else "min"
         medium = _medium(scene, f"flank_gap_{name}_um")
         gaps = leakage(scene, medium, profile, shape).gap.least
@@ -169,7 +163,6 @@ class LossTerm(Term):
     It is 1 minus the volumetric efficiency. The scene must have a section `pump`."""
 
     def value(self, scene, profile, shape, forces):
-        del forces
         medium = _medium(scene, "leakage_fraction")
         return 1 - leakage(scene, medium, profile, shape).efficiency
 
@@ -191,7 +184,6 @@ class SilentTerm(Term):
     sense: ClassVar[Literal["min", "max"]] = "max"
 
     def value(self, scene, profile, shape, forces):
-        del forces
         if scene.gear is None or scene.gear.errors is None:
             raise InputError(
                 f"the term `{SILENT}` needs a timing gear with errors; set "
@@ -204,7 +196,6 @@ class InertiaTerm(Term):
     """A term whose value is the polar moment of inertia of one rotor (kg·m²)."""
 
     def value(self, scene, profile, shape, forces):
-        del profile, forces
         return scene.inertia(shape)
 
 
@@ -214,7 +205,6 @@ class ForceTerm(Term):
     field: str = eqx.field(static=True)
 
     def value(self, scene, profile, shape, forces):
-        del scene, profile, shape
         return getattr(forces, self.field)
 
 
@@ -227,7 +217,6 @@ class BearingTerm(Term):
     twisted: bool = eqx.field(static=True, default=False)
 
     def value(self, scene, profile, shape, forces):
-        del profile, shape
         _need_bearings(scene, self.name)
         if self.twisted and scene.straight:
             raise InputError(
@@ -246,7 +235,6 @@ class GearTerm(Term):
     name: str = eqx.field(static=True)
 
     def value(self, scene, profile, shape, forces):
-        del profile, shape
         if scene.gear is None:
             raise InputError(
                 f"the term `{self.name}` needs the section `scene.timing_gear`; add it with "
@@ -270,7 +258,6 @@ class StaticBearingTerm(Term):
     equivalent: bool = eqx.field(static=True)
 
     def value(self, scene, profile, shape, forces):
-        del forces
         name = "equivalent" if self.equivalent else "max"
         _need_bearings(scene, f"static_bearing_load_{name}_N")
         equivalent, greatest = still_loads(scene, profile, shape)

@@ -22,6 +22,8 @@ from threadpoolctl import threadpool_limits
 import rootsopt
 from rootsopt.errors import InputError
 
+# Prefixes of the JAX variables that have their usual effect: they choose a device, a cache or a
+# log.
 _RESPECTED = (
     "JAX_PLATFORMS",
     "JAX_COMPILATION_CACHE_",
@@ -38,9 +40,9 @@ _RESPECTED = (
     "JAX_ONEAPI_VISIBLE_DEVICES",
     "JAX_PJRT_CLIENT_CREATE_OPTIONS",
 )
-"""Prefixes of the JAX variables that have their usual effect: they choose a device, a cache or a
-log."""
 
+# Settings of JAX on which every result relies. JAX's checks for NaN are off, because programs use
+# NaN on purpose.
 _REQUIRED = {
     "jax_enable_x64": True,
     "jax_numpy_dtype_promotion": "standard",
@@ -55,20 +57,21 @@ _REQUIRED = {
     "jax_no_tracing": False,
     "jax_no_execution": False,
 }
-"""Settings of JAX on which every result relies. JAX's checks for NaN are off, because programs use
-NaN on purpose."""
 
 _XLA_FLAGS = "XLA_FLAGS"
+
+# Name of the variable that tells child processes which value of XLA_FLAGS has been tested.
 _CHECKED = "ROOTSOPT_XLA_FLAGS_CHECKED"
-"""Name of the variable that tells child processes which value of XLA_FLAGS has been tested."""
 
 # On a CPU, XLA compiles a loop to one function if its buffers are small. Otherwise it calls one
 # function per operation and iteration, which here costs several times the arithmetic itself.
 _LOOPS = "xla_cpu_small_while_loop_byte_threshold"
 
+# Pattern of flags that make the compiler assume that NaN and infinity never occur.
 _UNSOUND = re.compile(r"--?(xla_cpu_enable_fast_math)(?:=(?:true|1|t|yes|y))?(?=\s|$)", re.I)
-"""Pattern of flags that make the compiler assume that NaN and infinity never occur."""
 
+# Python script that compiles one operation to test XLA_FLAGS. It imports only the necessary parts
+# of JAX.
 _TRIAL = """
 import sys
 try:
@@ -86,11 +89,10 @@ try:
 except (AttributeError, TypeError):
     pass
 """
-"""Python script that compiles one operation to test XLA_FLAGS. It imports only the necessary parts
-of JAX."""
 _TRIAL_SECONDS = 60.0
 _LOG_PREFIX = re.compile(r"^[IWEF]\d{4} \S+\s+\d+ \S+\] ")
 
+# Names of the variables with the number of threads of libraries for dense algebra (BLAS, LAPACK).
 _ALGEBRA = (
     "OPENBLAS_NUM_THREADS",
     "MKL_NUM_THREADS",
@@ -98,12 +100,10 @@ _ALGEBRA = (
     "VECLIB_MAXIMUM_THREADS",
     "OMP_NUM_THREADS",
 )
-"""Names of the variables with the number of threads of libraries for dense algebra (BLAS, LAPACK).
-"""
 
+# Terminal width (characters) in the variable COLUMNS below which the variable is ignored.
+# Narrower tables would lose their numbers.
 _NARROWEST = 40
-"""Terminal width (characters) in the variable COLUMNS below which the variable is ignored. Narrower
-tables would lose their numbers."""
 
 _noticed: set[str] = set()
 

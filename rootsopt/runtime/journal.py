@@ -20,8 +20,8 @@ from rootsopt.config.words import shown
 from rootsopt.errors import InputError
 from rootsopt.runtime.environment import versions
 
+# Maximum number of differences that an error message lists.
 _SHOWN = 5
-"""Maximum number of differences that an error message lists."""
 _ABSENT = "absent"
 
 
@@ -64,7 +64,6 @@ class Journal:
         """Return the result whose plain value is `value`.
 
         Raises `ValueError`, `LookupError` or `TypeError` if it is not valid."""
-        del key
         return value
 
     def plain(self, result: Any) -> Any:
@@ -227,6 +226,3 @@ def _file_digest(path: str) -> str:
         return hashlib.sha256(regular_file(path, "an outline").read_bytes()).hexdigest()
     except OSError as error:
         raise InputError(f"{path!r}: cannot be read: {reason(error)}") from None
-
-
-__all__ = ["Journal", "aside", "header_of", "set_aside"]

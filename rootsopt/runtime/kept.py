@@ -15,8 +15,9 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 
 T = TypeVar("T")
+
+# Number of values from which they are kept. It costs more to keep fewer than to repeat them.
 _MANY = 32
-"""Number of values from which they are kept. It costs more to keep fewer than to repeat them."""
 
 
 def kept(tree: T) -> T:
@@ -59,8 +60,4 @@ def _kept(leaves):
 
 @_kept.def_vmap
 def _(size, batched, leaves):
-    del size
     return _kept(leaves), batched[0]
-
-
-__all__ = ["kept", "kept_along"]

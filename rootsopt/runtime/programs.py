@@ -34,6 +34,8 @@ from rootsopt.config.families import outside_modules
 from rootsopt.runtime.store import Store, UnsafeFolderError
 
 _PACKAGES = ("jax", "jaxlib", "diffrax", "equinox", "lineax", "optimistix", "optax", "numpy")
+
+# Names of the JAX settings that change what is traced or compiled.
 _SETTINGS = (
     "jax_enable_x64",
     "jax_numpy_dtype_promotion",
@@ -50,7 +52,6 @@ _SETTINGS = (
     "jax_exec_time_optimization_effort",
     "eager_constant_folding",
 )
-"""Names of the JAX settings that change what is traced or compiled."""
 _VARIABLES = ("XLA_FLAGS", "EQX_ON_ERROR")
 COMPILER_OPTIONS: dict[str, str | bool] = {
     "xla_disable_hlo_passes": (
@@ -72,21 +73,24 @@ generator for fused operations.
 1.5
 """
 _PACKAGE = Path(__file__).parents[1]
+
+# Texts for people: docstrings and comments. Groups: other texts, which stay.
 _WORDS = re.compile(
     rb"""^[ \t]*[rR]?\"{3}(?:\\.|(?!\"{3})[^\\])*\"{3}[ \t]*$"""
     rb"""|(\"{3}(?:\\.|[^\\])*?\"{3}|'{3}(?:\\.|[^\\])*?'{3})"""
     rb"""|("(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*')|[ \t]*#[^\n]*""",
     re.DOTALL | re.MULTILINE,
 )
-"""Texts for people: docstrings and comments. Groups: other texts, which stay."""
+
+# Names of modules of this package: in imports, with what is imported, and elsewhere.
 _MENTIONED = re.compile(
     rb"from (rootsopt(?:\.\w+)*) import (\([^)]*\)|[^\n]*)|(rootsopt(?:\.\w+)+)"
 )
-"""Names of modules of this package: in imports, with what is imported, and elsewhere."""
 _store: Store | None = None
+
+# Whether the cache's folder has been chosen, or the cache turned off. If not, the first program
+# chooses the default folder.
 _chosen = False
-"""Whether the cache's folder has been chosen, or the cache turned off. If not, the first program
-chooses the default folder."""
 # Tracing runs in Python, so it is done one function at a time, in the order of requests. The
 # compiler then works in parallel.
 _tracing = threading.RLock()
@@ -309,7 +313,6 @@ def _split(args: tuple) -> tuple[list, _Kind]:
 @functools.cache
 def _precision(dtype: Any, wide: bool) -> str:
     """Return the name of the type that JAX uses for `dtype`; `wide`: whether it allows 64 bits."""
-    del wide
     return str(jax.dtypes.canonicalize_dtype(dtype))
 
 
@@ -424,7 +427,6 @@ def _source(file: Path, *state: int) -> tuple[str, list[str]]:
 
     `state`: numbers that differ after a change of the file. What it imports are names of this
     package, of modules or in them, also those in texts, such as the maker of a family."""
-    del state
     text = _WORDS.sub(lambda match: match[1] or match[2] or b"", file.read_bytes())
     text = re.sub(rb"\n(?:[ \t]*\n)+", b"\n", text).strip()
     names = set()

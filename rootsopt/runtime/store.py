@@ -1,36 +1,27 @@
-"""Files of compiled programs: owned by the user, signed, and limited in total size.
+"""Files of compiled programs: owned by the user, and limited in total size.
 
 Programs read from these files are executed, so other users must not be able to change them. Nor may
-they change the folder or replace a folder above it. Each entry is signed together with its name and
-purpose, with a key in the user's own state folder. An entry that is damaged, unsigned or stored
-under another name is ignored."""
+they change the folder or replace a folder above it. Each entry holds a checksum of its name,
+purpose and data. An entry that is damaged or stored under another name is ignored."""
 
 import contextlib
 import hashlib
-import hmac
 import os
-import secrets
 import stat
 import tempfile
 import time
 from pathlib import Path
-
-import platformdirs
 
 MOST_BYTES = 200 * 2**20
 """Total size (bytes) of all entries above which the least recently used entries are removed."""
 SUFFIX = ".program"
 """Suffix of the file names of entries. It distinguishes them from other files in the folder."""
 
-_KEY_NAME = "programs.key"
-_KEY_BYTES = 32
-_ATTEMPTS = 3
-_HEADER = b"rootsopt program 1\n"
-_MAC_BYTES = hashlib.sha256().digest_size
+_HEADER = b"rootsopt program 2\n"
 _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
-_OTHERS_AT_ALL = stat.S_IRWXG | stat.S_IRWXO
+
+# Age (s) of an unfinished file above which it is removed: its process has ended.
 _LEFT_SECONDS = 600.0
-"""Age (s) of an unfinished file above which it is removed: its process has ended."""
 # With these flags, a symbolic link is not followed and a named pipe does not block.
 _SAFELY = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 _HAS_OWNERS = hasattr(os, "geteuid")
@@ -43,15 +34,14 @@ class UnsafeFolderError(Exception):
 
 
 class Store:
-    """A folder `path` of signed entries.
+    """A folder `path` of entries.
 
-    Raises `UnsafeFolderError` if other users could change the entries or read the key. Raises
-    `OSError` if the folder cannot be used."""
+    Raises `UnsafeFolderError` if other users could change the entries. Raises `OSError` if the
+    folder cannot be used."""
 
     def __init__(self, path: Path):
         self._folder = _own_folder(path)
-        self._key = _key()
-        _sweep(self._folder, SUFFIX)
+        _sweep(self._folder)
 
     def _file(self, name: str) -> Path:
         return self._folder / (name + SUFFIX)
@@ -62,28 +52,16 @@ class Store:
 
     def read(self, name: str, purpose: str) -> bytes | None:
         """Return the data of the entry `name`, or `None` if no valid entry has this `purpose`."""
-        found = _read(self._file(name), MOST_BYTES)
-        if found is None:
-            return None
-        start = len(_HEADER) + _MAC_BYTES
-        data = found[start:]
-        if not hmac.compare_digest(found[:start], _HEADER + self._mac(name, purpose, data)):
-            return None
-        return data
+        found = _read(self._file(name), MOST_BYTES) or b""
+        data = found[len(_checksum(name, purpose, b"")) :]
+        return data if found and found == _checksum(name, purpose, data) + data else None
 
     def write(self, name: str, purpose: str, data: bytes) -> None:
-        """Write `data` as the entry `name`, completely or not at all.
+        """Write `data` as the entry `name` for this `purpose`, completely or not at all.
 
-        The entry is signed together with its `purpose`. Raises `OSError` if writing fails."""
-        _write(self._file(name), _HEADER + self._mac(name, purpose, data) + data)
+        Raises `OSError` if writing fails."""
+        _write(self._file(name), _checksum(name, purpose, data) + data)
         self._prune()
-
-    def _mac(self, name: str, purpose: str, data: bytes) -> bytes:
-        mac = hmac.new(self._key, digestmod=hashlib.sha256)
-        for part in (_HEADER, name.encode(), purpose.encode(), data):
-            mac.update(len(part).to_bytes(8, "big"))
-            mac.update(part)
-        return mac.digest()
 
     def _prune(self) -> None:
         """Remove the least recently used entries until the rest has at most `MOST_BYTES`."""
@@ -104,50 +82,22 @@ class Store:
                     file.unlink()
 
 
-def key_folder() -> Path:
-    """Return the path of the folder of the signing key, in the user's state folder."""
-    return Path(platformdirs.user_state_dir("rootsopt", appauthor=False))
+def _checksum(name: str, purpose: str, data: bytes) -> bytes:
+    parts = (name.encode(), purpose.encode(), data)
+    return _HEADER + hashlib.sha256(b"".join(hashlib.sha256(x).digest() for x in parts)).digest()
 
 
-def _key() -> bytes:
-    """Return the user's signing key; create one if there is no valid key.
-
-    Raises `UnsafeFolderError` if the key cannot be stored in a place that only the user can access.
-    """
-    path = key_folder()
-    try:
-        if not path.is_absolute():
-            raise OSError("it is not an absolute path")
-        file = _own_folder(path) / _KEY_NAME
-        _sweep(file.parent, _KEY_NAME)
-        for _ in range(_ATTEMPTS):
-            there = os.path.lexists(file)  # Check this first: a key that appears later is valid.
-            key = _read(file, _KEY_BYTES, _OTHERS_AT_ALL)
-            if key is not None and len(key) == _KEY_BYTES:
-                return key
-            # Replace a key that is damaged or that others may have read. Programs signed with it
-            # are compiled again.
-            _write(file, secrets.token_bytes(_KEY_BYTES), new=not there)
-        raise OSError("it cannot be read back")
-    except (OSError, UnsafeFolderError) as error:
-        said = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        raise UnsafeFolderError(
-            f"the key that compiled programs are signed with cannot be kept in "
-            f"{os.fspath(path)!r}: {said}; correct that, or set XDG_STATE_HOME to another folder"
-        ) from None
-
-
-def _read(file: Path, most: int, forbidden: int = _OTHERS_WRITE) -> bytes | None:
+def _read(file: Path, most: int) -> bytes | None:
     """Return the content of a regular file, or `None` if it cannot be trusted.
 
     `None` is returned if the file does not exist, belongs to another user, or is larger than `most`
-    bytes. It is also returned if the file has one of the `forbidden` permission bits."""
+    bytes. It is also returned if others may write to the file."""
     try:
         with open(os.open(file, os.O_RDONLY | _SAFELY), "rb") as stream:
             found = os.fstat(stream.fileno())
             if not stat.S_ISREG(found.st_mode) or found.st_size > most:
                 return None
-            if _HAS_OWNERS and (found.st_uid != os.geteuid() or found.st_mode & forbidden):
+            if _HAS_OWNERS and (found.st_uid != os.geteuid() or found.st_mode & _OTHERS_WRITE):
                 return None
             data = stream.read(most + 1)
         os.utime(file)
@@ -156,32 +106,23 @@ def _read(file: Path, most: int, forbidden: int = _OTHERS_WRITE) -> bytes | None
     return data if len(data) <= most else None
 
 
-def _write(file: Path, data: bytes, new: bool = False) -> None:
+def _write(file: Path, data: bytes) -> None:
     """Write `data` to a file that only the user can access, completely or not at all.
 
-    `new`: whether a file that another process has made in the meantime stays. Raises `OSError` if
-    writing fails."""
+    Raises `OSError` if writing fails."""
     handle, name = tempfile.mkstemp(prefix=f".{file.name}.", dir=file.parent)
     try:
         with open(handle, "wb") as stream:
             stream.write(data)
-        if new:
-            with contextlib.suppress(FileExistsError):
-                os.link(name, file)
-        else:
-            os.replace(name, file)
-    except (NotImplementedError, OSError):
-        if not new:
-            raise
-        os.replace(name, file)  # a file system without links
+        os.replace(name, file)
     finally:
         with contextlib.suppress(OSError):
             os.unlink(name)
 
 
-def _sweep(folder: Path, name: str) -> None:
-    """Remove unfinished files, with this `name` in theirs, that ended processes have left."""
-    for file in folder.glob(f".*{name}.*"):
+def _sweep(folder: Path) -> None:
+    """Remove unfinished files that ended processes have left."""
+    for file in folder.glob(f".*{SUFFIX}.*"):
         with contextlib.suppress(OSError):
             if abs(time.time() - file.lstat().st_mtime) > _LEFT_SECONDS:
                 file.unlink()

@@ -57,9 +57,6 @@ def on_all_cores(work: Callable[..., Any], *arrays: Any) -> Any:
     return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
 
 
-__all__ = ["on_all_cores", "one_thread"]
-
-
 def until_stopped(work: Callable[[], T], stop: threading.Event, patience: float) -> T | None:
     """Run `work()` in its own thread, and return its result, or `None` if it ends too late.
 

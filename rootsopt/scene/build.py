@@ -50,6 +50,9 @@ from rootsopt.scene.bearings import GRAVITY, Bearings, bearings_of
 from rootsopt.scene.medium import Medium, medium_of
 from rootsopt.scene.slicing import greatest_twist, slices_needed
 
+# Mean error of the contact torque of twisted rotors, relative to its maximum.
+_SLICE_ERROR = 1e-2
+
 
 class Scene(eqx.Module):
     """Everything except the design, in SI units: builds a rotor pair from a design.
@@ -139,7 +142,7 @@ class Scene(eqx.Module):
             found.clearance,
             jnp.asarray(found.static_depth),
             greatest_twist(config) * DEG,
-            config.solver.slice_error,
+            _SLICE_ERROR,
         )
         return dataclasses.replace(found, slices=count)
 

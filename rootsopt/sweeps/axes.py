@@ -18,8 +18,9 @@ from rootsopt.errors import InputError
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _RANGE = re.compile(rf"({_NUMBER}):({_NUMBER})(?::(\d+))?(:log)?")
+
+# Texts that are meant to be a range.
 _MEANT = re.compile(r"[-+\d.][-+\d.eE]*:[-+\d.eE:]*[-+\d.eE:](?:log)?")
-"""Texts that are meant to be a range."""
 MOST = 1_000_000
 """Number of values above which an axis is rejected, and of points above which a sweep is."""
 
@@ -178,6 +179,3 @@ def _interval(key: str, item: str) -> Any:
     if log and min(low, high) <= 0:
         raise InputError(f"`{key}`: a logarithmic range must have positive ends, but is {item}")
     return Interval(low, high, points, log, is_whole(tree(Config).get(key)))
-
-
-__all__ = ["MOST", "Axis", "Interval", "axis_of", "parse_over"]

@@ -15,8 +15,8 @@ from rootsopt.response.together import pays
 from rootsopt.sweeps.plan import Plan
 from rootsopt.sweeps.points import Row, simulated, simulated_together
 
+# Number of points that an accelerator steps together.
 _BATCH = 256
-"""Number of points that an accelerator steps together."""
 
 
 def in_process(
@@ -54,6 +54,3 @@ def divided(numbers: Sequence[int], size: int) -> Iterator[list[int]]:
     """Yield the numbers in chunks of at most `size`."""
     for begin in range(0, len(numbers), size):
         yield [*numbers[begin : begin + size]]
-
-
-__all__ = ["at_once", "divided", "in_process"]

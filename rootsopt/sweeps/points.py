@@ -139,15 +139,3 @@ def lost(status: Status, why: str = "") -> Row:
     message = f"{status.value} {sentence(why)}" if why else status.value
     none: Row = {name: {} for name in ("response", "gradient", "steady_state", "geometry")}
     return {"status": status.label, "message": message, **none}
-
-
-__all__ = [
-    "Row",
-    "check_row",
-    "configured",
-    "lost",
-    "prepared",
-    "row_of",
-    "simulated",
-    "simulated_together",
-]

@@ -166,6 +166,3 @@ class Points(Journal):
         if type(key) is not int or not 0 <= key < self._count:
             raise ValueError(f"{key} is not the number of a point")
         return check_row(value)
-
-
-__all__ = ["Points", "checked", "complete", "runner", "sweep_scenes"]

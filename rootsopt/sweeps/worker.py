@@ -58,7 +58,6 @@ def dask_setup(worker: Any) -> None:
     """Ignore Ctrl-C, which reaches all processes of a terminal: the sweep's own process reacts.
 
     Dask calls this function when it starts a process with this module as `preload`."""
-    del worker
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 
@@ -82,6 +81,3 @@ def _prepare(settings: Settings) -> None:
         environment.say(f"compiled programs are not kept between runs: {refused}")
     for name in settings.imports:
         import_named(name)
-
-
-__all__ = ["Settings", "dask_setup", "evaluate", "work"]

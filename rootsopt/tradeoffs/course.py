@@ -41,6 +41,3 @@ class Course:
         for other in others:
             self.seen += other.seen[other._first :]
             self.evaluations += other.evaluations
-
-
-__all__ = ["Course", "Seen"]

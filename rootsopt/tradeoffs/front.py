@@ -260,6 +260,3 @@ def ordered(values: NDArray[np.float64]) -> Sequence[int]:
 
     Points are sorted by the first term, equal ones by the next term."""
     return [int(k) for k in np.lexsort(values.T[::-1])]
-
-
-__all__ = ["Front", "FrontPoint", "Gap", "dominated", "ordered", "repeated"]

@@ -41,6 +41,3 @@ def links(found: Sequence[Key]) -> list[tuple[int, int]]:
             if other is not None:
                 pairs.append((number, other))
     return pairs
-
-
-__all__ = ["Key", "corners", "directions", "keys", "links"]

@@ -120,6 +120,3 @@ def end_scale(baseline: NDArray[np.float64], screened: NDArray[np.float64]) -> S
     spread = np.ptp(screened, axis=0) if len(screened) else np.zeros_like(magnitude)
     width = np.where(magnitude > 1e-3 * spread, magnitude, spread)
     return Scale(np.zeros_like(width), np.where(width > 0, width, 1.0))
-
-
-__all__ = ["RHO", "Scalar", "Scale", "end_scale", "rates"]

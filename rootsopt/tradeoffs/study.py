@@ -178,6 +178,3 @@ def _finite(sample: Sample) -> Sample | None:
         array for group in (*sample.terms, *sample.walls) for array in (group.values, group.slopes)
     ]
     return sample if all(np.all(np.isfinite(array)) for array in arrays) else None
-
-
-__all__ = ["PEAK", "Sample", "Study"]

@@ -1,16 +1,12 @@
 """Tests of `pareto` from outside: files, exit codes, messages, and a whole run with forces."""
 
-import contextlib
 import csv
 import json
-import re
 from pathlib import Path
 
 import pytest
-from browser import Browser
 
 import rootsopt
-from rootsopt import pages
 from rootsopt.commands.table import pareto
 from rootsopt.config import load
 from rootsopt.output.files import design_file
@@ -62,47 +58,6 @@ def test_config_of_a_point_is_its_design(folder):
         assert {name: found[name] for name in point["terms"]} == pytest.approx(
             point["terms"], rel=1e-12
         )
-
-
-def test_page_opens_without_a_network(folder):
-    pytest.importorskip("bokeh")
-    text = (folder / pages.FRONT).read_text("utf-8")
-    assert not re.search(r"<(script|link|img)[^>]*(src|href)=", text)
-    (data,) = re.findall(r'<script type="application/json" id="data">(.*?)</script>', text, re.S)
-    points = json.loads(data)["points"]
-    assert [*points] == ["1", "2", "3", "4"]
-    assert points["3"]["yaml"] == (folder / design_file(3)).read_text("utf-8")
-    assert len(points["3"]["outline"]) > 100
-    assert [text.count(f'<th scope="row">{k}</th>') for k in points] == [2, 2, 2, 2]
-
-
-def test_click_on_a_point_shows_its_config(folder, tmp_path):
-    """A click on the chart, and one on a row, choose a point; the console stays silent."""
-    with contextlib.closing(Browser(tmp_path)) as page:
-        page.open((folder / pages.FRONT).as_uri())
-        place = """
-        if (!window.Bokeh || !Bokeh.documents.length) return false;
-        const plot = Bokeh.documents[0].roots()[0], view = Bokeh.index.find_one_by_id(plot.id);
-        const box = view.canvas_view.el.getBoundingClientRect(), frame = view.frame;
-        if (!frame) return false;
-        const [across, up] = plot.name.split(" "), terms = data.points["3"].terms;
-        return [box.left + frame.x_scale.compute(terms[across]),
-                box.top + frame.y_scale.compute(terms[up])];"""
-        page.drag(*page.wait(place), 0)
-        read = 'return [at("name").textContent, at("yaml").textContent];'
-        name, yaml = page.wait(read.replace("return", 'if (at("save").disabled) return 0; return'))
-        assert name == "Point 3"
-        assert yaml == (folder / design_file(3)).read_text("utf-8")
-        page.run("rows[0].click()")
-        assert page.run(read)[0] == "Point 1 (dashed: point 3)"
-        assert [line for line in page.console() if not line.startswith("INFO")] == []
-
-
-def test_page_is_left_out_without_its_library(tmp_path, monkeypatch, capfd):
-    monkeypatch.setattr(pages.importlib.util, "find_spec", lambda name: None)
-    assert pareto.main([CIC, "-o", str(tmp_path / "run"), *FEW, "--set", "pareto.points=3"]) == 0
-    assert "rootsopt[pages]" in capfd.readouterr().err
-    assert not (tmp_path / "run" / pages.FRONT).exists()
 
 
 @pytest.mark.parametrize(

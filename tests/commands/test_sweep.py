@@ -52,15 +52,13 @@ def broken(config):
     raise points.InputError(f"at {config.scene.speed_rpm:g}")
 
 
-@pytest.mark.parametrize("name", ["sweep.nc", "sweep.zarr"])
-def test_formats_hold_the_same(name, tmp_path, monkeypatch):
+def test_dataset_is_read_back(tmp_path, monkeypatch):
     """Texts, nulls, samples and their seed are read back; nothing usable gives exit code 3."""
     monkeypatch.setattr(points, "check_geometry", broken)
     axes = "--over=rotor.bore_mm=null,10", "--over=scene.speed_rpm=100:6000"
-    options = ["--sobol=4", "--seed=5", f"--data={name}", "--no-figures"]
+    options = ["--sobol=4", "--seed=5", "--no-figures"]
     assert sweep.main(["cic", *axes, *options, "-o", str(tmp_path / "run")]) == 3
-    engine = "h5netcdf" if name.endswith(".nc") else "zarr"
-    with xarray.open_dataset(tmp_path / "run" / name, engine=engine) as found:
+    with xarray.open_dataset(tmp_path / "run" / "sweep.nc", engine="h5netcdf") as found:
         assert sorted(found["rotor.bore_mm"].values.tolist()) == ["10", "10", "null", "null"]
         assert found.sizes["sample"] == 4
         assert (found.attrs["method"], found.attrs["seed"]) == ("sobol", 5)
@@ -78,8 +76,6 @@ def test_formats_hold_the_same(name, tmp_path, monkeypatch):
         ([SPEEDS, "--over=scene.speed_rpm=3"], "given twice"),
         ([SPEEDS, "--seed=1"], "--sample N"),
         ([SPEEDS, "--zip", "--zip-keys=a,b"], "remove one"),
-        ([SPEEDS, "--data=../x.nc"], "--data"),
-        ([SPEEDS, "--data=x.csv"], "sweep.zarr"),
         ([SPEEDS, "--resume"], "there is no"),
         ([SPEEDS, "--tolerances=4"], "remove one"),
         (["--tolerances=4"], "section `tolerances`"),
@@ -92,18 +88,6 @@ def test_refused_in_one_sentence(options, words, tmp_path, capsys):
     assert words in told
     assert told.count("\n") == 1
     assert not any(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(
-    ("package", "data", "advice"),
-    [("h5netcdf", "a.nc", "pip install 'rootsopt'"), ("zarr", "a.zarr", "'rootsopt[zarr]'")],
-)
-def test_missing_package_is_named(package, data, advice, tmp_path, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, package, None)
-    assert sweep.main(["cic", SPEEDS, f"--data={data}", "-o", str(tmp_path / "run")]) == 2
-    told = capsys.readouterr().err
-    assert package in told
-    assert advice in told
 
 
 def arguments(folder):

@@ -18,7 +18,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "build" / "compat"
 VERSIONS = "oldest", "newest"
-EXTRAS = "cluster,completion,explore,pages,zarr"
+EXTRAS = "cluster,completion,explore,pages"
 """Extras that are installed and tried. The others are for studies, docs and development."""
 CAD = "cad"
 """A further extra of the jobs with the newest versions: build123d pins what it needs so narrowly
@@ -53,7 +53,7 @@ LEFT = (
     "tests/output/test_runs.py::test_nothing_is_written_outside_of_the_runs_own_folder",
 )
 """Tests that need the package's source, compiled programs or the extra `cad`."""
-IMPORTS = "distributed", "zarr", "bokeh", "jinja2", "shtab", "h5netcdf"
+IMPORTS = "distributed", "bokeh", "jinja2", "shtab", "h5netcdf"
 _JOB_SECONDS = 1500
 
 

@@ -68,7 +68,6 @@ def test_values_of_the_pages_are_usual():
         ("pump={viscosity_mPa_s: 0.001, pressure_difference_Pa: 1.0e5}", "Pa·s? write 1"),
         ("rotor.helix_deg=1.05", "radians? write 60.16"),
         ("contact.clearance_mm=0.0001", "metres? write 0.1"),
-        ("sweep.speed_rpm={from: 5, to: 50, points: 9999}", "Hz? write 3000"),
         ("constraints.terms={peak_force_N: {max: 0.2}}", "kN? write 200"),
         ("tolerances.conditions={a: {}, b: {scene.speed_rpm: 50.0}}", "conditions.b.scene.speed"),
     ],

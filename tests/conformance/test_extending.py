@@ -17,7 +17,6 @@ from rootsopt.config.families import (
     Family,
     Parameter,
     families,
-    for_a_time,
     import_named,
     outside_modules,
     parameters,
@@ -26,6 +25,7 @@ from rootsopt.config.families import (
 from rootsopt.errors import InputError
 from rootsopt.scene.families import profile_of
 from tests.conformance import families as suite
+from tests.standins import for_a_time
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.smoothing.study import LIMIT, SHAKY
+from experiments._common.scenes import SHAKY
 from rootsopt.config import load
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.status import Status
@@ -36,13 +36,12 @@ def forces(name, *changes):
 
 @pytest.mark.parametrize("name", SCENES)
 def test_default_smoothing_does_not_change_the_forces(name):
-    """Mean, peak and RMS force change by less than 1e-4; experiments/smoothing has many more
-    scenes.
+    """Mean, peak and RMS force change by less than 1e-4.
 
     Half the length removes at least half of a bias that falls in proportion or faster."""
     default, length = forces(name)
     half, _ = forces(name, f"contact.smoothing_mm={length / 2!r}")
-    np.testing.assert_allclose(half, default, rtol=LIMIT / 2)
+    np.testing.assert_allclose(half, default, rtol=1e-4 / 2)
 
 
 def length_of(*changes):

@@ -78,7 +78,6 @@ def drawing(shape, **changes):
         "notes": ("one", "two & <three>"),
         "root_radius": float(geometry(shape).root_radius) * 1e3,
         "block": (("Title", "Rotor"), ("Material", "iron")),
-        "points": 181,
     }
     return Drawing(**(given | changes))
 

@@ -245,7 +245,6 @@ def test_absent_limits_add_nothing():
             "both be baseline",
         ),
         (["constraints.terms.line_02_force_N.max=1"], "line_ORDER"),
-        ([PEAK + "1", "optimizer.method=adam"], r"optimizer\.method"),
         ([PEAK + "1", "objective.motion=ensemble"], "ensemble"),
         (["constraints.terms.mean_force_N.most=3"], "most"),
         (["constraints.terms.mean_force_N.max=.nan"], "constraints"),

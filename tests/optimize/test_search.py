@@ -5,11 +5,12 @@ import threading
 from collections.abc import Callable
 
 import numpy as np
+import optax
 import pytest
 
 from rootsopt.config import load
 from rootsopt.design.space import sobol
-from rootsopt.optimize import noise
+from rootsopt.optimize import descent, noise
 from rootsopt.optimize.outcome import Trial, history_of
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.search import Search, Stage, _apart, _ranked
@@ -53,7 +54,7 @@ def searching(truth=lambda point: 1.0, tight=None, **settings) -> Search:
     search.config = load("configs/cic_drawn.yaml")
     given = {"screening": 0, "seed": 0, "starts": 2} | settings
     search.settings = search.config.optimizer.model_copy(update=given)
-    search.method = search.settings.method
+    search.method = "slsqp"
     search.problem = object.__new__(Problem)
     vars(search.problem).update(
         design=lambda point: point,
@@ -188,9 +189,11 @@ class Told(Evaluator):
         return evaluation_of(force, status, design, start=np.asarray(design))
 
 
-def test_a_descent_goes_half_way_back_from_where_there_is_no_steady_state():
+def test_a_descent_goes_half_way_back_from_where_there_is_no_steady_state(monkeypatch):
     """Other steps are those of the update rule, each from the orbit of the previous trial."""
-    search = searching(method="sgd", learning_rate=0.2, iterations=6)
+    rates = optax.cosine_decay_schedule(0.2, 6, 0.05)
+    monkeypatch.setattr(descent, "_rule", lambda iterations: optax.sgd(rates))
+    search = searching(iterations=6)
     vars(search.problem)["descent"] = lambda point, slope: slope
     vars(search.problem)["slope"] = lambda evaluation, point: 2 * (point - 0.6)
     search.expected = 7

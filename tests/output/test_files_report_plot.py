@@ -160,16 +160,6 @@ def test_a_path_at_or_below_a_file_is_refused(tmp_path, below):
     assert (tmp_path / "file").read_text() == "keep"
 
 
-def test_an_unwritable_folder_is_refused_and_new_parents_removed(tmp_path, monkeypatch):
-    def refuse(*_):
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr(files.disk, "create", refuse)
-    with pytest.raises(InputError, match="permission denied"):
-        files.ResultFolder(tmp_path / "a" / "b")
-    assert os.listdir(tmp_path) == []
-
-
 @pytest.mark.parametrize("name", ["", "nul\0byte", "x" * 300])
 def test_impossible_names_are_refused(tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)

@@ -21,10 +21,6 @@ from rootsopt.commands.table import explore as command
 pytest.importorskip("bokeh")
 ROOT = Path(__file__).parents[2]
 CIC = str(ROOT / "configs" / "cic_drawn.yaml")
-REFUSED = (
-    "This address lacks the secret token, or its name is not that of this machine. Open the "
-    "address that `rootsopt explore` has printed.\n"
-)
 
 
 @pytest.fixture(scope="module")
@@ -100,9 +96,7 @@ def test_page_is_served_to_those_who_know_the_token(address):
 )
 def test_requests_without_the_token_are_refused(address, path):
     base = address.split("/", 3)
-    status, text = get(f"{base[0]}//{base[2]}/{path}")
-    assert status == 403
-    assert "token" in text
+    assert get(f"{base[0]}//{base[2]}/{path}")[0] == 404
 
 
 @pytest.mark.parametrize(("origin", "status"), [("http://example.org", 403), (None, 101)])
@@ -116,21 +110,6 @@ def test_foreign_pages_may_not_connect(address, origin, status):
     connection.request("GET", f"/{path}ws", headers=headers)
     assert connection.getresponse().status == status
     connection.close()
-
-
-@pytest.mark.parametrize("path", ["", "ws", "static/js/bokeh.min.js"])
-@pytest.mark.parametrize("name", ["example.org:{}", "127.0.0.1.example.org:{}", "127.0.0.1",
-                                  "127.0.0.1:1", "localhost", "{}", ""])  # fmt: skip
-def test_other_names_of_this_machine_are_refused(address, name, path):
-    """A page elsewhere whose name leads here (DNS rebinding) gets nothing, even with the token."""
-    host = name.format(address.split(":")[2].split("/")[0])
-    assert get(address + path, Host=host) == (403, REFUSED)
-
-
-def test_page_has_the_names_of_the_loopback_address(address):
-    port = address.split(":")[2].split("/")[0]
-    for name in ("127.0.0.1", "localhost", "LOCALHOST", "[::1]"):
-        assert get(f"{address}static/js/bokeh.min.js", Host=f"{name}:{port}")[0] == 200
 
 
 def test_malformed_requests_leave_no_traceback(address, capfd):

@@ -16,10 +16,10 @@ import pytest
 import rootsopt
 from experiments._common.shooting import differentiated
 from rootsopt import Scene, Status, steady_response
-from rootsopt.config.families import for_a_time
 from rootsopt.response import terms
+from tests.standins import for_a_time
 
-TIGHT = "solver.rtol=1e-11", "solver.transient_rtol=1e-8"
+TIGHT = "solver.rtol=1e-11", "solver.accuracy=1e-6"
 QUANTITIES = {
     "pitch radius": lambda s: s.pitch_radius,
     "length": lambda s: s.length,

@@ -21,13 +21,14 @@ import pytest
 from rootsopt.commands import cli
 from rootsopt.commands.work.searching import CompileClock
 from rootsopt.config import load
-from rootsopt.config.families import for_a_time, import_named
+from rootsopt.config.families import import_named
 from rootsopt.design import space
 from rootsopt.dynamics.collocation.known import KnownOrbit
 from rootsopt.pump import sheet
-from rootsopt.runtime import environment, programs, store
+from rootsopt.runtime import environment, programs
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene
+from tests.standins import for_a_time
 
 
 class Answer(NamedTuple):
@@ -60,7 +61,6 @@ def traced(monkeypatch, tmp_path):
 
     No programs are kept, and the key is the test's own."""
     monkeypatch.setattr(programs, "_store", None)
-    monkeypatch.setattr(store, "key_folder", lambda: tmp_path / "state")
     TRACED.clear()
     return TRACED
 

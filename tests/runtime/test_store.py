@@ -1,4 +1,4 @@
-"""Signed files of compiled programs: permissions, damage, eviction, processes."""
+"""Files of compiled programs: permissions, damage, eviction, processes."""
 
 import os
 import stat
@@ -14,14 +14,6 @@ from rootsopt.runtime.store import Store, UnsafeFolderError
 ROOT = Path(__file__).parents[2]
 DATA = b"program" * 1000
 posix = pytest.mark.skipif(os.name != "posix", reason="owners and permissions of POSIX")
-
-
-@pytest.fixture(autouse=True)
-def key_folder(tmp_path, monkeypatch):
-    """Return a state folder of the test's own, which holds the key."""
-    folder = tmp_path / "state"
-    monkeypatch.setattr(store, "key_folder", lambda: folder)
-    return folder
 
 
 @pytest.fixture
@@ -53,9 +45,9 @@ DAMAGE = {
     "one byte short": lambda data: data[:-1],
     "one byte long": lambda data: data + b"\0",
     "half": lambda data: data[: len(data) // 2],
-    "no signature": lambda data: DATA,
+    "no checksum": lambda data: DATA,
     "header": lambda data: flipped(data, 0),
-    "signature": lambda data: flipped(data, len(store._HEADER)),
+    "checksum": lambda data: flipped(data, len(store._HEADER)),
     "first byte": lambda data: flipped(data, len(store._HEADER) + 32),
     "last byte": lambda data: flipped(data, len(data) - 1),
 }
@@ -121,7 +113,7 @@ def refusal(folder):
         Store(folder)
     message = str(caught.value)
     assert "\n" not in message
-    assert "choose" in message or "cannot be kept" in message
+    assert "choose" in message
     return message
 
 
@@ -170,66 +162,6 @@ def test_a_folder_that_cannot_be_used_is_an_os_error(tmp_path):
         Store(tmp_path / "circle")
 
 
-def test_the_key_is_secret_and_lies_elsewhere(kept, key_folder, tmp_path):
-    """With another key, entries are not read, and are replaced."""
-    (key,) = key_folder.iterdir()
-    assert len(key.read_bytes()) == 32
-    if os.name == "posix":
-        assert stat.S_IMODE(key.stat().st_mode) == 0o600
-        assert stat.S_IMODE(key_folder.stat().st_mode) == 0o700
-    first = key.read_bytes()
-    Store(tmp_path / "cache")
-    assert key.read_bytes() == first
-    key.unlink()
-    other = Store(tmp_path / "cache")
-    assert key.read_bytes() != first
-    assert other.read("a", "for a") is None
-    other.write("a", "for a", DATA)
-    assert other.read("a", "for a") == DATA
-
-
-UNFIT = {
-    "empty": lambda key: key.write_bytes(b""),
-    "short": lambda key: key.write_bytes(key.read_bytes()[:31]),
-    "long": lambda key: key.write_bytes(key.read_bytes() + b"0"),
-    "readable by others": lambda key: key.chmod(0o604),
-    "readable by the group": lambda key: key.chmod(0o640),
-    "a link": lambda key: (key.rename(key.parent / "moved"), key.symlink_to(key.parent / "moved")),
-}
-
-
-@posix
-@pytest.mark.parametrize("how", UNFIT)
-def test_an_unfit_key_is_replaced(kept, key_folder, tmp_path, how):
-    key = key_folder / "programs.key"
-    first = key.read_bytes()
-    UNFIT[how](key)
-    other = Store(tmp_path / "cache")
-    assert other.read("a", "for a") is None
-    assert len(key.read_bytes()) == 32
-    assert key.read_bytes() != first
-    assert stat.S_ISREG(key.lstat().st_mode)
-    assert stat.S_IMODE(key.lstat().st_mode) == 0o600
-
-
-@posix
-def test_without_a_key_nothing_is_kept(tmp_path, key_folder, monkeypatch):
-    """Nothing is kept without a key, beside files that others can write, or without a state
-    folder."""
-    key_folder.mkdir()
-    key_folder.chmod(0o777)
-    assert "key" in refusal(tmp_path / "cache")
-    key_folder.chmod(0o700)
-    (key_folder / "programs.key").mkdir()
-    assert str(key_folder) in refusal(tmp_path / "cache")
-    (key_folder / "programs.key").rmdir()
-    for folder in (tmp_path / "cache" / "x" / "y", Path("relative")):
-        (tmp_path / "cache").mkdir(exist_ok=True)
-        (tmp_path / "cache" / "x").touch()
-        monkeypatch.setattr(store, "key_folder", lambda folder=folder: folder)
-        assert str(folder) in refusal(tmp_path / "cache")
-
-
 def at_once(number, work):
     """Return the results of `work(k)`, run in `number` threads that start together."""
     gate, results = threading.Barrier(number), [None] * number
@@ -269,21 +201,18 @@ def make_older(folder):
         os.utime(path, (time.time() - 1000,) * 2)
 
 
-def test_unfinished_files_of_dead_processes_are_removed(tmp_path, key_folder):
+def test_unfinished_files_of_dead_processes_are_removed(tmp_path):
     """Unfinished files of the last minutes stay, and so do other files."""
     cache = tmp_path / "cache"
     Store(cache)
-    (key_folder / ".programs.key.0123").write_bytes(b"left over")
     (cache / ".a.program.0123").write_bytes(b"half")
     (cache / ".program").write_text("the user's")
     (cache / ".a.txt").write_text("the user's")
     Store(cache)
     assert len(list(cache.iterdir())) == 3
-    make_older(key_folder)
     make_older(cache)
     Store(cache)
     assert {path.name for path in cache.iterdir()} == {".program", ".a.txt"}
-    assert [path.name for path in key_folder.iterdir()] == ["programs.key"]
 
 
 def test_the_entries_unused_for_longest_give_way(kept, monkeypatch, tmp_path):

@@ -70,9 +70,7 @@ OTHERS = sorted(
     KNOWN.keys()
     - {
         "gradients",
-        "smoothing",
         "tolerances",
-        "extremes",
         "benchmark",
         "twist",
         "paper",
@@ -89,18 +87,6 @@ def test_study_runs(study, tmp_path, programs):
 
 
 @pytest.mark.long
-def test_smoothing(tmp_path, programs):
-    """The default's bias is below its limit, and grows with the smoothing length."""
-    run("smoothing", tmp_path, programs)
-    summary = json.loads((tmp_path / "smoothing.json").read_text())["cic"]
-    assert summary["settled"] >= 5
-    sharp, wide, default = summary["by_width"].values()
-    assert sharp["greatest_bias"] == 0 < default["greatest_bias"] < 1e-4
-    assert default["greatest_bias"] <= wide["greatest_bias"]
-    assert max(default["median_gradient_error"]) < 1e-4
-
-
-@pytest.mark.long
 def test_tolerances(tmp_path, programs):
     """All designs are evaluated in every fresh scene.
 
@@ -112,23 +98,6 @@ def test_tolerances(tmp_path, programs):
     scenes = rows_of(tmp_path / "tolerances_scenes.csv")
     mean = np.mean(numbers(scenes, "robust_peak_force_N"))
     assert mean == pytest.approx(float(rows[2]["peak_force_N_mean"]), rel=1e-8)
-
-
-@pytest.mark.long
-def test_extremes(tmp_path, programs):
-    """Every scene has a named outcome, and results are finite.
-
-    SciPy finds the same results in the scenes chosen for it."""
-    run("extremes", tmp_path, programs)
-    rows = rows_of(tmp_path / "extremes.csv")
-    assert len(rows) == 40
-    assert {row["named"] for row in rows} == {"true"}
-    assert {"periodic", "solver_failed"} < {row["status"] for row in rows}
-    summary = json.loads((tmp_path / "extremes.json").read_text())
-    assert summary["not_finite"] == summary["unnamed"] == 0
-    assert summary["checks"]["law"]["values"] > 10_000
-    assert summary["scipy"]["compared"] >= 1
-    assert summary["scipy"]["worst_end"] < 1e-3
 
 
 @pytest.mark.long

@@ -18,13 +18,14 @@ from rootsopt.config import Config
 
 _MM = 1e-3
 _DEG = math.pi / 180
-Design = Sequence[float]
-"""A CIC design: pressure angle (deg), involute length (mm), tip arc angle (deg)."""
 
+# A CIC design: pressure angle (deg), involute length (mm), tip arc angle (deg).
+Design = Sequence[float]
+
+# Steps (deg, mm, deg) of the central differences. Around the paper's baseline, the truncation
+# error is 1e-4 of the gradient, at worst 1e-3. Forces at tolerances looser than 1e-7 are noisy
+# and need steps two to four times as long.
 FD_STEPS = (0.05, 0.025, 0.05)
-"""Steps (deg, mm, deg) of the central differences. Around the paper's baseline, the truncation
-error is 1e-4 of the gradient, at worst 1e-3. Forces at tolerances looser than 1e-7 are noisy and
-need steps two to four times as long."""
 
 
 @dataclasses.dataclass(frozen=True)

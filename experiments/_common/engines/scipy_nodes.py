@@ -111,13 +111,15 @@ def _flank(rotor: Rotor, nodes: int) -> NDArray[np.complex128]:
 
 # Contact
 
+# Number of nodes in the window on either side of the last contact.
 _WINDOW = 8
-"""Number of nodes in the window on either side of the last contact."""
+
+# Number of nodes of the coarse search along the whole flank.
 _COARSE = 64
-"""Number of nodes of the coarse search along the whole flank."""
+
+# Number of segments by which the window of segments exceeds the window of nodes on either side.
+# The contact may slide by this distance between two calls.
 _PAD = 4
-"""Number of segments by which the window of segments exceeds the window of nodes on either side.
-The contact may slide by this distance between two calls."""
 
 
 class _Segments(NamedTuple):

@@ -7,7 +7,7 @@ from rich.console import Console
 
 from rootsopt.commands import cli
 from rootsopt.config import Config
-from rootsopt.output import files, tables, terminal
+from rootsopt.output import files
 from rootsopt.output.runs import RunFolder
 from rootsopt.response.attractors import find
 from rootsopt.response.evaluation import Evaluator
@@ -51,8 +51,5 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
 
         basin_figures(folder, found, config)
 
-    def show(out: Console) -> None:
-        out.print(terminal.shown(tables.tables_of(data)))
-
     usable = any(one.evaluation.usable for one in found.attractors)
-    return cli.Outcome(cli.OK if usable else cli.NO_RESULT, show)
+    return cli.Outcome(cli.OK if usable else cli.NO_RESULT)

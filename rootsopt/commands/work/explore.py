@@ -64,6 +64,3 @@ def _redirection(folder: Path, url: str) -> str:
     text = f'<meta http-equiv="refresh" content="0; url={target}"><a href="{target}">{target}</a>'
     disk.create(file, text.encode())
     return file.as_uri()
-
-
-__all__ = ["body"]

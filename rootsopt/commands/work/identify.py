@@ -8,7 +8,7 @@ from rootsopt.commands import cli
 from rootsopt.config import Config
 from rootsopt.errors import InputError
 from rootsopt.identification.fit import identify
-from rootsopt.output import files, tables, terminal
+from rootsopt.output import files
 from rootsopt.output.runs import RunFolder
 
 
@@ -40,7 +40,4 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
 
         identified_figure(folder, found)
 
-    def show(out: Console) -> None:
-        out.print(terminal.shown(tables.tables_of(data)))
-
-    return cli.Outcome(cli.OK if found.status.usable else cli.NO_RESULT, show)
+    return cli.Outcome(cli.OK if found.status.usable else cli.NO_RESULT)

@@ -5,7 +5,6 @@ import sys
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 
 from rootsopt import pages
 from rootsopt.commands import cli
@@ -18,7 +17,6 @@ from rootsopt.design.space import widened
 from rootsopt.errors import InputError
 from rootsopt.measured.source import Found, found
 from rootsopt.optimize.surviving import survives, surviving
-from rootsopt.output import terminal
 from rootsopt.output.comparison import NOTHING_BETTER, WORTH, better_tables
 from rootsopt.output.names import stated
 from rootsopt.output.runs import RunFolder
@@ -28,26 +26,31 @@ from rootsopt.scene.check import shape_of
 from rootsopt.scene.families import classical
 from rootsopt.status import Status
 
+# Terms of the objective by aim; `quieter` has the mean and the peak force instead.
 _TERMS = {"tighter": "leakage_fraction", "smoother": "flow_ripple"}
-"""Terms of the objective by aim; `quieter` has the mean and the peak force instead."""
+
+# Values of `configs/cic_drawn.yaml` that follow the pitch radius, each with its power: the same
+# tip speed and gas pressure.
 _SCALED = {
     "rotor.length_mm": 1, "contact.stiffness_N_per_mm_e": 1, "contact.max_damping_N_s_per_mm": 1,
     "scene.speed_rpm": -1, "scene.load.torque_N_m": 3, "scene.timing_gear.stiffness_N_m_per_rad": 3,
     "scene.timing_gear.backlash_mm": 1,
 }  # fmt: skip
-"""Values of `configs/cic_drawn.yaml` that follow the pitch radius, each with its power: the same
-tip speed and gas pressure."""
+
+# The section `pump` that is assumed, without its clearances.
 _AIR = {"viscosity_mPa_s": 0.018, "pressure_difference_Pa": 2e4, "gas": {"inlet_pressure_Pa": 1e5}}
-"""The section `pump` that is assumed, without its clearances."""
+
+# Families that are compared first, because they are common or fitted quickly.
 _COMMON = "ee", "arc", "cic"
-"""Families that are compared first, because they are common or fitted quickly."""
+
+# Distance (m) of a family's member at which no further families are compared, and above which the
+# free form is compared, too. Three times the scatter of the points is added to both.
 _EXACT, _FAR = 1e-6, 20e-6
-"""Distance (m) of a family's member at which no further families are compared, and above which
-the free form is compared, too. Three times the scatter of the points is added to both."""
+
+# Number of parameters that the limits take from a family. In pitch radii: distance of the fitted
+# profile from the outline above which it is rejected, and clearance that is assumed without a
+# gap. Room (mm, cm³) that limits leave for rounding.
 _HELD, _LOOSE, _GAP, _ROOM = 2, 0.01, 3e-3, 1e-6
-"""Number of parameters that the limits take from a family. In pitch radii: distance of the fitted
-profile from the outline above which it is rejected, and clearance that is assumed without a gap.
-Room (mm, cm³) that limits leave for rounding."""
 
 
 def config_of(options: argparse.Namespace) -> Config:
@@ -215,12 +218,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
         return told | {"improve": options.known | {"cases": cases, "message": survives(cases)}}
 
     outcome = optimize.searched_for(config, options, folder, further)
-    data = folder.result
-
-    def show(out: Console) -> None:
-        for line in options.known["found"]:
-            out.print(line, soft_wrap=True, markup=False, highlight=False)
-        out.print(terminal.shown(better_tables(data)))
-
-    gain = (data.get("improvement") or {}).get("objective", 0.0)
-    return cli.Outcome(outcome.code if abs(gain) >= WORTH else cli.NO_RESULT, show)
+    gain = (folder.result.get("improvement") or {}).get("objective", 0.0)
+    code = outcome.code if abs(gain) >= WORTH else cli.NO_RESULT
+    tables = [*better_tables(folder.result)]
+    return cli.Outcome(code, tables=tables, head=options.known["found"])

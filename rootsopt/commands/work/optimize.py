@@ -3,19 +3,15 @@
 import argparse
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager, closing
+from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
-from rich.console import Console
 
-from rootsopt.commands import cli, door
+from rootsopt.commands import cli
 from rootsopt.commands.work.searching import (
-    CompileClock,
-    checkpoint_of,
     nothing_known,
     progress_bar,
-    runs_of,
     searched,
 )
 from rootsopt.config import Config
@@ -26,7 +22,7 @@ from rootsopt.measured import conjugacy
 from rootsopt.optimize import noise
 from rootsopt.optimize.outcome import Optimization
 from rootsopt.optimize.robust import search_of
-from rootsopt.output import files, tables, terminal
+from rootsopt.output import files
 from rootsopt.output.runs import RunFolder
 from rootsopt.pump.sheet import check_clearances, record_of
 from rootsopt.response.touching import touching
@@ -54,18 +50,12 @@ def searched_for(
     cli.load_figures(options, "runs")
     check_geometry(config)
     check_clearances(config)
-    clock = CompileClock()
-    promise = "keeping the best design so far and writing the files"
-    with (
-        clock,
-        door.patience(promise) as stop,
-        runs_of(options) as runs,
-        _progress(Console(stderr=True)) as progress,
-        closing(checkpoint_of("optimize", config, options, folder)) as checkpoint,
-    ):
-        result = searched(lambda: search_of(config, progress, stop, checkpoint, runs), stop)
-    if not stop.is_set():  # A stopped search can go on later.
-        folder.remove_afterwards(folder.checkpoint)
+    bar = partial(
+        progress_bar, first="baseline, compiling", then="optimising", counted="designs",
+        field="best objective",
+    )  # fmt: skip
+    given = "optimize", config, options, folder, search_of, bar, "the best design so far"
+    result, compiled = searched(*given)
     if result is None:
         empty = {"baseline": None, "optimized": None}
         return nothing_known(config, folder, "simulated", empty)
@@ -75,25 +65,18 @@ def searched_for(
     alike = {} if result.interrupted else _alike(config, result)
     sheets = _sheets(config, result)
     alike |= further(result)
-    data = _write(folder, config, options, result, alike, sheets, clock.seconds, ran)
+    _write(folder, config, options, result, alike, sheets, compiled, ran)
     if result.optimized is not None and formats:
         from rootsopt.figures.writing import write_simulated
 
         write_simulated(folder, _searching(config, result), formats, result.optimized)
     total = time.perf_counter() - began
-
-    def show(out: Console) -> None:
-        out.print(terminal.shown(tables.tables_of(data)))
-        if result.beginning is not None:
-            conjugacy.say(config, out)
-        out.print(
-            f"compile {clock.seconds:.1f} s, run {ran - clock.seconds:.1f} s, "
-            f"reports {total - ran:.1f} s",
-            soft_wrap=True,
-        )
-
+    lines = [] if result.beginning is None else conjugacy.notes(config)
+    lines.append(
+        f"compile {compiled:.1f} s, run {ran - compiled:.1f} s, reports {total - ran:.1f} s"
+    )
     found = result.optimized is not None and not result.interrupted
-    return cli.Outcome(cli.OK if found else cli.NO_RESULT, show)
+    return cli.Outcome(cli.OK if found else cli.NO_RESULT, lines)
 
 
 def _contradiction(config: Config, folder: RunFolder, result) -> cli.Outcome:
@@ -108,11 +91,7 @@ def _contradiction(config: Config, folder: RunFolder, result) -> cli.Outcome:
     if result.beginning is not None:
         data["beginning"] = result.beginning.record()
     folder.write_json("result.json", data)
-
-    def show(out):
-        out.print(terminal.shown(tables.tables_of(data)))
-
-    return cli.Outcome(cli.NO_RESULT, show)
+    return cli.Outcome(cli.NO_RESULT)
 
 
 def _alike(config: Config, result) -> dict:
@@ -191,8 +170,8 @@ def _interrupted(result) -> str:
     )
 
 
-def _write(folder, config, options, result, alike, sheets, compiled, ran) -> dict:
-    """Write the files of a search; return the content of the result file."""
+def _write(folder, config, options, result, alike, sheets, compiled, ran) -> None:
+    """Write the files of a search."""
     records = {"baseline": result.baseline, "optimized": result.optimized}
     if result.nominal is not None:
         records["nominal"] = result.nominal
@@ -249,7 +228,6 @@ def _write(folder, config, options, result, alike, sheets, compiled, ran) -> dic
     folder.write_json("result.json", data)
     if not options.no_figures:
         _draw(folder, config, result, data)
-    return files.plain(data)
 
 
 def _draw(folder, config: Config, result, data: dict) -> None:
@@ -298,9 +276,3 @@ def _write_robustness(folder, config, options, robustness) -> None:
         count = len(next(iter(robustness.scenes.values())))
         made = distributions(designs, f"Contact force in {count} fresh scenes")
         folder.write_figure("figures/tolerances.png", made)
-
-
-def _progress(console) -> "AbstractContextManager[Callable[..., None] | None]":
-    """Return a context manager for a function (done, expected, best objective): `progress_bar`."""
-    texts = "baseline, compiling", "optimising", "designs"
-    return progress_bar(console, *texts, field="best objective")

@@ -2,25 +2,17 @@
 
 import argparse
 import time
-from collections.abc import Callable
-from contextlib import AbstractContextManager, closing
+from functools import partial
 
-from rich.console import Console
-
-from rootsopt import pages
-from rootsopt.commands import cli, door
+from rootsopt.commands import cli
 from rootsopt.commands.work.searching import (
-    CompileClock,
-    checkpoint_of,
     nothing_known,
     progress_bar,
-    runs_of,
     searched,
 )
 from rootsopt.config import Config
-from rootsopt.output import files, tables, terminal
+from rootsopt.output import files
 from rootsopt.output.runs import RunFolder
-from rootsopt.runtime.environment import say
 from rootsopt.scene import check_geometry
 from rootsopt.tradeoffs.trace import Tracer
 
@@ -32,23 +24,16 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     began = time.perf_counter()
     check_geometry(config)
     cli.load_figures(options, "front")
-    clock = CompileClock()
-    promise = "keeping the points found so far and writing the files"
-    with (
-        clock,
-        door.patience(promise) as stop,
-        runs_of(options) as runs,
-        _progress(Console(stderr=True)) as progress,
-        closing(checkpoint_of("pareto", config, options, folder)) as checkpoint,
-    ):
-        front = searched(lambda: Tracer(config, progress, stop, runs, checkpoint), stop)
-    if not stop.is_set():  # A stopped search can go on later.
-        folder.remove_afterwards(folder.checkpoint)
+    bar = partial(
+        progress_bar, first="baseline and screening", then="tracing the front", counted="searches"
+    )
+    given = "pareto", config, options, folder, Tracer, bar, "the points found so far"
+    front, compiled = searched(*given)
     if front is None:
         return nothing_known(config, folder, "evaluated", {"points": []})
     ran = time.perf_counter() - began
     record = front.record()
-    seconds = {"compile_seconds": clock.seconds, "run_seconds": ran - clock.seconds}
+    seconds = {"compile_seconds": compiled, "run_seconds": ran - compiled}
     record["statistics"] |= seconds
     files.write_config(folder, config)
     if front.points:
@@ -61,28 +46,11 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
         from rootsopt.figures.front import front_figure
 
         front_figure(folder, front)
-        if words := pages.missing():
-            say(f"{pages.FRONT} is not written, because it needs {words}")
-        else:
-            from rootsopt.pages.html import front_text
-
-            folder.write_text(pages.FRONT, front_text(front))
     if front.interrupted and not front.points:
         folder.overwrite = False  # An earlier result is more valuable than this one.
-
-    def show(out: Console) -> None:
-        out.print(terminal.shown(tables.tables_of(record)))
-        out.print(
-            f"{front.searches} searches, {front.evaluations} designs, compile "
-            f"{clock.seconds:.1f} s, run {ran - clock.seconds:.1f} s",
-            soft_wrap=True,
-        )
-
+    line = (
+        f"{front.searches} searches, {front.evaluations} designs, compile "
+        f"{compiled:.1f} s, run {ran - compiled:.1f} s"
+    )
     found = front.certified > 0 and not front.interrupted
-    return cli.Outcome(cli.OK if found else cli.NO_RESULT, show)
-
-
-def _progress(console) -> "AbstractContextManager[Callable[..., None] | None]":
-    """Return a context manager for a function (searches done, searches expected), as
-    `progress_bar`."""
-    return progress_bar(console, "baseline and screening", "tracing the front", "searches")
+    return cli.Outcome(cli.OK if found else cli.NO_RESULT, [line])

@@ -3,8 +3,6 @@
 import argparse
 from typing import Any
 
-from rich.console import Console
-
 from rootsopt.commands import cli
 from rootsopt.config import Config
 from rootsopt.design.resemblance import free_likeness, likenesses
@@ -12,7 +10,7 @@ from rootsopt.errors import InputError
 from rootsopt.figures import chosen
 from rootsopt.figures.writing import write
 from rootsopt.measured import conjugacy
-from rootsopt.output import files, tables, terminal
+from rootsopt.output import files
 from rootsopt.output.runs import RunFolder
 from rootsopt.profiles import Profile, geometry
 from rootsopt.pump.sheet import sheet
@@ -57,15 +55,10 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     if alike:
         record["resembles"] = alike
     folder.write_json("result.json", record | {"versions": files.versions()})
-    projected = None if coefficients is None else _projected(folder, config, coefficients)
-
-    def show(out: Console) -> None:
-        out.print(terminal.shown(tables.tables_of(record)))
-        conjugacy.say(config, out)
-        if projected is not None:
-            out.print(projected, soft_wrap=True)
-
-    return cli.Outcome(cli.OK, show)
+    lines = conjugacy.notes(config)
+    if coefficients is not None:
+        lines.append(_projected(folder, config, coefficients))
+    return cli.Outcome(cli.OK, lines)
 
 
 def resembles(profile: Profile) -> list[dict[str, Any]]:

@@ -3,7 +3,6 @@
 import argparse
 import contextlib
 import os
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
@@ -15,7 +14,7 @@ import jax
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from rootsopt.commands import cli
+from rootsopt.commands import cli, door
 from rootsopt.config import Config
 from rootsopt.output import files
 from rootsopt.output.runs import RunFolder
@@ -87,18 +86,41 @@ def opened(make: Callable[[Path, bool], J], options: argparse.Namespace, folder:
     return found
 
 
-def searched(make: "Callable[[], Searches[Found]]", stop: threading.Event) -> "Found | None":
-    """Run the search that `make` returns, and return its outcome.
+def searched(
+    command: str,
+    config: Config,
+    options: argparse.Namespace,
+    folder: RunFolder,
+    make: Callable[..., Searches[Found]],
+    bar: Callable[[Console], contextlib.AbstractContextManager],
+    kept: str,
+) -> tuple[Found | None, float]:
+    """Run the search of a `command`; return its outcome and the time (s) spent on compiling.
 
-    It is `None` if `stop`, an event that stops the search, came before the baseline was known."""
+    `make`: makes the search, with the keywords `progress`, `stop`, `checkpoint` and `runs`; `bar`:
+    returns the progress bar on a console; `kept`: what is kept if the user stops the search, in
+    words. The outcome is `None` if the search was stopped before the baseline was known."""
     made: list[Searches[Found]] = []
+    clock = CompileClock()
+    with (
+        clock,
+        door.patience(f"keeping {kept} and writing the files") as stop,
+        runs_of(options) as runs,
+        bar(Console(stderr=True)) as progress,
+        contextlib.closing(checkpoint_of(command, config, options, folder)) as checkpoint,
+    ):
 
-    def work():
-        made.append(make())
-        return made[0].run()
+        def work():
+            made.append(
+                make(config, progress=progress, stop=stop, checkpoint=checkpoint, runs=runs)
+            )
+            return made[0].run()
 
-    found = until_stopped(work, stop, PATIENCE)
-    return made[0].so_far() if found is None and made else found
+        found = until_stopped(work, stop, PATIENCE)
+        found = made[0].so_far() if found is None and made else found
+    if not stop.is_set():  # A stopped search can go on later.
+        folder.remove_afterwards(folder.checkpoint)
+    return found, clock.seconds
 
 
 def nothing_known(
@@ -114,7 +136,7 @@ def nothing_known(
     data = {**empty, "status": status.label, "message": message}
     folder.write_json("result.json", data | {"versions": files.versions()})
     folder.overwrite = False  # An earlier result is more valuable than this one.
-    return cli.Outcome(cli.NO_RESULT, lambda out: None)
+    return cli.Outcome(cli.NO_RESULT)
 
 
 @contextlib.contextmanager

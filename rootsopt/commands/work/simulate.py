@@ -8,7 +8,7 @@ from rootsopt.commands import cli
 from rootsopt.config import Config
 from rootsopt.figures import chosen
 from rootsopt.measured import conjugacy
-from rootsopt.output import files, tables, terminal
+from rootsopt.output import files, tables
 from rootsopt.output.runs import RunFolder
 from rootsopt.pump.sheet import check_clearances, record_of
 from rootsopt.response.evaluation import Evaluator
@@ -45,10 +45,6 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
         from rootsopt.figures import runs
 
         runs.simulation_figures(folder, evaluation, config)
-
-    def show(out: Console) -> None:
-        shown = [*tables.tables_of(data), tables.effort_table(data)]
-        out.print(terminal.shown(shown))
-        conjugacy.say(config, out)
-
-    return cli.Outcome(cli.OK if evaluation.usable else cli.NO_RESULT, show)
+    shown = [*tables.tables_of(data), tables.effort_table(data)]
+    code = cli.OK if evaluation.usable else cli.NO_RESULT
+    return cli.Outcome(code, conjugacy.notes(config), tables=shown)

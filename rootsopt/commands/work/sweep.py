@@ -13,7 +13,7 @@ from rootsopt.commands.work.searching import opened, progress_bar
 from rootsopt.config import Config
 from rootsopt.config.plausible import notes_on_swept
 from rootsopt.errors import InputError
-from rootsopt.output import files, sweeps, tables, terminal
+from rootsopt.output import files, sweeps
 from rootsopt.output.runs import RunFolder
 from rootsopt.response import speeds
 from rootsopt.response.evaluation import Evaluator
@@ -27,8 +27,9 @@ from rootsopt.sweeps.scenes import Points, checked, complete, runner
 from rootsopt.sweeps.table import dataset_of
 
 _DATA = "sweep.nc"
+
+# Number of points above which the terminal shows only the first.
 _FEW = 40
-"""Number of points above which the terminal shows only the first."""
 _FIRST = "compiling and simulating"
 _PROMISE = "keeping the points that are done and writing the files"
 
@@ -66,12 +67,8 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
 
         name = config.profile.family.upper()
         speed_figure(folder, {name: parts}, f"Contact force of the {name} pair over speed")
-
-    def show(out: Console) -> None:
-        out.print(terminal.shown(tables.tables_of(data, most=len(rows))))
-
     usable = any(part.evaluation.usable for part in parts)
-    return cli.Outcome(cli.OK if usable else cli.NO_RESULT, show)
+    return cli.Outcome(cli.OK if usable else cli.NO_RESULT, most=len(rows))
 
 
 def _over_keys(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.Outcome:
@@ -80,8 +77,6 @@ def _over_keys(config: Config, options: argparse.Namespace, folder: RunFolder) -
     Return the `Outcome`. Raises `InputError` if a key, a value or an option is not valid."""
     began = time.perf_counter()
     cli.load_figures(options, "sweep")
-    name = _DATA if options.data is None else options.data
-    sweeps.check_name(name)
     config, plan = _points(config, options)
     plan = checked(config, plan)
     columns = {key: values for one in plan.dimensions for key, values in one.columns.items()}
@@ -103,10 +98,10 @@ def _over_keys(config: Config, options: argparse.Namespace, folder: RunFolder) -
     files.write_config(folder, config)
     rows = sweeps.rows_of(plan, records)
     folder.write_csv("sweep.csv", files.row_columns(rows))
-    sweeps.write_dataset(folder, name, dataset)
+    sweeps.write_dataset(folder, _DATA, dataset)
     statistics: dict[str, Any] = {"seconds": seconds, "resumed_points": known}
     statistics["points_per_second"] = (len(records) - known) / seconds
-    record = sweeps.summary(plan, records) | {"data": name, "statistics": statistics}
+    record = sweeps.summary(plan, records) | {"data": _DATA, "statistics": statistics}
     folder.write_json("result.json", record | {"versions": files.versions()})
     if not options.no_figures:
         from rootsopt.figures.sweep import sweep_figure
@@ -116,14 +111,10 @@ def _over_keys(config: Config, options: argparse.Namespace, folder: RunFolder) -
         folder.remove_afterwards(folder.checkpoint)
     else:
         folder.overwrite = False  # An earlier result is more valuable than this one.
-
-    def show(out: Console) -> None:
-        out.print(terminal.shown(tables.tables_of(record, rows, _FEW)))
-        rate = statistics["points_per_second"]
-        out.print(f"{len(records) - known} points in {seconds:.1f} s, {rate:.3g} per second")
-
+    rate = statistics["points_per_second"]
+    line = f"{len(records) - known} points in {seconds:.1f} s, {rate:.3g} per second"
     usable = done and any(Status[row["status"].upper()].usable for row in rows)
-    return cli.Outcome(cli.OK if usable else cli.NO_RESULT, show, rows)
+    return cli.Outcome(cli.OK if usable else cli.NO_RESULT, [line], rows, _FEW)
 
 
 def _points(config: Config, options: argparse.Namespace) -> tuple[Config, Plan]:
@@ -162,7 +153,7 @@ def _silent(done: int, expected: int) -> None:
 
 def refuse_options(options: argparse.Namespace) -> None:
     """Raise `InputError` if an option that needs `--over` is given without `--over`."""
-    names = "zip", "zip_keys", "sample", "sobol", "seed", "data", "workers", "scheduler", "resume"
+    names = "zip", "zip_keys", "sample", "sobol", "seed", "workers", "scheduler", "resume"
     for name in names:
         if getattr(options, name) not in (None, False, []):
             raise InputError(

@@ -30,7 +30,6 @@ def greatest(count: Int[Array, ""]) -> Int[Array, ""]:
 
 @greatest.def_vmap
 def _(size, batched, count):
-    del size, batched
     return jnp.max(count), False
 
 

@@ -42,10 +42,11 @@ from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.orbit import choose
 from rootsopt.dynamics.pair import RotorPair
 
+# Maximum number of Newton steps.
 _TURNS = 12
-"""Maximum number of Newton steps."""
+
+# Newton step (scaled) below which Newton's method stops.
 _SMALL = 1e-10
-"""Newton step (scaled) below which Newton's method stops."""
 
 Family = Callable[[Float[Array, ""]], tuple[RotorPair, RotorPair]]
 """Type of a function that maps a parameter to the pair, and to the pair's derivative with respect
@@ -147,7 +148,6 @@ class _Follower(Closer):
         return lax.stop_gradient(self.family(now.line.share)[0])
 
     def limit(self, now: Loop) -> Float[Array, ""]:
-        del now
         return jnp.asarray(_SMALL)
 
     def judged(self, now: Loop, after: Loop, size: Float[Array, ""], found: Any) -> Loop:
@@ -246,6 +246,3 @@ def followed(
     return Followed(
         closed.found, loop.line, KnownOrbit(closed.found.elements, *errors, closed.sound, yes)
     )
-
-
-__all__ = ["Family", "Followed", "Line", "Plane", "followed"]

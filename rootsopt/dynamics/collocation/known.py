@@ -97,6 +97,3 @@ def padded(known: KnownOrbit, room: tuple[int, int]) -> KnownOrbit:
     )
     wide = (np.pad(x, ((0, elements), *((0, 0),) * (x.ndim - 1))) for x in parts)
     return known._replace(elements=Elements(full, *wide))  # pyright: ignore[reportArgumentType]
-
-
-__all__ = ["KnownOrbit", "padded", "trimmed"]

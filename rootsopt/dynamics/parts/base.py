@@ -128,7 +128,6 @@ class Part(eqx.Module):
         """Return the part, completed with values from the scene's `context`.
 
         Keep these values differentiable: store them as JAX arrays."""
-        del context
         return self
 
     # The part's own states: m numbers in SI units. A motion begins at `start`. The solver works
@@ -143,7 +142,6 @@ class Part(eqx.Module):
 
     def start(self, units: Units) -> Float[Array, " m"] | None:
         """Return the part's own states (m,) at the start of a motion, in SI units; None: zero."""
-        del units
         return None
 
     def rates(self, motion: Motion, own: Own, loads: Loads) -> Float[Array, " m"]:
@@ -167,7 +165,6 @@ class Part(eqx.Module):
     def lost(self, own: Own) -> Bool[Array, ""] | None:
         """Return whether the part's own states show that the pair no longer runs; None: they never
         do."""
-        del own
         return None
 
     # Loads from the part. None: no load.
@@ -178,7 +175,6 @@ class Part(eqx.Module):
         `motion`: position and velocity of the pair; `own` (m,): the part's own states (SI units).
         This method is called only if rotor 1 is `free`.
         """
-        del motion, own
         return None
 
     def torque_on_2(self, motion: Motion, own: Own) -> Float[Array, ""] | None:
@@ -186,7 +182,6 @@ class Part(eqx.Module):
 
         `motion`: position and velocity of the pair; `own` (m,): the part's own states (SI
         units)."""
-        del motion, own
         return None
 
     def force_on_axes(self, motion: Motion, own: Own) -> Float[Array, "2 2"] | None:
@@ -194,7 +189,6 @@ class Part(eqx.Module):
 
         `motion`: position and velocity of the pair; `own` (m,): the part's own states (SI units).
         This method is called only if a part `displaces` the axes."""
-        del motion, own
         return None
 
     def drag(self, force: Float[Array, ""], sliding: Float[Array, ""]) -> Float[Array, ""]:
@@ -213,12 +207,10 @@ class Part(eqx.Module):
 
         `motion`: position and velocity of the pair; `own` (m,): the part's own states (SI
         units)."""
-        del motion, own
         return jnp.zeros(0, bool)
 
     def drag_switches(self, sliding: Float[Array, ""]) -> Bool[Array, " s"]:
         """Return flags (s,) that change where the drag is not smooth in `sliding` (m/s)."""
-        del sliding
         return jnp.zeros(0, bool)
 
     # Numbers that are positive where these flags are set. Each is smooth across the instant at
@@ -228,13 +220,11 @@ class Part(eqx.Module):
     def margins(self, motion: Motion, own: Own) -> Float[Array, " s"]:
         """Return numbers (s,), each positive where the flag of `switches` with the same index is
         set."""
-        del motion, own
         return jnp.zeros(0)
 
     def drag_margins(self, sliding: Float[Array, ""]) -> Float[Array, " s"]:
         """Return numbers (s,), each positive where the flag of `drag_switches` with the same index
         is set."""
-        del sliding
         return jnp.zeros(0)
 
     # Data from which the solver chooses its steps.
@@ -254,7 +244,6 @@ class Part(eqx.Module):
 
     def edges_at(self, phi: Float[Array, ""]) -> tuple[Float[Array, ""], ...]:
         """Return the `edges` at φ1 = `phi` (rad), for a part of `whole_turns` whose edges move."""
-        del phi
         return self.edges
 
     @property
@@ -267,5 +256,4 @@ class Part(eqx.Module):
 
         `inertia` (kg·m²) of one rotor. The result is None if the part has no oscillation of its
         own."""
-        del inertia
         return None

@@ -43,7 +43,6 @@ class MotorDrive(Drive):
         return self.inertia
 
     def torque_on_1(self, motion, own):
-        del own
         return self.torque_at(motion.speed)
 
     def torque_at(self, speed: Float[Array, "*n"]) -> Float[Array, "*n"]:

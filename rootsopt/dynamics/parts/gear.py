@@ -105,7 +105,6 @@ class TimingGear(Part):
         return spring + self.damping * engaged * rate
 
     def torque_on_1(self, motion: Motion, own) -> Float[Array, ""]:
-        del own
         gear, rate = self.meshing(motion)
         return gear(motion.relative, rate)
 
@@ -138,13 +137,11 @@ class TimingGear(Part):
 
     def switches(self, motion: Motion, own) -> Bool[Array, "2"]:
         """Return flags (2,): whether the gear is engaged, and whether it is beyond the rounding."""
-        del own
         gear = self.meshing(motion)[0]
         excess = jnp.abs(gear._from_middle(motion.relative)) - gear.half_backlash
         return excess > jnp.stack([jnp.zeros_like(self.rounding), self.rounding])
 
     def margins(self, motion: Motion, own) -> Float[Array, "2"]:
-        del own
         gear = self.meshing(motion)[0]
         excess = jnp.abs(gear._from_middle(motion.relative)) - gear.half_backlash
         return excess - jnp.stack([jnp.zeros_like(self.rounding), self.rounding])

@@ -38,12 +38,10 @@ class Load(Part):
         """Mean torque (N·m) against both rotors together."""
 
     def torque_on_1(self, motion, own):
-        del own
         torque = self.torque1(motion.phi)
         return None if torque is None else -torque
 
     def torque_on_2(self, motion, own):
-        del own
         return -self.torque2(motion.phi)
 
 
@@ -53,11 +51,9 @@ class ConstantLoad(Load):
     torque: Float[Array, ""]
 
     def torque1(self, phi):
-        del phi
         return None
 
     def torque2(self, phi):
-        del phi
         return self.torque
 
     @property
@@ -127,7 +123,6 @@ class GasLoad(Load):
         return self.margins(motion, own) > 0
 
     def margins(self, motion, own) -> Float[Array, " s"]:
-        del own
         phi, half = motion.phi, self.profile.half_pitch
         roll = self._roll(phi)
         addendum = half - jnp.abs(roll - half)

@@ -154,7 +154,6 @@ class AxisLoads(Part):
         return jnp.stack([jnp.abs(across) * jnp.tan(self.tooth_angle), across])
 
     def force_on_axes(self, motion, own) -> Float[Array, "2 2"]:
-        del own
         teeth = self.gear_force(motion)
         total = jnp.stack([-teeth, teeth])
         if self.gas is not None:
@@ -164,7 +163,6 @@ class AxisLoads(Part):
         return total
 
     def switches(self, motion, own) -> Bool[Array, " s"]:
-        del own
         flags = []
         if self.gear is not None:
             flags.append((self.gear.torque_on_1(motion, np.zeros(0)) > 0)[None])

@@ -6,9 +6,9 @@ from jaxtyping import Array, Bool, Float
 
 from rootsopt.dynamics.parts.base import Context, Loads, Motion, Part, Units
 
+# Displacement of an axis (fraction of the centre distance) above which the rotors no longer count
+# as being in mesh.
 _DISPLACED = 0.1
-"""Displacement of an axis (fraction of the centre distance) above which the rotors no longer count
-as being in mesh."""
 
 
 class Supports(Part):
@@ -51,7 +51,6 @@ class Supports(Part):
         return jnp.concatenate([own[4:], loads.axes.ravel() / self.mass])
 
     def force_on_axes(self, motion: Motion, own: Float[Array, "8"]) -> Float[Array, "2 2"]:
-        del own
         assert motion.shift is not None
         assert motion.drift is not None
         return self.force(motion.shift, motion.drift)
@@ -60,7 +59,6 @@ class Supports(Part):
         return jnp.any(jnp.abs(own[:4]) > _DISPLACED * 2 * self.radius)
 
     def quickest(self, inertia: Float[Array, ""]) -> Float[Array, ""]:
-        del inertia
         return jnp.sqrt(self.mass / self.stiffness)
 
     def force(
