@@ -12,14 +12,14 @@ from rootsopt.contact.point import ContactPoint, contact_point
 from rootsopt.profiles import trigonometry as trig
 from rootsopt.runtime.kept import kept_along
 
+# Magnitude of the Newton step (rad) above which the flanks count as having no common normal.
 _FARTHEST = 0.06
-"""Magnitude of the Newton step (rad) above which the flanks count as having no common normal."""
+# Distance (rad) from a given root at which the offset is linearised. An event may lie exactly where
+# a segment ends. Automatic differentiation would give a mixture of both slopes there.
 _ASIDE = 1e-12
-"""Distance (rad) from a given root at which the offset is linearised. An event may lie exactly
-where a segment ends. Automatic differentiation would give a mixture of both slopes there."""
+# Distance (rad) from the range of the search's nodes above which a root outside it is rejected. The
+# flanks then count as having no common normal.
 _BEYOND = 0.05
-"""Distance (rad) from the range of the search's nodes above which a root outside it is rejected.
-The flanks then count as having no common normal."""
 
 
 class NearContact(Contact):

@@ -10,8 +10,8 @@ from rootsopt.profiles import Profile
 
 LINES = 12
 """Number of cosine terms in the series of the wear over the roll coordinate, without the mean."""
+# Number of roll angles from which the coefficients of the series are computed.
 _POSES = 512
-"""Number of roll angles from which the coefficients of the series are computed."""
 
 
 class WornContact(WrappedContact):

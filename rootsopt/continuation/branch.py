@@ -18,16 +18,16 @@ from rootsopt.continuation.arclength import End, Spot, StepSizes, StoppedError, 
 from rootsopt.continuation.family import SPAN, BranchPoint, OrbitFamily
 from rootsopt.errors import InputError
 
+# Distance (unit of `StepSizes`) below which the states at the start and the middle of an orbit
+# count as equal. A branch whose steps have become too small there ends at an orbit of half the
+# period (`End.HALVED`).
 _HALVED = 0.004
-"""Distance (unit of `StepSizes`) below which the states at the start and the middle of an orbit
-count as equal. A branch whose steps have become too small there ends at an orbit of half the period
-(`End.HALVED`)."""
+# Distances (unit of `StepSizes`) from a period doubling at which the orbit of twice the period is
+# tried, in this order.
 _SIZES = 3e-4, 1e-3, 3e-3, 1e-4, 1e-2
-"""Distances (unit of `StepSizes`) from a period doubling at which the orbit of twice the period is
-tried, in this order."""
+# Number of points below which a doubled branch that falls back to the single period is tried again,
+# from another distance.
 _FEW = 8
-"""Number of points below which a doubled branch that falls back to the single period is tried
-again, from another distance."""
 
 
 class Kind(enum.Enum):

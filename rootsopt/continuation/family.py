@@ -34,12 +34,11 @@ LONGEST = 8
 SPAN = 20.0
 """Change of the scaled state that has the same length as the whole range of the parameter, when
 step lengths are measured."""
+# Number of uniform instants on an orbit at which it is checked whether the rotors run as a pair.
 _LOOKS = 504
-"""Number of uniform instants on an orbit at which it is checked whether the rotors run as a
-pair."""
+# Distance (unit of `StepSizes`) between the states at the start and the middle of an orbit below
+# which the orbit has half the period.
 _HALF_ALIKE = 1e-5
-"""Distance (unit of `StepSizes`) between the states at the start and the middle of an orbit below
-which the orbit has half the period."""
 
 
 @dataclasses.dataclass(frozen=True)

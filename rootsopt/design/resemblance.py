@@ -37,27 +37,27 @@ from rootsopt.scene.families import check, classical, profile_of
 
 COEFFICIENTS = 12
 """Number of coefficients of a free form that is fitted to a profile."""
+# Number of nodes per flank, on each side of the pitch circle, at which a search compares two
+# outlines.
 _NODES = 128
-"""Number of nodes per flank, on each side of the pitch circle, at which a search compares two
-outlines."""
+# Number of sampled members of a family. The searches start from the best of them.
 _SAMPLE = 128
-"""Number of sampled members of a family. The searches start from the best of them."""
+# Number of searches per family.
 _STARTS = 3
-"""Number of searches per family."""
+# Limits of a search: number of linear programs after which the search ends; greatest step; step
+# below which the search ends. Steps are fractions of the parameters' usual ranges.
 _PROGRAMS, _LONGEST, _SHORTEST = 80, 0.2, 1e-9
-"""Limits of a search: number of linear programs after which the search ends; greatest step; step
-below which the search ends. Steps are fractions of the parameters' usual ranges."""
+# Relative decrease of the distance in one step below which a search ends.
 _GAIN = 1e-7
-"""Relative decrease of the distance in one step below which a search ends."""
+# Weight of a negative margin in the function that a search minimises. The weight times the margin's
+# magnitude (relative to its scale) is added to the distance (pitch radii).
 _UNSOUND_WEIGHT = 10.0
-"""Weight of a negative margin in the function that a search minimises. The weight times the
-margin's magnitude (relative to its scale) is added to the distance (pitch radii)."""
+# Magnitude of a negative margin (relative to its scale) above which a member counts as unsound.
 _UNSOUND = 1e-6
-"""Magnitude of a negative margin (relative to its scale) above which a member counts as unsound."""
 
 
+# Greatest inset and range of usual insets (pitch radii).
 _INSET, _INSET_USUAL = 0.05, 0.01
-"""Greatest inset and range of usual insets (pitch radii)."""
 
 
 class Likeness(NamedTuple):

@@ -20,14 +20,14 @@ from rootsopt.scene import Scene
 from rootsopt.scene.check import shape_of
 from rootsopt.scene.families import check
 
+# Number of sampled members, and of searches that begin at the best of them; magnitude (mm) that
+# stands for values that are not finite.
 _SAMPLE, _STARTS, _FAR = 64, 3, 1e3
-"""Number of sampled members, and of searches that begin at the best of them; magnitude (mm) that
-stands for values that are not finite."""
+# Least margin of a member, as a fraction of the greatest one in the sample, and its tolerance;
+# deviation (mm) of the outer radius up to which it counts as met.
+#
+# A margin that is 0 in every member, such as the lever at the tip, needs no room.
 _ROOM, _SLACK, _CLOSE = 0.02, 1e-6, 1e-6
-"""Least margin of a member, as a fraction of the greatest one in the sample, and its tolerance;
-deviation (mm) of the outer radius up to which it counts as met.
-
-A margin that is 0 in every member, such as the lever at the tip, needs no room."""
 
 
 def sized(config: Config) -> Config | list[float]:

@@ -27,9 +27,9 @@ from rootsopt.profiles.geometry import ProfileMargins, margins
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene
 
+# Distance (fraction of the width of the bounds) from a design to the bounds that are widened for
+# it.
 _ROOM = 0.1
-"""Distance (fraction of the width of the bounds) from a design to the bounds that are widened for
-it."""
 
 
 def bounds_of(config: Config) -> list[tuple[float, float]]:
@@ -97,6 +97,7 @@ def _pair(config: Config, parameter: Parameter) -> tuple[float, float]:
     return given
 
 
+# Fixed keys of the section `constraints`, with what they limit (see `Constraint`).
 _LIMITED = (
     # key, name, quantity, unit, scale, factor
     ("area_efficiency_min", "area efficiency", "area_efficiency", "", 0.01, 1.0),
@@ -105,8 +106,9 @@ _LIMITED = (
     ("outer_radius_max_mm", "outer radius", "outer_radius", "mm", MM, MM),
     ("outer_radius_min_mm", "outer radius", "outer_radius", "mm", MM, MM),
 )
-"""Fixed keys of the section `constraints`, with what they limit (see `Constraint`)."""
 
+# Constraints that keep a profile sound, in addition to the constraint on the undercut margin. The
+# columns are name, margin, unit, limit, scale and factor (see `Constraint`).
 _SOUND = (
     # name, margin, unit, limit, scale, factor
     ("least turn of a flank segment", "turning", "deg", 0.0, 0.1, DEG),
@@ -118,11 +120,9 @@ _SOUND = (
     ("tangents clear of the axis", "star", "mm", 0.0, MM, MM),
     ("root radius", "root", "mm", 0.0, MM, MM),
 )
-"""Constraints that keep a profile sound, in addition to the constraint on the undercut margin. The
-columns are name, margin, unit, limit, scale and factor (see `Constraint`)."""
 
+# Greatest lower bound of a parameter in `Space.ranges`, as a fraction of its upper bound.
 _NARROW = 0.999
-"""Greatest lower bound of a parameter in `Space.ranges`, as a fraction of its upper bound."""
 
 
 class Constraint(eqx.Module):

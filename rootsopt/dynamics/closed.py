@@ -38,16 +38,16 @@ from rootsopt.dynamics.steady import (
 from rootsopt.dynamics.window import PERIODS, Window, lyapunov
 from rootsopt.status import Status
 
+# Scaled difference below which states nearly repeat. Newton's method then decides whether there is
+# an orbit, possibly of a shorter period.
 _NEARLY = 0.05
-"""Scaled difference below which states nearly repeat. Newton's method then decides whether there is
-an orbit, possibly of a shorter period."""
+# Tolerance of the first transient, unless that of the solver is coarser: it only has to lead to the
+# neighbourhood of the orbit. Each further attempt is ten times finer.
 _COARSE = 1e-5
-"""Tolerance of the first transient, unless that of the solver is coarser: it only has to lead to
-the neighbourhood of the orbit. Each further attempt is ten times finer."""
+# Maximum number of attempts to close an orbit at the end of a transient, and maximum number of mesh
+# periods by which the transient continues before each further attempt. The states of the transient
+# must then repeat ten times more closely.
 _ATTEMPTS, _LONGER = 3, 160.0
-"""Maximum number of attempts to close an orbit at the end of a transient, and maximum number of
-mesh periods by which the transient continues before each further attempt. The states of the
-transient must then repeat ten times more closely."""
 
 
 class Start(eqx.Module):

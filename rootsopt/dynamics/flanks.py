@@ -331,8 +331,8 @@ def has_margins(kind: type, flags: str = "switches") -> bool:
     return places[0] <= places[1]
 
 
+# Methods that return margins, keyed by those that return flags.
 _MARGINS = {"switches": "margins", "drag_switches": "drag_margins"}
-"""Methods that return margins, keyed by those that return flags."""
 
 
 def pushes_of(pair: "RotorPair", motion: Motion) -> Pushes:

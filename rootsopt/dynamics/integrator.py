@@ -14,12 +14,12 @@ METHODS: dict[str, Callable[..., diffrax.AbstractERK]] = {
     "tsit5": diffrax.Tsit5,
     "dopri8": diffrax.Dopri8,
 }
+# Upper limits on the step length: an absolute length (mesh periods), and a multiple of
+# `Timescales.fall`. The smaller limit applies. In free flight, the error control alone would let a
+# step skip a short contact of the gear. The third number, divided by `max_steps`, is the least
+# value (mesh periods) of the second limit. Steps of this length use at most a quarter of
+# `max_steps` per mesh period.
 _LONGEST = 1 / 32, 1 / 8, 4.0
-"""Upper limits on the step length: an absolute length (mesh periods), and a multiple of
-`Timescales.fall`. The smaller limit applies. In free flight, the error control alone would let a
-step skip a short contact of the gear. The third number, divided by `max_steps`, is the least value
-(mesh periods) of the second limit. Steps of this length use at most a quarter of `max_steps` per
-mesh period."""
 
 
 class Integrator(eqx.Module):

@@ -16,24 +16,24 @@ from jaxtyping import Array, Float
 
 from rootsopt.dynamics.pair import RotorPair
 
+# Time (mesh periods) after reaching an edge at which a step should end. A contact shorter than this
+# may be missed.
 _BEYOND = 1e-4
-"""Time (mesh periods) after reaching an edge at which a step should end. A contact shorter than
-this may be missed."""
+# Time since passing an edge, in units of `_BEYOND`, above which a step is repeated with a shorter
+# length.
 _LATE = 10.0
-"""Time since passing an edge, in units of `_BEYOND`, above which a step is repeated with a shorter
-length."""
+# Maximum length of the first step after an edge, in units of `_BEYOND`.
 _AFTER = 5.0
-"""Maximum length of the first step after an edge, in units of `_BEYOND`."""
+# Distance (scaled ε) between the vertex of the parabola and an edge below which the next step ends
+# no later than at the vertex.
 _CLOSE = 0.05
-"""Distance (scaled ε) between the vertex of the parabola and an edge below which the next step ends
-no later than at the vertex."""
+# Maximum step (mesh periods) where ε alone does not determine whether the flanks touch: beyond the
+# clearance, or with displaced axes.
 _INSIDE = 1 / 128
-"""Maximum step (mesh periods) where ε alone does not determine whether the flanks touch: beyond the
-clearance, or with displaced axes."""
+# Two lengths for the first step: an absolute length (mesh periods), and a multiple of
+# `Timescales.swing`. The smaller one is used. The error control rejects a first step that is too
+# long.
 _FIRST = 1e-3, 0.05
-"""Two lengths for the first step: an absolute length (mesh periods), and a multiple of
-`Timescales.swing`. The smaller one is used. The error control rejects a first step that is too
-long."""
 
 
 class LandingControl(diffrax.AbstractAdaptiveStepSizeController):

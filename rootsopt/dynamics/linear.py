@@ -8,11 +8,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Complex, Float
 
+# Number of squarings of a matrix from which its growth rate is computed. After so many, the result
+# no longer depends on the norm used.
 _SQUARINGS = 40
-"""Number of squarings of a matrix from which its growth rate is computed. After so many, the result
-no longer depends on the norm used."""
+# Maximum number of QR iterations, per eigenvalue on average.
 _SWEEPS = 40
-"""Maximum number of QR iterations, per eigenvalue on average."""
 
 
 def solved(matrix: Float[Array, "n n"], right: Float[Array, "n m"]) -> Float[Array, "n m"]:

@@ -38,26 +38,26 @@ Quantity: TypeAlias = Callable[[RotorPair, Float[Array, ""], Float[Array, " n"]]
 """A number of a pair at a time (mesh periods) and a scaled state (n,)."""
 MOST = 12
 """Maximum number of local maxima that are reported: the greatest ones."""
+# Maximum number of shoulders that are reported in addition to the maxima.
 _BESIDES = 4
-"""Maximum number of shoulders that are reported in addition to the maxima."""
+# Fractions of an element at which the force is evaluated to find the maxima.
 _PLACES = np.arange(8) / 8
-"""Fractions of an element at which the force is evaluated to find the maxima."""
+# Number of instants tried around each maximum in one round of refinement, and number of rounds.
 _CLOSER, _ROUNDS = 16, 10
-"""Number of instants tried around each maximum in one round of refinement, and number of rounds."""
+# Distance (mesh periods) before and after a maximum at which the force is differentiated. The last
+# round of refinement locates a corner a hundred times more closely.
 _ASIDE = 1e-9
-"""Distance (mesh periods) before and after a maximum at which the force is differentiated. The last
-round of refinement locates a corner a hundred times more closely."""
+# Relative difference between the forces at these instants above which the force jumps.
 _JUMP = 1e-6
-"""Relative difference between the forces at these instants above which the force jumps."""
+# Fall of the force between two maxima (fraction of the lower one) below which they count as one
+# maximum.
 _DIP = 1e-6
-"""Fall of the force between two maxima (fraction of the lower one) below which they count as one
-maximum."""
+# Fraction of the greatest force below which a maximum is left out.
 _LEAST = 1e-3
-"""Fraction of the greatest force below which a maximum is left out."""
+# Difference from the greatest force, as a fraction of that force, above which a shoulder is not
+# listed. A shoulder is an instant at which the force almost has a maximum (see the module's
+# docstring).
 _SHOULDER = 0.02
-"""Difference from the greatest force, as a fraction of that force, above which a shoulder is not
-listed. A shoulder is an instant at which the force almost has a maximum (see the module's
-docstring)."""
 
 
 class Maxima(NamedTuple):

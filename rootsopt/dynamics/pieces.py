@@ -13,12 +13,12 @@ from rootsopt.dynamics.pair import RotorPair
 
 LONGEST = 8
 """Maximum length of an orbit (mesh periods), rounded up by `RotorPair.whole`."""
+# Minimum number of pieces into which one mesh period is divided.
 _EVEN = 128
-"""Minimum number of pieces into which one mesh period is divided."""
+# Maximum number of instants at which flags change, and number of bisections that locate them.
 _FLAGS, _HALVED = 64, 40
-"""Maximum number of instants at which flags change, and number of bisections that locate them."""
+# Length (mesh periods) below which a piece counts as empty. Many corners coincide.
 _EMPTY = 1e-13
-"""Length (mesh periods) below which a piece counts as empty. Many corners coincide."""
 
 
 def smooth_pieces(

@@ -27,12 +27,12 @@ from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.pieces import smooth_pieces
 from rootsopt.dynamics.varied import VariedOrbit
 
+# Number of positions of rotor 2 at which the least gap is computed. Newton's method leads from one
+# to the next; the gap is nearly linear in the position.
 _NEWTON = 6
-"""Number of positions of rotor 2 at which the least gap is computed. Newton's method leads from one
-to the next; the gap is nearly linear in the position."""
+# Greatest move towards the middle of the backlash, as a share of the distance from it. Without
+# clearance, flanks part only in the middle, where the other flanks touch.
 _INWARDS = 0.9999
-"""Greatest move towards the middle of the backlash, as a share of the distance from it. Without
-clearance, flanks part only in the middle, where the other flanks touch."""
 INSTANTS = 96
 """Number of instants over an orbit at which `gaps` are computed."""
 

@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+# Distance from 1 (in multiples of eps) below which a step ends at 1. Otherwise the last step might
+# be too short for its own rounding errors. diffrax has the same rule.
 _NEARLY = 50.0
-"""Distance from 1 (in multiples of eps) below which a step ends at 1. Otherwise the last step might
-be too short for its own rounding errors. diffrax has the same rule."""
 
 
 class Records(NamedTuple):

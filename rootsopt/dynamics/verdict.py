@@ -18,14 +18,13 @@ TOO_DEEP = 0.02
 UNRESOLVED = 1e-2
 """Relative error of the greatest force, from rounding of the gap, above which an orbit's forces
 count as unresolved."""
+# Estimated error of an orbit (scaled) above which the orbit is rejected.
 _UNKNOWN = 0.1
-"""Estimated error of an orbit (scaled) above which the orbit is rejected."""
+# Distance from 1 below which a Floquet multiplier counts as 1. A multiplier above 1 also does.
 _FREE = 1e-6
-"""Distance from 1 below which a Floquet multiplier counts as 1. A multiplier above 1 also does."""
+# Estimated relative error of the derivatives above which they are uncertain. The limit is the first
+# number times the square root of the tolerance, at least the second number and at most the third.
 _AGREE = 10.0, 1e-3, 3e-2
-"""Estimated relative error of the derivatives above which they are uncertain. The limit is the
-first number times the square root of the tolerance, at least the second number and at most the
-third."""
 
 
 class Verdict(NamedTuple):

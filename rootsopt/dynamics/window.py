@@ -24,26 +24,26 @@ from rootsopt.dynamics.pair import RotorPair
 
 PERIODS = 128
 """Length of a window (mesh periods)."""
+# Number of batches into which a window is divided to estimate the standard error of the Lyapunov
+# exponent.
 _BATCHES = 16
-"""Number of batches into which a window is divided to estimate the standard error of the Lyapunov
-exponent."""
+# Scaled distance between the two motions: the first number times the tolerance, at least the second
+# and at most the third number.
 _APART = 1e4, 1e-2, 0.2
-"""Scaled distance between the two motions: the first number times the tolerance, at least the
-second and at most the third number."""
+# Divisor of this distance in every second batch.
 _NEARER = 8.0
-"""Divisor of this distance in every second batch."""
+# Rounding errors that replace the tolerance, if they exceed it, when the distance is chosen.
 _ROUNDINGS = 200.0
-"""Rounding errors that replace the tolerance, if they exceed it, when the distance is chosen."""
+# Difference between the growth rates at both distances above which noise or the finite distance,
+# not the motion, sets them.
 _ALIKE = float(np.log(3.0))
-"""Difference between the growth rates at both distances above which noise or the finite distance,
-not the motion, sets them."""
+# Number of states stored per mesh period.
 _KEPT = 105
-"""Number of states stored per mesh period."""
+# Force, in units of the pair's `force_scale`, below which differences are relative to this force.
+# Flanks that only just touch push so little that the integration takes no account of it.
 _FAINT = 1e-3
-"""Force, in units of the pair's `force_scale`, below which differences are relative to this force.
-Flanks that only just touch push so little that the integration takes no account of it."""
+# Array type of a window: JAX arrays, or NumPy arrays after a copy from the device.
 _Arrays = Array | np.ndarray
-"""Array type of a window: JAX arrays, or NumPy arrays after a copy from the device."""
 
 
 class Window(NamedTuple):

@@ -22,18 +22,18 @@ OVERLENGTH = 0.02
 which a config is rejected. Beyond u_max the roll angle turns back and two points of a flank mesh at
 once. A node search finds no interference (< 1 nm) up to 5 % excess; the paper's printed Table 1 has
 1.2 %."""
+# Excess (pitch radii) of the involute length over its lower limit below which a config is rejected.
+# At this limit, the centre of the tip arc lies on the pitch circle, and one of the arc's normals is
+# tangent to the circle. With a shorter involute, some of these normals miss the circle: their
+# points touch nothing on the other rotor.
 _CLEAR = 1e-6
-"""Excess (pitch radii) of the involute length over its lower limit below which a config is
-rejected. At this limit, the centre of the tip arc lies on the pitch circle, and one of the arc's
-normals is tangent to the circle. With a shorter involute, some of these normals miss the circle:
-their points touch nothing on the other rotor."""
 LEAST = 0.002
 """Involute length (fraction of the longest) below which a config is rejected. A shorter involute
 has no effect, and its length was probably given in metres."""
+# Undercut (mm) up to which a config is accepted: a search may end at such a design.
 _TOUCHING = 1e-6
-"""Undercut (mm) up to which a config is accepted: a search may end at such a design."""
+# Factor by which a search stays away from the lower limits of a config.
 _INSIDE = 1 + 1e-6
-"""Factor by which a search stays away from the lower limits of a config."""
 
 
 def ranges(

@@ -16,13 +16,12 @@ from numpy.typing import NDArray
 from rootsopt.profiles.base import Profile
 from rootsopt.runtime.programs import CachedFunction
 
+# Default of `nodes`, the least number of points of a flank on each side of the pitch circle.
 _NODES = 400
-"""Default of `nodes`, the least number of points of a flank on each side of the pitch circle."""
+# Number of points of each neighbouring flank that are appended to the ends of a flank.
 _BEYOND = 8
-"""Number of points of each neighbouring flank that are appended to the ends of a flank."""
+# Angle (rad) between successive segments of a polygonal line above which their joint is a corner.
 _CORNER = 0.1
-"""Angle (rad) between successive segments of a polygonal line above which their joint is a corner.
-"""
 
 
 class Departure(NamedTuple):

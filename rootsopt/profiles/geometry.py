@@ -16,13 +16,13 @@ from rootsopt.profiles.base import Profile, Quadrature
 from rootsopt.profiles.outline import Outline
 from rootsopt.runtime.programs import CachedFunction
 
+# Constant g of the graded quadrature rule, which maps Gauss-Legendre nodes x to tanh(g x) /
+# tanh(g).
+#
+# Powers, hyperbolic tangents and double exponentials with 32 to 96 nodes were compared. The
+# integrand was a square root whose branch point lies 1e-4 to 0.3 of the length beyond an end. This
+# rule had the least error, 1e-13.
 _GRADING = 4.0
-"""Constant g of the graded quadrature rule, which maps Gauss-Legendre nodes x to tanh(g x) /
-tanh(g).
-
-Powers, hyperbolic tangents and double exponentials with 32 to 96 nodes were compared. The integrand
-was a square root whose branch point lies 1e-4 to 0.3 of the length beyond an end. This rule had the
-least error, 1e-13."""
 
 
 class Geometry(eqx.Module):
@@ -217,13 +217,13 @@ def _rotate(points: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
 PURE = ("turning", "rolling", "order", "limits")
 """Names of the margins that are angles or ratios. All other margins are lengths, or lengths per
 angle."""
+# Number of points at which margins are evaluated, per smooth part of a flank and per knot span of a
+# wavy flank.
 _POINTS = 400, 100
-"""Number of points at which margins are evaluated, per smooth part of a flank and per knot span of
-a wavy flank."""
+# Violations up to which a design counts as sound: of an angle (rad) or ratio, and of a length (m).
+# A search ends at such points, because it lets constraints be violated by a millionth of their
+# scale.
 _ROUNDING = 1e-7, 1e-9
-"""Violations up to which a design counts as sound: of an angle (rad) or ratio, and of a length (m).
-A search ends at such points, because it lets constraints be violated by a millionth of their
-scale."""
 
 
 class ProfileMargins(NamedTuple):

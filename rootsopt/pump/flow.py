@@ -17,8 +17,8 @@ from jaxtyping import Array, Float
 
 from rootsopt.profiles import Geometry, Profile, quadrature_nodes
 
+# Number of panels of the quadrature over the length of twisted rotors.
 _PANELS = 64
-"""Number of panels of the quadrature over the length of twisted rotors."""
 
 
 def displaced_volume(shape: Geometry, length: Float[Array, ""]) -> Float[Array, ""]:

@@ -51,10 +51,10 @@ def equivalent_load(force: Inexact[Array, "*k n"], exponent: float = ROLLER) -> 
     return jnp.mean(jnp.abs(force) ** exponent, axis=-1) ** (1 / exponent)
 
 
+# Number of quantities that are averaged: a power of each bearing's load, and 1.
 _INTEGRANDS = 5
-"""Number of quantities that are averaged: a power of each bearing's load, and 1."""
+# Distance (mesh periods) before and after a jump at which the integrands are evaluated.
 _ASIDE = 1e-9
-"""Distance (mesh periods) before and after a jump at which the integrands are evaluated."""
 POSES = 720
 """Number of angles of rotor 1, over a mesh period, for loads without a motion."""
 

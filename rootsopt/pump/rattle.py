@@ -23,13 +23,13 @@ from rootsopt.status import Status
 
 SILENT = "silent_eccentricity_um"
 """Name of the limit of silent running in result files."""
+# Fractions of an element at which the gear is evaluated. Its elements end where teeth touch or
+# part.
 _PLACES = (np.arange(8) + 0.5) / 8
-"""Fractions of an element at which the gear is evaluated. Its elements end where teeth touch or
-part."""
+# Number of angles over a turn for the linear motion, and for its check that no flank touches.
 _ANGLES, _POSES = 2880, 360
-"""Number of angles over a turn for the linear motion, and for its check that no flank touches."""
+# Ratio of the eccentricities in place of that of gears without any: only the first gear's.
 _FIRST = np.array([1.0, 0.0])
-"""Ratio of the eccentricities in place of that of gears without any: only the first gear's."""
 
 
 class SilentLimit(NamedTuple):

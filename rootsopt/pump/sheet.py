@@ -25,8 +25,8 @@ L_MIN = 1e-3 / 60
 """One litre per minute (m³/s)."""
 MRAD = 1e-3
 """One milliradian (rad)."""
+# Overlap (m) of the flanks up to which it counts as rounding of an outline.
 _ROUNDING = 1e-8
-"""Overlap (m) of the flanks up to which it counts as rounding of an outline."""
 LINES = 4
 """Number of lines of the flow in the sheet."""
 NOTE = (

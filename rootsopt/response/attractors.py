@@ -30,21 +30,21 @@ from rootsopt.runtime.threads import on_all_cores
 from rootsopt.scene import design_vector
 from rootsopt.status import Status
 
+# Maximum length of a cycle (mesh periods) that the search recognises, unless the equation repeats
+# only after several mesh periods (`RotorPair.whole`).
 _LONGEST = 8
-"""Maximum length of a cycle (mesh periods) that the search recognises, unless the equation repeats
-only after several mesh periods (`RotorPair.whole`)."""
+# Scaled distance above which two motions always count as different.
 _APART = 0.3
-"""Scaled distance above which two motions always count as different."""
+# Maximum number of motions that are evaluated, in addition to the motion from rest.
 _TRIES = 24
-"""Maximum number of motions that are evaluated, in addition to the motion from rest."""
+# Penetration of the flanks (multiples of the static penetration) up to which the grid extends.
 _DEPTHS = 3.0
-"""Penetration of the flanks (multiples of the static penetration) up to which the grid extends."""
+# Statuses of motions that do not count as attractors: there is no such pair, the mesh was lost, or
+# the simulation failed.
 _LOST = (
     *(Status.UNSOUND, Status.PASSED_THROUGH, Status.STALLED),
     *(Status.SOLVER_FAILED, Status.NON_FINITE),
 )
-"""Statuses of motions that do not count as attractors: there is no such pair, the mesh was lost, or
-the simulation failed."""
 _GONE = tuple(status.code for status in _LOST)
 
 

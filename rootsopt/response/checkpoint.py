@@ -23,6 +23,7 @@ from rootsopt.status import Status
 
 _POINT = TypeAdapter(list[float])
 _NUMBERS = TypeAdapter(dict[str, float])
+# Types of the fields of an evaluation that are plain values.
 _KINDS = {
     "design": _NUMBERS,
     "geometry": _NUMBERS,
@@ -32,7 +33,6 @@ _KINDS = {
     "statistics": TypeAdapter(dict[str, Any]),
     "message": TypeAdapter(str),
 }
-"""Types of the fields of an evaluation that are plain values."""
 
 
 class Checkpoint(Journal):

@@ -7,6 +7,8 @@ import xarray
 if TYPE_CHECKING:
     from rootsopt.response.evaluation import Evaluation
 
+# Columns of the dataset, keyed by the field of a `Series`. Each entry holds the name in CSV files,
+# the unit, a long name, and the factor from SI units to this unit.
 _COLUMNS = {
     "rotation": ("rotation_deg", "deg", "rotation of rotor 1", 57.29577951308232),
     "relative": ("relative_rotation_rad", "rad", "relative rotation of rotor 2", 1.0),
@@ -16,8 +18,6 @@ _COLUMNS = {
     "force": ("contact_force_N", "N", "contact force: sum of the normal forces", 1.0),
     "depth": ("penetration_m", "m", "greatest penetration; negative: least gap", 1.0),
 }
-"""Columns of the dataset, keyed by the field of a `Series`. Each entry holds the name in CSV files,
-the unit, a long name, and the factor from SI units to this unit."""
 
 
 def dataset(evaluation: "Evaluation") -> xarray.Dataset:

@@ -54,12 +54,12 @@ from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene
 from rootsopt.status import Status
 
+# Finest tolerance at which the motions of an ensemble are integrated. The standard errors of an
+# ensemble are far larger than the error of such steps (docs/chaos.md).
 _RTOL = 1e-6
-"""Finest tolerance at which the motions of an ensemble are integrated. The standard errors of an
-ensemble are far larger than the error of such steps (docs/chaos.md)."""
+# Divisor of `ensemble.settle_periods` for motions that start from the last states of a neighbouring
+# design's motions.
 _AGAIN = 4
-"""Divisor of `ensemble.settle_periods` for motions that start from the last states of a
-neighbouring design's motions."""
 VERIFYING = 4
 """Factor by which the number of members is increased to verify the best design of a search."""
 SIGNIFICANT = 3.0

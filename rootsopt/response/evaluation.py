@@ -58,12 +58,12 @@ from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene, check_geometry, design_keys, design_vector, fault_of
 from rootsopt.status import Status
 
+# Difference between an orbit closed by collocation and an integration over its period (see
+# `integrated_difference`) above which the orbit is rejected: the first number, at least the second
+# times the tolerance of orbits.
 _APART = 1e-4, 1e3
-"""Difference between an orbit closed by collocation and an integration over its period (see
-`integrated_difference`) above which the orbit is rejected: the first number, at least the second
-times the tolerance of orbits."""
+# Greatest tolerance of this integration.
 _FINE = 1e-8
-"""Greatest tolerance of this integration."""
 
 
 @dataclasses.dataclass(frozen=True)

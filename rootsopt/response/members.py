@@ -19,12 +19,12 @@ from rootsopt.dynamics.pair import RotorPair
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.status import Status
 
+# Number of members in one call of the compiled program.
 _MEMBERS = 4
-"""Number of members in one call of the compiled program."""
+# Longest period (mesh periods) of a motion that is recognised as repeating.
 _LONGEST = 8
-"""Longest period (mesh periods) of a motion that is recognised as repeating."""
+# Scaled difference between states below which a motion counts as repeating.
 _REPEATS = 1e-2
-"""Scaled difference between states below which a motion counts as repeating."""
 
 
 class Members(NamedTuple):

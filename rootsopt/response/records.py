@@ -21,12 +21,12 @@ from rootsopt.status import Status
 
 RESPONSES = ("mean_force_N", "peak_force_N", "rms_force_N")
 """Keys of the mean, peak and RMS force in a response."""
+# Floquet multiplier above which a message says how slowly disturbances fade.
 _SLOW = 0.999
-"""Floquet multiplier above which a message says how slowly disturbances fade."""
+# Fraction of itself to which a disturbance is said to fade.
 _FADED = 0.01
-"""Fraction of itself to which a disturbance is said to fade."""
+# Kinds of motions without an orbit, by status; all others are transient.
 _KINDS = {Status.CHAOTIC: "chaotic", Status.IDLE: "idle"}
-"""Kinds of motions without an orbit, by status; all others are transient."""
 
 
 def bearing_record(loads: OrbitLoads) -> dict[str, tuple[float, NDArray[np.float64]]]:
@@ -258,6 +258,7 @@ def _solver_failed(config: Config) -> list[str]:
     return [f"raise solver.max_steps_per_period ({most}; {need})", *looser]
 
 
+# Statuses whose advice depends on the scene, each with a function that returns it.
 _WAYS = {
     Status.PASSED_THROUGH: _passed_through,
     Status.TOO_DEEP: _too_deep,
@@ -268,7 +269,6 @@ _WAYS = {
     Status.INACCURATE: _inaccurate,
     Status.SOLVER_FAILED: _solver_failed,
 }
-"""Statuses whose advice depends on the scene, each with a function that returns it."""
 
 
 def apart_message(config: Config, depth: float, backlash: float | None = None) -> str:

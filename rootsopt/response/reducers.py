@@ -27,8 +27,8 @@ from rootsopt.config.tolerances import TolerancesConfig
 from rootsopt.response.result import Evaluation, Part
 from rootsopt.status import Status
 
+# Standard deviation, relative to the mean, below which all values count as equal.
 _EQUAL = 1e-14
-"""Standard deviation, relative to the mean, below which all values count as equal."""
 
 
 class Combined(NamedTuple):

@@ -16,6 +16,7 @@ from rootsopt.status import Status
 if TYPE_CHECKING:
     import xarray
 
+# Entries of `steady_state` in the row of a speed.
 _STEADY = (
     "kind",
     "period",
@@ -23,7 +24,6 @@ _STEADY = (
     "lyapunov_exponent_per_mesh_period",
     "lyapunov_standard_error",
 )
-"""Entries of `steady_state` in the row of a speed."""
 
 
 @dataclasses.dataclass(frozen=True)

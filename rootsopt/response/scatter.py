@@ -21,8 +21,8 @@ from rootsopt.scene import Scene
 
 NOMINAL, RANDOM = "as given", "random"
 """Names of the config's own scene, and of random ones before their number, in `assumed`."""
+# Index of the random stream from which fresh samples are drawn.
 _FRESH = 1
-"""Index of the random stream from which fresh samples are drawn."""
 
 
 class Shift(NamedTuple):

@@ -25,10 +25,10 @@ from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene, along
 from rootsopt.status import Status
 
+# Relative step of the difference quotients that approximate the derivatives of the scene with
+# respect to a quantity. Their error is small, since the scene depends almost linearly on its
+# quantities.
 _STEP = 1e-6
-"""Relative step of the difference quotients that approximate the derivatives of the scene with
-respect to a quantity. Their error is small, since the scene depends almost linearly on its
-quantities."""
 MICROMETRE = 1e-3
 """One micrometre (mm): change of clearance, backlash and centre distance error for which the table
 states the effect."""

@@ -15,8 +15,8 @@ from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import Steady
 from rootsopt.status import Status
 
+# Types of numbers in an orbit.
 _KINDS = ("float64", "int64", "bool")
-"""Types of numbers in an orbit."""
 
 
 class Seed(NamedTuple):

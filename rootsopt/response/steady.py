@@ -183,9 +183,9 @@ def _moved(scene: Any, design: Any) -> tuple[list[tuple[int, Array]], list[Array
     return numbers, leaves
 
 
+# Fields of a scene that are numerical settings, not physical quantities. Their tangents are
+# ignored.
 _SETTINGS = ("solver",)
-"""Fields of a scene that are numerical settings, not physical quantities. Their tangents are
-ignored."""
 
 
 def _leaves(tree: Any) -> list[tuple[Any, Any]]:
@@ -193,8 +193,8 @@ def _leaves(tree: Any) -> list[tuple[Any, Any]]:
     return jax.tree_util.tree_flatten_with_path(tree, is_leaf=lambda x: x is None)[0]
 
 
+# Fields of a response that are constant to JAX.
 _CONSTANT = "period", "multipliers", "residual", "status", "margins", "start"
-"""Fields of a response that are constant to JAX."""
 
 
 def _split(values, response: Response) -> dict[str, Any]:

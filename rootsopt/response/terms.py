@@ -26,10 +26,10 @@ from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene
 from rootsopt.scene.medium import Medium
 
+# Length of a centimetre (m).
 _CM = 1e-2
-"""Length of a centimetre (m)."""
+# One litre per minute (m³/s).
 _LITRE_PER_MINUTE = 1e-3 / 60
-"""One litre per minute (m³/s)."""
 
 
 class Forces(NamedTuple):

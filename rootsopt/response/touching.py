@@ -26,12 +26,12 @@ from rootsopt.status import Status
 
 MACHINES, SIMULATED = 10_000, 32
 """Number of machines that are drawn, and number of those that are simulated."""
+# Standard deviation of each distribution, as a share of its width.
 _SPREAD = {"normal": 1.0, "uniform": 3**-0.5, "triangular": 6**-0.5}
-"""Standard deviation of each distribution, as a share of its width."""
 
 
+# Key that makes a pair two-sided, even if it is 0.
 _ERROR = "scene.center_distance_error_mm"
-"""Key that makes a pair two-sided, even if it is 0."""
 _gaps = CachedFunction(gaps)
 
 

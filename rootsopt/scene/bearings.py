@@ -9,8 +9,8 @@ from rootsopt.config.units import DEG, MM
 
 GRAVITY = 9.80665
 """Standard acceleration of free fall (m/s²)."""
+# Exponents of the life of bearings (ISO 281).
 _EXPONENTS = {"ball": 3.0, "roller": 10 / 3}
-"""Exponents of the life of bearings (ISO 281)."""
 
 
 class Bearings(eqx.Module):

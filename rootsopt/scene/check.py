@@ -13,9 +13,9 @@ from rootsopt.scene import families
 from rootsopt.scene.build import Scene
 from rootsopt.scene.reading import design_vector
 
+# Distance (mm) by which a bore may be wider than the root circle of a design: a search may end
+# there.
 _TOUCHING = 1e-6
-"""Distance (mm) by which a bore may be wider than the root circle of a design: a search may end
-there."""
 
 
 def check_geometry(config: Config, design: ArrayLike | None = None, simulated: bool = True) -> None:

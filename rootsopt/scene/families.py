@@ -18,10 +18,10 @@ from rootsopt.profiles.geometry import Soundness, margins, soundness
 from rootsopt.runtime.environment import say
 from rootsopt.runtime.programs import CachedFunction
 
+# Number of operations for a point of a flank above which a family has a note.
 _MOST_OPERATIONS = 1500
-"""Number of operations for a point of a flank above which a family has a note."""
+# Units of margins that are not lengths: name of the unit, and its SI value.
 _UNITS = {"turning": ("deg", DEG), "order": ("deg", DEG), "rolling": ("", 1.0), "limits": ("", 1.0)}
-"""Units of margins that are not lengths: name of the unit, and its SI value."""
 
 
 def classical() -> tuple[str, ...]:

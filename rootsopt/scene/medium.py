@@ -7,8 +7,8 @@ from jaxtyping import Array, Float
 from rootsopt.config import Config
 from rootsopt.config.units import MM
 
+# One millipascal-second (Pa·s).
 _MPA_S = 1e-3
-"""One millipascal-second (Pa·s)."""
 
 
 class Gas(eqx.Module):

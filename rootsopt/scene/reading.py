@@ -16,9 +16,9 @@ from rootsopt.dynamics.parts import Friction, GearErrors, MotorDrive, Supports, 
 from rootsopt.dynamics.steady import Solver
 from rootsopt.measured.table import transmission_error
 
+# Limit on the number of solver steps for a whole orbit, as a multiple of the number that the config
+# allows per mesh period.
 _ORBIT_STEPS = 4
-"""Limit on the number of solver steps for a whole orbit, as a multiple of the number that the
-config allows per mesh period."""
 
 
 def design_vector(config: Config) -> Float[Array, " d"]:

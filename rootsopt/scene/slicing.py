@@ -14,12 +14,12 @@ from rootsopt.runtime.programs import CachedFunction
 
 MOST = 32
 """Maximum number of slices that is chosen automatically."""
+# Numbers of slices that are tried, in ascending order.
 _COUNTS = (*range(2, 13), 14, 16, 20, 24, 28, MOST)
-"""Numbers of slices that are tried, in ascending order."""
+# Number of angles of rotor 1, evenly spaced over a mesh period, at which torques are computed.
 _POSES = 720
-"""Number of angles of rotor 1, evenly spaced over a mesh period, at which torques are computed."""
+# Number of evenly spaced slices of the reference.
 _REFERENCE = 400
-"""Number of evenly spaced slices of the reference."""
 
 
 def greatest_twist(config: Config) -> float:

@@ -18,8 +18,8 @@ from rootsopt.errors import InputError
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _RANGE = re.compile(rf"({_NUMBER}):({_NUMBER})(?::(\d+))?(:log)?")
+# Texts that are meant to be a range.
 _MEANT = re.compile(r"[-+\d.][-+\d.eE]*:[-+\d.eE:]*[-+\d.eE:](?:log)?")
-"""Texts that are meant to be a range."""
 MOST = 1_000_000
 """Number of values above which an axis is rejected, and of points above which a sweep is."""
 

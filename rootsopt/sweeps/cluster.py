@@ -31,24 +31,24 @@ _MISSING = (
     "`--workers` and `--scheduler` need the package distributed, which is not installed; install "
     "it with `pip install 'rootsopt[cluster]'`"
 )
+# Number of chunks per worker into which a sweep is divided, so that all workers end together.
 _CHUNKS = 8
-"""Number of chunks per worker into which a sweep is divided, so that all workers end together."""
+# Maximum number of points in a chunk. A worker that is killed loses at most this many.
 _LARGEST = 32
-"""Maximum number of points in a chunk. A worker that is killed loses at most this many."""
+# Number of chunks per worker that are sent to the scheduler in advance.
 _AHEAD = 3
-"""Number of chunks per worker that are sent to the scheduler in advance."""
+# Time (s) within which a scheduler must answer.
 _ANSWER = 10.0
-"""Time (s) within which a scheduler must answer."""
+# Time (s) within which a scheduler must have a worker.
 _WORKERS = 60.0
-"""Time (s) within which a scheduler must have a worker."""
+# Time (s) after which a request to stop is noticed.
 _POLL = 0.5
-"""Time (s) after which a request to stop is noticed."""
+# Dask's settings for processes started here. By default, Dask gives up a process that was killed
+# unless its successor is ready in 15 s. On a busy machine, it takes longer to import everything.
 _SETTINGS = {
     "distributed.worker.multiprocessing-method": "spawn",
     "distributed.deploy.lost-worker-timeout": "1h",
 }
-"""Dask's settings for processes started here. By default, Dask gives up a process that was killed
-unless its successor is ready in 15 s. On a busy machine, it takes longer to import everything."""
 
 
 class Cluster:

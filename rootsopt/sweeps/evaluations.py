@@ -20,12 +20,12 @@ from rootsopt.response.evaluation import Evaluation
 from rootsopt.response.many import HERE, Point, Runs
 from rootsopt.sweeps.worker import Settings, evaluate
 
+# Time (s) after which a lost connection and the end of the search are noticed.
 _POLL = 0.5
-"""Time (s) after which a lost connection and the end of the search are noticed."""
 
 
+# Time (s) after which a scheduler without workers is given up: a new one takes 10 to 60 s.
 _DESERTED = 600.0
-"""Time (s) after which a scheduler without workers is given up: a new one takes 10 to 60 s."""
 
 
 class ClosedError(Exception):

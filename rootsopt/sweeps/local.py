@@ -15,8 +15,8 @@ from rootsopt.response.together import pays
 from rootsopt.sweeps.plan import Plan
 from rootsopt.sweeps.points import Row, simulated, simulated_together
 
+# Number of points that an accelerator steps together.
 _BATCH = 256
-"""Number of points that an accelerator steps together."""
 
 
 def in_process(

@@ -30,12 +30,12 @@ _LONG = {
     "undercut_margin_mm": "margin to undercut",
     "seal_width_mm": "arc length of the tip land",
 }
+# Unit and long name of each number that is taken from `steady_state`.
 _SCALARS = {
     "period": ("mesh periods", "period of the motion (0: not periodic)"),
     "floquet_multiplier": ("1", "greatest modulus of the Floquet multipliers"),
     "lyapunov_exponent_per_mesh_period": ("1", "Lyapunov exponent per mesh period"),
 }
-"""Unit and long name of each number that is taken from `steady_state`."""
 _PLAIN = str.maketrans({"·": " ", "°": "deg", "²": "2", "³": "3", "µ": "u"})
 
 

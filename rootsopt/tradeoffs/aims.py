@@ -11,10 +11,10 @@ from rootsopt.response.reporting import is_force, reporting
 from rootsopt.response.terms import terms_of
 from rootsopt.scene import Scene
 
+# Keys of `constraints` that may be absent; a floor of 0 has the same effect in the others.
 _OPTIONAL = "outer_radius_min_mm", "outer_radius_max_mm"
-"""Keys of `constraints` that may be absent; a floor of 0 has the same effect in the others."""
+# Config key that names the terms.
 _KEY = "pareto.terms"
-"""Config key that names the terms."""
 
 
 class Aim(NamedTuple):

@@ -17,8 +17,8 @@ from rootsopt.tradeoffs.gaps import Bisections, Edge, Pair, Spacing, along, amon
 from rootsopt.tradeoffs.scalar import Scalar, Scale, rates
 from rootsopt.tradeoffs.study import Sample, Study
 
+# Multiplier of a limit below which the limit counts as inactive.
 _HELD = 1e-6
-"""Multiplier of a limit below which the limit counts as inactive."""
 
 
 class Node(NamedTuple):

@@ -15,17 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 Pair = tuple[int, int]
+# Distance in terms (multiples of the spacing) above which two neighbours are bisected.
 _WIDE_TERMS = 1.8
-"""Distance in terms (multiples of the spacing) above which two neighbours are bisected."""
+# Distances in the unit box (multiples of the typical distance; absolute) above which two neighbours
+# are bisected. Both must be exceeded.
 _WIDE_DESIGN, _LEAST_DESIGN = 3.0, 0.05
-"""Distances in the unit box (multiples of the typical distance; absolute) above which two
-neighbours are bisected. Both must be exceeded."""
+# Distance in terms (multiples of the spacing) below which two neighbours with distant designs are a
+# gap of kind `design`, without another bisection.
 _CLOSE = 0.3
-"""Distance in terms (multiples of the spacing) below which two neighbours with distant designs are
-a gap of kind `design`, without another bisection."""
+# Distance from a neighbour (fraction of the distance between both neighbours) below which a point
+# found by bisection counts as that neighbour.
 _BACK = 0.1
-"""Distance from a neighbour (fraction of the distance between both neighbours) below which a point
-found by bisection counts as that neighbour."""
 
 
 class Edge(NamedTuple):

@@ -48,29 +48,28 @@ from rootsopt.tradeoffs.lattice import Key, corners, directions, keys, links
 from rootsopt.tradeoffs.scalar import Scalar, Scale, end_scale
 from rootsopt.tradeoffs.study import Sample, Study
 
+# Gain in the objective (fraction of a term's range) above which a design evaluated earlier starts
+# another search.
 _BETTER = 1e-4
-"""Gain in the objective (fraction of a term's range) above which a design evaluated earlier starts
-another search."""
+# Excess over the best objective (fraction of a term's range) below which a design evaluated
+# earlier, far from the best one, starts another search.
 _PROMISING = 0.25
-"""Excess over the best objective (fraction of a term's range) below which a design evaluated
-earlier, far from the best one, starts another search."""
+# Distance in the unit box above which two designs count as distant from each other.
 _APART = 0.15
-"""Distance in the unit box above which two designs count as distant from each other."""
+# Minimum effort where no term needs a simulation: number of evaluations per search, of starts per
+# end, and of screened designs.
 _CHEAP_EVALUATIONS, _CHEAP_STARTS, _CHEAP_SCREENING = 300, 6, 64
-"""Minimum effort where no term needs a simulation: number of evaluations per search, of starts per
-end, and of screened designs."""
+# Difference between the objectives of two searches (fraction of a term's range) below which a
+# search that has converged counts as the better one.
 _EQUAL = 1e-7
-"""Difference between the objectives of two searches (fraction of a term's range) below which a
-search that has converged counts as the better one."""
+# Accuracy (fraction of the gap's width) with which the sides of a gap are located.
 _SHARP = 0.01
-"""Accuracy (fraction of the gap's width) with which the sides of a gap are located."""
+# Maximum number of points at which the search for the least violation of the constraints starts.
 _EXPLAINED = 8
-"""Maximum number of points at which the search for the least violation of the constraints starts.
-"""
+# Relative difference of a term between search and verification above which a point is dropped.
 _HOLDS_UP = 0.01
-"""Relative difference of a term between search and verification above which a point is dropped."""
+# Range of a term over the ends (relative to its scale) below which the terms do not conflict.
 _SAME_ENDS = 1e-6
-"""Range of a term over the ends (relative to its scale) below which the terms do not conflict."""
 
 Task, Done = TypeVar("Task"), TypeVar("Done")
 Progress = Callable[[int, int], None]

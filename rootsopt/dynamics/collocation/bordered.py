@@ -42,10 +42,10 @@ from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.orbit import choose
 from rootsopt.dynamics.pair import RotorPair
 
+# Maximum number of Newton steps.
 _TURNS = 12
-"""Maximum number of Newton steps."""
+# Newton step (scaled) below which Newton's method stops.
 _SMALL = 1e-10
-"""Newton step (scaled) below which Newton's method stops."""
 
 Family = Callable[[Float[Array, ""]], tuple[RotorPair, RotorPair]]
 """Type of a function that maps a parameter to the pair, and to the pair's derivative with respect

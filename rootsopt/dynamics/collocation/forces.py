@@ -17,8 +17,8 @@ from rootsopt.dynamics.collocation.gauss import GAUSS, summed
 from rootsopt.dynamics.collocation.peak import Peak
 from rootsopt.dynamics.collocation.system import Step, moved_at, moved_places, unchanged
 
+# Distance (fraction of an element's length) between two instants below which they count as one.
 _COINCIDE = 1e-6
-"""Distance (fraction of an element's length) between two instants below which they count as one."""
 
 
 class OrbitForces(NamedTuple):

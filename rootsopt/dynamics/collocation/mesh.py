@@ -12,24 +12,24 @@ from rootsopt.dynamics.collocation.events import _SAME
 from rootsopt.dynamics.collocation.gauss import GAUSS
 from rootsopt.dynamics.pair import RotorPair
 
+# Density of elements that is added everywhere, as a fraction of the mean density. It limits the
+# length of elements.
 _FLOOR = 0.15
-"""Density of elements that is added everywhere, as a fraction of the mean density. It limits the
-length of elements."""
 
 
+# Maximum number of elements per mesh period: in each of the first two mesh periods, and in each
+# further one, unless the flank is wavy or forked. Free forms have some 45 events in each mesh
+# period, four arcs up to 35. Others have fewer, and would pay for the room: sorting events takes
+# half of the time from rest with room for 64 events in each of eight mesh periods. Shorter orbits
+# can use the room of longer ones, up to the third number per mesh period at the usual accuracy.
 _MOST, _FINEST = (96, 48), 160
-"""Maximum number of elements per mesh period: in each of the first two mesh periods, and in each
-further one, unless the flank is wavy or forked. Free forms have some 45 events in each mesh period,
-four arcs up to 35. Others have fewer, and would pay for the room: sorting events takes half of the
-time from rest with room for 64 events in each of eight mesh periods. Shorter orbits can use the
-room of longer ones, up to the third number per mesh period at the usual accuracy."""
+# Number of events above which the search for the orbit fails, counted like elements.
 _TIMES = 64, 24
-"""Number of events above which the search for the orbit fails, counted like elements."""
+# Greatest share of the elements that is left out to save the evaluation of a further block.
 _SPARED = 0.06
-"""Greatest share of the elements that is left out to save the evaluation of a further block."""
+# Growth of these numbers for each further slice of twisted rotors, as a fraction: each slice has
+# its own events.
 _SLICES = 0.5
-"""Growth of these numbers for each further slice of twisted rotors, as a fraction: each slice has
-its own events."""
 
 
 def room_for(pair: RotorPair, periods: int) -> tuple[int, int]:

@@ -24,12 +24,12 @@ UNREFINED, _ROUNDED = 10.0, 5e-9
 """Estimated error of the forces above which an orbit is rejected, in multiples of the requested
 error, but at least the second number. The estimate exceeds the request if the mesh has no room for
 refinement, or if rounding of the gap hides it: beside the cusp of EE, forces round at some 1e-9."""
+# Scaled difference between the states at φ1 = 0 and after a fraction of the period, below which
+# this fraction is the orbit's true period. The limit is the first number (tolerances), but at least
+# the second.
 _REPEATS = 1e3, 1e-5
-"""Scaled difference between the states at φ1 = 0 and after a fraction of the period, below which
-this fraction is the orbit's true period. The limit is the first number (tolerances), but at least
-the second."""
+# Number of instants per mesh period at which an orbit is compared with the transient.
 _ALONG = 8
-"""Number of instants per mesh period at which an orbit is compared with the transient."""
 
 
 class Collocated(NamedTuple):

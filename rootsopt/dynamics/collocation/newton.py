@@ -18,13 +18,13 @@ from rootsopt.dynamics.collocation.system import Columns, Lines, Step, own_colum
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.runtime.kept import kept
 
+# Greatest fraction of an interval's length by which one step may shorten the interval.
 _ROOM = 0.7
-"""Greatest fraction of an interval's length by which one step may shorten the interval."""
+# Change of a state (scaled) above which a Newton step is shortened.
 _LONGEST = 1.0
-"""Change of a state (scaled) above which a Newton step is shortened."""
+# Step (scaled) below which Newton's method also stops if the step exceeds the second number times
+# the step before. The steps then only follow rounding.
 _STALLED = 1e-7, 0.5
-"""Step (scaled) below which Newton's method also stops if the step exceeds the second number times
-the step before. The steps then only follow rounding."""
 
 
 def evaluated(

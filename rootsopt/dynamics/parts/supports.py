@@ -6,9 +6,9 @@ from jaxtyping import Array, Bool, Float
 
 from rootsopt.dynamics.parts.base import Context, Loads, Motion, Part, Units
 
+# Displacement of an axis (fraction of the centre distance) above which the rotors no longer count
+# as being in mesh.
 _DISPLACED = 0.1
-"""Displacement of an axis (fraction of the centre distance) above which the rotors no longer count
-as being in mesh."""
 
 
 class Supports(Part):
