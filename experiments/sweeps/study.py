@@ -22,11 +22,10 @@ from experiments._common.scenes import CIC
 from experiments._common.style import BLUE, ORANGE, grid_below, sheet
 from experiments._common.tables import Row, show
 from rootsopt.config import Config, load
-from rootsopt.sweeps.local import divided
+from rootsopt.sweeps.cluster import running
 from rootsopt.sweeps.plan import Plan, plan_of
-from rootsopt.sweeps.points import simulated_together
-from rootsopt.sweeps.scenes import Points, complete, runner
-from rootsopt.sweeps.scenes import Run as Way
+from rootsopt.sweeps.points import Numbered, simulated_together
+from rootsopt.sweeps.scenes import Points, complete
 
 ROUNDS = 2
 """Number of times that everything is measured; the fastest round counts."""
@@ -47,18 +46,26 @@ def _best(config: Config, plan: Plan, workers: int | None, rounds: int) -> Row:
     return max(found, key=lambda row: row["points_per_second"])
 
 
-def _together(config: Config, plan: Plan, numbers: Sequence[int], stop: threading.Event) -> Any:
-    """Simulate points as an accelerator would: those of a chunk are stepped together."""
-    del stop
-    for some in divided([*numbers], TOGETHER):
-        rows = simulated_together(config, [plan.at(number) for number in some])
-        yield [*zip(some, rows, strict=True)]
+class _Together:
+    """Simulates points as an accelerator would: those of a chunk are stepped together."""
+
+    slots = 1
+
+    def share(self, count: int) -> int:
+        """Return the number of points in a chunk."""
+        return min(count, TOGETHER)
+
+    def simulated(self, config: Config, points: Sequence[Numbered], stop: threading.Event) -> Any:
+        """Return (number, record) of `points`."""
+        del stop
+        numbers, every = zip(*points, strict=True)
+        return [*zip(numbers, simulated_together(config, every), strict=True)]
 
 
-def _timed(config: Config, plan: Plan, workers: int | None, run: Way | None = None) -> Row:
+def _timed(config: Config, plan: Plan, workers: int | None, together: bool = False) -> Row:
     """Run a sweep with its file; return start-up time (s), total time (s) and rate.
 
-    `run`: how to simulate the points, by default as a sweep does with this number of `workers`.
+    The points are simulated as a sweep does with this number of `workers`, or `together`.
     `cpu_ms_per_point` is the processor time of this process alone: with workers, that of scheduler
     and collector."""
     arrivals: list[tuple[float, float, int]] = []
@@ -69,8 +76,9 @@ def _timed(config: Config, plan: Plan, workers: int | None, run: Way | None = No
 
     with tempfile.TemporaryDirectory() as folder:
         journal = Points(config, plan, (), Path(folder) / "points")
-        way = run or runner(workers)
-        rows = complete(config, plan, way, journal, progress, threading.Event())
+        with running(workers) as runs:
+            way = _Together() if together else runs
+            rows = complete(config, plan, way, journal, progress)
         journal.close()
     assert len(rows) == plan.count
     (first, used, had), (last, spent, done) = arrivals[1], arrivals[-1]
@@ -126,7 +134,7 @@ def run(job: Run) -> None:
     if not job.quick:
         plan = plan_of({SPEED: f"1000:4000:{4 * TOGETHER}"})
         name = f"this process, {TOGETHER} at a time (vmap)"
-        ways.append({"way": name} | _timed(config, plan, None, _together))
+        ways.append({"way": name} | _timed(config, plan, None, together=True))
     for name, rows in tables.items():
         job.csv(f"{name}.csv", rows)
         show(f"Points of {name}.csv", rows)

@@ -13,8 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from rootsopt.contact.gap import Approach
-from rootsopt.contact.point import ContactPoint
+from rootsopt.contact.gap import Approach, ContactPoint
 from rootsopt.dynamics.parts import Motion
 
 if TYPE_CHECKING:

@@ -28,10 +28,9 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 from numpy.typing import NDArray
 
-from rootsopt.dynamics.collocation.blocks import in_blocks
-from rootsopt.dynamics.collocation.elements import Elements, Mesh
+from rootsopt.dynamics.collocation.elements import Elements, Mesh, in_blocks
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.varied import VariedOrbit
+from rootsopt.dynamics.steady import VariedOrbit
 from rootsopt.runtime.programs import CachedFunction
 
 Quantity: TypeAlias = Callable[[RotorPair, Float[Array, ""], Float[Array, " n"]], Any]

@@ -19,8 +19,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.contact.gap import Contact
-from rootsopt.contact.impact import force_rounding
-from rootsopt.contact.law import ContactLaw
+from rootsopt.contact.law import ContactLaw, force_rounding
 from rootsopt.dynamics.flanks import (
     FlankForce,
     Margins,

@@ -15,14 +15,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Complex, Float, Inexact
 
-from rootsopt.dynamics.collocation.blocks import BLOCK, in_blocks, whole_blocks
-from rootsopt.dynamics.collocation.gauss import GAUSS, POINTS
+from rootsopt.dynamics.collocation.elements import BLOCK, GAUSS, POINTS, in_blocks, whole_blocks
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.parts import AxisLoads
-from rootsopt.dynamics.parts.resultants import MIRROR, GasResultant
-from rootsopt.dynamics.pieces import LONGEST, smooth_pieces
-from rootsopt.dynamics.steady import SAMPLES
-from rootsopt.dynamics.varied import VariedOrbit
+from rootsopt.dynamics.parts.load import MIRROR, GasResultant
+from rootsopt.dynamics.reserve import LONGEST, smooth_pieces
+from rootsopt.dynamics.steady import SAMPLES, VariedOrbit
 from rootsopt.profiles import Geometry, Profile, geometry
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene

@@ -13,11 +13,10 @@ from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry, Profile, geometry
 from rootsopt.pump import flow
 from rootsopt.pump.gap import Play, play
-from rootsopt.pump.leakage import leakage
 from rootsopt.pump.loads import static_loads
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene, design_vector
-from rootsopt.scene.medium import Medium
+from rootsopt.scene.reading import Medium
 
 CM3 = 1e-6
 """One cubic centimetre (m³)."""
@@ -250,7 +249,7 @@ def _leaks(scene: Scene, design: Float[Array, " d"]) -> tuple[Array, dict[str, A
     """Return (least gap of the flanks (m), rows of the sheet)."""
     assert scene.medium is not None
     profile = scene.profile(design)
-    found = leakage(scene, scene.medium, profile, geometry(profile))
+    found = flow.leakage(scene, scene.medium, profile, geometry(profile))
     least = jnp.min(found.gap.least)
     return least, {
         "flank_gap_min_um": least / UM,

@@ -28,7 +28,7 @@ from rootsopt.config import EnsembleConfig
 from rootsopt.design.space import Space
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.verdict import TOO_DEEP
+from rootsopt.dynamics.steady import TOO_DEEP
 from rootsopt.dynamics.window import PERIODS
 from rootsopt.profiles import Geometry
 from rootsopt.response.evaluation import (

@@ -19,8 +19,7 @@ from rootsopt.dynamics.measures import PEAK_NORM, line_name
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.reserve import apart
 from rootsopt.dynamics.settle import BLOCK
-from rootsopt.dynamics.steady import CLOSED, OPEN, SAMPLES, Solver, Steady, window_status
-from rootsopt.dynamics.varied import varied
+from rootsopt.dynamics.steady import CLOSED, OPEN, SAMPLES, Solver, Steady, varied, window_status
 from rootsopt.dynamics.window import PERIODS, integrated_difference, lyapunov
 from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry

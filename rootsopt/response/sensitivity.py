@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from rootsopt.config import Config
 from rootsopt.dynamics.maxima import local_maxima
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.steady import Steady
-from rootsopt.dynamics.varied import varied
+from rootsopt.dynamics.steady import Steady, varied
 from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.response.starts import Seed, Seeds, begun
 from rootsopt.runtime.programs import CachedFunction

@@ -18,18 +18,12 @@ from rootsopt.config.units import MM, UM
 from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry, Profile, geometry
 from rootsopt.pump import flow
-from rootsopt.pump.leakage import leakage
 from rootsopt.pump.loads import still_loads
 from rootsopt.pump.rattle import SILENT, silent_eccentricity
-from rootsopt.pump.sheet import MRAD, play_of, ripple_of
+from rootsopt.pump.sheet import CM3, L_MIN, MRAD, play_of, ripple_of
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene
-from rootsopt.scene.medium import Medium
-
-# Length of a centimetre (m).
-_CM = 1e-2
-# One litre per minute (m³/s).
-_LITRE_PER_MINUTE = 1e-3 / 60
+from rootsopt.scene.reading import Medium
 
 
 class Forces(NamedTuple):
@@ -99,7 +93,7 @@ class DisplacementTerm(Term):
 
     def value(self, scene, profile, shape, forces):
         del profile, forces
-        return flow.displaced_volume(shape, scene.length) / _CM**3
+        return flow.displaced_volume(shape, scene.length) / CM3
 
 
 class FlowTerm(Term):
@@ -112,11 +106,11 @@ class FlowTerm(Term):
 
     def value(self, scene, profile, shape, forces):
         del forces
-        found = flow.theoretical_flow(shape, scene.length, scene.speed) / _LITRE_PER_MINUTE
+        found = flow.theoretical_flow(shape, scene.length, scene.speed) / L_MIN
         if not self.delivered:
             return found
         medium = _medium(scene, "delivered_flow_l_min")
-        return found * leakage(scene, medium, profile, shape).efficiency
+        return found * flow.leakage(scene, medium, profile, shape).efficiency
 
 
 class RippleTerm(Term):
@@ -159,7 +153,7 @@ class GapTerm(Term):
         del forces
         name = "mean" if self.mean else "min"
         medium = _medium(scene, f"flank_gap_{name}_um")
-        gaps = leakage(scene, medium, profile, shape).gap.least
+        gaps = flow.leakage(scene, medium, profile, shape).gap.least
         return (jnp.mean(gaps) if self.mean else jnp.min(gaps)) / UM
 
 
@@ -171,7 +165,7 @@ class LossTerm(Term):
     def value(self, scene, profile, shape, forces):
         del forces
         medium = _medium(scene, "leakage_fraction")
-        return 1 - leakage(scene, medium, profile, shape).efficiency
+        return 1 - flow.leakage(scene, medium, profile, shape).efficiency
 
 
 def _medium(scene: Scene, name: str) -> Medium:

@@ -17,7 +17,7 @@ from rootsopt.config import Config
 from rootsopt.config.tolerances import Scatter
 from rootsopt.config.units import UM
 from rootsopt.dynamics.reserve import INSTANTS, gaps
-from rootsopt.dynamics.varied import varied
+from rootsopt.dynamics.steady import varied
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.scatter import draw, shifts
 from rootsopt.response.sensitivity import direction, motions_along

@@ -21,8 +21,7 @@ from rootsopt.config.units import DEG
 from rootsopt.contact.gap import Contact
 from rootsopt.contact.law import ContactLaw
 from rootsopt.contact.search import SearchContact
-from rootsopt.contact.twisted import TwistedContact, slices_of
-from rootsopt.contact.worn import WornContact, wear_series
+from rootsopt.contact.wrapped import TwistedContact, WornContact, slices_of, wear_series
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.parts import (
     AxisLoads,
@@ -46,8 +45,7 @@ from rootsopt.profiles import Geometry, Outline, Profile, geometry
 from rootsopt.profiles.geometry import Soundness, soundness
 from rootsopt.runtime.environment import check_precision
 from rootsopt.scene import families, reading
-from rootsopt.scene.bearings import GRAVITY, Bearings, bearings_of
-from rootsopt.scene.medium import Medium, medium_of
+from rootsopt.scene.reading import GRAVITY, Bearings, Medium, bearings_of, medium_of
 from rootsopt.scene.slicing import greatest_twist, slices_needed
 
 

@@ -39,7 +39,7 @@ from rootsopt.response.starts import Seeds
 from rootsopt.runtime.threads import one_thread
 from rootsopt.scene import check_geometry
 from rootsopt.status import Standing
-from rootsopt.sweeps.evaluations import evaluating
+from rootsopt.sweeps.cluster import running
 from rootsopt.tradeoffs.assembly import Node, gaps_of, points_of, selected, spacing_of
 from rootsopt.tradeoffs.course import Course, Seen
 from rootsopt.tradeoffs.front import Front
@@ -604,7 +604,7 @@ def pareto_front(
     [39.0, 43.1, 47.8]
     """
     check_geometry(config)
-    with evaluating(workers, scheduler) as runs:
+    with running(workers, scheduler) as runs:
         return Tracer(config, progress, runs=runs).run()
 
 

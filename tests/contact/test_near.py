@@ -9,8 +9,7 @@ from scipy.optimize import brentq
 
 import rootsopt
 from rootsopt.contact.closest import FlankPair
-from rootsopt.contact.near import NearContact
-from rootsopt.contact.search import SearchContact
+from rootsopt.contact.search import NearContact, SearchContact
 from rootsopt.dynamics.collocation.events import kinds
 from rootsopt.profiles import CIC, arc, four_arcs
 from rootsopt.scene import Scene

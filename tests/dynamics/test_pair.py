@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rootsopt.dynamics.verdict import TOO_DEEP
+from rootsopt.dynamics.steady import TOO_DEEP
 from rootsopt.status import Status
 from tests.standins import HALF_BACKLASH, SCALE, Near, oscillator
 

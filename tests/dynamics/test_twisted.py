@@ -11,7 +11,7 @@ import pytest
 import rootsopt
 from rootsopt import Scene
 from rootsopt.contact.search import SearchContact
-from rootsopt.contact.twisted import TwistedContact, slices_of
+from rootsopt.contact.wrapped import TwistedContact, slices_of
 from rootsopt.dynamics.parts import TwistedLoad
 from rootsopt.scene.slicing import MOST, sliced_mean, slices_needed
 

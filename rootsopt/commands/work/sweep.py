@@ -22,9 +22,9 @@ from rootsopt.runtime.environment import say
 from rootsopt.scene import check_geometry, design_keys, design_vector
 from rootsopt.status import Status
 from rootsopt.sweeps.axes import parse_over
+from rootsopt.sweeps.cluster import running
 from rootsopt.sweeps.plan import Plan, plan_of, scattered
-from rootsopt.sweeps.scenes import Points, checked, complete, runner
-from rootsopt.sweeps.table import dataset_of
+from rootsopt.sweeps.scenes import Points, checked, complete, dataset_of
 
 _DATA = "sweep.nc"
 _FEW = 40
@@ -89,14 +89,15 @@ def _over_keys(config: Config, options: argparse.Namespace, folder: RunFolder) -
     for note in found:
         say(note)
     folder.add_notes(found)
-    run = runner(options.workers, options.scheduler, options.imports, not options.no_cache)
+    cache = not options.no_cache
     with (
+        running(options.workers, options.scheduler, options.imports, cache) as runs,
         closing(opened(partial(Points, config, plan, options.imports), options, folder)) as journal,
         door.patience(_PROMISE) as stop,
         progress_bar(Console(stderr=True), _FIRST, "simulating", "points") as progress,
     ):
         known = len(journal.resumed)
-        records = complete(config, plan, run, journal, progress or _silent, stop)
+        records = complete(config, plan, runs, journal, progress or _silent, stop)
     done = len(records) == plan.count
     seconds = time.perf_counter() - began
     dataset = dataset_of(config, plan, records)

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from rootsopt.dynamics.collocation.elements import Elements
+from rootsopt.dynamics.collocation.elements import POINTS, Elements
 from rootsopt.dynamics.collocation.equation import CollocatedEquation, Points
 from rootsopt.dynamics.collocation.events import (
     Events,
@@ -34,7 +34,6 @@ from rootsopt.dynamics.collocation.events import (
     rooted,
 )
 from rootsopt.dynamics.collocation.forces import OrbitForces, forces_of, no_forces
-from rootsopt.dynamics.collocation.gauss import POINTS
 from rootsopt.dynamics.collocation.known import KnownOrbit
 from rootsopt.dynamics.collocation.mesh import (
     aligned,
@@ -59,10 +58,9 @@ from rootsopt.dynamics.collocation.system import Step, chained, condensed
 from rootsopt.dynamics.orbit import branch, choose
 from rootsopt.dynamics.pair import RotorPair
 
-FIRST, _SHARE, _EVENT = 40, 0.5, 1
-"""Number of elements per mesh period before events are known. The first mesh that is aligned with
-events has the second number times as many at the usual accuracy, more at a finer one, and the third
-number per event."""
+# The first mesh that is aligned with events has this many elements for each of the mesh before, at
+# the usual accuracy, more at a finer one, and the second number per event.
+_SHARE, _EVENT = 0.5, 1
 # Relative error of the forces (usual accuracy) for which `_SHARE` and `CORRECTED` hold.
 _USUAL = 1e-7
 # Order of the forces' error in the length of the elements.
@@ -500,4 +498,4 @@ def _differences(before: OrbitForces, after: OrbitForces, scale: Float[Array, ""
     return choose(other[2] > 0, (error, drift), (apart, moved))
 
 
-__all__ = ["FIRST", "Closed", "Closer", "Loop", "close", "corrected"]
+__all__ = ["Closed", "Closer", "Loop", "close", "corrected"]

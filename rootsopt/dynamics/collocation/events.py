@@ -19,11 +19,9 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.contact.closest import RANKS
+from rootsopt.contact.gap import WrappedContact, around, innermost
 from rootsopt.contact.search import SearchContact
-from rootsopt.contact.wrapped import WrappedContact, around, innermost
-from rootsopt.dynamics.collocation.blocks import in_blocks
-from rootsopt.dynamics.collocation.elements import Elements, Mesh
-from rootsopt.dynamics.collocation.gauss import GAUSS
+from rootsopt.dynamics.collocation.elements import GAUSS, Elements, Mesh, in_blocks
 from rootsopt.dynamics.flanks import Margins, has_margins, margins_of, touch_of
 from rootsopt.dynamics.orbit import branch
 from rootsopt.dynamics.pair import RotorPair

@@ -11,9 +11,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from rootsopt.dynamics.collocation.elements import Elements
+from rootsopt.dynamics.collocation.elements import GAUSS, Elements, summed
 from rootsopt.dynamics.collocation.equation import CollocatedEquation, Points
-from rootsopt.dynamics.collocation.gauss import GAUSS, summed
 from rootsopt.dynamics.collocation.peak import Peak
 from rootsopt.dynamics.collocation.system import Step, moved_at, moved_places, unchanged
 

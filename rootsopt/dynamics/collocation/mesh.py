@@ -4,12 +4,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from rootsopt.contact.gap import innermost
 from rootsopt.contact.search import SearchContact
-from rootsopt.contact.wrapped import innermost
-from rootsopt.dynamics.collocation.blocks import BLOCK
-from rootsopt.dynamics.collocation.elements import Elements, Mesh
+from rootsopt.dynamics.collocation.elements import BLOCK, GAUSS, Elements, Mesh
 from rootsopt.dynamics.collocation.events import _SAME
-from rootsopt.dynamics.collocation.gauss import GAUSS
 from rootsopt.dynamics.pair import RotorPair
 
 # Density of elements that is added everywhere, as a fraction of the mean density. It limits the

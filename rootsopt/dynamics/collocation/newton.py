@@ -9,10 +9,8 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
-from rootsopt.dynamics.collocation.blocks import in_blocks
-from rootsopt.dynamics.collocation.elements import Elements
+from rootsopt.dynamics.collocation.elements import GAUSS, Elements, in_blocks
 from rootsopt.dynamics.collocation.equation import CollocatedEquation, Points
-from rootsopt.dynamics.collocation.gauss import GAUSS
 from rootsopt.dynamics.collocation.peak import Rivals
 from rootsopt.dynamics.collocation.system import Columns, Lines, Step, own_column
 from rootsopt.dynamics.pair import RotorPair

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from rootsopt.contact.impact import balanced_ramp, balanced_step
+from rootsopt.contact.law import balanced_ramp, balanced_step
 from rootsopt.dynamics.parts.base import Motion, Part
 
 
