@@ -62,17 +62,16 @@ class ContactLaw(eqx.Module):
     def switches(self, depth: Float[Array, ""], rate: Float[Array, ""]) -> Bool[Array, " s"]:
         """Return flags (s,) that identify the smooth piece of the law.
 
-        `depth`: penetration (m); `rate`: its rate (m/s). By default, the only flag says whether
-        there is penetration."""
-        del rate
-        return jnp.stack([depth > 0])
+        `depth`: penetration (m); `rate`: its rate (m/s). By default, they are those of
+        `margins`."""
+        return self.margins(depth, rate) > 0
 
     def margins(self, depth: Float[Array, ""], rate: Float[Array, ""]) -> Float[Array, " s"]:
         """Return numbers (s,) that are positive where the flags of `switches` are set.
 
         `depth`, `rate`: as in `switches`. Each number passes smoothly through zero where its flag
-        changes. Margins of a class that overrides only `switches` are not used (see
-        `flanks.margins_of`)."""
+        changes. By default, the only one is the penetration. Margins of a class that overrides only
+        `switches` are not used (see `flanks.margins_of`)."""
         del rate
         return jnp.stack([depth])
 
@@ -169,18 +168,12 @@ class ImpactLaw(ContactLaw):
         rounded = elastic * ramp(share, width)
         return jnp.where(positive, jnp.where(releasing, rounded, jnp.maximum(total, 0.0)), 0.0)
 
-    def switches(self, depth: Float[Array, ""], rate: Float[Array, ""]) -> Bool[Array, "5"]:
-        """Return flags (5,) that identify the smooth piece of the law.
+    def margins(self, depth: Float[Array, ""], rate: Float[Array, ""]) -> Float[Array, "5"]:
+        """Return numbers (5,) that identify the smooth piece of the law.
 
-        `depth`: penetration (m); `rate`: its rate (m/s). In order, the flags are: in contact;
+        `depth`: penetration (m); `rate`: its rate (m/s). In order, they are positive: in contact;
         beyond the rounding of the onset; fully damped; not released; beyond the rounding of the
         release."""
-        positive, elastic, total, width = self._parts(depth, rate)
-        depths = jnp.stack([jnp.zeros_like(depth), self.smoothing, self.full_damping_depth])
-        limits = jnp.stack([jnp.zeros_like(elastic), width * elastic])
-        return jnp.concatenate([depth > depths, positive & (total > limits)])
-
-    def margins(self, depth: Float[Array, ""], rate: Float[Array, ""]) -> Float[Array, "5"]:
         positive, elastic, total, width = self._parts(depth, rate)
         depths = jnp.stack([jnp.zeros_like(depth), self.smoothing, self.full_damping_depth])
         # Relative to the elastic force, which vanishes with the depth.

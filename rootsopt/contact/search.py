@@ -34,6 +34,9 @@ class _FlankContact(Contact):
     def __call__(self, roll, relative):
         return self.approach(roll, relative)[:3]
 
+    def switches(self, roll, approach: Approach):
+        return self.margins(roll, approach) > 0
+
     def at_distance(self, distance: Float[Array, ""]):
         return eqx.tree_at(lambda contact: contact.pair.center_distance, self, distance)
 
@@ -70,9 +73,6 @@ class SearchContact(_FlankContact):
 
     def point(self, roll, relative, approach: Approach) -> ContactPoint:
         return contact_point(self.pair, roll, relative, approach.place)
-
-    def switches(self, roll, approach: Approach):
-        return self.pair.switches(roll, approach.place)
 
     def margins(self, roll, approach: Approach):
         return self.pair.margins(roll, approach.place)

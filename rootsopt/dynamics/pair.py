@@ -28,7 +28,6 @@ from rootsopt.dynamics.flanks import (
     kink_margins,
     pushes_of,
     sum_of,
-    switches_of,
     touches_of,
 )
 from rootsopt.dynamics.parts import (
@@ -307,12 +306,10 @@ class RotorPair(eqx.Module):
         flags that matter.
 
         The flags describe the side of contact, the flank segment, the contact law and the parts, at
-        rotation `tau` (mesh periods) and scaled `state`. The mask excludes flanks out of contact.
+        rotation `tau` (mesh periods) and scaled `state`. The mask excludes flanks without a force.
         """
-        motion, acting = self._moving(tau, state)
-        flags, counts = switches_of(self, motion)
-        flags = jnp.concatenate([flags, *(part.switches(motion, own) for part, own in acting)])
-        return flags, jnp.pad(counts, (0, flags.size - counts.size), constant_values=True)
+        found = self.margins(tau, state)
+        return found.values > 0, found.counts
 
     @eqx.filter_jit
     def margins(self, tau: Float[Array, ""], state: Float[Array, " n"]) -> Margins:

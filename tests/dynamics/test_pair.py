@@ -40,7 +40,7 @@ def test_switches_of_a_pair_are_those_of_its_parts():
         assert bool(flags[5]) == (side < 0)
         assert np.all(counts)
     _, counts = oscillator().switches(jnp.asarray(0.2), jnp.array([0.1, 0.0]))
-    assert counts.tolist() == 5 * [False] + 3 * [True]
+    assert counts.tolist() == 6 * [False] + 2 * [True]
 
 
 def test_limits_are_those_that_are_told():

@@ -212,14 +212,14 @@ class Part(eqx.Module):
         """Return flags (s,) that change where the part's loads or rates are not smooth.
 
         `motion`: position and velocity of the pair; `own` (m,): the part's own states (SI
-        units)."""
-        del motion, own
-        return jnp.zeros(0, bool)
+        units). By default, they are those of `margins`."""
+        return self.margins(motion, own) > 0
 
     def drag_switches(self, sliding: Float[Array, ""]) -> Bool[Array, " s"]:
-        """Return flags (s,) that change where the drag is not smooth in `sliding` (m/s)."""
-        del sliding
-        return jnp.zeros(0, bool)
+        """Return flags (s,) that change where the drag is not smooth in `sliding` (m/s).
+
+        By default, they are those of `drag_margins`."""
+        return self.drag_margins(sliding) > 0
 
     # Numbers that are positive where these flags are set. Each is smooth across the instant at
     # which its flag changes, and zero there. Without margins, such instants take more iterations to

@@ -5,7 +5,7 @@ import dataclasses
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from rootsopt.contact.law import balanced_ramp, balanced_step
 from rootsopt.dynamics.parts.base import Motion, Part
@@ -136,14 +136,8 @@ class TimingGear(Part):
     def holding_stiffness(self) -> Float[Array, ""]:
         return self.stiffness
 
-    def switches(self, motion: Motion, own) -> Bool[Array, "2"]:
-        """Return flags (2,): whether the gear is engaged, and whether it is beyond the rounding."""
-        del own
-        gear = self.meshing(motion)[0]
-        excess = jnp.abs(gear._from_middle(motion.relative)) - gear.half_backlash
-        return excess > jnp.stack([jnp.zeros_like(self.rounding), self.rounding])
-
     def margins(self, motion: Motion, own) -> Float[Array, "2"]:
+        """Return numbers (2,): penetration of the teeth (rad), and its excess of the rounding."""
         del own
         gear = self.meshing(motion)[0]
         excess = jnp.abs(gear._from_middle(motion.relative)) - gear.half_backlash

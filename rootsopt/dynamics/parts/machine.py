@@ -80,13 +80,9 @@ class Friction(Part):
     def drag(self, force: Float[Array, ""], sliding: Float[Array, ""]) -> Float[Array, ""]:
         return self(sliding) * force
 
-    def drag_switches(self, sliding: Float[Array, ""]) -> Bool[Array, "4"]:
-        """Return flags (4,) that change where the coefficient is not smooth: at ±`stiction_speed`
-        and ±`friction_speed`."""
-        speeds = jnp.stack([self.stiction_speed, self.friction_speed])
-        return sliding > jnp.concatenate([speeds, -speeds])
-
     def drag_margins(self, sliding: Float[Array, ""]) -> Float[Array, "4"]:
+        """Return numbers (4,) that are zero where the coefficient is not smooth: at
+        ±`stiction_speed` and ±`friction_speed`."""
         speeds = jnp.stack([self.stiction_speed, self.friction_speed])
         return sliding - jnp.concatenate([speeds, -speeds])
 
