@@ -71,7 +71,6 @@ LATE = {
     "measured/conjugacy.py": {"rootsopt.measured.source"},
     # Only an objective over several motions needs these.
     "response/evaluation.py": {"rootsopt.response.attractors", "rootsopt.response.ensemble"},
-    "response/result.py": {"rootsopt.response.dataset"},
     "scene/families.py": {"rootsopt.measured.source"},
     # Only searches over an ensemble need this.
     "optimize/search.py": {"rootsopt.optimize"},

@@ -234,6 +234,3 @@ def _follow(over: _Range, start: Any, guess: Float[Array, " m"], across: Float[A
     half_way = jnp.max(jnp.abs(states[_LOOKS // 2] - made.found.state)) / SPAN
     sound = pair.sound & over.at(guess[-1])[0].sound
     return made, (half_way, unit, jnp.any(jax.vmap(pair.lost)(states)), sound)
-
-
-__all__ = ["SPAN", "BranchPoint", "OrbitFamily"]

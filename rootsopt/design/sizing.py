@@ -82,7 +82,6 @@ def _met(config: Config, design) -> Config | None:
 
 
 def _space(config: Config) -> Space:
-    """Return the design space of a config's family at this number of lobes."""
     profile, bounds = config.profile, {}
     for one in family_of(profile.family).parameters:
         # Bounds about the example would not hold the members of other numbers of lobes.

@@ -319,6 +319,3 @@ def seen(
     missed = (status == Status.NOT_SETTLED.code) & repeats
     status = jnp.where(missed, Status.NOT_CLOSED.code, status)
     return found._replace(window=window, status=status)
-
-
-__all__ = ["Start", "examined", "seen", "steady_motion", "unknown"]

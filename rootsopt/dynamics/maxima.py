@@ -169,7 +169,6 @@ def contact_force(pair: RotorPair, tau: Float[Array, ""], state: Float[Array, " 
 
 @CachedFunction
 def _forces(pair: RotorPair, elements: Elements) -> tuple[Float[Array, "e q"], Float[Array, "e q"]]:
-    """Return times (mesh periods) and contact forces (N) at several places of each element."""
     return along_elements(contact_force, pair, elements)
 
 
@@ -202,7 +201,6 @@ def around(mesh: Mesh, values: Float[Array, "e q"], times: Float[Array, "e q"]) 
 
 @CachedFunction
 def _located(pair: RotorPair, tangents: RotorPair, orbit: VariedOrbit, places, count):
-    """Return the result of `located` for the contact force."""
     return located(contact_force, pair, tangents, orbit, places, count)
 
 
@@ -269,16 +267,3 @@ def located(
     nothing = jnp.zeros_like(places[0])
     rows = jnp.zeros((nothing.shape[0], orbit.variation.state.shape[-1]))
     return lax.fori_loop(0, count, one, (nothing, nothing, rows))
-
-
-__all__ = [
-    "MOST",
-    "Maxima",
-    "along_elements",
-    "around",
-    "candidates",
-    "local_maxima",
-    "located",
-    "prepare_maxima",
-    "shoulders",
-]

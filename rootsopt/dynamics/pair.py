@@ -385,7 +385,6 @@ class RotorPair(eqx.Module):
         return self._lost(state, zip(self.all_parts, self.own_states(state), strict=True))
 
     def _lost(self, state, acting) -> Bool[Array, ""]:
-        """Return `lost` for a scaled `state`; `acting`: pairs (part, its own states in SI)."""
         lost = ~(jnp.abs(self.angle_scale * state[0]) < self.angle_limit)
         for part, own in acting:
             gone = part.lost(own)

@@ -161,7 +161,6 @@ def reserve(
 
 
 def _depth(moved: Float[Array, ""], *at) -> Float[Array, ""]:
-    """Return the penetration (m) of `_contact`."""
     return _contact(moved, *at).depth
 
 
@@ -202,7 +201,6 @@ def gaps(
 
 
 def _torque(pair: RotorPair, tau, state) -> Float[Array, ""]:
-    """Return the torque of the timing gear (N·m) at a time (mesh periods) and scaled state."""
     assert pair.gear is not None
     torque = pair.gear.torque_on_1(pair.motion(tau, state), np.zeros(0))
     assert torque is not None

@@ -21,7 +21,7 @@ from rootsopt.output.names import brief, in_words, label, stated, value
 from rootsopt.output.tables import varied
 from rootsopt.pages.gather import Case
 from rootsopt.profiles import Profile, outline
-from rootsopt.response.series import Series
+from rootsopt.response.records import Series
 from rootsopt.scene import Scene
 
 # The models of Bokeh accept more than their annotations say.

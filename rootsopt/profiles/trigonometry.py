@@ -51,6 +51,3 @@ def _circle(keep, angle):
 def _(keep, primals, tangents):
     (cos, sin), (turned,) = _circle(keep, *primals), tangents
     return (cos, sin), (-sin * turned, cos * turned)
-
-
-__all__ = ["computed_once", "cos", "sin"]

@@ -328,7 +328,6 @@ def _openings(dynamic, static, moved) -> tuple[Array, Array] | None:
 
 
 def _channels(loads: BearingLoads, scene: Scene) -> Float[Array, "*n k"]:
-    """Return all quantities whose greatest value is reported."""
     if scene.straight:
         return loads.sizes
     return jnp.concatenate([loads.sizes, loads.axial_sizes], axis=-1)

@@ -106,7 +106,6 @@ def _of_orbit(pair: RotorPair, elements: Elements):
 
 @CachedFunction
 def _of_window(pair: RotorPair, states: Float[Array, "p s n"]):
-    """Return the `_teeth` at the states of a window."""
     periods, samples, _ = states.shape
     tau = jnp.arange(periods * samples).reshape(periods, samples) / samples
     return jax.vmap(jax.vmap(lambda t, z: _teeth(pair, t, z)))(tau, states)
@@ -175,6 +174,3 @@ def silent_eccentricity(
     relative = measured + limit * swings - gear.half_backlash - (rest + limit * swing)
     relative = relative if gear.offset is None else relative + gear.offset
     return scene.pitch_radius * limit, relative
-
-
-__all__ = ["SILENT", "SilentLimit", "rattle_record", "silent_limit", "silent_record"]

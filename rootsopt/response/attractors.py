@@ -357,7 +357,6 @@ class Coexisting(Motions):
 
 
 def _of(evaluator: Evaluator, basins: Basins) -> Evaluation:
-    """Return the evaluation that combines all motions as `objective.motion` specifies."""
     orbits = [a for a in basins.attractors if closed(a.evaluation)]
     if not orbits:
         return basins.rest

@@ -124,6 +124,3 @@ def read_evaluation(found: Mapping[str, Any]) -> Evaluation:
     speeds = (Part({"speed_rpm": rpm}, read_evaluation(one), share) for rpm, share, one in parts)
     values["speeds"] = values["scenes"][0].evaluation.speeds if scenes else tuple(speeds)
     return Evaluation(**values)
-
-
-__all__ = ["Checkpoint", "plain_evaluation", "read_evaluation"]

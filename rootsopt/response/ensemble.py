@@ -263,7 +263,6 @@ def _slopes(
 
 
 def _space(evaluator: Evaluator, design) -> Space:
-    """Return the unit box of the design parameters, extended if `design` lies outside."""
     space = Space.of(evaluator.config, evaluator.scene)
     lower, upper = np.minimum(space.lower, design), np.maximum(space.upper, design)
     bounds = jnp.asarray(lower), jnp.asarray(upper)
@@ -352,7 +351,6 @@ _pair = CachedFunction(Scene.pair_and_shape)
 
 @CachedFunction
 def _point(space: Space, design):
-    """Return the point (d,) of the unit box nearest to a design (d,) in config units."""
     return space.point(design)
 
 
@@ -361,16 +359,3 @@ def _around(space: Space, design, points):
     """Return the designs at `points` of the unit box, and the Jacobian of the design with respect
     to the point."""
     return jax.vmap(space.design)(points), jax.jacfwd(space.design)(space.point(design))
-
-
-__all__ = [
-    "ERRORS",
-    "SIGNIFICANT",
-    "VERIFYING",
-    "Ensemble",
-    "fitted_slope",
-    "independent",
-    "integrator",
-    "neighbours",
-    "per_config_unit",
-]

@@ -28,28 +28,25 @@ from rootsopt.pump.rattle import rattle_record, silent_limit, silent_record
 from rootsopt.response.many import HERE, IN_TURN, Point, Runs, evaluate_many
 from rootsopt.response.records import (
     RESPONSES,
+    Series,
     apart_message,
     apart_record,
     bearing_record,
+    contact_series,
     fading_note,
     geometry_record,
     message_of,
     orbit_record,
+    orbit_series,
     orbit_statistics,
+    sampled,
     unsettled,
     window_record,
-)
-from rootsopt.response.reducers import over_scenes, over_speeds
-from rootsopt.response.result import Evaluation, Part
-from rootsopt.response.scatter import Shift, draw, shifts
-from rootsopt.response.series import (
-    Series,
-    contact_series,
-    orbit_series,
-    sampled,
     window_series,
 )
-from rootsopt.response.speeds import parts_at, shares
+from rootsopt.response.reducers import over_scenes, over_speeds, parts_at, shares
+from rootsopt.response.result import Evaluation, Part
+from rootsopt.response.scatter import Shift, draw, shifts
 from rootsopt.response.starts import Seed, Seeds, begun
 from rootsopt.response.terms import BEARING, GEAR, OF_MOTION, RESERVES, terms_of, values_of
 from rootsopt.runtime.environment import check_precision
@@ -260,7 +257,6 @@ class Evaluator:
         return over_speeds(parts_at(self.speeds, evaluate_many(points, IN_TURN)), own)
 
     def _at(self, number: int) -> "Evaluator":
-        """Return the evaluator at one of `speeds`."""
         references = self.references[number : number + 1]
         alone = self.at_speed(self.speeds[number][0])
         return dataclasses.replace(alone, references=references)
@@ -520,7 +516,6 @@ class Evaluator:
 
     @property
     def _names(self) -> tuple[str, ...]:
-        """Names of the further terms of the objective."""
         return tuple(self.config.objective.terms)
 
     def _terms(self, design, response, gradient):
@@ -615,6 +610,3 @@ def evaluate(config: Config, design: ArrayLike | Sequence[float] | None = None) 
     if found.status is Status.UNSOUND:
         raise InputError(found.message)
     return found
-
-
-__all__ = ["RESPONSES", "Evaluation", "Evaluator", "Series", "evaluate"]

@@ -94,6 +94,3 @@ def as_done(
                 return
             ended, _ = wait(running, return_when=FIRST_COMPLETED)
             done = [(running.pop(one), one.result()) for one in ended]
-
-
-__all__ = ["HERE", "IN_TURN", "LocalRunner", "Point", "Runs", "as_done", "evaluate_many"]

@@ -178,6 +178,3 @@ def by_scene(evaluator: Evaluator, evaluation: Evaluation) -> Evaluation | None:
     if maxima is not None:
         maxima = maxima._replace(slopes=np.concatenate(slopes, axis=1))
     return dataclasses.replace(evaluation, gradient=gradient, maxima=maxima)
-
-
-__all__ = ["NAMES", "Quantity", "by_scene", "direction", "motions_along", "quantities"]

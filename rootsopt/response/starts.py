@@ -104,6 +104,3 @@ def _read(kind: str, shape: list[int], data: str) -> NDArray[Any]:
 def _numbers(pair: RotorPair) -> RotorPair:
     """Return the numbers of `pair` in arrays of NumPy, with `None` in place of all other leaves."""
     return jax.tree.map(np.asarray, eqx.filter(pair, eqx.is_inexact_array))
-
-
-__all__ = ["Seed", "Seeds", "begun", "plain", "read"]

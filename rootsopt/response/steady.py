@@ -197,7 +197,6 @@ _CONSTANT = "period", "multipliers", "residual", "status", "margins", "start"
 
 
 def _split(values, response: Response) -> dict[str, Any]:
-    """Split `values` into the differentiated fields of a `response`, by name."""
     found, place = {}, 0
     for name, old in response._asdict().items():
         if name not in _CONSTANT:
@@ -311,7 +310,6 @@ def _next_start(solver: Solver, pair: RotorPair, found: Steady, state: Float[Arr
 
 
 def _named(solver: Solver, pair: RotorPair, tangents: RotorPair, found: Steady):
-    """Return the response of a motion, and the derivatives of its differentiated fields."""
     measures = solver.measures
     orbit, period = found.orbit, found.period
     closed = among(found.status, CLOSED) | found.held

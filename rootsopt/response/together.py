@@ -66,6 +66,3 @@ def _motions(arrays, others) -> Steady:
         return examined(pair, found, solver)
 
     return jax.vmap(one)(arrays)
-
-
-__all__ = ["evaluate_together", "pays"]

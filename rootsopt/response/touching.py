@@ -151,6 +151,3 @@ class _Look:
             values, slopes = jax.device_get(_gaps(pair, tangents, varied(motion)))
             found.append(slopes / UM)
         return values / UM, np.concatenate(found, axis=1)[:, :count]
-
-
-__all__ = ["MACHINES", "Touching", "touching"]

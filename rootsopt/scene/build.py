@@ -402,5 +402,4 @@ class _Static(eqx.Module):
 
 
 def _as_arrays(tree):
-    """Return `tree` with its numbers converted to arrays."""
     return jax.tree.map(lambda x: jnp.asarray(x, float) if isinstance(x, int | float) else x, tree)

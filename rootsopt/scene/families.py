@@ -182,13 +182,11 @@ def margins_of(config: ProfileConfig) -> dict[str, float]:
 
 @CachedFunction
 def _margins(family, lobes, pitch_radius, design):
-    """Return the margins (SI units) of the profile of a design in config units."""
     return margins(profile_of(family, lobes, pitch_radius, design))
 
 
 @CachedFunction
 def _soundness(family, lobes, pitch_radius, design):
-    """Return the margins of all checks of a profile's design, in config units."""
     profile = profile_of(family, lobes, pitch_radius, design)
     return soundness(profile, None, family_of(family).inherent)
 

@@ -178,6 +178,3 @@ def _interval(key: str, item: str) -> Any:
     if log and min(low, high) <= 0:
         raise InputError(f"`{key}`: a logarithmic range must have positive ends, but is {item}")
     return Interval(low, high, points, log, is_whole(tree(Config).get(key)))
-
-
-__all__ = ["MOST", "Axis", "Interval", "axis_of", "parse_over"]

@@ -89,7 +89,6 @@ def dask_setup(worker: Any) -> None:
 
 @functools.cache
 def _prepare(settings: Settings) -> None:
-    """Choose precision, threads and cache, and import extensions, once per process."""
     here = dict(versions())
     odd = [name for name, version in settings.versions if here.get(name) != version]
     if odd:
@@ -303,6 +302,3 @@ def _started(dask: Any, workers: int) -> Iterator[Any]:
         ) as cluster,
     ):
         yield cluster
-
-
-__all__ = ["ClosedError", "DaskRunner", "Settings", "running", "work"]

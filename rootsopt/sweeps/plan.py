@@ -249,6 +249,3 @@ def _refuse_repetitions(columns: Mapping[str, Sequence[Any]]) -> None:
             twice = ", ".join(map(shown, values))
             raise InputError(f"{keys}: values must differ, but {twice} is given twice; remove one")
         seen.add(text)
-
-
-__all__ = ["Dimension", "Plan", "check_values", "plan_of", "scattered"]

@@ -100,14 +100,12 @@ class InProcess:
 
 
 def _evaluator(config: Config, values: Mapping[str, Any]) -> Evaluator:
-    """Return the evaluator of a point. Raises `InputError` if its config is not valid."""
     one = configured(config, values)
     check_geometry(one)
     return Evaluator.of_objective(one)
 
 
 def _lost_by(error: Exception) -> Row:
-    """Return the record of a point that ended with an error."""
     if isinstance(error, InputError):
         return lost(Status.INVALID, str(error))
     return lost(Status.FAILED, f"{type(error).__name__}: {error}")
@@ -174,18 +172,3 @@ def lost(status: Status, why: str = "") -> Row:
     message = f"{status.value} {sentence(why)}" if why else status.value
     none: Row = {name: {} for name in ("response", "gradient", "steady_state", "geometry")}
     return {"status": status.label, "message": message, **none}
-
-
-__all__ = [
-    "InProcess",
-    "Numbered",
-    "Row",
-    "at_once",
-    "check_row",
-    "configured",
-    "lost",
-    "prepared",
-    "row_of",
-    "simulated",
-    "simulated_together",
-]

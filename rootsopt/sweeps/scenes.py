@@ -124,7 +124,6 @@ class _Grid:
 
 
 def _statuses(grid: _Grid, found: Sequence[Row]) -> dict[str, Any]:
-    """Return labels, messages and codes of the statuses."""
     labels = [row["status"] for row in found]
     codes = np.array([Status[label.upper()].code for label in labels], np.int8)
     flags = {
@@ -140,7 +139,6 @@ def _statuses(grid: _Grid, found: Sequence[Row]) -> dict[str, Any]:
 
 
 def _motions(grid: _Grid, found: Sequence[Row]) -> dict[str, Any]:
-    """Return the kind of motion: period, Floquet multipliers, Lyapunov exponent."""
     steady = [row["steady_state"] for row in found]
     columns: dict[str, Any] = {}
     for name, (units, long) in _SCALARS.items():

@@ -40,13 +40,30 @@ from rootsopt.runtime.threads import one_thread
 from rootsopt.scene import check_geometry
 from rootsopt.status import Standing
 from rootsopt.sweeps.cluster import running
-from rootsopt.tradeoffs.assembly import Node, gaps_of, points_of, selected, spacing_of
-from rootsopt.tradeoffs.course import Course, Seen
+from rootsopt.tradeoffs.assembly import (
+    Bisections,
+    Edge,
+    Node,
+    Pair,
+    Spacing,
+    divides,
+    gaps_of,
+    points_of,
+    selected,
+    spacing_of,
+)
 from rootsopt.tradeoffs.front import Front
-from rootsopt.tradeoffs.gaps import Bisections, Edge, Pair, Spacing, divides
-from rootsopt.tradeoffs.lattice import Key, corners, directions, keys, links
-from rootsopt.tradeoffs.scalar import Scalar, Scale, end_scale
-from rootsopt.tradeoffs.study import Sample, Study
+from rootsopt.tradeoffs.scalar import (
+    Key,
+    Scalar,
+    Scale,
+    corners,
+    directions,
+    end_scale,
+    keys,
+    links,
+)
+from rootsopt.tradeoffs.study import Course, Sample, Seen, Study
 
 # Gain in the objective (fraction of a term's range) above which a design evaluated earlier starts
 # another search.
@@ -171,7 +188,6 @@ class Tracer:
         return [point for point in self._sample if problem.feasible(point)]
 
     def _screen(self, points: Sequence[NDArray[np.float64]]) -> None:
-        """Evaluate `points`, keep their terms, and set the scale for the ends."""
         found = self._side_by_side(self._screened, points)
         signs = np.array([aim.sign for aim in self.study.aims])
         names = [aim.name for aim in self.study.aims]
@@ -264,12 +280,10 @@ class Tracer:
         return wanted.points - 1 if len(wanted.terms) == 2 else wanted.divisions
 
     def _reference(self, key: Key) -> NDArray[np.float64]:
-        """Return the reference point (k,) of a `key` of the grid, in scaled terms."""
         ends = [self._nodes[one].sample.values for one in corners(len(key), self._divisions)]
         return np.array(key) / self._divisions @ self.scale.of(np.array(ends))
 
     def _trace(self) -> None:
-        """Solve all points between the ends, by two chains and by further searches."""
         inner = [k for k in keys(len(self.study.aims), self._divisions) if k not in self._nodes]
         ends = dict(self._nodes)
         chains = self._side_by_side(lambda ahead: self._chain(inner, ends, ahead), (True, False))
@@ -285,7 +299,6 @@ class Tracer:
         self._course.join(self._side_by_side(finish, inner))
 
     def _scalar(self, key: Key) -> Scalar:
-        """Return the objective of a point between the ends."""
         return Scalar(self.scale, self._reference(key), tuple(range(len(key))))
 
     def _chain(self, inner: Sequence[Key], ends: Mapping[Key, Node], ahead: bool) -> Course:
@@ -306,7 +319,6 @@ class Tracer:
         return course
 
     def _keep(self, key: Key, node: Node | None) -> None:
-        """Keep a `node` for a `key` of the grid, if it is better than the one known."""
         with self._lock:
             best = _better(self._nodes.get(key), node)
             if best is not None:
@@ -416,7 +428,6 @@ class Tracer:
     # Gaps.
 
     def _all(self) -> list[Node]:
-        """Return all nodes, those of the ends first."""
         with self._lock:
             return [*self._nodes.values(), *self._extra]
 
@@ -449,7 +460,6 @@ class Tracer:
         return max(open_ones, key=spacing.excess, default=None)
 
     def _divide(self, edge: Edge, nodes: Sequence[Node]) -> None:
-        """Search for a point between two neighbours, and record it, or the gap."""
         ends = [nodes[k] for k in edge.pair]
         values = [self.scale.of(node.sample.values) for node in ends]
         middle = np.mean(values, axis=0)
@@ -499,7 +509,6 @@ class Tracer:
         return min(first, second), max(first, second)
 
     def _scaled(self, number: int) -> NDArray[np.float64]:
-        """Return the scaled terms (k,) of a node."""
         return self.scale.of(self._all()[number].sample.values)
 
     # The result.
@@ -517,7 +526,6 @@ class Tracer:
         return [known.get(k, node) for k, node in enumerate(nodes)]
 
     def _checked(self, node: Node) -> Node:
-        """Return a node after its design has been simulated again from rest, unless stopped."""
         if self.stop.is_set():
             return node
         sample = self.study.verified(node.sample.point)
@@ -606,6 +614,3 @@ def pareto_front(
     check_geometry(config)
     with running(workers, scheduler) as runs:
         return Tracer(config, progress, runs=runs).run()
-
-
-__all__ = ["Tracer", "pareto_front"]

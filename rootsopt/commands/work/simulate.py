@@ -12,7 +12,7 @@ from rootsopt.output import files, tables, terminal
 from rootsopt.output.runs import RunFolder
 from rootsopt.pump.sheet import check_clearances, record_of
 from rootsopt.response.evaluation import Evaluator
-from rootsopt.response.speeds import alone
+from rootsopt.response.reducers import alone
 from rootsopt.response.touching import touching
 from rootsopt.scene import check_geometry, outline_mm
 

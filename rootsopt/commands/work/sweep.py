@@ -15,9 +15,8 @@ from rootsopt.config.plausible import notes_on_swept
 from rootsopt.errors import InputError
 from rootsopt.output import files, sweeps, tables, terminal
 from rootsopt.output.runs import RunFolder
-from rootsopt.response import speeds
 from rootsopt.response.evaluation import Evaluator
-from rootsopt.response.reducers import overall
+from rootsopt.response.reducers import alone, overall, swept_speeds
 from rootsopt.runtime.environment import say
 from rootsopt.scene import check_geometry, design_keys, design_vector
 from rootsopt.status import Status
@@ -43,9 +42,9 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     refuse_options(options)
     check_geometry(config)
     cli.load_figures(options, "sweep")
-    swept = speeds.swept_speeds(config)
+    swept = swept_speeds(config)
     with progress_bar(Console(stderr=True), _FIRST, "simulating", "speeds") as progress:
-        evaluator = Evaluator.of_objective(speeds.alone(config)).without_gradient()
+        evaluator = Evaluator.of_objective(alone(config)).without_gradient()
         count = partial(progress or _silent, expected=len(swept))
         parts = evaluator.swept(swept, progress=count)
     rows = [part.row(whole=True) for part in parts]

@@ -246,6 +246,3 @@ def followed(
     return Followed(
         closed.found, loop.line, KnownOrbit(closed.found.elements, *errors, closed.sound, yes)
     )
-
-
-__all__ = ["Family", "Followed", "Line", "Plane", "followed"]

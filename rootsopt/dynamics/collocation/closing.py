@@ -496,6 +496,3 @@ def _differences(before: OrbitForces, after: OrbitForces, scale: Float[Array, ""
     moved /= jnp.maximum(jnp.max(jnp.abs(after.moved), initial=0.0), _LEAST)
     apart = jnp.max(jnp.abs(before.state - after.state))
     return choose(other[2] > 0, (error, drift), (apart, moved))
-
-
-__all__ = ["Closed", "Closer", "Loop", "close", "corrected"]

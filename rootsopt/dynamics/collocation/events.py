@@ -302,7 +302,6 @@ class _Compared(NamedTuple):
 
 
 def _compared(pair: RotorPair, elements: Elements, seen: FlagScan) -> _Compared:
-    """Compare the flags `seen` along the motion `elements` with the events of its mesh."""
     mesh = elements.mesh
     places = seen.tau.shape[0]
     per = places // elements.state.shape[0]

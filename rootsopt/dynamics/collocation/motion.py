@@ -111,7 +111,6 @@ def apart(known: KnownOrbit, pieces: Pieces) -> Float[Array, ""]:
 
 
 def _known(closed: Closed, verified: Bool[Array, ""]) -> KnownOrbit:
-    """Return the orbit `closed` in the form from which orbits of similar pairs can be closed."""
     yes = jnp.ones((), bool)
     errors = closed.roughness, closed.error, closed.drift
     return KnownOrbit(closed.found.elements, *errors, verified, yes)
@@ -120,7 +119,6 @@ def _known(closed: Closed, verified: Bool[Array, ""]) -> KnownOrbit:
 def _as_orbit(
     pair: RotorPair, found: OrbitForces, residual: Float[Array, ""], closed: Closed
 ) -> Orbit:
-    """Return the orbit `found` of `pair`; `residual`: that of the orbit; `closed`: its closing."""
     mesh, peak = found.elements.mesh, found.peak
     time = mesh.ends[0][peak.element] + peak.share * mesh.lengths[peak.element]
     # The force of a pair that is not smooth may jump where no element ends.

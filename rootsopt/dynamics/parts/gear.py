@@ -144,5 +144,4 @@ class TimingGear(Part):
         return excess - jnp.stack([jnp.zeros_like(self.rounding), self.rounding])
 
     def _from_middle(self, relative):
-        """Return ε (rad) relative to the middle of the backlash."""
         return relative if self.offset is None else relative - self.offset
