@@ -12,6 +12,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -52,12 +53,9 @@ class _Together:
     slots = 1
 
     def share(self, count: int) -> int:
-        """Return the number of points in a chunk."""
         return min(count, TOGETHER)
 
-    def simulated(self, config: Config, points: Sequence[Numbered], stop: threading.Event) -> Any:
-        """Return (number, record) of `points`."""
-        del stop
+    def simulated(self, config: Config, points: Sequence[Numbered], _: threading.Event) -> Any:
         numbers, every = zip(*points, strict=True)
         return [*zip(numbers, simulated_together(config, every), strict=True)]
 
@@ -76,10 +74,8 @@ def _timed(config: Config, plan: Plan, workers: int | None, together: bool = Fal
 
     with tempfile.TemporaryDirectory() as folder:
         journal = Points(config, plan, (), Path(folder) / "points")
-        with running(workers) as runs:
-            way = _Together() if together else runs
-            rows = complete(config, plan, way, journal, progress)
-        journal.close()
+        with running(workers) as runs, closing(journal):
+            rows = complete(config, plan, _Together() if together else runs, journal, progress)
     assert len(rows) == plan.count
     (first, used, had), (last, spent, done) = arrivals[1], arrivals[-1]
     return {
@@ -132,9 +128,10 @@ def run(job: Run) -> None:
             )
     ways = tables["sweeps"]
     if not job.quick:
-        plan = plan_of({SPEED: f"1000:4000:{4 * TOGETHER}"})
-        name = f"this process, {TOGETHER} at a time (vmap)"
-        ways.append({"way": name} | _timed(config, plan, None, together=True))
+        together = _timed(
+            config, plan_of({SPEED: f"1000:4000:{4 * TOGETHER}"}), None, together=True
+        )
+        ways.append({"way": f"this process, {TOGETHER} at a time (vmap)"} | together)
     for name, rows in tables.items():
         job.csv(f"{name}.csv", rows)
         show(f"Points of {name}.csv", rows)

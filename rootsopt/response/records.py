@@ -251,6 +251,11 @@ def fading_note(multiplier: float, period: int) -> str:
     )
 
 
+def _also_0(value: float) -> bool:
+    del value
+    return True
+
+
 def _ways(config: Config) -> dict[Status, list[str]]:
     """Return the advice for statuses whose advice depends on the scene of a `config`."""
 
@@ -258,14 +263,11 @@ def _ways(config: Config) -> dict[Status, list[str]]:
         value = config.value(key)
         return [f"{verb} {key} ({value:g})"] if value is not None and when(value) else []
 
-    def known(value: float) -> bool:
-        return np.isfinite(value)
-
     load = change("lower", "scene.load.torque_N_m")
     load += change("lower", "scene.load.pressure_difference_Pa")
     backlash = change("lower", "scene.timing_gear.backlash_mm")
-    damping = change("raise", "scene.timing_gear.damping_ratio", known)
-    damping = damping or change("raise", "contact.max_damping_N_s_per_mm", known)
+    damping = change("raise", "scene.timing_gear.damping_ratio", _also_0)
+    damping = damping or change("raise", "contact.max_damping_N_s_per_mm", _also_0)
     held = change("raise", "scene.timing_gear.stiffness_N_m_per_rad")
     phased = change("bring closer to 0", "scene.phase_error_mrad")
     # What presses the rotors into each other comes first.

@@ -7,7 +7,7 @@ models of second order. The share of machines whose flanks touch follows from th
 machines, and some are simulated as a check."""
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -35,62 +35,13 @@ _ERROR = "scene.center_distance_error_mm"
 _gaps = CachedFunction(gaps)
 
 
-class Touching(NamedTuple):
-    """The reserve (µm) of one design where k values scatter.
+def touching(config: Config) -> dict[str, Any] | None:
+    """Return how the reserve of the design of a `config` with `tolerances` scatters, as the record
+    for the result file.
 
-    `keys`: their config keys; `spreads` (k,): standard deviations, in the unit of each key;
-    `reaches` (k,): greatest distance from the nominal value; `reserve`: at the nominal values;
-    `gradient` (k,): of the reserve; `worst`: least reserve if all values are as bad as they can be,
-    to first order; `first`, `second`: share of `MACHINES` that touch, by the models of first and
-    second order; `simulated`, `model`: reserves (m,) of some of them by simulation, NaN if the
-    motion is not known, and by the model of second order."""
-
-    keys: tuple[str, ...]
-    spreads: NDArray[np.float64]
-    reaches: NDArray[np.float64]
-    reserve: float
-    gradient: NDArray[np.float64]
-    worst: float
-    first: float
-    second: float
-    simulated: NDArray[np.float64]
-    model: NDArray[np.float64]
-
-    def record(self) -> dict[str, Any]:
-        """Return the record for the result file; the key that costs most reserve comes first."""
-        lost = np.abs(self.gradient) * self.spreads
-        total = float(np.sum(lost**2))
-        rows = [
-            {
-                "key": self.keys[k],
-                "standard_deviation": float(self.spreads[k]),
-                "contact_reserve_um_per_unit": float(self.gradient[k]),
-                "lost_um": float(lost[k]),
-                "lost_at_most_um": float(abs(self.gradient[k]) * self.reaches[k]),
-                "share_of_variance": float(lost[k] ** 2 / (total or 1.0)),
-            }
-            for k in np.argsort(-lost, kind="stable")
-        ]
-        known = np.isfinite(self.simulated)
-        apart = np.abs(self.simulated - self.model)[known]
-        return {
-            "contact_reserve_um": self.reserve,
-            "standard_deviation_um": math.sqrt(total),
-            "worst_case_um": self.worst,
-            "machines": MACHINES,
-            "touching_share_first_order": self.first,
-            "touching_share": self.second,
-            "simulated": len(self.simulated),
-            "simulated_touching": int(np.sum(self.simulated[known] < 0)),
-            "model_touching": int(np.sum(self.model[known] < 0)),
-            "not_known": int(np.sum(~known)),
-            "greatest_difference_um": float(np.max(apart)) if apart.size else None,
-            "keys": rows,
-        }
-
-
-def touching(config: Config) -> Touching | None:
-    """Return how the reserve of the design of a `config` with `tolerances` scatters.
+    The reserve, its standard deviation, and the least one if all values are as bad as they can be
+    (to first order) are in µm; the share of `MACHINES` that touch is that by models of first and
+    second order. `SIMULATED` of them check the latter. The key that costs most comes first.
 
     Return None without a timing gear, without `tolerances.over`, or if the motion at the nominal
     values, or at a value moved by a standard deviation, is not known."""
@@ -101,7 +52,6 @@ def touching(config: Config) -> Touching | None:
         config = config.replaced({_ERROR: 0.0})
     scatters = config.scatters
     spreads = np.array([_SPREAD[one.kind] * one.width for one in scatters])
-    reaches = np.array([one.half for one in scatters])
     look, nominal = _Look(config, scatters), np.array([one.nominal for one in scatters])
     moves = np.concatenate([np.zeros((1, len(spreads))), np.diag(spreads), -np.diag(spreads)])
     # Values (points, gaps) and gradients (points, gaps, k).
@@ -116,18 +66,37 @@ def touching(config: Config) -> Touching | None:
     second = linear + np.einsum("ni,sij,nj->ns", machines, hessian, machines, optimize=True) / 2
     first, second = np.min(linear, axis=1), np.min(second, axis=1)
     simulated = np.array([np.min(look(nominal + one)[0]) for one in machines[:SIMULATED]])
-    return Touching(
-        keys=tuple(one.key for one in scatters),
-        spreads=spreads,
-        reaches=reaches,
-        reserve=float(values[0, near]),
-        gradient=slopes[0, near],
-        worst=float(np.min(values[0] - np.abs(slopes[0]) @ reaches)),
-        first=float(np.mean(first < 0)),
-        second=float(np.mean(second < 0)),
-        simulated=simulated,
-        model=second[:SIMULATED],
-    )
+    gradient, model = slopes[0, near], second[:SIMULATED]
+    lost = np.abs(gradient) * spreads
+    total = float(np.sum(lost**2))
+    rows = [
+        {
+            "key": scatters[k].key,
+            "standard_deviation": float(spreads[k]),
+            "contact_reserve_um_per_unit": float(gradient[k]),
+            "lost_um": float(lost[k]),
+            "lost_at_most_um": float(abs(gradient[k]) * scatters[k].half),
+            "share_of_variance": float(lost[k] ** 2 / (total or 1.0)),
+        }
+        for k in np.argsort(-lost, kind="stable")
+    ]
+    known = np.isfinite(simulated)
+    apart = np.abs(simulated - model)[known]
+    reaches = np.array([one.half for one in scatters])
+    return {
+        "contact_reserve_um": float(values[0, near]),
+        "standard_deviation_um": math.sqrt(total),
+        "worst_case_um": float(np.min(values[0] - np.abs(slopes[0]) @ reaches)),
+        "machines": MACHINES,
+        "touching_share_first_order": float(np.mean(first < 0)),
+        "touching_share": float(np.mean(second < 0)),
+        "simulated": len(simulated),
+        "simulated_touching": int(np.sum(simulated[known] < 0)),
+        "model_touching": int(np.sum(model[known] < 0)),
+        "not_known": int(np.sum(~known)),
+        "greatest_difference_um": float(np.max(apart)) if apart.size else None,
+        "keys": rows,
+    }
 
 
 class _Look:

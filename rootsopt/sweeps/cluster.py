@@ -112,18 +112,40 @@ class ClosedError(Exception):
 
 
 class DaskRunner:
-    """Runs evaluations, and points of a sweep, on the workers of a Dask `client`.
+    """Runs evaluations, and points of a sweep, on the workers of a Dask `client`, for many threads.
 
     `dask`: the package distributed; `settings`: what the workers must agree on."""
 
     def __init__(self, dask: Any, client: Any, settings: Settings):
         self._dask, self._client, self._settings = dask, client, settings
-        self._closed, self._watch = threading.Event(), Watch(client)
+        self._closed, self._lock = threading.Event(), threading.Lock()
+        self._count, self._asked, self._seen = 1, -math.inf, time.monotonic()
 
     @property
     def slots(self) -> int:
         """Twice the number of tasks that the workers can run at a time."""
-        return 2 * self._watch.count()
+        return 2 * self._workers()
+
+    def _workers(self) -> int:
+        """Return the number of tasks that the workers can run at a time, at least 1."""
+        with self._lock:
+            now = time.monotonic()
+            if now - self._asked > _POLL:
+                found = sum(self._client.nthreads().values())
+                self._asked, self._count = now, max(1, found)
+                self._seen = now if found else self._seen
+            return self._count
+
+    def _check(self) -> None:
+        """Raise `InputError` if the connection is lost, or if there has been no worker for long."""
+        if self._client.status != "running":
+            raise _gone()
+        self._workers()
+        if time.monotonic() - self._seen > _DESERTED:
+            raise InputError(
+                f"there has been no worker for {_DESERTED:g} s; what was done is kept: start "
+                "workers, and run the same command again with `--resume` if it has that option"
+            )
 
     def evaluated(self, point: Point) -> Evaluation:
         """Return the evaluation of a point, computed by a worker.
@@ -140,7 +162,7 @@ class DaskRunner:
 
     def share(self, count: int) -> int:
         """Return the number of points in a chunk, for a sweep of `count` points."""
-        return min(-(-count // (_CHUNKS * self._watch.count())), _LARGEST)
+        return min(-(-count // (_CHUNKS * self._workers())), _LARGEST)
 
     def simulated(
         self, config: Config, points: Sequence[Numbered], stop: threading.Event
@@ -170,7 +192,7 @@ class DaskRunner:
             if stop.is_set() or self._closed.is_set():
                 future.cancel()
                 raise ClosedError
-            self._watch.check()
+            self._check()
         if future.status in ("cancelled", "lost"):
             raise ClosedError if self._closed.is_set() else _gone()
         error = future.exception()
@@ -188,37 +210,6 @@ class DaskRunner:
     def close(self) -> None:
         """End all waiting threads; nothing can be evaluated any more."""
         self._closed.set()
-
-
-class Watch:
-    """Keeps an eye on the workers of a Dask `client`. Threads can share an instance."""
-
-    def __init__(self, client: Any):
-        self._client, self._lock = client, threading.Lock()
-        self._count, self._asked = 1, -math.inf
-        self._seen = time.monotonic()
-
-    def count(self) -> int:
-        """Return the number of tasks that the workers can run at a time, at least 1."""
-        with self._lock:
-            now = time.monotonic()
-            if now - self._asked > _POLL:
-                self._asked = now
-                found = sum(self._client.nthreads().values())
-                self._seen = now if found else self._seen
-                self._count = max(1, found)
-            return self._count
-
-    def check(self) -> None:
-        """Raise `InputError` if the connection is lost, or if there has been no worker for long."""
-        if self._client.status != "running":
-            raise _gone()
-        self.count()
-        if time.monotonic() - self._seen > _DESERTED:
-            raise InputError(
-                f"there has been no worker for {_DESERTED:g} s; what was done is kept: start "
-                "workers, and run the same command again with `--resume` if it has that option"
-            )
 
 
 def _gone() -> InputError:

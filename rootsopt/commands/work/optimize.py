@@ -232,8 +232,7 @@ def _write(folder, config, options, result, alike, sheets, compiled, ran) -> dic
     if result.robustness is not None:
         data["robustness"] = result.robustness.record()
         if result.optimized is not None and config.tolerances is not None:
-            scattered = touching(_designed(searching, result.optimized))
-            data["touching"] = None if scattered is None else scattered.record()
+            data["touching"] = touching(_designed(searching, result.optimized))
     if result.assumptions is not None:
         data["assumptions"] = result.assumptions.record()
         folder.write_csv("assumptions.csv", result.assumptions.columns())
