@@ -101,7 +101,8 @@ class Tracer:
     evaluated; `checkpoint`: file that stores every evaluation and supplies those of an interrupted
     search.
 
-    Raises `InputError` if there is no design parameter."""
+    The baseline is evaluated at once. Raises `InputError` if there is no design parameter, for
+    unknown terms, or for a scene that cannot be simulated."""
 
     def __init__(
         self,
@@ -118,39 +119,26 @@ class Tracer:
                 f"{config.profile.family}: it has no design parameter; use `simulate` for it, "
                 "or make the twist one with `optimizer.bounds.helix_deg`"
             )
-        self.config, self.runs, self.checkpoint = config, runs, checkpoint
+        self.config, self.runs = config, runs
         self.progress = progress or (lambda done, expected: None)
         self.stop = threading.Event() if stop is None else stop
-        self._study: Study | None = None
+        self.study = Study.of(config, runs, checkpoint)
+        # Those of the grid, then those found by bisection, which have keys of one number.
         self._nodes: dict[Key, Node] = {}
-        self._extra: list[Node] = []
         self._gaps = Bisections([])
         self._spacing = Spacing(np.inf, np.inf)
-        self._scale: Scale | None = None
+        count = len(self.study.aims)
+        self.scale = Scale(np.zeros(count), np.ones(count))  # Until designs are screened.
         self._course = Course()
         self._lock = threading.Lock()
         self._searches = self._evaluations = 0
         self._expected = 0
 
-    @property
-    def study(self) -> Study:
-        """The study that evaluates designs; available once the baseline has been evaluated."""
-        assert self._study is not None
-        return self._study
-
-    @property
-    def scale(self) -> Scale:
-        """Scale of the terms; available after the screening, final once the ends are known."""
-        assert self._scale is not None
-        return self._scale
-
     def run(self) -> Front:
-        """Evaluate the baseline, find the ends, trace the front, and verify its points.
+        """Find the ends, trace the front, and verify its points.
 
-        Return the front. If `stop` is set, the front has the points found so far.
-
-        Raises `InputError` for unknown terms, or for a scene that cannot be simulated."""
-        study = self._study = Study.of(self.config, self.runs, self.checkpoint)
+        Return the front. If `stop` is set, the front has the points found so far."""
+        study = self.study
         if not study.usable or self.stop.is_set():
             return self._front([])
         points = self._feasible()
@@ -163,16 +151,11 @@ class Tracer:
             self._bisect()
         return self._front(self._verified(self._all()))
 
-    def so_far(self) -> Front | None:
+    def so_far(self) -> Front:
         """Return the points found so far, without verification.
 
-        Return `None` until the baseline has been evaluated. Another thread can call this method
-        during the search."""
-        if self._study is None:
-            return None
-        with self._lock:
-            nodes = [*self._nodes.values(), *self._extra]
-        return self._front(nodes)
+        Another thread can call this method during the search."""
+        return self._front(self._all())
 
     # The ends of the front.
 
@@ -204,7 +187,7 @@ class Tracer:
         self._evaluations += len(points)
         baseline = signs * [self.study.problem.baseline.response[name] for name in names]
         every = np.array([one.values for one in self._course.seen]).reshape(-1, len(names))
-        self._scale = end_scale(baseline, every)
+        self.scale = end_scale(baseline, every)
 
     def _side_by_side(self, work: Callable[[Task], Done], tasks: Iterable[Task]) -> list[Done]:
         """Return `work(task)` for all tasks, in their order; they run side by side."""
@@ -238,7 +221,7 @@ class Tracer:
         width = np.ptp(ends, axis=0)
         conflict = bool(np.all(width > _SAME_ENDS * self.scale.width))
         if conflict:
-            self._scale = Scale(np.min(ends, axis=0), width)
+            self.scale = Scale(np.min(ends, axis=0), width)
         return conflict and not self.stop.is_set()
 
     def _solved_from(
@@ -287,7 +270,11 @@ class Tracer:
         inner = [k for k in keys(len(self.study.aims), self._divisions) if k not in self._nodes]
         ends = dict(self._nodes)
         chains = self._side_by_side(lambda ahead: self._chain(inner, ends, ahead), (True, False))
-        self._course.join(chains)
+        self._course.join([course for course, _ in chains])
+        # In a fixed order: of two that are equally good, the first counts.
+        best = {key: _better(*(nodes.get(key) for _, nodes in chains)) for key in inner}
+        with self._lock:
+            self._nodes = ends | {key: node for key, node in best.items() if node is not None}
 
         def finish(key: Key) -> Course:
             course, scalar = self._course.branch(), self._scalar(key)
@@ -301,8 +288,10 @@ class Tracer:
     def _scalar(self, key: Key) -> Scalar:
         return Scalar(self.scale, self._reference(key), tuple(range(len(key))))
 
-    def _chain(self, inner: Sequence[Key], ends: Mapping[Key, Node], ahead: bool) -> Course:
-        """Solve the points `inner` from neighbour to neighbour, and return the course.
+    def _chain(
+        self, inner: Sequence[Key], ends: Mapping[Key, Node], ahead: bool
+    ) -> tuple[Course, dict[Key, Node]]:
+        """Solve the points `inner` from neighbour to neighbour; return the course and all nodes.
 
         `ends`: nodes to begin from; `ahead`: whether in the order given, or in the opposite one."""
         course, nodes = self._course.branch(), {**ends}
@@ -316,7 +305,7 @@ class Tracer:
             if best is not None:
                 nodes[key] = best
                 self._keep(key, best)
-        return course
+        return course, nodes
 
     def _keep(self, key: Key, node: Node | None) -> None:
         with self._lock:
@@ -429,7 +418,7 @@ class Tracer:
 
     def _all(self) -> list[Node]:
         with self._lock:
-            return [*self._nodes.values(), *self._extra]
+            return [*self._nodes.values()]
 
     def _bisect(self) -> None:
         """Search between neighbours that lie far apart, as long as refinements are left."""
@@ -478,7 +467,7 @@ class Tracer:
             gaps.closed[pair], gaps.tried[pair] = kind, gaps.tried[edge.pair]
             return
         with self._lock:
-            self._extra.append(best)
+            self._nodes[(len(self._nodes),)] = best
         gaps.divided(edge.pair, len(nodes))
 
     def _sharpened(self, pair: Pair) -> Pair:
@@ -503,7 +492,7 @@ class Tracer:
             found = self.scale.of(best.sample.values)
             if found[lead] < start[lead] - _BETTER and found[1 - lead] < limit[1 - lead]:
                 with self._lock:
-                    self._extra.append(best)
+                    self._nodes[(len(self._nodes),)] = best
                 moved = len(self._all()) - 1
                 first, second = (first, moved) if lead == 0 else (moved, second)
         return min(first, second), max(first, second)

@@ -351,13 +351,12 @@ def test_interrupted_front_keeps_its_points():
             stop.set()
 
     tracer = Tracer(config(RADIUS), progress, stop)
-    assert tracer.so_far() is None
+    assert tracer.so_far().points == ()
     front = tracer.run()
     assert front.status is Status.INTERRUPTED
     assert 2 <= len(front.points) < 11
     assert {point.standing for point in front.points} == {Standing.NOT_VERIFIED}
     again = tracer.so_far()
-    assert again is not None
     assert [p.design for p in again.points] == [p.design for p in front.points]
 
 
@@ -521,8 +520,8 @@ def test_a_point_holds_up_only_if_all_its_terms_do(off, reason, standing):
     searched = sample(2.0)
     node = Node(scalar, searched, certify(scalar.local(searched), point), reason)
     tracer = Tracer(config(RADIUS))
-    tracer._scale = scale
-    tracer._study = study = object.__new__(Study)
+    tracer.scale = scale
+    tracer.study = study = object.__new__(Study)
     vars(study)["verified"] = lambda point: sample(2.0 * (1 + off))
     checked = tracer._checked(node)
     assert (checked.standing.label, checked.reason) == (standing, reason)
