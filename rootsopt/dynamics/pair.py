@@ -41,7 +41,7 @@ from rootsopt.dynamics.parts import (
     TimingGear,
     Units,
 )
-from rootsopt.dynamics.timescales import Timescales
+from rootsopt.dynamics.parts.base import Timescales
 from rootsopt.errors import InputError
 from rootsopt.profiles.geometry import Soundness
 

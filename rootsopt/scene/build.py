@@ -21,7 +21,14 @@ from rootsopt.config.units import DEG
 from rootsopt.contact.gap import Contact
 from rootsopt.contact.law import ContactLaw
 from rootsopt.contact.search import SearchContact
-from rootsopt.contact.wrapped import TwistedContact, WornContact, slices_of, wear_series
+from rootsopt.contact.wrapped import (
+    TwistedContact,
+    WornContact,
+    greatest_twist,
+    slices_needed,
+    slices_of,
+    wear_series,
+)
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.parts import (
     AxisLoads,
@@ -39,14 +46,13 @@ from rootsopt.dynamics.parts import (
     TimingGear,
     TwistedLoad,
 )
+from rootsopt.dynamics.parts.base import Timescales
 from rootsopt.dynamics.steady import Solver
-from rootsopt.dynamics.timescales import Timescales
 from rootsopt.profiles import Geometry, Outline, Profile, geometry
 from rootsopt.profiles.geometry import Soundness, soundness
 from rootsopt.runtime.environment import check_precision
 from rootsopt.scene import families, reading
 from rootsopt.scene.reading import GRAVITY, Bearings, Medium, bearings_of, medium_of
-from rootsopt.scene.slicing import greatest_twist, slices_needed
 
 
 class Scene(eqx.Module):

@@ -15,8 +15,8 @@ from rootsopt.contact.law import ImpactLaw, force_rounding
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.orbit import Orbit
 from rootsopt.dynamics.parts import TimingGear
+from rootsopt.dynamics.parts.base import Timescales
 from rootsopt.dynamics.steady import final, is_consistent, is_idle, is_steady
-from rootsopt.dynamics.timescales import Timescales
 from rootsopt.errors import InputError
 from rootsopt.response.evaluation import Evaluator, _motion
 from rootsopt.scene import Scene, check_geometry, design_vector

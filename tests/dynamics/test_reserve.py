@@ -17,7 +17,7 @@ from rootsopt.config import load
 from rootsopt.pump.sheet import play_of
 from rootsopt.response import evaluation
 from rootsopt.response.evaluation import Evaluator
-from rootsopt.response.touching import touching
+from rootsopt.response.sensitivity import touching
 from rootsopt.scene import Scene, outline_mm
 from rootsopt.status import Status
 

@@ -29,7 +29,7 @@ from rootsopt.optimize.robust import search_of
 from rootsopt.output import files, tables, terminal
 from rootsopt.output.runs import RunFolder
 from rootsopt.pump.sheet import check_clearances, record_of
-from rootsopt.response.touching import touching
+from rootsopt.response.sensitivity import touching
 from rootsopt.scene import Scene, check_geometry, outline_mm
 
 

@@ -13,7 +13,7 @@ from rootsopt.output.runs import RunFolder
 from rootsopt.pump.sheet import check_clearances, record_of
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.reducers import alone
-from rootsopt.response.touching import touching
+from rootsopt.response.sensitivity import touching
 from rootsopt.scene import check_geometry, outline_mm
 
 

@@ -19,15 +19,16 @@ from rootsopt.dynamics.collocation.closing import Closer, Loop
 from rootsopt.dynamics.collocation.elements import Elements
 from rootsopt.dynamics.collocation.equation import CollocatedEquation, Points
 from rootsopt.dynamics.collocation.events import look, rooted
-from rootsopt.dynamics.collocation.forces import OrbitForces, origin
 from rootsopt.dynamics.collocation.known import KnownOrbit
 from rootsopt.dynamics.collocation.mesh import ordered
 from rootsopt.dynamics.collocation.newton import (
+    OrbitForces,
     advanced,
     columns_of,
     evaluated,
     lines,
     numbers,
+    origin,
 )
 from rootsopt.dynamics.collocation.system import (
     Chain,

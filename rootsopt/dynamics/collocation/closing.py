@@ -33,7 +33,6 @@ from rootsopt.dynamics.collocation.events import (
     look,
     rooted,
 )
-from rootsopt.dynamics.collocation.forces import OrbitForces, forces_of, no_forces
 from rootsopt.dynamics.collocation.known import KnownOrbit
 from rootsopt.dynamics.collocation.mesh import (
     aligned,
@@ -45,12 +44,15 @@ from rootsopt.dynamics.collocation.mesh import (
     snug,
 )
 from rootsopt.dynamics.collocation.newton import (
+    OrbitForces,
     advanced,
     between,
     columns_of,
     evaluated,
+    forces_of,
     has_stalled,
     lines,
+    no_forces,
     with_numbers,
 )
 from rootsopt.dynamics.collocation.peak import Rivals, forces_along, is_settled, peak_of, rivals_of

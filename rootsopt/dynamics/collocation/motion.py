@@ -8,8 +8,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.dynamics.collocation.closing import Closed, close
 from rootsopt.dynamics.collocation.equation import CollocatedEquation
-from rootsopt.dynamics.collocation.forces import OrbitForces
 from rootsopt.dynamics.collocation.known import KnownOrbit
+from rootsopt.dynamics.collocation.newton import OrbitForces
 from rootsopt.dynamics.flow import Pieces
 from rootsopt.dynamics.linear import spectral_radius
 from rootsopt.dynamics.orbit import Orbit

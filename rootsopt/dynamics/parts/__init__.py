@@ -1,7 +1,6 @@
 """Parts that can act on a rotor pair. A scene holds only the parts it needs."""
 
 from rootsopt.dynamics.parts.base import Context, Loads, Motion, Own, Part, Units
-from rootsopt.dynamics.parts.gear import GearErrors, TimingGear
 from rootsopt.dynamics.parts.load import (
     AxisLoads,
     ConstantLoad,
@@ -10,7 +9,15 @@ from rootsopt.dynamics.parts.load import (
     Load,
     TwistedLoad,
 )
-from rootsopt.dynamics.parts.machine import Drive, Friction, MotorDrive, PrescribedDrive, Supports
+from rootsopt.dynamics.parts.machine import (
+    Drive,
+    Friction,
+    GearErrors,
+    MotorDrive,
+    PrescribedDrive,
+    Supports,
+    TimingGear,
+)
 
 __all__ = [
     "AxisLoads",

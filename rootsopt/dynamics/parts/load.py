@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 from rootsopt.contact.gap import Slices
 from rootsopt.contact.law import smooth_step
 from rootsopt.dynamics.parts.base import Part
-from rootsopt.dynamics.parts.gear import TimingGear
+from rootsopt.dynamics.parts.machine import TimingGear
 from rootsopt.profiles.base import Profile
 
 BRIEF = 0.01

@@ -23,9 +23,9 @@ from rootsopt.dynamics.collocation.events import (
     look,
     rooted,
 )
-from rootsopt.dynamics.collocation.forces import OrbitForces
 from rootsopt.dynamics.collocation.known import KnownOrbit, padded, trimmed
 from rootsopt.dynamics.collocation.mesh import roughness, sizes
+from rootsopt.dynamics.collocation.newton import OrbitForces
 from rootsopt.dynamics.collocation.peak import Rivals, peak_of, rivals_of
 from rootsopt.dynamics.collocation.system import Step, moved_at, unchanged
 from rootsopt.dynamics.steady import VariedOrbit
