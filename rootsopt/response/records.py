@@ -251,11 +251,6 @@ def fading_note(multiplier: float, period: int) -> str:
     )
 
 
-def _also_0(value: float) -> bool:
-    del value
-    return True
-
-
 def _ways(config: Config) -> dict[Status, list[str]]:
     """Return the advice for statuses whose advice depends on the scene of a `config`."""
 
@@ -266,8 +261,8 @@ def _ways(config: Config) -> dict[Status, list[str]]:
     load = change("lower", "scene.load.torque_N_m")
     load += change("lower", "scene.load.pressure_difference_Pa")
     backlash = change("lower", "scene.timing_gear.backlash_mm")
-    damping = change("raise", "scene.timing_gear.damping_ratio", _also_0)
-    damping = damping or change("raise", "contact.max_damping_N_s_per_mm", _also_0)
+    damping = change("raise", "scene.timing_gear.damping_ratio", lambda _: True)
+    damping = damping or change("raise", "contact.max_damping_N_s_per_mm", lambda _: True)
     held = change("raise", "scene.timing_gear.stiffness_N_m_per_rad")
     phased = change("bring closer to 0", "scene.phase_error_mrad")
     # What presses the rotors into each other comes first.
