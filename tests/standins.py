@@ -9,7 +9,7 @@ import numpy as np
 
 from rootsopt.config import families
 from rootsopt.contact.gap import Contact
-from rootsopt.contact.impact import ImpactLaw
+from rootsopt.contact.law import ImpactLaw
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.parts import ConstantLoad, PrescribedDrive, TimingGear
 from rootsopt.response.evaluation import RESPONSES, Evaluation

@@ -72,10 +72,7 @@ LATE = {
     "measured/conjugacy.py": {"rootsopt.measured.source"},
     # Only an objective over several motions needs these.
     "response/evaluation.py": {"rootsopt.response.attractors", "rootsopt.response.ensemble"},
-    "response/result.py": {"rootsopt.response.dataset"},
     "scene/families.py": {"rootsopt.measured.source"},
-    "sweeps/evaluations.py": {"rootsopt.sweeps.cluster"},
-    "sweeps/scenes.py": {"rootsopt.sweeps.cluster"},
     # Only searches over an ensemble need this.
     "optimize/search.py": {"rootsopt.optimize"},
     # JAX reads the environment when it is imported; it has no public test for a started backend.

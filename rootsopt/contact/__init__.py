@@ -2,8 +2,7 @@
 
 from rootsopt.contact.closest import ClosestApproach, FlankPair
 from rootsopt.contact.gap import Contact
-from rootsopt.contact.impact import ImpactLaw, ramp, smooth_step
-from rootsopt.contact.law import ContactLaw
+from rootsopt.contact.law import ContactLaw, ImpactLaw, ramp, smooth_step
 
 __all__ = [
     "ClosestApproach",

@@ -219,23 +219,6 @@ class FlankPair(eqx.Module):
         centered = centered - 4 * half * jnp.round(centered / (4 * half))
         return half - jnp.abs(centered), centered > 0
 
-    def switches(self, roll: Float[Array, ""], found: ClosestApproach) -> Bool[Array, " s"]:
-        """Return flags (s,) that identify the smooth pieces on which the closest approach lies.
-
-        `roll`: x (rad); `found`: closest approach at this pose. Where a flag changes, derivatives
-        of the gap jump: second derivatives with respect to the pose, and first derivatives of the
-        levers with respect to the design."""
-        normals = jnp.stack([found.normal1, found.normal2])
-        beyond = (normals[:, None] > self._ends).ravel()
-        half = self.profile.half_pitch
-        mirrored = trig.sin(jnp.pi / 2 * (roll - half) / half) > 0
-        pieces = [found.found, mirrored]
-        if self.jumps:
-            pieces.append(self._leap(found) > 0)
-        if self.frozen.wavy:
-            pieces += [found.rank > 0.5 + number for number in range(RANKS)]
-        return jnp.concatenate([jnp.stack(pieces), beyond])
-
     @property
     def jumps(self) -> bool:
         """Whether the contact may jump from one minimum of the gap to another one."""
@@ -259,16 +242,9 @@ class FlankPair(eqx.Module):
         These are the ends of the segments, without the pitch crossing unless the curvature jumps
         there. On a wavy flank they are the knots, where higher derivatives jump, and the pitch
         crossing, where rotor 2's dedendum ends."""
-        if not self.frozen.wavy:
-            return self._ends
-        return jnp.stack([piece.stop for piece in self.profile.stretches()])
-
-    @property
-    def _ends(self) -> Float[Array, " k"]:
-        """Normal angles (rad) at which curvature jumps: ends of segments, the last one included if
-        the flank is `inflected`."""
-        pieces = self.profile.segments()
-        pieces = pieces if self.profile.inflected else pieces[:-1]
+        pieces = self.profile.stretches() if self.frozen.wavy else self.profile.segments()
+        whole = self.frozen.wavy or self.profile.inflected
+        pieces = pieces if whole else pieces[:-1]
         return jnp.stack([piece.stop for piece in pieces] or [jnp.zeros(())])
 
     def margins(
@@ -276,12 +252,14 @@ class FlankPair(eqx.Module):
     ) -> Float[Array, " s"]:
         """Return numbers (s,) that change their signs where the closest approach changes its piece.
 
-        They are positive where the flags of `switches` are set; there is one for each of `edges`
-        and each rotor. The number for a common normal is 1 or -1, because it changes only where the
+        Derivatives of the gap jump there: second derivatives with respect to the pose, and first
+        derivatives of the levers with respect to the design. There is a number for each of `edges`
+        and each rotor. The one for a common normal is 1 or -1, because it changes only where the
         flanks are apart.
 
-        `roll`, `found`: as in `switches`; `rival`: gap (m) of the minimum to which the contact
-        jumps, if known. The number for the jump then passes smoothly through zero."""
+        `roll`: x (rad); `found`: closest approach at this pose; `rival`: gap (m) of the minimum to
+        which the contact jumps, if known. The number for the jump then passes smoothly through
+        zero."""
         normals = jnp.stack([found.normal1, found.normal2])
         beyond = (normals[:, None] - self.edges).ravel()
         half = self.profile.half_pitch

@@ -1,14 +1,44 @@
 """Base class of all contacts: gap and levers of two flanks at a pose."""
 
 import abc
+import dataclasses
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from rootsopt.contact.point import ContactPoint
+from rootsopt.contact.closest import ClosestApproach, FlankPair
 from rootsopt.errors import InputError
+
+
+class ContactPoint(NamedTuple):
+    """Position and direction of a flank contact.
+
+    n is the common normal, directed from rotor 1 to rotor 2; O1 and O2 are the axes.
+    `support1`: (P - O1)·n (m), where P is the point of contact.
+    `support2`: (O2 - P)·n (m).
+    `radial`: component of n along the line of centres.
+    """
+
+    support1: Float[Array, ""]
+    support2: Float[Array, ""]
+    radial: Float[Array, ""]
+
+
+def contact_point(
+    pair: FlankPair, roll: Float[Array, ""], relative: Float[Array, ""], found: ClosestApproach
+) -> ContactPoint:
+    """Return position and direction of a contact, given the closest approach `found`.
+
+    `pair`: the flanks; `roll`, `relative`: x and ε (rad) at which `found` was computed."""
+    folded, mirrored = pair.folded(roll)
+    support1, support2, radial = pair.supports_along(found.normal1, found.normal2, folded, relative)
+    return ContactPoint(
+        support1=jnp.where(mirrored, support2, support1),
+        support2=jnp.where(mirrored, support1, support2),
+        radial=radial,
+    )
 
 
 class Approach(NamedTuple):
@@ -105,6 +135,7 @@ class Contact(eqx.Module):
     def in_slice(self, number: Int[Array, ""]) -> "Contact":
         """Return the contact in the slice with the index `number`; by default, this contact
         itself."""
+        del number
         return self
 
     @property
@@ -126,6 +157,7 @@ class Contact(eqx.Module):
         """Return the contact of the same flanks at another centre `distance` (m).
 
         Raises `InputError` if the contact supports only the nominal distance."""
+        del distance
         raise self._lacks("another centre distance", "displaced axes need")
 
     def approach(self, roll: Float[Array, ""], relative: Float[Array, ""]) -> Approach:
@@ -141,6 +173,7 @@ class Contact(eqx.Module):
 
         `roll`, `relative`: x and ε (rad). Raises `InputError` if the contact cannot compute the
         point."""
+        del roll, relative, approach
         raise self._lacks("the point of contact", "friction and supports need")
 
     def switches(self, roll: Float[Array, ""], approach: Approach) -> Bool[Array, " s"]:
@@ -148,6 +181,7 @@ class Contact(eqx.Module):
 
         `approach`: result of `approach` at the same pose. A flag changes wherever a derivative of
         the gap jumps."""
+        del roll, approach
         return jnp.zeros(0, bool)
 
     def margins(self, roll: Float[Array, ""], approach: Approach) -> Float[Array, " s"]:
@@ -161,6 +195,7 @@ class Contact(eqx.Module):
         """Return the contact for one side of the flanks; by default, this contact itself.
 
         `side`: 1 for the drive flanks, -1 for the coast flanks."""
+        del side
         return self
 
     def _lacks(self, what: str, why: str) -> InputError:
@@ -168,3 +203,75 @@ class Contact(eqx.Module):
             f"the contact `{type(self).__name__}` does not give {what}, which {why}; use "
             "`SearchContact`, the scene's own contact, or override the method that raises this"
         )
+
+
+class WrappedContact(Contact):
+    """A contact that delegates to its `section`, except for what a subclass overrides."""
+
+    section: eqx.AbstractVar[Contact]
+
+    @property
+    def slices(self) -> Slices | None:
+        return self.section.slices
+
+    @property
+    def sections(self) -> int:
+        return self.section.sections
+
+    def in_slice(self, number: Int[Array, ""]):
+        return dataclasses.replace(self, section=self.section.in_slice(number))
+
+    @property
+    def smooth(self) -> bool:
+        return self.section.smooth
+
+    @property
+    def jumps(self) -> bool:
+        return self.section.jumps
+
+    @property
+    def two_sided(self) -> bool:
+        return self.section.two_sided
+
+    @property
+    def length_scale(self) -> Float[Array, ""] | None:
+        return self.section.length_scale
+
+    @property
+    def center_distance(self) -> Float[Array, ""]:
+        return self.section.center_distance
+
+    def __call__(self, roll, relative):
+        return self.approach(roll, relative)[:3]
+
+    def at_distance(self, distance: Float[Array, ""]):
+        return dataclasses.replace(self, section=self.section.at_distance(distance))
+
+    def on_side(self, side: Float[Array, ""]):
+        return dataclasses.replace(self, section=self.section.on_side(side))
+
+    def approach(self, roll, relative) -> Approach:
+        return self.section.approach(roll, relative)
+
+    def point(self, roll, relative, approach: Approach) -> ContactPoint:
+        return self.section.point(roll, relative, approach)
+
+    def switches(self, roll, approach: Approach):
+        return self.section.switches(roll, approach)
+
+    def margins(self, roll, approach: Approach):
+        return self.section.margins(roll, approach)
+
+
+def innermost(contact: Contact) -> Contact:
+    """Return the contact inside all wrappers of `contact`."""
+    while isinstance(contact, WrappedContact):
+        contact = contact.section
+    return contact
+
+
+def around(contact: Contact, inside: Contact) -> Contact:
+    """Return `contact` with the contact `inside` all of its wrappers."""
+    if not isinstance(contact, WrappedContact):
+        return inside
+    return dataclasses.replace(contact, section=around(contact.section, inside))

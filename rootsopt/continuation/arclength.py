@@ -21,18 +21,14 @@ from numpy.typing import NDArray
 # Cosines of the angle between the tangents at successive points of the curve. Below the first
 # cosine, a step is rejected. Above the second, the next step is longer.
 _TURN, _STRAIGHT = 0.9, 0.99
-
 # Distance (steps) from the predicted to the corrected point above which the corrected point is
 # assumed to lie on another curve.
 _ASTRAY = 0.5
-
 # Distances from a corner of the curve (unit of `StepSizes`) at which the search for the curve's
 # continuation is made, shortest first.
 _CORNER = 3e-5, 1e-4, 3e-4, 1e-3
-
 # Distance (unit of `StepSizes`) below which two points of a curve count as the same.
 _SAME = 1e-6
-
 # Number of points above which the curve is checked for a return to its first point.
 _CLOSING = 8
 

@@ -22,13 +22,11 @@ from rootsopt.errors import InputError
 # count as equal. A branch whose steps have become too small there ends at an orbit of half the
 # period (`End.HALVED`).
 _HALVED = 0.004
-
 # Distances (unit of `StepSizes`) from a period doubling at which the orbit of twice the period is
 # tried, in this order.
 _SIZES = 3e-4, 1e-3, 3e-3, 1e-4, 1e-2
-
-# Number of points below which a doubled branch that falls back to the single period is tried
-# again, from another distance.
+# Number of points below which a doubled branch that falls back to the single period is tried again,
+# from another distance.
 _FEW = 8
 
 

@@ -20,11 +20,11 @@ from numpy.typing import ArrayLike, NDArray
 from rootsopt.config import Config, parse
 from rootsopt.continuation.arclength import End, Spot, StepSizes, StoppedError
 from rootsopt.dynamics.collocation.bordered import Followed, Line, Plane, followed
+from rootsopt.dynamics.collocation.known import PIECES, from_pieces
 from rootsopt.dynamics.collocation.motion import ACCURACY, UNREFINED
-from rootsopt.dynamics.collocation.seed import PIECES, from_pieces
 from rootsopt.dynamics.flow import strobe
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.verdict import TOO_DEEP
+from rootsopt.dynamics.steady import TOO_DEEP
 from rootsopt.errors import InputError
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene, along, design_vector
@@ -34,10 +34,8 @@ LONGEST = 8
 SPAN = 20.0
 """Change of the scaled state that has the same length as the whole range of the parameter, when
 step lengths are measured."""
-
 # Number of uniform instants on an orbit at which it is checked whether the rotors run as a pair.
 _LOOKS = 504
-
 # Distance (unit of `StepSizes`) between the states at the start and the middle of an orbit below
 # which the orbit has half the period.
 _HALF_ALIKE = 1e-5

@@ -37,28 +37,21 @@ from rootsopt.scene.families import check, classical, profile_of
 
 COEFFICIENTS = 12
 """Number of coefficients of a free form that is fitted to a profile."""
-
 # Number of nodes per flank, on each side of the pitch circle, at which a search compares two
 # outlines.
 _NODES = 128
-
 # Number of sampled members of a family. The searches start from the best of them.
 _SAMPLE = 128
-
 # Number of searches per family.
 _STARTS = 3
-
 # Limits of a search: number of linear programs after which the search ends; greatest step; step
 # below which the search ends. Steps are fractions of the parameters' usual ranges.
 _PROGRAMS, _LONGEST, _SHORTEST = 80, 0.2, 1e-9
-
 # Relative decrease of the distance in one step below which a search ends.
 _GAIN = 1e-7
-
-# Weight of a negative margin in the function that a search minimises. The weight times the
-# margin's magnitude (relative to its scale) is added to the distance (pitch radii).
+# Weight of a negative margin in the function that a search minimises. The weight times the margin's
+# magnitude (relative to its scale) is added to the distance (pitch radii).
 _UNSOUND_WEIGHT = 10.0
-
 # Magnitude of a negative margin (relative to its scale) above which a member counts as unsound.
 _UNSOUND = 1e-6
 

@@ -23,7 +23,6 @@ from rootsopt.scene.families import check
 # Number of sampled members, and of searches that begin at the best of them; magnitude (mm) that
 # stands for values that are not finite.
 _SAMPLE, _STARTS, _FAR = 64, 3, 1e3
-
 # Least margin of a member, as a fraction of the greatest one in the sample, and its tolerance;
 # deviation (mm) of the outer radius up to which it counts as met.
 #
@@ -83,7 +82,6 @@ def _met(config: Config, design) -> Config | None:
 
 
 def _space(config: Config) -> Space:
-    """Return the design space of a config's family at this number of lobes."""
     profile, bounds = config.profile, {}
     for one in family_of(profile.family).parameters:
         # Bounds about the example would not hold the members of other numbers of lobes.

@@ -167,6 +167,7 @@ class Constraint(eqx.Module):
         found: ProfileMargins | None,
     ) -> Float[Array, ""]:
         """Return the slack of a `design` (d,) of a `space`, given its `profile`; see `slack`."""
+        del space, design, profile
         return self.slack(shape, found)
 
 
@@ -176,6 +177,7 @@ class RangeConstraint(Constraint):
     The range depends on the other parameters; `quantity` is the parameter's key."""
 
     def slack_of(self, space, design, profile, shape, found):
+        del profile, shape, found
         return self.scaled(_NARROW * space.ranges(design)[self.quantity][1] * self.factor)
 
 

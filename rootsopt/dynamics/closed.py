@@ -15,11 +15,10 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.dynamics.collocation.closing import corrected
-from rootsopt.dynamics.collocation.known import KnownOrbit
+from rootsopt.dynamics.collocation.known import PIECES, KnownOrbit, from_pieces
 from rootsopt.dynamics.collocation.mesh import room_for
 from rootsopt.dynamics.collocation.motion import ACCURACY, Collocated, apart, closed_orbit
 from rootsopt.dynamics.collocation.newton import numbers
-from rootsopt.dynamics.collocation.seed import PIECES, from_pieces
 from rootsopt.dynamics.collocation.system import unchanged
 from rootsopt.dynamics.orbit import Orbit, branch
 from rootsopt.dynamics.pair import RotorPair
@@ -38,17 +37,15 @@ from rootsopt.dynamics.steady import (
 from rootsopt.dynamics.window import PERIODS, Window, lyapunov
 from rootsopt.status import Status
 
-# Scaled difference below which states nearly repeat. Newton's method then decides whether there
-# is an orbit, possibly of a shorter period.
+# Scaled difference below which states nearly repeat. Newton's method then decides whether there is
+# an orbit, possibly of a shorter period.
 _NEARLY = 0.05
-
-# Tolerance of the first transient, unless that of the solver is coarser: it only has to lead to
-# the neighbourhood of the orbit. Each further attempt is ten times finer.
+# Tolerance of the first transient, unless that of the solver is coarser: it only has to lead to the
+# neighbourhood of the orbit. Each further attempt is ten times finer.
 _COARSE = 1e-5
-
-# Maximum number of attempts to close an orbit at the end of a transient, and maximum number of
-# mesh periods by which the transient continues before each further attempt. The states of the
-# transient must then repeat ten times more closely.
+# Maximum number of attempts to close an orbit at the end of a transient, and maximum number of mesh
+# periods by which the transient continues before each further attempt. The states of the transient
+# must then repeat ten times more closely.
 _ATTEMPTS, _LONGER = 3, 160.0
 
 

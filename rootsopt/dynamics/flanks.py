@@ -13,8 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from rootsopt.contact.gap import Approach
-from rootsopt.contact.point import ContactPoint
+from rootsopt.contact.gap import Approach, ContactPoint
 from rootsopt.dynamics.parts import Motion
 
 if TYPE_CHECKING:
@@ -241,36 +240,6 @@ def touch_of(
     return Touch(-gap - pair.clearance, closing, roll, approach, sliding)
 
 
-def switches_of(pair: "RotorPair", motion: Motion):
-    """Return flags (s,) of the flanks, and a mask (s,) of those that matter.
-
-    The flags describe the side of contact, the flank segment and the contact law. The mask excludes
-    flanks out of contact."""
-
-    def of_flank(side, motion):
-        touch = touch_of(pair, side, motion)
-        flags = [
-            pair.law.switches(touch.depth, touch.closing),
-            pair.contact.switches(touch.roll, touch.approach),
-        ]
-        if touch.sliding is not None:
-            speed = touch.sliding.speed
-            flags += [part.drag_switches(speed) for part in pair.all_parts if part.rubs]
-        found = jnp.concatenate(flags)
-        return found, jnp.full_like(found, touch.depth > 0)
-
-    def of_section(_, motion):
-        if not pair.two_sided:
-            return of_flank(jnp.where(motion.relative < 0, 1.0, -1.0), motion)
-        sides = jnp.asarray([1.0, -1.0], pair.angle_scale.dtype)
-        return tuple(x.ravel() for x in jax.vmap(of_flank, (0, None))(sides, motion))
-
-    flags, counts = (x.ravel() for x in by_slice(pair, of_section, motion))
-    if not pair.two_sided:
-        flags, counts = jnp.append(flags, motion.relative < 0), jnp.append(counts, True)
-    return flags, counts
-
-
 def kink_margins(pair: "RotorPair", motion: Motion, acting, touches: Any) -> Margins:
     """Return the `Margins` at a `motion`.
 
@@ -289,6 +258,7 @@ def kink_margins(pair: "RotorPair", motion: Motion, acting, touches: Any) -> Mar
         return values, pair.law(touch.depth, touch.closing) > 0, touch.approach.place
 
     def of_section(section, motion, side, touch):
+        del motion
         if pair.two_sided:
             return jax.vmap(functools.partial(of_flank, section.contact))(side, touch)
         found = of_flank(section.contact, side, touch)

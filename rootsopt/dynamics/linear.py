@@ -8,10 +8,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Complex, Float
 
-# Number of squarings of a matrix from which its growth rate is computed. After so many, the
-# result no longer depends on the norm used.
+# Number of squarings of a matrix from which its growth rate is computed. After so many, the result
+# no longer depends on the norm used.
 _SQUARINGS = 40
-
 # Maximum number of QR iterations, per eigenvalue on average.
 _SWEEPS = 40
 

@@ -28,40 +28,31 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 from numpy.typing import NDArray
 
-from rootsopt.dynamics.collocation.blocks import in_blocks
-from rootsopt.dynamics.collocation.elements import Elements, Mesh
+from rootsopt.dynamics.collocation.elements import Elements, Mesh, in_blocks
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.varied import VariedOrbit
+from rootsopt.dynamics.steady import VariedOrbit
 from rootsopt.runtime.programs import CachedFunction
 
 Quantity: TypeAlias = Callable[[RotorPair, Float[Array, ""], Float[Array, " n"]], Any]
 """A number of a pair at a time (mesh periods) and a scaled state (n,)."""
 MOST = 12
 """Maximum number of local maxima that are reported: the greatest ones."""
-
 # Maximum number of shoulders that are reported in addition to the maxima.
 _BESIDES = 4
-
 # Fractions of an element at which the force is evaluated to find the maxima.
 _PLACES = np.arange(8) / 8
-
 # Number of instants tried around each maximum in one round of refinement, and number of rounds.
 _CLOSER, _ROUNDS = 16, 10
-
-# Distance (mesh periods) before and after a maximum at which the force is differentiated. The
-# last round of refinement locates a corner a hundred times more closely.
+# Distance (mesh periods) before and after a maximum at which the force is differentiated. The last
+# round of refinement locates a corner a hundred times more closely.
 _ASIDE = 1e-9
-
 # Relative difference between the forces at these instants above which the force jumps.
 _JUMP = 1e-6
-
 # Fall of the force between two maxima (fraction of the lower one) below which they count as one
 # maximum.
 _DIP = 1e-6
-
 # Fraction of the greatest force below which a maximum is left out.
 _LEAST = 1e-3
-
 # Difference from the greatest force, as a fraction of that force, above which a shoulder is not
 # listed. A shoulder is an instant at which the force almost has a maximum (see the module's
 # docstring).
@@ -178,7 +169,6 @@ def contact_force(pair: RotorPair, tau: Float[Array, ""], state: Float[Array, " 
 
 @CachedFunction
 def _forces(pair: RotorPair, elements: Elements) -> tuple[Float[Array, "e q"], Float[Array, "e q"]]:
-    """Return times (mesh periods) and contact forces (N) at several places of each element."""
     return along_elements(contact_force, pair, elements)
 
 
@@ -211,7 +201,6 @@ def around(mesh: Mesh, values: Float[Array, "e q"], times: Float[Array, "e q"]) 
 
 @CachedFunction
 def _located(pair: RotorPair, tangents: RotorPair, orbit: VariedOrbit, places, count):
-    """Return the result of `located` for the contact force."""
     return located(contact_force, pair, tangents, orbit, places, count)
 
 

@@ -19,8 +19,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.contact.gap import Contact
-from rootsopt.contact.impact import force_rounding
-from rootsopt.contact.law import ContactLaw
+from rootsopt.contact.law import ContactLaw, force_rounding
 from rootsopt.dynamics.flanks import (
     FlankForce,
     Margins,
@@ -29,7 +28,6 @@ from rootsopt.dynamics.flanks import (
     kink_margins,
     pushes_of,
     sum_of,
-    switches_of,
     touches_of,
 )
 from rootsopt.dynamics.parts import (
@@ -43,7 +41,7 @@ from rootsopt.dynamics.parts import (
     TimingGear,
     Units,
 )
-from rootsopt.dynamics.timescales import Timescales
+from rootsopt.dynamics.parts.base import Timescales
 from rootsopt.errors import InputError
 from rootsopt.profiles.geometry import Soundness
 
@@ -308,12 +306,10 @@ class RotorPair(eqx.Module):
         flags that matter.
 
         The flags describe the side of contact, the flank segment, the contact law and the parts, at
-        rotation `tau` (mesh periods) and scaled `state`. The mask excludes flanks out of contact.
+        rotation `tau` (mesh periods) and scaled `state`. The mask excludes flanks without a force.
         """
-        motion, acting = self._moving(tau, state)
-        flags, counts = switches_of(self, motion)
-        flags = jnp.concatenate([flags, *(part.switches(motion, own) for part, own in acting)])
-        return flags, jnp.pad(counts, (0, flags.size - counts.size), constant_values=True)
+        found = self.margins(tau, state)
+        return found.values > 0, found.counts
 
     @eqx.filter_jit
     def margins(self, tau: Float[Array, ""], state: Float[Array, " n"]) -> Margins:
@@ -389,7 +385,6 @@ class RotorPair(eqx.Module):
         return self._lost(state, zip(self.all_parts, self.own_states(state), strict=True))
 
     def _lost(self, state, acting) -> Bool[Array, ""]:
-        """Return `lost` for a scaled `state`; `acting`: pairs (part, its own states in SI)."""
         lost = ~(jnp.abs(self.angle_scale * state[0]) < self.angle_limit)
         for part, own in acting:
             gone = part.lost(own)

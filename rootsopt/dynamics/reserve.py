@@ -11,26 +11,75 @@ may move (envelope theorem), and of s by the implicit function theorem.
 """
 
 import functools
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from rootsopt.dynamics.collocation.gauss import GAUSS
+from rootsopt.dynamics.collocation.elements import GAUSS, Elements
 from rootsopt.dynamics.flanks import FlankForce, by_slice, touch_of
 from rootsopt.dynamics.maxima import along_elements, around, located
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.pieces import smooth_pieces
-from rootsopt.dynamics.varied import VariedOrbit
+from rootsopt.dynamics.steady import VariedOrbit
 
-# Number of positions of rotor 2 at which the least gap is computed. Newton's method leads from
-# one to the next; the gap is nearly linear in the position.
+LONGEST = 8
+"""Maximum length of an orbit (mesh periods), rounded up by `RotorPair.whole`."""
+# Minimum number of pieces into which one mesh period is divided.
+_EVEN = 128
+# Maximum number of instants at which flags change, and number of bisections that locate them.
+_FLAGS, _HALVED = 64, 40
+# Length (mesh periods) below which a piece counts as empty. Many corners coincide.
+_EMPTY = 1e-13
+
+
+def smooth_pieces(
+    pair: RotorPair,
+    elements: Elements,
+    corners: Float[Array, " k"],
+    flags: Callable[[Any], Any],
+) -> tuple[Float[Array, " pieces"], Float[Array, " pieces"], Int[Array, ""]]:
+    """Return starts and ends (mesh periods) of pieces of an orbit of `pair` in which a quantity is
+    smooth, and the number of pieces in use. The others, which are empty, come last.
+
+    `corners` (k,): times from 0 to 1 at which the quantity is not smooth, in each mesh period;
+    `flags`: function that returns, at a time, flags (s,) that change where it is not smooth. Pieces
+    end there, and at the ends of elements. They are shorter than elements, because a power of a
+    quantity needs shorter pieces than the motion."""
+    mesh = elements.mesh
+    period = mesh.period
+    turns = jnp.arange(pair.whole(LONGEST))[:, None]
+    every = jnp.append(corners, jnp.arange(1, _EVEN + 1) / _EVEN)
+    own = jnp.mod(mesh.ends[1], period)
+    ends = jnp.append(own, jnp.minimum((every + turns).ravel(), period))
+    ends = jnp.sort(jnp.minimum(lax.stop_gradient(ends), period))
+    begins = jnp.append(0.0, ends[:-1])
+    before = jax.vmap(flags)(begins)
+    changes = jnp.any(before != jnp.append(before[1:], before[:1], axis=0), axis=1)
+    # Unused places get the last piece, which is empty.
+    piece = jnp.nonzero(changes, size=_FLAGS, fill_value=len(ends) - 1)[0]
+
+    def halved(_, ends):
+        low, high = ends
+        middle = (low + high) / 2
+        same = jnp.all(jax.vmap(flags)(middle) == jax.vmap(flags)(low), axis=1)
+        return jnp.where(same, middle, low), jnp.where(same, high, middle)
+
+    _, high = lax.fori_loop(0, _HALVED, halved, (begins[piece], ends[piece]))
+    ends = jnp.sort(jnp.append(ends, high))
+    begins = jnp.append(0.0, ends[:-1])
+    empty = ends - begins < _EMPTY
+    order = jnp.argsort(empty)
+    return begins[order], ends[order], jnp.sum(~empty)
+
+
+# Number of positions of rotor 2 at which the least gap is computed. Newton's method leads from one
+# to the next; the gap is nearly linear in the position.
 _NEWTON = 6
-
 # Greatest move towards the middle of the backlash, as a share of the distance from it. Without
 # clearance, flanks part only in the middle, where the other flanks touch.
 _INWARDS = 0.9999
@@ -112,7 +161,6 @@ def reserve(
 
 
 def _depth(moved: Float[Array, ""], *at) -> Float[Array, ""]:
-    """Return the penetration (m) of `_contact`."""
     return _contact(moved, *at).depth
 
 
@@ -153,7 +201,6 @@ def gaps(
 
 
 def _torque(pair: RotorPair, tau, state) -> Float[Array, ""]:
-    """Return the torque of the timing gear (N·m) at a time (mesh periods) and scaled state."""
     assert pair.gear is not None
     torque = pair.gear.torque_on_1(pair.motion(tau, state), np.zeros(0))
     assert torque is not None

@@ -20,10 +20,8 @@ from rootsopt.dynamics.pair import RotorPair
 
 BLOCK = 4
 """Least number of mesh periods integrated between two checks of whether the motion repeats."""
-
 # Least number of stroboscopic states stored, and least excess over twice the longest cycle.
 _MEMORY, _MORE = 20, 4
-
 # Numbers of mesh periods after which a transient continues with a finer tolerance, each with the
 # greatest value of that tolerance. The noise of coarser steps can hide that the motion repeats.
 _PATIENCE = (32, 1e-5), (128, 1e-7)

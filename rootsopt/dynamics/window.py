@@ -24,32 +24,24 @@ from rootsopt.dynamics.pair import RotorPair
 
 PERIODS = 128
 """Length of a window (mesh periods)."""
-
 # Number of batches into which a window is divided to estimate the standard error of the Lyapunov
 # exponent.
 _BATCHES = 16
-
-# Scaled distance between the two motions: the first number times the tolerance, at least the
-# second and at most the third number.
+# Scaled distance between the two motions: the first number times the tolerance, at least the second
+# and at most the third number.
 _APART = 1e4, 1e-2, 0.2
-
 # Divisor of this distance in every second batch.
 _NEARER = 8.0
-
 # Rounding errors that replace the tolerance, if they exceed it, when the distance is chosen.
 _ROUNDINGS = 200.0
-
 # Difference between the growth rates at both distances above which noise or the finite distance,
 # not the motion, sets them.
 _ALIKE = float(np.log(3.0))
-
 # Number of states stored per mesh period.
 _KEPT = 105
-
 # Force, in units of the pair's `force_scale`, below which differences are relative to this force.
 # Flanks that only just touch push so little that the integration takes no account of it.
 _FAINT = 1e-3
-
 # Array type of a window: JAX arrays, or NumPy arrays after a copy from the device.
 _Arrays = Array | np.ndarray
 

@@ -20,7 +20,7 @@ from rootsopt.figures.pieces import polyline
 from rootsopt.figures.profiles import draw_rotor
 from rootsopt.figures.style import BLUE, ORANGE, SKY, VERMILION, beside, figure
 from rootsopt.profiles import Profile, place_pair
-from rootsopt.response.series import Series
+from rootsopt.response.records import Series
 from rootsopt.runtime.programs import CachedFunction
 
 _MM = 1e3

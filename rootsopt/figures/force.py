@@ -8,7 +8,7 @@ from matplotlib.markers import CARETDOWN
 from numpy.typing import ArrayLike, NDArray
 
 from rootsopt.figures.style import BLUE, COLORS, VERMILION, beside
-from rootsopt.response.series import Series
+from rootsopt.response.records import Series
 
 _MOST_TURNS = 4  # revolutions in a force panel, at most
 _LINES = 400  # spectral lines above which a curve is drawn instead of single lines

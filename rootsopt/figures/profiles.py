@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from rootsopt.figures.style import BLUE, GREY, ORANGE, SKY, VERMILION, looks
 from rootsopt.profiles import place_pair
 from rootsopt.profiles.departure import beyond, feet
-from rootsopt.response.series import Series
+from rootsopt.response.records import Series
 
 
 def plot_profiles(

@@ -15,7 +15,7 @@ from rootsopt.output.names import in_words, label, name_and_unit
 from rootsopt.response.result import Part
 from rootsopt.status import Status
 from rootsopt.sweeps.plan import Plan
-from rootsopt.sweeps.table import is_numeric, written
+from rootsopt.sweeps.scenes import is_numeric, written
 
 if TYPE_CHECKING:
     import xarray

@@ -12,7 +12,7 @@ from rootsopt.figures.drawing import Drawing, coordinates, svg_text
 from rootsopt.figures.dxf import dxf_bytes
 from rootsopt.output.files import ResultFolder
 from rootsopt.response.evaluation import Evaluation
-from rootsopt.response.series import Series
+from rootsopt.response.records import Series
 from rootsopt.scene import Scene
 
 POINTS = "rotor_points.csv"

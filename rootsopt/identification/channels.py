@@ -11,9 +11,9 @@ from jax import lax
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from rootsopt.dynamics.collocation.blocks import BLOCK
+from rootsopt.dynamics.collocation.elements import BLOCK
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.varied import VariedOrbit
+from rootsopt.dynamics.steady import VariedOrbit
 from rootsopt.runtime.programs import CachedFunction
 
 CHANNELS = (

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rootsopt.config import Config
-from rootsopt.dynamics.steady import Steady
-from rootsopt.dynamics.varied import varied
+from rootsopt.dynamics.steady import Steady, varied
 from rootsopt.errors import InputError
 from rootsopt.identification.channels import CHANNELS, channels_at
 from rootsopt.identification.quantities import OFFSET, Fitted, values_at

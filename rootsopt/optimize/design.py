@@ -8,7 +8,7 @@ from rootsopt.optimize.outcome import Optimization
 from rootsopt.optimize.robust import search_of
 from rootsopt.runtime.threads import one_thread
 from rootsopt.scene import check_geometry
-from rootsopt.sweeps.evaluations import evaluating
+from rootsopt.sweeps.cluster import running
 
 
 @one_thread
@@ -43,5 +43,5 @@ def optimize_design(
     True
     """
     check_geometry(config)
-    with evaluating(workers, scheduler) as runs:
+    with running(workers, scheduler) as runs:
         return search_of(config, progress, stop, runs=runs).run()

@@ -16,7 +16,7 @@ from rootsopt.config.study import BASELINE
 from rootsopt.config.units import unit_of, words
 from rootsopt.design.space import Constraint
 from rootsopt.errors import InputError
-from rootsopt.response.reporting import depends_on_forces, is_force, reporting
+from rootsopt.response.still import depends_on_forces, is_force, reporting
 from rootsopt.response.terms import Forces, Term, terms_of
 from rootsopt.scene import Scene
 

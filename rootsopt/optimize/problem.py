@@ -28,7 +28,7 @@ from rootsopt.optimize.limits import (
 from rootsopt.optimize.local import Group, Linearization
 from rootsopt.optimize.optimality import Holder
 from rootsopt.response.evaluation import RESPONSES, Evaluation, objective_weights
-from rootsopt.response.speeds import counted
+from rootsopt.response.reducers import counted
 from rootsopt.response.terms import sense_of
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from rootsopt.config import Config
-    from rootsopt.response.series import Series
+    from rootsopt.response.records import Series
 
 DPI = 150
 """Resolution (dots per inch) of the figures."""

@@ -10,7 +10,7 @@ from rootsopt.response.records import RESPONSES
 from rootsopt.status import Status
 from rootsopt.sweeps.plan import Plan
 from rootsopt.sweeps.points import Row
-from rootsopt.sweeps.table import is_numeric, written
+from rootsopt.sweeps.scenes import is_numeric, written
 
 if TYPE_CHECKING:
     import xarray

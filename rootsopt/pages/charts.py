@@ -19,7 +19,7 @@ from rootsopt.figures.style import BLUE, COLORS, GREY, ORANGE, VERMILION
 from rootsopt.output.names import in_words, label, value
 from rootsopt.pages.gather import Case
 from rootsopt.profiles import Profile, outline
-from rootsopt.response.series import Series
+from rootsopt.response.records import Series
 from rootsopt.scene import Scene
 
 # The models of Bokeh accept more than their annotations say.

@@ -12,9 +12,8 @@ from rootsopt.config.units import MM
 from rootsopt.pages.charts import motion, rotor
 from rootsopt.profiles import Geometry, Profile, geometry, outline
 from rootsopt.response.evaluation import Evaluation, Evaluator
-from rootsopt.response.records import geometry_record
-from rootsopt.response.series import Series
-from rootsopt.response.speeds import alone
+from rootsopt.response.records import Series, geometry_record
+from rootsopt.response.reducers import alone
 from rootsopt.response.starts import Seeds
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene, check_geometry, design_vector

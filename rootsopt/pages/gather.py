@@ -13,7 +13,7 @@ from rootsopt.config import Config, load
 from rootsopt.output.ending import Ending, ending
 from rootsopt.output.files import ResultFolder, design_file
 from rootsopt.output.tables import NAMES, records_of
-from rootsopt.response.series import Series
+from rootsopt.response.records import Series
 
 # Columns of `response_*.csv`, by field of `Series`.
 _COLUMNS = {

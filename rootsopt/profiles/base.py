@@ -38,19 +38,15 @@ from rootsopt.profiles import trigonometry as trig
 # Number of equal intervals into which a segment is divided. The search for the normal angle at a
 # given roll angle starts in one of these intervals.
 _BRACKETS = 16
-
 # Number of safeguarded Newton steps in the search for the normal angle at a given roll angle. A
 # step that leaves the bracket is replaced by a bisection.
 _STEPS = 10
-
 # Distance (rad) from the bracket above which a Newton step counts as leaving it. Without slack,
 # rounding at the root could send the search back to the middle of a wide bracket.
 _SLACK = 1e-9
-
-# Number of plain Newton steps after the safeguarded ones. Derivatives of the result are correct
-# up to this order.
+# Number of plain Newton steps after the safeguarded ones. Derivatives of the result are correct up
+# to this order.
 _POLISH = 3
-
 # Value of dβ/dν below which a Newton step divides by this constant instead of by dβ/dν. The
 # derivative is 0 on an arc centred on the pitch circle.
 _FLAT = 1e-9
@@ -299,6 +295,7 @@ class Profile(eqx.Module):
         """Return the lever (m) at the normal angle `nu` (rad), given two trigonometric functions.
 
         `cos`, `sin`: cosine and sine of κν, with the factor κ = `turn_ratio`."""
+        del cos, sin
         return self.lever(nu)
 
     @property

@@ -22,19 +22,16 @@ OVERLENGTH = 0.02
 which a config is rejected. Beyond u_max the roll angle turns back and two points of a flank mesh at
 once. A node search finds no interference (< 1 nm) up to 5 % excess; the paper's printed Table 1 has
 1.2 %."""
-
-# Excess (pitch radii) of the involute length over its lower limit below which a config is
-# rejected. At this limit, the centre of the tip arc lies on the pitch circle, and one of the
-# arc's normals is tangent to the circle. With a shorter involute, some of these normals miss the
-# circle: their points touch nothing on the other rotor.
+# Excess (pitch radii) of the involute length over its lower limit below which a config is rejected.
+# At this limit, the centre of the tip arc lies on the pitch circle, and one of the arc's normals is
+# tangent to the circle. With a shorter involute, some of these normals miss the circle: their
+# points touch nothing on the other rotor.
 _CLEAR = 1e-6
 LEAST = 0.002
 """Involute length (fraction of the longest) below which a config is rejected. A shorter involute
 has no effect, and its length was probably given in metres."""
-
 # Undercut (mm) up to which a config is accepted: a search may end at such a design.
 _TOUCHING = 1e-6
-
 # Factor by which a search stays away from the lower limits of a config.
 _INSIDE = 1 + 1e-6
 
@@ -52,6 +49,7 @@ def ranges(
     pressure angle `pressure_angle_deg` and half the tip land's angle, `tip_arc_angle_deg`.
     `involute_length_mm` is not used. The longest involute is `CIC.longest_involute`, so that u ≤
     u_max holds by construction."""
+    del involute_length_mm
     half = jnp.pi / (2 * lobes)
     base = pitch_radius_mm * jnp.sin(pressure_angle_deg * DEG)
     longest = base * (half - tip_arc_angle_deg * DEG)

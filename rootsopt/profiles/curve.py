@@ -20,11 +20,9 @@ from rootsopt.profiles.base import Profile, Quadrature, Segment
 INTERVALS = 48
 """Number of intervals per piece of the addendum. With one quintic per interval, a smooth curve is
 reproduced to about 1e-11 pitch radii."""
-
-# Number of Newton steps in the search for the normal angle at a given roll angle. The search
-# starts from a table accurate to about 1e-4 rad.
+# Number of Newton steps in the search for the normal angle at a given roll angle. The search starts
+# from a table accurate to about 1e-4 rad.
 _STEPS = 4
-
 # Gauss-Legendre nodes and weights for an interval or a part of it. The integral is exact to
 # rounding error.
 _GAUSS = np.polynomial.legendre.leggauss(4)

@@ -18,10 +18,8 @@ from rootsopt.runtime.programs import CachedFunction
 
 # Default of `nodes`, the least number of points of a flank on each side of the pitch circle.
 _NODES = 400
-
 # Number of points of each neighbouring flank that are appended to the ends of a flank.
 _BEYOND = 8
-
 # Angle (rad) between successive segments of a polygonal line above which their joint is a corner.
 _CORNER = 0.1
 

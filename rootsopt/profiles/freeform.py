@@ -17,29 +17,22 @@ from rootsopt.runtime.programs import CachedFunction
 # Degree of the B-spline.
 _DEGREE = 2
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
-
 # Number of safeguarded Newton steps in the search for the normal angle at a given roll angle. A
 # step that leaves the bracket is replaced by a bisection.
 _STEPS = 8
-
 # Distance (fractions of a span) from the bracket above which a Newton step counts as leaving it.
 # Without slack, rounding at the root could send the search back to the middle of a wide bracket.
 _SLACK = 1e-9
-
-# Number of plain Newton steps after the safeguarded ones. Derivatives of the result are correct
-# up to this order.
+# Number of plain Newton steps after the safeguarded ones. Derivatives of the result are correct up
+# to this order.
 _POLISH = 3
-
 # Number of nodes per knot span on which the contact search brackets the minima of the gap.
 _NODES_PER_SPAN = 6
-
 # Number of points per knot span in the least-squares fit of a free form.
 _SAMPLES = 40
-
 # Factor on the row of the pitch crossing in the least-squares fit of a free form. All other rows
 # have the factor 1.
 _FIRMLY = 1e3
-
 # Value of dβ/dν below which a Newton step divides by this constant instead of by dβ/dν. The
 # derivative is 0 on an arc centred on the pitch circle.
 _FLAT = 1e-9

@@ -20,8 +20,8 @@ from rootsopt.runtime.programs import CachedFunction
 # tanh(g).
 #
 # Powers, hyperbolic tangents and double exponentials with 32 to 96 nodes were compared. The
-# integrand was a square root whose branch point lies 1e-4 to 0.3 of the length beyond an end.
-# This rule had the least error, 1e-13.
+# integrand was a square root whose branch point lies 1e-4 to 0.3 of the length beyond an end. This
+# rule had the least error, 1e-13.
 _GRADING = 4.0
 
 
@@ -217,14 +217,12 @@ def _rotate(points: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
 PURE = ("turning", "rolling", "order", "limits")
 """Names of the margins that are angles or ratios. All other margins are lengths, or lengths per
 angle."""
-
-# Number of points at which margins are evaluated, per smooth part of a flank and per knot span of
-# a wavy flank.
+# Number of points at which margins are evaluated, per smooth part of a flank and per knot span of a
+# wavy flank.
 _POINTS = 400, 100
-
-# Violations up to which a design counts as sound: of an angle (rad) or ratio, and of a length
-# (m). A search ends at such points, because it lets constraints be violated by a millionth of
-# their scale.
+# Violations up to which a design counts as sound: of an angle (rad) or ratio, and of a length (m).
+# A search ends at such points, because it lets constraints be violated by a millionth of their
+# scale.
 _ROUNDING = 1e-7, 1e-9
 
 

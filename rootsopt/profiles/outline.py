@@ -92,6 +92,7 @@ class Outline(Profile):
         return Mate(*self.valley(jnp.clip(nu, self.valley.node[0], self.valley.node[-1])))
 
     def mate(self, nu, support=True):
+        del support
         pitch = self.pitch_normal
         beyond = nu > pitch
         reflected = jnp.where(beyond, 2 * pitch - nu, pitch)

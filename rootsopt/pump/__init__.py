@@ -4,9 +4,11 @@ All functions are pure, take SI units and can be differentiated by JAX with resp
 scene. Nothing here enters the simulation."""
 
 from rootsopt.pump.flow import (
+    Leakage,
     displaced_volume,
     flow_lines,
     greatest_radius_ratio,
+    leakage,
     relative_flow,
     ripple,
     theoretical_flow,
@@ -15,7 +17,6 @@ from rootsopt.pump.flow import (
     twisted_ripple,
 )
 from rootsopt.pump.gap import Allowances, MeshGap, Play, mesh_gap, play, relative_curvature
-from rootsopt.pump.leakage import Leakage, leakage
 
 __all__ = [
     "Allowances",

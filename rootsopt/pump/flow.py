@@ -7,15 +7,26 @@ at distance s from the pitch point, ρ1² + ρ2² = 2 (r² + s²), and the flow 
 
 r is the pitch radius, r_a the outer radius, L the rotor's length. `docs/pump.md` derives this and
 what follows from it.
+
+The mesh leaks along the rotor's whole length, with a gap that changes over the rotation. Both tips
+leak along the same length, and the four end faces leak across the rotors. A liquid flows by
+Reynolds' equation. A gas flows at the lesser of two limits, friction (compressible laminar flow)
+and inertia (an ideal nozzle of the gap's height).
 """
 
 import math
+from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from rootsopt.contact.wrapped import series_at, wear_series
 from rootsopt.profiles import Geometry, Profile, quadrature_nodes
+from rootsopt.pump.gap import Allowances, MeshGap, mesh_gap, rolls
+from rootsopt.scene import Scene
+from rootsopt.scene.reading import Gas, Medium
 
 # Number of panels of the quadrature over the length of twisted rotors.
 _PANELS = 64
@@ -119,3 +130,201 @@ def tip_height_share(profile: Profile, shape: Geometry) -> Float[Array, ""]:
 def _mean(shape: Geometry) -> Float[Array, ""]:
     """Return the mean flow (m²), η r_a², per metre of rotor length and radian of rotation."""
     return shape.area_efficiency * shape.outer_radius**2
+
+
+CONTINUUM = 0.01
+"""Knudsen number above which gas slips at the walls, so that it leaks more than the laminar formula
+states.
+"""
+MOLECULAR = 1.0
+"""Knudsen number above which molecules meet the walls more often than each other. The formulas of
+this module do not hold there."""
+
+
+def critical_ratio(heat_ratio: Float[Array, ""]) -> Float[Array, ""]:
+    """Return the pressure ratio below which a nozzle is choked, (2 / (κ + 1))^(κ / (κ - 1)).
+
+    `heat_ratio`: κ."""
+    return (2 / (heat_ratio + 1)) ** (heat_ratio / (heat_ratio - 1))
+
+
+def nozzle_flux(
+    upstream: Float[Array, "*n"], downstream: Float[Array, "*n"], gas: Gas
+) -> Float[Array, "*n"]:
+    """Return the mass flow (kg/(s·m²)) per area of an ideal nozzle (Saint-Venant and Wantzel).
+
+    `upstream`, `downstream`: pressures (Pa), the former greater; `gas`: its temperature is the one
+    upstream."""
+    k = gas.heat_ratio
+    ratio = jnp.maximum(downstream / upstream, critical_ratio(k))
+    expansion = jnp.maximum(ratio ** (2 / k) - ratio ** ((k + 1) / k), 0.0)
+    # The slope of a root is infinite where there is no pressure difference.
+    moving = expansion > 0
+    speed = jnp.sqrt(2 * k / (k - 1) * jnp.where(moving, expansion, 1.0))
+    density = upstream / jnp.sqrt(gas.gas_constant * gas.temperature)
+    return jnp.where(moving, density * speed, 0.0)
+
+
+def laminar_mass_flow(
+    height: Float[Array, "*n"],
+    length: Float[Array, "*n"],
+    upstream: Float[Array, ""],
+    downstream: Float[Array, ""],
+    viscosity: Float[Array, ""],
+    gas: Gas,
+) -> Float[Array, "*n"]:
+    """Return the isothermal laminar mass flow (kg/(s·m)) per width of slots.
+
+    h³ (p1² - p2²) / (24 μ R T L): the slot's flow with the density at the mean pressure.
+    `height`: h (m); `length`: L (m); `upstream`, `downstream`: p1, p2 (Pa); `viscosity`: μ (Pa·s);
+    `gas`: gives R T."""
+    driven = (upstream**2 - downstream**2) / (gas.gas_constant * gas.temperature)
+    return height**3 * driven / (24 * viscosity * length)
+
+
+def mean_free_path(
+    pressure: Float[Array, ""], viscosity: Float[Array, ""], gas: Gas
+) -> Float[Array, ""]:
+    """Return the mean free path (m) of the molecules, (μ/p) √(π R T / 2) (Maxwell).
+
+    `pressure`: p (Pa); `viscosity`: μ (Pa·s)."""
+    return viscosity / pressure * jnp.sqrt(jnp.pi / 2 * gas.gas_constant * gas.temperature)
+
+
+FACES = 4
+"""Number of end faces of the two rotors."""
+_NODES, _WEIGHTS = (x / 2 for x in np.polynomial.legendre.leggauss(64))
+# Nodes and weights of the rule of Gauss and Legendre on [0, 1], for the gap beside a tip.
+_SHARES = _NODES + 0.5
+
+
+class Leakage(NamedTuple):
+    """Leakage flows (m³/s) of a pair; of a gas, at suction pressure.
+
+    `mesh`: between the rotors, mean over the rotation; `tips`: between both rotors and the housing;
+    `ends`: across the end faces. `gap`: the gap over the mesh. `efficiency`: volumetric efficiency,
+    1 minus leakage over theoretical flow. `knudsen`: mean free path at suction pressure divided by
+    the least gap that is open; 0 for a liquid, or without an open gap."""
+
+    mesh: Float[Array, ""]
+    tips: Float[Array, ""]
+    ends: Float[Array, ""]
+    gap: MeshGap
+    efficiency: Float[Array, ""]
+    knudsen: Float[Array, ""]
+
+    @property
+    def total(self) -> Float[Array, ""]:
+        """Leakage of all gaps (m³/s)."""
+        return self.mesh + self.tips + self.ends
+
+
+def tip_length(profile: Profile, shape: Geometry, height: Float[Array, ""]) -> Float[Array, ""]:
+    """Return the length (m) of a slot with the same laminar flow as the gap at a tip of a
+    `profile`.
+
+    It is the width of the land, plus h³ ∫ dl / d³ along the addendum on both of its sides. d is the
+    distance from the bore of the housing, h its least value, the clearance `height` (m)."""
+    bore = shape.outer_radius + height
+    sides = [one for one in profile.segments() if not one.land]
+    start, stop = (jnp.stack([getattr(s, end) for s in sides]) for end in ("start", "stop"))
+    turn = (stop - start)[:, None]
+    nu = start[:, None] + turn * _SHARES**2  # denser near the tip, where the gap is narrow
+    point, speed, _ = profile.speeds(nu)
+    depth = bore - jnp.linalg.norm(profile.position(point), axis=-1)
+    film = jnp.sum(2 * turn * _SHARES * _WEIGHTS * speed * (height / depth) ** 3)
+    return shape.seal_width + 2 * film
+
+
+def end_shape(shape: Geometry) -> Float[Array, ""]:
+    """Return the width over the length of the strip that represents an end face, 4 r_a² / A.
+
+    `shape`: geometry of the rotor. The strip is as wide as the rotor, 2 r_a, and as long as its
+    mean chord, A / 2r_a. By Jensen's inequality, parallel strips of unequal chords leak more."""
+    return 4 * shape.outer_radius**2 / shape.area
+
+
+def leakage(scene: Scene, medium: Medium, profile: Profile, shape: Geometry) -> Leakage:
+    """Return the leakage of a pair.
+
+    `profile`, `shape`: of the design. Where the rotors overlap (`gap.least` < 0), the flows have no
+    meaning."""
+    zero = jnp.zeros_like(scene.clearance)
+    error = scene.center_distance_error
+    center = zero if error is None else error
+    normal, strain = scene.clearance, zero if medium.strain is None else medium.strain
+    if scene.wear is not None:
+        series, lobes = wear_series(profile, scene.wear), jnp.asarray(float(profile.lobes))
+        normal = normal + jax.vmap(lambda x: series_at(series, lobes, x)[0])(rolls(profile))
+    found = mesh_gap(profile, Allowances(normal, center, medium.radial_allowance))
+    mesh = _per_width(medium, found.least, found.length, 1)
+    tips, ends = zero, zero
+    heights = [jnp.min(found.least)]
+    if medium.tip_clearance is not None:
+        height = medium.tip_clearance + medium.radial_allowance + strain * shape.outer_radius
+        length = tip_length(profile, shape, jnp.maximum(height, 1e-9))
+        tips = 2 * _per_width(medium, height, length, medium.tips)
+        heights.append(height)
+    if medium.end_clearance is not None:
+        height = medium.end_clearance + strain * scene.length / 2
+        width = 2 * shape.outer_radius
+        ends = FACES * width * _per_width(medium, height, width / end_shape(shape), 1)
+        heights.append(height)
+    mesh, tips = scene.length * mesh, scene.length * tips
+    ideal = theoretical_flow(shape, scene.length, scene.speed)
+    knudsen = zero
+    if medium.gas is not None:
+        path = mean_free_path(medium.gas.inlet_pressure, medium.viscosity, medium.gas)
+        each = jnp.stack(heights)
+        # Nothing flows through a closed gap.
+        knudsen = path / jnp.min(jnp.where(each > 0, each, jnp.inf))
+    return Leakage(mesh, tips, ends, found, 1 - (mesh + tips + ends) / ideal, knudsen)
+
+
+def _per_width(medium: Medium, height, length, series: int):
+    """Return the flow (m²/s) per width through `series` equal gaps in series.
+
+    `height`, `length` (m): of one of them; with one of each per roll angle (n,), the flow is the
+    mean over the rotation. The flow of a gas is that at suction pressure."""
+    across = medium.pressure_difference
+    length = series * jnp.where(height > 0, length, 1.0)
+    height = jnp.maximum(height, 0.0)
+    if medium.gas is None:
+        return jnp.mean(slot_flow(height, length, across, medium.viscosity))
+    down = medium.gas.inlet_pressure
+    up = down + across
+    slow = laminar_mass_flow(height, length, up, down, medium.viscosity, medium.gas)
+    # Nozzles in series share the pressure ratio.
+    stage = up * (down / up) ** (1 / series)
+    fast = height * nozzle_flux(up, stage, medium.gas)
+    density = down / (medium.gas.gas_constant * medium.gas.temperature)
+    return _lesser(slow, fast) / density
+
+
+def _lesser(slow, fast):
+    """Return the lesser of two flows, or its mean over the rotation of flows (n,) at roll angles.
+
+    Between roll angles, the flows are linear. A mean over the angles alone would have a gradient
+    that jumps whenever one of them passes from one limit to the other."""
+    if not slow.ndim:
+        return jnp.minimum(slow, fast)
+    excess = slow - fast
+    low, high = (one(excess[1:], excess[:-1]) for one in (jnp.minimum, jnp.maximum))
+    cross = (low < 0) & (high > 0)
+    triangle = -(low**2) / (2 * jnp.where(cross, high - low, 1.0))
+    between = jnp.where(cross, triangle, jnp.minimum((low + high) / 2, 0.0))
+    # The first and the last angle stand for half a step each beyond them, too.
+    ends = jnp.minimum(excess[0], 0.0) / 2 + jnp.minimum(excess[-1], 0.0) / 2
+    return jnp.mean(fast) + (jnp.sum(between) + ends) / len(excess)
+
+
+def slot_flow(
+    height: Float[Array, "*n"],
+    length: Float[Array, "*n"],
+    pressure: Float[Array, ""],
+    viscosity: Float[Array, ""],
+) -> Float[Array, "*n"]:
+    """Return the flow (m²/s) per width through slots, h³ Δp / (12 μ L).
+
+    `height`: h (m); `length`: L (m) along the flow; `pressure`: Δp (Pa); `viscosity`: μ (Pa·s)."""
+    return height**3 * pressure / (12 * viscosity * length)

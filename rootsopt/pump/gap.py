@@ -85,10 +85,8 @@ def half_valley(flank: Flank, lobes: int, radius: Float[Array, "*n"]) -> Float[A
 POSES = 48
 """Number of roll angles, evenly spaced over the quarter of the mesh in which one addendum touches.
 By symmetry, the other quarters have the same gap."""
-
 # Number of points per segment of a flank at which the gap's width is computed.
 _POINTS = 400
-
 # Cosine of the angle between a flank's normal and that at the narrowest place: below the first, a
 # point is not part of the gap; above the second, it fully is. A sharp limit would make the length
 # jump when it passes a sampled point.
@@ -213,11 +211,9 @@ def _part(cosine):
 POINTS = 1000
 """Number of points per segment of a flank. The angles are then accurate to about 1e-6 rad, and
 mostly to 1e-8 rad."""
-
 # Least clearance that is added to separate rotors that overlap, beyond their greatest depth: in
 # pitch radii, and as a share of this depth. It is trebled until they are apart.
 _STEP, _SHARE = 3e-8, 1e-2
-
 # Number of angles of rotor 1 over a quarter of a lobe pitch in the search for an overlap.
 _FINE = 361
 PLAY_POSES = 96

@@ -15,14 +15,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Complex, Float, Inexact
 
-from rootsopt.dynamics.collocation.blocks import BLOCK, in_blocks, whole_blocks
-from rootsopt.dynamics.collocation.gauss import GAUSS, POINTS
+from rootsopt.dynamics.collocation.elements import BLOCK, GAUSS, POINTS, in_blocks, whole_blocks
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.parts import AxisLoads
-from rootsopt.dynamics.parts.resultants import MIRROR, GasResultant
-from rootsopt.dynamics.pieces import LONGEST, smooth_pieces
-from rootsopt.dynamics.steady import SAMPLES
-from rootsopt.dynamics.varied import VariedOrbit
+from rootsopt.dynamics.parts.load import MIRROR, GasResultant
+from rootsopt.dynamics.reserve import LONGEST, smooth_pieces
+from rootsopt.dynamics.steady import SAMPLES, VariedOrbit
 from rootsopt.profiles import Geometry, Profile, geometry
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene
@@ -53,7 +51,6 @@ def equivalent_load(force: Inexact[Array, "*k n"], exponent: float = ROLLER) -> 
 
 # Number of quantities that are averaged: a power of each bearing's load, and 1.
 _INTEGRANDS = 5
-
 # Distance (mesh periods) before and after a jump at which the integrands are evaluated.
 _ASIDE = 1e-9
 POSES = 720
@@ -331,7 +328,6 @@ def _openings(dynamic, static, moved) -> tuple[Array, Array] | None:
 
 
 def _channels(loads: BearingLoads, scene: Scene) -> Float[Array, "*n k"]:
-    """Return all quantities whose greatest value is reported."""
     if scene.straight:
         return loads.sizes
     return jnp.concatenate([loads.sizes, loads.axial_sizes], axis=-1)

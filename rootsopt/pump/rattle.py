@@ -23,14 +23,11 @@ from rootsopt.status import Status
 
 SILENT = "silent_eccentricity_um"
 """Name of the limit of silent running in result files."""
-
 # Fractions of an element at which the gear is evaluated. Its elements end where teeth touch or
 # part.
 _PLACES = (np.arange(8) + 0.5) / 8
-
 # Number of angles over a turn for the linear motion, and for its check that no flank touches.
 _ANGLES, _POSES = 2880, 360
-
 # Ratio of the eccentricities in place of that of gears without any: only the first gear's.
 _FIRST = np.array([1.0, 0.0])
 
@@ -109,7 +106,6 @@ def _of_orbit(pair: RotorPair, elements: Elements):
 
 @CachedFunction
 def _of_window(pair: RotorPair, states: Float[Array, "p s n"]):
-    """Return the `_teeth` at the states of a window."""
     periods, samples, _ = states.shape
     tau = jnp.arange(periods * samples).reshape(periods, samples) / samples
     return jax.vmap(jax.vmap(lambda t, z: _teeth(pair, t, z)))(tau, states)

@@ -13,11 +13,10 @@ from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry, Profile, geometry
 from rootsopt.pump import flow
 from rootsopt.pump.gap import Play, play
-from rootsopt.pump.leakage import leakage
 from rootsopt.pump.loads import static_loads
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene, design_vector
-from rootsopt.scene.medium import Medium
+from rootsopt.scene.reading import Medium
 
 CM3 = 1e-6
 """One cubic centimetre (m³)."""
@@ -25,7 +24,6 @@ L_MIN = 1e-3 / 60
 """One litre per minute (m³/s)."""
 MRAD = 1e-3
 """One milliradian (rad)."""
-
 # Overlap (m) of the flanks up to which it counts as rounding of an outline.
 _ROUNDING = 1e-8
 LINES = 4
@@ -251,7 +249,7 @@ def _leaks(scene: Scene, design: Float[Array, " d"]) -> tuple[Array, dict[str, A
     """Return (least gap of the flanks (m), rows of the sheet)."""
     assert scene.medium is not None
     profile = scene.profile(design)
-    found = leakage(scene, scene.medium, profile, geometry(profile))
+    found = flow.leakage(scene, scene.medium, profile, geometry(profile))
     least = jnp.min(found.gap.least)
     return least, {
         "flank_gap_min_um": least / UM,

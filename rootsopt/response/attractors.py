@@ -33,18 +33,14 @@ from rootsopt.status import Status
 # Maximum length of a cycle (mesh periods) that the search recognises, unless the equation repeats
 # only after several mesh periods (`RotorPair.whole`).
 _LONGEST = 8
-
 # Scaled distance above which two motions always count as different.
 _APART = 0.3
-
 # Maximum number of motions that are evaluated, in addition to the motion from rest.
 _TRIES = 24
-
 # Penetration of the flanks (multiples of the static penetration) up to which the grid extends.
 _DEPTHS = 3.0
-
-# Statuses of motions that do not count as attractors: there is no such pair, the mesh was lost,
-# or the simulation failed.
+# Statuses of motions that do not count as attractors: there is no such pair, the mesh was lost, or
+# the simulation failed.
 _LOST = (
     *(Status.UNSOUND, Status.PASSED_THROUGH, Status.STALLED),
     *(Status.SOLVER_FAILED, Status.NON_FINITE),
@@ -356,7 +352,6 @@ class Coexisting(Motions):
 
 
 def _of(evaluator: Evaluator, basins: Basins) -> Evaluation:
-    """Return the evaluation that combines all motions as `objective.motion` specifies."""
     orbits = [a for a in basins.attractors if closed(a.evaluation)]
     if not orbits:
         return basins.rest

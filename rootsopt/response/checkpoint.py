@@ -23,7 +23,6 @@ from rootsopt.status import Status
 
 _POINT = TypeAdapter(list[float])
 _NUMBERS = TypeAdapter(dict[str, float])
-
 # Types of the fields of an evaluation that are plain values.
 _KINDS = {
     "design": _NUMBERS,

@@ -28,7 +28,7 @@ from rootsopt.config import EnsembleConfig
 from rootsopt.design.space import Space
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.verdict import TOO_DEEP
+from rootsopt.dynamics.steady import TOO_DEEP
 from rootsopt.dynamics.window import PERIODS
 from rootsopt.profiles import Geometry
 from rootsopt.response.evaluation import (
@@ -57,9 +57,8 @@ from rootsopt.status import Status
 # Finest tolerance at which the motions of an ensemble are integrated. The standard errors of an
 # ensemble are far larger than the error of such steps (docs/chaos.md).
 _RTOL = 1e-6
-
-# Divisor of `ensemble.settle_periods` for motions that start from the last states of a
-# neighbouring design's motions.
+# Divisor of `ensemble.settle_periods` for motions that start from the last states of a neighbouring
+# design's motions.
 _AGAIN = 4
 VERIFYING = 4
 """Factor by which the number of members is increased to verify the best design of a search."""
@@ -264,7 +263,6 @@ def _slopes(
 
 
 def _space(evaluator: Evaluator, design) -> Space:
-    """Return the unit box of the design parameters, extended if `design` lies outside."""
     space = Space.of(evaluator.config, evaluator.scene)
     lower, upper = np.minimum(space.lower, design), np.maximum(space.upper, design)
     bounds = jnp.asarray(lower), jnp.asarray(upper)
@@ -353,7 +351,6 @@ _pair = CachedFunction(Scene.pair_and_shape)
 
 @CachedFunction
 def _point(space: Space, design):
-    """Return the point (d,) of the unit box nearest to a design (d,) in config units."""
     return space.point(design)
 
 

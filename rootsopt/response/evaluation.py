@@ -19,8 +19,7 @@ from rootsopt.dynamics.measures import PEAK_NORM, line_name
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.reserve import apart
 from rootsopt.dynamics.settle import BLOCK
-from rootsopt.dynamics.steady import CLOSED, OPEN, SAMPLES, Solver, Steady, window_status
-from rootsopt.dynamics.varied import varied
+from rootsopt.dynamics.steady import CLOSED, OPEN, SAMPLES, Solver, Steady, varied, window_status
 from rootsopt.dynamics.window import PERIODS, integrated_difference, lyapunov
 from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry
@@ -29,28 +28,25 @@ from rootsopt.pump.rattle import rattle_record, silent_limit, silent_record
 from rootsopt.response.many import HERE, IN_TURN, Point, Runs, evaluate_many
 from rootsopt.response.records import (
     RESPONSES,
+    Series,
     apart_message,
     apart_record,
     bearing_record,
+    contact_series,
     fading_note,
     geometry_record,
     message_of,
     orbit_record,
+    orbit_series,
     orbit_statistics,
+    sampled,
     unsettled,
     window_record,
-)
-from rootsopt.response.reducers import over_scenes, over_speeds
-from rootsopt.response.result import Evaluation, Part
-from rootsopt.response.scatter import Shift, draw, shifts
-from rootsopt.response.series import (
-    Series,
-    contact_series,
-    orbit_series,
-    sampled,
     window_series,
 )
-from rootsopt.response.speeds import parts_at, shares
+from rootsopt.response.reducers import over_scenes, over_speeds, parts_at, shares
+from rootsopt.response.result import Evaluation, Part
+from rootsopt.response.scatter import Shift, draw, shifts
 from rootsopt.response.starts import Seed, Seeds, begun
 from rootsopt.response.terms import BEARING, GEAR, OF_MOTION, RESERVES, terms_of, values_of
 from rootsopt.runtime.environment import check_precision
@@ -59,10 +55,9 @@ from rootsopt.scene import Scene, check_geometry, design_keys, design_vector, fa
 from rootsopt.status import Status
 
 # Difference between an orbit closed by collocation and an integration over its period (see
-# `integrated_difference`) above which the orbit is rejected: the first number, at least the
-# second times the tolerance of orbits.
+# `integrated_difference`) above which the orbit is rejected: the first number, at least the second
+# times the tolerance of orbits.
 _APART = 1e-4, 1e3
-
 # Greatest tolerance of this integration.
 _FINE = 1e-8
 
@@ -262,7 +257,6 @@ class Evaluator:
         return over_speeds(parts_at(self.speeds, evaluate_many(points, IN_TURN)), own)
 
     def _at(self, number: int) -> "Evaluator":
-        """Return the evaluator at one of `speeds`."""
         references = self.references[number : number + 1]
         alone = self.at_speed(self.speeds[number][0])
         return dataclasses.replace(alone, references=references)
@@ -522,7 +516,6 @@ class Evaluator:
 
     @property
     def _names(self) -> tuple[str, ...]:
-        """Names of the further terms of the objective."""
         return tuple(self.config.objective.terms)
 
     def _terms(self, design, response, gradient):

@@ -21,10 +21,8 @@ from rootsopt.status import Status
 
 # Number of members in one call of the compiled program.
 _MEMBERS = 4
-
 # Longest period (mesh periods) of a motion that is recognised as repeating.
 _LONGEST = 8
-
 # Scaled difference between states below which a motion counts as repeating.
 _REPEATS = 1e-2
 

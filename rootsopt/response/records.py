@@ -1,33 +1,118 @@
-"""Entries of the result file for one evaluation, and advice that fits its scene."""
+"""What is reported of one evaluation: series, entries of the result file, and advice."""
 
+import dataclasses
+import functools
+from collections.abc import Callable
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from rootsopt.config import Config
 from rootsopt.config.units import MM, UM
+from rootsopt.dynamics.collocation.elements import Elements
 from rootsopt.dynamics.orbit import Orbit
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.reserve import Apart
-from rootsopt.dynamics.steady import OPEN, Solver, Steady
+from rootsopt.dynamics.steady import OPEN, SAMPLES, Solver, Steady
 from rootsopt.dynamics.window import Window
 from rootsopt.profiles import Geometry
 from rootsopt.pump.loads import OrbitLoads
-from rootsopt.response.series import Series, window_series
 from rootsopt.response.terms import EQUIVALENT, GEAR, RESERVES
+from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene
 from rootsopt.status import Status
 
+
+@dataclasses.dataclass(frozen=True)
+class Series:
+    """Motion, force and penetration over the reported window, as NumPy arrays (samples,).
+
+    `time` (s): uniform unless rotor 1 is free; `rotation` of rotor 1 (rad), uniform; `relative`: ε
+    (rad); `rate`: dε/dt (rad/s); `drive_force`, `coast_force`: normal force (N) on each flank;
+    `depth`: greatest penetration (m; negative: gap); `bearing_loads` (samples, 4): loads (N) on the
+    bearings, None without `scene.bearings` or without an orbit. The bearings are that of rotor 1 at
+    the timing gear's end, its other one, and those of rotor 2."""
+
+    time: NDArray[np.float64]
+    rotation: NDArray[np.float64]
+    relative: NDArray[np.float64]
+    rate: NDArray[np.float64]
+    drive_force: NDArray[np.float64]
+    coast_force: NDArray[np.float64]
+    depth: NDArray[np.float64]
+    bearing_loads: NDArray[np.float64] | None = None
+
+    @property
+    def force(self) -> NDArray[np.float64]:
+        """Contact force (N): sum of the normal forces on both flanks."""
+        return self.drive_force + self.coast_force
+
+
+@CachedFunction
+def contact_series(pair: RotorPair, tau, states):
+    """Return (mesh period (s), relative durations (t,), (ε (rad), dε/dt (rad/s)), flank contact).
+
+    `tau` (t,): times (mesh periods); `states` (t, n): scaled states; all results but the first have
+    an axis (t,). A relative duration is that of a mesh period, divided by the mesh period."""
+    lapse = pair.lapse(states) if pair.free else jnp.ones_like(tau)
+    contact = jax.vmap(pair.contact_at)(tau, states)
+    return pair.mesh_period, lapse, pair.physical(tau, states)[1:], contact
+
+
+def series_of(pair: RotorPair, tau, states) -> Series:
+    """Return the series of a motion with scaled `states` (t, n) at `tau` (t,) in mesh periods."""
+    # Reduce to one turn of the rotor: the rounding error of a late time is greater.
+    turn = np.mod(tau, pair.lobes)
+    period, lapse, (relative, rate), contact = contact_series(pair, turn, states)
+    period = np.asarray(period)
+    time = period * tau
+    if pair.free:
+        from scipy.integrate import cumulative_simpson  # Slow import (0.5 s), only for motors.
+
+        time = period * cumulative_simpson(lapse, x=tau, initial=0.0)
+    double = functools.partial(np.asarray, dtype=np.float64)
+    return Series(
+        time=double(time),
+        rotation=2 * np.pi / pair.lobes * np.asarray(tau, np.float64),
+        relative=double(relative),
+        rate=double(rate),
+        drive_force=double(contact.drive),
+        coast_force=double(contact.coast),
+        depth=double(contact.depth),
+    )
+
+
+def orbit_series(pair: RotorPair, found: Steady) -> Series:
+    """Return the series of a closed orbit, repeated to cover at least one revolution of rotor 1."""
+    period = int(found.period)
+    cycles = -(-pair.lobes // period)
+    tau = period * np.arange(cycles * SAMPLES) / SAMPLES
+    return series_of(pair, tau, np.tile(np.asarray(sampled(found.known.elements)), (cycles, 1)))
+
+
+def window_series(pair: RotorPair, window: Window) -> Series:
+    """Return the series of a window of a motion that does not settle."""
+    states = np.asarray(window.states)
+    periods, samples, count = states.shape
+    return series_of(pair, np.arange(periods * samples) / samples, states.reshape(-1, count))
+
+
+@CachedFunction
+def sampled(elements: Elements) -> Float[Array, "samples n"]:
+    """Return `SAMPLES` uniform samples of the scaled states of an orbit, from φ1 = 0 on."""
+    return elements.motion(elements.mesh.period * jnp.arange(SAMPLES) / SAMPLES)
+
+
 RESPONSES = ("mean_force_N", "peak_force_N", "rms_force_N")
 """Keys of the mean, peak and RMS force in a response."""
-
 # Floquet multiplier above which a message says how slowly disturbances fade.
 _SLOW = 0.999
-
 # Fraction of itself to which a disturbance is said to fade.
 _FADED = 0.01
-
 # Kinds of motions without an orbit, by status; all others are transient.
 _KINDS = {Status.CHAOTIC: "chaotic", Status.IDLE: "idle"}
 
@@ -145,9 +230,10 @@ def message_of(config: Config, status: Status) -> str:
 
     The advice names only what the scene has or lacks: no timing gear where there is one, and no
     value to lower that is 0."""
-    if status not in _WAYS:
+    ways = _ways(config).get(status)
+    if ways is None:
         return status.value
-    first, *others = _WAYS[status](config)
+    first, *others = ways
     return f"{status.meaning} {', or '.join([first[0].upper() + first[1:], *others])}."
 
 
@@ -165,113 +251,42 @@ def fading_note(multiplier: float, period: int) -> str:
     )
 
 
-def _way(verb: str, key: str, value: float | None) -> list[str]:
-    """Return the advice to change a key; empty if there is no `value`, or 0, to change."""
-    return [f"{verb} {key} ({value:g})"] if value else []
+def _ways(config: Config) -> dict[Status, list[str]]:
+    """Return the advice for statuses whose advice depends on the scene of a `config`."""
 
+    def change(verb: str, key: str, when: Callable[[float], bool] = bool) -> list[str]:
+        value = config.value(key)
+        return [f"{verb} {key} ({value:g})"] if value is not None and when(value) else []
 
-def _load(config: Config, verb: str = "lower") -> list[str]:
-    """Return the advice to change the load."""
-    load = config.scene.load
-    for key in ("torque_N_m", "pressure_difference_Pa"):
-        if (value := getattr(load, key)) is not None:
-            if verb == "raise" and not value:
-                return [f"raise scene.load.{key} above 0"]
-            return _way(verb, f"scene.load.{key}", value)
-    return []
-
-
-def _backlash(config: Config, verb: str = "lower") -> list[str]:
-    """Return the advice to change the backlash of the timing gear, if there is one."""
-    gear = config.scene.timing_gear
-    if gear is not None and verb == "raise":
-        return [f"raise scene.timing_gear.backlash_mm ({gear.backlash_mm:g})"]
-    return [] if gear is None else _way(verb, "scene.timing_gear.backlash_mm", gear.backlash_mm)
-
-
-def _damping(config: Config) -> list[str]:
-    """Return the advice to add damping where the scene has it."""
-    gear, most = config.scene.timing_gear, config.contact.max_damping_N_s_per_mm
-    if gear is not None:
-        return [f"raise scene.timing_gear.damping_ratio ({gear.damping_ratio:g})"]
-    return [f"raise contact.max_damping_N_s_per_mm ({most:g})"]
-
-
-def _passed_through(config: Config) -> list[str]:
-    gear, phase = config.scene.timing_gear, config.scene.phase_error_mrad
-    held = ["add a scene.timing_gear"]
-    if gear is not None:
-        stiffness = gear.stiffness_N_m_per_rad
-        held = _way("raise", "scene.timing_gear.stiffness_N_m_per_rad", stiffness)
-    phased = _way("bring closer to 0", "scene.phase_error_mrad", phase)
-    return [*held, *_load(config), *_backlash(config), *phased]
-
-
-def _too_deep(config: Config) -> list[str]:
-    """Return advice: what presses the rotors into each other comes first."""
-    error, wear = config.scene.center_distance_error_mm or 0.0, config.contact.wear
-    close = _way("raise", "scene.center_distance_error_mm", min(error, 0.0))
-    coated = _way("raise", "contact.wear.offset_mm", min(wear.offset_mm, 0.0) if wear else None)
-    tight = ["raise contact.clearance_mm"] if close or coated else []
-    stiffness = config.contact.stiffness_N_per_mm_e
-    stiffer = _way("raise", "contact.stiffness_N_per_mm_e", stiffness)
-    return [*close, *coated, *tight, *stiffer, *_load(config)]
-
-
-def _stalled(config: Config) -> list[str]:
-    motor = config.scene.motor
-    torque = None if motor is None else motor.torque_N_m
-    given = _way("raise", "scene.motor.torque_N_m", torque) or ["set scene.motor.torque_N_m"]
-    return [*given, "raise scene.motor.slope_N_m_s_per_rad", *_load(config)]
-
-
-def _chaotic(config: Config) -> list[str]:
+    load = change("lower", "scene.load.torque_N_m")
+    load += change("lower", "scene.load.pressure_difference_Pa")
+    backlash = change("lower", "scene.timing_gear.backlash_mm")
+    damping = change("raise", "scene.timing_gear.damping_ratio", lambda _: True)
+    damping = damping or change("raise", "contact.max_damping_N_s_per_mm", lambda _: True)
+    held = change("raise", "scene.timing_gear.stiffness_N_m_per_rad")
+    phased = change("bring closer to 0", "scene.phase_error_mrad")
+    # What presses the rotors into each other comes first.
+    near = change("raise", "scene.center_distance_error_mm", lambda error: error < 0)
+    near += change("raise", "contact.wear.offset_mm", lambda offset: offset < 0)
+    near += ["raise contact.clearance_mm"] if near else []
+    near += change("raise", "contact.stiffness_N_per_mm_e")
+    torque = change("raise", "scene.motor.torque_N_m") or ["set scene.motor.torque_N_m"]
     averaged = "set objective.motion to ensemble to optimise averages over an ensemble of motions"
-    slower = _way("lower", "scene.speed_rpm", config.scene.speed_rpm)
-    return [averaged, *slower, *_load(config), *_backlash(config), *_damping(config)]
-
-
-def _not_settled(config: Config) -> list[str]:
-    longer = _way("raise", "solver.max_mesh_periods", config.solver.max_mesh_periods)
-    return [*longer, *_damping(config)]
-
-
-def _tolerance(config: Config) -> tuple[str, float]:
-    """Return the key that sets the tolerance of orbits, and its value."""
-    solver = config.solver
-    if solver.rtol is None:
-        return "solver.accuracy", solver.accuracy
-    return "solver.rtol", solver.rtol
-
-
-def _unresolved(config: Config) -> list[str]:
-    return _way("tighten", *_tolerance(config))
-
-
-def _inaccurate(config: Config) -> list[str]:
-    most = config.solver.max_steps_per_period
-    steps = _way("raise", "solver.max_steps_per_period", most)
-    return [*_unresolved(config), "raise contact.smoothing_mm", *steps]
-
-
-def _solver_failed(config: Config) -> list[str]:
-    most = f"{config.solver.max_steps_per_period:g}"
+    tolerance = "solver.accuracy" if config.solver.rtol is None else "solver.rtol"
+    finer = change("tighten", tolerance)
+    steps = change("raise", "solver.max_steps_per_period")
     need = "ten are needed for each of statistics.swings_per_mesh_period"
-    looser = _way("loosen", *_tolerance(config))
-    return [f"raise solver.max_steps_per_period ({most}; {need})", *looser]
-
-
-# Statuses whose advice depends on the scene, each with a function that returns it.
-_WAYS = {
-    Status.PASSED_THROUGH: _passed_through,
-    Status.TOO_DEEP: _too_deep,
-    Status.STALLED: _stalled,
-    Status.CHAOTIC: _chaotic,
-    Status.NOT_SETTLED: _not_settled,
-    Status.UNRESOLVED: _unresolved,
-    Status.INACCURATE: _inaccurate,
-    Status.SOLVER_FAILED: _solver_failed,
-}
+    more = [f"{steps[0][:-1]}; {need})"]
+    return {
+        Status.PASSED_THROUGH: [*(held or ["add a scene.timing_gear"]), *load, *backlash, *phased],
+        Status.TOO_DEEP: [*near, *load],
+        Status.STALLED: [*torque, "raise scene.motor.slope_N_m_s_per_rad", *load],
+        Status.CHAOTIC: [averaged, *change("lower", "scene.speed_rpm"), *load, *backlash, *damping],
+        Status.NOT_SETTLED: [*change("raise", "solver.max_mesh_periods"), *damping],
+        Status.UNRESOLVED: finer,
+        Status.INACCURATE: [*finer, "raise contact.smoothing_mm", *steps],
+        Status.SOLVER_FAILED: [*more, *change("loosen", tolerance)],
+    }
 
 
 def apart_message(config: Config, depth: float, backlash: float | None = None) -> str:

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rootsopt.dynamics.maxima import Maxima
-from rootsopt.response.records import RESPONSES
-from rootsopt.response.series import Series
+from rootsopt.response.records import RESPONSES, Series
 from rootsopt.response.starts import Seed, Seeds
 from rootsopt.status import Status
 
@@ -24,6 +23,19 @@ _STEADY = (
     "lyapunov_exponent_per_mesh_period",
     "lyapunov_standard_error",
 )
+
+
+# Columns of the dataset, keyed by the field of a `Series`. Each entry holds the name in CSV files,
+# the unit, a long name, and the factor from SI units to this unit.
+_COLUMNS = {
+    "rotation": ("rotation_deg", "deg", "rotation of rotor 1", 57.29577951308232),
+    "relative": ("relative_rotation_rad", "rad", "relative rotation of rotor 2", 1.0),
+    "rate": ("relative_speed_rad_s", "rad/s", "relative angular speed of rotor 2", 1.0),
+    "drive_force": ("drive_flank_force_N", "N", "normal force on the drive flank", 1.0),
+    "coast_force": ("coast_flank_force_N", "N", "normal force on the coast flank", 1.0),
+    "force": ("contact_force_N", "N", "contact force: sum of the normal forces", 1.0),
+    "depth": ("penetration_m", "m", "greatest penetration; negative: least gap", 1.0),
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,14 +104,27 @@ class Evaluation:
         Design, geometry, response and status are its attributes.
 
         Raises ValueError if the evaluation has no series."""
-        if self.series is None:
+        series = self.series
+        if series is None:
             raise ValueError(
                 f"An evaluation must have a series to become a dataset, but this one is "
                 f"{self.status.label} and has none; pass `series=True`, or choose another design"
             )
-        from rootsopt.response.dataset import dataset
+        import xarray  # Slow import.
 
-        return dataset(self)
+        columns = {
+            name: ("time_s", factor * getattr(series, field), {"units": unit, "long_name": long})
+            for field, (name, unit, long, factor) in _COLUMNS.items()
+        }
+        time = ("time_s", series.time, {"units": "s", "long_name": "time"})
+        attributes = {
+            "status": self.status.label,
+            "message": self.message,
+            **{f"design_{name}": value for name, value in self.design.items()},
+            **self.geometry,
+            **self.response,
+        }
+        return xarray.Dataset(columns, coords={"time_s": time}, attrs=attributes)
 
     @property
     def state(self) -> NDArray[np.float64] | None:

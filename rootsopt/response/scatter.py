@@ -5,7 +5,7 @@ the distributions more evenly than random ones. Fresh samples are pseudo-random 
 that statistics over them have the usual standard errors.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -21,7 +21,6 @@ from rootsopt.scene import Scene
 
 NOMINAL, RANDOM = "as given", "random"
 """Names of the config's own scene, and of random ones before their number, in `assumed`."""
-
 # Index of the random stream from which fresh samples are drawn.
 _FRESH = 1
 
@@ -134,16 +133,3 @@ def _difference(before: Scene, after: Scene) -> Scene:
         return found if found.any() else None
 
     return jax.tree.map(change, *(eqx.filter(x, eqx.is_inexact_array) for x in (after, before)))
-
-
-__all__: Sequence[str] = [
-    "NOMINAL",
-    "RANDOM",
-    "Shift",
-    "assumed",
-    "draw",
-    "in_conditions",
-    "quantiles",
-    "scene_of",
-    "shifts",
-]

@@ -21,8 +21,7 @@ from rootsopt.dynamics.closed import Start, examined, steady_motion
 from rootsopt.dynamics.linear import eigenvalues
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.reserve import reserve
-from rootsopt.dynamics.steady import CLOSED, OPEN, Solver, Steady, among
-from rootsopt.dynamics.varied import varied
+from rootsopt.dynamics.steady import CLOSED, OPEN, Solver, Steady, among, varied
 from rootsopt.profiles.geometry import Soundness
 from rootsopt.runtime.environment import check_precision
 from rootsopt.runtime.programs import CachedFunction
@@ -198,7 +197,6 @@ _CONSTANT = "period", "multipliers", "residual", "status", "margins", "start"
 
 
 def _split(values, response: Response) -> dict[str, Any]:
-    """Split `values` into the differentiated fields of a `response`, by name."""
     found, place = {}, 0
     for name, old in response._asdict().items():
         if name not in _CONSTANT:
@@ -312,7 +310,6 @@ def _next_start(solver: Solver, pair: RotorPair, found: Steady, state: Float[Arr
 
 
 def _named(solver: Solver, pair: RotorPair, tangents: RotorPair, found: Steady):
-    """Return the response of a motion, and the derivatives of its differentiated fields."""
     measures = solver.measures
     orbit, period = found.orbit, found.period
     closed = among(found.status, CLOSED) | found.held
@@ -377,6 +374,7 @@ def _once(scene, design, start, numbers):
 
 @_once.def_jvp
 def _once_jvp(primals, tangents):
+    del primals, tangents
     raise NotImplementedError(
         "The steady response has first derivatives only: differentiate it once, and use a method "
         "that needs no second derivatives (BFGS, Gauss-Newton)"

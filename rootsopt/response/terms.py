@@ -6,7 +6,8 @@ of the forces.
 """
 
 import abc
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import equinox as eqx
@@ -18,19 +19,11 @@ from rootsopt.config.units import MM, UM
 from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry, Profile, geometry
 from rootsopt.pump import flow
-from rootsopt.pump.leakage import leakage
 from rootsopt.pump.loads import still_loads
 from rootsopt.pump.rattle import SILENT, silent_eccentricity
-from rootsopt.pump.sheet import MRAD, play_of, ripple_of
+from rootsopt.pump.sheet import CM3, L_MIN, MRAD, play_of, ripple_of
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene
-from rootsopt.scene.medium import Medium
-
-# Length of a centimetre (m).
-_CM = 1e-2
-
-# One litre per minute (m³/s).
-_LITRE_PER_MINUTE = 1e-3 / 60
 
 
 class Forces(NamedTuple):
@@ -76,192 +69,70 @@ class Term(eqx.Module):
         peak and RMS of the steady contact force in the `scene`."""
 
 
-class GeometryTerm(Term):
-    """A term whose value is the field of `Geometry` (SI units) named `field`, divided by `unit`."""
+class _At(NamedTuple):
+    """Arguments of `Term.value`."""
 
-    field: str = eqx.field(static=True)
-    unit: float = eqx.field(static=True)
+    scene: Scene
+    profile: Profile
+    shape: Geometry
+    forces: Forces
+
+
+class Formula(Term):
+    """A term of the package; `name`: that of its formula."""
+
+    name: str = eqx.field(static=True)
 
     def value(self, scene, profile, shape, forces):
-        return getattr(shape, self.field) / self.unit
+        return (_LESS | _MORE)[self.name](_At(scene, profile, shape, forces))
 
 
-class LargeTerm(GeometryTerm):
-    """A `GeometryTerm` that is to be maximised."""
+class LargeFormula(Formula):
+    """A `Formula` of a term that is to be maximised."""
 
     sense: ClassVar[Literal["min", "max"]] = "max"
 
 
-class DisplacementTerm(Term):
-    """A term whose value is the volume (cm³) that a pair displaces per revolution."""
-
-    sense: ClassVar[Literal["min", "max"]] = "max"
-
-    def value(self, scene, profile, shape, forces):
-        return flow.displaced_volume(shape, scene.length) / _CM**3
+def _flow(at: _At) -> Float[Array, ""]:
+    return flow.theoretical_flow(at.shape, at.scene.length, at.scene.speed) / L_MIN
 
 
-class FlowTerm(Term):
-    """A term whose value is the flow (l/min) at the scene's speed: without leakage, or `delivered`.
-
-    The flow delivered needs the section `pump`."""
-
-    sense: ClassVar[Literal["min", "max"]] = "max"
-    delivered: bool = eqx.field(static=True)
-
-    def value(self, scene, profile, shape, forces):
-        found = flow.theoretical_flow(shape, scene.length, scene.speed) / _LITRE_PER_MINUTE
-        if not self.delivered:
-            return found
-        medium = _medium(scene, "delivered_flow_l_min")
-        return found * leakage(scene, medium, profile, shape).efficiency
-
-
-class RippleTerm(Term):
-    """A term whose value is the peak-to-peak ripple of the flow, as a fraction of the mean flow."""
-
-    def value(self, scene, profile, shape, forces):
-        return ripple_of(scene, profile, shape)
-
-
-class BacklashTerm(Term):
-    """A term whose value is the backlash (mm) up to which a timing gear keeps the flanks apart.
-
-    It is 0 without clearance, and negative where the rotors overlap."""
-
-    sense: ClassVar[Literal["min", "max"]] = "max"
-
-    def value(self, scene, profile, shape, forces):
-        return play_of(scene, profile).gear_backlash / MM
-
-
-class PlayTerm(Term):
-    """A term whose value is the least angular play (mrad) of rotor 2 over the rotation."""
-
-    def value(self, scene, profile, shape, forces):
-        return jnp.min(play_of(scene, profile).total) / MRAD
-
-
-class GapTerm(Term):
-    """A term whose value is the least gap (um) of the flanks over the mesh, or its `mean`.
-
-    The scene must have a section `pump`. A negative least gap is an overlap."""
-
-    sense: ClassVar[Literal["min", "max"]] = "max"
-    mean: bool = eqx.field(static=True)
-
-    def value(self, scene, profile, shape, forces):
-        name = "mean" if self.mean else "min"
-        medium = _medium(scene, f"flank_gap_{name}_um")
-        gaps = leakage(scene, medium, profile, shape).gap.least
-        return (jnp.mean(gaps) if self.mean else jnp.min(gaps)) / UM
-
-
-class LossTerm(Term):
-    """A term whose value is the leakage as a fraction of the theoretical flow.
-
-    It is 1 minus the volumetric efficiency. The scene must have a section `pump`."""
-
-    def value(self, scene, profile, shape, forces):
-        medium = _medium(scene, "leakage_fraction")
-        return 1 - leakage(scene, medium, profile, shape).efficiency
-
-
-def _medium(scene: Scene, name: str) -> Medium:
-    if scene.medium is None:
+def _leakage(at: _At, name: str) -> flow.Leakage:
+    if at.scene.medium is None:
         raise InputError(
             f"the term `{name}` needs the section `pump`; add it with `pump.viscosity_mPa_s` and "
             "`pump.pressure_difference_Pa`"
         )
-    return scene.medium
+    return flow.leakage(at.scene, at.scene.medium, at.profile, at.shape)
 
 
-class SilentTerm(Term):
-    """A term whose value is the eccentricity (µm) up to which the timing gear does not rattle.
-
-    The scene must have a timing gear with errors."""
-
-    sense: ClassVar[Literal["min", "max"]] = "max"
-
-    def value(self, scene, profile, shape, forces):
-        if scene.gear is None or scene.gear.errors is None:
-            raise InputError(
-                f"the term `{SILENT}` needs a timing gear with errors; set "
-                "`scene.timing_gear.eccentricity_um`, which may be 0"
-            )
-        return silent_eccentricity(scene, profile, shape)[0] / UM
+def _gaps(at: _At, name: str) -> Float[Array, " n"]:
+    return _leakage(at, name).gap.least
 
 
-class InertiaTerm(Term):
-    """A term whose value is the polar moment of inertia of one rotor (kg·m²)."""
-
-    def value(self, scene, profile, shape, forces):
-        return scene.inertia(shape)
-
-
-class ForceTerm(Term):
-    """A term whose value is the field of `Forces` (N) named `field`."""
-
-    field: str = eqx.field(static=True)
-
-    def value(self, scene, profile, shape, forces):
-        return getattr(forces, self.field)
+def _silent(at: _At) -> Float[Array, ""]:
+    if at.scene.gear is None or at.scene.gear.errors is None:
+        raise InputError(
+            f"the term `{SILENT}` needs a timing gear with errors; set "
+            "`scene.timing_gear.eccentricity_um`, which may be 0"
+        )
+    return silent_eccentricity(at.scene, at.profile, at.shape)[0] / UM
 
 
-class BearingTerm(Term):
-    """A term from the loads on the bearings along the motion, under the `name` of a response.
-
-    The scene must have a section `scene.bearings`; for a `twisted` one, also a helix."""
-
-    name: str = eqx.field(static=True)
-    twisted: bool = eqx.field(static=True, default=False)
-
-    def value(self, scene, profile, shape, forces):
-        _need_bearings(scene, self.name)
-        if self.twisted and scene.straight:
-            raise InputError(
-                f"the term `{self.name}` needs twisted rotors, because it is 0 for straight ones; "
-                "set `rotor.helix_deg`, or make the twist a design parameter with "
-                "`optimizer.bounds.helix_deg`"
-            )
-        return forces.of_motion
+def _still_loads(at: _At, name: str) -> tuple[Array, Array]:
+    _need_bearings(at.scene, name)
+    return still_loads(at.scene, at.profile, at.shape)
 
 
-class GearTerm(Term):
-    """A term from the torque of the timing gear along the motion, under the `name` of a response.
-
-    The scene must have a section `scene.timing_gear`."""
-
-    name: str = eqx.field(static=True)
-
-    def value(self, scene, profile, shape, forces):
-        if scene.gear is None:
-            raise InputError(
-                f"the term `{self.name}` needs the section `scene.timing_gear`; add it with "
-                "`scene.timing_gear.stiffness_N_m_per_rad` and `scene.timing_gear.backlash_mm`"
-            )
-        return forces.of_motion
-
-
-class ReserveTerm(GearTerm):
-    """A `GearTerm` for the distance of the flanks from touching, which is to be maximised."""
-
-    sense: ClassVar[Literal["min", "max"]] = "max"
-
-
-class StaticBearingTerm(Term):
-    """A term whose value is a load (N) of the bearings while the timing gear carries the load.
-
-    It is the greatest one of the four bearings, or the greatest `equivalent` load. Nothing is
-    simulated. The scene must have a section `scene.bearings`."""
-
-    equivalent: bool = eqx.field(static=True)
-
-    def value(self, scene, profile, shape, forces):
-        name = "equivalent" if self.equivalent else "max"
-        _need_bearings(scene, f"static_bearing_load_{name}_N")
-        equivalent, greatest = still_loads(scene, profile, shape)
-        return jnp.max(equivalent if self.equivalent else greatest)
+def _of_bearings(at: _At, name: str) -> Any:
+    _need_bearings(at.scene, name)
+    if name in BEARING[2:] and at.scene.straight:
+        raise InputError(
+            f"the term `{name}` needs twisted rotors, because it is 0 for straight ones; "
+            "set `rotor.helix_deg`, or make the twist a design parameter with "
+            "`optimizer.bounds.helix_deg`"
+        )
+    return at.forces.of_motion
 
 
 def _need_bearings(scene: Scene, name: str) -> None:
@@ -270,6 +141,15 @@ def _need_bearings(scene: Scene, name: str) -> None:
             f"the term `{name}` needs the section `scene.bearings`; add it, as in "
             "`scene.bearings={}`"
         )
+
+
+def _of_gear(at: _At, name: str) -> Any:
+    if at.scene.gear is None:
+        raise InputError(
+            f"the term `{name}` needs the section `scene.timing_gear`; add it with "
+            "`scene.timing_gear.stiffness_N_m_per_rad` and `scene.timing_gear.backlash_mm`"
+        )
+    return at.forces.of_motion
 
 
 EQUIVALENT = "bearing_load_equivalent_N"
@@ -286,6 +166,41 @@ GEAR = tuple(
 """
 OF_MOTION = (*BEARING, *RESERVES, *GEAR)
 """Names of all terms that an evaluation takes from the motion itself."""
+# Formulas of the terms that are to be minimised, and to be maximised.
+_LESS: dict[str, Callable[[_At], Any]] = {
+    "mean_force_N": lambda at: at.forces.mean,
+    "peak_force_N": lambda at: at.forces.peak,
+    "rms_force_N": lambda at: at.forces.rms,
+    "polar_inertia_kg_m2": lambda at: at.scene.inertia(at.shape),
+    "outer_radius_mm": lambda at: at.shape.outer_radius / MM,
+    "area_mm2": lambda at: at.shape.area / MM**2,
+    "flow_ripple": lambda at: ripple_of(at.scene, at.profile, at.shape),
+    "leakage_fraction": lambda at: 1 - _leakage(at, "leakage_fraction").efficiency,
+    "angular_play_min_mrad": lambda at: jnp.min(play_of(at.scene, at.profile).total) / MRAD,
+    "static_bearing_load_max_N": lambda at: jnp.max(
+        _still_loads(at, "static_bearing_load_max_N")[1]
+    ),
+    "static_bearing_load_equivalent_N": lambda at: jnp.max(
+        _still_loads(at, "static_bearing_load_equivalent_N")[0]
+    ),
+    **{name: partial(_of_bearings, name=name) for name in BEARING},
+    **{name: partial(_of_gear, name=name) for name in GEAR},
+}
+_MORE: dict[str, Callable[[_At], Any]] = {
+    "area_efficiency": lambda at: at.shape.area_efficiency,
+    "root_radius_mm": lambda at: at.shape.root_radius / MM,
+    "undercut_margin_mm": lambda at: at.shape.undercut_margin / MM,
+    "seal_width_mm": lambda at: at.shape.seal_width / MM,
+    "displaced_volume_cm3": lambda at: flow.displaced_volume(at.shape, at.scene.length) / CM3,
+    "theoretical_flow_l_min": _flow,
+    "delivered_flow_l_min": lambda at: _flow(at) * _leakage(at, "delivered_flow_l_min").efficiency,
+    # Backlash up to which a timing gear keeps the flanks apart; negative where the rotors overlap.
+    "gear_backlash_max_mm": lambda at: play_of(at.scene, at.profile).gear_backlash / MM,
+    "flank_gap_min_um": lambda at: jnp.min(_gaps(at, "flank_gap_min_um")) / UM,
+    "flank_gap_mean_um": lambda at: jnp.mean(_gaps(at, "flank_gap_mean_um")) / UM,
+    SILENT: _silent,
+    **{name: partial(_of_gear, name=name) for name in RESERVES},
+}
 _terms: dict[str, Term] = {}
 
 
@@ -393,35 +308,6 @@ def sense_of(name: str) -> Literal["min", "max"]:
     return terms_of([name])[0].sense
 
 
-def _own() -> dict[str, Any]:
-    return {
-        "mean_force_N": ForceTerm("mean"),
-        "peak_force_N": ForceTerm("peak"),
-        "rms_force_N": ForceTerm("rms"),
-        "polar_inertia_kg_m2": InertiaTerm(),
-        "outer_radius_mm": GeometryTerm("outer_radius", MM),
-        "area_mm2": GeometryTerm("area", MM**2),
-        "area_efficiency": LargeTerm("area_efficiency", 1.0),
-        "root_radius_mm": LargeTerm("root_radius", MM),
-        "undercut_margin_mm": LargeTerm("undercut_margin", MM),
-        "seal_width_mm": LargeTerm("seal_width", MM),
-        "displaced_volume_cm3": DisplacementTerm(),
-        "theoretical_flow_l_min": FlowTerm(delivered=False),
-        "flow_ripple": RippleTerm(),
-        "gear_backlash_max_mm": BacklashTerm(),
-        "leakage_fraction": LossTerm(),
-        "delivered_flow_l_min": FlowTerm(delivered=True),
-        "angular_play_min_mrad": PlayTerm(),
-        SILENT: SilentTerm(),
-        "flank_gap_min_um": GapTerm(mean=False),
-        "flank_gap_mean_um": GapTerm(mean=True),
-        "static_bearing_load_max_N": StaticBearingTerm(equivalent=False),
-        "static_bearing_load_equivalent_N": StaticBearingTerm(equivalent=True),
-        **{name: BearingTerm(name, name in BEARING[2:]) for name in BEARING},
-        **{name: ReserveTerm(name) for name in RESERVES},
-        **{name: GearTerm(name) for name in GEAR},
-    }
-
-
-for _name, _term in _own().items():
-    register_term(_name, _term)
+for _kind, _formulas in ((Formula, _LESS), (LargeFormula, _MORE)):
+    for _name in _formulas:
+        register_term(_name, _kind(_name))

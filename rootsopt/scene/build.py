@@ -21,8 +21,14 @@ from rootsopt.config.units import DEG
 from rootsopt.contact.gap import Contact
 from rootsopt.contact.law import ContactLaw
 from rootsopt.contact.search import SearchContact
-from rootsopt.contact.twisted import TwistedContact, slices_of
-from rootsopt.contact.worn import WornContact, wear_series
+from rootsopt.contact.wrapped import (
+    TwistedContact,
+    WornContact,
+    greatest_twist,
+    slices_needed,
+    slices_of,
+    wear_series,
+)
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.parts import (
     AxisLoads,
@@ -40,15 +46,13 @@ from rootsopt.dynamics.parts import (
     TimingGear,
     TwistedLoad,
 )
+from rootsopt.dynamics.parts.base import Timescales
 from rootsopt.dynamics.steady import Solver
-from rootsopt.dynamics.timescales import Timescales
 from rootsopt.profiles import Geometry, Outline, Profile, geometry
 from rootsopt.profiles.geometry import Soundness, soundness
 from rootsopt.runtime.environment import check_precision
 from rootsopt.scene import families, reading
-from rootsopt.scene.bearings import GRAVITY, Bearings, bearings_of
-from rootsopt.scene.medium import Medium, medium_of
-from rootsopt.scene.slicing import greatest_twist, slices_needed
+from rootsopt.scene.reading import GRAVITY, Bearings, Medium, bearings_of, medium_of
 
 # Mean error of the contact torque of twisted rotors, relative to its maximum.
 _SLICE_ERROR = 1e-2
@@ -407,5 +411,4 @@ class _Static(eqx.Module):
 
 
 def _as_arrays(tree):
-    """Return `tree` with its numbers converted to arrays."""
     return jax.tree.map(lambda x: jnp.asarray(x, float) if isinstance(x, int | float) else x, tree)

@@ -47,7 +47,6 @@ def shape_of(config: Config) -> Geometry:
 
 @CachedFunction
 def _shape(scene: Scene, design):
-    """Return the geometry of a design (d,) in config units."""
     return geometry(scene.profile(design))
 
 

@@ -20,7 +20,6 @@ from rootsopt.runtime.programs import CachedFunction
 
 # Number of operations for a point of a flank above which a family has a note.
 _MOST_OPERATIONS = 1500
-
 # Units of margins that are not lengths: name of the unit, and its SI value.
 _UNITS = {"turning": ("deg", DEG), "order": ("deg", DEG), "rolling": ("", 1.0), "limits": ("", 1.0)}
 
@@ -183,13 +182,11 @@ def margins_of(config: ProfileConfig) -> dict[str, float]:
 
 @CachedFunction
 def _margins(family, lobes, pitch_radius, design):
-    """Return the margins (SI units) of the profile of a design in config units."""
     return margins(profile_of(family, lobes, pitch_radius, design))
 
 
 @CachedFunction
 def _soundness(family, lobes, pitch_radius, design):
-    """Return the margins of all checks of a profile's design, in config units."""
     profile = profile_of(family, lobes, pitch_radius, design)
     return soundness(profile, None, family_of(family).inherent)
 

@@ -1,23 +1,24 @@
-"""Converts a config into the parts of a scene: SI quantities, contact law, parts, solver."""
+"""Converts a config into the parts of a scene: SI quantities, contact law, parts, fluid, solver."""
 
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from rootsopt.config import Config
 from rootsopt.config.units import DEG, MM, RPM, UM
-from rootsopt.contact.impact import ImpactLaw
+from rootsopt.contact.law import ImpactLaw
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.parts import Friction, GearErrors, MotorDrive, Supports, TimingGear
 from rootsopt.dynamics.steady import Solver
 from rootsopt.measured.table import transmission_error
 
-# Limit on the number of solver steps for a whole orbit, as a multiple of the number that the
-# config allows per mesh period.
+# Limit on the number of solver steps for a whole orbit, as a multiple of the number that the config
+# allows per mesh period.
 _ORBIT_STEPS = 4
 
 
@@ -180,3 +181,103 @@ def measures(config: Config) -> Measures:
 
 def _optional(value: float | None, unit: float = 1.0) -> Float[Array, ""] | None:
     return None if value is None else jnp.asarray(value * unit)
+
+
+# One millipascal-second (Pa·s).
+_MPA_S = 1e-3
+
+
+class Gas(eqx.Module):
+    """An ideal gas: `inlet_pressure` (Pa), `temperature` (K), `gas_constant` (J/(kg·K)) and
+    `heat_ratio`, the ratio of its specific heats."""
+
+    inlet_pressure: Float[Array, ""]
+    temperature: Float[Array, ""]
+    gas_constant: Float[Array, ""]
+    heat_ratio: Float[Array, ""]
+
+
+class Medium(eqx.Module):
+    """What leakage needs beyond a simulation, in SI units.
+
+    `viscosity` (Pa·s); `pressure_difference` (Pa), discharge minus suction. `tip_clearance`,
+    `end_clearance` (m), `None`: no leakage there; `tips`: tips that seal in series.
+    `radial_allowance` (m): radius by which both rotors are smaller everywhere. `strain`: growth of
+    the housing minus that of the rotors, as a fraction of any length; `None`: all have the same
+    temperature. `gas`: `None` for a liquid."""
+
+    viscosity: Float[Array, ""]
+    pressure_difference: Float[Array, ""]
+    tip_clearance: Float[Array, ""] | None
+    end_clearance: Float[Array, ""] | None
+    radial_allowance: Float[Array, ""]
+    strain: Float[Array, ""] | None
+    gas: Gas | None
+    tips: int = eqx.field(static=True)
+
+
+def medium_of(config: Config) -> Medium | None:
+    """Return the medium of a config; `None` if it has no section `pump`."""
+    pump = config.pump
+    if pump is None:
+        return None
+    gas, across = pump.gas, pump.pressure_difference_Pa
+    wear, heat, tip = config.contact.wear, config.scene.heat, pump.tip_clearance_mm
+    if wear is not None and tip is not None:
+        tip = tip + wear.offset_mm
+    assert across is not None
+    return Medium(
+        viscosity=jnp.asarray(pump.viscosity_mPa_s * _MPA_S),
+        pressure_difference=jnp.asarray(across),
+        tip_clearance=_optional(tip, MM),
+        end_clearance=_optional(pump.end_clearance_mm, MM),
+        radial_allowance=jnp.asarray(pump.radial_allowance_mm * MM),
+        strain=None if heat is None else jnp.asarray(heat.strain),
+        gas=None
+        if gas is None
+        else Gas(
+            inlet_pressure=jnp.asarray(gas.inlet_pressure_Pa),
+            temperature=jnp.asarray(gas.temperature_K),
+            gas_constant=jnp.asarray(gas.gas_constant_J_per_kg_K),
+            heat_ratio=jnp.asarray(gas.heat_ratio),
+        ),
+        tips=pump.tips_in_series,
+    )
+
+
+GRAVITY = 9.80665
+"""Standard acceleration of free fall (m/s²)."""
+# Exponents of the life of bearings (ISO 281).
+_EXPONENTS = {"ball": 3.0, "roller": 10 / 3}
+
+
+class Bearings(eqx.Module):
+    """Two bearings per rotor, equally far from its end faces, and the gear beyond one.
+
+    `tooth_angle` (rad): pressure angle of the timing gear; `port` (rad): angle before the lowest
+    point of the bore at which a pocket opens to discharge; `distance` (m): of each bearing from the
+    nearer end face; `gear_distance` (m): of the timing gear from the end face at z = L/2;
+    `exponent`: p of the equivalent load, (mean |F|^p)^(1/p); `heavy`: whether the rotors' weight
+    counts."""
+
+    tooth_angle: Float[Array, ""]
+    port: Float[Array, ""]
+    distance: Float[Array, ""]
+    gear_distance: Float[Array, ""]
+    exponent: float = eqx.field(static=True)
+    heavy: bool = eqx.field(static=True)
+
+
+def bearings_of(config: Config) -> Bearings | None:
+    """Return the bearings of a config; `None` if it has no section `scene.bearings`."""
+    given = config.scene.bearings
+    if given is None:
+        return None
+    return Bearings(
+        tooth_angle=jnp.asarray(given.gear_pressure_angle_deg * DEG),
+        port=jnp.asarray(given.port_deg * DEG),
+        distance=jnp.asarray(given.bearing_distance_mm * MM),
+        gear_distance=jnp.asarray(given.gear_distance_mm * MM),
+        exponent=_EXPONENTS[given.kind],
+        heavy=given.weight,
+    )

@@ -1,5 +1,10 @@
-"""One point of a sweep: its config, its evaluation, and the record that is kept of it."""
+"""Points of a sweep: their configs, their evaluations, and the records that are kept of them.
 
+Points of the same structure share compiled programs. On a CPU, a thread per core works through them
+one by one: as arrays, all motions would take as many steps as the longest. On an accelerator, they
+are stepped together as arrays."""
+
+import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,14 +18,19 @@ from rootsopt.config.sources import FILES
 from rootsopt.config.words import sentence
 from rootsopt.errors import InputError
 from rootsopt.response.evaluation import Evaluation, Evaluator
-from rootsopt.response.together import evaluate_together
+from rootsopt.response.many import HERE
+from rootsopt.response.together import evaluate_together, pays
 from rootsopt.scene import check_geometry
 from rootsopt.status import Status
 
 Row = dict[str, Any]
 """Record of one point as plain values: `status` (label), `message`, `response`, `gradient`,
 `steady_state`, `geometry`. Dictionaries are empty if nothing is known."""
+Numbered = tuple[int, dict[str, Any]]
+"""Number of a point, and its values by dotted key."""
 _FAMILY = "profile.family"
+# Number of points that an accelerator steps together.
+_BATCH = 256
 
 
 def prepared(key: str, value: Any) -> Any:
@@ -64,15 +74,38 @@ def simulated(config: Config, values: Mapping[str, Any]) -> Row:
         return _lost_by(error)
 
 
+def at_once(config: Config, points: Sequence[Numbered]) -> list[tuple[int, Row]]:
+    """Return (number, record) of all `points`, in this thread."""
+    numbers, every = zip(*points, strict=True)
+    rows = (simulated(config, values) for values in every)
+    return [*zip(numbers, simulated_together(config, every) if pays() else rows, strict=True)]
+
+
+class InProcess:
+    """Simulates points of a sweep in this process."""
+
+    def __init__(self) -> None:
+        self.slots = 1 if pays() else HERE.slots
+
+    def share(self, count: int) -> int:
+        """Return the number of points in a chunk, for a sweep of `count` points."""
+        return min(count, _BATCH) if pays() else 1
+
+    def simulated(
+        self, config: Config, points: Sequence[Numbered], stop: threading.Event
+    ) -> list[tuple[int, Row]]:
+        """Return (number, record) of `points`; `stop` has no effect on a chunk."""
+        del stop
+        return at_once(config, points)
+
+
 def _evaluator(config: Config, values: Mapping[str, Any]) -> Evaluator:
-    """Return the evaluator of a point. Raises `InputError` if its config is not valid."""
     one = configured(config, values)
     check_geometry(one)
     return Evaluator.of_objective(one)
 
 
 def _lost_by(error: Exception) -> Row:
-    """Return the record of a point that ended with an error."""
     if isinstance(error, InputError):
         return lost(Status.INVALID, str(error))
     return lost(Status.FAILED, f"{type(error).__name__}: {error}")

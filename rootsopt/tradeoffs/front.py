@@ -14,7 +14,7 @@ from rootsopt.optimize.certificate import RESIDUAL
 from rootsopt.optimize.infeasible import Infeasible
 from rootsopt.response.evaluation import Evaluation
 from rootsopt.status import Standing, Status
-from rootsopt.tradeoffs.aims import Aim
+from rootsopt.tradeoffs.study import Aim
 
 EQUAL = 1e-6
 """Difference between two designs in a term (fraction of its range along the front) below which the

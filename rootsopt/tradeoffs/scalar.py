@@ -14,8 +14,15 @@ Steuer and Choo, An interactive weighted Tchebycheff procedure, Mathematical Pro
 
 The maximum is one `Group` of branches. The certificate gives the share of each branch. The shares
 are the weights of the terms at the optimum, and their ratios are the rates at which the terms
-trade."""
+trade.
 
+The reference points of a front form a grid: a line for two terms, a triangle for three. A *key*
+identifies one of them by one whole number per term; their sum is the number of divisions. At the
+end of a term (the optimum of this term alone), the number of this term is that sum, and all others
+are 0."""
+
+import itertools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -120,3 +127,39 @@ def end_scale(baseline: NDArray[np.float64], screened: NDArray[np.float64]) -> S
     spread = np.ptp(screened, axis=0) if len(screened) else np.zeros_like(magnitude)
     width = np.where(magnitude > 1e-3 * spread, magnitude, spread)
     return Scale(np.zeros_like(width), np.where(width > 0, width, 1.0))
+
+
+Key = tuple[int, ...]
+
+
+def keys(count: int, divisions: int) -> list[Key]:
+    """Return all keys for `count` terms, beginning with the end of the first term. `divisions`:
+    number of steps from one end to another.
+
+    Subtract one of the `directions` from a key to get a neighbour that comes before it."""
+    every = itertools.product(range(divisions, -1, -1), repeat=count)
+    return [key for key in every if sum(key) == divisions]
+
+
+def corners(count: int, divisions: int) -> list[Key]:
+    """Return the keys of the ends of the front, in the order of the `count` terms."""
+    return [tuple(divisions * (i == k) for i in range(count)) for k in range(count)]
+
+
+def directions(count: int) -> list[Key]:
+    """Return the steps from a key to those neighbours that come after it in `keys`, for `count`
+    terms."""
+    pairs = itertools.combinations(range(count), 2)
+    return [tuple((k == j) - (k == i) for k in range(count)) for i, j in pairs]
+
+
+def links(found: Sequence[Key]) -> list[tuple[int, int]]:
+    """Return the pairs of neighbours on the grid, as indices of the keys in `found`."""
+    place = {key: number for number, key in enumerate(found)}
+    pairs = []
+    for key, number in place.items():
+        for step in directions(len(key)):
+            other = place.get(tuple(a + b for a, b in zip(key, step, strict=True)))
+            if other is not None:
+                pairs.append((number, other))
+    return pairs

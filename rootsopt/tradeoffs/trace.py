@@ -39,43 +39,52 @@ from rootsopt.response.starts import Seeds
 from rootsopt.runtime.threads import one_thread
 from rootsopt.scene import check_geometry
 from rootsopt.status import Standing
-from rootsopt.sweeps.evaluations import evaluating
-from rootsopt.tradeoffs.assembly import Node, gaps_of, points_of, selected, spacing_of
-from rootsopt.tradeoffs.course import Course, Seen
+from rootsopt.sweeps.cluster import running
+from rootsopt.tradeoffs.assembly import (
+    Bisections,
+    Edge,
+    Node,
+    Pair,
+    Spacing,
+    divides,
+    gaps_of,
+    points_of,
+    selected,
+    spacing_of,
+)
 from rootsopt.tradeoffs.front import Front
-from rootsopt.tradeoffs.gaps import Bisections, Edge, Pair, Spacing, divides
-from rootsopt.tradeoffs.lattice import Key, corners, directions, keys, links
-from rootsopt.tradeoffs.scalar import Scalar, Scale, end_scale
-from rootsopt.tradeoffs.study import Sample, Study
+from rootsopt.tradeoffs.scalar import (
+    Key,
+    Scalar,
+    Scale,
+    corners,
+    directions,
+    end_scale,
+    keys,
+    links,
+)
+from rootsopt.tradeoffs.study import Course, Sample, Seen, Study
 
 # Gain in the objective (fraction of a term's range) above which a design evaluated earlier starts
 # another search.
 _BETTER = 1e-4
-
 # Excess over the best objective (fraction of a term's range) below which a design evaluated
 # earlier, far from the best one, starts another search.
 _PROMISING = 0.25
-
 # Distance in the unit box above which two designs count as distant from each other.
 _APART = 0.15
-
 # Minimum effort where no term needs a simulation: number of evaluations per search, of starts per
 # end, and of screened designs.
 _CHEAP_EVALUATIONS, _CHEAP_STARTS, _CHEAP_SCREENING = 300, 6, 64
-
 # Difference between the objectives of two searches (fraction of a term's range) below which a
 # search that has converged counts as the better one.
 _EQUAL = 1e-7
-
 # Accuracy (fraction of the gap's width) with which the sides of a gap are located.
 _SHARP = 0.01
-
 # Maximum number of points at which the search for the least violation of the constraints starts.
 _EXPLAINED = 8
-
 # Relative difference of a term between search and verification above which a point is dropped.
 _HOLDS_UP = 0.01
-
 # Range of a term over the ends (relative to its scale) below which the terms do not conflict.
 _SAME_ENDS = 1e-6
 
@@ -92,7 +101,8 @@ class Tracer:
     evaluated; `checkpoint`: file that stores every evaluation and supplies those of an interrupted
     search.
 
-    Raises `InputError` if there is no design parameter."""
+    The baseline is evaluated at once. Raises `InputError` if there is no design parameter, for
+    unknown terms, or for a scene that cannot be simulated."""
 
     def __init__(
         self,
@@ -109,39 +119,26 @@ class Tracer:
                 f"{config.profile.family}: it has no design parameter; use `simulate` for it, "
                 "or make the twist one with `optimizer.bounds.helix_deg`"
             )
-        self.config, self.runs, self.checkpoint = config, runs, checkpoint
+        self.config, self.runs = config, runs
         self.progress = progress or (lambda done, expected: None)
         self.stop = threading.Event() if stop is None else stop
-        self._study: Study | None = None
+        self.study = Study.of(config, runs, checkpoint)
+        # Those of the grid, then those found by bisection, which have keys of one number.
         self._nodes: dict[Key, Node] = {}
-        self._extra: list[Node] = []
         self._gaps = Bisections([])
         self._spacing = Spacing(np.inf, np.inf)
-        self._scale: Scale | None = None
+        count = len(self.study.aims)
+        self.scale = Scale(np.zeros(count), np.ones(count))  # Until designs are screened.
         self._course = Course()
         self._lock = threading.Lock()
         self._searches = self._evaluations = 0
         self._expected = 0
 
-    @property
-    def study(self) -> Study:
-        """The study that evaluates designs; available once the baseline has been evaluated."""
-        assert self._study is not None
-        return self._study
-
-    @property
-    def scale(self) -> Scale:
-        """Scale of the terms; available after the screening, final once the ends are known."""
-        assert self._scale is not None
-        return self._scale
-
     def run(self) -> Front:
-        """Evaluate the baseline, find the ends, trace the front, and verify its points.
+        """Find the ends, trace the front, and verify its points.
 
-        Return the front. If `stop` is set, the front has the points found so far.
-
-        Raises `InputError` for unknown terms, or for a scene that cannot be simulated."""
-        study = self._study = Study.of(self.config, self.runs, self.checkpoint)
+        Return the front. If `stop` is set, the front has the points found so far."""
+        study = self.study
         if not study.usable or self.stop.is_set():
             return self._front([])
         points = self._feasible()
@@ -154,16 +151,11 @@ class Tracer:
             self._bisect()
         return self._front(self._verified(self._all()))
 
-    def so_far(self) -> Front | None:
+    def so_far(self) -> Front:
         """Return the points found so far, without verification.
 
-        Return `None` until the baseline has been evaluated. Another thread can call this method
-        during the search."""
-        if self._study is None:
-            return None
-        with self._lock:
-            nodes = [*self._nodes.values(), *self._extra]
-        return self._front(nodes)
+        Another thread can call this method during the search."""
+        return self._front(self._all())
 
     # The ends of the front.
 
@@ -179,7 +171,6 @@ class Tracer:
         return [point for point in self._sample if problem.feasible(point)]
 
     def _screen(self, points: Sequence[NDArray[np.float64]]) -> None:
-        """Evaluate `points`, keep their terms, and set the scale for the ends."""
         found = self._side_by_side(self._screened, points)
         signs = np.array([aim.sign for aim in self.study.aims])
         names = [aim.name for aim in self.study.aims]
@@ -196,7 +187,7 @@ class Tracer:
         self._evaluations += len(points)
         baseline = signs * [self.study.problem.baseline.response[name] for name in names]
         every = np.array([one.values for one in self._course.seen]).reshape(-1, len(names))
-        self._scale = end_scale(baseline, every)
+        self.scale = end_scale(baseline, every)
 
     def _side_by_side(self, work: Callable[[Task], Done], tasks: Iterable[Task]) -> list[Done]:
         """Return `work(task)` for all tasks, in their order; they run side by side."""
@@ -230,7 +221,7 @@ class Tracer:
         width = np.ptp(ends, axis=0)
         conflict = bool(np.all(width > _SAME_ENDS * self.scale.width))
         if conflict:
-            self._scale = Scale(np.min(ends, axis=0), width)
+            self.scale = Scale(np.min(ends, axis=0), width)
         return conflict and not self.stop.is_set()
 
     def _solved_from(
@@ -272,16 +263,18 @@ class Tracer:
         return wanted.points - 1 if len(wanted.terms) == 2 else wanted.divisions
 
     def _reference(self, key: Key) -> NDArray[np.float64]:
-        """Return the reference point (k,) of a `key` of the grid, in scaled terms."""
         ends = [self._nodes[one].sample.values for one in corners(len(key), self._divisions)]
         return np.array(key) / self._divisions @ self.scale.of(np.array(ends))
 
     def _trace(self) -> None:
-        """Solve all points between the ends, by two chains and by further searches."""
         inner = [k for k in keys(len(self.study.aims), self._divisions) if k not in self._nodes]
         ends = dict(self._nodes)
         chains = self._side_by_side(lambda ahead: self._chain(inner, ends, ahead), (True, False))
-        self._course.join(chains)
+        self._course.join([course for course, _ in chains])
+        # In a fixed order: of two that are equally good, the first counts.
+        best = {key: _better(*(nodes.get(key) for _, nodes in chains)) for key in inner}
+        with self._lock:
+            self._nodes = ends | {key: node for key, node in best.items() if node is not None}
 
         def finish(key: Key) -> Course:
             course, scalar = self._course.branch(), self._scalar(key)
@@ -293,11 +286,12 @@ class Tracer:
         self._course.join(self._side_by_side(finish, inner))
 
     def _scalar(self, key: Key) -> Scalar:
-        """Return the objective of a point between the ends."""
         return Scalar(self.scale, self._reference(key), tuple(range(len(key))))
 
-    def _chain(self, inner: Sequence[Key], ends: Mapping[Key, Node], ahead: bool) -> Course:
-        """Solve the points `inner` from neighbour to neighbour, and return the course.
+    def _chain(
+        self, inner: Sequence[Key], ends: Mapping[Key, Node], ahead: bool
+    ) -> tuple[Course, dict[Key, Node]]:
+        """Solve the points `inner` from neighbour to neighbour; return the course and all nodes.
 
         `ends`: nodes to begin from; `ahead`: whether in the order given, or in the opposite one."""
         course, nodes = self._course.branch(), {**ends}
@@ -311,10 +305,9 @@ class Tracer:
             if best is not None:
                 nodes[key] = best
                 self._keep(key, best)
-        return course
+        return course, nodes
 
     def _keep(self, key: Key, node: Node | None) -> None:
-        """Keep a `node` for a `key` of the grid, if it is better than the one known."""
         with self._lock:
             best = _better(self._nodes.get(key), node)
             if best is not None:
@@ -424,9 +417,8 @@ class Tracer:
     # Gaps.
 
     def _all(self) -> list[Node]:
-        """Return all nodes, those of the ends first."""
         with self._lock:
-            return [*self._nodes.values(), *self._extra]
+            return [*self._nodes.values()]
 
     def _bisect(self) -> None:
         """Search between neighbours that lie far apart, as long as refinements are left."""
@@ -457,7 +449,6 @@ class Tracer:
         return max(open_ones, key=spacing.excess, default=None)
 
     def _divide(self, edge: Edge, nodes: Sequence[Node]) -> None:
-        """Search for a point between two neighbours, and record it, or the gap."""
         ends = [nodes[k] for k in edge.pair]
         values = [self.scale.of(node.sample.values) for node in ends]
         middle = np.mean(values, axis=0)
@@ -476,7 +467,7 @@ class Tracer:
             gaps.closed[pair], gaps.tried[pair] = kind, gaps.tried[edge.pair]
             return
         with self._lock:
-            self._extra.append(best)
+            self._nodes[(len(self._nodes),)] = best
         gaps.divided(edge.pair, len(nodes))
 
     def _sharpened(self, pair: Pair) -> Pair:
@@ -501,13 +492,12 @@ class Tracer:
             found = self.scale.of(best.sample.values)
             if found[lead] < start[lead] - _BETTER and found[1 - lead] < limit[1 - lead]:
                 with self._lock:
-                    self._extra.append(best)
+                    self._nodes[(len(self._nodes),)] = best
                 moved = len(self._all()) - 1
                 first, second = (first, moved) if lead == 0 else (moved, second)
         return min(first, second), max(first, second)
 
     def _scaled(self, number: int) -> NDArray[np.float64]:
-        """Return the scaled terms (k,) of a node."""
         return self.scale.of(self._all()[number].sample.values)
 
     # The result.
@@ -525,7 +515,6 @@ class Tracer:
         return [known.get(k, node) for k, node in enumerate(nodes)]
 
     def _checked(self, node: Node) -> Node:
-        """Return a node after its design has been simulated again from rest, unless stopped."""
         if self.stop.is_set():
             return node
         sample = self.study.verified(node.sample.point)
@@ -612,5 +601,5 @@ def pareto_front(
     [39.0, 43.1, 47.8]
     """
     check_geometry(config)
-    with evaluating(workers, scheduler) as runs:
+    with running(workers, scheduler) as runs:
         return Tracer(config, progress, runs=runs).run()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rootsopt.contact import ImpactLaw
-from rootsopt.contact.point import ContactPoint
+from rootsopt.contact.gap import ContactPoint
 from rootsopt.contact.search import SearchContact
 from rootsopt.dynamics.parts import (
     ConstantLoad,

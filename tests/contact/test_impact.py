@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from rootsopt.contact.impact import ImpactLaw
+from rootsopt.contact.law import ImpactLaw
 
 K, E, C, D = 1e8, 1.5, 1000.0, 1e-3
 MASS, SPEED = 1.0, 1.0

@@ -7,7 +7,7 @@ import pytest
 
 import rootsopt
 from rootsopt import InputError, Scene
-from rootsopt.contact.worn import WornContact, series_at, wear_series, wear_shape
+from rootsopt.contact.wrapped import WornContact, series_at, wear_series, wear_shape
 from rootsopt.profiles import EE
 from rootsopt.response.scatter import draw, shifts
 from tests.conformance.families import LOBES, R, made

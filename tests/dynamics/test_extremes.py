@@ -11,13 +11,12 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from rootsopt.config import load
-from rootsopt.contact.impact import ImpactLaw, force_rounding
+from rootsopt.contact.law import ImpactLaw, force_rounding
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.orbit import Orbit
 from rootsopt.dynamics.parts import TimingGear
-from rootsopt.dynamics.steady import final
-from rootsopt.dynamics.timescales import Timescales
-from rootsopt.dynamics.verdict import is_consistent, is_idle, judged
+from rootsopt.dynamics.parts.base import Timescales
+from rootsopt.dynamics.steady import final, is_consistent, is_idle, is_steady
 from rootsopt.errors import InputError
 from rootsopt.response.evaluation import Evaluator, _motion
 from rootsopt.scene import Scene, check_geometry, design_vector
@@ -151,7 +150,7 @@ def orbit_of(multipliers=(0.5, 0.1), size=1.0, residual=0.0, peak=1.0, depth=1e-
     )
 
 
-judgement = jax.jit(judged)
+judgement = jax.jit(is_steady)
 
 
 def accepted(orbit, rtol=1e-8, moved=0.0, residual=1e-9):

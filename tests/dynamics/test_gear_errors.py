@@ -15,8 +15,8 @@ from rootsopt.dynamics.flow import one_period, strobe
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.parts import GearErrors
+from rootsopt.dynamics.parts.base import Timescales
 from rootsopt.dynamics.steady import Solver
-from rootsopt.dynamics.timescales import Timescales
 from rootsopt.dynamics.window import lyapunov
 from rootsopt.scene import Scene, design_vector
 from rootsopt.status import Status

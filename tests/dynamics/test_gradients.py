@@ -160,7 +160,7 @@ def test_jump_is_a_switch(lobes, depth):
     @jax.jit
     def look(roll):
         found = pair(roll, jnp.asarray(-depth))
-        return found.normal2, pair.switches(roll, found)
+        return found.normal2, pair.margins(roll, found) > 0
 
     normals, switches = (np.asarray(x) for x in jax.lax.map(look, rolls))
     jumps = np.flatnonzero(np.abs(np.diff(normals)) > 3 * depth)

@@ -10,10 +10,9 @@ import pytest
 
 from experiments._common.shooting import closed, differentiated
 from rootsopt.config import load
-from rootsopt.dynamics.integrator import Integrator
-from rootsopt.dynamics.landing import LandingControl
+from rootsopt.dynamics.integrator import Integrator, LandingControl
 from rootsopt.dynamics.orbit import Orbit
-from rootsopt.dynamics.verdict import agreement, verdict
+from rootsopt.dynamics.steady import agreement, verdict
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.scene import Scene, design_vector
 from rootsopt.status import Status

@@ -17,7 +17,7 @@ from rootsopt.config import load
 from rootsopt.pump.sheet import play_of
 from rootsopt.response import evaluation
 from rootsopt.response.evaluation import Evaluator
-from rootsopt.response.touching import touching
+from rootsopt.response.sensitivity import touching
 from rootsopt.scene import Scene, outline_mm
 from rootsopt.status import Status
 
@@ -174,19 +174,18 @@ def test_share_of_machines_that_touch_has_a_closed_form():
     over = "contact.clearance_mm: {uniform: 0.14}, scene.timing_gear.backlash_mm: {uniform: 0.01}"
     config = load("cic_drawn", [*APART, f"tolerances={{over: {{{over}}}}}"])
     found = touching(config)
-    record = found.record()
-    assert found.reserve == pytest.approx(held().response["contact_reserve_um"], rel=1e-4)
-    assert found.gradient[0] == pytest.approx(1e3, rel=1e-6)
-    share = (140 - found.reserve) / 280
-    error = np.sqrt(share * (1 - share) / record["machines"])
+    clearance, backlash = found["keys"]
+    reserve = found["contact_reserve_um"]
+    assert reserve == pytest.approx(held().response["contact_reserve_um"], rel=1e-4)
+    assert clearance["contact_reserve_um_per_unit"] == pytest.approx(1e3, rel=1e-6)
+    share = (140 - reserve) / 280
+    error = np.sqrt(share * (1 - share) / found["machines"])
     assert 0.02 < share < 0.2
-    assert 0.01 * abs(found.gradient[1]) < 140 - found.reserve
+    assert backlash["lost_at_most_um"] < 140 - reserve
     for name in ("touching_share", "touching_share_first_order"):
-        assert record[name] == pytest.approx(share, abs=4 * error)
-    assert record["keys"][0]["key"] == "contact.clearance_mm"
-    assert record["simulated_touching"] == record["model_touching"]
-    apart = found.simulated > 0
-    assert found.simulated[apart] == pytest.approx(found.model[apart], abs=0.05)
+        assert found[name] == pytest.approx(share, abs=4 * error)
+    assert clearance["key"] == "contact.clearance_mm"
+    assert found["simulated_touching"] == found["model_touching"]
 
 
 def test_a_search_without_forces_simulates_nothing(monkeypatch):

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from rootsopt.dynamics.flow import integrated
 from rootsopt.dynamics.integrator import Integrator
-from rootsopt.dynamics.stepping import integrated
 
 START = (0.3, -1.2)
 """Angle (rad) and speed (rad per unit of time) of the pendulum at the start."""

@@ -11,9 +11,8 @@ import pytest
 import rootsopt
 from rootsopt import Scene
 from rootsopt.contact.search import SearchContact
-from rootsopt.contact.twisted import TwistedContact, slices_of
+from rootsopt.contact.wrapped import MOST, TwistedContact, sliced_mean, slices_needed, slices_of
 from rootsopt.dynamics.parts import TwistedLoad
-from rootsopt.scene.slicing import MOST, sliced_mean, slices_needed
 
 TIGHT = "solver.rtol=1e-11", "solver.accuracy=1e-6"
 PHI, DEPTHS = np.linspace(0, 2 * np.pi / 3, 1200, endpoint=False), (2e-4, -3e-4)

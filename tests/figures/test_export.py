@@ -25,7 +25,7 @@ from rootsopt.figures.drawing import Drawing, svg_text
 from rootsopt.figures.dxf import dxf_bytes
 from rootsopt.figures.pieces import Arc, Spline, outline_pieces, polyline
 from rootsopt.profiles import CIC, EE, geometry, outline, place_pair
-from rootsopt.response.series import Series
+from rootsopt.response.records import Series
 from rootsopt.scene import Scene, check_geometry, design_vector
 from rootsopt.scene.families import profile_of
 

@@ -12,7 +12,7 @@ from rootsopt.figures import runs
 from rootsopt.figures.history import plot_prices, plot_residual, plot_starts
 from rootsopt.figures.profiles import plot_departure, plot_forces_together
 from rootsopt.figures.style import figure
-from rootsopt.response.series import Series
+from rootsopt.response.records import Series
 from rootsopt.scene import outline_mm
 
 CIC = load("configs/cic_drawn.yaml")

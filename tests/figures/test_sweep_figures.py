@@ -12,7 +12,7 @@ from rootsopt.output.tables import scene_tables
 from rootsopt.status import Status
 from rootsopt.sweeps.plan import plan_of
 from rootsopt.sweeps.points import lost
-from rootsopt.sweeps.table import dataset_of
+from rootsopt.sweeps.scenes import dataset_of
 from tests.figures.test_optimum_figures import overlaps
 
 SPEED, PLAY = "scene.speed_rpm", "scene.timing_gear.backlash_mm"

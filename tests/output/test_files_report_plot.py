@@ -18,7 +18,7 @@ from rootsopt.figures.style import figure
 from rootsopt.output import files, names, tables, terminal
 from rootsopt.output.names import table
 from rootsopt.response.evaluation import Evaluation
-from rootsopt.response.series import Series
+from rootsopt.response.records import Series
 from rootsopt.status import Status
 
 CONFIG = """

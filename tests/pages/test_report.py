@@ -24,8 +24,7 @@ from rootsopt.pages.charts import animations
 from rootsopt.pages.gather import Run
 from rootsopt.pages.html import report_text
 from rootsopt.pages.words import glossary, linked
-from rootsopt.response.records import message_of
-from rootsopt.response.series import Series
+from rootsopt.response.records import Series, message_of
 from rootsopt.status import Status
 
 pytest.importorskip("bokeh")

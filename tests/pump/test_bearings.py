@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial import KDTree
 
 from rootsopt.dynamics.parts import GasLoad
-from rootsopt.dynamics.parts.resultants import GasResultant
+from rootsopt.dynamics.parts.load import GasResultant
 from rootsopt.profiles import geometry, place_pair
 from rootsopt.pump import flow, loads
 from tests.conformance.families import LOBES, R, made, outline_of

@@ -16,8 +16,7 @@ from rootsopt import load_config
 from rootsopt.errors import InputError
 from rootsopt.profiles import geometry, place_pair
 from rootsopt.profiles.epicycloid import circle_epicycloid
-from rootsopt.pump.gap import Allowances, mesh_gap, relative_curvature
-from rootsopt.pump.leakage import (
+from rootsopt.pump.flow import (
     critical_ratio,
     laminar_mass_flow,
     leakage,
@@ -26,10 +25,11 @@ from rootsopt.pump.leakage import (
     slot_flow,
     tip_length,
 )
+from rootsopt.pump.gap import Allowances, mesh_gap, relative_curvature
 from rootsopt.pump.sheet import KEYS, missing, sheet, warnings
 from rootsopt.response.terms import terms_of
 from rootsopt.scene import Scene, design_vector
-from rootsopt.scene.medium import Gas
+from rootsopt.scene.reading import Gas
 from tests.conformance.families import LOBES, R, made, outline_of
 
 AIR = Gas(*map(jnp.asarray, (1e5, 293.15, 287.05, 1.4)))

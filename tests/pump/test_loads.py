@@ -15,7 +15,7 @@ from rootsopt.profiles import geometry
 from rootsopt.pump import loads as formulas
 from rootsopt.pump.loads import BearingSet, static_loads
 from rootsopt.response.terms import Forces, needs_forces, terms_of
-from rootsopt.scene.bearings import GRAVITY
+from rootsopt.scene.reading import GRAVITY
 
 GAS, BEARINGS = "scene.load={pressure_difference_Pa: 5e4}", "scene.bearings={weight: true}"
 

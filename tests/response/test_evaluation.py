@@ -4,7 +4,7 @@ import numpy as np
 
 from rootsopt.dynamics.flanks import FlankForce
 from rootsopt.output import files
-from rootsopt.response import series
+from rootsopt.response import records
 from tests.standins import oscillator
 
 
@@ -19,9 +19,9 @@ def test_series_has_drive_and_coast_where_they_belong(monkeypatch):
     )  # fmt: skip
     physical = 0.2 * one, 0.3 * one
     monkeypatch.setattr(
-        series, "contact_series", lambda *args: (0.02, np.ones(count), physical, contact)
+        records, "contact_series", lambda *args: (0.02, np.ones(count), physical, contact)
     )
-    columns = files.response_columns(series.series_of(oscillator(), tau, states))
+    columns = files.response_columns(records.series_of(oscillator(), tau, states))
     expected = {
         "time_s": 0.02 * tau,
         "rotation_deg": 120 * tau,  # three lobes

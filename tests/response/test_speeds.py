@@ -10,7 +10,7 @@ from rootsopt.commands.console import main
 from rootsopt.config import load, parse
 from rootsopt.errors import InputError
 from rootsopt.optimize.problem import Problem
-from rootsopt.response import speeds
+from rootsopt.response import reducers
 from rootsopt.response.attractors import Coexisting
 from rootsopt.response.evaluation import Evaluator, _build, _motion
 from rootsopt.response.reducers import overall
@@ -221,12 +221,12 @@ def test_refusals_name_the_key(overrides, words):
 def test_speeds_of_a_config():
     """A config says which speeds are simulated and which count; so does the resolved config."""
     config = config_of(SPEEDS, WEIGHTS)
-    assert speeds.shares(config) == {2000: 0.25, 3000: 0, 4000: 0.75}
-    assert speeds.shares(speeds.alone(config)) == {3000: 1}
-    assert speeds.shares(config_of("objective.speeds_rpm=[3000]")) == {3000: 1}
+    assert reducers.shares(config) == {2000: 0.25, 3000: 0, 4000: 0.75}
+    assert reducers.shares(reducers.alone(config)) == {3000: 1}
+    assert reducers.shares(config_of("objective.speeds_rpm=[3000]")) == {3000: 1}
     assert parse(config.to_yaml()) == config
-    assert speeds.swept_speeds(config) == [2000, 4000]
-    default = speeds.swept_speeds(config_of())
+    assert reducers.swept_speeds(config) == [2000, 4000]
+    default = reducers.swept_speeds(config_of())
     assert (default[0], default[-1], len(default)) == (300, 6000, 39)
 
 

@@ -102,7 +102,7 @@ def test_table_keeps_names_apart():
         def value(self, scene, profile, shape, forces):
             return jnp.ones(())
 
-    with pytest.raises(ValueError, match="'area_mm2' is that of `GeometryTerm`"):
+    with pytest.raises(ValueError, match="'area_mm2' is that of `Formula`"):
         register_term("area_mm2", Nothing())
     with pytest.raises(ValueError, match="must be a word"):
         register_term("two words", Nothing())

@@ -321,9 +321,9 @@ def test_a_program_follows_the_code_that_it_imports(package):
         assert replaced(name, "\n\n\n", "\n\n\n# It's \"one\n\n\n") == first
     seen = [first]
     for name, old, new in (
-        ("dynamics/verdict.py", "= 1e-", "= 2e-"),  # imported by what is imported
+        ("dynamics/settle.py", "BLOCK = 4", "BLOCK = 8"),  # imported by what is imported
         ("profiles/cic.py", "return ", "return 2 * "),  # named by the table of families
-        ("dynamics/parts/gear.py", " - ", " + "),
+        ("dynamics/parts/machine.py", " - ", " + "),
         ("runtime/programs.py", "return [x for x in jax", "return [1 * x for x in jax"),
         ("scene/__init__.py", "\nfrom", "\nimport time\nfrom"),
     ):

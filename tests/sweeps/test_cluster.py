@@ -12,7 +12,8 @@ import pytest
 import rootsopt
 from rootsopt.config import load
 from rootsopt.errors import InputError
-from rootsopt.sweeps.cluster import Cluster
+from rootsopt.sweeps import cluster
+from rootsopt.sweeps.cluster import running
 from rootsopt.sweeps.plan import plan_of
 from rootsopt.sweeps.scenes import Points, complete
 from tests.sweeps.workers import DEADLY
@@ -29,7 +30,7 @@ def kill_a_worker() -> None:
             return
 
 
-def swept(path, plan, after=0, cluster=None):
+def swept(path, plan, after=0):
     """Sweep with two workers, and kill one after the first `after` points; return the journal."""
     config, killed = load("cic_drawn"), []
 
@@ -39,8 +40,8 @@ def swept(path, plan, after=0, cluster=None):
             kill_a_worker()
 
     journal = Points(config, plan, (), path)
-    cluster = cluster or Cluster(2, imports=(IMPORT,))
-    complete(config, plan, cluster.run, journal, progress)
+    with running(2, imports=(IMPORT,)) as runs:
+        complete(config, plan, runs, journal, progress)
     journal.close()
     assert bool(killed) == bool(after)
     return Points(config, plan, (), path, resume=True).rows
@@ -88,10 +89,9 @@ def test_simulated_points_are_those_of_one_process(tmp_path, monkeypatch):
 
 def test_workers_of_other_versions_are_refused(tmp_path, monkeypatch):
     monkeypatch.setenv("TEST_SECONDS", "0")
-    cluster = Cluster(1)
-    cluster._settings = cluster._settings._replace(versions=(("jax", "0.0.1"),))
+    monkeypatch.setattr(cluster, "versions", lambda: {"jax": "0.0.1"})
     with pytest.raises(InputError, match=r"jax .* instead of 0\.0\.1"):
-        swept(tmp_path / "points", plan_of({SPEED: "1,2"}), cluster=cluster)
+        swept(tmp_path / "points", plan_of({SPEED: "1,2"}))
 
 
 def test_missing_package_is_named(monkeypatch):
@@ -106,8 +106,8 @@ def test_missing_package_is_named(monkeypatch):
     [(0, None, "from 1 to"), (2, "tcp://127.0.0.1:1", "exclude each other")],
 )
 def test_wrong_clusters(workers, scheduler, words):
-    with pytest.raises(InputError, match=words):
-        Cluster(workers, scheduler)
+    with pytest.raises(InputError, match=words), running(workers, scheduler):
+        pass
 
 
 def test_scheduler_that_is_none(monkeypatch):

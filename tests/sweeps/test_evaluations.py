@@ -17,10 +17,8 @@ from rootsopt.config import load
 from rootsopt.errors import InputError
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.many import HERE, Point
-from rootsopt.sweeps import evaluations
-from rootsopt.sweeps.cluster import Cluster
-from rootsopt.sweeps.evaluations import ClosedError, DaskRunner, evaluating
-from rootsopt.sweeps.worker import Settings
+from rootsopt.sweeps import cluster
+from rootsopt.sweeps.cluster import ClosedError, DaskRunner, Settings, running
 from tests.sweeps.test_cluster import IMPORT
 from tests.sweeps.workers import DEADLY
 
@@ -30,7 +28,7 @@ def test_a_design_that_kills_its_process_ends_the_search(monkeypatch):
     monkeypatch.setenv("TEST_SECONDS", "0.01")
     evaluator = Evaluator.of(load("cic_drawn", [f"scene.speed_rpm={DEADLY}"]))
     with (
-        Cluster(1, imports=(IMPORT,)).evaluations() as runs,
+        running(1, imports=(IMPORT,)) as runs,
         pytest.raises(InputError, match=r"several times.*--resume"),
     ):
         runs.evaluated(Point(evaluator, np.ones(3)))
@@ -71,7 +69,7 @@ class Future:
 
 
 def test_threads_that_wait_end_with_the_search(monkeypatch):
-    monkeypatch.setattr(evaluations, "_POLL", 0.01)
+    monkeypatch.setattr(cluster, "_POLL", 0.01)
     client = Client()
     runs = DaskRunner(None, client, Settings(()))
     assert runs.slots == 6
@@ -87,15 +85,15 @@ def test_threads_that_wait_end_with_the_search(monkeypatch):
 
 
 def test_a_lost_connection_is_named(monkeypatch):
-    monkeypatch.setattr(evaluations, "_POLL", 0.01)
+    monkeypatch.setattr(cluster, "_POLL", 0.01)
     monkeypatch.setattr(Client, "status", "closed")
     with pytest.raises(InputError, match="connection to the scheduler was lost"):
         DaskRunner(None, Client(), Settings(())).evaluated(point())
 
 
 def test_a_scheduler_without_workers_is_given_up(monkeypatch):
-    monkeypatch.setattr(evaluations, "_POLL", 0.01)
-    monkeypatch.setattr(evaluations, "_DESERTED", 0.05)
+    monkeypatch.setattr(cluster, "_POLL", 0.01)
+    monkeypatch.setattr(cluster, "_DESERTED", 0.05)
     monkeypatch.setattr(Client, "nthreads", lambda self: {})
     with pytest.raises(InputError, match=r"no worker for 0\.05 s"):
         DaskRunner(None, Client(), Settings(())).evaluated(point())
@@ -122,8 +120,7 @@ def test_classes_of_a_script_travel(tmp_path):
         "from rootsopt.config import load\n"
         "from rootsopt.response.evaluation import Evaluator\n"
         "from rootsopt.response.many import Point\n"
-        "from rootsopt.sweeps.evaluations import DaskRunner\n"
-        "from rootsopt.sweeps.worker import Settings\n"
+        "from rootsopt.sweeps.cluster import DaskRunner, Settings\n"
         "class Own(Evaluator):\n"
         "    answer = 42\n"
         "config = load('cic_drawn')\n"
@@ -136,14 +133,14 @@ def test_classes_of_a_script_travel(tmp_path):
         "DaskRunner(None, Client(), Settings(())).evaluated(Point(own, np.ones(3)))\n"
     )
     subprocess.run([sys.executable, str(script)], check=True, env={**os.environ, "PYTHONPATH": "."})
-    evaluator, design, start, _ = pickle.loads(task.read_bytes())
+    _, (evaluator, design, start, _) = pickle.loads(task.read_bytes())
     assert type(evaluator).answer == 42
     assert design.tolist() == [1.0, 1.0, 1.0]
     assert start is None
 
 
 def test_without_workers_evaluations_run_here():
-    with evaluating() as runs:
+    with running() as runs:
         assert runs is HERE
 
 

@@ -10,11 +10,11 @@ import xarray
 
 import rootsopt
 from rootsopt import InputError, Status
-from rootsopt.sweeps import points
-from rootsopt.sweeps.local import in_process
+from rootsopt.response.many import LocalRunner
+from rootsopt.sweeps import points, scenes
 from rootsopt.sweeps.plan import plan_of
 from rootsopt.sweeps.points import configured, lost, simulated
-from rootsopt.sweeps.table import dataset_of
+from rootsopt.sweeps.scenes import dataset_of
 
 SPEED, LOAD, CLEARANCE = "scene.speed_rpm", "scene.load.torque_N_m", "contact.clearance_mm"
 ANGLE, FAMILY = "profile.pressure_angle_deg", "profile.family"
@@ -143,9 +143,11 @@ def test_stopped_sweep_keeps_what_has_begun(config, monkeypatch):
         raise InputError("not simulated")
 
     monkeypatch.setattr(points, "check_geometry", check)
-    monkeypatch.setattr("os.cpu_count", lambda: 1)
+    here = LocalRunner(2)
+    monkeypatch.setattr(points, "HERE", here)
+    monkeypatch.setattr(scenes, "HERE", here)
     plan = plan_of({SPEED: "1,2,3,4,5,6"})
-    found = dict(one for some in in_process(config, plan, range(6), stop) for one in some)
+    found = scenes.complete(config, plan, here, scenes.Points(config, plan), stop=stop)
     assert 2 <= len(begun) < 6
     assert sorted(found) == [*range(len(begun))]
 

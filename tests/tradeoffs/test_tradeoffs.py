@@ -29,12 +29,11 @@ from rootsopt.response import terms
 from rootsopt.response.terms import needs_forces
 from rootsopt.scene import Scene
 from rootsopt.status import Standing, Status
-from rootsopt.tradeoffs import gaps, lattice, trace
-from rootsopt.tradeoffs.aims import Aim, aims_of, freed
+from rootsopt.tradeoffs import assembly, scalar, trace
 from rootsopt.tradeoffs.assembly import Node, points_of, selected
 from rootsopt.tradeoffs.front import dominated
 from rootsopt.tradeoffs.scalar import RHO, Scalar, Scale
-from rootsopt.tradeoffs.study import Sample, Study
+from rootsopt.tradeoffs.study import Aim, Sample, Study, aims_of, freed
 from rootsopt.tradeoffs.trace import Tracer, pareto_front
 
 SCENE = """
@@ -352,13 +351,12 @@ def test_interrupted_front_keeps_its_points():
             stop.set()
 
     tracer = Tracer(config(RADIUS), progress, stop)
-    assert tracer.so_far() is None
+    assert tracer.so_far().points == ()
     front = tracer.run()
     assert front.status is Status.INTERRUPTED
     assert 2 <= len(front.points) < 11
     assert {point.standing for point in front.points} == {Standing.NOT_VERIFIED}
     again = tracer.so_far()
-    assert again is not None
     assert [p.design for p in again.points] == [p.design for p in front.points]
 
 
@@ -464,17 +462,17 @@ def test_rates_have_the_signs_of_the_terms_themselves():
 def test_neighbours_on_the_grid_differ_by_one_step():
     """One step from one term to another, in every pair of terms; found by comparing all points."""
     for count, divisions in ((2, 5), (3, 4)):
-        grid = lattice.keys(count, divisions)
+        grid = scalar.keys(count, divisions)
         apart = np.sum(np.abs(np.array(grid)[:, None] - np.array(grid)), axis=2)
         expected = {(i, j) for i, j in np.argwhere(apart == 2).tolist() if i < j}
-        found = lattice.links(grid)
+        found = scalar.links(grid)
         assert len(found) == len(expected)
         assert {(min(pair), max(pair)) for pair in found} == expected
 
 
 def test_halves_of_divided_neighbours_know_how_often_they_were_tried():
     """A gap states how many searches looked for a point between its sides, also before a half."""
-    search = gaps.Bisections([(0, 3), (3, 4)], {(0, 3): 2})
+    search = assembly.Bisections([(0, 3), (3, 4)], {(0, 3): 2})
     search.divided((0, 3), 5)
     assert sorted(search.pairs) == [(0, 5), (3, 4), (3, 5)]
     assert [search.tried[pair] for pair in ((0, 5), (3, 5))] == [2, 2]
@@ -522,8 +520,8 @@ def test_a_point_holds_up_only_if_all_its_terms_do(off, reason, standing):
     searched = sample(2.0)
     node = Node(scalar, searched, certify(scalar.local(searched), point), reason)
     tracer = Tracer(config(RADIUS))
-    tracer._scale = scale
-    tracer._study = study = object.__new__(Study)
+    tracer.scale = scale
+    tracer.study = study = object.__new__(Study)
     vars(study)["verified"] = lambda point: sample(2.0 * (1 + off))
     checked = tracer._checked(node)
     assert (checked.standing.label, checked.reason) == (standing, reason)
@@ -540,9 +538,9 @@ def test_a_point_divides_neighbours_if_it_lies_between_them():
 
     It does not at an end, or farther from one of them than they are apart."""
     one, other = np.array([0.0, 1.0]), np.array([1.0, 0.0])
-    edge = gaps.measured((0, 1), np.stack([one, other]), np.zeros((2, 3)))
+    edge = assembly.measured((0, 1), np.stack([one, other]), np.zeros((2, 3)))
     assert edge.distance == pytest.approx(2**0.5)
-    assert gaps.divides(edge, np.array([0.5, 0.5]), one, other)
-    assert gaps.divides(edge, np.array([0.2, 0.7]), one, other)
+    assert assembly.divides(edge, np.array([0.5, 0.5]), one, other)
+    assert assembly.divides(edge, np.array([0.2, 0.7]), one, other)
     for outside in (one, other, [0.001, 0.999], [1.5, -0.5], [2.0, 2.0]):
-        assert not gaps.divides(edge, np.array(outside), one, other)
+        assert not assembly.divides(edge, np.array(outside), one, other)

@@ -25,7 +25,7 @@ from rootsopt.optimize.robust import search_of
 from rootsopt.output import files
 from rootsopt.output.runs import RunFolder
 from rootsopt.pump.sheet import check_clearances, record_of
-from rootsopt.response.touching import touching
+from rootsopt.response.sensitivity import touching
 from rootsopt.scene import Scene, check_geometry, outline_mm
 
 
@@ -211,8 +211,7 @@ def _write(folder, config, options, result, alike, sheets, compiled, ran) -> Non
     if result.robustness is not None:
         data["robustness"] = result.robustness.record()
         if result.optimized is not None and config.tolerances is not None:
-            scattered = touching(_designed(searching, result.optimized))
-            data["touching"] = None if scattered is None else scattered.record()
+            data["touching"] = touching(_designed(searching, result.optimized))
     if result.assumptions is not None:
         data["assumptions"] = result.assumptions.record()
         folder.write_csv("assumptions.csv", result.assumptions.columns())

@@ -24,7 +24,7 @@ from rootsopt.runtime.environment import say
 from rootsopt.runtime.journal import Journal, header_of, set_aside
 from rootsopt.runtime.threads import until_stopped
 from rootsopt.status import Status
-from rootsopt.sweeps.evaluations import evaluating
+from rootsopt.sweeps.cluster import running
 
 Found = TypeVar("Found", covariant=True)
 PATIENCE = 5.0
@@ -55,7 +55,7 @@ def runs_of(options: argparse.Namespace) -> contextlib.AbstractContextManager[Ru
             "cores; leave it out unless a design may end its process"
         )
     cache = not options.no_cache
-    return evaluating(options.workers, options.scheduler, options.imports, cache)
+    return running(options.workers, options.scheduler, options.imports, cache)
 
 
 def checkpoint_of(

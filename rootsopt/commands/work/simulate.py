@@ -12,8 +12,8 @@ from rootsopt.output import files, tables
 from rootsopt.output.runs import RunFolder
 from rootsopt.pump.sheet import check_clearances, record_of
 from rootsopt.response.evaluation import Evaluator
-from rootsopt.response.speeds import alone
-from rootsopt.response.touching import touching
+from rootsopt.response.reducers import alone
+from rootsopt.response.sensitivity import touching
 from rootsopt.scene import check_geometry, outline_mm
 
 
@@ -35,7 +35,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     if config.pump is not None or config.scene.bearings is not None:
         data["pump"] = record_of(config, [*evaluation.design.values()])
     if config.tolerances is not None and (scattered := touching(config)) is not None:
-        data["touching"] = scattered.record()
+        data["touching"] = scattered
     folder.write_json("result.json", data | {"versions": files.versions()})
     if formats:
         from rootsopt.figures.writing import write_simulated

@@ -15,16 +15,15 @@ from rootsopt.config.plausible import notes_on_swept
 from rootsopt.errors import InputError
 from rootsopt.output import files, sweeps
 from rootsopt.output.runs import RunFolder
-from rootsopt.response import speeds
 from rootsopt.response.evaluation import Evaluator
-from rootsopt.response.reducers import overall
+from rootsopt.response.reducers import alone, overall, swept_speeds
 from rootsopt.runtime.environment import say
 from rootsopt.scene import check_geometry, design_keys, design_vector
 from rootsopt.status import Status
 from rootsopt.sweeps.axes import parse_over
+from rootsopt.sweeps.cluster import running
 from rootsopt.sweeps.plan import Plan, plan_of, scattered
-from rootsopt.sweeps.scenes import Points, checked, complete, runner
-from rootsopt.sweeps.table import dataset_of
+from rootsopt.sweeps.scenes import Points, checked, complete, dataset_of
 
 _DATA = "sweep.nc"
 
@@ -44,9 +43,9 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     refuse_options(options)
     check_geometry(config)
     cli.load_figures(options, "sweep")
-    swept = speeds.swept_speeds(config)
+    swept = swept_speeds(config)
     with progress_bar(Console(stderr=True), _FIRST, "simulating", "speeds") as progress:
-        evaluator = Evaluator.of_objective(speeds.alone(config)).without_gradient()
+        evaluator = Evaluator.of_objective(alone(config)).without_gradient()
         count = partial(progress or _silent, expected=len(swept))
         parts = evaluator.swept(swept, progress=count)
     rows = [part.row(whole=True) for part in parts]
@@ -84,14 +83,15 @@ def _over_keys(config: Config, options: argparse.Namespace, folder: RunFolder) -
     for note in found:
         say(note)
     folder.add_notes(found)
-    run = runner(options.workers, options.scheduler, options.imports, not options.no_cache)
+    cache = not options.no_cache
     with (
+        running(options.workers, options.scheduler, options.imports, cache) as runs,
         closing(opened(partial(Points, config, plan, options.imports), options, folder)) as journal,
         door.patience(_PROMISE) as stop,
         progress_bar(Console(stderr=True), _FIRST, "simulating", "points") as progress,
     ):
         known = len(journal.resumed)
-        records = complete(config, plan, run, journal, progress or _silent, stop)
+        records = complete(config, plan, runs, journal, progress or _silent, stop)
     done = len(records) == plan.count
     seconds = time.perf_counter() - began
     dataset = dataset_of(config, plan, records)

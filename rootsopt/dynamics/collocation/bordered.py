@@ -19,15 +19,16 @@ from rootsopt.dynamics.collocation.closing import Closer, Loop
 from rootsopt.dynamics.collocation.elements import Elements
 from rootsopt.dynamics.collocation.equation import CollocatedEquation, Points
 from rootsopt.dynamics.collocation.events import look, rooted
-from rootsopt.dynamics.collocation.forces import OrbitForces, origin
 from rootsopt.dynamics.collocation.known import KnownOrbit
 from rootsopt.dynamics.collocation.mesh import ordered
 from rootsopt.dynamics.collocation.newton import (
+    OrbitForces,
     advanced,
     columns_of,
     evaluated,
     lines,
     numbers,
+    origin,
 )
 from rootsopt.dynamics.collocation.system import (
     Chain,
@@ -44,7 +45,6 @@ from rootsopt.dynamics.pair import RotorPair
 
 # Maximum number of Newton steps.
 _TURNS = 12
-
 # Newton step (scaled) below which Newton's method stops.
 _SMALL = 1e-10
 
@@ -148,6 +148,7 @@ class _Follower(Closer):
         return lax.stop_gradient(self.family(now.line.share)[0])
 
     def limit(self, now: Loop) -> Float[Array, ""]:
+        del now
         return jnp.asarray(_SMALL)
 
     def judged(self, now: Loop, after: Loop, size: Float[Array, ""], found: Any) -> Loop:

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from rootsopt.dynamics.collocation.elements import Elements
+from rootsopt.dynamics.collocation.elements import POINTS, Elements
 from rootsopt.dynamics.collocation.equation import CollocatedEquation, Points
 from rootsopt.dynamics.collocation.events import (
     Events,
@@ -33,8 +33,6 @@ from rootsopt.dynamics.collocation.events import (
     look,
     rooted,
 )
-from rootsopt.dynamics.collocation.forces import OrbitForces, forces_of, no_forces
-from rootsopt.dynamics.collocation.gauss import POINTS
 from rootsopt.dynamics.collocation.known import KnownOrbit
 from rootsopt.dynamics.collocation.mesh import (
     aligned,
@@ -46,12 +44,15 @@ from rootsopt.dynamics.collocation.mesh import (
     snug,
 )
 from rootsopt.dynamics.collocation.newton import (
+    OrbitForces,
     advanced,
     between,
     columns_of,
     evaluated,
+    forces_of,
     has_stalled,
     lines,
+    no_forces,
     with_numbers,
 )
 from rootsopt.dynamics.collocation.peak import Rivals, forces_along, is_settled, peak_of, rivals_of
@@ -59,66 +60,51 @@ from rootsopt.dynamics.collocation.system import Step, chained, condensed
 from rootsopt.dynamics.orbit import branch, choose
 from rootsopt.dynamics.pair import RotorPair
 
-FIRST, _SHARE, _EVENT = 40, 0.5, 1
-"""Number of elements per mesh period before events are known. The first mesh that is aligned with
-events has the second number times as many at the usual accuracy, more at a finer one, and the third
-number per event."""
-
+# The first mesh that is aligned with events has this many elements for each of the mesh before, at
+# the usual accuracy, more at a finer one, and the second number per event.
+_SHARE, _EVENT = 0.5, 1
 # Relative error of the forces (usual accuracy) for which `_SHARE` and `CORRECTED` hold.
 _USUAL = 1e-7
-
 # Order of the forces' error in the length of the elements.
 _ORDER = 2 * POINTS
-
-# Estimated relative errors of forces and of their derivatives on a first mesh, as multiples of
-# its roughness, which counts as at least the third number. In 45 random pairs, 95 % of the errors
-# were below 8e-6 and 1.5e-3 times the roughness.
+# Estimated relative errors of forces and of their derivatives on a first mesh, as multiples of its
+# roughness, which counts as at least the third number. In 45 random pairs, 95 % of the errors were
+# below 8e-6 and 1.5e-3 times the roughness.
 _UNCOMPARED = 1e-5, 1e-3, 0.1
-
-# Factor by which the number of elements grows when the mesh is refined, and least factor for
-# which a second or later mesh is refined that has less room than that. A mesh of nearly the same
-# size would have nearly the same error, and say nothing about it.
+# Factor by which the number of elements grows when the mesh is refined, and least factor for which
+# a second or later mesh is refined that has less room than that. A mesh of nearly the same size
+# would have nearly the same error, and say nothing about it.
 _FINER, _LAST = 1.4, 1.4**0.5
-
 # Maximum number of evaluations of the flags, and of Newton steps after each of them.
 _TURNS, _STEPS = 24, 16
-
 # Fraction of the way to the new pair over which the predictor takes its difference.
 _WAY = 1e-3
-
 # Change of a root (rad) above which it is limited to this value.
 _TURNED = 0.1
 CORRECTED = 1e-6
 """Last correction of the states (scaled) above which an orbit is rejected, at the usual
 accuracy."""
-
 # Number of failures of Newton's method above which the search for the orbit fails.
 _FAILURES = 4
-
 # Greatest Newton step (scaled) at which Newton's method may stop. It stops at a step whose square
 # is below the error of the forces to reach. Convergence is quadratic, so the next step, which is
 # made together with the derivatives, is about as small.
 _LARGEST = 3e-3
-
 # Correction (scaled) that does not count in the derivatives, at the usual accuracy, and the share
 # of the correction before above which it only follows rounding.
 _NEGLIGIBLE, _STALLED = 3e-9, 0.5
-
 # Difference (rad) between the contact's normal angle in the solved orbit and that found by a
 # search, above which the orbit is solved again from the latter. Roots lag one Newton step behind,
 # and another minimum of the gap lies much further away.
 _FAR = 1e-3
-
 # Numbers by which the difference between two meshes is divided to estimate the error on the finer
-# one, if that has `_FINER` times as many elements: for forces and for derivatives. In theory,
-# both errors fall by 1.4⁸. Derivatives fall less evenly, and their estimate must be a bound.
-# `gained` returns the numbers for other meshes.
+# one, if that has `_FINER` times as many elements: for forces and for derivatives. In theory, both
+# errors fall by 1.4⁸. Derivatives fall less evenly, and their estimate must be a bound. `gained`
+# returns the numbers for other meshes.
 _GAINS = 10.0, 0.2
-
 # Error of derivatives above which the mesh is refined: the first number times the error of the
 # forces to reach, at least the second and at most the third.
 _TURNING = 100.0, 2.5e-7, 1e-2
-
 # Relative error of derivatives that does not show in their difference: both meshes have the same
 # roots of the gap to 1e-6 rad, and the same rounding errors.
 _ROUGH = 1e-7
@@ -126,7 +112,6 @@ _ROUGH = 1e-7
 
 # Force, as a share of the pair's, below which errors are relative to this force.
 _WEAK = 1e-3
-
 # Derivative of the states (scaled) below which errors of derivatives are relative to this number,
 # for an orbit without contact.
 _LEAST = 1e-6
@@ -257,10 +242,12 @@ class Closer(eqx.Module):
 
     def frozen_at(self, now: Loop) -> RotorPair:
         """Return the pair whose flags are evaluated, treated as constant by JAX."""
+        del now
         return self.frozen
 
     def limit(self, now: Loop) -> Float[Array, ""]:
         """Return the size of a step (scaled) at which Newton's method stops."""
+        del now
         return jnp.minimum(jnp.sqrt(self.tolerance), _LARGEST)
 
     def step(self, now: Loop) -> tuple[CollocatedEquation, Points, Array, Step, Any]:

@@ -3,14 +3,101 @@
 Events are instants at which the equation of motion is not smooth. They divide the period into
 *intervals*. Each interval consists of one or more elements, at fixed fractions of its length. All
 elements therefore move when the events at the ends of their interval move.
+
+On an element of length h, the state is z(σ) = z(0) + h Σ a_j(σ) k_j for 0 ≤ σ ≤ 1. The k_j are the
+slopes at the s Gauss points c_j, and a_j is the integral of the j-th Lagrange polynomial. The error
+is of order 2s at the end of the element, and of order s + 1 inside the element. See de Boor and
+Swartz, SIAM J. Numer. Anal. 10 (1973) 582-606.
+
+The arrays of a mesh have room for more elements than the mesh uses. Blocks of unused elements are
+not evaluated.
 """
 
-from typing import NamedTuple
+import functools
+import operator
+from collections.abc import Iterable
+from typing import Any, NamedTuple
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.custom_batching import custom_vmap
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import NDArray
 
-from rootsopt.dynamics.collocation.gauss import GAUSS
+POINTS = 4
+"""Number s of Gauss points per element."""
+
+
+class Gauss(NamedTuple):
+    """Gauss-Legendre rule with s points on the interval from 0 to 1.
+
+    `nodes` (s,): points c_i; `weights` (s,); `integral` (s, s): a_j(c_i), the matrix of the
+    Runge-Kutta method; `powers` (s, s): matrix that converts values at the points to coefficients
+    of powers of σ.
+    """
+
+    nodes: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    integral: NDArray[np.float64]
+    powers: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, count: int) -> "Gauss":
+        """Return the rule with `count` points."""
+        node, weight = np.polynomial.legendre.leggauss(count)
+        node, weight = (node + 1) / 2, weight / 2
+        powers = np.asarray(np.linalg.inv(np.vander(node, count, increasing=True)), np.float64)
+        order = np.arange(1, count + 1)
+        integral = (node[:, None] ** order / order) @ powers
+        return cls(node, weight, integral, powers)
+
+    def lagrange(self, share: Float[Array, "*m"]) -> Float[Array, "*m s"]:
+        """Return the s Lagrange polynomials at σ = `share`."""
+        return _polynomials(self.powers, share)
+
+    def integrated(self, share: Float[Array, "*m"]) -> Float[Array, "*m s"]:
+        """Return the integrals a_j of the s Lagrange polynomials from 0 to σ = `share`."""
+        order = np.arange(1, len(self.nodes) + 1)
+        return share[..., None] * _polynomials(self.powers / order[:, None], share)
+
+    def derivative(self, share: Float[Array, "*m"]) -> Float[Array, "*m s"]:
+        """Return the derivatives of the s Lagrange polynomials at σ = `share`."""
+        order = np.arange(1, len(self.nodes))
+        return _polynomials(order[:, None] * self.powers[1:], share)
+
+    def inside(self, slopes: Float[Array, "e s *c"]) -> Float[Array, "e s *c"]:
+        """Return the integrals of `slopes` (values at the s points) from 0 to each of the points.
+
+        The integrals are those over elements of length 1."""
+        rows = self.integral.T.reshape(*self.integral.shape, *(1,) * (slopes.ndim - 2))
+        return summed(row * slopes[:, j, None] for j, row in enumerate(rows))
+
+    def whole(self, slopes: Float[Array, "e s *c"]) -> Float[Array, "e ..."]:
+        """Return the integrals of `slopes` (values at the s points) over elements of length 1."""
+        return summed(weight * slopes[:, j] for j, weight in enumerate(self.weights))
+
+
+def _polynomials(powers: NDArray[np.float64], share: Float[Array, "*m"]) -> Float[Array, "*m s"]:
+    """Return s polynomials at σ = `share`; `powers` (p, s): coefficients, constants first."""
+    share = share[..., None]
+    found = jnp.broadcast_to(jnp.asarray(powers[-1]), (*share.shape[:-1], powers.shape[1]))
+    for row in powers[-2::-1]:
+        found = found * share + row
+    return found
+
+
+def summed(terms: Iterable[Array]) -> Array:
+    """Return the sum of a few arrays of equal shape.
+
+    XLA computes this in one loop over their entries. A reduction over a short axis is slower."""
+    return functools.reduce(operator.add, terms)
+
+
+GAUSS = Gauss.of(POINTS)
 
 
 class Mesh(NamedTuple):
@@ -121,3 +208,59 @@ class Elements(NamedTuple):
         weights = GAUSS.integrated(self.share(k, tau))
         rise = jnp.sum(weights[..., None] * self.slopes[k], axis=-2)
         return self.state[k] + self.mesh.lengths[k][..., None] * rise
+
+
+BLOCK = 48
+"""Number of elements evaluated together. The arrays of a mesh have room for a multiple of this
+number."""
+
+
+@custom_vmap
+def greatest(count: Int[Array, ""]) -> Int[Array, ""]:
+    """Return `count` or, in a batch, the greatest of the batch.
+
+    A loop with one number of iterations for all motions of a batch only writes what is new. With a
+    number for each motion, every iteration would copy all arrays, to keep those of motions that are
+    done."""
+    return count
+
+
+@greatest.def_vmap
+def _(size, batched, count):
+    del size, batched
+    return jnp.max(count), False
+
+
+def whole_blocks(*arrays: Array) -> list[Array]:
+    """Return `arrays`, padded with zeros to a whole number of blocks."""
+    spare = -arrays[0].shape[0] % BLOCK
+    return [jnp.pad(x, ((0, spare), *((0, 0),) * (x.ndim - 1))) for x in arrays]
+
+
+def in_blocks(function: Any, used: Int[Array, ""], *arrays: Any) -> Any:
+    """Return `function(*arrays)`, evaluated block by block along the leading axis of elements.
+
+    `function` maps arrays (e, …) of e elements to arrays (e, …); `used`: number of elements in use.
+    Blocks without such elements are not evaluated, except in a batch, where another motion uses
+    them; their results have no meaning."""
+    count = jax.tree.leaves(arrays)[0].shape[0]
+    size = min(BLOCK, count)
+
+    def sliced(begin):
+        return jax.tree.map(lambda x: lax.dynamic_slice_in_dim(x, begin, size), arrays)
+
+    function = eqx.filter_closure_convert(function, *sliced(0))  # traced once
+    shapes = jax.eval_shape(function, *sliced(0))
+    nothing = jax.tree.map(lambda x: jnp.zeros((count, *x.shape[1:]), x.dtype), shapes)
+    # The numbers of a pair enter the loop as one vector. XLA would copy each of them.
+    numbers, rest = eqx.partition(function, eqx.is_inexact_array)
+    vector, back = ravel_pytree(numbers)
+
+    def block(number, found):
+        begin = number * size
+        new = eqx.combine(back(vector), rest)(*sliced(begin))
+        return jax.tree.map(
+            lambda old, x: lax.dynamic_update_slice_in_dim(old, x, begin, 0), found, new
+        )
+
+    return lax.fori_loop(0, greatest((used + size - 1) // size), block, nothing)

@@ -8,10 +8,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from rootsopt.contact.near import NearContact
-from rootsopt.contact.search import SearchContact
-from rootsopt.contact.wrapped import around, innermost
-from rootsopt.dynamics.collocation.blocks import greatest
+from rootsopt.contact.gap import around, innermost
+from rootsopt.contact.search import NearContact, SearchContact
+from rootsopt.dynamics.collocation.elements import greatest
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.runtime.kept import kept

@@ -19,11 +19,9 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.contact.closest import RANKS
+from rootsopt.contact.gap import WrappedContact, around, innermost
 from rootsopt.contact.search import SearchContact
-from rootsopt.contact.wrapped import WrappedContact, around, innermost
-from rootsopt.dynamics.collocation.blocks import in_blocks
-from rootsopt.dynamics.collocation.elements import Elements, Mesh
-from rootsopt.dynamics.collocation.gauss import GAUSS
+from rootsopt.dynamics.collocation.elements import GAUSS, Elements, Mesh, in_blocks
 from rootsopt.dynamics.flanks import Margins, has_margins, margins_of, touch_of
 from rootsopt.dynamics.orbit import branch
 from rootsopt.dynamics.pair import RotorPair
@@ -32,28 +30,22 @@ from rootsopt.dynamics.pair import RotorPair
 # smaller of two: the first number (mesh periods), and the second number times the length of the
 # shorter adjacent element.
 _ASIDE = 2e-7, 0.02
-
-# Greatest error (mesh periods) of a located event. The second number determines how far beyond
-# the chord's root the next instant is, so that both ends of the range approach the event.
+# Greatest error (mesh periods) of a located event. The second number determines how far beyond the
+# chord's root the next instant is, so that both ends of the range approach the event.
 _LOCATED, _STEEP = 3e-10, 0.2
-
 # Time (mesh periods) between two events below which they are merged into one.
 _SAME = 3e-9
-
 # Range of an element (fraction of its length) for the instants of `extra`. Those at the element's
 # ends are beside it.
 _WITHIN = 0.03, 0.97
-
 # End and start of an element, as fractions of its length.
 _ENDS = (1.0, 0.0)
 FIXED, UNSAID = -1, -2
 """In place of the index of an event's margin: the time is fixed, as that of φ1 = 0; the time is
 where a flag without a margin changes, and stays until flags are evaluated again."""
-
 # Difference (rad) between the normal angles beside a located event above which the contact jumps
 # there, from one minimum of the gap to another one.
 _LEAP = 1e-6
-
 # Number of flag changes per event for which there is room. Several flags may change at one event.
 # If more change, the search for the orbit fails.
 _CHANGES = 2
@@ -310,7 +302,6 @@ class _Compared(NamedTuple):
 
 
 def _compared(pair: RotorPair, elements: Elements, seen: FlagScan) -> _Compared:
-    """Compare the flags `seen` along the motion `elements` with the events of its mesh."""
     mesh = elements.mesh
     places = seen.tau.shape[0]
     per = places // elements.state.shape[0]

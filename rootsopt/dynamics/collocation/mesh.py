@@ -4,12 +4,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from rootsopt.contact.gap import innermost
 from rootsopt.contact.search import SearchContact
-from rootsopt.contact.wrapped import innermost
-from rootsopt.dynamics.collocation.blocks import BLOCK
-from rootsopt.dynamics.collocation.elements import Elements, Mesh
+from rootsopt.dynamics.collocation.elements import BLOCK, GAUSS, Elements, Mesh
 from rootsopt.dynamics.collocation.events import _SAME
-from rootsopt.dynamics.collocation.gauss import GAUSS
 from rootsopt.dynamics.pair import RotorPair
 
 # Density of elements that is added everywhere, as a fraction of the mean density. It limits the
@@ -23,13 +21,10 @@ _FLOOR = 0.15
 # half of the time from rest with room for 64 events in each of eight mesh periods. Shorter orbits
 # can use the room of longer ones, up to the third number per mesh period at the usual accuracy.
 _MOST, _FINEST = (96, 48), 160
-
 # Number of events above which the search for the orbit fails, counted like elements.
 _TIMES = 64, 24
-
 # Greatest share of the elements that is left out to save the evaluation of a further block.
 _SPARED = 0.06
-
 # Growth of these numbers for each further slice of twisted rotors, as a fraction: each slice has
 # its own events.
 _SLICES = 0.5

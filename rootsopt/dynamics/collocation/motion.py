@@ -8,8 +8,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.dynamics.collocation.closing import Closed, close
 from rootsopt.dynamics.collocation.equation import CollocatedEquation
-from rootsopt.dynamics.collocation.forces import OrbitForces
 from rootsopt.dynamics.collocation.known import KnownOrbit
+from rootsopt.dynamics.collocation.newton import OrbitForces
 from rootsopt.dynamics.flow import Pieces
 from rootsopt.dynamics.linear import spectral_radius
 from rootsopt.dynamics.orbit import Orbit
@@ -24,12 +24,10 @@ UNREFINED, _ROUNDED = 10.0, 5e-9
 """Estimated error of the forces above which an orbit is rejected, in multiples of the requested
 error, but at least the second number. The estimate exceeds the request if the mesh has no room for
 refinement, or if rounding of the gap hides it: beside the cusp of EE, forces round at some 1e-9."""
-
 # Scaled difference between the states at φ1 = 0 and after a fraction of the period, below which
-# this fraction is the orbit's true period. The limit is the first number (tolerances), but at
-# least the second.
+# this fraction is the orbit's true period. The limit is the first number (tolerances), but at least
+# the second.
 _REPEATS = 1e3, 1e-5
-
 # Number of instants per mesh period at which an orbit is compared with the transient.
 _ALONG = 8
 
@@ -113,7 +111,6 @@ def apart(known: KnownOrbit, pieces: Pieces) -> Float[Array, ""]:
 
 
 def _known(closed: Closed, verified: Bool[Array, ""]) -> KnownOrbit:
-    """Return the orbit `closed` in the form from which orbits of similar pairs can be closed."""
     yes = jnp.ones((), bool)
     errors = closed.roughness, closed.error, closed.drift
     return KnownOrbit(closed.found.elements, *errors, verified, yes)
@@ -122,7 +119,6 @@ def _known(closed: Closed, verified: Bool[Array, ""]) -> KnownOrbit:
 def _as_orbit(
     pair: RotorPair, found: OrbitForces, residual: Float[Array, ""], closed: Closed
 ) -> Orbit:
-    """Return the orbit `found` of `pair`; `residual`: that of the orbit; `closed`: its closing."""
     mesh, peak = found.elements.mesh, found.peak
     time = mesh.ends[0][peak.element] + peak.share * mesh.lengths[peak.element]
     # The force of a pair that is not smooth may jump where no element ends.

@@ -18,38 +18,30 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import NDArray
 
-from rootsopt.dynamics.collocation.elements import Elements
+from rootsopt.dynamics.collocation.elements import GAUSS, Elements
 from rootsopt.dynamics.collocation.equation import CollocatedEquation, Points
-from rootsopt.dynamics.collocation.gauss import GAUSS
 
 RIVALS = len(GAUSS.nodes) + 1
 """Number of elements that may contain the peak: as many as an element has instants, so that the
 equation is evaluated in all of them on one additional element."""
-
 # Places in each element at which the polynomials of the force are compared.
 _PLACES = np.linspace(0.0, 1.0, 9)
-
 # Number of Newton steps from the best of these places to the maximum of a polynomial.
 _STEPS = 4
-
 # Distance of the peak from the instant at which the equation is evaluated (fraction of the
 # element's length) below which force and derivative are extrapolated to it: both errors are then
 # far below those of the orbit. The first number holds at the usual accuracy, and grows with the
 # error to reach; the second is the least distance.
 _CLOSE, _LEAST = 1e-5, 1e-9
-
 # Distance between two instants (fraction of the element's length) below which the errors of their
 # interpolated roots count as equal.
 _BESIDE = 1e-2
-
 # Least distance of such an instant from the ends of its element, as a fraction of its length.
 # Closer to an end, which may be an event, slope and roots may be those of the other side.
 _INSIDE = 1e-4
-
 # Relative difference between the force at an element's end, and that extrapolated from inside the
 # element, above which the force jumps there.
 _JUMP = 1e-6
-
 # Greatest distance of the peak from the instant at which the equation is evaluated, as a fraction
 # of the element's length. The latter lies at the maximum of a polynomial.
 _NEAREST = 0.1

@@ -20,9 +20,14 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from rootsopt.dynamics.collocation.blocks import greatest, in_blocks
-from rootsopt.dynamics.collocation.elements import Elements, Mesh
-from rootsopt.dynamics.collocation.gauss import GAUSS, summed
+from rootsopt.dynamics.collocation.elements import (
+    GAUSS,
+    Elements,
+    Mesh,
+    greatest,
+    in_blocks,
+    summed,
+)
 from rootsopt.dynamics.linear import solved
 
 

@@ -1,12 +1,23 @@
 """Parts that can act on a rotor pair. A scene holds only the parts it needs."""
 
 from rootsopt.dynamics.parts.base import Context, Loads, Motion, Own, Part, Units
-from rootsopt.dynamics.parts.drive import Drive, MotorDrive, PrescribedDrive
-from rootsopt.dynamics.parts.friction import Friction
-from rootsopt.dynamics.parts.gear import GearErrors, TimingGear
-from rootsopt.dynamics.parts.load import ConstantLoad, GasLoad, Load, TwistedLoad
-from rootsopt.dynamics.parts.resultants import AxisLoads, GasResultant
-from rootsopt.dynamics.parts.supports import Supports
+from rootsopt.dynamics.parts.load import (
+    AxisLoads,
+    ConstantLoad,
+    GasLoad,
+    GasResultant,
+    Load,
+    TwistedLoad,
+)
+from rootsopt.dynamics.parts.machine import (
+    Drive,
+    Friction,
+    GearErrors,
+    MotorDrive,
+    PrescribedDrive,
+    Supports,
+    TimingGear,
+)
 
 __all__ = [
     "AxisLoads",

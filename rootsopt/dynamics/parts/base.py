@@ -1,11 +1,17 @@
-"""The base class of all parts of a scene, and the data that the rotor pair gives a part."""
+"""The base class of all parts of a scene, and the data that the rotor pair gives a part.
 
+Timescales of a pair, which follow from its parts, set the solver's first and longest steps."""
+
+from collections.abc import Iterable
 from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Float
+
+from rootsopt.contact.law import ContactLaw
 
 _Part = TypeVar("_Part", bound="Part")
 Own = Float[Array, " m"] | Float[np.ndarray, " m"]
@@ -128,6 +134,7 @@ class Part(eqx.Module):
         """Return the part, completed with values from the scene's `context`.
 
         Keep these values differentiable: store them as JAX arrays."""
+        del context
         return self
 
     # The part's own states: m numbers in SI units. A motion begins at `start`. The solver works
@@ -142,6 +149,7 @@ class Part(eqx.Module):
 
     def start(self, units: Units) -> Float[Array, " m"] | None:
         """Return the part's own states (m,) at the start of a motion, in SI units; None: zero."""
+        del units
         return None
 
     def rates(self, motion: Motion, own: Own, loads: Loads) -> Float[Array, " m"]:
@@ -165,6 +173,7 @@ class Part(eqx.Module):
     def lost(self, own: Own) -> Bool[Array, ""] | None:
         """Return whether the part's own states show that the pair no longer runs; None: they never
         do."""
+        del own
         return None
 
     # Loads from the part. None: no load.
@@ -175,6 +184,7 @@ class Part(eqx.Module):
         `motion`: position and velocity of the pair; `own` (m,): the part's own states (SI units).
         This method is called only if rotor 1 is `free`.
         """
+        del motion, own
         return None
 
     def torque_on_2(self, motion: Motion, own: Own) -> Float[Array, ""] | None:
@@ -182,6 +192,7 @@ class Part(eqx.Module):
 
         `motion`: position and velocity of the pair; `own` (m,): the part's own states (SI
         units)."""
+        del motion, own
         return None
 
     def force_on_axes(self, motion: Motion, own: Own) -> Float[Array, "2 2"] | None:
@@ -189,6 +200,7 @@ class Part(eqx.Module):
 
         `motion`: position and velocity of the pair; `own` (m,): the part's own states (SI units).
         This method is called only if a part `displaces` the axes."""
+        del motion, own
         return None
 
     def drag(self, force: Float[Array, ""], sliding: Float[Array, ""]) -> Float[Array, ""]:
@@ -206,12 +218,14 @@ class Part(eqx.Module):
         """Return flags (s,) that change where the part's loads or rates are not smooth.
 
         `motion`: position and velocity of the pair; `own` (m,): the part's own states (SI
-        units)."""
-        return jnp.zeros(0, bool)
+        units). By default, they are those of `margins`."""
+        return self.margins(motion, own) > 0
 
     def drag_switches(self, sliding: Float[Array, ""]) -> Bool[Array, " s"]:
-        """Return flags (s,) that change where the drag is not smooth in `sliding` (m/s)."""
-        return jnp.zeros(0, bool)
+        """Return flags (s,) that change where the drag is not smooth in `sliding` (m/s).
+
+        By default, they are those of `drag_margins`."""
+        return self.drag_margins(sliding) > 0
 
     # Numbers that are positive where these flags are set. Each is smooth across the instant at
     # which its flag changes, and zero there. Without margins, such instants take more iterations to
@@ -220,11 +234,13 @@ class Part(eqx.Module):
     def margins(self, motion: Motion, own: Own) -> Float[Array, " s"]:
         """Return numbers (s,), each positive where the flag of `switches` with the same index is
         set."""
+        del motion, own
         return jnp.zeros(0)
 
     def drag_margins(self, sliding: Float[Array, ""]) -> Float[Array, " s"]:
         """Return numbers (s,), each positive where the flag of `drag_switches` with the same index
         is set."""
+        del sliding
         return jnp.zeros(0)
 
     # Data from which the solver chooses its steps.
@@ -244,6 +260,7 @@ class Part(eqx.Module):
 
     def edges_at(self, phi: Float[Array, ""]) -> tuple[Float[Array, ""], ...]:
         """Return the `edges` at φ1 = `phi` (rad), for a part of `whole_turns` whose edges move."""
+        del phi
         return self.edges
 
     @property
@@ -256,4 +273,58 @@ class Part(eqx.Module):
 
         `inertia` (kg·m²) of one rotor. The result is None if the part has no oscillation of its
         own."""
+        del inertia
         return None
+
+
+class Timescales(eqx.Module):
+    """Timescales of the fastest oscillation and of free flight.
+
+    `swing`: 1/ω (s), where ω is the angular frequency of the fastest oscillation: of rotor 2 on
+    flank and timing gear, or of another part; `fall`: time (s) in which the load closes the whole
+    backlash of the timing gear; `free`: |ε| (rad) below which the clearance keeps the flanks apart
+    at the nominal centre distance. If the backlash is at most the rotation at static penetration,
+    there is no free flight, and `fall` is infinite.
+    """
+
+    swing: Float[Array, ""]
+    fall: Float[Array, ""]
+    free: Float[Array, ""]
+
+    @classmethod
+    def of(
+        cls,
+        law: ContactLaw,
+        parts: Iterable[Part],
+        inertia: Float[Array, ""],
+        force: Float[Array, ""],
+        radius: Float[Array, ""],
+        clearance: Float[Array, ""],
+    ) -> "Timescales":
+        """Return the timescales of a pair, without derivatives.
+
+        `law`: contact law; `parts`: all parts of the scene; `inertia` (kg·m²) of one rotor; `force`
+        (N): static flank force at the pitch `radius` (m); `clearance` (m) of the flanks. The
+        contact stiffness is taken at the greater of two depths: the static penetration, and the
+        penetration of an impact after free flight through the whole backlash. The energy of this
+        impact is the work of the load."""
+        parts = tuple(parts)
+        play = jnp.zeros_like(force)
+        for part in parts:
+            play = play if part.play is None else play + 2 * part.play
+        static = law.depth_at(force)
+        deepest = jnp.maximum(static, law.depth_absorbing(force * radius * play))
+        stiffness = radius**2 * law.stiffness_at(deepest)
+        for part in parts:
+            holding = part.holding_stiffness
+            stiffness = stiffness if holding is None else stiffness + holding
+        flies = play > static / radius
+        fall = jnp.sqrt(2 * jnp.where(flies, play, 1.0) * inertia / (force * radius))
+        swing = jnp.sqrt(inertia / stiffness)
+        for part in parts:
+            own = part.quickest(inertia)
+            swing = swing if own is None else jnp.minimum(swing, own)
+        # No lever is longer than the pitch radius.
+        free = jnp.maximum(clearance, 0.0) / radius
+        found = cls(swing, jnp.where(flies, fall, jnp.inf), free)
+        return lax.stop_gradient(found)

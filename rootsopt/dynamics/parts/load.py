@@ -1,4 +1,8 @@
-"""Loads: the parts that oppose the rotation."""
+"""Loads that oppose the rotation, and forces on the axes: gas, teeth of the timing gear, weight.
+
+Frame: rotor 1 at the origin, rotor 2 at (2r, 0). Rotor 1 turns counter-clockwise. Gas is carried
+along the housing from suction, above, to discharge, below. `docs/bearings.md` derives the formulas.
+"""
 
 import abc
 from collections.abc import Callable
@@ -6,10 +10,13 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from rootsopt.contact.impact import smooth_step
+from rootsopt.contact.gap import Slices
+from rootsopt.contact.law import smooth_step
 from rootsopt.dynamics.parts.base import Part
+from rootsopt.dynamics.parts.machine import TimingGear
 from rootsopt.profiles.base import Profile
 
 BRIEF = 0.01
@@ -38,10 +45,12 @@ class Load(Part):
         """Mean torque (N·m) against both rotors together."""
 
     def torque_on_1(self, motion, own):
+        del own
         torque = self.torque1(motion.phi)
         return None if torque is None else -torque
 
     def torque_on_2(self, motion, own):
+        del own
         return -self.torque2(motion.phi)
 
 
@@ -51,9 +60,11 @@ class ConstantLoad(Load):
     torque: Float[Array, ""]
 
     def torque1(self, phi):
+        del phi
         return None
 
     def torque2(self, phi):
+        del phi
         return self.torque
 
     @property
@@ -123,6 +134,7 @@ class GasLoad(Load):
         return self.margins(motion, own) > 0
 
     def margins(self, motion, own) -> Float[Array, " s"]:
+        del own
         phi, half = motion.phi, self.profile.half_pitch
         roll = self._roll(phi)
         addendum = half - jnp.abs(roll - half)
@@ -211,3 +223,160 @@ def _spread_share(addendum, begin, end):
     roll angles at the ends of a flank segment. `addendum`: roll angle of the addendum point in
     contact. All angles are in rad. Outside the jump, the fraction is negative or exceeds 1."""
     return (addendum - (begin + end - BRIEF) / 2) / BRIEF
+
+
+MIRROR = np.array([-1.0, 1.0])
+"""Factors of x and y that mirror a vector at the plane midway between the rotors."""
+
+
+def contact_place(profile: Profile, phi: Float[Array, ""]) -> Float[Array, "2"]:
+    """Return the place (m) where the rotors touch in perfect rolling, x and y from rotor 1's axis.
+
+    `phi`: φ1 (rad). Where a whole arc touches at once, the place moves along it while φ1 changes by
+    a short angle. `GasLoad` spreads the jump of its torque over the same angle."""
+    half = profile.half_pitch
+    centred = phi - 4 * half * jnp.round(phi / (4 * half))
+    roll = jnp.abs(centred)
+    lead = jnp.where(roll < half, 1.0, -1.0)
+    # At φ1 < 0 the leading flank of rotor 1 touches.
+    side = jnp.where(centred < 0, 1.0, -1.0)
+
+    def place(nu):
+        _, psi, s = profile.addendum(nu)
+        across = profile.pitch_radius + lead * s * jnp.sin(psi)
+        return jnp.stack([across, lead * side * s * jnp.cos(psi)])
+
+    return over_segments(profile, half - jnp.abs(roll - half), place)
+
+
+class GasResultant(eqx.Module):
+    """Resultant of the gas pressure on each rotor.
+
+    `pressure_length`: Δp L (N/m); `profile`; `outer_radius` r_a (m); `port` (rad): angle before the
+    lowest point of the bore at which a pocket opens to discharge; `slices` of twisted rotors, or
+    `None`."""
+
+    pressure_length: Float[Array, ""]
+    profile: Profile
+    outer_radius: Float[Array, ""]
+    port: Float[Array, ""]
+    slices: Slices | None = None
+
+    @property
+    def weights(self) -> Float[Array, " s"] | Float[np.ndarray, " s"]:
+        """Share (s,) of the length of every slice; [1] for straight rotors."""
+        return np.ones(1) if self.slices is None else self.slices.weights
+
+    @property
+    def places(self) -> Float[Array, " s"] | Float[np.ndarray, " s"]:
+        """Distance (s,) of every slice from the middle, as a share of the length."""
+        return np.zeros(1) if self.slices is None else self.slices.places
+
+    @property
+    def _ahead(self) -> Float[Array, ""] | float:
+        """Angle (rad) by which the leading end of the rotors is ahead of the middle."""
+        return 0.0 if self.slices is None else jnp.abs(self.slices.twist) / 2
+
+    def chords(
+        self, phi: Float[Array, ""]
+    ) -> tuple[Float[Array, "s rotor xy"], Float[Array, "s rotor xy"]]:
+        """Return both ends (m) of the surface under discharge pressure: contact and sealing tip.
+
+        Both are given for every slice and rotor, seen from the rotor's axis; those of rotor 2 are
+        mirrored. `phi`: φ1 (rad) of the middle. A pocket has one pressure along its length, so it
+        opens where its leading end passes the port."""
+        pitch = 2 * jnp.pi / self.profile.lobes
+        offsets = jnp.zeros(1) if self.slices is None else self.slices.offsets
+        ahead, opening = self._ahead, -jnp.pi / 2 - self.port
+        turned = phi + ahead + pitch / 2 * np.arange(2)
+        # The last tip whose leading end is before the port, in the sense of rotation.
+        tip = opening - jnp.mod(opening - turned, pitch) - ahead
+
+        def of_slice(offset):
+            first = contact_place(self.profile, phi + offset)
+            second = MIRROR * (first - jnp.stack([2 * self.profile.pitch_radius, 0.0]))
+            tips = self.outer_radius * jnp.stack([jnp.cos(tip + offset), jnp.sin(tip + offset)], 1)
+            return jnp.stack([first, second]), tips
+
+        return jax.vmap(of_slice)(offsets)
+
+    def slice_forces(self, phi: Float[Array, ""]) -> Float[Array, "s rotor xy"]:
+        """Return the force (N) on every slice and rotor; `phi`: φ1 (rad).
+
+        It is Δp L times the chord, rotated by a right angle, times the slice's share of the length.
+        """
+        contact, tip = self.chords(phi)
+        chord = contact - tip
+        turned = jnp.stack([-chord[..., 1], chord[..., 0]], axis=-1)
+        turned = turned * np.stack([np.ones(2), MIRROR])
+        weights = jnp.asarray(self.weights)
+        return self.pressure_length * weights[:, None, None] * turned
+
+    def openings(self) -> Float[Array, "2"]:
+        """Return the angles φ1 (rad), each in one mesh period, at which a pocket opens."""
+        pitch = 2 * jnp.pi / self.profile.lobes
+        opening = -jnp.pi / 2 - self.port - self._ahead - pitch / 2 * np.arange(2)
+        return jnp.mod(opening, pitch)
+
+    def corners(self) -> Float[Array, " k"]:
+        """Return the angles φ1 (rad, in one mesh period) at which the forces are not smooth.
+
+        Pockets open there, or the contact of a slice passes the end of a segment."""
+        pitch = 2 * jnp.pi / self.profile.lobes
+        rolls = [jnp.zeros(1), pitch / 4 * jnp.ones(1)]
+        for segment in self.profile.segments():
+            ends = self.profile.roll_angle(jnp.stack([segment.start, segment.stop]))
+            rolls += [ends, (ends[:1] + ends[1:] + BRIEF * np.array([-1.0, 1.0])) / 2]
+        roll = jnp.concatenate(rolls)
+        each = jnp.concatenate([roll, -roll, pitch / 2 - roll, roll - pitch / 2])
+        if self.slices is not None:
+            each = (each[:, None] - self.slices.offsets).ravel()
+        return jnp.mod(jnp.concatenate([self.openings(), each]), pitch)
+
+    def passed(self, phi: Float[Array, ""]) -> Bool[Array, "4"]:
+        """Return flags that change where a pocket opens, a tip passes the line of centres, or the
+        contact crosses the pitch circle."""
+        pitch = 2 * jnp.pi / self.profile.lobes
+        turned = phi + self._ahead + self.port + jnp.pi / 2 + pitch / 2 * np.arange(2)
+        opened = jnp.mod(jnp.floor(turned / pitch), 2) > 0
+        half = jnp.floor(phi * self.profile.lobes / jnp.pi + jnp.array([0.0, 0.5]))
+        return jnp.concatenate([opened, jnp.mod(half, 2) > 0])
+
+
+class AxisLoads(Part):
+    """Forces on the axes other than those of the flanks: gas, teeth of the timing gear, weight.
+
+    `gas`, `gear`: absent if `None`; `tooth_angle` (rad): pressure angle of the gear's teeth;
+    `radius` (m): pitch radius; `weight` (N) of a rotor, downwards, `None`: not counted."""
+
+    gas: GasResultant | None
+    gear: TimingGear | None
+    tooth_angle: Float[Array, ""]
+    radius: Float[Array, ""]
+    weight: Float[Array, ""] | None = None
+
+    def gear_force(self, motion) -> Float[Array, "2"]:
+        """Return the force (N) of the teeth on rotor 2, x and y; on rotor 1 it is the opposite."""
+        if self.gear is None:
+            return jnp.zeros(2, motion.relative.dtype)
+        across = -self.gear.torque_on_1(motion, np.zeros(0)) / self.radius
+        return jnp.stack([jnp.abs(across) * jnp.tan(self.tooth_angle), across])
+
+    def force_on_axes(self, motion, own) -> Float[Array, "2 2"]:
+        del own
+        teeth = self.gear_force(motion)
+        total = jnp.stack([-teeth, teeth])
+        if self.gas is not None:
+            total = total + jnp.sum(self.gas.slice_forces(motion.phi), axis=0)
+        if self.weight is not None:
+            total = total - self.weight * np.array([[0.0, 1.0], [0.0, 1.0]])
+        return total
+
+    def switches(self, motion, own) -> Bool[Array, " s"]:
+        del own
+        flags = []
+        if self.gear is not None:
+            flags.append((self.gear.torque_on_1(motion, np.zeros(0)) > 0)[None])
+        if self.gas is not None:
+            flags.append(self.gas.passed(motion.phi))
+        return jnp.concatenate(flags) if flags else jnp.zeros(0, bool)

@@ -12,7 +12,7 @@ import pytest
 import rootsopt
 from experiments._common.shooting import closed as shooting
 from rootsopt.dynamics.collocation.closing import Closed, Closer, Loop, gained
-from rootsopt.dynamics.collocation.elements import Elements, Mesh
+from rootsopt.dynamics.collocation.elements import GAUSS, POINTS, Elements, Mesh
 from rootsopt.dynamics.collocation.equation import Points
 from rootsopt.dynamics.collocation.events import (
     FIXED,
@@ -23,13 +23,12 @@ from rootsopt.dynamics.collocation.events import (
     look,
     rooted,
 )
-from rootsopt.dynamics.collocation.forces import OrbitForces
-from rootsopt.dynamics.collocation.gauss import GAUSS, POINTS
 from rootsopt.dynamics.collocation.known import KnownOrbit, padded, trimmed
 from rootsopt.dynamics.collocation.mesh import roughness, sizes
+from rootsopt.dynamics.collocation.newton import OrbitForces
 from rootsopt.dynamics.collocation.peak import Rivals, peak_of, rivals_of
 from rootsopt.dynamics.collocation.system import Step, moved_at, unchanged
-from rootsopt.dynamics.varied import VariedOrbit
+from rootsopt.dynamics.steady import VariedOrbit
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.scene import Scene
 from rootsopt.status import Status

@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rootsopt.dynamics.collocation.elements import Elements, Mesh
+from rootsopt.dynamics.collocation.elements import GAUSS, POINTS, Elements, Mesh
 from rootsopt.dynamics.collocation.events import zero_of
-from rootsopt.dynamics.collocation.gauss import GAUSS, POINTS
 from rootsopt.dynamics.collocation.mesh import aligned, counted, moved, needed, ordered
 
 ROOM = 32

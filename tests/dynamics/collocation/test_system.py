@@ -4,9 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rootsopt.dynamics.collocation.blocks import BLOCK, in_blocks
-from rootsopt.dynamics.collocation.elements import Elements, Mesh
-from rootsopt.dynamics.collocation.gauss import GAUSS
+from rootsopt.dynamics.collocation.elements import BLOCK, GAUSS, Elements, Mesh, in_blocks
 from rootsopt.dynamics.collocation.system import Columns, Lines, chained, condensed, own_column
 
 STATES, POINTS = 3, 4
