@@ -5,7 +5,6 @@ import os
 import shutil
 import tempfile
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -30,10 +29,9 @@ from rootsopt.runtime import programs  # noqa: E402
 from rootsopt.runtime.environment import use_float64  # noqa: E402
 
 # Each process of a session has a core of its own: a program is compiled in one piece, which takes a
-# fifth less work than many pieces side by side. Programs are not optimised: compiling takes half the
-# time, and the arithmetic is the same except for rounding. The variable reaches commands in processes
-# of their own, so that all share their programs. What XLA_FLAGS gives stays: `make test-all` tries
-# programs that are optimised as for a user.
+# fifth less work than many pieces side by side. Programs are not optimised, which halves the time
+# that compiling takes; results differ by rounding. Commands in processes of their own inherit the
+# variable, so that all share their programs. What the caller gives in it stays.
 _GIVEN = os.environ.get("XLA_FLAGS", "")
 _FLAGS = {
     "xla_cpu_parallel_codegen_split_count": 1,

@@ -33,7 +33,9 @@ from jax.experimental import serialize_executable
 from rootsopt.config.families import outside_modules
 from rootsopt.runtime.store import Store, UnsafeFolderError
 
-_PACKAGES = ("jax", "jaxlib", "diffrax", "equinox", "lineax", "optimistix", "optax", "numpy")
+_PACKAGES = (
+    *("jax", "jaxlib", "jaxtyping", "diffrax", "equinox", "lineax", "optimistix", "optax", "numpy"),
+)
 _SETTINGS = (
     "jax_enable_x64",
     "jax_numpy_dtype_promotion",

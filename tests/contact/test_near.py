@@ -13,7 +13,7 @@ from rootsopt.contact.near import NearContact
 from rootsopt.contact.search import SearchContact
 from rootsopt.dynamics.collocation.events import kinds
 from rootsopt.profiles import CIC, arc, four_arcs
-from rootsopt.scene import Scene
+from rootsopt.response.evaluation import Evaluator
 
 GAS = [
     "scene.load={pressure_difference_Pa: 2.0e4}",
@@ -35,8 +35,7 @@ SCENES = {
 
 def _pair(name):
     config = rootsopt.load_config(f"configs/{SCENES[name][0]}.yaml", SCENES[name][1])
-    scene = Scene.from_config(config)
-    return eqx.filter_jit(lambda s, d: s.pair(d))(scene, jnp.asarray(config.design, float))
+    return Evaluator.of(config).pair(config.design)
 
 
 def _states(pair, count):
@@ -53,7 +52,13 @@ def _near(pair, normals):
     return eqx.tree_at(lambda p: p.contact, pair, NearContact(pair.contact.pair, roots))
 
 
-@pytest.mark.parametrize("name", SCENES)
+SHORT = "pump", "four arcs"
+"""Scenes with every part, and with a contact that jumps."""
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[pytest.mark.long] * (n not in SHORT)) for n in SCENES]
+)
 def test_margins_have_the_sign_of_the_flags(name):
     pair = _pair(name)
     assert isinstance(pair.contact, SearchContact)
@@ -78,7 +83,9 @@ def test_margins_have_the_sign_of_the_flags(name):
     assert seen > 100
 
 
-@pytest.mark.parametrize("name", ["cic_drawn", "ee", "pump"])
+@pytest.mark.parametrize(
+    "name", ["cic_drawn", *(pytest.param(n, marks=pytest.mark.long) for n in ("ee", "pump"))]
+)
 def test_equation_near_a_root_is_that_of_the_search(name):
     """From a root 1e-3 away, two evaluations reach the search's forces and derivatives."""
     pair = _pair(name)
@@ -172,9 +179,8 @@ def test_margin_of_a_jump_is_zero_where_both_minima_are_equally_deep():
     assert found == pytest.approx(jump, abs=1e-9)
 
 
-@pytest.mark.parametrize("name", ["cic_drawn", "pump"])
-def test_force_and_margins_from_one_contact_are_those_of_two(name):
-    pair = _pair(name)
+def test_force_and_margins_from_one_contact_are_those_of_two():
+    pair = _pair("pump")
     tau, state = (x[0] for x in _states(pair, 1))
 
     @eqx.filter_jit

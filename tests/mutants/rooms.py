@@ -9,7 +9,7 @@ _OF = {
     "continuation/family": "continuation",
     "contact/closest": "closed_forms contact accuracy families gradients",
     "contact/gap": "conformance",
-    "contact/impact": "impact contact extremes",
+    "contact/impact": "contact extremes",
     "contact/law": "conformance extending_parts",
     "contact/near": "near",
     "contact/point": "scene",

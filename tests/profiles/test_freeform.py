@@ -97,8 +97,10 @@ def test_ee_is_a_free_form_of_equal_coefficients():
     [
         # Distance (µm) with 6, 12 and 24 coefficients. Arcs that are tangent alone bend suddenly.
         (CIC(3, R, 27.3 * DEG, 0.77e-3, 1.27 * DEG), (5.0, 0.5, 0.1)),
-        (made("arc", 29.7), (2.0, 0.05, 0.01)),
-        (made("four_arcs", 30.0, 13.0, 40.0), (200.0, 50.0, 10.0)),
+        pytest.param(made("arc", 29.7), (2.0, 0.05, 0.01), marks=pytest.mark.long),
+        pytest.param(
+            made("four_arcs", 30.0, 13.0, 40.0), (200.0, 50.0, 10.0), marks=pytest.mark.long
+        ),
         (EE(3, R), (1e-6, 1e-6, 1e-6)),
     ],
 )
