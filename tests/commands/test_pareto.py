@@ -98,29 +98,6 @@ def test_click_on_a_point_shows_its_config(folder, tmp_path):
         assert [line for line in page.console() if not line.startswith("INFO")] == []
 
 
-def test_page_is_left_out_without_its_library(tmp_path, monkeypatch, capfd):
-    monkeypatch.setattr(pages.importlib.util, "find_spec", lambda name: None)
-    assert pareto.main([CIC, "-o", str(tmp_path / "run"), *FEW, "--set", "pareto.points=3"]) == 0
-    assert "rootsopt[pages]" in capfd.readouterr().err
-    assert not (tmp_path / "run" / pages.FRONT).exists()
-
-
-@pytest.mark.parametrize(
-    ("overrides", "words"),
-    [
-        (["pareto.terms=[noise, area_mm2]"], "noise"),
-        (["pareto.points=1"], "pareto.points"),
-        (["profile={family: ee, lobes: 3, pitch_radius_mm: 33}"], "no design parameter"),
-    ],
-)
-def test_bad_input_ends_with_one_line(tmp_path, capsys, overrides, words):
-    given = [part for override in overrides for part in ("--set", override)]
-    assert pareto.main([CIC, "-o", str(tmp_path / "run"), *given]) == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    assert words in line
-    assert not (tmp_path / "run").exists()
-
-
 def test_contradicting_constraints_end_with_advice(tmp_path, capsys):
     limits = ["--set", "constraints={area_efficiency_min: 0.48, seal_width_min_mm: 25}"]
     assert pareto.main([CIC, "-o", str(tmp_path / "run"), *FEW, *limits]) == 3
