@@ -42,12 +42,6 @@ def numbers(evaluation):
     return np.array([evaluation.response[name] for name in RESPONSES])
 
 
-def gradients(evaluation):
-    """Return the gradients as an array (response, design parameter)."""
-    rows = (evaluation.gradient[name] for name in RESPONSES)
-    return np.array([[row[key] for key in DESIGN_KEYS] for row in rows])
-
-
 def integrator(rtol):
     return Integrator("dopri8", jnp.asarray(rtol), 20_000)
 
@@ -194,38 +188,6 @@ def test_series_is_the_motion_over_one_revolution(orbits):
 
 
 # Gradients
-
-
-def test_peak_on_a_corner_has_its_gradient():
-    """If the peak is on a corner of the force, its derivative is neither of the two beside it.
-
-    The corner is where the contact moves from the involute to the tip arc."""
-    evaluator = Evaluator.of(load("configs/cic_drawn.yaml"))
-    design, step = jnp.array([35.0, 5.602843, 3.5]), 1e-3
-
-    def peak(at):
-        return evaluator(at, series=False).response["peak_force_N"]
-
-    slope = np.array(list(evaluator(design, series=False).gradient["peak_force_N"].values()))
-    difference = [
-        (peak(design + step * unit) - peak(design - step * unit)) / (2 * step) for unit in np.eye(3)
-    ]
-    np.testing.assert_allclose(slope, difference, atol=2e-4 * np.max(np.abs(slope)))
-
-
-@pytest.mark.parametrize("design", [(28.0, 3.0, 1.5), (34.0, 7.0, 3.0)])
-def test_gradient_at_the_default_tolerance(design):
-    """The gradient agrees with that at 1e-11, because elements end where the equation is not
-    smooth.
-
-    Otherwise, gradients would be wrong by 1e-3 to 6e-3."""
-    evaluator = Evaluator.of(load("configs/cic_drawn.yaml"))
-    usual, tight = (
-        gradients(one(jnp.array(design), series=False))
-        for one in (evaluator, evaluator.at_tolerance(1e-11))
-    )
-    error = np.max(np.abs(usual - tight), axis=1) / np.max(np.abs(tight), axis=1)
-    assert np.max(error) < 5e-5
 
 
 # Statuses
