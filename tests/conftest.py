@@ -54,19 +54,10 @@ settings.load_profile("rootsopt")
 
 
 _LONGEST_FIRST = (
-    "steady",
-    "cli",
-    "response",
-    "improve",
-    "ensemble",
-    "reserve",
-    "continuation",
-    "basins",
-    "landing",
-    "gear_errors",
-    "export",
-    "near",
+    *("response", "tradeoffs", "continuation", "basins", "start", "steady", "known", "reserve"),
+    *("improve", "families", "rattle", "cli", "robust", "leakage", "ensemble", "gradients"),
 )
+"""The first two share few programs: neither process repeats what the other compiles."""
 
 
 def pytest_collection_modifyitems(items):
