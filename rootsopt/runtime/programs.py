@@ -34,7 +34,15 @@ from rootsopt.config.families import outside_modules
 from rootsopt.runtime.store import Store, UnsafeFolderError
 
 _PACKAGES = (
-    *("jax", "jaxlib", "jaxtyping", "diffrax", "equinox", "lineax", "optimistix", "optax", "numpy"),
+    "jax",
+    "jaxlib",
+    "jaxtyping",
+    "diffrax",
+    "equinox",
+    "lineax",
+    "optimistix",
+    "optax",
+    "numpy",
 )
 _SETTINGS = (
     "jax_enable_x64",
