@@ -11,8 +11,9 @@ optimize: $(VENV)/.run
 test: $(VENV)/.dev
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not long"
 
+# With programs that are optimised as for a user.
 test-all: $(VENV)/.dev
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+	XLA_FLAGS=--xla_backend_optimization_level=3 $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 # The site, in build/site; notebooks run if they or the code have changed. A warning is an error.
 docs: $(VENV)/.dev

@@ -5,7 +5,6 @@ import os
 import shutil
 import tempfile
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -28,20 +27,22 @@ from rootsopt.runtime import programs  # noqa: E402
 from rootsopt.runtime.environment import use_float64  # noqa: E402
 
 # Each process of a session has a core of its own: a program is compiled in one piece, which takes a
-# fifth less work than many pieces side by side. The tests' own functions are compiled with the
-# options of the package's programs.
-_GIVEN = os.environ.get("XLA_FLAGS")
-_FLAGS = {"xla_cpu_parallel_codegen_split_count": 1, **programs.COMPILER_OPTIONS}
+# fifth less work than many pieces side by side. Programs are not optimised, which halves the time
+# that compiling takes; results differ by rounding. Commands in processes of their own inherit the
+# variable, so that all share their programs. What the caller gives in it stays.
+_GIVEN = os.environ.get("XLA_FLAGS", "")
+_FLAGS = {
+    "xla_cpu_parallel_codegen_split_count": 1,
+    "xla_backend_optimization_level": 0,
+    **programs.COMPILER_OPTIONS,
+}
 os.environ["XLA_FLAGS"] = " ".join(
-    [
-        _GIVEN or "",
-        *(f"--{name}={str(value).lower()}" for name, value in _FLAGS.items()),
-    ]
+    [_GIVEN, *(f"--{k}={v}".lower() for k, v in _FLAGS.items() if k not in _GIVEN)]
 ).strip()
 try:
     use_float64()
 except InputError:  # XLA versions differ in the flags that they take, and none of these is needed.
-    os.environ["XLA_FLAGS"] = _GIVEN or ""
+    os.environ["XLA_FLAGS"] = _GIVEN
     use_float64()
 use_cache()
 settings.register_profile("rootsopt", deadline=None, derandomize=True, max_examples=25)
@@ -50,55 +51,11 @@ settings.register_profile("fuzz", deadline=None, max_examples=5_000, print_blob=
 settings.load_profile("rootsopt")
 
 
-_OPTIMISED = (
-    "ensemble",
-    "basins",
-    "continuation",
-    "speeds",
-    "experiments",
-    "gradients",
-    "measures",
-    "optimize",
-    "steady",
-)
-"""Test files that compute longer than they compile. They share their programs, also with commands
-in processes of their own."""
-
-
-@pytest.fixture(autouse=True, scope="module")
-def compiled(request):
-    """Optimise programs, as for a user, only in files where this saves time.
-
-    In the others, the arithmetic is the same except for rounding, and compiling takes half the
-    time."""
-    name = request.path.stem.removeprefix("test_")
-    if name in _OPTIMISED:
-        yield
-        return
-    options = programs.COMPILER_OPTIONS | {"xla_backend_optimization_level": 0}
-    # The package's programs take the options; functions that a test compiles itself take the flag.
-    jax.config.update("jax_disable_most_optimizations", True)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(programs, "COMPILER_OPTIONS", options)
-        yield
-    jax.config.update("jax_disable_most_optimizations", False)
-
-
 _LONGEST_FIRST = (
-    "steady",
-    "cli",
-    "response",
-    "improve",
-    "ensemble",
-    "reserve",
-    "continuation",
-    "basins",
-    "landing",
-    "gear_errors",
-    "export",
-    "near",
+    *("response", "tradeoffs", "continuation", "basins", "start", "steady", "known", "reserve"),
+    *("improve", "families", "rattle", "cli", "robust", "leakage", "ensemble", "gradients"),
 )
-"""The first two compile with different options: neither process repeats what the other compiles."""
+"""The first two share few programs: neither process repeats what the other compiles."""
 
 
 def pytest_collection_modifyitems(items):

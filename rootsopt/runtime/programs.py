@@ -33,7 +33,17 @@ from jax.experimental import serialize_executable
 from rootsopt.config.families import outside_modules
 from rootsopt.runtime.store import Store, UnsafeFolderError
 
-_PACKAGES = ("jax", "jaxlib", "diffrax", "equinox", "lineax", "optimistix", "optax", "numpy")
+_PACKAGES = (
+    "jax",
+    "jaxlib",
+    "jaxtyping",
+    "diffrax",
+    "equinox",
+    "lineax",
+    "optimistix",
+    "optax",
+    "numpy",
+)
 
 # Names of the JAX settings that change what is traced or compiled.
 _SETTINGS = (

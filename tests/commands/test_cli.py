@@ -31,6 +31,7 @@ SMALL = [
     "--set", "optimizer.screening=2",
     "--set", "optimizer.starts=1",
     "--set", "optimizer.iterations=2",
+    "--set", "optimizer.prove=false",
     "--set", "assumptions.scenes=0",
 ]  # fmt: skip
 

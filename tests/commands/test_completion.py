@@ -64,8 +64,3 @@ def test_unknown_shell_and_missing_library(monkeypatch, capsys):
     monkeypatch.setattr(completion.importlib.util, "find_spec", lambda name: None)
     assert main(["--completion", "bash"]) == 2
     assert "rootsopt[completion]" in capsys.readouterr().err
-
-
-def test_help_mentions_it(capsys):
-    assert main(["--help"]) == 0
-    assert "--completion bash" in capsys.readouterr().out

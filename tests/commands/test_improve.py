@@ -1,9 +1,11 @@
 """`rootsopt improve`: a rotor from a file, and a better one in its place."""
 
+import inspect
 import json
 import os
 import pty
 import tty
+from types import SimpleNamespace
 
 import ezdxf
 import numpy as np
@@ -11,7 +13,9 @@ import pytest
 
 from rootsopt.commands.table import improve
 from rootsopt.commands.work import improve as work
+from rootsopt.output.comparison import NOTHING_BETTER, WORTH
 from tests.measured.test_finding import cut_cic, cycloids, write
+from tests.standins import evaluation_of
 
 DESIGN = {"pressure_angle_deg": 36.43, "involute_length_mm": 8.5, "tip_arc_angle_deg": 4.0}
 QUICK = (
@@ -72,16 +76,20 @@ def test_a_better_rotor_takes_the_place_of_that_of_a_file(aim, least, tmp_path, 
         assert one["share"] == pytest.approx(gain / result["improvement"]["objective"], rel=1e-3)
 
 
-def test_a_gain_too_small_to_count_is_none(tmp_path, monkeypatch):
-    """Status, message and exit code agree; the design is reported all the same."""
-    monkeypatch.setattr(work, "WORTH", 2.0)
-    file, folder = file_of(tmp_path, 0.0), tmp_path / "run"
-    sets = [word for one in QUICK for word in ("--set", one)]
-    assert improve.main([file, "--smoother", "--no-figures", *sets, "-o", str(folder)]) == 3
-    result = json.loads((folder / "result.json").read_text())
-    assert result["status"] == "not_improved"
-    assert "no better rotor" in result["message"]
-    assert result["optimized"]["status"] == "geometry_only"
+def test_a_gain_too_small_to_count_is_none(monkeypatch):
+    """Status, message and exit code agree."""
+    gain = {"objective": 0.9 * WORTH}
+    found = SimpleNamespace(improvement=gain, interrupted=False, optimized=evaluation_of())
+
+    def searched(config, options, folder, further):
+        folder.result = {"improvement": gain} | further(found)
+        return SimpleNamespace(code=0)
+
+    monkeypatch.setattr(work.optimize, "searched_for", searched)
+    folder, body = SimpleNamespace(), inspect.unwrap(work.body)
+    code = body(None, SimpleNamespace(known={"found": []}), folder).code
+    told = folder.result["status"], folder.result["message"]
+    assert (code, *told) == (3, "not_improved", NOTHING_BETTER)
 
 
 @pytest.mark.long

@@ -36,8 +36,8 @@ def made(path, **changes):
     [
         (2, 125.0, 200.0, None),
         (3, 20.0, 29.0, "five_arcs"),
-        (5, 300.0, 353.0, "hypo_epicycloid"),
-        (6, 1000.0, 1180.0, "arc"),
+        pytest.param(5, 300.0, 353.0, "hypo_epicycloid", marks=pytest.mark.long),
+        pytest.param(6, 1000.0, 1180.0, "arc", marks=pytest.mark.long),
     ],
 )
 def test_rotors_have_the_diameter_and_mesh_at_the_centre_distance(

@@ -60,22 +60,6 @@ def test_config_of_a_point_is_its_design(folder):
         )
 
 
-@pytest.mark.parametrize(
-    ("overrides", "words"),
-    [
-        (["pareto.terms=[noise, area_mm2]"], "noise"),
-        (["pareto.points=1"], "pareto.points"),
-        (["profile={family: ee, lobes: 3, pitch_radius_mm: 33}"], "no design parameter"),
-    ],
-)
-def test_bad_input_ends_with_one_line(tmp_path, capsys, overrides, words):
-    given = [part for override in overrides for part in ("--set", override)]
-    assert pareto.main([CIC, "-o", str(tmp_path / "run"), *given]) == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    assert words in line
-    assert not (tmp_path / "run").exists()
-
-
 def test_contradicting_constraints_end_with_advice(tmp_path, capsys):
     limits = ["--set", "constraints={area_efficiency_min: 0.48, seal_width_min_mm: 25}"]
     assert pareto.main([CIC, "-o", str(tmp_path / "run"), *FEW, *limits]) == 3

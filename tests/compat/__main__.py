@@ -29,7 +29,6 @@ COPIED = "tests", "configs", "experiments", "docs", "pyproject.toml", "README.md
 TESTS = (
     "tests/config",
     "tests/contact/test_closed_forms.py",
-    "tests/contact/test_impact.py",
     "tests/design/test_bounds.py",
     "tests/pages/test_knobs.py",
     "tests/pages/test_latest.py",

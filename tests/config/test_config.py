@@ -109,14 +109,6 @@ def test_resolved_yaml_round_trips():
     assert config.solver.orbit_tolerance == pytest.approx(1e-8)
 
 
-def test_load_reads_a_file_and_applies_overrides(tmp_path):
-    """load() is parse() of a file."""
-    path = tmp_path / "scene.yaml"
-    path.write_text(MINIMAL + "# Ø of a comment\n", encoding="utf-8")
-    assert load(path) == parse(MINIMAL)
-    assert load(str(path), ["scene.speed_rpm=1500"]).scene.speed_rpm == 1500.0
-
-
 # What is refused
 
 

@@ -158,8 +158,10 @@ def equations(jaxpr):
 
 
 def size(pair):
-    """Return the number of states, equations and numbers of a pair's right-hand side."""
-    numbers, static = eqx.partition(pair, eqx.is_array)
+    """Return the number of states, equations and numbers of a pair's right-hand side.
+
+    The pair may have shapes in place of arrays."""
+    numbers, static = eqx.partition(pair, lambda x: hasattr(x, "shape"))
     program = jax.make_jaxpr(lambda tau, y, n: eqx.combine(n, static).derivative(tau, y)[0])(
         jnp.zeros(()), jnp.zeros(pair.states), numbers
     )

@@ -25,6 +25,7 @@ PROFILES = {
 }
 
 closest = eqx.filter_jit(lambda pair, x, e: jax.vmap(pair)(x, e))
+paired = eqx.filter_jit(FlankPair.of)
 every_profile = pytest.mark.parametrize("name", PROFILES)
 
 
@@ -43,10 +44,11 @@ def test_root_is_found_to_twelve_digits(name, error_mm):
 
     This holds wherever T crosses zero smoothly. The two normals are parallel by construction."""
     profile = PROFILES[name]
-    pair = FlankPair.of(profile, jnp.asarray(2 * R + error_mm * 1e-3))
+    pair = paired(profile, jnp.asarray(2 * R + error_mm * 1e-3))
     x, relative = poses(4000, float(profile.half_pitch))
     found = closest(pair, x, relative)
-    offset = np.abs(jax.vmap(pair._mesh)(found.normal2, x, relative)[0]) / R
+    mesh = jax.jit(jax.vmap(pair._mesh))
+    offset = np.abs(mesh(found.normal2, x, relative)[0]) / R
     touching = np.asarray(found.found)
     assert np.mean(touching) > 0.6
     assert np.quantile(offset[touching], 0.995) < 1e-12
@@ -81,7 +83,7 @@ def test_deepest_of_several_minima_is_found_on_a_wavy_flank(seed):
     first or the last one."""
     rng = np.random.default_rng(seed)
     moved = np.clip(np.array(WAVY) + rng.uniform(-0.2, 0.2, len(WAVY)) * (seed > 0), -1, 1)
-    pair = FlankPair.of(FreeForm(3, R, 1.2658 * DEG, moved))
+    pair = paired(FreeForm(3, R, 1.2658 * DEG, moved))
     roll = jnp.asarray(np.append(rng.uniform(-0.1, 0.4, 200), np.linspace(0.1, 0.11, 100)))
     relative = jnp.asarray(-np.append(10 ** rng.uniform(-4, -2.4, 200), np.full(100, 1.7437e-3)))
     deepest, count, found = jax.tree.map(np.asarray, _sampled(pair, roll, relative))
@@ -115,7 +117,7 @@ def test_deeper_minimum_away_from_rolling_is_found(family, design):
     joint = float(profile.roll_angle(profile.segments()[-2].stop))
     beside = joint + rng.uniform(-8, 8, 100) * turn[-100:]
     roll = np.concatenate([rng.uniform(0.1, 0.3, 100), rng.uniform(-0.05, 0.5, 100), beside])
-    sampled = _sampled(FlankPair.of(profile), jnp.asarray(roll), jnp.asarray(-turn))
+    sampled = _sampled(paired(profile), jnp.asarray(roll), jnp.asarray(-turn))
     deepest, count, found = jax.tree.map(np.asarray, sampled)
     touching = found.found & (deepest < -1e-7) & (deepest > -1e-3)
     assert np.sum(touching & (count > 1)) > 5

@@ -12,8 +12,9 @@ from rootsopt.contact.closest import FlankPair
 from rootsopt.contact.search import NearContact, SearchContact
 from rootsopt.dynamics.collocation.events import kinds
 from rootsopt.profiles import CIC, arc, four_arcs
-from rootsopt.scene import Scene
+from rootsopt.response.evaluation import Evaluator
 
+paired = eqx.filter_jit(FlankPair.of)
 GAS = [
     "scene.load={pressure_difference_Pa: 2.0e4}",
     "contact.friction={static: 0.2, kinetic: 0.1, stiction_speed_mm_s: 100, "
@@ -34,8 +35,7 @@ SCENES = {
 
 def _pair(name):
     config = rootsopt.load_config(f"configs/{SCENES[name][0]}.yaml", SCENES[name][1])
-    scene = Scene.from_config(config)
-    return eqx.filter_jit(lambda s, d: s.pair(d))(scene, jnp.asarray(config.design, float))
+    return Evaluator.of(config).pair(config.design)
 
 
 def _states(pair, count):
@@ -52,7 +52,13 @@ def _near(pair, normals):
     return eqx.tree_at(lambda p: p.contact, pair, NearContact(pair.contact.pair, roots))
 
 
-@pytest.mark.parametrize("name", SCENES)
+SHORT = "pump", "four arcs"
+"""Scenes with every part, and with a contact that jumps."""
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[pytest.mark.long] * (n not in SHORT)) for n in SCENES]
+)
 def test_margins_have_the_sign_of_the_flags(name):
     pair = _pair(name)
     assert isinstance(pair.contact, SearchContact)
@@ -78,7 +84,9 @@ def test_margins_have_the_sign_of_the_flags(name):
     assert seen > 100
 
 
-@pytest.mark.parametrize("name", ["cic_drawn", "ee", "pump"])
+@pytest.mark.parametrize(
+    "name", ["cic_drawn", *(pytest.param(n, marks=pytest.mark.long) for n in ("ee", "pump"))]
+)
 def test_equation_near_a_root_is_that_of_the_search(name):
     """From a root 1e-3 away, two evaluations reach the search's forces and derivatives."""
     pair = _pair(name)
@@ -103,7 +111,7 @@ def test_equation_near_a_root_is_that_of_the_search(name):
 
 def test_root_at_the_end_of_a_segment_has_one_slope():
     """There, automatic differentiation mixes the slopes of both segments to one of wrong sign."""
-    flanks = FlankPair.of(CIC(3, 0.033, np.radians(34.85), 3.956e-3, np.radians(3.29)))
+    flanks = paired(CIC(3, 0.033, np.radians(34.85), 3.956e-3, np.radians(3.29)))
     relative = jnp.asarray(-1.135e-3)
     end = flanks.profile.segments()[1].stop
     offset = eqx.filter_jit(lambda *at: flanks._mesh(*at)[0])
@@ -126,7 +134,7 @@ def test_lever_bends_where_a_margin_changes_its_sign(profile, kinks):
     """The curvature of an arc jumps at the pitch crossing, that of an involute does not.
 
     A search shows the kink as a jump of the lever's slope."""
-    flanks = FlankPair.of(profile)
+    flanks = paired(profile)
     relative = jnp.asarray(-1e-3)
     # Rotor 2 touches at its crossing where half of the mesh has passed, less about ε.
     rolls = flanks.profile.half_pitch + 4e-3 * jnp.linspace(-1, -1e-3, 4001)
@@ -148,7 +156,7 @@ def test_lever_bends_where_a_margin_changes_its_sign(profile, kinks):
 
 def test_margin_of_a_jump_is_zero_where_both_minima_are_equally_deep():
     """The contact of four arcs jumps over their joint. A search finds the same roll angle."""
-    flanks = FlankPair.of(four_arcs(3, 0.033, 0.023964, 0.020659, np.radians(34.22)))
+    flanks = paired(four_arcs(3, 0.033, 0.023964, 0.020659, np.radians(34.22)))
     assert flanks.jumps
     relative = jnp.asarray(-1e-3)
     search = jax.jit(lambda roll: flanks(roll, relative).normal2)
@@ -172,9 +180,8 @@ def test_margin_of_a_jump_is_zero_where_both_minima_are_equally_deep():
     assert found == pytest.approx(jump, abs=1e-9)
 
 
-@pytest.mark.parametrize("name", ["cic_drawn", "pump"])
-def test_force_and_margins_from_one_contact_are_those_of_two(name):
-    pair = _pair(name)
+def test_force_and_margins_from_one_contact_are_those_of_two():
+    pair = _pair("pump")
     tau, state = (x[0] for x in _states(pair, 1))
 
     @eqx.filter_jit

@@ -1,5 +1,6 @@
 """Wear, normal offset and heat as changes of the clearance, and scenes that an optimum holds in."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +15,8 @@ from tests.conformance.families import LOBES, R, made
 
 BASE = ("contact.clearance_mm=0.05", "contact.wear={}", "scene.heat={}")
 
+shape = jax.jit(wear_shape)
+
 
 def scene_of(*changes: str) -> tuple[rootsopt.Config, Scene]:
     config = rootsopt.load_config("cic_drawn", [*BASE, *changes])
@@ -25,7 +28,7 @@ def test_ee_wears_evenly(lobes):
     """s, dl1/dβ and dl2/dβ of EE are proportional to sin ψ: 8N / (4N² - 1) everywhere."""
     roll = jnp.linspace(0.02, 0.98, 20) * np.pi / (2 * lobes)
     expected = 8 * lobes / (4 * lobes**2 - 1)
-    np.testing.assert_allclose(wear_shape(EE(lobes, R), roll), expected, rtol=1e-9)
+    np.testing.assert_allclose(shape(EE(lobes, R), roll), expected, rtol=1e-9)
 
 
 def test_shape_from_the_ways_of_the_contact():
@@ -35,12 +38,12 @@ def test_shape_from_the_ways_of_the_contact():
     nu = profile.normal_at(jnp.asarray(roll))
     lengths = []
     for curve in (profile.addendum, profile.dedendum):
-        beta, psi, s = map(np.asarray, curve(nu))
+        beta, psi, s = map(np.asarray, eqx.filter_jit(curve)(nu))
         points = np.exp(1j * beta) * (float(profile.pitch_radius) + s * 1j * np.exp(-1j * psi))
         lengths.append(np.abs(np.diff(points)) / np.diff(roll))
     s = np.abs(np.asarray(profile.addendum(nu)[2]))
     expected = (s[1:] + s[:-1]) * (1 / lengths[0] + 1 / lengths[1])
-    found = np.asarray(wear_shape(profile, jnp.asarray((roll[1:] + roll[:-1]) / 2)))
+    found = np.asarray(shape(profile, jnp.asarray((roll[1:] + roll[:-1]) / 2)))
     np.testing.assert_allclose(found, expected, rtol=1e-3)
 
 
@@ -48,8 +51,9 @@ def test_shape_from_the_ways_of_the_contact():
 def test_series_has_the_depth_and_no_ripples(family):
     profile, depth = made(family), jnp.asarray(2e-5)
     roll = np.linspace(0, np.pi / LOBES, 512)
-    series = wear_series(profile, depth)
-    values, rates = jax.vmap(lambda x: series_at(series, jnp.asarray(float(LOBES)), x))(roll)
+    series = jax.jit(wear_series)(profile, depth)
+    at = jax.jit(jax.vmap(lambda x: series_at(series, jnp.asarray(float(LOBES)), x)))
+    values, rates = at(roll)
     values = np.asarray(values)
     assert np.max(values) == pytest.approx(2e-5, rel=1e-3)
     assert np.min(values) >= 0
@@ -61,7 +65,7 @@ def test_worn_gap_has_a_potential():
     """Gap and levers: d gap = -lever1 dφ1 + lever2 dφ2, and the gap grows by the wear."""
     _, scene = scene_of("contact.wear.depth_mm=0.03")
     design = jnp.array([36.43, 9.0, 4.0])
-    worn = scene.contact(scene.profile(design))
+    worn = eqx.filter_jit(lambda design: scene.contact(scene.profile(design)))(design)
     assert isinstance(worn, WornContact)
 
     def gap(contact, first, second):

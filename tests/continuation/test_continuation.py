@@ -247,41 +247,50 @@ def test_units_of_the_state_are_those_of_each_config(branch):
     assert alone.response["peak_force_N"] == pytest.approx(end.peak, rel=1e-6)
 
 
-def test_period_doubling_leads_to_the_doubled_orbit(branch, monkeypatch):
-    """Below 3651 rpm the orbit is unstable, and one of twice the period is born.
-
-    A multiplier there is -1 by central differences, too. The doubled orbit is found on the other
-    side if the first side gives none."""
+@pytest.fixture(scope="module")
+def below(branch):
+    """Return orbits over speed down to a period doubling, and that bifurcation."""
     lowest = min((p for p in branch.at(3900.0) if p.stable), key=lambda p: p.peak)
-    below = follow(config_at(3900.0), SPEED, lowest.state, 1, StepSizes(3600, 4000))
-    (doubling,) = (one for one in below.bifurcations if one.kind is Kind.PERIOD_DOUBLING)
+    found = follow(config_at(3900.0), SPEED, lowest.state, 1, StepSizes(3600, 4000))
+    (doubling,) = (one for one in found.bifurcations if one.kind is Kind.PERIOD_DOUBLING)
+    return found, doubling
+
+
+def test_period_doubling_is_found(branch, below, monkeypatch):
+    """Below 3651 rpm the orbit is unstable; a multiplier there is -1 by central differences, too.
+
+    A doubled orbit is looked for on both sides; there may be none."""
+    found, doubling = below
     assert np.min(np.abs(doubling.point.multipliers + 1)) < 1e-6
     multipliers = np.linalg.eigvals(by_integration(doubling.point)[1])
     assert np.min(np.abs(multipliers + 1)) < 1e-3
     assert doubling.point.value == pytest.approx(3650.528, abs=0.01)
-    assert not below.points[doubling.after].stable
-    assert below.points[doubling.after + 1].stable
-    sides, closed = [], OrbitFamily.from_integration
+    assert not found.points[doubling.after].stable
+    assert found.points[doubling.after + 1].stable
+    sides = []
 
-    def one_side(family, place, across):
+    def none(family, place, across):
         sides.append(across)
-        if len(sides) == 1:
-            raise StoppedError(End.STEP_TOO_SMALL)
-        return closed(family, place, across)
+        raise StoppedError(End.STEP_TOO_SMALL)
 
-    monkeypatch.setattr(OrbitFamily, "from_integration", one_side)
-    doubled = follow_doubled(below, doubling, points=6)
-    # The sign of the eigenvector depends on the machine; one side may fail at the first distance.
+    monkeypatch.setattr(OrbitFamily, "from_integration", none)
+    assert follow_doubled(found, doubling, points=6) is None
     assert np.linalg.norm(sides[1]) == pytest.approx(1)
     np.testing.assert_array_equal(sides[1], -sides[0])
+    with pytest.raises(ValueError, match="period doubling"):
+        follow_doubled(branch, next(one for one in branch.bifurcations if one.kind is Kind.FOLD))
+
+
+@pytest.mark.long
+def test_period_doubling_leads_to_the_doubled_orbit(below):
+    """An orbit of twice the period is born, which is another one than those of the single."""
+    doubled = follow_doubled(*below, points=6)
     assert doubled is not None
     assert doubled.ends[1] is not End.HALVED
     assert doubled.family.period == 2
     assert max(point.residual for point in doubled.points) < 1e-9
-    simple = below.at(doubled.points[-1].value)
+    simple = below[0].at(doubled.points[-1].value)
     assert all(abs(p.peak - doubled.points[-1].peak) > 1e-3 * p.peak for p in simple)
-    with pytest.raises(ValueError, match="period doubling"):
-        follow_doubled(branch, next(one for one in branch.bifurcations if one.kind is Kind.FOLD))
 
 
 def test_wrong_input_is_explained(branch):

@@ -58,8 +58,14 @@ def errors(config, levels=3):
     return found
 
 
-@pytest.mark.parametrize("design", CIC)
-@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize(
+    ("scene", "design"),
+    [
+        pytest.param(scene, design, marks=[pytest.mark.long] * (i != k))
+        for i, scene in enumerate(SCENES)
+        for k, design in enumerate(CIC)
+    ],
+)
 def test_cic(scene, design):
     """Derivatives of mean, peak, lines and p-norm with respect to the three design parameters are
     correct."""

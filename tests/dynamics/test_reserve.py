@@ -204,6 +204,7 @@ def test_a_search_without_forces_simulates_nothing(monkeypatch):
     assert 0.01 < found.improvement["flow_ripple"] == pytest.approx(found.improvement["objective"])
 
 
+@pytest.mark.long
 def test_a_reserve_limits_a_search():
     """The limit holds at the optimum, where it has a price."""
     quick = ["optimizer.starts=1", "optimizer.screening=0", "optimizer.iterations=12"]

@@ -192,7 +192,10 @@ OTHERS = {
 }
 
 
-@pytest.mark.parametrize("family", OTHERS)
+@pytest.mark.parametrize(
+    "family",
+    [pytest.param(name, marks=[pytest.mark.long] * (name != "free_form")) for name in OTHERS],
+)
 def test_any_family_is_drawn(family, tmp_path):
     """Arcs with an edge, a curve with a cusp and a free form are read back with an area right to
     1e-6."""

@@ -157,7 +157,7 @@ def test_a_wrong_pitch_radius_is_told_from_a_wrong_unit(tmp_path):
         read(path)
 
 
-@pytest.mark.parametrize("size", [1, 5, 20])
+@pytest.mark.parametrize("size", [5, 20])
 def test_refused_points_are_said_to_be_scattered(tmp_path, size):
     """The message states the scatter, without smoothing and with too little.
 
@@ -190,8 +190,8 @@ def test_points_closer_than_they_scatter_are_to_be_thinned(tmp_path):
     assert read(path, smoothing_mm=0.006)[2].record()["scatter_um"] == pytest.approx(5, rel=0.15)
 
 
-@pytest.mark.parametrize("lobes", [2, 3, 4, 6])
-@pytest.mark.parametrize("count", [40, 89, 150, 600])
+@pytest.mark.parametrize("lobes", [2, 6])
+@pytest.mark.parametrize("count", [40, 150])
 def test_no_scatter_is_invented_for_exact_points(lobes, count):
     """However few the points are, scatter is 0 or unknown, and then the rest is stated."""
     found = estimates(outlines.epicycloid(lobes, 33.0, count), lobes)

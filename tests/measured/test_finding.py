@@ -43,7 +43,9 @@ ROTORS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", ROTORS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[pytest.mark.long] * ("CIC" not in n)) for n in ROTORS]
+)
 def test_unit_axis_lobes_distance_and_inset_are_found(name, tmp_path):
     points, unit, lobes, distance, inset, axis = ROTORS[name]
     file = write(tmp_path / "rotor.csv", points / LENGTHS[unit])
@@ -76,7 +78,9 @@ REFUSED = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", REFUSED)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[pytest.mark.long] * ("lobes" in n)) for n in REFUSED]
+)
 def test_what_is_no_rotor_is_refused(name, tmp_path):
     points, given, message = REFUSED[name]
     with pytest.raises(InputError, match=message):

@@ -9,7 +9,7 @@ _OF = {
     "continuation/family": "continuation",
     "contact/closest": "closed_forms contact accuracy families gradients",
     "contact/gap": "conformance worn twisted scene",
-    "contact/law": "conformance extending_parts impact contact extremes",
+    "contact/law": "conformance extending_parts contact extremes",
     "contact/search": "closed_forms conformance near",
     "contact/wrapped": "twisted worn",
     "dynamics/closed": "start motion steady",

@@ -34,6 +34,7 @@ HELD = (
 QUICK = (
     "optimizer.screening=12",
     "optimizer.starts=1",
+    "optimizer.prove=false",
     "optimizer.iterations=8",
     "assumptions.scenes=8",
     f"assumptions.over={HELD}",

@@ -143,9 +143,9 @@ def _checked(seeds) -> tuple[int, int]:
 
 def test_a_wrong_basin_is_never_proven():
     """Problems of one to three parameters, with corners and limits, against grids."""
-    proven, wrong = _checked(range(9))
-    assert proven == 9
-    assert wrong >= 2
+    proven, wrong = _checked(range(5))
+    assert proven == 5
+    assert wrong >= 1
 
 
 @pytest.mark.long

@@ -28,7 +28,7 @@ scene:
   load: {torque_N_m: 4.775}
   timing_gear: {stiffness_N_m_per_rad: 2.0e4, damping_ratio: 0.5, backlash_mm: 0.1}
 constraints: {seal_width_min_mm: 2.0}
-optimizer: {screening: 3, starts: 2, iterations: 8}
+optimizer: {screening: 2, starts: 1, iterations: 4, prove: false}
 """
 HEADER = {"config": {"a": 1}, "versions": {"jax": "1"}}
 

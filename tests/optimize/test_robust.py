@@ -306,7 +306,8 @@ def test_optimize_command(tmp_path, capsys):
         "assumptions.scenes=0",
         "optimizer.screening=0",
         "optimizer.starts=1",
-        "optimizer.iterations=3",
+        "optimizer.iterations=2",
+        "optimizer.prove=false",
         "solver.rtol=1e-7",
     ]
     options = [f"--set={one}" for one in overrides]

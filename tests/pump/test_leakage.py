@@ -96,7 +96,7 @@ def test_laminar_gas_by_quadrature_of_its_pressure():
     assert float(path) == pytest.approx(0.0662e-6, rel=0.01)
 
 
-@pytest.mark.parametrize("family", ["ee", "cic", "five_arcs", "ellipse"])
+@pytest.mark.parametrize("family", ["ee", "cic"])
 def test_gaps_are_those_of_polygons(family):
     """At another centre distance, and of rotors of smaller radius."""
     outline = outline_of(family) / 1e3
@@ -114,7 +114,9 @@ def test_gaps_are_those_of_polygons(family):
         )
 
 
-@pytest.mark.parametrize("family", ["ee", "cic", "circle_epicycloid"])
+@pytest.mark.parametrize(
+    "family", ["cic", pytest.param("circle_epicycloid", marks=pytest.mark.long)]
+)
 def test_film_is_that_of_polygons(family):
     """h³ ∫ dl / d³ over the polygon of rotor 1, with its distance d from that of rotor 2; and the
     parabola of the same curvature where that is short."""
@@ -258,7 +260,7 @@ def test_mesh_leakage_is_smooth_where_friction_takes_over_from_inertia():
     the slope of a design that is moved by as little as a film's sampled points are apart."""
     scene = dataclasses.replace(scene_of(*IN_SERIES), clearance=jnp.asarray(3e-5))
     design = design_vector(load_config("configs/cic_drawn.yaml"))
-    rows = [mesh_slopes(scene, design + shift) for shift in np.outer(range(9), [2e-3, 2e-3, 0])]
+    rows = [mesh_slopes(scene, design + shift) for shift in np.outer(range(5), [2e-3, 2e-3, 0])]
     flow, slope, length = (np.array(x) for x in zip(*rows, strict=True))
     slow = (3e-5) ** 3 * (9e10 - 1e10) / (24 * 1.82e-5 * length[0] * 1e5)
     fast = 3e-5 * float(nozzle_flux(jnp.asarray(3e5), jnp.asarray(1e5), AIR)) * 287.05

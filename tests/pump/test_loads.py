@@ -25,11 +25,14 @@ def scene_of(*changes: str) -> tuple[Scene, jnp.ndarray]:
     return Scene.from_config(config), jnp.asarray(config.design)
 
 
+bearing_set = eqx.filter_jit(BearingSet.of)
+
+
 @pytest.fixture(scope="module")
 def twisted():
     """Twisted rotors in some poses: loads, and the flanks' forces in every slice."""
     scene, design = scene_of(GAS, BEARINGS, "rotor.helix_deg=50", "solver.slices=4")
-    bearings = BearingSet.of(scene, design)
+    bearings = bearing_set(scene, design)
     pair = bearings.pair
 
     @jax.jit
@@ -89,9 +92,10 @@ def test_bearings_balance_all_forces(twisted):
     gas, loads = bearings.loads.gas, bearings.loads
     length, slices = float(bearings.length), gas.slices
     heights = length * np.asarray(slices.places)
+    slice_forces, chords = eqx.filter_jit(gas.slice_forces), eqx.filter_jit(gas.chords)
     mirror = np.stack([np.ones(2), [-1, 1]])
     for out, pushes, _, motion in found:
-        pressed = np.asarray(gas.slice_forces(motion.phi))
+        pressed = np.asarray(slice_forces(motion.phi))
         torque = float(loads.gear(motion.relative, motion.rate))
         teeth = complex(formulas.gear_force(jnp.asarray(-torque), loads.radius, loads.tooth_angle))
         teeth = np.array([[-teeth.real, -teeth.imag], [teeth.real, teeth.imag]])
@@ -102,7 +106,7 @@ def test_bearings_balance_all_forces(twisted):
         np.testing.assert_allclose(np.asarray(out.radial).sum(1), total, rtol=1e-9)
         place = np.asarray(pushes.place)[:, 0]
         places = np.stack([place, place - [2 * float(loads.radius), 0]], axis=1)
-        contact, tip = (np.asarray(x) * mirror for x in gas.chords(motion.phi))
+        contact, tip = (np.asarray(x) * mirror for x in chords(motion.phi))
         rate = float(slices.twist) / length
         axial = -rate * np.asarray(pushes.torque)[:, 0]
         against = (np.sum(tip**2, -1) - np.sum(contact**2, -1)) / 2
@@ -135,7 +139,7 @@ def test_bearings_balance_all_forces(twisted):
 def test_pockets_of_twisted_rotors_open_at_once():
     """At the leading end: all tips of a pocket jump back together, on either rotor."""
     scene, design = scene_of(GAS, BEARINGS, "rotor.helix_deg=-50", "solver.slices=4")
-    gas = BearingSet.of(scene, design).loads.gas
+    gas = bearing_set(scene, design).loads.gas
     phi = np.linspace(0, 2 * np.pi / 3, 2001)
     tips = np.asarray(jax.jit(jax.vmap(lambda x: gas.chords(x)[1]))(phi)) @ [1, 1j]
     back = np.angle(tips[1:] / tips[:-1]) < -1
@@ -152,11 +156,11 @@ def test_pockets_of_twisted_rotors_open_at_once():
 def test_static_loads():
     """Gear and gas alone, from the formulas; more weight, more load."""
     scene, design = scene_of(GAS, "scene.bearings={bearing_distance_mm: 0, kind: ball}")
-    bearings = BearingSet.of(scene, design)
+    bearings = bearing_set(scene, design)
     phi = 2 * np.pi / 3 * (np.arange(720) + 0.5) / 720
     gas = bearings.loads.gas
-    forces = np.asarray(jax.vmap(gas.slice_forces)(phi))[:, 0] @ [1, 1j]
-    torque = np.asarray(jax.vmap(bearings.pair.load.torque2)(phi))
+    forces = np.asarray(jax.jit(jax.vmap(gas.slice_forces))(phi))[:, 0] @ [1, 1j]
+    torque = np.asarray(jax.jit(jax.vmap(bearings.pair.load.torque2))(phi))
     teeth = np.asarray(formulas.gear_force(*map(jnp.asarray, (torque, 0.033, np.radians(20.0)))))
     # Half of the gas, and the gear 50 mm beyond a bearing of two that are 100 mm apart.
     each = [forces.T[0] / 2 - 1.5 * teeth, forces.T[0] / 2 + 0.5 * teeth]

@@ -42,7 +42,16 @@ def test_ee_and_involute():
     np.testing.assert_allclose(np.asarray(found.behind)[near], -angle, rtol=1e-5)
 
 
-@pytest.mark.parametrize("family", ["ee", "cic", "five_arcs", "ellipse", "extended_cycloid"])
+@pytest.mark.parametrize(
+    "family",
+    [
+        "cic",
+        *(
+            pytest.param(one, marks=pytest.mark.long)
+            for one in ("ee", "five_arcs", "ellipse", "extended_cycloid")
+        ),
+    ],
+)
 def test_polygons_touch_where_the_play_ends(family):
     """The rotors' polygons, with nominal flanks, overlap there by the clearance; half the way they
     do by less."""
@@ -63,7 +72,7 @@ def shrunk(outline, clearance):
     return z + 1j * clearance * side / abs(side)
 
 
-@pytest.mark.parametrize("error", [0.0, 3e-5])
+@pytest.mark.parametrize("error", [pytest.param(0.0, marks=pytest.mark.long), 3e-5])
 def test_rotors_intersect_beyond_their_play(error):
     """Points of one polygon lie inside of the other just beyond the play, and none just within;
     also at another centre distance, where the flanks are not conjugate."""
@@ -101,7 +110,8 @@ def at_clearances(profile, clearances):
     return np.array(rows, float).T
 
 
-@pytest.mark.parametrize("family", [pytest.param("ee", marks=pytest.mark.long), "cic"])
+@pytest.mark.long
+@pytest.mark.parametrize("family", ["ee", "cic"])
 def test_play_is_continuous_in_the_overlap(family):
     """Points with 2 µm of scatter: from overlap to clearance, the backlash changes by twice the
     clearance over the cosine of the least pressure angle, and the overlap is that of the gap."""

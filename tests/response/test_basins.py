@@ -23,7 +23,7 @@ COEXIST = (
     "scene.speed_rpm=6000",
 )
 WEAK = "scene.timing_gear.stiffness_N_m_per_rad=1", "scene.load.torque_N_m=40"
-GRID = "attractors.relatives=12", "attractors.rates=9"
+GRID = "attractors.relatives=6", "attractors.rates=5"
 FORCES = ("mean_force_N", "peak_force_N", "rms_force_N")
 
 
@@ -38,7 +38,7 @@ def coexisting():
     return evaluator, find(evaluator, series=True)
 
 
-long_run = CachedFunction(lambda pair, state, how: strobe(pair, state, 240, how).states)
+long_run = CachedFunction(lambda pair, state, how: strobe(pair, state, 160, how).states)
 
 
 def test_motions_that_coexist_are_told_apart(coexisting):
@@ -70,12 +70,12 @@ def test_the_one_reached_is_that_of_the_plain_evaluation(coexisting):
 def test_initial_states_lead_where_a_long_simulation_ends(coexisting):
     """Cells of the grid lead to the attractor that a long simulation reaches.
 
-    It runs for 240 mesh periods at another tolerance with another method."""
+    It runs for 160 mesh periods at another tolerance with another method."""
     evaluator, basins = coexisting
     pair = evaluator.pair(jnp.array([36.43, 9.0, 4.0]))
     how = Integrator("dopri8", jnp.asarray(1e-9), 4096)
     agree = []
-    for row, column in [(0, 0), (1, 4), (2, 2), (3, 5), (4, 1), (5, 7), (2, 9), (7, 3)]:
+    for row, column in [(0, 0), (1, 4), (2, 2), (3, 5), (4, 1)]:
         start = jnp.array([basins.relative[column], basins.rate[row] * basins.mesh_period])
         ends = np.asarray(long_run(pair, start / basins.angle_scale, how))[-8:]
         cycle = basins.attractors[basins.leads_to[row, column]].cycle
@@ -83,7 +83,7 @@ def test_initial_states_lead_where_a_long_simulation_ends(coexisting):
         # Every point of the end lies on the cycle and every point of the cycle is visited.
         agree.append(np.max(np.min(apart, axis=1)) < 0.02 and np.max(np.min(apart, axis=0)) < 0.02)
     # Next to a boundary of the basins the tolerance decides.
-    assert sum(agree) >= 7
+    assert sum(agree) >= 4
 
 
 def test_a_known_motion_is_not_lost_on_a_coarse_grid(coexisting):
@@ -102,11 +102,12 @@ def test_a_known_motion_is_not_lost_on_a_coarse_grid(coexisting):
     assert sum(one.share for one in together.attractors) == pytest.approx(1)
 
 
-def test_worst_and_weighted(coexisting):
+def test_worst_and_weighted(coexisting, monkeypatch):
     """The worst has the greatest weighted force, the weighted one averages by share."""
     _, basins = coexisting
     shares = np.array([one.share for one in basins.attractors])
     responses = [one.evaluation.response for one in basins.attractors]
+    monkeypatch.setattr("rootsopt.response.attractors.find", lambda *_, **__: basins)
     settings = *COEXIST, "objective.mean_weight=0", "objective.peak_weight=1"
     worst = Evaluator.of_objective(config_of(*settings, "objective.motion=worst"))()
     assert worst.response["peak_force_N"] == max(r["peak_force_N"] for r in responses)
@@ -123,20 +124,27 @@ def test_worst_and_weighted(coexisting):
     assert mean.start.shape == (len(shares), 2)
 
 
-def test_the_reference_decides_which_is_worst(coexisting):
+def test_the_reference_decides_which_is_worst(coexisting, monkeypatch):
     """The worst motion depends on the reference forces.
 
     Relative to a tiny mean force, the motion of the greatest mean is worst, not that of the
     greatest peak."""
     _, basins = coexisting
-    responses = [one.evaluation.response for one in basins.attractors]
-    base = dataclasses.replace(
-        basins.rest, response={"mean_force_N": 1e-3, "peak_force_N": 1e6, "rms_force_N": 1.0}
+    responses = [
+        {"mean_force_N": mean, "peak_force_N": peak, "rms_force_N": 2.0}
+        for mean, peak in ((2.0, 3.0), (1.0, 4.0))
+    ]
+    made = tuple(
+        dataclasses.replace(one, evaluation=dataclasses.replace(one.evaluation, response=response))
+        for one, response in zip(basins.attractors, responses, strict=False)
     )
+    told = dataclasses.replace(basins, attractors=made)
+    monkeypatch.setattr("rootsopt.response.attractors.find", lambda *_, **__: told)
     evaluator = Evaluator.of_objective(config_of(*COEXIST, "objective.motion=worst"))
-    found = evaluator.relative_to(base)(series=False)
-    assert found.response["mean_force_N"] == max(r["mean_force_N"] for r in responses)
-    assert found.response["peak_force_N"] < max(r["peak_force_N"] for r in responses)
+    for mean, peak, worst in ((1e-3, 1e6, 0), (1e6, 1e-3, 1)):
+        forces = {"mean_force_N": mean, "peak_force_N": peak, "rms_force_N": 1.0}
+        base = dataclasses.replace(basins.rest, response=forces)
+        assert evaluator.relative_to(base)(series=False).response == responses[worst]
 
 
 def test_a_chaotic_basin_is_no_steady_state():
@@ -146,6 +154,8 @@ def test_a_chaotic_basin_is_no_steady_state():
         "scene.timing_gear.damping_ratio=0.05",
         "scene.load.torque_N_m=2",
         "scene.speed_rpm=6000",
+        "attractors.relatives=3",
+        "attractors.rates=3",
     )
     found = Evaluator.of_objective(config_of(*scene, "objective.motion=worst"))(series=False)
     assert found.status is Status.CHAOTIC
@@ -194,8 +204,8 @@ def test_command(tmp_path, capsys):
     assert len(shares) >= 2
     with open(tmp_path / "basins.csv", newline="") as file:
         numbers = [int(row["attractor"]) for row in csv.DictReader(file)]
-    assert len(numbers) == 108
-    assert [numbers.count(k + 1) / 108 for k in range(len(shares))] == pytest.approx(shares)
+    assert len(numbers) == 30
+    assert [numbers.count(k + 1) / 30 for k in range(len(shares))] == pytest.approx(shares)
     assert (tmp_path / "figures" / "basins.png").read_bytes()[:4] == b"\x89PNG"
     assert (tmp_path / "response_2.csv").exists()
     weak = (f"--set={key}" for key in WEAK)

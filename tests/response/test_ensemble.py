@@ -172,6 +172,7 @@ def test_chaos_is_averaged_and_named():
     json.dumps(evaluation.record(), allow_nan=False)
 
 
+@pytest.mark.long
 def test_standard_errors_are_honest():
     """Independent ensembles differ by as much as their standard errors state."""
     found = [numbers(chaotic(seed=seed, members=16)) for seed in range(3)]
@@ -183,6 +184,7 @@ def test_standard_errors_are_honest():
     assert np.max(apart) > 0.3
 
 
+@pytest.mark.long
 def test_gradient_of_chaos_has_its_standard_error():
     """Estimates of two seeds differ by as much as their standard errors state."""
     size = "ensemble.members=4", "ensemble.settle_periods=16", "ensemble.periods=16"
@@ -326,6 +328,7 @@ def test_evaluator_of_a_motion():
 # Commands
 
 
+@pytest.mark.long
 def test_optimize_a_chaotic_scene(tmp_path, capsys):
     """A small run says whether its gain is significant; the history has standard errors."""
     size = "ensemble.members=4", "ensemble.designs=12", "ensemble.spread=0.1"
@@ -353,6 +356,7 @@ def test_optimize_a_chaotic_scene(tmp_path, capsys):
         assert result["optimized"] is None
 
 
+@pytest.mark.long
 def test_simulate_an_ensemble(tmp_path):
     """The exit code is 0, and the run has averages, the series of one member, and figures."""
     size = "ensemble.members=4", "ensemble.designs=12", "ensemble.periods=16"

@@ -368,7 +368,14 @@ def example_of(name):
     return found
 
 
-@pytest.mark.parametrize("name", rootsopt.__all__)
+_SLOW = "identify", "Identification"
+"""Names whose examples fit a record, which `tests/identification` does faster."""
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(one, marks=[pytest.mark.long] * (one in _SLOW)) for one in rootsopt.__all__],
+)
 def test_example_in_the_docstring_runs(name, monkeypatch):
     """It prints what it says, and sets double precision itself where it needs it."""
     monkeypatch.setattr(terms, "_terms", dict(terms._terms))

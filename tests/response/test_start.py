@@ -48,7 +48,7 @@ def respond():
 @pytest.fixture(scope="module")
 def first(scene, respond):
     """Return the response from rest, by the program that takes a start."""
-    start = steady_response(scene, DESIGN).start
+    start = steady_response(scene, DESIGN, np.zeros(2)).start
     _, found = respond(scene, DESIGN, unused(start))
     return jax.tree.map(lambda x: x[0], found)
 
@@ -109,7 +109,7 @@ def test_start_travels_through_scan(scene, respond, first):
     _, found = respond(scene, NEAR, first.start)
     for factor, mean, peak in zip(SPEEDS, found.mean, found.peak, strict=True):
         moved = eqx.tree_at(lambda s: s.speed, scene, factor * scene.speed)
-        alone = steady_response(moved, NEAR)
+        alone = steady_response(moved, NEAR, np.zeros(2))
         assert float(mean) == pytest.approx(float(alone.mean), rel=1e-8)
         assert float(peak) == pytest.approx(float(alone.peak), rel=1e-8)
 

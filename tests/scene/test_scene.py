@@ -18,6 +18,7 @@ from rootsopt.errors import InputError
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.scene import Scene, design_vector
 from rootsopt.status import Status
+from tests.conformance.parts import size
 from tests.planar import Planar
 
 MOTOR = ["scene.drive=torque", "scene.motor={slope_N_m_s_per_rad: 0.1}"]
@@ -205,54 +206,25 @@ def test_energy_balance_with_all_parts():
     assert float(stored) == pytest.approx(work.sum(), abs=1e-8 * abs(work[:2]).max())
 
 
-def equations(jaxpr):
-    total = len(jaxpr.eqns)
-    for equation in jaxpr.eqns:
-        for value in jax.tree.leaves(equation.params, is_leaf=lambda v: hasattr(v, "jaxpr")):
-            closed = getattr(value, "jaxpr", value)
-            if hasattr(closed, "eqns"):
-                total += equations(closed)
-    return total
+STATES = {"motor": 3, "supports": 10}
 
 
-def size(overrides):
+def size_of(*overrides):
     """Return the numbers of states, equations and constants of a scene's right-hand side."""
     config = load("configs/cic_drawn.yaml", overrides)
-    pair = eqx.filter_eval_shape(Scene.pair, Scene.from_config(config), design_vector(config))
-    numbers, static = eqx.partition(pair, lambda x: isinstance(x, jax.ShapeDtypeStruct))
-    program = jax.make_jaxpr(lambda tau, y, n: eqx.combine(n, static).derivative(tau, y)[0])(
-        jnp.zeros(()), jnp.zeros(pair.states), numbers
-    )
-    return pair.states, equations(program.jaxpr), len(program.jaxpr.invars)
-
-
-STATES = {"motor": 3, "supports": 10}
+    return size(eqx.filter_eval_shape(Scene.pair, Scene.from_config(config), design_vector(config)))
 
 
 @pytest.mark.parametrize("part", PARTS)
 def test_an_absent_part_costs_nothing(part):
-    """Leaving a part out makes the program smaller or equal in all three sizes.
-
-    A part adds its states, equations and constants to the smallest program."""
-    states, length, numbers = size([])
-    assert states == 2
-    more = size(PARTS[part])
-    assert more[0] == STATES.get(part, 2)
+    """A part adds its states, equations and constants; a gear without errors adds four numbers."""
+    states, length, numbers = size_of()
+    more = size_of(*PARTS[part])
+    assert (states, more[0]) == (2, STATES.get(part, 2))
     assert more[1] > length
     # The search's own centre distance is a number of every scene.
     assert more[2] >= numbers + (part != "centre distance error")
-    others = [override for name, one in PARTS.items() if name != part for override in one]
-    whole, rest = size(ALL), size(others)
-    assert whole[0] - rest[0] == STATES.get(part, 2) - 2
-    if part != "centre distance error":  # Supports have it looked for, error or not.
-        assert rest[1] < whole[1]
-        assert rest[2] < whole[2]
-
-
-def test_an_absent_gear_costs_nothing():
-    """A gear without errors adds four numbers: stiffness, damping, backlash, rounding."""
-    (states, length, numbers), (least, shorter, fewer) = size([]), size(["scene.timing_gear=null"])
-    assert states == least == 2
+    _, shorter, fewer = size_of("scene.timing_gear=null")
     assert shorter < length
     assert numbers - fewer == 4
 
@@ -302,6 +274,7 @@ def test_parts_that_do_not_go_together_are_refused(overrides, words):
         load("configs/cic_drawn.yaml", overrides)
 
 
+@pytest.mark.long
 def test_a_motor_too_weak_for_its_load_is_said_to_stall():
     weak = "scene.motor={slope_N_m_s_per_rad: 0.001, torque_N_m: 0.5}"
     found = Evaluator.of(load("configs/cic_drawn.yaml", ["scene.drive=torque", weak]))(series=False)

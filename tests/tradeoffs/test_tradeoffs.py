@@ -360,14 +360,6 @@ def test_interrupted_front_keeps_its_points():
     assert [p.design for p in again.points] == [p.design for p in front.points]
 
 
-def test_contradicting_constraints_are_explained():
-    front = pareto_front(config(RADIUS, "constraints.seal_width_min_mm=25",
-                                "constraints.area_efficiency_min=0.49"))  # fmt: skip
-    assert front.status is Status.INFEASIBLE
-    assert "seal width" in front.message
-    assert front.points == ()
-
-
 @pytest.mark.parametrize(
     ("override", "words"),
     [

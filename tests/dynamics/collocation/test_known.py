@@ -1,5 +1,6 @@
 """Tests of orbits closed from those of neighbouring pairs."""
 
+import functools
 from types import SimpleNamespace
 from typing import Any
 
@@ -37,6 +38,7 @@ PERIOD, BEGIN, USED = 2, 0.3, 10
 TURN = 2 * np.pi / PERIOD
 
 
+@functools.partial(jax.jit, static_argnums=0)
 def _known(room=(48, 51)):
     """Return a sine over two mesh periods on equal elements, from τ = 0.3, with an end at τ = 2."""
     elements, times = room
@@ -97,7 +99,7 @@ def test_orbit_varies_at_constant_time():
     slopes = -TURN * jnp.sin(TURN * tau) * (1 + TURN * moves(tau))
     variation = Step(state[:, None, None], slopes[..., None, None], times, still.monodromy)
     asked = jnp.asarray([0.0, 0.7, 1.9, 1.95, 2.05])
-    found, rate, moved = VariedOrbit(elements, variation).at(asked)
+    found, rate, moved = jax.jit(VariedOrbit(elements, variation).at)(asked)
     np.testing.assert_allclose(found[:, 0], np.sin(TURN * asked), atol=1e-5)
     # The slopes' cubic misses by h⁴ ω⁵ / (4! 70) = 6.4e-4 at the ends of elements.
     np.testing.assert_allclose(rate[:, 0], TURN * np.cos(TURN * asked), atol=7e-4)
@@ -158,11 +160,11 @@ def test_peak_is_located(place, corner):
     points = Points(nothing, nothing[..., None], roots, force, force)
     rivals = Rivals.anywhere(elements)
     for _ in range(2):
-        rivals = rivals_of(elements, points, force, rate, rivals)
+        rivals = jax.jit(rivals_of)(elements, points, force, rate, rivals)
         there = np.asarray(rivals.places(elements)[0]) - 1e-12
         new = _bump(there, place, corner)
         force, rate = (x.at[USED].set(y) for x, y in zip((force, rate), new, strict=True))
-    found = peak_of(elements, rivals, force, rate)
+    found = jax.jit(peak_of)(elements, rivals, force, rate)
     begin, length = elements.mesh.ends[0][found.element], elements.mesh.lengths[found.element]
     np.testing.assert_allclose(float(begin + length * found.share), place, atol=2e-7)
     np.testing.assert_allclose(float(found.force), 200.0, rtol=1e-10)

@@ -33,6 +33,11 @@ def _elements(times, state, slopes):
     return Elements(mesh, state, slopes, jnp.zeros((6, POINTS + 1, 1, 2)))
 
 
+@jax.jit
+def _stepped(elements, lines, columns):
+    return chained(elements, lines, columns, condensed(elements, lines, columns))
+
+
 def _misses(unknown):
     """Return the residuals of the equations of the used elements, written one by one."""
     z = unknown[: USED * STATES].reshape(USED, STATES)
@@ -58,8 +63,8 @@ def test_newton_step_solves_the_dense_equations():
     slopes = jnp.asarray(draw.normal(size=(6, POINTS, STATES)))
     elements = _elements(jnp.asarray(TIMES), state, slopes)
     tau, z = elements.places
-    each = jax.vmap(jax.vmap(lambda t, y: jax.jacfwd(
-        lambda p: _equation(p[0], p[1:]))(jnp.append(t, y))))  # fmt: skip
+    each = jax.jit(jax.vmap(jax.vmap(lambda t, y: jax.jacfwd(
+        lambda p: _equation(p[0], p[1:]))(jnp.append(t, y)))))  # fmt: skip
     bend = jax.vmap(lambda t, y: jax.jacfwd(lambda p: _margin(p[0], p[1:]))(jnp.append(t, y)))
     lines = Lines(
         miss=jax.vmap(jax.vmap(_equation))(tau, z)[:, :POINTS] - slopes,
@@ -68,9 +73,9 @@ def test_newton_step_solves_the_dense_equations():
         bend=bend(tau[:, -1], z[:, -1]),
     )
     columns = own_column(elements, lines)
-    step = chained(elements, lines, columns, condensed(elements, lines, columns))
+    step = _stepped(elements, lines, columns)
     unknown = jnp.concatenate([state[:USED].ravel(), slopes[:USED].ravel(), TIMES[1:2]])
-    expected = np.linalg.solve(jax.jacfwd(_misses)(unknown), -_misses(unknown))
+    expected = np.linalg.solve(jax.jit(jax.jacfwd(_misses))(unknown), -jax.jit(_misses)(unknown))
     found = np.concatenate(
         [step.state[:USED, :, 0].ravel(), step.slopes[:USED, ..., 0].ravel(), step.times[1]]
     )
@@ -91,10 +96,10 @@ def test_columns_are_independent():
     )
     columns = Columns(*(jnp.asarray(draw.normal(size=shape)) for shape in (
         (6, POINTS, STATES, 2), (6, STATES, 2), (6, 2))))  # fmt: skip
-    step = chained(elements, lines, columns, condensed(elements, lines, columns))
+    step = _stepped(elements, lines, columns)
     for k in range(2):
         one = Columns(*(x[..., k : k + 1] for x in columns))
-        alone = chained(elements, lines, one, condensed(elements, lines, one))
+        alone = _stepped(elements, lines, one)
         np.testing.assert_allclose(step.state[..., k], alone.state[..., 0], rtol=1e-9, atol=1e-12)
 
 
