@@ -12,21 +12,8 @@ from numpy.typing import NDArray
 from rootsopt.config import Config
 from rootsopt.design.space import sobol
 from rootsopt.errors import InputError
-from rootsopt.identification.answer import (
-    STRUCTURED,
-    Identification,
-    Spread,
-    adopted,
-    caveats,
-    combinations,
-    further,
-    parameters,
-    profile,
-    quality,
-    relative_misfit,
-    residuals,
-    structure,
-)
+from rootsopt.identification import answer
+from rootsopt.identification.answer import Identification, Spread, relative_misfit, structure
 from rootsopt.identification.model import Begin, Point
 from rootsopt.identification.quantities import OFFSET, fitted
 from rootsopt.identification.record import observed
@@ -36,29 +23,19 @@ from rootsopt.response.still import reporting
 from rootsopt.runtime.environment import check_precision
 from rootsopt.status import Status
 
-# Scenes that are tried for each quantity before local fits, and maximum number of simulations.
-_TRIED, _MOST = 16, 256
-
-# Relative misfit above which other coexisting motions are tried.
-_POOR = 0.3
-
-# Relative misfit above which a scene does not explain the record.
+_TRIED, _MOST, _ROUNDS = 16, 256, 4
+"""Scenes that are tried for each quantity before local fits, maximum number of simulations, and
+how often at most both are done while no fit explains the record."""
+_POOR, _PLACES = 0.05, 2
+"""Relative misfit of averages above which a fit does not explain them. Number of fits around which
+other coexisting motions are tried."""
 _NO_FIT = 0.7
-
-# Distance between places from which local fits begin. Greatest multiple of the given number of
-# fits: more are made while residuals do not look random.
-_APART, _AGAIN = 0.15, 4
-
-# Distance on the scales of the quantities up to which two optima are the same.
-_SAME = 0.01
-
-# Ratio of losses up to which another optimum fits nearly as well.
-_NEARLY = 2.0
-
-# Relative misfit up to which all optima fit as well as the best.
-_EQUAL = 1e-3
-
-# Probability of the residuals, with given standard deviations, above which any misfit is noise.
+"""Relative misfit above which a scene does not explain the record."""
+_APART, _SAME = 0.15, 0.01
+"""Distance between places from which local fits begin, and up to which two optima are the same."""
+_NEARLY, _EQUAL = 2.0, 1e-3
+"""Ratio of misfits up to which another optimum fits nearly as well, and misfit up to which all
+optima fit as well as the best."""
 _CHANCE = 1e-3
 
 # Number of local fits in which standard deviations are estimated from the residuals.
@@ -126,44 +103,40 @@ def identify(  # Keywords of the public interface, each independent of the other
     best = search.run()
     if best is None:
         return Identification(
-            config, {}, np.zeros((0, 0)), [], {}, [], [], {}, {}, Status.NOT_IDENTIFIED,
-            search.lost(), search.statistics(began),
-        )  # fmt: skip
+            config, Status.NOT_IDENTIFIED, search.lost(), search.statistics(began)
+        )
     for count in range(_PASSES):
         progress(f"estimating errors, {count + 1} of {_PASSES}")
         # The length that rounds corners may follow the values.
-        base = adopted(reported, problem, best)
+        base = answer.adopted(reported, problem, best)
         problem = Problem.of([Point.of(base, one) for one in seen], quantities, gains, constants)
-        deviation = problem.estimated(best.fit - problem.measured)
+        deviation = problem.estimated(best.fit - problem.rows.measured.to_numpy())
         best = problem.fitted(best.place, best.begins, deviation) or best
-    spread = Spread.of(problem, best)
-    progress("finding what the record does not tell")
-    quality_of, told = quality(problem, best, spread), combinations(problem, spread)
-    curves = {}
+    spread, curves = Spread.of(problem, best), {}
     for k, one in enumerate(quantities):
         progress(f"finding intervals, {k + 1} of {len(quantities)}")
-        curves[one.key] = profile(problem, best, spread, k, one.key in profiles)
+        curves[one.key] = answer.profile(problem, best, spread, k, one.key in profiles)
+    progress("finding what the record does not tell")
     rivals = search.others(problem, best, spread.factor)
-    known = parameters(problem, best, spread, curves, rivals)
-    next_, chance = further(problem, best, spread), quality_of["probability"]
-    fits = quality_of["relative_misfit"] < _NO_FIT or (chance or 0.0) > _CHANCE
+    entries: dict[str, Any] = {
+        "parameters": answer.parameters(problem, best, spread, curves, rivals),
+        "combinations": answer.combinations(problem, spread),
+        "fit": answer.quality(problem, best, spread),
+        "motions": answer.motions(problem, best),
+        "optima": rivals,
+        "further": answer.further(problem, best, spread),
+        "profiles": {key: curves[key] for key in profiles},
+    }
+    fits = (entries["fit"]["probability"] or 0.0) > _CHANCE
+    fits |= entries["fit"]["relative_misfit"] < _NO_FIT
     status = Status.IDENTIFIED if fits else Status.NOT_IDENTIFIED
     scales = np.array([one.slope(x) for one, x in zip(quantities, best.values, strict=True)])
     return Identification(
-        config=adopted(config, problem, best),
-        parameters=known,
+        answer.adopted(config, problem, best), status,
+        " ".join([status.value, *answer.caveats(entries)]), search.statistics(began), **entries,
         covariance=spread.covariance * np.outer(scales, scales),
-        combinations=told,
-        fit=quality_of,
-        optima=rivals,
-        further=next_,
-        profiles={key: curves[key] for key in profiles},
-        residuals=residuals(problem, best),
-        status=status,
-        message=" ".join([status.value, *caveats(quality_of, known, told, rivals, next_)]),
-        statistics=search.statistics(began),
-        best=(problem, best, spread),
-    )
+        residuals=answer.residuals(problem, best), best=(problem, best, spread),
+    )  # fmt: skip
 
 
 class _Search:
@@ -171,7 +144,7 @@ class _Search:
 
     def __init__(self, problem: Problem, starts: int, seed: int, progress: Callable[[str], None]):
         self.problem, self.starts, self.seed, self.progress = problem, starts, seed, progress
-        self.deviation, known = problem.estimated(), np.all(np.isfinite(problem.given))
+        self.deviation, known = problem.estimated(), problem.rows.given.notna().all()
         self.turn = TURN if known else 1.0
         self.ends: list[Local] = []
         self.failed: list[Status] = []
@@ -179,59 +152,70 @@ class _Search:
 
     def run(self) -> Local | None:
         """Return the best fit; None if no scene has a motion to trust at all points."""
-        problem, p = self.problem, len(self.problem.quantities)
-        begins = [point.begin for point in problem.points]
-        count = int(np.clip(_MOST // len(problem.points), 8, _TRIED * p))
-        own, known = [one.scaled(one.own) for one in problem.quantities], []
-        for place in [own, *sobol(count, self.seed, p)]:
-            self.tried += 1
-            self.progress(f"trying scenes, {self.tried} of {count + 1}")
-            known += self._at(np.array(place), begins)
-        known.sort(key=lambda one: one.cost)
-        best = None
-        while known and len(self.ends) < self.starts * (1 if self._explains(best) else _AGAIN):
-            self._fit(known[:1])
-            # The next fit begins elsewhere, as long as there is another place.
-            begun = [known.pop(0).place, *(one.place for one in self.ends)]
-            away = [min(np.max(np.abs(one.place - x)) for x in begun) < _APART for one in known]
-            known = [one for _, one in sorted(zip(away, known, strict=True), key=lambda x: x[0])]
-            best = min(self.ends, key=lambda one: one.cost, default=None)
-        if best is not None and relative_misfit(problem, best) > _POOR:
-            self._fit(self._other_motions(best))
-        return min(self.ends, key=lambda one: one.cost, default=None)
+        points, p, known = self.problem.points, len(self.problem.quantities), []
+        count = int(np.clip(_MOST // len(points), 8, _TRIED * p))
+        own = np.array([one.scaled(one.own) for one in self.problem.quantities])
+        places = [own, *sobol(_ROUNDS * count, self.seed, p)]
+        while places and not self._explained:
+            some, places = places[: count + 1], places[count + 1 :]
+            for place in some:
+                self.tried += 1
+                self.progress(f"trying scenes, {self.tried}")
+                known += self._at(place, [None] * len(points))
+            known.sort(key=lambda one: one.cost)
+            for _ in range(min(self.starts, len(known))):
+                # A fit begins where none has begun or ended, as long as there is such a place.
+                self._fit(known[0])
+                begun = [known.pop(0).place, *(one.place for one in self.ends)]
+                near = [min(np.max(np.abs(one.place - x)) for x in begun) < _APART for one in known]
+                known = [
+                    one for _, one in sorted(zip(near, known, strict=True), key=lambda x: x[0])
+                ]
+        for one in self._best[:_PLACES]:
+            averaged = not self.problem.rows.sampled.any()
+            if not self._explained or (averaged and relative_misfit(self.problem, one) > _EQUAL):
+                self._fit_other_motions(one)
+        return next(iter(self._best), None)
 
-    def _explains(self, best: Local | None) -> bool:
-        """Return whether what the `best` fit leaves of the record looks random."""
-        return best is not None and structure(self.problem, best) < STRUCTURED
+    @property
+    def _best(self) -> list[Local]:
+        """The ends of the fits, the best one first."""
+        return sorted(self.ends, key=lambda one: one.cost)
+
+    @property
+    def _explained(self) -> bool:
+        """Whether what the best fit leaves of samples looks random, and of averages is small."""
+        for one in self._best[:1]:
+            random = structure(self.problem, one) < answer.STRUCTURED
+            small = relative_misfit(self.problem, one) < _POOR
+            return random and (small or bool(self.problem.rows.sampled.any()))
+        return False
 
     def _at(self, place: NDArray[np.float64], begins: Sequence[Begin]) -> list[Local]:
-        found, told = self.problem.at(place, begins, self.deviation, self.turn)
-        self.failed += [one.status for one in told if one.values is None]
+        found, lost = self.problem.at(place, begins, self.deviation, self.turn)
+        self.failed += lost
         return [] if found is None else [found]
 
-    def _fit(self, begins: Sequence[Local]) -> None:
-        for one in begins:
-            self.progress(f"fitting from the best scenes, {len(self.ends) + 1}")
-            end = self.problem.fitted(one.place, one.begins, self.deviation, self.turn)
-            self.ends += [] if end is None else [end]
+    def _fit(self, one: Local) -> None:
+        self.progress(f"fitting from the best scenes, {len(self.ends) + 1}")
+        end = self.problem.fitted(one.place, one.begins, self.deviation, self.turn)
+        self.ends += [] if end is None else [end]
 
-    def _other_motions(self, best: Local) -> list[Local]:
-        """Return the best fits with other coexisting motions, where the record does not show the
-        state in which to begin."""
-        named = zip(self.problem.quantities, best.values, strict=True)
-        values = {one.key: float(x) for one, x in named if one.key != OFFSET}
-        found = [best]
-        for k, point in enumerate(self.problem.points):
-            if not point.seen.sampled or point.begin is not None:
-                continue
+    def _fit_other_motions(self, one: Local) -> None:
+        """Fit from the scene of a fit again, with the other motions that coexist there."""
+        named = zip(self.problem.quantities, one.values, strict=True)
+        values = {q.key: float(x) for q, x in named if q.key != OFFSET}
+        each: list[list[Any]] = []
+        for point, own in zip(self.problem.points, one.begins, strict=True):
             self.progress("trying other motions")
             config, evaluator = point.moved(values)
-            for one in find(evaluator, jnp.asarray(config.design)).attractors:
-                begins = [*found[0].begins]
-                begins[k] = one.evaluation.start if closed(one.evaluation) else begins[k]
-                found += self._at(best.place, begins)
-            found = [min(found, key=lambda one: one.cost)]
-        return [] if found[0] is best else found
+            found = find(evaluator, jnp.asarray(config.design)).attractors
+            starts = [x.evaluation.start for x in found if closed(x.evaluation)]
+            each.append(starts or [own])
+        for k in range(max(map(len, each))):
+            for other in self._at(one.place, [some[min(k, len(some) - 1)] for some in each]):
+                if np.max(np.abs(other.fit - one.fit) / self.problem.rows.scale) > _EQUAL:
+                    self._fit(other)
 
     def others(self, problem: Problem, best: Local, factor: float) -> list[dict[str, Any]]:
         """Return the entry `optima` of the result file: other scenes that fit nearly as well.
@@ -239,20 +223,16 @@ class _Search:
         `factor`: see `Spread`."""
         kept, misfit = [best], relative_misfit(problem, best)
 
-        def new(place: NDArray[np.float64]) -> bool:
-            return all(np.max(np.abs(place - other.place)) > _SAME for other in kept)
+        def new(one: Local) -> bool:
+            return all(np.max(np.abs(one.place - other.place)) > _SAME for other in kept)
 
-        for one in self.ends:
-            if not new(one.place):
-                continue
-            end = problem.fitted(one.place, one.begins, best.deviation)
-            if end is None or relative_misfit(problem, end) > max(_NEARLY * misfit, _EQUAL):
-                continue
-            kept += [end] if new(end.place) else []
-        keys = [one.key for one in problem.quantities]
+        for one in filter(new, self.ends):
+            end = problem.fitted(one.place, one.begins, best.deviation) or best
+            if new(end) and relative_misfit(problem, end) <= max(_NEARLY * misfit, _EQUAL):
+                kept.append(end)
         return [{"relative_misfit": relative_misfit(problem, one),
                  "increase": 2 * (one.cost - best.cost) / factor,
-                 "values": dict(zip(keys, one.values.tolist(), strict=True))}
+                 "values": answer.named(problem, one.values)}
                 for one in kept[1:]]  # fmt: skip
 
     def lost(self) -> str:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -18,7 +18,7 @@ from rootsopt.identification.record import Observed
 from rootsopt.response.ensemble import ERRORS, Ensemble, fitted_slope, neighbours
 from rootsopt.response.evaluation import Evaluator, apart_program
 from rootsopt.response.many import HERE, as_done
-from rootsopt.response.records import apart_record
+from rootsopt.response.records import apart_record, orbit_record
 from rootsopt.response.sensitivity import direction, motions_along
 from rootsopt.response.starts import Seed
 from rootsopt.scene import check_geometry
@@ -27,21 +27,26 @@ from rootsopt.sweeps.points import configured
 
 Begin = Seed | NDArray[np.float64] | None
 """Where the search for a motion begins: near a known one, or at ε (rad) and dε/dt (rad/s) at φ1 = 0
-as an array (2,); None: at rest. Averages begin with the states (members, n) of an ensemble."""
+as an array (2,); None: at the state that the record shows, or at rest if it shows none. Averages
+begin with the states (members, n) of an ensemble."""
+REST = np.zeros(2)
+"""Where a motion from rest begins."""
 
 
 class Predicted(NamedTuple):
     """What is predicted for the n rows and c columns that were measured at an operating point.
 
     `status` of the motion; `values` (n, c) and `slopes` (n, c, p): None if there is no motion to
-    trust, slopes with respect to the p quantities; `begin`: where the search for the motion of a
-    neighbouring scene begins; `errors` (n, c): standard errors of averages, 0 for orbits."""
+    trust, slopes with respect to the p quantities; `errors` (n, c): standard errors of averages, 0
+    for orbits; `begin`: where the search for the motion of a neighbouring scene begins; `orbit`:
+    its period, multipliers and residual, as in the result file."""
 
     status: Status
     values: Any = None
     slopes: Any = None
+    errors: Any = None
     begin: Begin = None
-    errors: Any = 0.0
+    orbit: Mapping[str, Any] = {}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,12 +80,6 @@ class Point:
         """The evaluator of the config, for a search over many scenes."""
         return Evaluator.of(self.config).surveying()
 
-    @property
-    def begin(self) -> Begin:
-        """The state that the record shows, None if it shows none."""
-        pair = self.evaluator.pair(self.config.design)
-        return self.seen.state(pair.lobes, pair.repeats, self.config.scene.speed_rpm)
-
     def moved(self, named: dict[str, float]) -> tuple[Config, Evaluator]:
         """Return config and evaluator with other values of some keys, which are not checked."""
         config = self.config.moved(named)
@@ -100,10 +99,12 @@ class Point:
         moving = named or {"rotor.density_kg_m3": config.rotor.density_kg_m3}
         ways = [direction(config, evaluator.scene, *one) for one in moving.items()]
         start: Any = begin
-        if isinstance(begin, np.ndarray):
+        if not isinstance(begin, Seed):
             pair = evaluator.pair(config.design)
             units = np.array([1.0, float(pair.mesh_period)]) / float(pair.angle_scale)
-            start = pair.at_start(begin * units)
+            if begin is None:
+                start = self.seen.state(pair.lobes, pair.repeats, float(pair.mesh_period), offset)
+            start = pair.at_start((REST if start is None else start) * units)
         seed, lead, columns, value = None, None, [], np.zeros(0)
         for count, pair, tangents, motion in motions_along(evaluator, config.design, ways, start):
             status = Status.of(motion.status)
@@ -120,7 +121,8 @@ class Point:
             columns.append(slope[..., :count])
         slopes = np.concatenate([*columns, by_offset], axis=-1)
         places = [[*named, OFFSET].index(key) for key in keys] if named else [-1]
-        return Predicted(status, value, slopes[..., places], seed)
+        orbit = orbit_record(motion.orbit, int(motion.period))
+        return Predicted(status, value, slopes[..., places], np.zeros(value.shape), seed, orbit)
 
     def _sampled(self, pair, tangents, motion: Steady, turned, lead: int | None):
         """Return samples (n, c), their derivatives (n, c, d + 1), and how many mesh periods the
@@ -173,7 +175,7 @@ class Point:
         scales = [one.slope(x) for one, x in zip(quantities, values, strict=True)]
         slopes = fitted_slope(np.array(found), steps)[0] / np.array(scales)
         errors = np.array([[here.steady_state[ERRORS[name]] for name in self.seen.names]])
-        return Predicted(here.status, np.array([rows(here)]), slopes[None], here.start, errors)
+        return Predicted(here.status, np.array([rows(here)]), slopes[None], errors, here.start)
 
 
 def predict(
@@ -189,5 +191,9 @@ def predict(
     def work(number: int) -> Predicted:
         return points[number].predicted(quantities, values, begins[number])
 
-    found = dict(as_done(work, range(len(points)), min(HERE.slots, len(points))))
-    return [found[number] for number in range(len(points))]
+    return [
+        one for _, one in sorted(as_done(work, range(len(points)), min(HERE.slots, len(points))))
+    ]
+
+
+__all__ = ["REST", "Begin", "Point", "Predicted", "predict"]

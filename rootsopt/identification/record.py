@@ -36,8 +36,9 @@ _MOST = 4096
 
 # Rotation (°) in 1 s at 1 rpm.
 _DEGREES_PER_RPM = 6.0
-
-# Averages other than those of the force.
+"""Rotation (°) in 1 s at 1 rpm."""
+_BESIDE, _ENOUGH = 0.1, 6
+"""Distance (mesh periods) from an instant up to which samples show its state, and how many do."""
 _AVERAGES = *RESERVES, *GEAR
 
 
@@ -69,27 +70,39 @@ class Observed:
         """The measured values (n, c)."""
         return np.stack([self.column(name) for name in self.names], axis=1)
 
-    @property
-    def deviations(self) -> NDArray[np.float64]:
-        """The standard deviations (n, c) of the measured values, NaN where they are not known."""
-        return np.stack([self.column(name + _SPREAD) for name in self.names], axis=1)
+    def rows(self) -> pandas.DataFrame:
+        """Return a row for each measured value: `source`, `line`, `values`, `rotation_deg`,
+        `column`, `measured`, standard deviation (`given`, NaN if not known), and `sampled`."""
+        measured = self.measured
+        given = np.stack([self.column(name + _SPREAD) for name in self.names], axis=1)
+        k, c = np.nonzero(np.isfinite(measured))
+        where = {"source": self.source, "line": self.table.index[k]} | self.values
+        where |= {"rotation_deg": self.column()[k], "column": np.array(self.names)[c]}
+        found = {"measured": measured[k, c], "given": given[k, c], "sampled": self.sampled}
+        return pandas.DataFrame(where | found)
 
-    def state(self, lobes: int, turns: int, speed: float) -> NDArray[np.float64] | None:
+    def state(
+        self, lobes: int, turns: int, period: float, offset: float
+    ) -> NDArray[np.float64] | None:
         """Return ε (rad) and dε/dt (rad/s) at a φ1 that is a multiple of `turns` mesh periods.
 
-        They are those of the sample that is nearest to it; None unless ε was measured. `lobes` of a
-        rotor; `speed` of rotor 1 (rpm), by which a missing rate follows from ε."""
-        turned, relative, rate = map(self.column, (_ROTATION, *CHANNELS[:2]))
-        known = np.isfinite(turned) & np.isfinite(relative)
-        if np.isnan(rate).all() and np.count_nonzero(known) > 1:
-            rate[known] = np.gradient(relative[known]) / np.gradient(turned[known])
-            rate *= _DEGREES_PER_RPM * speed
-        known &= np.isfinite(rate)
-        if not (self.sampled and known.any()):
+        They are those of cubics through the samples beside it; None unless enough of ε were
+        measured. `lobes` of a rotor; `period` (s) of the mesh; `offset` (°): rotation at φ1 = 0."""
+        place, relative, rate = map(self.column, (_ROTATION, *CHANNELS[:2]))
+        place = (place - offset) * lobes / 360
+        number = np.round(place / turns)
+        away = place - turns * number
+        near = np.isfinite(relative) & (np.abs(away) < _BESIDE)
+        if np.count_nonzero(near) < _ENOUGH:
             return None
-        share = turned * lobes / (360 * turns)
-        nearest = np.argmin(np.where(known, np.abs(share - np.round(share)), np.inf))
-        return np.array([relative[nearest], rate[nearest]])
+        most = pandas.Series(number[near]).value_counts()
+        # Samples that are few in each mesh period are taken together.
+        near &= (number == most.index[0]) | (most.iloc[0] < _ENOUGH)
+        *_, speed, angle = np.polyfit(away[near], relative[near], 3)
+        near &= np.isfinite(rate)
+        if np.count_nonzero(near) >= _ENOUGH:
+            return np.array([angle, np.polyfit(away[near], rate[near], 3)[-1]])
+        return np.array([angle, speed / period])
 
 
 def observed(config: Config, data: Any) -> list[Observed]:

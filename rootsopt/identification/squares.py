@@ -7,35 +7,29 @@ variable projection method for solving separable nonlinear least squares problem
 49-57)."""
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas
 from numpy.typing import NDArray
 
 from rootsopt.errors import InputError
 from rootsopt.identification.model import Begin, Point, predict
 from rootsopt.identification.quantities import Fitted, values_at
+from rootsopt.status import Status
 
 TURN = 3.0
 """Residual, in standard deviations, above which the loss grows linearly."""
-
-# Least size of an average that its relative error refers to, as a share of its column's RMS.
-_LEAST = 0.1
-
-# Maximum number of scenes in a local fit.
-_STEPS = 40
-
-# Number of times that residuals beyond `TURN` standard deviations are clipped to estimate one.
-_CLIPS = 8
-
-# Number of values of a column from which on it has a standard deviation of its own.
+_LEAST, _STILL = 0.1, 1e-4
+"""Least size of an average that its relative error refers to, and least variation of samples that
+theirs refer to, as shares of their column's RMS."""
+_STEPS, _CLIPS = 40, 8
+"""Maximum number of scenes in a local fit. Number of times that residuals are clipped at `TURN`
+standard deviations to estimate one."""
 _MANY = 30
-
-# Least variation of samples, as a share of their RMS, that their errors refer to.
-_STILL = 1e-4
-
-# Least standard deviation, as a share of the scale.
+"""Number of values of a column from which on it has a standard deviation of its own."""
 _FINEST = 1e-6
 
 
@@ -64,65 +58,48 @@ class Problem:
     """A record and the quantities to fit.
 
     `points`: operating points; `quantities`: what is fitted; `gains`: groups of columns that share
-    an unknown gain; `constants`: columns to which an unknown constant is added. The n measured
-    values stand one after the other: `measured` (n,); `given` (n,): standard deviations, NaN if not
-    known; `scale` (n,): size of what varies in their column; `place` (n,): number of the point;
-    `column` (n,): name."""
+    an unknown gain; `constants`: columns to which an unknown constant is added; `rows`: table of
+    the n measured values, as `Observed.rows`, with the number of the point (`place`) and the size
+    of what varies in their column (`scale`)."""
 
     points: tuple[Point, ...]
     quantities: tuple[Fitted, ...]
     gains: tuple[tuple[str, ...], ...]
     constants: tuple[str, ...]
-    measured: NDArray[np.float64]
-    given: NDArray[np.float64]
-    scale: NDArray[np.float64]
-    place: NDArray[np.int64]
-    column: NDArray[Any]
+    rows: pandas.DataFrame
 
     @classmethod
     def of(
         cls,
         points: Sequence[Point],
         quantities: Sequence[Fitted],
-        gains: Sequence[Sequence[str]],
-        constants: Sequence[str],
+        gains: Sequence[Sequence[str]] = (),
+        constants: Sequence[str] = (),
     ) -> "Problem":
         """Return the problem.
 
         Raises `InputError` if a name in `gains` or `constants` is not that of a column."""
-        seen = [point.seen for point in points]
-        columns = [np.broadcast_to(one.names, one.measured.shape) for one in seen]
-        places = [np.full(one.measured.shape, k) for k, one in enumerate(seen)]
-        measured, given, column, place = (
-            np.concatenate(
-                [x[np.isfinite(one.measured)] for x, one in zip(some, seen, strict=True)]
-            )
-            for some in ([x.measured for x in seen], [x.deviations for x in seen], columns, places)
-        )
-        for name in (*(name for group in gains for name in group), *constants):
-            if name not in column:
+        each = [point.seen.rows().assign(place=k) for k, point in enumerate(points)]
+        rows = pandas.concat(each, ignore_index=True)
+        names, measured = sorted({*rows.column}), rows.groupby("column")["measured"]
+        for name in itertools.chain(*gains, constants):
+            if name not in names:
                 raise InputError(
                     f"a gain or constant must belong to a column of the record "
-                    f"({', '.join(np.unique(column))}), but is that of {name}; correct it"
+                    f"({', '.join(names)}), but is that of {name}; correct it"
                 )
-        sampled, scale = np.array([one.sampled for one in seen])[place], np.zeros_like(measured)
-        for name in np.unique(column):
-            mine = column == name
-            varies = np.std(measured[mine]) if sampled[mine].any() else 0.0
-            size = np.sqrt(np.mean(measured[mine] ** 2))
-            scale[mine] = max(varies, _STILL * size) if varies else size
+        size = measured.transform(lambda x: np.sqrt(np.mean(x**2)))
+        varies = measured.transform(lambda x: np.std(x.to_numpy()))
+        scale = size.where(~rows.sampled, varies.clip(lower=_STILL * size))
         # A column of zeros has the scale of the others with its unit.
-        kinds = np.array([name.rpartition("_")[2] for name in column])
-        for kind in np.unique(kinds):
-            mine = kinds == kind
-            scale[mine & (scale == 0)] = np.max(scale[mine]) or 1.0
+        like = scale.groupby(rows.column.str.rpartition("_")[2]).transform("max")
+        scale = scale.mask(scale == 0, like).replace(0.0, 1.0)
         # Averages have relative errors, samples those of their column.
-        scale = np.where(sampled, scale, np.maximum(np.abs(measured), _LEAST * scale))
+        scale = scale.where(rows.sampled, np.maximum(rows.measured.abs(), _LEAST * scale))
         groups = tuple(map(tuple, gains))
         return cls(
-            tuple(points), tuple(quantities), groups, tuple(constants),
-            measured, given, scale, place, column,
-        )  # fmt: skip
+            tuple(points), tuple(quantities), groups, tuple(constants), rows.assign(scale=scale)
+        )
 
     @property
     def lost(self) -> int:
@@ -132,28 +109,26 @@ class Problem:
     @property
     def box(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Lower and upper bounds (p,) on the scales of the quantities."""
-        low, high = zip(
-            *((x.scaled(x.low), x.scaled(x.high)) for x in self.quantities), strict=True
-        )
-        return np.array(low), np.array(high)
+        ends = np.array([(x.scaled(x.low), x.scaled(x.high)) for x in self.quantities])
+        return ends[:, 0], ends[:, 1]
 
     def estimated(self, away: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
         """Return the standard deviations (n,): those given, else from the differences `away` (n,)
         between prediction and record, or without these, the scale.
 
         Columns of few values share one relative deviation."""
-        found, open_ = self.given.copy(), np.isnan(self.given)
+        scale, found = self.rows.scale.to_numpy(), self.rows.given.to_numpy(copy=True)
+        unknown = np.isnan(found)
         if away is None:
-            return np.where(open_, self.scale, found)
+            return np.where(unknown, scale, found)
+        share, of = (away / scale) ** 2, self.rows.column[unknown]
         freed = np.sqrt(len(away) / max(len(away) - self.lost, 1))
-        groups = [np.flatnonzero(open_ & (self.column == name)) for name in np.unique(self.column)]
-        few = np.concatenate([one for one in groups if len(one) < _MANY] or [[]]).astype(int)
-        for mine in [few, *(one for one in groups if len(one) >= _MANY)]:
-            sizes = (away / self.scale)[mine] ** 2
-            size = np.mean(sizes) if len(mine) else 0.0
-            for _ in range(_CLIPS if len(mine) >= _MANY else 0):
-                size = np.mean(np.minimum(sizes, TURN**2 * size))
-            found[mine] = max(np.sqrt(size) * freed, _FINEST) * self.scale[mine]
+        groups = of.where(of.groupby(of).transform("size") >= _MANY, "")
+        for mine in (one.index for _, one in groups.groupby(groups)):
+            size = np.mean(share[mine])
+            for _ in range(_CLIPS):
+                size = np.mean(np.minimum(share[mine], TURN**2 * size))
+            found[mine] = max(np.sqrt(size) * freed, _FINEST) * scale[mine]
         return found
 
     def at(
@@ -161,48 +136,45 @@ class Problem:
         place: NDArray[np.float64],
         begins: Sequence[Begin],
         deviation: NDArray[np.float64],
-        turn: float,
-    ) -> tuple[Local | None, list[Any]]:
-        """Return the fit at a `place` (p,), None if a motion is not usable, and what is predicted.
+        turn: float = TURN,
+    ) -> tuple[Local | None, list[Status]]:
+        """Return the fit at a `place` (p,), None if a motion is not usable, and the statuses of
+        such motions.
 
         `deviation` (n,): standard deviations; `turn`: residual at which the loss turns linear."""
-        values, p = values_at(self.quantities, place), len(place)
+        values, rows = values_at(self.quantities, place), self.rows
         found = predict(self.points, self.quantities, values, begins)
-        if any(one.values is None for one in found):
-            return None, found
+        if lost := [one.status for one in found if one.values is None]:
+            return None, lost
         known = [np.isfinite(point.seen.measured) for point in self.points]
-
-        def joined(parts: list[Any]) -> NDArray[np.float64]:
-            whole = (np.broadcast_to(x, (*k.shape, *np.shape(x)[2:]))[k]
-                     for x, k in zip(parts, known, strict=True))  # fmt: skip
-            return np.concatenate([*whole])
-
-        predicted, slopes = joined([x.values for x in found]), joined([x.slopes for x in found])
-        deviation = np.hypot(deviation, joined([x.errors for x in found]))
-        if not (np.all(np.isfinite(predicted)) and np.all(np.isfinite(slopes))):
-            return None, found
-        scales = [one.slope(x) for one, x in zip(self.quantities, values, strict=True)]
-        slopes = slopes.reshape(-1, p) * np.array(scales) / deviation[:, None]
-        fit, gains = predicted, np.zeros(0, float)
+        fit, slopes, errors = (
+            np.concatenate([getattr(x, name)[k] for x, k in zip(found, known, strict=True)])
+            for name in ("values", "slopes", "errors")
+        )
+        if not (np.all(np.isfinite(fit)) and np.all(np.isfinite(slopes))):
+            return None, [Status.NON_FINITE]
+        deviation, gains = np.hypot(deviation, errors), np.zeros(0)
+        slopes = slopes * [one.slope(x) for one, x in zip(self.quantities, values, strict=True)]
+        slopes /= deviation[:, None]
         if self.gains or self.constants:
-            shared = [np.isin(self.column, group) for group in self.gains]
-            columns = [np.where(mine, predicted, 0.0) for mine in shared]
-            columns += [(self.column == name).astype(float) for name in self.constants]
-            basis = np.stack(columns, axis=1) / deviation[:, None]
-            fixed = np.where(np.any(shared, axis=0), 0.0, predicted) if shared else predicted
-            gains = np.linalg.lstsq(basis, (self.measured - fixed) / deviation, rcond=None)[0]
+            shared = [rows.column.isin(group).to_numpy() for group in self.gains]
+            columns = [np.where(mine, fit, 0.0) for mine in shared]
+            columns += [(rows.column == name).to_numpy(float) for name in self.constants]
+            basis, fixed = (
+                np.stack(columns, axis=1) / deviation[:, None],
+                fit - sum(columns[: len(shared)]),
+            )
+            gains = np.linalg.lstsq(basis, (rows.measured - fixed) / deviation)[0]
             fit = fixed + deviation * (basis @ gains)
             for mine, gain in zip(shared, gains, strict=False):
-                slopes = np.where(mine[:, None], gain * slopes, slopes)
+                slopes[mine] *= gain
             frame = np.linalg.svd(basis, full_matrices=False)[0]
             slopes = slopes - frame @ (frame.T @ slopes)
-        residual = (fit - self.measured) / deviation
+        residual = (fit - rows.measured.to_numpy()) / deviation
         size = np.abs(residual)
         cost = np.sum(np.where(size <= turn, size**2 / 2, turn * (size - turn / 2)))
         begin = [one.begin for one in found]
-        return Local(
-            place, values, float(cost), residual, slopes, fit, gains, begin, deviation
-        ), found
+        return Local(place, values, float(cost), residual, slopes, fit, gains, begin, deviation), []
 
     def fitted(
         self,
@@ -218,7 +190,7 @@ class Problem:
         from scipy.optimize import least_squares  # Slow import (0.5 s).
 
         low, high = self.box
-        free = [k for k in range(len(place)) if k not in held]
+        free = np.delete(np.arange(len(place)), held)
         # The search stays inside the bounds.
         room = 1e-9 * (high - low)
         place = np.clip(place, low + room, high - room)
@@ -237,13 +209,13 @@ class Problem:
 
         def residual(some: NDArray[np.float64]) -> NDArray[np.float64]:
             found = at(some)
-            return np.full(len(self.measured), np.nan) if found is None else found.residual
+            return np.full(len(self.rows), np.nan) if found is None else found.residual
 
         def slopes(some: NDArray[np.float64]) -> NDArray[np.float64]:
             return known[some.tobytes()].slopes[:, free]
 
         first = at(place[free])
-        if first is None or not free:
+        if first is None or not len(free):
             return first
         done = least_squares(
             residual, place[free], slopes,  # pyright: ignore[reportArgumentType]

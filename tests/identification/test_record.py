@@ -27,7 +27,7 @@ def test_a_table_holds_samples_at_several_operating_points(tmp_path):
     assert (one.names, one.sampled) == (("contact_force_N",), True)
     assert one.column().tolist() == [720.0]
     assert one.measured.tolist() == [[1.5]]
-    assert two.deviations.tolist() == [[0.2]]
+    assert two.rows().given.tolist() == [0.2]
 
 
 def test_a_table_holds_averages_with_a_row_per_point(tmp_path):
@@ -43,7 +43,7 @@ def test_rotation_follows_from_time_and_state_from_the_samples(tmp_path):
     data = {"time_s": time, "relative_rotation_rad": 1e-3 * np.sin(1e3 * time)}
     (one,) = observed(CIC, data)
     np.testing.assert_allclose(one.column(), 18_000 * time)
-    relative, rate = one.state(3, 1, 3000.0)
+    relative, rate = one.state(3, 1, 120 / 18_000, 0.0)
     assert one.timed
     phase = np.arcsin(relative / 1e-3)
     assert abs(rate) == pytest.approx(np.cos(phase), abs=1e-3)

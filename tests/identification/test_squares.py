@@ -31,7 +31,7 @@ def problem_of(model, data, monkeypatch, deviation=None, count=2, gains=(), cons
         steps = 1e-6 * np.eye(count)
         slopes = [(model(values + h, X) - model(values - h, X)) / 2e-6 for h in steps]
         value, slope = model(values, X)[:, None], np.stack(slopes, axis=-1)[:, None]
-        return [Predicted(Status.PERIODIC, value, slope)]
+        return [Predicted(Status.PERIODIC, value, slope, np.zeros(value.shape))]
 
     monkeypatch.setattr(squares, "predict", predict)
     return Problem.of([Point(load_config("cic"), seen)], quantities, gains, constants)
@@ -94,7 +94,7 @@ def test_outliers_hardly_count(monkeypatch):
     problem = problem_of(wave, data, monkeypatch)
     best = problem.fitted(np.array([1.0, 1.0]), [None], problem.estimated(), turn=1.0)
     for _ in range(3):
-        deviation = problem.estimated(best.fit - problem.measured)
+        deviation = problem.estimated(best.fit - problem.rows.measured.to_numpy())
         best = problem.fitted(best.place, [None], deviation)
     plain = curve_fit(lambda x, a, b: wave([a, b], x), X, data, [1.0, 1.0])[0]
     assert np.abs(best.values - [1.5, 0.8]).max() < 0.1 * np.abs(plain - [1.5, 0.8]).max()
