@@ -1,9 +1,9 @@
 """Fits records of simulated scenes whose values are known.
 
 Each scene has random values of `RANGES` and a random speed. Its record is a turn of two sampled
-columns with normal noise, whose standard deviation is a share of the column's RMS. `identify` is
-not told the noise. The true values should lie in the joint 95 % region of 95 % of the fits, and
-each of them in 95 % of its intervals."""
+columns with normal noise, whose standard deviation is a share of the column's RMS. The record holds
+no standard deviations, so `identify` estimates the noise. The true values should lie in the joint
+95 % region of 95 % of the fits, and each of them in 95 % of its intervals."""
 
 import time
 from typing import Any

@@ -205,7 +205,7 @@ def motions(problem: Problem, best: Local) -> list[dict[str, Any]]:
         same = rest.values is not None and np.allclose(
             rest.values, mine.values, rtol=0, atol=_SAME * np.max(np.abs(mine.values), axis=0)
         )
-        found.append(point.seen.values | dict(mine.orbit) | {"reached_from_rest": bool(same)})
+        found.append({"at": point.seen.values, **mine.orbit, "reached_from_rest": bool(same)})
     return found
 
 

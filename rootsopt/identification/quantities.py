@@ -110,24 +110,33 @@ def _bounds(key: str, text: str) -> Any:
 
 
 def _fitted(config: Config, key: str, pair: Any) -> tuple[Config, Fitted]:
+    if pair is not None and not (np.shape(pair) == (2,) and np.all(np.isfinite(pair))):
+        raise InputError(f"`{key}` must have two finite bounds, but has {pair}; correct them")
+    if pair is not None and not pair[0] < pair[1]:
+        raise InputError(
+            f"`{key}` must have a lower bound below the upper one, but has {pair[0]:g} and "
+            f"{pair[1]:g}; correct them"
+        )
     if key == OFFSET:
         half = 180.0 / config.profile.lobes
         low, high = pair or (-half, half)
         return config, Fitted(key, low, high, low, high, min(max(0.0, low), high), False)
-    if pair is not None and not (np.shape(pair) == (2,) and np.all(np.isfinite(pair))):
-        raise InputError(f"`{key}` must have two finite bounds, but has {pair}; correct them")
-    own = config.value(key)
-    if own is None and key in tree(Config):
-        middle = sum(pair) / 2 if pair else 0.0
-        config = configured(config, {key: middle})
-        own = middle
+    if config.value(key) is None and key in tree(Config):
+        try:
+            config = configured(config, {key: sum(pair) / 2 if pair else 0.0})
+        except InputError as error:
+            raise (
+                error
+                if pair
+                else InputError(
+                    f"`{key}` has no value in the config; give it one, or bounds, as in {key}=0.1:0.5"
+                )
+            ) from None
     values = scatterable(config)
     if key not in values:
         raise InputError(unknown_key(key, values, tree(Config), "--fit"))
     own = values[key]
-    low, high = sorted(map(float, pair)) if pair else _allowed(config, key)
-    if low == high:
-        raise InputError(f"`{key}` must have two different bounds, but has {low:g} twice")
+    low, high = map(float, pair or _allowed(config, key))
     for end in (low, high):
         config.check_values({key: end})
     if pair:

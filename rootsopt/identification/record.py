@@ -155,6 +155,11 @@ def _points(config: Config, name: str, cells: pandas.DataFrame) -> Iterator[Obse
     keys = [title for title in titles if title in tree(Config)]
     known = {_ROTATION, _TIME, *keys, *(title + _SPREAD for title in titles)}
     names = tuple(title for title in titles if title not in known)
+    if not sampled and (samples := [title for title in names if title in CHANNELS]):
+        raise InputError(
+            f"{name}: the samples {samples[0]} need a column {_ROTATION} or {_TIME}; add it, or "
+            "rename the one that holds it"
+        )
     for title in names:
         _check(config, name, title, sampled)
     if not names:

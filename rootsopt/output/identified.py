@@ -4,7 +4,18 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from rootsopt.output.comparison import label_of
-from rootsopt.output.names import Cell, Row, Table, brief, listed, name_and_unit, table, value
+from rootsopt.output.names import (
+    Cell,
+    Row,
+    Table,
+    brief,
+    listed,
+    name_and_unit,
+    quantity,
+    stated,
+    table,
+    value,
+)
 
 
 def identified_tables(result: Mapping[str, Any]) -> Iterator[Table | None]:
@@ -25,6 +36,12 @@ def identified_tables(result: Mapping[str, Any]) -> Iterator[Table | None]:
             for one in result["combinations"]]  # fmt: skip
     note = "Standard error: as a share of the range in which the search begins."
     yield table("Combinations of the quantities", ("", "standard error", ""), [("", rows)], note)
+    rows = [[", ".join(stated(key, x, named=True) for key, x in one["at"].items()),
+             value(one["period"]), value(one["floquet_multiplier"]),
+             "from rest" if one["reached_from_rest"] else Cell("not from rest", False)]
+            for one in result["motions"]]  # fmt: skip
+    heads = "at", "period (mesh periods)", "largest multiplier", "reached"
+    yield table("Motions that the record shows", heads, [("", rows)])
     rows = [[f"{name_and_unit(one['column'])[0]} at {one['scene.speed_rpm']:g} rpm",
              *map(value, one["standard_errors"].values())]
             for one in result["further"]]  # fmt: skip
@@ -43,7 +60,9 @@ def identified(
     found = []
     for key, one in (result.get("parameters") or {}).items():
         (name, unit), error = name_and_unit(key), one["standard_error"]
-        sure = "not determined" if error is None else f"± {brief(error, 2)}"
-        found.append(f"{name} {brief(one['value'])} {sure} {unit}".strip())
+        if error is None:
+            found.append(f"{name} {quantity(one['value'], unit)} (not determined)")
+        else:
+            found.append(f"{name} {brief(one['value'])} ± {brief(error, 2)} {unit}".strip())
     said = str(result["message"]).partition(". ")[2]
     return [("Found", f"{listed(found)}."), ("How sure", said)] if found else []

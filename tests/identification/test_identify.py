@@ -17,6 +17,8 @@ from rootsopt.identification.channels import CHANNELS
 from rootsopt.identification.model import Point
 from rootsopt.identification.quantities import fitted
 from rootsopt.identification.record import observed
+from rootsopt.response.attractors import find
+from rootsopt.response.evaluation import Evaluator
 
 BACKLASH, LOAD = "scene.timing_gear.backlash_mm", "scene.load.torque_N_m"
 DAMPING = "scene.timing_gear.damping_ratio"
@@ -134,6 +136,51 @@ def test_averages_over_speeds_lead_to_the_true_values_with_outlier_and_gaps(tmp_
     for key, true in TRUE.items():
         low, high = found.parameters[key]["interval_95"]
         assert low < true < high
+
+
+@functools.cache
+def coexisting():
+    """Return (config, its motions) of a scene with quiet and noisy motions side by side."""
+    moved = {"scene.speed_rpm": 4000.0, BACKLASH: 0.2, DAMPING: 0.2}
+    config = load_config("cic_drawn").replaced(moved)
+    found = find(Evaluator.of(config), series=True).attractors
+    return config, {one.reached: one.evaluation for one in reversed(found)}
+
+
+@pytest.mark.parametrize("kind", ["samples", "force", "averages"])
+def test_a_motion_that_is_not_reached_from_rest_is_matched(kind):
+    config, found = coexisting()
+    quiet, rng = found[False], np.random.default_rng(0)
+    assert quiet.response["peak_force_N"] < 0.8 * found[True].response["peak_force_N"]
+    names = ["relative_rotation_rad", "contact_force_N"][kind == "force" :]
+    data = quiet.to_dataset()
+    record = {"rotation_deg": data.rotation_deg.values[::20]}
+    for name in names:
+        values = data[name].values[::20]
+        record[name] = values + 0.03 * np.std(values) * rng.standard_normal(len(values))
+    if kind == "averages":
+        names = "mean_force_N", "peak_force_N", "rms_force_N", "line_1_force_N"
+        record = {name: quiet.response[name] * (1 + 1e-3 * rng.standard_normal())
+                  for name in names if name in quiet.response}  # fmt: skip
+    keys = {BACKLASH: (0.1, 0.3)}
+    fit = rootsopt.identify(config.replaced({BACKLASH: 0.17}), record, keys, starts=1)
+    assert fit.parameters[BACKLASH]["value"] == pytest.approx(0.2, rel=0.01)
+    (motion,) = fit.motions
+    assert (motion["period"], motion["reached_from_rest"]) == (1, False)
+    assert "not reached from rest" in fit.message
+
+
+def test_a_motion_of_two_mesh_periods_is_matched_whichever_comes_first():
+    config, found = coexisting()
+    data = found[True].to_dataset()
+    record = {"rotation_deg": data.rotation_deg.values[::20] + 120}
+    record["contact_force_N"] = data["contact_force_N"].values[::20]
+    keys = {BACKLASH: (0.1, 0.3)}
+    fit = rootsopt.identify(config.replaced({BACKLASH: 0.19}), record, keys, starts=1)
+    assert fit.parameters[BACKLASH]["value"] == pytest.approx(0.2, rel=1e-3)
+    (motion,) = fit.motions
+    assert (motion["period"], motion["reached_from_rest"]) == (2, True)
+    assert "not reached" not in fit.message
 
 
 def test_gain_offset_and_rotation_of_a_record_are_found():
