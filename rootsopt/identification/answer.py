@@ -102,11 +102,13 @@ class Spread:
         size = rows.measured.groupby(rows.column).transform(lambda x: np.sqrt(np.mean(x**2)))
         exact = share * (_EXACT * math.sqrt(count) * size.to_numpy() / best.deviation)
         covariance = covariance + exact @ exact.T
-        errors, unknown = np.sqrt(np.diag(covariance)), not known and freedom <= 0
+        # HC3 scatters where few samples tell of a quantity: its errors are never the smaller ones.
+        errors = np.sqrt(np.maximum(np.diag(covariance), factor * np.diag(plain)))
+        factors = errors**2 / np.maximum(np.diag(plain), 1e-300)
+        unknown = not known and freedom <= 0
         errors[unknown | np.any(np.abs(ways[loose]) > _PART, axis=0)] = math.inf
         each = np.einsum("kp,pq,kq->k", ways, covariance, ways)
         deviations = np.where(loose, math.inf, math.nan if unknown else np.sqrt(np.abs(each)))
-        factors = np.diag(covariance) / np.maximum(np.diag(plain), 1e-300)
         joint = float(np.mean((each * sizes**2)[~loose])) if np.any(~loose) else 1.0
         width = stats.norm.ppf(0.975) if trusted else stats.t.ppf(0.975, max(freedom, 1))
         order = ways[::-1], deviations[::-1]
