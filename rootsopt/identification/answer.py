@@ -172,7 +172,7 @@ def structure(problem: Problem, best: Local) -> float:
     lacks something, or is the wrong one, they are not independent."""
     if relative_misfit(problem, best) < _NUMERICAL:
         return 0.0
-    rows = problem.rows.assign(away=np.clip(best.residual, -TURN, TURN))[problem.rows.sampled]
+    rows = problem.rows.assign(away=np.clip(best.residual, -TURN, TURN)).query("sampled")
     groups = rows.sort_values("rotation_deg", kind="stable").groupby(["place", "column"])
     each = [one.to_numpy() for _, one in groups["away"]]
     total = sum(x[1:] @ x[:-1] / np.mean(x**2) for x in each if np.any(x))
@@ -228,7 +228,9 @@ def further(problem: Problem, best: Local, spread: Spread) -> list[dict[str, Any
             config.moved({"scene.speed_rpm": speed}), Observed("", {}, table, _FURTHER, True)
         )
         one = point.predicted(problem.quantities, best.values, best.begins[0])
-        for k, name in enumerate(_FURTHER if one.values is not None else ()):
+        if one.values is None:
+            continue
+        for k, name in enumerate(_FURTHER):
             size = max(relative, 1e-3) * float(np.std(one.values[:, k]))
             if (name in {*problem.rows.column} and share == 1) or not size:
                 continue

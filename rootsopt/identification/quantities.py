@@ -124,13 +124,11 @@ def _fitted(config: Config, key: str, pair: Any) -> tuple[Config, Fitted]:
     if config.value(key) is None and key in tree(Config):
         try:
             config = configured(config, {key: sum(pair) / 2 if pair else 0.0})
-        except InputError as error:
-            raise (
-                error
-                if pair
-                else InputError(
-                    f"`{key}` has no value in the config; give it one, or bounds, as in {key}=0.1:0.5"
-                )
+        except InputError:
+            if pair:
+                raise
+            raise InputError(
+                f"`{key}` has no value in the config; give it one, or bounds as {key}=0.1:0.5"
             ) from None
     values = scatterable(config)
     if key not in values:

@@ -88,7 +88,7 @@ class Problem:
                     f"a gain or constant must belong to a column of the record "
                     f"({', '.join(names)}), but is that of {name}; correct it"
                 )
-        size = measured.transform(lambda x: np.sqrt(np.mean(x**2)))
+        size: Any = measured.transform(lambda x: np.sqrt(np.mean(x**2)))
         varies = measured.transform(lambda x: np.std(x.to_numpy()))
         scale = size.where(~rows.sampled, varies.clip(lower=_STILL * size))
         # A column of zeros has the scale of the others with its unit.
