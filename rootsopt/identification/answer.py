@@ -8,7 +8,7 @@ improved finite sample properties, J. Econometrics 29 (1985) 305-325)."""
 import dataclasses
 import functools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -23,36 +23,44 @@ from rootsopt.identification.record import Observed
 from rootsopt.identification.squares import TURN, Local, Problem
 from rootsopt.status import Status
 
+# Standard deviation of a combination, as a share of the range in which the search begins, above
+# which the record does not determine it. Share of a quantity in it below which it does not count.
 _LOOSE, _PART = 0.3, 0.1
-"""Standard deviation of a combination, as a share of the range in which the search begins, above
-which the record does not determine it. Share of a quantity in it below which it does not count."""
+
+# Distance from a bound, as a share of this range, up to which a quantity lies at it.
 _NEAR = 1e-4
-"""Distance from a bound, as a share of this range, up to which a quantity lies at it."""
 STRUCTURED = 4.0
 """Value of `structure` above which residuals are not independent."""
+
+# Relative error of a simulated orbit, the same in all samples; relative misfit below which
+# residuals are such errors.
 _EXACT, _NUMERICAL = 1e-5, 1e-4
-"""Relative error of a simulated orbit, the same in all samples; relative misfit below which
-residuals are such errors."""
+
+# Singular value of the derivatives, as a share of the greatest, below which it is an error of the
+# derivatives.
 _SINGULAR = 1e-5
-"""Singular value of the derivatives, as a share of the greatest, below which it is an error of the
-derivatives."""
+
+# Error of the end of an interval, as a share of its distance from the best value, and factor by
+# which this distance grows until it holds the end.
 _CLOSE, _WIDER = 0.03, 2.0
-"""Error of the end of an interval, as a share of its distance from the best value, and factor by
-which this distance grows until it holds the end."""
+
+# Degrees of freedom from which on the errors may differ between samples (HC3).
 _MANY = 50
-"""Degrees of freedom from which on the errors may differ between samples (HC3)."""
 UNLIKELY = 0.01
 """Probability of residuals this large, with the given standard deviations, below which these are
 taken for too small."""
+
+# Relative difference of predictions up to which two motions are the same.
 _SAME = 1e-3
-"""Relative difference of predictions up to which two motions are the same."""
+
+# Speeds of further measurements, as multiples of the config's, and their relative error if the
+# record has none.
 _SPEEDS, _USUAL = (0.5, 1.0, 2.0), 0.01
-"""Speeds of further measurements, as multiples of the config's, and their relative error if the
-record has none."""
 ENTRIES = "parameters", "combinations", "fit", "motions", "optima", "further", "profiles"
 """Entries of the result file."""
+
+# Columns of further measurements.
 _FURTHER = CHANNELS[0], CHANNELS[1], CHANNELS[4], *CHANNELS[6:]
-"""Columns of further measurements."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -294,45 +302,6 @@ def named(problem: Problem, values: NDArray[np.float64]) -> dict[str, float]:
     return dict(zip((one.key for one in problem.quantities), map(float, values), strict=True))
 
 
-def caveats(entries: Mapping[str, Any]) -> Iterator[str]:
-    """Yield sentences on what limits the answer, from the `entries` of the result file."""
-    fit = entries["fit"]
-    loose = [one["words"] for one in entries["combinations"] if not one["determined"]]
-    away = [one for one in entries["motions"] if not one["reached_from_rest"]]
-    yield f"It differs from the record by {100 * fit['relative_misfit']:.3g} % of its variation."
-    if away:
-        yield (
-            "The record shows a motion that is not reached from rest, of period "
-            f"{' and '.join({str(one['period']): 1 for one in away})}: `rootsopt attractors` "
-            "finds it."
-        )
-    if fit["degrees_of_freedom"] <= 0:
-        yield (
-            f"The record has {fit['measured_values']} values, which leave nothing to estimate "
-            "errors from: fit fewer quantities, or give more values and their standard deviations."
-        )
-    if loose:
-        yield f"The record does not determine {'; '.join(loose)}."
-        for one in entries["further"][:1]:
-            yield f"Measure {one['column']} over a turn at {one['scene.speed_rpm']:g} rpm as well."
-    for key, one in entries["parameters"].items():
-        if one["at_bound"]:
-            yield f"{key} lies at its {one['at_bound']} bound: widen it unless it is a limit."
-    if entries["optima"]:
-        count = len(entries["optima"])
-        yield f"Other scenes within the bounds fit nearly as well (optima): {count}."
-    if fit["structure"] > STRUCTURED:
-        yield (
-            "Residuals of neighbouring samples are alike, so that the scene lacks something or is "
-            "not the best within the bounds: the errors are too small. Raise --starts."
-        )
-    if fit["probability"] is not None and fit["probability"] < UNLIKELY:
-        yield (
-            "The residuals are larger than the standard deviations allow, so that the scene lacks "
-            "something or these are too small: the errors are scaled up."
-        )
-
-
 @dataclasses.dataclass(frozen=True)
 class Identification:
     """The scene that fits a record best, and how sure it is.
@@ -414,24 +383,3 @@ def adopted(config: Config, problem: Problem, best: Local) -> Config:
     values = named(problem, best.values)
     values.pop(OFFSET, None)
     return config.replaced(values) if values else config
-
-
-__all__ = [
-    "ENTRIES",
-    "STRUCTURED",
-    "UNLIKELY",
-    "Identification",
-    "Spread",
-    "adopted",
-    "caveats",
-    "combinations",
-    "further",
-    "motions",
-    "named",
-    "parameters",
-    "profile",
-    "quality",
-    "relative_misfit",
-    "residuals",
-    "structure",
-]

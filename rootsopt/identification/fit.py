@@ -2,7 +2,7 @@
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -23,19 +23,23 @@ from rootsopt.response.still import reporting
 from rootsopt.runtime.environment import check_precision
 from rootsopt.status import Status
 
+# Scenes that are tried for each quantity before local fits, maximum number of simulations, and how
+# often at most both are done while no fit explains the record.
 _TRIED, _MOST, _ROUNDS = 16, 256, 4
-"""Scenes that are tried for each quantity before local fits, maximum number of simulations, and
-how often at most both are done while no fit explains the record."""
+
+# Relative misfit of averages above which a fit does not explain them. Number of fits around which
+# other coexisting motions are tried.
 _POOR, _PLACES = 0.05, 2
-"""Relative misfit of averages above which a fit does not explain them. Number of fits around which
-other coexisting motions are tried."""
+
+# Relative misfit above which a scene does not explain the record.
 _NO_FIT = 0.7
-"""Relative misfit above which a scene does not explain the record."""
+
+# Distance between places from which local fits begin, and up to which two optima are the same.
 _APART, _SAME = 0.15, 0.01
-"""Distance between places from which local fits begin, and up to which two optima are the same."""
+
+# Ratio of misfits up to which another optimum fits nearly as well, and misfit up to which all
+# optima fit as well as the best.
 _NEARLY, _EQUAL = 2.0, 1e-3
-"""Ratio of misfits up to which another optimum fits nearly as well, and misfit up to which all
-optima fit as well as the best."""
 _CHANCE = 1e-3
 
 # Number of local fits in which standard deviations are estimated from the residuals.
@@ -133,10 +137,49 @@ def identify(  # Keywords of the public interface, each independent of the other
     scales = np.array([one.slope(x) for one, x in zip(quantities, best.values, strict=True)])
     return Identification(
         answer.adopted(config, problem, best), status,
-        " ".join([status.value, *answer.caveats(entries)]), search.statistics(began), **entries,
+        " ".join([status.value, *_caveats(entries)]), search.statistics(began), **entries,
         covariance=spread.covariance * np.outer(scales, scales),
         residuals=answer.residuals(problem, best), best=(problem, best, spread),
     )  # fmt: skip
+
+
+def _caveats(entries: Mapping[str, Any]) -> Iterator[str]:
+    """Yield sentences on what limits the answer, from the `entries` of the result file."""
+    fit = entries["fit"]
+    loose = [one["words"] for one in entries["combinations"] if not one["determined"]]
+    away = [one for one in entries["motions"] if not one["reached_from_rest"]]
+    yield f"It differs from the record by {100 * fit['relative_misfit']:.3g} % of its variation."
+    if away:
+        yield (
+            "The record shows a motion that is not reached from rest, of period "
+            f"{' and '.join({str(one['period']): 1 for one in away})}: `rootsopt attractors` "
+            "finds it."
+        )
+    if fit["degrees_of_freedom"] <= 0:
+        yield (
+            f"The record has {fit['measured_values']} values, which leave nothing to estimate "
+            "errors from: fit fewer quantities, or give more values and their standard deviations."
+        )
+    if loose:
+        yield f"The record does not determine {'; '.join(loose)}."
+        for one in entries["further"][:1]:
+            yield f"Measure {one['column']} over a turn at {one['scene.speed_rpm']:g} rpm as well."
+    for key, one in entries["parameters"].items():
+        if one["at_bound"]:
+            yield f"{key} lies at its {one['at_bound']} bound: widen it unless it is a limit."
+    if entries["optima"]:
+        count = len(entries["optima"])
+        yield f"Other scenes within the bounds fit nearly as well (optima): {count}."
+    if fit["structure"] > answer.STRUCTURED:
+        yield (
+            "Residuals of neighbouring samples are alike, so that the scene lacks something or is "
+            "not the best within the bounds: the errors are too small. Raise --starts."
+        )
+    if fit["probability"] is not None and fit["probability"] < answer.UNLIKELY:
+        yield (
+            "The residuals are larger than the standard deviations allow, so that the scene lacks "
+            "something or these are too small: the errors are scaled up."
+        )
 
 
 class _Search:

@@ -194,6 +194,3 @@ def predict(
     return [
         one for _, one in sorted(as_done(work, range(len(points)), min(HERE.slots, len(points))))
     ]
-
-
-__all__ = ["REST", "Begin", "Point", "Predicted", "predict"]

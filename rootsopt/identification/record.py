@@ -35,10 +35,12 @@ _SPREAD = "_std"
 _MOST = 4096
 
 # Rotation (°) in 1 s at 1 rpm.
+
+# Rotation (°) in 1 s at 1 rpm.
 _DEGREES_PER_RPM = 6.0
-"""Rotation (°) in 1 s at 1 rpm."""
+
+# Distance (mesh periods) from an instant up to which samples show its state, and how many do.
 _BESIDE, _ENOUGH = 0.1, 6
-"""Distance (mesh periods) from an instant up to which samples show its state, and how many do."""
 _AVERAGES = *RESERVES, *GEAR
 
 

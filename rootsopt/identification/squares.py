@@ -22,14 +22,17 @@ from rootsopt.status import Status
 
 TURN = 3.0
 """Residual, in standard deviations, above which the loss grows linearly."""
+
+# Least size of an average that its relative error refers to, and least variation of samples that
+# theirs refer to, as shares of their column's RMS.
 _LEAST, _STILL = 0.1, 1e-4
-"""Least size of an average that its relative error refers to, and least variation of samples that
-theirs refer to, as shares of their column's RMS."""
+
+# Maximum number of scenes in a local fit. Number of times that residuals are clipped at `TURN`
+# standard deviations to estimate one.
 _STEPS, _CLIPS = 40, 8
-"""Maximum number of scenes in a local fit. Number of times that residuals are clipped at `TURN`
-standard deviations to estimate one."""
+
+# Number of values of a column from which on it has a standard deviation of its own.
 _MANY = 30
-"""Number of values of a column from which on it has a standard deviation of its own."""
 _FINEST = 1e-6
 
 
