@@ -157,7 +157,7 @@ def _caveats(entries: Mapping[str, Any]) -> Iterator[str]:
         )
     if fit["degrees_of_freedom"] <= 0:
         yield (
-            f"The record has {fit['measured_values']} values, which leave nothing to estimate "
+            f"The record's number of values, {fit['measured_values']}, leaves nothing to estimate "
             "errors from: fit fewer quantities, or give more values and their standard deviations."
         )
     if loose:

@@ -36,7 +36,7 @@ def identified_tables(result: Mapping[str, Any]) -> Iterator[Table | None]:
             for one in result["combinations"]]  # fmt: skip
     note = "Standard error: as a share of the range in which the search begins."
     yield table("Combinations of the quantities", ("", "standard error", ""), [("", rows)], note)
-    rows = [[", ".join(stated(key, x, named=True) for key, x in one["at"].items()),
+    rows = [[", ".join(stated(key, x, named=True) for key, x in one["at"].items()) or "the config",
              value(one["period"]), value(one["floquet_multiplier"]),
              "from rest" if one["reached_from_rest"] else Cell("not from rest", False)]
             for one in result["motions"]]  # fmt: skip

@@ -120,19 +120,20 @@ def test_channels_have_the_slopes_of_difference_quotients_and_the_torque_of_the_
     assert 5.5 < np.mean(column["shaft_torque_N_m"]) < 1.6 * 5.5
 
 
-def test_averages_over_speeds_lead_to_the_true_values_with_outlier_and_gaps(tmp_path):
+def test_averages_over_speeds_lead_to_the_true_values_with_gaps(tmp_path):
     rng, rows = np.random.default_rng(1), []
-    for speed in (1500.0, 2000.0, 2500.0, 3000.0):
+    names = "peak_force_N", "mean_force_N", "rms_force_N"
+    for speed in (1500.0, 3000.0):
         response = simulated(speed_rpm=speed).response
         rows.append([speed, *(response[key] * (1 + 0.01 * rng.standard_normal())
-                              for key in ("peak_force_N", "mean_force_N"))])  # fmt: skip
+                              for key in names)])  # fmt: skip
     rows[1][2] = ""
     with open(tmp_path / "record.csv", "w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerows([["scene.speed_rpm", "peak_force_N", "mean_force_N"], *rows])
+        writer.writerows([["scene.speed_rpm", *names], *rows])
     keys = [f"{BACKLASH}=0.05:0.3", f"{LOAD}=3:9"]
     found = rootsopt.identify(CIC, str(tmp_path / "record.csv"), keys, starts=2)
-    assert found.fit["measured_values"] == 7
+    assert found.fit["measured_values"] == 5
     for key, true in TRUE.items():
         low, high = found.parameters[key]["interval_95"]
         assert low < true < high
@@ -206,7 +207,7 @@ def test_more_quantities_than_values_are_not_determined():
     assert found.status is Status.IDENTIFIED
     assert found.fit["relative_misfit"] < 1e-4
     assert not found.combinations[0]["determined"]
-    assert "leave nothing to estimate errors from" in found.message
+    assert "leaves nothing to estimate errors from" in found.message
     assert found.record()["parameters"][LOAD]["interval_95"] == [3.0, 9.0]
 
 
