@@ -13,18 +13,18 @@ from unittest import mock
 
 ROOT = Path(__file__).parents[1]
 MOST = {
-    "statements of the package": 29_130,
-    "statements of the tests": 17_651,
-    "statements of the experiments": 5_996,
+    "statements of the package": 27_505,
+    "statements of the tests": 17_435,
+    "statements of the experiments": 5_088,
     "packages": 19,
-    "files of the package": 270,
+    "files of the package": 234,
     "lines of the longest file": 672,
-    "floors of packages": 16,
-    "depth of imports": 40,
-    "config keys": 151,
-    "lines of the longest help": 60,
+    "floors of packages": 15,
+    "depth of imports": 37,
+    "config keys": 138,
+    "lines of the longest help": 59,
     "pages of docs": 45,
-    "words of docs": 34_706,
+    "words of docs": 34_397,
 }
 """Greatest values that are accepted. Lower them when the project becomes lighter. Whoever raises
 one gives the reason in the changelog: what users can do now that is worth the weight."""
