@@ -80,9 +80,10 @@ class Bound(NamedTuple):
     of designs from which it follows. `factor`, `curvature` (d,): estimated curvature of the
     objective along each parameter (unit box), already multiplied by the factor; `pairs`, `jumps`:
     number of pairs of designs that are compared, and of those too steep for a curvature, because
-    the objective jumps or has a corner downwards between them. `unusable`: designs without a usable motion. `regions_left`, `volume_left`: number and
-    share of the unit box of the regions that may hold a better design. `proven`: whether no design
-    is better by more than 1e-4 (relative), if the estimate holds."""
+    the objective jumps or has a corner downwards between them. `unusable`: designs without a usable
+    motion. `regions_left`, `volume_left`: number and share of the unit box of the regions that may
+    hold a better design. `proven`: whether no design is better by more than 1e-4 (relative), if the
+    estimate holds."""
 
     lower_bound: float
     gap: float
