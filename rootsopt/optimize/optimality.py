@@ -101,11 +101,15 @@ class Bound(NamedTuple):
     def assumption(self) -> str:
         """What the bound takes for granted, in a sentence."""
         listed = ", ".join(f"{one:.3g}" for one in self.curvature)
+        steeper = (
+            f" {self.jumps} pairs are steeper, as at a corner or a jump: across corners, bounds fall "
+            f"off with {self.factor:g} times the steepest of them; none reaches over a jump."
+        )
         return (
             f"The objective bends downwards by at most {listed} along the parameters (second "
             f"derivatives in the unit box): {self.factor:g} times the most seen in {self.pairs} "
             "pairs of designs, whose motions were followed from one design to the next."
-        )
+        ) + steeper * bool(self.jumps)
 
     def record(self) -> dict[str, Any]:
         """Return the entry `optimality.global` of the result file, with `None` for no bound."""
