@@ -102,8 +102,8 @@ class Bound(NamedTuple):
         """What the bound takes for granted, in a sentence."""
         listed = ", ".join(f"{one:.3g}" for one in self.curvature)
         steeper = (
-            f" {self.jumps} pairs are steeper, as at a corner or a jump: across corners, bounds fall "
-            f"off with {self.factor:g} times the steepest of them; none reaches over a jump."
+            f" {self.jumps} pairs are steeper, as at a corner or a jump: across corners, bounds "
+            f"fall off with {self.factor:g} times the steepest of them; none reaches over a jump."
         )
         return (
             f"The objective bends downwards by at most {listed} along the parameters (second "
