@@ -1,5 +1,7 @@
 """Scenes evaluated as one batch are those evaluated one by one."""
 
+import threading
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,8 +11,7 @@ import pytest
 import rootsopt
 from rootsopt.response import together
 from rootsopt.response.evaluation import Evaluator, _motion
-from rootsopt.sweeps import local
-from rootsopt.sweeps.plan import plan_of
+from rootsopt.sweeps import points
 from rootsopt.sweeps.points import simulated, simulated_together
 
 SPEED, LOAD, ANGLE = "scene.speed_rpm", "scene.load.torque_N_m", "profile.pressure_angle_deg"
@@ -71,14 +72,13 @@ def test_a_batch_that_fails_is_done_one_by_one(config, monkeypatch):
 
 def test_accelerators_take_batches(config, monkeypatch):
     asked = []
-    monkeypatch.setattr(local, "pays", lambda: True)
-    monkeypatch.setattr(local, "_BATCH", 2)
-    monkeypatch.setattr(local, "simulated_together", lambda _, some: asked.append(some) or some)
-    plan = plan_of({SPEED: [1.0, 2.0, 3.0]})
-    stop = local.threading.Event()
-    found = [one for some in local.in_process(config, plan, range(3), stop) for one in some]
-    assert found == [(number, {SPEED: number + 1.0}) for number in range(3)]
-    assert [len(some) for some in asked] == [2, 1]
+    monkeypatch.setattr(points, "pays", lambda: True)
+    monkeypatch.setattr(points, "_BATCH", 2)
+    monkeypatch.setattr(points, "simulated_together", lambda _, some: asked.append(some) or some)
+    here, given = points.InProcess(), [(number, {SPEED: number + 1.0}) for number in range(2)]
+    assert (here.slots, here.share(3)) == (1, 2)
+    assert here.simulated(config, given, threading.Event()) == given
+    assert [len(some) for some in asked] == [2]
 
 
 @pytest.mark.long
