@@ -64,8 +64,8 @@ KINDS: dict[str, tuple[str, list[str]]] = {
 # Kind of pairs with random friction, motor and gas. Half of all pairs are of this kind.
 FULL = "cic, friction, motor and gas"
 
-# Kind of pairs of which only orbits of five mesh periods or more are kept. About one scene in
-# twenty of this kind has such an orbit.
+# Kind of pairs whose orbits last five mesh periods or more. Of the scenes drawn for it, about one
+# in twenty has such an orbit; the others are left out.
 LONG = "cic, long periods"
 
 # Maximum number of scenes of the kind `LONG` drawn for each pair wanted.

@@ -43,8 +43,8 @@ class SolverConfig(Section):
     )
     slices: Annotated[int, Field(ge=1, le=64)] | None = Field(
         None,
-        description="slices (Gauss points) along twisted rotors; absent: as many as a mean error "
-        "of 1 % in the contact torque allows",
+        description="slices (Gauss points) along twisted rotors; absent: as many as the contact "
+        "torque needs for a mean error of 1 %",
     )
     method: Literal["tsit5", "dopri8"] = Field(
         "tsit5", description="Runge-Kutta method, of order 5 or 8 (cheaper below an rtol of 1e-10)"

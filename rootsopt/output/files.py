@@ -1,6 +1,7 @@
 """Result files, in a folder that is checked beforehand.
 
-Commands write whole folders in one step (`rootsopt.output.runs`)."""
+Commands write a folder under a temporary name and rename it when it is whole
+(`rootsopt.output.runs`)."""
 
 import csv
 import enum
