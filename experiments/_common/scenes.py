@@ -5,6 +5,9 @@ from rootsopt.config import Config, load
 # The shipped CIC pair with flanks as drawn, relative to the repository root.
 CIC = "configs/cic_drawn.yaml"
 
+# The same pair with a clearance, and with limits that make every design pump and seal as it does.
+FAIR = "configs/cic.yaml"
+
 # Names of the forces that most studies compare.
 FORCES = ("mean_force_N", "peak_force_N")
 

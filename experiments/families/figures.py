@@ -19,7 +19,7 @@ from experiments._common.style import (
     grid_below,
     sheet,
 )
-from experiments.families.study import Row, by_study, is_missing, title
+from experiments.families.study import Row, bore_of, by_study, is_missing, title
 from rootsopt.config.families import families
 from rootsopt.config.units import MM, si_unit
 from rootsopt.figures.profiles import plot_flank
@@ -91,13 +91,12 @@ def profiles_figure(data: dict[str, Any]) -> Figure:
         panels = axes[begin : begin + height].ravel()
         begin += height
         best = np.array(rows[0]["outline_mm"])
-        bore = 2 * data["references"][name]["geometry"]["outer_radius_mm"]
         for ax in panels[len(rows) :]:
             ax.axis("off")
         for place, (ax, row) in enumerate(zip(panels, rows, strict=False)):
             lines = {"family": np.array(row["outline_mm"]), "best": best}
             plot_flank(ax, lines, row["lobes"], row["pitch_radius_mm"])
-            text = f"{row['family'].replace('_', ' ')}, bore {bore:.1f} mm"
+            text = f"{row['family'].replace('_', ' ')}, bore {bore_of(name):.1f} mm"
             ax.set_title(text, fontsize=9)
             ax.set(xlabel="x (mm)" if place + _COLUMNS >= len(rows) else "")
             ax.set(ylabel="" if place % _COLUMNS else "y (mm)")

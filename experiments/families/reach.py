@@ -71,17 +71,19 @@ def changed(config: Config, **sections: dict[str, Any]) -> Config:
     return Config.model_validate(data)
 
 
-def in_housing(config: Config, bore_radius_mm: float, area_efficiency: float) -> Config:
+def in_housing(
+    config: Config, bore_radius_mm: float, area_efficiency: float, seal_width_mm: float
+) -> Config:
     """Return `config` with the constraints of a housing.
 
-    The rotors must fill the bore, and have at least the given area efficiency."""
+    The rotors must fill the bore, and have at least the given area efficiency and tip land."""
     return changed(
         config,
         constraints={
             "area_efficiency_min": area_efficiency,
             "outer_radius_min_mm": bore_radius_mm - BAND_MM,
             "outer_radius_max_mm": bore_radius_mm,
-            "seal_width_min_mm": 0.0,
+            "seal_width_min_mm": seal_width_mm,
             "undercut_margin_min_mm": 0.0,
         },
     )

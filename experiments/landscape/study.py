@@ -1,11 +1,11 @@
 """Compares the optimum with an exhaustive grid of designs, in different scenes.
 
-The study lays a regular grid over pressure angle, involute share and tip arc angle within the
-config's bounds. The grid is fine enough for the requested number of feasible designs. Each design
-is simulated at the tolerance of a screening, without gradients. Finer and finer grids follow around
-the best designs that lie apart. Points outside the constraints are moved onto their boundary. No
-step uses the gradient of the objective. The best design of all grids is simulated at the full
-tolerance, and compared with the result of `rootsopt optimize`."""
+The study lays a regular grid over pressure angle, involute share and tip arc angle, in the box that
+the feasible designs of `configs/cic.yaml` span, fine enough for the requested number of feasible
+designs. Each design is simulated at the tolerance of a screening, without gradients. Finer and
+finer grids follow around the best designs that lie apart. Points outside the constraints are moved
+onto their boundary. No step uses the gradient of the objective. The best design of all grids is
+simulated at the full tolerance, and compared with the result of `rootsopt optimize`."""
 
 import itertools
 import os
@@ -21,22 +21,23 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from experiments._common.driver import NoResultError, Run
-from experiments._common.scenes import CIC
+from experiments._common.scenes import FAIR
 from experiments._common.style import VERMILION, sheet
 from experiments._common.tables import Row, show
 from rootsopt.config import load
+from rootsopt.design.space import sobol
 from rootsopt.optimize.outcome import Optimization
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.search import Search
 
-# Number of points along each axis of the coarsest grid.
-GRID = 6
+# Number of points along each axis of the coarsest grid, and of the finest.
+GRID, MOST = 5, 80
 
-# Number of points along each axis in a reduced run.
-QUICK_GRID = 5
+# Number of points whose projections span the first grid.
+SAMPLE = 256
 
-# Minimum number of designs of the first grid.
-DESIGNS = 400
+# Minimum number of designs of the first grid: in a full run, and in a reduced run.
+DESIGNS, QUICK_DESIGNS = 400, 1
 
 # Number of seeds of the screening: in a full run, and in a reduced run.
 SEEDS, QUICK_SEEDS = 10, 2
@@ -48,8 +49,9 @@ QUICK = (
     "optimizer.iterations=15",
 )
 
-# Distance in the unit box between the designs that finer grids surround, and their number.
-APART, CENTERS = 0.15, 3
+# Number of designs that finer grids surround, and the least distance between them in spacings of
+# the first grid.
+CENTERS, APART = 3, 3
 
 # Number of finer grids around each of them. Each has half the spacing of the one before.
 LEVELS, QUICK_LEVELS = 5, 1
@@ -61,24 +63,23 @@ AGREES = 1e-3
 SAME = 1e-5
 
 
-def feasible_grid(problem: Problem, wanted: int, first: int = GRID) -> tuple[np.ndarray, float]:
-    """Lay a regular grid over the unit box; return its points (n, 3) within the constraints.
+def feasible_grid(problem: Problem, wanted: int) -> tuple[np.ndarray, NDArray[np.float64]]:
+    """Lay a regular grid over the feasible designs; return its points (n, 3), and its spacing (3,).
 
-    The first grid has `first` points along each axis. It is refined until at least `wanted` points
-    are feasible. Also return its spacing. Raises `NoResultError` if the constraints exclude nearly
-    all designs.
+    The grid fills the box of `SAMPLE` points of a Sobol sequence that are moved onto the
+    constraints. It is refined until at least `wanted` points are feasible. Raises `NoResultError`
+    if the constraints exclude nearly all designs.
     """
     look = jax.jit(jax.vmap(problem.space.slacks))
-    for count in itertools.count(first):
-        axis = np.linspace(0, 1, count)
-        points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
-        slack = np.asarray(look(points)).min(axis=1)
-        feasible = points[slack >= 0]
+    moved = [problem.project(point) for point in sobol(SAMPLE, 0, 3)]
+    moved = [point for point in moved if problem.feasible(point)]
+    for count in range(GRID, MOST if moved else 0):
+        axes = np.linspace(np.min(moved, axis=0), np.max(moved, axis=0), count).T
+        points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+        feasible = points[np.asarray(look(points)).min(axis=1) >= 0]
         if len(feasible) >= wanted:
-            return feasible, 1 / (count - 1)
-        if count > 80:
-            raise NoResultError("the constraints leave hardly any design; relax them")
-    raise AssertionError
+            return feasible, np.ptp(moved, axis=0) / (count - 1)
+    raise NoResultError("the constraints leave hardly any design; relax them")
 
 
 def survey(search: Search, points: np.ndarray, level: int) -> list[Row]:
@@ -104,16 +105,20 @@ def survey(search: Search, points: np.ndarray, level: int) -> list[Row]:
 
 
 def finer(
-    problem: Problem, points: np.ndarray, values: NDArray[np.float64], spacing: float
+    problem: Problem,
+    points: np.ndarray,
+    values: NDArray[np.float64],
+    spacing: NDArray[np.float64],
+    apart: NDArray[np.float64],
 ) -> np.ndarray:
-    """Return the points (m, 3) of grids with a `spacing` around the best of `points` (n, 3).
+    """Return the points (m, 3) of grids with a `spacing` (3,) around the best of `points` (n, 3).
 
-    `values` (n,): their objectives. Points that cannot be moved onto the feasible set are left
-    out."""
+    `values` (n,): their objectives; `apart` (3,): semi-axes of the ellipsoid around a centre that
+    holds no other. Points that cannot be moved onto the feasible set are left out."""
     chosen: list[np.ndarray] = []
     for place in np.argsort(np.where(np.isnan(values), np.inf, values)):
-        apart = all(np.linalg.norm(points[place] - other) > APART for other in chosen)
-        if apart and len(chosen) < CENTERS and not np.isnan(values[place]):
+        far = all(np.linalg.norm((points[place] - other) / apart) > 1 for other in chosen)
+        if far and len(chosen) < CENTERS and not np.isnan(values[place]):
             chosen.append(points[place])
     around = [np.array(shift) for shift in itertools.product((-1, 0, 1), repeat=3) if any(shift)]
     tried = [problem.project(center + spacing * shift) for center in chosen for shift in around]
@@ -150,31 +155,35 @@ SHOWN = (
 
 def searched(quick: bool, *overrides: str) -> tuple[Search, Optimization]:
     """Optimise the shipped pair with `overrides`. Return the search and its result."""
-    search = Search(load(CIC, [*(QUICK if quick else ()), *overrides]))
+    search = Search(load(FAIR, [*(QUICK if quick else ()), *overrides]))
     return search, search.run()
 
 
 def compared(name: str, quick: bool) -> tuple[Row, list[Row]]:
     """Optimise in the scene `name`, and simulate grids of designs.
 
-    Returns a record of the comparison, and a row per design of the grids. Raises `NoResultError` if
-    the optimiser finds no design better than the baseline.
+    Returns a record of the comparison, and a row per design of the grids. Where no feasible design
+    is better than the baseline, which is not quite feasible itself, the best one of the search is
+    compared. Raises `NoResultError` if the search has none.
     """
     search, result = searched(quick, *CASES[name])
     problem, optimum, known = result.problem, result.optimized, result.optimality
-    if problem is None or optimum is None:
-        raise NoResultError(f"{name}: the optimiser has no result: {result.verification}")
-    points, spacing = feasible_grid(problem, *((1, QUICK_GRID) if quick else (DESIGNS, GRID)))
-    rows = survey(search, points, 0)
+    rows = [row for row in result.history if row["feasible"] and np.isfinite(row["objective"])]
+    if problem is None or not rows:
+        raise NoResultError(f"{name}: the search has no feasible design")
+    last = min(rows, key=lambda row: row["objective"])
+    design = {key: last[key] for key in NAMES} if optimum is None else optimum.design
+    own = last["objective"] if optimum is None else problem.objective(optimum)
+    points, spacing = feasible_grid(problem, QUICK_DESIGNS if quick else DESIGNS)
+    rows, apart = survey(search, points, 0), APART * spacing
     for level in range(1, 1 + (QUICK_LEVELS if quick else LEVELS)):
-        spacing /= 2
-        new = finer(problem, points, np.array([row["objective"] for row in rows]), spacing)
+        spacing = spacing / 2
+        new = finer(problem, points, np.array([row["objective"] for row in rows]), spacing, apart)
         rows += survey(search, new, level)
         points = np.concatenate([points, new])
     values, first = np.array([(row["objective"], row["level"] == 0) for row in rows]).T
     first, place = first.astype(bool), int(np.nanargmin(values))
     best = problem.objective(search.exact(problem.design(points[place]), series=False))
-    own = problem.objective(optimum)
     return {
         "scene": name,
         "grid_designs": int(first.sum()),
@@ -188,8 +197,8 @@ def compared(name: str, quick: bool) -> tuple[Row, list[Row]]:
         "certified": known is not None and known.converged,
         "optima": 0 if known is None else len(known.optima),
         "agrees": bool(own <= (1 + AGREES) * best),
-        "grid_design": {key: rows[place][key] for key in optimum.design},
-        "optimizer_design": optimum.design,
+        "grid_design": {key: rows[place][key] for key in design},
+        "optimizer_design": design,
     }, rows
 
 
@@ -244,7 +253,9 @@ def run(job: Run) -> bool:
     seeds = []
     for seed in range(QUICK_SEEDS if job.quick else SEEDS):
         _, result = searched(job.quick, f"optimizer.seed={seed}")
-        own = 1 - result.improvement.get("objective", np.nan)
+        assert result.problem is not None
+        assert result.optimized is not None
+        own = result.problem.objective(result.optimized)
         seeds.append({"seed": seed, "objective": own, "designs": len(result.history)})
     values = [row["objective"] for row in seeds]
     apart = float(np.ptp(values) / np.min(values))

@@ -290,7 +290,7 @@ class Config(Section):
         if tolerances is None:
             return self
         valid, known = scatterable(self), tree(Config)
-        for key in (*tolerances.over, *tolerances.changed):
+        for key in tolerances.keys:
             require(key in valid, unknown_key(key, valid, known))
         require(
             self.objective.motion != "ensemble",

@@ -148,6 +148,11 @@ class TolerancesConfig(Section):
         """Keys that some of the `conditions` change."""
         return tuple(dict.fromkeys(key for one in self.conditions.values() for key in one))
 
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """Keys that scatter, or that a condition changes."""
+        return (*self.over, *self.changed)
+
     def scatters(self, values: Mapping[str, float]) -> tuple[Scatter, ...]:
         """Return the distributions, in the order of the config.
 

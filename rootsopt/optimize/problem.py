@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -400,6 +400,14 @@ class Problem:
             move = np.linalg.lstsq(np.where(held, 0.0, rows), want, rcond=1e-8)[0]
             point = np.clip(point + np.clip(move, -0.3, 0.3), 0.0, 1.0)
         return np.asarray(point, dtype=np.float64)
+
+    def nearby(self, point, sizes: Sequence[float]) -> Iterator[NDArray[np.float64]]:
+        """Yield points beside a feasible `point` (d,), towards the middle of the unit box.
+
+        `sizes`: distances along each coordinate. An orbit can fail a check of accuracy at a design
+        although its neighbours pass."""
+        for size in sizes:
+            yield self.toward(point + size * np.sign(0.5 - point), point)
 
     def toward(self, point, inside) -> NDArray[np.float64]:
         """Return a point near `point` (d,) that is feasible if possible.

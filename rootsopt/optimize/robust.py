@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 from numpy.typing import NDArray
 
 from rootsopt.config import Config
@@ -274,7 +275,11 @@ class TolerantSearch:
             "nominal": self._nominal.optimized,
             "robust": found.optimized,
         }
-        designs = {name: one.nominal for name, one in known.items() if one is not None}
+        designs = {
+            name: (stage.source if name == "baseline" else stage.fast, one.nominal)
+            for name, one in known.items()
+            if one is not None
+        }
         drawn = draw(self.config, tolerances.check_samples, fresh=True)
         best = found.problem.objective(found.optimized) if found.optimized else float("nan")
         before = self._done + len(found.history)
@@ -290,8 +295,7 @@ class TolerantSearch:
                     self.progress(before + ended[0] // per, expected, best)
             return self.stop.is_set()
 
-        scenes = shifts(self.config, drawn)
-        fresh = compare(stage.fast, found.problem, designs, scenes, tick, self.runs)
+        fresh = compare(found.problem, designs, drawn, tick, self.runs)
         if self.stop.is_set():
             return {}, {}
         keys = [one.key for one in self.config.scatters]
@@ -299,28 +303,26 @@ class TolerantSearch:
 
 
 def compare(
-    evaluator: Evaluator,
     problem: RobustProblem,
-    designs: Mapping[str, Evaluation],
-    scenes: Sequence[Shift],
+    designs: Mapping[str, tuple[Evaluator, Evaluation]],
+    drawn: Float[np.ndarray, "n q"],
     tick: Callable[[], bool] = lambda: False,
     runs: Runs = HERE,
 ) -> dict[str, Scattered]:
-    """Simulate designs in many scenes, and return each design's `Scattered` by name.
+    """Simulate designs in the scenes `drawn`, and return each design's `Scattered` by name.
 
-    `evaluator`: that of the nominal scene; `problem`: defines the objective; `designs`: their
-    evaluations in the nominal scene, the first one is the baseline. Each motion starts at the
-    design's orbit in the nominal scene. Equal designs are simulated only once. `tick`: function
-    called before each simulation; if it returns True, no further one begins."""
+    `problem`: defines the objective; `designs`: an evaluator of the nominal scene and the
+    evaluation there, the baseline's first. Each motion starts at the design's orbit in the nominal
+    scene. Equal designs are simulated only once. `tick`: function called before each simulation; if
+    it returns True, no further one begins."""
     found: dict[str, Scattered] = {}
-    points = {name: problem.point(list(one.design.values())) for name, one in designs.items()}
     reference = 1.0
-    for name, nominal in designs.items():
-        twin = next((k for k in found if _same(points[k], points[name])), None)
+    for name, (evaluator, nominal) in designs.items():
+        twin = next((k for k in found if _same(problem, designs[k][1], nominal)), None)
         if twin is not None:
             found[name] = found[twin]
             continue
-        one = _scattered(evaluator, problem, nominal, scenes, tick, runs)
+        one = _scattered(evaluator, problem, nominal, shifts(evaluator.config, drawn), tick, runs)
         if not found:
             reference = one.combined
         found[name] = dataclasses.replace(one, combined=one.combined / reference)
@@ -356,8 +358,11 @@ def _scattered(
     return Scattered(values, counts, combined)
 
 
-def _same(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
-    return bool(np.max(np.abs(one - other), initial=0.0) < _APART)
+def _same(problem: Problem, one: Evaluation, other: Evaluation) -> bool:
+    if one.design.keys() != other.design.keys():
+        return False
+    here, there = (problem.point([*each.design.values()]) for each in (one, other))
+    return bool(np.max(np.abs(here - there), initial=0.0) < _APART)
 
 
 def without(config: Config) -> Config:

@@ -55,6 +55,10 @@ _BOUND = -2
 # and by default.
 _PARAMETERS, _QUICK = 4, 3
 
+# Distances (unit box, per coordinate) from a start without a usable motion at which a local search
+# begins instead.
+_BESIDE = 1e-5, 1e-4, 1e-3, 1e-2
+
 # Number of evaluations and of boxes of a lower bound that is asked for.
 _MOST = 2000, 20_000
 
@@ -194,16 +198,21 @@ class Search:
         exact.prepare(maxima=maxima)
         Space.of(self.config, exact.scene).prepare()
         first = exact()
-        baseline = first
+        baseline, source = first, exact
         if self.beginning is not None:
             self.beginning = dataclasses.replace(self.beginning, evaluation=first)
-            baseline = needed_motion(self.given)()
+            source = self.stage.evaluator(needed_motion(self.given), self.runs)
+            baseline = source()
         if not baseline.usable:
             return Optimization(None, baseline, None, [], {}, self.stop.is_set())
         # Forces of coexisting motions are compared relative to the baseline's.
         self.exact = exact = exact.relative_to(baseline)
         # Screening and descent need a ranking of designs and gradients, but only a few digits.
-        self.fast = exact.at_tolerance(max(1e-6, self.config.solver.orbit_tolerance)).surveying()
+        # `source` is the baseline's, which may be of another family.
+        rtol = max(1e-6, self.config.solver.orbit_tolerance)
+        self.fast, self.source = (
+            one.at_tolerance(rtol).surveying() for one in (exact, source.relative_to(baseline))
+        )
         self.problem = self.stage.problem(self.config, exact.scene, baseline)
         self._bar = np.inf if self.problem.broken(baseline) else 1.0
         if self.problem.with_maxima:
@@ -221,8 +230,11 @@ class Search:
         trials: list[Trial] = []
         if self.settings.screening:
             trials = self._side_by_side(self._screen, list(enumerate(points)))
-        ranked = _ranked(trials) if self.settings.screening else points
-        starts = _apart(ranked, self.stage.apart, self.settings.starts) or points[:1]
+        ranked, least = points, self.stage.apart
+        if self.settings.screening:
+            # Limits may leave only a small part of the bounds.
+            ranked, least = _ranked(trials), least * float(np.max(np.ptp(points, axis=0)))
+        starts = _apart(ranked, least, self.settings.starts) or points[:1]
         work = self._descend if self.noisy else self._solve
         trials += self._side_by_side(work, list(enumerate(starts, self.stage.first)))
         bounding, further = self._bounded(trials, self.stage.first + len(starts))
@@ -428,10 +440,14 @@ class Search:
             return trial.local
 
         stops = Stops(evaluations=self.settings.iterations + 1, asked=self.stop.is_set)
-        if not self.stop.is_set():
-            found = descend(look, point, stops, self.problem.limits_at)
+        for begin in (point, *self.problem.nearby(point, _BESIDE)):
+            if self.stop.is_set():
+                break
+            found = descend(look, begin, stops, self.problem.limits_at)
             with self._lock:
                 self._found[number] = found
+            if found.local is not None:
+                break
         return trials
 
     def _descend(self, number: int, point: NDArray[np.float64]) -> list[Trial]:

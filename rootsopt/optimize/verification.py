@@ -100,8 +100,8 @@ class Verification:
         An orbit can fail a check of accuracy at a design although all its neighbours pass."""
         yield self.exact, point
         yield self.exact.at_tolerance(_SHARPER * self.tolerance), point
-        for size in _BESIDE:
-            yield self.exact, self.problem.toward(point + size * np.sign(0.5 - point), point)
+        for beside in self.problem.nearby(point, _BESIDE):
+            yield self.exact, beside
 
     def optimality(self, optimized: Evaluation, trials: list[Trial]) -> Optimality | None:
         """Return the first-order conditions at a verified design, and the outcomes of the starts.

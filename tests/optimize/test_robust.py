@@ -273,18 +273,19 @@ def test_fresh_scenes_from_the_neighbouring_orbit(spread):
     evaluator, baseline, moved = spread
     problem = problem_of(evaluator, baseline)
     config = problem.config
-    fresh = shifts(config, draw(config, 3, fresh=True))
-    designs = {"baseline": baseline.nominal, "nominal": moved.nominal, "robust": moved.nominal}
-    found = compare(evaluator, problem, designs, fresh)
+    drawn = draw(config, 3, fresh=True)
+    known = {"baseline": baseline.nominal, "nominal": moved.nominal, "robust": moved.nominal}
+    designs = {name: (evaluator, one) for name, one in known.items()}
+    found = compare(problem, designs, drawn)
     assert found["robust"] is found["nominal"] or found["robust"] == found["nominal"]
     assert found["baseline"].combined == 1
-    for k, shift in enumerate(fresh):
+    for k, shift in enumerate(shifts(config, drawn)):
         alone = Evaluator.of(config.moved(shift.values))
         one = alone(problem.design(POINT) + shift.design, series=False)
         peak = found["nominal"].values["peak_force_N"][k]
         assert peak == pytest.approx(one.response["peak_force_N"], rel=1e-6)
     assert found["nominal"].statuses == {"periodic": 3}
-    again = compare(evaluator, problem, designs, fresh)
+    again = compare(problem, designs, drawn)
     for name, values in again["nominal"].values.items():
         np.testing.assert_array_equal(values, found["nominal"].values[name])
 
