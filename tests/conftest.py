@@ -82,7 +82,7 @@ def _graded_normals(profile, points):
             continue
         nu = np.linspace(float(segment.start), float(segment.stop), 2001)
         middle = jnp.asarray((nu[1:] + nu[:-1]) / 2)
-        addendum, dedendum = profile.addendum_speed(middle), profile.dedendum_speed(middle)
+        _, addendum, dedendum = profile.speeds(middle)
         speed = np.maximum(np.abs(addendum), np.abs(dedendum))
         speed = speed + 0.3 * float(profile.pitch_radius)
         pieces.append((nu, np.concatenate([[0.0], np.cumsum(speed * np.diff(nu))])))

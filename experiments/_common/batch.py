@@ -12,8 +12,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.dynamics.closed import Start, steady_motion
-from rootsopt.dynamics.integrator import Integrator
-from rootsopt.dynamics.steady import Solver
+from rootsopt.dynamics.integrator import Integrator, Solver
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.runtime.threads import on_all_cores
 from rootsopt.scene import Scene

@@ -31,7 +31,7 @@ from rootsopt.optimize.search import Search
 from rootsopt.profiles.departure import departure
 from rootsopt.response.evaluation import Evaluation
 from rootsopt.scene import check_geometry, design_vector, outline_mm
-from rootsopt.scene.families import classical, free_form_of, with_design
+from rootsopt.scene.families import classical, free_form_of
 
 # Outer radius (mm) of a rotor that fills the bore, by reference: the EE rotor's own, which every
 # family can reach, and the limit of `configs/cic.yaml`.
@@ -92,7 +92,7 @@ def optimised(config: Config, reference: dict[str, float]) -> Config:
 
 def with_values(config: Config, design: ArrayLike) -> Config:
     """Return `config` with another `design` (d,), in config units."""
-    return config.model_copy(update={"profile": with_design(config.profile, design)})
+    return config.with_design(np.asarray(design, float))
 
 
 def placed(

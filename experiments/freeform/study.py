@@ -18,7 +18,6 @@ from rootsopt.design.resemblance import likenesses
 from rootsopt.optimize.search import Search
 from rootsopt.profiles import Profile
 from rootsopt.profiles.departure import departure, flank_points
-from rootsopt.scene.families import with_design
 
 MM, UM = 1e-3, 1e-6
 
@@ -92,7 +91,7 @@ def run(job: Run) -> None:
     start, found = (
         profile_of(config, list(one.design.values())) for one in (result.baseline, result.optimized)
     )
-    profile = with_design(config.profile, list(result.optimized.design.values()))
+    profile = config.profile.with_design([*result.optimized.design.values()])
     job.folder.write_text("freeform.yaml", config.model_copy(update={"profile": profile}).to_yaml())
     designs = {"paper": paper, "best CIC": result.baseline, "free form": result.optimized}
     record = {

@@ -162,7 +162,7 @@ def _sound(family: str, lobes: int, design):
         assert isinstance(profile, CIC)
         return good & (profile.arc_radius > 0) & (profile.arc_center_radius > 0)
     good = jnp.ones((), bool)
-    for name, value in margins(profile)._asdict().items():
+    for name, value in margins(profile).of_flank.items():
         if name not in family_of(family).inherent:
             scale = 1.0 if name in PURE else RADIUS_MM * MM
             good &= value >= -_ROUNDING * scale

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from rootsopt.optimize.certificate import certify
-from rootsopt.optimize.local import Group, Linearization, Look
+from rootsopt.optimize.local import Group, Linearization, Look, certify
 from rootsopt.optimize.sqp import EndError, Stops
 
 # Factor from the variables z of a method to the point x of the unit box: x = `SCALE` · z. It

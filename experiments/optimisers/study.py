@@ -25,9 +25,8 @@ from experiments._common.tables import show
 from experiments.optimisers.epigraph import SCALE, Epigraph
 from rootsopt.config import load
 from rootsopt.figures.style import COLORS, DASHES, figure
-from rootsopt.optimize.certificate import certify
-from rootsopt.optimize.local import Linearization, Look
-from rootsopt.optimize.problem import FEASIBLE, Problem
+from rootsopt.optimize.local import FEASIBLE, Linearization, Look, certify
+from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.sqp import EndError, Stops, descend
 from rootsopt.response.evaluation import Evaluator
 

@@ -8,7 +8,6 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from rootsopt.contact.closest import ClosestApproach, FlankPair
 from rootsopt.errors import InputError
 
 
@@ -24,21 +23,6 @@ class ContactPoint(NamedTuple):
     support1: Float[Array, ""]
     support2: Float[Array, ""]
     radial: Float[Array, ""]
-
-
-def contact_point(
-    pair: FlankPair, roll: Float[Array, ""], relative: Float[Array, ""], found: ClosestApproach
-) -> ContactPoint:
-    """Return position and direction of a contact, given the closest approach `found`.
-
-    `pair`: the flanks; `roll`, `relative`: x and ε (rad) at which `found` was computed."""
-    folded, mirrored = pair.folded(roll)
-    support1, support2, radial = pair.supports_along(found.normal1, found.normal2, folded, relative)
-    return ContactPoint(
-        support1=jnp.where(mirrored, support2, support1),
-        support2=jnp.where(mirrored, support1, support2),
-        radial=radial,
-    )
 
 
 class Approach(NamedTuple):
@@ -139,14 +123,6 @@ class Contact(eqx.Module):
         return self
 
     @property
-    def length_scale(self) -> Float[Array, ""] | None:
-        """Length (m) from which the rounding error of the gap follows: about the pitch radius.
-
-        The gap's error is the rounding error of a number of this size. `None`: the gap's rounding
-        error is negligible."""
-        return None
-
-    @property
     def center_distance(self) -> Float[Array, ""]:
         """Distance between the rotors' axes (m).
 
@@ -232,10 +208,6 @@ class WrappedContact(Contact):
     @property
     def two_sided(self) -> bool:
         return self.section.two_sided
-
-    @property
-    def length_scale(self) -> Float[Array, ""] | None:
-        return self.section.length_scale
 
     @property
     def center_distance(self) -> Float[Array, ""]:

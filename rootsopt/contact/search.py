@@ -7,10 +7,25 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from rootsopt.contact.closest import ClosestApproach, FlankPair, contact_begins
-from rootsopt.contact.gap import Approach, Contact, ContactPoint, contact_point
+from rootsopt.contact.gap import Approach, Contact, ContactPoint
 from rootsopt.profiles import trigonometry as trig
 from rootsopt.profiles.base import Profile
 from rootsopt.runtime.kept import kept_along
+
+
+def contact_point(
+    pair: FlankPair, roll: Float[Array, ""], relative: Float[Array, ""], found: ClosestApproach
+) -> ContactPoint:
+    """Return position and direction of a contact, given the closest approach `found`.
+
+    `pair`: the flanks; `roll`, `relative`: x and ε (rad) at which `found` was computed."""
+    folded, mirrored = pair.folded(roll)
+    support1, support2, radial = pair.supports_along(found.normal1, found.normal2, folded, relative)
+    return ContactPoint(
+        support1=jnp.where(mirrored, support2, support1),
+        support2=jnp.where(mirrored, support1, support2),
+        radial=radial,
+    )
 
 
 class _FlankContact(Contact):
@@ -22,10 +37,6 @@ class _FlankContact(Contact):
     def jumps(self) -> bool:
         """Whether levers may jump where two minima of the gap are equally deep."""
         return self.pair.jumps
-
-    @property
-    def length_scale(self) -> Float[Array, ""]:
-        return self.pair.center_distance / 2
 
     @property
     def center_distance(self) -> Float[Array, ""]:

@@ -175,12 +175,12 @@ class OrbitFamily:
             raise StoppedError(End.STEP_TOO_SMALL)
         if lost:
             raise StoppedError(End.LOST_MESH)
-        if made.found.depth > TOO_DEEP * scene.pitch_radius:
+        if made.orbit.depth > TOO_DEEP * scene.pitch_radius:
             raise StoppedError(End.TOO_DEEP)
         if self.halves and half_way < _HALF_ALIKE:
             raise StoppedError(End.HALVED)
-        state, monodromy = np.asarray(made.found.state), np.asarray(line.monodromy)
-        mean, square, peak = map(float, made.found.response[:3])
+        state, monodromy = np.asarray(made.orbit.state), np.asarray(line.monodromy)
+        mean, square, peak = map(float, made.orbit.response[:3])
         opened = np.column_stack([monodromy - np.eye(len(state)), line.by_share])
         point = BranchPoint(
             value=self.value(line.share),
@@ -229,8 +229,8 @@ def _follow(over: _Range, start: Any, guess: Float[Array, " m"], across: Float[A
         Plane(guess, across, jnp.asarray(SPAN)),
         ACCURACY * solver.orbit.tolerance,
     )
-    (pair, unit), motion = over.at(made.line.share), made.found.elements
+    (pair, unit), motion = over.at(made.line.share), made.known.elements
     states = motion.motion(motion.mesh.period * jnp.arange(_LOOKS) / _LOOKS)
-    half_way = jnp.max(jnp.abs(states[_LOOKS // 2] - made.found.state)) / SPAN
+    half_way = jnp.max(jnp.abs(states[_LOOKS // 2] - made.orbit.state)) / SPAN
     sound = pair.sound & over.at(guess[-1])[0].sound
     return made, (half_way, unit, jnp.any(jax.vmap(pair.lost)(states)), sound)

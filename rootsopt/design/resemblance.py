@@ -361,7 +361,7 @@ def _member(family: str, lobes: int, radius: Float[Array, ""], design):
         profile = profile_of(family, lobes, radius, design)
         nu = profile.pitch_normal * jnp.linspace(0.0, 1.0, _NODES)
         upper, lower = (profile.position(f(nu)) for f in (profile.addendum, profile.dedendum))
-        found = margins(profile)._asdict()
+        found = margins(profile).of_flank
         scaled = [
             value / (1.0 if name in PURE else radius)
             for name, value in found.items()

@@ -23,7 +23,7 @@ from rootsopt.config.study import BASELINE
 from rootsopt.config.units import DEG, MM, si_unit, unit_of, words
 from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry, Profile, geometry
-from rootsopt.profiles.geometry import ProfileMargins, margins
+from rootsopt.profiles.geometry import Soundness, margins
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene
 
@@ -129,7 +129,7 @@ class Constraint(eqx.Module):
     """A constraint: value ≥ limit, or value ≤ limit for a `ceiling`.
 
     `name`: name in reports; `quantity`: name of the limited field of `Geometry`, or of
-    `ProfileMargins` if `margin` is true; `limit`: limit in SI units; `scale`: divisor (SI) that
+    `Soundness` if `margin` is true; `limit`: limit in SI units; `scale`: divisor (SI) that
     makes slacks comparable, about the size of the limit; `unit`: unit in reports; `factor`: SI
     value of one such unit."""
 
@@ -147,7 +147,17 @@ class Constraint(eqx.Module):
         """+1 if `limit` is a least value, -1 if it is a greatest value."""
         return -1.0 if self.ceiling else 1.0
 
-    def slack(self, shape: Geometry, found: ProfileMargins | None = None) -> Float[Array, ""]:
+    @property
+    def sense(self) -> str:
+        """Relation between value and limit."""
+        return "<=" if self.ceiling else ">="
+
+    @property
+    def bound(self) -> float:
+        """The limit in the unit of reports."""
+        return float(self.limit) / self.factor
+
+    def slack(self, shape: Geometry, found: Soundness | None = None) -> Float[Array, ""]:
         """Return the distance from the limit, divided by `scale`; ≥ 0 if the constraint holds.
 
         `shape`, `found`: geometry and margins of the design. `found` is needed only if `margin` is
@@ -164,7 +174,7 @@ class Constraint(eqx.Module):
         design: Float[Array, " d"],
         profile: Profile,
         shape: Geometry,
-        found: ProfileMargins | None,
+        found: Soundness | None,
     ) -> Float[Array, ""]:
         """Return the slack of a `design` (d,) of a `space`, given its `profile`; see `slack`."""
         del space, design, profile

@@ -20,12 +20,12 @@ from rootsopt.dynamics.collocation.mesh import room_for
 from rootsopt.dynamics.collocation.motion import ACCURACY, Collocated, apart, closed_orbit
 from rootsopt.dynamics.collocation.newton import numbers
 from rootsopt.dynamics.collocation.system import unchanged
+from rootsopt.dynamics.integrator import Solver
 from rootsopt.dynamics.orbit import Orbit, branch
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.settle import Transient, no_pieces, settle, settled_within
 from rootsopt.dynamics.steady import (
     OPEN,
-    Solver,
     Steady,
     Verdict,
     among,
@@ -129,9 +129,8 @@ class _Attempts(eqx.Module):
         unsound = ~pair.sound
         pieces = no_pieces(pair, state, solver.max_orbit, PIECES)
         known = unknown(pair, solver.max_orbit)
-        orbit = Orbit.empty(state, directions, solver.measures.count + 1)
-        if solver.variation:
-            orbit = orbit._replace(variation=unchanged(known.elements, directions))
+        still = unchanged(known.elements, directions) if solver.variation else None
+        orbit = Orbit.empty(state, directions, solver.measures.count + 1, still)
         found = Steady(
             status=jnp.where(unsound, Status.UNSOUND.code, Status.NOT_SETTLED.code),
             orbit=orbit,

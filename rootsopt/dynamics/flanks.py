@@ -24,19 +24,17 @@ class FlankForce(NamedTuple):
     """Contact of the flanks at one or several instants.
 
     `drive`, `coast`: normal force (N) on each flank; `depth`: greatest penetration (m; negative:
-    gap); `closing`: rate of `depth` (m/s); `lever1`, `lever2`: levers (m) of the deeper flank;
-    `torque1`, `torque2`: contact torques (N·m) on the rotors, each positive in its rotor's sense of
-    rotation; `push`: contact force (N) on rotor 2 in x and y, None if no part lets the axes move.
-    The force on rotor 1 is equal and opposite.
+    gap); `lever2`: lever (m) of rotor 2 at the deeper flank; `torque1`, `torque2`: contact torques
+    (N·m) on the rotors, each positive in its rotor's sense of rotation; `push`: contact force (N)
+    on rotor 2 in x and y, None if no part lets the axes move. The force on rotor 1 is equal and
+    opposite.
 
-    For twisted rotors, forces, torques and `push` are sums over the slices, and the levers are
-    means."""
+    For twisted rotors, forces, torques and `push` are sums over the slices, and the lever is a
+    mean."""
 
     drive: Float[Array, "*n"]
     coast: Float[Array, "*n"]
     depth: Float[Array, "*n"]
-    closing: Float[Array, "*n"]
-    lever1: Float[Array, "*n"]
     lever2: Float[Array, "*n"]
     torque1: Float[Array, "*n"]
     torque2: Float[Array, "*n"]
@@ -133,8 +131,7 @@ def force_of(pair: "RotorPair", motion: Motion, touches: Any = None) -> FlankFor
         return _section_force(pair, motion, *touches)
     found = jax.vmap(functools.partial(_section_force, pair), (None, 0, 0))(motion, *touches)
     whole = jax.tree.map(lambda x: jnp.tensordot(slices.weights, x, 1), found)
-    deepest = jnp.argmax(found.depth)
-    return whole._replace(depth=found.depth[deepest], closing=found.closing[deepest])
+    return whole._replace(depth=jnp.max(found.depth))
 
 
 def _section_force(pair: "RotorPair", motion: Motion, side: Float[Array, "*sides"], touch: Touch):
@@ -150,8 +147,6 @@ def _section_force(pair: "RotorPair", motion: Motion, side: Float[Array, "*sides
             drive=drive,
             coast=coast,
             depth=flanks.depth[deeper],
-            closing=flanks.closing[deeper],
-            lever1=flanks.lever1[deeper],
             lever2=flanks.lever2[deeper],
         )
     drives = motion.relative < 0
@@ -187,8 +182,6 @@ def _flank_force(
         drive=force,
         coast=jnp.zeros_like(force),
         depth=touch.depth,
-        closing=touch.closing,
-        lever1=lever1,
         lever2=lever2,
         torque1=torque1,
         torque2=torque2,

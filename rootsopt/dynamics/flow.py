@@ -27,54 +27,26 @@ _NEARLY = 50.0
 class Records(NamedTuple):
     """All accepted steps of an integration, padded with inf.
 
-    `ends` (steps,): ends of the steps; `after` (steps, m): y at the ends; `dense`: what
-    `solver.interpolation_cls` needs in order to interpolate within each step.
+    `ends` (steps,): ends of the steps; `dense`: what `solver.interpolation_cls` needs in order to
+    interpolate within each step.
     """
 
     ends: Float[Array, " steps"]
-    after: Float[Array, "steps m"]
     dense: Any
 
 
 class Integrated(NamedTuple):
-    """Result of an integration.
+    """State of an integration, and its result.
 
-    `end` (m,): y at the end; `steps`: number of accepted and rejected steps; `accepted`: number of
-    accepted steps; `solved`: whether the solver reached the end; `control`: final state of the step
-    size control; `records`: the accepted steps, or None if they were not recorded.
+    The next step goes from `begin` to `stop`, and starts at `end` (m,), which is y at the end of
+    the last one; `memory`: state of the solver; `control`: state of the step size control; `sound`:
+    whether neither has failed; `steps`: number of accepted and rejected steps; `accepted`: number
+    of accepted steps; `records`: the accepted steps, or None if they were not recorded.
     """
-
-    end: Float[Array, " m"]
-    steps: Int[Array, ""]
-    accepted: Int[Array, ""]
-    solved: Bool[Array, ""]
-    control: Any
-    records: Records | None
-
-
-def interpolated(
-    out: Integrated, solver: diffrax.AbstractSolver, share: Float[Array, ""]
-) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """Return y and its derivative at `share` of the unit interval, inside the steps of `out`."""
-    assert out.records is not None
-    ends, _, dense = out.records
-    k = jnp.minimum(jnp.searchsorted(ends, share), jnp.maximum(out.accepted - 1, 0))
-    begin = jnp.where(k > 0, ends[jnp.maximum(k - 1, 0)], 0.0)
-    within = jax.tree.map(lambda x: x[k], dense)
-    step = solver.interpolation_cls(t0=begin, t1=ends[k], **within)
-    return jax.jvp(step.evaluate, (share,), (jnp.ones_like(share),))
-
-
-class _State(NamedTuple):
-    """State of the loop over steps.
-
-    The next step goes from `begin` to `stop`, and starts at `y`. `memory`: state of the solver;
-    `sound`: whether neither the solver nor the control has failed. The other fields are those of
-    `Integrated`."""
 
     begin: Float[Array, ""]
     stop: Float[Array, ""]
-    y: Float[Array, " m"]
+    end: Float[Array, " m"]
     memory: Any
     control: Any
     sound: Bool[Array, ""]
@@ -82,8 +54,26 @@ class _State(NamedTuple):
     accepted: Int[Array, ""]
     records: Records | None
 
+    @property
+    def solved(self) -> Bool[Array, ""]:
+        """Whether the solver reached the end."""
+        return self.sound & ~(self.begin < 1)
 
-def integrated(  # 97 lines: the functions of its loop share the settings of one call.
+
+def interpolated(
+    out: Integrated, solver: diffrax.AbstractSolver, share: Float[Array, ""]
+) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """Return y and its derivative at `share` of the unit interval, inside the steps of `out`."""
+    assert out.records is not None
+    ends, dense = out.records
+    k = jnp.minimum(jnp.searchsorted(ends, share), jnp.maximum(out.accepted - 1, 0))
+    begin = jnp.where(k > 0, ends[jnp.maximum(k - 1, 0)], 0.0)
+    within = jax.tree.map(lambda x: x[k], dense)
+    step = solver.interpolation_cls(t0=begin, t1=ends[k], **within)
+    return jax.jvp(step.evaluate, (share,), (jnp.ones_like(share),))
+
+
+def integrated(  # 88 lines: the functions of its loop share the settings of one call.
     term: diffrax.AbstractTerm,
     solver: diffrax.AbstractSolver,
     control: diffrax.AbstractAdaptiveStepSizeController,
@@ -109,19 +99,19 @@ def integrated(  # 97 lines: the functions of its loop share the settings of one
     first = jnp.minimum(first, one)
     memory = solver.init(term, zero, first, start, args)
 
-    def go_on(now: _State):
+    def go_on(now: Integrated):
         return (now.begin < one) & now.sound
 
-    def advance(now: _State) -> _State:
+    def advance(now: Integrated) -> Integrated:
         y, error, dense, memory, result = solver.step(
-            term, now.begin, now.stop, now.y, args, now.memory, made_jump=False
+            term, now.begin, now.stop, now.end, args, now.memory, made_jump=False
         )
         # Not a number means that the step was too long.
         error = cast(Array, error)
         error = jnp.where(jnp.isnan(error), jnp.inf, error)
         keep: Any
         keep, begin, stop, _, control_state, control_result = control.adapt_step_size(
-            now.begin, now.stop, now.y, y, args, error, order, now.control
+            now.begin, now.stop, now.end, y, args, error, order, now.control
         )
         begin = jnp.minimum(begin, one)
         last = jnp.where(keep, one, begin + 0.5 * (one - begin))
@@ -129,13 +119,13 @@ def integrated(  # 97 lines: the functions of its loop share the settings of one
         if records is not None:
             records = jax.tree.map(
                 lambda x, kept: eqxi.buffer_at_set(kept, now.accepted, x, pred=keep),
-                Records(begin, y, dense),
+                Records(begin, dense),
                 records,
             )
-        return _State(
+        return Integrated(
             begin=begin,
             stop=jnp.where(stop > nearly, last, stop),
-            y=jnp.where(keep, y, now.y),
+            end=jnp.where(keep, y, now.end),
             memory=jax.tree.map(lambda x, old: jnp.where(keep, x, old), memory, now.memory),
             control=control_state,
             sound=now.sound & (~keep | (result == successful)) & (control_result == successful),
@@ -147,15 +137,15 @@ def integrated(  # 97 lines: the functions of its loop share the settings of one
     records = None
     if recorded:
         shapes = jax.eval_shape(
-            lambda: solver.step(term, zero, first, start, args, memory, made_jump=False)[:3:2]
+            lambda: solver.step(term, zero, first, start, args, memory, made_jump=False)[2]
         )
         room = jax.tree.map(lambda x: jnp.full((max_steps, *x.shape), jnp.inf, x.dtype), shapes)
-        records = Records(jnp.full(max_steps, jnp.inf, dtype), *room)
+        records = Records(jnp.full(max_steps, jnp.inf, dtype), room)
     nothing = jnp.zeros((), int)
-    state = _State(
+    state = Integrated(
         begin=zero,
         stop=first,
-        y=start,
+        end=start,
         memory=memory,
         control=control_start,
         sound=jnp.ones((), bool),
@@ -164,21 +154,13 @@ def integrated(  # 97 lines: the functions of its loop share the settings of one
         records=records,
     )
     # equinox keeps `vmap` from copying all records in every step.
-    state = eqxi.while_loop(
+    return eqxi.while_loop(
         go_on,
         advance,
         state,
         max_steps=max_steps,
         buffers=lambda now: now.records,
         kind="lax",
-    )
-    return Integrated(
-        end=state.y,
-        steps=state.steps,
-        accepted=state.accepted,
-        solved=state.sound & ~(state.begin < one),
-        control=state.control,
-        records=state.records,
     )
 
 

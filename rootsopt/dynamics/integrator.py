@@ -1,4 +1,4 @@
-"""Integration of the equation of motion: method, tolerance and steps.
+"""Settings of the solver, and integration of the equation of motion: method, tolerance and steps.
 
 In free flight the motion is a parabola, for which a high-order method estimates an error of zero.
 Steps grow until one of them skips a whole contact between two stages, at any tolerance. Two
@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.pair import RotorPair
 
 METHODS: dict[str, Callable[..., diffrax.AbstractERK]] = {
@@ -63,6 +64,26 @@ class Integrator(eqx.Module):
             longest = jnp.minimum(longest, flying)
         base = diffrax.PIDController(rtol=rtol, atol=rtol, dtmax=longest)
         return base if pair.timescales is None else LandingControl.of(base, pair)
+
+
+class Solver(eqx.Module):
+    """Settings for finding a steady motion.
+
+    `transient`, `orbit`: integrators of the transient, and of the check of an orbit, whose
+    tolerance sets the accuracy of the orbit; `measures`: averages of the force to compute;
+    `max_periods`: maximum length of the transient (mesh periods); `probe_chaos`: 1 to integrate a
+    window of a motion that does not settle (see `closed.examined`), 0 to skip it; `max_orbit`:
+    longest period of an orbit to find (mesh periods), at most 8; `variation`: whether an orbit has
+    its `Orbit.variation`. `max_periods` and `probe_chaos` are floats, as are all leaves.
+    """
+
+    transient: Integrator
+    orbit: Integrator
+    measures: Measures
+    max_periods: Float[Array, ""]
+    probe_chaos: Float[Array, ""]
+    max_orbit: int = eqx.field(static=True)
+    variation: bool = eqx.field(static=True, default=False)
 
 
 # Time (mesh periods) after reaching an edge at which a step should end. A contact shorter than this

@@ -14,18 +14,17 @@ from rootsopt.dynamics.collocation.system import Step
 
 
 class Orbit(NamedTuple):
-    """A closed orbit of k mesh periods, with its first derivatives.
+    """Results of a closed orbit, with their first derivatives along d directions.
 
-    `state`: scaled state at φ1 = 0; `residual`: greatest entry of Newton's last correction
-    (scaled), inf if Newton's method has not converged; `monodromy`: derivative of the state after
-    one period with respect to `state`, whose eigenvalues are the Floquet multipliers; `multiplier`:
-    greatest modulus of the Floquet multipliers; `response`: mean (N), mean square (N²), peak (N)
-    and the further measures; `sensitivity` (r, d): derivatives of `response` with respect to the
-    design, along the family of orbits; `moved` (n, d): likewise, derivatives of `state`;
-    `peak_time` of the peak force (mesh periods); `depth`: greatest penetration (m; negative: least
-    gap); `newton_steps`: number of Newton steps; `disagreement`: estimated relative error of the
-    derivatives. `variation`: changes of the whole motion along the directions of the design, `None`
-    unless they were requested.
+    `state` (n,): scaled state at φ1 = 0; `residual`: greatest entry of Newton's last correction
+    (scaled), inf if Newton's method has not converged; `monodromy` (n, n): matrix at the start of
+    the mesh, whose eigenvalues are the Floquet multipliers; `multiplier`: greatest modulus of the
+    Floquet multipliers; `response` (r,): mean (N), mean square (N²), peak (N) and the further
+    measures; `sensitivity` (r, d): derivatives of `response` along the family of orbits; `moved`
+    (n, d): likewise, derivatives of `state`; `depth`: greatest penetration (m; negative: least gap)
+    at Gauss points and element ends; `newton_steps`: number of Newton steps before the last one;
+    `disagreement`: estimated relative error of the derivatives, inf if not known; `variation`:
+    changes of the whole motion along the directions, `None` unless they were requested.
     """
 
     state: Float[Array, " n"]
@@ -35,17 +34,19 @@ class Orbit(NamedTuple):
     response: Float[Array, " r"]
     sensitivity: Float[Array, "r d"]
     moved: Float[Array, "n d"]
-    peak_time: Float[Array, ""]
     depth: Float[Array, ""]
     newton_steps: Int[Array, ""]
     disagreement: Float[Array, ""]
     variation: Step | None = None
 
     @classmethod
-    def empty(cls, state: Float[Array, " n"], directions: int, rows: int) -> "Orbit":
+    def empty(
+        cls, state: Float[Array, " n"], directions: int, rows: int, variation: Step | None = None
+    ) -> "Orbit":
         """Return a placeholder for an orbit near the scaled `state` (n,).
 
-        `directions`: number d of design directions; `rows`: number r of entries of `response`."""
+        `directions`: number d of directions; `rows`: number r of entries of `response`;
+        `variation`: zeros like those of the orbit, if it has a variation."""
         count, dtype = state.shape[0], state.dtype
         nothing, infinite = jnp.zeros((), dtype), jnp.asarray(jnp.inf, dtype)
         return cls(
@@ -56,10 +57,10 @@ class Orbit(NamedTuple):
             response=jnp.zeros(rows, dtype),
             sensitivity=jnp.zeros((rows, directions), dtype),
             moved=jnp.zeros((count, directions), dtype),
-            peak_time=nothing,
             depth=nothing,
             newton_steps=jnp.zeros((), int),
             disagreement=nothing,
+            variation=variation,
         )
 
 

@@ -19,7 +19,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.contact.gap import Contact
-from rootsopt.contact.law import ContactLaw, force_rounding
+from rootsopt.contact.law import ContactLaw
 from rootsopt.dynamics.flanks import (
     FlankForce,
     Margins,
@@ -185,15 +185,6 @@ class RotorPair(eqx.Module):
         """Whether the contact force may jump (see `Contact.jumps`)."""
         return self.contact.jumps
 
-    def rounding(self, depth: Float[Array, ""]) -> Float[Array, ""]:
-        """Return the relative error of the force, due to rounding of the gap, at a `depth` (m).
-
-        It is 0 if the contact has no `length_scale`."""
-        length = self.contact.length_scale
-        if length is None:
-            return jnp.zeros_like(depth)
-        return force_rounding(depth, self.law.exponent, length)
-
     def at_start(self, first: Float[np.ndarray, "*k 2"]) -> Float[np.ndarray, "*k n"]:
         """Return scaled states (…, n) for the start of a motion, from ε and dε/dt.
 
@@ -266,13 +257,6 @@ class RotorPair(eqx.Module):
         nothing = jnp.zeros(self.states, self.angle_scale.dtype)
         start = self.in_si(nothing)
         return ((state - start) / (self.in_si(nothing + 1) - start)).astype(start.dtype)
-
-    def physical(
-        self, tau: Float[Array, "*k"], state: Float[Array, "*k n"]
-    ) -> tuple[Float[Array, "*k"], Float[Array, "*k"], Float[Array, "*k"]]:
-        """Return φ1 (rad), ε (rad) and dε/dt (rad/s) at rotation `tau` (mesh periods) and scaled
-        `state`."""
-        return self.motion(tau, state)[:3]
 
     def contact_force(
         self, phi: Float[Array, ""], relative: Float[Array, ""], rate: Float[Array, ""]

@@ -14,7 +14,6 @@ import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,6 +26,14 @@ from rootsopt.dynamics.maxima import along_elements, around, located
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import VariedOrbit
 
+RESERVES = "contact_reserve_um", "backlash_reserve_mm"
+"""Names of the least gap of the flanks along the motion, and of the backlash that would use it up.
+"""
+GEAR = tuple(
+    f"{which}gear_{what}" for what in ("torque_N_m", "force_N") for which in ("mean_", "", "rms_")
+)
+"""Names of mean, greatest and RMS torque of the timing gear, and of its force at the pitch circle.
+"""
 LONGEST = 8
 """Maximum length of an orbit (mesh periods), rounded up by `RotorPair.whole`."""
 # Minimum number of pieces into which one mesh period is divided.
@@ -173,30 +180,20 @@ def gaps(
     Each gap is smooth, while their least value has corners: it is that of another side, or at
     another instant. The pair must be two-sided."""
     assert pair.two_sided
-    dynamic, static = eqx.partition(pair, eqx.is_inexact_array)
-    directions = eqx.filter(tangents, eqx.is_inexact_array)
-    period = orbit.elements.mesh.period
+    times = orbit.elements.mesh.period * jnp.arange(INSTANTS) / INSTANTS
+
+    def of_section(pair, motion):
+        sides = jnp.array([1.0, -1.0])
+        return jax.vmap(lambda side: touch_of(pair, side, motion).depth)(sides)
+
+    def both(pair, tau, state):
+        found = by_slice(pair, of_section, pair.motion(tau, state))
+        return -jnp.max(found.reshape(-1, 2), axis=0)
 
     def at(tau):
-        state, _, changes = orbit.at(tau)
+        return orbit.pushed(both, tau, pair, tangents)
 
-        def both(state, dynamic):
-            pair = eqx.combine(dynamic, static)
-
-            def of_section(pair, motion):
-                sides = jnp.array([1.0, -1.0])
-                return jax.vmap(lambda side: touch_of(pair, side, motion).depth)(sides)
-
-            found = by_slice(pair, of_section, pair.motion(tau, state))
-            return -jnp.max(found.reshape(-1, 2), axis=0)
-
-        def push(change, along):
-            return jax.jvp(both, (state, dynamic), (change, along))
-
-        values, slopes = jax.vmap(push, (1, 0), (None, 0))(changes, directions)
-        return values, slopes.T
-
-    values, slopes = lax.map(at, period * jnp.arange(INSTANTS) / INSTANTS, batch_size=INSTANTS // 2)
+    values, slopes = lax.map(at, times, batch_size=INSTANTS // 2)
     return values.ravel(), slopes.reshape(2 * INSTANTS, -1)
 
 
@@ -213,22 +210,13 @@ def gear_torque(
     """Return mean, greatest and RMS torque of the gear over an `orbit`, and their derivatives.
 
     Units: as in `Apart`. Averages are over time."""
-    dynamic, static = eqx.partition(pair, eqx.is_inexact_array)
-    directions = eqx.filter(tangents, eqx.is_inexact_array)
 
-    def integrands(tau, state, dynamic):
-        pair = eqx.combine(dynamic, static)
+    def integrands(pair, tau, state):
         size = jnp.abs(_torque(pair, tau, state))
         return pair.lapse(state) * jnp.stack([size, size**2, jnp.ones_like(size)])
 
     def varied(tau):
-        state, _, changes = orbit.at(tau)
-
-        def push(change, along):
-            at = functools.partial(integrands, tau)
-            return jax.jvp(at, (state, dynamic), (change, along))
-
-        return jax.vmap(push, (1, 0), (None, -1))(changes, directions)
+        return orbit.pushed(integrands, tau, pair, tangents)
 
     def flags(tau):
         return (_torque(pair, tau, orbit.elements.motion(tau)) > 0)[None]

@@ -1,12 +1,14 @@
-"""What is known of a steady motion: its status, its orbit, and the settings that found it.
+"""What is known of a steady motion: its status and its orbit.
 
 An orbit is checked: whether it is the steady motion, and whether its forces are known. The checks
 are the same for single designs and for batches.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -15,9 +17,8 @@ from rootsopt.contact.law import force_rounding
 from rootsopt.dynamics.collocation.elements import GAUSS, Elements
 from rootsopt.dynamics.collocation.known import KnownOrbit
 from rootsopt.dynamics.collocation.system import Step, moved_at
-from rootsopt.dynamics.integrator import Integrator
+from rootsopt.dynamics.integrator import Solver
 from rootsopt.dynamics.linear import solved
-from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.orbit import Orbit
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.settle import NOISE, Transient
@@ -142,26 +143,6 @@ def agreement(tolerance: Float[Array, ""]) -> Float[Array, ""]:
 SAMPLES = 2520
 """Number of uniform samples of an orbit. It is divisible by every period up to ten, so that a
 sample falls on the end of each mesh period."""
-
-
-class Solver(eqx.Module):
-    """Settings for finding a steady motion.
-
-    `transient`, `orbit`: integrators of the transient, and of the check of an orbit, whose
-    tolerance sets the accuracy of the orbit; `measures`: averages of the force to compute;
-    `max_periods`: maximum length of the transient (mesh periods); `probe_chaos`: 1 to integrate a
-    window of a motion that does not settle (see `closed.examined`), 0 to skip it; `max_orbit`:
-    longest period of an orbit to find (mesh periods), at most 8; `variation`: whether an orbit has
-    its `Orbit.variation`. `max_periods` and `probe_chaos` are floats, as are all leaves.
-    """
-
-    transient: Integrator
-    orbit: Integrator
-    measures: Measures
-    max_periods: Float[Array, ""]
-    probe_chaos: Float[Array, ""]
-    max_orbit: int = eqx.field(static=True)
-    variation: bool = eqx.field(static=True, default=False)
 
 
 class Steady(NamedTuple):
@@ -330,6 +311,26 @@ class VariedOrbit(NamedTuple):
         rate = jnp.sum(GAUSS.lagrange(share)[..., None] * elements.slopes[k], axis=-2)
         times, moved = moved_at(elements, self.variation, k, share)
         return elements.inside(k, tau), rate, moved - rate[..., None] * times[..., None, :]
+
+    def pushed(
+        self, quantity: Callable[..., Any], tau: Float[Array, ""], model: Any, tangents: Any
+    ) -> tuple[Float[Array, "*q"], Float[Array, "*q d"]]:
+        """Return `quantity(model, tau, state)` at `tau` (mesh periods), and its derivatives along
+        the directions, at constant time.
+
+        `model`: a pair, or what else depends on the directions; `tangents`: its derivatives along
+        them, with a leading axis."""
+        dynamic, static = eqx.partition(model, eqx.is_inexact_array)
+        state, _, changes = self.at(tau)
+
+        def push(change, along):
+            def value(state, dynamic):
+                return quantity(eqx.combine(dynamic, static), tau, state)
+
+            return jax.jvp(value, (state, dynamic), (change, along))
+
+        moved = eqx.filter(tangents, eqx.is_inexact_array)
+        return jax.vmap(push, (1, 0), (None, -1))(changes, moved)
 
 
 def varied(found: Steady) -> VariedOrbit:

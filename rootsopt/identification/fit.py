@@ -19,7 +19,7 @@ from rootsopt.identification.quantities import OFFSET, fitted
 from rootsopt.identification.record import observed
 from rootsopt.identification.squares import TURN, Local, Problem
 from rootsopt.response.attractors import closed, find
-from rootsopt.response.still import reporting
+from rootsopt.response.terms import reporting
 from rootsopt.runtime.environment import check_precision
 from rootsopt.status import Status
 

@@ -22,8 +22,7 @@ from rootsopt.errors import InputError
 from rootsopt.identification.channels import CHANNELS
 from rootsopt.measured.guard import short
 from rootsopt.measured.table import measured_number, titled
-from rootsopt.response.still import is_force
-from rootsopt.response.terms import GEAR, RESERVES
+from rootsopt.response.terms import GEAR, RESERVES, is_force
 
 # Columns of a table of samples, as in `response_*.csv`; the time counts only without rotation.
 _ROTATION, _TIME = "rotation_deg", "time_s"

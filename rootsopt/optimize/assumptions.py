@@ -8,10 +8,8 @@ Motions begin at rest. Beginning on the orbit of the config's own scene took thr
 the scenes are too far apart. Motions that need more than a quarter of the allowed transient to
 settle are left out: one of these takes as long as a hundred others."""
 
-import dataclasses
 import itertools
 import math
-import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
@@ -30,9 +28,9 @@ from rootsopt.optimize.assumed import (
     Scenes,
 )
 from rootsopt.optimize.limits import limited
-from rootsopt.optimize.local import Linearization
+from rootsopt.optimize.local import FEASIBLE, Linearization
 from rootsopt.optimize.outcome import Optimization
-from rootsopt.optimize.problem import FEASIBLE, Problem
+from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.sqp import Stops, descend
 from rootsopt.response.evaluation import Evaluation
 from rootsopt.response.many import HERE, Point, Runs, evaluate_many
@@ -318,36 +316,3 @@ def _compared(work: _Comparison) -> Assumed:
             for name in objectives if name in others
         },
     )  # fmt: skip
-
-
-class AssumedSearch:
-    """A search, and the comparison of its optimum with the baseline over `assumptions`.
-
-    `search`: a `Search` or `TolerantSearch`; `config`: its config. For the rest, see `Search`."""
-
-    def __init__(
-        self,
-        search: Any,
-        config: Config,
-        progress: Callable[[int, int, float], None] | None,
-        stop: threading.Event | None,
-        runs: Runs,
-    ):
-        self.search, self.config, self.progress, self.runs = search, config, progress, runs
-        self.stop = threading.Event() if stop is None else stop
-        self.so_far = search.so_far
-
-    def run(self) -> Optimization:
-        """Run the search, then the comparison. Return the outcome with its `assumptions`.
-
-        If `stop` is set, there is no comparison."""
-        found = self.search.run()
-        best = 1 - found.improvement.get("objective", float("nan"))
-
-        def tick(done: int, expected: int) -> None:
-            before = len(found.history)
-            if self.progress is not None:
-                self.progress(before + done, before + expected, best)
-
-        spread = compared(self.config, found, self.runs, self.stop.is_set, tick)
-        return dataclasses.replace(found, assumptions=spread)

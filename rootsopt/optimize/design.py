@@ -4,11 +4,38 @@ import threading
 from collections.abc import Callable
 
 from rootsopt.config import Config
+from rootsopt.errors import InputError
 from rootsopt.optimize.outcome import Optimization
-from rootsopt.optimize.robust import search_of
+from rootsopt.optimize.robust import StagedSearch, is_robust
+from rootsopt.optimize.search import Progress, Search
+from rootsopt.response.checkpoint import Checkpoint
+from rootsopt.response.many import HERE, Runs
 from rootsopt.runtime.threads import one_thread
 from rootsopt.scene import check_geometry
 from rootsopt.sweeps.cluster import running
+
+
+def search_of(
+    config: Config,
+    progress: Progress | None = None,
+    stop: threading.Event | None = None,
+    checkpoint: Checkpoint | None = None,
+    runs: Runs = HERE,
+) -> Search | StagedSearch:
+    """Return the search that a `config` needs.
+
+    It is a `StagedSearch` with `tolerances` or `objective.over: assumptions`, and unless
+    `assumptions.scenes` is 0. Arguments: see `Search`.
+
+    Raises `InputError` for `tolerances` with a profile from a file, which has no design
+    parameters."""
+    if config.tolerances is not None and config.profile.family == "outline":
+        raise InputError(
+            "`tolerances` must be absent for `profile.family` outline; optimise it without them, "
+            "then optimise the `optimized.yaml` of that run with `tolerances`"
+        )
+    kind = StagedSearch if config.spans or is_robust(config) else Search
+    return kind(config, progress, stop, checkpoint, runs)
 
 
 @one_thread

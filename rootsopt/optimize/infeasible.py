@@ -5,16 +5,18 @@ Wright, Numerical Optimization (2006), section 18.5. The constraints that keep t
 zero are in conflict. If the geometry alone rules out all designs, none is simulated."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rootsopt.design.space import Constraint
 from rootsopt.optimize.limits import ForceLimit
-from rootsopt.optimize.local import Group, Linearization, Look
-from rootsopt.optimize.problem import FEASIBLE, Problem
+from rootsopt.optimize.local import FEASIBLE, Group, Linearization, Look
 from rootsopt.optimize.sqp import Found, Stops, descend
+
+if TYPE_CHECKING:
+    from rootsopt.optimize.problem import Problem
 
 _STOPS = Stops(feasibility=1e-9, evaluations=300)
 
@@ -92,7 +94,7 @@ class Infeasible(NamedTuple):
 
 
 def explain(
-    problem: Problem, starts: Sequence[NDArray[np.float64]], look: Look | None = None
+    problem: "Problem", starts: Sequence[NDArray[np.float64]], look: Look | None = None
 ) -> Infeasible:
     """Return why no design satisfies all constraints of a `problem`.
 
@@ -129,7 +131,7 @@ def explain(
     return Infeasible(best.local.objective, tuple(conflicts), design, look is not None)
 
 
-def _geometry(problem: Problem, point: NDArray[np.float64]) -> Linearization | None:
+def _geometry(problem: "Problem", point: NDArray[np.float64]) -> Linearization | None:
     """Return the constraints of the geometry at a `point` (d,), without an objective."""
     slack, normals = problem.look(point)[2:]
     if not np.all(np.isfinite(slack)) or not np.all(np.isfinite(normals)):
@@ -184,14 +186,11 @@ def _conflict(one: Constraint | ForceLimit, excess: float, alone: float | None) 
 
     `excess`: scaled excess over the limit in the design of least violation; `alone`: the same if
     all other constraints hold."""
-    if isinstance(one, ForceLimit):
-        sign, sense, limit, size = one.sign, one.sense, one.limit, one.scale
-    else:
-        sign, sense = -one.sign, "<=" if one.ceiling else ">="
-        limit, size = float(one.limit) / one.factor, one.scale / one.factor
-    reached = limit + sign * size * excess
-    nearest = None if alone is None else limit + sign * size * alone
-    return Conflict(one.name, sense, limit, one.unit, reached, nearest)
+    forced = isinstance(one, ForceLimit)
+    limit, size = (one.limit, one.scale) if forced else (one.bound, one.scale / one.factor)
+    size = size if one.ceiling else -size
+    nearest = None if alone is None else limit + size * alone
+    return Conflict(one.name, one.sense, limit, one.unit, limit + size * excess, nearest)
 
 
 def _best(found: Sequence[Found]) -> Found | None:

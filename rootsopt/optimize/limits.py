@@ -16,8 +16,7 @@ from rootsopt.config.study import BASELINE
 from rootsopt.config.units import unit_of, words
 from rootsopt.design.space import Constraint
 from rootsopt.errors import InputError
-from rootsopt.response.still import depends_on_forces, is_force, reporting
-from rootsopt.response.terms import Forces, Term, terms_of
+from rootsopt.response.terms import Forces, Term, depends_on_forces, is_force, reporting, terms_of
 from rootsopt.scene import Scene
 
 LIMITS = "constraints.terms"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.optimize.certificate import RESIDUAL, Certificate
+from rootsopt.optimize.local import RESIDUAL, Certificate
 from rootsopt.optimize.sqp import REASONS
 
 if TYPE_CHECKING:

@@ -9,16 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rootsopt.optimize.beginning import Beginning
-from rootsopt.optimize.certificate import certify
 from rootsopt.optimize.infeasible import Infeasible
-from rootsopt.optimize.local import Linearization
+from rootsopt.optimize.local import FEASIBLE, Linearization, certify
 from rootsopt.optimize.optimality import Optimality
-from rootsopt.optimize.problem import FEASIBLE, Problem
 from rootsopt.response.evaluation import RESPONSES, Evaluation, objective_weights
 from rootsopt.status import Status
 
 if TYPE_CHECKING:
     from rootsopt.optimize.assumptions import Assumed
+    from rootsopt.optimize.problem import Problem
     from rootsopt.optimize.robust import Robustness
 
 
@@ -88,7 +87,7 @@ class Optimization:
     ['mean_force_N', 'objective', 'peak_force_N', 'rms_force_N']
     """
 
-    problem: Problem | None
+    problem: "Problem | None"
     baseline: Evaluation
     optimized: Evaluation | None
     history: list[dict[str, Any]]

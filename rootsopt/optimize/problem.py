@@ -16,7 +16,6 @@ from rootsopt.config.units import unit_of, words
 from rootsopt.design.space import RangeConstraint, Space, slacks_and_slopes
 from rootsopt.dynamics.measures import PEAK_NORM, line_name
 from rootsopt.errors import InputError
-from rootsopt.optimize.certificate import NEAR, Certificate
 from rootsopt.optimize.limits import (
     PEAK,
     ForceLimit,
@@ -25,7 +24,7 @@ from rootsopt.optimize.limits import (
     settled,
     term_constraints,
 )
-from rootsopt.optimize.local import Group, Linearization
+from rootsopt.optimize.local import FEASIBLE, NEAR, Certificate, Group, Linearization
 from rootsopt.optimize.optimality import Holder
 from rootsopt.response.evaluation import RESPONSES, Evaluation, objective_weights
 from rootsopt.response.reducers import counted
@@ -51,9 +50,6 @@ SCENE_KINDS = 64
 
 # Maximum number of times that an infeasible point is moved halfway towards a feasible point.
 _DRAWN = 5
-FEASIBLE = 1e-6
-"""Scaled violation of a constraint above which a point counts as infeasible. It is also the
-distance from a bound of the unit box above which the bound counts as inactive."""
 
 
 @CachedFunction
@@ -454,42 +450,32 @@ class Problem:
         `optimized`: evaluation of the optimum. Upper limits of parameters whose range depends on
         the others have rows too. With a `certificate`, each row has a `multiplier`: the change of
         the objective per unit of the limit. Active bounds of the search then have rows as well."""
-        rows = []
+        rows, both = [], (self.baseline, optimized)
         always = self._always(optimized)
         for k, c in enumerate(self.space.constraints):
-            limit = float(c.limit) / c.factor
-            before, after = (self._limited_value(one, k) for one in (self.baseline, optimized))
-            slacks = [self._slack(one, k) for one in (self.baseline, optimized)]
-            sense = "<=" if c.ceiling else ">="
-            row = _row(c.name, before, after, limit, c.unit, slacks, sense)
+            before, after = (self._limited_value(one, k) for one in both)
+            slacks = [self._slack(one, k) for one in both]
+            row = _row(c.name, before, after, c.bound, c.unit, slacks, c.sense)
             if always[k]:
                 row |= {"active": False, "always": True}
             if certificate is not None:
                 per_unit = certificate.multipliers[k] * c.factor / c.scale
                 row |= self._multiplier(row, per_unit, optimized)
             rows.append(row)
-        rows += self._limit_rows(optimized, certificate)
-        return rows + self._range_rows(optimized, certificate)
-
-    def _limit_rows(
-        self, optimized: Evaluation, certificate: Certificate | None = None
-    ) -> list[dict]:
-        """Return one row for each of `limits`, with its value at the worst speed."""
-        rows = []
         for k, one in enumerate(self.limits):
-            before, after = (self.worst(every, one) for every in (self.baseline, optimized))
+            before, after = (self.worst(every, one) for every in both)
             slacks = [-float(one.excess(value)) for value in (before, after)]
             row = _row(one.name, before, after, one.limit, one.unit, slacks, one.sense)
             if certificate is not None:
                 per_unit = float(np.sum(certificate.walls[k])) / one.scale
                 row |= self._multiplier(row, per_unit, optimized)
             rows.append(row)
-        return rows
+        return rows + self._range_rows(optimized, certificate)
 
     def _slack(self, evaluation: Evaluation, k: int) -> float:
         """Return the scaled slack of constraint `k` for an evaluated design, NaN if not known."""
         one = self.space.constraints[k]
-        beyond = self._limited_value(evaluation, k) - float(one.limit) / one.factor
+        beyond = self._limited_value(evaluation, k) - one.bound
         return one.sign * beyond * one.factor / one.scale
 
     def _limited_value(self, evaluation: Evaluation, k: int) -> float:
@@ -675,6 +661,3 @@ def _row(name, before, after, limit, unit, slacks, sense) -> dict:
         "baseline_satisfied": None if math.isnan(first) else bool(first >= -1e-6),
         "active": bool(abs(slack) < NEAR),
     }
-
-
-__all__: Sequence[str] = ["FEASIBLE", "Problem"]

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 
 from rootsopt.config import Config
 from rootsopt.config.study import OptimizerConfig
-from rootsopt.errors import InputError
 from rootsopt.optimize.assumed import RIVAL
-from rootsopt.optimize.assumptions import AssumedSearch, compared
+from rootsopt.optimize.assumptions import compared
 from rootsopt.optimize.local import Linearization
 from rootsopt.optimize.outcome import Optimization
 from rootsopt.optimize.problem import Problem
@@ -179,10 +178,12 @@ class RobustStage(Stage):
         return problem.local(evaluation, point, shares)
 
 
-class TolerantSearch:
-    """Both stages of the search, and the comparison over fresh scenes.
+class StagedSearch:
+    """The stages of a search, and the comparisons that follow.
 
-    Arguments: see `Search`. `config` has `tolerances`, or its objective is over `assumptions`."""
+    The first stage finds the nominal optimum, the second one that over a sample of scenes, if there
+    are `tolerances` or the objective is over `assumptions`. The designs are then compared over
+    fresh scenes, and over what is assumed about the scene. Arguments: see `Search`."""
 
     def __init__(
         self,
@@ -197,20 +198,36 @@ class TolerantSearch:
         self.stop = threading.Event() if stop is None else stop
         self._done, self._expected = 0, 0
         self._nominal: Optimization | None = None
-        nominal = without(config)
-        if config.optimizer.prove == "auto":
+        self._robust = is_robust(config)
+        first = without(config)
+        if self._robust and config.optimizer.prove == "auto":
             # A bound of the nominal objective says little about the robust one.
-            nominal = nominal.replaced({"optimizer.prove": False})
-        self._stage: Search = Search(nominal, self._report, self.stop, checkpoint, runs)
+            first = first.replaced({"optimizer.prove": False})
+        self._stage: Search = Search(first, self._report, self.stop, checkpoint, runs)
 
     def run(self) -> Optimization:
-        """Run both stages and the comparison. Return the outcome of the second stage.
+        """Run the stages and the comparisons. Return the outcome of the last stage.
 
         If the first stage ends without a problem to solve, or `stop` is set, return its outcome.
+        If `stop` is set, no further comparison begins.
 
         Raises `InputError` if the objective is not defined for the baseline."""
+        found = self._optimum()
+        if not self.config.spans:
+            return found
+        before, best = len(found.history), 1 - found.improvement.get("objective", float("nan"))
+
+        def tick(done: int, expected: int) -> None:
+            self.progress(before + done, before + expected, best)
+
+        spread = compared(self.config, found, self.runs, self.stop.is_set, tick)
+        return dataclasses.replace(found, assumptions=spread)
+
+    def _optimum(self) -> Optimization:
+        """Run the stages, and compare their designs over fresh scenes."""
         nominal = self._stage.run()
-        if self.stop.is_set() or nominal.problem is None or nominal.infeasible is not None:
+        ended = self.stop.is_set() or nominal.problem is None or nominal.infeasible is not None
+        if ended or not self._robust:
             return nominal
         self._done, self._expected = len(nominal.history), self._stage.expected
         second = self._second(nominal)
@@ -371,25 +388,6 @@ def without(config: Config) -> Config:
     return config.model_copy(update={"tolerances": None, "objective": objective})
 
 
-def search_of(
-    config: Config,
-    progress: Progress | None = None,
-    stop: threading.Event | None = None,
-    checkpoint: Checkpoint | None = None,
-    runs: Runs = HERE,
-) -> Search | TolerantSearch | AssumedSearch:
-    """Return the search that a `config` needs.
-
-    With `tolerances` or `objective.over: assumptions`, it is a `TolerantSearch`; unless
-    `assumptions.scenes` is 0, it is followed by a comparison. Arguments: see `Search`.
-
-    Raises `InputError` for `tolerances` with a profile from a file, which has no design
-    parameters."""
-    if config.tolerances is not None and config.profile.family == "outline":
-        raise InputError(
-            "`tolerances` must be absent for `profile.family` outline; optimise it without them, "
-            "then optimise the `optimized.yaml` of that run with `tolerances`"
-        )
-    nominal = config.tolerances is None and config.objective.over == "nominal"
-    found = (Search if nominal else TolerantSearch)(config, progress, stop, checkpoint, runs)
-    return AssumedSearch(found, config, progress, stop, runs) if config.spans else found
+def is_robust(config: Config) -> bool:
+    """Return whether the objective of `config` is one over several scenes."""
+    return config.tolerances is not None or config.objective.over != "nominal"

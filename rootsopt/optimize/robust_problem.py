@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rootsopt.config import Config
-from rootsopt.optimize.certificate import Certificate
 from rootsopt.optimize.limits import ForceLimit
-from rootsopt.optimize.local import Group, Linearization
+from rootsopt.optimize.local import Certificate, Group, Linearization
 from rootsopt.optimize.optimality import Holder
 from rootsopt.optimize.problem import SCENE_KINDS, Problem, settled_by
 from rootsopt.response.evaluation import Evaluation

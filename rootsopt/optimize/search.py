@@ -2,7 +2,7 @@
 
 Screening simulates a Sobol sample of feasible designs and chooses the best as starts. From each
 start, a local search begins. It is either sequential quadratic programming on exact gradients
-(`rootsopt.optimize.sqp`), or a descent by an optax update rule (`rootsopt.optimize.descent`). In a
+(`rootsopt.optimize.sqp`), or a descent by an optax update rule (`rootsopt.optimize.noise`). In a
 local search, the last orbit is the first guess for the next.
 
 The best design is simulated again from rest before it is reported, and its first-order conditions
@@ -23,14 +23,14 @@ from rootsopt.config import FAMILY_KEYS, Config
 from rootsopt.config.study import OptimizerConfig
 from rootsopt.design.space import Space, sobol
 from rootsopt.errors import InputError
+from rootsopt.optimize import noise
 from rootsopt.optimize.beginning import beginning
 from rootsopt.optimize.bounding import FIRST, Bounding
-from rootsopt.optimize.descent import descended
 from rootsopt.optimize.infeasible import Infeasible, explain
 from rootsopt.optimize.limits import force_limits, limited
-from rootsopt.optimize.local import Linearization
+from rootsopt.optimize.local import FEASIBLE, Linearization
 from rootsopt.optimize.outcome import Optimization, Trial, candidate, history_of, near, objective
-from rootsopt.optimize.problem import FEASIBLE, Problem, needs_maxima
+from rootsopt.optimize.problem import Problem, needs_maxima
 from rootsopt.optimize.sqp import Found, Stops, descend
 from rootsopt.optimize.verification import Verification
 from rootsopt.optimize.vertices import VertexOptimum, vertex_optimum
@@ -245,8 +245,6 @@ class Search:
             trials = self._in_order()
         rows = history_of(trials)
         if self.noisy:
-            from rootsopt.optimize import noise
-
             noise.add_errors(rows, trials, self.problem)
             found = noise.verify(self.problem, self.exact, trials)
             settled = found.problem, found.baseline, found.optimized, rows, found.record
@@ -362,8 +360,6 @@ class Search:
         ]
         best = min(better, key=objective, default=None)
         if self.noisy:
-            from rootsopt.optimize import noise
-
             noise.add_errors(rows, trials, self.problem)
             best = noise.most_promising(self.problem, trials)
         verification: dict[str, Any] = {"holds_up": None, "rejected": []}
@@ -459,7 +455,7 @@ class Search:
             return self._evaluate(self.fast, point, number, iteration, orbit)
 
         iterations, asked = self.settings.iterations, self.stop.is_set
-        return descended(self.problem, evaluate, point, iterations, asked)
+        return noise.descended(self.problem, evaluate, point, iterations, asked)
 
     def _evaluate(
         self, evaluator: Evaluator, point, start, iteration, orbit=None, key=None

@@ -20,8 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.optimize.certificate import RESIDUAL, Certificate, certify
-from rootsopt.optimize.local import Linearization, Look
+from rootsopt.optimize.local import RESIDUAL, Certificate, Linearization, Look, certify
 from rootsopt.optimize.models import Limits, Models
 
 # Half width of the trust region (unit box): at the start, greatest, and that below which the

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.optimize.certificate import RESIDUAL, Certificate, certify
+from rootsopt.optimize.local import FEASIBLE, RESIDUAL, Certificate, certify
 from rootsopt.optimize.optimality import Optimality, StartOutcome, judged
 from rootsopt.optimize.outcome import Trial, candidate, near, objective
-from rootsopt.optimize.problem import FEASIBLE, Problem
+from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.sqp import Found
 from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.response.sensitivity import by_scene, quantities

@@ -340,26 +340,12 @@ class Profile(eqx.Module):
     ) -> tuple[RollPoint, Float[Array, "*n"], Float[Array, "*n"]]:
         """Return (addendum point, speed of the addendum, speed of the dedendum) at `nu` (rad).
 
-        A speed is the arc length per normal angle `nu` (m/rad). The dedendum is the partner's curve
-        that meshes with the addendum."""
+        A speed is the arc length per normal angle `nu` (m/rad). That of the addendum is its radius
+        of curvature. The dedendum is the partner's curve that meshes with the addendum; its speed
+        is 0 at a cusp, and negative where it is undercut."""
         point, rate = self.addendum(nu), self.roll_rate(nu)
         sliding = self.pitch_radius * jnp.sin(point.psi)
         return point, sliding * rate + point.s, (sliding - 2 * point.s) * rate + point.s
-
-    def addendum_speed(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Return the arc length of the addendum per normal angle (m/rad), its radius of curvature.
-
-        `nu`: normal angle (rad)."""
-        return self.speeds(nu)[1]
-
-    def dedendum_speed(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Return the arc length of the dedendum per normal angle of the partner's addendum (m/rad).
-
-        `nu`: normal angle (rad) of the partner's addendum. On an involute or land this is the
-        tangential speed r sin ψ + s (1 - ψ′) of the contact point per roll angle. Zero means a
-        cusp, and a negative value means undercut.
-        """
-        return self.speeds(nu)[2]
 
 
 def _inverse(profile: Profile, roll_angle: Float[Array, "*n"]) -> Float[Array, "*n"]:

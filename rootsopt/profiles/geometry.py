@@ -3,6 +3,7 @@
 Margins measure how far a profile, or a design, is from being unsound."""
 
 import functools
+import itertools
 from typing import NamedTuple
 
 import equinox as eqx
@@ -30,8 +31,8 @@ class Geometry(eqx.Module):
 
     `outer_radius` r_a, `root_radius`: greatest and least distance (m) of the outline from the axis.
     `area`: A (m²). `area_efficiency`: 1 - A/(π r_a²). `polar_area_moment`: ∫r² dA about the axis
-    (m⁴). `undercut_margin`: least `Profile.dedendum_speed` (m/rad). `seal_width`: arc length of the
-    whole tip land (m).
+    (m⁴). `undercut_margin`: least speed of the dedendum (m/rad, `Profile.speeds`). `seal_width`:
+    arc length of the whole tip land (m).
     """
 
     outer_radius: Float[Array, ""]
@@ -226,8 +227,11 @@ _POINTS = 400, 100
 _ROUNDING = 1e-7, 1e-9
 
 
-class ProfileMargins(NamedTuple):
-    """Margins of a flank: least values of nine quantities, none negative on a sound profile.
+class Soundness(NamedTuple):
+    """Margins of all checks of a design; it is sound if none of them is negative (`sound`).
+
+    The first nine are least values along a flank (`margins`). A margin is inf if the family or the
+    scene has no such check.
 
     `turning`: range of normal angles of a segment (rad), negative where joints are out of order.
     `convexity`: radius of curvature of the addendum (m).
@@ -238,32 +242,14 @@ class ProfileMargins(NamedTuple):
     between them. The centre of curvature then lies outside the pitch circle.
     `order`: β (rad), negative where a flank meshes before its tip, together with the lobe's other
     flank.
-    `undercut`: `Profile.dedendum_speed` (m/rad).
+    `undercut`: speed of the dedendum (m/rad, `Profile.speeds`).
     `star`: distance of a tangent of addendum or dedendum from the axis (m), negative where the
     outline folds back as seen from the axis. While it is positive, the two flanks of a lobe, or of
     a valley, do not cross.
     `root`: root radius (m).
+    `limits`: least distance of a ratio of the family from its limits (`Profile.limit_margin`).
+    `bore`: root radius minus the radius of the bore (m).
     """
-
-    turning: Float[Array, ""]
-    convexity: Float[Array, ""]
-    reach: Float[Array, ""]
-    fall: Float[Array, ""]
-    rolling: Float[Array, ""]
-    order: Float[Array, ""]
-    undercut: Float[Array, ""]
-    star: Float[Array, ""]
-    root: Float[Array, ""]
-
-
-class Soundness(NamedTuple):
-    """Margins of all checks of a design; it is sound if none of them is negative (`sound`).
-
-    The first nine are those of `ProfileMargins`: lengths in m, or in m/rad; `turning` and `order`
-    in rad; `rolling` a ratio. `limits`: least distance of a ratio of the family from its limits
-    (`Profile.limit_margin`). `bore`: root radius minus the radius of the bore (m).
-
-    A margin is inf if the family or the scene has no such check."""
 
     turning: Float[Array, ""]
     convexity: Float[Array, ""]
@@ -276,6 +262,11 @@ class Soundness(NamedTuple):
     root: Float[Array, ""]
     limits: Float[Array, ""]
     bore: Float[Array, ""]
+
+    @property
+    def of_flank(self) -> dict[str, Float[Array, ""]]:
+        """The margins of a flank by name: all but `limits` and `bore`."""
+        return dict(itertools.islice(self._asdict().items(), 9))
 
     @property
     def sound(self) -> Bool[Array, ""]:
@@ -304,18 +295,17 @@ def soundness(
     profile, bore = lax.stop_gradient((profile, bore))
     free = jnp.full_like(profile.pitch_radius, jnp.inf)
     if isinstance(profile, Outline):
-        found = ProfileMargins._make([*[free] * 8, profile.root_radius])
+        found = Soundness._make([*[free] * 8, profile.root_radius, free, free])
     else:
         found = margins(profile)
-    checked = found._replace(**dict.fromkeys(inherent, free))
     room = free if bore is None else found.root - bore
     own = jnp.asarray(profile.limit_margin(), free.dtype)
-    return Soundness._make([*checked, own, room])
+    return found._replace(**dict.fromkeys(inherent, free), limits=own, bore=room)
 
 
 @CachedFunction
-def margins(profile: Profile) -> ProfileMargins:
-    """Return the margins of a profile.
+def margins(profile: Profile) -> Soundness:
+    """Return the margins of a profile, without `limits` and `bore`.
 
     Least values along the flank are taken over `_POINTS` of each smooth part: a segment, or a
     knot span of a wavy flank. Both sides of a joint are evaluated. Between the points, a minimum is
@@ -343,4 +333,5 @@ def margins(profile: Profile) -> ProfileMargins:
     least = jnp.min(jnp.where(present, values, jnp.inf), axis=(1, 2))
     turning = jnp.min(jnp.stack([s.stop - s.start for s in profile.segments()]))
     root = r - profile.contact_distance(jnp.zeros_like(r))
-    return ProfileMargins._make([turning, *least, root])
+    free = jnp.full_like(r, jnp.inf)
+    return Soundness._make([turning, *least, root, free, free])

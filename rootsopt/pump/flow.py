@@ -24,10 +24,16 @@ from jaxtyping import Array, Float
 
 from rootsopt.contact.wrapped import series_at, wear_series
 from rootsopt.profiles import Geometry, Profile, quadrature_nodes
-from rootsopt.pump.gap import Allowances, MeshGap, mesh_gap, rolls
+from rootsopt.pump.gap import Allowances, MeshGap, Play, mesh_gap, play, rolls
 from rootsopt.scene import Scene
 from rootsopt.scene.reading import Gas, Medium
 
+CM3 = 1e-6
+"""One cubic centimetre (m³)."""
+L_MIN = 1e-3 / 60
+"""One litre per minute (m³/s)."""
+MRAD = 1e-3
+"""One milliradian (rad)."""
 # Number of panels of the quadrature over the length of twisted rotors.
 _PANELS = 64
 
@@ -111,6 +117,13 @@ def twisted_ripple(profile: Profile, shape: Geometry, twist: Float[Array, ""]) -
     return jnp.abs(means[1] - means[0])
 
 
+def ripple_of(scene: Scene, profile: Profile, shape: Geometry) -> Float[Array, ""]:
+    """Return the ripple of the flow in a `scene`, with its twist."""
+    if scene.helix is None:
+        return ripple(profile, shape)
+    return twisted_ripple(profile, shape, scene.helix)
+
+
 def greatest_radius_ratio(lobes: int) -> float:
     """Return the limit of r_a / r for symmetric conjugate profiles, 1 + 2 sin(π/4N).
 
@@ -130,6 +143,23 @@ def tip_height_share(profile: Profile, shape: Geometry) -> Float[Array, ""]:
 def _mean(shape: Geometry) -> Float[Array, ""]:
     """Return the mean flow (m²), η r_a², per metre of rotor length and radian of rotation."""
     return shape.area_efficiency * shape.outer_radius**2
+
+
+def play_of(scene: Scene, profile: Profile) -> Play:
+    """Return the play in a `scene`, with all its clearances."""
+    return play(profile, scene.clearance, center_distance(scene), radial=radial_allowance(scene))
+
+
+def radial_allowance(scene: Scene) -> Float[Array, ""]:
+    """Return the radius (m) by which both rotors are smaller everywhere."""
+    medium = scene.medium
+    return jnp.zeros_like(scene.clearance) if medium is None else medium.radial_allowance
+
+
+def center_distance(scene: Scene) -> Float[Array, ""]:
+    """Return the distance between the rotors' axes (m)."""
+    error = scene.center_distance_error
+    return 2 * scene.pitch_radius + (0.0 if error is None else error)
 
 
 CONTINUUM = 0.01

@@ -1,10 +1,9 @@
 """Loads on the bearings along a motion: of flanks, gas, timing gear and weight.
 
-A rotor's bearings sit at z = ±(L/2 + a), the timing gear at z = L/2 + g. Forces are complex
-numbers, x + iy, in the fixed frame: rotor 1 at the origin, rotor 2 at (2r, 0). Rotor 1 turns
-counter-clockwise. `docs/bearings.md` derives the formulas."""
+A rotor's bearings sit at z = ±(L/2 + a), the timing gear at z = L/2 + g. Forces are those in the
+fixed frame: rotor 1 at the origin, rotor 2 at (2r, 0). Rotor 1 turns counter-clockwise.
+`docs/bearings.md` derives the formulas."""
 
-import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -13,12 +12,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Complex, Float, Inexact
+from jaxtyping import Array, Float, Inexact
 
 from rootsopt.dynamics.collocation.elements import BLOCK, GAUSS, POINTS, in_blocks, whole_blocks
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.parts import AxisLoads
-from rootsopt.dynamics.parts.load import MIRROR, GasResultant
+from rootsopt.dynamics.parts.load import MIRROR, GasResultant, tooth_force
 from rootsopt.dynamics.reserve import LONGEST, smooth_pieces
 from rootsopt.dynamics.steady import SAMPLES, VariedOrbit
 from rootsopt.profiles import Geometry, Profile, geometry
@@ -26,23 +25,13 @@ from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene
 from rootsopt.scene.build import along
 
-BALL, ROLLER = 3.0, 10 / 3
-"""Exponents of the life of ball and roller bearings (ISO 281)."""
+EQUIVALENT = "bearing_load_equivalent_N"
+"""Name of the greatest equivalent dynamic load of the bearings."""
+BEARING = (*(EQUIVALENT, "bearing_load_max_N", "axial_force_max_N", "tilting_moment_max_N_m"),)
+"""Names of what an evaluation takes from the bearing loads along the motion."""
 
 
-def gear_force(
-    torque: Float[Array, "*n"], radius: Float[Array, ""], pressure_angle: Float[Array, ""]
-) -> Complex[Array, "*n"]:
-    """Return the force (N) of the timing gear's teeth on rotor 2; on rotor 1 it is the opposite.
-
-    `torque` (N·m): torque that the gear passes on to rotor 2, in its sense of rotation; `radius`
-    (m): pitch radius; `pressure_angle` (rad): of the teeth. The teeth press along their common
-    normal: torque / radius upwards at the pitch point, and away from rotor 1."""
-    across = torque / radius
-    return 1j * across + jnp.abs(across) * jnp.tan(pressure_angle)
-
-
-def equivalent_load(force: Inexact[Array, "*k n"], exponent: float = ROLLER) -> Float[Array, "*k"]:
+def equivalent_load(force: Inexact[Array, "*k n"], exponent: float) -> Float[Array, "*k"]:
     """Return the constant load (N) with the same bearing life, (mean |F|^p)^(1/p).
 
     `force` (…, n): loads (N) at equal steps of rotation; `exponent`: p."""
@@ -229,12 +218,11 @@ def orbit_loads(scene: Scene, design: Float[Array, " d"], orbit: VariedOrbit) ->
     sizes = _channels(series, scene)
     latest = jnp.argmax(sizes, axis=0)
 
-    def quantities(tau, state, dynamic):
+    def quantities(bearings, tau, state):
         """Return the integrands, then all quantities whose greatest value is reported.
 
         The integrands are the loads to the power of the exponent, and 1. Averages are over time:
         both are multiplied by the relative duration of a mesh period."""
-        bearings = eqx.combine(dynamic, static)
         found = bearings.at(tau, state)
         size = found.sizes / unit
         # The root of a load that vanishes has no derivative.
@@ -245,12 +233,7 @@ def orbit_loads(scene: Scene, design: Float[Array, " d"], orbit: VariedOrbit) ->
 
     def varied(tau):
         """Return the quantities, and their derivatives along the design, at constant time."""
-        state, _, changes = orbit.at(tau)
-
-        def push(change, along):
-            return jax.jvp(functools.partial(quantities, tau), (state, dynamic), (change, along))
-
-        return jax.vmap(push, (1, 0), (None, -1))(changes, moved)
+        return orbit.pushed(quantities, tau, bearings, tangents)
 
     # The loads have corners that the motion does not have, as where the gear's torque changes sign.
     corners, flags = loads_corners(bearings), bearings.flags(orbit)
@@ -353,8 +336,7 @@ def still_loads(scene: Scene, profile: Profile, shape: Geometry) -> tuple[Array,
 
     def size(phi):
         forces, first, _ = _from_gas(loads.gas, scene.length, scene.helix, phi)
-        across = load.torque2(phi) / loads.radius
-        teeth = jnp.stack([jnp.abs(across) * jnp.tan(loads.tooth_angle), across])
+        teeth = tooth_force(load.torque2(phi), loads.radius, loads.tooth_angle)
         teeth = jnp.stack([-teeth, teeth]) if scene.gear is not None else jnp.zeros((2, 2))
         forces, first = forces + teeth, first + (half + found.gear_distance) * teeth
         if loads.weight is not None:

@@ -10,20 +10,14 @@ from jaxtyping import Array, Float
 from rootsopt.config import Config
 from rootsopt.config.units import DEG, MM, UM
 from rootsopt.errors import InputError
-from rootsopt.profiles import Geometry, Profile, geometry
+from rootsopt.profiles import geometry
 from rootsopt.pump import flow
-from rootsopt.pump.gap import Play, play
+from rootsopt.pump.flow import CM3, CONTINUUM, L_MIN, MOLECULAR, MRAD, play_of, ripple_of
 from rootsopt.pump.loads import static_loads
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene, design_vector
 from rootsopt.scene.reading import Medium
 
-CM3 = 1e-6
-"""One cubic centimetre (m³)."""
-L_MIN = 1e-3 / 60
-"""One litre per minute (m³/s)."""
-MRAD = 1e-3
-"""One milliradian (rad)."""
 # Overlap (m) of the flanks up to which it counts as rounding of an outline.
 _ROUNDING = 1e-8
 LINES = 4
@@ -33,10 +27,6 @@ NOTE = (
     "efficiency eta given, no other shape of the flank changes it; a twist lowers it."
 )
 """Sentence for the user: what determines the ripple."""
-
-
-SLIP, MOLECULAR = 0.01, 1.0
-"""Knudsen numbers above which gas slips at the walls, and above which the flow is molecular."""
 
 
 def sheet(scene: Scene, design: Float[Array, " d"]) -> dict[str, Any]:
@@ -96,7 +86,7 @@ def warnings(rows: Mapping[str, Any]) -> list[str]:
             f"The flow through the gaps is molecular (Knudsen number {knudsen:.2g} > 1): the "
             "leakage and the volumetric efficiency above do not hold."
         )
-    elif knudsen > SLIP:
+    elif knudsen > CONTINUUM:
         found.append(
             f"Gas slips at the walls of the gaps (Knudsen number {knudsen:.2g} > 0.01): more leaks "
             "than reported."
@@ -181,13 +171,6 @@ def _flow(scene: Scene, design: Float[Array, " d"]) -> dict[str, Array]:
     }
 
 
-def ripple_of(scene: Scene, profile: Profile, shape: Geometry) -> Float[Array, ""]:
-    """Return the ripple of the flow in a `scene`, with its twist."""
-    if scene.helix is None:
-        return flow.ripple(profile, shape)
-    return flow.twisted_ripple(profile, shape, scene.helix)
-
-
 def _has_play(scene: Scene) -> bool:
     """Return whether rotor 2 has play between its flanks, or the rotors may overlap."""
     odd = scene.outline is not None or scene.center_distance_error is not None
@@ -206,23 +189,6 @@ def _play(scene: Scene, design: Float[Array, " d"]) -> dict[str, Array]:
         "flank_interference_um": found.overlap / UM,
         "flank_interference_at_deg": found.overlap_at / DEG,
     }
-
-
-def play_of(scene: Scene, profile: Profile) -> Play:
-    """Return the play in a `scene`, with all its clearances."""
-    return play(profile, scene.clearance, center_distance(scene), radial=radial_allowance(scene))
-
-
-def radial_allowance(scene: Scene) -> Float[Array, ""]:
-    """Return the radius (m) by which both rotors are smaller everywhere."""
-    medium = scene.medium
-    return jnp.zeros_like(scene.clearance) if medium is None else medium.radial_allowance
-
-
-def center_distance(scene: Scene) -> Float[Array, ""]:
-    """Return the distance between the rotors' axes (m)."""
-    error = scene.center_distance_error
-    return 2 * scene.pitch_radius + (0.0 if error is None else error)
 
 
 def _leaking(scene: Scene, medium: Medium, design: Float[Array, " d"]) -> dict[str, Any]:

@@ -1,6 +1,5 @@
 """What is reported of one evaluation: series, entries of the result file, and advice."""
 
-import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -14,42 +13,18 @@ from numpy.typing import NDArray
 from rootsopt.config import Config
 from rootsopt.config.units import MM, UM
 from rootsopt.dynamics.collocation.elements import Elements
+from rootsopt.dynamics.integrator import Solver
 from rootsopt.dynamics.orbit import Orbit
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.reserve import Apart
-from rootsopt.dynamics.steady import OPEN, SAMPLES, Solver, Steady
+from rootsopt.dynamics.reserve import GEAR, RESERVES, Apart
+from rootsopt.dynamics.steady import OPEN, SAMPLES, Steady
 from rootsopt.dynamics.window import Window
 from rootsopt.profiles import Geometry
-from rootsopt.pump.loads import OrbitLoads
-from rootsopt.response.terms import EQUIVALENT, GEAR, RESERVES
+from rootsopt.pump.loads import EQUIVALENT, OrbitLoads
+from rootsopt.response.result import RESPONSES, Series
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene
 from rootsopt.status import Status
-
-
-@dataclasses.dataclass(frozen=True)
-class Series:
-    """Motion, force and penetration over the reported window, as NumPy arrays (samples,).
-
-    `time` (s): uniform unless rotor 1 is free; `rotation` of rotor 1 (rad), uniform; `relative`: ε
-    (rad); `rate`: dε/dt (rad/s); `drive_force`, `coast_force`: normal force (N) on each flank;
-    `depth`: greatest penetration (m; negative: gap); `bearing_loads` (samples, 4): loads (N) on the
-    bearings, None without `scene.bearings` or without an orbit. The bearings are that of rotor 1 at
-    the timing gear's end, its other one, and those of rotor 2."""
-
-    time: NDArray[np.float64]
-    rotation: NDArray[np.float64]
-    relative: NDArray[np.float64]
-    rate: NDArray[np.float64]
-    drive_force: NDArray[np.float64]
-    coast_force: NDArray[np.float64]
-    depth: NDArray[np.float64]
-    bearing_loads: NDArray[np.float64] | None = None
-
-    @property
-    def force(self) -> NDArray[np.float64]:
-        """Contact force (N): sum of the normal forces on both flanks."""
-        return self.drive_force + self.coast_force
 
 
 @CachedFunction
@@ -60,7 +35,7 @@ def contact_series(pair: RotorPair, tau, states):
     an axis (t,). A relative duration is that of a mesh period, divided by the mesh period."""
     lapse = pair.lapse(states) if pair.free else jnp.ones_like(tau)
     contact = jax.vmap(pair.contact_at)(tau, states)
-    return pair.mesh_period, lapse, pair.physical(tau, states)[1:], contact
+    return pair.mesh_period, lapse, pair.motion(tau, states)[1:3], contact
 
 
 def series_of(pair: RotorPair, tau, states) -> Series:
@@ -107,8 +82,6 @@ def sampled(elements: Elements) -> Float[Array, "samples n"]:
     return elements.motion(elements.mesh.period * jnp.arange(SAMPLES) / SAMPLES)
 
 
-RESPONSES = ("mean_force_N", "peak_force_N", "rms_force_N")
-"""Keys of the mean, peak and RMS force in a response."""
 # Floquet multiplier above which a message says how slowly disturbances fade.
 _SLOW = 0.999
 # Fraction of itself to which a disturbance is said to fade.

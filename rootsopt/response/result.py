@@ -8,13 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rootsopt.dynamics.maxima import Maxima
-from rootsopt.response.records import RESPONSES, Series
 from rootsopt.response.starts import Seed, Seeds
 from rootsopt.status import Status
 
 if TYPE_CHECKING:
     import xarray
 
+RESPONSES = ("mean_force_N", "peak_force_N", "rms_force_N")
+"""Keys of the mean, peak and RMS force in a response."""
 # Entries of `steady_state` in the row of a speed.
 _STEADY = (
     "kind",
@@ -23,6 +24,31 @@ _STEADY = (
     "lyapunov_exponent_per_mesh_period",
     "lyapunov_standard_error",
 )
+
+
+@dataclasses.dataclass(frozen=True)
+class Series:
+    """Motion, force and penetration over the reported window, as NumPy arrays (samples,).
+
+    `time` (s): uniform unless rotor 1 is free; `rotation` of rotor 1 (rad), uniform; `relative`: ε
+    (rad); `rate`: dε/dt (rad/s); `drive_force`, `coast_force`: normal force (N) on each flank;
+    `depth`: greatest penetration (m; negative: gap); `bearing_loads` (samples, 4): loads (N) on the
+    bearings, None without `scene.bearings` or without an orbit. The bearings are that of rotor 1 at
+    the timing gear's end, its other one, and those of rotor 2."""
+
+    time: NDArray[np.float64]
+    rotation: NDArray[np.float64]
+    relative: NDArray[np.float64]
+    rate: NDArray[np.float64]
+    drive_force: NDArray[np.float64]
+    coast_force: NDArray[np.float64]
+    depth: NDArray[np.float64]
+    bearing_loads: NDArray[np.float64] | None = None
+
+    @property
+    def force(self) -> NDArray[np.float64]:
+        """Contact force (N): sum of the normal forces on both flanks."""
+        return self.drive_force + self.coast_force
 
 
 # Columns of the dataset, keyed by the field of a `Series`. Each entry holds the name in CSV files,

@@ -6,6 +6,7 @@ of the forces.
 """
 
 import abc
+import re
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, ClassVar, Literal, NamedTuple
@@ -13,15 +14,20 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from rootsopt.config import Config
 from rootsopt.config.units import MM, UM
+from rootsopt.dynamics.measures import PEAK_NORM, line_name
+from rootsopt.dynamics.reserve import GEAR, RESERVES
 from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry, Profile, geometry
 from rootsopt.pump import flow
-from rootsopt.pump.loads import still_loads
+from rootsopt.pump.flow import CM3, L_MIN, MRAD, play_of, ripple_of
+from rootsopt.pump.loads import BEARING, still_loads
 from rootsopt.pump.rattle import SILENT, silent_eccentricity
-from rootsopt.pump.sheet import CM3, L_MIN, MRAD, play_of, ripple_of
+from rootsopt.response.result import RESPONSES
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene
 
@@ -152,18 +158,6 @@ def _of_gear(at: _At, name: str) -> Any:
     return at.forces.of_motion
 
 
-EQUIVALENT = "bearing_load_equivalent_N"
-"""Name of the greatest equivalent dynamic load of the bearings."""
-BEARING = (*(EQUIVALENT, "bearing_load_max_N", "axial_force_max_N", "tilting_moment_max_N_m"),)
-"""Names of the terms that an evaluation takes from the bearing loads along the motion."""
-RESERVES = "contact_reserve_um", "backlash_reserve_mm"
-"""Names of the least gap of the flanks along the motion, and of the backlash that would use it up.
-"""
-GEAR = tuple(
-    f"{which}gear_{what}" for what in ("torque_N_m", "force_N") for which in ("mean_", "", "rms_")
-)
-"""Names of mean, greatest and RMS torque of the timing gear, and of its force at the pitch circle.
-"""
 OF_MOTION = (*BEARING, *RESERVES, *GEAR)
 """Names of all terms that an evaluation takes from the motion itself."""
 # Formulas of the terms that are to be minimised, and to be maximised.
@@ -202,6 +196,7 @@ _MORE: dict[str, Callable[[_At], Any]] = {
     **{name: partial(_of_gear, name=name) for name in RESERVES},
 }
 _terms: dict[str, Term] = {}
+_LINE = re.compile(r"line_(\d+(?:\.\d+)?)_force_N")
 
 
 def register_term(name: str, term: Term) -> None:
@@ -299,6 +294,56 @@ def needs_forces(scene: Scene, term: Term, design: Float[Array, " d"]) -> bool:
     except _UsedError:
         return True
     return False
+
+
+def is_force(config: Config, name: str, key: str) -> bool:
+    """Return whether `name` is a measure of the force; otherwise, it can only be a registered term.
+
+    `key`: config key that holds the name, for the message. Raises `InputError` for a measure that
+    cannot exist."""
+    if name == PEAK_NORM and config.objective.peak_norm is None:
+        raise InputError(
+            f"`{key}` names {PEAK_NORM}, which needs `objective.peak_norm`; set it, or name "
+            "peak_force_N"
+        )
+    found = _LINE.fullmatch(name)
+    if found is None:
+        return name in RESPONSES or name == PEAK_NORM
+    order = float(found[1])
+    if not 1e-2 <= order <= 1e3 or line_name(order) != name:
+        raise InputError(
+            f"`{key}` must name a line as line_ORDER_force_N with an order from 0.01 to "
+            f"1000, as in line_2_force_N, but names {name}"
+        )
+    return True
+
+
+def depends_on_forces(config: Config, scene: Scene, name: str, key: str) -> bool:
+    """Return whether the quantity `name` is a force, or a term that reads forces.
+
+    `key`: config key that holds the name. Raises `InputError` if no quantity has this name."""
+    if is_force(config, name, key):
+        return True
+    (term,) = terms_of([name], key)
+    return needs_forces(scene, term, jnp.asarray(np.asarray(config.design, np.float64)))
+
+
+def reporting(config: Config, names: Sequence[str], key: str) -> Config:
+    """Return a copy of a `config` whose evaluations report all quantities in `names`.
+
+    `key`: config key that holds the names."""
+    lines = [*config.response.lines]
+    terms = dict(config.objective.terms)
+    for name in names:
+        forced = is_force(config, name, key)
+        if found := _LINE.fullmatch(name):
+            order = float(found[1])
+            lines += [order] * (order not in lines)
+        elif not forced:
+            terms.setdefault(name, 0.0)
+    response = config.response.model_copy(update={"lines": tuple(lines)})
+    objective = config.objective.model_copy(update={"terms": terms})
+    return config.model_copy(update={"response": response, "objective": objective})
 
 
 def sense_of(name: str) -> Literal["min", "max"]:

@@ -29,6 +29,7 @@ from rootsopt.contact.wrapped import (
     slices_of,
     wear_series,
 )
+from rootsopt.dynamics.integrator import Solver
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.parts import (
     AxisLoads,
@@ -47,7 +48,6 @@ from rootsopt.dynamics.parts import (
     TwistedLoad,
 )
 from rootsopt.dynamics.parts.base import Timescales
-from rootsopt.dynamics.steady import Solver
 from rootsopt.profiles import Geometry, Outline, Profile, geometry
 from rootsopt.profiles.geometry import Soundness, soundness
 from rootsopt.runtime.environment import check_precision

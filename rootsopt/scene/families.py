@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from numpy.typing import ArrayLike
 
 from rootsopt.config import ProfileConfig
 from rootsopt.config.families import families, family_of, is_shipped
@@ -45,21 +44,9 @@ def profile_of(
     return found.make(lobes, pitch_radius, **values)
 
 
-def keys_of(config: ProfileConfig) -> tuple[str, ...]:
-    """Return the names of a config's design parameters.
-
-    The entries of a list-valued parameter are numbered from 1."""
-    return config.design_keys
-
-
 def design_of(config: ProfileConfig) -> Float[Array, " d"]:
     """Return the design parameters (d,) of a config, in config units."""
     return jnp.asarray(config.design)
-
-
-def with_design(config: ProfileConfig, design: ArrayLike) -> ProfileConfig:
-    """Return a copy of a profile's config with the given `design` (d,) in config units."""
-    return config.with_design([float(value) for value in np.asarray(design)])
 
 
 def free_form_of(config: ProfileConfig, count: int) -> tuple[ProfileConfig, float]:
@@ -172,7 +159,7 @@ def margins_of(config: ProfileConfig) -> dict[str, float]:
     if config.from_file:
         return {}
     radius = jnp.asarray(config.pitch_radius_mm * MM)
-    found = _margins(config.family, config.lobes, radius, design_of(config))._asdict()
+    found = _margins(config.family, config.lobes, radius, design_of(config)).of_flank
     record = {}
     for name, value in found.items():
         unit, size = _UNITS.get(name, ("mm", MM))

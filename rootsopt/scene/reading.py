@@ -11,10 +11,9 @@ from jaxtyping import Array, Float
 from rootsopt.config import Config
 from rootsopt.config.units import DEG, MM, RPM, UM
 from rootsopt.contact.law import ImpactLaw
-from rootsopt.dynamics.integrator import Integrator
+from rootsopt.dynamics.integrator import Integrator, Solver
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.parts import Friction, GearErrors, MotorDrive, Supports, TimingGear
-from rootsopt.dynamics.steady import Solver
 from rootsopt.measured.table import transmission_error
 
 # Limit on the number of solver steps for a whole orbit, as a multiple of the number that the config

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rootsopt.config.units import words
-from rootsopt.optimize.certificate import Certificate
+from rootsopt.optimize.local import Certificate
 from rootsopt.status import Standing
 from rootsopt.tradeoffs.front import FrontPoint, Gap, dominated, ordered, repeated
 from rootsopt.tradeoffs.scalar import Scalar, Scale, rates

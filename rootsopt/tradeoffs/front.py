@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from rootsopt.config import Config
 from rootsopt.config.units import words
-from rootsopt.optimize.certificate import RESIDUAL
 from rootsopt.optimize.infeasible import Infeasible
+from rootsopt.optimize.local import RESIDUAL
 from rootsopt.response.evaluation import Evaluation
 from rootsopt.status import Standing, Status
 from rootsopt.tradeoffs.study import Aim

@@ -28,8 +28,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.optimize.certificate import Certificate
-from rootsopt.optimize.local import Group, Linearization
+from rootsopt.optimize.local import Certificate, Group, Linearization
 from rootsopt.tradeoffs.study import Sample
 
 RHO = 1e-3

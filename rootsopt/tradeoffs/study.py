@@ -16,20 +16,21 @@ from rootsopt.design.space import Space
 from rootsopt.errors import InputError
 from rootsopt.optimize.limits import (
     LIMITS,
+    PEAK,
     depends_on_forces,
     force_limits,
     limited,
     quantity_of,
     term_constraints,
 )
-from rootsopt.optimize.local import Group
-from rootsopt.optimize.problem import FEASIBLE, Problem, settled_by
+from rootsopt.optimize.local import FEASIBLE, Group
+from rootsopt.optimize.problem import Problem, settled_by
 from rootsopt.response.checkpoint import Checkpoint
 from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.response.many import HERE, Point, Runs
 from rootsopt.response.starts import Seeds
-from rootsopt.response.still import Still, is_force, reporting
-from rootsopt.response.terms import terms_of
+from rootsopt.response.still import Still
+from rootsopt.response.terms import is_force, reporting, terms_of
 from rootsopt.scene import Scene
 
 # Keys of `constraints` that may be absent; a floor of 0 has the same effect in the others.
@@ -135,10 +136,6 @@ def freed(config: Config) -> tuple[Config, tuple[str, ...]]:
         return config, ()
     limits = limits.model_copy(update=values | {"terms": kept})
     return config.model_copy(update={"constraints": limits}), tuple(sorted(names))
-
-
-PEAK = "peak_force_N"
-"""Key of the peak force: the greatest of several local maxima, each a smooth branch."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -27,11 +27,9 @@ from numpy.typing import NDArray
 from rootsopt.config import FAMILY_KEYS, Config
 from rootsopt.design.space import sobol
 from rootsopt.errors import InputError
-from rootsopt.optimize.certificate import RESIDUAL, certify
 from rootsopt.optimize.infeasible import Infeasible, explain
-from rootsopt.optimize.local import Linearization
+from rootsopt.optimize.local import FEASIBLE, RESIDUAL, Linearization, certify
 from rootsopt.optimize.optimality import judged
-from rootsopt.optimize.problem import FEASIBLE
 from rootsopt.optimize.sqp import Stops, descend
 from rootsopt.response.checkpoint import Checkpoint
 from rootsopt.response.many import HERE, Runs, as_done

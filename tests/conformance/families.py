@@ -25,7 +25,7 @@ from rootsopt.errors import InputError
 from rootsopt.profiles import geometry
 from rootsopt.profiles.geometry import margins
 from rootsopt.scene import Scene
-from rootsopt.scene.families import check, design_of, profile_of, with_design
+from rootsopt.scene.families import check, design_of, profile_of
 
 R = 0.033
 LOBES = 3
@@ -80,7 +80,7 @@ def looked_at(profile, nu):
         "lever": profile.lever(nu),
         "support": profile.support(nu),
         "rate": profile.roll_rate(nu),
-        "length": profile.addendum_speed(nu),
+        "length": profile.speeds(nu)[1],
         "inverse": profile.normal_at(profile.roll_angle(nu)),
     }
 
@@ -148,9 +148,9 @@ def what_margins_call_sound_is_one_curve(family):
     def looked(design):
         profile = profile_of(family, LOBES, jnp.asarray(R), design)
         nu = profile.pitch_normal * jnp.linspace(0.0, 1.0, COUNT)
-        found = margins(profile)._asdict()
+        found = margins(profile).of_flank
         least = [value for key, value in found.items() if key not in row.inherent]
-        curved = jnp.max(profile.addendum_speed(nu))
+        curved = jnp.max(profile.speeds(nu)[1])
         return jnp.min(jnp.stack(least)), curved, nu[1], profile.support(nu), profile.lever(nu)
 
     found = jax.jit(lambda designs: jax.lax.map(looked, designs))(jnp.asarray(designs))
@@ -279,7 +279,7 @@ def config_is_read_and_written(family):
     assert parse(config.to_yaml()) == config
     assert config.profile.parameters == {**family_of(family).example}
     design = np.asarray(design_of(config.profile))
-    assert with_design(config.profile, design) == config.profile
+    assert config.profile.with_design(design.tolist()) == config.profile
     for key, parameter in {p.key: p for p in family_of(family).parameters}.items():
         assert maker(family)(jnp.asarray(design)).lobes == LOBES
         for value in (parameter.lowest - 1e6, parameter.highest + 1e6):

@@ -12,11 +12,10 @@ from scipy.integrate import solve_ivp
 import rootsopt
 from rootsopt.dynamics.closed import Start, steady_motion
 from rootsopt.dynamics.flow import one_period, strobe
-from rootsopt.dynamics.integrator import Integrator
+from rootsopt.dynamics.integrator import Integrator, Solver
 from rootsopt.dynamics.measures import Measures
 from rootsopt.dynamics.parts import GearErrors
 from rootsopt.dynamics.parts.base import Timescales
-from rootsopt.dynamics.steady import Solver
 from rootsopt.dynamics.window import lyapunov
 from rootsopt.scene import Scene, design_vector
 from rootsopt.status import Status

@@ -14,7 +14,7 @@ import rootsopt
 from experiments._common.shooting import differentiated
 from rootsopt import steady_response
 from rootsopt.config import load
-from rootsopt.pump.sheet import play_of
+from rootsopt.pump.flow import play_of
 from rootsopt.response import evaluation
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.sensitivity import touching

@@ -16,7 +16,7 @@ from rootsopt.config.tolerances import Span
 from rootsopt.design.space import Space
 from rootsopt.optimize.assumed import BASELINE, OPTIMIZED, Assumed
 from rootsopt.optimize.assumptions import _change, _known, compared
-from rootsopt.optimize.robust import search_of
+from rootsopt.optimize.design import search_of
 from rootsopt.optimize.robust_problem import RobustProblem
 from rootsopt.optimize.search import Search
 from rootsopt.response.reducers import over_scenes

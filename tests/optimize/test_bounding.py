@@ -10,8 +10,8 @@ import pytest
 
 from rootsopt import load_config
 from rootsopt.optimize import bounding
-from rootsopt.optimize.local import Group, Linearization
-from rootsopt.optimize.problem import FEASIBLE, Problem
+from rootsopt.optimize.local import FEASIBLE, Group, Linearization
+from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.search import Search, Stage
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.many import HERE

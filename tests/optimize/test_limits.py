@@ -10,10 +10,9 @@ from rootsopt.config import parse
 from rootsopt.design.space import RangeConstraint
 from rootsopt.dynamics.maxima import Maxima
 from rootsopt.errors import InputError
-from rootsopt.optimize.certificate import Certificate
 from rootsopt.optimize.infeasible import explain
 from rootsopt.optimize.limits import TermConstraint, force_limits, limited, term_constraints
-from rootsopt.optimize.local import Linearization
+from rootsopt.optimize.local import Certificate, Linearization
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.search import Search
 from rootsopt.profiles import geometry

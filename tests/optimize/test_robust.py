@@ -9,10 +9,10 @@ import pytest
 
 from rootsopt.commands.console import main
 from rootsopt.config import load
-from rootsopt.optimize.certificate import certify
-from rootsopt.optimize.local import Group, Linearization
+from rootsopt.optimize.design import search_of
+from rootsopt.optimize.local import Group, Linearization, certify
 from rootsopt.optimize.problem import Problem
-from rootsopt.optimize.robust import Scattered, compare, search_of, without
+from rootsopt.optimize.robust import Scattered, compare, without
 from rootsopt.optimize.robust_problem import RobustProblem
 from rootsopt.optimize.search import Search
 from rootsopt.optimize.sqp import Stops, descend

@@ -10,7 +10,7 @@ import pytest
 
 from rootsopt.config import load
 from rootsopt.design.space import sobol
-from rootsopt.optimize import descent, noise
+from rootsopt.optimize import noise
 from rootsopt.optimize.outcome import Trial, history_of
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.search import Search, Stage, _apart, _ranked
@@ -192,7 +192,7 @@ class Told(Evaluator):
 def test_a_descent_goes_half_way_back_from_where_there_is_no_steady_state(monkeypatch):
     """Other steps are those of the update rule, each from the orbit of the previous trial."""
     rates = optax.cosine_decay_schedule(0.2, 6, 0.05)
-    monkeypatch.setattr(descent, "_rule", lambda iterations: optax.sgd(rates))
+    monkeypatch.setattr(noise, "_rule", lambda iterations: optax.sgd(rates))
     search = searching(iterations=6)
     vars(search.problem)["descent"] = lambda point, slope: slope
     vars(search.problem)["slope"] = lambda evaluation, point: 2 * (point - 0.6)

@@ -15,7 +15,7 @@ from rootsopt.optimize.problem import Problem
 from rootsopt.profiles import CIC, EE, FreeForm, geometry, project
 from rootsopt.profiles.departure import departure
 from rootsopt.scene import Scene, design_vector
-from rootsopt.scene.families import check, free_form_of, keys_of, profile_of, with_design
+from rootsopt.scene.families import check, free_form_of, profile_of
 from tests.optimize.test_optimize import SCENE
 
 R = 0.033
@@ -118,10 +118,14 @@ def test_projections_come_closer_with_more_coefficients(other, within):
 def test_keys_design_and_back():
     """The list is one key in the config, and numbered entries in a design."""
     config = free()
-    assert keys_of(config.profile)[:3] == ("tip_arc_angle_deg", "coefficients_1", "coefficients_2")
+    assert config.profile.design_keys[:3] == (
+        "tip_arc_angle_deg",
+        "coefficients_1",
+        "coefficients_2",
+    )
     design = np.asarray(design_vector(config))
     np.testing.assert_allclose(design, [2.0, *SHARES])
-    changed = with_design(config.profile, design + 0.01)
+    changed = config.profile.with_design((design + 0.01).tolist())
     assert changed.coefficients == pytest.approx(tuple(SHARES + 0.01))
     assert parse(config.to_yaml()) == config
     check(config.profile)
@@ -164,7 +168,7 @@ def test_coefficients_may_reach_their_bound(last):
     config = free("profile.tip_arc_angle_deg=0", f"profile.coefficients={shares.tolist()}").profile
     check(config)
     with pytest.raises(InputError, match="two points of a flank would mesh at once"):
-        check(with_design(config, [0.0, *(shares + 1e-6 * (shares == 1))]))
+        check(config.with_design([0.0, *(shares + 1e-6 * (shares == 1))]))
 
 
 def test_profile_command_projects(tmp_path, capsys):
@@ -215,7 +219,7 @@ def test_points_of_any_box_become_sound_profiles(family, inside):
         found = problem.toward(sample, start)
         assert problem.feasible(found)
         drawn += not problem.feasible(problem.project(sample))
-        check(with_design(settings.profile, problem.design(found)))
+        check(settings.profile.with_design(problem.design(found).tolist()))
     assert drawn > 0
 
 

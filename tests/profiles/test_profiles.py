@@ -136,7 +136,7 @@ def test_land_is_equation_1_and_its_mate_the_circle_that_touches_it(profile):
     polar = np.stack([np.cos(turned), np.sin(turned)], -1)
     np.testing.assert_allclose(positions[1], (2 * R - outer) * polar, rtol=0, atol=1e-14)
     turning = 2 * profile.roll_rate(jnp.asarray(theta)) - 1
-    bend = profile.dedendum_speed(jnp.asarray(theta)) / turning
+    bend = profile.speeds(jnp.asarray(theta))[2] / turning
     np.testing.assert_allclose(bend[theta < tip], 2 * R - outer, rtol=1e-12)
 
 

@@ -11,8 +11,8 @@ import pytest
 import rootsopt
 from rootsopt import InputError, Scene
 from rootsopt.config.units import DEG
+from rootsopt.dynamics.parts.load import tooth_force
 from rootsopt.profiles import geometry
-from rootsopt.pump import loads as formulas
 from rootsopt.pump.loads import BearingSet, static_loads
 from rootsopt.response.terms import Forces, needs_forces, terms_of
 from rootsopt.scene.reading import GRAVITY
@@ -97,8 +97,8 @@ def test_bearings_balance_all_forces(twisted):
     for out, pushes, _, motion in found:
         pressed = np.asarray(slice_forces(motion.phi))
         torque = float(loads.gear(motion.relative, motion.rate))
-        teeth = complex(formulas.gear_force(jnp.asarray(-torque), loads.radius, loads.tooth_angle))
-        teeth = np.array([[-teeth.real, -teeth.imag], [teeth.real, teeth.imag]])
+        teeth = np.asarray(tooth_force(jnp.asarray(-torque), loads.radius, loads.tooth_angle))
+        teeth = np.array([-teeth, teeth])
         force = np.asarray(pushes.force).sum(1)
         flank = np.stack([-force, force], axis=1)
         weight = np.array([0, -float(loads.weight)])
@@ -161,7 +161,7 @@ def test_static_loads():
     gas = bearings.loads.gas
     forces = np.asarray(jax.jit(jax.vmap(gas.slice_forces))(phi))[:, 0] @ [1, 1j]
     torque = np.asarray(jax.jit(jax.vmap(bearings.pair.load.torque2))(phi))
-    teeth = np.asarray(formulas.gear_force(*map(jnp.asarray, (torque, 0.033, np.radians(20.0)))))
+    teeth = tooth_force(*map(jnp.asarray, (torque, 0.033, np.radians(20.0)))) @ np.array([1, 1j])
     # Half of the gas, and the gear 50 mm beyond a bearing of two that are 100 mm apart.
     each = [forces.T[0] / 2 - 1.5 * teeth, forces.T[0] / 2 + 0.5 * teeth]
     each += [forces.T[1] / 2 + 1.5 * teeth, forces.T[1] / 2 - 0.5 * teeth]

@@ -14,8 +14,7 @@ def test_series_has_drive_and_coast_where_they_belong(monkeypatch):
     tau, states = np.arange(count) / count, np.zeros((count, 2))
     one = np.arange(1.0, count + 1)
     contact = FlankForce(
-        drive=one, coast=10 * one, depth=2 * one, closing=3 * one, lever1=4 * one, lever2=5 * one,
-        torque1=6 * one, torque2=7 * one,
+        drive=one, coast=10 * one, depth=2 * one, lever2=5 * one, torque1=6 * one, torque2=7 * one,
     )  # fmt: skip
     physical = 0.2 * one, 0.3 * one
     monkeypatch.setattr(

@@ -21,8 +21,7 @@ from rootsopt.config import parse
 from rootsopt.config.study import BASELINE
 from rootsopt.config.units import words
 from rootsopt.errors import InputError
-from rootsopt.optimize.certificate import certify
-from rootsopt.optimize.local import Group
+from rootsopt.optimize.local import Group, certify
 from rootsopt.optimize.problem import check_senses
 from rootsopt.profiles import geometry
 from rootsopt.response import terms

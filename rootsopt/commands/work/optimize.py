@@ -20,8 +20,8 @@ from rootsopt.design.resemblance import likenesses
 from rootsopt.figures import chosen
 from rootsopt.measured import conjugacy
 from rootsopt.optimize import noise
+from rootsopt.optimize.design import search_of
 from rootsopt.optimize.outcome import Optimization
-from rootsopt.optimize.robust import search_of
 from rootsopt.output import files
 from rootsopt.output.runs import RunFolder
 from rootsopt.pump.sheet import check_clearances, record_of

@@ -22,7 +22,6 @@ from rootsopt.dynamics.collocation.events import look, rooted
 from rootsopt.dynamics.collocation.known import KnownOrbit
 from rootsopt.dynamics.collocation.mesh import ordered
 from rootsopt.dynamics.collocation.newton import (
-    OrbitForces,
     advanced,
     columns_of,
     evaluated,
@@ -40,7 +39,7 @@ from rootsopt.dynamics.collocation.system import (
 )
 from rootsopt.dynamics.linear import solved
 from rootsopt.dynamics.measures import Measures
-from rootsopt.dynamics.orbit import choose
+from rootsopt.dynamics.orbit import Orbit, choose
 from rootsopt.dynamics.pair import RotorPair
 
 # Maximum number of Newton steps.
@@ -98,12 +97,12 @@ class Line(NamedTuple):
 class Followed(NamedTuple):
     """An orbit on a curve.
 
-    `found`: its forces, without derivatives; `line`: the curve there; `known`: the orbit, from
+    `orbit`: its forces, without derivatives; `line`: the curve there; `known`: its motion, from
     which the next one can be computed. It is `sound` if Newton's method has converged on a mesh
     that ends at the orbit's events.
     """
 
-    found: OrbitForces
+    orbit: Orbit
     line: Line
     known: KnownOrbit
 
@@ -159,8 +158,9 @@ class _Follower(Closer):
         size = jnp.maximum(size, jnp.abs(after.line.share - now.line.share))
         new = super().judged(now, after, size, found)
         lost = now.trusted & new.looks & ~new.solved
-        begun = self.start()._replace(looks=lost, trusted=~lost, closed=new.closed)
-        return choose(lost, begun._replace(failures=new.failures), new)
+        begun = self.start()._replace(looks=lost, trusted=~lost, orbit=new.orbit, known=new.known)
+        begun = begun._replace(turns=new.turns, steps=new.steps, failures=new.failures)
+        return choose(lost, begun, new)
 
     def step(self, now: Loop) -> tuple[CollocatedEquation, Points, Array, Step, Line]:
         """Solve the linearised equation together with that of the plane, as `Closer.step`."""
@@ -241,9 +241,4 @@ def followed(
         equation, frozen, nothing, known, numbers(frozen), tolerance,
         family=family, measures=measures, plane=plane, rising=rising,
     ).run()  # fmt: skip
-    closed = loop.closed
-    yes = jnp.ones((), bool)
-    errors = closed.roughness, closed.error, closed.drift
-    return Followed(
-        closed.found, loop.line, KnownOrbit(closed.found.elements, *errors, closed.sound, yes)
-    )
+    return Followed(loop.orbit, loop.line, loop.known)

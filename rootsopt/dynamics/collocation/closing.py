@@ -44,7 +44,6 @@ from rootsopt.dynamics.collocation.mesh import (
     snug,
 )
 from rootsopt.dynamics.collocation.newton import (
-    OrbitForces,
     advanced,
     between,
     columns_of,
@@ -52,12 +51,11 @@ from rootsopt.dynamics.collocation.newton import (
     forces_of,
     has_stalled,
     lines,
-    no_forces,
     with_numbers,
 )
 from rootsopt.dynamics.collocation.peak import Rivals, forces_along, is_settled, peak_of, rivals_of
-from rootsopt.dynamics.collocation.system import Step, chained, condensed
-from rootsopt.dynamics.orbit import branch, choose
+from rootsopt.dynamics.collocation.system import Step, chained, condensed, unchanged
+from rootsopt.dynamics.orbit import Orbit, branch, choose
 from rootsopt.dynamics.pair import RotorPair
 
 # The first mesh that is aligned with events has this many elements for each of the mesh before, at
@@ -117,30 +115,15 @@ _WEAK = 1e-3
 _LEAST = 1e-6
 
 
-class Closed(NamedTuple):
-    """A closed orbit.
-
-    `found`: its forces and derivatives; `roughness`: that of its elements (`mesh.roughness`), for
-    which the errors hold; `error`: estimated relative error of the forces, the largest of mean, RMS
-    and peak; `drift`: estimated error of their derivatives, relative to the largest derivative of
-    the same force; `sound`: whether Newton's method has converged and the flags agree with the
-    events of the mesh; `turns`: number of evaluations of the flags; `steps`: number of Newton
-    steps before the last, which yields the forces. `error` and `drift` are inf if not known.
-    """
-
-    found: OrbitForces
-    roughness: Float[Array, ""]
-    error: Float[Array, ""]
-    drift: Float[Array, ""]
-    sound: Bool[Array, ""]
-    turns: Int[Array, ""]
-    steps: Int[Array, ""]
-
-
 class Loop(NamedTuple):
     """State of the loop.
 
-    `closed`: result so far; `elements`: motion for the next iteration; `rivals`: instants at which
+    The result so far: `orbit`: forces and derivatives; `known`: motion and errors, `sound` if
+    Newton's method has converged and the flags agree with the events of the mesh; `turns`: number
+    of evaluations of the flags; `steps`: number of Newton steps before the last, which yields the
+    forces.
+
+    For the next iteration: `elements`: motion for the next iteration; `rivals`: instants at which
     its force may be greatest; `looks`: whether the next iteration evaluates the flags along the
     motion. Otherwise it makes a step of Newton's method. `keeps`: whether the motion is a solution
     with the right events, so that the step is the last one, which yields forces and derivatives;
@@ -153,7 +136,10 @@ class Loop(NamedTuple):
     determines (see `bordered`).
     """
 
-    closed: Closed
+    orbit: Orbit
+    known: KnownOrbit
+    turns: Int[Array, ""]
+    steps: Int[Array, ""]
     elements: Elements
     rivals: Rivals
     looks: Bool[Array, ""]
@@ -187,10 +173,17 @@ def gained(coarse: Int[Array, ""], fine: Int[Array, ""]) -> tuple[Array, Array]:
 
 
 class Closer(eqx.Module):
-    """The loop of `close`: `start` returns its initial state, `turn` makes one iteration.
+    """Closes the orbit near a `known` one, and computes its forces and their derivatives.
 
-    `frozen`: the pair of `equation`, treated as constant by JAX. The other fields are arguments of
-    `close`."""
+    `equation`: that of the orbit; `frozen`: its pair, treated as constant by JAX; `tangents`: d
+    directions of the pair's parameters along which to differentiate, stacked along a leading axis;
+    `neighbour` (m,): `numbers` of the pair whose orbit is the known one; `tolerance`: relative
+    error of the forces to reach.
+
+    If the mesh of the known orbit is aligned with events, the new one is solved on it, and its
+    error follows from the known one. Otherwise, and if the events are others or the error is too
+    large, the mesh is changed until flags and events agree and the error is small enough. `start`
+    returns the initial state of the loop, `turn` makes one iteration."""
 
     equation: CollocatedEquation
     frozen: RotorPair
@@ -203,10 +196,15 @@ class Closer(eqx.Module):
         """Return the initial state of the loop."""
         known, elements = self.known, self.known.elements
         infinite, zero, no = jnp.asarray(jnp.inf), jnp.zeros((), int), jnp.zeros((), bool)
-        forces = no_forces(self.equation, elements, self.directions)
-        nothing = Closed(forces, jnp.ones(()), infinite, infinite, no, zero, zero)
+        equation, count = self.equation, self.directions
+        still = unchanged(elements, count) if equation.variation else None
+        orbit = Orbit.empty(elements.state[0], count, equation.measures.count + 1, still)
+        unknown = KnownOrbit(elements, jnp.ones(()), infinite, infinite, no, ~no)
         return Loop(
-            closed=nothing,
+            orbit=orbit,
+            known=unknown,
+            turns=zero,
+            steps=zero,
             elements=elements,
             rivals=Rivals.anywhere(elements),
             looks=~known.aligned,
@@ -305,10 +303,9 @@ class Closer(eqx.Module):
         come from the search, since those of Newton's method lag behind."""
         keeps = agree & now.solved & (apart(now.elements, seen) <= _FAR)
         motion = choose(agree, rooted(self.frozen, now.elements, seen), now.elements)
-        closed = now.closed._replace(turns=now.closed.turns + 1)
         fresh = jnp.full_like(now.size, jnp.inf), jnp.zeros_like(now.tries)
         return now._replace(
-            closed=closed,
+            turns=now.turns + 1,
             elements=motion,
             rivals=now.rivals.rooted(now.elements, motion),
             looks=~agree,
@@ -321,7 +318,7 @@ class Closer(eqx.Module):
         """Return the final state of the loop."""
 
         def go_on(now: Loop) -> Bool[Array, ""]:
-            return ~now.over & (now.closed.turns < _TURNS)
+            return ~now.over & (now.turns < _TURNS)
 
         return lax.while_loop(go_on, lambda now: self.turn(now), self.start())
 
@@ -364,7 +361,7 @@ class Closer(eqx.Module):
 
         def kept() -> Loop:
             found = forces_of(equation, at, peak, (points, direct), step, moved)
-            return self.keep(now._replace(line=line), found)
+            return self.keep(now._replace(line=line), found, moved)
 
         def goes_on() -> Loop:
             rivals = rivals_of(at, points, *along, now.rivals)
@@ -372,8 +369,7 @@ class Closer(eqx.Module):
             after = now._replace(elements=moved, rivals=rivals, line=line)
             return self.judged(now, after, size, found)
 
-        new = branch(now.keeps, kept, goes_on)
-        return new._replace(closed=new.closed._replace(steps=now.closed.steps + ~now.keeps))
+        return branch(now.keeps, kept, goes_on)._replace(steps=now.steps + ~now.keeps)
 
     def judged(self, now: Loop, after: Loop, size: Float[Array, ""], found: Any) -> Loop:
         """Return the loop's state `after` a step of the given size.
@@ -411,12 +407,12 @@ class Closer(eqx.Module):
         known_errors = known.error * growth, known.drift * growth
         return choose(known.aligned, known_errors, (force * rough, slope * rough))
 
-    def keep(self, now: Loop, found: OrbitForces) -> Loop:
-        """Return the loop's state with the forces `found`, their derivatives and errors."""
-        size = roughness(found.elements)
+    def keep(self, now: Loop, found: Orbit, motion: Elements) -> Loop:
+        """Return the loop's state with the orbit `found`, its corrected `motion` and errors."""
+        size = roughness(motion)
         first = now.meshes == 0
-        apart, turned = _differences(now.closed.found, found, self.equation.top)
-        force, slope = gained(now.closed.found.elements.mesh.used, now.elements.mesh.used)
+        apart, turned = _differences(now.orbit, found, self.equation.top)
+        force, slope = gained(now.known.elements.mesh.used, now.elements.mesh.used)
         compared = apart / force, turned / slope + _ROUGH
         error, drift = choose(first, self.uncompared(size), compared)
         steep, least, most = _TURNING
@@ -426,26 +422,21 @@ class Closer(eqx.Module):
         # Newton's method has converged, so the correction must be small. It is NaN where the time
         # derivative of a margin vanishes at its event. Derivatives are those before the correction:
         # if it is not yet negligible, they are computed once more.
-        correction = found.correction
+        correction = found.residual
         good = correction < corrected(self.tolerance)
         falls = correction < _STALLED * now.size
         failures = now.failures + ~good
         again = jnp.isfinite(correction) & falls & (correction > _NEGLIGIBLE * self.ease)
         again &= failures <= _FAILURES
         least = jnp.where(first & self.known.aligned, self.known.roughness, 0.0)
-        size = jnp.maximum(size, least)
-        kept = now.closed
-        closed = kept._replace(
-            found=choose(good, found, kept.found),
-            roughness=jnp.where(good, size, kept.roughness),
-            error=jnp.where(good, error, kept.error),
-            drift=jnp.where(good, drift, kept.drift),
-            sound=kept.sound | good,
-        )
+        yes = jnp.ones((), bool)
+        known = KnownOrbit(motion, jnp.maximum(size, least), error, drift, yes, yes)
+        orbit, known = choose(good & ~again, (found, known), (now.orbit, now.known))
         reached = ((error <= self.tolerance) & certain) | full
         return now._replace(
-            closed=choose(again, now.closed, closed),
-            elements=found.elements,
+            orbit=orbit,
+            known=known,
+            elements=motion,
             solved=good & ~again,
             size=correction,
             failures=failures,
@@ -454,26 +445,7 @@ class Closer(eqx.Module):
         )
 
 
-def close(
-    equation: CollocatedEquation,
-    tangents: Any,
-    known: KnownOrbit,
-    neighbour: Float[Array, " m"],
-    tolerance: Float[Array, ""],
-) -> Closed:
-    """Close the orbit near a `known` one, and compute its forces and their derivatives.
-
-    `tangents`: d directions of the pair's parameters along which to differentiate, stacked along a
-    leading axis; `neighbour` (m,): `numbers` of the pair whose orbit is the known one;
-    `tolerance`: relative error of the forces to reach. If the mesh of the known orbit is aligned
-    with events, the new one is solved on it, and its error follows from the known one. Otherwise,
-    and if the events are others or the error is too large, the mesh is changed until flags and
-    events agree and the error is small enough."""
-    frozen = lax.stop_gradient(equation.pair)
-    return Closer(equation, frozen, tangents, known, neighbour, tolerance).run().closed
-
-
-def _differences(before: OrbitForces, after: OrbitForces, scale: Float[Array, ""]):
+def _differences(before: Orbit, after: Orbit, scale: Float[Array, ""]):
     """Return two relative differences between the results on two meshes.
 
     The first is the largest difference in mean, RMS and peak force and in the further measures, the

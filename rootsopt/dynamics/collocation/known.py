@@ -17,9 +17,10 @@ class KnownOrbit(NamedTuple):
     """A closed orbit from which orbits of similar pairs can be closed.
 
     `elements`: its motion; `roughness`: that of the elements (`mesh.roughness`) for which the
-    errors were estimated; `error`, `drift`: these estimates, as in `closing.Closed`; `sound`:
-    whether the orbit was closed and confirmed; `aligned`: whether the mesh ends at the orbit's
-    events. If not, errors are not known.
+    errors were estimated; `error`: estimated relative error of the forces, the largest of mean, RMS
+    and peak; `drift`: that of their derivatives, relative to the largest derivative of the same
+    force; both are inf if not known; `sound`: whether the orbit was closed and confirmed;
+    `aligned`: whether the mesh ends at the orbit's events. If not, errors are not known.
     """
 
     elements: Elements

@@ -1,22 +1,18 @@
 """An orbit closed by collocation, near a known one or near the end of a transient."""
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from rootsopt.dynamics.collocation.closing import Closed, close
+from rootsopt.dynamics.collocation.closing import Closer, Loop
 from rootsopt.dynamics.collocation.equation import CollocatedEquation
 from rootsopt.dynamics.collocation.known import KnownOrbit
-from rootsopt.dynamics.collocation.newton import OrbitForces
 from rootsopt.dynamics.flow import Pieces
-from rootsopt.dynamics.linear import spectral_radius
+from rootsopt.dynamics.integrator import Solver
 from rootsopt.dynamics.orbit import Orbit
 from rootsopt.dynamics.pair import RotorPair
-
-if TYPE_CHECKING:
-    from rootsopt.dynamics.steady import Solver
 
 ACCURACY = 10.0
 """Requested relative error of the forces, in tolerances of the orbit's integrator."""
@@ -53,7 +49,7 @@ def closed_orbit(
     pair: RotorPair,
     tangents: Any,
     start: tuple[KnownOrbit, Float[Array, " m"]],
-    settings: "Solver",
+    settings: Solver,
 ) -> Collocated:
     """Close the orbit near a known motion.
 
@@ -65,34 +61,37 @@ def closed_orbit(
     tolerance = integrator.tolerance
     top = lax.stop_gradient(pair.force_scale)
     equation = CollocatedEquation(pair, measures, top, settings.variation)
-    closed = close(equation, tangents, known, neighbour, ACCURACY * tolerance)
-    found, sound = closed.found, closed.sound & known.sound
-    verified = sound & (closed.error <= jnp.maximum(UNREFINED * ACCURACY * tolerance, _ROUNDED))
-    period = jnp.round(found.elements.mesh.period).astype(int)
+    frozen, accuracy = lax.stop_gradient(pair), ACCURACY * tolerance
+    closed = Closer(equation, frozen, tangents, known, neighbour, accuracy).run()
+    orbit, found, sound = closed.orbit, closed.known, closed.known.sound & known.sound
+    verified = sound & (found.error <= jnp.maximum(UNREFINED * ACCURACY * tolerance, _ROUNDED))
     # The transient may have mistaken several periods of the orbit for one.
-    shorter = _repeats(pair, found, period, settings.max_orbit, tolerance) * sound
+    shorter = _repeats(pair, closed, settings.max_orbit, tolerance) * sound
     verified &= shorter == 0
-    residual = jnp.where(sound, found.correction, jnp.inf)
-    orbit = _as_orbit(pair, found, residual, closed)
-    return Collocated(orbit, sound, shorter, verified, _known(closed, verified))
+    orbit = orbit._replace(
+        residual=jnp.where(sound, orbit.residual, jnp.inf),
+        newton_steps=closed.steps,
+        disagreement=found.drift,
+    )
+    if not pair.smooth:  # The force may jump where no element ends.
+        unknown = jnp.nan * orbit.sensitivity, jnp.nan * orbit.moved
+        orbit = orbit._replace(sensitivity=unknown[0], moved=unknown[1])
+    return Collocated(orbit, sound, shorter, verified, found._replace(sound=verified))
 
 
 def _repeats(
-    pair: RotorPair,
-    found: OrbitForces,
-    period: Int[Array, ""],
-    longest: int,
-    tolerance: Float[Array, ""],
+    pair: RotorPair, closed: Loop, longest: int, tolerance: Float[Array, ""]
 ) -> Int[Array, ""]:
-    """Return the least fraction of the orbit's `period` (mesh periods) after which it repeats, or
-    0.
+    """Return the least fraction of the period (mesh periods) of the orbit `closed` after which it
+    repeats, or 0.
 
     Only a fraction after which the equation of `pair` repeats counts. `longest`: longest period of
     an orbit (mesh periods); `tolerance`: that of the orbit's integrator."""
-    shorter = pair.orders(max(longest // 2, 1))
-    states = found.elements.motion(shorter.astype(found.state.dtype))
+    motion, state = closed.known.elements, closed.orbit.state
+    shorter, period = pair.orders(max(longest // 2, 1)), jnp.round(motion.mesh.period).astype(int)
+    states = motion.motion(shorter.astype(state.dtype))
     limit = jnp.maximum(_REPEATS[0] * tolerance, _REPEATS[1])
-    same = jnp.max(jnp.abs(states - found.state), axis=1) < limit
+    same = jnp.max(jnp.abs(states - state), axis=1) < limit
     same &= (shorter < period) & (period % shorter == 0)
     return jnp.where(jnp.any(same), shorter[jnp.argmax(same)], 0)
 
@@ -108,32 +107,3 @@ def apart(known: KnownOrbit, pieces: Pieces) -> Float[Array, ""]:
     miss = jnp.abs(motion.motion(times) - pieces.states[:, ::every])
     within = (times > -1e-9)[..., None]
     return jnp.max(jnp.where(within, miss, 0.0))
-
-
-def _known(closed: Closed, verified: Bool[Array, ""]) -> KnownOrbit:
-    yes = jnp.ones((), bool)
-    errors = closed.roughness, closed.error, closed.drift
-    return KnownOrbit(closed.found.elements, *errors, verified, yes)
-
-
-def _as_orbit(
-    pair: RotorPair, found: OrbitForces, residual: Float[Array, ""], closed: Closed
-) -> Orbit:
-    mesh, peak = found.elements.mesh, found.peak
-    time = mesh.ends[0][peak.element] + peak.share * mesh.lengths[peak.element]
-    # The force of a pair that is not smooth may jump where no element ends.
-    known = 1.0 if pair.smooth else jnp.nan
-    return Orbit(
-        state=found.state,
-        residual=residual,
-        monodromy=found.monodromy,
-        multiplier=spectral_radius(found.monodromy),
-        response=found.response,
-        sensitivity=known * found.sensitivity,
-        moved=known * found.moved,
-        peak_time=jnp.mod(time, mesh.period),
-        depth=found.depth,
-        newton_steps=closed.steps,
-        disagreement=closed.drift,
-        variation=found.variation,
-    )

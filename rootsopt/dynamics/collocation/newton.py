@@ -6,7 +6,7 @@ linear equations as Newton's step. The right-hand sides are the derivatives of t
 the margins. Events move with the parameters, and elements move with the events. Therefore no kink
 or jump crosses a Gauss point."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -24,8 +24,9 @@ from rootsopt.dynamics.collocation.system import (
     moved_at,
     moved_places,
     own_column,
-    unchanged,
 )
+from rootsopt.dynamics.linear import spectral_radius
+from rootsopt.dynamics.orbit import Orbit
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.runtime.kept import kept
 
@@ -153,30 +154,6 @@ def advanced(
 _COINCIDE = 1e-6
 
 
-class OrbitForces(NamedTuple):
-    """Results of a closed orbit, with derivatives along d directions of the parameters.
-
-    `elements`: the orbit after a last correction; `response` (r,): mean (N), mean square (N²), peak
-    (N) and the further measures; `sensitivity` (r, d): derivatives of `response`; `state` (n,):
-    scaled state at φ1 = 0; `moved` (n, d): derivatives of `state`; `monodromy` (n, n): monodromy
-    matrix at the start of the mesh; `depth`: greatest penetration (m) at Gauss points and element
-    ends; `peak`: the greatest force before the last correction; `correction`: greatest entry of the
-    last correction of the states (scaled); `variation`: changes of the whole motion along the
-    directions, `None` unless the equation asks for it.
-    """
-
-    elements: Elements
-    response: Float[Array, " r"]
-    sensitivity: Float[Array, "r d"]
-    state: Float[Array, " n"]
-    moved: Float[Array, "n d"]
-    monodromy: Float[Array, "n n"]
-    depth: Float[Array, ""]
-    peak: Peak
-    correction: Float[Array, ""]
-    variation: Step | None = None
-
-
 def forces_of(
     equation: CollocatedEquation,
     elements: Elements,
@@ -184,8 +161,8 @@ def forces_of(
     evaluated: tuple[Points, Float[Array, "e p r k"]],
     step: Step,
     corrected: Elements,
-) -> OrbitForces:
-    """Return the forces of the closed orbit `elements` and their derivatives.
+) -> Orbit:
+    """Return the closed orbit of the motion `elements`, with its forces and their derivatives.
 
     `peak`: result of `peak_of`; `evaluated`: equation along the orbit (`newton.evaluated`), and
     direct changes of its values in the columns of `step`; `step`: a last correction of the motion,
@@ -199,8 +176,7 @@ def forces_of(
     averages, factors = equation.measures.values(raw, unit, top)
     by_averages = changes * factors[:, None]
     by_height = unit * _by_height(equation, elements, peak, (points, direct, change), step)
-    peak = peak._replace(force=unit * peak.force)
-    values = jnp.concatenate([averages[:2], peak.force[None], averages[2:]])
+    values = jnp.concatenate([averages[:2], unit * peak.force[None], averages[2:]])
     slopes = jnp.concatenate([by_averages[:2], by_height[None], by_averages[2:]])
     variation = None
     if equation.variation:
@@ -208,35 +184,18 @@ def forces_of(
         variation = Step(*columns, monodromy=step.monodromy)
     first = origin(elements)
     used = (jnp.arange(elements.state.shape[0]) < elements.mesh.used)[:, None]
-    return OrbitForces(
-        elements=corrected,
+    return Orbit(
+        state=corrected.state[first],
+        residual=jnp.max(jnp.abs(step.state[..., 0])),
+        monodromy=step.monodromy,
+        multiplier=spectral_radius(step.monodromy),
         response=values + slopes[:, 0],
         sensitivity=slopes[:, 1:],
-        state=corrected.state[first],
         moved=step.state[first, :, 1:],
-        monodromy=step.monodromy,
         depth=jnp.max(jnp.where(used, points.depth, -jnp.inf)),
-        peak=peak,
-        correction=jnp.max(jnp.abs(step.state[..., 0])),
+        newton_steps=jnp.zeros((), int),
+        disagreement=jnp.asarray(jnp.inf),
         variation=variation,
-    )
-
-
-def no_forces(equation: CollocatedEquation, elements: Elements, directions: int) -> OrbitForces:
-    """Return zeros in place of the forces of a motion like `elements`."""
-    rows, count = equation.measures.count + 1, elements.state.shape[1]
-    zeros, zero, index = jnp.zeros, jnp.zeros(()), jnp.zeros((), int)
-    return OrbitForces(
-        elements=elements,
-        response=zeros(rows),
-        sensitivity=zeros((rows, directions)),
-        state=zeros(count),
-        moved=zeros((count, directions)),
-        monodromy=zeros((count, count)),
-        depth=zero,
-        peak=Peak(index, zero, (index, index), zero, zero),
-        correction=zero,
-        variation=unchanged(elements, directions) if equation.variation else None,
     )
 
 

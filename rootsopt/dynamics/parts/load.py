@@ -130,9 +130,6 @@ class GasLoad(Load):
         squares = over_segments(profile, addendum, vane)
         return self.pressure_length / 2 * squares
 
-    def switches(self, motion, own) -> Bool[Array, " s"]:
-        return self.margins(motion, own) > 0
-
     def margins(self, motion, own) -> Float[Array, " s"]:
         del own
         phi, half = motion.phi, self.profile.half_pitch
@@ -202,15 +199,9 @@ class TwistedLoad(Load):
     def torque2(self, phi):
         return jnp.dot(self.weights, jax.vmap(self.section.torque2)(phi + self.offsets))
 
-    def switches(self, motion, own) -> Bool[Array, " s"]:
-        return self._by_slice(self.section.switches, motion, own)
-
     def margins(self, motion, own) -> Float[Array, " s"]:
-        return self._by_slice(self.section.margins, motion, own)
-
-    def _by_slice(self, flags, motion, own):
         def of_slice(offset):
-            return flags(motion._replace(phi=motion.phi + offset), own)
+            return self.section.margins(motion._replace(phi=motion.phi + offset), own)
 
         return jax.vmap(of_slice)(self.offsets).ravel()
 
@@ -343,6 +334,18 @@ class GasResultant(eqx.Module):
         return jnp.concatenate([opened, jnp.mod(half, 2) > 0])
 
 
+def tooth_force(
+    torque: Float[Array, "*n"], radius: Float[Array, ""], pressure_angle: Float[Array, ""]
+) -> Float[Array, "*n 2"]:
+    """Return the force (N) of the timing gear's teeth on rotor 2, x and y.
+
+    `torque` (N·m): torque that the gear passes on to rotor 2, in its sense of rotation; `radius`
+    (m): pitch radius; `pressure_angle` (rad): of the teeth. The teeth press along their common
+    normal: torque / radius upwards at the pitch point, and away from rotor 1."""
+    across = torque / radius
+    return jnp.stack([jnp.abs(across) * jnp.tan(pressure_angle), across], axis=-1)
+
+
 class AxisLoads(Part):
     """Forces on the axes other than those of the flanks: gas, teeth of the timing gear, weight.
 
@@ -359,8 +362,8 @@ class AxisLoads(Part):
         """Return the force (N) of the teeth on rotor 2, x and y; on rotor 1 it is the opposite."""
         if self.gear is None:
             return jnp.zeros(2, motion.relative.dtype)
-        across = -self.gear.torque_on_1(motion, np.zeros(0)) / self.radius
-        return jnp.stack([jnp.abs(across) * jnp.tan(self.tooth_angle), across])
+        torque = self.gear.torque_on_2(motion, np.zeros(0))
+        return tooth_force(torque, self.radius, self.tooth_angle)
 
     def force_on_axes(self, motion, own) -> Float[Array, "2 2"]:
         del own

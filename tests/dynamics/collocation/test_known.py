@@ -12,7 +12,7 @@ import pytest
 
 import rootsopt
 from experiments._common.shooting import closed as shooting
-from rootsopt.dynamics.collocation.closing import Closed, Closer, Loop, gained
+from rootsopt.dynamics.collocation.closing import Closer, Loop, gained
 from rootsopt.dynamics.collocation.elements import GAUSS, POINTS, Elements, Mesh
 from rootsopt.dynamics.collocation.equation import Points
 from rootsopt.dynamics.collocation.events import (
@@ -26,9 +26,9 @@ from rootsopt.dynamics.collocation.events import (
 )
 from rootsopt.dynamics.collocation.known import KnownOrbit, padded, trimmed
 from rootsopt.dynamics.collocation.mesh import roughness, sizes
-from rootsopt.dynamics.collocation.newton import OrbitForces
 from rootsopt.dynamics.collocation.peak import Rivals, peak_of, rivals_of
 from rootsopt.dynamics.collocation.system import Step, moved_at, unchanged
+from rootsopt.dynamics.orbit import Orbit
 from rootsopt.dynamics.steady import VariedOrbit
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.scene import Scene
@@ -286,23 +286,23 @@ def test_a_mesh_is_refined_only_if_the_finer_one_says_something_new(used, meshes
 
     def forces(slope, elements):
         mesh = start.elements.mesh._replace(used=jnp.asarray(elements))
-        found: dict[str, Any] = dict.fromkeys(OrbitForces._fields, zero) | {
-            "elements": start.elements._replace(mesh=mesh),
+        found: dict[str, Any] = dict.fromkeys(Orbit._fields, zero) | {
             "response": jnp.ones(3),
             "sensitivity": jnp.full((3, 1), slope),
         }
-        return OrbitForces(**found)
+        return Orbit(**found), start.elements._replace(mesh=mesh)
 
-    closed = Closed(forces(1.0, 100), zero, zero, zero, no, zero, zero)
-    finer = forces(1.1, used)
+    orbit, coarse = forces(1.0, 100)
+    finer, motion = forces(1.1, used)
     now: dict[str, Any] = dict.fromkeys(Loop._fields, zero) | {
-        "closed": closed,
-        "elements": finer.elements,
+        "orbit": orbit,
+        "known": KnownOrbit(coarse, zero, zero, zero, no, no),
+        "elements": motion,
         "meshes": jnp.asarray(meshes),
     }
     equation: Any = SimpleNamespace(top=jnp.ones(()))
     loop = _Crowded(equation, nothing, nothing, start, nothing, jnp.asarray(1e-7))
-    assert bool(loop.keep(Loop(**now), finer).over) is ends
+    assert bool(loop.keep(Loop(**now), finer, motion).over) is ends
 
 
 @pytest.mark.long
