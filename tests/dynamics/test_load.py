@@ -105,7 +105,7 @@ def test_steps_end_where_a_spread_jump_begins_and_ends(length):
 
     def flags(phi):
         still = jnp.zeros(())
-        return pair.load.switches(Motion(phi, still, still, jnp.ones(())), None)
+        return pair.load.switches(Motion(phi, still, still, jnp.ones(())), np.zeros(0))
 
     bend = np.asarray(jax.jit(jax.vmap(jax.grad(jax.grad(pair.load.torque2))))(phi))
     changed = np.any(np.diff(np.asarray(jax.jit(jax.vmap(flags))(phi)), axis=0), axis=1)

@@ -53,7 +53,7 @@ def test_slices_are_means_over_sections(straight):
         for count in (2, 4, 8):
             found = forces(twisted(pair, twist, count), PHI[at], jnp.asarray(-depth))
             gaps = []
-            for name in ("drive", "coast", "torque1", "torque2", "lever1"):
+            for name in ("drive", "coast", "torque1", "torque2", "lever2"):
                 expected = sliced_mean(np.asarray(getattr(section, name)), offsets, 3)[at]
                 away = np.abs(np.asarray(getattr(found, name)) - expected)
                 gaps.append(np.max(away) / max(np.max(np.abs(expected)), 1e-9))
@@ -75,7 +75,7 @@ def test_no_twist_is_straight(straight):
     at = slice(None, None, 100)
     for depth, section in zip(DEPTHS, sections, strict=True):
         found = forces(twisted(pair, 0.0, 3), PHI[at], jnp.asarray(-depth))
-        for name in ("drive", "coast", "torque1", "torque2", "depth", "closing", "lever1"):
+        for name in ("drive", "coast", "torque1", "torque2", "depth", "lever2"):
             one = np.asarray(getattr(section, name))[at]
             # The rounding of a gap of flanks 33 mm away, in penetrations of some micrometres.
             np.testing.assert_allclose(getattr(found, name), one, rtol=1e-10, atol=1e-10)
