@@ -1,4 +1,4 @@
-"""Optimises the pair of `configs/cic.yaml` with tolerances, and compares designs in fresh scenes.
+"""Optimises a free form for `configs/cic.yaml` with tolerances, and compares it in fresh scenes.
 
 `rootsopt.optimize_design` finds the nominal and the robust optimum. Baseline and both optima are
 then simulated in the same fresh scenes. The standard
@@ -38,15 +38,20 @@ def deviation(scatter: Scatter) -> float:
     )
 
 
-# Overrides of the config: the values that scatter.
+# Overrides of the config: the search varies a free form, because no CIC is much better than the
+# paper's in this pump.
+FREE = "optimizer.family=free_form", "optimizer.bounds={}"
+
+# The values that scatter.
 OVER = (
     "tolerances.over={contact.clearance_mm: {normal: 0.002}, "
     "scene.timing_gear.backlash_mm: {uniform: 0.02}, "
     "scene.load.torque_N_m: {relative_normal: 0.05}}",
 )
 
-# Overrides of a reduced run.
+# Overrides of a reduced run: the three parameters of the CIC, which gains by a narrower tip land.
 QUICK = (
+    "constraints.seal_width_min_mm=4.3",
     "tolerances.over={contact.clearance_mm: {normal: 0.002}}",
     "tolerances.samples=2",
     "tolerances.check_samples=8",
@@ -111,9 +116,7 @@ def run(job: Run) -> bool:
 
     Returns whether the robust optimum is at least as good as the nominal one, over the sample of
     the search."""
-    import os
-
-    config = load(FAIR, [*(QUICK if job.quick else OVER), *os.environ.get("MORE", "").split()])
+    config = load(FAIR, QUICK if job.quick else [*FREE, *OVER])
     result = optimize_design(config)
     robustness = result.robustness
     assert robustness is not None
