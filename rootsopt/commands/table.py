@@ -112,7 +112,7 @@ def _sweep(parser: "ArgumentParser") -> None:
         default=[],
         metavar="KEY=VALUES",
         help="values of a config key: a list (0.05,0.1), a range (300:6000:39, 1:100:9:log) "
-        "or, for samples, an interval (300:6000); repeatable",
+        "or, for samples, an interval (300:6000); repeatable (default: speeds)",
     )
     group.add_argument(
         "--zip", action="store_true", help="advance all keys together instead of combining them"
@@ -138,7 +138,7 @@ def _sweep(parser: "ArgumentParser") -> None:
         help="simulate N fresh scenes of `tolerances`, instead of --over",
     )
     group.add_argument("--seed", type=int, metavar="N", help="seed of the samples (default: 0)")
-    group = parser.add_argument_group("how a sweep runs (with --over or --tolerances)")
+    group = parser.add_argument_group("how a sweep runs")
     _shared(group)
 
 

@@ -1,4 +1,4 @@
-"""Shared parts of the commands that search or sweep: `optimize`, `pareto` and `sweep --over`."""
+"""Shared parts of the commands that search or sweep: `optimize`, `pareto` and `sweep`."""
 
 import argparse
 import contextlib
