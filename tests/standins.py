@@ -79,5 +79,4 @@ def for_a_time():
         families._families.clear()
         families._families.update(before)
         for name in families._origins.keys() - before.keys():
-            del families._origins[name]
-        families._follow()
+            del families._origins[name], families.FAMILY_KEYS[name]

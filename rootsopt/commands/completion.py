@@ -2,7 +2,7 @@
 
 import argparse
 import importlib.util
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 
 from rootsopt.commands import cli
 from rootsopt.commands.table import COMMANDS
@@ -54,36 +54,31 @@ def _complete(parser: argparse.ArgumentParser, file: Mapping, folder: Mapping) -
 
     `file`, `folder`: shtab's functions for files and folders, by shell."""
     ways = {
-        "config": {"bash": _CONFIGS, "zsh": f"_alternative 'c:config:({_words(shipped())})' "
+        "config": {"bash": _CONFIGS, "zsh": f"_alternative 'c:config:({' '.join(shipped())})' "
                    "'f:file:_files'"},
         "output": folder,
         "imports": file,
-        "overrides": {"bash": _KEYS, "zsh": f"({_words(_keys())})"},
-        "over": {"bash": _KEYS, "zsh": f"({_words(_keys())})"},
+        "overrides": {"bash": _KEYS, "zsh": f"({_keys()})"},
+        "over": {"bash": _KEYS, "zsh": f"({_keys()})"},
     }  # fmt: skip
     for action in parser._actions:
         if action.dest in ways:
             action.complete = ways[action.dest]  # type: ignore[attr-defined]
 
 
-def _keys() -> list[str]:
-    return [f"{key}=" for key in tree(Config)]
-
-
-def _words(words: Iterable[str]) -> str:
-    return " ".join(words)
+def _keys() -> str:
+    return " ".join(f"{key}=" for key in tree(Config))
 
 
 def _preamble() -> dict[str, str]:
     """Return the functions of the bash script that list keys and configs."""
-    keys, configs = _words(_keys()), _words(shipped())
     return {
         "bash": f"""
 {_KEYS}() {{
-  compgen -W "{keys}" -- "$1"
+  compgen -W "{_keys()}" -- "$1"
 }}
 {_CONFIGS}() {{
-  compgen -W "{configs}" -- "$1"
+  compgen -W "{" ".join(shipped())}" -- "$1"
   compgen -f -- "$1"
 }}
 """

@@ -94,6 +94,7 @@ def _profile(parser: "ArgumentParser") -> None:
     figures.add_option(parser, "dxf,svg")
     parser.add_argument(
         "--project",
+        type=_whole(3, 64),
         metavar="N",
         help="write free_form.yaml: the profile as a free form of N coefficients",
     )
@@ -138,7 +139,7 @@ def _sweep(parser: "ArgumentParser") -> None:
         help="simulate N fresh scenes of `tolerances`, instead of --over",
     )
     group.add_argument("--seed", type=int, metavar="N", help="seed of the samples (default: 0)")
-    group = parser.add_argument_group("how a sweep runs (with --over or --tolerances)")
+    group = parser.add_argument_group("how a sweep runs")
     _shared(group)
 
 
@@ -154,17 +155,23 @@ def _identify(parser: "ArgumentParser") -> None:
         ("profile", "KEY", "fit all others at several values of this key, too; repeatable"),
     ):  # fmt: skip
         group.add_argument(f"--{name}", action="append", default=[], metavar=form, help=meaning)
-    group.add_argument("--starts", type=_starts, default=4, metavar="N",
+    group.add_argument("--starts", type=_whole(1, 1000), default=4, metavar="N",
                        help="local fits, from the best of many scenes (default: 4)")  # fmt: skip
     group.add_argument("--seed", type=int, default=0, metavar="N", help="seed of these scenes")
 
 
-def _starts(text: str) -> int:
-    import argparse
+def _whole(low: int, high: int) -> Callable[[str], int]:
+    """Return the type of an option: a whole number from `low` to `high`."""
 
-    if not text.isdecimal() or not 1 <= int(text) <= 1000:
-        raise argparse.ArgumentTypeError(f"must be a whole number from 1 to 1000, but is {text}")
-    return int(text)
+    def read(text: str) -> int:
+        import argparse
+
+        if not text.isdecimal() or not low <= int(text) <= high:
+            words = f"must be a whole number from {low} to {high}, but is {text}"
+            raise argparse.ArgumentTypeError(words)
+        return int(text)
+
+    return read
 
 
 def _shared(parser: "ArgumentParser | _ArgumentGroup") -> None:
@@ -190,7 +197,7 @@ def _shared(parser: "ArgumentParser | _ArgumentGroup") -> None:
 def _explore(parser: "ArgumentParser") -> None:
     parser.add_argument(
         "--port",
-        type=_port,
+        type=_whole(0, 65535),
         default=0,
         metavar="N",
         help="port of the page on 127.0.0.1 (default: any free one)",
@@ -198,15 +205,6 @@ def _explore(parser: "ArgumentParser") -> None:
     parser.add_argument(
         "--no-browser", action="store_true", help="print the page's address without opening it"
     )
-
-
-def _port(text: str) -> int:
-    import argparse
-
-    number = int(text)
-    if not 0 <= number <= 65535:
-        raise argparse.ArgumentTypeError(f"must be a number from 0 to 65535, but is {text}")
-    return number
 
 
 def _new(parser: "ArgumentParser") -> None:

@@ -27,6 +27,8 @@ _MOST_NODES = 5000
 # Number of nested levels (sections and lists) above which a document is rejected.
 _DEEPEST = 32
 
+_TOO_DEEP = f"there are more than {_DEEPEST} nested levels"
+
 # Length of a scalar (characters) above which a document is rejected.
 _LONGEST_VALUE = 4096
 
@@ -49,10 +51,38 @@ def read_document(text: str, source: str) -> Any:
         )
     try:
         loader = _Loader(text)
-        return _unshared(loader.get_single_data())
+        node = loader.get_single_node()
+        if node is None:
+            return None
+        _extent(node, 1, {})
+        return _unshared(loader.construct_document(node))
+    except RecursionError:
+        raise InputError(f"{source}: is not valid YAML: {_TOO_DEEP}") from None
     # Only the reader runs here, so the text causes any exception.
     except Exception as error:
         raise InputError(sentence(f"{source}: is not valid YAML{_told(error)}")) from None
+
+
+def _extent(node: Node, level: int, known: dict[int, Any]) -> tuple[int, int]:
+    """Return (number of values, number of levels) in a `node`, with aliases expanded.
+
+    `level`: that of the node, from 1; `known`: extents by the node's `id`, `None` inside a node.
+    Raises an error if a limit is exceeded."""
+    if id(node) not in known:
+        known[id(node)] = None
+        parts = [] if isinstance(node, ScalarNode) else node.value
+        pairs = (part if isinstance(node, MappingNode) else (part,) for part in parts)
+        inner = [_extent(one, level + 1, known) for pair in pairs for one in pair]
+        known[id(node)] = 1 + sum(n for n, _ in inner), 1 + max((n for _, n in inner), default=0)
+    if known[id(node)] is None:
+        raise _wrong("an alias is inside the node that it names", node.start_mark)
+    count, levels = known[id(node)]
+    if level + levels - 1 > _DEEPEST:
+        raise _wrong(_TOO_DEEP, node.start_mark)
+    if count > _MOST_NODES:
+        words = f"there are more than {_MOST_NODES} values once aliases are expanded"
+        raise _wrong(words, node.start_mark)
+    return count, levels
 
 
 def _told(error: Exception) -> str:
@@ -81,55 +111,10 @@ def _unshared(data: Any) -> Any:
 
 
 class _Loader(yaml.SafeLoader):
-    """PyYAML's SafeLoader with size limits, and with messages for users of a config.
-
-    The limits are checked while the document is read."""
+    """PyYAML's SafeLoader with messages for users of a config."""
 
     yaml_implicit_resolvers = {}  # noqa: RUF012
     yaml_constructors = {}  # noqa: RUF012
-
-    def __init__(self, text: str):
-        super().__init__(text)
-        # Pairs (nodes, height): the count so far of each open node, and the total of each complete
-        # anchored node.
-        self._open: list[tuple[int, int]] = []
-        self._anchored: dict[str, tuple[int, int]] = {}
-
-    def compose_node(self, parent, index):
-        event: Any = self.peek_event()
-        mark, anchor = event.start_mark, event.anchor
-        if isinstance(event, yaml.AliasEvent):
-            if anchor in self.anchors and anchor not in self._anchored:
-                raise _wrong(f"the alias *{named(anchor)} is inside the node it names", mark)
-            node = super().compose_node(parent, index)
-            self._count(*self._anchored[anchor], mark)
-            return node
-        if len(self._open) >= _DEEPEST:
-            raise _wrong(f"there are more than {_DEEPEST} nested levels", mark)
-        self._open.append((1, 1))
-        node = super().compose_node(parent, index)
-        extent = self._open.pop()
-        if anchor is not None:
-            self._anchored[anchor] = extent
-        self._count(*extent, mark)
-        return node
-
-    def _count(self, nodes: int, height: int, mark) -> None:
-        """Add a complete node to the counts of its parent.
-
-        `nodes`: number of nodes in it, including itself; `height`: number of nested levels; `mark`:
-        position in the text. Raises an error if a limit is exceeded."""
-        if len(self._open) + height > _DEEPEST:
-            raise _wrong(f"there are more than {_DEEPEST} nested levels", mark)
-        if not self._open:
-            return
-        before, highest = self._open[-1]
-        self._open[-1] = before + nodes, max(highest, 1 + height)
-        if before + nodes > _MOST_NODES:
-            raise _wrong(
-                f"there are more than {_MOST_NODES} values once aliases are expanded",
-                mark,
-            )
 
     def compose_scalar_node(self, anchor):
         node = super().compose_scalar_node(anchor)

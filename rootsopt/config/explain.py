@@ -48,6 +48,7 @@ _SYNONYMS = {
 }
 _SEARCHED = "contact is always found by the search, the most accurate of the former models"
 _IN_BLOCK = "write it as {heading: text} under `drawing.title_block`"
+_ONE_SEED = "set `optimizer.seed`, that of all samples"
 _BY_ACCURACY = "set `solver.accuracy` to trade accuracy for time"
 
 # Keys of former versions: (values that are still true, among them the default, which a resolved
@@ -77,7 +78,11 @@ _REMOVED: dict[str, tuple[tuple[Any, ...], str]] = {
     ),
     "optimizer.method": (("auto", "slsqp"), "it follows from `objective.motion`"),
     "optimizer.learning_rate": ((0.05,), "set `optimizer.iterations`"),
+    "tolerances.seed": ((0,), _ONE_SEED),
+    "assumptions.seed": ((0,), _ONE_SEED),
     "tolerances.normal_limit": ((4.0,), "normal distributions are cut off at 4 deviations"),
+    "drawing.title": (("Roots rotor",), _IN_BLOCK),
+    "drawing.material": ((), _IN_BLOCK),
     "drawing.number": ((), _IN_BLOCK),
     "drawing.revision": ((), _IN_BLOCK),
     "drawing.drawn_by": ((), _IN_BLOCK),

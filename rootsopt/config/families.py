@@ -267,7 +267,6 @@ class Family:
 
 _families: dict[str, Family] = {}
 _origins: dict[str, str] = {}
-_parameters: dict[str, Parameter] = {}
 FAMILY_KEYS: dict[str, tuple[str, ...]] = {}
 """Keys of the design parameters of each registered family; `register_family` updates it."""
 
@@ -290,7 +289,7 @@ def register_family(family: Family) -> Family:
     _check(family)
     _families[family.name] = family
     _origins[family.name] = sys._getframe(1).f_globals.get("__name__", "")
-    _follow()
+    FAMILY_KEYS[family.name] = family.keys
     return family
 
 
@@ -306,12 +305,13 @@ def family_of(name: str) -> Family:
 
 def parameters() -> dict[str, Parameter]:
     """Return the parameters of all registered families by key."""
-    return dict(_parameters)
+    return {one.key: one for family in _families.values() for one in family.parameters}
 
 
 def is_list(key: str) -> bool:
     """Return whether a key holds a list of design parameters rather than a single number."""
-    return key in _parameters and _parameters[key].count is not None
+    found = parameters().get(key)
+    return found is not None and found.count is not None
 
 
 def users_of(key: str) -> list[str]:
@@ -366,14 +366,6 @@ def _file(module: str) -> Path | None:
 
 def _installed(path: Path) -> bool:
     return not {"site-packages", "dist-packages"}.isdisjoint(path.parts)
-
-
-def _follow() -> None:
-    _parameters.clear()
-    FAMILY_KEYS.clear()
-    for family in _families.values():
-        _parameters.update({parameter.key: parameter for parameter in family.parameters})
-        FAMILY_KEYS[family.name] = family.keys
 
 
 def _found(hook: Hook | None) -> Callable[..., Any]:
@@ -451,7 +443,7 @@ def _check_parameter(parameter: Parameter) -> None:
             f"Arguments `lowest` and `highest` of {key} must be increasing, but are "
             f"{parameter.lowest:g} and {parameter.highest:g}"
         )
-    if _parameters.get(key, parameter) != parameter:
+    if parameters().get(key, parameter) != parameter:
         raise ValueError(
             f"Argument `key` of a parameter must have one meaning, but {key} of "
             f"{', '.join(users_of(key))} has another one; take that (`parameters()[{key!r}]`), or "

@@ -276,15 +276,13 @@ class DrawingConfig(Section):
 
     Nothing here is simulated."""
 
-    title: _Text = Field("Roots rotor", description="title of the drawing")
-    material: _Text | None = Field(None, description="material, in quotes if it is a number")
     tolerance_mm: Annotated[float, between(1e-4, 10)] | None = Field(
         None, description="width of the tolerance zone of the flank (profile of a line, ISO 1101)"
     )
     title_block: dict[_Text, _Text] = Field(
         default_factory=dict,
-        description="fields of the title block by heading, as {Drawing number: '4711', Revision: "
-        "A, Drawn by: J. Doe}",
+        description="fields of the title block by heading, as {Title: Blower rotor, Material: "
+        "EN-GJS-500-7, Drawing number: '4711'}; numbers in quotes",
     )
     inset_mm: Annotated[float, Field(ge=0, le=5)] = Field(
         0.0,

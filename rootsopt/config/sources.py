@@ -6,6 +6,7 @@ import os
 import stat
 from pathlib import Path
 
+from rootsopt.config.words import placed
 from rootsopt.errors import InputError
 
 FILES = {
@@ -14,6 +15,10 @@ FILES = {
 }
 """Keys that hold the path of a file, each with the stem of its copy in a result folder and the name
 of its content in a message."""
+
+
+MOST_BYTES = 50_000_000
+"""Size (bytes) above which a file that a config names is refused."""
 
 
 def reason(error: Exception) -> str:
@@ -44,6 +49,28 @@ def regular_file(path: str | os.PathLike, what: str) -> Path:
         if is_kind(mode):
             raise InputError(f"{str(path)!r}: is {name}; give the path of {what} (a regular file)")
     return Path(path)
+
+
+def content(path: str | os.PathLike, key: str, most: int = MOST_BYTES) -> bytes:
+    """Return the content of the file that a `key` of the config names.
+
+    `most`: size (bytes) above which it is refused. Raises `InputError` if it cannot be read."""
+    file = regular_file(path, FILES[key][1])
+    try:
+        with file.open("rb") as stream:
+            data = stream.read(most + 1)
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"`{key}` must be a file that can be read, but is {placed(path)!r}: {reason(error)}; a "
+            "path in a config is relative to the config's folder, a path given with --set to the "
+            "current folder"
+        ) from None
+    if len(data) > most:
+        raise InputError(
+            f"{placed(file.name)}: must have at most {most / 1e6:g} MB, but is larger; export what "
+            "is needed alone, with fewer points"
+        )
+    return data
 
 
 _PACKAGE = Path(__file__).parents[1]

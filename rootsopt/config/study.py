@@ -390,7 +390,7 @@ class OptimizerConfig(Section):
     screening: Annotated[int, Field(ge=0, le=4096)] = Field(
         48, description="designs screened to place the starts; 0 starts at the baseline only"
     )
-    seed: Seed = Field(0, description="seed of the screening sample")
+    seed: Seed = Field(0, description="seed of all samples: designs and scenes")
     prove: Literal["auto"] | bool = Field(
         "auto",
         description="whether the objective of all designs is bounded from below, for up to 4 "

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 from pydantic import Field, model_validator
 
-from rootsopt.config.section import Increasing, Listed, Section, Seed, bare, between, require, such
+from rootsopt.config.section import Increasing, Listed, Section, bare, between, require, such
 from rootsopt.config.words import named
 
 _RELATIVE = "relative_"
@@ -105,7 +105,6 @@ class TolerancesConfig(Section):
         description="other random scenes in which baseline, nominal and robust optimum are "
         "compared; 0: no comparison",
     )
-    seed: Annotated[int, Field(ge=0, le=2**31 - 1)] = Field(0, description="seed of all samples")
 
     @model_validator(mode="before")
     @classmethod
@@ -344,7 +343,6 @@ class AssumptionsConfig(Section):
         description="with objective.over assumptions: mean or worst objective over these scenes, "
         "or the greatest distance from the best design known in a scene",
     )
-    seed: Seed = Field(0, description="seed of these scenes")
 
     @model_validator(mode="before")
     @classmethod

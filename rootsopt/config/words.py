@@ -35,9 +35,11 @@ def shown(value: Any) -> str:
     return clipped(_repr(value), 2 * _VALUE)
 
 
-def named(part: Any) -> str:
-    """Return a config key as printable text for a message, shortened if it is long."""
-    text = clipped(part if isinstance(part, str) else shown(part), _NAME)
+def named(part: Any, longest: int = _NAME) -> str:
+    """Return a config key or another text as printable text for a message.
+
+    It is shortened if it has more than `longest` characters."""
+    text = clipped(part if isinstance(part, str) else shown(part), longest)
     return text if text.isprintable() else ascii(text)[1:-1]
 
 

@@ -204,10 +204,10 @@ def _block(config: Config) -> tuple[tuple[str, str], ...]:
     stated, profile = config.drawing or DrawingConfig.model_validate({}), config.profile
     tolerance = stated.tolerance_mm
     texts = {
-        "Title": stated.title,
+        "Title": "Roots rotor",
         "Drawing number": None,
         "Revision": None,
-        "Material": stated.material or f"density {config.rotor.density_kg_m3:g} kg/m3",
+        "Material": f"density {config.rotor.density_kg_m3:g} kg/m3",
         "Flank, profile of a line": None if tolerance is None else f"{tolerance:g} mm (ISO 1101)",
         "General tolerances": None,
         "Rotor": f"{profile.family}, {profile.lobes} lobes, length {config.rotor.length_mm:g} mm",

@@ -1,5 +1,4 @@
-"""Figures of a search: its history, the convergence of its local searches, the optima that they
-found, and what relaxing each limit gains."""
+"""Figures of a search: its history, and the designs that the limits leave."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -7,13 +6,12 @@ from typing import Any
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from rootsopt.config import DESIGN_KEYS
 from rootsopt.config.families import is_list
 from rootsopt.figures.force import number
-from rootsopt.figures.style import BLUE, COLORS, GREY, VERMILION, beside
+from rootsopt.figures.style import COLORS, GREY, VERMILION, beside
 from rootsopt.output.names import brief, label
 
 _MARKERS = "os^Dvp"
@@ -141,51 +139,8 @@ def _outside(ax, history):
         ax.plot([], [], "o", color=GREY, markerfacecolor="white", label="constraint not met")
 
 
-# Number of characters above which the name of a limit is shortened.
-_WIDEST = 40
-
 # Columns of `feasible.csv` after the two parameters.
 _FEASIBLE = "slack", "objective"
-
-# Minimum range of the axis of objectives, so that differences by rounding do not show.
-_RANGE = 0.01
-
-
-def plot_residual(ax: Axes, history: Sequence[Mapping[str, Any]], required: float) -> Axes:
-    """Draw the first-order residual at the best design of each local search so far.
-
-    `history`: rows with `start`, `iteration`, `objective`, `feasible` and `residual`; `required`:
-    residual up to which a design counts as an optimum. Trials of the screening, and trials without
-    a residual, are left out. Return `ax`."""
-    starts = sorted({int(row["start"]) for row in history if int(row["start"]) >= 0})
-    for start in starts:
-        # The last trials measure second derivatives beside the optimum: their residual is large.
-        rows = _leading([row for row in history if int(row["start"]) == start])
-        x = np.array([row["iteration"] for row in rows], dtype=float)
-        y = np.array([row["residual"] for row in rows], dtype=float)
-        known = np.isfinite(y)
-        color = COLORS[start % len(COLORS)]
-        ax.semilogy(
-            x[known], np.maximum(y[known], 1e-16), "o-", color=color, label=f"start {start}"
-        )
-    ax.axhline(required, color=GREY, linestyle=":", label="required")
-    ax.set_xlabel("iteration")
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
-    ax.set_ylabel("first-order residual (of the unit box)")
-    ax.legend(frameon=False)
-    return ax
-
-
-def _leading(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """Return the rows of a search that were the best until then: feasible, then by objective."""
-    found: list[Mapping[str, Any]] = []
-    for row in rows:
-        if not np.isfinite(row["objective"]):
-            continue
-        rank = not row["feasible"], row["objective"]
-        if not found or rank <= (not found[-1]["feasible"], found[-1]["objective"]):
-            found.append(row)
-    return found
 
 
 def plot_feasible(
@@ -224,60 +179,4 @@ def plot_feasible(
         ax.plot(row["design"][one], row["design"][two], "s", mfc="none", color="black", label=name)
     rest = [f"{label(key)} = {brief(x)}" for key, x in design.items() if key not in (one, two)]
     ax.set(xlabel=label(one), ylabel=label(two), title=", ".join(rest))
-    return ax
-
-
-def plot_prices(ax: Axes, constraints: Sequence[Mapping[str, Any]], converged: bool = True) -> Axes:
-    """Draw bars of the gain in the objective (%) from relaxing each limit by one step.
-
-    `constraints`: rows of the result file; those without a multiplier are left out. `converged`:
-    whether the design is an optimum; otherwise, the axis says that the gains are rough. Return
-    `ax`."""
-    rows = [row for row in constraints if abs(row.get("multiplier") or 0.0) > 0]
-    rows.sort(key=lambda row: row["relaxed_objective_percent"], reverse=True)
-    names = []
-    for row in rows:
-        name, step = row["name"], f"{row['relaxed_by']:+g} {row['unit']}".strip()
-        short = name if len(name) <= _WIDEST else f"{name[:_WIDEST]}…"
-        names.append(f"{short}, {step}")
-    gains = [-row["relaxed_objective_percent"] for row in rows]
-    # Names may repeat, so that bars are placed by number.
-    bars = ax.barh(range(len(rows)), gains, color=BLUE)
-    ax.bar_label(bars, [f"{gain:.2g} %" for gain in gains], padding=3)
-    ax.set_yticks(range(len(rows)), names)
-    ax.margins(x=0.2)
-    if not rows:
-        ax.text(0.5, 0.5, "no limit holds the optimum", ha="center", transform=ax.transAxes)
-        ax.set_yticks([])
-    rough = "" if converged else ", rough: no optimum"
-    ax.set_xlabel(f"decrease of the objective (%){rough}")
-    return ax
-
-
-def plot_starts(
-    ax: Axes, starts: Sequence[Mapping[str, Any]], optima: Sequence[Mapping[str, Any]]
-) -> Axes:
-    """Draw the objective at the end of each local search, and the distinct optima as lines.
-
-    `starts`, `optima`: entries of the result file. Searches without a certificate are drawn hollow.
-    Return `ax`."""
-    for place, one in enumerate(optima):
-        label = f"optimum {place + 1}: {one['objective']:.5f}, found {one['found']}×"
-        color = COLORS[place % len(COLORS)]
-        ax.axhline(one["objective"], color=color, linewidth=1.2, label=label)
-    for one in starts:
-        if one["objective"] is not None:
-            face = "black" if one["reason"] == "converged" else "none"
-            ax.plot(one["start"], one["objective"], "o", mfc=face, mec="black")
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
-    ax.margins(y=0.15)
-    ax.set_xlim(-0.5, max((one["start"] for one in starts), default=0) + 0.5)
-    ax.set(xlabel="local search", ylabel="objective at its end (baseline = 1)")
-    # Searches that agree must look alike, whatever their rounding.
-    low, high = ax.get_ylim()
-    spare = max(0.0, _RANGE - (high - low)) / 2
-    ax.set_ylim(low - spare, high + spare)
-    ax.ticklabel_format(axis="y", useOffset=False)
-    if optima:
-        ax.legend(frameon=False, fontsize=8)
     return ax

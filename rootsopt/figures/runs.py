@@ -9,13 +9,7 @@ import numpy as np
 from rootsopt.config import FAMILY_KEYS, Config
 from rootsopt.config.families import is_list
 from rootsopt.figures.force import plot_force, plot_gap, plot_spectrum
-from rootsopt.figures.history import (
-    plot_feasible,
-    plot_history,
-    plot_prices,
-    plot_residual,
-    plot_starts,
-)
+from rootsopt.figures.history import plot_feasible, plot_history
 from rootsopt.figures.profiles import (
     plot_conjugacy,
     plot_departure,
@@ -80,23 +74,6 @@ def optimization_figures(
     if history:
         keys = FAMILY_KEYS[config.profile.family]
         write(folder, "history", _history(history, keys), "Optimisation history")
-
-
-def certificate_figure(
-    folder: ResultFolder,
-    history: Sequence[Mapping[str, Any]],
-    constraints: Sequence[Mapping[str, Any]],
-    optimality: Mapping[str, Any],
-) -> None:
-    """Write optimum.png, the figures of `rootsopt.figures.history`.
-
-    `history`: as in `plot_residual`; `constraints`: as in `plot_prices`; `optimality`: entry of the
-    result file."""
-    made, axes = figure(14, 4.4, 1, 3, gridspec_kw={"width_ratios": [1, 1, 0.8]})
-    plot_residual(axes[0, 0], history, optimality["required_residual"])
-    plot_prices(axes[0, 1], constraints, optimality["converged"])
-    plot_starts(axes[0, 2], optimality["starts"], optimality["optima"])
-    write(folder, "optimum", made, "Certificate of the optimum")
 
 
 def feasible_figure(

@@ -20,7 +20,6 @@ from rootsopt.config.sources import reason, regular_file
 from rootsopt.config.words import named, near, shown
 from rootsopt.errors import InputError
 from rootsopt.identification.channels import CHANNELS
-from rootsopt.measured.guard import short
 from rootsopt.measured.table import measured_number, titled
 from rootsopt.response.terms import GEAR, RESERVES, is_force
 
@@ -211,7 +210,7 @@ def _check(config: Config, name: str, title: str, sampled: bool) -> None:
     told = CHANNELS if sampled else ("mean_force_N", "peak_force_N", "rms_force_N", *_AVERAGES)
     meant = near(title, [*tree(Config)] if "." in title else [*told])
     raise InputError(
-        f"{name}: the column {short(title)!r} must be {'a sample' if sampled else 'an average'} "
+        f"{name}: the column {named(title)!r} must be {'a sample' if sampled else 'an average'} "
         f"({', '.join(told)}), a config key, or one of these with {_SPREAD} for its standard "
         f"deviations; {f'did you mean {meant}?' if meant else 'rename or remove it'}"
     )

@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from rootsopt.config.words import named
 from rootsopt.errors import InputError
 from rootsopt.measured.entities import chain, strokes
 from rootsopt.measured.estimates import UNITS
-from rootsopt.measured.guard import guarded, short, silenced
+from rootsopt.measured.guard import guarded, silenced
 from rootsopt.measured.loop import Loop
 
 with silenced():  # Importing ezdxf writes to its log.
@@ -94,14 +95,14 @@ def from_dxf(data: bytes, name: str, unit: str | None = None) -> list[Loop]:
             reason = next((text for text in reasons if kind in text), "damaged")
             raise InputError(
                 f"{name}: {counted[kind] - kept[kind]} of {counted[kind]} {kind} are not valid "
-                f"({short(reason, 100)}); repair or remove them in the drawing"
+                f"({named(reason, 100)}); repair or remove them in the drawing"
             )
     scale = _UNITS.get(code) if isinstance(code, int) else None
     scale = scale if unit is None else UNITS[unit]
     if scale is None:
         raise InputError(
             f"{name}: $INSUNITS must be the code of a length unit (4: mm, 1: inch, 0: none), but "
-            f"is {short(code)}; set the drawing's units, or `profile.outline_unit`"
+            f"is {named(code)}; set the drawing's units, or `profile.outline_unit`"
         )
     with silenced():
         parts = [strokes(entity, scale, name) for entity in _chosen(document, name)]
@@ -150,7 +151,7 @@ def _check_tags(data: bytes, binary: bool, name: str) -> Counter[str]:
                 where = f"tag {number}" if binary else f"line {2 * number}"
                 raise InputError(
                     f"{name}, {where}: a number of {kind} must be finite and at most "
-                    f"{_LARGEST:g}, but is {short(_raw(value).decode('latin-1'))!r}; repair or "
+                    f"{_LARGEST:g}, but is {named(_raw(value).decode('latin-1'))!r}; repair or "
                     "remove the entity, or export the drawing again"
                 )
     count = sum(counted[kind] for kind in (*_KINDS, *_PARTS))
@@ -214,7 +215,7 @@ def _exploded(inserts: list[Any], name: str) -> list[Any]:
     def skipped(entity, reason):
         if entity.dxftype() in _KINDS:
             raise InputError(
-                f"{name}: {entity.dxftype()} in a block cannot be placed: {short(reason)}; "
+                f"{name}: {entity.dxftype()} in a block cannot be placed: {named(reason)}; "
                 "explode the blocks in the drawing"
             )
 

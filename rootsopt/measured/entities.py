@@ -16,8 +16,9 @@ from ezdxf.math import ConstructionEllipse, open_uniform_knot_vector
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
+from rootsopt.config.words import named
 from rootsopt.errors import InputError
-from rootsopt.measured.guard import guarded, short
+from rootsopt.measured.guard import guarded
 from rootsopt.measured.loop import Loop
 
 # Minimum number of sampling intervals on an arc or spline.
@@ -110,7 +111,7 @@ def strokes(entity: Any, scale: float, name: str) -> list[Stroke]:
     the entity cannot be read or is not valid."""
     kind = entity.dxftype()
     with guarded(name, f"{kind} cannot be read", "repair or remove it in the drawing"):
-        handle = short(entity.dxf.handle or "unknown", 20)
+        handle = named(entity.dxf.handle or "unknown", 20)
 
         def fault(must: str, but: str) -> InputError:
             return InputError(

@@ -12,21 +12,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from rootsopt.config.words import named
 from rootsopt.errors import InputError
 
 _LOGGER = "ezdxf"
 
 # Number of characters above which a library's own message is shortened.
 _REASON = 120
-
-
-def short(value: object, width: int = 60) -> str:
-    """Return `value` as printable text for a message, shortened to about `width` characters."""
-    whole = str(value)
-    text = whole[:width]
-    if not text.isprintable():
-        text = text.encode("unicode_escape").decode("ascii")[: 2 * width]
-    return f"{text}... ({len(whole)} characters)" if len(whole) > width else text
 
 
 @contextlib.contextmanager
@@ -58,7 +50,7 @@ def guarded(name: str, fault: str, remedy: str) -> Iterator[None]:
     except InputError:
         raise
     except Exception as error:
-        reason = short(" ".join(str(error).split()), _REASON)
+        reason = named(" ".join(str(error).split()), _REASON)
         if not reason or isinstance(error, KeyError):
             reason = f"{type(error).__name__} {reason}".strip()
         raise InputError(f"{name}: {fault}: {reason}; {remedy}") from error

@@ -3,8 +3,6 @@
 import contextlib
 import dataclasses
 import math
-import os
-import stat
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -12,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
+from rootsopt.config.sources import content
+from rootsopt.config.words import named
 from rootsopt.errors import InputError
 from rootsopt.measured.estimates import SEEN, SIZED, unit_of_size, written
-from rootsopt.measured.guard import short
 from rootsopt.measured.loop import JOIN, Loop, joined, moment, place, signed_area, tails
 from rootsopt.measured.table import from_csv
 
@@ -45,9 +44,6 @@ _RAYS, _UNLIKE = 720, 0.25
 # is the longest step between successive points.
 _WIDEST = 5.0
 
-# Size (bytes) above which a file is rejected.
-_BYTES = 50_000_000
-
 # Number of points above which an outline is rejected. Reading and fitting take about 20 µs per
 # point.
 _POINTS = 500_000
@@ -59,11 +55,6 @@ _SIZES = 0.1, 1e5
 # Distance (fraction of the outline's greatest coordinate) below which successive points are
 # merged into one.
 _SAME = 1e-9
-_NOT_FILES = (
-    (stat.S_ISDIR, "a folder"),
-    (stat.S_ISFIFO, "a pipe"),
-    (stat.S_ISSOCK, "a socket"),
-)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,7 +100,7 @@ def read(
 
     Raises `InputError` if the file cannot be read or contains no closed outline.
     """
-    name, kind = short(path.name), path.suffix.lower()
+    name, kind = named(path.name), path.suffix.lower()
     if kind not in (".csv", ".txt", ".dxf"):
         raise InputError(
             f"`profile.outline_file` must be a .csv, .txt or .dxf file, but is {name!r}; save "
@@ -266,34 +257,8 @@ def _above(length: float) -> float:
 def _bytes(path: Path, name: str) -> bytes:
     """Return the content of the file at `path`. `name`: name of the file in messages.
 
-    Raises `InputError` if `path` is not a regular file, or the file is unreadable, too large or
-    empty."""
-    try:
-        mode = path.stat().st_mode
-        if not stat.S_ISREG(mode):
-            kind = next((what for test, what in _NOT_FILES if test(mode)), "a device")
-            raise InputError(
-                f"`profile.outline_file` must be a file, but {name!r} is {kind}; give the path of "
-                "a .csv, .txt or .dxf file"
-            )
-        # Do not wait for a pipe that has replaced the file in the meantime.
-        flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
-        with open(os.open(path, flags), "rb") as file:
-            data = file.read(_BYTES + 1) or b""
-    except (OSError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        reason = getattr(error, "strerror", None) or str(error)
-        raise InputError(
-            "`profile.outline_file` must be a file that can be read, but is "
-            f"{short(str(path), 120)!r}: {short(reason.lower())}; a path in a config is relative "
-            "to the config's folder, a path given with --set to the current folder"
-        ) from None
-    if len(data) > _BYTES:
-        raise InputError(
-            f"{name}: must have at most {_BYTES / 1e6:g} MB, but is larger; export the outline "
-            "alone, with fewer points"
-        )
+    Raises `InputError` if it is not a regular file, unreadable, too large or empty."""
+    data = content(path, "profile.outline_file")
     if not data.strip():
         raise InputError(f"{name}: must hold an outline, but is empty; export it again")
     return data

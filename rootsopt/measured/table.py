@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.config.sources import FILES, reason, regular_file
+from rootsopt.config.sources import content
 from rootsopt.config.units import DEG, UM
+from rootsopt.config.words import named
 from rootsopt.errors import InputError
 from rootsopt.measured.estimates import UNITS
-from rootsopt.measured.guard import guarded, short
+from rootsopt.measured.guard import guarded
 from rootsopt.measured.loop import Loop
 
 # Number of characters in a line above which a table is rejected.
@@ -166,7 +167,7 @@ def _check_commas(rows: list[tuple[int, list[str]]], name: str) -> None:
     if 2 < len(row) <= 4 and all(re.fullmatch(r"\s*[+-]?\d+\s*", cell) for cell in row):
         raise InputError(
             f"{name}, line {number}: must separate columns by another character than decimals, "
-            f"but {short(','.join(row))!r} has commas only; save the table with semicolons, or "
+            f"but {named(','.join(row))!r} has commas only; save the table with semicolons, or "
             "with decimal points"
         )
 
@@ -185,7 +186,7 @@ def _columns(headers: list[list[str]], name: str) -> tuple[tuple[int, int], str 
         (first, one), (second, two) = (one for one in found if one)
         polar = axes[0] == "r"
         if one not in (None, *_LENGTHS) or two not in ((None, *_ANGLES) if polar else (one,)):
-            stated = short(f"{header[first]}, {header[second]}")
+            stated = named(f"{header[first]}, {header[second]}")
             raise InputError(
                 f"{name}: the header must state no unit of length or one of {', '.join(_LENGTHS)}"
                 f"{' and of angle deg or rad' if polar else ''}, but is {stated!r}; correct it, or "
@@ -225,7 +226,7 @@ def _values(row: list[str], places: tuple[int, int], what: str, where: str) -> l
     found = [value for cell in cells if (value := _number(cell)) is not None]
     if len(found) < 2 or not all(map(math.isfinite, found)):
         raise InputError(
-            f"{where}: must hold {what}, but is {short(', '.join(row))!r}; correct or remove the "
+            f"{where}: must hold {what}, but is {named(', '.join(row))!r}; correct or remove the "
             "line"
         )
     return found
@@ -312,13 +313,7 @@ def transmission_error(path: Path) -> tuple[NDArray[np.float64], NDArray[np.floa
     coefficients (m/rad^k) of the polynomials that continue each knot, highest power first.
 
     Raises `InputError` if the file cannot be read, or the table is not that of one turn."""
-    try:
-        data = regular_file(path, FILES[KEY][1]).read_bytes()
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"`{KEY}` must be a file that can be read, but is {str(path)!r}: {reason(error)}; a "
-            "path in a config is relative to the config's folder"
-        ) from None
+    data = content(path, KEY)
     turned, error = named_columns(data, path.name, _COLUMNS).T
     whole = len(turned) > 1 and abs(turned[-1] - turned[0] - 360) < _SAME[0]
     apart = float(abs(error[-1] - error[0])) if whole else 0.0

@@ -106,7 +106,7 @@ def ending(
 
 def _usable(command: str, status: str, result: Record, rows: Sequence[Record]) -> bool:
     """Return whether a run needs no explanation of its status: its facts say how sure they are."""
-    several = {"sweep": rows or result.get("speeds"), "attractors": result.get("attractors")}
+    several = {"sweep": rows, "attractors": result.get("attractors")}
     found = [row.get("status") for row in several.get(command) or ()]
     explained = command == "optimize" and result.get("optimized")
     return bool(explained) or not {status, *found}.isdisjoint(_SAID)
@@ -132,7 +132,7 @@ def _steps(
         number, count = (len(result["points"]) + 1) // 2, len(result["points"])
         file, where = design_file(number), f" (here {number} of {count})"
     if command == "sweep":
-        key, (row, *_) = facts.ranked(result, rows)
+        key, (row, *_) = facts.ranked(rows)
         worst = "lowest" if key.endswith("_um") else "highest"
         where = f" in the scene with the {worst} {name_and_unit(key)[0]}"
         sets = "".join(f" --set {shlex.quote(text)}" for text in _settings(row))
@@ -152,10 +152,10 @@ def _steps(
 def _settings(row: Record) -> Iterator[str]:
     """Yield `key=value` for each key that a sweep sets in a row: those before its forces."""
     for key in itertools.takewhile(lambda one: not one.endswith("_force_N"), row):
-        if key == "speed_rpm" or "." in key:
+        if "." in key:
             x = row[key]
             shown = f"{x:.12g}" if isinstance(x, int | float) and x is not True else str(x)
-            yield f"{'scene.' if key == 'speed_rpm' else ''}{key}={shown}"
+            yield f"{key}={shown}"
 
 
 def _steepest(record: Record) -> str:

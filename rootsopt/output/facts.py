@@ -293,13 +293,13 @@ def traced(result: Record, rows: Sequence[Record]) -> Facts:
     return [*facts, ("How sure", str(result["message"]))] if certified else facts
 
 
-def ranked(result: Record, rows: Sequence[Record]) -> tuple[str, list[Record]]:
+def ranked(rows: Sequence[Record]) -> tuple[str, list[Record]]:
     """Return the quantity that ranks the rows of a sweep, and the rows that have it, worst first.
 
     It is the peak force, or where no flanks touch, the contact reserve."""
 
     def known(key: str, falling: bool) -> list[Record]:
-        given = [(row, row.get(key)) for row in rows or result.get("speeds") or ()]
+        given = [(row, row.get(key)) for row in rows]
         found = [row for row, x in given if x is not None and math.isfinite(x)]
         return sorted(found, key=lambda row: row[key], reverse=falling)
 
@@ -312,20 +312,20 @@ def ranked(result: Record, rows: Sequence[Record]) -> tuple[str, list[Record]]:
 def swept(result: Record, rows: Sequence[Record]) -> Facts:
     """Return facts on a sweep: where the force or the reserve is least and greatest, how many are
     steady."""
-    given, (key, known) = rows or result.get("speeds") or (), ranked(result, rows)
-    axes, ends = varied(given) if given else [], []
+    key, known = ranked(rows)
+    axes, ends = varied(rows) if rows else [], []
     for word, pick in (("lowest", min), ("highest", max)) if known and axes else ():
         row = pick(known, key=lambda one: one[key])
         where = [stated(axis, row.get(axis), named=True) for axis in axes]
         ends.append(f"{word}, {stated(key, row[key])}, at {listed(where)}")
-    statuses = [str(row.get("status")) for row in given]
+    statuses = [str(row.get("status")) for row in rows]
     steady = sum(one in STEADY for one in statuses)
     others = [f"{statuses.count(one)} {in_words(one)}" for one in {*statuses} - {*STEADY}]
     rest = f" The others: {listed(sorted(others))}." if others else ""
-    sure = f"{steady} of {len(given)} scenes have a steady state.{rest}"
+    sure = f"{steady} of {len(rows)} scenes have a steady state.{rest}"
     name = name_and_unit(key)[0].capitalize()
     found = [(name, f"It is {'; '.join(ends)}.")] if ends else []
-    return [*found, ("How sure", sure)] if given else []
+    return [*found, ("How sure", sure)] if rows else []
 
 
 def coexisting(result: Record, rows: Sequence[Record]) -> Facts:

@@ -165,16 +165,11 @@ def write_config(folder: ResultFolder, config: "Config") -> None:
 
     The written config names the copies, so that the folder can be moved. Raises `InputError` if
     a file cannot be read or written."""
-    for key, (stem, what) in sources.FILES.items():
+    for key, (stem, _) in sources.FILES.items():
         if config.value(key) is None:
             continue
-        source = sources.regular_file(config.value(key), what)
-        copy = f"{stem}{source.suffix.lower()}"
-        try:
-            data = source.read_bytes()
-        except OSError as error:
-            raise InputError(f"{str(source)!r}: cannot be read: {sources.reason(error)}") from None
-        folder.write_bytes(copy, data)
+        copy = f"{stem}{Path(config.value(key)).suffix.lower()}"
+        folder.write_bytes(copy, sources.content(config.value(key), key))
         config = config.moved({key: copy})
     folder.write_text("config.yaml", config.to_yaml())
 

@@ -40,7 +40,6 @@ _CAPTIONS = {
     "gap.png": "Gap of the flanks over time",
     "comparison.png": "Forces together, and departure of the flanks",
     "history.png": "Objective and design over the search",
-    "optimum.png": "Certificate: residual, prices of the limits, starts",
     "speeds.png": "Contact force over speed",
     "basins.png": "Initial states and the motion that each leads to",
     "front.png": "Best compromises",

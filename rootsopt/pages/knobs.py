@@ -42,17 +42,6 @@ _AROUND = 0.2, 2.0
 _ZERO = {"mm": 0.2, "mrad": 1.0, "°": 60.0, "K": 60.0}
 _ELSE = 1.0
 
-# Keys whose slider reaches as far below 0 as above.
-_SIGNED = (
-    "rotor.helix_deg",
-    "contact.wear.offset_mm",
-    "scene.center_distance_error_mm",
-    "scene.phase_error_mrad",
-    "scene.heat.rotor_warming_K",
-    "scene.heat.housing_warming_K",
-    "scene.bearings.port_deg",
-)
-
 # Least number of steps of a slider that is not whole.
 _STEPS = 200
 
@@ -140,7 +129,7 @@ def _count(value: object) -> int:
 def _scene(field: FieldInfo, key: str, value: float) -> Knob:
     """Return the knob of any other number of the config."""
     (least, most), whole = limits_of(field).ends, is_whole(field)
-    low, high = _span(key, float(value))
+    low, high = _span(key, float(value), least < 0)
     if whole:
         low, high = least, most
     low, high = max(low, least), min(high, most)
@@ -152,10 +141,12 @@ def _scene(field: FieldInfo, key: str, value: float) -> Knob:
     ).with_value(float(value))  # fmt: skip
 
 
-def _span(key: str, value: float) -> tuple[float, float]:
-    """Return the span of a slider around a `value`, before the key's limits are applied."""
-    reach = max(2 * abs(value), _ZERO.get(unit_of(key), _ELSE) * (key in _SIGNED or not value))
-    if key in _SIGNED:
+def _span(key: str, value: float, signed: bool) -> tuple[float, float]:
+    """Return the span of a slider around a `value`, before the key's limits are applied.
+
+    `signed`: whether the key may be negative; its slider then reaches as far below 0 as above."""
+    reach = max(2 * abs(value), _ZERO.get(unit_of(key), _ELSE) * (signed or not value))
+    if signed:
         return -reach, reach
     if not value:
         return 0.0, reach

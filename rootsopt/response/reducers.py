@@ -187,14 +187,6 @@ def counted(
     return [(1.0, worst, base)]
 
 
-def swept_speeds(config: Config) -> list[float]:
-    """Return the speeds (rpm) of a sweep without keys, ascending.
-
-    They are those of the objective, or from 0.1 to 2 times that of the scene."""
-    own = config.scene.speed_rpm
-    return sorted(config.objective.speeds_rpm) or np.linspace(0.1 * own, 2 * own, 39).tolist()
-
-
 def parts_at(
     shares: Iterable[tuple[float, float]], found: Iterable[Evaluation]
 ) -> tuple[Part, ...]:

@@ -59,8 +59,9 @@ def draw(config: Config, count: int, fresh: bool = False) -> Float[np.ndarray, "
 
     With `tolerances.conditions`, the samples are these conditions. `fresh`: whether the sample is
     pseudo-random and independent of the search's, instead of the fixed Sobol sample of the search.
-    Both follow from `tolerances.seed` alone."""
+    Both follow from `optimizer.seed` alone."""
     scatters, tolerances = config.scatters, config.tolerances
+    seed = config.optimizer.seed
     assert tolerances is not None
     if tolerances.conditions:
         rows = [
@@ -69,9 +70,9 @@ def draw(config: Config, count: int, fresh: bool = False) -> Float[np.ndarray, "
         ]
         return np.array(rows, float).reshape(len(rows), len(scatters))
     if fresh:
-        levels = np.random.default_rng([tolerances.seed, _FRESH]).random((count, len(scatters)))
+        levels = np.random.default_rng([seed, _FRESH]).random((count, len(scatters)))
     else:
-        levels = sobol(count, tolerances.seed, len(scatters))
+        levels = sobol(count, seed, len(scatters))
     columns = [quantiles(one, levels[:, k]) for k, one in enumerate(scatters)]
     return np.stack(columns, axis=1)
 
@@ -103,7 +104,7 @@ def assumed(config: Config) -> dict[str, dict[str, float]]:
         return {}
     ends = {scene_of(one.key, end): {one.key: end} for one in spans for end in one.ends}
     keys, low, high = zip(*spans, strict=True)
-    levels = sobol(config.assumptions.scenes, config.assumptions.seed, len(spans))
+    levels = sobol(config.assumptions.scenes, config.optimizer.seed, len(spans))
     rows = np.array(low) + levels * (np.array(high) - np.array(low))
     drawn = {
         f"{RANDOM} {number}": dict(zip(keys, row.tolist(), strict=True))

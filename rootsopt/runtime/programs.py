@@ -84,6 +84,12 @@ generator for fused operations.
 """
 _PACKAGE = Path(__file__).parents[1]
 
+# Parts of this package on which any program may depend, beside the one that defines it.
+_INNER = (
+    *("config", "contact", "design", "dynamics", "profiles", "pump", "response", "runtime"),
+    *("scene", "errors.py", "status.py"),
+)
+
 # Texts for people: docstrings and comments. Groups: other texts, which stay.
 _WORDS = re.compile(
     rb"""^[ \t]*[rR]?\"{3}(?:\\.|(?!\"{3})[^\\])*\"{3}[ \t]*$"""
@@ -92,10 +98,6 @@ _WORDS = re.compile(
     re.DOTALL | re.MULTILINE,
 )
 
-# Names of modules of this package: in imports, with what is imported, and elsewhere.
-_MENTIONED = re.compile(
-    rb"from (rootsopt(?:\.\w+)*) import (\([^)]*\)|[^\n]*)|(rootsopt(?:\.\w+)+)"
-)
 _store: Store | None = None
 
 # Whether the cache's folder has been chosen, or the cache turned off. If not, the first program
@@ -411,49 +413,38 @@ def _modules(kind: _Kind) -> set[str]:
 def _sources(modules: set[str]) -> list[str] | None:
     """Return digests of the source files on which a program depends.
 
-    These are the files of `modules` and of this one, and all files of this package that they
-    import, directly or not. Modules of Python, and of packages with a known version, are left out.
-    Return `None` if a file is missing."""
-    waiting = [__name__, *modules]
-    found: dict[str, str] = {}
-    while waiting:
-        name = waiting.pop()
-        top = name.partition(".")[0]
-        if name in found or top in _PACKAGES or top in sys.stdlib_module_names:
-            continue
-        file = _file(name) or Path(getattr(sys.modules.get(name), "__file__", None) or "")
-        try:
-            now = file.stat()
-            found[name], imported = _source(file, now.st_mtime_ns, now.st_size)
-        except OSError:
-            return None
-        waiting += filter(_file, imported)
-    return [f"{name} {found[name]}" for name in sorted(found)]
+    These are the parts of this package in `_INNER` and those of `modules`, and the files of other
+    `modules`. Modules of Python, and of packages with a known version, are left out. Return `None`
+    if a file is missing."""
+    own, places = __name__.partition(".")[0], {_PACKAGE / part for part in _INNER}
+    for name in modules:
+        top, *parts = name.split(".")
+        if top == own:
+            place = _PACKAGE.joinpath(*parts[:1])
+            places.add(place if place.is_dir() else place.with_suffix(".py"))
+        elif top not in _PACKAGES and top not in sys.stdlib_module_names:
+            file = getattr(sys.modules.get(name), "__file__", None)
+            if file is None:
+                return None
+            places.add(Path(file))
+    try:
+        states = {place: place.stat() for place in sorted(places)}
+        return [f"{x.name} {_digest(x, at.st_mtime_ns, at.st_size)}" for x, at in states.items()]
+    except OSError:
+        return None
 
 
 @functools.lru_cache(maxsize=4096)
-def _source(file: Path, *state: int) -> tuple[str, list[str]]:
-    """Return a digest of a source file without comments and docstrings, and what it imports.
+def _digest(place: Path, *state: int) -> str:
+    """Return a digest of a source file, or of all in a folder, without comments and docstrings.
 
-    `state`: numbers that differ after a change of the file. What it imports are names of this
-    package, of modules or in them, also those in texts, such as the maker of a family."""
-    text = _WORDS.sub(lambda match: match[1] or match[2] or b"", file.read_bytes())
-    text = re.sub(rb"\n(?:[ \t]*\n)+", b"\n", text).strip()
-    names = set()
-    for room, members, alone in _MENTIONED.findall(text):
-        names |= {room, alone, *(room + b"." + one for one in re.findall(rb"\w+", members))}
-    return hashlib.sha256(text).hexdigest(), sorted(name.decode() for name in names if name)
-
-
-@functools.cache
-def _file(name: str) -> Path | None:
-    """Return the source file of a module of this package, or `None` if `name` is not one."""
-    top, *parts = name.split(".")
-    if top != __name__.partition(".")[0]:
-        return None
-    place = _PACKAGE.joinpath(*parts)
-    files = place.with_suffix(".py"), place / "__init__.py"
-    return next((file for file in files if file.is_file()), None)
+    `state`: numbers that differ after a change of the file."""
+    found = hashlib.sha256()
+    for file in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
+        text = _WORDS.sub(lambda match: match[1] or match[2] or b"", file.read_bytes())
+        found.update(file.name.encode() + b"\0")
+        found.update(re.sub(rb"\n(?:[ \t]*\n)+", b"\n", text).strip())
+    return found.hexdigest()
 
 
 @functools.cache

@@ -144,7 +144,7 @@ def scattered(config: Config, count: int) -> tuple[Config, Plan]:
         raise InputError(f"`--tolerances` must be from 1 to {MOST}, but is {count}")
     values = draw(config, count, fresh=True)
     columns = {one.key: tuple(values[:, k].tolist()) for k, one in enumerate(config.scatters)}
-    plan = Plan((Dimension("sample", columns),), "tolerances", config.tolerances.seed)
+    plan = Plan((Dimension("sample", columns),), "tolerances", config.optimizer.seed)
     return config.model_copy(update={"tolerances": None}), plan
 
 

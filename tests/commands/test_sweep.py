@@ -1,4 +1,4 @@
-"""`rootsopt sweep --over`: files, exit codes, and going on after a kill."""
+"""`rootsopt sweep`: files, exit codes, and going on after a kill."""
 
 import csv
 import json
@@ -66,12 +66,22 @@ def test_dataset_is_read_back(tmp_path, monkeypatch):
         assert found.mean_force_N.attrs["units"] == "N"
 
 
+def test_speeds_without_keys(tmp_path, monkeypatch):
+    """The speeds are those of the objective, or from 0.1 to 2 times that of the scene."""
+    monkeypatch.setattr(points, "check_geometry", broken)
+    for given, wanted in (("[3000,2000]", [2000, 3000]), ("[]", np.linspace(300, 6000, 39))):
+        folder = tmp_path / str(len(wanted))
+        options = [f"--set=objective.speeds_rpm={given}", "--no-figures", "-o", str(folder)]
+        assert sweep.main(["cic", *options]) == 3
+        with xarray.open_dataset(folder / "sweep.nc", engine="h5netcdf") as found:
+            np.testing.assert_allclose(found["scene.speed_rpm"], wanted, rtol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--zip"], "add `--over"),
-        (["--workers=2"], "add `--over"),
-        (["--resume"], "add `--over"),
+        (["--resume"], "there is no"),
+        (["--sobol=4", "--zip"], "does not go with samples"),
         (["--over=scene.sped_rpm=1,2"], "did you mean `scene.speed_rpm`"),
         ([SPEEDS, "--over=scene.speed_rpm=3"], "given twice"),
         ([SPEEDS, "--seed=1"], "--sample N"),

@@ -62,9 +62,9 @@ def merges(levels):
         ("x" * MOST_BYTES + "x", f"at most {MOST_BYTES} bytes"),
         ("é" * (MOST_BYTES // 2 + 1), f"at most {MOST_BYTES} bytes"),
         ("a: '" + "x" * 100_000 + "'", "at most 4096"),
-        ("profile: &a [*a]", "*a is inside"),
-        ("profile: &a {lobes: {x: *a}}", "*a is inside"),
-        ("profile: &a {<<: *a}", "*a is inside"),
+        ("profile: &a [*a]", "an alias is inside"),
+        ("profile: &a {lobes: {x: *a}}", "an alias is inside"),
+        ("profile: &a {<<: *a}", "an alias is inside"),
         ("a: *" + "x" * 5000, "undefined alias"),
     ],
 )

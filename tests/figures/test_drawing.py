@@ -103,10 +103,9 @@ def test_ends_of_pieces_are_among_the_coordinates():
 
 
 STATED = {
-    "drawing.title": "Blower rotor",
-    "drawing.material": "EN-GJS-500-7",
     "drawing.tolerance_mm": "0.02",
-    "drawing.title_block": "{General: ISO 2768-mK, Number: '4711', By: '%%c</script>^J'}",
+    "drawing.title_block": "{Title: Blower rotor, Material: EN-GJS-500-7, General: ISO 2768-mK, "
+    "Number: '4711', By: '%%c</script>^J'}",
 }
 
 
@@ -134,11 +133,12 @@ def test_title_block_states_the_config(tmp_path):
 @pytest.mark.parametrize(
     ("override", "words"),
     [
-        ("drawing.material=1.4301", "quotes"),
-        ("drawing.title=" + 61 * "x", "at most 60 characters"),
-        ("drawing.title=''", "one line"),
+        ("drawing.title_block={Material: 1.4301}", "quotes"),
+        ("drawing.title_block={Title: " + 61 * "x" + "}", "at most 60 characters"),
+        ("drawing.title_block={Title: ''}", "one line"),
         ("drawing.tolerance_mm=-1", "drawing.tolerance_mm"),
         ("drawing.revision=A", "title_block"),
+        ("drawing.material=steel", "title_block"),
         ("drawing.colour=red", "drawing"),
     ],
 )

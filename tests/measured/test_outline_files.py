@@ -85,7 +85,7 @@ def test_undamaged_files_are_read(tmp_path):
         "header alone": ("x_mm,y_mm\n", "has 0"),
         "long field": ("1," + "9" * 10_000_000, "line 1: must have at most 100000 characters"),
         "quoted field": ('1,"' + "9" * 90_000, "line 1: must hold x and y|larger than field limit"),
-        "long text field": ("x,y\n" + "a" * 90_000 + ",1\n", r"line 2: .*a\.\.\. \(90"),
+        "long text field": ("x,y\n" + "a" * 90_000 + ",1\n", r"line 2: .*a \.\.\. a"),
         "columns": ("x,y\n" + "1," * 5000, r"has 1; add the rest"),
         "zero byte": ("1,2\n3,\0\n", "line 2: must be text, but has a zero byte"),
         "latin 1": (b"x,y\n1,\xe9\n", "must be UTF-8 text, but is not at byte 6"),
@@ -133,7 +133,7 @@ def test_what_is_no_file_is_refused_at_once(tmp_path):
     signal.alarm(30)
     try:
         for name, what in (("pipe", "a pipe"), ("folder", "a folder"), ("device", "a device")):
-            with pytest.raises(InputError, match=f"must be a file, but '{name}.csv' is {what}"):
+            with pytest.raises(InputError, match=f"{name}.csv': is {what}; give .* an outline"):
                 read(tmp_path / f"{name}.csv")
     finally:
         signal.alarm(0)

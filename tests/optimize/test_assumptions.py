@@ -198,7 +198,7 @@ def test_scenes_are_named_and_seeded():
     found, other = assumed(config), assumed(load("cic_drawn", ["assumptions.scenes=4"]))
     assert found == other
     assert len(found) == 1 + 2 * len(config.spans) + 4
-    assert found != assumed(config.replaced({"assumptions.seed": 1}))
+    assert found != assumed(config.replaced({"optimizer.seed": 1}))
     for span in config.spans:
         drawn = [found[f"random {k}"][span.key] for k in range(1, 5)]
         # A Sobol sample has one point in each quarter.

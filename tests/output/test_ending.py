@@ -208,9 +208,8 @@ def front():
 
 
 def sweep():
-    speeds = [{"speed_rpm": 1e3 * k, "peak_force_N": 50.0 + 10 * (k == 2) if k < 3 else None,
+    return [{"scene.speed_rpm": 1e3 * k, "peak_force_N": 50.0 + 10 * (k == 2) if k < 3 else None,
                "status": "chaotic" if k == 3 else "periodic"} for k in (1, 2, 3)]  # fmt: skip
-    return run_of("sweep", speeds=speeds, status="chaotic")
 
 
 def motions():
@@ -231,7 +230,7 @@ def test_short_endings():
         "Costs": "The peak force at point 2: +25 N for +0.01 of area efficiency.",
         "How sure": "Certified.",
     }
-    assert facts_of(sweep()) == {
+    assert facts_of(run_of("sweep", status="chaotic"), rows=sweep()) == {
         "Peak force": "It is lowest, 50 N, at speed 1000 rpm; highest, 60 N, at speed 2000 rpm.",
         "How sure": "2 of 3 scenes have a steady state. The others: 1 chaotic.",
     }
@@ -252,8 +251,8 @@ def test_every_command_parses():
     """Paths and values are quoted for a shell, files of `--import` come along."""
     row = {"point": 0, "scene.load.torque_N_m": 4.8, "profile.family": "it's"}
     rows = [row | {"peak_force_N": 9.0, "status": "periodic"}]
-    given = [optimum(), run_of("simulate", **record()), front(), sweep(), motions(), geometry()]
-    runs = [(one, ()) for one in given] + [(run_of("sweep"), rows)]
+    given = [optimum(), run_of("simulate", **record()), front(), motions(), geometry()]
+    runs = [(one, ()) for one in given] + [(run_of("sweep"), rows), (run_of("sweep"), sweep())]
     runs.append((run_of("pareto", status="interrupted"), ()))
     count, place = 0, "-my runs/{a}'é"
     for result, table in runs:
@@ -270,7 +269,7 @@ def test_every_command_parses():
     assert shlex.split(first)[3:] == [
         "--set", "scene.load.torque_N_m=4.8", "--set", "profile.family=it's"
     ]  # fmt: skip
-    assert "--set scene.speed_rpm=2000" in steps_of(sweep())[0]
+    assert "--set scene.speed_rpm=2000" in steps_of(run_of("sweep"), rows=sweep())[0]
     assert steps_of(motions())[0].endswith("config.yaml --set objective.motion=worst")
 
 

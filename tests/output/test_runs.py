@@ -226,7 +226,7 @@ def test_what_a_command_leaves_when_it_fails(tmp_path, capsys, monkeypatch):
     unchanged."""
     monkeypatch.chdir(ROOT)
     target = tmp_path / "new" / "run"
-    assert _profile(target, "--project", "two") == 2
+    assert _profile(target, "--export", "paper") == 2
     assert os.listdir(tmp_path) == []
     assert _profile(target, "--export", "none") == 0
     before = digest(target)

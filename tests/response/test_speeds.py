@@ -1,6 +1,5 @@
 """One design at several speeds: evaluator, objective, optimiser, sweep."""
 
-import csv
 import json
 
 import numpy as np
@@ -225,44 +224,11 @@ def test_speeds_of_a_config():
     assert reducers.shares(reducers.alone(config)) == {3000: 1}
     assert reducers.shares(config_of("objective.speeds_rpm=[3000]")) == {3000: 1}
     assert parse(config.to_yaml()) == config
-    assert reducers.swept_speeds(config) == [2000, 4000]
-    default = reducers.swept_speeds(config_of())
-    assert (default[0], default[-1], len(default)) == (300, 6000, 39)
 
 
 def run(command, folder, *overrides, options=()):
     arguments = [f"--set={key}" for key in overrides]
     return main([command, CIC, "-o", str(folder), *arguments, *options])
-
-
-def test_sweep_command(tmp_path, capsys, singles):
-    """CSV and result file hold the values of single simulations.
-
-    Pictures and exit codes are checked too."""
-    assert run("sweep", tmp_path, TIGHT, SPEEDS) == 0
-    assert "4000.0" in capsys.readouterr().out
-    with open(tmp_path / "sweep.csv", newline="") as file:
-        rows = list(csv.DictReader(file))
-    result = json.loads((tmp_path / "result.json").read_text())
-    assert result["status"] == "periodic"
-    for row, record, (speed, (single, _)) in zip(
-        rows, result["speeds"], singles.items(), strict=True
-    ):
-        assert float(row["speed_rpm"]) == record["speed_rpm"] == speed
-        assert (row["kind"], row["period"], row["status"]) == ("periodic", "1", "periodic")
-        for key, value in single.response.items():
-            assert float(row[key]) == pytest.approx(value, rel=1e-9)
-            assert record[key] == pytest.approx(value, rel=1e-12)
-    assert (tmp_path / "figures" / "speeds.png").read_bytes()[:4] == b"\x89PNG"
-    lost = "scene.timing_gear.stiffness_N_m_per_rad=1", "scene.load.torque_N_m=40"
-    lost = *lost, SPEEDS
-    assert run("sweep", tmp_path / "lost", *lost, options=["--no-figures"]) == 3
-    record = json.loads((tmp_path / "lost" / "result.json").read_text())
-    assert record["status"] == "passed_through"
-    assert record["message"].startswith("At 2000 rpm: ")
-    with open(tmp_path / "lost" / "sweep.csv", newline="") as file:
-        assert {row["mean_force_N"] for row in csv.DictReader(file)} == {""}
-    assert run("sweep", tmp_path / "bad", "sweep.speed_rpm=3") == 2
 
 
 def test_optimize_over_speeds(tmp_path, capsys):

@@ -136,7 +136,7 @@ def test_samples_have_the_statistics_of_their_distributions():
         np.testing.assert_allclose(sample.std(axis=0), sigmas, rtol=max(share, 0.02))
         np.testing.assert_array_equal(sample, draw(config, count, fresh))
         assert np.all(np.abs(np.corrcoef(sample.T) - np.eye(4)) < 0.05)
-    other = config_of(*SPREAD, "tolerances.seed=1")
+    other = config_of(*SPREAD, "optimizer.seed=1")
     for fresh in (False, True):
         assert not np.any(draw(other, 8, fresh) == draw(config, 8, fresh))
     assert not np.any(draw(config, 8, True) == draw(config, 8))

@@ -237,11 +237,10 @@ def _draw(folder, config: Config, result, data: dict) -> None:
         pair, rows = (result.baseline, result.optimized), result.history
         given = None if result.beginning is None else config
         runs.optimization_figures(folder, *pair, rows, _searching(config, result), given)
-        if result.optimality is not None:
-            runs.certificate_figure(folder, rows, data["constraints"], data["optimality"])
-            if (vertex := result.optimality.vertex) is not None and vertex.keys:
-                design = data["optimized"]["design"]
-                runs.feasible_figure(folder, vertex.columns(), design, data["optimality"]["vertex"])
+        vertex = None if result.optimality is None else result.optimality.vertex
+        if vertex is not None and vertex.keys:
+            design = data["optimized"]["design"]
+            runs.feasible_figure(folder, vertex.columns(), design, data["optimality"]["vertex"])
     else:
         runs.simulation_figures(folder, result.baseline, config)
     if config.objective.speeds_rpm:

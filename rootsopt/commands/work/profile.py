@@ -6,7 +6,6 @@ from typing import Any
 from rootsopt.commands import cli
 from rootsopt.config import Config
 from rootsopt.design.resemblance import free_likeness, likenesses
-from rootsopt.errors import InputError
 from rootsopt.figures import chosen
 from rootsopt.figures.writing import write
 from rootsopt.measured import conjugacy
@@ -27,7 +26,6 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     formats = chosen(options.export)
     cli.load_figures(options, "runs")
     check_geometry(config, simulated=False)
-    coefficients = _coefficients(options.project)
     scene, design = Scene.from_config(config), design_vector(config)
     shape = geometry(scene.profile(design))
     record = {
@@ -56,8 +54,8 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
         record["resembles"] = alike
     folder.write_json("result.json", record | {"versions": files.versions()})
     lines = conjugacy.notes(config)
-    if coefficients is not None:
-        lines.append(_projected(folder, config, coefficients))
+    if options.project is not None:
+        lines.append(_projected(folder, config, options.project))
     return cli.Outcome(cli.OK, lines)
 
 
@@ -68,20 +66,6 @@ def resembles(profile: Profile) -> list[dict[str, Any]]:
     named = likenesses(profile)
     free = free_likeness(profile, *named[:2])
     return [one.record() for one in (*named, *([] if free is None else [free]))]
-
-
-def _coefficients(given: str | None) -> int | None:
-    """Return the value of `--project` as a number, or `None` if the option is absent.
-
-    Raises `InputError` unless the value is a whole number from 3 to 64."""
-    if given is None:
-        return None
-    if not (given.isdecimal() and 3 <= int(given) <= 64):
-        raise InputError(
-            f"`--project` must be a number of coefficients from 3 to 64, but is {given}; "
-            "12 come within some micrometres of most profiles"
-        )
-    return int(given)
 
 
 def _projected(folder: RunFolder, config: Config, count: int) -> str:

@@ -1,4 +1,4 @@
-"""Shared parts of the commands that search or sweep: `optimize`, `pareto` and `sweep --over`."""
+"""Shared parts of the commands that search or sweep: `optimize`, `pareto` and `sweep`."""
 
 import argparse
 import contextlib
@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Protocol, TypeVar
 
 import jax
@@ -184,8 +183,8 @@ _COMPILE_EVENTS = (
 )
 
 
-class CompileClock:
-    """Context manager that measures the time spent on tracing, lowering and compiling.
+class CompileClock(contextlib.AbstractContextManager):
+    """Measures the time spent on tracing, lowering and compiling, to the end of a `with` block.
 
     JAX reports the duration of each of these steps. Steps overlap, because programs compile in
     parallel and traces are nested. The clock therefore counts the time during which at least one
@@ -193,7 +192,8 @@ class CompileClock:
 
     def __init__(self) -> None:
         self._spans: list[tuple[float, float]] = []
-        self._running = False
+        self._running = True
+        jax.monitoring.register_event_duration_secs_listener(self._listen)
 
     @property
     def seconds(self) -> float:
@@ -204,17 +204,7 @@ class CompileClock:
             reached = max(reached, end)
         return total
 
-    def __enter__(self) -> "CompileClock":
-        self._running = True
-        jax.monitoring.register_event_duration_secs_listener(self._listen)
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._running = False
 
     def _listen(self, event: str, duration_secs: float, **_: object) -> None:

@@ -1,4 +1,4 @@
-"""The work of `rootsopt sweep`: at speeds, or with `--over` and `--tolerances` over any keys."""
+"""The work of `rootsopt sweep`."""
 
 import argparse
 import time
@@ -6,6 +6,7 @@ from contextlib import closing
 from functools import partial
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 
 from rootsopt.commands import cli, door
@@ -15,10 +16,7 @@ from rootsopt.config.plausible import notes_on_swept
 from rootsopt.errors import InputError
 from rootsopt.output import files, sweeps
 from rootsopt.output.runs import RunFolder
-from rootsopt.response.evaluation import Evaluator
-from rootsopt.response.reducers import alone, overall, swept_speeds
 from rootsopt.runtime.environment import say
-from rootsopt.scene import check_geometry, design_keys, design_vector
 from rootsopt.status import Status
 from rootsopt.sweeps.axes import parse_over
 from rootsopt.sweeps.cluster import running
@@ -34,44 +32,7 @@ _PROMISE = "keeping the points that are done and writing the files"
 
 
 def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.Outcome:
-    """Run `rootsopt sweep`: simulate the design at all speeds, and write files into `folder`.
-
-    With `--over` or `--tolerances`, sweep any keys instead. Return the `Outcome`. Raises
-    `InputError` if the config is invalid."""
-    if options.over or options.tolerances is not None:
-        return _over_keys(config, options, folder)
-    refuse_options(options)
-    check_geometry(config)
-    cli.load_figures(options, "sweep")
-    swept = swept_speeds(config)
-    with progress_bar(Console(stderr=True), _FIRST, "simulating", "speeds") as progress:
-        evaluator = Evaluator.of_objective(alone(config)).without_gradient()
-        count = partial(progress or _silent, expected=len(swept))
-        parts = evaluator.swept(swept, progress=count)
-    rows = [part.row(whole=True) for part in parts]
-    status, message = overall(parts)
-    files.write_config(folder, config)
-    folder.write_csv("sweep.csv", files.row_columns(rows))
-    data = {
-        "design": dict(zip(design_keys(config), map(float, design_vector(config)), strict=True)),
-        "geometry": parts[0].evaluation.geometry,
-        "speeds": rows,
-        "status": status.label,
-        "message": message,
-        "versions": files.versions(),
-    }
-    folder.write_json("result.json", data)
-    if not options.no_figures:
-        from rootsopt.figures.sweep import speed_figure
-
-        name = config.profile.family.upper()
-        speed_figure(folder, {name: parts}, f"Contact force of the {name} pair over speed")
-    usable = any(part.evaluation.usable for part in parts)
-    return cli.Outcome(cli.OK if usable else cli.NO_RESULT, most=len(rows))
-
-
-def _over_keys(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.Outcome:
-    """Run a sweep over any keys: simulate all points, and write files into `folder`.
+    """Run `rootsopt sweep`: simulate all points, and write files into `folder`.
 
     Return the `Outcome`. Raises `InputError` if a key, a value or an option is not valid."""
     began = time.perf_counter()
@@ -127,16 +88,20 @@ def _points(config: Config, options: argparse.Namespace) -> tuple[Config, Plan]:
                     "effect; remove one of them"
                 )
         return scattered(config, options.tolerances)
-    return config, _plan(options)
+    return config, _plan(config, options)
 
 
-def _plan(options: argparse.Namespace) -> Plan:
-    axes = {}
+def _plan(config: Config, options: argparse.Namespace) -> Plan:
+    axes: dict[str, Any] = {}
     for text in options.over:
         key, axis = parse_over(text)
         if key in axes:
             raise InputError(f"`--over {key}=...` is given twice; write all its values in one list")
         axes[key] = axis
+    if not axes:
+        speed = config.scene.speed_rpm
+        speeds = sorted(config.objective.speeds_rpm) or np.linspace(0.1 * speed, 2 * speed, 39)
+        axes = {"scene.speed_rpm": speeds}
     groups = [[key.strip() for key in text.split(",")] for text in options.zip_keys]
     if options.zip and groups:
         raise InputError("`--zip` zips all keys, so that `--zip-keys` has no effect; remove one")
@@ -149,14 +114,3 @@ def _plan(options: argparse.Namespace) -> Plan:
 
 def _silent(done: int, expected: int) -> None:
     """Do nothing, in place of a progress bar."""
-
-
-def refuse_options(options: argparse.Namespace) -> None:
-    """Raise `InputError` if an option that needs `--over` is given without `--over`."""
-    names = "zip", "zip_keys", "sample", "sobol", "seed", "workers", "scheduler", "resume"
-    for name in names:
-        if getattr(options, name) not in (None, False, []):
-            raise InputError(
-                f"`--{name.replace('_', '-')}` needs keys to sweep; add `--over KEY=VALUES`, as in "
-                "--over scene.speed_rpm=300:6000:39"
-            )
