@@ -154,11 +154,12 @@ class Arcs(Profile):
         r = self.pitch_radius
         pitch = r * jnp.stack([jnp.cos(roll_angle), jnp.sin(roll_angle)], axis=-1)
         reach = pitch - self.center[arc]
-        # If the arc's centre is outside the pitch circle, the normal points away from the pitch
-        # point.
-        outside = jnp.sum(self.center[arc] ** 2, axis=-1) > r**2
-        reach = jnp.where(outside[..., None], -reach, reach)
-        x, y = jnp.moveaxis(reach, -1, 0)
+        # The normal points to the pitch point or away from it, to the side to which the arc's own
+        # normals point.
+        middle = (self.joints[arc] + self.joints[arc + 1]) / 2
+        side = jnp.stack([jnp.cos(middle), jnp.sin(middle)], axis=-1)
+        away = jnp.sum(reach * side, axis=-1, keepdims=True) < 0
+        x, y = jnp.moveaxis(jnp.where(away, -reach, reach), -1, 0)
         return jnp.arctan2(y, x)
 
     @property

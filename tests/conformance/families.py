@@ -138,8 +138,9 @@ def curve_is_the_one_its_normals_say(family):
 def what_margins_call_sound_is_one_curve(family):
     """Check all members within the bounds that the margins call sound.
 
-    Support function and lever must be continuous, and the law of gearing must hold: h′ = -lever. At
-    least two members must be sound."""
+    Support function and lever must be continuous, the law of gearing must hold, h′ = -lever, and
+    the normal angle at a roll angle must have this roll angle. At least two members must be
+    sound."""
     row, designs = family_of(family), [design_of(config_of(family))]
     if row.classical and row.parameters:
         low, high = np.array([one.usually(1e3 * R, LOBES) for one in row.parameters]).T
@@ -151,10 +152,13 @@ def what_margins_call_sound_is_one_curve(family):
         found = margins(profile).of_flank
         least = [value for key, value in found.items() if key not in row.inherent]
         curved = jnp.max(profile.speeds(nu)[1])
-        return jnp.min(jnp.stack(least)), curved, nu[1], profile.support(nu), profile.lever(nu)
+        roll = profile.half_pitch * jnp.linspace(0.02, 0.98, 49)
+        off = jnp.max(jnp.abs(profile.roll_angle(profile.normal_at(roll)) - roll))
+        return jnp.min(jnp.stack(least)), curved, nu[1], profile.support(nu), profile.lever(nu), off
 
     found = jax.jit(lambda designs: jax.lax.map(looked, designs))(jnp.asarray(designs))
-    least, curved, step, support, lever = map(np.asarray, found)
+    least, curved, step, support, lever, off = map(np.asarray, found)
+    assert np.max(off[(least >= -1e-9) & np.isfinite(curved)]) < 1e-7
     # Exclude almost straight flanks, where the lever may change at any rate.
     sound = (least >= -1e-9) & (curved < 3 * R)
     assert sound[0] or row.by_limits
