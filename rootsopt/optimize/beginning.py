@@ -12,7 +12,6 @@ import jax.numpy as jnp
 from rootsopt.config import Config
 from rootsopt.config.families import FREE_FORM, families, family_of
 from rootsopt.config.study import NEAREST
-from rootsopt.config.tolerances import scatterable
 from rootsopt.config.units import MM
 from rootsopt.design.resemblance import COEFFICIENTS, Likeness, free_likeness, likeness
 from rootsopt.design.space import widened
@@ -95,9 +94,8 @@ class Beginning:
 def beginning(config: Config) -> Beginning | None:
     """Return where the search of a `config` begins; `None` if it varies the baseline's own family.
 
-    Raises `InputError` if the file holds no usable outline, if no profile of the family
-    `optimizer.family` could be fitted to it, or if `tolerances` names a parameter that this family
-    does not have."""
+    Raises `InputError` if the file holds no usable outline, or if no profile of the family
+    `optimizer.family` could be fitted to it."""
     wanted, own = config.optimizer.family, config.profile
     given = profile_from_file(own)
     if given is None:
@@ -112,12 +110,6 @@ def beginning(config: Config) -> Beginning | None:
         except (InputError, ValueError):
             continue
         other, oversize = _cut(config.model_copy(update={"profile": profile}), one.inset)
-        for key in [] if other.tolerances is None else other.tolerances.keys:
-            if key not in scatterable(other):
-                raise InputError(
-                    f"`tolerances` must not name `{key}` if the search varies another family "
-                    f"(`optimizer.family`): {one.family} has no such parameter; remove it"
-                )
         other, keys = widened(other)
         file = Path(config.profile.outline_file or "").name
         return Beginning(other, one, found, keys, file, oversize=oversize)

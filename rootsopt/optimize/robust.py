@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 
 from rootsopt.config import Config
 from rootsopt.config.study import OptimizerConfig
+from rootsopt.config.tolerances import scatterable
+from rootsopt.errors import InputError
 from rootsopt.optimize.assumed import RIVAL
 from rootsopt.optimize.assumptions import compared
 from rootsopt.optimize.local import Linearization
@@ -183,7 +185,9 @@ class StagedSearch:
 
     The first stage finds the nominal optimum, the second one that over a sample of scenes, if there
     are `tolerances` or the objective is over `assumptions`. The designs are then compared over
-    fresh scenes, and over what is assumed about the scene. Arguments: see `Search`."""
+    fresh scenes, and over what is assumed about the scene. Arguments: see `Search`.
+
+    Raises `InputError` if `tolerances` name a parameter that the family of the search lacks."""
 
     def __init__(
         self,
@@ -204,6 +208,13 @@ class StagedSearch:
             # A bound of the nominal objective says little about the robust one.
             first = first.replaced({"optimizer.prove": False})
         self._stage: Search = Search(first, self._report, self.stop, checkpoint, runs)
+        if config.tolerances is not None:
+            varied = self._stage.config
+            for key in set(config.tolerances.keys) - scatterable(varied).keys():
+                raise InputError(
+                    f"`tolerances` must not name `{key}` for `optimizer.family` "
+                    f"{varied.profile.family}, which has no such parameter; remove it"
+                )
 
     def run(self) -> Optimization:
         """Run the stages and the comparisons. Return the outcome of the last stage.

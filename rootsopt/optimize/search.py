@@ -230,11 +230,7 @@ class Search:
         trials: list[Trial] = []
         if self.settings.screening:
             trials = self._side_by_side(self._screen, list(enumerate(points)))
-        ranked, least = points, self.stage.apart
-        if self.settings.screening:
-            # Limits may leave only a small part of the bounds.
-            ranked, least = _ranked(trials), least * float(np.max(np.ptp(points, axis=0)))
-        starts = _apart(ranked, least, self.settings.starts) or points[:1]
+        starts = self._starts(points, trials) or points[:1]
         work = self._descend if self.noisy else self._solve
         trials += self._side_by_side(work, list(enumerate(starts, self.stage.first)))
         bounding, further = self._bounded(trials, self.stage.first + len(starts))
@@ -265,6 +261,17 @@ class Search:
             vertex = self._vertex(optimized, trials)
             optimality = dataclasses.replace(optimality, vertex=vertex)
         return Optimization(*settled, self.stop.is_set(), optimality)
+
+    def _starts(self, points: list[NDArray[np.float64]], trials: list[Trial]) -> list[NDArray]:
+        """Return where the local searches begin, apart from each other.
+
+        They are the best of the `trials` of the screening; without one, the first of the `points`
+        (d,)."""
+        if not self.settings.screening:
+            return _apart(points, self.stage.apart, self.settings.starts)
+        # Limits may leave only a small part of the bounds.
+        extent = float(np.max(np.ptp(points, axis=0)))
+        return _apart(_ranked(trials), extent * self.stage.apart, self.settings.starts)
 
     def _bounded(self, trials: list[Trial], number: int) -> tuple[Bounding | None, list[Trial]]:
         """Look for a lower bound of the objective, and search again from each better design.

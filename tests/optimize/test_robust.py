@@ -9,6 +9,7 @@ import pytest
 
 from rootsopt.commands.console import main
 from rootsopt.config import load
+from rootsopt.errors import InputError
 from rootsopt.optimize.design import search_of
 from rootsopt.optimize.local import Group, Linearization, certify
 from rootsopt.optimize.problem import Problem
@@ -269,13 +270,18 @@ def test_statistics_of_fresh_scenes():
 
 
 def test_fresh_scenes_from_the_neighbouring_orbit(spread):
-    """Forces in fresh scenes equal those found from rest; equal designs are simulated once."""
+    """Forces in fresh scenes equal those found from rest; equal designs are simulated once.
+
+    The baseline has an evaluator of its own."""
     evaluator, baseline, moved = spread
     problem = problem_of(evaluator, baseline)
     config = problem.config
     drawn = draw(config, 3, fresh=True)
     known = {"baseline": baseline.nominal, "nominal": moved.nominal, "robust": moved.nominal}
     designs = {name: (evaluator, one) for name, one in known.items()}
+    heavy = config.replaced({"scene.load.torque_N_m": 6.0})
+    own = Evaluator.of(heavy).scattered().with_maxima()
+    designs["baseline"] = own, own(series=False).nominal
     found = compare(problem, designs, drawn)
     assert found["robust"] is found["nominal"] or found["robust"] == found["nominal"]
     assert found["baseline"].combined == 1
@@ -285,9 +291,40 @@ def test_fresh_scenes_from_the_neighbouring_orbit(spread):
         peak = found["nominal"].values["peak_force_N"][k]
         assert peak == pytest.approx(one.response["peak_force_N"], rel=1e-6)
     assert found["nominal"].statuses == {"periodic": 3}
+    alone = Evaluator.of(heavy.moved(shifts(heavy, drawn)[0].values))(series=False)
+    peak = found["baseline"].values["peak_force_N"][0]
+    assert peak == pytest.approx(alone.response["peak_force_N"], rel=1e-6)
     again = compare(problem, designs, drawn)
     for name, values in again["nominal"].values.items():
         np.testing.assert_array_equal(values, found["nominal"].values[name])
+
+
+@pytest.mark.long
+def test_baseline_of_another_family():
+    """Forces of the baseline in the fresh scenes are those of the rotor simulated alone there."""
+    config = config_of(
+        "optimizer={family: arc_involute, screening: 0, starts: 1, iterations: 1, prove: false}",
+        "constraints={area_efficiency_min: 0.4, seal_width_min_mm: 0}",
+        "tolerances.samples=2",
+        "tolerances.check_samples=3",
+        "assumptions.scenes=0",
+    )
+    found = search_of(config).run().robustness
+    assert found is not None
+    assert np.isfinite(found.begun)
+    baseline = found.fresh["baseline"]
+    assert baseline.combined == 1
+    (widths,) = found.scenes.values()
+    for width, force in zip(widths, baseline.values["mean_force_N"], strict=True):
+        alone = Evaluator.of(without(config).replaced({"contact.clearance_mm": float(width)}))
+        assert force == pytest.approx(alone(series=False).response["mean_force_N"], rel=1e-6)
+
+
+def test_a_parameter_that_the_family_of_the_search_lacks_cannot_scatter():
+    key, found = "profile.tip_arc_angle_deg", {"optimizer.family": "arc_involute"}
+    config = config_of().replaced(found | {"tolerances.over": {key: {"normal": 1e-3}}})
+    with pytest.raises(InputError, match=rf"must not name `{key}`"):
+        search_of(config)
 
 
 def test_without_tolerances_the_search_is_the_plain_one():

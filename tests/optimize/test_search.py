@@ -11,6 +11,7 @@ import pytest
 from rootsopt.config import load
 from rootsopt.design.space import sobol
 from rootsopt.optimize import noise
+from rootsopt.optimize.local import Linearization
 from rootsopt.optimize.outcome import Trial, history_of
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.search import Search, Stage, _apart, _ranked
@@ -162,6 +163,41 @@ def test_a_verification_is_repeated_more_tightly_and_beside_the_design(truth, ti
         assert record["searched_objective"] == 0.95
         shown = rejected_table({"verification": record})
         assert shown.groups[0][1][0][-1].text == "inaccurate (6 attempts)"
+
+
+@pytest.mark.parametrize("size", [1.0, 0.1])
+def test_starts_lie_apart_in_the_part_of_the_bounds_that_limits_leave(size):
+    points = [size * np.array(point) for point in ((0, 0), (0.1, 0), (0.5, 0.5), (1, 0))]
+    trials = [trial_of(point, 0.9 + place / 100) for place, point in enumerate(points)]
+    search = searching(screening=4, starts=3)
+    np.testing.assert_array_equal(search._starts(points, trials), np.array(points)[[0, 2, 3]])
+    search = searching(screening=0, starts=3)
+    wide = [0, 2, 3] if size == 1 else [0]
+    np.testing.assert_array_equal(search._starts(points, []), np.array(points)[wide])
+
+
+@pytest.mark.parametrize("hole", [0.0, 1e-6, 5e-4, 1.0])
+def test_a_local_search_begins_beside_a_start_without_a_usable_motion(hole):
+    """The objective is |x - 0.6| in each coordinate, except within a distance of the start."""
+    start = np.array([0.2, 0.3])
+
+    def local(number, evaluation, point):
+        if np.max(np.abs(point - start)) < hole:
+            return None
+        slopes = np.sign(point - 0.6)
+        empty = np.zeros((0, 2))
+        return Linearization(float(np.sum(np.abs(point - 0.6))), slopes, (), empty[:, 0], empty)
+
+    search = searching()
+    search.noisy, search.sharp = False, search.exact
+    search._lock, search._best = threading.Lock(), 1.0
+    search.expected, search.progress = 1, lambda *_: None
+    search.stage.local = lambda _, *given: local(*given)
+    vars(search.problem).update(toward=lambda point, inside: np.clip(point, 0, 1), limits_at=None)
+    trials = search._solve(0, start)
+    tried = sum(trial.local is None for trial in trials)
+    assert tried == {0.0: 0, 1e-6: 1, 5e-4: 3, 1.0: 5}[hole]
+    assert (search._found[0].local is None) == (hole == 1)
 
 
 def test_an_ensemble_takes_no_infeasible_candidate():
