@@ -179,8 +179,8 @@ def _iso_efficiency(ax: Axes) -> None:
         ripple = 100 * (ratio - 1) ** 2 / (eta * ratio**2)
         ax.plot(ratio, ripple, color=GREY, linewidth=0.8, zorder=1)
         inside = np.flatnonzero((ripple > bottom) & (ripple < top))
-        if inside.size:
-            place = inside[int(0.85 * inside.size)]
+        if inside.size > len(ratio) / 4:
+            place = inside[int(0.7 * inside.size)]
             beside = {"textcoords": "offset points", "xytext": (4, -4), "fontsize": 8}
             ax.annotate(f"η = {eta:.2f}", (ratio[place], ripple[place]), color="0.3", **beside)
     ax.set(xlim=(low, high), ylim=(bottom, top))

@@ -116,7 +116,7 @@ def test_optimize_writes_the_contract(tmp_path, command):
     assert all("multiplier" in row for row in result["constraints"])
     assert result["run"]["command"] == "optimize"
     figures = {path.name for path in (tmp_path / "figures").iterdir()}
-    names = ("profiles", "meshing", "force", "spectrum", "history", "optimum", "comparison")
+    names = ("profiles", "meshing", "force", "spectrum", "history", "comparison")
     assert figures == {f"{name}.png" for name in names}
     assert (tmp_path / "history.csv").read_text().count("\n") >= 4
     # The optimised design, as a config and as a drawing, both read back.
