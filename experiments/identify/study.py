@@ -6,6 +6,7 @@ no standard deviations, so `identify` estimates the noise. The true values shoul
 95 % region of 95 % of the fits, and each of them in 95 % of its intervals."""
 
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -77,12 +78,26 @@ def fitted(
     return row, found
 
 
+def coverage(rows: Sequence[Row]) -> list[Row]:
+    """Return the share of regions and intervals that hold the true values, by noise."""
+    table: list[Row] = []
+    for noise in sorted({row["noise"] for row in rows}):
+        mine = [row for row in rows if row["noise"] == noise]
+        shares = {key.split(".")[-1]: np.mean([row.get(f"{key} inside", False) for row in mine])
+                  for key in RANGES}  # fmt: skip
+        inside = np.mean([row["inside"] for row in mine])
+        table.append({"noise": noise, "fits": len(mine), "region": inside} | shares)
+    return table
+
+
 def run(job: Run) -> bool:
-    """Fit all records; return whether enough regions hold the true values."""
+    """Fit all records; return whether enough regions hold the true values.
+
+    The files are written after each scene, so that a run that is stopped leaves those it did."""
     rng = np.random.default_rng(0)
     scenes = 2 if job.quick else job.options.scenes or SCENES
     noises = NOISES[1:2] if job.quick else NOISES
-    rows = []
+    rows, table = [], []
     for number in range(1, scenes + 1):
         one = scene(rng)
         for noise in noises:
@@ -90,16 +105,10 @@ def run(job: Run) -> bool:
             rows.append({"scene": number} | row)
             if number == 1 and noise == NOISES[1]:
                 job.figure("identify.png", drawn(found))
-        if number % 10 == 0 or number == scenes:
+        table = coverage(rows)
+        job.csv("identify.csv", rows)
+        job.json("identify.json", {"coverage": table})
+        if number % 10 == 0:
             job.say(f"{number} scenes, {np.mean([row['inside'] for row in rows]):.0%} inside")
-            job.csv("identify.csv", rows)
-    table, intervals = [], [f"{key} inside" for key in RANGES]
-    for noise in noises:
-        mine = [row for row in rows if row["noise"] == noise]
-        shares = {key.split(".")[-1]: np.mean([row.get(key, False) for row in mine])
-                  for key in intervals}  # fmt: skip
-        inside = np.mean([row["inside"] for row in mine])
-        table.append({"noise": noise, "fits": len(mine), "region": inside} | shares)
-    job.json("identify.json", {"coverage": table})
     show("Share of 95 % regions and intervals that hold the true values", table)
     return job.quick or all(row["region"] >= PROMISED for row in table)

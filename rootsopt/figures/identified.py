@@ -44,9 +44,8 @@ def plot_orders(ax: Axes, turned: NDArray, measured: NDArray, fitted: NDArray) -
     orders = np.arange(1, _ORDERS + 1)
     waves = np.exp(-1j * np.radians(turned) * orders[:, None])
     for values, color, mark in ((measured, GREY, "o"), (fitted, BLUE, "x")):
-        ax.plot(
-            orders, 2 * np.abs(waves @ (values - np.mean(values))) / len(turned), mark, color=color
-        )
+        sizes = 2 * np.abs(waves @ (values - np.mean(values))) / len(turned)
+        ax.plot(orders, sizes, mark, color=color)
     ax.set_yscale("log")
     ax.set_ylim(bottom=_FLOOR * np.max(np.abs(measured)))
     ax.set_xlabel("order (cycles per turn)")
@@ -65,9 +64,9 @@ def plot_region(ax: Axes, found: "Identification", first: int, second: int) -> A
     )
     ax.plot(*middle, "+", color=VERMILION)
     ax.autoscale_view()
-    ax.locator_params(nbins=4)
+    ax.locator_params(nbins=5, steps=[1, 2, 2.5, 5, 10])
     ax.ticklabel_format(useOffset=False, style="plain")
-    ax.set(xlabel=label_of(keys[first]), ylabel=label_of(keys[second]))
+    ax.set(xlabel=label_of(keys[first]), ylabel=label_of(keys[second]), title="95 % region")
     return ax
 
 
@@ -86,10 +85,10 @@ def drawn(found: "Identification") -> Figure:
         ax.set(xlabel="rotation (°)" if sampled else "line of the record", title=label(name))
         if name == names[0]:
             ax.legend(frameon=False)
-            beside = axes[0, len(names)]
+            beside, (called, unit) = axes[0, len(names)], name_and_unit(name)
             if sampled:
                 plot_orders(beside, place, table["measured"][mine], table["fitted"][mine])
-                beside.set_title(f"orders of the {name_and_unit(name)[0]}")
+                beside.set(title=f"orders of the {called}", ylabel=f"amplitude ({unit})")
             else:
                 beside.plot(table["line"], table["residual"], "o", color=GREY)
                 beside.set(xlabel="line of the record", title="difference / its error")

@@ -204,18 +204,19 @@ def quality(problem: Problem, best: Local, spread: Spread) -> dict[str, Any]:
     }
 
 
-def motions(problem: Problem, best: Local) -> list[dict[str, Any]]:
-    """Return the entry `motions` of the result file: the motion that fits at each point, and
-    whether it is reached from rest. An ensemble has none."""
+def motions(problem: Problem, best: Local, others: Sequence[int | None]) -> list[dict[str, Any]]:
+    """Return the entry `motions` of the result file: the motion that fits at each point, whether it
+    is reached from rest, and how many `others` there are. An ensemble has none."""
     found = []
-    for point, begin in zip(problem.points, best.begins, strict=True):
+    for point, begin, count in zip(problem.points, best.begins, others, strict=True):
         mine, rest = (point.predicted(problem.quantities, best.values, x) for x in (begin, REST))
         if mine.values is None or not mine.orbit:
             continue
         same = rest.values is not None and np.allclose(
             rest.values, mine.values, rtol=0, atol=_SAME * np.max(np.abs(mine.values), axis=0)
         )
-        found.append({"at": point.seen.values, **mine.orbit, "reached_from_rest": bool(same)})
+        where = {"at": point.seen.values, **mine.orbit}
+        found.append(where | {"reached_from_rest": bool(same), "other_motions": count})
     return found
 
 

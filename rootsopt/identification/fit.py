@@ -126,7 +126,7 @@ def identify(  # Keywords of the public interface, each independent of the other
         "parameters": answer.parameters(problem, best, spread, curves, rivals),
         "combinations": answer.combinations(problem, spread),
         "fit": answer.quality(problem, best, spread),
-        "motions": answer.motions(problem, best),
+        "motions": answer.motions(problem, best, search.coexisting(best)),
         "optima": rivals,
         "further": answer.further(problem, best, spread),
         "profiles": {key: curves[key] for key in profiles},
@@ -137,15 +137,17 @@ def identify(  # Keywords of the public interface, each independent of the other
     scales = np.array([one.slope(x) for one, x in zip(quantities, best.values, strict=True)])
     return Identification(
         answer.adopted(config, problem, best), status,
-        " ".join([status.value, *_caveats(entries)]), search.statistics(began), **entries,
+        " ".join([status.value, *_caveats(problem, entries)]), search.statistics(began), **entries,
         covariance=spread.covariance * np.outer(scales, scales),
         residuals=answer.residuals(problem, best), best=(problem, best, spread),
     )  # fmt: skip
 
 
-def _caveats(entries: Mapping[str, Any]) -> Iterator[str]:
+def _caveats(problem: Problem, entries: Mapping[str, Any]) -> Iterator[str]:
     """Yield sentences on what limits the answer, from the `entries` of the result file."""
-    fit = entries["fit"]
+    fit, points = entries["fit"], len(entries["motions"])
+    averaged = not problem.rows.sampled.any()
+    doubtful = sum(bool(one["other_motions"]) for one in entries["motions"])
     loose = [one["words"] for one in entries["combinations"] if not one["determined"]]
     away = [one for one in entries["motions"] if not one["reached_from_rest"]]
     yield f"It differs from the record by {100 * fit['relative_misfit']:.3g} % of its variation."
@@ -154,6 +156,18 @@ def _caveats(entries: Mapping[str, Any]) -> Iterator[str]:
             "The record shows a motion that is not reached from rest, of period "
             f"{' and '.join({str(one['period']): 1 for one in away})}: `rootsopt attractors` "
             "finds it."
+        )
+    if averaged and doubtful:
+        yield (
+            f"At {doubtful} of {points} operating points other motions coexist, and averages do "
+            "not show well which was measured: the values may belong to another one (`rootsopt "
+            "attractors`). Samples of relative_rotation_rad would show it."
+        )
+    if averaged and fit["relative_misfit"] > _POOR:
+        yield (
+            "No fit explains the averages to within "
+            f"{100 * _POOR:g} %: the scene lacks something, or the motion that was measured was "
+            "missed. Do not trust the values; raise --starts, or give samples."
         )
     if fit["degrees_of_freedom"] <= 0:
         yield (
@@ -164,6 +178,12 @@ def _caveats(entries: Mapping[str, Any]) -> Iterator[str]:
         yield f"The record does not determine {'; '.join(loose)}."
         for one in entries["further"][:1]:
             yield f"Measure {one['column']} over a turn at {one['scene.speed_rpm']:g} rpm as well."
+    for one in problem.quantities:
+        if not one.low <= one.own <= one.high:
+            yield (
+                f"{one.key} is {one.own:g} in the config, outside its bounds: the search began in "
+                "their middle."
+            )
     for key, one in entries["parameters"].items():
         if one["at_bound"]:
             yield f"{key} lies at its {one['at_bound']} bound: widen it unless it is a limit."
@@ -192,13 +212,14 @@ class _Search:
         self.ends: list[Local] = []
         self.failed: list[Status] = []
         self.tried = 0
+        self.others_at: list[tuple[NDArray[np.float64], list[int]]] = []
 
     def run(self) -> Local | None:
         """Return the best fit; None if no scene has a motion to trust at all points."""
         points, p, known = self.problem.points, len(self.problem.quantities), []
         count = int(np.clip(_MOST // len(points), 8, _TRIED * p))
-        own = np.array([one.scaled(one.own) for one in self.problem.quantities])
-        places = [own, *sobol(_ROUNDS * count, self.seed, p)]
+        first = np.array([one.first for one in self.problem.quantities])
+        places = [first, *sobol(_ROUNDS * count, self.seed, p)]
         while places and not self._explained:
             some, places = places[: count + 1], places[count + 1 :]
             for place in some:
@@ -214,10 +235,12 @@ class _Search:
                 known = [
                     one for _, one in sorted(zip(near, known, strict=True), key=lambda x: x[0])
                 ]
-        for one in self._best[:_PLACES]:
-            averaged = not self.problem.rows.sampled.any()
-            if not self._explained or (averaged and relative_misfit(self.problem, one) > _EQUAL):
-                self._fit_other_motions(one)
+        # Averages do not show which of several motions was measured.
+        averaged = not self.problem.rows.sampled.any()
+        if points[0].config.objective.motion != "ensemble":
+            for one in self._best[:_PLACES]:
+                if averaged or not self._explained:
+                    self._fit_other_motions(one)
         return next(iter(self._best), None)
 
     @property
@@ -255,10 +278,19 @@ class _Search:
             found = find(evaluator, jnp.asarray(config.design)).attractors
             starts = [x.evaluation.start for x in found if closed(x.evaluation)]
             each.append(starts or [own])
+        self.others_at.append((one.place, [len(some) - 1 for some in each]))
         for k in range(max(map(len, each))):
             for other in self._at(one.place, [some[min(k, len(some) - 1)] for some in each]):
                 if np.max(np.abs(other.fit - one.fit) / self.problem.rows.scale) > _EQUAL:
                     self._fit(other)
+
+    def coexisting(self, best: Local) -> Sequence[int | None]:
+        """Return how many other motions there are at each point of the `best` fit.
+
+        They are counted at the nearest scene where they were looked for; None where they were
+        not."""
+        near = sorted(self.others_at, key=lambda one: np.max(np.abs(one[0] - best.place)))
+        return near[0][1] if near else [None] * len(best.begins)
 
     def others(self, problem: Problem, best: Local, factor: float) -> list[dict[str, Any]]:
         """Return the entry `optima` of the result file: other scenes that fit nearly as well.

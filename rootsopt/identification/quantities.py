@@ -32,8 +32,8 @@ class Fitted(NamedTuple):
     """A quantity to fit.
 
     `key` in the config, or `OFFSET`; `low`, `high`: bounds; `begin`, `end`: range in which a search
-    begins, inside the bounds; `own`: the config's value, in this range; `log`: whether the scale is
-    logarithmic. On this scale, the range is 0 … 1."""
+    begins, inside the bounds; `own`: the config's value; `log`: whether the scale is logarithmic.
+    On this scale, the range is 0 … 1."""
 
     key: str
     low: float
@@ -48,6 +48,12 @@ class Fitted(NamedTuple):
         if self.log:
             return math.log(value / self.begin) / math.log(self.end / self.begin)
         return (value - self.begin) / (self.end - self.begin)
+
+    @property
+    def first(self) -> float:
+        """Place where a search begins: that of the config's value, or the middle if it lies outside
+        the range."""
+        return self.scaled(self.own) if self.begin <= self.own <= self.end else 0.5
 
     def value(self, place: float) -> float:
         """Return the value at a `place` on the scale, within the bounds."""
@@ -138,15 +144,13 @@ def _fitted(config: Config, key: str, pair: Any) -> tuple[Config, Fitted]:
     for end in (low, high):
         config.check_values({key: end})
     if pair:
-        inside = low <= own <= high
         log = low > 0 and high > _WIDE * low
-        middle = math.sqrt(low * high) if log else (low + high) / 2
-        return config, Fitted(key, low, high, low, high, own if inside else middle, log)
+        return config, Fitted(key, low, high, low, high, own, log)
     begin, end = sorted((own / _AROUND, own * _AROUND))
     if own == 0:
         begin, end = _SMALL * low, _SMALL * high
     begin, end = max(begin, low), min(end, high)
-    return config, Fitted(key, low, high, begin, end, min(max(own, begin), end), low > 0)
+    return config, Fitted(key, low, high, begin, end, own, low > 0)
 
 
 def _allowed(config: Config, key: str) -> tuple[float, float]:

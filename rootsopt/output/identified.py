@@ -38,9 +38,10 @@ def identified_tables(result: Mapping[str, Any]) -> Iterator[Table | None]:
     yield table("Combinations of the quantities", ("", "standard error", ""), [("", rows)], note)
     rows = [[", ".join(stated(key, x, named=True) for key, x in one["at"].items()) or "the config",
              value(one["period"]), value(one["floquet_multiplier"]),
-             "from rest" if one["reached_from_rest"] else Cell("not from rest", False)]
+             "from rest" if one["reached_from_rest"] else Cell("not from rest", False),
+             value(one["other_motions"])]
             for one in result["motions"]]  # fmt: skip
-    heads = "at", "period (mesh periods)", "largest multiplier", "reached"
+    heads = "at", "period (mesh periods)", "largest multiplier", "reached", "others that coexist"
     yield table("Motions that the record shows", heads, [("", rows)])
     rows = [[f"{name_and_unit(one['column'])[0]} at {one['scene.speed_rpm']:g} rpm",
              *map(value, one["standard_errors"].values())]

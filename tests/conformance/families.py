@@ -144,6 +144,8 @@ def what_margins_call_sound_is_one_curve(family):
     row, designs = family_of(family), [design_of(config_of(family))]
     if row.classical and row.parameters:
         low, high = np.array([one.usually(1e3 * R, LOBES) for one in row.parameters]).T
+        ends = np.array([(one.lowest, one.highest) for one in row.parameters]).T
+        low, high = np.maximum(low, ends[0]), np.minimum(high, ends[1])
         designs.extend(low + (high - low) * sobol(128, 1, len(low)))
 
     def looked(design):

@@ -169,6 +169,9 @@ def test_a_motion_that_is_not_reached_from_rest_is_matched(kind):
     (motion,) = fit.motions
     assert (motion["period"], motion["reached_from_rest"]) == (1, False)
     assert "not reached from rest" in fit.message
+    if kind == "averages":
+        assert motion["other_motions"] == 1
+        assert "At 1 of 1 operating points other motions coexist" in fit.message
 
 
 def test_a_motion_of_two_mesh_periods_is_matched_whichever_comes_first():
@@ -203,8 +206,9 @@ def test_gain_offset_and_rotation_of_a_record_are_found():
 def test_more_quantities_than_values_are_not_determined():
     keys = {**BOUNDS, "contact.stiffness_N_per_mm_e": (1e5, 4e5)}
     record = {name: simulated().response[name] for name in ("mean_force_N", "peak_force_N")}
-    found = rootsopt.identify(CIC, record, keys, starts=1)
+    found = rootsopt.identify(CIC.replaced({LOAD: 12.0}), record, keys, starts=1)
     assert found.status is Status.IDENTIFIED
+    assert f"{LOAD} is 12 in the config, outside its bounds" in found.message
     assert found.fit["relative_misfit"] < 1e-4
     assert not found.combinations[0]["determined"]
     assert "leaves nothing to estimate errors from" in found.message
