@@ -19,7 +19,7 @@ from experiments._common.style import (
     grid_below,
     sheet,
 )
-from experiments.families.study import Row, bore_of, by_study, is_missing, title
+from experiments.families.study import HOUSINGS, Row, by_study, title
 from rootsopt.config.families import families
 from rootsopt.config.units import MM, si_unit
 from rootsopt.figures.profiles import plot_flank
@@ -47,7 +47,7 @@ def ranking_figure(data: dict[str, Any]) -> Figure:
     for ax, (name, rows) in zip(axes[0], studies.items(), strict=True):
         reference = data["references"][name]
         forces = reference["response"]
-        kept = [row for row in rows if not is_missing(row)]
+        kept = [row for row in rows if not np.isnan(row["objective"])]
         for place, row in enumerate(kept):
             shares = [row[key] / forces[key] for key in ("mean_force_N", "peak_force_N")]
             face = "black" if row["reached"] else "white"
@@ -96,7 +96,7 @@ def profiles_figure(data: dict[str, Any]) -> Figure:
         for place, (ax, row) in enumerate(zip(panels, rows, strict=False)):
             lines = {"family": np.array(row["outline_mm"]), "best": best}
             plot_flank(ax, lines, row["lobes"], row["pitch_radius_mm"])
-            text = f"{row['family'].replace('_', ' ')}, bore {bore_of(name):.1f} mm"
+            text = f"{row['family'].replace('_', ' ')}, bore {2 * HOUSINGS[name]:.1f} mm"
             ax.set_title(text, fontsize=9)
             ax.set(xlabel="x (mm)" if place + _COLUMNS >= len(rows) else "")
             ax.set(ylabel="" if place % _COLUMNS else "y (mm)")

@@ -14,14 +14,13 @@ import functools
 import itertools
 import multiprocessing
 from concurrent.futures import ProcessPoolExecutor
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from experiments._common.driver import Run, start_process
-from experiments._common.scenes import FAIR, FORCES
+from experiments._common.scenes import FORCES
 from experiments._common.simulation import evaluate, objective, profile_of
 from experiments._common.tables import Row, show
 from experiments.families.reach import Reach, changed, in_housing, of_family, problem_of, reach
@@ -33,9 +32,9 @@ from rootsopt.response.evaluation import Evaluation
 from rootsopt.scene import check_geometry, design_vector, outline_mm
 from rootsopt.scene.families import classical, free_form_of
 
-# Outer radius (mm) of a rotor that fills the bore, by reference: the EE rotor's own, which every
-# family can reach, and the limit of `configs/cic.yaml`.
-HOUSINGS = {"configs/ee.yaml": 44.0, FAIR: 45.2}
+# Outer radius (mm) of a rotor that fills the bore, by shipped config: the EE rotor's own, which
+# every family can reach, and the limit of `configs/cic.yaml`.
+HOUSINGS = {"ee": 44.0, "cic": 45.2}
 
 # Override of both: each flank is cut within 10 µm of its drawing.
 CLEARANCE = "contact.clearance_mm=0.02"
@@ -144,18 +143,18 @@ def row_of(study: str, config: Config, reference: dict[str, float]) -> dict[str,
 
 
 @functools.cache
-def reference_of(path: str) -> tuple[Config, Evaluation]:
+def reference_of(name: str) -> tuple[Config, Evaluation]:
     """Load and simulate a reference config. Return config and evaluation."""
-    config = load(path, [CLEARANCE])
+    config = load(name, [CLEARANCE])
     return config, evaluate(config)
 
 
-def one_family(path: str, family: str, quick: bool) -> dict[str, Any] | None:
-    """Return the row of a family's best design in the housing of the reference at `path`.
+def one_family(name: str, family: str, quick: bool) -> dict[str, Any] | None:
+    """Return the row of a family's best design in the housing of the reference at `name`.
 
     The result is `None` if the family does not fit."""
-    reference, base = reference_of(path)
-    bore, land = HOUSINGS[path], base.geometry["seal_width_mm"]
+    reference, base = reference_of(name)
+    bore, land = HOUSINGS[name], base.geometry["seal_width_mm"]
     config = in_housing(of_family(reference, family), bore, 0.0, land)
     found = reach(config, 24) if quick else reach(config)
     if found is None:
@@ -164,7 +163,7 @@ def one_family(path: str, family: str, quick: bool) -> dict[str, Any] | None:
     if found.points.shape[1]:
         config = optimised(config, base.response)
     return {
-        **row_of(Path(path).stem, config, base.response),
+        **row_of(name, config, base.response),
         "reached": reached,
         "least_efficiency": float(found.efficiencies[0]),
         "most_efficiency": float(found.efficiencies[-1]),
@@ -189,9 +188,9 @@ def free_starts(rows: list[Row], count: int) -> list[tuple[Row, Config, Config]]
     return found[:count]
 
 
-def free_form(path: str, start: tuple[Row, Config, Config], quick: bool) -> Row:
+def free_form(name: str, start: tuple[Row, Config, Config], quick: bool) -> Row:
     """Optimise a free form from one of the `free_starts`. Return its row."""
-    _, base = reference_of(path)
+    _, base = reference_of(name)
     best, given, config = start
     settings: dict[str, Any] = {"bounds": {"tip_arc_angle_deg": (0.0, 45 / given.profile.lobes)}}
     settings |= SEARCH_FREE | ({"iterations": 2} if quick else {})
@@ -201,7 +200,7 @@ def free_form(path: str, start: tuple[Row, Config, Config], quick: bool) -> Row:
     )
     config = optimised(config, base.response)
     return {
-        **row_of(Path(path).stem, config, base.response),
+        **row_of(name, config, base.response),
         "reached": best["reached"],
         "begun_at": best["family"],
         "departure_um": departure(profile_of(config), profile_of(given)) / 1e-6,
@@ -219,26 +218,18 @@ def by_study(data: dict[str, Any]) -> dict[str, list[Row]]:
     for row in data["rows"]:
         studies[row["study"]].append(row)
     for rows in studies.values():
-        rows.sort(key=lambda row: (is_missing(row), not row["reached"], row["objective"]))
+        rows.sort(
+            key=lambda row: (np.isnan(row["objective"]), not row["reached"], row["objective"])
+        )
     return studies
-
-
-def is_missing(row: Row) -> bool:
-    """Return whether a row has no periodic motion."""
-    return not np.isfinite(row["objective"])
-
-
-def bore_of(name: str) -> float:
-    """Return the bore (mm) of the housing of the config `name`."""
-    return 2 * next(radius for path, radius in HOUSINGS.items() if Path(path).stem == name)
 
 
 def title(name: str, reference: Row) -> str:
     """Return a title for a housing: bore, area efficiency, tip land, and `name` of the config."""
     shape = reference["geometry"]
     return (
-        f"Bore {bore_of(name):.1f} mm; area efficiency {shape['area_efficiency']:.4f} and tip land "
-        f"{shape['seal_width_mm']:.1f} mm of {name}.yaml"
+        f"Bore {2 * HOUSINGS[name]:.1f} mm; area efficiency {shape['area_efficiency']:.4f} and tip "
+        f"land {shape['seal_width_mm']:.1f} mm of {name}.yaml"
     )
 
 
@@ -248,14 +239,16 @@ def print_tables(data: dict[str, Any]) -> None:
         forces = "{mean_force_N:.2f} N mean, {peak_force_N:.1f} N peak"
         reference = data["references"][name]
         said = forces.format(**reference["response"])
-        ranked = sum(row["reached"] and not is_missing(row) for row in rows)
+        ranked = sum(row["reached"] and not np.isnan(row["objective"]) for row in rows)
         show(
             f"### {title(name, reference)}; the reference has {said}",
             [
                 {
                     "": str(place) if place <= ranked else "-",
                     "family": f"`{row['family']}`",
-                    "objective": row["status"] if is_missing(row) else f"{row['objective']:.4f}",
+                    "objective": row["status"]
+                    if np.isnan(row["objective"])
+                    else f"{row['objective']:.4f}",
                     "forces": forces.format(**row),
                     "area efficiency": f"{row['area_efficiency']:.4f}",
                     "reachable": "{:.4f} to {:.4f}".format(
@@ -296,29 +289,29 @@ def run(job: Run) -> None:
     from experiments.families import figures
 
     quick = job.quick
-    paths, families = ([*HOUSINGS][-1:], QUICK) if quick else ([*HOUSINGS], classical())
-    tasks = list(itertools.product(paths, families))
+    names, families = ([*HOUSINGS][-1:], QUICK) if quick else ([*HOUSINGS], classical())
+    tasks = list(itertools.product(names, families))
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(
         2, mp_context=context, initializer=start_process, initargs=(True,)
     ) as pool:
         pending = [pool.submit(one_family, *task, quick) for task in tasks]
         rows: list[Row] = []
-        for (path, family), future in zip(tasks, pending, strict=True):
+        for (name, family), future in zip(tasks, pending, strict=True):
             row = future.result()
             found = "does not fit" if row is None else f"{row['objective']:.4f}, {row['status']}"
-            job.say(f"{Path(path).stem:8s} {family:18s} {found}")
+            job.say(f"{name:8s} {family:18s} {found}")
             rows += [row] if row else []
-        for path in paths:
-            own = [row for row in rows if row["study"] == Path(path).stem and row["reached"]]
-            own = [row for row in own if not is_missing(row)]
+        for name in names:
+            own = [row for row in rows if row["study"] == name and row["reached"]]
+            own = [row for row in own if not np.isnan(row["objective"])]
             starts = free_starts(own, 1 if quick else STARTS) if own else []
-            free = [pool.submit(free_form, path, start, quick) for start in starts]
+            free = [pool.submit(free_form, name, start, quick) for start in starts]
             made = [future.result() for future in free]
             for row in made:
                 job.say(f"{row['study']:8s} free_form {row['objective']:.4f}, {row['begun_at']}")
             rows += sorted(made, key=lambda row: np.nan_to_num(row["objective"], nan=np.inf))[:1]
-    references = {Path(path).stem: reference_of(path)[1].record() for path in paths}
+    references = {name: reference_of(name)[1].record() for name in names}
     data = {"references": references, "rows": rows}
     job.json("families.json", data)
     job.csv("families.csv", rows, [key for key in rows[0] if key not in LONG])

@@ -17,7 +17,6 @@ from experiments._common.scenes import FAIR
 from experiments._common.style import sheet
 from experiments._common.tables import show
 from rootsopt.config import Config, load
-from rootsopt.config.tolerances import Scatter
 from rootsopt.figures.spread import PANELS, plot_distribution
 from rootsopt.optimize.design import optimize_design
 from rootsopt.optimize.outcome import Optimization
@@ -30,13 +29,8 @@ FORCES = ("mean_force_N", "peak_force_N")
 STATISTICS = ("mean", "sigma", "quantile_95", "worst")
 
 
-def deviation(scatter: Scatter) -> float:
-    """Return the standard deviation of a key; for a normal distribution, before it is cut off."""
-    return (
-        scatter.width
-        / {"normal": 1.0, "uniform": math.sqrt(3), "triangular": math.sqrt(6)}[scatter.kind]
-    )
-
+# Standard deviation of a distribution of width 1; of a normal one before it is cut off.
+DEVIATIONS = {"normal": 1.0, "uniform": 1 / math.sqrt(3), "triangular": 1 / math.sqrt(6)}
 
 # Overrides of the config: the search varies a free form, because no CIC is much better than the
 # paper's in this pump.
@@ -90,7 +84,7 @@ def linear_of(config: Config, robustness: Robustness) -> list[dict[str, Any]]:
         return []
     rows: list[dict[str, Any]] = []
     for scatter in config.scatters:
-        row, width = by_key[scatter.key], deviation(scatter)
+        row, width = by_key[scatter.key], scatter.width * DEVIATIONS[scatter.kind]
         parts = {force: abs(row[force] / row["step"]) * width for force in FORCES}
         rows.append({"key": scatter.key, "sigma_of_key": width} | parts)
     total = {force: math.hypot(*(row[force] for row in rows)) for force in FORCES}
