@@ -13,18 +13,18 @@ from unittest import mock
 
 ROOT = Path(__file__).parents[1]
 MOST = {
-    "statements of the package": 27_506,
-    "statements of the tests": 17_449,
-    "statements of the experiments": 5_088,
+    "statements of the package": 27_255,
+    "statements of the tests": 17_451,
+    "statements of the experiments": 5_087,
     "packages": 19,
-    "files of the package": 234,
-    "lines of the longest file": 672,
+    "files of the package": 232,
+    "lines of the longest file": 663,
     "floors of packages": 15,
-    "depth of imports": 37,
-    "config keys": 138,
+    "depth of imports": 30,
+    "config keys": 134,
     "lines of the longest help": 59,
     "pages of docs": 45,
-    "words of docs": 34_472,
+    "words of docs": 34_476,
 }
 """Greatest values that are accepted. Lower them when the project becomes lighter. Whoever raises
 one gives the reason in the changelog: what users can do now that is worth the weight."""

@@ -238,7 +238,7 @@ class _Search:
         # Averages do not show which of several motions was measured.
         averaged = not self.problem.rows.sampled.any()
         if points[0].config.objective.motion != "ensemble":
-            for one in self._best[:_PLACES]:
+            for one in self._best[: 1 if self._explained else _PLACES]:
                 if averaged or not self._explained:
                     self._fit_other_motions(one)
         return next(iter(self._best), None)

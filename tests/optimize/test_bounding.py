@@ -111,6 +111,7 @@ def bounded(made: Made, **settings):
         design=lambda point: point,
         objective=lambda one: one.response.get("mean_force_N", math.nan),
         feasible=lambda point: bool(made.limits(point)[0] >= -FEASIBLE),
+        toward=lambda point, inside: np.clip(point, 0.0, 1.0),
         excess=lambda one: 0.0,
         limits_at=made.limits,
         local=lambda one, point: made.local(point) if one.usable else None,
