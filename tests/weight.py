@@ -14,7 +14,7 @@ from unittest import mock
 ROOT = Path(__file__).parents[1]
 MOST = {
     "statements of the package": 27_255,
-    "statements of the tests": 17_451,
+    "statements of the tests": 17_449,
     "statements of the experiments": 5_087,
     "packages": 19,
     "files of the package": 232,
@@ -24,7 +24,7 @@ MOST = {
     "config keys": 134,
     "lines of the longest help": 59,
     "pages of docs": 45,
-    "words of docs": 34_476,
+    "words of docs": 34_472,
 }
 """Greatest values that are accepted. Lower them when the project becomes lighter. Whoever raises
 one gives the reason in the changelog: what users can do now that is worth the weight."""

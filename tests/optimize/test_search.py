@@ -172,8 +172,9 @@ def test_starts_lie_apart_in_the_part_of_the_bounds_that_limits_leave(size):
     search = searching(screening=4, starts=3)
     np.testing.assert_array_equal(search._starts(points, trials), np.array(points)[[0, 2, 3]])
     search = searching(screening=0, starts=3)
-    wide = [0, 2, 3] if size == 1 else [0]
-    np.testing.assert_array_equal(search._starts(points, []), np.array(points)[wide])
+    np.testing.assert_array_equal(
+        search._starts(points, []), np.array(points)[[0, 2, 3] if size == 1 else [0]]
+    )
 
 
 @pytest.mark.parametrize("hole", [0.0, 1e-6, 5e-4, 1.0])
@@ -184,9 +185,8 @@ def test_a_local_search_begins_beside_a_start_without_a_usable_motion(hole):
     def local(number, evaluation, point):
         if np.max(np.abs(point - start)) < hole:
             return None
-        slopes = np.sign(point - 0.6)
-        empty = np.zeros((0, 2))
-        return Linearization(float(np.sum(np.abs(point - 0.6))), slopes, (), empty[:, 0], empty)
+        slopes, none = np.sign(point - 0.6), np.zeros((0, 2))
+        return Linearization(float(np.sum(np.abs(point - 0.6))), slopes, (), none[:, 0], none)
 
     search = searching()
     search.noisy, search.sharp = False, search.exact
