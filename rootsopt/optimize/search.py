@@ -285,7 +285,8 @@ class Search:
         asked = self.stage.bounded and not self.noisy and size <= _PARAMETERS and given is not False
         if not (asked and candidates and (quick or given is True)):
             return None, []
-        most, boxes = _MOST if given is True else (2 * len(trials), 25 * len(trials))
+        # By default the bound may cost about as much as the search.
+        most, boxes = _MOST if given is True else (3 * len(trials) // 2, 18 * len(trials))
         best = min(candidates, key=objective).objective
         bounding = Bounding(self.problem.limits_at, size, best, boxes)
         known, further, count = [], [], 0
