@@ -37,7 +37,7 @@ class CollocatedEquation(eqx.Module):
 
     Forces in the integrands are in units of `pair.force_scale`. If rotor 1 is free, the integrands
     are multiplied by `RotorPair.lapse`, which is also the last integrand. `top` (N): roughly the
-    greatest force. `variation`: whether a closed orbit has its `OrbitForces.variation`.
+    greatest force. `variation`: whether a closed orbit has its `Orbit.variation`.
     """
 
     pair: RotorPair
