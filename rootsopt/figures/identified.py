@@ -84,7 +84,7 @@ def drawn(found: "Identification") -> Figure:
         plot_record(ax, place, table["measured"][mine], table["fitted"][mine])
         ax.set(xlabel="rotation (°)" if sampled else "line of the record", title=label(name))
         if name == names[0]:
-            ax.legend(frameon=False)
+            made.legend(loc="outside lower left", ncols=2, frameon=False)
             beside, (called, unit) = axes[0, len(names)], name_and_unit(name)
             if sampled:
                 plot_orders(beside, place, table["measured"][mine], table["fitted"][mine])
