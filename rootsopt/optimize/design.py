@@ -24,8 +24,8 @@ def search_of(
 ) -> Search | StagedSearch:
     """Return the search that a `config` needs.
 
-    It is a `StagedSearch` with `tolerances` or `objective.over: assumptions`, and unless
-    `assumptions.scenes` is 0. Arguments: see `Search`.
+    It is a `Search` if there are no `tolerances` and `assumptions.scenes` is 0, and otherwise a
+    `StagedSearch`. Arguments: see `Search`.
 
     Raises `InputError` for `tolerances` with a profile from a file, which has no design
     parameters."""
