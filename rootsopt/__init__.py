@@ -26,20 +26,20 @@ if TYPE_CHECKING:
     from rootsopt.identification.fit import identify as identify
     from rootsopt.optimize.design import optimize_design as optimize_design
     from rootsopt.optimize.outcome import Optimization as Optimization
+    from rootsopt.optimize.tradeoffs.front import Front as Front
+    from rootsopt.optimize.tradeoffs.trace import pareto_front as pareto_front
     from rootsopt.profiles.base import Profile as Profile
     from rootsopt.profiles.base import Segment as Segment
     from rootsopt.response.evaluation import Evaluation as Evaluation
     from rootsopt.response.evaluation import evaluate as evaluate
     from rootsopt.response.steady import Response as Response
     from rootsopt.response.steady import steady_response as steady_response
+    from rootsopt.response.sweeps.scenes import sweep_scenes as sweep_scenes
     from rootsopt.response.terms import Term as Term
     from rootsopt.response.terms import register_term as register_term
     from rootsopt.runtime.programs import COMPILER_OPTIONS as COMPILER_OPTIONS
     from rootsopt.scene import Scene as Scene
     from rootsopt.status import Status as Status
-    from rootsopt.sweeps.scenes import sweep_scenes as sweep_scenes
-    from rootsopt.tradeoffs.front import Front as Front
-    from rootsopt.tradeoffs.trace import pareto_front as pareto_front
 
 __version__ = "0.2.0"
 
@@ -51,7 +51,7 @@ _PUBLIC = {
     "ContactLaw": "rootsopt.contact.law:ContactLaw",
     "Evaluation": "rootsopt.response.evaluation:Evaluation",
     "Family": "rootsopt.config.families:Family",
-    "Front": "rootsopt.tradeoffs.front:Front",
+    "Front": "rootsopt.optimize.tradeoffs.front:Front",
     "Identification": "rootsopt.identification.answer:Identification",
     "InputError": "rootsopt.errors:InputError",
     "Optimization": "rootsopt.optimize.outcome:Optimization",
@@ -67,11 +67,11 @@ _PUBLIC = {
     "identify": "rootsopt.identification.fit:identify",
     "load_config": "rootsopt.config:load_config",
     "optimize_design": "rootsopt.optimize.design:optimize_design",
-    "pareto_front": "rootsopt.tradeoffs.trace:pareto_front",
+    "pareto_front": "rootsopt.optimize.tradeoffs.trace:pareto_front",
     "register_family": "rootsopt.config.families:register_family",
     "register_term": "rootsopt.response.terms:register_term",
     "steady_response": "rootsopt.response.steady:steady_response",
-    "sweep_scenes": "rootsopt.sweeps.scenes:sweep_scenes",
+    "sweep_scenes": "rootsopt.response.sweeps.scenes:sweep_scenes",
 }
 __all__ = ["__version__", *_PUBLIC]  # pyright: ignore[reportUnsupportedDunderAll]
 

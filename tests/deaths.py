@@ -15,8 +15,8 @@ from types import SimpleNamespace
 from typing import Any
 
 from rootsopt.errors import InputError
-from rootsopt.output import disk
-from rootsopt.output.runs import RunFolder
+from rootsopt.view import disk
+from rootsopt.view.runs import RunFolder
 
 WRITING = ("open", "write", "fsync", "mkdir", "rename", "replace", "ftruncate", "pwrite")
 """Operations that a full disk makes fail."""

@@ -45,28 +45,28 @@ LATE = {
         "rootsopt.config.sheet",
     },
     "commands/cli.py": {
-        "rootsopt.output.ending", "rootsopt.output.runs", "rootsopt.output.tables",
-        "rootsopt.output.terminal",
-        "rootsopt.pages.gather", "rootsopt.pages.html", "rootsopt.runtime",
+        "rootsopt.view.ending", "rootsopt.view.runs", "rootsopt.view.tables",
+        "rootsopt.view.terminal",
+        "rootsopt.view.pages.gather", "rootsopt.view.pages.html", "rootsopt.runtime",
     },
     "commands/console.py": {"rootsopt", "rootsopt.commands", "rootsopt.errors"},
     # Figures are imported in the background; exports, only if they are asked for.
-    **{f"commands/work/{name}.py": {"rootsopt.figures", f"rootsopt.figures.{module}"}
+    **{f"commands/work/{name}.py": {"rootsopt.view.figures", f"rootsopt.view.figures.{module}"}
        for name, module in (("attractors", "basins"), ("identify", "identified"),
                             ("profile", "runs"))},
     "commands/work/pareto.py": {
-        "rootsopt.figures", "rootsopt.figures.front",
+        "rootsopt.view.figures", "rootsopt.view.figures.front",
     },
     "commands/work/optimize.py": {
-        "rootsopt.figures.writing", "rootsopt.figures", "rootsopt.figures.spread",
+        "rootsopt.view.figures.writing", "rootsopt.view.figures", "rootsopt.view.figures.spread",
     },
-    "commands/work/simulate.py": {"rootsopt.figures.writing", "rootsopt.figures"},
-    "commands/work/sweep.py": {"rootsopt.figures.sweep"},
-    "figures/writing.py": {"rootsopt.figures.animation"},
+    "commands/work/simulate.py": {"rootsopt.view.figures.writing", "rootsopt.view.figures"},
+    "commands/work/sweep.py": {"rootsopt.view.figures.sweep"},
+    "figures/writing.py": {"rootsopt.view.figures.animation"},
     "optimize/__init__.py": {"rootsopt.commands.table"},
     # Modules that import optional or slow libraries.
-    "commands/work/explore.py": {"rootsopt.pages.engine", "rootsopt.pages.server"},
-    "figures/__init__.py": {"rootsopt.figures.solid"},
+    "commands/work/explore.py": {"rootsopt.view.pages.engine", "rootsopt.view.pages.server"},
+    "figures/__init__.py": {"rootsopt.view.figures.solid"},
     "figures/runs.py": {"rootsopt.measured.source"},
     "measured/reading.py": {"rootsopt.measured.dxf"},
     "measured/conjugacy.py": {"rootsopt.measured.source"},

@@ -4,9 +4,9 @@ from typing import Any
 
 from matplotlib.axes import Axes
 
-from rootsopt.figures.style import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILION
-from rootsopt.figures.style import GREY as GREY
-from rootsopt.figures.style import figure as sheet
+from rootsopt.view.figures.style import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILION
+from rootsopt.view.figures.style import GREY as GREY
+from rootsopt.view.figures.style import figure as sheet
 
 __all__ = [
     "BLACK",

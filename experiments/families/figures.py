@@ -22,9 +22,9 @@ from experiments._common.style import (
 from experiments.families.study import HOUSINGS, Row, by_study, title
 from rootsopt.config.families import families
 from rootsopt.config.units import MM, si_unit
-from rootsopt.figures.profiles import plot_flank
 from rootsopt.profiles import Profile, geometry
 from rootsopt.profiles.geometry import outline
+from rootsopt.view.figures.profiles import plot_flank
 
 _COLUMNS = 4
 

@@ -16,10 +16,10 @@ from rootsopt.config import Config
 from rootsopt.config.families import family_of
 from rootsopt.config.study import limits_of
 from rootsopt.config.units import MM
-from rootsopt.design.space import Space, sobol
 from rootsopt.optimize.problem import Problem
 from rootsopt.profiles import geometry
 from rootsopt.scene import Scene, design_keys
+from rootsopt.scene.space import Space, sobol
 
 # Clearance (mm) between tip and bore above which a rotor does not fill the bore.
 BAND_MM = 1e-3

@@ -14,10 +14,10 @@ from experiments._common.simulation import evaluate, objective, profile_of
 from experiments._common.style import BLUE, grid_below, sheet
 from experiments._common.tables import print_record, show
 from rootsopt.config import load
-from rootsopt.design.resemblance import likenesses
 from rootsopt.optimize.search import Search
 from rootsopt.profiles import Profile
 from rootsopt.profiles.departure import departure, flank_points
+from rootsopt.scene.resemblance import likenesses
 
 MM, UM = 1e-3, 1e-6
 

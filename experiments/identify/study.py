@@ -17,11 +17,11 @@ from experiments._common.driver import Run
 from experiments._common.scenes import shipped
 from experiments._common.tables import Row, show
 from rootsopt.config import Config
-from rootsopt.figures.identified import drawn
 from rootsopt.identification.answer import Identification
 from rootsopt.identification.fit import identify
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.status import Status
+from rootsopt.view.figures.identified import drawn
 
 # Ranges of the values by key, which are the bounds of the fits, too.
 RANGES = {

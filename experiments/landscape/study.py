@@ -25,10 +25,10 @@ from experiments._common.scenes import FAIR
 from experiments._common.style import VERMILION, sheet
 from experiments._common.tables import Row, show
 from rootsopt.config import load
-from rootsopt.design.space import sobol
 from rootsopt.optimize.outcome import Optimization
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.search import Search
+from rootsopt.scene.space import sobol
 
 # Number of points along each axis of the coarsest grid, and of the finest.
 GRID, MOST = 5, 80

@@ -19,11 +19,11 @@ from experiments._common.simulation import evaluate, profile_of
 from experiments._common.style import BLUE, GREY, grid_below, sheet
 from experiments._common.tables import print_record
 from rootsopt.config import Config, load
-from rootsopt.figures.profiles import plot_conjugacy
 from rootsopt.measured.conjugacy import conjugacy, gaps_um
 from rootsopt.measured.source import outline_of
 from rootsopt.profiles import Profile, outline
 from rootsopt.scene import check_geometry, design_keys
+from rootsopt.view.figures.profiles import plot_conjugacy
 
 # Form error of the addenda, differences between lobes, and RMS noise of the points (mm).
 FORM, LOBES, NOISE = 20e-3, 3e-3, 1e-3

@@ -24,11 +24,11 @@ from experiments._common.driver import Run
 from experiments._common.tables import show
 from experiments.optimisers.epigraph import SCALE, Epigraph
 from rootsopt.config import load
-from rootsopt.figures.style import COLORS, DASHES, figure
 from rootsopt.optimize.local import FEASIBLE, Linearization, Look, certify
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.sqp import EndError, Stops, descend
 from rootsopt.response.evaluation import Evaluator
+from rootsopt.view.figures.style import COLORS, DASHES, figure
 
 # Distance of the objective from the optimum below which a method has reached the optimum.
 REACHED = 1e-6

@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 from experiments._common.style import COLORS, grid_below, sheet
 from experiments.paper.scene import FAMILIES, PAPER, QUANTITIES, Response, config_of
 from experiments.paper.study import Row
-from rootsopt.figures.force import plot_force, plot_spectrum
+from rootsopt.view.figures.force import plot_force, plot_spectrum
 
 # Range of misfits (%) shown. Larger misfits and non-periodic motions are at the upper edge.
 LOWEST, HIGHEST = 0.1, 300.0

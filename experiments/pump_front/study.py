@@ -23,12 +23,12 @@ from experiments._common.tables import Row, show
 from rootsopt.config import Config, load
 from rootsopt.config.families import family_of
 from rootsopt.errors import InputError
+from rootsopt.optimize.tradeoffs.trace import pareto_front
 from rootsopt.profiles import geometry
 from rootsopt.pump import relative_flow
 from rootsopt.pump.sheet import sheet as pump_sheet
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.scene import Scene, design_vector
-from rootsopt.tradeoffs.trace import pareto_front
 
 # Terms of the trade-off; less of each is better.
 TERMS = "mean_force_N", "leakage_fraction", "flow_ripple"

@@ -17,7 +17,7 @@ from experiments._common.style import (
     sheet,
 )
 from experiments.speed.study import OPTIMISED, Row, Study
-from rootsopt.figures.sweep import LABELS, legend_entries, plot_speeds
+from rootsopt.view.figures.sweep import LABELS, legend_entries, plot_speeds
 
 TITLES = {"shipped": "shipped scene", "light": "gear damping ratio 0.1"}
 

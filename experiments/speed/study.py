@@ -23,12 +23,12 @@ from experiments._common.simulation import evaluator_of
 from experiments._common.tables import Row, print_record
 from rootsopt.config import Config
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.figures.sweep import LABELS
 from rootsopt.optimize.search import Search
 from rootsopt.response.evaluation import Evaluation, objective_weights
 from rootsopt.response.result import Part
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import design_vector
+from rootsopt.view.figures.sweep import LABELS
 
 SCENES = {"shipped": (), "light": ("scene.timing_gear.damping_ratio=0.1",)}
 

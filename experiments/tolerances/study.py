@@ -17,10 +17,10 @@ from experiments._common.scenes import FAIR
 from experiments._common.style import sheet
 from experiments._common.tables import show
 from rootsopt.config import Config, load
-from rootsopt.figures.spread import PANELS, plot_distribution
 from rootsopt.optimize.design import optimize_design
 from rootsopt.optimize.outcome import Optimization
 from rootsopt.optimize.robust import Robustness
+from rootsopt.view.figures.spread import PANELS, plot_distribution
 
 # Forces whose distributions are reported.
 FORCES = ("mean_force_N", "peak_force_N")

@@ -17,7 +17,6 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
-from rootsopt import pages
 from rootsopt.commands import door
 from rootsopt.commands.door import BAD_INPUT, NO_RESULT
 from rootsopt.commands.door import OK as OK
@@ -32,15 +31,16 @@ from rootsopt.config.explain import GROUPS, describe, outline
 from rootsopt.config.families import families, import_named
 from rootsopt.config.sources import shipped
 from rootsopt.errors import InputError
-from rootsopt.pages import REPORT
 from rootsopt.runtime import environment
 from rootsopt.runtime.environment import use_float64
+from rootsopt.view import pages
+from rootsopt.view.pages import REPORT
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from rootsopt.output.names import Table
-    from rootsopt.output.runs import RunFolder
+    from rootsopt.view.names import Table
+    from rootsopt.view.runs import RunFolder
 
 # Equinox's checks of traced values call back to Python, and a program with callbacks cannot be
 # cached between processes. Every integration here returns a status instead. Equinox reads this
@@ -265,7 +265,7 @@ def _work(command: str, name: str = "body") -> Callable[..., Any]:
 
 
 def _in_folder(command: str, config: Config, options: argparse.Namespace) -> int:
-    from rootsopt.output.runs import RunFolder
+    from rootsopt.view.runs import RunFolder
 
     if options.report:
         pages.require("`--report`")
@@ -282,9 +282,9 @@ def _in_folder(command: str, config: Config, options: argparse.Namespace) -> int
         # Write files first: importing the console takes half of the time, and stdout may fail.
         from rich.console import Console
 
-        from rootsopt.output.ending import ending
-        from rootsopt.output.tables import tables_of
-        from rootsopt.output.terminal import show_ending, shown
+        from rootsopt.view.ending import ending
+        from rootsopt.view.tables import tables_of
+        from rootsopt.view.terminal import show_ending, shown
 
         out = Console()
         result, rows = folder.result, outcome.rows
@@ -307,8 +307,8 @@ def _report(folder: "RunFolder", options: argparse.Namespace, outcome: Outcome) 
     """Write the report of a run that has written all its other files.
 
     If it cannot be made, say so on stderr: the result of a long run must not be lost with it."""
-    from rootsopt.pages.gather import Run
-    from rootsopt.pages.html import report_text
+    from rootsopt.view.pages.gather import Run
+    from rootsopt.view.pages.html import report_text
 
     try:
         given = shlex.join(options.given), outcome.code == door.OK, options.imports
@@ -322,12 +322,12 @@ def _report(folder: "RunFolder", options: argparse.Namespace, outcome: Outcome) 
 
 
 def load_figures(options: argparse.Namespace, module: str) -> None:
-    """Import a `module` of `rootsopt.figures` in the background, if the `options` want figures.
+    """Import a `module` of `view.figures` in the background, if the `options` want figures.
 
     With matplotlib it takes 0.5 s. Meanwhile, programs are loaded or compiled, which does not hold
     Python's lock."""
     if not options.no_figures:
-        name = f"rootsopt.figures.{module}"
+        name = f"rootsopt.view.figures.{module}"
         threading.Thread(target=importlib.import_module, args=(name,)).start()
 
 

@@ -54,7 +54,7 @@ def _optimize(parser: "ArgumentParser") -> None:
 
 
 def _improve(parser: "ArgumentParser") -> None:
-    from rootsopt import figures
+    from rootsopt.view import figures
 
     figures.add_option(parser, "dxf")
     parser.set_defaults(report=True)
@@ -82,13 +82,13 @@ def _improve(parser: "ArgumentParser") -> None:
 
 
 def _simulate(parser: "ArgumentParser") -> None:
-    from rootsopt import figures
+    from rootsopt.view import figures
 
     figures.add_option(parser, "none")
 
 
 def _profile(parser: "ArgumentParser") -> None:
-    from rootsopt import figures
+    from rootsopt.view import figures
 
     # Drawings take less than 1 s, a solid takes 10 s.
     figures.add_option(parser, "dxf,svg")

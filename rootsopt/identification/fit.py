@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rootsopt.config import Config
-from rootsopt.design.space import sobol
 from rootsopt.errors import InputError
 from rootsopt.identification import answer
 from rootsopt.identification.answer import Identification, Spread, relative_misfit, structure
@@ -21,6 +20,7 @@ from rootsopt.identification.squares import TURN, Local, Problem
 from rootsopt.response.attractors import closed, find
 from rootsopt.response.terms import reporting
 from rootsopt.runtime.environment import check_precision
+from rootsopt.scene.space import sobol
 from rootsopt.status import Status
 
 # Scenes that are tried for each quantity before local fits, maximum number of simulations, and how

@@ -21,9 +21,9 @@ from rootsopt.response.many import HERE, as_done
 from rootsopt.response.records import apart_record, orbit_record
 from rootsopt.response.sensitivity import direction, motions_along
 from rootsopt.response.starts import Seed
+from rootsopt.response.sweeps.points import configured
 from rootsopt.scene import check_geometry
 from rootsopt.status import Status
-from rootsopt.sweeps.points import configured
 
 Begin = Seed | NDArray[np.float64] | None
 """Where the search for a motion begins: near a known one, or at ε (rad) and dε/dt (rad/s) at φ1 = 0

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from rootsopt.config import Config
 from rootsopt.config.explain import limits_of, tree
 from rootsopt.config.tolerances import scatterable, unknown_key
-from rootsopt.design.space import bounds_of
 from rootsopt.errors import InputError
 from rootsopt.response.sensitivity import NAMES
-from rootsopt.sweeps.axes import Interval, axis_of
-from rootsopt.sweeps.points import configured
+from rootsopt.response.sweeps.axes import Interval, axis_of
+from rootsopt.response.sweeps.points import configured
+from rootsopt.scene.space import bounds_of
 
 OFFSET = "rotation_offset_deg"
 """The quantity of a record whose rotation is measured from an unknown angle: its reading minus the

@@ -13,8 +13,6 @@ from rootsopt.config import Config
 from rootsopt.config.families import FREE_FORM, families, family_of
 from rootsopt.config.study import NEAREST
 from rootsopt.config.units import MM
-from rootsopt.design.resemblance import COEFFICIENTS, Likeness, free_likeness, likeness
-from rootsopt.design.space import widened
 from rootsopt.errors import InputError
 from rootsopt.optimize.limits import settled
 from rootsopt.profiles import Outline, Profile
@@ -23,6 +21,8 @@ from rootsopt.response.records import geometry_record
 from rootsopt.scene import Scene
 from rootsopt.scene.check import shape_of
 from rootsopt.scene.families import classical, design_of, profile_from_file, profile_of
+from rootsopt.scene.resemblance import COEFFICIENTS, Likeness, free_likeness, likeness
+from rootsopt.scene.space import widened
 
 # Distance (m) of the nearest named family above which the message recommends a free form.
 _FAR = 20e-6

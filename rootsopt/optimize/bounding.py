@@ -23,10 +23,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.design.space import sobol
 from rootsopt.optimize.local import FEASIBLE, Linearization
 from rootsopt.optimize.models import Limits, Rows
 from rootsopt.optimize.optimality import Bound
+from rootsopt.scene.space import sobol
 
 FACTOR = 2.0
 """Factor on the least curvatures that agree with all pairs."""

@@ -10,9 +10,9 @@ from rootsopt.optimize.robust import StagedSearch, is_robust
 from rootsopt.optimize.search import Progress, Search
 from rootsopt.response.checkpoint import Checkpoint
 from rootsopt.response.many import HERE, Runs
+from rootsopt.response.sweeps.cluster import running
 from rootsopt.runtime.threads import one_thread
 from rootsopt.scene import check_geometry
-from rootsopt.sweeps.cluster import running
 
 
 def search_of(

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.design.space import Constraint
 from rootsopt.optimize.limits import ForceLimit
 from rootsopt.optimize.local import FEASIBLE, Group, Linearization, Look
 from rootsopt.optimize.sqp import Found, Stops, descend
+from rootsopt.scene.space import Constraint
 
 if TYPE_CHECKING:
     from rootsopt.optimize.problem import Problem

@@ -14,10 +14,10 @@ import jax.numpy as jnp
 from rootsopt.config import Config
 from rootsopt.config.study import BASELINE
 from rootsopt.config.units import unit_of, words
-from rootsopt.design.space import Constraint
 from rootsopt.errors import InputError
 from rootsopt.response.terms import Forces, Term, depends_on_forces, is_force, reporting, terms_of
 from rootsopt.scene import Scene
+from rootsopt.scene.space import Constraint
 
 LIMITS = "constraints.terms"
 """Config key that names the limited quantities."""

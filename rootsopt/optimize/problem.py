@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from rootsopt.config import Config
 from rootsopt.config.units import unit_of, words
-from rootsopt.design.space import RangeConstraint, Space, slacks_and_slopes
 from rootsopt.dynamics.measures import PEAK_NORM, line_name
 from rootsopt.errors import InputError
 from rootsopt.optimize.limits import (
@@ -31,6 +30,7 @@ from rootsopt.response.reducers import counted
 from rootsopt.response.terms import sense_of
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene
+from rootsopt.scene.space import RangeConstraint, Space, slacks_and_slopes
 from rootsopt.status import Status
 
 # Amplitude of the baseline's line (relative to its mean force) below which it can be no objective.

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from rootsopt.config import FAMILY_KEYS, Config
 from rootsopt.config.study import OptimizerConfig
-from rootsopt.design.space import Space, sobol
 from rootsopt.errors import InputError
 from rootsopt.optimize import noise
 from rootsopt.optimize.beginning import beginning
@@ -41,6 +40,7 @@ from rootsopt.response.starts import Seeds
 from rootsopt.response.still import Still, needed_motion
 from rootsopt.runtime.threads import POLL
 from rootsopt.scene import Scene
+from rootsopt.scene.space import Space, sobol
 
 # Maximum number of points at which the search for the least violation of the constraints starts.
 _EXPLAINED = 8

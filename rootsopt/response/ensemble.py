@@ -25,7 +25,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rootsopt.config import EnsembleConfig
-from rootsopt.design.space import Space
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import TOO_DEEP
@@ -52,6 +51,7 @@ from rootsopt.response.members import (
 )
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene
+from rootsopt.scene.space import Space
 from rootsopt.status import Status
 
 # Finest tolerance at which the motions of an ensemble are integrated. The standard errors of an

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from rootsopt.config import Config
 from rootsopt.config.tolerances import Scatter, TolerancesConfig
-from rootsopt.design.space import sobol
 from rootsopt.scene import Scene
+from rootsopt.scene.space import sobol
 
 NOMINAL, RANDOM = "as given", "random"
 """Names of the config's own scene, and of random ones before their number, in `assumed`."""

@@ -86,8 +86,8 @@ _PACKAGE = Path(__file__).parents[1]
 
 # Parts of this package on which any program may depend, beside the one that defines it.
 _INNER = (
-    *("config", "contact", "design", "dynamics", "profiles", "pump", "response", "runtime"),
-    *("scene", "errors.py", "status.py"),
+    *("config", "contact", "dynamics", "profiles", "pump", "response", "runtime", "scene"),
+    *("errors.py", "status.py"),
 )
 
 # Texts for people: docstrings and comments. Groups: other texts, which stay.

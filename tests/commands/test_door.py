@@ -121,7 +121,7 @@ WAITING = """
 import sys, time
 from pathlib import Path
 from rootsopt.commands import door
-from rootsopt.output.runs import RunFolder
+from rootsopt.view.runs import RunFolder
 def work():
     with RunFolder(sys.argv[1]) as folder, door.leaving(folder.abandon):
         folder.write_text("config.yaml", "new")
@@ -254,7 +254,7 @@ def test_commands_import_late_what_a_run_may_not_need():
         "xarray",
         "jinja2",
         "bokeh",
-        "rootsopt.pages.html",
+        "rootsopt.view.pages.html",
     )
     code = "import sys; from rootsopt.commands import cli, table; cli.parser(table.profile)"
     code += f"\nimport {work}; print([n for n in {slow} if n in sys.modules])"

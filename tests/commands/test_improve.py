@@ -13,7 +13,7 @@ import pytest
 
 from rootsopt.commands.table import improve
 from rootsopt.commands.work import improve as work
-from rootsopt.output.comparison import NOTHING_BETTER, WORTH
+from rootsopt.view.comparison import NOTHING_BETTER, WORTH
 from tests.measured.test_finding import cut_cic, cycloids, write
 from tests.standins import evaluation_of
 

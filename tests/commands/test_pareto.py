@@ -9,10 +9,10 @@ import pytest
 import rootsopt
 from rootsopt.commands.table import pareto
 from rootsopt.config import load
-from rootsopt.output.files import design_file
 from rootsopt.profiles import geometry
 from rootsopt.response.records import geometry_record
 from rootsopt.scene import Scene, design_vector
+from rootsopt.view.files import design_file
 
 ROOT = Path(__file__).parents[2]
 CIC = str(ROOT / "configs" / "cic_drawn.yaml")

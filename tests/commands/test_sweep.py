@@ -14,7 +14,7 @@ import pytest
 import xarray
 
 from rootsopt.commands.table import sweep
-from rootsopt.sweeps import points
+from rootsopt.response.sweeps import points
 
 ROOT = Path(__file__).parents[2]
 WORKERS = ROOT / "tests" / "sweeps" / "workers.py"

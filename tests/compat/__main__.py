@@ -29,27 +29,27 @@ COPIED = "tests", "configs", "experiments", "docs", "pyproject.toml", "README.md
 TESTS = (
     "tests/config",
     "tests/contact/test_closed_forms.py",
-    "tests/design/test_bounds.py",
-    "tests/pages/test_knobs.py",
-    "tests/pages/test_latest.py",
-    "tests/pages/test_server.py",
-    "tests/figures/test_drawing.py",
+    "tests/scene/test_bounds.py",
+    "tests/view/test_knobs.py",
+    "tests/view/test_latest.py",
+    "tests/view/test_server.py",
+    "tests/view/test_drawing.py",
     "tests/optimize/test_sqp.py",
-    "tests/output/test_runs.py",
+    "tests/view/test_runs.py",
     "tests/profiles/test_freeform.py",
     "tests/pump/test_pump_flow.py",
-    "tests/pages/test_report.py",
+    "tests/view/test_report.py",
     "tests/runtime/test_store.py",
     "tests/scene/test_scene.py",
-    "tests/sweeps/test_axes.py",
-    "tests/sweeps/test_plan.py",
+    "tests/response/test_axes.py",
+    "tests/response/test_plan.py",
     "tests/runtime/test_journal.py",
 )
 """A few test files per package that take seconds, apart from compiling."""
 LEFT = (
     "tests/config/test_shipped.py::test_an_installed_package_has_its_configs_and_types",
-    "tests/pages/test_server.py::test_ctrl_c_ends_with_success",
-    "tests/output/test_runs.py::test_nothing_is_written_outside_of_the_runs_own_folder",
+    "tests/view/test_server.py::test_ctrl_c_ends_with_success",
+    "tests/view/test_runs.py::test_nothing_is_written_outside_of_the_runs_own_folder",
 )
 """Tests that need the package's source, compiled programs or the extra `cad`."""
 IMPORTS = "distributed", "bokeh", "jinja2", "shtab", "h5netcdf"

@@ -20,12 +20,12 @@ from rootsopt.config import Config, parse
 from rootsopt.config.explain import describe
 from rootsopt.config.families import families, family_of
 from rootsopt.contact.closest import FlankPair
-from rootsopt.design.space import Space, sobol
 from rootsopt.errors import InputError
 from rootsopt.profiles import geometry
 from rootsopt.profiles.geometry import margins
 from rootsopt.scene import Scene
 from rootsopt.scene.families import check, design_of, profile_of
+from rootsopt.scene.space import Space, sobol
 
 R = 0.033
 LOBES = 3

@@ -12,13 +12,13 @@ import ezdxf
 import numpy as np
 
 from rootsopt.config import load
-from rootsopt.figures.drawing import Drawing
-from rootsopt.figures.dxf import dxf_bytes
 from rootsopt.measured.conjugacy import conjugacy
 from rootsopt.measured.fit import imported
 from rootsopt.measured.reading import read
 from rootsopt.profiles import CIC, EE, outline
 from rootsopt.scene import Scene, design_vector
+from rootsopt.view.figures.drawing import Drawing
+from rootsopt.view.figures.dxf import dxf_bytes
 from tests.fuzz.verdict import fault_of
 
 SECONDS = 20.0

@@ -5,9 +5,9 @@ import pytest
 import xarray
 
 from rootsopt import InputError, load_config
-from rootsopt.design.space import bounds_of
 from rootsopt.identification.quantities import fitted
 from rootsopt.identification.record import observed
+from rootsopt.scene.space import bounds_of
 
 CIC = load_config("cic")
 

@@ -19,10 +19,10 @@ from rootsopt.measured.fit import imported
 from rootsopt.measured.loop import Loop
 from rootsopt.measured.source import advice, outline_of
 from rootsopt.optimize.design import optimize_design
+from rootsopt.optimize.tradeoffs.trace import pareto_front
 from rootsopt.profiles import CIC, EE, geometry, outline
 from rootsopt.scene import check_geometry
 from rootsopt.scene.families import free_form_of
-from rootsopt.tradeoffs.trace import pareto_front
 
 R = 0.033
 CIC3 = CIC(3, R, np.deg2rad(36.43), 8.5e-3, np.deg2rad(4.0))

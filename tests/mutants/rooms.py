@@ -4,9 +4,9 @@ from pathlib import Path
 
 _TESTS = Path(__file__).parents[1]
 _OF = {
-    "continuation/arclength": "arclength continuation",
-    "continuation/branch": "continuation",
-    "continuation/family": "continuation",
+    "response/continuation/arclength": "arclength continuation",
+    "response/continuation/branch": "continuation",
+    "response/continuation/family": "continuation",
     "contact/closest": "closed_forms contact accuracy families gradients",
     "contact/gap": "conformance worn twisted scene",
     "contact/law": "conformance extending_parts contact extremes",
@@ -40,9 +40,9 @@ _OF = {
     "dynamics/parts/machine": "drive scene friction pair orbit contact dynamics gear_errors",
     "dynamics/parts/load": "load scene dynamics bearings loads",
     "config/families": "extending families config",
-    "design/sizing": "new",
-    "design/resemblance": "resemblance",
-    "design/space": "search optimize freeform bounds families beginning",
+    "scene/sizing": "new",
+    "scene/resemblance": "resemblance",
+    "scene/space": "search optimize freeform bounds families beginning",
     "identification/answer": "squares identify",
     "identification/channels": "identify",
     "identification/fit": "identify",
@@ -97,14 +97,14 @@ _OF = {
     "response/steady": "steady gradients",
     "response/terms": "terms loads leakage free_twist",
     "response/together": "together",
-    "sweeps/axes": "axes",
-    "sweeps/plan": "plan",
-    "sweeps/scenes": "scenes",
-    "tradeoffs/assembly": "tradeoffs",
-    "tradeoffs/front": "tradeoffs",
-    "tradeoffs/scalar": "tradeoffs evaluations",
-    "tradeoffs/study": "tradeoffs",
-    "tradeoffs/trace": "tradeoffs",
+    "response/sweeps/axes": "axes",
+    "response/sweeps/plan": "plan",
+    "response/sweeps/scenes": "scenes",
+    "optimize/tradeoffs/assembly": "tradeoffs",
+    "optimize/tradeoffs/front": "tradeoffs",
+    "optimize/tradeoffs/scalar": "tradeoffs evaluations",
+    "optimize/tradeoffs/study": "tradeoffs",
+    "optimize/tradeoffs/trace": "tradeoffs",
 }
 """Modules, and the WORDs in the names `test_WORD.py` of their tests."""
 

@@ -13,7 +13,6 @@ import rootsopt
 from rootsopt.commands.console import main
 from rootsopt.config import load
 from rootsopt.config.tolerances import Span
-from rootsopt.design.space import Space
 from rootsopt.optimize.assumed import BASELINE, OPTIMIZED, Assumed
 from rootsopt.optimize.assumptions import _change, _known, compared
 from rootsopt.optimize.design import search_of
@@ -23,6 +22,7 @@ from rootsopt.response.reducers import over_scenes
 from rootsopt.response.result import Part
 from rootsopt.response.scatter import assumed, in_conditions
 from rootsopt.scene import Scene
+from rootsopt.scene.space import Space
 from tests.standins import evaluation_of
 
 CLEARANCE, LOAD = "contact.clearance_mm", "scene.load.torque_N_m"

@@ -11,16 +11,16 @@ import yaml
 
 from rootsopt.commands.work.searching import checkpoint_of
 from rootsopt.config import load, parse
-from rootsopt.design.resemblance import Likeness
-from rootsopt.design.space import bounds_of, widened
 from rootsopt.errors import InputError
 from rootsopt.optimize import beginning as module
 from rootsopt.optimize.beginning import beginning
 from rootsopt.optimize.outcome import Optimization
 from rootsopt.optimize.search import Search
-from rootsopt.output.runs import RunFolder
 from rootsopt.scene import outline_mm
 from rootsopt.scene.check import shape_of
+from rootsopt.scene.resemblance import Likeness
+from rootsopt.scene.space import bounds_of, widened
+from rootsopt.view.runs import RunFolder
 from tests.measured.test_outline import cut
 from tests.standins import evaluation_of
 

@@ -11,11 +11,11 @@ from rootsopt.commands.work import optimize as work
 from rootsopt.config import parse
 from rootsopt.errors import InputError
 from rootsopt.optimize.search import Search
-from rootsopt.output.runs import RunFolder
 from rootsopt.response.checkpoint import Checkpoint
 from rootsopt.response.evaluation import Evaluation
 from rootsopt.response.starts import Seed
 from rootsopt.status import Status
+from rootsopt.view.runs import RunFolder
 
 SCENE = """
 profile: {family: cic, lobes: 3, pitch_radius_mm: 33.0, pressure_angle_deg: 36.43,

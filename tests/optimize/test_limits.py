@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from rootsopt.config import parse
-from rootsopt.design.space import RangeConstraint
 from rootsopt.dynamics.maxima import Maxima
 from rootsopt.errors import InputError
 from rootsopt.optimize.infeasible import explain
@@ -21,6 +20,7 @@ from rootsopt.response.records import geometry_record
 from rootsopt.response.result import Part
 from rootsopt.response.terms import Term, _terms, register_term
 from rootsopt.scene import Scene
+from rootsopt.scene.space import RangeConstraint
 from rootsopt.status import Status
 from tests.optimize.test_optimize import SCENE, baseline
 

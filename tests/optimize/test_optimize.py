@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 
 from rootsopt.config import parse
-from rootsopt.design.space import Space, sobol
 from rootsopt.errors import InputError
 from rootsopt.optimize.infeasible import explain
 from rootsopt.optimize.problem import Problem
@@ -27,6 +26,7 @@ from rootsopt.profiles.geometry import margins
 from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.runtime.threads import until_stopped
 from rootsopt.scene import Scene
+from rootsopt.scene.space import Space, sobol
 from rootsopt.status import Status
 
 SCENE = """

@@ -9,16 +9,16 @@ import optax
 import pytest
 
 from rootsopt.config import load
-from rootsopt.design.space import sobol
 from rootsopt.optimize import noise
 from rootsopt.optimize.local import Linearization
 from rootsopt.optimize.outcome import Trial, history_of
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.search import Search, Stage, _apart, _ranked
-from rootsopt.output.tables import rejected_table
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.many import HERE
+from rootsopt.scene.space import sobol
 from rootsopt.status import Status
+from rootsopt.view.tables import rejected_table
 from tests.standins import evaluation_of
 
 

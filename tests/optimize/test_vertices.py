@@ -11,9 +11,9 @@ from scipy.spatial import HalfspaceIntersection
 from rootsopt.commands.console import main
 from rootsopt.config import load
 from rootsopt.optimize.vertices import FeasibleSet
-from rootsopt.output.names import brief
 from rootsopt.profiles import geometry
 from rootsopt.scene import Scene
+from rootsopt.view.names import brief
 
 OBJECTIVE = "objective={mean_weight: 0, peak_weight: 0, terms: {outer_radius_mm: 1}}"
 

@@ -9,13 +9,13 @@ import pytest
 from scipy.interpolate import BSpline
 
 from rootsopt.config import parse
-from rootsopt.design.space import sobol
 from rootsopt.errors import InputError
 from rootsopt.optimize.problem import Problem
 from rootsopt.profiles import CIC, EE, FreeForm, geometry, project
 from rootsopt.profiles.departure import departure
 from rootsopt.scene import Scene, design_vector
 from rootsopt.scene.families import check, free_form_of, profile_of
+from rootsopt.scene.space import sobol
 from tests.optimize.test_optimize import SCENE
 
 R = 0.033

@@ -13,7 +13,6 @@ import pytest
 from rootsopt import optimize
 from rootsopt.commands.table import simulate
 from rootsopt.config import DESIGN_KEYS, EnsembleConfig, load
-from rootsopt.output import tables
 from rootsopt.response.ensemble import (
     ERRORS,
     SIGNIFICANT,
@@ -25,6 +24,7 @@ from rootsopt.response.ensemble import (
 from rootsopt.response.evaluation import RESPONSES, Evaluator
 from rootsopt.response.members import Members
 from rootsopt.status import Status
+from rootsopt.view import tables
 
 PERIODIC = ("ensemble.members=8", "ensemble.settle_periods=48", "ensemble.periods=8")
 GEAR = "scene.timing_gear={stiffness_N_m_per_rad: 2.0e4, damping_ratio: 0.1, backlash_mm: 0.4}"

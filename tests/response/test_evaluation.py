@@ -3,8 +3,8 @@
 import numpy as np
 
 from rootsopt.dynamics.flanks import FlankForce
-from rootsopt.output import files
 from rootsopt.response import records
+from rootsopt.view import files
 from tests.standins import oscillator
 
 

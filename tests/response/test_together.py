@@ -11,8 +11,8 @@ import pytest
 import rootsopt
 from rootsopt.response import together
 from rootsopt.response.evaluation import Evaluator, _motion
-from rootsopt.sweeps import points
-from rootsopt.sweeps.points import simulated, simulated_together
+from rootsopt.response.sweeps import points
+from rootsopt.response.sweeps.points import simulated, simulated_together
 
 SPEED, LOAD, ANGLE = "scene.speed_rpm", "scene.load.torque_N_m", "profile.pressure_angle_deg"
 POINTS = [{SPEED: 2000.0}, {ANGLE: 5.0}, {SPEED: 3000.0}, {LOAD: 3000.0}]
@@ -65,7 +65,7 @@ def test_a_batch_that_fails_is_done_one_by_one(config, monkeypatch):
     def broken(evaluators):
         raise MemoryError
 
-    monkeypatch.setattr("rootsopt.sweeps.points.evaluate_together", broken)
+    monkeypatch.setattr("rootsopt.response.sweeps.points.evaluate_together", broken)
     found = simulated_together(config, POINTS[:1])
     assert found == [simulated(config, POINTS[0])]
 

@@ -14,11 +14,11 @@ from rootsopt.response.checkpoint import Checkpoint, plain_evaluation
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.many import Point
 from rootsopt.response.result import Part
+from rootsopt.response.sweeps.plan import plan_of
+from rootsopt.response.sweeps.points import lost
+from rootsopt.response.sweeps.scenes import Points
 from rootsopt.runtime.journal import Journal, _line, header_of, set_aside
 from rootsopt.status import Status
-from rootsopt.sweeps.plan import plan_of
-from rootsopt.sweeps.points import lost
-from rootsopt.sweeps.scenes import Points
 from tests.optimize.test_checkpoint import evaluation
 
 ROW = lost(Status.INVALID) | {"response": {"mean_force_N": 0.1 + 0.2, "peak_force_N": float("nan")}}

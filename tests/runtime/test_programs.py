@@ -22,12 +22,11 @@ from rootsopt.commands import cli
 from rootsopt.commands.work.searching import CompileClock
 from rootsopt.config import load
 from rootsopt.config.families import import_named
-from rootsopt.design import space
 from rootsopt.dynamics.collocation.known import KnownOrbit
 from rootsopt.pump import sheet
 from rootsopt.runtime import environment, programs
 from rootsopt.runtime.programs import CachedFunction
-from rootsopt.scene import Scene
+from rootsopt.scene import Scene, space
 from tests.standins import for_a_time
 
 

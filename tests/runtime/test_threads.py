@@ -17,10 +17,10 @@ import rootsopt
 from rootsopt.config import load
 from rootsopt.errors import InputError
 from rootsopt.optimize import design
+from rootsopt.optimize.tradeoffs import trace
 from rootsopt.runtime.environment import own_process
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.runtime.threads import on_all_cores, one_thread
-from rootsopt.tradeoffs import trace
 
 ROOT = Path(__file__).parents[2]
 

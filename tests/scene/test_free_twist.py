@@ -7,10 +7,10 @@ import pytest
 import rootsopt
 from rootsopt import InputError, Scene
 from rootsopt.config.units import DEG
-from rootsopt.design.space import Space, bounds_of
 from rootsopt.optimize.search import Search
 from rootsopt.pump.sheet import sheet
 from rootsopt.response.terms import terms_of, values_of
+from rootsopt.scene.space import Space, bounds_of
 
 FREE = "optimizer.bounds.helix_deg=[0, 90]", "rotor.helix_deg=20", "solver.slices=2"
 GAS = "scene.load={pressure_difference_Pa: 5e4}", "scene.bearings={weight: true}"

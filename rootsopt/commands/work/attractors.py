@@ -7,12 +7,12 @@ from rich.console import Console
 
 from rootsopt.commands import cli
 from rootsopt.config import Config
-from rootsopt.output import files
-from rootsopt.output.runs import RunFolder
 from rootsopt.response.attractors import find
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.records import message_of
 from rootsopt.scene import check_geometry
+from rootsopt.view import files
+from rootsopt.view.runs import RunFolder
 
 
 def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.Outcome:
@@ -47,7 +47,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
             response = files.response_columns(one.evaluation.series)
             folder.write_csv(f"response_{number}.csv", response)
     if not options.no_figures:
-        from rootsopt.figures.basins import basin_figures
+        from rootsopt.view.figures.basins import basin_figures
 
         basin_figures(folder, found, config)
 

@@ -9,12 +9,11 @@ import threading
 import webbrowser
 from pathlib import Path
 
-from rootsopt import pages
 from rootsopt.commands import door
 from rootsopt.config import Config
-from rootsopt.output import disk
 from rootsopt.runtime import environment
 from rootsopt.scene import check_geometry
+from rootsopt.view import disk, pages
 
 
 def body(config: Config, options: argparse.Namespace) -> int:
@@ -23,10 +22,11 @@ def body(config: Config, options: argparse.Namespace) -> int:
     Raises `InputError` if the config or an option is invalid, or if a library is missing."""
     pages.require("`explore`", "explore")
     check_geometry(config)
-    from rootsopt.pages.engine import Engine
-    from rootsopt.pages.server import PageServer
+    from rootsopt.optimize.design import optimize_design
+    from rootsopt.view.pages.engine import Engine
+    from rootsopt.view.pages.server import PageServer
 
-    engine = Engine(config)
+    engine = Engine(config, optimize_design)
     server = PageServer(engine, str(options.config), options.port)
 
     def prepare() -> None:

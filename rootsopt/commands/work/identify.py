@@ -8,8 +8,8 @@ from rootsopt.commands import cli
 from rootsopt.config import Config
 from rootsopt.errors import InputError
 from rootsopt.identification.fit import identify
-from rootsopt.output import files
-from rootsopt.output.runs import RunFolder
+from rootsopt.view import files
+from rootsopt.view.runs import RunFolder
 
 
 def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.Outcome:
@@ -36,7 +36,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
         folder.write_csv("residuals.csv", found.residuals)
     folder.write_json("result.json", data | {"versions": files.versions()})
     if found.parameters and not options.no_figures:
-        from rootsopt.figures.identified import identified_figure
+        from rootsopt.view.figures.identified import identified_figure
 
         identified_figure(folder, found)
 

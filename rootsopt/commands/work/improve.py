@@ -6,25 +6,25 @@ from typing import Any
 
 import numpy as np
 
-from rootsopt import pages
 from rootsopt.commands import cli
 from rootsopt.commands.work import optimize
 from rootsopt.config import Config, load
 from rootsopt.config.document import read_document
 from rootsopt.config.families import FREE_FORM
-from rootsopt.design.resemblance import Likeness, free_likeness, likeness
-from rootsopt.design.space import widened
 from rootsopt.errors import InputError
 from rootsopt.measured.source import Found, found
 from rootsopt.optimize.surviving import survives, surviving
-from rootsopt.output.comparison import NOTHING_BETTER, WORTH, better_tables
-from rootsopt.output.names import stated
-from rootsopt.output.runs import RunFolder
 from rootsopt.pump.sheet import record_of
 from rootsopt.runtime.environment import say
 from rootsopt.scene.check import shape_of
 from rootsopt.scene.families import classical
+from rootsopt.scene.resemblance import Likeness, free_likeness, likeness
+from rootsopt.scene.space import widened
 from rootsopt.status import Status
+from rootsopt.view import pages
+from rootsopt.view.comparison import NOTHING_BETTER, WORTH, better_tables
+from rootsopt.view.names import stated
+from rootsopt.view.runs import RunFolder
 
 # Terms of the objective by aim; `quieter` has the mean and the peak force instead.
 _TERMS = {"tighter": "leakage_fraction", "smoother": "flow_ripple"}

@@ -19,11 +19,11 @@ from rootsopt.config.families import family_of
 from rootsopt.config.sheet import Sheet, made, option
 from rootsopt.config.sources import regular_file
 from rootsopt.config.words import placed, sentence
-from rootsopt.design.sizing import sized
 from rootsopt.errors import InputError
-from rootsopt.output import disk
 from rootsopt.runtime.environment import say
 from rootsopt.scene.check import shape_of
+from rootsopt.scene.sizing import sized
+from rootsopt.view import disk
 
 _POWERS = "power_kW", "pressure_difference_bar"
 

@@ -16,17 +16,17 @@ from rootsopt.commands.work.searching import (
 )
 from rootsopt.config import Config
 from rootsopt.config.families import family_of
-from rootsopt.design.resemblance import likenesses
-from rootsopt.figures import chosen
 from rootsopt.measured import conjugacy
 from rootsopt.optimize import noise
 from rootsopt.optimize.design import search_of
 from rootsopt.optimize.outcome import Optimization
-from rootsopt.output import files
-from rootsopt.output.runs import RunFolder
 from rootsopt.pump.sheet import check_clearances, record_of
 from rootsopt.response.sensitivity import touching
 from rootsopt.scene import Scene, check_geometry, outline_mm
+from rootsopt.scene.resemblance import likenesses
+from rootsopt.view import files
+from rootsopt.view.figures import chosen
+from rootsopt.view.runs import RunFolder
 
 
 def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.Outcome:
@@ -67,7 +67,7 @@ def searched_for(
     alike |= further(result)
     _write(folder, config, options, result, alike, sheets, compiled, ran)
     if result.optimized is not None and formats:
-        from rootsopt.figures.writing import write_simulated
+        from rootsopt.view.figures.writing import write_simulated
 
         write_simulated(folder, _searching(config, result), formats, result.optimized)
     total = time.perf_counter() - began
@@ -231,7 +231,7 @@ def _write(folder, config, options, result, alike, sheets, compiled, ran) -> Non
 
 def _draw(folder, config: Config, result, data: dict) -> None:
     """Write the figures of a search; `data`: content of the result file."""
-    from rootsopt.figures import runs, spread, sweep
+    from rootsopt.view.figures import runs, spread, sweep
 
     if result.optimized is not None:
         pair, rows = (result.baseline, result.optimized), result.history
@@ -268,7 +268,7 @@ def _write_robustness(folder, config, options, robustness) -> None:
         columns |= {f"{name}_{key}": values for key, values in one.values.items()}
     folder.write_csv("tolerances.csv", columns)
     if not options.no_figures:
-        from rootsopt.figures.spread import distributions
+        from rootsopt.view.figures.spread import distributions
 
         designs = {name: one.values for name, one in robustness.fresh.items()}
         count = len(next(iter(robustness.scenes.values())))

@@ -11,10 +11,10 @@ from rootsopt.commands.work.searching import (
     searched,
 )
 from rootsopt.config import Config
-from rootsopt.output import files
-from rootsopt.output.runs import RunFolder
+from rootsopt.optimize.tradeoffs.trace import Tracer
 from rootsopt.scene import check_geometry
-from rootsopt.tradeoffs.trace import Tracer
+from rootsopt.view import files
+from rootsopt.view.runs import RunFolder
 
 
 def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.Outcome:
@@ -43,7 +43,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
         folder.write_text(files.design_file(point.number), text)
     folder.write_json("result.json", record | {"versions": files.versions()})
     if front.points and not options.no_figures:
-        from rootsopt.figures.front import front_figure
+        from rootsopt.view.figures.front import front_figure
 
         front_figure(folder, front)
     if front.interrupted and not front.points:

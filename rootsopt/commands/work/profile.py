@@ -5,18 +5,18 @@ from typing import Any
 
 from rootsopt.commands import cli
 from rootsopt.config import Config
-from rootsopt.design.resemblance import free_likeness, likenesses
-from rootsopt.figures import chosen
-from rootsopt.figures.writing import write
 from rootsopt.measured import conjugacy
-from rootsopt.output import files
-from rootsopt.output.runs import RunFolder
 from rootsopt.profiles import Profile, geometry
 from rootsopt.pump.sheet import sheet
 from rootsopt.response.records import geometry_record
 from rootsopt.scene import Scene, check_geometry, design_keys, design_vector, outline_mm
 from rootsopt.scene.families import free_form_of, margins_of
+from rootsopt.scene.resemblance import free_likeness, likenesses
 from rootsopt.status import Status
+from rootsopt.view import files
+from rootsopt.view.figures import chosen
+from rootsopt.view.figures.writing import write
+from rootsopt.view.runs import RunFolder
 
 
 def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.Outcome:
@@ -46,7 +46,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     folder.write_csv("profile_design.csv", files.profile_columns(outline_mm(config)))
     write(folder, config, formats, record["design"])
     if not options.no_figures:
-        from rootsopt.figures import runs
+        from rootsopt.view.figures import runs
 
         runs.profile_figures(folder, config, record)
     alike = resembles(scene.profile(design)) if options.resembles else []

@@ -15,15 +15,15 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from rootsopt.commands import cli, door
 from rootsopt.config import Config
-from rootsopt.output import files
-from rootsopt.output.runs import RunFolder
 from rootsopt.response.checkpoint import Checkpoint
 from rootsopt.response.many import Runs
+from rootsopt.response.sweeps.cluster import running
 from rootsopt.runtime.environment import say
 from rootsopt.runtime.journal import Journal, header_of, set_aside
 from rootsopt.runtime.threads import until_stopped
 from rootsopt.status import Status
-from rootsopt.sweeps.cluster import running
+from rootsopt.view import files
+from rootsopt.view.runs import RunFolder
 
 Found = TypeVar("Found", covariant=True)
 PATIENCE = 5.0

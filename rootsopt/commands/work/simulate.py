@@ -6,15 +6,15 @@ from rich.console import Console
 
 from rootsopt.commands import cli
 from rootsopt.config import Config
-from rootsopt.figures import chosen
 from rootsopt.measured import conjugacy
-from rootsopt.output import files, tables
-from rootsopt.output.runs import RunFolder
 from rootsopt.pump.sheet import check_clearances, record_of
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.reducers import alone
 from rootsopt.response.sensitivity import touching
 from rootsopt.scene import check_geometry, outline_mm
+from rootsopt.view import files, tables
+from rootsopt.view.figures import chosen
+from rootsopt.view.runs import RunFolder
 
 
 def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.Outcome:
@@ -38,11 +38,11 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
         data["touching"] = scattered
     folder.write_json("result.json", data | {"versions": files.versions()})
     if formats:
-        from rootsopt.figures.writing import write_simulated
+        from rootsopt.view.figures.writing import write_simulated
 
         write_simulated(folder, config, formats, evaluation)
     if not options.no_figures:
-        from rootsopt.figures import runs
+        from rootsopt.view.figures import runs
 
         runs.simulation_figures(folder, evaluation, config)
     shown = [*tables.tables_of(data), tables.effort_table(data)]

@@ -14,14 +14,14 @@ from rootsopt.commands.work.searching import opened, progress_bar
 from rootsopt.config import Config
 from rootsopt.config.plausible import notes_on_swept
 from rootsopt.errors import InputError
-from rootsopt.output import files, sweeps
-from rootsopt.output.runs import RunFolder
+from rootsopt.response.sweeps.axes import parse_over
+from rootsopt.response.sweeps.cluster import running
+from rootsopt.response.sweeps.plan import Plan, plan_of, scattered
+from rootsopt.response.sweeps.scenes import Points, checked, complete, dataset_of
 from rootsopt.runtime.environment import say
 from rootsopt.status import Status
-from rootsopt.sweeps.axes import parse_over
-from rootsopt.sweeps.cluster import running
-from rootsopt.sweeps.plan import Plan, plan_of, scattered
-from rootsopt.sweeps.scenes import Points, checked, complete, dataset_of
+from rootsopt.view import files, sweeps
+from rootsopt.view.runs import RunFolder
 
 _DATA = "sweep.nc"
 
@@ -65,7 +65,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     record = sweeps.summary(plan, records) | {"data": _DATA, "statistics": statistics}
     folder.write_json("result.json", record | {"versions": files.versions()})
     if not options.no_figures:
-        from rootsopt.figures.sweep import sweep_figure
+        from rootsopt.view.figures.sweep import sweep_figure
 
         sweep_figure(folder, plan, dataset)
     if done:

@@ -1,0 +1,297 @@
+"""Assembles a front from its nodes: which points stay, which are neighbours, and the rates.
+
+A *node* is an optimum that the tracing has found; a *point* belongs to the finished front. An *end*
+of the front is the optimum of one term alone.
+
+If two neighbours lie far apart, a search looks for a point between them (bisection). Without a gap,
+it finds such a point. At a gap, where the terms or the designs jump, it leads back to one of the
+two neighbours. The *spacing* of terms is the distance between neighbouring reference points
+(`rootsopt.optimize.tradeoffs.scalar`). Points are identified by their indices."""
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rootsopt.config.units import words
+from rootsopt.optimize.local import Certificate
+from rootsopt.optimize.tradeoffs.front import FrontPoint, Gap, dominated, ordered, repeated
+from rootsopt.optimize.tradeoffs.scalar import Scalar, Scale, rates
+from rootsopt.optimize.tradeoffs.study import Sample, Study
+from rootsopt.status import Standing
+
+Pair = tuple[int, int]
+# Distance in terms (multiples of the spacing) above which two neighbours are bisected.
+_WIDE_TERMS = 1.8
+# Distances in the unit box (multiples of the typical distance; absolute) above which two neighbours
+# are bisected. Both must be exceeded.
+_WIDE_DESIGN, _LEAST_DESIGN = 3.0, 0.05
+# Distance in terms (multiples of the spacing) below which two neighbours with distant designs are a
+# gap of kind `design`, without another bisection.
+_CLOSE = 0.3
+# Distance from a neighbour (fraction of the distance between both neighbours) below which a point
+# found by bisection counts as that neighbour.
+_BACK = 0.1
+
+
+class Edge(NamedTuple):
+    """Two neighbours on a front, and the distances between them.
+
+    `pair`: indices of the neighbours; `distance`: Euclidean distance in scaled terms;
+    `design_distance`: greatest difference of a coordinate of the unit box."""
+
+    pair: Pair
+    distance: float
+    design_distance: float
+
+
+class Spacing(NamedTuple):
+    """Typical distances between neighbours: `terms` in scaled terms, `design` in the unit box."""
+
+    terms: float
+    design: float
+
+    def excess(self, edge: Edge) -> float:
+        """Return the distance of two neighbours divided by that above which they are bisected.
+
+        The greater of the quotients in terms and in the unit box counts."""
+        jump = edge.design_distance / max(_WIDE_DESIGN * self.design, _LEAST_DESIGN)
+        return max(edge.distance / (_WIDE_TERMS * self.terms), jump)
+
+    def kind(self, edge: Edge) -> str:
+        """Return "terms" if two neighbours are far apart in terms, otherwise "design"."""
+        return "terms" if edge.distance > _WIDE_TERMS * self.terms else "design"
+
+    def close(self, edge: Edge) -> bool:
+        """Return whether two neighbours are too close in terms to be bisected."""
+        return edge.distance <= _CLOSE * self.terms
+
+
+def measured(pair: Pair, values: NDArray[np.float64], points: NDArray[np.float64]) -> Edge:
+    """Return the `Edge` of a `pair` of points.
+
+    `values` (n, k): scaled terms of all points; `points` (n, d): their designs in the unit box."""
+    i, j = pair
+    apart = float(np.linalg.norm(values[i] - values[j]))
+    return Edge(pair, apart, float(np.max(np.abs(points[i] - points[j]))))
+
+
+def along(kept: Sequence[int]) -> list[Pair]:
+    """Return the pairs of neighbours on a front of two terms: successive indices in `kept`."""
+    return list(itertools.pairwise(kept))
+
+
+def among(pairs: Sequence[Pair], kept: Sequence[int], same: Sequence[int]) -> list[Pair]:
+    """Return those `pairs` whose points are both in `kept`, each once.
+
+    `same`: for each point, the index of the point that replaces it, or -1."""
+    found: dict[Pair, None] = {}
+    for pair in pairs:
+        i, j = sorted(same[k] if same[k] >= 0 else k for k in pair)
+        if i != j and i in kept and j in kept:
+            found[i, j] = None
+    return [*found]
+
+
+def divides(
+    edge: Edge, values: NDArray[np.float64], one: NDArray[np.float64], other: NDArray[np.float64]
+) -> bool:
+    """Return whether a point with scaled terms `values` (k,) lies between two neighbours.
+
+    `edge`: edge of the neighbours; `one`, `other` (k,): their scaled terms."""
+    apart = [float(np.linalg.norm(values - end)) for end in (one, other)]
+    return min(apart) > _BACK * edge.distance and max(apart) < edge.distance * (1 + _BACK)
+
+
+@dataclasses.dataclass
+class Bisections:
+    """Results of all bisections so far.
+
+    `pairs`: pairs of neighbours (three terms only); `tried`: number of searches between each pair;
+    `closed`: kind of the gap between each pair that is not bisected further."""
+
+    pairs: list[Pair]
+    tried: dict[Pair, int] = dataclasses.field(default_factory=dict)
+    closed: dict[Pair, str] = dataclasses.field(default_factory=dict)
+
+    def divided(self, pair: Pair, middle: int) -> None:
+        """Record that the point with the index `middle` was found between the two of a `pair`."""
+        count = self.tried.get(pair, 0)
+        for end in pair:
+            new = (min(end, middle), max(end, middle))
+            self.tried[new] = count
+            self.pairs.append(new)
+        if pair in self.pairs:
+            self.pairs.remove(pair)
+
+
+# Multiplier of a limit below which the limit counts as inactive.
+_HELD = 1e-6
+
+
+class Node(NamedTuple):
+    """One point of a front while it is traced.
+
+    `scalar`: the objective that was minimised; `sample`: the best design; `certificate`:
+    first-order conditions there; `reason`: why the search ended; `end`: index of the term whose
+    optimum this is, or -1; `standing`: status, `NOT_VERIFIED` until the design has been simulated
+    again."""
+
+    scalar: Scalar
+    sample: Sample
+    certificate: Certificate
+    reason: str
+    end: int = -1
+    standing: Standing = Standing.NOT_VERIFIED
+
+    @property
+    def objective(self) -> float:
+        """Value of the objective."""
+        return self.scalar.value(self.sample.values)
+
+    @property
+    def point(self) -> NDArray[np.float64]:
+        """The design (d,) in the unit box."""
+        return self.sample.point
+
+
+class Selection(NamedTuple):
+    """The nodes, out of n, that form the front.
+
+    `values` (n, k): scaled terms; `points` (n, d): designs in the unit box; `standings`: status of
+    each node; `same`: for each node that repeats another one, the index of that other node, or -1;
+    `kept`: indices of the nodes on the front, in order."""
+
+    values: NDArray[np.float64]
+    points: NDArray[np.float64]
+    standings: list[Standing]
+    same: list[int]
+    kept: list[int]
+
+    def edges(self, pairs: Sequence[Pair]) -> list[Edge]:
+        """Return the pairs of neighbours on the front.
+
+        `pairs`: indices of neighbouring nodes; used for three terms only. With two terms,
+        neighbours are nodes that follow each other in `kept`."""
+        if self.values.shape[1] == 2:
+            found = [(min(pair), max(pair)) for pair in along(self.kept)]
+        else:
+            found = among(pairs, self.kept, self.same)
+        return [measured(pair, self.values, self.points) for pair in found]
+
+
+def selected(nodes: Sequence[Node], scale: Scale) -> Selection:
+    """Return the `nodes` that form the front.
+
+    Nodes that are dominated, repeat another node, or failed the verification are left out."""
+    count = len(scale.width)
+    values = scale.of(np.array([node.sample.values for node in nodes]).reshape(-1, count))
+    points = np.array([node.sample.point for node in nodes])
+    standings = [node.standing for node in nodes]
+    same = [-1] * len(nodes)
+    alive = [k for k, one in enumerate(standings) if one.kept]
+    # Of several equal nodes, keep an end if there is one, otherwise a certified node.
+    alive.sort(key=lambda k: (nodes[k].end < 0, standings[k] is not Standing.CERTIFIED))
+    beaten = dominated(values[alive]) if alive else []
+    for k, one in zip(alive, beaten, strict=True):
+        if one:
+            standings[k] = Standing.DOMINATED
+    alive = [k for k in alive if standings[k].kept]
+    for k, first in zip(alive, repeated(values[alive], points[alive]), strict=True):
+        if first >= 0:
+            standings[k], same[k] = Standing.REPEATED, alive[first]
+    alive = [k for k in alive if standings[k].kept]
+    kept = [alive[k] for k in ordered(values[alive])] if alive else []
+    return Selection(values, points, standings, same, kept)
+
+
+def spacing_of(selection: Selection, pairs: Sequence[Pair], ends: int, divisions: int) -> Spacing:
+    """Return the typical distances between neighbours before any bisection.
+
+    `selection`: nodes on the front; `pairs`: as in `Selection.edges`; `ends`: number of ends, which
+    are the first nodes; `divisions`: number of steps between two ends."""
+    corners = selection.values[:ends]
+    sides = [np.linalg.norm(a - b) for k, a in enumerate(corners) for b in corners[k + 1 :]]
+    moves = [edge.design_distance for edge in selection.edges(pairs)]
+    if not sides:
+        return Spacing(np.inf, np.inf)
+    return Spacing(float(np.mean(sides)) / divisions, float(np.median(moves)) if moves else 0.0)
+
+
+def points_of(
+    study: Study, nodes: Sequence[Node], selection: Selection, scale: Scale
+) -> tuple[list[FrontPoint], list[FrontPoint]]:
+    """Return (points of the front in order, points that were dropped) for all `nodes`.
+
+    `study`: evaluates their designs; `selection`: nodes that form the front; `scale`: that of the
+    terms."""
+    number = {k: place for place, k in enumerate(selection.kept, start=1)}
+    every = [
+        _point(study, node, number.get(k, 0), standing, scale)
+        for k, (node, standing) in enumerate(zip(nodes, selection.standings, strict=True))
+    ]
+    dropped = [one for k, one in enumerate(every) if k not in number]
+    return [every[k] for k in selection.kept], dropped
+
+
+def gaps_of(
+    selection: Selection, search: Bisections, spacing: Spacing
+) -> tuple[list[tuple[int, int]], list[Gap]]:
+    """Return (pairs of neighbours without a gap between them, the gaps).
+
+    Both refer to points by their numbers on the front (`FrontPoint.number`). `search`: results of
+    the bisections; `spacing`: typical distances between neighbours."""
+    number = {k: place for place, k in enumerate(selection.kept, start=1)}
+    edges, gaps = [], []
+    for edge in selection.edges(search.pairs):
+        first, second = sorted(number[k] for k in edge.pair)
+        closed = search.closed.get(edge.pair)
+        if closed is None and spacing.excess(edge) <= 1:
+            edges.append((first, second))
+            continue
+        kind = closed or spacing.kind(edge)
+        tried = search.tried.get(edge.pair, 0)
+        far = edge.distance, edge.design_distance
+        gaps.append(Gap(first, second, kind, *far, tried, closed is not None))
+    return edges, sorted(gaps)
+
+
+def _point(study: Study, node: Node, number: int, standing: Standing, scale: Scale) -> FrontPoint:
+    names = [aim.name for aim in study.aims]
+    signs = np.array([aim.sign for aim in study.aims])
+    weights = node.scalar.weights(node.sample, node.certificate)
+    # The rates are those of terms to be minimised; the signs convert them to the terms themselves.
+    traded = rates(weights, scale.width)[0] * signs[0] * signs
+    return FrontPoint(
+        number=number,
+        end_of=names[node.end] if node.end >= 0 else "",
+        point=node.sample.point,
+        terms=study.term_values(node.sample.evaluation),
+        evaluation=node.sample.evaluation,
+        standing=standing,
+        reason=node.reason,
+        residual=node.certificate.residual,
+        violation=node.certificate.violation,
+        weights=dict(zip(names, map(float, weights), strict=True)),
+        rates={name: float(rate) for name, rate in zip(names[1:], traded[1:], strict=True)},
+        limits=_limits(study, node.certificate),
+    )
+
+
+def _limits(study: Study, certificate: Certificate) -> dict[str, float]:
+    found = {
+        constraint.name: float(multiplier)
+        for constraint, multiplier in zip(
+            study.problem.space.constraints, certificate.multipliers, strict=True
+        )
+        if multiplier > _HELD
+    }
+    keys = study.config.design_keys
+    for side, multipliers in (("lower", certificate.lower), ("upper", certificate.upper)):
+        for key, multiplier in zip(keys, multipliers, strict=True):
+            if multiplier > _HELD:
+                found[f"{side} bound of {words(key)}"] = float(multiplier)
+    return found

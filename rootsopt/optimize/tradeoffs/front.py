@@ -1,0 +1,262 @@
+"""The front of a trade-off as a result: points, what was dropped, gaps, status."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rootsopt.config import Config
+from rootsopt.config.units import words
+from rootsopt.optimize.infeasible import Infeasible
+from rootsopt.optimize.local import RESIDUAL
+from rootsopt.optimize.tradeoffs.study import Aim
+from rootsopt.response.evaluation import Evaluation
+from rootsopt.status import Standing, Status
+
+EQUAL = 1e-6
+"""Difference between two designs in a term (fraction of its range along the front) below which the
+term counts as equal when designs are compared."""
+
+
+@dataclasses.dataclass(frozen=True)
+class FrontPoint:
+    """One design of a front.
+
+    `number`: number of the point, from 1 at the best design in the first term; 0 if it was dropped.
+    `end_of`: name of the term in which this design is the best, or "". `point` (d,): the design in
+    the unit box. `terms`: value of each term, in its unit. `evaluation`: the simulated design, or
+    its geometry if no term needs a simulation.
+
+    `standing`: status; `reason`: why the local search ended, as in `rootsopt.optimize.sqp`;
+    `residual`, `violation`: first-order conditions, as in `Certificate`. A *range* of a term is its
+    range along the front; the residual is in ranges per side of the unit box. `weights`: weight of
+    each term at the optimum; their sum is 1. `rates`: change of the first term per unit of each
+    other term along the front, NaN if unknown. `limits`: multiplier of each active constraint and
+    bound by name, in ranges per scaled unit."""
+
+    number: int
+    end_of: str
+    point: NDArray[np.float64]
+    terms: dict[str, float]
+    evaluation: Evaluation
+    standing: Standing
+    reason: str
+    residual: float
+    violation: float
+    weights: dict[str, float]
+    rates: dict[str, float]
+    limits: dict[str, float]
+
+    @property
+    def design(self) -> dict[str, float]:
+        """Design parameters in config units, by key."""
+        return self.evaluation.design
+
+    def record(self) -> dict[str, Any]:
+        """Return the entry of the point in the result file."""
+        shown = self.evaluation.record()
+        del shown["design"]
+        evaluation = {f"evaluation_{k}" if k in ("status", "message") else k: v
+                      for k, v in shown.items()}  # fmt: skip
+        return {
+            "point": self.number,
+            "end_of": self.end_of or None,
+            "terms": self.terms,
+            "design": self.design,
+            "status": self.standing.label,
+            "message": self.standing.value,
+            "certificate": {
+                "reason": self.reason,
+                "residual": self.residual,
+                "required_residual": RESIDUAL,
+                "violation": self.violation,
+            },
+            "weights": self.weights,
+            "rates": {k: None if math.isnan(v) else v for k, v in self.rates.items()},
+            "multipliers": self.limits,
+        } | evaluation
+
+    def row(self) -> dict[str, Any]:
+        """Return the row of the point in front.csv."""
+        first = next(iter(self.terms))
+        rates = {f"{first}_per_{k}": None if math.isnan(v) else v for k, v in self.rates.items()}
+        geometry = {k: v for k, v in self.evaluation.geometry.items() if k not in self.terms}
+        row = {"point": self.number, "status": self.standing.label, "end_of": self.end_of}
+        row |= self.terms | rates | self.design | geometry
+        forces = {k: v for k, v in self.evaluation.response.items() if k not in row}
+        return row | forces | {"residual": self.residual}
+
+
+class Gap(NamedTuple):
+    """A gap between two points of a front, where the terms or the designs jump.
+
+    `first`, `second`: numbers of the points on both sides. `kind`: `terms` if there is no best
+    compromise between them, `design` if the terms are continuous but the designs jump.
+    `distance`: distance between the points in terms, in ranges along the front; `design_distance`:
+    greatest difference of a coordinate of the unit box. `tried`: number of searches for a point in
+    between. `confirmed`: whether these searches led back to one of the two sides. Otherwise,
+    `pareto.refinements` was used up before."""
+
+    first: int
+    second: int
+    kind: str
+    distance: float
+    design_distance: float
+    tried: int
+    confirmed: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class Front:
+    """Outcome of a trade-off.
+
+    `config`: config of the run; `aims`: the terms; `baseline`: the evaluated design of the config;
+    `baseline_terms`: its terms, empty if it has no usable steady state. `points`: the front, from
+    the best in the first term on. `dropped`: points that are dominated, repeated or not usable.
+    `edges`: pairs of point numbers of neighbours without a gap between them; `gaps`: the gaps.
+
+    `limits_dropped`: terms whose limits under `constraints`, the baseline's values, were dropped,
+    because they would cut off a side of the front. `searches`, `evaluations`: effort.
+    `interrupted`: whether the search was stopped. `infeasible`: why no design satisfies all
+    constraints, `None` if one does.
+
+    >>> import jax
+    >>> import rootsopt
+    >>> jax.config.update("jax_enable_x64", True)
+    >>> terms = "pareto.terms=[outer_radius_mm, area_efficiency]"
+    >>> quick = [terms, "pareto.points=3", "pareto.refinements=0"]
+    >>> front = rootsopt.pareto_front(rootsopt.load_config("cic_drawn", quick))
+    >>> front.status.label, len(front.points)
+    ('geometry_only', 3)
+    """
+
+    config: Config
+    aims: tuple[Aim, ...]
+    baseline: Evaluation
+    baseline_terms: dict[str, float]
+    points: tuple[FrontPoint, ...] = ()
+    dropped: tuple[FrontPoint, ...] = ()
+    edges: tuple[tuple[int, int], ...] = ()
+    gaps: tuple[Gap, ...] = ()
+    limits_dropped: tuple[str, ...] = ()
+    searches: int = 0
+    evaluations: int = 0
+    interrupted: bool = False
+    infeasible: Infeasible | None = None
+
+    @property
+    def certified(self) -> int:
+        """Number of certified points."""
+        return sum(one.standing is Standing.CERTIFIED for one in self.points)
+
+    @property
+    def status(self) -> Status:
+        """Status of the front as a whole."""
+        if self.interrupted:
+            return Status.INTERRUPTED
+        if not self.baseline_terms:
+            return self.baseline.status
+        if self.infeasible is not None:
+            return Status.INFEASIBLE
+        if not self.certified:
+            return Status.NOT_CONVERGED
+        return self.baseline.status
+
+    @property
+    def message(self) -> str:
+        """Sentences for the user: what was found, with advice."""
+        if self.interrupted:
+            count = len(self.points)
+            return (
+                f"The search was stopped: the front has the {count} point"
+                f"{'s' if count != 1 else ''} found so far. Run it again for the whole front."
+            )
+        if not self.baseline_terms:
+            return f"baseline: {self.baseline.message}"
+        if self.infeasible is not None:
+            return self.infeasible.message
+        if not self.points:
+            return (
+                "No point of the front held up when simulated from rest. Raise "
+                "optimizer.screening or optimizer.starts, or tighten solver.accuracy."
+            )
+        if not self.certified:
+            return f"No point of the front is certified. {Standing.NOT_CERTIFIED.value}"
+        parts = [f"{self.certified} of {len(self.points)} points are certified."]
+        if len(self.points) == 1:
+            parts.append("One design is the best in all terms: they are not in conflict.")
+        if self.gaps:
+            parts.append(f"The front has {len(self.gaps)} gap{'s' if len(self.gaps) > 1 else ''}.")
+        if self.limits_dropped:
+            names = ", ".join(map(words, self.limits_dropped))
+            parts.append(
+                "Limits that are the baseline's own values were dropped, because they limit terms: "
+                f"{names}. A number under constraints stays."
+            )
+        return " ".join(parts)
+
+    def config_of(self, point: FrontPoint) -> Config:
+        """Return the config of the run with the design of a `point`."""
+        return self.config.with_design([*point.design.values()])
+
+    def record(self) -> dict[str, Any]:
+        """Return the entries of the result file."""
+        found: dict[str, Any] = {
+            "terms": [
+                {"name": aim.name, "sense": aim.sense, "unit": aim.unit} for aim in self.aims
+            ],
+            "baseline": self.baseline.record() | {"terms": self.baseline_terms},
+            "points": [one.record() for one in self.points],
+            "dropped": [one.record() for one in self.dropped],
+            "edges": [[*pair] for pair in self.edges],
+            "gaps": [one._asdict() for one in self.gaps],
+            "limits_dropped": [*self.limits_dropped],
+            "status": self.status.label,
+            "message": self.message,
+            "statistics": {"searches": self.searches, "evaluations": self.evaluations},
+        }
+        if self.infeasible is not None:
+            found["infeasible"] = self.infeasible.record()
+        return found
+
+
+def dominated(values: NDArray[np.float64], equal: float = EQUAL) -> NDArray[np.bool_]:
+    """Return a mask (n,) of the points that another point dominates.
+
+    `values` (n, k): scaled terms, of which less is better. A point is dominated if another one is
+    no worse in any term and better in one, by more than `equal`."""
+    worse = values[:, None, :] - values[None, :, :]
+    beaten = np.all(worse >= -equal, axis=2) & np.any(worse > equal, axis=2)
+    # Compare the sums as well: within `equal`, two points could otherwise dominate each other.
+    total = values.sum(axis=1)
+    return np.any(beaten & (total[None, :] < total[:, None]), axis=1)
+
+
+def repeated(
+    values: NDArray[np.float64], points: NDArray[np.float64], near: float = 2e-3
+) -> list[int]:
+    """Return, for each of n points, the number of an earlier point that is the same, or -1.
+
+    `values` (n, k): scaled terms; `points` (n, d): designs in the unit box. Two points are the same
+    if no term differs by more than `near`, and no coordinate by more than 5 times `near`."""
+    found: list[int] = []
+    for k in range(len(values)):
+        same = [
+            j
+            for j in range(k)
+            if found[j] < 0
+            and np.max(np.abs(values[j] - values[k])) <= near
+            and np.max(np.abs(points[j] - points[k])) <= 5 * near
+        ]
+        found.append(same[0] if same else -1)
+    return found
+
+
+def ordered(values: NDArray[np.float64]) -> Sequence[int]:
+    """Return the indices (n,) that sort points by their scaled terms `values` (n, k).
+
+    Points are sorted by the first term, equal ones by the next term."""
+    return [int(k) for k in np.lexsort(values.T[::-1])]

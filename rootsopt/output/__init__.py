@@ -1,1 +1,0 @@
-"""Result folders, result files, and tables for the terminal."""

@@ -1,0 +1,1 @@
+"""Periodic orbits followed along a parameter; `rootsopt.continuation` has the public names."""

@@ -1,0 +1,1 @@
+"""What a run shows: its folder and files, facts, tables, figures and pages."""

@@ -1,0 +1,156 @@
+"""Figures of the contact force over time and over frequency, drawn on given axes."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.markers import CARETDOWN
+from numpy.typing import ArrayLike, NDArray
+
+from rootsopt.response.records import Series
+from rootsopt.view.figures.style import BLUE, COLORS, VERMILION, beside
+
+_MOST_TURNS = 4  # revolutions in a force panel, at most
+_LINES = 400  # spectral lines above which a curve is drawn instead of single lines
+_NOTHING = 1e-300  # amplitude drawn for 0 on a logarithmic axis
+
+
+def plot_force(
+    axes: Sequence[Axes] | NDArray,
+    series: Mapping[str, Series],
+    responses: Mapping[str, Mapping[str, float]],
+) -> Sequence[Axes] | NDArray:
+    """Draw the contact force over time, one panel per design, all on one scale.
+
+    `axes`: one for each design; `series`, `responses`: simulated motion and response of each
+    design, keyed by its name. Mean and peak are taken from the response (`mean_force_N`,
+    `peak_force_N`), which is more accurate than the samples. All panels cover the same number of
+    revolutions, at most a few, and each includes the largest force of its design. Time is 0 at the
+    start of each panel. Return `axes`.
+    """
+    turns = min(_MOST_TURNS, *(np.ptp(run.rotation) / (2 * np.pi) for run in series.values()))
+    for ax, (name, run) in zip(axes, series.items(), strict=True):
+        shown = _around_peak(run, turns)
+        force = run.force[shown]
+        step = (run.time[1] - run.time[0]) * 1e3
+        time = step * np.arange(len(force))
+        plot_flank_force(ax, time, run.drive_force[shown], BLUE, "drive flank")
+        plot_flank_force(ax, time, run.coast_force[shown], VERMILION, "coast flank")
+        mean, peak = responses[name]["mean_force_N"], responses[name]["peak_force_N"]
+        label = f"mean {number(mean)} N"
+        ax.axhline(mean, color="black", linestyle="--", linewidth=1.1, label=label)
+        first = time[np.argmax(force >= 0.999 * np.max(force))]
+        label = f"peak {number(peak)} N"
+        ax.plot(first, peak, color="black", marker=CARETDOWN, ls="", markersize=9, label=label)
+        ax.set(title=name, ylabel="contact force (N)", xlim=(0, len(force) * step))
+        beside(ax)
+    top = max(max(responses[k]["peak_force_N"], np.max(series[k].force)) for k in series)
+    for ax in axes:
+        ax.set_ylim(0, 1.12 * top if top > 0 else 1)
+    axes[-1].set_xlabel("time (ms)")
+    return axes
+
+
+def plot_gap(
+    axes: Sequence[Axes] | NDArray, series: Mapping[str, Series]
+) -> Sequence[Axes] | NDArray:
+    """Draw the gap of flanks that never touch over one revolution, one panel per design.
+
+    `axes`: one for each design; `series`: simulated motion of each design, keyed by its name.
+    Return `axes`."""
+    for ax, (name, run) in zip(axes, series.items(), strict=True):
+        turn = run.rotation <= run.rotation[0] + 2 * np.pi
+        time, gap = (run.time[turn] - run.time[0]) * 1e3, -1e6 * run.depth[turn]
+        ax.plot(time, gap, color=BLUE, linewidth=1.2, label="gap of the nearer flanks")
+        least = float(np.min(gap))
+        label = f"least gap {number(least)} µm"
+        ax.axhline(least, color="black", linestyle="--", linewidth=1.1, label=label)
+        # Between two lobes, the gap is as wide as the rotors: only its narrow part tells something.
+        high = min(1.12 * float(np.max(gap)), 4 * least)
+        ax.set(title=name, ylabel="gap (µm)", xlim=(0, time[-1]), ylim=(0, high))
+        beside(ax)
+    axes[-1].set_xlabel("time (ms)")
+    return axes
+
+
+def plot_flank_force(ax: Axes, time: NDArray, force: NDArray, color: str, label: str) -> None:
+    """Draw the force on a flank over time or rotation, with a shade below it."""
+    if not np.any(force > 0):
+        label += " (no contact)"
+    ax.fill_between(time, force, color=color, alpha=0.15, linewidth=0)
+    ax.plot(time, force, color=color, linewidth=1.2, label=label)
+
+
+def number(value: float) -> str:
+    """Format `value` with four significant digits, keeping final zeros."""
+    return f"{value:#.4g}".rstrip(".")
+
+
+def _around_peak(run: Series, turns: float) -> slice:
+    """Return the slice of `run`'s samples that covers `turns` revolutions around the largest force.
+
+    Near an end of the run, the slice is shifted to lie within the run."""
+    count = len(run.time)
+    shown = min(count, round(count * turns * 2 * np.pi / np.ptp(run.rotation)))
+    start = 0 if shown == count else int(np.argmax(run.force)) - shown // 2
+    start = min(max(start, 0), count - shown)
+    return slice(start, start + shown)
+
+
+def amplitude_spectrum(
+    signal: ArrayLike, step: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return (frequencies above 0, one-sided amplitudes at these frequencies) of a `signal` (n,).
+
+    The samples must be a constant `step` apart and cover whole periods, without repeating the first
+    sample at the end. No window function is used: a cosine of amplitude a gives one line of height
+    a. The unit of frequency is 1 / (unit of `step`).
+    """
+    signal = np.asarray(signal)
+    amplitude = 2 * np.abs(np.fft.rfft(signal)) / len(signal)
+    if len(signal) % 2 == 0:
+        amplitude[-1] /= 2
+    frequency = np.fft.rfftfreq(len(signal), step)
+    return np.asarray(frequency[1:], dtype=np.float64), np.asarray(amplitude[1:], dtype=np.float64)
+
+
+def plot_spectrum(
+    axes: Sequence[Axes] | NDArray,
+    series: Mapping[str, Series],
+    mesh_frequency_Hz: float,
+    harmonics: int = 40,
+) -> Sequence[Axes] | NDArray:
+    """Draw the amplitude spectrum of the contact force, one panel per design, all on one scale.
+
+    `axes`: one for each design; `series`: simulated motion of each design, keyed by its name;
+    `mesh_frequency_Hz`: mesh frequency (Hz); `harmonics`: number of multiples of the mesh frequency
+    on the frequency axis. The mean (0 Hz) is omitted. Return `axes`.
+    """
+    limit = (harmonics + 0.5) * mesh_frequency_Hz
+    top = 0.0
+    for ax, (name, run), color in zip(axes, series.items(), COLORS, strict=False):
+        frequency, amplitude = amplitude_spectrum(run.force, run.time[1] - run.time[0])
+        shown = frequency <= limit
+        frequency, amplitude = frequency[shown] / 1e3, np.maximum(amplitude[shown], _NOTHING)
+        top = max(top, float(np.max(amplitude, initial=0)))
+        if len(frequency) <= _LINES:
+            ax.vlines(frequency, _NOTHING, amplitude, color=color, linewidth=2)
+        else:
+            ax.plot(frequency, amplitude, color=color, linewidth=0.7)
+        ax.set(title=name, ylabel="force amplitude (N)", xlim=(0, limit / 1e3))
+    for ax in axes:
+        ax.set_yscale("log")
+        ax.set_ylim(*((1e-4 * top, 2 * top) if top > 0 else (1e-4, 1)))
+    for ax in axes:  # Panels that share an axis get its ticks back with the scale of each.
+        ax.minorticks_off()  # Ticks between decades took a third of the time of this figure.
+    per_mesh = mesh_frequency_Hz / 1e3
+    orders = axes[0].secondary_xaxis(
+        "top",
+        functions=(
+            lambda f: np.asarray(f) / per_mesh,
+            lambda order: np.asarray(order) * per_mesh,
+        ),
+    )
+    orders.set_xlabel(f"multiple of the mesh frequency, {mesh_frequency_Hz:.4g} Hz")
+    axes[-1].set_xlabel("frequency (kHz)")
+    return axes

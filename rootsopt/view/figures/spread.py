@@ -1,0 +1,142 @@
+"""Figures of designs over many scenes: what is assumed of the scene, and scattered values."""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
+
+from rootsopt.view.comparison import label_of, named
+from rootsopt.view.figures.style import BLUE, GREEN, GREY, VERMILION, figure, write
+from rootsopt.view.names import brief, name_and_unit
+
+if TYPE_CHECKING:
+    from rootsopt.view.files import ResultFolder
+
+_OBJECTIVE = "objective (baseline in the same scene = 1)"
+
+# Multiple of the 90 % quantile of the objectives at which their axis ends.
+_WIDE = 1.5
+
+
+def plot_ranges(ax: Axes, keys: Sequence[Mapping[str, Any]], own: float) -> Axes:
+    """Draw the objective at both ends of the range of each quantity, one row per quantity.
+
+    `keys`: rows of the result file; `own`: objective in the config's own scene. Return `ax`."""
+    for k, row in enumerate(keys):
+        low, high = (np.nan if row[f"objective_{end}"] is None else row[f"objective_{end}"]
+                     for end in ("low", "high"))  # fmt: skip
+        ax.plot([low, own, high], [k] * 3, "-", color=GREY, linewidth=1)
+        ax.plot(low, k, "o", mfc="white", mec=BLUE, label="low end" if k == 0 else None)
+        ax.plot(high, k, "o", color=BLUE, label="high end" if k == 0 else None)
+    names = [
+        f"{named(row['key'])}\n{brief(row['low'], 3)} … {brief(row['high'], 3)} "
+        f"{name_and_unit(row['key'])[1]}".rstrip()
+        for row in keys
+    ]
+    ax.set_yticks(range(len(keys)), names)
+    ax.axvline(own, color=BLUE, linewidth=0.8, linestyle=":", label="as given")
+    ax.axvline(1, color="black", linewidth=0.8)
+    ax.invert_yaxis()
+    ax.set_xlabel(_OBJECTIVE)
+    return ax
+
+
+def plot_scenes(ax: Axes, key: str, columns: Mapping[str, Sequence[Any]]) -> Axes:
+    """Draw the objective of all designs in the random scenes over the quantity `key`.
+
+    `columns`: those of `assumptions.csv`. Return `ax`."""
+    names = [name for name in columns if name.startswith("objective_")]
+    values = np.array(columns[key], float)
+    drawn = np.array([name.startswith("random") for name in columns["scene"]])
+    looks = {"objective_optimized": (BLUE, "o"), "objective_design_1": (VERMILION, "x")}
+    for name in names:
+        color, mark = looks.get(name, (GREY, "+"))
+        if name != "objective_baseline":
+            word = name.removeprefix("objective_").replace("_", " ").replace("ized", "ised")
+            ax.plot(
+                values[drawn], np.array(columns[name], float)[drawn], mark, color=color, label=word
+            )
+    ax.axhline(1, color="black", linewidth=0.8, label="baseline")
+    places = np.concatenate([np.column_stack(line.get_data()) for line in ax.get_lines()[:-1]])
+    places = places[np.isfinite(places).all(axis=1)].reshape(-1, 2)
+    # A baseline nearly without force would leave no room for the other scenes.
+    high = _WIDE * max(1.0, np.quantile(places[:, 1], 0.9)) if len(places) else np.inf
+    beyond = places[places[:, 1] > high]
+    if len(beyond):
+        low = np.min(places[:, 1])
+        ax.set_ylim(low - 0.05 * (high - low), high)
+        at = {"transform": ax.get_xaxis_transform(), "clip_on": False, "label": "above the axis"}
+        ax.plot(beyond[:, 0], np.full(len(beyond), 0.98), "^", color=GREY, **at)
+    ax.set(xlabel=f"{label_of(key)}, all else random, too", ylabel=_OBJECTIVE)
+    return ax
+
+
+def spread_figure(
+    folder: "ResultFolder", record: Mapping[str, Any], columns: Mapping[str, Sequence[Any]]
+) -> None:
+    """Write `figures/assumptions.png`.
+
+    `record`: entry `assumptions` of the result file; `columns`: those of `assumptions.csv`."""
+    rows, rivals = record["keys"], record["rivals"]
+    made, ((left, right),) = figure(11, 1.6 + 0.5 * max(5, len(rows)), 1, 2)
+    plot_ranges(left, rows, columns["objective_optimized"][0])
+    plot_scenes(right, rivals[0]["key"] if rivals else record["decides"], columns)
+    entries = [x for ax in (left, right) for x in ax.get_legend_handles_labels()[0]]
+    write(folder, "assumptions", made, "The optimum where the pump may run", entries, 6)
+
+
+NAMES = {"baseline": "baseline", "nominal": "nominal optimum", "robust": "robust optimum"}
+"""Names of the designs in legends."""
+_STYLES = {
+    "baseline": (GREY, "-"),
+    "nominal": (BLUE, "-"),
+    "robust": (GREEN, (0, (4, 1.5))),
+}
+
+# Maximum number of bins of a histogram.
+_BINS = 50
+
+# Least average number of scenes per bin, if there are few scenes.
+_PER_BIN = 6
+PANELS = {"mean_force_N": "mean force (N)", "peak_force_N": "peak force (N)"}
+"""Forces that `distributions` draws, with the labels of their axes."""
+
+
+def plot_distribution(ax: Axes, designs: Mapping[str, ArrayLike], label: str) -> Axes:
+    """Draw a histogram of each design's force, and a vertical line at its 95 % quantile.
+
+    `designs`: force in each scene (n,) by name of the design (keys of `NAMES`); scenes without a
+    usable motion are NaN and left out. `label`: that of the horizontal axis. Return `ax`.
+    """
+    known = {name: np.asarray(values, float) for name, values in designs.items()}
+    known = {name: values[np.isfinite(values)] for name, values in known.items()}
+    known = {name: values for name, values in known.items() if values.size}
+    every = np.concatenate([np.zeros(0), *known.values()])
+    most = max((values.size for values in known.values()), default=0)
+    bins = max(1, min(_BINS, most // _PER_BIN))
+    edges = np.histogram_bin_edges(every, bins).tolist()
+    for name, values in known.items():
+        color, dashes = _STYLES[name]
+        style = {"color": color, "linestyle": dashes}
+        weights = np.full(len(values), 100 / len(values))
+        ax.hist(values, edges, weights=weights, histtype="step", linewidth=1.6,
+                label=NAMES[name], **style)  # fmt: skip
+        ax.axvline(float(np.quantile(values, 0.95)), linewidth=1.0, alpha=0.8, **style)
+    ax.set(xlabel=label, ylabel="share of the scenes (%)")
+    return ax
+
+
+def distributions(designs: Mapping[str, Mapping[str, ArrayLike]], title: str) -> Figure:
+    """Return a figure of the distributions of mean and peak force, one panel each.
+
+    `designs`: by name of the design, its forces in each scene by key (`PANELS`)."""
+    made, axes = figure(11, 4.4, 1, len(PANELS))
+    for ax, (key, label) in zip(axes[0], PANELS.items(), strict=True):
+        plot_distribution(ax, {name: one[key] for name, one in designs.items()}, label)
+    lines, names = axes[0, 0].get_legend_handles_labels()
+    made.legend(lines, names, loc="outside lower center", ncols=3, frameon=False)
+    made.suptitle(f"{title}; vertical lines: 95 % quantiles")
+    return made

@@ -1,0 +1,93 @@
+"""Writes the files of the option `--export`."""
+
+import math
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+
+from rootsopt.config import Config
+from rootsopt.response.evaluation import Evaluation
+from rootsopt.response.records import Series
+from rootsopt.scene import Scene
+from rootsopt.view.figures import SOLID, solid
+from rootsopt.view.figures.drawing import Drawing, coordinates, svg_text
+from rootsopt.view.figures.dxf import dxf_bytes
+from rootsopt.view.files import ResultFolder
+
+POINTS = "rotor_points.csv"
+"""Name of the table of coordinates, which is written beside the DXF drawing."""
+
+# Number of points over one lobe in this table, beside the ends of all pieces.
+_COUNT = 361
+
+
+def write(
+    folder: ResultFolder,
+    config: Config,
+    formats: Sequence[str],
+    design: dict[str, float],
+    series: Series | None = None,
+    periods: int = 1,
+) -> None:
+    """Write drawings of a `design` into `folder`.
+
+    `config`: config of the rotor; `formats`: keys of `FORMATS`; `design`: values of the design
+    parameters (config units), keyed by config key. If `series` holds a simulated motion, the GIF
+    shows `periods` mesh periods of it. Otherwise the GIF shows perfect rolling.
+    """
+    if not formats:
+        return
+    values = jnp.asarray(np.array(list(design.values()), dtype=float))
+    profile = Scene.from_config(config).profile(values)
+    drawing = Drawing.of(config, profile, design)
+    files: dict[str, bytes] = {}
+    if "dxf" in formats:
+        files["rotor.dxf"] = dxf_bytes(drawing)
+        found = coordinates(drawing.pieces, drawing.lobes, _COUNT)
+        folder.write_csv(POINTS, found.columns())
+    if "svg" in formats:
+        files["rotor.svg"] = svg_text(drawing).encode()
+    if set(formats) & set(SOLID):
+        files |= _solids(drawing, formats, folder.place)
+    if "gif" in formats:
+        from rootsopt.view.figures.animation import meshing_gif
+
+        files["figures/meshing.gif"] = meshing_gif(drawing, profile, series, periods)
+    for name, data in files.items():
+        folder.write_bytes(name, data)
+
+
+def write_simulated(
+    folder: ResultFolder, config: Config, formats: Sequence[str], evaluation: Evaluation
+) -> None:
+    """Write drawings of a simulated design.
+
+    `folder`, `config`, `formats`: as in `write`; `evaluation`: result of the simulation. The GIF
+    shows the simulated motion. If `evaluation` has no motion, no GIF is written."""
+    series = evaluation.series
+    if series is None:
+        formats = tuple(name for name in formats if name != "gif")
+    periods = evaluation.steady_state.get("period") or config.profile.lobes
+    write(folder, config, formats, evaluation.design, series, periods)
+
+
+def _solids(drawing, formats, place) -> dict[str, bytes]:
+    """Return the contents of the STEP and STL files, keyed by file name.
+
+    `place`: folder for temporary files. The solid of each shape is made only once."""
+    body = drawing.length, drawing.bore, math.radians(drawing.helix_deg)
+    shapes = {
+        "rotor": solid.rotor(drawing.pieces, *body),
+        "pair": solid.pair(drawing.pieces, drawing.lobes, 2 * drawing.pitch_radius, *body),
+    }
+    make = {
+        "step": solid.step_bytes,
+        "stl": lambda shape: solid.stl_bytes(shape, place),
+    }
+    return {
+        f"{name}.{suffix}": make[suffix](shape)
+        for suffix in SOLID
+        if suffix in formats
+        for name, shape in shapes.items()
+    }

@@ -1,0 +1,336 @@
+"""The state of one page of the explorer: values, what is computed for them, and a search.
+
+A session knows nothing of the page. It tells it what is new by messages, from several threads."""
+
+import dataclasses
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+from rootsopt.config import Config, notes
+from rootsopt.errors import InputError
+from rootsopt.response.evaluation import Evaluation
+from rootsopt.view.pages.engine import Engine, Shape, frames, same_motion
+
+if TYPE_CHECKING:
+    from rootsopt.optimize.outcome import Optimization
+
+
+class Latest:
+    """Runs jobs one at a time in a thread of its own; the newest waiting job replaces all others.
+
+    A slider can ask for work faster than it can be done. A job that has not begun when a newer one
+    arrives never begins. `failed` is called with the exception of a job that raises one."""
+
+    def __init__(self, failed: Callable[[Exception], None]):
+        self._failed = failed
+        self._job: Callable[[], object] | None = None
+        self._due = 0.0
+        self._changed = threading.Condition()
+        self._closed = False
+        self._began: float | None = None
+        threading.Thread(target=self._work, daemon=True).start()
+
+    def submit(self, job: Callable[[], object], delay: float = 0.0) -> None:
+        """Run `job` as soon as the present one has ended, but not before `delay` (s).
+
+        A newer job within this time replaces it."""
+        with self._changed:
+            self._job, self._due = job, time.monotonic() + delay
+            self._changed.notify()
+
+    def clear(self) -> None:
+        """Drop the waiting job."""
+        with self._changed:
+            self._job = None
+
+    def close(self) -> None:
+        """Drop the waiting job, and end the thread after the present one."""
+        with self._changed:
+            self._job, self._closed = None, True
+            self._changed.notify()
+
+    @property
+    def seconds(self) -> float:
+        """Time (s) that the present job has taken so far; 0 if none is running."""
+        began = self._began
+        return 0.0 if began is None else time.monotonic() - began
+
+    def _work(self) -> None:
+        while (job := self._next()) is not None:
+            self._began = time.monotonic()
+            try:
+                job()
+            except Exception as error:
+                self._failed(error)
+            finally:
+                self._began = None
+
+    def _next(self) -> Callable[[], object] | None:
+        """Wait for a job that is due and return it; `None` once the thread is to end."""
+        with self._changed:
+            while not self._closed:
+                if self._job is None:
+                    self._changed.wait()
+                elif (left := self._due - time.monotonic()) > 0:
+                    self._changed.wait(left)
+                else:
+                    job, self._job = self._job, None
+                    return job
+            return None
+
+
+# Time (s) without a new value after which the motion is computed from rest.
+_IDLE = 0.4
+
+
+@dataclasses.dataclass(frozen=True)
+class Message:
+    """What is new for the values with this `number`; the first values have the number 0."""
+
+    number: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Problem(Message):
+    """The values are refused, or nothing can be computed for them. `words`: why, what to do."""
+
+    words: str
+
+
+@dataclasses.dataclass(frozen=True)
+class NewShape(Message):
+    """The `shape` of the rotor, and `notes` on values that are not usual."""
+
+    shape: Shape
+    notes: tuple[str, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class NewMotion(Message):
+    """The `evaluation`, and the `frames` of its motion, as in `rootsopt.view.pages.charts`.
+
+    `near`: whether the motion was reached from that of other values, and not from rest; `final`:
+    whether the status is final. If not, a computation from rest follows."""
+
+    evaluation: Evaluation
+    frames: Mapping[str, Any]
+    near: bool
+    final: bool = True
+
+
+@dataclasses.dataclass(frozen=True)
+class FromRest(Message):
+    """The motion from rest is known. `same`: whether it is the one shown; `evaluation`: its own."""
+
+    same: bool
+    evaluation: Evaluation
+
+
+@dataclasses.dataclass(frozen=True)
+class Progress(Message):
+    """A search has simulated `done` of about `expected` designs; `best`: best objective so far."""
+
+    done: int
+    expected: int
+    best: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Searched(Message):
+    """A search has ended. `found`: its outcome; `None`: an error, which `words` explains.
+
+    `values`: design parameters of the optimum by key; empty if there is none."""
+
+    found: "Optimization | None"
+    values: Mapping[str, float]
+    words: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Saved(Message):
+    """The config of the values as YAML `text`. `evaluation`: its motion from rest."""
+
+    text: str
+    evaluation: Evaluation
+
+
+class Session:
+    """One page of the explorer.
+
+    `engine`: computes everything; sessions share it. `show`: function that takes messages; it is
+    called from several threads. `idle`: time (s) without a new value after which the motion is
+    computed from rest."""
+
+    def __init__(self, engine: Engine, show: Callable[[Message], None], idle: float = _IDLE):
+        self.engine = engine
+        self.show = show
+        self.idle = idle
+        self.number = 0
+        self.values: dict[str, float] = {}
+        self.searching = threading.Event()
+        self._lock = threading.Lock()
+        self._start: Any = None
+        self._shown: NewMotion | None = None
+        self._rest: FromRest | None = None
+        self._stop = threading.Event()
+        self._shapes, self._motions, self._rests = (Latest(self._failed) for _ in range(3))
+        self._ask(0)
+
+    def move(self, values: Mapping[str, float]) -> int:
+        """Set new `values`, numbers by dotted config key; return their number."""
+        with self._lock:
+            self.values |= values
+            self.number += 1
+            number = self.number
+        self._ask(number)
+        return number
+
+    def show_from_rest(self) -> None:
+        """Show the motion that starts at rest, even if another one is known."""
+        number = self.number
+        self._submit(self._rests, number, lambda: self._from_rest(number, True))
+
+    def save(self) -> None:
+        """Make the YAML of the values, and compute their motion from rest, as `simulate` does."""
+        number = self.number
+        self._submit(self._rests, number, lambda: self._save(number))
+
+    def optimize(self) -> None:
+        """Search for the optimum from the present values, in a thread of its own."""
+        if self.searching.is_set():
+            return
+        self.searching.set()
+        self._stop = threading.Event()
+        threading.Thread(target=self._optimize, args=(self.number, self._stop), daemon=True).start()
+
+    def cancel(self) -> None:
+        """End the search with the best design found so far."""
+        self._stop.set()
+
+    def close(self) -> None:
+        """End all threads of the session."""
+        self.cancel()
+        for lane in (self._shapes, self._motions, self._rests):
+            lane.close()
+
+    @property
+    def seconds(self) -> float:
+        """Time (s) that the present computation of the motion has taken; 0 if none is running."""
+        return max(self._shapes.seconds, self._motions.seconds)
+
+    def config(self) -> Config:
+        """Return the config with the present values.
+
+        Raises `InputError` if the values do not fit each other."""
+        with self._lock:
+            values: dict[str, Any] = dict(self.values)
+        whole = ("profile.lobes",)
+        values |= {key: int(values[key]) for key in whole if key in values}
+        return self.engine.base.replaced(values) if values else self.engine.base
+
+    def _ask(self, number: int) -> None:
+        """Compute shape and motion of the values with this `number`."""
+        self._motions.clear()
+        self._rests.clear()
+        self._submit(self._shapes, number, lambda: self._compute_shape(number))
+
+    def _compute_shape(self, number: int) -> None:
+        config = self.config()
+        shape = self.engine.shape(config)
+        self.show(NewShape(number, shape, notes(config)))
+        self._submit(self._motions, number, lambda: self._compute_motion(number, config, shape))
+
+    def _compute_motion(self, number: int, config: Config, shape: Shape) -> None:
+        self.engine.ready.wait()
+        start = self._start
+        near = start is not None
+        found = self.engine.near(config, start) if near else self.engine.from_rest(config)
+        if found.usable:
+            self._start = found.start
+        final = found.usable or not near
+        self._present(NewMotion(number, found, frames(shape.profile, found), near, final))
+        if near:
+            delay = self.idle if found.usable else 0.0
+            self._submit(self._rests, number, lambda: self._from_rest(number, False), delay)
+
+    def _present(self, motion: NewMotion) -> None:
+        self._shown = motion
+        self.show(motion)
+
+    def _from_rest(self, number: int, forced: bool) -> Evaluation | None:
+        """Compute the motion from rest of the values with this `number`, and compare it.
+
+        `forced`: whether to show it even if it is not the one that is shown. It is shown in any
+        case if the one that is shown has no steady state."""
+        if number != self.number:
+            return None
+        shown, known = self._shown, self._rest
+        config = self.config()
+        shape = self.engine.shape(config)  # refuses a profile that is not sound
+        if known is not None and known.number == number:
+            found = known.evaluation
+        else:
+            found = self.engine.from_rest(config)
+        if number != self.number:
+            return found
+        same = shown is not None and shown.number == number and same_motion(shown.evaluation, found)
+        self._rest = FromRest(number, same, found)
+        useless = shown is None or shown.number != number or not shown.final
+        if useless or (forced and not same):
+            if found.usable:
+                self._start = found.start
+            self._present(NewMotion(number, found, frames(shape.profile, found), False))
+        else:
+            self.show(self._rest)
+        return found
+
+    def _save(self, number: int) -> None:
+        found = self._from_rest(number, True)
+        if found is not None:
+            self.show(Saved(number, self.config().to_yaml(), found))
+
+    def _submit(
+        self, lane: Latest, number: int, work: Callable[[], object], delay: float = 0.0
+    ) -> None:
+        """Let a `lane` do `work` after a `delay` (s); if the values are refused, say so."""
+
+        def refusing() -> None:
+            try:
+                work()
+            except InputError as error:
+                self.show(Problem(number, str(error)))
+
+        lane.submit(refusing, delay)
+
+    def _optimize(self, number: int, stop: threading.Event) -> None:
+        def progress(done: int, expected: int, best: float) -> None:
+            self.show(Progress(number, done, expected, best))
+
+        found, values, words = None, {}, ""
+        try:
+            self.engine.ready.wait()
+            config = self.config()
+            if config.objective.over == "nominal":  # The page shows nothing of other scenes.
+                config = config.replaced({"assumptions.scenes": 0})
+            found = self.engine.optimize(config, progress, stop=stop)
+            if found.optimized is not None:
+                values = {f"profile.{key}": x for key, x in found.optimized.design.items()}
+        except InputError as error:
+            words = str(error)
+        except Exception as error:
+            words = _unexpected(error)
+        self.searching.clear()
+        self.show(Searched(number, found, values, words))
+
+    def _failed(self, error: Exception) -> None:
+        self.show(Problem(self.number, _unexpected(error)))
+
+
+def _unexpected(error: Exception) -> str:
+    """Return the words for an error that should not occur, and print one line about it."""
+    words = f"{type(error).__name__}: {error}".splitlines()[0]
+    print(f"rootsopt explore: {words}", file=sys.stderr)
+    return f"The computation failed ({words}). Move the slider back, or choose other values."

@@ -1,0 +1,121 @@
+"""Tests of following a curve through folds and corners, on curves with a closed form."""
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+
+from rootsopt.response.continuation.arclength import (
+    End,
+    Spot,
+    StepSizes,
+    StoppedError,
+    follow_curve,
+)
+
+
+def curve_of(residual, jacobian):
+    """Return the curve of one equation in (x, parameter), corrected by Newton's method."""
+
+    def corrected(guess, across, near):
+        place = guess
+        for _ in range(20):
+            matrix = np.array([jacobian(*place), across])
+            miss = np.array([residual(*place), across @ (place - guess)])
+            if np.max(np.abs(miss)) < 1e-12:
+                tangent = np.linalg.svd(matrix[:1])[2][-1]
+                turn = np.sign(np.linalg.det([matrix[0], tangent]))
+                return Spot(place, tangent, turn, None)
+            if abs(np.linalg.det(matrix)) < 1e-12:
+                break
+            place = place - np.linalg.solve(matrix, miss)
+        raise StoppedError(End.STEP_TOO_SMALL)
+
+    return corrected
+
+
+CIRCLE = curve_of(lambda x, p: x**2 + p**2 - 1, lambda x, p: [2 * x, 2 * p])
+CUBIC = curve_of(lambda x, p: p - x + x**3, lambda x, p: [3 * x**2 - 1, 1.0])
+FOLD = {"FOLD": lambda spot: float(spot.tangent[-1])}
+
+
+def start_of(curve, x, p, way=1.0):
+    spot = curve(np.array([x, p]), np.array([0.0, 1.0]), None)
+    return spot.along(np.array([0.0, way]))
+
+
+def test_circle_is_closed_with_a_fold_on_either_side():
+    """Every point lies on the circle, the folds are at ±1, and the curve ends at its start."""
+    path = follow_curve(CIRCLE, start_of(CIRCLE, 1.0, 0.0), StepSizes(-2, 2, 0.02, 1e-6, 0.1), FOLD)
+    assert path.end is End.CLOSED
+    places = np.array([spot.place for spot in path.spots])
+    np.testing.assert_allclose(np.hypot(*places.T), 1, atol=1e-10)
+    turned = np.unwrap(np.arctan2(places[:, 1], places[:, 0]))[-1]
+    assert turned == pytest.approx(2 * np.pi, abs=0.2)
+    assert [name for _, name, _ in path.crossings] == ["FOLD", "FOLD"]
+    found = [spot.place for _, _, spot in path.crossings]
+    np.testing.assert_allclose(found, [[0, 1], [0, -1]], atol=1e-8)
+
+
+def test_cubic_passes_both_folds_to_the_end_of_the_range():
+    """λ = x - x³ has folds at x = ±1/√3; three points at λ = 0 are on one curve."""
+    path = follow_curve(CUBIC, start_of(CUBIC, -1.4, 1.3, -1), StepSizes(-1.5, 1.5), FOLD)
+    assert path.end is End.RANGE_END
+    assert path.spots[-1].place[-1] == -1.5
+    x, p = np.array([spot.place for spot in path.spots]).T
+    assert np.count_nonzero(np.diff(np.sign(p))) == 3
+    folds = np.array([spot.place for _, _, spot in path.crossings])
+    top = 1 / np.sqrt(3)
+    np.testing.assert_allclose(folds, [[-top, -top + top**3], [top, top - top**3]], atol=1e-8)
+    assert all(spot.tangent @ after.tangent > 0.9 for spot, after in itertools.pairwise(path.spots))
+    assert len({spot.orientation for spot in path.spots}) == 1
+    for index, _, spot in path.crossings:
+        assert x[index] <= spot.place[0] <= x[index + 1]
+
+
+def test_steps_follow_the_rate_of_convergence():
+    """Steps grow to the maximum on a straight stretch."""
+    line = curve_of(lambda x, p: x - p, lambda x, p: [1.0, -1.0])
+    path = follow_curve(line, start_of(line, 0.0, 0.0), StepSizes(-1, 1, 1e-3, 1e-6, 0.05), {})
+    strides = [np.linalg.norm(b.place - a.place) for a, b in itertools.pairwise(path.spots)]
+    np.testing.assert_allclose(strides[:3], [1e-3, 1.5e-3, 2.25e-3], rtol=1e-9)
+    assert max(strides) == pytest.approx(0.05)
+
+
+def test_ends_are_named():
+    """A curve ends after too many points, where it stops, and if its start leaves the range at
+    once."""
+    few = follow_curve(CIRCLE, start_of(CIRCLE, 1.0, 0.0), StepSizes(-2, 2, points=7), {})
+    assert (few.end, len(few.spots)) == (End.MAX_POINTS, 7)
+
+    def until(guess, across, near):
+        if guess[-1] > 0.5:
+            raise StoppedError(End.TOO_DEEP)
+        return CIRCLE(guess, across, near)
+
+    path = follow_curve(until, start_of(CIRCLE, 1.0, 0.0), StepSizes(-2, 2), {})
+    assert path.end is End.TOO_DEEP
+    assert path.spots[-1].place[-1] == pytest.approx(0.5, abs=1e-4)
+    outward = follow_curve(CIRCLE, start_of(CIRCLE, 1.0, 0.0), StepSizes(-1, 0), {})
+    assert (outward.end, len(outward.spots)) == (End.RANGE_END, 1)
+
+
+def test_a_corner_is_passed():
+    """λ = -|x| turns by a right angle; the curve is found again beyond the corner, which is
+    recorded."""
+    roof = curve_of(lambda x, p: p + abs(x), lambda x, p: [np.sign(x), 1.0])
+    path = follow_curve(roof, start_of(roof, -1.0, -1.0), StepSizes(-2, 1), FOLD)
+    assert path.end is End.RANGE_END
+    assert path.spots[-1].place == pytest.approx([2.0, -2.0])
+    assert [name for _, name, _ in path.crossings] == ["CORNER", "FOLD"]
+    assert path.crossings[1][2].place == pytest.approx([0, 0], abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "word"),
+    [({"low": 3.0}, "low"), ({"least": 0.1}, "least"), ({"points": 0}, "points")],
+)
+def test_steps_are_checked(wrong, word):
+    with pytest.raises(ValueError, match=word):
+        dataclasses.replace(StepSizes(0.0, 1.0), **wrong)

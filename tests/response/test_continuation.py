@@ -1,0 +1,330 @@
+"""Tests of periodic orbits of the rotor pair, followed through folds and period doublings."""
+
+import types
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rootsopt.config import load
+from rootsopt.errors import InputError
+from rootsopt.continuation import End, Kind, StepSizes, follow, follow_doubled
+from rootsopt.response.continuation.arclength import StoppedError
+from rootsopt.response.continuation.family import OrbitFamily
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.scene import Scene, design_vector
+from rootsopt.status import Status
+
+SPEED, BACKLASH = "scene.speed_rpm", "scene.timing_gear.backlash_mm"
+ECCENTRICITY = "scene.timing_gear.eccentricity_um"
+TORQUE, INVOLUTE = "scene.load.torque_N_m", "profile.involute_length_mm"
+SCENE = (
+    "scene.load.torque_N_m=4.775",
+    "scene.timing_gear={stiffness_N_m_per_rad: 2.0e4, damping_ratio: 0.2, backlash_mm: 0.2}",
+)
+RANGE = StepSizes(3740, 5000)
+START = (-0.235, -1.809)
+
+
+def config_at(speed):
+    return load("configs/cic_drawn.yaml", [*SCENE, f"scene.speed_rpm={speed!r}"])
+
+
+@pytest.fixture(scope="module")
+def branch():
+    """Return orbits over speed, beginning with a stable one at 4000 rpm."""
+    config = config_at(4000.0)
+    found = Evaluator.of(config)(start=np.array(START), series=False)
+    assert found.status is Status.PERIODIC
+    assert found.steady_state["period"] == 1
+    return follow(config, SPEED, found.state, 1, RANGE)
+
+
+def start_of(branch):
+    """Return the orbit at which the branch began, far from any grazing contact."""
+    return min(branch.spots, key=lambda spot: np.max(np.abs(spot.data.state - START)))
+
+
+@jax.jit
+def _ends(scene, design, states):
+    """Return the states (m, n) after one mesh period from each of the scaled `states` (m, n).
+
+    A step of any length could miss a short touch in free flight."""
+    pair = scene.pair(design)
+    term = diffrax.ODETerm(lambda tau, state, _: pair.derivative(tau, state)[0])
+    control = diffrax.PIDController(rtol=1e-11, atol=1e-11, dtmax=1 / 256)
+
+    def end(state):
+        solver = diffrax.Dopri8(scan_kind="lax")
+        out = diffrax.diffeqsolve(
+            term, solver, 0.0, 1.0, 1e-3, state, stepsize_controller=control, max_steps=100_000
+        )
+        return out.ys[-1]
+
+    return jax.lax.map(end, states)
+
+
+def by_integration(point):
+    """Return the end of a motion over one mesh period, and its derivative (n, n) with respect to
+    the start, by central differences.
+
+    Noise of the integration, 1e-9, and curvature both stay below 1e-4 of it."""
+    config, step = config_at(point.value), 1e-4
+    states = point.state + step * np.vstack([np.zeros(2), np.eye(2), -np.eye(2)])
+    end, *ends = np.asarray(_ends(Scene.from_config(config), design_vector(config), states))
+    return end, (np.array(ends[:2]) - np.array(ends[2:])).T / (2 * step)
+
+
+def test_points_agree_with_orbits_closed_for_themselves(branch):
+    """Mean, peak and RMS of stable points agree with those of an `Evaluator` started nearby.
+
+    The greatest multiplier agrees as well. Next to a grazing touch, such as near the fold, it
+    changes with the square root of the state's error. There it must lie among those of the
+    neighbouring points."""
+    stable = [point for point in branch.points if point.stable]
+    sizes = [np.max(np.abs(point.multipliers)) for point in stable]
+    steady = 0
+    for number in range(0, len(stable), len(stable) // 6):
+        point, near = stable[number], sizes[max(number - 1, 0) : number + 2]
+        alone = Evaluator.of(config_at(point.value))(start=0.999 * point.state, series=False)
+        assert alone.status is Status.PERIODIC
+        found = [alone.response[f"{name}_force_N"] for name in ("mean", "peak", "rms")]
+        np.testing.assert_allclose([point.mean, point.peak, point.rms], found, rtol=1e-6)
+        largest = alone.steady_state["floquet_multiplier"]
+        if np.ptp(near) < 0.1 * largest:
+            steady += 1
+            assert sizes[number] == pytest.approx(largest, rel=1e-5)
+        else:
+            assert min(near) * (1 - 1e-5) < largest < max(near) * (1 + 1e-5)
+        np.testing.assert_allclose(point.state, alone.state, atol=1e-6, rtol=0)
+    assert steady >= 2
+
+
+def test_points_are_orbits_of_an_integration(branch):
+    """Stable or not, the motion returns, and its monodromy is that of central differences."""
+    points = branch.points[::8]
+    assert {point.stable for point in points} == {True, False}
+    for point in points:
+        end, monodromy = by_integration(point)
+        np.testing.assert_allclose(end, point.state, atol=1e-6)
+        line = point.made.line
+        moved = line.to_state @ line.monodromy @ np.linalg.inv(line.to_state)
+        np.testing.assert_allclose(moved, monodromy, atol=5e-4 * np.max(np.abs(monodromy)))
+        np.testing.assert_allclose(
+            np.sort_complex(point.multipliers), np.sort_complex(np.linalg.eigvals(moved))
+        )
+
+
+def test_every_point_is_closed(branch):
+    assert max(point.residual for point in branch.points) < 1e-9
+    assert branch.ends == (End.RANGE_END, End.RANGE_END)
+    assert len(branch.points) > 20
+
+
+def test_branch_turns_back_at_folds(branch):
+    """At a fold, a multiplier is +1 and stability is lost; several orbits have the same speed."""
+    folds = [one for one in branch.bifurcations if one.kind is Kind.FOLD]
+    assert len(folds) == 2
+    for fold in folds:
+        near = np.min(np.abs(fold.point.multipliers - 1))
+        assert near < 1e-3
+        assert abs(fold.spot.tangent[-1]) < 1e-4
+        before, after = branch.spots[fold.after : fold.after + 2]
+        assert before.tangent[-1] * after.tangent[-1] < 0
+        assert before.data.stable != after.data.stable
+    values = sorted(fold.point.value for fold in folds)
+    assert values == pytest.approx([3804.646, 4133.342], abs=0.01)
+    orbits = branch.at(4000.0)
+    assert len(orbits) == 3
+    assert [orbit.stable for orbit in orbits].count(True) == 2
+    assert all(orbit.value == pytest.approx(4000) for orbit in orbits)
+    peaks = sorted(orbit.peak for orbit in orbits)
+    assert np.min(np.diff(peaks)) > 10
+    assert branch.at(9000.0) == []
+
+
+def test_plane_holds_the_place(branch):
+    """The orbit lies in the plane that was asked for, at a fixed parameter or across the curve."""
+    start = start_of(branch)
+    guess = start.place + 0.008 * start.tangent
+    for across in (start.tangent, np.eye(3)[-1], np.eye(3)[1]):
+        spot = branch.family(guess, across, start)
+        assert across @ (spot.place - guess) == pytest.approx(0, abs=1e-10)
+        assert np.linalg.norm(spot.tangent) == pytest.approx(1)
+        assert abs(spot.tangent @ start.tangent) > 0.99
+        assert spot.along(start.tangent).orientation == start.orientation
+
+
+@pytest.mark.parametrize("wrong", [True, False])
+def test_orbit_to_which_its_neighbour_does_not_lead(branch, monkeypatch, wrong):
+    """It is closed from an integration, whether its neighbour leads to none or to a wrong one.
+
+    Other reasons to stop are final."""
+    family, start = branch.family, branch.spots[0]
+    way, guess = start.tangent, start.place + 1e-3 * start.tangent
+    right, closed, asked = family(guess, way, start), family._closed, []
+    aside = 1e-4 * np.cross(way, [0.0, 0.0, 1.0])
+    end = End.STEP_TOO_SMALL
+
+    def misled(known, *rest):
+        asked.append(float(known[2]))
+        if len(asked) > 1:
+            return closed(known, *rest)
+        if wrong and end is End.STEP_TOO_SMALL:
+            return right._replace(place=right.place + aside)
+        raise StoppedError(end)
+
+    monkeypatch.setattr(family, "_closed", misled)
+    again = family(guess, way, start)
+    assert asked == [pytest.approx(1e-3, abs=1e-9), 0.0]
+    np.testing.assert_allclose(again.place, right.place, atol=1e-9)
+    np.testing.assert_allclose(np.abs(again.tangent @ right.tangent), 1, atol=1e-9)
+    end = End.TOO_DEEP
+    asked.clear()
+    with pytest.raises(StoppedError, match="too deep"):
+        family(guess, way, start)
+
+
+TWISTED = ("rotor.helix_deg=20", "solver.slices=2")
+MOTOR = (
+    "scene.drive=torque",
+    "scene.motor={slope_N_m_s_per_rad: 0.1, inertia_kg_m2: 1.0e-3}",
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "key", "ends"),
+    [
+        ("cic_drawn", (), SPEED, (2000, 4000)),
+        ("cic_drawn", (), BACKLASH, (0.05, 0.4)),
+        ("cic_drawn", (f"{ECCENTRICITY}=5",), ECCENTRICITY, (1, 20)),
+        ("cic_drawn", (), INVOLUTE, (5, 9)),
+        ("free", (), "profile.coefficients_2", (0.2, 0.4)),
+        ("ee", (), "contact.clearance_mm", (0.0, 0.01)),
+        ("pump", (), "scene.load.pressure_difference_Pa", (1e4, 4e4)),
+        ("cic_drawn", MOTOR, TORQUE, (1, 10)),
+        ("ee", (*TWISTED, "optimizer.bounds.helix_deg=[0, 90]"), "rotor.helix_deg", (5, 40)),
+    ],
+)
+def test_scenes_along_a_curve_are_those_of_the_configs(monkeypatch, name, changes, key, ends):
+    """Scene and design at 30 % of the range are those of a config with this value."""
+    pair = types.SimpleNamespace(angle_scale=jnp.asarray(1e-3), smooth=True, repeats=1)
+    pair.whole = lambda periods: periods
+    monkeypatch.setattr("rootsopt.response.continuation.family._pair", lambda *scene: pair)
+    config = load(f"configs/{name}.yaml", list(changes))
+    family = OrbitFamily(config, key, 1, StepSizes(*ends))
+    value = 0.7 * ends[0] + 0.3 * ends[1]
+    assert family.value(0.3) == pytest.approx(value)
+    own = family.value(family.share)
+    moved = config.moved({key: own})
+    np.testing.assert_allclose(moved.design, config.design, rtol=1e-9)
+    scenes = [
+        Scene.from_config(config).renewed(one)
+        for one in (moved, config, config.moved({key: value}))
+    ]
+    change = jax.tree.map(lambda x: 0.3 * x, family.range.change)
+    scene, design = eqx.apply_updates(family.range.low, change)
+    np.testing.assert_allclose(design, config.moved({key: value}).design, rtol=1e-12)
+    for one, other in ((scene, scenes[2]), (scenes[0], scenes[1])):
+        assert jax.tree.structure(one) == jax.tree.structure(other)
+        for x, y in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+            np.testing.assert_allclose(x, y, rtol=1e-9)
+
+
+def test_units_of_the_state_are_those_of_each_config(branch):
+    """States can be used as a start even if the scale of the angle changes with the parameter."""
+    point = branch.at(4000.0)[0]
+    config = config_at(4000.0)
+    other = follow(config, BACKLASH, point.state, 1, StepSizes(0.19, 0.21))
+    end = other.points[0]
+    assert (end.value, other.points[-1].value) == (0.19, 0.21)
+    assert other.ends == (End.RANGE_END, End.RANGE_END)
+    alone = Evaluator.of(config.moved({BACKLASH: 0.19}))(start=end.state, series=False)
+    np.testing.assert_allclose(alone.state, end.state, rtol=1e-6)
+    assert alone.response["peak_force_N"] == pytest.approx(end.peak, rel=1e-6)
+
+
+@pytest.fixture(scope="module")
+def below(branch):
+    """Return orbits over speed down to a period doubling, and that bifurcation."""
+    lowest = min((p for p in branch.at(3900.0) if p.stable), key=lambda p: p.peak)
+    found = follow(config_at(3900.0), SPEED, lowest.state, 1, StepSizes(3600, 4000))
+    (doubling,) = (one for one in found.bifurcations if one.kind is Kind.PERIOD_DOUBLING)
+    return found, doubling
+
+
+def test_period_doubling_is_found(branch, below, monkeypatch):
+    """Below 3651 rpm the orbit is unstable; a multiplier there is -1 by central differences, too.
+
+    A doubled orbit is looked for on both sides; there may be none."""
+    found, doubling = below
+    assert np.min(np.abs(doubling.point.multipliers + 1)) < 1e-6
+    multipliers = np.linalg.eigvals(by_integration(doubling.point)[1])
+    assert np.min(np.abs(multipliers + 1)) < 1e-3
+    assert doubling.point.value == pytest.approx(3650.528, abs=0.01)
+    assert not found.points[doubling.after].stable
+    assert found.points[doubling.after + 1].stable
+    sides = []
+
+    def none(family, place, across):
+        sides.append(across)
+        raise StoppedError(End.STEP_TOO_SMALL)
+
+    monkeypatch.setattr(OrbitFamily, "from_integration", none)
+    assert follow_doubled(found, doubling, points=6) is None
+    assert np.linalg.norm(sides[1]) == pytest.approx(1)
+    np.testing.assert_array_equal(sides[1], -sides[0])
+    with pytest.raises(ValueError, match="period doubling"):
+        follow_doubled(branch, next(one for one in branch.bifurcations if one.kind is Kind.FOLD))
+
+
+@pytest.mark.long
+def test_period_doubling_leads_to_the_doubled_orbit(below):
+    """An orbit of twice the period is born, which is another one than those of the single."""
+    doubled = follow_doubled(*below, points=6)
+    assert doubled is not None
+    assert doubled.ends[1] is not End.HALVED
+    assert doubled.family.period == 2
+    assert max(point.residual for point in doubled.points) < 1e-9
+    simple = below[0].at(doubled.points[-1].value)
+    assert all(abs(p.peak - doubled.points[-1].peak) > 1e-3 * p.peak for p in simple)
+
+
+def test_wrong_input_is_explained(branch):
+    config, state = config_at(4000.0), branch.points[0].state
+    for key, limits, said in (
+        ("scene.speed", RANGE, r"did you mean `scene\.speed_rpm`"),
+        (
+            SPEED,
+            StepSizes(4100, 4200),
+            "must lie in the range to follow, 4100 to 4200, but is 4000",
+        ),
+        (BACKLASH, StepSizes(-0.1, 0.3), r"backlash_mm` must be at least 0"),
+        ("contact.exponent", StepSizes(2.0, 2.5), "`contact.exponent` must be a number on which"),
+        ("solver.accuracy", StepSizes(1e-6, 1e-4), "`solver.accuracy` must be a number on which"),
+        ("scene", RANGE, "`scene` must be a section"),
+        ("profile.lobes", StepSizes(2, 4), "`profile.lobes` must be a whole number"),
+        ("rotor.helix_deg", StepSizes(0, 40), "`rotor.helix_deg` must be a number on which"),
+    ):
+        with pytest.raises(InputError, match=said):
+            follow(config, key, state, 1, limits)
+    with pytest.raises(InputError, match="period"):
+        follow(config, SPEED, state, 0, RANGE)
+    bare = load("configs/ee.yaml", ["scene.timing_gear=null"])
+    with pytest.raises(InputError, match="timing_gear"):
+        follow(bare, BACKLASH, state, 1, StepSizes(0.1, 0.3))
+    with pytest.raises(InputError, match="no orbit of 1 mesh periods"):
+        follow(config, SPEED, [40.0, 300.0], 1, RANGE)
+
+
+def test_a_design_ends_where_no_profile_can_be_made(branch):
+    """The branch ends where the roll angle allows no longer involute."""
+    config = config_at(4000.0)
+    state = branch.at(4000.0)[0].state
+    path = follow(config, INVOLUTE, state, 1, StepSizes(8.9, 9.5))
+    assert path.ends[1] is End.NO_GEOMETRY
+    assert path.points[-1].value == pytest.approx(9.071, abs=2e-3)
+    assert max(point.residual for point in path.points) < 1e-9

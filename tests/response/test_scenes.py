@@ -1,0 +1,193 @@
+"""Sweeps from Python: what the dataset holds, also where a point fails."""
+
+import threading
+import time
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import xarray
+
+import rootsopt
+from rootsopt import InputError, Status
+from rootsopt.response.many import LocalRunner
+from rootsopt.response.sweeps import points, scenes
+from rootsopt.response.sweeps.plan import plan_of
+from rootsopt.response.sweeps.points import configured, lost, simulated
+from rootsopt.response.sweeps.scenes import dataset_of
+
+SPEED, LOAD, CLEARANCE = "scene.speed_rpm", "scene.load.torque_N_m", "contact.clearance_mm"
+ANGLE, FAMILY = "profile.pressure_angle_deg", "profile.family"
+
+
+@pytest.fixture(scope="module")
+def config() -> rootsopt.Config:
+    return rootsopt.load_config("cic_drawn", ["objective.terms={outer_radius_mm: 0.5}"])
+
+
+@pytest.fixture(scope="module")
+def found(config) -> xarray.Dataset:
+    return rootsopt.sweep_scenes(config, {LOAD: [4.0, 3000.0], CLEARANCE: [0.0, 0.3]})
+
+
+def test_grid_of_any_keys(config, found):
+    assert found.mean_force_N.dims == (LOAD, CLEARANCE)
+    assert found.status.values.tolist() == [["periodic", "idle"], ["passed_through"] * 2]
+    point = {LOAD: 4.0, CLEARANCE: 0.0}
+    one = rootsopt.evaluate(config.replaced(point))
+    here = found.sel(point)
+    assert float(here.mean_force_N) == one.response["mean_force_N"]
+    slope = one.gradient["outer_radius_mm"]["involute_length_mm"]
+    assert float(here.gradient_outer_radius_mm.sel(design_key="involute_length_mm")) == slope
+    assert float(here.area_efficiency) == one.geometry["area_efficiency"]
+    first, *_ = one.steady_state["floquet_multipliers"]
+    real, imaginary = here.floquet_multiplier_real, here.floquet_multiplier_imaginary
+    assert [float(real[0]), float(imaginary[0])] == first
+    assert abs(complex(*first)) == pytest.approx(float(here.floquet_multiplier), rel=1e-12)
+
+
+def test_units_and_flags(found):
+    assert found.mean_force_N.attrs == {"units": "N", "long_name": "mean contact force"}
+    assert found[LOAD].attrs["units"] == "N m"
+    assert found.design_unit.values.tolist() == ["deg", "mm", "deg"]
+    codes, meanings = (found.status_code.attrs[f"flag_{x}"] for x in ("values", "meanings"))
+    names = dict(zip(codes.tolist(), meanings.split(), strict=True))
+    assert (
+        np.vectorize(names.get)(found.status_code.values).tolist() == found.status.values.tolist()
+    )
+    assert all("units" in v.attrs or v.dtype.kind in "Oi" for v in found.data_vars.values())
+    assert all("long_name" in v.attrs for v in found.variables.values())
+
+
+def test_wrong_keys_and_values_are_refused_before_anything_runs(config, monkeypatch):
+    monkeypatch.setattr(points, "simulated", None)
+    for wrong in ({"scene.sped_rpm": [1.0]}, {"scene.speed_rpm": [-1.0]}, {}, {LOAD: []}):
+        with pytest.raises(InputError):
+            rootsopt.sweep_scenes(config, wrong)
+
+
+def test_point_that_cannot_be_built_is_a_status(config):
+    found = rootsopt.sweep_scenes(config, {ANGLE: "5,36.43"})
+    assert found.status.values.tolist() == ["invalid", "periodic"]
+    assert "profile.involute_length_mm" in str(found.message.values[0])
+    assert np.isnan(found.mean_force_N.values).tolist() == [True, False]
+
+
+def test_family_takes_its_own_parameters(config):
+    """Those of another family, in the config or among the axes, are left out."""
+    ellipse = {"profile.family": "EE", ANGLE: 30.0}
+    assert configured(config, ellipse).profile.parameters == {}
+    own = configured(config, {FAMILY: "cic", ANGLE: 37.0}).profile
+    assert own.pressure_angle_deg == 37.0
+    assert own.involute_length_mm == config.profile.involute_length_mm
+    with pytest.raises(InputError, match="does not belong to family ee"):
+        configured(rootsopt.load_config("ee"), {ANGLE: 37.0})
+    with pytest.raises(InputError, match="is required for family arc"):
+        configured(config, {FAMILY: "arc"})
+
+
+def from_file(path, more="") -> rootsopt.Config:
+    """Return a config whose rotor is read from the file `path`, which need not exist."""
+    profile = f"{{family: outline, lobes: 3, pitch_radius_mm: 33, outline_file: '{path}'{more}}}"
+    return rootsopt.load_config("cic_drawn", [f"profile={profile}"])
+
+
+def test_family_leaves_the_file_of_an_outline():
+    """A point with another family has nothing of the file, and a point without keeps it."""
+    more = ", outline_smoothing_mm: 0.002, outline_center: fit, outline_unit: inch"
+    config = from_file("rotor.csv", more)
+    names = [name for name in type(config.profile).model_fields if name.startswith("outline_")]
+    own = {ANGLE: 36.0, "profile.involute_length_mm": 8.0, "profile.tip_arc_angle_deg": 4.0}
+    found = configured(config, {FAMILY: "cic", **own}).profile
+    assert not found.from_file
+    assert [*found.parameters.values()] == [36.0, 8.0, 4.0]
+    assert {getattr(found, name) for name in names} == {None}
+    for values in ({LOAD: 1.0}, {FAMILY: "outline"}):
+        kept = configured(config, values).profile
+        assert (kept.outline_smoothing_mm, kept.outline_unit) == (0.002, "inch")
+        assert kept.outline_file == config.profile.outline_file
+
+
+@pytest.mark.parametrize("place", ["config", "axis"])
+def test_points_of_another_outline_are_not_used_again(tmp_path, monkeypatch, place):
+    """Known points are those of the file as it was; after a change of it they are refused."""
+    files = [tmp_path / f"{number}.csv" for number in range(3)]
+    for file in files:
+        file.write_text("x_mm,y_mm\n1,0\n")
+    axes = {"profile.outline_file": [*map(str, files[1:])]} if place == "axis" else {SPEED: "1,2"}
+    asked, known = [], {"checkpoint": tmp_path / "points", "resume": True}
+
+    def check(config):
+        asked.append(config)
+        raise InputError("not simulated")
+
+    monkeypatch.setattr(points, "check_geometry", check)
+    config = from_file(files[0])
+    rootsopt.sweep_scenes(config, axes, checkpoint=tmp_path / "points")
+    rootsopt.sweep_scenes(config, axes, **known)
+    assert len(asked) == 2
+    files[place == "axis"].write_text("x_mm,y_mm\n2,0\n")
+    with pytest.raises(InputError, match="files: "):
+        rootsopt.sweep_scenes(config, axes, **known)
+
+
+def test_stopped_sweep_keeps_what_has_begun(config, monkeypatch):
+    """Points that wait are dropped without an error, those that have begun are reported."""
+    stop, begun = threading.Event(), []
+
+    def check(config):
+        begun.append(config.scene.speed_rpm)
+        if len(begun) == 2:
+            stop.set()
+        time.sleep(0.1)
+        raise InputError("not simulated")
+
+    monkeypatch.setattr(points, "check_geometry", check)
+    here = LocalRunner(2)
+    monkeypatch.setattr(points, "HERE", here)
+    monkeypatch.setattr(scenes, "HERE", here)
+    plan = plan_of({SPEED: "1,2,3,4,5,6"})
+    found = scenes.complete(config, plan, here, scenes.Points(config, plan), stop=stop)
+    assert 2 <= len(begun) < 6
+    assert sorted(found) == [*range(len(begun))]
+
+
+def test_part_can_be_null(config):
+    assert configured(config, {"scene.timing_gear": None}).scene.timing_gear is None
+
+
+def test_an_error_costs_one_point(config, monkeypatch):
+    def broken(config):
+        raise ZeroDivisionError("a bug")
+
+    monkeypatch.setattr(points, "check_geometry", broken)
+    row = simulated(config, {LOAD: 1.0})
+    assert row["status"] == "failed"
+    assert row["message"].endswith("ZeroDivisionError: a bug")
+
+
+def test_points_of_two_families_have_all_parameters():
+    """NaN where a point has no such parameter; texts where an axis has no numbers."""
+    plan = plan_of({FAMILY: "cic,arc", "rotor.bore_mm": "null,10"})
+    slopes = {"mean_force_N": {"pressure_angle_deg": 1.0}}, {"mean_force_N": {"arc_center_mm": 2.0}}
+    rows = {
+        number: lost(Status.PERIODIC) | {"response": {"mean_force_N": 3.0}, "gradient": slope}
+        for number, slope in zip((0, 2), slopes, strict=True)
+    }
+    # The number of mesh periods belongs to a periodic motion, not to one that is given up.
+    rows[0] |= {"steady_state": {"period": 3}}
+    rows[2] |= {"steady_state": {"period": 4}, "status": Status.CHAOTIC.label}
+    found = dataset_of(rootsopt.load_config("cic_drawn"), plan, rows)
+    slope = found.gradient_mean_force_N
+    assert slope.design_key.values.tolist() == ["pressure_angle_deg", "arc_center_mm"]
+    np.testing.assert_array_equal(slope.values[:, 0], [[1.0, np.nan], [np.nan, 2.0]])
+    assert found["rotor.bore_mm"].values.tolist() == ["null", "10"]
+    assert found.status.values[:, 1].tolist() == ["not_simulated"] * 2
+    assert found.period.values.tolist() == [[3, 0], [0, 0]]
+
+
+def test_single_precision_of_jax_is_refused(config, monkeypatch):
+    monkeypatch.setattr("jax.config.read", lambda name: False)
+    assert jnp.ones(1).dtype == jnp.float64
+    with pytest.raises(RuntimeError, match="jax_enable_x64"):
+        rootsopt.sweep_scenes(config, {LOAD: [1.0]})

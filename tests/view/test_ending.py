@@ -1,0 +1,291 @@
+"""The end of a run: its sentences from results with known numbers, its commands in a shell."""
+
+import io
+import shlex
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from rootsopt.commands import cli
+from rootsopt.commands.table import COMMANDS
+from rootsopt.config import load
+from rootsopt.status import Status
+from rootsopt.view import terminal
+from rootsopt.view.ending import ending
+
+DESIGN = dict(zip(load("cic_drawn").design_keys, (36.0, 9.0, 4.0), strict=True))
+STEADY = {"kind": "periodic", "period": 2, "floquet_multiplier": -0.25, "residual": 3e-12}
+
+
+def record(mean=50.0, peak=100.0, **more):
+    response = {"mean_force_N": mean, "peak_force_N": peak}
+    known = {"design": DESIGN, "response": response, "gradient": {}, "steady_state": STEADY}
+    return known | {"status": "periodic", "message": Status.PERIODIC.value} | more
+
+
+def run_of(command, **more):
+    return {"run": {"command": command}, "status": "periodic", "message": "Found."} | more
+
+
+def optimum(**more):
+    """Return an optimum: 40 % less mean force, 10 % more peak, half the seal width, two prices."""
+    before = record(geometry={"seal_width_mm": 6.0, "polar_inertia_kg_m2": 2e-3})
+    after = record(30.0, 110.0, geometry={"seal_width_mm": 3.0, "polar_inertia_kg_m2": 1.8e-3})
+    before["pump"], after["pump"] = {"leakage_fraction": 0.2}, {"leakage_fraction": 0.0}
+    row = {"sense": ">=", "limit": 3.0, "unit": "mm", "satisfied": True, "multiplier": 1.0}
+    limits = [
+        row | {"name": "seal width", "relaxed_by": -0.1, "relaxed_objective_percent": -0.5},
+        row | {"name": "root radius", "relaxed_by": -0.1, "relaxed_objective_percent": -2.0},
+        row | {"name": "outer radius", "baseline_satisfied": False, "multiplier": 0.0},
+    ]
+    found = {"converged": True, "residual": 2e-9, "required_residual": 1e-4, "message": "Yes.",
+             "starts": [{}] * 3, "optima": [{"objective": 0.85, "found": 2}]}  # fmt: skip
+    check = {"searched_objective": 0.8, "verified_objective": 0.84, "rejected": []}
+    return run_of("optimize", baseline=before, optimized=after, improvement={"objective": 0.15},
+                  constraints=limits, optimality=found, verification=check) | more  # fmt: skip
+
+
+def facts_of(result, **more):
+    return dict(ending(result, Path("run"), "cic", **more).facts)
+
+
+def steps_of(result, place="run", source="cic", **more):
+    return [command for _, command in ending(result, Path(place), source, **more).steps]
+
+
+def test_optimum_in_other_scenes():
+    """Where it is better, where it is worse, which design wins where, what cannot be compared."""
+    keys = [
+        {"key": "contact.clearance_mm", "low": 0.0, "high": 0.04, "rank_correlation": 0.2,
+         "worse": [[0.023, 0.04]]},
+        {"key": "scene.load.torque_N_m", "low": 2.0, "high": 8.0, "rank_correlation": -0.75,
+         "worse": [[2.0, 3.21], [5.0, 6.0]]},
+    ]  # fmt: skip
+    rival = {"design": {"pressure_angle_deg": 44.04}, "share_better": 0.375, "objective": 0.9,
+             "rank_correlation": 0.5, "key": "contact.clearance_mm", "better": []}  # fmt: skip
+    spread = {
+        "compared": 31, "share_better": 30 / 31, "ends_better": 2, "ends_compared": 4,
+        "objective_quantiles": {"quantile_5": 0.7, "median": 0.8, "quantile_95": 0.95},
+        "worst": {"objective": 1.17}, "keys": keys, "decides": "scene.load.torque_N_m",
+        "rivals": [rival],
+        "not_compared": [{"status_baseline": "idle", "status_optimized": "chaotic"}] * 2,
+    }  # fmt: skip
+    assert facts_of(optimum(assumptions=spread))["Other scenes"] == (
+        "The optimum is better than the baseline in 30 of 31 random scenes within the assumptions "
+        "and at 2 of 4 ends of their ranges: objective 0.7 to 0.95 (5 % to 95 % of the random "
+        "scenes), at worst 1.17. All else as given, it is worse where the clearance of the flanks "
+        "is above 23 µm and where the load is below 3.21 N·m or is between 5 N·m and 6 N·m. "
+        "Another design (pressure angle 44°) is better than the optimum in 37.5 % of the random "
+        "scenes, mostly with more clearance of the flanks (rank correlation 0.5). "
+        "Scenes that cannot be compared: 2 (baseline idle, optimum chaotic)."
+    )
+    for row in keys:
+        row["worse"] = []
+    rival["better"], rival["share_better"] = [[0.01, 0.04]], None
+    told = facts_of(optimum(assumptions=spread))["Other scenes"]
+    assert "Its objective rises most with less load (rank correlation −0.75)." in told
+    assert "in – of the random scenes and, all else as given, where the clearance" in told
+
+
+def test_optimum_in_three_sentences():
+    assert facts_of(optimum()) == {
+        "Gained": "The objective is 15 % below the baseline's: mean force −40 %, leakage fraction "
+        "−100 % and polar inertia −10 %; limits that the baseline violates are satisfied: outer "
+        "radius.",
+        "Costs": "Seal width −50 % and peak force +10 %; price of a limit, in objective: root "
+        "radius ≥ 3 mm (−2 % for −0.1 mm) and seal width ≥ 3 mm (−0.5 % for −0.1 mm).",
+        "How sure": "A certified optimum: first-order residual 2 × 10⁻⁹, at most 0.0001 required; "
+        "2 of 3 local searches found it; simulated again from rest, its objective agrees to 0.05 "
+        "(relative).",
+    }
+
+
+def test_optimum_that_is_none_says_so():
+    doubted = {"converged": False, "message": "Raise optimizer.iterations."}
+    given = optimum(status="not_converged", improvement={"objective": -0.05})
+    given["optimality"] = given["optimality"] | doubted
+    given["robustness"] = {"fresh": {
+        name: {"scenes": 9, "objective": {"mean": mean}, "failed_share": lost}
+        for name, mean, lost in (("baseline", 1.0, 0.0), ("robust", 0.9, 0.125))
+    }}  # fmt: skip
+    facts = facts_of(given)
+    assert facts["Gained"].startswith("The objective is 5 % above the baseline's: ")
+    assert "; rough price of a limit" in facts["Costs"]
+    assert facts["How sure"].startswith("Not an optimum: first-order residual 2 × 10⁻⁹")
+    assert "local searches" not in facts["How sure"]
+    assert facts["How sure"].endswith(
+        "mean objective in 9 fresh scenes that scatter: baseline 1 and robust 0.9, without a "
+        "usable motion: baseline 0 % and robust 12.5 %. Raise optimizer.iterations."
+    )
+    same = record(geometry={"seal_width_mm": 6.0})
+    given = run_of("optimize", baseline=same, optimized=same, verification={})
+    assert facts_of(given) == {
+        "Gained": "No reported quantity is better.",
+        "Costs": "No reported quantity is worse by 0.05 % or more.",
+        "How sure": "The design has no certificate.",
+    }
+
+
+def test_simulation_says_how_sure_it_is():
+    slow = f"{Status.PERIODIC.value} But a disturbance fades slowly."
+    given = run_of("simulate", **record(gradient={"peak_force_N": dict(DESIGN)}, message=slow))
+    given["statistics"] = {"gradient_disagreement": 4e-6}
+    assert facts_of(given) == {
+        "Contact force": "A mean of 50 N and a peak of 100 N, 2 times the mean; the motion repeats "
+        "every 2 mesh periods.",
+        "How sure": "The orbit is closed to a residual of 3 × 10⁻¹²; its largest Floquet "
+        "multiplier is 0.25; halving the steps changes its derivatives by 4 × 10⁻⁶ (relative). But "
+        "a disturbance fades slowly.",
+    }
+    given["steady_state"] = STEADY | {"mean_force_standard_error_N": 1.5}
+    assert "; standard errors: mean force 1.5 N. But" in facts_of(given)["How sure"]
+
+
+@pytest.mark.parametrize("command", ["simulate", "optimize", "pareto", "attractors"])
+@pytest.mark.parametrize("status", [Status.CHAOTIC, Status.NOT_IMPROVED, Status.PASSED_THROUGH])
+def test_run_without_a_result_says_why_and_what_to_change(command, status):
+    window = {"kind": "transient", "window_mesh_periods": 300}
+    alone = record(steady_state=window) if command == "simulate" else {}
+    given = run_of(command, **alone) | {"status": status.label, "message": status.value}
+    first, rest = ending(given, Path("run"), "cic --set a=1"), status.value.partition(". ")[2]
+    assert first.facts[0] == (
+        "Status", f"{status.label.replace('_', ' ').capitalize()}: {status.meaning}"
+    )  # fmt: skip
+    assert [text for text, _ in first.steps] == [rest, "Then run it again"]
+    assert first.steps[1][1] == f"rootsopt {command} cic --set a=1"
+    if command == "simulate":
+        assert dict(first.facts)["How sure"] == (
+            "The numbers are those of a window of 300 mesh periods."
+        )
+
+
+@pytest.mark.parametrize(("pump", "term"), [({}, "flow_ripple"), ({"volumetric_efficiency": 0.9},
+                                            "leakage_fraction")])  # fmt: skip
+def test_flanks_that_stay_apart_are_a_result(pump, term):
+    """The ending says what keeps them apart, how many machines touch, and what to minimise."""
+    said = "The timing gear keeps the flanks apart. Their least gap is 120 µm."
+    given = run_of("simulate", **record(message=said)) | {"status": "idle", "pump": pump}
+    given["response"] = {"mean_force_N": 0.0, "peak_force_N": 0.0, "gear_force_N": 254.4}
+    keys = [{"key": "contact.clearance_mm"}]
+    given["touching"] = {"machines": 10000, "touching_share": 0.016, "keys": keys}
+    assert facts_of(given)["Flanks"] == (
+        f"{said} The teeth of the timing gear carry up to 254.4 N; the motion repeats every 2 mesh "
+        "periods."
+    )
+    assert facts_of(given)["How sure"].endswith(
+        "Of 10000 machines within tolerances, 1.6 % touch; clearance costs most of the reserve."
+    )
+    steps = dict(ending(given, Path("run"), "cic").steps)
+    assert f"{{{term}: 1}}" in steps["Optimise the design"]
+    assert all(term not in step for why, step in steps.items() if why != "Optimise the design")
+
+
+def test_constraints_in_conflict_are_part_of_the_status():
+    told, advice = "No design does. In conflict: width >= 25 mm.", "Relax one of these."
+    given = run_of("optimize", status="infeasible", message=f"{told} {advice}")
+    assert facts_of(given) == {"Status": f"Infeasible: {told}"}
+    assert ending(given, Path("run"), "cic").steps[0] == (advice, "")
+
+
+def test_the_reserve_is_part_of_what_was_gained():
+    response = {"mean_force_N": 0.0, "peak_force_N": 0.0, "contact_reserve_um": 12.5}
+    striking = run_of("simulate", **record(response=response | {"contact_reserve_um": -3.0}))
+    assert "the reserve against contact is −3 µm" in facts_of(striking)["Contact force"]
+    closer = record(response=response | {"contact_reserve_um": 20.0})
+    given = run_of("optimize", baseline=record(response=response), optimized=closer)
+    assert "contact goes from 12.5 µm to 20 µm" in facts_of(given)["Gained"]
+
+
+def front():
+    aims = [{"name": "peak_force_N", "sense": "min"}, {"name": "area_efficiency", "sense": "max"}]
+    points = [
+        {"point": k, "terms": {"peak_force_N": 100.0 * k, "area_efficiency": 0.4 + 0.01 * k},
+         "rates": {"area_efficiency": rate}, "design": DESIGN}
+        for k, rate in ((1, None), (2, 2500.0), (3, None))
+    ]  # fmt: skip
+    return run_of("pareto", terms=aims, points=points, baseline=record(), message="Certified.")
+
+
+def sweep():
+    return [{"scene.speed_rpm": 1e3 * k, "peak_force_N": 50.0 + 10 * (k == 2) if k < 3 else None,
+               "status": "chaotic" if k == 3 else "periodic"} for k in (1, 2, 3)]  # fmt: skip
+
+
+def motions():
+    rows = [record(share=share, reached=share > 0.5) for share in (0.75, 0.2)]
+    return run_of("attractors", attractors=rows, lost={"chaotic": 0.05})
+
+
+def geometry():
+    sheet = {"displaced_volume_cm3": 555.0, "flow_ripple": 0.16}
+    shape = {"outer_radius_mm": 45.0, "area_efficiency": 0.4345}
+    return run_of("profile", design=DESIGN, geometry=shape, pump=sheet, status="geometry_only")
+
+
+def test_short_endings():
+    assert facts_of(front()) == {
+        "Best compromises": "3 points: peak force from 100 to 300 N and area efficiency from 0.41 "
+        "to 0.43.",
+        "Costs": "The peak force at point 2: +25 N for +0.01 of area efficiency.",
+        "How sure": "Certified.",
+    }
+    assert facts_of(run_of("sweep", status="chaotic"), rows=sweep()) == {
+        "Peak force": "It is lowest, 50 N, at speed 1000 rpm; highest, 60 N, at speed 2000 rpm.",
+        "How sure": "2 of 3 scenes have a steady state. The others: 1 chaotic.",
+    }
+    assert facts_of(motions()) == {
+        "Motions": "2 motions coexist; motion 1 (periodic): peak force 100 N, 75 % of the initial "
+        "states, reached from rest; motion 2 (periodic): peak force 100 N, 20 % of the initial "
+        "states.",
+        "How sure": "5 % of the initial states lead to no reported motion.",
+    }
+    assert facts_of(geometry()) == {
+        "Rotor": "Outer radius 45 mm; 43.45 % of the circle of this radius pumps; displaced volume "
+        "555 cm³; flow ripple 0.16.",
+        "How sure": "Found.",
+    }
+
+
+def test_every_command_parses():
+    """Paths and values are quoted for a shell, files of `--import` come along."""
+    row = {"point": 0, "scene.load.torque_N_m": 4.8, "profile.family": "it's"}
+    rows = [row | {"peak_force_N": 9.0, "status": "periodic"}]
+    given = [optimum(), run_of("simulate", **record()), front(), motions(), geometry()]
+    runs = [(one, ()) for one in given] + [(run_of("sweep"), rows), (run_of("sweep"), sweep())]
+    runs.append((run_of("pareto", status="interrupted"), ()))
+    count, place = 0, "-my runs/{a}'é"
+    for result, table in runs:
+        source = shlex.join(["cic", "-o", place])
+        steps = steps_of(result, place, source, imports=["my file.py"], rows=table)
+        for program, name, *arguments in map(shlex.split, steps):
+            options = cli.parser(COMMANDS[name]).parse_args(arguments)
+            assert program == "rootsopt"
+            assert options.imports == ["my file.py"] or options.resume
+            assert str(options.config) == "cic" or options.config.parent.is_relative_to(place)
+            count += 1
+    assert count == 3 + 3 + 2 + 2 + 1 + 2 + 2 + 1
+    (first, _) = steps_of(run_of("sweep"), rows=rows)
+    assert shlex.split(first)[3:] == [
+        "--set", "scene.load.torque_N_m=4.8", "--set", "profile.family=it's"
+    ]  # fmt: skip
+    assert "--set scene.speed_rpm=2000" in steps_of(run_of("sweep"), rows=sweep())[0]
+    assert steps_of(motions())[0].endswith("config.yaml --set objective.motion=worst")
+
+
+def test_design_without_parameters_is_not_to_be_optimised():
+    given = run_of("simulate", **record(design={}))
+    assert not any("optimize" in one for one in steps_of(given))
+
+
+def test_terminal_prints_commands_in_lines_of_their_own():
+    out = Console(width=40, file=io.StringIO())
+    place = "a folder with a long name that no line of this width holds, é"
+    end = ending(optimum(), Path(place), "cic")
+    terminal.show_ending(out, end)
+    lines = out.file.getvalue().splitlines()
+    for _, command in end.steps:
+        assert f"  {command}" in lines
+    told = " ".join(" ".join(lines).split())
+    for heading, sentences in end.facts:
+        assert f"{heading}: {terminal.ascii_text(sentences)}" in told

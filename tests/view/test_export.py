@@ -1,0 +1,432 @@
+"""Tests of drawings, solids and animation, read back and compared with the exact geometry."""
+
+import io
+import itertools
+import re
+import sys
+from collections import Counter
+from pathlib import Path
+
+import ezdxf
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+
+from experiments._common.polygons import signed_distance
+from rootsopt.commands.table import profile
+from rootsopt.config import load
+from rootsopt.errors import InputError
+from rootsopt.profiles import CIC, EE, geometry, outline, place_pair
+from rootsopt.response.records import Series
+from rootsopt.scene import Scene, check_geometry, design_vector
+from rootsopt.scene.families import profile_of
+from rootsopt.scene.space import Space
+from rootsopt.view.figures import chosen, solid
+from rootsopt.view.figures.animation import meshing_gif, rolling_contacts
+from rootsopt.view.figures.drawing import Drawing, svg_text
+from rootsopt.view.figures.dxf import dxf_bytes
+from rootsopt.view.figures.pieces import Arc, Spline, outline_pieces, polyline
+
+ROOT = Path(__file__).parents[2]
+R = 0.033
+LENGTH = 100.0
+
+
+def textbook(lobes, alpha, tip):
+    """Return a CIC whose tip arc is centred on the pitch circle: every flank has two arcs."""
+    longest = float(CIC(lobes, R, alpha, 1e-3, tip).longest_involute)
+    return CIC(lobes, R, alpha, longest, tip)
+
+
+PROFILES = {
+    "cic 2, no land": CIC(2, R, 0.85, 5e-3, 0.0),
+    "cic 3": CIC(3, R, 0.6358, 8.5e-3, 0.07),
+    "cic 3, past the longest": CIC(3, R, 0.6358, 9.0e-3, 0.07),
+    "cic 3, textbook": textbook(3, 0.6358, 0.07),
+    "cic 3, textbook, no land": textbook(3, 0.6358, 0.0),
+    "ee 3": EE(3, R),
+    "ee 4": EE(4, R),
+}
+SOLIDS = ("cic 2, no land", "cic 3", "cic 3, textbook, no land", "ee 3", "ee 4")
+every_profile = pytest.mark.parametrize("shape", PROFILES.values(), ids=PROFILES)
+
+
+def area_mm2(shape):
+    return float(geometry(shape).area) * 1e6
+
+
+def written(shape, folder):
+    """Return a solid or assembly, read back from its STEP file."""
+    from build123d import import_step
+
+    file = folder / "shape.step"
+    file.write_bytes(solid.step_bytes(shape))
+    return import_step(file)
+
+
+def drawing(shape, **changes):
+    given = {
+        "pieces": outline_pieces(shape),
+        "pitch_radius": R * 1e3,
+        "outer_radius": float(geometry(shape).outer_radius) * 1e3,
+        "lobes": shape.lobes,
+        "length": LENGTH,
+        "helix_deg": 0.0,
+        "bore": None,
+        "notes": ("one", "two & <three>"),
+        "root_radius": float(geometry(shape).root_radius) * 1e3,
+        "block": (("Title", "Rotor"), ("Material", "iron")),
+    }
+    return Drawing(**(given | changes))
+
+
+def green(points):
+    """Return the shoelace area of a closed run of complex points."""
+    return np.sum(np.imag(np.conj(points) * np.roll(points, -1))) / 2
+
+
+def read(document):
+    """Return (start, stop, fine points) of every entity on the layer OUTLINE, by ezdxf alone."""
+    for entity in document.modelspace().query('*[layer=="OUTLINE"]'):
+        assert entity.dxftype() in ("ARC", "SPLINE")
+        curve = entity.construction_tool()
+        if entity.dxftype() == "ARC":
+            first = np.radians(entity.dxf.start_angle)
+            sweep = np.radians((entity.dxf.end_angle - entity.dxf.start_angle) % 360)
+            turn = np.exp(1j * (first + sweep * np.linspace(0, 1, 2001)))
+            points = complex(*entity.dxf.center.vec2) + entity.dxf.radius * turn
+        else:
+            assert entity.dxf.degree == 3
+            ends = sorted(set(entity.knots))
+            fine = [np.linspace(a, b, 100, endpoint=False) for a, b in itertools.pairwise(ends)]
+            points = np.array([complex(p.x, p.y) for p in curve.points(np.concatenate(fine))])
+            points = np.append(points, complex(*entity.control_points[-1][:2]))
+        yield points
+
+
+def chained(parts):
+    """Return all points in one closed counter-clockwise run, and the largest gap between entities.
+
+    A concave arc of a DXF runs the other way round."""
+    gaps, run = [], []
+    ends = parts[-1][[0, -1]]
+    here = ends[np.argmin(np.min(np.abs(ends[:, None] - parts[0][[0, -1]]), axis=1))]
+    for points in parts:
+        if abs(points[-1] - here) < abs(points[0] - here):
+            points = points[::-1]
+        gaps.append(abs(points[0] - here))
+        run.append(points[:-1])
+        here = points[-1]
+    return np.concatenate(run), max(gaps)
+
+
+@every_profile
+def test_pieces_lie_on_the_flank(shape):
+    """The package's outline, computed with other normals, lies on the pieces within their
+    tolerance.
+
+    Arcs are recognised where the profile has them."""
+    pieces = outline_pieces(shape)
+    fine = polyline(pieces, 0.01)
+    true = np.asarray(outline(shape, 20))[:-1] * 1e3
+    polygon = np.stack([fine.real, fine.imag], -1)
+    distance = signed_distance(true, polygon, refine=False)
+    # Sagitta of the polygon's chords of 0.01 mm on radii of 5 mm and more, and the tolerance.
+    away = np.abs(distance)
+    assert away.max() < 1e-5
+    arcs = [piece for piece in pieces if isinstance(piece, Arc)]
+    if isinstance(shape, EE):
+        assert not arcs
+    elif float(shape.tip_arc_angle) > 0:
+        ra = float(geometry(shape).outer_radius) * 1e3
+        lands = [a for a in arcs if abs(a.center) < 1e-6 and abs(a.radius - ra) < 1e-6]
+        assert len(lands) == shape.lobes
+        assert lands[0].sweep == pytest.approx(2 * float(shape.tip_arc_angle), abs=1e-12)
+    else:
+        assert len(arcs) >= shape.lobes
+
+
+def test_textbook_cic_has_arcs_about_the_pitch_circle():
+    """The tip arc and its conjugate are circles of equal radius, centred on the pitch circle.
+
+    Halves of an arc on both sides of a lobe's axis are one piece."""
+    pieces = outline_pieces(textbook(3, 0.6358, 0.0))
+    arcs = [piece for piece in pieces if isinstance(piece, Arc)]
+    assert len(arcs) == 6
+    np.testing.assert_allclose([abs(arc.center) for arc in arcs], 33.0, atol=1e-8)
+    np.testing.assert_allclose([arc.radius for arc in arcs], arcs[0].radius, atol=1e-8)
+    assert sorted(np.sign([arc.sweep for arc in arcs])) == [-1] * 3 + [1] * 3
+    assert len([piece for piece in pieces if isinstance(piece, Spline)]) == 12
+
+
+@every_profile
+def test_dxf_read_back(shape):
+    """The DXF is in millimetres, has the layers, and is closed to 1e-9 mm; its area is right to
+    1e-6."""
+    document = ezdxf.read(io.StringIO(dxf_bytes(drawing(shape, bore=12.0)).decode()))
+    assert document.units == ezdxf.units.MM
+    assert not document.audit().has_errors
+    layers = Counter(entity.dxf.layer for entity in document.modelspace())
+    assert set(layers) == {
+        "OUTLINE", "BORE", "PITCH_CIRCLE", "CENTER_LINES", "TEXT",
+        "CIRCLES", "DIMENSIONS", "TITLE_BLOCK", "TABLE",
+    }  # fmt: skip
+    (bore,) = document.modelspace().query('CIRCLE[layer=="BORE"]')
+    assert bore.dxf.radius == 6.0
+    (pitch,) = document.modelspace().query('CIRCLE[layer=="PITCH_CIRCLE"]')
+    assert pitch.dxf.radius == 33.0
+    run, gap = chained(list(read(document)))
+    assert gap < 1e-9
+    assert green(run) == pytest.approx(area_mm2(shape), rel=1e-6)
+    tip = np.max(np.abs(run))
+    assert tip == pytest.approx(float(geometry(shape).outer_radius) * 1e3, abs=1e-5)
+    assert abs(np.angle(run[np.argmin(np.abs(run - tip))])) < 1e-3
+
+
+OTHERS = {
+    "arcs_epicycloid": [27.0, 8.0, 1.0],
+    "extended_cycloid": [1.3],
+    "free_form": [2.0, 0.7, 0.9, 0.95, 0.8, 0.4, 0.1, -0.3],
+}
+
+
+@pytest.mark.parametrize(
+    "family",
+    [pytest.param(name, marks=[pytest.mark.long] * (name != "free_form")) for name in OTHERS],
+)
+def test_any_family_is_drawn(family, tmp_path):
+    """Arcs with an edge, a curve with a cusp and a free form are read back with an area right to
+    1e-6."""
+    shape = profile_of(family, 3, jnp.asarray(R), jnp.asarray(OTHERS[family]))
+    document = ezdxf.read(io.StringIO(dxf_bytes(drawing(shape)).decode()))
+    run, gap = chained(list(read(document)))
+    assert gap < 1e-9
+    assert green(run) == pytest.approx(area_mm2(shape), rel=1e-6)
+    if family == "arcs_epicycloid":
+        return  # A solid of arcs is among those below.
+    pytest.importorskip("build123d")
+    body = written(solid.rotor(outline_pieces(shape), LENGTH, None, 0.0), tmp_path)
+    assert body.is_valid
+    assert body.volume / LENGTH == pytest.approx(area_mm2(shape), rel=1e-6)
+
+
+@pytest.mark.parametrize("name", ["cic 2, no land", "cic 3", "ee 4"])
+def test_svg_read_back(name):
+    """The drawing has true size, and its own curves enclose the area to 1e-6."""
+    shape = PROFILES[name]
+    text = svg_text(drawing(shape))
+    size, unit = re.search(r'<svg [^>]*width="([\d.]+)(\w+)"', text).groups()
+    assert unit == "mm"
+    assert re.search(r'viewBox="(\S+) (\S+) (\S+) (\S+)"', text).group(3) == size
+    assert "two &amp; &lt;three&gt;" in text
+    path = re.search(r'class="outline" d="([^"]+)"', text).group(1)
+    here, run = None, []
+    for command, body in re.findall(r"([MACZ])([^MACZ]*)", path):
+        numbers = list(map(float, body.split()))
+        share = np.linspace(0, 1, 4000, endpoint=False)
+        if command == "M":
+            first = here = complex(*numbers)
+        elif command == "C":
+            a, b, stop = (complex(*numbers[i : i + 2]) for i in (0, 2, 4))
+            rest = 1 - share
+            run.append(
+                rest**3 * here + 3 * rest**2 * share * a + 3 * rest * share**2 * b + share**3 * stop
+            )
+            here = stop
+        elif command == "A":
+            radius, large, sweep, stop = numbers[0], numbers[3], numbers[4], complex(*numbers[5:])
+            chord = stop - here
+            rise = np.sqrt(radius**2 - abs(chord) ** 2 / 4)
+            side = 1 if large != sweep else -1
+            center = (here + stop) / 2 + side * 1j * rise * chord / abs(chord)
+            # y points down: a sweep of 1 turns towards growing angles of (x, y).
+            turn = np.angle((stop - center) / (here - center)) % (2 * np.pi)
+            turn = turn if sweep else turn - 2 * np.pi
+            assert (abs(turn) > np.pi) == bool(large)
+            run.append(center + (here - center) * np.exp(1j * turn * share))
+            here = stop
+    assert abs(here - first) < 1e-9
+    # Counter-clockwise with y up is clockwise with y down.
+    assert -green(np.concatenate(run)) == pytest.approx(area_mm2(shape), rel=1e-6)
+
+
+@pytest.mark.parametrize("name", SOLIDS)
+def test_step_read_back(name, tmp_path):
+    """Volume over length, and area of the section, are right to 1e-6; arcs are cylinders.
+
+    This also holds with bore and twist."""
+    build123d = pytest.importorskip("build123d")
+    shape = PROFILES[name]
+    pieces = outline_pieces(shape)
+    for bore, helix in ((None, 0.0), (10.0, -np.pi / 3)):
+        made = solid.rotor(pieces, LENGTH, bore, helix)
+        back = written(made, tmp_path)
+        assert back.is_valid
+        exact = area_mm2(shape) - (0 if bore is None else np.pi * bore**2 / 4)
+        assert back.volume / LENGTH == pytest.approx(exact, rel=1e-6)
+        ends = [f for f in back.faces() if f.geom_type == build123d.GeomType.PLANE]
+        assert [end.area for end in ends] == pytest.approx([exact, exact], rel=1e-6)
+        assert sorted(end.center().Z for end in ends) == pytest.approx([0, LENGTH], abs=1e-9)
+        box = back.bounding_box()
+        assert pytest.approx(LENGTH, abs=1e-6) == box.max.Z - box.min.Z
+        rounds = [f for f in back.faces() if f.geom_type == build123d.GeomType.CYLINDER]
+        arcs = sum(isinstance(piece, Arc) for piece in pieces)
+        assert len(rounds) == (arcs if bore is None else 1)
+
+
+def test_pair_meshes_along_its_length(tmp_path):
+    """In every section of the twisted pair, rotor 2 is where the package's frame puts it.
+
+    The rotors overlap nowhere, and the STL is closed."""
+    build123d = pytest.importorskip("build123d")
+    shape, helix = PROFILES["cic 3"], np.radians(50.0)
+    pair = solid.pair(outline_pieces(shape), 3, 66.0, LENGTH, None, helix)
+    back = written(pair, tmp_path)
+    assert len(back.solids()) == 2
+    assert {child.label for child in back.children} == {"rotor_1", "rotor_2"}
+    points = np.asarray(outline(shape, 12)) * 1e3
+    for z, turn in ((0.0, 0.0), (LENGTH, helix)):
+        for rotor, placed in zip(
+            back.solids(), place_pair(points, 3, 66.0, turn, turn), strict=True
+        ):
+            distances = [rotor.distance_to(build123d.Vertex(x, y, z)) for x, y in placed[::9]]
+            assert max(distances) < 1e-4
+            middle = placed[:-1].mean(axis=0)
+            # And the points are on its surface, not inside.
+            outward = middle + (placed[::9] - middle) * (1 + 1e-4)
+            outside = [rotor.distance_to(build123d.Vertex(x, y, z)) for x, y in outward]
+            assert min(outside) > 1e-4
+    data = solid.stl_bytes(back.solids()[0])
+    kind = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("rest", "<u2")])
+    corners = np.frombuffer(data[84:], kind)["corners"].astype(float)
+    volume = np.sum(np.linalg.det(corners)) / 6
+    assert volume / LENGTH == pytest.approx(area_mm2(shape), rel=1e-3)
+    names = {}
+    faces = [[names.setdefault(tuple(c), len(names)) for c in face] for face in corners]
+    edges = Counter((f[i], f[i - 1]) for f in faces for i in range(3))
+    assert all(edges[b, a] == count for (a, b), count in edges.items())
+
+
+def test_solids_without_a_kernel(tmp_path, monkeypatch, capsys):
+    """Without a kernel, the exit code is 2, and one line says what to install; nothing is
+    written."""
+    monkeypatch.setitem(sys.modules, "build123d", None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    arguments = [
+        str(ROOT / "configs/cic_drawn.yaml"),
+        "-o",
+        str(tmp_path / "x"),
+        "--export",
+        "dxf,step",
+    ]
+    assert profile.main(arguments) == 2
+    message = capsys.readouterr().err
+    assert "rootsopt[cad]" in message
+    assert message.count("\n") == 1
+    assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize("text", ["dwg", "dxf,png", "none,dxf"])
+def test_formats_that_are_not_known(text):
+    with pytest.raises(InputError, match="must be formats out of dxf, svg, step, stl, gif"):
+        chosen(text)
+
+
+@pytest.fixture
+def few_frames(monkeypatch):
+    """Use eight frames per mesh period, a fifth of the usual number."""
+    monkeypatch.setattr("rootsopt.view.figures.animation._FRAMES", 8)
+
+
+def test_profile_writes_drawings_and_animation(tmp_path, few_frames):
+    """DXF and SVG are written by default; the GIF has one frame per step and moves."""
+    folder, config = tmp_path / "out", str(ROOT / "configs/cic_drawn.yaml")
+    assert profile.main([config, "-o", str(folder), "--no-figures"]) == 0
+    assert {"rotor.dxf", "rotor.svg"} <= {path.name for path in folder.iterdir()}
+    assert "outer radius 45.102855 mm" in (folder / "rotor.dxf").read_text()
+    arguments = ["--no-figures", "--export", "gif", "--set", "rotor.helix_deg=40"]
+    assert profile.main([config, "-o", str(folder), *arguments]) == 0
+    gif = folder / "figures/meshing.gif"
+    assert gif.stat().st_size < 2e6 / 5
+    with Image.open(gif) as picture:
+        assert picture.n_frames == 8
+        frames = []
+        for i in (0, 2, 4):
+            picture.seek(i)
+            frames.append(np.asarray(picture.convert("RGB"), float))
+    assert all(np.mean(np.abs(a - b)) > 3 for a, b in itertools.pairwise(frames))
+
+
+@every_profile
+def test_rolling_contacts_touch_both_rotors(shape):
+    """The contact point lies on both outlines, and a step along the normal leads from rotor 1 to 2.
+
+    Drive and coast flanks take turns."""
+    points = np.asarray(outline(shape, 200)) * 1e3
+    angles = np.linspace(0.05, 2 * np.pi / shape.lobes - 0.03, 7)
+    flanks = [rolling_contacts(shape, angles, coast) for coast in (False, True)]
+    assert np.all(flanks[0].present ^ flanks[1].present)
+    for i, angle in enumerate(angles):
+        flank = flanks[int(flanks[1].present[i])]
+        pair = place_pair(points, shape.lobes, 66.0, angle, angle)
+        steps = flank.point[i] + np.array([[0.0], [0.05], [-0.05]]) * flank.normal[i]
+        first, second = (signed_distance(steps, one) for one in pair)
+        assert abs(first[0]) < 2e-3
+        assert abs(second[0]) < 2e-3
+        assert first[2] < 0 < first[1]
+        assert second[1] < 0 < second[2]
+
+
+def test_arrow_follows_the_force(few_frames):
+    """The GIF of a simulation covers the requested periods.
+
+    It has red and blue arrows only while that flank carries a force."""
+    shape = PROFILES["cic 3"]
+    turn = 2 * np.pi * np.arange(360) / 360
+    force = np.where(np.arange(360) % 120 >= 60, 50.0, 0.0)
+    series = Series(turn, turn, 0 * turn, 0 * turn, force, 0 * turn, 0 * turn)
+    data = meshing_gif(drawing(shape), shape, series, 1)
+    with Image.open(io.BytesIO(data)) as picture:
+        assert picture.n_frames == 8
+        blue = []
+        for i in (2, 6):
+            picture.seek(i)
+            rgb = np.asarray(picture.convert("RGB"), float)[: picture.height // 2]
+            blue.append(np.sum(np.abs(rgb - [0, 114, 178]).sum(-1) < 40))
+    assert blue[0] < 0.2 * blue[1]
+
+
+def test_bore_takes_mass_and_inertia():
+    """A bore removes π ρ L r² and π/2 ρ L r⁴; derivatives with respect to the design do not change.
+
+    An optimisation keeps the root circle outside the bore."""
+    plain, bored = (
+        load(ROOT / "configs/cic_drawn.yaml", sets) for sets in ([], ["rotor.bore_mm=20"])
+    )
+    shape = geometry(Scene.from_config(plain).profile(design_vector(plain)))
+    one, other = Scene.from_config(plain), Scene.from_config(bored)
+    cylinder = 7800.0 * 0.1 * np.pi * 0.01**2
+    assert float(one.mass(shape) - other.mass(shape)) == pytest.approx(cylinder, rel=1e-9)
+    lost = float(one.inertia(shape) - other.inertia(shape))
+    assert lost == pytest.approx(cylinder * 0.01**2 / 2, rel=1e-9)
+
+    def slope(model):
+        turn = jnp.ones(3)
+        inertia = lambda design: model.inertia(geometry(model.profile(design)))  # noqa: E731
+        return float(jax.jvp(inertia, (design_vector(plain),), (turn,))[1])
+
+    assert slope(other) == pytest.approx(slope(one), rel=1e-12)
+    assert abs(slope(one)) > 0
+    limits = {c.name: c for c in Space.of(bored, other).constraints}
+    room = float(shape.root_radius) * 1e3 - 10.0
+    assert float(limits["root radius"].slack(shape)) == pytest.approx(room, rel=1e-9)
+    assert "root radius" not in {c.name for c in Space.of(plain, one).constraints}
+
+
+def test_bore_must_fit():
+    config = load(ROOT / "configs/ee.yaml", ["rotor.bore_mm=44.0"])
+    with pytest.raises(InputError, match=r"`rotor.bore_mm` must be less than 44 .* but is 44"):
+        check_geometry(config)
+    check_geometry(load(ROOT / "configs/ee.yaml", ["rotor.bore_mm=43.9"]))

@@ -1,0 +1,425 @@
+"""Tests of result files, tables and figures, from made-up evaluations."""
+
+import csv
+import dataclasses
+import json
+import os
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from rootsopt.config import parse
+from rootsopt.errors import InputError
+from rootsopt.response.evaluation import Evaluation
+from rootsopt.response.records import Series
+from rootsopt.status import Status
+from rootsopt.view import files, names, tables, terminal
+from rootsopt.view.figures import runs
+from rootsopt.view.figures.force import amplitude_spectrum, plot_force, plot_gap
+from rootsopt.view.figures.runs import optimization_figures, simulation_figures
+from rootsopt.view.figures.style import figure
+from rootsopt.view.names import table
+
+CONFIG = """
+profile: {family: cic, lobes: 3, pitch_radius_mm: 33.0, pressure_angle_deg: 36.43,
+          involute_length_mm: 8.5, tip_arc_angle_deg: 4.0}
+rotor: {length_mm: 100.0, density_kg_m3: 7800.0}
+contact: {stiffness_N_per_mm_e: 2.0e5, exponent: 2.2, max_damping_N_s_per_mm: 0.25,
+          full_damping_depth_mm: 0.01}
+scene: {speed_rpm: 3000.0, load: {torque_N_m: 1.0}}
+"""
+DESIGN = {"pressure_angle_deg": 36.43, "involute_length_mm": 8.5, "tip_arc_angle_deg": 4.0}
+
+
+def _series(periods=3, samples=64):
+    tau = np.arange(periods * samples) / samples
+    drive = np.maximum(0, 30 * np.cos(2 * np.pi * tau))
+    coast = np.maximum(0, -10 * np.cos(2 * np.pi * tau))
+    turn = 2 * np.pi / 3 * tau
+    return Series(
+        time=tau / 150,
+        rotation=turn,
+        relative=-1e-4 * tau,
+        rate=0 * tau,
+        drive_force=drive,
+        coast_force=coast,
+        depth=0 * tau,
+    )
+
+
+def _evaluation(mean=14.830332, peak=83.824854, **changes):
+    made = Evaluation(
+        design=dict(DESIGN),
+        geometry={"outer_radius_mm": 45.1028545, "polar_inertia_kg_m2": 0.00210070},
+        response={"mean_force_N": mean, "peak_force_N": peak, "rms_force_N": 22.45494},
+        gradient={"mean_force_N": {"pressure_angle_deg": -0.24457, "involute_length_mm": 0.65}},
+        steady_state={"kind": "periodic", "period": 2, "floquet_multiplier": 0.37066967},
+        status=Status.PERIODIC,
+        message=Status.PERIODIC.value,
+        statistics={"solver_steps": 3055, "seconds": 21.16},
+        series=_series(),
+    )
+    return dataclasses.replace(made, **changes)
+
+
+def _failed():
+    return _evaluation(
+        response={},
+        gradient={},
+        steady_state={"kind": "transient"},
+        status=Status.PASSED_THROUGH,
+        message=Status.PASSED_THROUGH.value,
+        series=None,
+    )
+
+
+def _history():
+    rows = []
+    for i in range(12):
+        row = DESIGN | {"evaluation": i, "start": -1 if i < 4 else i // 8, "iteration": i}
+        row |= {"objective": 1.2 - 0.05 * i, "best_objective": min(1.0, 1.2 - 0.05 * i)}
+        row |= {"feasible": i != 6, "status": "periodic"}
+        rows.append(row)
+    rows[5]["objective"] = float("nan")
+    return rows
+
+
+def _read(path):
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+# ---------------------------------------------------------------------------- files
+
+
+def test_csv_keeps_ten_digits(tmp_path):
+    series = _series()
+    columns = files.response_columns(series)
+    path = files.ResultFolder(tmp_path).write_csv("response_baseline.csv", columns)
+    assert path == tmp_path / "response_baseline.csv"
+    rows = _read(path)
+    assert list(rows[0]) == [
+        "time_s", "rotation_deg", "relative_rotation_rad", "relative_speed_rad_s",
+        "drive_flank_force_N", "coast_flank_force_N", "contact_force_N",
+    ]  # fmt: skip
+    for name, values in columns.items():
+        np.testing.assert_allclose([float(row[name]) for row in rows], values, rtol=1e-9)
+    assert float(rows[64]["rotation_deg"]) == 120
+    np.testing.assert_allclose(columns["contact_force_N"], series.drive_force + series.coast_force)
+
+
+def test_csv_of_rows_keeps_text_truth_and_gaps(tmp_path):
+    rows = [{"a": 1, "b": True, "c": "x,y"}, {"a": 2, "b": False, "d": float("nan")}]
+    folder = files.ResultFolder(tmp_path)
+    read = _read(folder.write_csv("history.csv", files.row_columns(rows)))
+    assert read[0] == {"a": "1", "b": "true", "c": "x,y", "d": ""}
+    assert read[1] == {"a": "2", "b": "false", "c": "", "d": "nan"}
+    empty = folder.write_csv("history.csv", files.row_columns([], keys=("a", "b")))
+    assert empty.read_text() == "a,b\n"
+
+
+def test_csv_refuses_uneven_columns(tmp_path):
+    with pytest.raises(ValueError, match="one length"):
+        files.ResultFolder(tmp_path).write_csv("x.csv", {"a": [1.0], "b": [1.0, 2.0]})
+    assert os.listdir(tmp_path) == []
+
+
+def test_json_has_null_for_what_is_not_finite(tmp_path):
+    data = {
+        "a": float("nan"),
+        "b": [np.inf, np.float64(1.5)],
+        "c": np.array([1, 2]),
+        "d": {"e": np.bool_(True), "f": None, "g": Status.CHAOTIC},
+    }
+    path = files.ResultFolder(tmp_path).write_json("result.json", data)
+
+    def refuse(name):
+        raise AssertionError(name)
+
+    assert json.loads(path.read_text(), parse_constant=refuse) == {
+        "a": None, "b": [None, 1.5], "c": [1, 2],
+        "d": {"e": True, "f": None, "g": "chaotic"},
+    }  # fmt: skip
+
+
+def test_a_new_folder_is_made_with_its_parents(tmp_path):
+    folder = files.ResultFolder(tmp_path / "a" / "b")
+    assert folder.path.is_dir()
+    assert os.listdir(folder.path) == []
+
+
+@pytest.mark.parametrize("below", ["", "x", "x/y/z"])
+def test_a_path_at_or_below_a_file_is_refused(tmp_path, below):
+    (tmp_path / "file").write_text("keep")
+    with pytest.raises(InputError, match="output folder") as caught:
+        files.ResultFolder(tmp_path / "file" / below)
+    assert str(tmp_path / "file") in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert os.listdir(tmp_path) == ["file"]
+    assert (tmp_path / "file").read_text() == "keep"
+
+
+@pytest.mark.parametrize("name", ["", "nul\0byte", "x" * 300])
+def test_impossible_names_are_refused(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError):
+        files.ResultFolder(name)
+    assert os.listdir(tmp_path) == []
+
+
+# --------------------------------------------------------------------------- tables
+
+
+def _render(*made):
+    console = Console(width=80, force_terminal=False, color_system=None)
+    with console.capture() as capture:
+        console.print(terminal.shown(made))
+    text = capture.get()
+    assert text.isascii()
+    assert "\x1b" not in text
+    assert max(map(len, text.splitlines()), default=0) <= 80
+    return text
+
+
+def _row(made, label):
+    """Return the cells of the row of a table with this label, as texts."""
+    (row,) = [row for _, rows in made.groups for row in rows if row[0].text == label]
+    return [cell.text for cell in row[1:]]
+
+
+CONSTRAINTS = [
+    {"name": "area_efficiency", "baseline": 0.4344578, "optimized": 0.4344579, "unit": "",
+     "limit": 0.4344578, "sense": ">=", "satisfied": True, "active": True, "multiplier": 2.0,
+     "relaxed_by": -0.01, "relaxed_objective_percent": -2.63},
+    {"name": "undercut_margin", "baseline": 7.4, "optimized": -0.1, "unit": "mm", "limit": 0.0,
+     "sense": ">=", "satisfied": False, "active": False, "baseline_satisfied": False,
+     "baseline_limit": 7.0},
+]  # fmt: skip
+
+
+def _compared(first, second, **gains):
+    return {"baseline": first.record(), "optimized": second.record(), "improvement": gains,
+            "constraints": CONSTRAINTS}  # fmt: skip
+
+
+def test_numbers_of_two_designs_are_compared():
+    result = _compared(_evaluation(), _evaluation(13.3472988, 41.912427), objective=0.25)
+    made = tables.numbers_table(result)
+    assert _row(made, "relative to the baseline") == ["1", "0.75000", "−25.00 %"]
+    assert _row(made, "mean force (N)") == ["14.830", "13.347", "−10.00 %"]
+    assert _row(made, "peak force (N)") == ["83.825", "41.912", "−50.00 %"]
+    assert _row(made, "pressure angle (°)") == ["36.430", "36.430", "0.00 %"]
+    assert _row(made, "polar inertia (kg·m²)")[0] == "0.0021007"
+    assert _row(made, "status") == ["periodic", "periodic", ""]
+    assert made.note == f"both: {Status.PERIODIC.value}"
+    limits = tables.constraint_table(result)
+    price = ["active", "−2.63 % for −0.01"]
+    assert _row(limits, "area efficiency ≥ 0.43446") == ["0.43446", "0.43446", *price]
+    beyond = ["7.4000 > 7.0000", "−0.10000", "violated", ""]
+    assert _row(limits, "undercut margin ≥ 0 mm") == beyond
+    gradients = [*tables.gradient_tables(result)]
+    assert [one.title.rpartition(", ")[2] for one in gradients] == ["baseline", "optimised"]
+    text = _render(*tables.tables_of(result))
+    assert "polar inertia (kg m^2)" in text
+    assert "undercut margin >= 0 mm" in text
+
+
+def test_numbers_without_a_usable_result():
+    result = _compared(_evaluation(), _failed(), objective=float("nan"))
+    made = tables.numbers_table(result)
+    assert _row(made, "relative to the baseline") == ["–", "–", ""]
+    assert _row(made, "mean force (N)") == ["14.830", "–", ""]
+    assert _row(made, "status") == ["periodic", "passed through", ""]
+    assert made.groups[-1][1][-1][2].good is False
+    assert "passed through each other" in made.note
+    assert len([one for one in tables.gradient_tables(result) if one]) == 1
+
+
+def test_numbers_of_one_design():
+    record = _evaluation().record()
+    made = tables.numbers_table(record)
+    assert _row(made, "mean force (N)") == ["14.830"]
+    assert _row(made, "period (mesh periods)") == ["2"]
+    assert _row(made, "status") == ["periodic"]
+    slopes = next(tables.gradient_tables(record))
+    assert _row(slopes, "involute length (mm)") == ["0.65000"]
+    errors = {"mean_force_N": {"involute_length_mm": 0.25}}
+    record = record | {"steady_state": {"gradient_standard_error": errors}}
+    slopes = next(tables.gradient_tables(record))
+    assert _row(slopes, "involute length (mm)") == ["0.65000 ± 0.25000"]
+    assert "0.65000 +- 0.25000" in _render(slopes)
+    assert _row(tables.effort_table(record), "time (s)") == ["21.160"]
+
+
+def test_pump_sheet():
+    """The sheet shows baseline beside optimum, with rows of both or one of them, and the forces."""
+    known = {"design": DESIGN, "response": {"mean_force_N": 10.0}}
+    first = known | {"pump": {"flow_ripple": 0.2, "flow_lines": [0.5, 0.25]}}
+    overlap = {"flank_interference_um": 30.0, "flank_interference_at_deg": 5.0}
+    sheet = {"flow_ripple": 0.1, "tip_leakage_l_min": 2.5, **overlap}
+    made = tables.pump_table({"baseline": first, "optimized": known | {"pump": sheet}})
+    assert _row(made, "flow ripple") == ["0.20000", "0.10000", "−50.00 %"]
+    assert _row(made, "tip leakage (l/min)") == ["–", "2.5000", ""]
+    assert _row(made, "flow lines, 2 of 2") == ["0.25000", "–", ""]
+    assert _row(made, "mean force (N)") == ["10.000", "10.000", "0.00 %"]
+    assert "optimised: The flanks overlap" in made.note
+    _render(made)
+
+
+def test_steps_of_the_scene_have_their_own_unit():
+    """A clearance moves by a micrometre, another length by a hundredth of itself."""
+    row = {"unit": "mm", "mean_force_N": 0.1, "peak_force_N": -0.2}
+    rows = [row | {"quantity": "clearance", "step": 1e-3, "value": 0.1},
+            row | {"quantity": "rotor length", "step": 1.0, "value": 100.0}]  # fmt: skip
+    optimality = {"converged": True, "reason": "converged", "message": "", "residual": 0.0,
+                  "required_residual": 1e-4, "violation": 0.0, "method": "slsqp",
+                  "sensitivities": rows}  # fmt: skip
+    made = [one for one in tables.certificate_tables({"optimality": optimality}) if one][-1]
+    assert _row(made, "clearance +1 µm") == ["+0.1", "−0.2", "–"]
+    assert _row(made, "rotor length +1 %") == ["+0.1", "−0.2", "–"]
+    assert "clearance +1 um" in _render(made)
+
+
+def test_scenes_have_columns_for_what_differs():
+    """Values that all rows share stand below; long tables are truncated, and say so."""
+    rows = [{"speed_rpm": 1000.0 * k, "mean_force_N": 10.0 + k, "peak_force_N": None,
+             "period": 2, "status": "periodic"} for k in range(1, 9)]  # fmt: skip
+    (made,) = tables.scene_tables({}, rows, most=5)
+    assert made.heads == ("speed (rpm)", "status", "mean force (N)")
+    assert len(made.groups[0][1]) == 5
+    assert made.note == "The first 5 of 8 rows. In all rows: period 2 mesh periods."
+    of_both = {"baseline": {"design": DESIGN, "speeds": rows},
+               "optimized": {"design": DESIGN, "speeds": rows},
+               "objective_by_speed": [row | {"objective": 0.5} for row in rows]}  # fmt: skip
+    first, second = tables.scene_tables(of_both, (), most=200)
+    assert "objective" not in first.heads
+    assert "objective 0.5" in second.note
+
+
+def test_wide_tables_are_divided_on_the_terminal():
+    """Every part repeats the first column, fits into the width, and no cell or note is lost."""
+    heads = ["point", *(f"a quantity with number {k}, ½ (mm)" for k in range(30))]
+    rows = [[f"row {k}", *(f"{k}.{j:04d} × 10⁻⁷" for j in range(30))] for k in range(3)]
+    made = table("Wide [table]", heads, [("", rows)], "Nothing is lost → here.")
+    text = _render(made)
+    assert text.count("Wide [table]") > 3
+    for row in rows:
+        assert text.count(row[0]) == text.count("Wide [table]")
+        for cell in row[1:]:
+            assert text.count(f" {terminal.ascii_text(cell)} ") == 1
+    assert "Nothing is lost -> here." in text
+    assert table("Empty", heads, [("", [])]) is None
+
+
+@pytest.mark.parametrize(
+    ("printed", "plain"),
+    [("5 µm at 4° (°)", "5 um at 4 deg (deg)"), ("−1.2 × 10⁻⁷ kg·m²", "-1.2e-07 kg m^2"),
+     ("3 × 10¹² ≥ – ± ≤", "3e+12 >= - +- <="), ("line at 2 × mesh", "line at 2 x mesh"),
+     ("ψ(β)", "?(?)")],
+)  # fmt: skip
+def test_terminal_replaces_the_signs_of_print(printed, plain):
+    assert terminal.ascii_text(printed) == plain
+
+
+@pytest.mark.parametrize(
+    ("given", "shown"),
+    [(0.0, "0"), (1973.3, "1973.3"), (-1.23456e-7, "−1.235 × 10⁻⁷"), (3, "3"), (None, "–"),
+     (float("nan"), "–"), (123456.7, "123457"), (True, "yes"), ("passed_through", "passed through"),
+     ([1, 2.5], "1, 2.5000")],
+)  # fmt: skip
+def test_values(given, shown):
+    assert names.value(given) == shown
+
+
+@pytest.mark.parametrize(
+    ("key", "shown"),
+    [("scene.timing_gear.backlash_mm", "backlash (mm)"), ("rms_force_N", "RMS force (N)"),
+     ("line_1.5_force_N", "line at 1.5 × mesh frequency (N)"),
+     ("flank_gap_min_um", "flank gap min (µm)"), ("area_efficiency", "area efficiency"),
+     ("tilting_moment_max_N_m", "tilting moment max (N·m)")],
+)  # fmt: skip
+def test_names(key, shown):
+    assert names.label(key) == shown
+
+
+def test_changes():
+    assert names.percent(-2.0, -1.0) == "+50.00 %"
+    assert names.percent(1.0, 1.0 - 1e-9) == "0.00 %"
+    assert names.percent(0.001, 3.0) == "+3 × 10⁵ %"
+    assert names.percent(0.0, 1.0) == names.percent(None, 1.0) == ""
+
+
+# -------------------------------------------------------------------------- figures
+
+
+@pytest.mark.parametrize("count", [96, 97])
+def test_spectrum_of_a_cosine(count):
+    step = 3 / (150 * count)  # three whole periods of 150 Hz
+    time = step * np.arange(count)
+    signal = 5 + 2.5 * np.cos(2 * np.pi * 150 * time + 0.3) + 0.5 * np.sin(2 * np.pi * 300 * time)
+    frequency, amplitude = amplitude_spectrum(signal, step)
+    expected = np.zeros_like(frequency)
+    expected[np.isclose(frequency, 150)] = 2.5
+    expected[np.isclose(frequency, 300)] = 0.5
+    assert np.count_nonzero(expected) == 2
+    assert frequency[0] == pytest.approx(50)
+    np.testing.assert_allclose(amplitude, expected, atol=1e-12)
+
+
+def test_force_panels_show_each_peak_on_a_common_time_axis():
+    long = _series(periods=128)
+    late = np.where(np.arange(128 * 64) == 100 * 64, 500.0, long.drive_force)
+    long = dataclasses.replace(long, drive_force=late)
+    _, axes = figure(6, 4, 2, 1, sharex=True)
+    responses = {"a": {"mean_force_N": 10.0, "peak_force_N": 500.0},
+                 "b": {"mean_force_N": 10.0, "peak_force_N": 30.0}}  # fmt: skip
+    plot_force(axes[:, 0], {"a": long, "b": _series()}, responses)
+    drawn = axes[0, 0].lines[0]
+    assert drawn.get_ydata().max() == 500
+    assert axes[0, 0].get_xlim() == pytest.approx((0, 20))
+    assert drawn.get_xdata()[-1] < 20
+
+
+def test_gap_panel_shows_the_least_gap():
+    """One revolution is drawn; a gap as wide as the rotors does not set the scale."""
+    series = _series(periods=6)
+    gap = 1e-4 * (1 + (np.arange(len(series.time)) % 64 == 32) * 600.0)
+    gap[5] = 8e-5
+    _, axes = figure(6, 2, 1, 1)
+    plot_gap(axes[:, 0], {"a": dataclasses.replace(series, depth=-gap)})
+    curve, least = axes[0, 0].lines
+    assert least.get_ydata()[0] == pytest.approx(80)
+    assert least.get_label() == "least gap 80.00 µm"
+    assert axes[0, 0].get_ylim() == pytest.approx((0, 320))
+    assert (
+        np.ptp(series.rotation)
+        > 2 * np.pi
+        > 0.9 * np.ptp(series.rotation[: curve.get_xdata().size])
+    )
+
+
+def _png_size(path):
+    data = path.read_bytes()
+    assert data.startswith(b"\x89PNG")
+    return int.from_bytes(data[16:20]), int.from_bytes(data[20:24])
+
+
+def test_optimization_figures(tmp_path):
+    folder = files.ResultFolder(tmp_path)
+    better = _evaluation(design=DESIGN | {"involute_length_mm": 8.0})
+    optimization_figures(folder, _evaluation(), better, _history(), parse(CONFIG))
+    names = "comparison", "force", "history", "meshing", "profiles", "spectrum"
+    assert sorted(os.listdir(tmp_path / "figures")) == [f"{name}.png" for name in names]
+    for file in (tmp_path / "figures").iterdir():
+        width, height = _png_size(file)
+        assert width >= 1400
+        assert height >= 700
+        assert file.stat().st_size > 20_000
+
+
+def test_simulation_figures_without_a_series(tmp_path):
+    folder = files.ResultFolder(tmp_path)
+    simulation_figures(folder, _failed(), parse(CONFIG))
+    assert sorted(os.listdir(tmp_path / "figures")) == ["meshing.png", "profiles.png"]
+    assert "pyplot" not in vars(runs)

@@ -1,0 +1,95 @@
+"""The sliders of a config: which keys have one, their spans, steps and ranges."""
+
+import math
+from pathlib import Path
+
+import pytest
+
+from rootsopt.config import load, parse
+from rootsopt.config.families import families
+from rootsopt.view.pages.knobs import _step, knobs_of
+
+ROOT = Path(__file__).parents[2]
+CONFIGS = sorted(path.stem for path in (ROOT / "configs").glob("*.yaml"))
+
+
+def by_key(config):
+    return {knob.key: knob for knob in knobs_of(config)}
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_every_knob_can_be_set(name):
+    """A knob's own value lies in its span, the span in its range, and the config accepts it."""
+    config = load(ROOT / "configs" / f"{name}.yaml")
+    knobs = knobs_of(config)
+    assert len({knob.key for knob in knobs}) == len(knobs)
+    for knob in knobs:
+        assert knob.least <= knob.low <= knob.value <= knob.high <= knob.most
+        assert knob.step > 0
+        assert knob.group == knob.group.strip() != ""
+    values = {knob.key: int(knob.value) if knob.whole else knob.value for knob in knobs}
+    assert config.replaced(values) == config.replaced({})
+    config.check_values({knob.key: knob.low for knob in knobs if not knob.whole})
+
+
+@pytest.mark.parametrize("family", [name for name, one in families().items() if one.maker])
+def test_every_family_has_a_knob_per_design_parameter(family):
+    """Design parameters come first, and span the bounds of an optimisation."""
+    example = families()[family].example
+    rows = "\n".join(f"  {key}: {list(x) if isinstance(x, tuple) else x}"
+                     for key, x in example.items())  # fmt: skip
+    text = (ROOT / "configs" / "ee.yaml").read_text().replace("family: ee", f"family: {family}")
+    text = text.replace("  lobes: 3", f"  lobes: 3\n{rows}")
+    knobs = knobs_of(config := parse(text))
+    design = [knob for knob in knobs if knob.group == "Design"]
+    assert [knob.key for knob in design] == [f"profile.{key}" for key in config.design_keys]
+    assert knobs[: len(design)] == design
+    assert [knob.value for knob in design] == list(config.design)
+    assert all(math.isfinite(knob.low) and math.isfinite(knob.high) for knob in design)
+
+
+def test_only_parts_of_the_scene_have_knobs():
+    cic, pump = by_key(load("cic_drawn")), by_key(load("pump"))
+    assert "scene.timing_gear.backlash_mm" in cic
+    assert not [key for key in cic if "motor" in key or "friction" in key]
+    assert {"scene.motor.slope_N_m_s_per_rad", "contact.friction.static"} <= pump.keys()
+    assert "scene.load.torque_N_m" not in pump
+    bare = by_key(load("cic_drawn", ["scene.timing_gear=null"]))
+    assert not [key for key in bare if "timing_gear" in key]
+
+
+def test_spans_units_and_texts():
+    knobs = by_key(load("cic_drawn"))
+    speed = knobs["scene.speed_rpm"]
+    assert (speed.low, speed.high, speed.step, speed.unit) == (600, 6000, 20, "rpm")
+    assert (speed.least, speed.most) == (1e-2, 1e6)
+    assert "speed of rotor 1" in speed.help
+    angle = knobs["profile.pressure_angle_deg"]
+    assert (angle.low, angle.high, angle.unit, angle.name) == (25, 45, "°", "pressure angle")
+    clearance = knobs["contact.clearance_mm"]
+    assert clearance.low == clearance.value == 0 < clearance.high
+    assert knobs["rotor.helix_deg"].low == -knobs["rotor.helix_deg"].high
+    assert knobs["profile.lobes"].whole
+    far = by_key(load("cic_drawn", ["profile.tip_arc_angle_deg=12"]))["profile.tip_arc_angle_deg"]
+    assert far.high == 12  # beyond its bounds
+
+
+def test_the_span_of_an_unbounded_parameter_ends_at_its_limit():
+    long = ["profile.pitch_radius_mm=5000", "profile.involute_length_mm=6000"]
+    knob = by_key(load("cic_drawn", long))["profile.involute_length_mm"]
+    assert knob.high == knob.most == 10_000
+
+
+def test_smoothing_has_a_knob_only_if_it_is_given():
+    key = "contact.smoothing_mm"
+    assert key not in by_key(load("cic_drawn"))
+    assert key in by_key(load("cic_drawn", [f"{key}=1e-4"]))
+
+
+@pytest.mark.parametrize("width", [1e-4, 0.3, 1.0, 4.0, 20.0, 5400.0, 1e6])
+def test_steps_are_round_and_many(width):
+    step = _step(width)
+    assert 200 <= width / step * (1 + 1e-9) < 500
+    assert step / 10 ** math.floor(math.log10(step) + 1e-9) == pytest.approx(
+        round(step / 10 ** math.floor(math.log10(step) + 1e-9))
+    )

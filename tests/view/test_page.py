@@ -1,0 +1,399 @@
+"""The explorer's session, and its page in a real browser."""
+
+import dataclasses
+import queue
+import re
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from browser import Browser
+
+from rootsopt.config import load, parse
+from rootsopt.optimize.design import optimize_design
+from rootsopt.optimize.outcome import Optimization
+from rootsopt.profiles import EE
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.status import Status
+from rootsopt.view.pages import session as sessions
+from rootsopt.view.pages import shown as texts
+from rootsopt.view.pages.engine import Engine, Shape, same_motion
+from rootsopt.view.pages.session import (
+    FromRest,
+    NewMotion,
+    NewShape,
+    Problem,
+    Saved,
+    Searched,
+    Session,
+)
+from tests.standins import evaluation_of
+
+pytest.importorskip("bokeh")
+ROOT = Path(__file__).parents[2]
+CIC = ROOT / "configs" / "cic_drawn.yaml"
+SPEED, TIP, LOAD = "scene.speed_rpm", "profile.tip_arc_angle_deg", "scene.load.torque_N_m"
+
+
+@pytest.fixture(scope="module")
+def engine():
+    made = Engine(load(CIC), optimize_design)
+    made.prepare()
+    return made
+
+
+class Told(Session):
+    """A session whose messages are collected."""
+
+    def __init__(self, engine, idle=0.05):
+        self.messages: queue.Queue = queue.Queue()
+        super().__init__(engine, self.messages.put, idle)
+
+    def next(self, kind, number):
+        """Return the next message of a kind for the values with this number."""
+        while True:
+            message = self.messages.get(timeout=120)
+            if isinstance(message, kind) and message.number == number:
+                return message
+
+
+@pytest.fixture
+def session(engine):
+    made = Told(engine)
+    assert made.next(NewMotion, 0).evaluation.status is Status.PERIODIC
+    yield made
+    made.close()
+
+
+class Stub(Engine):
+    """An engine that computes nothing: a motion near another one has the given `status`.
+
+    Its force is 1 N, that of a motion from rest 2 N. `calls`: names and times (s) of both."""
+
+    def __init__(self):
+        super().__init__(load(CIC))
+        self.status, self.calls = Status.PERIODIC, []
+        self._base = self.given
+        self.ready.set()
+
+    def shape(self, config):
+        return Shape(np.zeros((1, 2)), {}, None, EE(3, 33e-3))
+
+    def near(self, config, start):
+        self.calls.append(("near", time.monotonic()))
+        return evaluation_of(1.0, self.status)
+
+    def from_rest(self, config):
+        self.calls.append(("rest", time.monotonic()))
+        return evaluation_of(2.0)
+
+
+@pytest.fixture
+def stub():
+    return Stub()
+
+
+@pytest.fixture
+def told(stub):
+    """Return a session in which nothing is computed, after its first motion."""
+    made = Told(stub, idle=0.3)
+    made.next(NewMotion, 0)
+    yield made
+    made.close()
+
+
+def test_rest_waits_until_the_slider_rests(stub, told):
+    """A motion that is known near the last one is compared with that from rest only later.
+
+    One that is not known near the last one is simulated from rest at once."""
+    for _ in range(3):
+        number = told.move({SPEED: 3100.0})
+        told.next(NewMotion, number)
+    told.next(FromRest, number)
+    names, times = zip(*stub.calls, strict=True)
+    assert names[:2] == ("rest", "near")
+    assert names[-1] == "rest"
+    assert times[-1] - times[-2] >= 0.3
+    told.idle, stub.status = 600.0, Status.NOT_SETTLED
+    number = told.move({SPEED: 3200.0})
+    assert [told.next(NewMotion, number).near for _ in range(2)] == [True, False]
+
+
+def test_motion_from_rest_is_shown_when_asked(told):
+    """On its own it only says that there is another motion; asked for, it is shown, once."""
+    number = told.move({SPEED: 3100.0})
+    assert told.next(NewMotion, number).near
+    assert not told.next(FromRest, number).same
+    told.show_from_rest()
+    shown = told.next(NewMotion, number)
+    assert not shown.near
+    assert shown.evaluation.response["mean_force_N"] == 2
+    told.show_from_rest()
+    assert told.next(FromRest, number).same
+
+
+def test_sliders_of_whole_numbers_give_whole_numbers(told):
+    told.move({"profile.lobes": 4.0})
+    assert type(told.config().profile.lobes) is int
+
+
+def test_motions_are_the_same_if_all_their_forces_agree():
+    one, other = evaluation_of(100.0), evaluation_of(100.05)
+    assert same_motion(one, other)
+    apart = dataclasses.replace(other, response=other.response | {"peak_force_N": 101.0})
+    assert not same_motion(one, apart)
+    assert not same_motion(one, dataclasses.replace(other, status=Status.CHAOTIC))
+
+
+class Better(Optimization):
+    """An outcome whose objective is a fifth lower, and whose peak force is a tenth higher."""
+
+    @property
+    def improvement(self):
+        return {"objective": 0.2, "peak_force_N": -0.1}
+
+
+def test_changes_have_the_sign_of_what_they_change():
+    """Now against the start in the tables; the optimum against the start of its search."""
+    table = texts.numbers_table(evaluation_of(90.0).record(), evaluation_of(100.0).record())
+    assert "−10.00\N{NO-BREAK SPACE}%" in table
+    start = evaluation_of(100.0)
+    found = Better(None, start, start, [], {})
+    line = texts.searched_line(Searched(0, found, {}))
+    assert "objective −20.00 %, peak force +10.00 %" in line
+
+
+def test_forces_near_a_motion_are_those_from_rest(session, engine):
+    """The motion that follows a slider has the forces of a simulation from rest, and says so."""
+    number = session.move({SPEED: 3050.0, TIP: 4.2})
+    shape = session.next(NewShape, number).shape
+    motion = session.next(NewMotion, number)
+    assert motion.near
+    assert motion.evaluation.series is not None
+    turned, taken = (np.subtract(motion.frames[key], motion.frames[key][0])
+                     for key in ("rotation", "time"))  # fmt: skip
+    # 3050 revolutions per minute are 18.3 degrees per millisecond.
+    np.testing.assert_allclose(taken, turned / 18.3, rtol=1e-6, atol=1e-9)
+    assert session.next(FromRest, number).same
+    config = load(CIC, [f"{SPEED}=3050", f"{TIP}=4.2"])
+    alone = Evaluator.of(config)()
+    assert motion.evaluation.response == pytest.approx(alone.response, rel=1e-5)
+    assert shape.record == pytest.approx(alone.geometry)
+    assert np.hypot(*shape.outline.T).max() == pytest.approx(alone.geometry["outer_radius_mm"])
+
+
+def test_values_that_do_not_fit_are_refused_in_words(session):
+    number = session.move({TIP: 31.0})
+    problem = session.next(Problem, number)
+    assert "`profile.tip_arc_angle_deg` must be less than 30" in problem.words
+    assert "Traceback" not in problem.words
+    number = session.move({TIP: 4.0})
+    assert session.next(NewMotion, number).evaluation.usable
+
+
+def test_refused_values_are_not_saved_or_simulated(session):
+    number = session.move({"profile.involute_length_mm": 17.0})
+    session.next(Problem, number)
+    session.save()
+    session.show_from_rest()
+    assert "involute_length_mm" in session.next(Problem, number).words
+    seen = []
+    time.sleep(0.5)
+    while not session.messages.empty():
+        seen.append(session.messages.get())
+    assert not [one for one in seen if isinstance(one, Saved | NewMotion)]
+
+
+def test_motion_without_a_result_is_final_only_after_rest(session):
+    """Under a load that no flank can hold, the status is that of a simulation from rest."""
+    number = session.move({LOAD: 1e5})
+    (note,) = session.next(NewShape, number).notes
+    assert "is that N·mm? write 100" in texts.notes_lines((note,))
+    assert texts.notes_lines(("<b>",)) == '<div class="note">&lt;b&gt;</div>'
+    first = session.next(NewMotion, number)
+    assert not first.final
+    last = session.next(NewMotion, number)
+    assert last.final
+    assert not last.near
+    assert not last.evaluation.usable
+    assert "Lower" in last.evaluation.message or "lower" in last.evaluation.message
+    number = session.move({LOAD: 4.775})
+    assert session.next(NewMotion, number).evaluation.usable
+
+
+def test_yaml_reproduces_the_numbers(session):
+    number = session.move({SPEED: 2900.0})
+    shown = session.next(NewMotion, number).evaluation
+    session.save()
+    saved = session.next(Saved, number)
+    config = parse(saved.text)
+    assert config.scene.speed_rpm == 2900
+    assert Evaluator.of(config)().response == pytest.approx(shown.response, rel=1e-5)
+
+
+def test_search_can_be_cancelled_and_its_design_is_taken(session, monkeypatch):
+    design = {"pressure_angle_deg": 40.0}
+    optimum = dataclasses.replace(session.next(NewMotion, session.move({SPEED: 3020.0})).evaluation,
+                                  design=design)  # fmt: skip
+    found = Optimization(None, optimum, optimum, [], {}, interrupted=True)
+
+    def search(config, progress, stop):
+        assert config.scene.speed_rpm == 3010
+        progress(1, 9, 0.9)
+        assert stop.wait(60)
+        return found
+
+    monkeypatch.setattr(session.engine, "optimize", search)
+    number = session.move({SPEED: 3010.0})
+    session.optimize()
+    assert session.next(sessions.Progress, number).best == 0.9
+    session.cancel()
+    while not isinstance(message := session.messages.get(timeout=60), Searched):
+        pass
+    assert message.values == {"profile.pressure_angle_deg": 40.0}
+    assert not session.searching.is_set()
+
+
+def test_search_without_design_parameters_says_why(engine):
+    made = Told(Engine(load(ROOT / "configs" / "ee.yaml"), optimize_design))
+    made.engine.ready.set()
+    made.optimize()
+    while not isinstance(message := made.messages.get(timeout=60), Searched):
+        pass
+    assert "has no design parameter" in message.words
+    made.close()
+
+
+@pytest.fixture(scope="module")
+def address(engine):
+    from rootsopt.view.pages.server import PageServer
+
+    found, up, stop = [], threading.Event(), threading.Event()
+
+    def serve():
+        PageServer(engine, "cic").run(stop, lambda url: (found.append(url), up.set()))
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    assert up.wait(60)
+    yield found[0]
+    stop.set()
+    thread.join(30)
+
+
+@pytest.fixture
+def page(address, tmp_path):
+    """Return a browser that shows the page, once its numbers are there."""
+    made = Browser(tmp_path)
+    try:
+        made.open(address)
+        shown(made, "motion 0")
+        yield made
+    finally:
+        made.close()
+
+
+MODEL = "const model = name => Bokeh.documents[0].get_model_by_name(name); "
+LOADED = "if (!(window.Bokeh && Bokeh.documents.length)) return false; "
+
+
+def shown(page, mark, seconds=120):
+    """Wait until the numbers with this `mark` are shown."""
+    code = LOADED + MODEL + "const m = model('mark'); return m && m.text === arguments[0];"
+    page.wait(code, mark, seconds=seconds)
+
+
+def read(page):
+    """Return what the page shows: outline, forces, texts."""
+    return page.run(
+        MODEL
+        + """
+        const list = x => Array.from(x);
+        return {
+          outline: list(model("outline_now").data.x), force: list(model("force_now").data.drive),
+          numbers: model("numbers_text").text,
+          gradient: model("gradient_text").text, status: model("status_text").text,
+          field: model("field profile.pressure_angle_deg").value,
+          pose: document.getElementById("pose").textContent,
+          rotors: [...document.querySelectorAll("#pair .rotor")].map(one => one.getAttribute("d")),
+          wide: document.documentElement.scrollWidth,
+          outside: performance.getEntriesByType("resource").map(one => one.name)
+            .filter(name => !name.startsWith(location.origin) && !name.startsWith("data:")),
+        };"""
+    )
+
+
+def test_dragged_slider_moves_outline_force_and_numbers(page):
+    """A drag with the mouse changes all that is shown, without a word on the console.
+
+    The page loads nothing from elsewhere, and is not wider than the window."""
+    before = read(page)
+    assert "periodic" in before["status"]
+    assert before["field"] == 36.43
+    left, top, width, height = page.run(
+        MODEL
+        + """
+        const view = Bokeh.index.find_one_by_id(model("slider profile.pressure_angle_deg").id);
+        const box = view.el.getBoundingClientRect();
+        return [box.left, box.top, box.width, box.height];"""
+    )
+    share = (36.43 - 25) / (45 - 25)
+    page.drag(left + share * width, top + height / 2, 0.1 * width)
+    page.wait(MODEL + "return model('field profile.pressure_angle_deg').value > 37;")
+    page.wait("return window.rootsoptDelay > 0;")
+    page.wait(MODEL + "return model('status_text').text.includes('the motion is the same');")
+    after = read(page)
+    for key in ("outline", "force", "numbers", "gradient", "rotors"):
+        assert after[key] != before[key], key
+    assert len(after["force"]) > 100
+    assert "drive flank" in after["pose"]
+    assert after["outside"] == []
+    assert after["wide"] <= 1400
+    assert [line for line in page.console() if not line.startswith("INFO")] == []
+
+
+def test_values_that_do_not_fit_show_no_old_numbers(page):
+    before = read(page)
+    page.run(MODEL + f"model('field {TIP}').value = 31;")
+    page.wait(MODEL + "return model('mark').text.startsWith('problem');")
+    after = read(page)
+    assert "must be less than 30" in after["status"]
+    assert after["force"] == []
+    assert re.search(r"mean force \(N\)</th>\s*<td>[^<]*</td>\s*<td>–</td>", after["numbers"])
+    assert after["outline"] == before["outline"]  # faded
+    page.run(MODEL + f"model('field {TIP}').value = 4;")
+    page.wait(MODEL + "return model('mark').text.startsWith('motion');")
+    assert read(page)["force"] != []
+
+
+def test_button_saves_a_config(page, tmp_path):
+    page.run(MODEL + f"model('field {SPEED}').value = 2950;")
+    page.wait(MODEL + "return model('mark').text.startsWith('motion ');")
+    page.wait("return window.rootsoptDelay > 0;")
+    page.run(
+        MODEL
+        + """
+        const view = Bokeh.index.find_one_by_id(model("save").id);
+        view.el.shadowRoot.querySelector("button").click();"""
+    )
+    end = time.monotonic() + 60
+    while not (files := list(tmp_path.glob("*.yaml"))) and time.monotonic() < end:
+        time.sleep(0.1)
+    assert [file.name for file in files] == ["cic-explored.yaml"]
+    assert load(files[0]).scene.speed_rpm == 2950
+
+
+def test_tabs_do_not_disturb_each_other(page, address):
+    (first,) = page.tabs()
+    second = page.tab()
+    page.switch(second)
+    page.open(address)
+    shown(page, "motion 0")
+    page.run(MODEL + f"model('field {SPEED}').value = 2500;")
+    shown(page, "motion 1")
+    other = read(page)
+    page.switch(first)
+    assert page.run(MODEL + f"return model('field {SPEED}').value;") == 3000
+    assert read(page)["numbers"] != other["numbers"]

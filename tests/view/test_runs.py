@@ -1,0 +1,304 @@
+"""Tests of result folders: complete, of one run, locked, rejected where they cannot be used."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from rootsopt.commands.console import main
+from rootsopt.errors import InputError
+from rootsopt.view import disk, runs
+from rootsopt.view.runs import RunFolder
+from tests.deaths import digest, digest_of, write_run
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_full_disk_or_death_at_every_file_operation():
+    """At each operation, the folder is the old run or the new one.
+
+    The next run finds it usable and leaves nothing behind. This runs in its own process, because it
+    forks."""
+    done = subprocess.run(
+        [sys.executable, "-m", "tests.deaths"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.count(" 0 wrong") == 3
+
+
+def test_an_earlier_run_is_moved_aside_or_replaced(tmp_path):
+    target = tmp_path / "run"
+    assert write_run(target, "first") == []
+    (note,) = write_run(target, "second")
+    assert note == f"the earlier run is now in {target}.1"
+    write_run(target, "third")
+    assert write_run(target, "fourth", overwrite=True) == []
+    assert sorted(os.listdir(tmp_path)) == ["run", "run.1", "run.2"]
+    found = [digest(tmp_path / name) for name in ("run", "run.1", "run.2")]
+    assert found == [digest_of(text) for text in ("fourth", "first", "second")]
+
+
+def test_what_a_run_needs_no_more_goes_when_it_is_in_place(tmp_path):
+    spent, gone = tmp_path / "spent", tmp_path / "gone"
+    spent.touch()
+    with RunFolder(tmp_path / "run") as run:
+        run.remove_afterwards(spent)
+        run.remove_afterwards(gone)
+        run.write_json("result.json", {})
+    assert spent.exists()  # The run was given up.
+    with RunFolder(tmp_path / "run") as run:
+        run.remove_afterwards(spent)
+        run.remove_afterwards(gone)
+        run.write_json("result.json", {})
+        run.put_in_place()
+    assert os.listdir(tmp_path) == ["run"]
+
+
+def test_files_that_are_not_the_runs_own_are_never_deleted(tmp_path):
+    target = tmp_path / "run"
+    write_run(target, "old")
+    (target / "figures" / "note.txt").write_text("mine")
+    (note,) = write_run(target, "new", overwrite=True)
+    assert "not its own" in note
+    assert (tmp_path / "run.1" / "figures" / "note.txt").read_text() == "mine"
+    assert digest(target) == digest_of("new")
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+@pytest.mark.parametrize("name", ["thesis.doc", "result.json", ".hidden", "sub/"])
+def test_folders_of_others_are_refused(tmp_path, overwrite, name):
+    target = tmp_path / "run"
+    target.mkdir()
+    if name.endswith("/"):
+        (target / name).mkdir()
+    else:
+        (target / name).write_text("mine")
+    before = digest(target)
+    with pytest.raises(InputError, match="another folder") as caught:
+        RunFolder(target, "simulate", overwrite)
+    assert name.strip("/") in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert digest(target) == before
+    assert os.listdir(tmp_path) == ["run"]
+
+
+def test_a_folder_that_others_fill_meanwhile_is_left_to_them(tmp_path):
+    target = tmp_path / "run"
+    with RunFolder(target) as folder:
+        folder.write_text("config.yaml", "")
+        target.mkdir()
+        (target / "theirs").write_text("")
+        folder.write_json("result.json", {})
+        (note,) = folder.put_in_place()
+    assert os.listdir(target) == ["theirs"]
+    assert str(tmp_path / "run.1") in note
+    assert sorted(os.listdir(tmp_path / "run.1")) == ["config.yaml", "result.json"]
+
+
+def test_a_link_leads_to_the_folder_and_permissions_stay(tmp_path):
+    (tmp_path / "there").mkdir(mode=0o700)
+    os.chmod(tmp_path / "there", 0o750)
+    (tmp_path / "link").symlink_to("there")
+    write_run(tmp_path / "link", "first")
+    write_run(tmp_path / "link", "second")
+    assert (tmp_path / "link").is_symlink()
+    assert digest(tmp_path / "there") == digest_of("second")
+    assert digest(tmp_path / "there.1") == digest_of("first")
+    assert (tmp_path / "there").stat().st_mode & 0o777 == 0o750
+
+
+@pytest.mark.parametrize("where", [".", "..", "sub/..", "file", "file/below", "pipe", "", "a\0b"])
+def test_places_that_no_folder_can_take(tmp_path, monkeypatch, where):
+    here = tmp_path / "parent" / "here"
+    (here / "sub").mkdir(parents=True)
+    monkeypatch.chdir(here)
+    (here / "file").write_text("")
+    os.mkfifo(here / "pipe")
+    before = digest(tmp_path)
+    with pytest.raises(InputError) as caught:
+        RunFolder(where, "simulate")
+    assert "\n" not in str(caught.value)
+    assert digest(tmp_path) == before
+
+
+def test_the_current_folder_is_refused_even_if_empty(tmp_path, monkeypatch):
+    """The current folder is rejected: another folder would replace it, under the user's shell."""
+    here = tmp_path / "here"
+    here.mkdir()
+    monkeypatch.chdir(here)
+    for where in (".", str(here), "../here"):
+        with pytest.raises(InputError, match="current folder"):
+            RunFolder(where, "simulate")
+    monkeypatch.chdir(tmp_path)
+    write_run(here, "old")
+    monkeypatch.chdir(here / "figures")
+    with pytest.raises(InputError, match="current folder"):
+        RunFolder("..", "simulate", overwrite=True)
+    assert digest(here) == digest_of("old")
+
+
+def test_mount_points_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(runs, "_mount_points", lambda: {os.path.realpath(tmp_path / "mounted")})
+    (tmp_path / "mounted").mkdir()
+    with pytest.raises(InputError, match=r"mount point.*mounted/simulate"):
+        RunFolder(tmp_path / "mounted", "simulate")
+    write_run(tmp_path / "mounted" / "simulate", "inside")
+
+
+def test_long_and_odd_names(tmp_path):
+    for name in ("x" * 240, "ü" * 120, "a b\nc", "-o", "trailing.", "run.1"):
+        write_run(tmp_path / "p" / name, "first")
+        write_run(tmp_path / "p" / name, "second")
+        assert digest(tmp_path / "p" / name) == digest_of("second")
+    assert len(os.listdir(tmp_path / "p")) == 12
+
+
+def test_a_second_process_is_kept_out(tmp_path):
+    target = tmp_path / "run"
+    with RunFolder(target):
+        with pytest.raises(InputError, match=f"process {os.getpid()} is writing") as caught:
+            RunFolder(target, overwrite=True)
+        assert "\n" not in str(caught.value)
+        write_run(tmp_path / "other", "not concerned")
+        assert len(list(tmp_path.iterdir())) == 3  # two of the run that goes on
+    assert os.listdir(tmp_path) == ["other"]
+    write_run(target, "free again")
+
+
+def test_a_lock_on_a_file_that_is_gone_is_none(tmp_path, monkeypatch):
+    """A lock is void if the last holder removes the file between opening and locking."""
+    real, calls = disk.fcntl.flock, []
+
+    def late(*arguments):
+        calls.append(arguments)
+        if len(calls) == 1:
+            os.unlink(tmp_path / "lock")
+        return real(*arguments)
+
+    monkeypatch.setattr(disk.fcntl, "flock", late)
+    held = disk.Lock(tmp_path / "lock")
+    assert len(calls) == 2
+    with pytest.raises(disk.TakenError):
+        disk.Lock(tmp_path / "lock")
+    held.release()
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_dead_process_keeps_nobody_out(tmp_path):
+    code = (
+        "import os, sys; from rootsopt.view.runs import RunFolder;"
+        "folder = RunFolder(sys.argv[1]);"
+        "folder.write_text('config.yaml', 'x'); os.kill(os.getpid(), 9)"
+    )
+    for name in ("run", "never again"):
+        subprocess.run([sys.executable, "-c", code, str(tmp_path / name)], cwd=ROOT, check=False)
+    # A folder and a lock; the second process has removed those of the first.
+    assert len(os.listdir(tmp_path)) == 2
+    write_run(tmp_path / "run", "new")
+    assert os.listdir(tmp_path) == ["run"]
+
+
+def test_without_locks_nothing_of_others_is_removed(tmp_path, monkeypatch):
+    stage = tmp_path / ".run.1-00000000.rootsopt"
+    stage.mkdir()
+
+    def refuse(*_):
+        raise OSError(37, "No locks available")
+
+    monkeypatch.setattr(disk.fcntl, "flock", refuse)
+    write_run(tmp_path / "run", "new")
+    assert sorted(os.listdir(tmp_path)) == [stage.name, "run"]
+
+
+def _profile(folder, *more):
+    return main(["profile", "configs/cic_drawn.yaml", "-o", str(folder), "--no-figures", *more])
+
+
+def test_what_a_command_leaves_when_it_fails(tmp_path, capsys, monkeypatch):
+    """After bad input found late, or an interrupt, nothing is new and the earlier run is
+    unchanged."""
+    monkeypatch.chdir(ROOT)
+    target = tmp_path / "new" / "run"
+    assert _profile(target, "--export", "paper") == 2
+    assert os.listdir(tmp_path) == []
+    assert _profile(target, "--export", "none") == 0
+    before = digest(target)
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("rootsopt.commands.work.profile.write", interrupted)
+    capsys.readouterr()
+    assert _profile(target) == 3
+    assert capsys.readouterr().err == "rootsopt profile: stopped by the user\n"
+    assert digest(target) == before
+    assert os.listdir(tmp_path / "new") == ["run"]
+
+
+def test_each_command_has_a_folder_of_its_own(tmp_path, monkeypatch):
+    """Each command has its own default folder, and the result names the command."""
+    config = str(ROOT / "configs" / "cic_drawn.yaml")
+    monkeypatch.chdir(tmp_path)
+    assert main(["profile", config, "--no-figures"]) == 0
+    record = json.loads((tmp_path / "results" / "cic_drawn-profile" / "result.json").read_text())
+    assert record["run"]["command"] == "profile"
+    written = {p.name for p in (tmp_path / "results" / "cic_drawn-profile").iterdir()}
+    assert set(record["run"]["files"]) == written
+
+
+AUDIT = """
+import os, sys
+seen = []
+def hook(event, args):
+    if event == "open" and isinstance(args[0], (str, bytes)):
+        flags = args[2] if isinstance(args[2], int) else 0
+        if flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT):
+            seen.append(os.fsdecode(args[0]))
+    elif event in ("os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.symlink", "os.link"):
+        if args[-1] not in (None, -1) and event in ("os.remove", "os.rmdir"):
+            return  # relative to a folder that was itself to be removed
+        seen.append(os.fsdecode(args[0]))
+sys.addaudithook(hook)
+from rootsopt.commands.console import main
+assert main(sys.argv[2:]) == 0
+parent = os.path.realpath(sys.argv[1])
+allowed = (os.path.join(parent, ".run."), "/dev/")
+allowed += tuple(os.environ[name] for name in ("MPLCONFIGDIR", "XDG_CACHE_HOME"))
+print(*sorted({p for p in seen if not os.path.abspath(p).startswith(allowed)}), sep="\\n")
+"""
+
+
+@pytest.mark.parametrize("formats", ["dxf,svg", pytest.param("all", marks=pytest.mark.long)])
+def test_nothing_is_written_outside_of_the_runs_own_folder(tmp_path, formats):
+    """Figures, drawings, solids and animations are included.
+
+    The system reports all files opened for writing, made, renamed or removed."""
+    parent = tmp_path / "parent"
+    parent.mkdir()
+    others = {name: str(tmp_path / name) for name in ("MPLCONFIGDIR", "XDG_CACHE_HOME")}
+    for folder in others.values():
+        os.mkdir(folder)
+    arguments = [
+        "profile",
+        "configs/cic_drawn.yaml",
+        "-o",
+        str(parent / "run"),
+        "--export",
+        formats,
+    ]
+    done = subprocess.run(
+        [sys.executable, "-B", "-c", AUDIT, str(parent), *arguments],
+        cwd=ROOT, env=os.environ | others | {"ROOTSOPT_CACHE": "off"}, capture_output=True,
+        text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    told = done.stdout.split(f"results in {parent / 'run'}\n")[1]
+    assert told.strip() == ""
+    assert os.listdir(parent) == ["run"]

@@ -1,0 +1,207 @@
+"""The explorer's server: its address, who may use it, how it ends, and what it needs."""
+
+import http.client
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import urllib.error
+import urllib.parse
+import urllib.request
+import webbrowser
+from pathlib import Path
+
+import pytest
+
+from rootsopt.commands.table import explore as command
+from rootsopt.view import pages
+
+pytest.importorskip("bokeh")
+ROOT = Path(__file__).parents[2]
+CIC = str(ROOT / "configs" / "cic_drawn.yaml")
+
+
+@pytest.fixture(scope="module")
+def address():
+    """Return the address of a running server."""
+    from rootsopt.config import load
+    from rootsopt.errors import InputError
+    from rootsopt.view.pages.engine import Engine
+    from rootsopt.view.pages.server import PageServer
+
+    class Idle(Engine):
+        """An engine that never gets ready: the server is tested, not what it shows."""
+
+        def shape(self, config):
+            raise InputError("no shape")
+
+    found, up, stop = [], threading.Event(), threading.Event()
+
+    def serve():
+        server = PageServer(Idle(load(CIC)), "cic")
+        server.run(stop, lambda url: (found.append(url), up.set()))
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    assert up.wait(60)
+    yield found[0]
+    stop.set()
+    thread.join(30)
+    assert not thread.is_alive()
+
+
+def raw(address, text):
+    """Return the first line of the answer to a request that no HTTP library would send."""
+    host, port = address.split("/")[2].split(":")
+    with socket.create_connection((host, int(port)), timeout=30) as connection:
+        connection.sendall(text.encode("latin1"))
+        return connection.makefile("rb").readline().decode("latin1")
+
+
+def get(url, **headers):
+    """Return (status, text) of a request."""
+    request = urllib.request.Request(url, headers=headers)
+    try:
+        with urllib.request.urlopen(request, timeout=30) as answer:
+            return answer.status, answer.read().decode()
+    except urllib.error.HTTPError as error:
+        return error.code, error.read().decode()
+
+
+def test_page_is_served_to_those_who_know_the_token(address):
+    assert re.fullmatch(r"http://127\.0\.0\.1:\d+/[\w-]{32}/", address)
+    status, page = get(address)
+    assert status == 200
+    assert "rootsopt explore cic" in page
+    scripts = re.findall(r'(?:src|href)="([^"]+)"', page)
+    assert scripts
+    assert all(one.startswith(("static/", address, "data:", "/")) for one in scripts)
+    assert "//cdn" not in page
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "",
+        "ws",
+        "static/js/bokeh.min.js",
+        "autoload.js",
+        "x" * 32 + "/",
+        "?token=1",
+        "metadata",
+        "favicon.ico",
+    ],
+)
+def test_requests_without_the_token_are_refused(address, path):
+    base = address.split("/", 3)
+    assert get(f"{base[0]}//{base[2]}/{path}")[0] == 404
+
+
+@pytest.mark.parametrize(("origin", "status"), [("http://example.org", 403), (None, 101)])
+def test_foreign_pages_may_not_connect(address, origin, status):
+    """A web page of another origin that knows the address cannot open the connection."""
+    _, _, host, path = address.split("/", 3)
+    connection = http.client.HTTPConnection(host, timeout=30)
+    headers = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Version": "13",
+               "Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==",
+               "Origin": origin or f"http://{host}"}  # fmt: skip
+    connection.request("GET", f"/{path}ws", headers=headers)
+    assert connection.getresponse().status == status
+    connection.close()
+
+
+def test_malformed_requests_leave_no_traceback(address, capfd):
+    """They are answered or dropped; stderr has at most one line for each, without the token."""
+    page, host = "/" + address.split("/", 3)[3], address.split("/")[2]
+    end = f" HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n"
+    upgrade = (
+        "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+        f"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nOrigin: http://{host}\r\n"
+    )
+    socket_of = f"GET {page}ws HTTP/1.1\r\nHost: {host}\r\n{upgrade}"
+    requests = [
+        "GET / HTTP/9.9\r\n\r\n", "\x16\x03\x01\xff\r\n\r\n", "GET /\r\n\r\n", f"FOO {page}{end}",
+        f"GET /\xff{end}", f"GET http://[{end}", "GET / HTTP/1.1\r\nHost: \x00\r\n\r\n",
+        f"POST /{end.replace('close', 'close' + chr(13) + chr(10) + 'Content-Length: -1')}",
+        f"GET {page}static/%00{end}", f"GET {page}static/%ff{end}",
+        f"GET {page}?bokeh-token=zz{end}",
+        f"GET {page}autoload.js?bokeh-autoload-element=1&bokeh-session-id=%00{end}",
+        f"{socket_of}\r\n", f"{socket_of}Sec-WebSocket-Protocol: bokeh, zz\r\n\r\n",
+        f"{socket_of}Sec-WebSocket-Protocol: bokeh\r\n\r\n{chr(255) * 30}",
+    ]  # fmt: skip
+    for text in requests:
+        raw(address, text)
+    assert get(f"{address}static/js/bokeh.min.js")[0] == 200
+    lines = capfd.readouterr().err.splitlines()
+    assert lines
+    assert all(line.startswith("rootsopt: explore: a request failed: ") for line in lines)
+    assert page.strip("/") not in "".join(lines)
+
+
+def test_browser_is_given_no_secret(monkeypatch):
+    """Its arguments, which all users can list, name a file that only this user can read."""
+    opened, ready = [], threading.Event()
+
+    class Serving:
+        def __init__(self, *_):
+            pass
+
+        def run(self, stop, started):
+            started("http://127.0.0.1:1/secret/")
+            assert ready.wait(60)
+
+    def browse(address):
+        file = Path(urllib.request.url2pathname(urllib.parse.urlparse(address).path))
+        opened.extend((address, file, file.read_text(), file.parent.stat().st_mode & 0o777))
+        ready.set()
+
+    monkeypatch.setattr("rootsopt.view.pages.server.PageServer", Serving)
+    monkeypatch.setattr("rootsopt.view.pages.engine.Engine.prepare", lambda self: None)
+    monkeypatch.setattr(webbrowser, "open", browse)
+    assert command.main([CIC]) == 0
+    address, file, text, mode = opened
+    assert "secret" not in address
+    assert 'url=http://127.0.0.1:1/secret/"' in text
+    assert mode == 0o700
+    assert not file.exists()
+
+
+def test_server_listens_on_the_loopback_address_only(address):
+    port = int(address.split(":")[2].split("/")[0])
+    for family, one in ((socket.AF_INET, "127.0.0.2"), (socket.AF_INET6, "::1")):
+        with socket.socket(family) as probe:
+            probe.settimeout(5)
+            assert probe.connect_ex((one, port)) != 0
+
+
+def test_library_is_named_if_it_is_missing(monkeypatch, capsys):
+    monkeypatch.setattr(pages.importlib.util, "find_spec", lambda name: None)
+    assert command.main([CIC]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "pip install 'rootsopt[explore]'" in line
+
+
+def test_port_in_use_is_named(capsys):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        assert command.main([CIC, "--no-browser", "--port", str(port)]) == 2
+    assert f"{port} cannot be used" in capsys.readouterr().err
+
+
+def test_ctrl_c_ends_with_success():
+    """The address is printed on standard output; Ctrl-C ends with exit code 0 and one line."""
+    run = [sys.executable, "-m", "rootsopt", "explore", CIC, "--no-browser"]
+    process = subprocess.Popen(run, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    first = process.stdout.readline()
+    assert get(first.split()[-1])[0] == 200
+    process.send_signal(signal.SIGINT)
+    rest, errors = process.communicate(timeout=60)
+    assert process.returncode == 0
+    assert errors.strip() == (
+        "rootsopt explore: Ctrl-C: the page closes (once more to stop at once)"
+    )
+    assert "Traceback" not in rest
