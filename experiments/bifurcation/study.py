@@ -17,8 +17,8 @@ from experiments._common.driver import Run
 from experiments._common.scenes import shipped
 from experiments._common.simulation import evaluator_of
 from rootsopt.config import Config
-from rootsopt.errors import InputError
 from rootsopt.continuation import Branch, End, Kind, StepSizes, follow, follow_doubled
+from rootsopt.errors import InputError
 
 Row = dict[str, Any]
 Say = Callable[[str], None]

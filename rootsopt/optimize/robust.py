@@ -27,8 +27,8 @@ from rootsopt.optimize.outcome import Optimization
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.robust_problem import RobustProblem
 from rootsopt.optimize.search import Progress, Search, Stage
-from rootsopt.response.checkpoint import Checkpoint
 from rootsopt.response.evaluation import RESPONSES, Evaluation, Evaluator
+from rootsopt.response.journal import Checkpoint
 from rootsopt.response.many import HERE, Runs, evaluate_many
 from rootsopt.response.reducers import combine
 from rootsopt.response.scatter import Shift, draw, in_conditions, shifts

@@ -33,8 +33,8 @@ from rootsopt.optimize.problem import Problem, needs_maxima
 from rootsopt.optimize.sqp import Found, Stops, descend
 from rootsopt.optimize.verification import Verification
 from rootsopt.optimize.vertices import VertexOptimum, vertex_optimum
-from rootsopt.response.checkpoint import Checkpoint
 from rootsopt.response.evaluation import Evaluation, Evaluator
+from rootsopt.response.journal import Checkpoint
 from rootsopt.response.many import HERE, Point, Runs
 from rootsopt.response.starts import Seeds
 from rootsopt.response.still import Still, needed_motion

@@ -29,7 +29,7 @@ from typing import Any, Literal
 
 from rootsopt.config import sources
 from rootsopt.errors import InputError
-from rootsopt.runtime.journal import aside
+from rootsopt.response.journal import aside
 from rootsopt.view import disk
 from rootsopt.view.disk import Lock, TakenError
 from rootsopt.view.files import ResultFolder, plain

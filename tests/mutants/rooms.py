@@ -4,6 +4,7 @@ from pathlib import Path
 
 _TESTS = Path(__file__).parents[1]
 _OF = {
+    "response/journal": "checkpoint journal",
     "response/continuation/arclength": "arclength continuation",
     "response/continuation/branch": "continuation",
     "response/continuation/family": "continuation",
@@ -85,7 +86,6 @@ _OF = {
     "pump/loads": "loads free_twist bearings",
     "pump/rattle": "rattle",
     "pump/sheet": "pump_flow play leakage",
-    "response/checkpoint": "checkpoint journal",
     "response/ensemble": "members ensemble",
     "response/members": "members ensemble",
     "response/many": "many evaluations tolerances",

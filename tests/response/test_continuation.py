@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from rootsopt.config import load
-from rootsopt.errors import InputError
 from rootsopt.continuation import End, Kind, StepSizes, follow, follow_doubled
+from rootsopt.errors import InputError
 from rootsopt.response.continuation.arclength import StoppedError
 from rootsopt.response.continuation.family import OrbitFamily
 from rootsopt.response.evaluation import Evaluator

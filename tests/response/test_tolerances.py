@@ -10,8 +10,8 @@ import scipy.stats
 from rootsopt.config import load, parse
 from rootsopt.config.tolerances import scatterable
 from rootsopt.errors import InputError
-from rootsopt.response.checkpoint import plain_evaluation, read_evaluation
 from rootsopt.response.evaluation import Evaluator, _build, _motion
+from rootsopt.response.journal import plain_evaluation, read_evaluation
 from rootsopt.response.scatter import draw, quantiles, shifts
 from rootsopt.scene import Scene
 from rootsopt.status import Status

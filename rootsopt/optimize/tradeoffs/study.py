@@ -24,8 +24,8 @@ from rootsopt.optimize.limits import (
 )
 from rootsopt.optimize.local import FEASIBLE, Group
 from rootsopt.optimize.problem import Problem, settled_by
-from rootsopt.response.checkpoint import Checkpoint
 from rootsopt.response.evaluation import Evaluation, Evaluator
+from rootsopt.response.journal import Checkpoint
 from rootsopt.response.many import HERE, Point, Runs
 from rootsopt.response.starts import Seeds
 from rootsopt.response.still import Still

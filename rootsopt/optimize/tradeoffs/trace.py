@@ -54,7 +54,7 @@ from rootsopt.optimize.tradeoffs.scalar import (
     links,
 )
 from rootsopt.optimize.tradeoffs.study import Course, Sample, Seen, Study
-from rootsopt.response.checkpoint import Checkpoint
+from rootsopt.response.journal import Checkpoint
 from rootsopt.response.many import HERE, Runs, as_done
 from rootsopt.response.starts import Seeds
 from rootsopt.response.sweeps.cluster import running

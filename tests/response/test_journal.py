@@ -10,14 +10,20 @@ import pytest
 from rootsopt.config import load
 from rootsopt.dynamics.maxima import Maxima
 from rootsopt.errors import InputError
-from rootsopt.response.checkpoint import Checkpoint, plain_evaluation
 from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.journal import (
+    Checkpoint,
+    Journal,
+    _line,
+    header_of,
+    plain_evaluation,
+    set_aside,
+)
 from rootsopt.response.many import Point
 from rootsopt.response.result import Part
 from rootsopt.response.sweeps.plan import plan_of
 from rootsopt.response.sweeps.points import lost
 from rootsopt.response.sweeps.scenes import Points
-from rootsopt.runtime.journal import Journal, _line, header_of, set_aside
 from rootsopt.status import Status
 from tests.optimize.test_checkpoint import evaluation
 
