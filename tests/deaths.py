@@ -15,7 +15,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from rootsopt.errors import InputError
-from rootsopt.view import disk
+from rootsopt.view import files
 from rootsopt.view.runs import RunFolder
 
 WRITING = ("open", "write", "fsync", "mkdir", "rename", "replace", "ftruncate", "pwrite")
@@ -53,15 +53,15 @@ class faulty:  # noqa: N801
         self.system = _System(operations, at, fail)
 
     def __enter__(self) -> _System:
-        self.before = disk.os, disk.shutil
-        disk.os = self.system  # type: ignore[assignment]
+        self.before = files.os, files.shutil
+        files.os = self.system  # type: ignore[assignment]
         if "unlink" in self.system.operations:
             removed = self.system.counted("rmtree", shutil.rmtree)
-            disk.shutil = SimpleNamespace(rmtree=removed)  # type: ignore[assignment]
+            files.shutil = SimpleNamespace(rmtree=removed)  # type: ignore[assignment]
         return self.system
 
     def __exit__(self, *_) -> None:
-        disk.os, disk.shutil = self.before
+        files.os, files.shutil = self.before
 
 
 def full_disk(name: str, do: Callable[[], Any]) -> None:

@@ -11,7 +11,7 @@ from tests.weight import MOST, measured
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "rootsopt"
 FILES = sorted(PACKAGE.rglob("*.py"))
-FACE = {"__init__.py", "errors.py", "status.py", "py.typed"}
+FACE = {"__init__.py", "continuation.py", "errors.py", "status.py", "py.typed"}
 DOORS = {
     "__main__.py",
     "attractors.py",
@@ -45,29 +45,29 @@ LATE = {
         "rootsopt.config.sheet",
     },
     "commands/cli.py": {
-        "rootsopt.view.ending", "rootsopt.view.runs", "rootsopt.view.tables",
-        "rootsopt.view.terminal",
+        "rootsopt.view.terminal", "rootsopt.view.runs", "rootsopt.view.tables",
         "rootsopt.view.pages.gather", "rootsopt.view.pages.html", "rootsopt.runtime",
     },
     "commands/console.py": {"rootsopt", "rootsopt.commands", "rootsopt.errors"},
     # Figures are imported in the background; exports, only if they are asked for.
     **{f"commands/work/{name}.py": {"rootsopt.view.figures", f"rootsopt.view.figures.{module}"}
-       for name, module in (("attractors", "basins"), ("identify", "identified"),
+       for name, module in (("attractors", "sweep"), ("identify", "force"),
                             ("profile", "runs"))},
     "commands/work/pareto.py": {
-        "rootsopt.view.figures", "rootsopt.view.figures.front",
+        "rootsopt.view.figures", "rootsopt.view.figures.comparisons",
     },
     "commands/work/optimize.py": {
-        "rootsopt.view.figures.writing", "rootsopt.view.figures", "rootsopt.view.figures.spread",
+        "rootsopt.view.figures", "rootsopt.view.figures.comparisons",
+        "rootsopt.view.figures.writing",
     },
     "commands/work/simulate.py": {"rootsopt.view.figures.writing", "rootsopt.view.figures"},
     "commands/work/sweep.py": {"rootsopt.view.figures.sweep"},
-    "figures/writing.py": {"rootsopt.view.figures.animation"},
+    "view/figures/writing.py": {"rootsopt.view.figures.animation"},
     "optimize/__init__.py": {"rootsopt.commands.table"},
     # Modules that import optional or slow libraries.
-    "commands/work/explore.py": {"rootsopt.view.pages.engine", "rootsopt.view.pages.server"},
-    "figures/__init__.py": {"rootsopt.view.figures.solid"},
-    "figures/runs.py": {"rootsopt.measured.source"},
+    "commands/work/explore.py": {"rootsopt.view.pages.knobs", "rootsopt.view.pages.server"},
+    "view/figures/__init__.py": {"rootsopt.view.figures.cad"},
+    "view/figures/runs.py": {"rootsopt.measured.source"},
     "measured/reading.py": {"rootsopt.measured.dxf"},
     "measured/conjugacy.py": {"rootsopt.measured.source"},
     # Only an objective over several motions needs these.

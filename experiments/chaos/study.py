@@ -28,7 +28,7 @@ from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.search import Search
 from rootsopt.response.ensemble import ERRORS, Ensemble, integrator
 from rootsopt.response.evaluation import Evaluator
-from rootsopt.response.members import run_members
+from rootsopt.response.together import run_members
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene
 

@@ -24,7 +24,7 @@ from rootsopt.config.families import families
 from rootsopt.config.units import MM, si_unit
 from rootsopt.profiles import Profile, geometry
 from rootsopt.profiles.geometry import outline
-from rootsopt.view.figures.profiles import plot_flank
+from rootsopt.view.figures.designs import plot_flank
 
 _COLUMNS = 4
 

@@ -21,7 +21,7 @@ from rootsopt.identification.answer import Identification
 from rootsopt.identification.fit import identify
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.status import Status
-from rootsopt.view.figures.identified import drawn
+from rootsopt.view.figures.force import drawn
 
 # Ranges of the values by key, which are the bounds of the fits, too.
 RANGES = {

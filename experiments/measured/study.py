@@ -23,7 +23,7 @@ from rootsopt.measured.conjugacy import conjugacy, gaps_um
 from rootsopt.measured.source import outline_of
 from rootsopt.profiles import Profile, outline
 from rootsopt.scene import check_geometry, design_keys
-from rootsopt.view.figures.profiles import plot_conjugacy
+from rootsopt.view.figures.designs import plot_conjugacy
 
 # Form error of the addenda, differences between lobes, and RMS noise of the points (mm).
 FORM, LOBES, NOISE = 20e-3, 3e-3, 1e-3

@@ -20,7 +20,7 @@ from rootsopt.config import Config, load
 from rootsopt.optimize.design import optimize_design
 from rootsopt.optimize.outcome import Optimization
 from rootsopt.optimize.robust import Robustness
-from rootsopt.view.figures.spread import PANELS, plot_distribution
+from rootsopt.view.figures.comparisons import PANELS, plot_distribution
 
 # Forces whose distributions are reported.
 FORCES = ("mean_force_N", "peak_force_N")

@@ -282,9 +282,8 @@ def _in_folder(command: str, config: Config, options: argparse.Namespace) -> int
         # Write files first: importing the console takes half of the time, and stdout may fail.
         from rich.console import Console
 
-        from rootsopt.view.ending import ending
         from rootsopt.view.tables import tables_of
-        from rootsopt.view.terminal import show_ending, shown
+        from rootsopt.view.terminal import ending, show_ending, shown
 
         out = Console()
         result, rows = folder.result, outcome.rows

@@ -13,7 +13,7 @@ import yaml
 from yaml.constructor import ConstructorError
 from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
-from rootsopt.config.words import clipped, named, sentence, shown
+from rootsopt.config.units import clipped, named, sentence, shown
 from rootsopt.errors import InputError
 
 MOST_BYTES = 128 * 1024

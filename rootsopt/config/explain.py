@@ -10,8 +10,7 @@ from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 
 from rootsopt.config.section import UNMET, Section, bare, choices, number, require
-from rootsopt.config.units import RPM, hint, readings, unit_of, without_unit
-from rootsopt.config.words import named, near, shown
+from rootsopt.config.units import RPM, hint, named, near, readings, shown, unit_of, without_unit
 
 # Maximum number of valid keys that a message lists.
 _MOST_NAMES = 12

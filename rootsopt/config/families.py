@@ -24,8 +24,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import Field
 
 from rootsopt.config.section import Listed, bare, between
-from rootsopt.config.units import si_unit
-from rootsopt.config.words import placed, sentence
+from rootsopt.config.units import placed, sentence, si_unit
 from rootsopt.errors import InputError
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from rootsopt.config.section import Listed, Section, require, such
-from rootsopt.config.words import shown
+from rootsopt.config.units import shown
 
 
 class ParetoConfig(Section):

@@ -37,8 +37,7 @@ from rootsopt.config.tolerances import (
     scatterable,
     unknown_key,
 )
-from rootsopt.config.units import hint
-from rootsopt.config.words import placed, sentence, shown
+from rootsopt.config.units import hint, placed, sentence, shown
 from rootsopt.errors import InputError
 
 _SPEED = "scene.speed_rpm"

@@ -10,7 +10,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError, core_schema
 
-from rootsopt.config.words import named
+from rootsopt.config.units import named
 from rootsopt.errors import InputError
 
 

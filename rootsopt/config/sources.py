@@ -6,7 +6,7 @@ import os
 import stat
 from pathlib import Path
 
-from rootsopt.config.words import placed
+from rootsopt.config.units import placed
 from rootsopt.errors import InputError
 
 FILES = {

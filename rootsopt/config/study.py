@@ -20,8 +20,7 @@ from rootsopt.config.section import (
     require,
     such,
 )
-from rootsopt.config.units import hint
-from rootsopt.config.words import named, shown
+from rootsopt.config.units import hint, named, shown
 
 NEAREST = "nearest"
 """Word in `optimizer.family` for the named family that is nearest to an outline."""

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, NamedTuple, get_args
 from pydantic import Field, model_validator
 
 from rootsopt.config.section import Increasing, Listed, Section, bare, between, require, such
-from rootsopt.config.words import named
+from rootsopt.config.units import named
 
 _RELATIVE = "relative_"
 _Kind = Literal[

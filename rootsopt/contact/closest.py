@@ -38,7 +38,7 @@ from jax import lax
 from jax.custom_batching import custom_vmap, sequential_vmap
 from jaxtyping import Array, Bool, Float
 
-from rootsopt.profiles import trigonometry as trig
+from rootsopt.profiles import base as trig
 from rootsopt.profiles.base import Profile
 from rootsopt.runtime.kept import kept
 

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Int
 
 from rootsopt.contact.closest import ClosestApproach, FlankPair, contact_begins
 from rootsopt.contact.gap import Approach, Contact, ContactPoint
-from rootsopt.profiles import trigonometry as trig
+from rootsopt.profiles import base as trig
 from rootsopt.profiles.base import Profile
 from rootsopt.runtime.kept import kept_along
 

@@ -15,15 +15,13 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.dynamics.collocation.closing import corrected
-from rootsopt.dynamics.collocation.known import PIECES, KnownOrbit, from_pieces
-from rootsopt.dynamics.collocation.mesh import room_for
+from rootsopt.dynamics.collocation.mesh import PIECES, KnownOrbit, from_pieces, room_for
 from rootsopt.dynamics.collocation.motion import ACCURACY, Collocated, apart, closed_orbit
 from rootsopt.dynamics.collocation.newton import numbers
 from rootsopt.dynamics.collocation.system import unchanged
-from rootsopt.dynamics.integrator import Solver
+from rootsopt.dynamics.integrator import Solver, Transient, no_pieces, settle, settled_within
 from rootsopt.dynamics.orbit import Orbit, branch
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.settle import Transient, no_pieces, settle, settled_within
 from rootsopt.dynamics.steady import (
     OPEN,
     Steady,

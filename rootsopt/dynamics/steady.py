@@ -15,14 +15,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.contact.law import force_rounding
 from rootsopt.dynamics.collocation.elements import GAUSS, Elements
-from rootsopt.dynamics.collocation.known import KnownOrbit
+from rootsopt.dynamics.collocation.mesh import KnownOrbit
 from rootsopt.dynamics.collocation.system import Step, moved_at
-from rootsopt.dynamics.integrator import Solver
-from rootsopt.dynamics.linear import solved
+from rootsopt.dynamics.integrator import NOISE, Solver, Transient
 from rootsopt.dynamics.orbit import Orbit
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.settle import NOISE, Transient
-from rootsopt.dynamics.window import Window
+from rootsopt.dynamics.window import Window, solved
 from rootsopt.status import Status
 
 TOO_DEEP = 0.02

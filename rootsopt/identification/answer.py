@@ -16,10 +16,8 @@ import pandas
 from numpy.typing import NDArray
 
 from rootsopt.config import Config
-from rootsopt.identification.channels import CHANNELS
-from rootsopt.identification.model import REST, Point
-from rootsopt.identification.quantities import OFFSET
-from rootsopt.identification.record import Observed
+from rootsopt.identification.model import CHANNELS, REST, Point
+from rootsopt.identification.record import OFFSET, Observed
 from rootsopt.identification.squares import TURN, Local, Problem
 from rootsopt.status import Status
 

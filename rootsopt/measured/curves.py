@@ -17,8 +17,7 @@ from scipy.interpolate import BSpline, make_interp_spline, make_splprep, splprep
 
 from rootsopt.errors import InputError
 from rootsopt.measured.estimates import Estimates
-from rootsopt.measured.guard import guarded
-from rootsopt.measured.loop import lengths_along
+from rootsopt.measured.loop import guarded, lengths_along
 
 # Length (pitch radii) that contributes as much to a curve's parameter as a turn of 1 rad.
 _TURNING = 0.3

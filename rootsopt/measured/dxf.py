@@ -6,12 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from rootsopt.config.words import named
+from rootsopt.config.units import named
 from rootsopt.errors import InputError
 from rootsopt.measured.entities import chain, strokes
 from rootsopt.measured.estimates import UNITS
-from rootsopt.measured.guard import guarded, silenced
-from rootsopt.measured.loop import Loop
+from rootsopt.measured.loop import Loop, guarded, silenced
 
 with silenced():  # Importing ezdxf writes to its log.
     from ezdxf import recover

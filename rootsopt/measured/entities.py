@@ -16,10 +16,9 @@ from ezdxf.math import ConstructionEllipse, open_uniform_knot_vector
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
-from rootsopt.config.words import named
+from rootsopt.config.units import named
 from rootsopt.errors import InputError
-from rootsopt.measured.guard import guarded
-from rootsopt.measured.loop import Loop
+from rootsopt.measured.loop import Loop, guarded
 
 # Minimum number of sampling intervals on an arc or spline.
 _FEWEST = 24

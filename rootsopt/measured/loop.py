@@ -4,13 +4,18 @@ A chain is the points on one entity. A vertex is a place where ends of chains me
 chain whose two ends are at different vertices.
 """
 
+import contextlib
 import dataclasses
 import itertools
+import logging
+import warnings
+from collections.abc import Iterator
 
 import numpy as np
 from jaxtyping import Bool, Complex128, Float64
 from numpy.typing import NDArray
 
+from rootsopt.config.units import named
 from rootsopt.errors import InputError
 
 # Turn (rad) at a point above which the outline runs back there.
@@ -345,3 +350,44 @@ def _widest_gap(
     away = tree.query(tree.data, k=2)[0][:, 1]
     widest = int(np.argmax(away))
     return float(away[widest]), complex(places[widest])
+
+
+_LOGGER = "ezdxf"
+
+# Number of characters above which a library's own message is shortened.
+_REASON = 120
+
+
+@contextlib.contextmanager
+def silenced() -> Iterator[None]:
+    """Suppress a library's log records and warnings in the `with` block, also those of NumPy."""
+    logger = logging.getLogger(_LOGGER)
+    level = logger.level
+    if level > logging.CRITICAL:  # Nested: entering again is slow for thousands of entities.
+        yield
+        return
+    logger.setLevel(logging.CRITICAL + 1)
+    try:
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logger.setLevel(level)
+
+
+@contextlib.contextmanager
+def guarded(name: str, fault: str, remedy: str) -> Iterator[None]:
+    """Turn any exception in the `with` block, which calls a library, into an `InputError`.
+
+    The message reads "`name`: `fault`: (the exception's message); `remedy`". `MemoryError` and
+    `RecursionError` are converted, too; an `InputError` passes unchanged."""
+    try:
+        with silenced():
+            yield
+    except InputError:
+        raise
+    except Exception as error:
+        reason = named(" ".join(str(error).split()), _REASON)
+        if not reason or isinstance(error, KeyError):
+            reason = f"{type(error).__name__} {reason}".strip()
+        raise InputError(f"{name}: {fault}: {reason}; {remedy}") from error

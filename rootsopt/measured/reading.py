@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from rootsopt.config.sources import content
-from rootsopt.config.words import named
+from rootsopt.config.units import named
 from rootsopt.errors import InputError
 from rootsopt.measured.estimates import SEEN, SIZED, unit_of_size, written
 from rootsopt.measured.loop import JOIN, Loop, joined, moment, place, signed_area, tails

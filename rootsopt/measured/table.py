@@ -11,12 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rootsopt.config.sources import content
-from rootsopt.config.units import DEG, UM
-from rootsopt.config.words import named
+from rootsopt.config.units import DEG, UM, named
 from rootsopt.errors import InputError
 from rootsopt.measured.estimates import UNITS
-from rootsopt.measured.guard import guarded
-from rootsopt.measured.loop import Loop
+from rootsopt.measured.loop import Loop, guarded
 
 # Number of characters in a line above which a table is rejected.
 _LONGEST = 100_000

@@ -33,7 +33,8 @@ from rootsopt.optimize.outcome import Optimization
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.sqp import Stops, descend
 from rootsopt.response.evaluation import Evaluation
-from rootsopt.response.many import HERE, Point, Runs, evaluate_many
+from rootsopt.response.records import Still, needed_motion
+from rootsopt.response.reducers import HERE, Point, Runs, evaluate_many
 from rootsopt.response.scatter import (
     NOMINAL,
     Shift,
@@ -43,7 +44,6 @@ from rootsopt.response.scatter import (
     scene_of,
     shifts,
 )
-from rootsopt.response.still import Still, needed_motion
 
 # Number of designs of the search from which the best in the optimum's worst scene is taken.
 _TRIED = 4

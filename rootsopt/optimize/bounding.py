@@ -23,8 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.optimize.local import FEASIBLE, Linearization
-from rootsopt.optimize.models import Limits, Rows
+from rootsopt.optimize.local import FEASIBLE, Limits, Linearization, Rows
 from rootsopt.optimize.optimality import Bound
 from rootsopt.scene.space import sobol
 

@@ -9,7 +9,7 @@ from rootsopt.optimize.outcome import Optimization
 from rootsopt.optimize.robust import StagedSearch, is_robust
 from rootsopt.optimize.search import Progress, Search
 from rootsopt.response.journal import Checkpoint
-from rootsopt.response.many import HERE, Runs
+from rootsopt.response.reducers import HERE, Runs
 from rootsopt.response.sweeps.cluster import running
 from rootsopt.runtime.threads import one_thread
 from rootsopt.scene import check_geometry

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.optimize.beginning import Beginning
-from rootsopt.optimize.infeasible import Infeasible
+from rootsopt.optimize.infeasible import Beginning, Infeasible
 from rootsopt.optimize.local import FEASIBLE, Linearization, certify
 from rootsopt.optimize.optimality import Optimality
 from rootsopt.response.evaluation import RESPONSES, Evaluation, objective_weights

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rootsopt.config import Config
 from rootsopt.config.units import unit_of, words
-from rootsopt.dynamics.measures import PEAK_NORM, line_name
+from rootsopt.dynamics.orbit import PEAK_NORM, line_name
 from rootsopt.errors import InputError
 from rootsopt.optimize.limits import (
     PEAK,

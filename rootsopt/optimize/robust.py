@@ -29,8 +29,7 @@ from rootsopt.optimize.robust_problem import RobustProblem
 from rootsopt.optimize.search import Progress, Search, Stage
 from rootsopt.response.evaluation import RESPONSES, Evaluation, Evaluator
 from rootsopt.response.journal import Checkpoint
-from rootsopt.response.many import HERE, Runs, evaluate_many
-from rootsopt.response.reducers import combine
+from rootsopt.response.reducers import HERE, Runs, combine, evaluate_many
 from rootsopt.response.scatter import Shift, draw, in_conditions, shifts
 from rootsopt.scene import Scene
 

@@ -23,9 +23,8 @@ from rootsopt.config import FAMILY_KEYS, Config
 from rootsopt.config.study import OptimizerConfig
 from rootsopt.errors import InputError
 from rootsopt.optimize import noise
-from rootsopt.optimize.beginning import beginning
 from rootsopt.optimize.bounding import FIRST, Bounding
-from rootsopt.optimize.infeasible import Infeasible, explain
+from rootsopt.optimize.infeasible import Infeasible, beginning, explain
 from rootsopt.optimize.limits import force_limits, limited
 from rootsopt.optimize.local import FEASIBLE, Linearization
 from rootsopt.optimize.outcome import Optimization, Trial, candidate, history_of, near, objective
@@ -35,9 +34,9 @@ from rootsopt.optimize.verification import Verification
 from rootsopt.optimize.vertices import VertexOptimum, vertex_optimum
 from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.response.journal import Checkpoint
-from rootsopt.response.many import HERE, Point, Runs
-from rootsopt.response.starts import Seeds
-from rootsopt.response.still import Still, needed_motion
+from rootsopt.response.records import Still, needed_motion
+from rootsopt.response.reducers import HERE, Point, Runs
+from rootsopt.response.result import Seeds
 from rootsopt.runtime.threads import POLL
 from rootsopt.scene import Scene
 from rootsopt.scene.space import Space, sobol

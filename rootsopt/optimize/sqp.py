@@ -1,7 +1,7 @@
 """Local search by sequential quadratic programming, for an objective with corners.
 
 The corners come from maxima over smooth branches. Each branch and each limit of a force has a
-quadratic model (`rootsopt.optimize.models`). A step minimises the greatest model within a trust
+quadratic model (`rootsopt.optimize.local`). A step minimises the greatest model within a trust
 region, subject to the constraints of the geometry themselves. The method is sequential
 quadratically constrained quadratic programming. Source: Anitescu, A superlinearly convergent
 sequential quadratically constrained quadratic programming algorithm for degenerate nonlinear
@@ -20,8 +20,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.optimize.local import RESIDUAL, Certificate, Linearization, Look, certify
-from rootsopt.optimize.models import Limits, Models
+from rootsopt.optimize.local import (
+    RESIDUAL,
+    Certificate,
+    Limits,
+    Linearization,
+    Look,
+    Models,
+    certify,
+)
 
 # Half width of the trust region (unit box): at the start, greatest, and that below which the
 # search ends.

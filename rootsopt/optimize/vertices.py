@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rootsopt.config.units import words
-from rootsopt.optimize.local import NEAR
-from rootsopt.optimize.models import Limits
+from rootsopt.optimize.local import NEAR, Limits
 from rootsopt.optimize.problem import Problem
 
 # Length (unit box) of a step along an edge.

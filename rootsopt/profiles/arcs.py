@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from rootsopt.config.units import hint
 from rootsopt.errors import InputError
-from rootsopt.profiles import trigonometry as trig
+from rootsopt.profiles import base as trig
 from rootsopt.profiles.base import Profile, Segment
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from rootsopt.profiles import trigonometry as trig
+from rootsopt.profiles import base as trig
 from rootsopt.profiles.base import Profile, Quadrature, Segment
 
 INTERVALS = 48

@@ -10,7 +10,7 @@ from jax import lax
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from rootsopt.profiles import trigonometry as trig
+from rootsopt.profiles import base as trig
 from rootsopt.profiles.base import Profile, Quadrature, Segment
 from rootsopt.runtime.programs import CachedFunction
 

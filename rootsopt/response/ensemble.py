@@ -42,7 +42,7 @@ from rootsopt.response.evaluation import (
     unsettled,
     unsettled_status,
 )
-from rootsopt.response.members import (
+from rootsopt.response.together import (
     Members,
     initial_states,
     mean_and_error,

@@ -14,19 +14,17 @@ from numpy.typing import ArrayLike
 from rootsopt.config import Config
 from rootsopt.config.units import RPM
 from rootsopt.dynamics.closed import Start, seen, steady_motion
-from rootsopt.dynamics.integrator import Solver
+from rootsopt.dynamics.integrator import BLOCK, Solver
 from rootsopt.dynamics.maxima import local_maxima, prepare_maxima
-from rootsopt.dynamics.measures import PEAK_NORM, line_name
+from rootsopt.dynamics.orbit import PEAK_NORM, line_name
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.reserve import GEAR, RESERVES, apart
-from rootsopt.dynamics.settle import BLOCK
 from rootsopt.dynamics.steady import CLOSED, OPEN, SAMPLES, Steady, varied, window_status
 from rootsopt.dynamics.window import PERIODS, integrated_difference, lyapunov
 from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry
 from rootsopt.pump.loads import BEARING, orbit_loads
 from rootsopt.pump.rattle import rattle_record, silent_limit, silent_record
-from rootsopt.response.many import HERE, IN_TURN, Point, Runs, evaluate_many
 from rootsopt.response.records import (
     RESPONSES,
     Series,
@@ -45,10 +43,19 @@ from rootsopt.response.records import (
     window_record,
     window_series,
 )
-from rootsopt.response.reducers import over_scenes, over_speeds, parts_at, shares
-from rootsopt.response.result import Evaluation, Part
+from rootsopt.response.reducers import (
+    HERE,
+    IN_TURN,
+    Point,
+    Runs,
+    evaluate_many,
+    over_scenes,
+    over_speeds,
+    parts_at,
+    shares,
+)
+from rootsopt.response.result import Evaluation, Part, Seed, Seeds, begun
 from rootsopt.response.scatter import Shift, draw, shifts
-from rootsopt.response.starts import Seed, Seeds, begun
 from rootsopt.response.terms import OF_MOTION, terms_of, values_of
 from rootsopt.runtime.environment import check_precision
 from rootsopt.runtime.programs import CachedFunction

@@ -21,12 +21,11 @@ from pydantic import TypeAdapter
 
 from rootsopt.config import Config
 from rootsopt.config.sources import FILES, reason, regular_file
-from rootsopt.config.words import shown
+from rootsopt.config.units import shown
 from rootsopt.dynamics.maxima import Maxima
 from rootsopt.errors import InputError
-from rootsopt.response.many import Point
-from rootsopt.response.result import Evaluation, Part
-from rootsopt.response.starts import plain, read
+from rootsopt.response.reducers import Point
+from rootsopt.response.result import Evaluation, Part, plain, read
 from rootsopt.runtime.environment import versions
 from rootsopt.status import Status
 

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from rootsopt.config import Config
 from rootsopt.config.units import MM, UM
-from rootsopt.dynamics.measures import PEAK_NORM, line_name
+from rootsopt.dynamics.orbit import PEAK_NORM, line_name
 from rootsopt.dynamics.reserve import GEAR, RESERVES
 from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry, Profile, geometry

@@ -7,8 +7,7 @@ from jaxtyping import Array, Float
 
 from rootsopt.config import ProfileConfig
 from rootsopt.config.families import families, family_of, is_shipped
-from rootsopt.config.units import DEG, MM
-from rootsopt.config.words import shown
+from rootsopt.config.units import DEG, MM, shown
 from rootsopt.errors import InputError
 from rootsopt.measured.conjugacy import conjugacy
 from rootsopt.profiles import Outline, Profile, project

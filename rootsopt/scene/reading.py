@@ -12,7 +12,7 @@ from rootsopt.config import Config
 from rootsopt.config.units import DEG, MM, RPM, UM
 from rootsopt.contact.law import ImpactLaw
 from rootsopt.dynamics.integrator import Integrator, Solver
-from rootsopt.dynamics.measures import Measures
+from rootsopt.dynamics.orbit import Measures
 from rootsopt.dynamics.parts import Friction, GearErrors, MotorDrive, Supports, TimingGear
 from rootsopt.measured.table import transmission_error
 

@@ -30,9 +30,8 @@ from typing import Any, Literal
 from rootsopt.config import sources
 from rootsopt.errors import InputError
 from rootsopt.response.journal import aside
-from rootsopt.view import disk
-from rootsopt.view.disk import Lock, TakenError
-from rootsopt.view.files import ResultFolder, plain
+from rootsopt.view import files
+from rootsopt.view.files import Lock, ResultFolder, TakenError, plain
 
 RESULT = "result.json"
 """Name of the file that lists all files of a run and is written last."""
@@ -79,11 +78,11 @@ class RunFolder(ResultFolder):
         try:
             self.target = Path(os.path.realpath(self.path))
             self._refuse_places()
-            disk.make_folders(self.target.parent, self._made)
+            files.make_folders(self.target.parent, self._made)
             self._base = self.target.parent / _base(self.target.name)
             self.stage = self._temporary()
             self._claim()
-            disk.make_folder(self.stage)
+            files.make_folder(self.stage)
         except InputError:
             self.close()
             raise
@@ -155,14 +154,14 @@ class RunFolder(ResultFolder):
             left = self.target.parent / name
             if found[1] == self._base.name:
                 if _complete(left) and not os.path.lexists(self.target):
-                    disk.move(left, self.target)
+                    files.move(left, self.target)
                 else:
-                    disk.discard_tree(left)
+                    files.discard_tree(left)
                 continue
             with contextlib.suppress(InputError, OSError):  # belongs to a run in progress
                 other = Lock(self.target.parent / (found[1] + _SUFFIX))
                 if other.held and not _complete(left):
-                    disk.discard_tree(left)
+                    files.discard_tree(left)
                 other.release()
 
     def _state(self) -> _State:
@@ -202,10 +201,10 @@ class RunFolder(ResultFolder):
         Return the final path of the file. Raises `InputError` if the file cannot be written."""
         with self._busy, self._failing(name):
             file = self.stage / name
-            disk.make_folders(file.parent, [])
+            files.make_folders(file.parent, [])
             if name in self._written:
-                disk.discard(file)
-            disk.create(file, data)
+                files.discard(file)
+            files.create(file, data)
             self._written.add(name)
         return self.path / name
 
@@ -244,38 +243,38 @@ class RunFolder(ResultFolder):
         Return messages for the user, for example the new path of an earlier run. Raises
         `InputError` if this fails; the target is then unchanged."""
         with self._busy:
-            files = sorted(self._written | {RESULT})
-            run = {"run": {"command": self.command, "files": files}}
+            names = sorted(self._written | {RESULT})
+            run = {"run": {"command": self.command, "files": names}}
             super().write_json(RESULT, {**self._entries, **run})
             with self._failing():
-                for folder in {(self.stage / name).parent for name in files} | {self.stage}:
-                    disk.sync_folder(folder)
+                for folder in {(self.stage / name).parent for name in names} | {self.stage}:
+                    files.sync_folder(folder)
                 notes = self._take_place()
             self.placed = True
             for file in self._spent:
-                disk.discard(file)
+                files.discard(file)
             with contextlib.suppress(OSError):
-                disk.sync_folder(self.target.parent)
+                files.sync_folder(self.target.parent)
         return notes
 
     def _take_place(self) -> list[str]:
         state = self._state()
         if state in ("absent", "empty"):
             if state == "empty":
-                disk.adopt_mode(self.stage, self.target)
-            disk.move(self.stage, self.target)
+                files.adopt_mode(self.stage, self.target)
+            files.move(self.stage, self.target)
             return []
         if (
             state == "foreign"
         ):  # The target was different at the start of the run. Do not throw away a long run.
             self.target = self.path = self._free()
-            disk.move(self.stage, self.target)
+            files.move(self.stage, self.target)
             return [f"the requested folder now holds other files; this run is in {self.path}"]
-        disk.adopt_mode(self.stage, self.target)
+        files.adopt_mode(self.stage, self.target)
         if self.overwrite and state == "ours":
             older = self._temporary()
             self._swap_by(older)
-            disk.discard_tree(older)
+            files.discard_tree(older)
             return []
         aside = self._free()
         self._swap_by(aside)
@@ -289,11 +288,11 @@ class RunFolder(ResultFolder):
         """Move the earlier run to `older`, then this run to the target's path.
 
         If the second step fails, undo the first."""
-        disk.move(self.target, older)
+        files.move(self.target, older)
         try:
-            disk.move(self.stage, self.target)
+            files.move(self.stage, self.target)
         except BaseException:
-            disk.move(older, self.target)
+            files.move(older, self.target)
             raise
 
     def _free(self) -> Path:
@@ -319,12 +318,12 @@ class RunFolder(ResultFolder):
         A second call does nothing."""
         with self._busy:
             if not self.placed and hasattr(self, "stage"):
-                disk.discard_tree(self.stage)
+                files.discard_tree(self.stage)
             if self._lock is not None:
                 self._lock.release()
             if not self.placed:
                 for folder in reversed(self._made):
-                    disk.discard(folder)
+                    files.discard(folder)
 
     def abandon(self) -> str:
         """Close the folder, and prevent the run from writing any further files.
@@ -352,9 +351,9 @@ def _base(name: str) -> str:
 def _files_in(folder: Path) -> set[str]:
     """Return the relative paths of all files, links and empty folders inside a folder."""
     found: set[str] = set()
-    for place, folders, files in os.walk(folder):
+    for place, folders, inner in os.walk(folder):
         inside = Path(place).relative_to(folder)
-        names = files if files or folders else [""]
+        names = inner if inner or folders else [""]
         names += [name for name in folders if os.path.islink(os.path.join(place, name))]
         found |= {(inside / name).as_posix() for name in names}
     return found

@@ -13,8 +13,7 @@ from rootsopt.pump.sheet import NOTE, missing, warnings
 from rootsopt.response.records import RESPONSES, message_of
 from rootsopt.response.sensitivity import MICROMETRE
 from rootsopt.status import Standing, Status
-from rootsopt.view.comparison import assumption_tables, better_tables
-from rootsopt.view.identified import identified_tables
+from rootsopt.view.comparison import assumption_tables, better_tables, identified_tables
 from rootsopt.view.names import (
     Cell,
     Row,

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from rootsopt.config import load, parse
 from rootsopt.config.document import MOST_BYTES, read_document
-from rootsopt.config.words import named, sentence, shown
+from rootsopt.config.units import named, sentence, shown
 from rootsopt.errors import InputError
 from tests.config.test_config import MINIMAL
 from tests.fuzz import configs

@@ -13,7 +13,7 @@ import rootsopt
 from rootsopt.dynamics.closed import Start, steady_motion
 from rootsopt.dynamics.flow import one_period, strobe
 from rootsopt.dynamics.integrator import Integrator, Solver
-from rootsopt.dynamics.measures import Measures
+from rootsopt.dynamics.orbit import Measures
 from rootsopt.dynamics.parts import GearErrors
 from rootsopt.dynamics.parts.base import Timescales
 from rootsopt.dynamics.window import lyapunov

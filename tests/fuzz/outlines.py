@@ -17,8 +17,8 @@ from rootsopt.measured.fit import imported
 from rootsopt.measured.reading import read
 from rootsopt.profiles import CIC, EE, outline
 from rootsopt.scene import Scene, design_vector
+from rootsopt.view.figures.cad import dxf_bytes
 from rootsopt.view.figures.drawing import Drawing
-from rootsopt.view.figures.dxf import dxf_bytes
 from tests.fuzz.verdict import fault_of
 
 SECONDS = 20.0

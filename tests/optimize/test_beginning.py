@@ -12,8 +12,8 @@ import yaml
 from rootsopt.commands.work.searching import checkpoint_of
 from rootsopt.config import load, parse
 from rootsopt.errors import InputError
-from rootsopt.optimize import beginning as module
-from rootsopt.optimize.beginning import beginning
+from rootsopt.optimize import infeasible as module
+from rootsopt.optimize.infeasible import beginning
 from rootsopt.optimize.outcome import Optimization
 from rootsopt.optimize.search import Search
 from rootsopt.scene import outline_mm

@@ -14,7 +14,7 @@ from rootsopt.optimize.local import FEASIBLE, Group, Linearization
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.search import Search, Stage
 from rootsopt.response.evaluation import Evaluator
-from rootsopt.response.many import HERE
+from rootsopt.response.reducers import HERE
 from rootsopt.status import Status
 from tests.standins import evaluation_of
 

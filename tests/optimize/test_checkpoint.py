@@ -13,7 +13,7 @@ from rootsopt.errors import InputError
 from rootsopt.optimize.search import Search
 from rootsopt.response.evaluation import Evaluation
 from rootsopt.response.journal import Checkpoint
-from rootsopt.response.starts import Seed
+from rootsopt.response.result import Seed
 from rootsopt.status import Status
 from rootsopt.view.runs import RunFolder
 

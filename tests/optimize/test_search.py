@@ -15,7 +15,7 @@ from rootsopt.optimize.outcome import Trial, history_of
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.search import Search, Stage, _apart, _ranked
 from rootsopt.response.evaluation import Evaluator
-from rootsopt.response.many import HERE
+from rootsopt.response.reducers import HERE
 from rootsopt.scene.space import sobol
 from rootsopt.status import Status
 from rootsopt.view.tables import rejected_table

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from rootsopt.optimize.local import Group, Linearization, certify
-from rootsopt.optimize.models import Models
+from rootsopt.optimize.local import Group, Linearization, Models, certify
 from rootsopt.optimize.sqp import Stops, descend
 
 

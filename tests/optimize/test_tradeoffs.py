@@ -23,10 +23,9 @@ from rootsopt.config.units import words
 from rootsopt.errors import InputError
 from rootsopt.optimize.local import Group, certify
 from rootsopt.optimize.problem import check_senses
-from rootsopt.optimize.tradeoffs import assembly, scalar, trace
+from rootsopt.optimize.tradeoffs import assembly, trace
 from rootsopt.optimize.tradeoffs.assembly import Node, points_of, selected
-from rootsopt.optimize.tradeoffs.front import dominated
-from rootsopt.optimize.tradeoffs.scalar import RHO, Scalar, Scale
+from rootsopt.optimize.tradeoffs.front import RHO, Scalar, Scale, dominated, keys, links
 from rootsopt.optimize.tradeoffs.study import Aim, Sample, Study, aims_of, freed
 from rootsopt.optimize.tradeoffs.trace import Tracer, pareto_front
 from rootsopt.profiles import geometry
@@ -453,10 +452,10 @@ def test_rates_have_the_signs_of_the_terms_themselves():
 def test_neighbours_on_the_grid_differ_by_one_step():
     """One step from one term to another, in every pair of terms; found by comparing all points."""
     for count, divisions in ((2, 5), (3, 4)):
-        grid = scalar.keys(count, divisions)
+        grid = keys(count, divisions)
         apart = np.sum(np.abs(np.array(grid)[:, None] - np.array(grid)), axis=2)
         expected = {(i, j) for i, j in np.argwhere(apart == 2).tolist() if i < j}
-        found = scalar.links(grid)
+        found = links(grid)
         assert len(found) == len(expected)
         assert {(min(pair), max(pair)) for pair in found} == expected
 

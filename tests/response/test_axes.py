@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from rootsopt.errors import InputError
-from rootsopt.response.sweeps import axes
-from rootsopt.response.sweeps.axes import Interval, axis_of, parse_over
+from rootsopt.response.sweeps import plan
+from rootsopt.response.sweeps.plan import Interval, axis_of, parse_over
 
 SPEED, BACKLASH = "scene.speed_rpm", "scene.timing_gear.backlash_mm"
 
@@ -78,7 +78,7 @@ def test_wrong_texts(text, words):
     ids=["range", "long range", "count", "generator", "array", "interval", "text"],
 )
 def test_too_many_values_are_refused_before_they_are_made(given, monkeypatch):
-    monkeypatch.setattr(axes, "MOST", 1000)
+    monkeypatch.setattr(plan, "MOST", 1000)
     tracemalloc.start()
     with pytest.raises(InputError, match=rf"`{SPEED}` must have at most 1000 values"):
         axis_of(SPEED, given)

@@ -13,7 +13,7 @@ from rootsopt.config import load
 from rootsopt.continuation import End, Kind, StepSizes, follow, follow_doubled
 from rootsopt.errors import InputError
 from rootsopt.response.continuation.arclength import StoppedError
-from rootsopt.response.continuation.family import OrbitFamily
+from rootsopt.response.continuation.branch import OrbitFamily
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.scene import Scene, design_vector
 from rootsopt.status import Status
@@ -213,7 +213,7 @@ def test_scenes_along_a_curve_are_those_of_the_configs(monkeypatch, name, change
     """Scene and design at 30 % of the range are those of a config with this value."""
     pair = types.SimpleNamespace(angle_scale=jnp.asarray(1e-3), smooth=True, repeats=1)
     pair.whole = lambda periods: periods
-    monkeypatch.setattr("rootsopt.response.continuation.family._pair", lambda *scene: pair)
+    monkeypatch.setattr("rootsopt.response.continuation.branch._pair", lambda *scene: pair)
     config = load(f"configs/{name}.yaml", list(changes))
     family = OrbitFamily(config, key, 1, StepSizes(*ends))
     value = 0.7 * ends[0] + 0.3 * ends[1]

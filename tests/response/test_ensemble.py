@@ -22,7 +22,7 @@ from rootsopt.response.ensemble import (
     neighbours,
 )
 from rootsopt.response.evaluation import RESPONSES, Evaluator
-from rootsopt.response.members import Members
+from rootsopt.response.together import Members
 from rootsopt.status import Status
 from rootsopt.view import tables
 

@@ -16,7 +16,7 @@ from rootsopt.commands.work.searching import runs_of
 from rootsopt.config import load
 from rootsopt.errors import InputError
 from rootsopt.response.evaluation import Evaluator
-from rootsopt.response.many import HERE, Point
+from rootsopt.response.reducers import HERE, Point
 from rootsopt.response.sweeps import cluster
 from rootsopt.response.sweeps.cluster import ClosedError, DaskRunner, Settings, running
 from tests.response.test_cluster import IMPORT
@@ -119,7 +119,7 @@ def test_classes_of_a_script_travel(tmp_path):
         "import numpy as np\n"
         "from rootsopt.config import load\n"
         "from rootsopt.response.evaluation import Evaluator\n"
-        "from rootsopt.response.many import Point\n"
+        "from rootsopt.response.reducers import Point\n"
         "from rootsopt.response.sweeps.cluster import DaskRunner, Settings\n"
         "class Own(Evaluator):\n"
         "    answer = 42\n"

@@ -19,7 +19,7 @@ from rootsopt.response.journal import (
     plain_evaluation,
     set_aside,
 )
-from rootsopt.response.many import Point
+from rootsopt.response.reducers import Point
 from rootsopt.response.result import Part
 from rootsopt.response.sweeps.plan import plan_of
 from rootsopt.response.sweeps.points import lost

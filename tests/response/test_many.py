@@ -11,7 +11,7 @@ import pytest
 
 from rootsopt.config import load
 from rootsopt.response.evaluation import Evaluator
-from rootsopt.response.many import IN_TURN, LocalRunner, Point, as_done, evaluate_many
+from rootsopt.response.reducers import IN_TURN, LocalRunner, Point, as_done, evaluate_many
 from tests.standins import evaluation_of
 
 

@@ -9,8 +9,8 @@ import pytest
 
 from rootsopt.dynamics.flow import Period
 from rootsopt.dynamics.integrator import Integrator
-from rootsopt.response import ensemble, members
-from rootsopt.response.members import Members
+from rootsopt.response import ensemble, together
+from rootsopt.response.together import Members
 from tests.standins import oscillator
 
 
@@ -35,9 +35,9 @@ def test_averages_of_a_member(monkeypatch):
     half."""
     settle = 3
     means = np.random.default_rng(0).uniform(1, 2, 20) + np.arange(20)
-    monkeypatch.setattr(members, "one_period", lambda pair, state, *rest: told_flow(state, means))
+    monkeypatch.setattr(together, "one_period", lambda pair, state, *rest: told_flow(state, means))
     monkeypatch.setattr(
-        members,
+        together,
         "strobe",
         lambda pair, state, *rest: types.SimpleNamespace(
             states=state[None].at[0, 0].add(1.0), solved=jnp.asarray(True)
@@ -66,7 +66,7 @@ def test_averages_of_a_member(monkeypatch):
 def averages_from(state):
     """Return a function (settle, periods) → averages of a member that starts from `state`."""
     pair, how = oscillator(), Integrator("tsit5", jnp.asarray(1e-6), 64)
-    run = jax.jit(lambda *counts: members.member(pair, state, *counts, how))
+    run = jax.jit(lambda *counts: together.member(pair, state, *counts, how))
     return lambda settle, periods: run(jnp.asarray(settle), jnp.asarray(periods))
 
 
@@ -78,7 +78,7 @@ def test_a_member_repeats_after_its_period(monkeypatch):
 
     blank = told_flow(jnp.zeros(2), [1.0])
     monkeypatch.setattr(
-        members, "one_period", lambda pair, state, *rest: blank._replace(end=step(state))
+        together, "one_period", lambda pair, state, *rest: blank._replace(end=step(state))
     )
     averages = averages_from(jnp.zeros(2))
     # A cycle of k counts once the last k + 1 states have been there k mesh periods before.

@@ -10,7 +10,7 @@ import xarray
 
 import rootsopt
 from rootsopt import InputError, Status
-from rootsopt.response.many import LocalRunner
+from rootsopt.response.reducers import LocalRunner
 from rootsopt.response.sweeps import points, scenes
 from rootsopt.response.sweeps.plan import plan_of
 from rootsopt.response.sweeps.points import configured, lost, simulated

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rootsopt.profiles import trigonometry as trig
+from rootsopt.profiles import base as trig
 from rootsopt.runtime.kept import kept, kept_along
 
 ANGLES = jnp.linspace(-3.0, 3.0, 64)

@@ -12,8 +12,8 @@ from rootsopt.commands.table import profile as command
 from rootsopt.config import load
 from rootsopt.errors import InputError
 from rootsopt.profiles import CIC, EE, geometry
+from rootsopt.view.figures.cad import dxf_bytes
 from rootsopt.view.figures.drawing import coordinates
-from rootsopt.view.figures.dxf import dxf_bytes
 from rootsopt.view.figures.pieces import Arc, outline_pieces, polyline
 from tests.view.test_export import drawing
 

@@ -12,7 +12,7 @@ from rootsopt.commands.table import COMMANDS
 from rootsopt.config import load
 from rootsopt.status import Status
 from rootsopt.view import terminal
-from rootsopt.view.ending import ending
+from rootsopt.view.terminal import ending
 
 DESIGN = dict(zip(load("cic_drawn").design_keys, (36.0, 9.0, 4.0), strict=True))
 STEADY = {"kind": "periodic", "period": 2, "floquet_multiplier": -0.25, "residual": 3e-12}

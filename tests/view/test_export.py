@@ -23,10 +23,10 @@ from rootsopt.response.records import Series
 from rootsopt.scene import Scene, check_geometry, design_vector
 from rootsopt.scene.families import profile_of
 from rootsopt.scene.space import Space
-from rootsopt.view.figures import chosen, solid
+from rootsopt.view.figures import cad, chosen
 from rootsopt.view.figures.animation import meshing_gif, rolling_contacts
+from rootsopt.view.figures.cad import dxf_bytes
 from rootsopt.view.figures.drawing import Drawing, svg_text
-from rootsopt.view.figures.dxf import dxf_bytes
 from rootsopt.view.figures.pieces import Arc, Spline, outline_pieces, polyline
 
 ROOT = Path(__file__).parents[2]
@@ -62,7 +62,7 @@ def written(shape, folder):
     from build123d import import_step
 
     file = folder / "shape.step"
-    file.write_bytes(solid.step_bytes(shape))
+    file.write_bytes(cad.step_bytes(shape))
     return import_step(file)
 
 
@@ -207,7 +207,7 @@ def test_any_family_is_drawn(family, tmp_path):
     if family == "arcs_epicycloid":
         return  # A solid of arcs is among those below.
     pytest.importorskip("build123d")
-    body = written(solid.rotor(outline_pieces(shape), LENGTH, None, 0.0), tmp_path)
+    body = written(cad.rotor(outline_pieces(shape), LENGTH, None, 0.0), tmp_path)
     assert body.is_valid
     assert body.volume / LENGTH == pytest.approx(area_mm2(shape), rel=1e-6)
 
@@ -261,7 +261,7 @@ def test_step_read_back(name, tmp_path):
     shape = PROFILES[name]
     pieces = outline_pieces(shape)
     for bore, helix in ((None, 0.0), (10.0, -np.pi / 3)):
-        made = solid.rotor(pieces, LENGTH, bore, helix)
+        made = cad.rotor(pieces, LENGTH, bore, helix)
         back = written(made, tmp_path)
         assert back.is_valid
         exact = area_mm2(shape) - (0 if bore is None else np.pi * bore**2 / 4)
@@ -282,7 +282,7 @@ def test_pair_meshes_along_its_length(tmp_path):
     The rotors overlap nowhere, and the STL is closed."""
     build123d = pytest.importorskip("build123d")
     shape, helix = PROFILES["cic 3"], np.radians(50.0)
-    pair = solid.pair(outline_pieces(shape), 3, 66.0, LENGTH, None, helix)
+    pair = cad.pair(outline_pieces(shape), 3, 66.0, LENGTH, None, helix)
     back = written(pair, tmp_path)
     assert len(back.solids()) == 2
     assert {child.label for child in back.children} == {"rotor_1", "rotor_2"}
@@ -298,7 +298,7 @@ def test_pair_meshes_along_its_length(tmp_path):
             outward = middle + (placed[::9] - middle) * (1 + 1e-4)
             outside = [rotor.distance_to(build123d.Vertex(x, y, z)) for x, y in outward]
             assert min(outside) > 1e-4
-    data = solid.stl_bytes(back.solids()[0])
+    data = cad.stl_bytes(back.solids()[0])
     kind = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("rest", "<u2")])
     corners = np.frombuffer(data[84:], kind)["corners"].astype(float)
     volume = np.sum(np.linalg.det(corners)) / 6

@@ -9,7 +9,7 @@ from rootsopt.config import load
 from rootsopt.response.records import Series
 from rootsopt.scene import outline_mm
 from rootsopt.view.figures import runs
-from rootsopt.view.figures.profiles import plot_departure, plot_forces_together
+from rootsopt.view.figures.designs import plot_departure, plot_forces_together
 from rootsopt.view.figures.style import figure
 
 CIC = load("configs/cic_drawn.yaml")

@@ -17,9 +17,9 @@ from rootsopt.optimize.outcome import Optimization
 from rootsopt.profiles import EE
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.status import Status
+from rootsopt.view.pages import html as texts
 from rootsopt.view.pages import session as sessions
-from rootsopt.view.pages import shown as texts
-from rootsopt.view.pages.engine import Engine, Shape, same_motion
+from rootsopt.view.pages.knobs import Engine, Shape, same_motion
 from rootsopt.view.pages.session import (
     FromRest,
     NewMotion,

@@ -22,9 +22,8 @@ from rootsopt.view import pages, tables, terminal
 from rootsopt.view.files import ResultFolder, response_columns
 from rootsopt.view.pages import charts
 from rootsopt.view.pages.charts import animations
-from rootsopt.view.pages.gather import Run
+from rootsopt.view.pages.gather import Run, glossary, linked
 from rootsopt.view.pages.html import report_text
-from rootsopt.view.pages.words import glossary, linked
 
 pytest.importorskip("bokeh")
 ROOT = Path(__file__).parents[2]

@@ -10,7 +10,7 @@ import pytest
 
 from rootsopt.commands.console import main
 from rootsopt.errors import InputError
-from rootsopt.view import disk, runs
+from rootsopt.view import files, runs
 from rootsopt.view.runs import RunFolder
 from tests.deaths import digest, digest_of, write_run
 
@@ -174,7 +174,7 @@ def test_a_second_process_is_kept_out(tmp_path):
 
 def test_a_lock_on_a_file_that_is_gone_is_none(tmp_path, monkeypatch):
     """A lock is void if the last holder removes the file between opening and locking."""
-    real, calls = disk.fcntl.flock, []
+    real, calls = files.fcntl.flock, []
 
     def late(*arguments):
         calls.append(arguments)
@@ -182,11 +182,11 @@ def test_a_lock_on_a_file_that_is_gone_is_none(tmp_path, monkeypatch):
             os.unlink(tmp_path / "lock")
         return real(*arguments)
 
-    monkeypatch.setattr(disk.fcntl, "flock", late)
-    held = disk.Lock(tmp_path / "lock")
+    monkeypatch.setattr(files.fcntl, "flock", late)
+    held = files.Lock(tmp_path / "lock")
     assert len(calls) == 2
-    with pytest.raises(disk.TakenError):
-        disk.Lock(tmp_path / "lock")
+    with pytest.raises(files.TakenError):
+        files.Lock(tmp_path / "lock")
     held.release()
     assert os.listdir(tmp_path) == []
 
@@ -212,7 +212,7 @@ def test_without_locks_nothing_of_others_is_removed(tmp_path, monkeypatch):
     def refuse(*_):
         raise OSError(37, "No locks available")
 
-    monkeypatch.setattr(disk.fcntl, "flock", refuse)
+    monkeypatch.setattr(files.fcntl, "flock", refuse)
     write_run(tmp_path / "run", "new")
     assert sorted(os.listdir(tmp_path)) == [stage.name, "run"]
 

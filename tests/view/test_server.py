@@ -28,7 +28,7 @@ def address():
     """Return the address of a running server."""
     from rootsopt.config import load
     from rootsopt.errors import InputError
-    from rootsopt.view.pages.engine import Engine
+    from rootsopt.view.pages.knobs import Engine
     from rootsopt.view.pages.server import PageServer
 
     class Idle(Engine):
@@ -158,7 +158,7 @@ def test_browser_is_given_no_secret(monkeypatch):
         ready.set()
 
     monkeypatch.setattr("rootsopt.view.pages.server.PageServer", Serving)
-    monkeypatch.setattr("rootsopt.view.pages.engine.Engine.prepare", lambda self: None)
+    monkeypatch.setattr("rootsopt.view.pages.knobs.Engine.prepare", lambda self: None)
     monkeypatch.setattr(webbrowser, "open", browse)
     assert command.main([CIC]) == 0
     address, file, text, mode = opened

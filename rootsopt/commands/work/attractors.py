@@ -47,7 +47,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
             response = files.response_columns(one.evaluation.series)
             folder.write_csv(f"response_{number}.csv", response)
     if not options.no_figures:
-        from rootsopt.view.figures.basins import basin_figures
+        from rootsopt.view.figures.sweep import basin_figures
 
         basin_figures(folder, found, config)
 

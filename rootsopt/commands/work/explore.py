@@ -13,7 +13,7 @@ from rootsopt.commands import door
 from rootsopt.config import Config
 from rootsopt.runtime import environment
 from rootsopt.scene import check_geometry
-from rootsopt.view import disk, pages
+from rootsopt.view import files, pages
 
 
 def body(config: Config, options: argparse.Namespace) -> int:
@@ -23,7 +23,7 @@ def body(config: Config, options: argparse.Namespace) -> int:
     pages.require("`explore`", "explore")
     check_geometry(config)
     from rootsopt.optimize.design import optimize_design
-    from rootsopt.view.pages.engine import Engine
+    from rootsopt.view.pages.knobs import Engine
     from rootsopt.view.pages.server import PageServer
 
     engine = Engine(config, optimize_design)
@@ -62,5 +62,5 @@ def _redirection(folder: Path, url: str) -> str:
     file = folder / "explore.html"
     target = html.escape(url)
     text = f'<meta http-equiv="refresh" content="0; url={target}"><a href="{target}">{target}</a>'
-    disk.create(file, text.encode())
+    files.create(file, text.encode())
     return file.as_uri()

@@ -36,7 +36,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
         folder.write_csv("residuals.csv", found.residuals)
     folder.write_json("result.json", data | {"versions": files.versions()})
     if found.parameters and not options.no_figures:
-        from rootsopt.view.figures.identified import identified_figure
+        from rootsopt.view.figures.force import identified_figure
 
         identified_figure(folder, found)
 

@@ -13,7 +13,7 @@ from rootsopt.config.document import read_document
 from rootsopt.config.families import FREE_FORM
 from rootsopt.errors import InputError
 from rootsopt.measured.source import Found, found
-from rootsopt.optimize.surviving import survives, surviving
+from rootsopt.optimize.verification import survives, surviving
 from rootsopt.pump.sheet import record_of
 from rootsopt.runtime.environment import say
 from rootsopt.scene.check import shape_of

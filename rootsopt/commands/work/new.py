@@ -18,12 +18,12 @@ from rootsopt.config.explain import Key, explain, keys_of
 from rootsopt.config.families import family_of
 from rootsopt.config.sheet import Sheet, made, option
 from rootsopt.config.sources import regular_file
-from rootsopt.config.words import placed, sentence
+from rootsopt.config.units import placed, sentence
 from rootsopt.errors import InputError
 from rootsopt.runtime.environment import say
 from rootsopt.scene.check import shape_of
 from rootsopt.scene.sizing import sized
-from rootsopt.view import disk
+from rootsopt.view import files
 
 _POWERS = "power_kW", "pressure_difference_bar"
 
@@ -54,8 +54,8 @@ def body(options: argparse.Namespace) -> int:
             "be chaotic, and `rootsopt simulate` end with exit code 3"
         )
     new = path.with_name(f".{path.name}.{os.getpid()}") if options.overwrite else path
-    disk.create(new, text.encode())
-    disk.replace(new, path)
+    files.create(new, text.encode())
+    files.replace(new, path)
     named = zip(config.design_keys, config.design, strict=True)
     flow = sheet.displaced(efficiency)
     print(

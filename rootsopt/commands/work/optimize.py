@@ -231,7 +231,7 @@ def _write(folder, config, options, result, alike, sheets, compiled, ran) -> Non
 
 def _draw(folder, config: Config, result, data: dict) -> None:
     """Write the figures of a search; `data`: content of the result file."""
-    from rootsopt.view.figures import runs, spread, sweep
+    from rootsopt.view.figures import comparisons, runs, sweep
 
     if result.optimized is not None:
         pair, rows = (result.baseline, result.optimized), result.history
@@ -248,7 +248,7 @@ def _draw(folder, config: Config, result, data: dict) -> None:
         designs = {name: one.speeds for name, one in names.items() if one is not None}
         sweep.speed_figure(folder, designs, "Contact force over the speeds of the objective")
     if result.assumptions is not None:
-        spread.spread_figure(folder, data["assumptions"], result.assumptions.columns())
+        comparisons.spread_figure(folder, data["assumptions"], result.assumptions.columns())
 
 
 def _designed(config: Config, evaluation) -> Config:
@@ -268,7 +268,7 @@ def _write_robustness(folder, config, options, robustness) -> None:
         columns |= {f"{name}_{key}": values for key, values in one.values.items()}
     folder.write_csv("tolerances.csv", columns)
     if not options.no_figures:
-        from rootsopt.view.figures.spread import distributions
+        from rootsopt.view.figures.comparisons import distributions
 
         designs = {name: one.values for name, one in robustness.fresh.items()}
         count = len(next(iter(robustness.scenes.values())))

@@ -43,7 +43,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
         folder.write_text(files.design_file(point.number), text)
     folder.write_json("result.json", record | {"versions": files.versions()})
     if front.points and not options.no_figures:
-        from rootsopt.view.figures.front import front_figure
+        from rootsopt.view.figures.comparisons import front_figure
 
         front_figure(folder, front)
     if front.interrupted and not front.points:

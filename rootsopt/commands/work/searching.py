@@ -16,7 +16,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rootsopt.commands import cli, door
 from rootsopt.config import Config
 from rootsopt.response.journal import Checkpoint, Journal, header_of, set_aside
-from rootsopt.response.many import Runs
+from rootsopt.response.reducers import Runs
 from rootsopt.response.sweeps.cluster import running
 from rootsopt.runtime.environment import say
 from rootsopt.runtime.threads import until_stopped

@@ -14,9 +14,8 @@ from rootsopt.commands.work.searching import opened, progress_bar
 from rootsopt.config import Config
 from rootsopt.config.plausible import notes_on_swept
 from rootsopt.errors import InputError
-from rootsopt.response.sweeps.axes import parse_over
 from rootsopt.response.sweeps.cluster import running
-from rootsopt.response.sweeps.plan import Plan, plan_of, scattered
+from rootsopt.response.sweeps.plan import Plan, parse_over, plan_of, scattered
 from rootsopt.response.sweeps.scenes import Points, checked, complete, dataset_of
 from rootsopt.runtime.environment import say
 from rootsopt.status import Status

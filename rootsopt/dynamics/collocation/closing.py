@@ -21,8 +21,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from rootsopt.dynamics.collocation.bordered import CollocatedEquation, Points
 from rootsopt.dynamics.collocation.elements import POINTS, Elements
-from rootsopt.dynamics.collocation.equation import CollocatedEquation, Points
 from rootsopt.dynamics.collocation.events import (
     Events,
     FlagScan,
@@ -33,8 +33,8 @@ from rootsopt.dynamics.collocation.events import (
     look,
     rooted,
 )
-from rootsopt.dynamics.collocation.known import KnownOrbit
 from rootsopt.dynamics.collocation.mesh import (
+    KnownOrbit,
     aligned,
     counted,
     most_elements,

@@ -6,7 +6,7 @@ of the front is the optimum of one term alone.
 If two neighbours lie far apart, a search looks for a point between them (bisection). Without a gap,
 it finds such a point. At a gap, where the terms or the designs jump, it leads back to one of the
 two neighbours. The *spacing* of terms is the distance between neighbouring reference points
-(`rootsopt.optimize.tradeoffs.scalar`). Points are identified by their indices."""
+(`rootsopt.optimize.tradeoffs.front`). Points are identified by their indices."""
 
 import dataclasses
 import itertools
@@ -18,8 +18,16 @@ from numpy.typing import NDArray
 
 from rootsopt.config.units import words
 from rootsopt.optimize.local import Certificate
-from rootsopt.optimize.tradeoffs.front import FrontPoint, Gap, dominated, ordered, repeated
-from rootsopt.optimize.tradeoffs.scalar import Scalar, Scale, rates
+from rootsopt.optimize.tradeoffs.front import (
+    FrontPoint,
+    Gap,
+    Scalar,
+    Scale,
+    dominated,
+    ordered,
+    rates,
+    repeated,
+)
 from rootsopt.optimize.tradeoffs.study import Sample, Study
 from rootsopt.status import Standing
 

@@ -42,8 +42,8 @@ from rootsopt.optimize.tradeoffs.assembly import (
     selected,
     spacing_of,
 )
-from rootsopt.optimize.tradeoffs.front import Front
-from rootsopt.optimize.tradeoffs.scalar import (
+from rootsopt.optimize.tradeoffs.front import (
+    Front,
     Key,
     Scalar,
     Scale,
@@ -55,8 +55,8 @@ from rootsopt.optimize.tradeoffs.scalar import (
 )
 from rootsopt.optimize.tradeoffs.study import Course, Sample, Seen, Study
 from rootsopt.response.journal import Checkpoint
-from rootsopt.response.many import HERE, Runs, as_done
-from rootsopt.response.starts import Seeds
+from rootsopt.response.reducers import HERE, Runs, as_done
+from rootsopt.response.result import Seeds
 from rootsopt.response.sweeps.cluster import running
 from rootsopt.runtime.threads import one_thread
 from rootsopt.scene import check_geometry

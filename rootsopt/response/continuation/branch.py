@@ -9,11 +9,23 @@ import contextlib
 import dataclasses
 import enum
 import itertools
+from typing import Any, NamedTuple
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
-from numpy.typing import ArrayLike
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike, NDArray
 
-from rootsopt.config import Config
+from rootsopt.config import Config, parse
+from rootsopt.dynamics.collocation.bordered import Followed, Line, Plane, followed
+from rootsopt.dynamics.collocation.mesh import PIECES, from_pieces
+from rootsopt.dynamics.collocation.motion import ACCURACY, UNREFINED
+from rootsopt.dynamics.flow import strobe
+from rootsopt.dynamics.pair import RotorPair
+from rootsopt.dynamics.steady import TOO_DEEP
 from rootsopt.errors import InputError
 from rootsopt.response.continuation.arclength import (
     End,
@@ -22,7 +34,215 @@ from rootsopt.response.continuation.arclength import (
     StoppedError,
     follow_curve,
 )
-from rootsopt.response.continuation.family import SPAN, BranchPoint, OrbitFamily
+from rootsopt.runtime.programs import CachedFunction
+from rootsopt.scene import Scene, along, design_vector
+
+LONGEST = 8
+"""Longest orbit that can be followed (mesh periods), rounded up by `RotorPair.whole`."""
+SPAN = 20.0
+"""Change of the scaled state that has the same length as the whole range of the parameter, when
+step lengths are measured."""
+# Number of uniform instants on an orbit at which it is checked whether the rotors run as a pair.
+_LOOKS = 504
+# Distance (unit of `StepSizes`) between the states at the start and the middle of an orbit below
+# which the orbit has half the period.
+_HALF_ALIKE = 1e-5
+
+
+@dataclasses.dataclass(frozen=True)
+class BranchPoint:
+    """One periodic orbit of a branch.
+
+    `value` of the parameter (config's unit); `state` (n,) at φ1 = 0, scaled for the config with
+    that value, so that an `Evaluator` can start there; `period` (mesh periods); `mean`, `peak`,
+    `rms` of the contact force (N); `multipliers` (n,): Floquet multipliers; `residual`: greatest
+    entry of |Φ(z) - z|, divided by the greatest entry of |z| if that exceeds 1; `half_way`:
+    distance (unit of `StepSizes`) between the states at the start and the middle of the orbit;
+    `made`: the orbit in the form from which its neighbours on the curve are closed.
+    """
+
+    value: float
+    state: NDArray[np.float64]
+    period: int
+    mean: float
+    peak: float
+    rms: float
+    multipliers: NDArray[np.complex128]
+    residual: float
+    half_way: float
+    made: Followed = dataclasses.field(repr=False)
+
+    @property
+    def stable(self) -> bool:
+        """Whether all multipliers lie inside the unit circle."""
+        return bool(np.max(np.abs(self.multipliers)) < 1)
+
+
+class _Range(NamedTuple):
+    """Scenes and designs over the range of a parameter.
+
+    `low`: scene and design (d,) at its low end; `change`: their change over the range, with `None`
+    in place of all that is not a number; `unit` (rad): unit of ε, the same for the whole curve.
+    """
+
+    low: tuple[Scene, Array]
+    change: Any
+    unit: Float[Array, ""]
+
+    def at(self, share: Float[Array, ""]) -> tuple[RotorPair, Float[Array, ""]]:
+        """Return the pair at a `share` of the range, and its own unit of ε (rad)."""
+        moved = jax.tree.map(lambda change: share * change, self.change)
+        scene, design = eqx.apply_updates(self.low, moved)
+        pair = scene.pair(design)
+        return eqx.tree_at(lambda p: p.angle_scale, pair, self.unit), pair.angle_scale
+
+
+class OrbitFamily:
+    """Orbits of k mesh periods over a parameter, as a `SolutionCurve`.
+
+    The unknowns (n + 1,) are the scaled state at φ1 = 0 divided by `SPAN`, then the parameter as a
+    fraction of its range. `config` of the first orbit; `key`: dotted key of the parameter, such as
+    `scene.speed_rpm`; `period`: k; `limits`: range of the parameter (config's unit) and step sizes.
+    The attribute `share` is the config's own place in the range; `periods` are all periods that an
+    orbit of this config can have.
+
+    Raises `InputError` for an unknown key, a value that the config cannot have, a key on which
+    scene and design do not depend linearly, and a config whose orbits collocation does not close.
+    """
+
+    def __init__(self, config: Config, key: str, period: int, limits: StepSizes):
+        self.config, self.key, self.period, self.limits = config, key, period, limits
+        scene = Scene.from_config(config)
+        # Defaults that follow other keys stay as they are.
+        resolved, values = parse(config.to_yaml()), np.linspace(limits.low, limits.high, 3)
+        moved = [resolved.replaced({key: float(value)}) for value in values]
+        ends = [(scene.renewed(one), design_vector(one)) for one in (config, *moved)]
+        (own, _), (low, tree), (middle, _), (high, _) = (
+            # The numbers as a vector, and the function that undoes this.
+            ravel_pytree(eqx.filter(end, eqx.is_inexact_array))
+            for end in ends
+        )
+        change = high - low if own.shape == low.shape == high.shape else jnp.zeros(1)
+        most = np.nanargmax(np.abs(change))
+        if not change[most] or not np.allclose(
+            2 * middle, low + high, rtol=1e-9, atol=0, equal_nan=True
+        ):
+            raise InputError(
+                f"`{key}` must be a number on which scene or design depend linearly, but is not; "
+                "give a key such as `scene.speed_rpm`, `scene.load.torque_N_m`, "
+                "`scene.timing_gear.backlash_mm`, or that of a design parameter"
+            )
+        pair = _pair(scene, design_vector(config))
+        if not pair.smooth:
+            raise InputError(
+                f"Contact {type(pair.contact).__name__} must be `smooth` between events for orbits "
+                "to be followed, but is not; give its `switches`"
+            )
+        self.share = float((own - low)[most] / change[most])
+        self.periods = range(pair.repeats, pair.whole(LONGEST) + 1, pair.repeats)
+        # A number that the scene sets later is NaN here.
+        self.range = _Range(ends[1], tree(jnp.nan_to_num(change)), pair.angle_scale)
+
+    @property
+    def halves(self) -> bool:
+        """Whether orbits of half the period can exist."""
+        return self.period % (2 * self.periods.step) == 0
+
+    def value(self, share: Any) -> float:
+        """Return the parameter's value (config's unit) at a `share` of its range."""
+        return float(self.limits.low * (1 - share) + self.limits.high * share)
+
+    def __call__(self, guess: NDArray[np.float64], across: NDArray[np.float64], near: Spot) -> Spot:
+        """Return the orbit whose unknowns lie in the plane through `guess` normal to `across`.
+
+        `near`: an orbit of the curve. Raises `StoppedError` if no orbit is found from there."""
+        made, away = near.data.made, guess - near.place
+        start = made.known, made.line.motion, np.asarray(away @ made.line.tangent)
+        try:
+            guess = self._closed(start, guess, across).place
+        except StoppedError as stop:
+            if stop.end is not End.STEP_TOO_SMALL:
+                raise
+        # Next to a grazing contact, the neighbour's events may not be those of this orbit. From a
+        # neighbour alone, a short touch was overlooked: a multiplier was -1.06 instead of -0.99.
+        return self.from_integration(guess, across)
+
+    def from_integration(self, guess: NDArray[np.float64], across: NDArray[np.float64]) -> Spot:
+        """Return the orbit in a plane, as a call does, from an integration that begins at
+        `guess`."""
+        return self._closed(_seed(self.range, guess, self.period), guess, across)
+
+    def _closed(self, start: Any, guess: NDArray[np.float64], across: ArrayLike) -> Spot:
+        """Return the orbit in a plane; `start`: known motion, as for `bordered.followed`."""
+        made, checks = jax.device_get(_follow(self.range, start, guess, across))
+        half_way, unit, lost, sound = checks
+        scene, line, known = self.range.low[0], made.line, made.known
+        if not sound:
+            raise StoppedError(End.NO_GEOMETRY)
+        if not (known.sound and known.error <= ACCURACY * UNREFINED * scene.solver.orbit.rtol):
+            raise StoppedError(End.STEP_TOO_SMALL)
+        if lost:
+            raise StoppedError(End.LOST_MESH)
+        if made.orbit.depth > TOO_DEEP * scene.pitch_radius:
+            raise StoppedError(End.TOO_DEEP)
+        if self.halves and half_way < _HALF_ALIKE:
+            raise StoppedError(End.HALVED)
+        state, monodromy = np.asarray(made.orbit.state), np.asarray(line.monodromy)
+        mean, square, peak = map(float, made.orbit.response[:3])
+        opened = np.column_stack([monodromy - np.eye(len(state)), line.by_share])
+        point = BranchPoint(
+            value=self.value(line.share),
+            state=state * float(self.range.unit / unit),
+            period=self.period,
+            mean=mean,
+            peak=peak,
+            rms=square**0.5,
+            multipliers=np.linalg.eigvals(monodromy).astype(complex),
+            residual=float(line.residual / max(1.0, np.max(np.abs(state)))),
+            half_way=float(half_way),
+            made=made,
+        )
+        orientation = float(np.sign(np.linalg.det(np.vstack([opened, line.inner]))))
+        place = np.append(state / SPAN, line.share)
+        return Spot(place, np.asarray(line.tangent), orientation, point)
+
+
+_pair = CachedFunction(Scene.pair)
+
+
+@CachedFunction
+def _seed(over: _Range, guess: Float[Array, " m"], period: int):
+    """Return the motion of `period` mesh periods that begins at the place `guess` (m,).
+
+    It is in the form from which `_follow` starts."""
+    pair, _ = over.at(guess[-1])
+    out = strobe(pair, SPAN * guess[:-1], period, over.low[0].solver.orbit, PIECES)
+    assert out.pieces is not None
+    known = from_pieces(pair, out.pieces, jnp.asarray(period), period)
+    return known, Line.empty(known.elements, guess[-1]).motion, jnp.zeros(())
+
+
+@CachedFunction
+def _follow(over: _Range, start: Any, guess: Float[Array, " m"], across: Float[Array, " m"]):
+    """Return the orbit whose place lies in the plane through `guess` (m,) normal to `across` (m,).
+
+    `start`: motion to start from, direction of the curve there, and distance to go along it. The
+    second result is a tuple: `BranchPoint.half_way`; the pair's own unit of ε (rad); whether the
+    rotors no longer run as a pair; whether the profiles at the guess and at the orbit are sound."""
+    solver, one = over.low[0].solver, jnp.ones(1)
+    made = followed(
+        lambda share: along(over.at, share, one)[:2],
+        solver.measures,
+        start,
+        Plane(guess, across, jnp.asarray(SPAN)),
+        ACCURACY * solver.orbit.tolerance,
+    )
+    (pair, unit), motion = over.at(made.line.share), made.known.elements
+    states = motion.motion(motion.mesh.period * jnp.arange(_LOOKS) / _LOOKS)
+    half_way = jnp.max(jnp.abs(states[_LOOKS // 2] - made.orbit.state)) / SPAN
+    sound = pair.sound & over.at(guess[-1])[0].sound
+    return made, (half_way, unit, jnp.any(jax.vmap(pair.lost)(states)), sound)
+
 
 # Distance (unit of `StepSizes`) below which the states at the start and the middle of an orbit
 # count as equal. A branch whose steps have become too small there ends at an orbit of half the

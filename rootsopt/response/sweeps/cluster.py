@@ -24,10 +24,10 @@ import numpy as np
 
 from rootsopt.config import Config
 from rootsopt.config.families import import_named
-from rootsopt.config.words import shown
+from rootsopt.config.units import shown
 from rootsopt.errors import InputError
 from rootsopt.response.evaluation import Evaluation
-from rootsopt.response.many import HERE, Point, Runs
+from rootsopt.response.reducers import HERE, Point, Runs
 from rootsopt.response.sweeps.points import Numbered, Row, at_once, lost
 from rootsopt.runtime import environment, programs
 from rootsopt.runtime.environment import versions

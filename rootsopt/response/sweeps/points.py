@@ -15,10 +15,10 @@ from rootsopt.config import Config
 from rootsopt.config.families import families, family_of, find_installed, parameters
 from rootsopt.config.section import bare
 from rootsopt.config.sources import FILES
-from rootsopt.config.words import sentence
+from rootsopt.config.units import sentence
 from rootsopt.errors import InputError
 from rootsopt.response.evaluation import Evaluation, Evaluator
-from rootsopt.response.many import HERE
+from rootsopt.response.reducers import HERE
 from rootsopt.response.together import evaluate_together, pays
 from rootsopt.scene import check_geometry
 from rootsopt.status import Status

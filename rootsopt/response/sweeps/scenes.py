@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from rootsopt.config import Config
 from rootsopt.config.sources import FILES
 from rootsopt.response.journal import Journal, header_of
-from rootsopt.response.many import HERE, as_done
+from rootsopt.response.reducers import HERE, as_done
 from rootsopt.response.sweeps.cluster import ClosedError, running
 from rootsopt.response.sweeps.plan import Plan, check_values, plan_of
 from rootsopt.response.sweeps.points import InProcess, Row, check_row, prepared

@@ -43,7 +43,7 @@ def chosen(text: str) -> tuple[str, ...]:
                 f"has {name!r}; remove it"
             )
     if set(names) & set(SOLID):
-        from rootsopt.view.figures.solid import require_kernel
+        from rootsopt.view.figures.cad import require_kernel
 
         require_kernel()
     return tuple(name for name in FORMATS if name in names)

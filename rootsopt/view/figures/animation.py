@@ -17,10 +17,10 @@ from PIL import Image
 from rootsopt.profiles import Profile, place_pair
 from rootsopt.response.records import Series
 from rootsopt.runtime.programs import CachedFunction
+from rootsopt.view.figures.designs import draw_rotor
 from rootsopt.view.figures.drawing import Drawing
 from rootsopt.view.figures.force import plot_flank_force
 from rootsopt.view.figures.pieces import polyline
-from rootsopt.view.figures.profiles import draw_rotor
 from rootsopt.view.figures.style import BLUE, ORANGE, SKY, VERMILION, beside, figure
 
 _MM = 1e3

@@ -11,16 +11,17 @@ from rootsopt.config.families import is_list
 from rootsopt.measured.conjugacy import conjugacy, gaps_um
 from rootsopt.response.evaluation import Evaluation
 from rootsopt.scene import design_keys, outline_mm
-from rootsopt.view.figures.force import plot_force, plot_gap, plot_spectrum
-from rootsopt.view.figures.history import plot_feasible, plot_history
-from rootsopt.view.figures.profiles import (
+from rootsopt.view.figures.designs import (
     plot_conjugacy,
     plot_departure,
+    plot_feasible,
     plot_flank,
     plot_forces_together,
+    plot_history,
     plot_meshing,
     plot_profiles,
 )
+from rootsopt.view.figures.force import plot_force, plot_gap, plot_spectrum
 from rootsopt.view.figures.style import figure, write
 from rootsopt.view.files import ResultFolder
 

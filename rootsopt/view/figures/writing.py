@@ -10,9 +10,9 @@ from rootsopt.config import Config
 from rootsopt.response.evaluation import Evaluation
 from rootsopt.response.records import Series
 from rootsopt.scene import Scene
-from rootsopt.view.figures import SOLID, solid
+from rootsopt.view.figures import SOLID, cad
+from rootsopt.view.figures.cad import dxf_bytes
 from rootsopt.view.figures.drawing import Drawing, coordinates, svg_text
-from rootsopt.view.figures.dxf import dxf_bytes
 from rootsopt.view.files import ResultFolder
 
 POINTS = "rotor_points.csv"
@@ -78,12 +78,12 @@ def _solids(drawing, formats, place) -> dict[str, bytes]:
     `place`: folder for temporary files. The solid of each shape is made only once."""
     body = drawing.length, drawing.bore, math.radians(drawing.helix_deg)
     shapes = {
-        "rotor": solid.rotor(drawing.pieces, *body),
-        "pair": solid.pair(drawing.pieces, drawing.lobes, 2 * drawing.pitch_radius, *body),
+        "rotor": cad.rotor(drawing.pieces, *body),
+        "pair": cad.pair(drawing.pieces, drawing.lobes, 2 * drawing.pitch_radius, *body),
     }
     make = {
-        "step": solid.step_bytes,
-        "stl": lambda shape: solid.stl_bytes(shape, place),
+        "step": cad.step_bytes,
+        "stl": lambda shape: cad.stl_bytes(shape, place),
     }
     return {
         f"{name}.{suffix}": make[suffix](shape)

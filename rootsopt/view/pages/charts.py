@@ -17,7 +17,7 @@ from rootsopt.profiles import Profile, outline
 from rootsopt.response.records import Series
 from rootsopt.scene import Scene
 from rootsopt.view.figures.animation import Contacts, frames_of
-from rootsopt.view.figures.front import kinds
+from rootsopt.view.figures.comparisons import kinds
 from rootsopt.view.figures.style import BLUE, COLORS, GREY, ORANGE, VERMILION
 from rootsopt.view.names import in_words, label, value
 from rootsopt.view.pages.gather import Case

@@ -2,18 +2,23 @@
 
 import csv
 import dataclasses
+import functools
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup, escape
 
 from rootsopt.config import Config, load
+from rootsopt.config.families import family_of
 from rootsopt.response.records import Series
-from rootsopt.view.ending import Ending, ending
 from rootsopt.view.files import ResultFolder, design_file
-from rootsopt.view.tables import NAMES, records_of
+from rootsopt.view.names import brief, in_words, listed, name_and_unit, quantity, stated
+from rootsopt.view.tables import NAMES, records_of, varied
+from rootsopt.view.terminal import Ending, ending
 
 # Columns of `response_*.csv`, by field of `Series`.
 _COLUMNS = {
@@ -145,3 +150,180 @@ def _series(place: Path, name: str) -> Series | None:
     values = {field: table[:, heads.index(column)] for field, column in _COLUMNS.items()}
     values["rotation"] = np.radians(values["rotation"])
     return Series(**values, depth=np.full(len(table), np.nan))
+
+
+_ASKED = {
+    "optimize": "Find the design with the lowest objective, and compare it with the baseline.",
+    "improve": "Find a better rotor than that of a file, in its place.",
+    "simulate": "Simulate one design in one scene: steady state, contact force, gradient.",
+    "pareto": "Trace the best compromises between two or three quantities.",
+    "sweep": "Simulate one design in many scenes.",
+    "attractors": "Find the coexisting motions of a scene.",
+    "identify": "Fit quantities of a scene to a measured record.",
+    "profile": "Compute the geometry of one design.",
+}
+_TITLES = {
+    "optimize": "Optimisation of {pair}",
+    "improve": "A better rotor: {pair}",
+    "simulate": "Simulation of {pair}",
+    "pareto": "Best compromises for {pair}",
+    "sweep": "Sweep of {pair}",
+    "attractors": "Coexisting motions of {pair}",
+    "identify": "What a record tells of {pair}",
+    "profile": "Geometry of {pair}",
+}
+
+# Number of design parameters above which sentences do not list them.
+_FEW = 6
+
+
+def title(run: "Run") -> str:
+    """Return the title of the report."""
+    pattern = _TITLES.get(run.command, "{pair}")
+    return pattern.format(pair=_pair(run.config)).strip()
+
+
+def asked(run: "Run") -> list[str]:
+    """Return sentences on the task of the run."""
+    sentences = [_ASKED.get(run.command, f"Run the command {run.command}."), scene(run.config)]
+    sentences += (run.result.get("improve") or {}).get("found", [])
+    if run.command in ("optimize", "improve"):
+        sentences.append(_objective(run.config))
+        keys = [one.key for one in run.config.scatters]
+        if keys:
+            shown = listed(keys) if len(keys) <= _FEW else f"{len(keys)} numbers"
+            sentences.append(f"The design should be best while these scatter: {shown}.")
+    sentences += [f"{note}." for note in run.result.get("notes", ())]
+    if run.rows:
+        sentences.append(_over(run.rows))
+    aims = run.result.get("terms")
+    if run.command == "pareto" and aims:
+        words = [f"{name_and_unit(aim['name'])[0]} ({_sense(aim['sense'])})" for aim in aims]
+        sentences.append(f"The quantities are {listed(words)}.")
+    return sentences
+
+
+def _over(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return a sentence on the values that differ between the scenes of a sweep."""
+    parts = []
+    for key in varied(rows):
+        name = name_and_unit(key)[0]
+        found: list[Any] = [*dict.fromkeys(row.get(key) for row in rows)]
+        shown = f"{len(found)} values"
+        if len(found) <= _FEW:
+            shown = listed([stated(key, x) for x in found])
+        elif all(isinstance(x, int | float) for x in found):
+            shown += f" from {brief(min(found))} to {stated(key, max(found))}"
+        parts.append(f"{name}: {shown}")
+    return f"Between the scenes, these differ: {'; '.join(parts)}."
+
+
+def scene(config: Config) -> str:
+    """Return one sentence that describes the scene of a config."""
+    data = config.scene
+    speed = f"at {brief(data.speed_rpm)} rpm"
+    load = data.load
+    if load.torque_N_m is not None:
+        under = f"under a load of {brief(load.torque_N_m)} N·m on rotor 2"
+    else:
+        under = f"under a pressure difference of {quantity(load.pressure_difference_Pa, 'Pa')}"
+    gear, away = data.timing_gear, data.center_distance_error_mm
+    parts = (
+        gear and f"a timing gear with {brief(gear.backlash_mm)} mm backlash",
+        gear and gear.errs and "errors of the gear over a turn",
+        data.motor and "a motor whose speed falls under load",
+        config.rotor.helix_deg and f"rotors twisted by {quantity(config.rotor.helix_deg, '°')}",
+        config.contact.friction and "friction between the flanks",
+        data.supports and "elastic bearings",
+        config.contact.clearance_mm and f"{brief(config.contact.clearance_mm)} mm clearance",
+        away and f"a centre distance error of {brief(away)} mm",
+        data.phase_error_mrad and f"a phase error of {brief(data.phase_error_mrad)} mrad",
+    )
+    present = [str(part) for part in parts if part]
+    tail = f", with {listed(present)}" if present else ""
+    tail += "" if gear is not None else ", without a timing gear"
+    return f"The scene is {_pair(config)}, {speed} {under}{tail}."
+
+
+def _objective(config: Config) -> str:
+    weights = config.objective
+    shares = {
+        "mean force": weights.mean_weight,
+        "peak force": weights.peak_weight,
+        "RMS force": weights.rms_weight,
+    }
+    shares |= {f"line {order:g}": x for order, x in weights.line_weights.items()}
+    shares |= {name_and_unit(name)[0]: x for name, x in weights.terms.items()}
+    total = sum(shares.values()) or 1.0
+    words = [f"{100 * x / total:.3g} % {name}" for name, x in shares.items() if x]
+    speeds = weights.speeds_rpm
+    over = ""
+    if speeds:
+        over = f", over the speeds {listed([*map(brief, speeds)])} rpm"
+    return f"The objective is {listed(words)}, each relative to the baseline{over}."
+
+
+def _pair(config: Config) -> str:
+    profile = config.profile
+    name = "measured" if profile.from_file else in_words(profile.family)
+    if family_of(profile.family).maker is not None and len(name) <= 3:
+        name = name.upper()
+    radius = brief(profile.pitch_radius_mm)
+    article = "an" if name[0] in "aeioAEIO" else "a"
+    return f"{article} {name} rotor pair with {profile.lobes} lobes, pitch radius {radius} mm"
+
+
+def _sense(word: str) -> str:
+    return {"min": "as low as possible", "max": "as high as possible"}.get(word, word)
+
+
+_PACKAGE = Path(__file__).parents[1]
+
+# The page of the glossary: in an installed package, and in the source tree.
+_PLACES = _PACKAGE / "glossary.md", _PACKAGE.parent / "docs" / "glossary.md"
+
+# Ending of a common word that is linked only where it is the label of a margin.
+_MARGIN = " (margin)"
+
+
+@functools.cache
+def glossary() -> dict[str, str]:
+    """Return the meaning of each word, in the order of the page."""
+    page = next(path for path in _PLACES if path.exists()).read_text("utf-8")
+    found = re.findall(r"^(\S.*)\n((?:  .+\n)+)", page.partition("{glossary}\n")[2], re.M)
+    return {word: " ".join(meaning.split()) for word, meaning in found}
+
+
+def anchor(word: str) -> str:
+    """Return the identifier of a word's entry in a report."""
+    return "word-" + re.sub(r"\W+", "-", word).strip("-").lower()
+
+
+@functools.cache
+def _pattern() -> re.Pattern[str]:
+    """Return a pattern of tags, which are skipped, labels of margins (1) and other words (2)."""
+    words = sorted(map(re.escape, glossary()), key=len, reverse=True)
+    end = re.escape(_MARGIN)
+    margins = "|".join(word.removesuffix(end) for word in words if word.endswith(end))
+    others = "|".join(word for word in words if not word.endswith(end))
+    return re.compile(
+        rf"<code>.*?</code>|<[^>]*>|(?<=>)({margins})(?= \(|<)|"
+        rf"(?<![\w.-])({others})(?![\w-]|\.\w)",
+        re.IGNORECASE | re.DOTALL,
+    )
+
+
+def linked(html: str) -> Markup:
+    """Return HTML in which the first mention of each word of the glossary leads to its meaning."""
+    words = {word.lower(): word for word in glossary()}
+    told = set()
+
+    def link(found: re.Match[str]) -> str:
+        key = f"{found[1]}{_MARGIN}".lower() if found[1] else (found[2] or "").lower()
+        if key in told or key not in words:
+            return found[0]
+        told.add(key)
+        where, meaning = anchor(key), escape(glossary()[words[key]])
+        return f'<a class="term" href="#{where}" title="{meaning}">{found[0]}</a>'
+
+    return Markup(_pattern().sub(link, str(html)))

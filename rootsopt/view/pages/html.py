@@ -3,29 +3,40 @@
 The pages are Jinja2 templates, and Bokeh's script is part of them. Everything that comes from a
 config or a result is escaped."""
 
-# pyright: reportArgumentType=false
-# (Bokeh takes any text for the identifier of an element.)
-
 import base64
+import dataclasses
 import datetime
 import functools
+import html
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jinja2
+import numpy as np
 from bokeh.embed import json_item
+from bokeh.models import ColumnDataSource, DataRange1d, Range1d, Span
 from bokeh.resources import Resources
 from markupsafe import Markup, escape
+from numpy.typing import NDArray
 
 import rootsopt
+from rootsopt.config import Config
+from rootsopt.response.evaluation import RESPONSES, Evaluation, Series
+from rootsopt.status import Status
 from rootsopt.view import tables
-from rootsopt.view.names import Table, in_words
-from rootsopt.view.pages import charts, words
-from rootsopt.view.pages.charts import animations
-from rootsopt.view.pages.gather import Run
-from rootsopt.view.pages.words import anchor, glossary, linked
+from rootsopt.view.figures.style import BLUE, GREY, SKY, VERMILION
+from rootsopt.view.names import Table, brief, in_words, name_and_unit, percent
+from rootsopt.view.pages import charts, gather
+from rootsopt.view.pages.charts import animations, chart, hover
+from rootsopt.view.pages.gather import Run, anchor, glossary, linked
+from rootsopt.view.pages.knobs import Knob, Shape
+from rootsopt.view.pages.session import FromRest, NewMotion, Progress, Searched
+
+if TYPE_CHECKING:
+    from rootsopt.optimize.outcome import Optimization
+
 
 TEMPLATE = Path(__file__).with_name("report")
 """Folder of the templates, styles and scripts."""
@@ -122,14 +133,14 @@ def report_text(run: Run) -> str:
         "page.html.j2",
         [chart for *_, chart in drawn],
         {"animation": animation},
-        title=words.title(run),
+        title=gather.title(run),
         run=run,
         command_line=f"rootsopt {run.command} {run.source}",
         version=rootsopt.__version__,
         day=datetime.date.today().isoformat(),
         status=status,
         good=run.usable and status.good is not False,
-        asked=words.asked(run),
+        asked=gather.asked(run),
         end=run.end,
         conflict=tables.conflict_table(run.result),
         sections=tables.sections(run.result, run.rows),
@@ -161,3 +172,224 @@ def _charts(run: Run) -> list[tuple[str, str, Any]]:
     )
     found.append(force)
     return [one for one in found if one[2] is not None]
+
+
+# The models of Bokeh accept more than their annotations say.
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+
+
+class ProfilePicture:
+    """The outline of a rotor over the one at the start."""
+
+    def __init__(self) -> None:
+        ranges = [DataRange1d(range_padding=0.03) for _ in range(2)]
+        self.figure = chart(
+            "x (mm)", "y (mm)", 285, tools="", toolbar_location=None, match_aspect=True,
+            x_range=ranges[0], y_range=ranges[1], title="Profile, start dashed",
+        )  # fmt: skip
+        empty: dict[str, list[float]] = {"x": [], "y": []}
+        self.now = ColumnDataSource(empty, name="outline_now")
+        self.before, self.pitch = ColumnDataSource(empty), ColumnDataSource(empty)
+        self.ends = ColumnDataSource({"x": [-1.0, 1.0], "y": [-1.0, 1.0]})
+        self._reach = self._radius = 0.0
+        line = {"line_color": "#111111", "line_width": 1.5}
+        self.figure.patch("x", "y", source=self.now, fill_color=SKY, fill_alpha=0.35, **line)
+        dashes = {"line_dash": [5, 3], "line_width": 1.2}
+        self.figure.line("x", "y", source=self.before, line_color=VERMILION, **dashes)
+        self.figure.line("x", "y", source=self.pitch, line_color=GREY, line_dash=[2, 3])
+        frame = self.figure.scatter("x", "y", source=self.ends, alpha=0)
+        for one in ranges:
+            one.renderers = [frame]
+
+    def draw(self, shape: Shape) -> None:
+        """Draw the outline of a shape with its pitch circle. The first one is that of the start."""
+        outer, radius = shape.pair["rotor"]["outer"], shape.pair["rotor"]["pitch"]
+        if not 0.7 * self._reach < outer <= self._reach:  # Small changes do not move the axes.
+            self._reach = 1.08 * outer
+            self.ends.data = {"x": [-self._reach, self._reach], "y": [-self._reach, self._reach]}
+        self.now.data = _points(shape.outline)
+        if not len(self.before.data["x"]):
+            self.before.data = _points(shape.outline)
+        if radius != self._radius:
+            self._radius = radius
+            turn = np.linspace(0, 2 * np.pi, 181)
+            self.pitch.data = _points(radius * np.stack([np.cos(turn), np.sin(turn)], -1))
+
+
+def _points(outline: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+    return {"x": outline[:, 0], "y": outline[:, 1]}
+
+
+class ForcePicture:
+    """The contact force over time, over that at the start."""
+
+    def __init__(self) -> None:
+        self.figure = chart(
+            "time (ms)", "contact force (N)", 265, tools="xpan,xwheel_zoom,reset",
+            x_range=Range1d(0, 1), y_range=Range1d(0, 1), title="Contact force over time",
+        )  # fmt: skip
+        empty: dict[str, list[float]] = {"time": [], "drive": [], "coast": [], "total": []}
+        self.now = ColumnDataSource(empty, name="force_now")
+        self.before = ColumnDataSource(empty)
+        for name, color in (("drive", BLUE), ("coast", VERMILION)):
+            style = {"line_color": color, "line_width": 1.8, "legend_label": f"{name} flank"}
+            line = self.figure.line("time", name, source=self.now, **style)
+            if name == "drive":
+                fields = {"time": "@time{0.00} ms"}
+                fields |= {side: f"@{side}{{0.0}} N" for side in ("drive", "coast")}
+                hover(self.figure, [line], fields, mode="vline")
+        style = {"line_color": GREY, "line_width": 1.2, "line_dash": [5, 3]}
+        self.figure.line("time", "total", source=self.before, level="underlay",
+                         legend_label="at start, both flanks", **style)  # fmt: skip
+        self.mean = Span(location=0, dimension="width", line_color="#111111", line_dash=[2, 3])
+        self.cursor = Span(location=0, dimension="height", line_color="#8a9aa5", name="cursor",
+                           syncable=False)  # fmt: skip
+        for span in (self.mean, self.cursor):
+            span.visible = False
+            self.figure.add_layout(span)
+
+    def draw(self, series: Series, response: Mapping[str, float], start: bool) -> None:
+        """Draw the forces of a motion, and their mean (dotted); `start`: that of the start."""
+        time = 1e3 * (series.time - series.time[0])
+        data = {"time": time, "drive": series.drive_force, "coast": series.coast_force,
+                "total": series.force}  # fmt: skip
+        if start:
+            self.before.data = data
+        self.now.data = data
+        shown = [source.data for source in (self.now, self.before) if len(source.data["time"])]
+        self.figure.x_range.end = max(float(one["time"][-1]) for one in shown)
+        self.figure.y_range.end = 1.06 * max(float(np.max(one["total"])) for one in shown) or 1.0
+        mean = response.get("mean_force_N")
+        self.mean.location = 0.0 if mean is None else mean
+        self.mean.visible, self.cursor.visible = mean is not None, True
+        self.figure.title.text = "Contact force over time (dotted: mean)"
+
+    def clear(self, words: str) -> None:
+        """Remove the forces; `words`: why there are none."""
+        self.now.data = {name: [] for name in self.now.data}
+        self.mean.visible = self.cursor.visible = False
+        self.figure.title.text = f"Contact force over time: {words}"
+
+
+# Numbers of the kind of motion that the page has room for.
+_STEADY = "period", "floquet_multiplier", "lyapunov_exponent_per_mesh_period"
+
+
+def numbers_table(now: Mapping[str, Any], first: Mapping[str, Any]) -> str:
+    """Return the table of forces, geometry and kind of motion, at the start and now.
+
+    `now`, `first`: records as in the result file, perhaps without some entries: their numbers are
+    dashes."""
+    found = tables.numbers_table({"baseline": _shown(first), "optimized": _shown(now)})
+    heads = "", "at start", "now", "change"
+    return table_html(found and dataclasses.replace(found, title="Numbers", heads=heads))
+
+
+def _shown(record: Mapping[str, Any]) -> dict[str, Any]:
+    steady = {key: record.get("steady_state", {}).get(key) for key in _STEADY}
+    shown = {key: record[key] for key in ("geometry", "response", "status") if key in record}
+    return {"design": {}, "steady_state": {key: x for key, x in steady.items() if x}} | shown
+
+
+def gradient_table(config: Config, evaluation: Evaluation | None) -> str:
+    """Return the table of the derivatives of the forces, per unit of each design parameter."""
+    if not config.design_keys:
+        words = f"The family {html.escape(config.profile.family)} has no design parameters."
+        return f'<p><b>Gradient</b></p><p class="note">{words}</p>'
+    unknown = dict.fromkeys(config.design_keys)
+    gradient = {name: unknown for name in RESPONSES}
+    if evaluation is not None and evaluation.gradient:
+        gradient = evaluation.gradient
+    return table_html(next(tables.gradient_tables({"design": unknown, "gradient": gradient})))
+
+
+def status_line(word: str, kind: str, words: str, note: str = "") -> str:
+    """Return the line with a status: its `word`, `kind` (good, bad, wait), advice and a note."""
+    text = f'<span class="word {kind}">{html.escape(word)}</span><span>{html.escape(words)}</span>'
+    if note:
+        text += f'<span class="note">{html.escape(note)}</span>'
+    return f'<div class="status">{text}</div>'
+
+
+def notes_lines(notes: Iterable[str]) -> str:
+    """Return the `notes` on values that are not usual, one to a line."""
+    return "".join(f'<div class="note">{html.escape(note)}</div>' for note in notes)
+
+
+def motion_line(motion: NewMotion, rest: FromRest | None) -> str:
+    """Return the status of a motion, with whether it is the one that starts at rest.
+
+    `rest`: what is known of the motion from rest; `None`: nothing yet."""
+    found = motion.evaluation
+    if not motion.final:
+        words = "Near the motion of the last values, no steady motion was found."
+        return status_line("searching", "wait", words, "Simulating from rest …")
+    if not motion.near:
+        note = "Reached from rest."
+    elif rest is None:
+        note = "Reached from the motion of the last values; from rest: being computed."
+    elif rest.same:
+        note = "Reached from the motion of the last values; from rest, the motion is the same."
+    else:
+        note = f"From rest, another motion is reached: {_summary(rest.evaluation)}."
+    kind = "good" if found.usable else "bad"
+    words = found.message
+    if not found.usable and found.response and found.status is not Status.IDLE:
+        words += " The numbers below are those of this motion, without a gradient."
+    return status_line(in_words(found.status.label), kind, words, note)
+
+
+def _summary(evaluation: Evaluation) -> str:
+    mean, peak = (evaluation.response.get(key) for key in ("mean_force_N", "peak_force_N"))
+    word = in_words(evaluation.status.label)
+    if mean is None or peak is None:
+        return word
+    return f"{word}, mean {brief(mean, 4)} N, peak {brief(peak, 4)} N"
+
+
+def progress_line(progress: Progress | None, cancelled: bool) -> str:
+    """Return the state of a search that is running."""
+    if cancelled:
+        return status_line("stopping", "wait", "Checking the best design found so far …")
+    if progress is None:
+        return status_line("optimising", "wait", "Simulating the baseline …")
+    best = f"; best objective {progress.best:.4f}" if progress.best == progress.best else ""
+    words = f"{progress.done} of at most {progress.expected} designs simulated{best}."
+    return status_line("optimising", "wait", words)
+
+
+def searched_line(ended: Searched) -> str:
+    """Return the outcome of a search: improvement and certificate."""
+    found = ended.found
+    if found is None:
+        return status_line("not optimised", "bad", ended.words)
+    word = in_words(found.status.label)
+    if found.optimized is None:
+        reason = found.status.value if found.infeasible is None else found.infeasible.message
+        return status_line(word, "bad", reason)
+    if found.status is Status.PERIODIC:
+        word = "optimum"
+    return status_line(word, "good", _improved(found), _certified(found))
+
+
+def _improved(found: "Optimization") -> str:
+    """Return how much the optimum is below the design at which the search began."""
+    gains = found.improvement.items()
+    changes = (f"{name_and_unit(key)[0]} {percent(1, 1 - gain)}" for key, gain in gains)
+    return f"Against the start of the search: {', '.join(changes)}."
+
+
+def _certified(found: "Optimization") -> str:
+    """Return the certificate of an optimum: first-order conditions, and the limits that hold it."""
+    if found.optimality is None:
+        return "Without a certificate."
+    held = [in_words(row["name"]) for row in found.constraints if row.get("active")]
+    limits = f" Limits that hold it: {', '.join(held)}." if held else ""
+    return found.optimality.record()["message"] + limits
+
+
+def knob_label(knob: Knob) -> str:
+    """Return the label of a knob: name and unit, with its meaning as a tooltip."""
+    tip = f"{knob.key}: {knob.help}" if knob.help else knob.key
+    unit = f' <span class="unit">({html.escape(knob.unit)})</span>' if knob.unit else ""
+    return f'<div class="label" title="{html.escape(tip)}">{html.escape(knob.name)}{unit}</div>'

@@ -16,11 +16,11 @@ from bokeh.document import Document
 from bokeh.models import Button, CustomJS, Div, NumericInput, Row, Slider
 from bokeh.models.layouts import Column, LayoutDOM
 
-from rootsopt.view.pages import shown
+from rootsopt.view.pages import html
 from rootsopt.view.pages.charts import THEME
-from rootsopt.view.pages.engine import Engine, cut
 from rootsopt.view.pages.html import TEMPLATE as PAGES
-from rootsopt.view.pages.knobs import Knob, knobs_of
+from rootsopt.view.pages.html import ForcePicture, ProfilePicture
+from rootsopt.view.pages.knobs import Engine, Knob, cut, knobs_of
 from rootsopt.view.pages.session import (
     FromRest,
     Message,
@@ -32,7 +32,6 @@ from rootsopt.view.pages.session import (
     Searched,
     Session,
 )
-from rootsopt.view.pages.shown import ForcePicture, ProfilePicture
 
 _TEMPLATE = Path(__file__).with_name("explore")
 
@@ -151,7 +150,7 @@ class Page:
             pair=_file("pair.html", PAGES),
             script=_file("pair.js", PAGES),
         )
-        self.status.text = shown.status_line("preparing", "wait", "Computing the first profile …")
+        self.status.text = html.status_line("preparing", "wait", "Computing the first profile …")
         self._show_numbers()
 
     def _buttons(self) -> Row:
@@ -197,7 +196,7 @@ class Page:
             one.js_on_change("value", keep)
         field.on_change("value", functools.partial(self._moved, knob.key))
         self.sliders[knob.key], self.fields[knob.key] = slider, field
-        label = text(shown.knob_label(knob), width=132, sizing_mode=None, align="center")
+        label = text(html.knob_label(knob), width=132, sizing_mode=None, align="center")
         return Row(label, slider, field, sizing_mode="stretch_width", margin=(0, 0, 1, 0))
 
     # What the user does
@@ -220,14 +219,14 @@ class Page:
 
     def _optimize(self) -> None:
         self.progress, self.cancelled = None, False
-        self.search.text = shown.progress_line(None, False)
+        self.search.text = html.progress_line(None, False)
         self.search.visible = True
         self._lock(True)
         self.session.optimize()
 
     def _cancel(self) -> None:
         self.cancelled = True
-        self.search.text = shown.progress_line(self.progress, True)
+        self.search.text = html.progress_line(self.progress, True)
         self.session.cancel()
 
     def _lock(self, locked: bool) -> None:
@@ -254,10 +253,10 @@ class Page:
             case Progress():
                 self.progress = message
                 if not self.cancelled:
-                    self.search.text = shown.progress_line(message, False)
+                    self.search.text = html.progress_line(message, False)
             case Searched():
                 self._lock(False)
-                self.search.text = shown.searched_line(message)
+                self.search.text = html.searched_line(message)
                 if message.values:
                     self._set(dict(message.values))
             case Saved():
@@ -273,7 +272,7 @@ class Page:
                 self.rest = message
                 self.from_rest.disabled = message.same
                 if self.motion is not None and self.motion.number == message.number:
-                    self.status.text = shown.motion_line(self.motion, message)
+                    self.status.text = html.motion_line(self.motion, message)
 
     def _take_problem(self, problem: Problem) -> None:
         self.problem, self.motion, self.rest = problem, None, None
@@ -284,12 +283,12 @@ class Page:
         self.notes.text = ""
         self.force.clear("no motion")
         self._show_numbers()
-        self.status.text = shown.status_line("not valid", "bad", problem.words)
+        self.status.text = html.status_line("not valid", "bad", problem.words)
         self.mark.text = f"problem {problem.number}"
 
     def _take_shape(self, message: NewShape) -> None:
         self.shape, self.problem = message, None
-        self.notes.text = shown.notes_lines(message.notes)
+        self.notes.text = html.notes_lines(message.notes)
         self.start.setdefault("geometry", message.shape.record)
         fade([self.profile.figure], False)
         self.profile.draw(message.shape)
@@ -314,7 +313,7 @@ class Page:
             self.force.draw(cut(found.series), found.response, first)
         self._show_numbers()
         self.from_rest.disabled = True
-        self.status.text = shown.motion_line(motion, self.rest)
+        self.status.text = html.motion_line(motion, self.rest)
         self.mark.text = f"motion {motion.number}"
 
     # What is shown
@@ -328,8 +327,8 @@ class Page:
         now = None if self.motion is None else self.motion.evaluation
         record = {} if now is None else now.record()
         record |= {} if self.shape is None else {"geometry": self.shape.shape.record}
-        self.numbers.text = shown.numbers_table(record, self.start)
-        self.gradient.text = shown.gradient_table(self.config, now)
+        self.numbers.text = html.numbers_table(record, self.start)
+        self.gradient.text = html.gradient_table(self.config, now)
         fade([self.numbers, self.gradient, self.force.figure], faded)
 
     def _tick(self) -> None:
@@ -347,10 +346,10 @@ class Page:
                 "Compiling the programs for this kind of pair. The first time takes one to several "
                 f"minutes, later starts some seconds ({seconds:.0f} s so far)."
             )
-            self.status.text = shown.status_line("preparing", "wait", words)
+            self.status.text = html.status_line("preparing", "wait", words)
         else:
             words = (
                 f"Computing for {seconds:.0f} s. A new number of lobes, or a twist where there was "
                 "none, needs other programs, which are compiled first."
             )
-            self.status.text = shown.status_line("computing", "wait", words)
+            self.status.text = html.status_line("computing", "wait", words)

@@ -19,7 +19,7 @@ from tornado.netutil import bind_sockets
 
 from rootsopt.errors import InputError
 from rootsopt.runtime.environment import say, shortened
-from rootsopt.view.pages.engine import Engine
+from rootsopt.view.pages.knobs import Engine
 from rootsopt.view.pages.page import Page
 
 ADDRESS = "127.0.0.1"

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from rootsopt.config import Config, notes
 from rootsopt.errors import InputError
 from rootsopt.response.evaluation import Evaluation
-from rootsopt.view.pages.engine import Engine, Shape, frames, same_motion
+from rootsopt.view.pages.knobs import Engine, Shape, frames, same_motion
 
 if TYPE_CHECKING:
     from rootsopt.optimize.outcome import Optimization

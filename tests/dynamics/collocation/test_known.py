@@ -12,9 +12,9 @@ import pytest
 
 import rootsopt
 from experiments._common.shooting import closed as shooting
+from rootsopt.dynamics.collocation.bordered import Points
 from rootsopt.dynamics.collocation.closing import Closer, Loop, gained
 from rootsopt.dynamics.collocation.elements import GAUSS, POINTS, Elements, Mesh
-from rootsopt.dynamics.collocation.equation import Points
 from rootsopt.dynamics.collocation.events import (
     FIXED,
     FlagScan,
@@ -24,8 +24,7 @@ from rootsopt.dynamics.collocation.events import (
     look,
     rooted,
 )
-from rootsopt.dynamics.collocation.known import KnownOrbit, padded, trimmed
-from rootsopt.dynamics.collocation.mesh import roughness, sizes
+from rootsopt.dynamics.collocation.mesh import KnownOrbit, padded, roughness, sizes, trimmed
 from rootsopt.dynamics.collocation.peak import Rivals, peak_of, rivals_of
 from rootsopt.dynamics.collocation.system import Step, moved_at, unchanged
 from rootsopt.dynamics.orbit import Orbit
