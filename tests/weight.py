@@ -39,17 +39,20 @@ def measured() -> dict[str, int]:
     files = sorted((ROOT / "rootsopt").rglob("*.py"))
     modules = {_name(path): path for path in files}
     imports = {name: _imports(path, modules) for name, path in modules.items()}
+    packages = {path.name for path in (ROOT / "rootsopt").glob("[a-z]*") if path.is_dir()}
     rooms: dict[str, set[str]] = {}
+    # Entry points stand above all packages, errors and statuses below them.
     for name, found in imports.items():
-        room = rooms.setdefault(_room(name), set())
-        room |= {_room(other) for other in found} - {_room(name)}
+        if _room(name) in packages and not name.endswith("__main__"):
+            room = rooms.setdefault(_room(name), set())
+            room |= {_room(other) for other in found} & packages - {_room(name)}
     pages = sorted((ROOT / "docs").rglob("*.md"))
     words = sum(len(re.findall(r"\w[\w'’-]*", path.read_text("utf-8"))) for path in pages)
     return {
         "statements of the package": _statements(files),
         "statements of the tests": _statements((ROOT / "tests").rglob("*.py")),
         "statements of the experiments": _statements((ROOT / "experiments").rglob("*.py")),
-        "packages": sum(path.is_dir() for path in (ROOT / "rootsopt").glob("[a-z]*")),
+        "packages": len(packages),
         "files of the package": len(files),
         "lines of the longest file": max(
             len(path.read_text("utf-8").splitlines()) for path in files
@@ -75,7 +78,7 @@ def _name(path: Path) -> str:
 
 def _room(module: str) -> str:
     """Return the package in which a `module` lies."""
-    return ".".join(module.split(".")[:2])
+    return module.split(".")[1] if "." in module else ""
 
 
 def _imports(path: Path, modules: Iterable[str]) -> set[str]:

@@ -19,7 +19,7 @@ from rootsopt.dynamics.collocation.mesh import PIECES, KnownOrbit, from_pieces, 
 from rootsopt.dynamics.collocation.motion import ACCURACY, Collocated, apart, closed_orbit
 from rootsopt.dynamics.collocation.newton import numbers
 from rootsopt.dynamics.collocation.system import unchanged
-from rootsopt.dynamics.integrator import Solver, Transient, no_pieces, settle, settled_within
+from rootsopt.dynamics.integrator import Solver
 from rootsopt.dynamics.orbit import Orbit, branch
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import (
@@ -32,7 +32,15 @@ from rootsopt.dynamics.steady import (
     transient_status,
     window_status,
 )
-from rootsopt.dynamics.window import PERIODS, Window, lyapunov
+from rootsopt.dynamics.window import (
+    PERIODS,
+    Transient,
+    Window,
+    lyapunov,
+    no_pieces,
+    settle,
+    settled_within,
+)
 from rootsopt.status import Status
 
 # Scaled difference below which states nearly repeat. Newton's method then decides whether there is

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from rootsopt.contact.gap import Approach, ContactPoint
-from rootsopt.dynamics.parts import Motion
+from rootsopt.dynamics.parts.base import Motion
 
 if TYPE_CHECKING:
     from rootsopt.dynamics.pair import RotorPair

@@ -30,18 +30,9 @@ from rootsopt.dynamics.flanks import (
     sum_of,
     touches_of,
 )
-from rootsopt.dynamics.parts import (
-    Drive,
-    Friction,
-    Load,
-    Loads,
-    Motion,
-    Part,
-    Supports,
-    TimingGear,
-    Units,
-)
-from rootsopt.dynamics.parts.base import Timescales
+from rootsopt.dynamics.parts.base import Loads, Motion, Part, Timescales, Units
+from rootsopt.dynamics.parts.load import Load
+from rootsopt.dynamics.parts.machine import Drive, Friction, Supports, TimingGear
 from rootsopt.errors import InputError
 from rootsopt.profiles.geometry import Soundness
 

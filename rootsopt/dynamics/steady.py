@@ -17,10 +17,11 @@ from rootsopt.contact.law import force_rounding
 from rootsopt.dynamics.collocation.elements import GAUSS, Elements
 from rootsopt.dynamics.collocation.mesh import KnownOrbit
 from rootsopt.dynamics.collocation.system import Step, moved_at
-from rootsopt.dynamics.integrator import NOISE, Solver, Transient
+from rootsopt.dynamics.integrator import Solver
+from rootsopt.dynamics.linear import solved
 from rootsopt.dynamics.orbit import Orbit
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.window import Window, solved
+from rootsopt.dynamics.window import NOISE, Transient, Window
 from rootsopt.status import Status
 
 TOO_DEEP = 0.02

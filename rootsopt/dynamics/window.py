@@ -11,14 +11,17 @@ the distance exceeds the noise of steps and rounding. Every second batch therefo
 eight times smaller: noise then makes the growth factor eight times greater, chaos does not.
 """
 
+import dataclasses
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Complex, Float, Int
+from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import NDArray
 
-from rootsopt.dynamics.flow import Period, one_period
+from rootsopt.dynamics.flow import Period, Pieces, one_period, strobe
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.pair import RotorPair
 
@@ -225,135 +228,144 @@ def integrated_difference(
     return jnp.where(solved & jnp.isfinite(largest), largest, jnp.inf)
 
 
-# Number of squarings of a matrix from which its growth rate is computed. After so many, the result
-# no longer depends on the norm used.
-_SQUARINGS = 40
-# Maximum number of QR iterations, per eigenvalue on average.
-_SWEEPS = 40
+BLOCK = 4
+"""Least number of mesh periods integrated between two checks of whether the motion repeats."""
+# Least number of stroboscopic states stored, and least excess over twice the longest cycle.
+_MEMORY, _MORE = 20, 4
+# Numbers of mesh periods after which a transient continues with a finer tolerance, each with the
+# greatest value of that tolerance. The noise of coarser steps can hide that the motion repeats.
+_PATIENCE = (32, 1e-5), (128, 1e-7)
+NOISE = 100.0
+"""Relative noise (tolerances) that adaptive steps cause in the stroboscopic states."""
 
 
-def solved(matrix: Float[Array, "n n"], right: Float[Array, "n m"]) -> Float[Array, "n m"]:
-    """Return the solution X (n, m) of `matrix` X = `right`, by elimination with row pivoting."""
-    rows = jnp.concatenate([matrix, right], axis=1)
-    count = matrix.shape[0]
-    place = jnp.arange(count)
-    for k in range(count):
-        size = jnp.where(place >= k, jnp.abs(rows[:, k]), -1.0)
-        pivot = jnp.argmax(size)
-        order = jnp.where(place == k, pivot, jnp.where(place == pivot, k, place))
-        rows = rows[order]
-        row = rows[k] / rows[k, k]
-        rows = jnp.where((place == k)[:, None], row, rows - rows[:, k : k + 1] * row)
-    return rows[:, count:]
+class Transient(NamedTuple):
+    """End of a transient.
 
-
-def spectral_radius(matrix: Float[Array, "n n"]) -> Float[Array, ""]:
-    """Return the greatest modulus of the eigenvalues, in real arithmetic.
-
-    For two rows, the result follows from trace and determinant. For more rows, the result is the
-    growth rate of the powers of the matrix, computed by repeated squaring.
+    `state`: last stroboscopic state (scaled); `period`: length k of the cycle (mesh periods), 0 if
+    not settled; `nearest`: the period with which the last states repeat most closely; `spread`:
+    greatest scaled difference between states that are `nearest` periods apart; `periods`: mesh
+    periods simulated; `lost`: see `RotorPair.lost`; `solved`: whether the solver succeeded;
+    `steps`: number of solver steps; `pieces`: the motion over the last mesh periods, at least as
+    many as the longest orbit has, if it was requested.
     """
-    if matrix.shape[0] == 2:
-        half = jnp.trace(matrix) / 2
-        determinant = jnp.linalg.det(matrix)
-        square = half**2 - determinant
-        root = jnp.sqrt(jnp.abs(square))
-        return jnp.where(square >= 0, jnp.abs(half) + root, jnp.sqrt(jnp.abs(determinant)))
 
-    def double(_, carry):
-        power, growth, share = carry
-        size = jnp.max(jnp.abs(power))
-        scaled = power / jnp.where(size > 0, size, 1.0)
-        growth = growth + share * jnp.log(size)
-        # A sum: for matrices this small, calling a matrix product costs more.
-        return jnp.sum(scaled[:, :, None] * scaled[None], axis=1), growth, share / 2
-
-    start = matrix, jnp.zeros((), matrix.dtype), jnp.ones((), matrix.dtype)
-    return jnp.exp(lax.fori_loop(0, _SQUARINGS, double, start)[1])
+    state: Float[Array, " n"]
+    period: Int[Array, ""]
+    nearest: Int[Array, ""]
+    spread: Float[Array, ""]
+    periods: Int[Array, ""]
+    lost: Bool[Array, ""]
+    solved: Bool[Array, ""]
+    steps: Int[Array, ""]
+    pieces: Pieces | None = None
 
 
-def eigenvalues(matrix: Float[Array, "n n"]) -> Complex[Array, " n"]:
-    """Return the eigenvalues, greatest modulus first; NaN if the matrix is not finite.
+def settled_within(rtol: Float[Array, ""]) -> Float[Array, ""]:
+    """Return the scaled difference below which states count as repeating, at the tolerance `rtol`.
 
-    In a conjugate pair, the value with positive imaginary part comes first. The method is QR
-    iteration with Wilkinson's shift and deflation (Golub and Van Loan, Matrix Computations, section
-    7.5). There is no reduction to Hessenberg form, since the matrices have at most about 12 rows.
-    """
-    count = matrix.shape[0]
-    work = matrix.astype(jnp.result_type(matrix.dtype, jnp.complex64))
-    unit = jnp.eye(count, dtype=work.dtype)
-    place = jnp.arange(count)
-    small = float(jnp.finfo(matrix.dtype).eps)
-
-    def shift_of(work, size):
-        """Return Wilkinson's shift for the active block, the first `size` rows of `work`.
-
-        The shift is the eigenvalue of the block's last 2 x 2 block that is nearest to its last
-        entry."""
-        low, high = size - 1, jnp.maximum(size - 2, 0)
-        a, b, c, d = work[high, high], work[high, low], work[low, high], work[low, low]
-        half = (a - d) / 2
-        root = jnp.sqrt(half**2 + b * c)
-        root = jnp.where(jnp.abs(half + root) >= jnp.abs(half - root), root, -root)
-        far = half + root
-        return d - jnp.where(far == 0, 0.0, b * c / jnp.where(far == 0, 1.0, far))
-
-    def go_on(carry):
-        _, size, turn = carry
-        return (size > 1) & (turn < _SWEEPS * count)
-
-    def sweep(carry):
-        work, size, turn = carry
-        active = (place < size)[:, None] & (place < size)
-        shift = shift_of(work, size)
-        # An occasional exceptional shift breaks cycles.
-        beside = jnp.max(jnp.where(place < size - 1, jnp.abs(work[size - 1]), 0.0))
-        shift = jnp.where(turn % 8 == 7, shift + 0.7 * beside, shift)
-        left, right = _orthogonal(jnp.where(active, work - shift * unit, unit))
-        turned = jnp.sum(right[:, :, None] * left[None], axis=1) + shift * unit
-        work = jnp.where(active, turned, work)
-        beside = jnp.where(place < size - 1, jnp.abs(work[size - 1]), 0.0)
-        scale = jnp.maximum(jnp.max(jnp.where(active, jnp.abs(work), 0.0)), 1e-300)
-        done = jnp.max(beside) <= small * scale
-        return work, size - done, turn + 1
-
-    start = work, jnp.asarray(count), jnp.zeros((), int)
-    values = jnp.diagonal(lax.while_loop(go_on, sweep, start)[0])
-    if count == 2:
-        values = _of_two(matrix).astype(work.dtype)
-    values = jnp.where(jnp.all(jnp.isfinite(matrix)), values, jnp.nan)
-    # Moduli that differ by rounding alone rank as equal, so that the imaginary part orders a
-    # conjugate pair.
-    modulus = jnp.abs(values)
-    rank = jnp.sum(modulus[None] > modulus[:, None] * (1 + 100 * small), axis=1)
-    return values[jnp.lexsort((-values.imag, rank))]
+    The noise of adaptive steps is about a hundred times the tolerance."""
+    return jnp.clip(1000 * rtol, 3e-3, 3e-2)
 
 
-def _of_two(matrix: Float[Array, "2 2"]) -> Complex[Array, " 2"]:
-    """Return the eigenvalues of a 2 x 2 matrix from its trace and determinant."""
-    half = jnp.trace(matrix) / 2
-    determinant = matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0]
-    square = half**2 - determinant
-    root = jnp.sqrt(jnp.abs(square))
-    first = half + jnp.where(half >= 0, root, -root)
-    # The smaller root follows from the product of both; the difference would cancel.
-    second = determinant / jnp.where(first == 0, 1.0, first)
-    real = lax.complex(jnp.stack([first, second]), jnp.zeros(2, matrix.dtype))
-    pair = lax.complex(jnp.stack([half, half]), jnp.stack([root, -root]))
-    return jnp.where(square >= 0, real, pair)
+def settle(  # 85 lines: its inner functions share the arguments.
+    pair: RotorPair,
+    state: Float[Array, " n"],
+    integrator: Integrator,
+    tolerance: Float[Array, ""],
+    max_periods: Int[Array, ""],
+    max_orbit: int,
+    pieces: tuple[int, NDArray[np.float64]] | None = None,
+) -> Transient:
+    """Integrate from the scaled `state` (n,) until the stroboscopic states repeat with a period k.
+
+    `integrator`: method and steps, with the tolerance at the start. The motion has settled if the
+    last k + 1 states differ from the states k periods earlier by less than `tolerance` (scaled).
+    For large states, the noise of the steps replaces `tolerance` if it is greater. k is the
+    smallest such period that the equation allows (`RotorPair.orders`), at most `max_orbit` ≤ 8,
+    rounded up where the equation repeats after several mesh periods. Steps become finer after
+    `_PATIENCE`. The transient ends unsettled after `max_periods` mesh periods. `pieces`: as for
+    `strobe`."""
+    orders, block = pair.orders(max_orbit), pair.whole(BLOCK)
+    stored = max(_MEMORY, 2 * pair.whole(max_orbit) + _MORE)
+    age = jnp.arange(stored)[::-1]
+
+    def cycle(states, rtol):
+        # In large states, the noise of adaptive steps is proportional to the state.
+        noise = jnp.maximum(1.0, NOISE * rtol * jnp.abs(states) / tolerance)
+        noise = jnp.where(jnp.isfinite(noise), noise, 1.0)
+
+        def spread(k):
+            change = jnp.max(jnp.abs(states - jnp.roll(states, k, axis=0)) / noise, axis=1)
+            # Before the start the memory holds inf; inf - inf would be NaN.
+            change = jnp.where(jnp.isnan(change), jnp.inf, change)
+            return jnp.max(jnp.where(age <= k, change, 0.0))
+
+        spreads = jax.vmap(spread)(orders)
+        settled = spreads < tolerance
+        period = jnp.where(jnp.any(settled), orders[jnp.argmax(settled)], 0)
+        nearest = jnp.argmin(spreads)
+        return period, orders[nearest], spreads[nearest]
+
+    def go_on(loop):
+        carry, *_ = loop
+        alive = ~carry.lost & carry.solved & jnp.all(jnp.isfinite(carry.state))
+        return (carry.period == 0) & alive & (carry.periods < max_periods)
+
+    def advance(loop):
+        carry, memory = loop
+        rtol = integrator.rtol
+        for longest, fine in _PATIENCE:
+            rtol = jnp.where(carry.periods < longest, rtol, jnp.minimum(rtol, fine))
+        how = dataclasses.replace(integrator, rtol=rtol)
+        part = strobe(pair, carry.state, block, how, pieces)
+        memory = jnp.concatenate([memory[block:], part.states])
+        end = part.states[-1]
+        lost = pair.lost(end)
+        sound = part.solved & ~lost & jnp.all(jnp.isfinite(end))
+        period, nearest, spread = cycle(memory, rtol.astype(memory.dtype))
+        new = Transient(
+            state=end,
+            period=jnp.where(sound, period, 0),
+            nearest=nearest,
+            spread=spread,
+            periods=carry.periods + block,
+            lost=lost,
+            solved=part.solved,
+            steps=carry.steps + part.steps,
+            pieces=jax.tree.map(
+                lambda old, x: jnp.concatenate([old[block:], x]), carry.pieces, part.pieces
+            ),
+        )
+        return new, memory
+
+    start = Transient(
+        state=state,
+        period=jnp.zeros((), int),
+        nearest=jnp.ones((), int),
+        spread=jnp.full_like(state[0], jnp.inf),
+        periods=jnp.zeros((), int),
+        lost=jnp.zeros((), bool),
+        solved=jnp.ones((), bool),
+        steps=jnp.zeros((), int),
+        pieces=None if pieces is None else no_pieces(pair, state, max_orbit, pieces),
+    )
+    memory = jnp.full((stored, *state.shape), jnp.inf, state.dtype)
+    return lax.while_loop(go_on, advance, (start, memory))[0]
 
 
-def _orthogonal(matrix: Complex[Array, "n n"]) -> tuple[Complex[Array, "n n"], ...]:
-    """Return the QR factors (Q, R) of a matrix, by the Gram-Schmidt method with a second pass."""
-    count = matrix.shape[0]
-    columns, right = [], jnp.zeros_like(matrix)
-    for k in range(count):
-        column = matrix[:, k]
-        for j, done in [*enumerate(columns)] * 2:
-            share = jnp.vdot(done, column)
-            right = right.at[j, k].add(share)
-            column = column - share * done
-        size = jnp.sqrt(jnp.sum(jnp.abs(column) ** 2))
-        right = right.at[k, k].set(size.astype(matrix.dtype))
-        columns.append(column / jnp.where(size > 0, size, 1.0))
-    return jnp.stack(columns, axis=1), right
+def no_pieces(
+    pair: RotorPair,
+    state: Float[Array, " n"],
+    longest: int,
+    pieces: tuple[int, NDArray[np.float64]],
+) -> Pieces:
+    """Return the placeholder for `Transient.pieces` of `pair`, with states like `state` (n,).
+
+    `longest`: longest period of an orbit (mesh periods); `pieces`: as for `strobe`."""
+    count, inside = pieces
+    block = pair.whole(BLOCK)
+    shape = -(-pair.whole(longest) // block) * block, count
+    nothing = jnp.zeros(shape, state.dtype)
+    states = jnp.zeros((*shape, *state.shape), state.dtype)
+    return Pieces(nothing, states, jnp.zeros((*shape, len(inside), *state.shape), state.dtype))

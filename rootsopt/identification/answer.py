@@ -16,8 +16,9 @@ import pandas
 from numpy.typing import NDArray
 
 from rootsopt.config import Config
-from rootsopt.identification.model import CHANNELS, REST, Point
-from rootsopt.identification.record import OFFSET, Observed
+from rootsopt.identification.model import REST, Point
+from rootsopt.identification.quantities import OFFSET
+from rootsopt.identification.record import CHANNELS, Observed
 from rootsopt.identification.squares import TURN, Local, Problem
 from rootsopt.status import Status
 

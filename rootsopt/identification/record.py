@@ -5,29 +5,98 @@ which operating point a row was measured. A table with rotations or times holds 
 Any other one holds averages, a row per operating point."""
 
 import dataclasses
-import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import functools
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pandas
+from jax import lax
+from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from rootsopt.config import Config
 from rootsopt.config.document import read_document
-from rootsopt.config.explain import limits_of, tree
+from rootsopt.config.explain import tree
 from rootsopt.config.sources import reason, regular_file
-from rootsopt.config.tolerances import scatterable, unknown_key
 from rootsopt.config.units import named, near, shown
+from rootsopt.dynamics.collocation.elements import BLOCK
+from rootsopt.dynamics.pair import RotorPair
+from rootsopt.dynamics.steady import VariedOrbit
 from rootsopt.errors import InputError
-from rootsopt.identification.model import CHANNELS
 from rootsopt.measured.table import measured_number, titled
-from rootsopt.response.sensitivity import NAMES
-from rootsopt.response.sweeps.plan import Interval, axis_of
-from rootsopt.response.sweeps.points import configured
 from rootsopt.response.terms import GEAR, RESERVES, is_force
-from rootsopt.scene.space import bounds_of
+from rootsopt.runtime.programs import CachedFunction
+
+CHANNELS = (
+    "relative_rotation_rad", "relative_speed_rad_s", "drive_flank_force_N", "coast_flank_force_N",
+    "contact_force_N", "penetration_m", "gear_torque_N_m", "shaft_torque_N_m",
+)  # fmt: skip
+"""Names of the sampled quantities: the columns of a response, then the torque of the timing gear on
+rotor 1 and that of the shaft that drives rotor 1."""
+
+# Number of samples computed by one call of the program: a record of any length needs one only.
+_TOGETHER = 8 * BLOCK
+
+
+def channels_at(
+    pair: RotorPair, tangents: RotorPair, orbit: VariedOrbit, tau: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the `CHANNELS` (n, c) at the times `tau` (n,), in mesh periods, and their derivatives.
+
+    The derivatives (n, c, d + 1) are those along the directions to which the variation of the
+    `orbit` belongs (`tangents`), then that with respect to time."""
+    # The orbit and the rotors repeat together after this time; a late time would be rounded more.
+    times = orbit.elements.mesh.times
+    tau = np.mod(tau, pair.lobes * np.round(float(times[-1] - times[0])))
+    padded = np.pad(tau, (0, -len(tau) % _TOGETHER))
+    found = [_channels(pair, tangents, orbit, some) for some in padded.reshape(-1, _TOGETHER)]
+    values, slopes = zip(*jax.device_get(found), strict=True)
+    return np.concatenate(values)[: len(tau)], np.concatenate(slopes)[: len(tau)]
+
+
+@CachedFunction
+def _channels(pair: RotorPair, tangents: RotorPair, orbit: VariedOrbit, tau: Any):
+    dynamic, static = eqx.partition(pair, eqx.is_inexact_array)
+    directions = eqx.filter(tangents, eqx.is_inexact_array)
+    still = jax.tree.map(lambda x: jnp.pad(x, ((0, 1),) + ((0, 0),) * (x.ndim - 1)), directions)
+
+    def values(tau, state, dynamic):
+        return _values(eqx.combine(dynamic, static), tau, state)
+
+    def at(tau):
+        state, rate, along = orbit.at(tau)
+        times = jnp.append(jnp.zeros(along.shape[-1]), 1.0)
+        changes = jnp.concatenate([along, rate[:, None]], axis=1)
+
+        def push(time, change, moved):
+            return jax.jvp(values, (tau, state, dynamic), (time, change, moved))
+
+        return jax.vmap(push, (0, 1, 0), (None, -1))(times, changes, still)
+
+    return lax.map(at, tau, batch_size=BLOCK)
+
+
+def _values(pair: RotorPair, tau, state) -> Float[Array, " c"]:
+    """Return the `CHANNELS` at a time (mesh periods) and scaled state."""
+    motion, contact = pair.motion(tau, state), pair.contact_at(tau, state)
+    nothing = jnp.zeros_like(motion.relative)
+    gear = nothing if pair.gear is None else pair.gear.torque_on_1(motion, np.zeros(0))
+    if pair.free:
+        shaft = pair.drive.torque_on_1(motion, np.zeros(0))
+    else:  # Rotor 1 turns uniformly: the shaft balances all other torques on it.
+        each = zip(pair.all_parts, pair.own_states(state), strict=True)
+        torques = [part.torque_on_1(motion, own) for part, own in each]
+        shaft = -functools.reduce(jnp.add, [x for x in torques if x is not None], contact.torque1)
+    assert gear is not None
+    assert shaft is not None
+    forces = contact.drive, contact.coast, contact.total
+    return jnp.stack([motion.relative, motion.rate, *forces, contact.depth, gear, shaft])
+
 
 # Columns of a table of samples, as in `response_*.csv`; the time counts only without rotation.
 _ROTATION, _TIME = "rotation_deg", "time_s"
@@ -220,158 +289,3 @@ def _check(config: Config, name: str, title: str, sampled: bool) -> None:
         f"({', '.join(told)}), a config key, or one of these with {_SPREAD} for its standard "
         f"deviations; {f'did you mean {meant}?' if meant else 'rename or remove it'}"
     )
-
-
-OFFSET = "rotation_offset_deg"
-"""The quantity of a record whose rotation is measured from an unknown angle: its reading minus the
-rotation of rotor 1 (°)."""
-
-# Ratio of bounds above which a search moves on a logarithmic scale.
-_WIDE = 30.0
-
-# Without bounds, a search begins between the config's value over and times the first number. For
-# a value of 0, it begins within this share (the second) of the allowed range.
-_AROUND, _SMALL = 5.0, 0.02
-
-
-class Fitted(NamedTuple):
-    """A quantity to fit.
-
-    `key` in the config, or `OFFSET`; `low`, `high`: bounds; `begin`, `end`: range in which a search
-    begins, inside the bounds; `own`: the config's value; `log`: whether the scale is logarithmic.
-    On this scale, the range is 0 … 1."""
-
-    key: str
-    low: float
-    high: float
-    begin: float
-    end: float
-    own: float
-    log: bool
-
-    def scaled(self, value: float) -> float:
-        """Return the place of a `value` on the scale."""
-        if self.log:
-            return math.log(value / self.begin) / math.log(self.end / self.begin)
-        return (value - self.begin) / (self.end - self.begin)
-
-    @property
-    def first(self) -> float:
-        """Place where a search begins: that of the config's value, or the middle if it lies outside
-        the range."""
-        return self.scaled(self.own) if self.begin <= self.own <= self.end else 0.5
-
-    def value(self, place: float) -> float:
-        """Return the value at a `place` on the scale, within the bounds."""
-        if self.log:
-            found = self.begin * math.exp(place * math.log(self.end / self.begin))
-        else:
-            found = self.begin + place * (self.end - self.begin)
-        return min(max(found, self.low), self.high)
-
-    def slope(self, value: float) -> float:
-        """Return the derivative of the value with respect to its place on the scale."""
-        if self.log:
-            return value * math.log(self.end / self.begin)
-        return self.end - self.begin
-
-    @property
-    def name(self) -> str:
-        """Name in words."""
-        return NAMES.get(self.key) or self.key.rpartition(".")[2].replace("_", " ")
-
-
-def fitted(
-    config: Config, keys: Mapping[str, Any] | Iterable[str], given: Iterable[str]
-) -> tuple[Config, list[Fitted]]:
-    """Return (config that has all quantities, the quantities to fit).
-
-    `keys`: see `identify`; `given`: keys whose values the record holds. Raises `InputError` for a
-    key that cannot be fitted, or bounds that it cannot have."""
-    wanted = {}
-    for text, pair in keys.items() if isinstance(keys, Mapping) else ((key, None) for key in keys):
-        key, equals, bounds = str(text).partition("=")
-        key = key.strip()
-        if key in wanted:
-            raise InputError(f"`{key}` must be fitted once, but is named twice; remove one")
-        wanted[key] = _bounds(key, bounds) if equals else pair
-    if not wanted:
-        raise InputError(
-            "no quantity to fit is named; name one, as in scene.timing_gear.backlash_mm=0.02:0.4"
-        )
-    for key in {*wanted} & {*given}:
-        raise InputError(
-            f"`{key}` must not be fitted, because the record has a column of its values; remove "
-            "one of them"
-        )
-    found = []
-    for key, pair in wanted.items():
-        config, one = _fitted(config, key, pair)
-        found.append(one)
-    return config, found
-
-
-def _bounds(key: str, text: str) -> Any:
-    """Return the bounds in a text, as in `0.02:0.4`."""
-    values = axis_of(key, text).values
-    if not isinstance(values, Interval):
-        raise InputError(
-            f"`{key}` must have two bounds, as in {key}=0.1:0.5, but has {text!r}; correct them"
-        )
-    return values.low, values.high
-
-
-def _fitted(config: Config, key: str, pair: Any) -> tuple[Config, Fitted]:
-    if pair is not None and not (np.shape(pair) == (2,) and np.all(np.isfinite(pair))):
-        raise InputError(f"`{key}` must have two finite bounds, but has {pair}; correct them")
-    if pair is not None and not pair[0] < pair[1]:
-        raise InputError(
-            f"`{key}` must have a lower bound below the upper one, but has {pair[0]:g} and "
-            f"{pair[1]:g}; correct them"
-        )
-    if key == OFFSET:
-        half = 180.0 / config.profile.lobes
-        low, high = pair or (-half, half)
-        return config, Fitted(key, low, high, low, high, min(max(0.0, low), high), False)
-    if config.value(key) is None and key in tree(Config):
-        try:
-            config = configured(config, {key: sum(pair) / 2 if pair else 0.0})
-        except InputError:
-            if pair:
-                raise
-            raise InputError(
-                f"`{key}` has no value in the config; give it one, or bounds as {key}=0.1:0.5"
-            ) from None
-    values = scatterable(config)
-    if key not in values:
-        raise InputError(unknown_key(key, values, tree(Config), "--fit"))
-    own = values[key]
-    low, high = map(float, pair or _allowed(config, key))
-    for end in (low, high):
-        config.check_values({key: end})
-    if pair:
-        log = low > 0 and high > _WIDE * low
-        return config, Fitted(key, low, high, low, high, own, log)
-    begin, end = sorted((own / _AROUND, own * _AROUND))
-    if own == 0:
-        begin, end = _SMALL * low, _SMALL * high
-    begin, end = max(begin, low), min(end, high)
-    return config, Fitted(key, low, high, begin, end, own, low > 0)
-
-
-def _allowed(config: Config, key: str) -> tuple[float, float]:
-    """Return the bounds of a design parameter, or the range that the key allows."""
-    if key.startswith("profile."):
-        names = [f"profile.{name}" for name in config.design_keys]
-        low, high = bounds_of(config)[names.index(key)]
-        own = scatterable(config)[key]
-        return min(low, own), max(high, own)
-    low, high = limits_of(tree(Config)[key]).ends
-    if not (math.isfinite(low) and math.isfinite(high)):
-        raise InputError(f"`{key}` has no usual range; give bounds, as in {key}=0.1:0.5")
-    return low, high
-
-
-def values_at(quantities: Sequence[Fitted], place: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the values (p,) of the quantities at a `place` (p,) on their scales."""
-    return np.array([one.value(x) for one, x in zip(quantities, place, strict=True)])

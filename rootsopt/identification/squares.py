@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from rootsopt.errors import InputError
 from rootsopt.identification.model import Begin, Point, predict
-from rootsopt.identification.record import Fitted, values_at
+from rootsopt.identification.quantities import Fitted, values_at
 from rootsopt.status import Status
 
 TURN = 3.0

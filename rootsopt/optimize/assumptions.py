@@ -18,22 +18,21 @@ from numpy.typing import NDArray
 
 from rootsopt.config import Config
 from rootsopt.config.tolerances import Span
-from rootsopt.optimize.assumed import (
+from rootsopt.optimize.limits import limited
+from rootsopt.optimize.local import FEASIBLE, Linearization
+from rootsopt.optimize.outcome import (
     BASELINE,
     OPTIMIZED,
     RIVAL,
     WINS,
     Assumed,
+    Optimization,
     Piece,
     Scenes,
 )
-from rootsopt.optimize.limits import limited
-from rootsopt.optimize.local import FEASIBLE, Linearization
-from rootsopt.optimize.outcome import Optimization
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.sqp import Stops, descend
 from rootsopt.response.evaluation import Evaluation
-from rootsopt.response.records import Still, needed_motion
 from rootsopt.response.reducers import HERE, Point, Runs, evaluate_many
 from rootsopt.response.scatter import (
     NOMINAL,
@@ -44,6 +43,7 @@ from rootsopt.response.scatter import (
     scene_of,
     shifts,
 )
+from rootsopt.response.still import Still, needed_motion
 
 # Number of designs of the search from which the best in the optimum's worst scene is taken.
 _TRIED = 4

@@ -20,10 +20,9 @@ from rootsopt.config import Config
 from rootsopt.config.study import OptimizerConfig
 from rootsopt.config.tolerances import scatterable
 from rootsopt.errors import InputError
-from rootsopt.optimize.assumed import RIVAL
 from rootsopt.optimize.assumptions import compared
 from rootsopt.optimize.local import Linearization
-from rootsopt.optimize.outcome import Optimization
+from rootsopt.optimize.outcome import RIVAL, Optimization
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.robust_problem import RobustProblem
 from rootsopt.optimize.search import Progress, Search, Stage

@@ -34,9 +34,9 @@ from rootsopt.optimize.verification import Verification
 from rootsopt.optimize.vertices import VertexOptimum, vertex_optimum
 from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.response.journal import Checkpoint
-from rootsopt.response.records import Still, needed_motion
 from rootsopt.response.reducers import HERE, Point, Runs
 from rootsopt.response.result import Seeds
+from rootsopt.response.still import Still, needed_motion
 from rootsopt.runtime.threads import POLL
 from rootsopt.scene import Scene
 from rootsopt.scene.space import Space, sobol

@@ -15,9 +15,9 @@ from rootsopt.optimize.outcome import Optimization, Trial, candidate, near, obje
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.sqp import Found
 from rootsopt.response.evaluation import Evaluation, Evaluator
-from rootsopt.response.records import needed_motion
 from rootsopt.response.reducers import Point, evaluate_many
 from rootsopt.response.sensitivity import by_scene, quantities
+from rootsopt.response.still import needed_motion
 from rootsopt.status import Status
 
 # Relative difference between a design's objectives in search and verification above which the

@@ -16,8 +16,7 @@ from jaxtyping import Array, Float, Inexact
 
 from rootsopt.dynamics.collocation.elements import BLOCK, GAUSS, POINTS, in_blocks, whole_blocks
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.parts import AxisLoads
-from rootsopt.dynamics.parts.load import MIRROR, GasResultant, tooth_force
+from rootsopt.dynamics.parts.load import MIRROR, AxisLoads, GasResultant, tooth_force
 from rootsopt.dynamics.reserve import LONGEST, smooth_pieces
 from rootsopt.dynamics.steady import SAMPLES, VariedOrbit
 from rootsopt.profiles import Geometry, Profile, geometry

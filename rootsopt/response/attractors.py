@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from rootsopt.config import Config
 from rootsopt.config.units import MM
 from rootsopt.dynamics.flow import strobe
-from rootsopt.dynamics.integrator import BLOCK, Integrator, Transient, settle, settled_within
+from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import transient_status
+from rootsopt.dynamics.window import BLOCK, Transient, settle, settled_within
 from rootsopt.response.evaluation import Evaluation, Evaluator, Motions, objective_weights
 from rootsopt.response.records import message_of
 from rootsopt.response.reducers import mean

@@ -14,13 +14,13 @@ from numpy.typing import ArrayLike
 from rootsopt.config import Config
 from rootsopt.config.units import RPM
 from rootsopt.dynamics.closed import Start, seen, steady_motion
-from rootsopt.dynamics.integrator import BLOCK, Solver
+from rootsopt.dynamics.integrator import Solver
 from rootsopt.dynamics.maxima import local_maxima, prepare_maxima
 from rootsopt.dynamics.orbit import PEAK_NORM, line_name
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.reserve import GEAR, RESERVES, apart
 from rootsopt.dynamics.steady import CLOSED, OPEN, SAMPLES, Steady, varied, window_status
-from rootsopt.dynamics.window import PERIODS, integrated_difference, lyapunov
+from rootsopt.dynamics.window import BLOCK, PERIODS, integrated_difference, lyapunov
 from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry
 from rootsopt.pump.loads import BEARING, orbit_loads

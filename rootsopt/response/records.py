@@ -1,8 +1,6 @@
 """What is reported of one evaluation: series, entries of the result file, and advice."""
 
-import dataclasses
 import functools
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -21,14 +19,11 @@ from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.reserve import GEAR, RESERVES, Apart
 from rootsopt.dynamics.steady import OPEN, SAMPLES, Steady
 from rootsopt.dynamics.window import Window
-from rootsopt.profiles import Geometry, geometry
-from rootsopt.profiles.geometry import Soundness
+from rootsopt.profiles import Geometry
 from rootsopt.pump.loads import EQUIVALENT, OrbitLoads
-from rootsopt.response.evaluation import Evaluation, Evaluator, Motions, objective_weights
 from rootsopt.response.result import RESPONSES, Series
-from rootsopt.response.terms import depends_on_forces, terms_of, values_of
 from rootsopt.runtime.programs import CachedFunction
-from rootsopt.scene import Scene, fault_of
+from rootsopt.scene import Scene
 from rootsopt.status import Status
 
 
@@ -288,59 +283,3 @@ def apart_message(config: Config, depth: float, backlash: float | None = None) -
     if gap < clearance:
         return f"{said}; they touch with contact.clearance_mm below {clearance - gap:.4g}."
     return f"{said}."
-
-
-@dataclasses.dataclass(frozen=True)
-class Still(Motions):
-    """No motion counts. The response of an evaluation has the further terms of the objective."""
-
-    def evaluated(self, evaluator: Evaluator, design: Any, start: Any, series: bool) -> Evaluation:
-        """Evaluate a `design` (d,) in config units; the other arguments have no effect."""
-        began, scene, keys = time.perf_counter(), evaluator.scene, evaluator.keys
-        names = tuple(evaluator.config.objective.terms)
-        values, rows = map(np.asarray, values_of(scene, terms_of(names), *_arguments(design)))
-        shape, margins = _shape(scene, design)
-        # A search keeps margins of the profile above 0 by its constraints, to within rounding.
-        sound = bool(np.all(np.isfinite(values)) and np.all(np.isfinite(rows)))
-        status = Status.GEOMETRY_ONLY if sound else Status.UNSOUND
-        slopes = zip(names, rows, strict=True)
-        return Evaluation(
-            design=dict(zip(keys, np.asarray(design).tolist(), strict=True)),
-            geometry=geometry_record(scene, shape),
-            response=dict(zip(names, values.tolist(), strict=True)) if sound else {},
-            gradient={name: dict(zip(keys, row.tolist(), strict=True)) for name, row in slopes},
-            steady_state={},
-            status=status,
-            message=message_of(evaluator.config, status)
-            + ("" if sound else f" Here, {fault_of(margins)}."),
-            statistics={"seconds": time.perf_counter() - began},
-            series=None,
-        )
-
-    def prepare(self, evaluator: Evaluator, design: Any, series: bool, maxima: bool) -> None:
-        """Compile the programs in the background."""
-        names = tuple(evaluator.config.objective.terms)
-        values_of.prepare(evaluator.scene, terms_of(names), *_arguments(design))
-        _shape.prepare(evaluator.scene, design)
-
-
-def _arguments(design: Any) -> tuple[Any, Any, Any]:
-    return jnp.asarray(design), np.zeros(3), np.zeros((3, len(design)))
-
-
-@CachedFunction
-def _shape(scene: Scene, design: Float[Array, " d"]) -> tuple[Geometry, Soundness]:
-    profile = scene.profile(design)
-    return geometry(profile), scene.soundness(profile)
-
-
-def needed_motion(config: Config) -> Evaluator:
-    """Return the evaluator of a config's objective, without a motion if nothing depends on forces.
-
-    These are the objective and the limits of `constraints.terms`. Raises `InputError` as
-    `Evaluator.of` does."""
-    found = Evaluator.of_objective(config)
-    names = {*objective_weights(config), *config.objective.terms, *config.constraints.terms}
-    if any(depends_on_forces(config, found.scene, name, "objective.terms") for name in names):
-        return found
-    return dataclasses.replace(found, motions=Still())

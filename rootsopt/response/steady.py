@@ -19,10 +19,10 @@ from numpy.typing import ArrayLike
 
 from rootsopt.dynamics.closed import Start, examined, steady_motion
 from rootsopt.dynamics.integrator import Solver
+from rootsopt.dynamics.linear import eigenvalues
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.reserve import reserve
 from rootsopt.dynamics.steady import CLOSED, OPEN, Steady, among, varied
-from rootsopt.dynamics.window import eigenvalues
 from rootsopt.profiles.geometry import Soundness
 from rootsopt.runtime.environment import check_precision
 from rootsopt.runtime.programs import CachedFunction

@@ -31,23 +31,23 @@ from rootsopt.contact.wrapped import (
 )
 from rootsopt.dynamics.integrator import Solver
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.parts import (
+from rootsopt.dynamics.parts.base import Context, Part, Timescales
+from rootsopt.dynamics.parts.load import (
     AxisLoads,
     ConstantLoad,
-    Context,
-    Drive,
-    Friction,
     GasLoad,
     GasResultant,
     Load,
+    TwistedLoad,
+)
+from rootsopt.dynamics.parts.machine import (
+    Drive,
+    Friction,
     MotorDrive,
-    Part,
     PrescribedDrive,
     Supports,
     TimingGear,
-    TwistedLoad,
 )
-from rootsopt.dynamics.parts.base import Timescales
 from rootsopt.profiles import Geometry, Outline, Profile, geometry
 from rootsopt.profiles.geometry import Soundness, soundness
 from rootsopt.runtime.environment import check_precision

@@ -13,7 +13,7 @@ from rootsopt.config.units import DEG, MM, RPM, UM
 from rootsopt.contact.law import ImpactLaw
 from rootsopt.dynamics.integrator import Integrator, Solver
 from rootsopt.dynamics.orbit import Measures
-from rootsopt.dynamics.parts import Friction, GearErrors, MotorDrive, Supports, TimingGear
+from rootsopt.dynamics.parts.machine import Friction, GearErrors, MotorDrive, Supports, TimingGear
 from rootsopt.measured.table import transmission_error
 
 # Limit on the number of solver steps for a whole orbit, as a multiple of the number that the config

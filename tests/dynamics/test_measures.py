@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from rootsopt import steady_response
 from rootsopt.config import load
-from rootsopt.dynamics.window import spectral_radius
+from rootsopt.dynamics.linear import spectral_radius
 from rootsopt.errors import InputError
 from rootsopt.optimize.problem import Problem
 from rootsopt.response.evaluation import Evaluator, objective_weights

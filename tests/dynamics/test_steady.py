@@ -12,7 +12,7 @@ import pytest
 from rootsopt.config import DESIGN_KEYS, load
 from rootsopt.dynamics.flow import strobe
 from rootsopt.dynamics.integrator import Integrator
-from rootsopt.dynamics.window import spectral_radius
+from rootsopt.dynamics.linear import spectral_radius
 from rootsopt.response.evaluation import RESPONSES, Evaluator, evaluate
 from rootsopt.response.records import message_of
 from rootsopt.status import Status

@@ -5,7 +5,8 @@ import pytest
 import xarray
 
 from rootsopt import InputError, load_config
-from rootsopt.identification.record import fitted, observed
+from rootsopt.identification.quantities import fitted
+from rootsopt.identification.record import observed
 from rootsopt.scene.space import bounds_of
 
 CIC = load_config("cic")

@@ -9,7 +9,8 @@ from rootsopt import load_config
 from rootsopt.identification import squares
 from rootsopt.identification.answer import Spread, combinations, profile, structure
 from rootsopt.identification.model import Point, Predicted
-from rootsopt.identification.record import Fitted, Observed
+from rootsopt.identification.quantities import Fitted
+from rootsopt.identification.record import Observed
 from rootsopt.identification.squares import Problem
 from rootsopt.status import Status
 

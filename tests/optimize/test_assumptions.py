@@ -13,9 +13,9 @@ import rootsopt
 from rootsopt.commands.console import main
 from rootsopt.config import load
 from rootsopt.config.tolerances import Span
-from rootsopt.optimize.assumed import BASELINE, OPTIMIZED, Assumed
 from rootsopt.optimize.assumptions import _change, _known, compared
 from rootsopt.optimize.design import search_of
+from rootsopt.optimize.outcome import BASELINE, OPTIMIZED, Assumed
 from rootsopt.optimize.robust_problem import RobustProblem
 from rootsopt.optimize.search import Search
 from rootsopt.response.reducers import over_scenes

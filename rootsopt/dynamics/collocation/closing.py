@@ -21,8 +21,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from rootsopt.dynamics.collocation.bordered import CollocatedEquation, Points
 from rootsopt.dynamics.collocation.elements import POINTS, Elements
+from rootsopt.dynamics.collocation.equation import CollocatedEquation, Points
 from rootsopt.dynamics.collocation.events import (
     Events,
     FlagScan,

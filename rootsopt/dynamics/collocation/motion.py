@@ -6,8 +6,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from rootsopt.dynamics.collocation.bordered import CollocatedEquation
 from rootsopt.dynamics.collocation.closing import Closer, Loop
+from rootsopt.dynamics.collocation.equation import CollocatedEquation
 from rootsopt.dynamics.collocation.mesh import KnownOrbit
 from rootsopt.dynamics.flow import Pieces
 from rootsopt.dynamics.integrator import Solver

@@ -14,8 +14,8 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
-from rootsopt.dynamics.collocation.bordered import CollocatedEquation, Points
 from rootsopt.dynamics.collocation.elements import GAUSS, Elements, in_blocks, summed
+from rootsopt.dynamics.collocation.equation import CollocatedEquation, Points
 from rootsopt.dynamics.collocation.peak import Peak, Rivals
 from rootsopt.dynamics.collocation.system import (
     Columns,
@@ -25,9 +25,9 @@ from rootsopt.dynamics.collocation.system import (
     moved_places,
     own_column,
 )
+from rootsopt.dynamics.linear import spectral_radius
 from rootsopt.dynamics.orbit import Orbit
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.window import spectral_radius
 from rootsopt.runtime.kept import kept
 
 # Greatest fraction of an interval's length by which one step may shorten the interval.

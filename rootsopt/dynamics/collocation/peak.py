@@ -18,8 +18,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import NDArray
 
-from rootsopt.dynamics.collocation.bordered import CollocatedEquation, Points
 from rootsopt.dynamics.collocation.elements import GAUSS, Elements
+from rootsopt.dynamics.collocation.equation import CollocatedEquation, Points
 
 RIVALS = len(GAUSS.nodes) + 1
 """Number of elements that may contain the peak: as many as an element has instants, so that the

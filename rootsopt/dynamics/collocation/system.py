@@ -28,7 +28,7 @@ from rootsopt.dynamics.collocation.elements import (
     in_blocks,
     summed,
 )
-from rootsopt.dynamics.window import solved
+from rootsopt.dynamics.linear import solved
 
 
 class Lines(NamedTuple):

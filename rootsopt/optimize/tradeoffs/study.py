@@ -26,9 +26,9 @@ from rootsopt.optimize.local import FEASIBLE, Group
 from rootsopt.optimize.problem import Problem, settled_by
 from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.response.journal import Checkpoint
-from rootsopt.response.records import Still
 from rootsopt.response.reducers import HERE, Point, Runs
 from rootsopt.response.result import Seeds
+from rootsopt.response.still import Still
 from rootsopt.response.terms import is_force, reporting, terms_of
 from rootsopt.scene import Scene
 from rootsopt.scene.space import Space

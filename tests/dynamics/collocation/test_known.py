@@ -12,9 +12,9 @@ import pytest
 
 import rootsopt
 from experiments._common.shooting import closed as shooting
-from rootsopt.dynamics.collocation.bordered import Points
 from rootsopt.dynamics.collocation.closing import Closer, Loop, gained
 from rootsopt.dynamics.collocation.elements import GAUSS, POINTS, Elements, Mesh
+from rootsopt.dynamics.collocation.equation import Points
 from rootsopt.dynamics.collocation.events import (
     FIXED,
     FlagScan,
