@@ -1,4 +1,6 @@
-"""The command `rootsopt COMMAND ...`, which runs the command of this name."""
+"""The command `rootsopt COMMAND ...`, and `rootsopt --completion SHELL`.
+
+The second prints a script that completes commands, options and config keys."""
 
 import argparse
 import difflib

@@ -1,4 +1,6 @@
-"""Units in the names of keys, and hints for values that seem to be given in another unit."""
+"""Units in the names of keys, and values and messages in words of limited length.
+
+Hints name a value that seems to be given in another unit."""
 
 import difflib
 import math

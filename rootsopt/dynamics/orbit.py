@@ -1,4 +1,8 @@
-"""A closed periodic orbit, and branches of a search that batches can share."""
+"""A closed periodic orbit, averages of the force over a motion, and branches that batches share.
+
+Mean and mean square are always integrated along with the motion. Two kinds of average are computed
+on request: the Fourier coefficients of spectral lines, and the average of a power of the force,
+which gives its p-norm."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple

@@ -9,7 +9,10 @@ impacts grow although the motion repeats: at 1e-6, by a factor of 8 per mesh per
 with the multiplier 0.1. Two motions at a finite distance show what the motion does, provided that
 the distance exceeds the noise of steps and rounding. Every second batch therefore uses a distance
 eight times smaller: noise then makes the growth factor eight times greater, chaos does not.
-"""
+
+Before that, the transient is simulated until the motion repeats: the pair is forced with the mesh
+period, and the states at the end of each mesh period (the stroboscopic states) settle on a cycle of
+k points."""
 
 import dataclasses
 from typing import Any, NamedTuple

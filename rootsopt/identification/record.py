@@ -1,8 +1,9 @@
 """A measured record: what was measured, at which operating points.
 
 A record is one table or several. Columns named after config keys, such as `scene.speed_rpm`, say at
-which operating point a row was measured. A table with rotations or times holds samples of a motion.
-Any other one holds averages, a row per operating point."""
+which operating point a row was measured. A table with rotations or times holds samples of a motion:
+`CHANNELS` along a closed orbit, with derivatives along directions of the pair. Any other table
+holds averages, a row per operating point."""
 
 import dataclasses
 import functools

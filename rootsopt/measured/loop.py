@@ -2,7 +2,11 @@
 
 A chain is the points on one entity. A vertex is a place where ends of chains meet. A link is a
 chain whose two ends are at different vertices.
-"""
+
+Calls to libraries that read a user's files are guarded: any exception they raise becomes an
+`InputError`, with the exception as its cause, and their log records and warnings stay off the
+console. Little else than such calls is guarded, because an error of this package would also read as
+a fault of the file."""
 
 import contextlib
 import dataclasses

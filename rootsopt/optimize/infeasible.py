@@ -2,7 +2,11 @@
 
 A search minimises the greatest scaled violation of all constraints (elastic mode). See Nocedal and
 Wright, Numerical Optimization (2006), section 18.5. The constraints that keep this minimum above
-zero are in conflict. If the geometry alone rules out all designs, none is simulated."""
+zero are in conflict. If the geometry alone rules out all designs, none is simulated.
+
+`beginning` says where a search begins if the baseline is a rotor from a file, or of another family.
+Such a rotor does not have the parameters that the search varies. It remains the baseline. The
+search begins at the member of the family `optimizer.family` that is nearest to it."""
 
 import dataclasses
 from collections.abc import Callable, Sequence

@@ -15,7 +15,19 @@ each with a non-negative share. The shares of one maximum add up to 1. Multiplie
 computed from the point alone, by non-negative least squares. The certificate therefore does not
 depend on the method that found the point. See Nocedal and Wright, Numerical Optimization (2006),
 section 12.3. For the maxima, these are the conditions of the epigraph form, in which a variable
-bounds each branch from above."""
+bounds each branch from above.
+
+Second-order models of all functions of a problem near a point, and the step that minimises them.
+
+Each branch, and each limit that needs a simulation, has a model of its own: value and gradient at
+the point, and a Hessian. Differences of gradients give the Hessians, and symmetric rank-one updates
+correct them after each step (Nocedal and Wright, Numerical Optimization, 2006, section 6.2). With
+one Hessian for all functions together, steps leave the feasible set wherever constraints of
+different curvature are active (Maratos effect).
+
+Constraints of the geometry need no simulation. A step therefore meets them exactly, not their
+models. Along the curved edges of the feasible set, this saves most of the simulations that
+linearised constraints cost."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple

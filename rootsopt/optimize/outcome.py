@@ -1,4 +1,4 @@
-"""What a search returns: its trials, and its outcome with the gains over the baseline."""
+"""What a search returns: its trials, its gains over the baseline, and both over assumptions."""
 
 import dataclasses
 import itertools

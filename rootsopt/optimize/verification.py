@@ -1,4 +1,8 @@
-"""The verification of a search: its best design once more, from rest, with a certificate."""
+"""The verification of a search: its best design once more, from rest, with a certificate.
+
+`surviving` tells what is left of the gain if the rotors are not exactly as drawn: baseline and
+optimised design are evaluated again with the same errors of manufacture, all flanks too full or too
+lean, and the axes too near or too far."""
 
 import dataclasses
 import math

@@ -22,7 +22,8 @@ Words used for all profiles: the *pitch crossing* is the flank point on the pitc
 distance of a point's tangent from that axis; a *land* is an arc centred on that axis.
 
 Lengths are in metres, angles in radians. Everything is differentiable with respect to the design.
-"""
+
+Cosine and sine are computed once where this pays (`rootsopt.runtime.kept`)."""
 
 import abc
 import contextlib

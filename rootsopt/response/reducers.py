@@ -1,4 +1,6 @@
-"""Reduces many evaluations to one, and many values to one number with its gradient.
+"""Evaluates many points, and reduces many evaluations to one number with its gradient.
+
+Points are designs, scenes or speeds, in this process or on others.
 
 Combinations of values are R = Σ w_k(J) J_k, where J_k is the value in scene k of n. The weights w
 add up to 1:

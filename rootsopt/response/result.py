@@ -1,4 +1,7 @@
-"""What is known about one design: at one point, or at several speeds or in several scenes."""
+"""What is known about one design: at one point, or at several speeds or in several scenes.
+
+A `Seed` is where an evaluation begins: on the closed orbit of a similar design or scene, or at a
+state."""
 
 import base64
 import dataclasses

@@ -2,6 +2,8 @@
 
 On an accelerator, the motions of all scenes of one structure are computed together (`vmap`). On a
 CPU they would then take as many iterations as the longest, and all branches that one of them takes.
+
+The motions of one design from different initial states are computed in the same way, and averaged.
 """
 
 import functools

@@ -1,6 +1,7 @@
-"""Tables and sentences of an optimum beside its baseline.
+"""Tables and sentences of an optimum beside its baseline, and of what fits a record.
 
-They are those of `rootsopt improve`, and those over what is assumed about the scene."""
+They are those of `rootsopt improve`, of `rootsopt identify`, and those over what is assumed about
+the scene."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,7 +1,9 @@
-"""Result files, in a folder that is checked beforehand.
+"""Result files in a folder that is checked beforehand, by file operations that tests can break.
 
 Commands write a folder under a temporary name and rename it when it is whole
-(`rootsopt.view.runs`)."""
+(`rootsopt.view.runs`). Each operation is a small function on purpose: tests make each call fail in
+turn, or end the process at this call. The lock on a folder can be held by one process at a time,
+and the system releases it when that process ends."""
 
 import contextlib
 import csv

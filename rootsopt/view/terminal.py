@@ -1,4 +1,7 @@
-"""Tables for the terminal: plain ASCII in 80 columns, the same in a pipe or a log."""
+"""Tables for the terminal, and how a run ends: gains, costs, confidence and next commands.
+
+Tables are plain ASCII in 80 columns, the same in a pipe or a log. Terminal and report show the same
+sentences and commands, made from the content of the result file."""
 
 import itertools
 import re

@@ -1,4 +1,6 @@
-"""Meshes: distribution of elements over the intervals between events."""
+"""Meshes: distribution of elements over the intervals between events.
+
+`KnownOrbit` is a closed orbit in the form from which the orbits of similar pairs can be closed."""
 
 from typing import Any, NamedTuple
 

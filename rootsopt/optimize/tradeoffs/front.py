@@ -1,4 +1,27 @@
-"""The front of a trade-off as a result: points, what was dropped, gaps, status."""
+"""The front of a trade-off as a result: points, what was dropped, gaps, status.
+
+Turns several terms into one objective, whose optimum is one point of the front.
+
+The terms u_i are scaled so that less is better, and so that the ends of the front lie at 0 and 1.
+From a reference point r, the search finds the design that goes furthest in all terms at once:
+
+    min over x of   max_i (u_i(x) - r_i) / d_i  +  ρ Σ_i u_i(x),    i in the terms that lead.
+
+Every point of a front is the optimum for some r, also where the front is not convex. A weighted sum
+does not reach these points. All d_i are 1, except beside a gap. The small second part excludes
+designs that are worse in one term and better in none. Sources: Pascoletti and Serafini, Scalarizing
+vector optimization problems, Journal of Optimization Theory and Applications 42 (1984) 499-524.
+Steuer and Choo, An interactive weighted Tchebycheff procedure, Mathematical Programming 26 (1983)
+326-344.
+
+The maximum is one `Group` of branches. The certificate gives the share of each branch. The shares
+are the weights of the terms at the optimum, and their ratios are the rates at which the terms
+trade.
+
+The reference points of a front form a grid: a line for two terms, a triangle for three. A *key*
+identifies one of them by one whole number per term; their sum is the number of divisions. At the
+end of a term (the optimum of this term alone), the number of this term is that sum, and all others
+are 0."""
 
 import dataclasses
 import itertools

@@ -3,7 +3,11 @@
 A branch begins at a known orbit (`Evaluation.state` and its period). It is the curve of an
 `OrbitFamily`, followed by pseudo-arclength continuation (`arclength`). Unstable orbits, which a
 simulation does not show, are followed like stable orbits; `BranchPoint.stable` distinguishes them.
-"""
+
+An orbit of the curve is closed by collocation. The unknowns are the state at φ1 = 0 and the
+parameter. Newton's method solves for all instants of an orbit, for the times of its events and for
+the parameter at once (`rootsopt.dynamics.collocation.bordered`). It starts from the previous orbit,
+moved along the curve's tangent, and then once more from an integration over the orbit's period."""
 
 import contextlib
 import dataclasses

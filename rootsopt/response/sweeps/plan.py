@@ -1,4 +1,7 @@
-"""The points of a sweep: axes crossed, zipped or sampled."""
+"""The points of a sweep: axes crossed, zipped or sampled.
+
+An axis holds the values that a sweep gives to one key, as a user writes them: lists, ranges and
+intervals."""
 
 import dataclasses
 import itertools

@@ -1,4 +1,7 @@
-"""Figure of a front: points, gaps and baseline, in one panel for each pair of terms."""
+"""Figures that compare designs: points of a front, and designs over many scenes.
+
+A front has one panel for each pair of terms. Scenes are those assumed, or those of scattered
+values."""
 
 import itertools
 import math

@@ -1,4 +1,7 @@
-"""Figures of a search: its history, and the designs that the limits leave."""
+"""Figures of profiles, of meshing and conjugacy, and of a search.
+
+A search shows its history, its optimum beside the baseline, and the designs that the limits leave.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any

@@ -1,4 +1,4 @@
-"""Figures of the contact force over time and over frequency, drawn on given axes."""
+"""Figures of the contact force over time and over frequency, and of a fit to a record."""
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING

@@ -1,4 +1,6 @@
-"""Figures of a sweep: forces over speed, over any key, or over two."""
+"""Figures of a sweep and of coexisting motions.
+
+Forces over speed, over any key or over two; basins of attraction, and the force of each motion."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any

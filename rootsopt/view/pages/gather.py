@@ -1,4 +1,6 @@
-"""Reads the files of a run back into the data that the report shows."""
+"""Reads the files of a run back into the data and words that the report shows.
+
+The words are the task of the run in sentences, and the glossary they lead to."""
 
 import csv
 import dataclasses

@@ -1,7 +1,7 @@
-"""Lays out pages: the report of a run, and the page of a front. Both open without a network.
+"""Lays out pages, and pictures, texts and tables of the explorer, as HTML.
 
-The pages are Jinja2 templates, and Bokeh's script is part of them. Everything that comes from a
-config or a result is escaped."""
+The report of a run and the page of a front open without a network: they are Jinja2 templates, and
+Bokeh's script is part of them. Everything that comes from a config or a result is escaped."""
 
 import base64
 import dataclasses

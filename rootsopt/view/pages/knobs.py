@@ -1,4 +1,7 @@
-"""The numbers of a config that sliders move: names, units, spans and allowed ranges."""
+"""Sliders of the explorer: the numbers they move, and what is computed for their values.
+
+A knob has a name, a unit, a span and an allowed range. An `Engine` computes the geometry of a
+config, and its motion near a known one."""
 
 import dataclasses
 import math
