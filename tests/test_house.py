@@ -41,7 +41,7 @@ SLOW = {"PIL", "optax", "rich", "scipy"}
 LATE = {
     # The work of a command is loaded once its help or its config has asked for it.
     "commands/table.py": {
-        "rootsopt.commands", "rootsopt", "argparse", "rootsopt.config.explain",
+        "rootsopt.commands", "rootsopt.view", "argparse", "rootsopt.config.explain",
         "rootsopt.config.sheet",
     },
     "commands/cli.py": {
@@ -65,7 +65,9 @@ LATE = {
     "view/figures/writing.py": {"rootsopt.view.figures.animation"},
     "optimize/__init__.py": {"rootsopt.commands.table"},
     # Modules that import optional or slow libraries.
-    "commands/work/explore.py": {"rootsopt.view.pages.knobs", "rootsopt.view.pages.server"},
+    "commands/work/explore.py": {
+        "rootsopt.optimize.design", "rootsopt.view.pages.knobs", "rootsopt.view.pages.server",
+    },
     "view/figures/__init__.py": {"rootsopt.view.figures.cad"},
     "view/figures/runs.py": {"rootsopt.measured.source"},
     "measured/reading.py": {"rootsopt.measured.dxf"},

@@ -52,7 +52,7 @@ def test_every_folder_has_a_row_in_the_order_of_the_layers():
     assert folders() <= set(rows)
     assert all(is_module(PACKAGE / name) for name in rows)
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-    (contract,) = settings["tool"]["importlinter"]["contracts"]
+    contract, _ = settings["tool"]["importlinter"]["contracts"]
     layers = [re.findall(r"rootsopt\.(\w+)\b(?!\.__main__)", layer) for layer in contract["layers"]]
     first = {name: k for k, layer in reversed([*enumerate(layers)]) for name in layer}
     places = [first[name] for name in rows if name in folders()]
