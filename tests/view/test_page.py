@@ -73,7 +73,7 @@ class Stub(Engine):
     Its force is 1 N, that of a motion from rest 2 N. `calls`: names and times (s) of both."""
 
     def __init__(self):
-        super().__init__(load(CIC))
+        super().__init__(load(CIC), optimize_design)
         self.status, self.calls = Status.PERIODIC, []
         self._base = self.given
         self.ready.set()

@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from rootsopt.commands.table import explore as command
+from rootsopt.optimize.design import optimize_design
 from rootsopt.view import pages
 
 pytest.importorskip("bokeh")
@@ -40,7 +41,7 @@ def address():
     found, up, stop = [], threading.Event(), threading.Event()
 
     def serve():
-        server = PageServer(Idle(load(CIC)), "cic")
+        server = PageServer(Idle(load(CIC), optimize_design), "cic")
         server.run(stop, lambda url: (found.append(url), up.set()))
 
     thread = threading.Thread(target=serve)

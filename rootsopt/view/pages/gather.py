@@ -279,7 +279,7 @@ def _sense(word: str) -> str:
     return {"min": "as low as possible", "max": "as high as possible"}.get(word, word)
 
 
-_PACKAGE = Path(__file__).parents[1]
+_PACKAGE = Path(__file__).parents[2]
 
 # The page of the glossary: in an installed package, and in the source tree.
 _PLACES = _PACKAGE / "glossary.md", _PACKAGE.parent / "docs" / "glossary.md"
