@@ -44,6 +44,7 @@ from rootsopt.response.scatter import (
     shifts,
 )
 from rootsopt.response.still import Still, needed_motion
+from rootsopt.status import Status
 
 # Number of designs of the search from which the best in the optimum's worst scene is taken.
 _TRIED = 4
@@ -137,15 +138,16 @@ class _Comparison:
     def objectives(self, names: Iterable[str], scenes: Scenes) -> list[NDArray[np.float64]]:
         """Return the objectives (n,) of designs, relative to the baseline in the same scene.
 
-        They are NaN unless both have a usable motion, and the baseline has a force."""
+        They are NaN unless both have a usable motion, and where neither touches."""
         bases, *found = self.evaluations([BASELINE, *names], scenes)
-        return [
-            np.array([
-                self.problem.beside(base).objective(one) if base.usable else math.nan
-                for base, one in zip(bases, row, strict=True)
-            ])
-            for row in found
-        ]  # fmt: skip
+        return [np.array([*map(self._relative, bases, row)]) for row in found]
+
+    def _relative(self, base: Evaluation, one: Evaluation) -> float:
+        if not base.usable:
+            return math.nan
+        found = self.problem.beside(base).objective(one)
+        nothing = base.status is Status.IDLE and one is not base and found == 1
+        return math.nan if nothing else found
 
     def pieces(self, span: Span, first: str, other: str) -> list[Piece]:
         """Return the parts of a range in which design `first` is worse than the `other` one.

@@ -36,6 +36,9 @@ from rootsopt.status import Status
 # Amplitude of the baseline's line (relative to its mean force) below which it can be no objective.
 _NO_LINE = 1e-9
 
+# Share of a measure's nominal value below which the baseline's value in another scene is no unit.
+_LEAST = 0.1
+
 # Slack and slope (both scaled) below which every design counts as meeting a limit with equality.
 _SAME = 1e-6
 
@@ -90,13 +93,15 @@ class Problem:
 
     `config`: the config; `baseline`: evaluation of the config's own design, or of the outline that
     the search is to improve; `space`: unit box of the d design parameters, with m constraints;
-    `limits`: limits that depend on forces. In all methods, a *point* (d,) is a point of this box.
+    `limits`: limits that depend on forces; `added`: number added to the objective. In all methods,
+    a *point* (d,) is a point of this box.
     """
 
     config: Config
     baseline: Evaluation
     space: Space
     limits: tuple[ForceLimit, ...] = ()
+    added: float = 0.0
 
     @classmethod
     def of(cls, config: Config, scene: Scene, baseline: Evaluation) -> "Problem":
@@ -139,12 +144,15 @@ class Problem:
         return cls(config, baseline, space, force_limits(config, scene))
 
     def beside(self, baseline: Evaluation) -> "Problem":
-        """Return the problem relative to another evaluation of the `baseline`, as in another scene.
+        """Return the problem relative to another usable evaluation of the `baseline`.
 
-        Designs and constraints of the geometry are the same."""
-        found = Problem(self.config, baseline, self.space, self.limits)
+        Its objective is 1 + Σ w (F - F_0) / max(F_0, F_n / 10) over the measures F with the weights
+        w, where F_0 is the baseline's value there and F_n that of `self.baseline`. Where the
+        baseline hardly strikes or not at all, a ratio to F_0 alone would say nothing. Designs and
+        constraints of the geometry are the same."""
+        found = Problem(self.config, _in_units(baseline, self.baseline), self.space, self.limits)
         found.__dict__["_look_at"] = self._look_at  # Its results are costly, and the same.
-        return found
+        return dataclasses.replace(found, added=1 - found.objective(baseline))
 
     def objective(self, evaluation: Evaluation) -> float:
         """Return the objective of an `evaluation`, which is 1 for the baseline.
@@ -153,7 +161,8 @@ class Problem:
         speeds are combined. The result is NaN without a usable steady state."""
         if not evaluation.usable:
             return float("nan")
-        return sum(share * self._value(*pair) for share, *pair in self._counted(evaluation))
+        counted = self._counted(evaluation)
+        return self.added + sum(share * self._value(*pair) for share, *pair in counted)
 
     def by_speed(self, evaluation: Evaluation) -> list[dict[str, float]]:
         """Return one row per speed of `objective.speeds_rpm`, with the objective at this speed.
@@ -216,7 +225,7 @@ class Problem:
         # The same groups at every point, even if one of them has a single branch.
         cornered = self.cornered or self.config.objective.motion == "worst"
         parts = zip(evaluation.by_speed, self.baseline.by_speed, strict=True)
-        smooth, slope = 0.0, np.zeros(len(self.space.lower))
+        smooth, slope = self.added, np.zeros(len(self.space.lower))
         groups: list[Group] = []
         for number, (part, base) in enumerate(parts):
             if part.share <= 0:
@@ -622,6 +631,17 @@ def counting(evaluation: Evaluation) -> list[tuple[int, Evaluation]]:
             kind = SCENE_KINDS * scene + number
             found += [(kind, one) for one in (part.evaluation, *part.evaluation.rivals)]
     return found
+
+
+def _in_units(evaluation: Evaluation, other: Evaluation) -> Evaluation:
+    """Return an `evaluation` in which no measure is below `_LEAST` of its value in the `other`."""
+    least = {key: _LEAST * value for key, value in other.response.items()}
+    response = {k: max(value, least.get(k, value)) for k, value in evaluation.response.items()}
+    speeds = tuple(
+        one._replace(evaluation=_in_units(one.evaluation, two.evaluation))
+        for one, two in zip(evaluation.speeds, other.speeds, strict=True)
+    )
+    return dataclasses.replace(evaluation, response=response, speeds=speeds)
 
 
 def settled_by(config: Config, baseline: Evaluation) -> Config:

@@ -16,6 +16,7 @@ from rootsopt.config.tolerances import Span
 from rootsopt.optimize.assumptions import _change, _known, compared
 from rootsopt.optimize.design import search_of
 from rootsopt.optimize.outcome import BASELINE, OPTIMIZED, Assumed
+from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.robust_problem import RobustProblem
 from rootsopt.optimize.search import Search
 from rootsopt.response.reducers import over_scenes
@@ -23,6 +24,7 @@ from rootsopt.response.result import Part
 from rootsopt.response.scatter import assumed, in_conditions
 from rootsopt.scene import Scene
 from rootsopt.scene.space import Space
+from rootsopt.status import Status
 from tests.standins import evaluation_of
 
 CLEARANCE, LOAD = "contact.clearance_mm", "scene.load.torque_N_m"
@@ -59,18 +61,18 @@ def alone(scene, name):
 
 
 def by_hand(scene, name):
-    """Return the objective of a design in a scene, NaN without forces of the baseline."""
-    base, one = alone(scene, BASELINE), alone(scene, name)
-    if not (base.usable and one.usable and base.response["peak_force_N"]):
+    """Return the objective of a design in a scene, NaN if neither it nor the baseline touches."""
+    base, one, given = alone(scene, BASELINE), alone(scene, name), alone("as given", BASELINE)
+    if not (base.usable and one.usable) or base.status is one.status is Status.IDLE:
         return math.nan
-    keys = "mean_force_N", "peak_force_N"
-    return sum(0.5 * one.response[key] / base.response[key] for key in keys)
+    forces = [[x.response[k] for k in ("mean_force_N", "peak_force_N")] for x in (one, base, given)]
+    return 1 + sum(0.5 * (f - f0) / max(f0, 0.1 * fn) for f, f0, fn in zip(*forces, strict=True))
 
 
 def test_scenes_agree_with_configs_one_by_one():
     """Every scene gives what `evaluate` gives for a config with these values, from rest.
 
-    With a clearance of 60 µm, the baseline's flanks never touch: there is nothing to compare."""
+    With a clearance of 60 µm, no flanks touch: there is nothing to compare."""
     _, _, found = spread()
     assert [*found.scenes][:5] == [
         "as given", f"{LOAD}=2.865", f"{LOAD}=7.64", f"{CLEARANCE}=0", f"{CLEARANCE}=0.06"
@@ -183,7 +185,7 @@ def test_objective_over_assumptions_by_hand():
         assert [*kept] == ["random 0", "random 1", "random 2"]
         at = in_conditions(config, kept, combine=combine, k=0.0)
         bases = tuple(part.evaluation for part in base.samples)
-        problem = RobustProblem(at, base.nominal, space, (), 1.0, offsets, bases)
+        problem = RobustProblem(at, base.nominal, space, offsets=offsets, bases=bases)
         assert problem.combined(base).value == pytest.approx(1)
         return problem.objective(moved)
 
@@ -191,6 +193,17 @@ def test_objective_over_assumptions_by_hand():
     assert objective("worst", False) == pytest.approx(1.2)
     regrets = [np.max(x - np.minimum(rival, 1)[:3]) for x in (ratios[:3], np.ones(3))]
     assert objective("worst", True) == pytest.approx(1 + regrets[0] - regrets[1])
+
+
+@pytest.mark.parametrize(("own", "unit"), [(50.0, 50.0), (2.0, 10.0), (0.0, 10.0)])
+def test_a_baseline_that_hardly_strikes_is_no_unit(own, unit):
+    """Forces are 100 N as given, `own` in the scene, and those of the design there 4 N more."""
+    config = load("cic_drawn")
+    space = Space.of(config, Scene.from_config(config))
+    nominal, base, one = map(evaluation_of, (100.0, own, own + 4.0))
+    problem = Problem(config, nominal, space).beside(base)
+    assert problem.objective(base) == pytest.approx(1)
+    assert problem.objective(one) == pytest.approx(1 + 4 / unit)
 
 
 def test_scenes_are_named_and_seeded():
@@ -225,7 +238,7 @@ def test_nothing_without_a_motion_or_after_a_stop():
 def test_command_optimises_over_assumptions(tmp_path, capsys):
     """The command writes tables, figure and rows; its optimum has the least mean objective."""
     sets = [f"--set={one}" for one in (*QUICK, "objective.over=assumptions")]
-    assert main(["optimize", "cic", "-o", str(tmp_path), *sets]) == 0
+    assert main(["optimize", "cic_drawn", "-o", str(tmp_path), *sets]) == 0
     text = " ".join(capsys.readouterr().out.split())
     assert "Other scenes: The optimum is better than the baseline in" in text
     result = json.loads((tmp_path / "result.json").read_text())
