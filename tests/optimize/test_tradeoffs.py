@@ -381,6 +381,7 @@ def test_refused_configs(override, words):
         (["pareto.terms=[line_0_force_N, area_mm2]"], "line_2_force_N"),
         (["objective.motion=worst"], "objective.motion.*reached"),
         (["objective.speeds_rpm=[1000]"], "objective.speeds_rpm.*empty"),
+        (["objective.over=assumptions"], "objective.over.*nominal"),
     ],
 )
 def test_refused_terms(overrides, words):

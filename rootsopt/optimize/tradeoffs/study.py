@@ -103,6 +103,11 @@ def simulated(config: Config, scene: Scene) -> bool:
             f"but is {[*config.objective.speeds_rpm]}: a front is that of one speed; set it to [] "
             "and `scene.speed_rpm` to that speed"
         )
+    if config.objective.over != "nominal":
+        raise InputError(
+            f"`objective.over` must be nominal for `pareto.terms` with forces ({forced[0]}), but is "
+            f"{config.objective.over}: a front is that of the nominal scene; set it to nominal"
+        )
     if config.tolerances is not None:
         raise InputError(
             f"`tolerances` must be absent for `pareto.terms` with forces ({forced[0]}): a front is "
