@@ -322,9 +322,10 @@ class Bounding:
         if low >= self.target:
             return box._replace(bound=low), None
         if box.age >= self.size:
-            box = self._bent(box)
-            if (tangents := self._tangents(box)) is None:
+            bent = self._bent(box)
+            if bent is None or (tangents := self._tangents(bent)) is None:
                 return nothing
+            box = bent
         if not values.size:
             return box, box.middle
         # The greatest minorants at the middle and at each corner, for there are too many.
@@ -359,11 +360,19 @@ class Bounding:
         tops, normals = tops[known], normals[known]
         return None if np.any(tops + np.abs(normals) @ box.half < 0) else (tops, normals)
 
-    def _bent(self, box: Box) -> Box:
-        """Return a `box` with the deviations that are found at its corners."""
+    def _bent(self, box: Box) -> Box | None:
+        """Return a `box` with the deviations that are found at its corners.
+
+        Return `None` if one constraint is violated at all corners by more than it varies among
+        them. Corners at which no profile can be made are left out: next to them, the gradients of
+        constraints may have no bound."""
         slack, normals = self._look(box.middle)
         steps = self._corners * box.half
         tops, turned = zip(*[self._look(box.middle + step) for step in steps], strict=True)
+        every = np.vstack([slack, *tops])
+        high, low = np.fmax.reduce(every, axis=0), np.fmin.reduce(every, axis=0)
+        if np.any(2 * high - low < 0):
+            return None
         with np.errstate(invalid="ignore"):
             rise = np.array(tops) - slack - steps @ normals.T
             turn = (np.array(turned) - normals) * steps[:, None]
