@@ -43,7 +43,7 @@ TESTS = (
     "tests/scene/test_scene.py",
     "tests/response/test_axes.py",
     "tests/response/test_plan.py",
-    "tests/runtime/test_journal.py",
+    "tests/response/test_journal.py",
 )
 """A few test files per package that take seconds, apart from compiling."""
 LEFT = (

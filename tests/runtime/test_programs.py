@@ -311,14 +311,14 @@ def test_a_program_follows_the_code_that_it_may_import(package):
         return programs._sources({"rootsopt.response.evaluation"})
 
     first = replaced("status.py", "a", "a")
-    assert replaced("pages/html.py", "def ", "x = 1\n\n\ndef ") == first
+    assert replaced("view/pages/html.py", "def ", "x = 1\n\n\ndef ") == first
     assert replaced("commands/cli.py", "import", "import time  # or not\nimport") == first
     for name in ("dynamics/pair.py", "contact/search.py", "profiles/cic.py", "runtime/programs.py"):
         assert replaced(name, '"""', '"""Comparable to nothing.\n\n') == first
         assert replaced(name, "\n\n\n", "\n\n\n# It's \"one\n\n\n") == first
     seen = [first]
     for name, old, new in (
-        ("dynamics/settle.py", "BLOCK = 4", "BLOCK = 8"),  # imported by what is imported
+        ("dynamics/window.py", "BLOCK = 4", "BLOCK = 8"),  # imported by what is imported
         ("profiles/cic.py", "return ", "return 2 * "),  # named by the table of families
         ("dynamics/parts/machine.py", " - ", " + "),
         ("runtime/programs.py", "return [x for x in jax", "return [1 * x for x in jax"),

@@ -2,7 +2,7 @@
 
 First, each term alone is minimised from several starts. These optima are the ends of the front, and
 reference points are spread evenly between them: on the straight line between two ends, or on a
-triangular grid between three. The objective of `tradeoffs.scalar` is minimised for each of them.
+triangular grid between three. The objective of `Scalar` is minimised for each of them.
 The reference points are those of the normal-boundary method: Das and Dennis, Normal-boundary
 intersection, SIAM Journal on Optimization 8 (1998) 631-657. That method requires the solution to
 lie on the normal through the reference point; here, it may lie beside the normal.
