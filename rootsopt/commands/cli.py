@@ -28,8 +28,8 @@ from rootsopt.config import (
     sources,
 )
 from rootsopt.config.explain import GROUPS, describe, outline
-from rootsopt.config.families import families, import_named
-from rootsopt.config.sources import shipped
+from rootsopt.config.families import families
+from rootsopt.config.sources import import_named, shipped
 from rootsopt.errors import InputError
 from rootsopt.runtime import environment
 from rootsopt.runtime.environment import use_float64

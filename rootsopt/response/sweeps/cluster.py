@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rootsopt.config import Config
-from rootsopt.config.families import import_named
+from rootsopt.config.sources import import_named
 from rootsopt.config.units import shown
 from rootsopt.errors import InputError
 from rootsopt.response.evaluation import Evaluation

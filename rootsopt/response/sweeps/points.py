@@ -12,9 +12,9 @@ from typing import Any
 from pydantic import BaseModel
 
 from rootsopt.config import Config
-from rootsopt.config.families import families, family_of, find_installed, parameters
+from rootsopt.config.families import families, family_of, parameters
 from rootsopt.config.section import bare
-from rootsopt.config.sources import FILES
+from rootsopt.config.sources import FILES, find_installed
 from rootsopt.config.units import sentence
 from rootsopt.errors import InputError
 from rootsopt.response.evaluation import Evaluation, Evaluator
