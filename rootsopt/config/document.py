@@ -40,7 +40,6 @@ _MOST_DIGITS = 400
 _TAG = "tag:yaml.org,2002:"
 _MERGE = _TAG + "merge"
 
-
 # Number of dotted parts in a key above which an override is rejected. Config keys have at most
 # three parts.
 _MOST_PARTS = 8

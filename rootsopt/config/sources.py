@@ -27,10 +27,8 @@ FILES = {
 """Keys that hold the path of a file, each with the stem of its copy in a result folder and the name
 of its content in a message."""
 
-
 MOST_BYTES = 50_000_000
 """Size (bytes) above which a file that a config names is refused."""
-
 
 ENTRY_POINTS = "rootsopt.families"
 """Name of the entry-point group in which installed packages offer families.

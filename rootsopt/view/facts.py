@@ -11,8 +11,9 @@ from rootsopt.errors import InputError
 from rootsopt.response.ensemble import ERRORS
 from rootsopt.response.terms import RESERVES, sense_of
 from rootsopt.status import Status
-from rootsopt.view.comparison import elsewhere
+from rootsopt.view.comparison import elsewhere, price
 from rootsopt.view.names import (
+    Record,
     brief,
     in_words,
     limit,
@@ -23,7 +24,7 @@ from rootsopt.view.names import (
     signed,
     stated,
 )
-from rootsopt.view.tables import Record, price, varied
+from rootsopt.view.tables import varied
 
 Facts = list[tuple[str, str]]
 """Heading and sentences of each fact."""

@@ -18,7 +18,7 @@ from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.reducers import HERE
 from rootsopt.scene.space import sobol
 from rootsopt.status import Status
-from rootsopt.view.tables import rejected_table
+from rootsopt.view.comparison import rejected_table
 from tests.standins import evaluation_of
 
 

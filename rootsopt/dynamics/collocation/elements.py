@@ -31,7 +31,6 @@ from numpy.typing import NDArray
 POINTS = 4
 """Number s of Gauss points per element."""
 
-
 # Greatest error (mesh periods) of a located event. The second number determines how far beyond the
 # chord's root the next instant is, so that both ends of the range approach the event.
 _LOCATED, _STEEP = 3e-10, 0.2

@@ -22,7 +22,6 @@ from rootsopt.dynamics.pair import RotorPair
 # length of elements.
 _FLOOR = 0.15
 
-
 # Maximum number of elements per mesh period: in each of the first two mesh periods, and in each
 # further one, unless the flank is wavy or forked. Free forms have some 45 events in each mesh
 # period, four arcs up to 35. Others have fewer, and would pay for the room: sorting events takes
@@ -36,7 +35,6 @@ _SPARED = 0.06
 # Growth of these numbers for each further slice of twisted rotors, as a fraction: each slice has
 # its own events.
 _SLICES = 0.5
-
 
 # Force, as a share of the pair's, below which errors are relative to this force.
 _WEAK = 1e-3
