@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 
 from rootsopt.config.tolerances import Span
 from rootsopt.optimize.infeasible import Beginning, Infeasible
+from rootsopt.optimize.limits import constraint_rows
 from rootsopt.optimize.local import FEASIBLE, Linearization, certify
 from rootsopt.optimize.optimality import Optimality
-from rootsopt.response.evaluation import RESPONSES, Evaluation, objective_weights
+from rootsopt.response.evaluation import RESPONSES, Evaluation
 from rootsopt.response.scatter import RANDOM
+from rootsopt.response.terms import objective_weights
 from rootsopt.status import Status
 
 if TYPE_CHECKING:
@@ -173,7 +175,7 @@ class Optimization:
         if self.problem is None or self.optimized is None:
             return []
         certificate = None if self.optimality is None else self.optimality.certificate
-        return self.problem.constraint_rows(self.optimized, certificate)
+        return constraint_rows(self.problem, self.optimized, certificate)
 
     @property
     def objective_by_speed(self) -> list[dict[str, float]]:

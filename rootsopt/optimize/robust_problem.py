@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rootsopt.config import Config
-from rootsopt.optimize.limits import ForceLimit
+from rootsopt.optimize.limits import SCENE_KINDS, ForceLimit, settled_by
 from rootsopt.optimize.local import Certificate, Group, Linearization
 from rootsopt.optimize.optimality import Holder
-from rootsopt.optimize.problem import SCENE_KINDS, Problem, settled_by
+from rootsopt.optimize.problem import Problem
 from rootsopt.response.evaluation import Evaluation
 from rootsopt.response.reducers import Combined, combine
 from rootsopt.scene import Scene

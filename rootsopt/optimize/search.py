@@ -25,10 +25,10 @@ from rootsopt.errors import InputError
 from rootsopt.optimize import noise
 from rootsopt.optimize.bounding import FIRST, Bounding
 from rootsopt.optimize.infeasible import Infeasible, beginning, explain
-from rootsopt.optimize.limits import force_limits, limited
+from rootsopt.optimize.limits import force_limits, limited, needs_maxima
 from rootsopt.optimize.local import FEASIBLE, Linearization
 from rootsopt.optimize.outcome import Optimization, Trial, candidate, history_of, near, objective
-from rootsopt.optimize.problem import Problem, needs_maxima
+from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.sqp import Found, Stops, descend
 from rootsopt.optimize.verification import Verification
 from rootsopt.optimize.vertices import VertexOptimum, vertex_optimum

@@ -16,7 +16,6 @@ from rootsopt.config.units import RPM
 from rootsopt.dynamics.closed import Start, seen, steady_motion
 from rootsopt.dynamics.integrator import Solver
 from rootsopt.dynamics.maxima import local_maxima, prepare_maxima
-from rootsopt.dynamics.orbit import PEAK_NORM, line_name
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.reserve import GEAR, RESERVES, apart
 from rootsopt.dynamics.steady import CLOSED, OPEN, SAMPLES, Steady, varied, window_status
@@ -575,22 +574,6 @@ apart_program = CachedFunction(apart)
 lyapunov_program = CachedFunction(lyapunov)
 unsettled_status = CachedFunction(window_status)
 _seen = CachedFunction(seen)
-
-
-def objective_weights(config: Config) -> dict[str, float]:
-    """Return the weights of the responses in the objective, keyed by name; their sum is 1."""
-    wanted = config.objective
-    peak = PEAK_NORM if wanted.peak_norm is not None else "peak_force_N"
-    shares = {
-        "mean_force_N": wanted.mean_weight,
-        peak: wanted.peak_weight,
-        "rms_force_N": wanted.rms_weight,
-        **{line_name(order): weight for order, weight in wanted.line_weights.items()},
-    }
-    for name, weight in wanted.terms.items():
-        shares[name] = shares.get(name, 0.0) + weight
-    total = sum(shares.values())
-    return {name: share / total for name, share in shares.items() if share}
 
 
 _NO_GRADIENT = " The contact force jumps at many places, so that it has no gradient."

@@ -1,4 +1,4 @@
-"""Tables and sentences of an optimum: beside its baseline, its limits and certificate, its likeness.
+"""Tables and sentences of an optimum: beside its baseline, its limits, certificate and likeness.
 
 Also of what fits a record (`rootsopt identify`), and of an optimum over what is assumed about the
 scene."""

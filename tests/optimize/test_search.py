@@ -283,7 +283,7 @@ def test_a_slope_is_stripped_only_of_what_is_forbidden():
         ([1.0, 0.0], [1.0, 3.0], [0.0, 0.0]),
     ]
     for point, slope, expected in cases:
-        found = problem.descent(np.array(point), np.array(slope))
+        found = noise.descent(problem, np.array(point), np.array(slope))
         np.testing.assert_allclose(found, expected, atol=1e-12, err_msg=str(point))
 
 

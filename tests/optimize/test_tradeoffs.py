@@ -21,8 +21,8 @@ from rootsopt.config import parse
 from rootsopt.config.study import BASELINE
 from rootsopt.config.units import words
 from rootsopt.errors import InputError
+from rootsopt.optimize.limits import check_senses
 from rootsopt.optimize.local import Group, certify
-from rootsopt.optimize.problem import check_senses
 from rootsopt.optimize.tradeoffs import assembly, trace
 from rootsopt.optimize.tradeoffs.assembly import Node, points_of, selected
 from rootsopt.optimize.tradeoffs.front import RHO, Scalar, Scale, dominated, keys, links

@@ -20,10 +20,11 @@ from rootsopt.optimize.limits import (
     force_limits,
     limited,
     quantity_of,
+    settled_by,
     term_constraints,
 )
 from rootsopt.optimize.local import FEASIBLE, Group
-from rootsopt.optimize.problem import Problem, settled_by
+from rootsopt.optimize.problem import Problem
 from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.response.journal import Checkpoint
 from rootsopt.response.reducers import HERE, Point, Runs
