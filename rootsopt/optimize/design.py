@@ -5,9 +5,9 @@ from collections.abc import Callable
 
 from rootsopt.config import Config
 from rootsopt.errors import InputError
-from rootsopt.optimize.outcome import Optimization
+from rootsopt.optimize.outcome import Optimization, Progress
 from rootsopt.optimize.robust import StagedSearch, is_robust
-from rootsopt.optimize.search import Progress, Search
+from rootsopt.optimize.search import Search
 from rootsopt.response.journal import Checkpoint
 from rootsopt.response.reducers import HERE, Runs
 from rootsopt.response.sweeps.cluster import running

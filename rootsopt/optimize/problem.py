@@ -43,7 +43,6 @@ _NO_LINE = 1e-9
 # Share of a measure's nominal value below which the baseline's value in another scene is no unit.
 _LEAST = 0.1
 
-
 # Maximum number of times that an infeasible point is moved halfway towards a feasible point.
 _DRAWN = 5
 

@@ -22,10 +22,10 @@ from rootsopt.config.tolerances import scatterable
 from rootsopt.errors import InputError
 from rootsopt.optimize.assumptions import compared
 from rootsopt.optimize.local import Linearization
-from rootsopt.optimize.outcome import RIVAL, Optimization
+from rootsopt.optimize.outcome import RIVAL, Optimization, Progress
 from rootsopt.optimize.problem import Problem
-from rootsopt.optimize.robust_problem import RobustProblem
-from rootsopt.optimize.search import Progress, Search, Stage
+from rootsopt.optimize.robust_problem import RobustProblem, Stage
+from rootsopt.optimize.search import Search
 from rootsopt.response.evaluation import RESPONSES, Evaluation, Evaluator
 from rootsopt.response.journal import Checkpoint
 from rootsopt.response.reducers import HERE, Runs, combine, evaluate_many

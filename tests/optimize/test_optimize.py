@@ -21,7 +21,8 @@ from rootsopt.errors import InputError
 from rootsopt.optimize.infeasible import explain
 from rootsopt.optimize.limits import constraint_rows
 from rootsopt.optimize.problem import Problem
-from rootsopt.optimize.search import Search, Stage
+from rootsopt.optimize.robust_problem import Stage
+from rootsopt.optimize.search import Search
 from rootsopt.profiles import geometry
 from rootsopt.profiles.geometry import margins
 from rootsopt.response.evaluation import Evaluation, Evaluator

@@ -13,7 +13,8 @@ from rootsopt.optimize import noise
 from rootsopt.optimize.local import Linearization
 from rootsopt.optimize.outcome import Trial, history_of
 from rootsopt.optimize.problem import Problem
-from rootsopt.optimize.search import Search, Stage, _apart, _ranked
+from rootsopt.optimize.robust_problem import Stage
+from rootsopt.optimize.search import Search
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.reducers import HERE
 from rootsopt.scene.space import sobol
@@ -121,12 +122,12 @@ def test_the_best_feasible_trial_that_holds_up_is_taken():
     assert not rejected["holds_up"]
     best = [row["best_objective"] for row in history_of(trials)]
     np.testing.assert_array_equal(best, [0.65, 0.65, 0.65, 0.6, 0.51, 0.5])
-    starts = _apart(_ranked(trials), Stage.apart, 9)
+    starts = apart(ranked(trials), Stage.apart, 9)
     np.testing.assert_array_equal(starts, [[0.1, 0.1], [0.5, 0.5], [0.7, 0.2]])
     only_infeasible = trial_of([0.9, 0.9], 0.3, feasible=False)
     assert search._verification().confirmed([only_infeasible])[0] is None
     assert np.isnan(history_of([only_infeasible])[0]["best_objective"])
-    assert _ranked([only_infeasible]) == []
+    assert ranked([only_infeasible]) == []
 
 
 SPECK = (0.3, 0.7)
