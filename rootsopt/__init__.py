@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from rootsopt.optimize.tradeoffs.trace import pareto_front as pareto_front
     from rootsopt.profiles.base import Profile as Profile
     from rootsopt.profiles.base import Segment as Segment
-    from rootsopt.response.evaluation import Evaluation as Evaluation
     from rootsopt.response.evaluation import evaluate as evaluate
+    from rootsopt.response.result import Evaluation as Evaluation
     from rootsopt.response.steady import Response as Response
     from rootsopt.response.steady import steady_response as steady_response
     from rootsopt.response.sweeps.scenes import sweep_scenes as sweep_scenes
@@ -49,7 +49,7 @@ _PUBLIC = {
     "Config": "rootsopt.config:Config",
     "Contact": "rootsopt.contact.gap:Contact",
     "ContactLaw": "rootsopt.contact.law:ContactLaw",
-    "Evaluation": "rootsopt.response.evaluation:Evaluation",
+    "Evaluation": "rootsopt.response.result:Evaluation",
     "Family": "rootsopt.config.families:Family",
     "Front": "rootsopt.optimize.tradeoffs.front:Front",
     "Identification": "rootsopt.identification.answer:Identification",

@@ -23,7 +23,8 @@ from experiments._common.style import COLORS, sheet
 from experiments._common.tables import Row, show
 from rootsopt.config import load
 from rootsopt.dynamics.steady import agreement
-from rootsopt.response.evaluation import Evaluation, Evaluator
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.result import Evaluation
 
 TOLERANCES = (1e-8, 1e-9, 1e-10)
 

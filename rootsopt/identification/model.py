@@ -15,8 +15,8 @@ from rootsopt.errors import InputError
 from rootsopt.identification.quantities import OFFSET, Fitted, values_at
 from rootsopt.identification.record import CHANNELS, Observed, channels_at
 from rootsopt.response.ensemble import ERRORS, Ensemble, fitted_slope, neighbours
-from rootsopt.response.evaluation import Evaluator, apart_program
-from rootsopt.response.records import apart_record, orbit_record
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.records import apart_program, apart_record, orbit_record
 from rootsopt.response.reducers import HERE, as_done
 from rootsopt.response.result import Seed
 from rootsopt.response.sensitivity import direction, motions_along

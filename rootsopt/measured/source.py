@@ -20,8 +20,8 @@ from rootsopt.errors import InputError
 from rootsopt.measured.conjugacy import Conjugacy, conjugacy
 from rootsopt.measured.estimates import UNITS, Checks, Estimates, estimates, unit_of_size, written
 from rootsopt.measured.fit import imported
-from rootsopt.measured.loop import Loop
-from rootsopt.measured.reading import JOIN, LOBES, Sought, lobes_of, read, untangled
+from rootsopt.measured.loop import JOIN, Loop
+from rootsopt.measured.reading import LOBES, Sought, lobes_of, read, untangled
 from rootsopt.profiles import Outline
 
 if TYPE_CHECKING:

@@ -26,8 +26,8 @@ from rootsopt.optimize.limits import ForceLimit, settled
 from rootsopt.optimize.local import FEASIBLE, Group, Linearization, Look
 from rootsopt.optimize.sqp import Found, Stops, descend
 from rootsopt.profiles import Outline, Profile
-from rootsopt.response.evaluation import Evaluation
 from rootsopt.response.records import geometry_record
+from rootsopt.response.result import Evaluation
 from rootsopt.scene import Scene
 from rootsopt.scene.check import shape_of
 from rootsopt.scene.families import classical, design_of, profile_from_file, profile_of

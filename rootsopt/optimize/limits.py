@@ -19,7 +19,7 @@ from rootsopt.config.study import BASELINE
 from rootsopt.config.units import unit_of, words
 from rootsopt.errors import InputError
 from rootsopt.optimize.local import NEAR, Certificate
-from rootsopt.response.evaluation import Evaluation
+from rootsopt.response.result import Evaluation
 from rootsopt.response.terms import (
     Forces,
     Term,

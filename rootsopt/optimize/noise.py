@@ -21,7 +21,8 @@ from rootsopt.optimize.local import FEASIBLE
 from rootsopt.optimize.outcome import Trial
 from rootsopt.optimize.problem import Problem
 from rootsopt.response.ensemble import ERRORS, SIGNIFICANT, independent
-from rootsopt.response.evaluation import Evaluation, Evaluator
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.result import Evaluation
 from rootsopt.runtime.programs import CachedFunction
 
 # Distance between trials in the unit box below which they count as the same candidate.

@@ -18,7 +18,7 @@ from rootsopt.optimize.infeasible import Beginning, Infeasible
 from rootsopt.optimize.limits import constraint_rows
 from rootsopt.optimize.local import FEASIBLE, Linearization, certify
 from rootsopt.optimize.optimality import Optimality
-from rootsopt.response.evaluation import RESPONSES, Evaluation
+from rootsopt.response.result import RESPONSES, Evaluation
 from rootsopt.response.scatter import RANDOM
 from rootsopt.response.terms import objective_weights
 from rootsopt.status import Status

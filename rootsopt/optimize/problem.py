@@ -29,8 +29,8 @@ from rootsopt.optimize.limits import (
 )
 from rootsopt.optimize.local import FEASIBLE, Certificate, Group, Linearization
 from rootsopt.optimize.optimality import Holder
-from rootsopt.response.evaluation import RESPONSES, Evaluation
 from rootsopt.response.reducers import counted
+from rootsopt.response.result import RESPONSES, Evaluation
 from rootsopt.response.terms import objective_weights
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene

@@ -26,9 +26,10 @@ from rootsopt.optimize.outcome import RIVAL, Optimization, Progress
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.robust_problem import RobustProblem, Stage
 from rootsopt.optimize.search import Search
-from rootsopt.response.evaluation import RESPONSES, Evaluation, Evaluator
+from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.journal import Checkpoint
 from rootsopt.response.reducers import HERE, Runs, combine, evaluate_many
+from rootsopt.response.result import RESPONSES, Evaluation
 from rootsopt.response.scatter import Shift, draw, in_conditions, shifts
 from rootsopt.scene import Scene
 

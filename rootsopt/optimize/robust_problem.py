@@ -17,8 +17,9 @@ from rootsopt.optimize.limits import SCENE_KINDS, ForceLimit, settled_by
 from rootsopt.optimize.local import Certificate, Group, Linearization
 from rootsopt.optimize.optimality import Holder
 from rootsopt.optimize.problem import Problem
-from rootsopt.response.evaluation import Evaluation, Evaluator
+from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.reducers import Combined, Runs, combine
+from rootsopt.response.result import Evaluation
 from rootsopt.scene import Scene
 from rootsopt.scene.space import sobol
 

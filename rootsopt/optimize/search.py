@@ -42,10 +42,10 @@ from rootsopt.optimize.robust_problem import Stage
 from rootsopt.optimize.sqp import Found, Stops, descend
 from rootsopt.optimize.verification import Verification
 from rootsopt.optimize.vertices import AT_VERTEX, DRAWN, VertexOptimum, vertex_optimum
-from rootsopt.response.evaluation import Evaluation, Evaluator
+from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.journal import Checkpoint
 from rootsopt.response.reducers import HERE, Point, Runs
-from rootsopt.response.result import Seeds
+from rootsopt.response.result import Evaluation, Seeds
 from rootsopt.response.still import Still, needed_motion
 from rootsopt.runtime.threads import POLL
 from rootsopt.scene.space import Space

@@ -22,9 +22,10 @@ from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import transient_status
 from rootsopt.dynamics.window import BLOCK, Transient, settle, settled_within
-from rootsopt.response.evaluation import Evaluation, Evaluator, Motions
+from rootsopt.response.evaluation import Evaluator, Motions
 from rootsopt.response.records import message_of
 from rootsopt.response.reducers import mean
+from rootsopt.response.result import Evaluation
 from rootsopt.response.terms import objective_weights
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.runtime.threads import on_all_cores

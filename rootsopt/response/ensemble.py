@@ -30,18 +30,9 @@ from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import TOO_DEEP
 from rootsopt.dynamics.window import PERIODS
 from rootsopt.profiles import Geometry
-from rootsopt.response.evaluation import (
-    RESPONSES,
-    Evaluation,
-    Evaluator,
-    Motions,
-    apart_message,
-    geometry_record,
-    lyapunov_program,
-    message_of,
-    unsettled,
-    unsettled_status,
-)
+from rootsopt.response.evaluation import Evaluator, Motions, lyapunov_program, unsettled_status
+from rootsopt.response.records import apart_message, geometry_record, message_of, unsettled
+from rootsopt.response.result import RESPONSES, Evaluation
 from rootsopt.response.together import (
     Members,
     initial_states,

@@ -28,8 +28,8 @@ from rootsopt.dynamics.maxima import local_maxima
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.reserve import INSTANTS, gaps
 from rootsopt.dynamics.steady import Steady, varied
-from rootsopt.response.evaluation import Evaluation, Evaluator
-from rootsopt.response.result import Seed, Seeds, begun
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.result import Evaluation, Seed, Seeds, begun
 from rootsopt.response.scatter import draw, shifts
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene, along

@@ -14,8 +14,9 @@ from jaxtyping import Array, Float
 from rootsopt.config import Config
 from rootsopt.profiles import Geometry, geometry
 from rootsopt.profiles.geometry import Soundness
-from rootsopt.response.evaluation import Evaluation, Evaluator, Motions
+from rootsopt.response.evaluation import Evaluator, Motions
 from rootsopt.response.records import geometry_record, message_of
+from rootsopt.response.result import Evaluation
 from rootsopt.response.terms import depends_on_forces, objective_weights, terms_of, values_of
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene, fault_of

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from rootsopt.config import Config
-    from rootsopt.response.records import Series
+    from rootsopt.response.result import Series
 
 
 DPI = 150

@@ -10,7 +10,8 @@ from typing import Any
 from rootsopt.config import Config
 from rootsopt.config.units import words
 from rootsopt.pump.sheet import NOTE, missing, warnings
-from rootsopt.response.records import RESPONSES, message_of
+from rootsopt.response.records import message_of
+from rootsopt.response.result import RESPONSES
 from rootsopt.status import Standing, Status
 from rootsopt.view.comparison import (
     assumption_tables,

@@ -10,7 +10,8 @@ from rootsopt.optimize import noise
 from rootsopt.optimize.outcome import Trial
 from rootsopt.optimize.problem import Problem
 from rootsopt.response.ensemble import ERRORS, SIGNIFICANT
-from rootsopt.response.evaluation import RESPONSES, Evaluation, Evaluator
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.result import RESPONSES, Evaluation
 from rootsopt.status import Status
 
 INSIDE = (30.0, 4.0, 3.0)

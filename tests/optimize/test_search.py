@@ -11,7 +11,7 @@ import pytest
 from rootsopt.config import load
 from rootsopt.optimize import noise
 from rootsopt.optimize.local import Linearization
-from rootsopt.optimize.outcome import Trial, history_of
+from rootsopt.optimize.outcome import Trial, apart, history_of, ranked
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.robust_problem import Stage
 from rootsopt.optimize.search import Search

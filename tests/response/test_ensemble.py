@@ -21,7 +21,8 @@ from rootsopt.response.ensemble import (
     independent,
     neighbours,
 )
-from rootsopt.response.evaluation import RESPONSES, Evaluator
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.result import RESPONSES
 from rootsopt.response.together import Members
 from rootsopt.status import Status
 from rootsopt.view import tables

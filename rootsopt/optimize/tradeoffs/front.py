@@ -37,7 +37,7 @@ from rootsopt.config.units import words
 from rootsopt.optimize.infeasible import Infeasible
 from rootsopt.optimize.local import RESIDUAL, Certificate, Group, Linearization
 from rootsopt.optimize.tradeoffs.study import Aim, Sample
-from rootsopt.response.evaluation import Evaluation
+from rootsopt.response.result import Evaluation
 from rootsopt.status import Standing, Status
 
 EQUAL = 1e-6

@@ -16,7 +16,6 @@ from rootsopt.errors import InputError
 from rootsopt.optimize.limits import (
     LIMITS,
     PEAK,
-    depends_on_forces,
     force_limits,
     limited,
     quantity_of,
@@ -25,12 +24,12 @@ from rootsopt.optimize.limits import (
 )
 from rootsopt.optimize.local import FEASIBLE, Group
 from rootsopt.optimize.problem import Problem
-from rootsopt.response.evaluation import Evaluation, Evaluator
+from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.journal import Checkpoint
 from rootsopt.response.reducers import HERE, Point, Runs
-from rootsopt.response.result import Seeds
+from rootsopt.response.result import Evaluation, Seeds
 from rootsopt.response.still import Still
-from rootsopt.response.terms import is_force, reporting, terms_of
+from rootsopt.response.terms import depends_on_forces, is_force, reporting, terms_of
 from rootsopt.scene import Scene
 from rootsopt.scene.space import Space
 

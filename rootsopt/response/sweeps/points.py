@@ -17,8 +17,9 @@ from rootsopt.config.section import bare
 from rootsopt.config.sources import FILES, find_installed
 from rootsopt.config.units import sentence
 from rootsopt.errors import InputError
-from rootsopt.response.evaluation import Evaluation, Evaluator
+from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.reducers import HERE
+from rootsopt.response.result import Evaluation
 from rootsopt.response.together import evaluate_together, pays
 from rootsopt.scene import check_geometry
 from rootsopt.status import Status

@@ -27,7 +27,7 @@ import yaml
 import rootsopt
 from rootsopt.config.explain import tree
 from rootsopt.config.units import unit_of
-from rootsopt.response.records import RESPONSES
+from rootsopt.response.result import RESPONSES
 from rootsopt.response.sweeps.points import lost
 from rootsopt.status import Status
 

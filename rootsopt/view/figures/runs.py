@@ -9,7 +9,7 @@ import numpy as np
 from rootsopt.config import FAMILY_KEYS, Config
 from rootsopt.config.families import is_list
 from rootsopt.measured.conjugacy import conjugacy, gaps_um
-from rootsopt.response.evaluation import Evaluation
+from rootsopt.response.result import Evaluation
 from rootsopt.scene import design_keys, outline_mm
 from rootsopt.view.figures.designs import (
     plot_conjugacy,

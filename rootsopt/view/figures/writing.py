@@ -7,8 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rootsopt.config import Config
-from rootsopt.response.evaluation import Evaluation
-from rootsopt.response.records import Series
+from rootsopt.response.result import Evaluation, Series
 from rootsopt.scene import Scene
 from rootsopt.view.figures import SOLID, cad
 from rootsopt.view.figures.cad import dxf_bytes

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from rootsopt.config import Config
 from rootsopt.config.units import MM
 from rootsopt.profiles import Profile, outline
-from rootsopt.response.records import Series
+from rootsopt.response.result import Series
 from rootsopt.scene import Scene
 from rootsopt.view.figures.animation import Contacts, frames_of
 from rootsopt.view.figures.comparisons import kinds

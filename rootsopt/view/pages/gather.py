@@ -16,7 +16,7 @@ from markupsafe import Markup, escape
 
 from rootsopt.config import Config, load
 from rootsopt.config.families import family_of
-from rootsopt.response.records import Series
+from rootsopt.response.result import Series
 from rootsopt.view.files import ResultFolder, design_file
 from rootsopt.view.names import brief, in_words, listed, name_and_unit, quantity, stated
 from rootsopt.view.tables import NAMES, records_of, varied

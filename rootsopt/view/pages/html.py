@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 import rootsopt
 from rootsopt.config import Config
-from rootsopt.response.evaluation import RESPONSES, Evaluation, Series
+from rootsopt.response.result import RESPONSES, Evaluation, Series
 from rootsopt.status import Status
 from rootsopt.view import tables
 from rootsopt.view.figures.style import BLUE, GREY, SKY, VERMILION

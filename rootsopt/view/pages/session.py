@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from rootsopt.config import Config, notes
 from rootsopt.errors import InputError
-from rootsopt.response.evaluation import Evaluation
+from rootsopt.response.result import Evaluation
 from rootsopt.view.pages.knobs import Engine, Shape, frames, same_motion
 
 if TYPE_CHECKING:
