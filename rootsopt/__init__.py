@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from rootsopt.identification.answer import Identification as Identification
     from rootsopt.identification.fit import identify as identify
     from rootsopt.optimize.design import optimize_design as optimize_design
+    from rootsopt.optimize.design import pareto_front as pareto_front
     from rootsopt.optimize.outcome import Optimization as Optimization
     from rootsopt.optimize.tradeoffs.front import Front as Front
-    from rootsopt.optimize.tradeoffs.trace import pareto_front as pareto_front
     from rootsopt.profiles.base import Profile as Profile
     from rootsopt.profiles.base import Segment as Segment
     from rootsopt.response.evaluation import evaluate as evaluate
@@ -67,7 +67,7 @@ _PUBLIC = {
     "identify": "rootsopt.identification.fit:identify",
     "load_config": "rootsopt.config:load_config",
     "optimize_design": "rootsopt.optimize.design:optimize_design",
-    "pareto_front": "rootsopt.optimize.tradeoffs.trace:pareto_front",
+    "pareto_front": "rootsopt.optimize.design:pareto_front",
     "register_family": "rootsopt.config.families:register_family",
     "register_term": "rootsopt.response.terms:register_term",
     "steady_response": "rootsopt.response.steady:steady_response",

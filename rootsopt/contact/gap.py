@@ -383,10 +383,10 @@ def root_in(pair: "FlankPair", bracket, guess, guarded, roll, relative):
     converged to it).
 
     `bracket`: (low, high) (rad); `roll`, `relative`: as in `FlankPair._mesh`.
-    `guarded`: whether T falls through zero in the bracket. The bracket then shrinks around the root, and is halved if
-    Newton's step leaves it or is longer than half the previous step. Halving is needed because
-    T has a kink where ν1 crosses a segment's end. G, ν1 and the levers follow from values and
-    slopes before the last step; the error is of second order in this step.
+    `guarded`: whether T falls through zero in the bracket. The bracket then shrinks around the
+    root, and is halved if Newton's step leaves it or is longer than half the previous step. Halving
+    is needed because T has a kink where ν1 crosses a segment's end. G, ν1 and the levers follow
+    from values and slopes before the last step; the error is of second order in this step.
     """
     limit = jnp.where(guarded, _GUARDED_STEPS, _NEWTON_STEPS)
 
