@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.dynamics.steady import Steady, varied
 from rootsopt.errors import InputError
 from rootsopt.identification.quantities import OFFSET, Fitted, values_at
@@ -21,7 +21,7 @@ from rootsopt.response.reducers import HERE, as_done
 from rootsopt.response.result import Seed
 from rootsopt.response.sensitivity import direction, motions_along
 from rootsopt.response.sweeps.points import configured
-from rootsopt.scene import check_geometry
+from rootsopt.scene.check import check_geometry
 from rootsopt.status import Status
 
 Begin = Seed | NDArray[np.float64] | None

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.config import Config
 from rootsopt.config.explain import limits_of, tree
+from rootsopt.config.reading import Config
 from rootsopt.config.tolerances import scatterable, unknown_key
 from rootsopt.errors import InputError
 from rootsopt.response.sensitivity import NAMES

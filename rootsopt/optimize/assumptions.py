@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.config.tolerances import Span
 from rootsopt.optimize.limits import limited
 from rootsopt.optimize.local import FEASIBLE, Linearization

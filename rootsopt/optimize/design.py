@@ -3,7 +3,7 @@
 import threading
 from collections.abc import Callable
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.errors import InputError
 from rootsopt.optimize.outcome import Optimization, Progress
 from rootsopt.optimize.robust import StagedSearch, is_robust
@@ -14,7 +14,7 @@ from rootsopt.response.journal import Checkpoint
 from rootsopt.response.reducers import HERE, Runs
 from rootsopt.response.sweeps.cluster import running
 from rootsopt.runtime.threads import one_thread
-from rootsopt.scene import check_geometry
+from rootsopt.scene.check import check_geometry
 
 
 def search_of(

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.config.study import BASELINE
 from rootsopt.config.units import unit_of, words
 from rootsopt.errors import InputError
@@ -31,7 +31,7 @@ from rootsopt.response.terms import (
     terms_of,
 )
 from rootsopt.runtime.programs import CachedFunction
-from rootsopt.scene import Scene
+from rootsopt.scene.build import Scene
 from rootsopt.scene.space import Constraint, RangeConstraint, Space
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.config.tolerances import Span
 from rootsopt.optimize.infeasible import Beginning, Infeasible
 from rootsopt.optimize.limits import constraint_rows

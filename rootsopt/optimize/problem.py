@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.dynamics.orbit import PEAK_NORM, line_name
 from rootsopt.errors import InputError
 from rootsopt.optimize.limits import (
@@ -33,7 +33,7 @@ from rootsopt.response.reducers import counted
 from rootsopt.response.result import RESPONSES, Evaluation
 from rootsopt.response.terms import objective_weights
 from rootsopt.runtime.programs import CachedFunction
-from rootsopt.scene import Scene
+from rootsopt.scene.build import Scene
 from rootsopt.scene.space import Space, slacks_and_slopes
 from rootsopt.status import Status
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.config.study import OptimizerConfig
 from rootsopt.config.tolerances import scatterable
 from rootsopt.errors import InputError
@@ -31,7 +31,7 @@ from rootsopt.response.journal import Checkpoint
 from rootsopt.response.reducers import HERE, Runs, combine, evaluate_many
 from rootsopt.response.result import RESPONSES, Evaluation
 from rootsopt.response.scatter import Shift, draw, in_conditions, shifts
-from rootsopt.scene import Scene
+from rootsopt.scene.build import Scene
 
 OBJECTIVE = "objective"
 """Name of the objective among the compared quantities."""

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.config.study import OptimizerConfig
 from rootsopt.optimize.limits import SCENE_KINDS, ForceLimit, settled_by
 from rootsopt.optimize.local import Certificate, Group, Linearization
@@ -20,7 +20,7 @@ from rootsopt.optimize.problem import Problem
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.reducers import Combined, Runs, combine
 from rootsopt.response.result import Evaluation
-from rootsopt.scene import Scene
+from rootsopt.scene.build import Scene
 from rootsopt.scene.space import sobol
 
 # Share of a scene below which the scene does not count as active at the optimum.

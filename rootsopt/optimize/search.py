@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.config import FAMILY_KEYS, Config
+from rootsopt.config.families import FAMILY_KEYS
+from rootsopt.config.reading import Config
 from rootsopt.errors import InputError
 from rootsopt.optimize import noise
 from rootsopt.optimize.bounding import BETTER, FIRST, MOST, PARAMETERS, QUICK, TOGETHER, Bounding

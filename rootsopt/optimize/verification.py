@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.optimize.local import FEASIBLE, RESIDUAL, Certificate, certify
 from rootsopt.optimize.optimality import Optimality, StartOutcome, judged
 from rootsopt.optimize.outcome import Optimization, Trial, candidate, near, objective

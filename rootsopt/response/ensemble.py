@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.config import EnsembleConfig
+from rootsopt.config.study import EnsembleConfig
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import TOO_DEEP
@@ -41,7 +41,7 @@ from rootsopt.response.together import (
     run_members,
 )
 from rootsopt.runtime.programs import CachedFunction
-from rootsopt.scene import Scene
+from rootsopt.scene.build import Scene
 from rootsopt.scene.space import Space
 from rootsopt.status import Status
 

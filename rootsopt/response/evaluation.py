@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.dynamics.closed import Start, seen, steady_motion
 from rootsopt.dynamics.integrator import Solver
 from rootsopt.dynamics.maxima import local_maxima, prepare_maxima
@@ -46,7 +46,9 @@ from rootsopt.response.scatter import Shift, at_speed, draw, shifts
 from rootsopt.response.terms import OF_MOTION, terms_of, values_of
 from rootsopt.runtime.environment import check_precision
 from rootsopt.runtime.programs import CachedFunction
-from rootsopt.scene import Scene, check_geometry, design_keys, design_vector
+from rootsopt.scene.build import Scene
+from rootsopt.scene.check import check_geometry
+from rootsopt.scene.reading import design_keys, design_vector
 from rootsopt.status import Status
 
 # Difference between an orbit closed by collocation and an integration over its period (see

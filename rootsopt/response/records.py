@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.config.units import MM, UM
 from rootsopt.dynamics.collocation.elements import Elements
 from rootsopt.dynamics.integrator import Solver
@@ -29,7 +29,8 @@ from rootsopt.pump.rattle import rattle_record, silent_limit, silent_record
 from rootsopt.response.result import RESPONSES, Evaluation, Seed, Series
 from rootsopt.response.terms import terms_of, values_of
 from rootsopt.runtime.programs import CachedFunction
-from rootsopt.scene import Scene, fault_of
+from rootsopt.scene.build import Scene
+from rootsopt.scene.families import fault_of
 from rootsopt.status import Status
 
 if TYPE_CHECKING:

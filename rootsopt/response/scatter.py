@@ -15,10 +15,10 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.config.tolerances import Scatter, TolerancesConfig
 from rootsopt.config.units import RPM
-from rootsopt.scene import Scene
+from rootsopt.scene.build import Scene
 from rootsopt.scene.space import sobol
 
 NOMINAL, RANDOM = "as given", "random"

@@ -21,7 +21,7 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.config.tolerances import Scatter
 from rootsopt.config.units import UM
 from rootsopt.dynamics.maxima import local_maxima
@@ -32,7 +32,7 @@ from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.result import Evaluation, Seed, Seeds, begun
 from rootsopt.response.scatter import draw, shifts
 from rootsopt.runtime.programs import CachedFunction
-from rootsopt.scene import Scene, along
+from rootsopt.scene.build import Scene, along
 from rootsopt.status import Status
 
 # Relative step of the difference quotients that approximate the derivatives of the scene with

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.config.units import MM, UM
 from rootsopt.dynamics.orbit import PEAK_NORM, line_name
 from rootsopt.dynamics.reserve import GEAR, RESERVES
@@ -29,7 +29,7 @@ from rootsopt.pump.loads import BEARING, still_loads
 from rootsopt.pump.rattle import SILENT, silent_eccentricity
 from rootsopt.response.result import RESPONSES
 from rootsopt.runtime.programs import CachedFunction
-from rootsopt.scene import Scene
+from rootsopt.scene.build import Scene
 
 
 class Forces(NamedTuple):

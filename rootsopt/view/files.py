@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    from rootsopt.config import Config
+    from rootsopt.config.reading import Config
     from rootsopt.response.result import Series
 
 

@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.config.units import unit_of, words
 from rootsopt.status import Standing, Status
 

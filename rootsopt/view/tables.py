@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.config.units import words
 from rootsopt.pump.sheet import NOTE, missing, warnings
 from rootsopt.response.records import message_of

@@ -32,7 +32,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.config.units import words
 from rootsopt.optimize.infeasible import Infeasible
 from rootsopt.optimize.local import RESIDUAL, Certificate, Group, Linearization

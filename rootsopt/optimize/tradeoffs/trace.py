@@ -24,7 +24,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.config import FAMILY_KEYS, Config
+from rootsopt.config.families import FAMILY_KEYS
+from rootsopt.config.reading import Config
 from rootsopt.errors import InputError
 from rootsopt.optimize.infeasible import explain
 from rootsopt.optimize.local import FEASIBLE, RESIDUAL, Linearization, certify

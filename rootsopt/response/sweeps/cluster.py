@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.config.sources import import_named
 from rootsopt.config.units import shown
 from rootsopt.errors import InputError

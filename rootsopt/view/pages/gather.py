@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup, escape
 
-from rootsopt.config import Config, load
 from rootsopt.config.families import family_of
+from rootsopt.config.reading import Config, load
 from rootsopt.response.result import Series
 from rootsopt.view.files import ResultFolder, design_file
 from rootsopt.view.names import brief, in_words, listed, name_and_unit, quantity, stated

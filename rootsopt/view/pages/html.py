@@ -22,7 +22,7 @@ from markupsafe import Markup, escape
 from numpy.typing import NDArray
 
 import rootsopt
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.response.result import RESPONSES, Evaluation, Series
 from rootsopt.status import Status
 from rootsopt.view import tables
