@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from rootsopt.optimize.local import FEASIBLE
 from rootsopt.optimize.outcome import Trial
 from rootsopt.optimize.problem import Problem
-from rootsopt.response.ensemble import ERRORS, SIGNIFICANT, independent
+from rootsopt.response.ensemble import SIGNIFICANT, independent
 from rootsopt.response.evaluation import Evaluator
-from rootsopt.response.result import Evaluation
+from rootsopt.response.result import ERRORS, Evaluation
 from rootsopt.runtime.programs import CachedFunction
 
 # Distance between trials in the unit box below which they count as the same candidate.

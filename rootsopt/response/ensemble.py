@@ -32,7 +32,7 @@ from rootsopt.dynamics.window import PERIODS
 from rootsopt.profiles import Geometry
 from rootsopt.response.evaluation import Evaluator, Motions, lyapunov_program, unsettled_status
 from rootsopt.response.records import apart_message, geometry_record, message_of, unsettled
-from rootsopt.response.result import RESPONSES, Evaluation
+from rootsopt.response.result import ERRORS, RESPONSES, Evaluation
 from rootsopt.response.together import (
     Members,
     initial_states,
@@ -56,8 +56,6 @@ VERIFYING = 4
 SIGNIFICANT = 3.0
 """Difference between two averages (combined standard errors) above which it counts as significant.
 """
-ERRORS = {name: name.replace("_N", "_standard_error_N") for name in RESPONSES}
-"""Keys of the standard errors in `steady_state`, keyed by the name of the response."""
 
 
 @dataclasses.dataclass(frozen=True)

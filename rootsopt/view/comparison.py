@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from rootsopt.response.sensitivity import MICROMETRE, NAMES
+from rootsopt.config.units import MICROMETRE, NAMES
 from rootsopt.view.names import (
     DASH,
     Cell,

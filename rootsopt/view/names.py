@@ -5,6 +5,7 @@ ASCII where a table is printed.
 """
 
 import dataclasses
+import itertools
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -195,6 +196,16 @@ def status_cell(word: str) -> Cell:
     known = {status.label: status.usable for status in Status}
     known |= {one.label: one is Standing.CERTIFIED for one in Standing}
     return Cell(in_words(word), known.get(word))
+
+
+def varied(rows: Sequence[Record]) -> list[str]:
+    """Return the keys of the quantities that vary between scenes, beginning with a numeric one.
+
+    These are the keys before the forces in each row."""
+    keys = list(itertools.takewhile(lambda key: not key.endswith("_force_N"), rows[0]))
+    kept = [key for key in keys if key not in ("status", "point", "message")]
+    varied = [key for key in kept if len({row.get(key) for row in rows}) > 1] or kept[:1]
+    return sorted(varied, key=lambda key: not isinstance(rows[0].get(key), int | float))
 
 
 def table(

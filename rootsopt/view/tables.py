@@ -2,7 +2,6 @@
 
 The terminal (`rootsopt.view.terminal`) and the report lay out the same tables."""
 
-import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -201,16 +200,6 @@ def scene_rows(result: Record, rows: Sequence[Record] = ()) -> dict[str, Sequenc
     found = {name: record.get("speeds") for name, record in records_of(result).items()}
     found = {name: speeds for name, speeds in found.items() if speeds}
     return {"": found["design"]} if [*found] == ["design"] else found
-
-
-def varied(rows: Sequence[Record]) -> list[str]:
-    """Return the keys of the quantities that vary between scenes, beginning with a numeric one.
-
-    These are the keys before the forces in each row."""
-    keys = list(itertools.takewhile(lambda key: not key.endswith("_force_N"), rows[0]))
-    kept = [key for key in keys if key not in ("status", "point", "message")]
-    varied = [key for key in kept if len({row.get(key) for row in rows}) > 1] or kept[:1]
-    return sorted(varied, key=lambda key: not isinstance(rows[0].get(key), int | float))
 
 
 def scene_tables(result: Record, rows: Sequence[Record], most: int) -> Iterator[Table | None]:

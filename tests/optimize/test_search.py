@@ -231,7 +231,7 @@ def test_a_descent_goes_half_way_back_from_where_there_is_no_steady_state(monkey
     rates = optax.cosine_decay_schedule(0.2, 6, 0.05)
     monkeypatch.setattr(noise, "_rule", lambda iterations: optax.sgd(rates))
     search = searching(iterations=6)
-    vars(search.problem)["descent"] = lambda point, slope: slope
+    monkeypatch.setattr(noise, "descent", lambda problem, point, slope: slope)
     vars(search.problem)["slope"] = lambda evaluation, point: 2 * (point - 0.6)
     search.expected = 7
     search._lock, search._done, search._best = threading.Lock(), 0, float("nan")
