@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike
 from experiments._common.scenes import FORCES
 from rootsopt.config import Config
 from rootsopt.profiles import Profile
-from rootsopt.response.evaluation import Evaluator
-from rootsopt.response.result import Evaluation
+from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.scene import Scene, design_vector
 
 # Compiled `Scene.pair`: returns the rotor pair of a scene and a design.

@@ -23,8 +23,7 @@ from experiments._common.style import COLORS, sheet
 from experiments._common.tables import Row, show
 from rootsopt.config import load
 from rootsopt.dynamics.steady import agreement
-from rootsopt.response.evaluation import Evaluator
-from rootsopt.response.result import Evaluation
+from rootsopt.response.evaluation import Evaluation, Evaluator
 
 TOLERANCES = (1e-8, 1e-9, 1e-10)
 

@@ -23,8 +23,7 @@ from rootsopt.config.units import MM
 from rootsopt.dynamics.closed import Start, steady_motion
 from rootsopt.dynamics.orbit import Orbit
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.response.evaluation import Evaluator
-from rootsopt.response.result import Evaluation
+from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene, design_vector
 from rootsopt.status import Status

@@ -10,8 +10,7 @@ import time
 import numpy as np
 
 from rootsopt.errors import InputError
-from rootsopt.response.evaluation import Evaluator
-from rootsopt.response.result import Evaluation
+from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.response.sweeps import points
 from rootsopt.status import Status
 
