@@ -25,13 +25,13 @@ if TYPE_CHECKING:
     from rootsopt.identification.answer import Identification as Identification
     from rootsopt.identification.fit import identify as identify
     from rootsopt.optimize.design import optimize_design as optimize_design
+    from rootsopt.optimize.design import pareto_front as pareto_front
     from rootsopt.optimize.outcome import Optimization as Optimization
     from rootsopt.optimize.tradeoffs.front import Front as Front
-    from rootsopt.optimize.tradeoffs.trace import pareto_front as pareto_front
     from rootsopt.profiles.base import Profile as Profile
     from rootsopt.profiles.base import Segment as Segment
-    from rootsopt.response.evaluation import Evaluation as Evaluation
     from rootsopt.response.evaluation import evaluate as evaluate
+    from rootsopt.response.result import Evaluation as Evaluation
     from rootsopt.response.steady import Response as Response
     from rootsopt.response.steady import steady_response as steady_response
     from rootsopt.response.sweeps.scenes import sweep_scenes as sweep_scenes
@@ -49,7 +49,7 @@ _PUBLIC = {
     "Config": "rootsopt.config:Config",
     "Contact": "rootsopt.contact.gap:Contact",
     "ContactLaw": "rootsopt.contact.law:ContactLaw",
-    "Evaluation": "rootsopt.response.evaluation:Evaluation",
+    "Evaluation": "rootsopt.response.result:Evaluation",
     "Family": "rootsopt.config.families:Family",
     "Front": "rootsopt.optimize.tradeoffs.front:Front",
     "Identification": "rootsopt.identification.answer:Identification",
@@ -67,7 +67,7 @@ _PUBLIC = {
     "identify": "rootsopt.identification.fit:identify",
     "load_config": "rootsopt.config:load_config",
     "optimize_design": "rootsopt.optimize.design:optimize_design",
-    "pareto_front": "rootsopt.optimize.tradeoffs.trace:pareto_front",
+    "pareto_front": "rootsopt.optimize.design:pareto_front",
     "register_family": "rootsopt.config.families:register_family",
     "register_term": "rootsopt.response.terms:register_term",
     "steady_response": "rootsopt.response.steady:steady_response",

@@ -12,7 +12,7 @@ from rootsopt.contact.gap import Contact
 from rootsopt.contact.law import ImpactLaw
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.parts import ConstantLoad, PrescribedDrive, TimingGear
-from rootsopt.response.evaluation import RESPONSES, Evaluation
+from rootsopt.response.result import RESPONSES, Evaluation
 from rootsopt.status import Status
 
 LOBES, SPEED, INERTIA, STIFFNESS, DAMPING, LOAD = 3, 300.0, 2e-3, 2e3, 1.5, 0.4

@@ -24,7 +24,7 @@ from experiments._common.tables import Row, show
 from experiments._common.timing import processor_time
 from rootsopt.config import load
 from rootsopt.errors import InputError
-from rootsopt.response.evaluation import Evaluation
+from rootsopt.response.result import Evaluation
 from rootsopt.status import Status
 
 # Values of `solver.accuracy`.

@@ -26,8 +26,9 @@ from rootsopt.optimize.noise import standard_error
 from rootsopt.optimize.outcome import Optimization
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.search import Search
-from rootsopt.response.ensemble import ERRORS, Ensemble, integrator
+from rootsopt.response.ensemble import Ensemble, integrator
 from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.result import ERRORS
 from rootsopt.response.together import run_members
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import Scene

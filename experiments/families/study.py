@@ -28,7 +28,7 @@ from rootsopt.config import Config, load, parse
 from rootsopt.errors import InputError
 from rootsopt.optimize.search import Search
 from rootsopt.profiles.departure import departure
-from rootsopt.response.evaluation import Evaluation
+from rootsopt.response.result import Evaluation
 from rootsopt.scene import check_geometry, design_vector, outline_mm
 from rootsopt.scene.families import classical, free_form_of
 

@@ -23,7 +23,7 @@ from experiments._common.tables import Row, show
 from rootsopt.config import Config, load
 from rootsopt.config.families import family_of
 from rootsopt.errors import InputError
-from rootsopt.optimize.tradeoffs.trace import pareto_front
+from rootsopt.optimize.design import pareto_front
 from rootsopt.profiles import geometry
 from rootsopt.pump import relative_flow
 from rootsopt.pump.sheet import sheet as pump_sheet

@@ -24,8 +24,8 @@ from experiments._common.tables import Row, print_record
 from rootsopt.config import Config
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.optimize.search import Search
-from rootsopt.response.evaluation import Evaluation, objective_weights
-from rootsopt.response.result import Part
+from rootsopt.response.result import Evaluation, Part
+from rootsopt.response.terms import objective_weights
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import design_vector
 from rootsopt.view.figures.sweep import LABELS

@@ -21,15 +21,12 @@ from rootsopt.commands import door
 from rootsopt.commands.door import BAD_INPUT, NO_RESULT
 from rootsopt.commands.door import OK as OK
 from rootsopt.commands.table import Command
-from rootsopt.config import (
-    Config,
-    load,
-    notes,
-    sources,
-)
+from rootsopt.config import sources
 from rootsopt.config.explain import GROUPS, describe, outline
-from rootsopt.config.families import families, import_named
-from rootsopt.config.sources import shipped
+from rootsopt.config.families import families
+from rootsopt.config.plausible import notes
+from rootsopt.config.reading import Config, load
+from rootsopt.config.sources import import_named, shipped
 from rootsopt.errors import InputError
 from rootsopt.runtime import environment
 from rootsopt.runtime.environment import use_float64

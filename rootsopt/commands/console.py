@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 
 from rootsopt.commands import cli, door
 from rootsopt.commands.table import COMMANDS
-from rootsopt.config import Config
 from rootsopt.config.explain import tree
+from rootsopt.config.reading import Config
 from rootsopt.config.sources import shipped
 from rootsopt.errors import InputError
 

@@ -1,4 +1,4 @@
-"""Reads one YAML document as plain data, within size limits.
+"""Reads one YAML document as plain data, within size limits, and sets values in it.
 
 The language is YAML 1.1 as PyYAML reads it, with some exceptions that suit a config. `1e5` is a
 number; `1:30`, `2020-01-01`, `yes` and `off` are words; `010` is ten. A key may appear only once in
@@ -13,6 +13,7 @@ import yaml
 from yaml.constructor import ConstructorError
 from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
+from rootsopt.config.section import put
 from rootsopt.config.units import clipped, named, sentence, shown
 from rootsopt.errors import InputError
 
@@ -38,6 +39,10 @@ _MOST_DIGITS = 400
 
 _TAG = "tag:yaml.org,2002:"
 _MERGE = _TAG + "merge"
+
+# Number of dotted parts in a key above which an override is rejected. Config keys have at most
+# three parts.
+_MOST_PARTS = 8
 
 
 def read_document(text: str, source: str) -> Any:
@@ -239,3 +244,17 @@ for _kind, _pattern, _first in (
     ("merge", "<<", "<"),
 ):
     _Loader.add_implicit_resolver(_TAG + _kind, re.compile(rf"^(?:{_pattern})\Z"), list(_first))
+
+
+def override_in(data: dict, override: str) -> None:
+    """Set the value of an `override`, as for `--set`, in plain `data`.
+
+    Raises `InputError` if it is not of the form `dotted.key=value`."""
+    key, equals, value = override.partition("=")
+    parts = key.strip().split(".")
+    name = f"--set {shown(override)}"
+    if not equals or not all(parts):
+        raise InputError(f"{name}: must be dotted.key=value, as in scene.speed_rpm=1500")
+    if len(parts) > _MOST_PARTS:
+        raise InputError(f"{name}: has more than {_MOST_PARTS} dotted keys; no key is that deep")
+    put(data, ".".join(parts), read_document(value, name))

@@ -6,7 +6,6 @@ messages, the optimiser's bounds and the checks that a profile is sound. Nothing
 function that makes profiles may be named as "module:function" and is loaded when first needed.
 """
 
-import contextlib
 import dataclasses
 import functools
 import importlib
@@ -16,7 +15,6 @@ import importlib.util
 import inspect
 import re
 import sys
-import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -24,8 +22,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import Field
 
 from rootsopt.config.section import Listed, bare, between
-from rootsopt.config.units import placed, sentence, si_unit
-from rootsopt.errors import InputError
+from rootsopt.config.units import si_unit
 
 if TYPE_CHECKING:
     from rootsopt.config.rotor import ProfileConfig
@@ -36,10 +33,6 @@ MARGINS = (
 """Names of the margins that are ≥ 0 in a sound profile (see `rootsopt.profiles.geometry`)."""
 FREE_FORM = "free_form"
 """Name of the family whose members can approximate any profile."""
-ENTRY_POINTS = "rootsopt.families"
-"""Name of the entry-point group in which installed packages offer families.
-
-The name of each entry point is that of its family."""
 EXAMPLE_RADIUS = 33.0
 """Pitch radius (mm) of the rotors in `Family.example`."""
 
@@ -318,16 +311,6 @@ def users_of(key: str) -> list[str]:
     return [family.name for family in _families.values() if key in family.keys]
 
 
-def find_installed(name: str) -> None:
-    """Load the installed packages that offer a family with this `name`, if there are any.
-
-    Raises `InputError` if loading fails."""
-    for point in importlib.metadata.entry_points(group=ENTRY_POINTS):
-        if bare(point.name) == bare(name):
-            with _explained(f"profile family {point.name} of {point.value}"):
-                point.load()
-
-
 def is_shipped(name: str) -> bool:
     """Return whether the family of this name is one of the package's own."""
     return _origins[name].partition(".")[0] == __name__.partition(".")[0]
@@ -453,41 +436,3 @@ def _check_parameter(parameter: Parameter) -> None:
 _RESERVED = (
     *("family", "lobes", "pitch_radius_mm", "outline_file", "outline_smoothing_mm", "helix_deg"),
 )
-
-
-def import_named(name: str) -> None:
-    """Import a module by name, or a Python file by path, unless it has been imported before.
-
-    The module may register families. Raises `InputError` if the import fails."""
-    with _explained(f"`--import` {placed(name)}"):
-        if not (name.endswith(".py") or Path(name).is_file()):
-            importlib.import_module(name)
-            return
-        path = Path(name).resolve(strict=True)
-        known = "imported_" + re.sub(r"\W", "_", str(path))
-        if known in sys.modules:
-            return
-        loader = importlib.machinery.SourceFileLoader(known, str(path))
-        spec = importlib.util.spec_from_file_location(known, path, loader=loader)
-        assert spec is not None
-        module = sys.modules[known] = importlib.util.module_from_spec(spec)
-        try:
-            loader.exec_module(module)
-        except BaseException:
-            del sys.modules[known]
-            raise
-
-
-@contextlib.contextmanager
-def _explained(what: str) -> Iterator[None]:
-    """Turn any error in the `with` block into a one-line `InputError`.
-
-    `what`: what the block loads, as the start of the message."""
-    try:
-        yield
-    # Any exception here is caused by that module.
-    except Exception as error:
-        kind = type(error).__name__
-        frames = traceback.extract_tb(error.__traceback__)
-        line = f" (line {frames[-1].lineno} of {placed(frames[-1].filename)})" if frames else ""
-        raise InputError(sentence(f"{what}: fails with {kind}: {error}{line}")) from error

@@ -10,14 +10,14 @@ import yaml
 from numpy.typing import NDArray
 from pydantic import Field, SerializeAsAny, ValidationError, model_validator
 
-from rootsopt.config.document import MOST_BYTES, read_document
+from rootsopt.config.document import MOST_BYTES, override_in, read_document
 from rootsopt.config.explain import explain, tree, without_removed
-from rootsopt.config.families import families, family_of, find_installed, is_list
+from rootsopt.config.families import families, family_of, is_list
 from rootsopt.config.pareto import ParetoConfig
 from rootsopt.config.rotor import DrawingConfig, ProfileConfig, RotorConfig
 from rootsopt.config.scene import ContactConfig, PumpConfig, SceneConfig, following_mm
 from rootsopt.config.section import Section, bare, put, require
-from rootsopt.config.sources import FILES, advice, located, regular_file
+from rootsopt.config.sources import advice, find_installed, located, place_files, regular_file
 from rootsopt.config.study import (
     TWIST,
     AttractorsConfig,
@@ -37,14 +37,10 @@ from rootsopt.config.tolerances import (
     scatterable,
     unknown_key,
 )
-from rootsopt.config.units import hint, placed, sentence, shown
+from rootsopt.config.units import hint, placed, sentence
 from rootsopt.errors import InputError
 
 _SPEED = "scene.speed_rpm"
-
-# Number of dotted parts in a key above which an override is rejected. Config keys have at most
-# three parts.
-_MOST_PARTS = 8
 
 
 class Config(Section):
@@ -400,10 +396,10 @@ def parse(
             f"{name}: must hold sections such as `profile:` and `scene:`, but is a "
             f"{type(data).__name__}"
         )
-    _place_files(data, Path(folder))
+    place_files(data, Path(folder))
     for override in overrides:
         override_in(data, override)
-    _place_files(data, Path())
+    place_files(data, Path())
     _find_family(data)
     return _checked(data, f"{name}: ")
 
@@ -429,19 +425,6 @@ def _find_family(data: dict) -> None:
         find_installed(name)
 
 
-def _place_files(data: dict, folder: Path) -> None:
-    """Make relative paths of files in `data` absolute, in place.
-
-    `folder`: folder to which the paths are relative."""
-    for key in FILES:
-        *sections, name = key.split(".")
-        found: Any = data
-        for section in sections:
-            found = found.get(section) if isinstance(found, dict) else None
-        if isinstance(found, dict) and isinstance(found.get(name), str):
-            found[name] = str((folder / found[name]).absolute())
-
-
 def _read(path: Path) -> str:
     name = placed(path)
     regular_file(path, "a config")
@@ -462,17 +445,3 @@ def _read(path: Path) -> str:
         raise InputError(
             f"{name}: is not UTF-8 text (byte {error.start}); save it as UTF-8"
         ) from None
-
-
-def override_in(data: dict, override: str) -> None:
-    """Set the value of an `override`, as for `--set`, in plain `data`.
-
-    Raises `InputError` if it is not of the form `dotted.key=value`."""
-    key, equals, value = override.partition("=")
-    parts = key.strip().split(".")
-    name = f"--set {shown(override)}"
-    if not equals or not all(parts):
-        raise InputError(f"{name}: must be dotted.key=value, as in scene.speed_rpm=1500")
-    if len(parts) > _MOST_PARTS:
-        raise InputError(f"{name}: has more than {_MOST_PARTS} dotted keys; no key is that deep")
-    put(data, ".".join(parts), read_document(value, name))

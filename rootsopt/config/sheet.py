@@ -10,8 +10,8 @@ from typing import Annotated, Any
 import yaml
 from pydantic import Field
 
+from rootsopt.config.document import override_in
 from rootsopt.config.families import EXAMPLE_RADIUS, Family, families, family_of
-from rootsopt.config.reading import override_in
 from rootsopt.config.rotor import ProfileConfig
 from rootsopt.config.section import Among, Section, between, put
 from rootsopt.config.units import RPM

@@ -1,12 +1,23 @@
-"""Files that a config names, and the configs that come with the package."""
+"""Files and modules that a config names, and the configs that come with the package."""
 
+import contextlib
 import difflib
 import functools
+import importlib
+import importlib.machinery
+import importlib.metadata
+import importlib.util
 import os
+import re
 import stat
+import sys
+import traceback
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
-from rootsopt.config.units import placed
+from rootsopt.config.section import bare
+from rootsopt.config.units import placed, sentence
 from rootsopt.errors import InputError
 
 FILES = {
@@ -16,9 +27,13 @@ FILES = {
 """Keys that hold the path of a file, each with the stem of its copy in a result folder and the name
 of its content in a message."""
 
-
 MOST_BYTES = 50_000_000
 """Size (bytes) above which a file that a config names is refused."""
+
+ENTRY_POINTS = "rootsopt.families"
+"""Name of the entry-point group in which installed packages offer families.
+
+The name of each entry point is that of its family."""
 
 
 def reason(error: Exception) -> str:
@@ -98,9 +113,70 @@ def located(path: Path) -> Path:
     return shipped().get(path.stem, path)
 
 
+def place_files(data: dict, folder: Path) -> None:
+    """Make relative paths of files in `data` absolute, in place.
+
+    `folder`: folder to which the paths are relative."""
+    for key in FILES:
+        *sections, name = key.split(".")
+        found: Any = data
+        for section in sections:
+            found = found.get(section) if isinstance(found, dict) else None
+        if isinstance(found, dict) and isinstance(found.get(name), str):
+            found[name] = str((folder / found[name]).absolute())
+
+
 def advice(path: Path) -> str:
     """Return what to give instead of a `path` that does not exist."""
     near = difflib.get_close_matches(path.stem[:80], shipped(), n=1)
     meant = f"; did you mean {near[0]!r}?" if near else ""
     names = ", ".join(shipped())
     return f"give the path of a config, or the name of a shipped one ({names}){meant}"
+
+
+def find_installed(name: str) -> None:
+    """Load the installed packages that offer a family with this `name`, if there are any.
+
+    Raises `InputError` if loading fails."""
+    for point in importlib.metadata.entry_points(group=ENTRY_POINTS):
+        if bare(point.name) == bare(name):
+            with _explained(f"profile family {point.name} of {point.value}"):
+                point.load()
+
+
+def import_named(name: str) -> None:
+    """Import a module by name, or a Python file by path, unless it has been imported before.
+
+    The module may register families. Raises `InputError` if the import fails."""
+    with _explained(f"`--import` {placed(name)}"):
+        if not (name.endswith(".py") or Path(name).is_file()):
+            importlib.import_module(name)
+            return
+        path = Path(name).resolve(strict=True)
+        known = "imported_" + re.sub(r"\W", "_", str(path))
+        if known in sys.modules:
+            return
+        loader = importlib.machinery.SourceFileLoader(known, str(path))
+        spec = importlib.util.spec_from_file_location(known, path, loader=loader)
+        assert spec is not None
+        module = sys.modules[known] = importlib.util.module_from_spec(spec)
+        try:
+            loader.exec_module(module)
+        except BaseException:
+            del sys.modules[known]
+            raise
+
+
+@contextlib.contextmanager
+def _explained(what: str) -> Iterator[None]:
+    """Turn any error in the `with` block into a one-line `InputError`.
+
+    `what`: what the block loads, as the start of the message."""
+    try:
+        yield
+    # Any exception here is caused by that module.
+    except Exception as error:
+        kind = type(error).__name__
+        frames = traceback.extract_tb(error.__traceback__)
+        line = f" (line {frames[-1].lineno} of {placed(frames[-1].filename)})" if frames else ""
+        raise InputError(sentence(f"{what}: fails with {kind}: {error}{line}")) from error

@@ -1,6 +1,7 @@
 """Units in the names of keys, and values and messages in words of limited length.
 
-Hints name a value that seems to be given in another unit."""
+Hints name a value that seems to be given in another unit. `NAMES` are the quantities of a scene on
+which the contact forces depend."""
 
 import difflib
 import math
@@ -52,6 +53,31 @@ _SPELT = str.maketrans({"·": "_", "/": "_per_", "³": "3", "²": "2", "µ": "u"
 
 # Units as they are spelt in names of keys.
 _SHORT = {"metres": "m", "centimetres": "cm", "micrometres": "um", "radians": "rad"}
+
+MICROMETRE = 1e-3
+"""One micrometre (mm): change of clearance, backlash and centre distance error for which the table
+states the effect."""
+
+# Quantities of a scene on which the contact forces depend: key, name in words, and unit. Clearance,
+# backlash and centre distance error are lengths, in mm.
+LENGTHS = (
+    ("contact.clearance_mm", "clearance of the flanks"),
+    ("scene.timing_gear.backlash_mm", "backlash of the timing gear"),
+    ("scene.center_distance_error_mm", "centre distance error"),
+)
+OTHERS = (
+    ("scene.speed_rpm", "speed", "rpm"),
+    ("scene.load.torque_N_m", "load", "N m"),
+    ("scene.load.pressure_difference_Pa", "pressure difference", "Pa"),
+    ("scene.timing_gear.stiffness_N_m_per_rad", "stiffness of the timing gear", "N m/rad"),
+    ("scene.timing_gear.damping_ratio", "damping ratio of the timing gear", ""),
+    ("contact.stiffness_N_per_mm_e", "contact stiffness", "N/mm^e"),
+    ("contact.max_damping_N_s_per_mm", "contact damping", "N s/mm"),
+    ("rotor.density_kg_m3", "density", "kg/m^3"),
+    ("rotor.length_mm", "rotor length", "mm"),
+)
+NAMES = {key: name for key, name, *_ in (*LENGTHS, *OTHERS)}
+"""Names in words of these quantities, by config key."""
 
 
 def unit_of(key: str) -> str:

@@ -28,8 +28,6 @@ which rotor 1's addendum meets rotor 2's dedendum. Coast flanks follow from mirr
 ε → -ε.
 """
 
-from typing import NamedTuple
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -38,20 +36,11 @@ from jax import lax
 from jax.custom_batching import custom_vmap, sequential_vmap
 from jaxtyping import Array, Bool, Float
 
+from rootsopt.contact.gap import DEEPEST, ClosestApproach, FlankNodes, bracket_of, root_in
 from rootsopt.profiles import base as trig
 from rootsopt.profiles.base import Profile
 from rootsopt.runtime.kept import kept
 
-# Maximum number of Newton steps from the point of perfect rolling; two or three are usual.
-_NEWTON_STEPS = 5
-# Length (rad) of the last step below which Newton's method has converged. The next step would then
-# be smaller than the rounding error, even across a kink of T.
-_CONVERGED = 1e-8
-# Length (rad) of a step below which no further step is tried. Beside a kink of T, the normal angles
-# of the result err by this length.
-_FINISHED = 1e-11
-# Maximum number of steps inside a bracket; bisection alone needs about fifty.
-_GUARDED_STEPS = 60
 # Least number of poses that are searched in groups (see `FlankPair.together`), and size of a group.
 _MANY = 32
 # Marks a finished search: this is added to the number of attempts.
@@ -68,58 +57,9 @@ _FORK = 30.0
 # to |ε|: on epicycloids, this one lies at most 0.6 |ε| before the cusp, the other one at least
 # 5 |ε| where they are equally deep.
 _NEAR_CUSP = 1.8
-# Penetration (pitch radii) above which a pair of points on flanks that are not conjugate is
-# ignored.
-_DEEPEST = 0.1
-# Magnitude of T (pitch radii) below which T at a node counts as zero, because it may be a rounding
-# error.
-_SLACK = 1e-13
 # Number of extra nodes between the edge of a land, or a joint of a forked flank, and the next node.
 # Their distances from the edge double from one to the next.
 _CROWD = 12
-
-
-class ClosestApproach(NamedTuple):
-    """Result of one search.
-
-    `gap`: gap (m), negative when the flanks penetrate.
-    `lever1`, `lever2`: moment arms (m) of the common normal about rotor 1 and rotor 2, so that
-    d gap = -lever1 dφ1 + lever2 dφ2.
-    `normal1`, `normal2`: ν1 and ν2 (rad).
-    `found`: whether a common normal was found. Otherwise, the gap is the pitch radius and the
-    levers are zero. The search is skipped at poses at which the flanks cannot touch yet (see
-    `contact_begins`).
-    `rank`: on a wavy flank (`Profile.wavy`), number of minima of the gap at a smaller ν2; otherwise
-    0. Where it changes, the contact may jump from one minimum to another.
-    """
-
-    gap: Float[Array, ""]
-    lever1: Float[Array, ""]
-    lever2: Float[Array, ""]
-    normal1: Float[Array, ""]
-    normal2: Float[Array, ""]
-    found: Bool[Array, ""]
-    rank: Float[Array, ""] | float = 0.0
-
-
-class FlankNodes(NamedTuple):
-    """Nodes at which T is sampled, with the quantities that do not depend on the pose.
-
-    `normal` (n,): normal angles ν2 (rad) of the nodes.
-    `facing` (n,): direction (rad) of the common normal at x = 0.
-    `direction` (2, n): cosine and sine of `facing`.
-    `turned` (2, n): cosine and sine of `Profile.turn_ratio` times `facing`.
-    `lever` (n,): lever (m) of rotor 2's point.
-    `support` (n,): support function (m) of rotor 2's point; `None` for conjugate flanks, whose gap
-    has at most two minima.
-    """
-
-    normal: Float[Array, " n"]
-    facing: Float[Array, " n"]
-    direction: Float[Array, "2 n"]
-    turned: Float[Array, "2 n"]
-    lever: Float[Array, " n"]
-    support: Float[Array, " n"] | None
 
 
 class FlankPair(eqx.Module):
@@ -359,12 +299,12 @@ class FlankPair(eqx.Module):
             attempt, best = carry
             direct = attempt == 0
             bracket, guess, present, single = lax.cond(
-                direct, lambda: rolling, lambda: self._bracket(attempt, roll, relative)
+                direct, lambda: rolling, lambda: bracket_of(self, attempt, roll, relative)
             )
-            found, converged = self._root(bracket, guess, ~direct, roll, relative)
+            found, converged = root_in(self, bracket, guess, ~direct, roll, relative)
             gap, normal1, lever1, lever2, normal2 = found
             if self.frozen.wavy:  # A pair this deep belongs to the other flank of the lobe.
-                present &= gap > -_DEEPEST * self.profile.pitch_radius
+                present &= gap > -DEEPEST * self.profile.pitch_radius
             rank = jnp.maximum(attempt - 1.0, 0.0) if self.frozen.wavy else nothing
             new = ClosestApproach(gap, lever1, lever2, normal1, normal2, present, rank)
             better = present & ((gap < best.gap) | (attempt < 2))
@@ -401,7 +341,7 @@ class FlankPair(eqx.Module):
         """Return the start of Newton's method at perfect rolling, whether its result may be
         trusted, and whether the flanks cannot touch yet.
 
-        `roll`, `relative`: as in `_mesh`. The start has the form of the result of `_bracket`."""
+        `roll`, `relative`: as in `_mesh`. The start has the form of the result of `bracket_of`."""
         low, high = self.nodes.normal[0], self.nodes.normal[-1]
         absent = roll < contact_begins(relative)
         start = (low, high), jnp.clip(self.profile.normal_at(roll), low, high), ~absent, ~absent
@@ -423,8 +363,8 @@ class FlankPair(eqx.Module):
 
         def attempt(roll, relative):
             """Return the closest approach of attempt 1, and whether it is certain."""
-            bracket, guess, present, single = self._bracket(1, roll, relative)
-            found, _ = self._root(bracket, guess, jnp.ones((), bool), roll, relative)
+            bracket, guess, present, single = bracket_of(self, 1, roll, relative)
+            found, _ = root_in(self, bracket, guess, jnp.ones((), bool), roll, relative)
             gap, normal1, lever1, lever2, normal2 = found
             _, usual, absent = self._direct(roll, relative)
             absent &= usual
@@ -444,102 +384,13 @@ class FlankPair(eqx.Module):
         (rest,) = jnp.nonzero(~certain, size=count, fill_value=0)
         return lax.fori_loop(0, jnp.sum(~certain), one, found)
 
-    def _bracket(self, attempt, roll, relative):
-        """Return an interval between two nodes where T falls through zero.
-
-        `roll`, `relative`: as in `_mesh`. For conjugate flanks, attempt 1 takes the last such
-        interval and attempt 2 the first; on a wavy flank, attempt k takes the k-th. For other
-        flanks, attempt 1 takes the interval with the least gap and attempt 2 that with the second
-        least gap. The result is ((low, high), first guess, whether such an interval exists, whether
-        there is at most one)."""
-        profile, nodes = self.profile, self.nodes
-        turned = _rotate(nodes.turned, 2 * profile.turn_ratio * roll)
-        normal1 = nodes.facing + 2 * roll
-        lever1 = profile.lever_from(normal1, turned[0], turned[1])
-        cos, sin = _rotate(nodes.direction, roll - relative / 2)
-        offset = self.center_distance * sin - lever1 - nodes.lever
-        # The tolerance keeps a root on a node. A compiled program may round T[i] differently as the
-        # end of one interval and as the start of the next.
-        slack = _SLACK * profile.pitch_radius
-        falling = (offset[:-1] >= -slack) & (offset[1:] < slack)
-        if profile.wavy:
-            number = jnp.cumsum(falling)
-            index = jnp.argmax(falling & (number == attempt))
-            present, single = number[-1] >= attempt, number[-1] <= attempt
-        elif nodes.support is None:
-            # The maximum of integers is vectorised, an arg-minimum is not.
-            place = jnp.arange(falling.shape[0])
-            last = jnp.max(jnp.where(falling, place, -1))
-            first = jnp.min(jnp.where(falling, place, place.shape[0]))
-            present, single = last >= 0, first >= last
-            index = jnp.where(present, jnp.where(attempt == 1, last, first), 0)
-        else:
-            # The derivative of the gap between parallel tangents with respect to their angle is -T.
-            gap = self.center_distance * cos - profile.support(normal1) - nodes.support
-            share = _share(offset[:-1], offset[1:])
-            least = gap[:-1] - jnp.diff(nodes.facing) * share * offset[:-1] / 2
-            # A pair this deep belongs to the other flank of the lobe.
-            falling &= least > -_DEEPEST * profile.pitch_radius
-            least = jnp.where(falling, least, jnp.inf)
-            present, single = jnp.any(falling), jnp.sum(falling) < 2
-            first = jnp.argmin(least)
-            index = jnp.where(attempt == 1, first, jnp.argmin(least.at[first].set(jnp.inf)))
-        low, high = nodes.normal[index], nodes.normal[index + 1]
-        share = _share(offset[index], offset[index + 1])
-        return (low, high), low + (high - low) * share, present, single
-
-    def _root(self, bracket, guess, guarded, roll, relative):
-        """Return ((G, ν1, q1, q2, ν2) at a root of T, whether Newton's method from `guess` has
-        converged to it).
-
-        `bracket`: (low, high) (rad); `roll`, `relative`: as in `_mesh`. `guarded`: whether T falls
-        through zero in the bracket. The bracket then shrinks around the root, and is halved if
-        Newton's step leaves it or is longer than half the previous step. Halving is needed because
-        T has a kink where ν1 crosses a segment's end. G, ν1 and the levers follow from values and
-        slopes before the last step; the error is of second order in this step.
-        """
-        limit = jnp.where(guarded, _GUARDED_STEPS, _NEWTON_STEPS)
-
-        def go_on(carry):
-            count, step = carry[:2]
-            return (count < limit) & (jnp.abs(step) >= _FINISHED)
-
-        def newton(carry):
-            count, before, _, (low, high), found = carry
-            normal2 = found[-1]
-            (value, *here), (slope, *turned) = jax.jvp(
-                lambda nu: self._mesh(nu, roll, relative), (normal2,), (jnp.ones_like(normal2),)
-            )
-            step = value / jnp.where(slope < 0, slope, -jnp.inf)
-            left = guarded & (value >= 0)
-            low, high = jnp.where(left, normal2, low), jnp.where(guarded & ~left, normal2, high)
-            new = normal2 - step
-            slow = (slope >= 0) | (jnp.abs(step) > 0.5 * jnp.abs(before))
-            # The root may lie on an end of the bracket. A compiled program may round the step
-            # differently for each result. All results must agree on whether to halve.
-            slack = _FINISHED
-            halve = guarded & (slow | (new < low - slack) | (new > high + slack))
-            new = jnp.where(halve, (low + high) / 2, jnp.clip(new, low, high))
-            step = jnp.where(halve, (high - low) / 2, step)
-            # The gap is stationary at the root: its mean slope is half of that before the step.
-            moves = (new - normal2) * jnp.array([0.5, 1, 1, 1], new.dtype)
-            after = [x + move * by for x, move, by in zip(here, moves, turned, strict=True)]
-            return count + 1, step, slope, (low, high), (*after, new)
-
-        nothing = jnp.zeros_like(guess)
-        found = *[nothing] * 4, guess
-        start = 0, jnp.full_like(guess, jnp.inf), nothing, bracket, found
-        _, step, slope, (low, high), found = lax.while_loop(go_on, newton, start)
-        inside = (found[-1] > low) & (found[-1] < high) & (slope < 0)
-        return found, inside & (jnp.abs(step) < _CONVERGED)
-
 
 def _searched(pair: FlankPair, roll, relative):
     """Return the closest approach, without derivatives, for a `roll` from `FlankPair.folded`.
 
     `relative`: ε (rad). On a CPU, the poses of a batch are searched one at a time, unless the pair
     is to search them `together`. If the flanks are `rolling`, one pose rarely needs the bracketing
-    on all nodes (`FlankPair._bracket`). A batch searched as a whole would do it for every pose.
+    on all nodes (`bracket_of`). A batch searched as a whole would do it for every pose.
     Batches of pairs are always searched one pair at a time."""
     dynamic, static = eqx.partition(pair, eqx.is_inexact_array)
 
@@ -585,19 +436,3 @@ def contact_begins(relative: Float[Array, ""]) -> Float[Array, ""]:
 def _circle(angle):
     """Return cosine and sine of an `angle` (rad), stacked along a new first axis."""
     return jnp.stack([jnp.cos(angle), jnp.sin(angle)])
-
-
-def _share(before, after):
-    """Return the fraction of an interval at which a linear function has its zero.
-
-    `before`, `after`: values of the function at the interval's ends."""
-    fall = before - after
-    return jnp.clip(before / jnp.where(fall > 0, fall, 1.0), 0.0, 1.0)
-
-
-def _rotate(directions, angle):
-    """Return the cosines and sines (2, n) of angles, after adding `angle` (rad) to each of them.
-
-    `directions` (2, n): cosines and sines of the original angles."""
-    cos, sin = trig.cos(angle), trig.sin(angle)
-    return cos * directions[0] - sin * directions[1], cos * directions[1] + sin * directions[0]

@@ -1,14 +1,39 @@
-"""Base class of all contacts: gap and levers of two flanks at a pose."""
+"""Base class of all contacts: gap and levers of two flanks at a pose.
+
+Also finds a root of the tangential offset T, which `rootsopt.contact.closest` defines."""
 
 import abc
 import dataclasses
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.errors import InputError
+from rootsopt.profiles import base as trig
+
+if TYPE_CHECKING:
+    from rootsopt.contact.closest import FlankPair
+
+# Maximum number of Newton steps from the point of perfect rolling; two or three are usual.
+_NEWTON_STEPS = 5
+# Length (rad) of the last step below which Newton's method has converged. The next step would then
+# be smaller than the rounding error, even across a kink of T.
+_CONVERGED = 1e-8
+# Length (rad) of a step below which no further step is tried. Beside a kink of T, the normal angles
+# of the result err by this length.
+_FINISHED = 1e-11
+# Maximum number of steps inside a bracket; bisection alone needs about fifty.
+_GUARDED_STEPS = 60
+# Penetration (pitch radii) above which a pair of points on flanks that are not conjugate is
+# ignored.
+DEEPEST = 0.1
+# Magnitude of T (pitch radii) below which T at a node counts as zero, because it may be a rounding
+# error.
+_SLACK = 1e-13
 
 
 class ContactPoint(NamedTuple):
@@ -247,3 +272,153 @@ def around(contact: Contact, inside: Contact) -> Contact:
     if not isinstance(contact, WrappedContact):
         return inside
     return dataclasses.replace(contact, section=around(contact.section, inside))
+
+
+class ClosestApproach(NamedTuple):
+    """Result of one search.
+
+    `gap`: gap (m), negative when the flanks penetrate.
+    `lever1`, `lever2`: moment arms (m) of the common normal about rotor 1 and rotor 2, so that
+    d gap = -lever1 dφ1 + lever2 dφ2.
+    `normal1`, `normal2`: ν1 and ν2 (rad).
+    `found`: whether a common normal was found. Otherwise, the gap is the pitch radius and the
+    levers are zero. The search is skipped at poses at which the flanks cannot touch yet (see
+    `contact_begins`).
+    `rank`: on a wavy flank (`Profile.wavy`), number of minima of the gap at a smaller ν2; otherwise
+    0. Where it changes, the contact may jump from one minimum to another.
+    """
+
+    gap: Float[Array, ""]
+    lever1: Float[Array, ""]
+    lever2: Float[Array, ""]
+    normal1: Float[Array, ""]
+    normal2: Float[Array, ""]
+    found: Bool[Array, ""]
+    rank: Float[Array, ""] | float = 0.0
+
+
+class FlankNodes(NamedTuple):
+    """Nodes at which T is sampled, with the quantities that do not depend on the pose.
+
+    `normal` (n,): normal angles ν2 (rad) of the nodes.
+    `facing` (n,): direction (rad) of the common normal at x = 0.
+    `direction` (2, n): cosine and sine of `facing`.
+    `turned` (2, n): cosine and sine of `Profile.turn_ratio` times `facing`.
+    `lever` (n,): lever (m) of rotor 2's point.
+    `support` (n,): support function (m) of rotor 2's point; `None` for conjugate flanks, whose gap
+    has at most two minima.
+    """
+
+    normal: Float[Array, " n"]
+    facing: Float[Array, " n"]
+    direction: Float[Array, "2 n"]
+    turned: Float[Array, "2 n"]
+    lever: Float[Array, " n"]
+    support: Float[Array, " n"] | None
+
+
+def _share(before, after):
+    """Return the fraction of an interval at which a linear function has its zero.
+
+    `before`, `after`: values of the function at the interval's ends."""
+    fall = before - after
+    return jnp.clip(before / jnp.where(fall > 0, fall, 1.0), 0.0, 1.0)
+
+
+def _rotate(directions, angle):
+    """Return the cosines and sines (2, n) of angles, after adding `angle` (rad) to each of them.
+
+    `directions` (2, n): cosines and sines of the original angles."""
+    cos, sin = trig.cos(angle), trig.sin(angle)
+    return cos * directions[0] - sin * directions[1], cos * directions[1] + sin * directions[0]
+
+
+def bracket_of(pair: "FlankPair", attempt, roll, relative):
+    """Return an interval between two nodes where T falls through zero.
+
+    `roll`, `relative`: as in `FlankPair._mesh`. For conjugate flanks, attempt 1 takes the last such
+    interval and attempt 2 the first; on a wavy flank, attempt k takes the k-th. For other
+    flanks, attempt 1 takes the interval with the least gap and attempt 2 that with the second
+    least gap. The result is ((low, high), first guess, whether such an interval exists, whether
+    there is at most one)."""
+    profile, nodes = pair.profile, pair.nodes
+    turned = _rotate(nodes.turned, 2 * profile.turn_ratio * roll)
+    normal1 = nodes.facing + 2 * roll
+    lever1 = profile.lever_from(normal1, turned[0], turned[1])
+    cos, sin = _rotate(nodes.direction, roll - relative / 2)
+    offset = pair.center_distance * sin - lever1 - nodes.lever
+    # The tolerance keeps a root on a node. A compiled program may round T[i] differently as the
+    # end of one interval and as the start of the next.
+    slack = _SLACK * profile.pitch_radius
+    falling = (offset[:-1] >= -slack) & (offset[1:] < slack)
+    if profile.wavy:
+        number = jnp.cumsum(falling)
+        index = jnp.argmax(falling & (number == attempt))
+        present, single = number[-1] >= attempt, number[-1] <= attempt
+    elif nodes.support is None:
+        # The maximum of integers is vectorised, an arg-minimum is not.
+        place = jnp.arange(falling.shape[0])
+        last = jnp.max(jnp.where(falling, place, -1))
+        first = jnp.min(jnp.where(falling, place, place.shape[0]))
+        present, single = last >= 0, first >= last
+        index = jnp.where(present, jnp.where(attempt == 1, last, first), 0)
+    else:
+        # The derivative of the gap between parallel tangents with respect to their angle is -T.
+        gap = pair.center_distance * cos - profile.support(normal1) - nodes.support
+        share = _share(offset[:-1], offset[1:])
+        least = gap[:-1] - jnp.diff(nodes.facing) * share * offset[:-1] / 2
+        # A pair this deep belongs to the other flank of the lobe.
+        falling &= least > -DEEPEST * profile.pitch_radius
+        least = jnp.where(falling, least, jnp.inf)
+        present, single = jnp.any(falling), jnp.sum(falling) < 2
+        first = jnp.argmin(least)
+        index = jnp.where(attempt == 1, first, jnp.argmin(least.at[first].set(jnp.inf)))
+    low, high = nodes.normal[index], nodes.normal[index + 1]
+    share = _share(offset[index], offset[index + 1])
+    return (low, high), low + (high - low) * share, present, single
+
+
+def root_in(pair: "FlankPair", bracket, guess, guarded, roll, relative):
+    """Return ((G, ν1, q1, q2, ν2) at a root of T, whether Newton's method from `guess` has
+    converged to it).
+
+    `bracket`: (low, high) (rad); `roll`, `relative`: as in `FlankPair._mesh`.
+    `guarded`: whether T falls through zero in the bracket. The bracket then shrinks around the
+    root, and is halved if Newton's step leaves it or is longer than half the previous step. Halving
+    is needed because T has a kink where ν1 crosses a segment's end. G, ν1 and the levers follow
+    from values and slopes before the last step; the error is of second order in this step.
+    """
+    limit = jnp.where(guarded, _GUARDED_STEPS, _NEWTON_STEPS)
+
+    def go_on(carry):
+        count, step = carry[:2]
+        return (count < limit) & (jnp.abs(step) >= _FINISHED)
+
+    def newton(carry):
+        count, before, _, (low, high), found = carry
+        normal2 = found[-1]
+        (value, *here), (slope, *turned) = jax.jvp(
+            lambda nu: pair._mesh(nu, roll, relative), (normal2,), (jnp.ones_like(normal2),)
+        )
+        step = value / jnp.where(slope < 0, slope, -jnp.inf)
+        left = guarded & (value >= 0)
+        low, high = jnp.where(left, normal2, low), jnp.where(guarded & ~left, normal2, high)
+        new = normal2 - step
+        slow = (slope >= 0) | (jnp.abs(step) > 0.5 * jnp.abs(before))
+        # The root may lie on an end of the bracket. A compiled program may round the step
+        # differently for each result. All results must agree on whether to halve.
+        slack = _FINISHED
+        halve = guarded & (slow | (new < low - slack) | (new > high + slack))
+        new = jnp.where(halve, (low + high) / 2, jnp.clip(new, low, high))
+        step = jnp.where(halve, (high - low) / 2, step)
+        # The gap is stationary at the root: its mean slope is half of that before the step.
+        moves = (new - normal2) * jnp.array([0.5, 1, 1, 1], new.dtype)
+        after = [x + move * by for x, move, by in zip(here, moves, turned, strict=True)]
+        return count + 1, step, slope, (low, high), (*after, new)
+
+    nothing = jnp.zeros_like(guess)
+    found = *[nothing] * 4, guess
+    start = 0, jnp.full_like(guess, jnp.inf), nothing, bracket, found
+    _, step, slope, (low, high), found = lax.while_loop(go_on, newton, start)
+    inside = (found[-1] > low) & (found[-1] < high) & (slope < 0)
+    return found, inside & (jnp.abs(step) < _CONVERGED)

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from rootsopt.contact.closest import ClosestApproach, FlankPair, contact_begins
-from rootsopt.contact.gap import Approach, Contact, ContactPoint
+from rootsopt.contact.closest import FlankPair, contact_begins
+from rootsopt.contact.gap import Approach, ClosestApproach, Contact, ContactPoint
 from rootsopt.profiles import base as trig
 from rootsopt.profiles.base import Profile
 from rootsopt.runtime.kept import kept_along

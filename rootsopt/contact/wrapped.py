@@ -10,7 +10,8 @@ from jax import lax
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from rootsopt.config import TWIST, Config
+from rootsopt.config.reading import Config
+from rootsopt.config.study import TWIST
 from rootsopt.contact.gap import Approach, Contact, Slices, WrappedContact
 from rootsopt.contact.law import ContactLaw
 from rootsopt.contact.search import SearchContact

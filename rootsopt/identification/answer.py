@@ -15,7 +15,7 @@ import numpy as np
 import pandas
 from numpy.typing import NDArray
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.identification.model import REST, Point
 from rootsopt.identification.quantities import OFFSET
 from rootsopt.identification.record import CHANNELS, Observed

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.errors import InputError
 from rootsopt.identification import answer
 from rootsopt.identification.answer import Identification, Spread, relative_misfit, structure

@@ -9,19 +9,19 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.dynamics.steady import Steady, varied
 from rootsopt.errors import InputError
 from rootsopt.identification.quantities import OFFSET, Fitted, values_at
 from rootsopt.identification.record import CHANNELS, Observed, channels_at
-from rootsopt.response.ensemble import ERRORS, Ensemble, fitted_slope, neighbours
-from rootsopt.response.evaluation import Evaluator, apart_program
-from rootsopt.response.records import apart_record, orbit_record
+from rootsopt.response.ensemble import Ensemble, fitted_slope, neighbours
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.records import apart_program, apart_record, orbit_record
 from rootsopt.response.reducers import HERE, as_done
-from rootsopt.response.result import Seed
+from rootsopt.response.result import ERRORS, Seed
 from rootsopt.response.sensitivity import direction, motions_along
 from rootsopt.response.sweeps.points import configured
-from rootsopt.scene import check_geometry
+from rootsopt.scene.check import check_geometry
 from rootsopt.status import Status
 
 Begin = Seed | NDArray[np.float64] | None

@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.config import Config
 from rootsopt.config.explain import limits_of, tree
+from rootsopt.config.reading import Config
 from rootsopt.config.tolerances import scatterable, unknown_key
+from rootsopt.config.units import NAMES
 from rootsopt.errors import InputError
-from rootsopt.response.sensitivity import NAMES
 from rootsopt.response.sweeps.plan import Interval, axis_of
 from rootsopt.response.sweeps.points import configured
 from rootsopt.scene.space import bounds_of

@@ -20,9 +20,9 @@ from jax import lax
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from rootsopt.config import Config
 from rootsopt.config.document import read_document
 from rootsopt.config.explain import tree
+from rootsopt.config.reading import Config
 from rootsopt.config.sources import reason, regular_file
 from rootsopt.config.units import named, near, shown
 from rootsopt.dynamics.collocation.elements import BLOCK

@@ -11,7 +11,7 @@ from jax import lax
 from jaxtyping import Float64
 from numpy.typing import NDArray
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.contact.closest import FlankPair
 from rootsopt.errors import InputError
 from rootsopt.profiles import Profile

@@ -1,4 +1,4 @@
-"""Estimates of an outline's scatter, centre and unit from its points alone.
+"""Estimates of an outline's scatter, centre and unit from its points alone; what its checks report.
 
 Messages and results state the estimates. No estimate is used unless the config asks for it."""
 
@@ -7,6 +7,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Complex128
@@ -214,6 +215,58 @@ def unit_of_size(middle: float, pitch_radius: float) -> str | None:
     `middle`: mean of an outline's outer and root radius, in the file's unknown unit. Return `None`
     if there is no such unit."""
     return next((u for u, mm in UNITS.items() if abs(middle * mm / pitch_radius - 1) < SIZED), None)
+
+
+@dataclasses.dataclass(frozen=True)
+class Checks:
+    """Deviations and margins of an imported outline.
+
+    `points`: number of points of the outline as read, without repeated points.
+    `turned_deg`: angle (°) by which the outline was turned to put a lobe's axis on +x.
+    `reversed`: whether the points ran clockwise as read.
+    `axis_offset_um`: distance (µm) of the outline's centroid from the rotor's axis.
+    `lobe_deviation_um`: greatest normal distance between a flank and the mean of the same flank of
+    all lobes (µm).
+    `flank_deviation_um`: greatest normal distance between the mean leading flank and the mirrored
+    mean trailing flank (µm).
+    `fit_deviation_um`: RMS distance of the leading flank's points from the fitted curve (µm); 0 if
+    the curve passes through them.
+    `star_margin_mm`: least distance (mm) between a tangent of the flank and the rotor's axis,
+    negative if a tangent passes the axis on the wrong side.
+    `convexity_margin_mm`: least radius of curvature of the addendum (mm).
+    `axis`: rotor's axis in the file, as x + iy (mm). `seen`: estimates of scatter and of the centre
+    about this axis.
+    `notes`: what the reader converted, chose or changed.
+    """
+
+    points: int
+    turned_deg: float
+    axis_offset_um: float
+    lobe_deviation_um: float
+    flank_deviation_um: float
+    fit_deviation_um: float
+    star_margin_mm: float
+    convexity_margin_mm: float
+    seen: Estimates
+    axis: complex = 0j
+    reversed: bool = False
+    notes: tuple[str, ...] = ()
+
+    def record(self) -> dict[str, Any]:
+        """Return the fields and the estimates for the result file; the axis is the config's.
+
+        `scatter_um`, `interpolation_um`: see `Estimates` (µm), NaN if unknown. `center_x_mm`,
+        `center_y_mm`: centre (mm) of the lobes' symmetry in the file; `center_error_um`: its
+        standard error (µm)."""
+        center = self.seen.center + self.axis
+        own = {key: value for key, value in vars(self).items() if key not in ("seen", "axis")}
+        return own | {
+            "scatter_um": self.seen.scatter / UNITS["um"],
+            "interpolation_um": self.seen.interpolation / UNITS["um"],
+            "center_x_mm": center.real,
+            "center_y_mm": center.imag,
+            "center_error_um": self.seen.center_error / UNITS["um"],
+        }
 
 
 def estimates(points: Complex128[np.ndarray, " n"], lobes: int) -> Estimates:

@@ -1,7 +1,7 @@
 """Makes a profile from the closed loop of an outline."""
 
 import dataclasses
-from typing import Any, Literal
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 
 from rootsopt.errors import InputError
 from rootsopt.measured.curves import MeasuredCurve, stretch, through
-from rootsopt.measured.estimates import Estimates, estimates
+from rootsopt.measured.estimates import Checks, Estimates, estimates
 from rootsopt.measured.loop import Loop, lengths_along, moment, signed_area
 from rootsopt.profiles.outline import Outline, Table
 
@@ -70,58 +70,6 @@ _MANY = 20.0
 # 20 µs per point.
 _TRIED = 100_000
 _GAUSS = np.polynomial.legendre.leggauss(12)
-
-
-@dataclasses.dataclass(frozen=True)
-class Checks:
-    """Deviations and margins of an imported outline.
-
-    `points`: number of points of the outline as read, without repeated points.
-    `turned_deg`: angle (°) by which the outline was turned to put a lobe's axis on +x.
-    `reversed`: whether the points ran clockwise as read.
-    `axis_offset_um`: distance (µm) of the outline's centroid from the rotor's axis.
-    `lobe_deviation_um`: greatest normal distance between a flank and the mean of the same flank of
-    all lobes (µm).
-    `flank_deviation_um`: greatest normal distance between the mean leading flank and the mirrored
-    mean trailing flank (µm).
-    `fit_deviation_um`: RMS distance of the leading flank's points from the fitted curve (µm); 0 if
-    the curve passes through them.
-    `star_margin_mm`: least distance (mm) between a tangent of the flank and the rotor's axis,
-    negative if a tangent passes the axis on the wrong side.
-    `convexity_margin_mm`: least radius of curvature of the addendum (mm).
-    `axis`: rotor's axis in the file, as x + iy (mm). `seen`: estimates of scatter and of the centre
-    about this axis.
-    `notes`: what the reader converted, chose or changed.
-    """
-
-    points: int
-    turned_deg: float
-    axis_offset_um: float
-    lobe_deviation_um: float
-    flank_deviation_um: float
-    fit_deviation_um: float
-    star_margin_mm: float
-    convexity_margin_mm: float
-    seen: Estimates
-    axis: complex = 0j
-    reversed: bool = False
-    notes: tuple[str, ...] = ()
-
-    def record(self) -> dict[str, Any]:
-        """Return the fields and the estimates for the result file; the axis is the config's.
-
-        `scatter_um`, `interpolation_um`: see `Estimates` (µm), NaN if unknown. `center_x_mm`,
-        `center_y_mm`: centre (mm) of the lobes' symmetry in the file; `center_error_um`: its
-        standard error (µm)."""
-        center = self.seen.center + self.axis
-        own = {key: value for key, value in vars(self).items() if key not in ("seen", "axis")}
-        return own | {
-            "scatter_um": self.seen.scatter / _MM,
-            "interpolation_um": self.seen.interpolation / _MM,
-            "center_x_mm": center.real,
-            "center_y_mm": center.imag,
-            "center_error_um": self.seen.center_error / _MM,
-        }
 
 
 @dataclasses.dataclass(frozen=True)

@@ -18,10 +18,10 @@ from scipy.optimize import minimize_scalar
 from rootsopt.config.plausible import USUAL
 from rootsopt.errors import InputError
 from rootsopt.measured.conjugacy import Conjugacy, conjugacy
-from rootsopt.measured.estimates import UNITS, Estimates, estimates, unit_of_size, written
-from rootsopt.measured.fit import Checks, imported
-from rootsopt.measured.loop import Loop
-from rootsopt.measured.reading import JOIN, LOBES, Sought, lobes_of, read, untangled
+from rootsopt.measured.estimates import UNITS, Checks, Estimates, estimates, unit_of_size, written
+from rootsopt.measured.fit import imported
+from rootsopt.measured.loop import JOIN, Loop
+from rootsopt.measured.reading import LOBES, Sought, lobes_of, read, untangled
 from rootsopt.profiles import Outline
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.config.tolerances import Span
 from rootsopt.optimize.limits import limited
 from rootsopt.optimize.local import FEASIBLE, Linearization
@@ -32,17 +32,9 @@ from rootsopt.optimize.outcome import (
 )
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.sqp import Stops, descend
-from rootsopt.response.evaluation import Evaluation
 from rootsopt.response.reducers import HERE, Point, Runs, evaluate_many
-from rootsopt.response.scatter import (
-    NOMINAL,
-    Shift,
-    assumed,
-    draw,
-    in_conditions,
-    scene_of,
-    shifts,
-)
+from rootsopt.response.result import Evaluation
+from rootsopt.response.scatter import NOMINAL, Shift, assumed, draw, in_conditions, scene_of, shifts
 from rootsopt.response.still import Still, needed_motion
 from rootsopt.status import Status
 

@@ -67,6 +67,19 @@ _ROWS = 3
 _NARROW, _NARROWEST = 1 / 64, 1 / 8192
 _BESIDE = 0.01
 
+# Greatest number of design parameters for which a lower bound is looked for: if it is asked for,
+# and by default.
+PARAMETERS, QUICK = 4, 3
+
+# Number of evaluations and of boxes of a lower bound that is asked for.
+MOST = 2000, 20_000
+
+# Number of points of a lower bound that a search evaluates side by side.
+TOGETHER = 8
+
+# Relative gain of a design found beside a lower bound from which a local search begins at it.
+BETTER = 1e-5
+
 
 class Box(NamedTuple):
     """A box of points: `middle` ± `half` (d,), with a lower `bound` of the objective.

@@ -1,18 +1,20 @@
-"""The main task in one function: optimise a design and compare it with the baseline."""
+"""The main tasks in one function each: optimise a design, and trace a front of compromises."""
 
 import threading
 from collections.abc import Callable
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.errors import InputError
-from rootsopt.optimize.outcome import Optimization
+from rootsopt.optimize.outcome import Optimization, Progress
 from rootsopt.optimize.robust import StagedSearch, is_robust
-from rootsopt.optimize.search import Progress, Search
+from rootsopt.optimize.search import Search
+from rootsopt.optimize.tradeoffs.front import Front
+from rootsopt.optimize.tradeoffs.trace import Tracer
 from rootsopt.response.journal import Checkpoint
 from rootsopt.response.reducers import HERE, Runs
 from rootsopt.response.sweeps.cluster import running
 from rootsopt.runtime.threads import one_thread
-from rootsopt.scene import check_geometry
+from rootsopt.scene.check import check_geometry
 
 
 def search_of(
@@ -72,3 +74,37 @@ def optimize_design(
     check_geometry(config)
     with running(workers, scheduler) as runs:
         return search_of(config, progress, stop, runs=runs).run()
+
+
+@one_thread
+def pareto_front(
+    config: Config,
+    progress: Callable[[int, int], None] | None = None,
+    *,
+    workers: int | None = None,
+    scheduler: str | None = None,
+) -> Front:
+    """Trace the front of best compromises between the terms of `config.pareto`.
+
+    `progress`: function called after each local search with (searches done, searches expected).
+    `workers`, `scheduler`: where the designs are simulated, as in `sweep_scenes`; by default in
+    this process, on all cores.
+
+    Return a `Front`. Its main fields are `points` (each with `terms`, `design`, `rates` and
+    `standing`), `gaps`, `dropped`, `baseline_terms` and `status`.
+
+    Raises `InputError` if the config cannot be optimised, or for unknown terms. Raises
+    `RuntimeError` if JAX is not set to double precision.
+
+    >>> import jax
+    >>> import rootsopt
+    >>> jax.config.update("jax_enable_x64", True)
+    >>> terms = "pareto.terms=[outer_radius_mm, area_efficiency]"
+    >>> quick = [terms, "pareto.points=3", "pareto.refinements=0"]
+    >>> front = rootsopt.pareto_front(rootsopt.load_config("cic_drawn", quick))
+    >>> [round(point.terms["outer_radius_mm"], 1) for point in front.points]
+    [39.0, 43.1, 47.8]
+    """
+    check_geometry(config)
+    with running(workers, scheduler) as runs:
+        return Tracer(config, progress, runs=runs).run()

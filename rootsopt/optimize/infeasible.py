@@ -17,8 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.config import Config
 from rootsopt.config.families import FREE_FORM, families, family_of
+from rootsopt.config.reading import Config
 from rootsopt.config.study import NEAREST
 from rootsopt.config.units import MM
 from rootsopt.errors import InputError
@@ -26,9 +26,9 @@ from rootsopt.optimize.limits import ForceLimit, settled
 from rootsopt.optimize.local import FEASIBLE, Group, Linearization, Look
 from rootsopt.optimize.sqp import Found, Stops, descend
 from rootsopt.profiles import Outline, Profile
-from rootsopt.response.evaluation import Evaluation
 from rootsopt.response.records import geometry_record
-from rootsopt.scene import Scene
+from rootsopt.response.result import Evaluation
+from rootsopt.scene.build import Scene
 from rootsopt.scene.check import shape_of
 from rootsopt.scene.families import classical, design_of, profile_from_file, profile_of
 from rootsopt.scene.resemblance import COEFFICIENTS, Likeness, free_likeness, likeness

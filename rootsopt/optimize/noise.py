@@ -17,10 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from rootsopt.optimize.local import FEASIBLE
 from rootsopt.optimize.outcome import Trial
 from rootsopt.optimize.problem import Problem
-from rootsopt.response.ensemble import ERRORS, SIGNIFICANT, independent
-from rootsopt.response.evaluation import Evaluation, Evaluator
+from rootsopt.response.ensemble import SIGNIFICANT, independent
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.result import ERRORS, Evaluation
 from rootsopt.runtime.programs import CachedFunction
 
 # Distance between trials in the unit box below which they count as the same candidate.
@@ -66,7 +68,7 @@ def descended(
         last = trial
         if iteration == iterations:
             break
-        slope = problem.descent(point, problem.slope(trial.evaluation, point))
+        slope = descent(problem, point, problem.slope(trial.evaluation, point))
         if np.linalg.norm(slope) < _STATIONARY:
             break
         update, state = _update(iterations, slope, state)
@@ -243,3 +245,24 @@ def message(record: dict[str, Any]) -> str:
         f"standard error is {error:.2g}, and the difference must exceed "
         f"{record['required_standard_errors']:g} of these. {advice}"
     )
+
+
+def descent(problem: Problem, point, slope: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the gradient `slope` (d,) projected so that its negative is a feasible direction.
+
+    The negative of the result is the direction closest to -`slope` that violates no constraint
+    or bound active at `point` (d,). It solves a non-negative least-squares problem. The result
+    is zero exactly at a Karush-Kuhn-Tucker point."""
+    _, _, slack, jacobian = problem.look(point)
+    point = np.asarray(point)
+    walls = [row for row, s in zip(jacobian, slack, strict=True) if s < 1e-4]
+    sides = np.eye(len(point))
+    walls += [side for side, x in zip(sides, point, strict=True) if x <= FEASIBLE]
+    walls += [-side for side, x in zip(sides, point, strict=True) if x >= 1 - FEASIBLE]
+    if not walls:
+        return np.asarray(slope, dtype=np.float64)
+    from scipy.optimize import nnls  # Slow import (0.3 s).
+
+    normals = np.stack(walls)
+    multipliers, _ = nnls(normals.T, slope)
+    return np.asarray(slope - multipliers @ normals, dtype=np.float64)

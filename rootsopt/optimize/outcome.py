@@ -1,26 +1,35 @@
-"""What a search returns: its trials, its gains over the baseline, and both over assumptions."""
+"""What a search returns: its trials, its gains over the baseline, and both over assumptions.
+
+Also holds what a search asks of its trials: which are near, apart, or best to begin from."""
 
 import dataclasses
 import itertools
 import math
 import operator
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rootsopt.config.reading import Config
 from rootsopt.config.tolerances import Span
 from rootsopt.optimize.infeasible import Beginning, Infeasible
+from rootsopt.optimize.limits import constraint_rows
 from rootsopt.optimize.local import FEASIBLE, Linearization, certify
 from rootsopt.optimize.optimality import Optimality
-from rootsopt.response.evaluation import RESPONSES, Evaluation, objective_weights
+from rootsopt.response.result import RESPONSES, Evaluation
 from rootsopt.response.scatter import RANDOM
+from rootsopt.response.terms import objective_weights
 from rootsopt.status import Status
 
 if TYPE_CHECKING:
     from rootsopt.optimize.problem import Problem
     from rootsopt.optimize.robust import Robustness
+
+Progress = Callable[[int, int, float], None]
+"""Type of a progress callback, with arguments (evaluations done, evaluations expected, best
+objective)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -173,7 +182,7 @@ class Optimization:
         if self.problem is None or self.optimized is None:
             return []
         certificate = None if self.optimality is None else self.optimality.certificate
-        return self.problem.constraint_rows(self.optimized, certificate)
+        return constraint_rows(self.problem, self.optimized, certificate)
 
     @property
     def objective_by_speed(self) -> list[dict[str, float]]:
@@ -218,6 +227,32 @@ def history_of(trials: list[Trial]) -> list[dict[str, Any]]:
             }
         )
     return rows
+
+
+def method_of(config: Config) -> str:
+    """Return the method of the local searches: Adam's rule for averages, which have noise."""
+    return "adam" if config.objective.motion == "ensemble" else "slsqp"
+
+
+def ranked(trials: list[Trial]) -> list[NDArray[np.float64]]:
+    """Return the screened points at which a local search may begin, best first.
+
+    Designs that meet the limits of forces come first, then those that exceed them least."""
+    able = [trial for trial in trials if trial.begins]
+    able.sort(key=lambda one: (max(one.excess, FEASIBLE), one.objective))
+    return [trial.point for trial in able]
+
+
+def apart(
+    points: Sequence[NDArray[np.float64]], least: float, most: int
+) -> list[NDArray[np.float64]]:
+    """Return the first of the `points` (d,), at most `most`, that are more than `least` apart."""
+    chosen: list[NDArray[np.float64]] = []
+    for point in points:
+        far = all(np.linalg.norm(point - other) > least for other in chosen)
+        if far and len(chosen) < most:
+            chosen.append(point)
+    return chosen
 
 
 BASELINE, OPTIMIZED, RIVAL = "baseline", "optimized", "design"

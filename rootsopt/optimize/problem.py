@@ -11,26 +11,30 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from rootsopt.config import Config
-from rootsopt.config.units import unit_of, words
+from rootsopt.config.reading import Config
 from rootsopt.dynamics.orbit import PEAK_NORM, line_name
 from rootsopt.errors import InputError
 from rootsopt.optimize.limits import (
+    HELD,
     PEAK,
     ForceLimit,
-    TermConstraint,
+    check_senses,
+    counting,
     force_limits,
-    settled,
+    needs_maxima,
+    of_motions,
+    scaled_slack,
+    settled_by,
     term_constraints,
 )
-from rootsopt.optimize.local import FEASIBLE, NEAR, Certificate, Group, Linearization
+from rootsopt.optimize.local import FEASIBLE, Certificate, Group, Linearization
 from rootsopt.optimize.optimality import Holder
-from rootsopt.response.evaluation import RESPONSES, Evaluation, objective_weights
 from rootsopt.response.reducers import counted
-from rootsopt.response.terms import sense_of
+from rootsopt.response.result import RESPONSES, Evaluation
+from rootsopt.response.terms import objective_weights
 from rootsopt.runtime.programs import CachedFunction
-from rootsopt.scene import Scene
-from rootsopt.scene.space import RangeConstraint, Space, slacks_and_slopes
+from rootsopt.scene.build import Scene
+from rootsopt.scene.space import Space, slacks_and_slopes
 from rootsopt.status import Status
 
 # Amplitude of the baseline's line (relative to its mean force) below which it can be no objective.
@@ -38,18 +42,6 @@ _NO_LINE = 1e-9
 
 # Share of a measure's nominal value below which the baseline's value in another scene is no unit.
 _LEAST = 0.1
-
-# Slack and slope (both scaled) below which every design counts as meeting a limit with equality.
-_SAME = 1e-6
-
-# Multiplier of a bound, or share of a branch, below which the bound or branch counts as inactive.
-_HELD = 1e-6
-
-# Change of a limit, by the unit of the limit, for which the report states the effect on the
-# objective. In other units, it is the power of ten nearest to 1 % of the limit.
-_STEPS = {"mm": 0.1, "deg": 1.0, "°": 1.0, "": 0.01}
-SCENE_KINDS = 64
-"""Number of branch kinds reserved for each scene: one per speed, of which there are at most 33."""
 
 # Maximum number of times that an infeasible point is moved halfway towards a feasible point.
 _DRAWN = 5
@@ -59,32 +51,6 @@ _DRAWN = 5
 def _nearest(space: Space, design):
     """Return the point (d,) of the unit box nearest to a `design` (d,) in config units."""
     return space.point(design)
-
-
-@CachedFunction
-def _ranges(space: Space, design):
-    """Return {key: (high, least, most)} for the parameters whose range depends on others.
-
-    `high`: upper end of the range, whatever the bounds; `least`, `most`: ends within the bounds."""
-    within = {space.family.keys[place]: ends for place, *ends in space.within(design)}
-    return {key: (high, *within[key]) for key, (_, high) in space.ranges(design).items()}
-
-
-_slacks_of = CachedFunction(Space.slacks_of)
-
-
-def needs_maxima(config: Config, limits: Sequence[ForceLimit]) -> bool:
-    """Return whether evaluations need all local maxima of the force.
-
-    They do if the objective of `config` contains the peak force of single motions, or if one of its
-    `limits` is a ceiling of this force."""
-    cornered = PEAK in objective_weights(config) or any(one.cornered for one in limits)
-    return cornered and _of_motions(config)
-
-
-def _of_motions(config: Config) -> bool:
-    """Return whether the objective contains forces of single motions, not averages over many."""
-    return config.objective.motion in ("reached", "worst")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -303,7 +269,7 @@ class Problem:
         found = [
             one.name
             for k, one in enumerate(self.space.constraints)
-            if self._slack(evaluation, k) < -FEASIBLE
+            if scaled_slack(self, evaluation, k) < -FEASIBLE
         ]
         for one in self.limits:
             if evaluation.usable and one.excess(self.worst(evaluation, one)) > FEASIBLE:
@@ -328,7 +294,7 @@ class Problem:
     @property
     def cornered(self) -> bool:
         """Whether the objective contains the peak force of single motions, which has corners."""
-        return PEAK in objective_weights(self.config) and _of_motions(self.config)
+        return PEAK in objective_weights(self.config) and of_motions(self.config)
 
     def _branches(self, evaluation: Evaluation, baseline: Evaluation, number: int) -> Group:
         """Return the objective at one speed as branches, with gradients in config units.
@@ -431,162 +397,6 @@ class Problem:
             found = self.project(inside + share * (np.asarray(point) - inside))
         return found
 
-    def descent(self, point, slope: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the gradient `slope` (d,) projected so that its negative is a feasible direction.
-
-        The negative of the result is the direction closest to -`slope` that violates no constraint
-        or bound active at `point` (d,). It solves a non-negative least-squares problem. The result
-        is zero exactly at a Karush-Kuhn-Tucker point."""
-        _, _, slack, jacobian = self.look(point)
-        point = np.asarray(point)
-        walls = [row for row, s in zip(jacobian, slack, strict=True) if s < 1e-4]
-        sides = np.eye(len(point))
-        walls += [side for side, x in zip(sides, point, strict=True) if x <= FEASIBLE]
-        walls += [-side for side, x in zip(sides, point, strict=True) if x >= 1 - FEASIBLE]
-        if not walls:
-            return np.asarray(slope, dtype=np.float64)
-        from scipy.optimize import nnls  # Slow import (0.3 s).
-
-        normals = np.stack(walls)
-        multipliers, _ = nnls(normals.T, slope)
-        return np.asarray(slope - multipliers @ normals, dtype=np.float64)
-
-    def constraint_rows(
-        self, optimized: Evaluation, certificate: Certificate | None = None
-    ) -> list[dict]:
-        """Return one row per constraint for the report and the result file.
-
-        `optimized`: evaluation of the optimum. Upper limits of parameters whose range depends on
-        the others have rows too. With a `certificate`, each row has a `multiplier`: the change of
-        the objective per unit of the limit. Active bounds of the search then have rows as well."""
-        rows, both = [], (self.baseline, optimized)
-        always = self._always(optimized)
-        for k, c in enumerate(self.space.constraints):
-            before, after = (self._limited_value(one, k) for one in both)
-            slacks = [self._slack(one, k) for one in both]
-            row = _row(c.name, before, after, c.bound, c.unit, slacks, c.sense)
-            if always[k]:
-                row |= {"active": False, "always": True}
-            if certificate is not None:
-                per_unit = certificate.multipliers[k] * c.factor / c.scale
-                row |= self._multiplier(row, per_unit, optimized)
-            rows.append(row)
-        for k, one in enumerate(self.limits):
-            before, after = (self.worst(every, one) for every in both)
-            slacks = [-float(one.excess(value)) for value in (before, after)]
-            row = _row(one.name, before, after, one.limit, one.unit, slacks, one.sense)
-            if certificate is not None:
-                per_unit = float(np.sum(certificate.walls[k])) / one.scale
-                row |= self._multiplier(row, per_unit, optimized)
-            rows.append(row)
-        return rows + self._range_rows(optimized, certificate)
-
-    def _slack(self, evaluation: Evaluation, k: int) -> float:
-        """Return the scaled slack of constraint `k` for an evaluated design, NaN if not known."""
-        one = self.space.constraints[k]
-        beyond = self._limited_value(evaluation, k) - one.bound
-        return one.sign * beyond * one.factor / one.scale
-
-    def _limited_value(self, evaluation: Evaluation, k: int) -> float:
-        """Return the value that constraint `k` limits, in its unit, for an evaluated design.
-
-        Return NaN for a rotor without the parameters of the search if the value needs these."""
-        one = self.space.constraints[k]
-        if isinstance(one, TermConstraint):
-            return evaluation.response[one.quantity]
-        if not (one.margin or isinstance(one, RangeConstraint)):
-            key = f"{one.quantity}_{one.unit}" if one.unit else one.quantity
-            return evaluation.geometry.get(key, math.nan)
-        if tuple(evaluation.design) != tuple(self.config.design_keys):
-            return math.nan
-        slack = float(self._slacks(evaluation)[k])
-        return (float(one.limit) + one.sign * slack * one.scale) / one.factor
-
-    def _always(self, optimized: Evaluation) -> NDArray[np.bool_]:
-        """Return a mask (m,) of the constraints that every design meets with equality.
-
-        Their slack is 0 at the config's own design and at the optimum, and does not depend on the
-        design."""
-        found = np.ones(len(self.space.constraints), bool)
-        for design in (self.config.design, list(optimized.design.values())):
-            _, _, slack, normals = self.look(self.point(design))
-            found &= (np.abs(slack) < _SAME) & (np.linalg.norm(normals, axis=1) < _SAME)
-        return found
-
-    def _multiplier(self, row: dict, per_unit: float, optimized: Evaluation) -> dict:
-        """Return entries for a `row` that state how its limit affects the objective.
-
-        `per_unit`: decrease of the objective per unit by which the limit is relaxed."""
-        step = _step(row["unit"], row["limit"])
-        relax = step if row["sense"] == "<=" else -step
-        toward = -1.0 if row["sense"] == "<=" else 1.0
-        gain = -100 * per_unit * step / self.objective(optimized)
-        return {
-            "multiplier": toward * float(per_unit),
-            "relaxed_by": relax,
-            "relaxed_objective_percent": float(gain),
-        }
-
-    def _slacks(self, evaluation: Evaluation) -> NDArray[np.float64]:
-        """Return the scaled slacks (m,) of all constraints for an evaluated design."""
-        design = np.asarray(list(evaluation.design.values()), dtype=np.float64)
-        return np.asarray(_slacks_of(self.space, design))
-
-    def _range_rows(
-        self, optimized: Evaluation, certificate: Certificate | None = None
-    ) -> list[dict]:
-        """Return rows for limits that are not constraints of the config.
-
-        They are the upper limits of parameters whose range depends on the others. With a
-        `certificate`, active bounds of the search are included."""
-        design = np.asarray(list(optimized.design.values()), dtype=np.float64)
-        ranges, names = _ranges(self.space, design), list(optimized.design)
-        low, high = (np.array(x) for x in (self.space.lower, self.space.upper))
-        limited = dict.fromkeys(names, False)
-        rows = []
-        for key, (end, least, most) in ranges.items():
-            place = names.index(key)
-            before, after, limit = self.baseline.design.get(key), optimized.design[key], float(end)
-            own = self._upper_end(key)
-            slacks = [own - (math.nan if before is None else before), limit - after]
-            row = _row(words(key), before, after, limit, unit_of(key), slacks, "<=")
-            row["baseline_limit"] = None if math.isnan(own) else own
-            limited[key] = limit <= high[place]
-            low[place], high[place] = float(least), float(most)
-            if certificate is not None:
-                width = max(high[place] - low[place], 1e-300)
-                per_unit = certificate.upper[place] / width if limited[key] else 0.0
-                row |= self._multiplier(row, per_unit, optimized)
-            rows.append(row)
-        if certificate is None:
-            return rows
-        for place, key in enumerate(names):
-            width = max(high[place] - low[place], 1e-300)
-            sides = (
-                (">=", low[place], certificate.lower[place], "lower"),
-                ("<=", high[place], certificate.upper[place], "upper"),
-            )
-            for sense, limit, multiplier, side in sides:
-                if multiplier <= _HELD or (side == "upper" and limited[key]):
-                    continue
-                before, after = self.baseline.design.get(key), float(design[place])
-                known = before is not None and key not in ranges
-                pair = np.array([before if known else math.nan, after])
-                slacks = (pair - limit) / width * (1 if sense == ">=" else -1)
-                name, unit = f"{side} bound of {words(key)}", unit_of(key)
-                if side == "lower" and self.space.floors[place]:
-                    name += f" ({100 * self.space.floors[place]:g} %)"
-                row = _row(name, before, after, float(limit), unit, slacks, sense)
-                rows.append(row | self._multiplier(row, multiplier / width, optimized))
-        return rows
-
-    def _upper_end(self, key: str) -> float:
-        """Return the upper end of a parameter's range for the baseline, NaN for one from a file."""
-        if key not in self.baseline.design:
-            return math.nan
-        design = np.asarray([*self.baseline.design.values()], dtype=np.float64)
-        return float(_ranges(self.space, design)[key][0])
-
     def held_by(self, evaluation: Evaluation, certificate: Certificate) -> list[Holder]:
         """Return the branches of the objective that are active at an evaluated optimum.
 
@@ -616,21 +426,8 @@ class Problem:
             label._replace(share=float(share))
             for shares, group in zip(certificate.shares, labels, strict=False)
             for share, label in zip(shares, group, strict=True)
-            if share > _HELD
+            if share > HELD
         ]
-
-
-def counting(evaluation: Evaluation) -> list[tuple[int, Evaluation]]:
-    """Return (kind, evaluation) of each scene, speed and motion in which limits must hold."""
-    scenes = [part.evaluation for part in evaluation.scenes] or [evaluation]
-    found = []
-    for scene, whole in enumerate(scenes):
-        for number, part in enumerate(whole.by_speed):
-            if part.share <= 0:
-                continue
-            kind = SCENE_KINDS * scene + number
-            found += [(kind, one) for one in (part.evaluation, *part.evaluation.rivals)]
-    return found
 
 
 def _in_units(evaluation: Evaluation, other: Evaluation) -> Evaluation:
@@ -642,42 +439,3 @@ def _in_units(evaluation: Evaluation, other: Evaluation) -> Evaluation:
         for one, two in zip(evaluation.speeds, other.speeds, strict=True)
     )
     return dataclasses.replace(evaluation, response=response, speeds=speeds)
-
-
-def settled_by(config: Config, baseline: Evaluation) -> Config:
-    """Return a copy of a `config` in which limits that are `baseline` are its evaluated values."""
-    found = [one.response for _, one in counting(baseline)] if baseline.usable else []
-    return settled(config, baseline.geometry, found)
-
-
-def check_senses(config: Config) -> None:
-    """Raise `InputError` if the objective of a `config` has a term that is to be maximised."""
-    for name, weight in config.objective.terms.items():
-        if weight > 0 and sense_of(name) == "max":
-            raise InputError(
-                f"`objective.terms` must name terms of which less is better, but names {name}; "
-                "limit it under `constraints`, or trade it against others with `rootsopt pareto`"
-            )
-
-
-def _step(unit: str, limit: float) -> float:
-    """Return the change of a `limit` for which the report states the effect on the objective."""
-    if unit in _STEPS or limit == 0:
-        return _STEPS.get(unit, 1.0)
-    return 10.0 ** (round(math.log10(abs(limit))) - 2)
-
-
-def _row(name, before, after, limit, unit, slacks, sense) -> dict:
-    """Return a row of the report; `slacks`: those of baseline (NaN: not known) and optimum."""
-    first, slack = slacks
-    return {
-        "name": name,
-        "baseline": before,
-        "optimized": after,
-        "limit": limit,
-        "unit": unit,
-        "sense": sense,
-        "satisfied": bool(slack >= -1e-6),
-        "baseline_satisfied": None if math.isnan(first) else bool(first >= -1e-6),
-        "active": bool(abs(slack) < NEAR),
-    }

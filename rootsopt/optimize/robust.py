@@ -16,21 +16,22 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.config.study import OptimizerConfig
 from rootsopt.config.tolerances import scatterable
 from rootsopt.errors import InputError
 from rootsopt.optimize.assumptions import compared
 from rootsopt.optimize.local import Linearization
-from rootsopt.optimize.outcome import RIVAL, Optimization
+from rootsopt.optimize.outcome import RIVAL, Optimization, Progress
 from rootsopt.optimize.problem import Problem
-from rootsopt.optimize.robust_problem import RobustProblem
-from rootsopt.optimize.search import Progress, Search, Stage
-from rootsopt.response.evaluation import RESPONSES, Evaluation, Evaluator
+from rootsopt.optimize.robust_problem import RobustProblem, Stage
+from rootsopt.optimize.search import Search
+from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.journal import Checkpoint
 from rootsopt.response.reducers import HERE, Runs, combine, evaluate_many
+from rootsopt.response.result import RESPONSES, Evaluation
 from rootsopt.response.scatter import Shift, draw, in_conditions, shifts
-from rootsopt.scene import Scene
+from rootsopt.scene.build import Scene
 
 OBJECTIVE = "objective"
 """Name of the objective among the compared quantities."""

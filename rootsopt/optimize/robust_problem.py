@@ -1,9 +1,9 @@
-"""The design problem over a sample of scenes with scattered values.
+"""The design problem over a sample of scenes with scattered values, and the stages of a search.
 
 The objective in each scene is that of `Problem`, relative to the baseline in the nominal scene, or
 over `assumptions` in the same scene. A rule (`rootsopt.response.reducers`) combines the scenes to
 one number, which is divided by its value for the baseline. The robust objective of the baseline is
-therefore 1, too."""
+therefore 1, too. A `Stage` says which problem one stage of a search solves, and how."""
 
 import dataclasses
 from collections.abc import Iterator, Sequence
@@ -11,14 +11,17 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.config import Config
-from rootsopt.optimize.limits import ForceLimit
+from rootsopt.config.reading import Config
+from rootsopt.config.study import OptimizerConfig
+from rootsopt.optimize.limits import SCENE_KINDS, ForceLimit, settled_by
 from rootsopt.optimize.local import Certificate, Group, Linearization
 from rootsopt.optimize.optimality import Holder
-from rootsopt.optimize.problem import SCENE_KINDS, Problem, settled_by
-from rootsopt.response.evaluation import Evaluation
-from rootsopt.response.reducers import Combined, combine
-from rootsopt.scene import Scene
+from rootsopt.optimize.problem import Problem
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.reducers import Combined, Runs, combine
+from rootsopt.response.result import Evaluation
+from rootsopt.scene.build import Scene
+from rootsopt.scene.space import sobol
 
 # Share of a scene below which the scene does not count as active at the optimum.
 _HELD = 1e-6
@@ -198,6 +201,45 @@ class RobustProblem(Problem):
             nothing = float("nan")
             held.append(Holder(nothing, nothing, nothing, top, share, int(scene)))
         return held
+
+
+class Stage:
+    """What one stage of a search does in its own way. The base class is the usual search.
+
+    `first`: index of the first local search; `apart`: distance between their starts in the unit
+    box; `bounded`: whether a lower bound may be looked for."""
+
+    first = 0
+    apart = 0.15
+    bounded = True
+
+    def settings(self, given: OptimizerConfig) -> OptimizerConfig:
+        """Return the settings of the stage; `given`: those of the config."""
+        return given
+
+    def evaluator(self, exact: Evaluator, runs: Runs) -> Evaluator:
+        """Return the evaluator of the stage; `exact`: that of the config's objective."""
+        return exact
+
+    def problem(self, config: Config, scene: Scene, baseline: Evaluation) -> Problem:
+        """Return the design problem, given the scene and the evaluated `baseline`."""
+        return Problem.of(config, scene, baseline)
+
+    def sample(
+        self, problem: Problem, own: NDArray[np.float64], settings: OptimizerConfig
+    ) -> list[NDArray[np.float64]]:
+        """Return the points from which designs are chosen, moved onto the feasible set.
+
+        They are the baseline's `own` point (d,) and a Sobol sample. Some may remain infeasible."""
+        start = problem.project(own)
+        sample = sobol(settings.screening, settings.seed, len(own))
+        return [start, *(problem.toward(point, start) for point in sample)]
+
+    def local(
+        self, problem: Problem, start: int, evaluation: Evaluation, point: NDArray[np.float64]
+    ) -> Linearization | None:
+        """Return objective and constraints at a `point` (d,) of the local search `start`."""
+        return problem.local(evaluation, point)
 
 
 def top_slope(local: Linearization) -> NDArray[np.float64]:

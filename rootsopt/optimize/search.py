@@ -19,27 +19,37 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.config import FAMILY_KEYS, Config
-from rootsopt.config.study import OptimizerConfig
+from rootsopt.config.families import FAMILY_KEYS
+from rootsopt.config.reading import Config
 from rootsopt.errors import InputError
 from rootsopt.optimize import noise
-from rootsopt.optimize.bounding import FIRST, Bounding
+from rootsopt.optimize.bounding import BETTER, FIRST, MOST, PARAMETERS, QUICK, TOGETHER, Bounding
 from rootsopt.optimize.infeasible import Infeasible, beginning, explain
-from rootsopt.optimize.limits import force_limits, limited
+from rootsopt.optimize.limits import force_limits, limited, needs_maxima
 from rootsopt.optimize.local import FEASIBLE, Linearization
-from rootsopt.optimize.outcome import Optimization, Trial, candidate, history_of, near, objective
-from rootsopt.optimize.problem import Problem, needs_maxima
+from rootsopt.optimize.outcome import (
+    Optimization,
+    Progress,
+    Trial,
+    apart,
+    candidate,
+    history_of,
+    method_of,
+    near,
+    objective,
+    ranked,
+)
+from rootsopt.optimize.robust_problem import Stage
 from rootsopt.optimize.sqp import Found, Stops, descend
 from rootsopt.optimize.verification import Verification
-from rootsopt.optimize.vertices import VertexOptimum, vertex_optimum
-from rootsopt.response.evaluation import Evaluation, Evaluator
+from rootsopt.optimize.vertices import AT_VERTEX, DRAWN, VertexOptimum, vertex_optimum
+from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.journal import Checkpoint
 from rootsopt.response.reducers import HERE, Point, Runs
-from rootsopt.response.result import Seeds
+from rootsopt.response.result import Evaluation, Seeds
 from rootsopt.response.still import Still, needed_motion
 from rootsopt.runtime.threads import POLL
-from rootsopt.scene import Scene
-from rootsopt.scene.space import Space, sobol
+from rootsopt.scene.space import Space
 
 # Maximum number of points at which the search for the least violation of the constraints starts.
 _EXPLAINED = 8
@@ -50,67 +60,9 @@ _SIMULATED = 3
 # Start of the trials of a lower bound, in place of the index of a local search.
 _BOUND = -2
 
-# Greatest number of design parameters for which a lower bound is looked for: if it is asked for,
-# and by default.
-_PARAMETERS, _QUICK = 4, 3
-
 # Distances (unit box, per coordinate) from a start without a usable motion at which a local search
 # begins instead.
 _BESIDE = 1e-5, 1e-4, 1e-3, 1e-2
-
-# Number of evaluations and of boxes of a lower bound that is asked for.
-_MOST = 2000, 20_000
-
-# Number of points that it evaluates side by side.
-_TOGETHER = 8
-
-# Number of the first trial beside an optimum at a vertex, and greatest number of these trials.
-_AT_VERTEX, _DRAWN = 100_000, 40
-
-# Relative gain from which a local search begins at a better design that it finds.
-_BETTER = 1e-5
-Progress = Callable[[int, int, float], None]
-"""Type of a progress callback, with arguments (evaluations done, evaluations expected, best
-objective)."""
-
-
-class Stage:
-    """What one stage of a search does in its own way. The base class is the usual search.
-
-    `first`: index of the first local search; `apart`: distance between their starts in the unit
-    box; `bounded`: whether a lower bound may be looked for."""
-
-    first = 0
-    apart = 0.15
-    bounded = True
-
-    def settings(self, given: OptimizerConfig) -> OptimizerConfig:
-        """Return the settings of the stage; `given`: those of the config."""
-        return given
-
-    def evaluator(self, exact: Evaluator, runs: Runs) -> Evaluator:
-        """Return the evaluator of the stage; `exact`: that of the config's objective."""
-        return exact
-
-    def problem(self, config: Config, scene: Scene, baseline: Evaluation) -> Problem:
-        """Return the design problem, given the scene and the evaluated `baseline`."""
-        return Problem.of(config, scene, baseline)
-
-    def sample(
-        self, problem: Problem, own: NDArray[np.float64], settings: OptimizerConfig
-    ) -> list[NDArray[np.float64]]:
-        """Return the points from which designs are chosen, moved onto the feasible set.
-
-        They are the baseline's `own` point (d,) and a Sobol sample. Some may remain infeasible."""
-        start = problem.project(own)
-        sample = sobol(settings.screening, settings.seed, len(own))
-        return [start, *(problem.toward(point, start) for point in sample)]
-
-    def local(
-        self, problem: Problem, start: int, evaluation: Evaluation, point: NDArray[np.float64]
-    ) -> Linearization | None:
-        """Return objective and constraints at a `point` (d,) of the local search `start`."""
-        return problem.local(evaluation, point)
 
 
 class Search:
@@ -150,10 +102,10 @@ class Search:
                 f"{config.profile.family}: it has no design parameter; use `simulate` for it, "
                 "or make the twist one with `optimizer.bounds.helix_deg`"
             )
-        if config.optimizer.prove is True and len(config.design_keys) > _PARAMETERS:
+        if config.optimizer.prove is True and len(config.design_keys) > PARAMETERS:
             raise InputError(
                 f"`optimizer.prove` must be auto or false for {len(config.design_keys)} design "
-                f"parameters, but is true: a lower bound takes at most {_PARAMETERS}"
+                f"parameters, but is true: a lower bound takes at most {PARAMETERS}"
             )
         evaluator = needed_motion(config)
         if isinstance(evaluator.motions, Still):
@@ -267,10 +219,10 @@ class Search:
         They are the best of the `trials` of the screening; without one, the first of the `points`
         (d,)."""
         if not self.settings.screening:
-            return _apart(points, self.stage.apart, self.settings.starts)
+            return apart(points, self.stage.apart, self.settings.starts)
         # Limits may leave only a small part of the bounds.
         extent = float(np.max(np.ptp(points, axis=0)))
-        return _apart(_ranked(trials), extent * self.stage.apart, self.settings.starts)
+        return apart(ranked(trials), extent * self.stage.apart, self.settings.starts)
 
     def _bounded(self, trials: list[Trial], number: int) -> tuple[Bounding | None, list[Trial]]:
         """Look for a lower bound of the objective, and search again from each better design.
@@ -280,12 +232,12 @@ class Search:
         candidates = [one for one in trials if one.candidate]
         size = len(trials[0].point) if trials else 0
         given = self.settings.prove
-        quick = size <= _QUICK and FIRST * (size + 1) <= len(trials)
-        asked = self.stage.bounded and not self.noisy and size <= _PARAMETERS and given is not False
+        quick = size <= QUICK and FIRST * (size + 1) <= len(trials)
+        asked = self.stage.bounded and not self.noisy and size <= PARAMETERS and given is not False
         if not (asked and candidates and (quick or given is True)):
             return None, []
         # By default the bound may cost about as much as the search.
-        most, boxes = _MOST if given is True else (3 * len(trials) // 2, 18 * len(trials))
+        most, boxes = MOST if given is True else (3 * len(trials) // 2, 18 * len(trials))
         best = min(candidates, key=objective).objective
         bounding = Bounding(self.problem.limits_at, size, best, boxes)
         known, further, count = [], [], 0
@@ -296,14 +248,14 @@ class Search:
             known.extend(one for one in found if one.evaluation.usable)
 
         told(trials)
-        while count < most and (points := bounding.ask(_TOGETHER)):
+        while count < most and (points := bounding.ask(TOGETHER)):
             best, found = bounding.best, self._beside(known, points, count)
             told(found)
             count += len(points)
             if self.stop.is_set():
                 break
             first = min(filter(candidate, found), key=objective, default=None)
-            if first is not None and first.objective < best - _BETTER * abs(best):
+            if first is not None and first.objective < best - BETTER * abs(best):
                 further += (again := self._side_by_side(self._solve, [(number, first.point)]))
                 told(again)
                 number += 1
@@ -312,17 +264,17 @@ class Search:
     def _vertex(self, optimized: Evaluation, trials: list[Trial]) -> VertexOptimum | None:
         """Return what is known of an optimum at a vertex of the limits, from as many designs as the
         search had `trials`; `None` elsewhere, or where the objective is one over a sample."""
-        if not self.stage.bounded or len(optimized.design) > _PARAMETERS:
+        if not self.stage.bounded or len(optimized.design) > PARAMETERS:
             return None
         known = [one for one in trials if one.evaluation.usable]
 
         def simulated(points: list[NDArray[np.float64]]) -> list[float]:
-            found = self._beside(known, points, _AT_VERTEX)
+            found = self._beside(known, points, AT_VERTEX)
             values = [x.objective if x.excess <= FEASIBLE else math.nan for x in found]
             return values or [math.nan] * len(points)
 
         point = self.problem.point([*optimized.design.values()])
-        return vertex_optimum(self.problem, point, simulated, min(len(trials), _DRAWN))
+        return vertex_optimum(self.problem, point, simulated, min(len(trials), DRAWN))
 
     def _beside(
         self, known: list[Trial], points: list[NDArray[np.float64]], number: int
@@ -494,29 +446,3 @@ class Search:
                 self._best = float(np.fmin(self._best, objective))
             self.progress(len(self._trials), self.expected, self._best)
         return trial
-
-
-def method_of(config: Config) -> str:
-    """Return the method of the local searches: Adam's rule for averages, which have noise."""
-    return "adam" if config.objective.motion == "ensemble" else "slsqp"
-
-
-def _ranked(trials: list[Trial]) -> list[NDArray[np.float64]]:
-    """Return the screened points at which a local search may begin, best first.
-
-    Designs that meet the limits of forces come first, then those that exceed them least."""
-    able = [trial for trial in trials if trial.begins]
-    able.sort(key=lambda one: (max(one.excess, FEASIBLE), one.objective))
-    return [trial.point for trial in able]
-
-
-def _apart(
-    points: Sequence[NDArray[np.float64]], least: float, most: int
-) -> list[NDArray[np.float64]]:
-    """Return the first of the `points` (d,), at most `most`, that are more than `least` apart."""
-    chosen: list[NDArray[np.float64]] = []
-    for point in points:
-        far = all(np.linalg.norm(point - other) > least for other in chosen)
-        if far and len(chosen) < most:
-            chosen.append(point)
-    return chosen

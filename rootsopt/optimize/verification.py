@@ -12,14 +12,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.optimize.local import FEASIBLE, RESIDUAL, Certificate, certify
 from rootsopt.optimize.optimality import Optimality, StartOutcome, judged
 from rootsopt.optimize.outcome import Optimization, Trial, candidate, near, objective
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.sqp import Found
-from rootsopt.response.evaluation import Evaluation, Evaluator
+from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.reducers import Point, evaluate_many
+from rootsopt.response.result import Evaluation
 from rootsopt.response.sensitivity import by_scene, quantities
 from rootsopt.response.still import needed_motion
 from rootsopt.status import Status

@@ -37,6 +37,9 @@ _CORNERS = 4
 # Greatest number of other vertices that are simulated.
 _VERTICES = 8
 
+# Number of the first trial beside an optimum at a vertex, and greatest number of these trials.
+AT_VERTEX, DRAWN = 100_000, 40
+
 
 class Vertex(NamedTuple):
     """A vertex: its `point` (d,) of the unit box, and the numbers (d,) of the limits that hold it.

@@ -25,7 +25,7 @@ from jaxtyping import Array, Float
 from rootsopt.contact.wrapped import series_at, wear_series
 from rootsopt.profiles import Geometry, Profile, quadrature_nodes
 from rootsopt.pump.gap import Allowances, MeshGap, Play, mesh_gap, play, rolls
-from rootsopt.scene import Scene
+from rootsopt.scene.build import Scene
 from rootsopt.scene.reading import Gas, Medium
 
 CM3 = 1e-6

@@ -21,8 +21,7 @@ from rootsopt.dynamics.reserve import LONGEST, smooth_pieces
 from rootsopt.dynamics.steady import SAMPLES, VariedOrbit
 from rootsopt.profiles import Geometry, Profile, geometry
 from rootsopt.runtime.programs import CachedFunction
-from rootsopt.scene import Scene
-from rootsopt.scene.build import along
+from rootsopt.scene.build import Scene, along
 
 EQUIVALENT = "bearing_load_equivalent_N"
 """Name of the greatest equivalent dynamic load of the bearings."""

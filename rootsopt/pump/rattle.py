@@ -18,7 +18,7 @@ from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import CLOSED, OPEN, Steady
 from rootsopt.profiles import Geometry, Profile, geometry
 from rootsopt.runtime.programs import CachedFunction
-from rootsopt.scene import Scene
+from rootsopt.scene.build import Scene
 from rootsopt.status import Status
 
 SILENT = "silent_eccentricity_um"

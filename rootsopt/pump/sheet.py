@@ -7,7 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.config.units import DEG, MM, UM
 from rootsopt.errors import InputError
 from rootsopt.profiles import geometry
@@ -15,8 +15,8 @@ from rootsopt.pump import flow
 from rootsopt.pump.flow import CM3, CONTINUUM, L_MIN, MOLECULAR, MRAD, play_of, ripple_of
 from rootsopt.pump.loads import static_loads
 from rootsopt.runtime.programs import CachedFunction
-from rootsopt.scene import Scene, design_vector
-from rootsopt.scene.reading import Medium
+from rootsopt.scene.build import Scene
+from rootsopt.scene.reading import Medium, design_vector
 
 # Overlap (m) of the flanks up to which it counts as rounding of an outline.
 _ROUNDING = 1e-8

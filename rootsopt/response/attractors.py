@@ -15,19 +15,21 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.config.units import MM
 from rootsopt.dynamics.flow import strobe
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import transient_status
 from rootsopt.dynamics.window import BLOCK, Transient, settle, settled_within
-from rootsopt.response.evaluation import Evaluation, Evaluator, Motions, objective_weights
+from rootsopt.response.evaluation import Evaluator, Motions
 from rootsopt.response.records import message_of
 from rootsopt.response.reducers import mean
+from rootsopt.response.result import Evaluation
+from rootsopt.response.terms import objective_weights
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.runtime.threads import on_all_cores
-from rootsopt.scene import design_vector
+from rootsopt.scene.reading import design_vector
 from rootsopt.status import Status
 
 # Maximum length of a cycle (mesh periods) that the search recognises, unless the equation repeats

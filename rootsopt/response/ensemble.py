@@ -24,24 +24,15 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.config import EnsembleConfig
+from rootsopt.config.study import EnsembleConfig
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import TOO_DEEP
 from rootsopt.dynamics.window import PERIODS
 from rootsopt.profiles import Geometry
-from rootsopt.response.evaluation import (
-    RESPONSES,
-    Evaluation,
-    Evaluator,
-    Motions,
-    apart_message,
-    geometry_record,
-    lyapunov_program,
-    message_of,
-    unsettled,
-    unsettled_status,
-)
+from rootsopt.response.evaluation import Evaluator, Motions, lyapunov_program, unsettled_status
+from rootsopt.response.records import apart_message, geometry_record, message_of, unsettled
+from rootsopt.response.result import ERRORS, RESPONSES, Evaluation
 from rootsopt.response.together import (
     Members,
     initial_states,
@@ -50,7 +41,7 @@ from rootsopt.response.together import (
     run_members,
 )
 from rootsopt.runtime.programs import CachedFunction
-from rootsopt.scene import Scene
+from rootsopt.scene.build import Scene
 from rootsopt.scene.space import Space
 from rootsopt.status import Status
 
@@ -65,8 +56,6 @@ VERIFYING = 4
 SIGNIFICANT = 3.0
 """Difference between two averages (combined standard errors) above which it counts as significant.
 """
-ERRORS = {name: name.replace("_N", "_standard_error_N") for name in RESPONSES}
-"""Keys of the standard errors in `steady_state`, keyed by the name of the response."""
 
 
 @dataclasses.dataclass(frozen=True)

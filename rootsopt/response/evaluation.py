@@ -11,37 +11,24 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rootsopt.config import Config
-from rootsopt.config.units import RPM
+from rootsopt.config.reading import Config
 from rootsopt.dynamics.closed import Start, seen, steady_motion
 from rootsopt.dynamics.integrator import Solver
 from rootsopt.dynamics.maxima import local_maxima, prepare_maxima
-from rootsopt.dynamics.orbit import PEAK_NORM, line_name
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.reserve import GEAR, RESERVES, apart
 from rootsopt.dynamics.steady import CLOSED, OPEN, SAMPLES, Steady, varied, window_status
 from rootsopt.dynamics.window import BLOCK, PERIODS, integrated_difference, lyapunov
 from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry
-from rootsopt.pump.loads import BEARING, orbit_loads
-from rootsopt.pump.rattle import rattle_record, silent_limit, silent_record
+from rootsopt.pump.loads import orbit_loads
 from rootsopt.response.records import (
-    RESPONSES,
-    Series,
-    apart_message,
-    apart_record,
-    bearing_record,
+    apart_program,
     contact_series,
-    fading_note,
-    geometry_record,
-    message_of,
-    orbit_record,
-    orbit_series,
-    orbit_statistics,
+    geared,
+    loaded,
+    names_of,
+    reported,
     sampled,
-    unsettled,
-    window_record,
-    window_series,
 )
 from rootsopt.response.reducers import (
     HERE,
@@ -55,11 +42,13 @@ from rootsopt.response.reducers import (
     shares,
 )
 from rootsopt.response.result import Evaluation, Part, Seed, Seeds, begun
-from rootsopt.response.scatter import Shift, draw, shifts
+from rootsopt.response.scatter import Shift, at_speed, draw, shifts
 from rootsopt.response.terms import OF_MOTION, terms_of, values_of
 from rootsopt.runtime.environment import check_precision
 from rootsopt.runtime.programs import CachedFunction
-from rootsopt.scene import Scene, check_geometry, design_keys, design_vector, fault_of
+from rootsopt.scene.build import Scene
+from rootsopt.scene.check import check_geometry
+from rootsopt.scene.reading import design_keys, design_vector
 from rootsopt.status import Status
 
 # Difference between an orbit closed by collocation and an integration over its period (see
@@ -300,7 +289,7 @@ class Evaluator:
         found = self.motion(pair, tangents, begin)
         if series and self.confirm:
             found = self._confirmed(pair, tangents, begin, found)
-        report = self._report(design, (pair, tangents, shape), found, began, series)
+        report = reported(self, design, (pair, tangents, shape), found, began, series)
         if self.maxima and report.usable:
             maxima = local_maxima(pair, tangents, varied(found))
             report = dataclasses.replace(report, maxima=maxima)
@@ -377,13 +366,13 @@ class Evaluator:
 
         def then(found: Steady) -> None:
             orbit = varied(found)
-            if self._loaded(series):
+            if loaded(self, series):
                 orbit_loads.prepare(self.scene, design, orbit)
-            if self._geared(series):
+            if geared(self, series):
                 apart_program.prepare(pair, tangents, orbit)
             rows = np.zeros((found.orbit.response.shape[0], 1))
             forces = solver.measures.named(rows, 1)
-            added = [name for name in self._names if name not in (*forces, *OF_MOTION)]
+            added = [name for name in names_of(self) if name not in (*forces, *OF_MOTION)]
             if added:
                 values, slopes = (jax.ShapeDtypeStruct((3, *d), float) for d in ((), design.shape))
                 values_of.prepare(self.scene, terms_of(added), design, values, slopes)
@@ -415,146 +404,7 @@ class Evaluator:
 
         `built`: result of `assembled`; `found`: its motion; `began`: time at the start (s,
         `perf_counter`)."""
-        return self._report(design_vector(self.config), built, found, began, False)
-
-    def _report(self, design, built, found: Steady, began: float, series: bool) -> Evaluation:
-        """Return the evaluation of the motion `found`.
-
-        `built`: rotor pair, its derivatives along the design, and geometry; `began`: time at the
-        start of the evaluation (s, `perf_counter`); `series`: whether to compute the series."""
-        seconds, design = time.perf_counter() - began, np.asarray(design, np.float64)
-        (pair, tangents, shape), status = built, Status.of(found.status)
-        statistics: dict[str, int | float] = {
-            "transient_mesh_periods": int(found.used),
-            "solver_steps": int(found.steps),
-        }
-        idle, held = status is Status.IDLE, bool(found.held)
-        known = (status is Status.PERIODIC and pair.smooth) or idle
-        named = self._forces(found) if status in CLOSED or idle else {}
-        steady: dict[str, Any] = {"kind": "idle" if idle else "transient"}
-        said, hint, motion, start = message_of(self.config, status), "", None, None
-        if status in CLOSED or held:
-            steady = {"kind": "idle" if idle else "periodic"}
-            steady |= orbit_record(found.orbit, int(found.period))
-            statistics |= orbit_statistics(found, self.solver)
-            motion, further = self._along(design, (pair, tangents), found, series)
-            named, start = named | further, Seed.of(found, pair)
-            hint = "" if pair.smooth else _NO_GRADIENT
-            if status is Status.PERIODIC:
-                hint += fading_note(float(found.orbit.multiplier), int(found.period))
-        elif idle and found.window is not None:
-            steady |= window_record(found.window)
-            motion = window_series(pair, found.window) if series else None
-        response = {name: value for name, (value, _) in named.items()}
-        gradient = self._named({name: row for name, (_, row) in named.items()}) if known else {}
-        if status in CLOSED or idle:
-            terms, slopes = self._terms(design, response, gradient)
-            response |= terms
-            gradient |= slopes if known else {}
-        elif status is Status.UNSOUND and pair.soundness is not None:
-            hint = f" Here, {fault_of(pair.soundness)}."
-        elif found.window is not None:
-            steady, response, motion = unsettled(pair, status, found.window, series)
-        elif status is Status.SOLVER_FAILED and pair.timescales is not None:
-            swings = pair.mesh_period / (2 * np.pi * pair.timescales.swing)
-            statistics["swings_per_mesh_period"] = float(swings)
-        if idle:
-            depth = found.orbit.depth if found.window is None else found.window.depth
-            said = apart_message(self.config, float(depth), response.get(RESERVES[1]))
-        if pair.gear is not None and pair.gear.errors is not None:
-            steady |= rattle_record(pair, found)
-            if series:
-                limit = jax.device_get(silent_limit(self.scene, jnp.asarray(design)))
-                silent = silent_record(limit)
-                response |= {name: value for name, (value, _) in silent.items()}
-                gradient |= self._named({name: row for name, (_, row) in silent.items()})
-        return Evaluation(
-            design=dict(zip(self.keys, map(float, design), strict=True)),
-            geometry=geometry_record(self.scene, shape),
-            response=response,
-            gradient=gradient,
-            steady_state=steady,
-            status=status,
-            message=said + hint,
-            statistics=statistics | {"seconds": seconds},
-            series=motion,
-            start=start,
-        )
-
-    def _forces(self, found: Steady) -> dict[str, tuple[float, Any]]:
-        """Return the forces of an orbit and their derivatives (d,), by name; 0 without contact."""
-        rows = np.column_stack([found.orbit.response, found.orbit.sensitivity])
-        if Status.of(found.status) is Status.IDLE:
-            rows = np.zeros_like(rows)
-        return self.scene.solver.measures.named(rows, int(found.period))
-
-    def _along(
-        self, design, built, found: Steady, series: bool
-    ) -> tuple[Series | None, dict[str, tuple[float, Any]]]:
-        """Return the series of an orbit, and what else is computed along it: values and derivatives
-        (d,) by name.
-
-        `built`: rotor pair, and its derivatives along the `design`."""
-        pair, further = built[0], {}
-        motion = orbit_series(pair, found) if series else None
-        if self._loaded(series):
-            whole = varied(found)
-            loads = jax.device_get(orbit_loads(self.scene, jnp.asarray(design), whole))
-            further |= bearing_record(loads)
-            if motion is not None:
-                turns = len(motion.time) // len(loads.series.sizes), 1
-                each = np.tile(np.asarray(loads.series.sizes, np.float64), turns)
-                motion = dataclasses.replace(motion, bearing_loads=each)
-        # Without contact, the reserve is the result.
-        if self._geared(series or Status.of(found.status) is Status.IDLE):
-            reserve = jax.device_get(apart_program(*built, varied(found)))
-            further |= apart_record(reserve, float(self.scene.pitch_radius))
-        return motion, further
-
-    def _loaded(self, series: bool) -> bool:
-        """Return whether an evaluation computes loads on bearings; `series`: with a series."""
-        return self.scene.bearings is not None and (series or bool({*BEARING} & {*self._names}))
-
-    def _geared(self, series: bool) -> bool:
-        """Return whether an evaluation computes the reserve.
-
-        `series`: whether it has a series, or no contact."""
-        wanted = bool({*RESERVES, *GEAR} & {*self._names})
-        return self.scene.gear is not None and (series or wanted)
-
-    @property
-    def _names(self) -> tuple[str, ...]:
-        return tuple(self.config.objective.terms)
-
-    def _terms(self, design, response, gradient):
-        """Return the values of the objective's further terms, and their gradients.
-
-        The gradient of a term is NaN if it depends on gradients of the forces that are not known.
-        """
-        names = [name for name in self._names if name not in response]
-        if not names:
-            return {}, {}
-        forces = np.array([response[name] for name in RESPONSES])
-        slopes = np.full((3, len(self.keys)), np.nan)
-        if gradient:
-            slopes = np.array([list(gradient[name].values()) for name in RESPONSES])
-        found = values_of(self.scene, terms_of(names), design, forces, slopes)
-        values, rows = map(np.asarray, found)
-        return dict(zip(names, map(float, values), strict=True)), self._named(
-            dict(zip(names, rows, strict=True))
-        )
-
-    def _named(self, rows: dict[str, Any]) -> dict[str, dict[str, float]]:
-        """Return derivatives (d,) by name with the keys of the result file; {} without keys."""
-        keys = self.keys
-        named = {name: dict(zip(keys, map(float, row), strict=True)) for name, row in rows.items()}
-        return named if keys else {}
-
-
-def at_speed(scene: Scene, speed_rpm: float) -> Scene:
-    """Return the `scene` at the speed `speed_rpm`."""
-    speed = jnp.asarray(speed_rpm * RPM)
-    return eqx.tree_at(lambda scene: scene.speed, scene, speed)
+        return reported(self, design_vector(self.config), built, found, began, False)
 
 
 def _at_rest(pair: RotorPair, longest: int) -> Start:
@@ -571,29 +421,9 @@ def motion_from(pair: RotorPair, tangents: RotorPair, start: Start, radius, solv
 _build = CachedFunction(Scene.pair_and_tangents)
 _motion = CachedFunction(motion_from)
 _integrated = CachedFunction(integrated_difference)
-apart_program = CachedFunction(apart)
 lyapunov_program = CachedFunction(lyapunov)
 unsettled_status = CachedFunction(window_status)
 _seen = CachedFunction(seen)
-
-
-def objective_weights(config: Config) -> dict[str, float]:
-    """Return the weights of the responses in the objective, keyed by name; their sum is 1."""
-    wanted = config.objective
-    peak = PEAK_NORM if wanted.peak_norm is not None else "peak_force_N"
-    shares = {
-        "mean_force_N": wanted.mean_weight,
-        peak: wanted.peak_weight,
-        "rms_force_N": wanted.rms_weight,
-        **{line_name(order): weight for order, weight in wanted.line_weights.items()},
-    }
-    for name, weight in wanted.terms.items():
-        shares[name] = shares.get(name, 0.0) + weight
-    total = sum(shares.values())
-    return {name: share / total for name, share in shares.items() if share}
-
-
-_NO_GRADIENT = " The contact force jumps at many places, so that it has no gradient."
 
 
 def evaluate(config: Config, design: ArrayLike | Sequence[float] | None = None) -> Evaluation:

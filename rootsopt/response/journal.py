@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.config.sources import FILES, reason, regular_file
 from rootsopt.config.units import shown
 from rootsopt.dynamics.maxima import Maxima

@@ -1,8 +1,12 @@
-"""What is reported of one evaluation: series, entries of the result file, and advice."""
+"""What is reported of one evaluation: series, entries of the result file, and advice.
 
+`reported` makes the evaluation of a known motion from them."""
+
+import dataclasses
 import functools
+import time
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -10,21 +14,29 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.config.units import MM, UM
 from rootsopt.dynamics.collocation.elements import Elements
 from rootsopt.dynamics.integrator import Solver
 from rootsopt.dynamics.orbit import Orbit
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.dynamics.reserve import GEAR, RESERVES, Apart
-from rootsopt.dynamics.steady import OPEN, SAMPLES, Steady
+from rootsopt.dynamics.reserve import GEAR, RESERVES, Apart, apart
+from rootsopt.dynamics.steady import CLOSED, OPEN, SAMPLES, Steady, varied
 from rootsopt.dynamics.window import Window
 from rootsopt.profiles import Geometry
-from rootsopt.pump.loads import EQUIVALENT, OrbitLoads
-from rootsopt.response.result import RESPONSES, Series
+from rootsopt.pump.loads import BEARING, EQUIVALENT, OrbitLoads, orbit_loads
+from rootsopt.pump.rattle import rattle_record, silent_limit, silent_record
+from rootsopt.response.result import RESPONSES, Evaluation, Seed, Series
+from rootsopt.response.terms import terms_of, values_of
 from rootsopt.runtime.programs import CachedFunction
-from rootsopt.scene import Scene
+from rootsopt.scene.build import Scene
+from rootsopt.scene.families import fault_of
 from rootsopt.status import Status
+
+if TYPE_CHECKING:
+    from rootsopt.response.evaluation import Evaluator
+
+_NO_GRADIENT = " The contact force jumps at many places, so that it has no gradient."
 
 
 @CachedFunction
@@ -283,3 +295,151 @@ def apart_message(config: Config, depth: float, backlash: float | None = None) -
     if gap < clearance:
         return f"{said}; they touch with contact.clearance_mm below {clearance - gap:.4g}."
     return f"{said}."
+
+
+apart_program = CachedFunction(apart)
+
+
+def reported(
+    evaluator: "Evaluator", design, built, found: Steady, began: float, series: bool
+) -> Evaluation:
+    """Return the evaluation of the motion `found`.
+
+    `built`: rotor pair, its derivatives along the design, and geometry; `began`: time at the
+    start of the evaluation (s, `perf_counter`); `series`: whether to compute the series."""
+    seconds, design = time.perf_counter() - began, np.asarray(design, np.float64)
+    (pair, tangents, shape), status = built, Status.of(found.status)
+    statistics: dict[str, int | float] = {
+        "transient_mesh_periods": int(found.used),
+        "solver_steps": int(found.steps),
+    }
+    idle, held = status is Status.IDLE, bool(found.held)
+    known = (status is Status.PERIODIC and pair.smooth) or idle
+    named = _forces(evaluator, found) if status in CLOSED or idle else {}
+    steady: dict[str, Any] = {"kind": "idle" if idle else "transient"}
+    said, hint, motion, start = message_of(evaluator.config, status), "", None, None
+    if status in CLOSED or held:
+        steady = {"kind": "idle" if idle else "periodic"}
+        steady |= orbit_record(found.orbit, int(found.period))
+        statistics |= orbit_statistics(found, evaluator.solver)
+        motion, further = _along(evaluator, design, (pair, tangents), found, series)
+        named, start = named | further, Seed.of(found, pair)
+        hint = "" if pair.smooth else _NO_GRADIENT
+        if status is Status.PERIODIC:
+            hint += fading_note(float(found.orbit.multiplier), int(found.period))
+    elif idle and found.window is not None:
+        steady |= window_record(found.window)
+        motion = window_series(pair, found.window) if series else None
+    response = {name: value for name, (value, _) in named.items()}
+    gradient = _named(evaluator, {name: row for name, (_, row) in named.items()}) if known else {}
+    if status in CLOSED or idle:
+        terms, slopes = _terms(evaluator, design, response, gradient)
+        response |= terms
+        gradient |= slopes if known else {}
+    elif status is Status.UNSOUND and pair.soundness is not None:
+        hint = f" Here, {fault_of(pair.soundness)}."
+    elif found.window is not None:
+        steady, response, motion = unsettled(pair, status, found.window, series)
+    elif status is Status.SOLVER_FAILED and pair.timescales is not None:
+        swings = pair.mesh_period / (2 * np.pi * pair.timescales.swing)
+        statistics["swings_per_mesh_period"] = float(swings)
+    if idle:
+        depth = found.orbit.depth if found.window is None else found.window.depth
+        said = apart_message(evaluator.config, float(depth), response.get(RESERVES[1]))
+    if pair.gear is not None and pair.gear.errors is not None:
+        steady |= rattle_record(pair, found)
+        if series:
+            limit = jax.device_get(silent_limit(evaluator.scene, jnp.asarray(design)))
+            silent = silent_record(limit)
+            response |= {name: value for name, (value, _) in silent.items()}
+            gradient |= _named(evaluator, {name: row for name, (_, row) in silent.items()})
+    return Evaluation(
+        design=dict(zip(evaluator.keys, map(float, design), strict=True)),
+        geometry=geometry_record(evaluator.scene, shape),
+        response=response,
+        gradient=gradient,
+        steady_state=steady,
+        status=status,
+        message=said + hint,
+        statistics=statistics | {"seconds": seconds},
+        series=motion,
+        start=start,
+    )
+
+
+def _forces(evaluator: "Evaluator", found: Steady) -> dict[str, tuple[float, Any]]:
+    """Return the forces of an orbit and their derivatives (d,), by name; 0 without contact."""
+    rows = np.column_stack([found.orbit.response, found.orbit.sensitivity])
+    if Status.of(found.status) is Status.IDLE:
+        rows = np.zeros_like(rows)
+    return evaluator.scene.solver.measures.named(rows, int(found.period))
+
+
+def _along(
+    evaluator: "Evaluator", design, built, found: Steady, series: bool
+) -> tuple[Series | None, dict[str, tuple[float, Any]]]:
+    """Return the series of an orbit, and what else is computed along it: values and derivatives
+    (d,) by name.
+
+    `built`: rotor pair, and its derivatives along the `design`."""
+    pair, further = built[0], {}
+    motion = orbit_series(pair, found) if series else None
+    if loaded(evaluator, series):
+        whole = varied(found)
+        loads = jax.device_get(orbit_loads(evaluator.scene, jnp.asarray(design), whole))
+        further |= bearing_record(loads)
+        if motion is not None:
+            turns = len(motion.time) // len(loads.series.sizes), 1
+            each = np.tile(np.asarray(loads.series.sizes, np.float64), turns)
+            motion = dataclasses.replace(motion, bearing_loads=each)
+    # Without contact, the reserve is the result.
+    if geared(evaluator, series or Status.of(found.status) is Status.IDLE):
+        reserve = jax.device_get(apart_program(*built, varied(found)))
+        further |= apart_record(reserve, float(evaluator.scene.pitch_radius))
+    return motion, further
+
+
+def loaded(evaluator: "Evaluator", series: bool) -> bool:
+    """Return whether an evaluation computes loads on bearings; `series`: with a series."""
+    return evaluator.scene.bearings is not None and (
+        series or bool({*BEARING} & {*names_of(evaluator)})
+    )
+
+
+def geared(evaluator: "Evaluator", series: bool) -> bool:
+    """Return whether an evaluation computes the reserve.
+
+    `series`: whether it has a series, or no contact."""
+    wanted = bool({*RESERVES, *GEAR} & {*names_of(evaluator)})
+    return evaluator.scene.gear is not None and (series or wanted)
+
+
+def names_of(evaluator: "Evaluator") -> tuple[str, ...]:
+    """Return the names of the further terms of the objective."""
+    return tuple(evaluator.config.objective.terms)
+
+
+def _terms(evaluator: "Evaluator", design, response, gradient):
+    """Return the values of the objective's further terms, and their gradients.
+
+    The gradient of a term is NaN if it depends on gradients of the forces that are not known.
+    """
+    names = [name for name in names_of(evaluator) if name not in response]
+    if not names:
+        return {}, {}
+    forces = np.array([response[name] for name in RESPONSES])
+    slopes = np.full((3, len(evaluator.keys)), np.nan)
+    if gradient:
+        slopes = np.array([list(gradient[name].values()) for name in RESPONSES])
+    found = values_of(evaluator.scene, terms_of(names), design, forces, slopes)
+    values, rows = map(np.asarray, found)
+    return dict(zip(names, map(float, values), strict=True)), _named(
+        evaluator, dict(zip(names, rows, strict=True))
+    )
+
+
+def _named(evaluator: "Evaluator", rows: dict[str, Any]) -> dict[str, dict[str, float]]:
+    """Return derivatives (d,) by name with the keys of the result file; {} without keys."""
+    keys = evaluator.keys
+    named = {name: dict(zip(keys, map(float, row), strict=True)) for name, row in rows.items()}
+    return named if keys else {}

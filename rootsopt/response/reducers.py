@@ -28,7 +28,7 @@ from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.config.tolerances import TolerancesConfig
 from rootsopt.response.result import Evaluation, Part, Seeds
 from rootsopt.status import Status

@@ -117,6 +117,8 @@ def _numbers(pair: RotorPair) -> RotorPair:
 
 RESPONSES = ("mean_force_N", "peak_force_N", "rms_force_N")
 """Keys of the mean, peak and RMS force in a response."""
+ERRORS = {name: name.replace("_N", "_standard_error_N") for name in RESPONSES}
+"""Keys of the standard errors in `steady_state`, keyed by the name of the response."""
 # Entries of `steady_state` in the row of a speed.
 _STEADY = (
     "kind",

@@ -10,13 +10,15 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.config.tolerances import Scatter, TolerancesConfig
-from rootsopt.scene import Scene
+from rootsopt.config.units import RPM
+from rootsopt.scene.build import Scene
 from rootsopt.scene.space import sobol
 
 NOMINAL, RANDOM = "as given", "random"
@@ -134,3 +136,9 @@ def _difference(before: Scene, after: Scene) -> Scene:
         return found if found.any() else None
 
     return jax.tree.map(change, *(eqx.filter(x, eqx.is_inexact_array) for x in (after, before)))
+
+
+def at_speed(scene: Scene, speed_rpm: float) -> Scene:
+    """Return the `scene` at the speed `speed_rpm`."""
+    speed = jnp.asarray(speed_rpm * RPM)
+    return eqx.tree_at(lambda scene: scene.speed, scene, speed)

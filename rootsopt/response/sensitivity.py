@@ -21,27 +21,24 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.config.tolerances import Scatter
-from rootsopt.config.units import UM
+from rootsopt.config.units import LENGTHS, MICROMETRE, OTHERS, UM
 from rootsopt.dynamics.maxima import local_maxima
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.reserve import INSTANTS, gaps
 from rootsopt.dynamics.steady import Steady, varied
-from rootsopt.response.evaluation import Evaluation, Evaluator
-from rootsopt.response.result import Seed, Seeds, begun
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.result import Evaluation, Seed, Seeds, begun
 from rootsopt.response.scatter import draw, shifts
 from rootsopt.runtime.programs import CachedFunction
-from rootsopt.scene import Scene, along
+from rootsopt.scene.build import Scene, along
 from rootsopt.status import Status
 
 # Relative step of the difference quotients that approximate the derivatives of the scene with
 # respect to a quantity. Their error is small, since the scene depends almost linearly on its
 # quantities.
 _STEP = 1e-6
-MICROMETRE = 1e-3
-"""One micrometre (mm): change of clearance, backlash and centre distance error for which the table
-states the effect."""
 _PERCENT = 0.01
 
 
@@ -59,28 +56,6 @@ class Quantity(NamedTuple):
     step: float
 
 
-_LENGTHS = (
-    ("contact.clearance_mm", "clearance of the flanks"),
-    ("scene.timing_gear.backlash_mm", "backlash of the timing gear"),
-    ("scene.center_distance_error_mm", "centre distance error"),
-)
-_OTHERS = (
-    ("scene.speed_rpm", "speed", "rpm"),
-    ("scene.load.torque_N_m", "load", "N m"),
-    ("scene.load.pressure_difference_Pa", "pressure difference", "Pa"),
-    ("scene.timing_gear.stiffness_N_m_per_rad", "stiffness of the timing gear", "N m/rad"),
-    ("scene.timing_gear.damping_ratio", "damping ratio of the timing gear", ""),
-    ("contact.stiffness_N_per_mm_e", "contact stiffness", "N/mm^e"),
-    ("contact.max_damping_N_s_per_mm", "contact damping", "N s/mm"),
-    ("rotor.density_kg_m3", "density", "kg/m^3"),
-    ("rotor.length_mm", "rotor length", "mm"),
-)
-
-
-NAMES = {key: name for key, name, *_ in (*_LENGTHS, *_OTHERS)}
-"""Names in words of these quantities, by config key."""
-
-
 def quantities(config: Config) -> list[Quantity]:
     """Return the quantities that the sensitivity table lists for the scene of `config`.
 
@@ -88,11 +63,11 @@ def quantities(config: Config) -> list[Quantity]:
     error. For all other quantities, the change is 1 %. Quantities of parts that the scene does not
     have are left out. So are quantities that are 0, except the first three."""
     found = []
-    for key, name in _LENGTHS:
+    for key, name in LENGTHS:
         value = config.value(key)
         if value is not None:
             found.append(Quantity(key, name, "mm", value, MICROMETRE))
-    for key, name, unit in _OTHERS:
+    for key, name, unit in OTHERS:
         value = config.value(key)
         if value:
             found.append(Quantity(key, name, unit, value, _PERCENT * value))

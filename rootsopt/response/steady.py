@@ -26,7 +26,7 @@ from rootsopt.dynamics.steady import CLOSED, OPEN, Steady, among, varied
 from rootsopt.profiles.geometry import Soundness
 from rootsopt.runtime.environment import check_precision
 from rootsopt.runtime.programs import CachedFunction
-from rootsopt.scene import Scene, along
+from rootsopt.scene.build import Scene, along
 from rootsopt.status import Status
 
 

@@ -11,14 +11,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.profiles import Geometry, geometry
 from rootsopt.profiles.geometry import Soundness
-from rootsopt.response.evaluation import Evaluation, Evaluator, Motions, objective_weights
+from rootsopt.response.evaluation import Evaluator, Motions
 from rootsopt.response.records import geometry_record, message_of
-from rootsopt.response.terms import depends_on_forces, terms_of, values_of
+from rootsopt.response.result import Evaluation
+from rootsopt.response.terms import depends_on_forces, objective_weights, terms_of, values_of
 from rootsopt.runtime.programs import CachedFunction
-from rootsopt.scene import Scene, fault_of
+from rootsopt.scene.build import Scene
+from rootsopt.scene.families import fault_of
 from rootsopt.status import Status
 
 

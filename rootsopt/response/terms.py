@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.config.units import MM, UM
 from rootsopt.dynamics.orbit import PEAK_NORM, line_name
 from rootsopt.dynamics.reserve import GEAR, RESERVES
@@ -29,7 +29,7 @@ from rootsopt.pump.loads import BEARING, still_loads
 from rootsopt.pump.rattle import SILENT, silent_eccentricity
 from rootsopt.response.result import RESPONSES
 from rootsopt.runtime.programs import CachedFunction
-from rootsopt.scene import Scene
+from rootsopt.scene.build import Scene
 
 
 class Forces(NamedTuple):
@@ -356,3 +356,19 @@ def sense_of(name: str) -> Literal["min", "max"]:
 for _kind, _formulas in ((Formula, _LESS), (LargeFormula, _MORE)):
     for _name in _formulas:
         register_term(_name, _kind(_name))
+
+
+def objective_weights(config: Config) -> dict[str, float]:
+    """Return the weights of the responses in the objective, keyed by name; their sum is 1."""
+    wanted = config.objective
+    peak = PEAK_NORM if wanted.peak_norm is not None else "peak_force_N"
+    shares = {
+        "mean_force_N": wanted.mean_weight,
+        peak: wanted.peak_weight,
+        "rms_force_N": wanted.rms_weight,
+        **{line_name(order): weight for order, weight in wanted.line_weights.items()},
+    }
+    for name, weight in wanted.terms.items():
+        shares[name] = shares.get(name, 0.0) + weight
+    total = sum(shares.values())
+    return {name: share / total for name, share in shares.items() if share}

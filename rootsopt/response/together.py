@@ -26,8 +26,8 @@ from rootsopt.dynamics.flow import one_period, strobe
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import Steady
-from rootsopt.response.evaluation import Evaluation, Evaluator, motion_from
-from rootsopt.response.result import begun
+from rootsopt.response.evaluation import Evaluator, motion_from
+from rootsopt.response.result import Evaluation, begun
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.status import Status
 

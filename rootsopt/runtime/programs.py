@@ -6,9 +6,7 @@ code, but every process must trace and lower a function before it can look up th
 arguments."""
 
 import contextlib
-import ctypes
 import functools
-import gc
 import hashlib
 import os
 import pickle
@@ -32,6 +30,7 @@ from jax.experimental import serialize_executable
 
 from rootsopt.config.families import outside_modules
 from rootsopt.runtime.store import Store, UnsafeFolderError
+from rootsopt.runtime.threads import trim, without_collection
 
 _PACKAGES = (
     "jax",
@@ -255,7 +254,7 @@ class CachedFunction:
 
         flat.__name__ = flat.__qualname__ = self.function.__name__
         structs = [jax.ShapeDtypeStruct(s[0], np.dtype(s[1])) for s in kind.shapes if s]
-        with _tracing, _without_collection():
+        with _tracing, without_collection():
             lowered = jax.jit(flat).lower(*structs)
         outlined(outlines[-1])
         made = _Made(_finished(lowered), outlines[-1])
@@ -264,7 +263,7 @@ class CachedFunction:
             with contextlib.suppress(Exception):
                 _save(place, made, len(structs))
         del lowered
-        _trim()
+        trim()
         return made
 
     def _place(self, kind: _Kind) -> "_Place | None":
@@ -326,27 +325,6 @@ def _split(args: tuple) -> tuple[list, _Kind]:
 def _precision(dtype: Any, wide: bool) -> str:
     """Return the name of the type that JAX uses for `dtype`; `wide`: whether it allows 64 bits."""
     return str(jax.dtypes.canonicalize_dtype(dtype))
-
-
-@contextlib.contextmanager
-def _without_collection() -> Iterator[None]:
-    """Pause the collection of cyclic garbage. Tracing makes many objects and drops few of them, and
-    spends a quarter of its time in the collector."""
-    paused = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if paused:
-            gc.enable()
-
-
-def _trim() -> None:
-    """Give memory that the compiler has freed back to the system.
-
-    The C library of Linux keeps it otherwise: some 150 MB for each large program."""
-    with contextlib.suppress(OSError, AttributeError, TypeError):
-        ctypes.CDLL(None).malloc_trim(0)
 
 
 def _finished(lowered: jax.stages.Lowered) -> jax.stages.Compiled:

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rootsopt.config import ProfileConfig
 from rootsopt.config.families import families, family_of, is_shipped
+from rootsopt.config.rotor import ProfileConfig
 from rootsopt.config.units import DEG, MM, shown
 from rootsopt.errors import InputError
 from rootsopt.measured.conjugacy import conjugacy

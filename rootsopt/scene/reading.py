@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.config.units import DEG, MM, RPM, UM
 from rootsopt.contact.law import ImpactLaw
 from rootsopt.dynamics.integrator import Integrator, Solver

@@ -23,8 +23,8 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from rootsopt.config import ProfileConfig
 from rootsopt.config.families import FREE_FORM, Parameter, family_of
+from rootsopt.config.rotor import ProfileConfig
 from rootsopt.config.units import DEG, MM
 from rootsopt.errors import InputError
 from rootsopt.measured.conjugacy import conjugacy

@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.config import Config
 from rootsopt.config.families import family_of
+from rootsopt.config.reading import Config
 from rootsopt.config.study import limits_of
 from rootsopt.config.units import MM
 from rootsopt.errors import InputError
-from rootsopt.scene import Scene
+from rootsopt.scene.build import Scene
 from rootsopt.scene.check import shape_of
 from rootsopt.scene.families import check
 from rootsopt.scene.space import Space, slacks_and_slopes, sobol

@@ -17,15 +17,15 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
-from rootsopt.config import TWIST, Config
 from rootsopt.config.families import Family, Parameter, family_of
-from rootsopt.config.study import BASELINE
+from rootsopt.config.reading import Config
+from rootsopt.config.study import BASELINE, TWIST
 from rootsopt.config.units import DEG, MM, si_unit, unit_of, words
 from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry, Profile, geometry
 from rootsopt.profiles.geometry import Soundness, margins
 from rootsopt.runtime.programs import CachedFunction
-from rootsopt.scene import Scene
+from rootsopt.scene.build import Scene
 
 # Distance (fraction of the width of the bounds) from a design to the bounds that are widened for
 # it.

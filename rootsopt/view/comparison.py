@@ -1,25 +1,28 @@
-"""Tables and sentences of an optimum beside its baseline, and of what fits a record.
+"""Tables and sentences of an optimum: beside its baseline, its limits, certificate and likeness.
 
-They are those of `rootsopt improve`, of `rootsopt identify`, and those over what is assumed about
-the scene."""
+Also of what fits a record (`rootsopt identify`), and of an optimum over what is assumed about the
+scene."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from rootsopt.response.sensitivity import NAMES
+from rootsopt.config.units import MICROMETRE, NAMES
 from rootsopt.view.names import (
     DASH,
     Cell,
+    Record,
     Row,
     Table,
     brief,
     in_words,
     label,
+    limit,
     listed,
     name_and_unit,
     percent,
     quantity,
+    signed,
     stated,
     table,
     value,
@@ -27,6 +30,9 @@ from rootsopt.view.names import (
 
 # Length (mm) below which sentences state it in µm.
 _MICRO = 0.1
+
+# Estimated share of further starts with a new optimum above which more starts are recommended.
+_UNSURE = 0.5
 
 
 def assumption_tables(result: Mapping[str, Any]) -> Iterator[Table | None]:
@@ -263,3 +269,170 @@ def identified(
             found.append(f"{name} {brief(one['value'])} ± {brief(error, 2)} {unit}".strip())
     said = str(result["message"]).partition(". ")[2]
     return [("Found", f"{listed(found)}."), ("How sure", said)] if found else []
+
+
+def constraint_table(result: Record) -> Table | None:
+    """Return the constraints of an optimisation, with the price of each limit."""
+    rows = []
+    for row in result.get("constraints") or ():
+        word = "met by all" if row.get("always") else "active" if row.get("active") else "satisfied"
+        verdict = Cell(word if row["satisfied"] else "violated", bool(row["satisfied"]))
+        before = Cell(value(row["baseline"]))
+        if row.get("baseline_satisfied") is False:
+            own = row.get("baseline_limit")
+            beyond = "violated" if own is None else f"> {value(own)}"
+            before = Cell(f"{before.text} {beyond}", False)
+        rows.append([limit(row), before, value(row["optimized"]), verdict, price(row)])
+    heads = "", "baseline", "optimised", "verdict", "price of a limit"
+    note = (
+        "Price: change of the objective if the limit is relaxed by the step, to first order. An "
+        "empty price: the limit does not hold the optimum back."
+    )
+    found = result.get("optimality") or {}
+    if found and not found.get("converged"):
+        note += " The design is no optimum, so prices are rough."
+    return table("Constraints", heads, [("", rows)], note)
+
+
+def price(row: Record) -> str:
+    """Return the price of a limit in words: the change of the objective for a step of the limit."""
+    change = row.get("relaxed_objective_percent")
+    if change is None or not row.get("multiplier"):
+        return ""
+    return f"{signed(change, '%')} for {signed(row['relaxed_by'], row.get('unit') or '')}"
+
+
+def certificate_tables(result: Record) -> Iterator[Table | None]:
+    """Yield tables on the optimum: conditions, active branches, starts, sensitivities."""
+    found = result.get("optimality")
+    if not found:
+        return
+    good = bool(found["converged"])
+    conditions: list[Row] = [
+        ["residual of the first-order conditions (of the unit box)",
+         Cell(value(found["residual"]), good), f"at most {value(found['required_residual'])}"],
+        ["better nearby, promised (relative)", value(found.get("promised_decrease"))],
+        ["violation of a constraint (scaled)", value(found["violation"]), "0"],
+        ["why the search stopped", Cell(in_words(found["reason"]), good)],
+        ["method", str(found["method"])],
+    ]  # fmt: skip
+    heads = "", "value", "at an optimum"
+    yield table("First-order conditions", heads, [("", conditions)], found["message"])
+    held = [_held(one) for one in found.get("held_by") or ()]
+    note = "Peaks, speeds or motions that are equal at the optimum: none falls alone."
+    heads = "branch", "share", "its objective"
+    yield table("What holds the optimum", heads, [("", held if len(held) > 1 else [])], note)
+    starts: list[Row] = [
+        [f"start {one['start']}", Cell(in_words(one["reason"]), one["reason"] == "converged"),
+         str(one["evaluations"]), value(one["objective"])]
+        for one in found.get("starts") or ()
+    ]  # fmt: skip
+    optima: list[Row] = [
+        [f"optimum {number}", f"found by {one['found']} of {len(starts)} starts", "",
+         value(one["objective"])]
+        for number, one in enumerate(found.get("optima") or (), start=1)
+    ]  # fmt: skip
+    heads = "", "why it ended", "designs", "objective"
+    groups = [("starts", starts), ("distinct optima", optima)]
+    whole = found.get("global")
+    proven = whole is not None and whole["proven"]
+    yield table("Local searches", heads, groups, "" if proven else _unseen(found))
+    yield _whole(whole) if whole else None
+    yield _vertices(result) if "vertex" in found else None
+    rows = [_sensitive(one) for one in found.get("sensitivities") or ()]
+    heads = "", "mean force (N)", "peak force (N)", "objective (%)"
+    note = "What a small change of the scene does to the optimised design."
+    yield table("Sensitivity to the scene", heads, [("", rows)], note)
+
+
+def _vertices(result: Record) -> Table | None:
+    """Return the table on the vertices of the limits, the best first."""
+    known, own = result["optimality"]["vertex"], result["optimized"]["design"]
+    rows: list[Row] = [
+        [*map(value, one["design"].values()), value(one["objective"]), ", ".join(one["limits"])]
+        for one in known["others"]
+    ]
+    rows.insert(0, [*map(value, own.values()), "optimum", ", ".join(known["limits"])])
+    heads = [*map(label, own), "objective", "held by"]
+    note = "Where as many limits meet as there are parameters, the objective only chooses a vertex."
+    return table("Vertices of the limits", heads, [("", rows)], note)
+
+
+def _whole(found: Record) -> Table | None:
+    """Return the table on the lower bound `found` of all designs within the bounds."""
+    rows: list[Row] = [
+        ["lower bound of the objective", value(found["lower_bound"])],
+        ["distance of the optimum from it", Cell(value(found["gap"]), bool(found["proven"]))],
+        ["designs", str(found["evaluations"])],
+        ["designs without a usable motion", str(found["unusable"])],
+        ["jumps between motions", str(found["jumps"])],
+        ["regions left", str(found["regions_left"])],
+        ["their share of the bounds", f"{100 * found['volume_left']:.2g} %"],
+    ]
+    return table("All designs within the bounds", ("", "value"), [("", rows)], found["assumption"])
+
+
+def _held(one: Record) -> Row:
+    parts = []
+    if one.get("speed_rpm") is not None:
+        parts.append(stated("speed_rpm", one["speed_rpm"]))
+    if "scene" in one:
+        parts.append(f"scene {one['scene']} of the sample")
+    if one.get("rotation_deg") is not None:
+        parts.append(f"peak of {value(one['force_N'])} N at {one['rotation_deg']:.2f}°")
+    return [", ".join(parts) or "motion", f"{one['share']:.3f}", value(one["objective"])]
+
+
+def _unseen(found: Record) -> str:
+    share = (found.get("unseen") or {}).get("share_of_starts")
+    if share is None:
+        return "So few starts do not tell how many optima are left to find: raise optimizer.starts."
+    more = ": raise optimizer.starts" if share > _UNSURE else ""
+    return (
+        f"About {brief(100 * share, 2)} % of further starts would find an optimum that no start "
+        f"has found yet{more}."
+    )
+
+
+def _sensitive(one: Record) -> Row:
+    step = "+1 µm" if one["unit"] == "mm" and one["step"] == MICROMETRE else "+1 %"
+    keys = "mean_force_N", "peak_force_N", "objective_percent"
+    changes = (value(None) if one.get(key) is None else signed(one[key], "") for key in keys)
+    return [f"{one['quantity']} {step}", *changes]
+
+
+def rejected_table(result: Record) -> Table | None:
+    """Return the designs that did not hold up when simulated again from rest, or None."""
+    rows = []
+    for row in (result.get("verification") or {}).get("rejected") or ():
+        same = row["verified_objective"] is not None
+        reason = "another motion" if same else in_words(row["status"])
+        reason = Cell(f"{reason} ({len(row['attempts'])} attempts)", good=False)
+        numbers = (value(row[f"{word}_objective"]) for word in ("searched", "verified"))
+        rows.append([_design(row["design"]), *numbers, reason])
+    heads = "design", "objective in the search", "from rest", "reason"
+    return table("Rejected designs", heads, [("", rows)])
+
+
+def _design(design: Mapping[str, float]) -> str:
+    return ", ".join(f"{label(key)} {value(x)}" for key, x in design.items())
+
+
+def likeness_tables(result: Record) -> list[Table | None]:
+    """Return the family members nearest to the result's profile, and to an outline from a file."""
+    begun = result.get("beginning") or {}
+    return [
+        _likeness("Nearest profiles of the families", result.get("resembles") or (), ""),
+        _likeness("Nearest to the outline of the baseline", begun.get("considered") or (),
+                  begun.get("message", "")),
+    ]  # fmt: skip
+
+
+def _likeness(title: str, rows: Sequence[Record], note: str) -> Table | None:
+    cells = []
+    for row in rows:
+        inset = {"inset_mm": row["inset_um"] / 1e3} if row.get("inset_um") else {}
+        away = value(row["departure_um"]), value(row["departure_rms_um"])
+        cells.append([in_words(row["family"]), *away, _design(inset | row["design"])])
+    heads = "family", "largest distance (µm)", "RMS distance (µm)", "nearest member"
+    return table(title, heads, [("", cells)], note)

@@ -8,11 +8,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from rootsopt.errors import InputError
-from rootsopt.response.ensemble import ERRORS
+from rootsopt.response.result import ERRORS
 from rootsopt.response.terms import RESERVES, sense_of
 from rootsopt.status import Status
-from rootsopt.view.comparison import elsewhere
+from rootsopt.view.comparison import elsewhere, price
 from rootsopt.view.names import (
+    Record,
     brief,
     in_words,
     limit,
@@ -22,8 +23,8 @@ from rootsopt.view.names import (
     scalars,
     signed,
     stated,
+    varied,
 )
-from rootsopt.view.tables import Record, price, varied
 
 Facts = list[tuple[str, str]]
 """Heading and sentences of each fact."""

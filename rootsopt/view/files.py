@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    from rootsopt.config import Config
-    from rootsopt.response.records import Series
+    from rootsopt.config.reading import Config
+    from rootsopt.response.result import Series
 
 
 DPI = 150

@@ -5,13 +5,15 @@ ASCII where a table is printed.
 """
 
 import dataclasses
+import itertools
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.config.units import unit_of, words
+from rootsopt.status import Standing, Status
 
 DASH = "–"
 """Text in place of an unknown number."""
@@ -38,6 +40,10 @@ _NAMES = {
     "quantile_95": ("95 % quantile", ""),
 }
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+Record = Mapping[str, Any]
+"""The result file, or an entry of it."""
 
 
 def last_part(key: str) -> str:
@@ -173,6 +179,33 @@ class Table:
     heads: tuple[str, ...]
     groups: tuple[tuple[str, tuple[tuple[Cell, ...], ...]], ...]
     note: str = ""
+
+
+def statuses_in(data: Any) -> dict[str, None]:
+    """Return the labels of all statuses in the result file as keys, in order."""
+    if isinstance(data, list | tuple):
+        return {word: None for inner in data for word in statuses_in(inner)}
+    if not isinstance(data, Mapping):
+        return {}
+    own = {data[key]: None for key in ("status", "evaluation_status") if key in data}
+    return {word: None for word in own if isinstance(word, str)} | statuses_in([*data.values()])
+
+
+def status_cell(word: str) -> Cell:
+    """Return the cell of a status: its label in words, marked favourable or not."""
+    known = {status.label: status.usable for status in Status}
+    known |= {one.label: one is Standing.CERTIFIED for one in Standing}
+    return Cell(in_words(word), known.get(word))
+
+
+def varied(rows: Sequence[Record]) -> list[str]:
+    """Return the keys of the quantities that vary between scenes, beginning with a numeric one.
+
+    These are the keys before the forces in each row."""
+    keys = list(itertools.takewhile(lambda key: not key.endswith("_force_N"), rows[0]))
+    kept = [key for key in keys if key not in ("status", "point", "message")]
+    varied = [key for key in kept if len({row.get(key) for row in rows}) > 1] or kept[:1]
+    return sorted(varied, key=lambda key: not isinstance(rows[0].get(key), int | float))
 
 
 def table(

@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from rootsopt.response.records import RESPONSES
+from rootsopt.response.result import RESPONSES
 from rootsopt.response.sweeps.plan import Plan
 from rootsopt.response.sweeps.points import Row
 from rootsopt.response.sweeps.scenes import is_numeric, written

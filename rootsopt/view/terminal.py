@@ -19,8 +19,8 @@ from rootsopt.status import Status
 from rootsopt.view import facts
 from rootsopt.view.comparison import identified
 from rootsopt.view.files import design_file
-from rootsopt.view.names import Table, brief, in_words, name_and_unit, stated
-from rootsopt.view.tables import Record, records_of
+from rootsopt.view.names import Record, Table, brief, in_words, name_and_unit, stated
+from rootsopt.view.tables import records_of
 
 # What came out of a run, by command.
 _FACTS = {
@@ -57,7 +57,6 @@ _NEXT = {
     "pareto": (("Simulate one point", "simulate"), ("Draw its rotor", "profile")),
     "sweep": (_SIMULATE, _MOTIONS),
 }
-
 
 # Objective for flanks that stay apart, by whether the leakage is known: they have no force.
 _APART = {

@@ -19,7 +19,8 @@ from rootsopt.commands import console
 from rootsopt.commands.table import COMMANDS, profile
 from rootsopt.config import Config, load
 from rootsopt.config.explain import GROUPS, describe
-from rootsopt.measured.reading import read, signed_area
+from rootsopt.measured.loop import signed_area
+from rootsopt.measured.reading import read
 from rootsopt.runtime import programs
 from rootsopt.scene import Scene, design_vector
 from tests.runtime.test_environment import HARMLESS, SET_ASIDE

@@ -17,11 +17,11 @@ from rootsopt.config.families import (
     Family,
     Parameter,
     families,
-    import_named,
     outside_modules,
     parameters,
     register_family,
 )
+from rootsopt.config.sources import import_named
 from rootsopt.errors import InputError
 from rootsopt.scene.families import profile_of
 from tests.conformance import families as suite

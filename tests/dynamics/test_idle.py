@@ -17,10 +17,10 @@ from rootsopt.errors import InputError
 from rootsopt.optimize.problem import Problem
 from rootsopt.profiles import geometry
 from rootsopt.response.attractors import Attractor, Basins
-from rootsopt.response.evaluation import Evaluation, Evaluator
+from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.records import apart_message, fading_note, message_of, unsettled
 from rootsopt.response.reducers import mean, over_speeds
-from rootsopt.response.result import Part, Seed
+from rootsopt.response.result import Evaluation, Part, Seed
 from rootsopt.scene import Scene, design_vector
 from rootsopt.status import Status
 

@@ -12,8 +12,9 @@ from rootsopt.config import load
 from rootsopt.dynamics.linear import spectral_radius
 from rootsopt.errors import InputError
 from rootsopt.optimize.problem import Problem
-from rootsopt.response.evaluation import Evaluator, objective_weights
+from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.records import floquet
+from rootsopt.response.terms import objective_weights
 
 LIVELY = (
     "scene.speed_rpm=4000",

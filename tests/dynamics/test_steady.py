@@ -13,8 +13,9 @@ from rootsopt.config import DESIGN_KEYS, load
 from rootsopt.dynamics.flow import strobe
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.linear import spectral_radius
-from rootsopt.response.evaluation import RESPONSES, Evaluator, evaluate
+from rootsopt.response.evaluation import Evaluator, evaluate
 from rootsopt.response.records import message_of
+from rootsopt.response.result import RESPONSES
 from rootsopt.status import Status
 
 # A scene like that of the shipped configs, for which the figures below were measured.

@@ -18,8 +18,7 @@ from rootsopt.measured.curves import _jumps
 from rootsopt.measured.fit import imported
 from rootsopt.measured.loop import Loop
 from rootsopt.measured.source import advice, outline_of
-from rootsopt.optimize.design import optimize_design
-from rootsopt.optimize.tradeoffs.trace import pareto_front
+from rootsopt.optimize.design import optimize_design, pareto_front
 from rootsopt.profiles import CIC, EE, geometry, outline
 from rootsopt.scene import check_geometry
 from rootsopt.scene.families import free_form_of

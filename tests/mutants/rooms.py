@@ -11,7 +11,7 @@ _OF = {
     "response/continuation/arclength": "arclength continuation",
     "response/continuation/branch": "continuation",
     "contact/closest": "closed_forms contact accuracy families gradients",
-    "contact/gap": "conformance worn twisted scene",
+    "contact/gap": "closed_forms contact accuracy conformance worn twisted scene",
     "contact/law": "conformance extending_parts contact extremes",
     "contact/search": "closed_forms conformance near",
     "contact/wrapped": "twisted worn",

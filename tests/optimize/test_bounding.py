@@ -12,7 +12,8 @@ from rootsopt import load_config
 from rootsopt.optimize import bounding
 from rootsopt.optimize.local import FEASIBLE, Group, Linearization
 from rootsopt.optimize.problem import Problem
-from rootsopt.optimize.search import Search, Stage
+from rootsopt.optimize.robust_problem import Stage
+from rootsopt.optimize.search import Search
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.reducers import HERE
 from rootsopt.status import Status

@@ -11,9 +11,8 @@ from rootsopt.commands.work import optimize as work
 from rootsopt.config import parse
 from rootsopt.errors import InputError
 from rootsopt.optimize.search import Search
-from rootsopt.response.evaluation import Evaluation
 from rootsopt.response.journal import Checkpoint
-from rootsopt.response.result import Seed
+from rootsopt.response.result import Evaluation, Seed
 from rootsopt.status import Status
 from rootsopt.view.runs import RunFolder
 

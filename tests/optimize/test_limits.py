@@ -10,7 +10,13 @@ from rootsopt.config import parse
 from rootsopt.dynamics.maxima import Maxima
 from rootsopt.errors import InputError
 from rootsopt.optimize.infeasible import explain
-from rootsopt.optimize.limits import TermConstraint, force_limits, limited, term_constraints
+from rootsopt.optimize.limits import (
+    TermConstraint,
+    constraint_rows,
+    force_limits,
+    limited,
+    term_constraints,
+)
 from rootsopt.optimize.local import Certificate, Linearization
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.search import Search
@@ -114,7 +120,7 @@ def test_prices_are_per_unit_of_the_limits(registered):
     held = np.full(len(problem.space.constraints), 2.0)
     walls = np.zeros(1), np.array([0.25, 0.5])
     proof = Certificate(0.0, 0.0, held, np.zeros(3), np.zeros(3), (), walls)
-    rows = {row["name"]: row for row in problem.constraint_rows(found, proof)}
+    rows = {row["name"]: row for row in constraint_rows(problem, found, proof)}
     volume, force = rows["displaced volume"], rows["mean force"]
     # The objective, 0.8, rises with the least volume and falls with the greatest force.
     assert volume["multiplier"] == pytest.approx(2 / 400)
@@ -175,7 +181,7 @@ def test_the_baseline_breaks_limits_of_any_key(key, name):
     )
     problem = Problem.of(settings, scene, one)
     assert problem.broken(one) == [name]
-    rows = {row["name"]: row for row in problem.constraint_rows(one)}
+    rows = {row["name"]: row for row in constraint_rows(problem, one)}
     assert not rows[name]["baseline_satisfied"]
     assert sum(row["baseline_satisfied"] is False for row in rows.values()) == 1
 
@@ -199,7 +205,7 @@ def test_every_limit_can_be_the_baselines_own_value():
     whole = dataclasses.replace(slow, speeds=speeds)
     problem = Problem.of(settings, scene, whole)
     assert problem.broken(whole) == []
-    rows = {row["name"]: row for row in problem.constraint_rows(whole)}
+    rows = {row["name"]: row for row in constraint_rows(problem, whole)}
     assert rows["peak force"]["limit"] == 180.0
     assert rows["displaced volume"]["limit"] == pytest.approx(volume, rel=1e-12)
     for name, key in (

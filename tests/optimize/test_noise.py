@@ -9,8 +9,9 @@ from rootsopt.config import DESIGN_KEYS, load
 from rootsopt.optimize import noise
 from rootsopt.optimize.outcome import Trial
 from rootsopt.optimize.problem import Problem
-from rootsopt.response.ensemble import ERRORS, SIGNIFICANT
-from rootsopt.response.evaluation import RESPONSES, Evaluation, Evaluator
+from rootsopt.response.ensemble import SIGNIFICANT
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.result import ERRORS, RESPONSES, Evaluation
 from rootsopt.status import Status
 
 INSIDE = (30.0, 4.0, 3.0)

@@ -5,7 +5,7 @@ import pytest
 
 from rootsopt import load_config
 from rootsopt.optimize.optimality import StartOutcome, distinct, unseen
-from rootsopt.optimize.search import method_of
+from rootsopt.optimize.outcome import method_of
 
 
 def outcome(number, objective, *point):

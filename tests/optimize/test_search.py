@@ -11,14 +11,15 @@ import pytest
 from rootsopt.config import load
 from rootsopt.optimize import noise
 from rootsopt.optimize.local import Linearization
-from rootsopt.optimize.outcome import Trial, history_of
+from rootsopt.optimize.outcome import Trial, apart, history_of, ranked
 from rootsopt.optimize.problem import Problem
-from rootsopt.optimize.search import Search, Stage, _apart, _ranked
+from rootsopt.optimize.robust_problem import Stage
+from rootsopt.optimize.search import Search
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.reducers import HERE
 from rootsopt.scene.space import sobol
 from rootsopt.status import Status
-from rootsopt.view.tables import rejected_table
+from rootsopt.view.comparison import rejected_table
 from tests.standins import evaluation_of
 
 
@@ -121,12 +122,12 @@ def test_the_best_feasible_trial_that_holds_up_is_taken():
     assert not rejected["holds_up"]
     best = [row["best_objective"] for row in history_of(trials)]
     np.testing.assert_array_equal(best, [0.65, 0.65, 0.65, 0.6, 0.51, 0.5])
-    starts = _apart(_ranked(trials), Stage.apart, 9)
+    starts = apart(ranked(trials), Stage.apart, 9)
     np.testing.assert_array_equal(starts, [[0.1, 0.1], [0.5, 0.5], [0.7, 0.2]])
     only_infeasible = trial_of([0.9, 0.9], 0.3, feasible=False)
     assert search._verification().confirmed([only_infeasible])[0] is None
     assert np.isnan(history_of([only_infeasible])[0]["best_objective"])
-    assert _ranked([only_infeasible]) == []
+    assert ranked([only_infeasible]) == []
 
 
 SPECK = (0.3, 0.7)
@@ -230,7 +231,7 @@ def test_a_descent_goes_half_way_back_from_where_there_is_no_steady_state(monkey
     rates = optax.cosine_decay_schedule(0.2, 6, 0.05)
     monkeypatch.setattr(noise, "_rule", lambda iterations: optax.sgd(rates))
     search = searching(iterations=6)
-    vars(search.problem)["descent"] = lambda point, slope: slope
+    monkeypatch.setattr(noise, "descent", lambda problem, point, slope: slope)
     vars(search.problem)["slope"] = lambda evaluation, point: 2 * (point - 0.6)
     search.expected = 7
     search._lock, search._done, search._best = threading.Lock(), 0, float("nan")
@@ -283,7 +284,7 @@ def test_a_slope_is_stripped_only_of_what_is_forbidden():
         ([1.0, 0.0], [1.0, 3.0], [0.0, 0.0]),
     ]
     for point, slope, expected in cases:
-        found = problem.descent(np.array(point), np.array(slope))
+        found = noise.descent(problem, np.array(point), np.array(slope))
         np.testing.assert_allclose(found, expected, atol=1e-12, err_msg=str(point))
 
 

@@ -21,13 +21,14 @@ from rootsopt.config import parse
 from rootsopt.config.study import BASELINE
 from rootsopt.config.units import words
 from rootsopt.errors import InputError
+from rootsopt.optimize.design import pareto_front
+from rootsopt.optimize.limits import check_senses
 from rootsopt.optimize.local import Group, certify
-from rootsopt.optimize.problem import check_senses
 from rootsopt.optimize.tradeoffs import assembly, trace
 from rootsopt.optimize.tradeoffs.assembly import Node, points_of, selected
 from rootsopt.optimize.tradeoffs.front import RHO, Scalar, Scale, dominated, keys, links
 from rootsopt.optimize.tradeoffs.study import Aim, Sample, Study, aims_of, freed
-from rootsopt.optimize.tradeoffs.trace import Tracer, pareto_front
+from rootsopt.optimize.tradeoffs.trace import Tracer
 from rootsopt.profiles import geometry
 from rootsopt.response import terms
 from rootsopt.response.terms import needs_forces
@@ -518,8 +519,8 @@ def test_a_point_holds_up_only_if_all_its_terms_do(off, reason, standing):
     assert (checked.standing.label, checked.reason) == (standing, reason)
     # Of two equal designs, the one whose search has converged counts.
     worse = node._replace(reason="evaluations")
-    assert trace._better(worse, node) is (node if reason == "converged" else worse)
-    assert trace._better(node, worse) is node
+    assert assembly.better(worse, node) is (node if reason == "converged" else worse)
+    assert assembly.better(node, worse) is node
     vars(study)["verified"] = lambda point: None
     assert tracer._checked(node).standing is Standing.NOT_HELD_UP
 

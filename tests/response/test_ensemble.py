@@ -13,15 +13,9 @@ import pytest
 from rootsopt import optimize
 from rootsopt.commands.table import simulate
 from rootsopt.config import DESIGN_KEYS, EnsembleConfig, load
-from rootsopt.response.ensemble import (
-    ERRORS,
-    SIGNIFICANT,
-    Ensemble,
-    fitted_slope,
-    independent,
-    neighbours,
-)
-from rootsopt.response.evaluation import RESPONSES, Evaluator
+from rootsopt.response.ensemble import SIGNIFICANT, Ensemble, fitted_slope, independent, neighbours
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.result import ERRORS, RESPONSES
 from rootsopt.response.together import Members
 from rootsopt.status import Status
 from rootsopt.view import tables

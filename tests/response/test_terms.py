@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from rootsopt import InputError, Scene, Term, load_config, register_term
-from rootsopt.config.families import import_named
+from rootsopt.config.sources import import_named
 from rootsopt.optimize.problem import Problem
 from rootsopt.response import terms
-from rootsopt.response.evaluation import RESPONSES, Evaluator
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.result import RESPONSES
 from rootsopt.response.terms import values_of
 
 PAGE = Path(__file__).parents[2] / "docs" / "extending.md"

@@ -21,7 +21,7 @@ import pytest
 from rootsopt.commands import cli
 from rootsopt.commands.work.searching import CompileClock
 from rootsopt.config import load
-from rootsopt.config.families import import_named
+from rootsopt.config.sources import import_named
 from rootsopt.dynamics.collocation.mesh import KnownOrbit
 from rootsopt.pump import sheet
 from rootsopt.runtime import environment, programs

@@ -19,7 +19,7 @@ from rootsopt.commands.table import profile
 from rootsopt.config import load
 from rootsopt.errors import InputError
 from rootsopt.profiles import CIC, EE, geometry, outline, place_pair
-from rootsopt.response.records import Series
+from rootsopt.response.result import Series
 from rootsopt.scene import Scene, check_geometry, design_vector
 from rootsopt.scene.families import profile_of
 from rootsopt.scene.space import Space

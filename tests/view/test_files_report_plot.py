@@ -11,8 +11,7 @@ from rich.console import Console
 
 from rootsopt.config import parse
 from rootsopt.errors import InputError
-from rootsopt.response.evaluation import Evaluation
-from rootsopt.response.records import Series
+from rootsopt.response.result import Evaluation, Series
 from rootsopt.status import Status
 from rootsopt.view import files, names, tables, terminal
 from rootsopt.view.figures import runs

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rootsopt.config import load
-from rootsopt.response.records import Series
+from rootsopt.response.result import Series
 from rootsopt.scene import outline_mm
 from rootsopt.view.figures import runs
 from rootsopt.view.figures.designs import plot_departure, plot_forces_together

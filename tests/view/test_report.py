@@ -16,7 +16,8 @@ from rich.console import Console
 
 from rootsopt.commands.table import pareto, profile
 from rootsopt.config import load
-from rootsopt.response.records import Series, message_of
+from rootsopt.response.records import message_of
+from rootsopt.response.result import Series
 from rootsopt.status import Status
 from rootsopt.view import pages, tables, terminal
 from rootsopt.view.files import ResultFolder, response_columns

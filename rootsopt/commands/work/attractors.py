@@ -6,11 +6,11 @@ import numpy as np
 from rich.console import Console
 
 from rootsopt.commands import cli
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.response.attractors import find
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.records import message_of
-from rootsopt.scene import check_geometry
+from rootsopt.scene.check import check_geometry
 from rootsopt.view import files
 from rootsopt.view.runs import RunFolder
 

@@ -10,9 +10,9 @@ import webbrowser
 from pathlib import Path
 
 from rootsopt.commands import door
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.runtime import environment
-from rootsopt.scene import check_geometry
+from rootsopt.scene.check import check_geometry
 from rootsopt.view import files, pages
 
 

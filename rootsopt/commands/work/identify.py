@@ -5,7 +5,7 @@ import argparse
 from rich.console import Console
 
 from rootsopt.commands import cli
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.errors import InputError
 from rootsopt.identification.fit import identify
 from rootsopt.view import files

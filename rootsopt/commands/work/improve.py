@@ -8,9 +8,9 @@ import numpy as np
 
 from rootsopt.commands import cli
 from rootsopt.commands.work import optimize
-from rootsopt.config import Config, load
 from rootsopt.config.document import read_document
 from rootsopt.config.families import FREE_FORM
+from rootsopt.config.reading import Config, load
 from rootsopt.errors import InputError
 from rootsopt.measured.source import Found, found
 from rootsopt.optimize.verification import survives, surviving

@@ -12,10 +12,11 @@ from pydantic import ValidationError
 from rich.console import Console
 
 from rootsopt.commands import cli
-from rootsopt.config import Config, notes, parse
 from rootsopt.config.document import read_document
 from rootsopt.config.explain import Key, explain, keys_of
 from rootsopt.config.families import family_of
+from rootsopt.config.plausible import notes
+from rootsopt.config.reading import Config, parse
 from rootsopt.config.sheet import Sheet, made, option
 from rootsopt.config.sources import regular_file
 from rootsopt.config.units import placed, sentence

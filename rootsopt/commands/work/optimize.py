@@ -9,20 +9,17 @@ from typing import Any
 import jax.numpy as jnp
 
 from rootsopt.commands import cli
-from rootsopt.commands.work.searching import (
-    nothing_known,
-    progress_bar,
-    searched,
-)
-from rootsopt.config import Config
+from rootsopt.commands.work.searching import nothing_known, progress_bar, searched
 from rootsopt.config.families import family_of
+from rootsopt.config.reading import Config
 from rootsopt.measured import conjugacy
 from rootsopt.optimize import noise
 from rootsopt.optimize.design import search_of
 from rootsopt.optimize.outcome import Optimization
 from rootsopt.pump.sheet import check_clearances, record_of
 from rootsopt.response.sensitivity import touching
-from rootsopt.scene import Scene, check_geometry, outline_mm
+from rootsopt.scene.build import Scene
+from rootsopt.scene.check import check_geometry, outline_mm
 from rootsopt.scene.resemblance import likenesses
 from rootsopt.view import files
 from rootsopt.view.figures import chosen

@@ -5,14 +5,10 @@ import time
 from functools import partial
 
 from rootsopt.commands import cli
-from rootsopt.commands.work.searching import (
-    nothing_known,
-    progress_bar,
-    searched,
-)
-from rootsopt.config import Config
+from rootsopt.commands.work.searching import nothing_known, progress_bar, searched
+from rootsopt.config.reading import Config
 from rootsopt.optimize.tradeoffs.trace import Tracer
-from rootsopt.scene import check_geometry
+from rootsopt.scene.check import check_geometry
 from rootsopt.view import files
 from rootsopt.view.runs import RunFolder
 

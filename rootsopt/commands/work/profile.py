@@ -4,13 +4,15 @@ import argparse
 from typing import Any
 
 from rootsopt.commands import cli
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.measured import conjugacy
 from rootsopt.profiles import Profile, geometry
 from rootsopt.pump.sheet import sheet
 from rootsopt.response.records import geometry_record
-from rootsopt.scene import Scene, check_geometry, design_keys, design_vector, outline_mm
+from rootsopt.scene.build import Scene
+from rootsopt.scene.check import check_geometry, outline_mm
 from rootsopt.scene.families import free_form_of, margins_of
+from rootsopt.scene.reading import design_keys, design_vector
 from rootsopt.scene.resemblance import free_likeness, likenesses
 from rootsopt.status import Status
 from rootsopt.view import files

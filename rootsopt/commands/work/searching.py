@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from rootsopt.commands import cli, door
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.response.journal import Checkpoint, Journal, header_of, set_aside
 from rootsopt.response.reducers import Runs
 from rootsopt.response.sweeps.cluster import running

@@ -5,13 +5,13 @@ import argparse
 from rich.console import Console
 
 from rootsopt.commands import cli
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.measured import conjugacy
 from rootsopt.pump.sheet import check_clearances, record_of
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.reducers import alone
 from rootsopt.response.sensitivity import touching
-from rootsopt.scene import check_geometry, outline_mm
+from rootsopt.scene.check import check_geometry, outline_mm
 from rootsopt.view import files, tables
 from rootsopt.view.figures import chosen
 from rootsopt.view.runs import RunFolder

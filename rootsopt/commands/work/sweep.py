@@ -11,8 +11,8 @@ from rich.console import Console
 
 from rootsopt.commands import cli, door
 from rootsopt.commands.work.searching import opened, progress_bar
-from rootsopt.config import Config
 from rootsopt.config.plausible import notes_on_swept
+from rootsopt.config.reading import Config
 from rootsopt.errors import InputError
 from rootsopt.response.sweeps.cluster import running
 from rootsopt.response.sweeps.plan import Plan, parse_over, plan_of, scattered

@@ -37,6 +37,7 @@ from rootsopt.dynamics.collocation.mesh import (
     KnownOrbit,
     aligned,
     counted,
+    differences,
     most_elements,
     needed,
     ordered,
@@ -106,13 +107,6 @@ _TURNING = 100.0, 2.5e-7, 1e-2
 # Relative error of derivatives that does not show in their difference: both meshes have the same
 # roots of the gap to 1e-6 rad, and the same rounding errors.
 _ROUGH = 1e-7
-
-
-# Force, as a share of the pair's, below which errors are relative to this force.
-_WEAK = 1e-3
-# Derivative of the states (scaled) below which errors of derivatives are relative to this number,
-# for an orbit without contact.
-_LEAST = 1e-6
 
 
 class Loop(NamedTuple):
@@ -411,7 +405,7 @@ class Closer(eqx.Module):
         """Return the loop's state with the orbit `found`, its corrected `motion` and errors."""
         size = roughness(motion)
         first = now.meshes == 0
-        apart, turned = _differences(now.orbit, found, self.equation.top)
+        apart, turned = differences(now.orbit, found, self.equation.top)
         force, slope = gained(now.known.elements.mesh.used, now.elements.mesh.used)
         compared = apart / force, turned / slope + _ROUGH
         error, drift = choose(first, self.uncompared(size), compared)
@@ -443,30 +437,3 @@ class Closer(eqx.Module):
             meshes=now.meshes + (good & ~again),
             over=~again & (reached | ~good),
         )
-
-
-def _differences(before: Orbit, after: Orbit, scale: Float[Array, ""]):
-    """Return two relative differences between the results on two meshes.
-
-    The first is the largest difference in mean, RMS and peak force and in the further measures, the
-    second that in the derivatives of the first three. Spectral lines are relative to the mean, and
-    weak forces to a share of `scale` (N), since rounding counts for flanks that only just touch.
-    For an orbit without contact, they are those of the state at φ1 = 0 (scaled), and of its
-    derivatives."""
-
-    def rms(values):
-        return values.at[1].set(jnp.sqrt(jnp.maximum(values[1], 0.0)))
-
-    one, other = rms(before.response), rms(after.response)
-    least = jnp.where(jnp.arange(other.shape[0]) < 3, 1e-30, jnp.abs(other[0]))
-    size = jnp.maximum(jnp.abs(other), jnp.maximum(least, _WEAK * scale))
-    error = jnp.max(jnp.abs(one - other) / size)
-    slopes = jnp.max(jnp.abs(before.sensitivity - after.sensitivity), axis=1, initial=0.0)
-    largest = jnp.max(jnp.abs(after.sensitivity), axis=1, initial=0.0)
-    weak = jnp.abs(other) / size
-    drift = jnp.max((weak * slopes / jnp.where(largest > 0, largest, 1.0))[:3])
-    moved = jnp.max(jnp.abs(before.moved - after.moved), initial=0.0)
-    # Rounding counts where the motion hardly depends on the directions.
-    moved /= jnp.maximum(jnp.max(jnp.abs(after.moved), initial=0.0), _LEAST)
-    apart = jnp.max(jnp.abs(before.state - after.state))
-    return choose(other[2] > 0, (error, drift), (apart, moved))

@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 from rootsopt.contact.closest import RANKS
 from rootsopt.contact.gap import WrappedContact, around, innermost
 from rootsopt.contact.search import SearchContact
-from rootsopt.dynamics.collocation.elements import GAUSS, Elements, Mesh, in_blocks
+from rootsopt.dynamics.collocation.elements import GAUSS, Elements, Mesh, in_blocks, zero_of
 from rootsopt.dynamics.flanks import Margins, has_margins, margins_of, touch_of
 from rootsopt.dynamics.orbit import branch
 from rootsopt.dynamics.pair import RotorPair
@@ -30,9 +30,6 @@ from rootsopt.dynamics.pair import RotorPair
 # smaller of two: the first number (mesh periods), and the second number times the length of the
 # shorter adjacent element.
 _ASIDE = 2e-7, 0.02
-# Greatest error (mesh periods) of a located event. The second number determines how far beyond the
-# chord's root the next instant is, so that both ends of the range approach the event.
-_LOCATED, _STEEP = 3e-10, 0.2
 # Time (mesh periods) between two events below which they are merged into one.
 _SAME = 3e-9
 # Range of an element (fraction of its length) for the instants of `extra`. Those at the element's
@@ -389,51 +386,6 @@ def _located(pair: RotorPair, elements: Elements, seen: FlagScan, compared: _Com
     times, which, count = _merged(times, which, kind.rank)
     fits = (number <= most) & (count <= room - 3)
     return Events(times[:room], which[:room], count, new, gone, fits)
-
-
-def zero_of(margin, low, high, positive):
-    """Return the instant between `low` and `high` at which the sign of `margin` changes, and what
-    `margin` has returned besides just before and just after it.
-
-    `margin`: function of time (mesh periods), which returns the margin and another number;
-    `positive`: whether the margin is positive at `low`. Chord and bisection are combined by the ITP
-    method (Oliveira and Takahashi, ACM Trans. Math. Softw. 47 (2021) 5): a smooth margin takes
-    about ten evaluations, any other hardly more than bisection."""
-    width = high - low
-    most = jnp.ceil(jnp.log2(jnp.maximum(width / (2 * _LOCATED), 1.0))) + 1
-
-    def closer(ends):
-        low, high, at_low, at_high, before, after, count = ends
-        size, middle = high - low, (low + high) / 2
-        spare = _LOCATED * 2 ** (most - count) - size / 2
-        drop = at_low - at_high
-        chord = low + size * at_low / drop
-        chord = jnp.where((chord > low) & (chord < high), chord, middle)
-        inwards = jnp.sign(middle - chord)
-        beyond = _STEEP * size**2 / width
-        near = jnp.where(beyond <= jnp.abs(middle - chord), chord + inwards * beyond, middle)
-        inside = jnp.abs(near - middle) <= spare
-        place = jnp.where(inside, near, middle - inwards * spare)
-        # The first two iterations evaluate both ends, so that the margin is compiled once.
-        place = jnp.where(count == -2, low, jnp.where(count == -1, high, place))
-        here, beside = margin(place)
-        lower = jnp.where(count < 0, count == -2, (here > 0) == positive)
-        return (
-            jnp.where(lower, place, low),
-            jnp.where(lower, high, place),
-            jnp.where(lower, here, at_low),
-            jnp.where(lower, at_high, here),
-            jnp.where(lower, beside, before),
-            jnp.where(lower, after, beside),
-            count + 1,
-        )
-
-    def wide(ends):
-        return (ends[1] - ends[0] > 2 * _LOCATED) & (ends[-1] <= most)
-
-    start = low, high, *[jnp.zeros_like(low)] * 4, jnp.full_like(most, -2)
-    low, high, _, _, before, after, _ = lax.while_loop(wide, closer, start)
-    return (low + high) / 2, before, after
 
 
 def _merged(times, which, rank):

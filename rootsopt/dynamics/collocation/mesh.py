@@ -1,4 +1,4 @@
-"""Meshes: distribution of elements over the intervals between events.
+"""Meshes: distribution of elements over the intervals between events, and how results differ.
 
 `KnownOrbit` is a closed orbit in the form from which the orbits of similar pairs can be closed."""
 
@@ -15,12 +15,12 @@ from rootsopt.contact.search import SearchContact
 from rootsopt.dynamics.collocation.elements import BLOCK, GAUSS, Elements, Mesh
 from rootsopt.dynamics.collocation.events import _SAME
 from rootsopt.dynamics.flow import Pieces
+from rootsopt.dynamics.orbit import Orbit, choose
 from rootsopt.dynamics.pair import RotorPair
 
 # Density of elements that is added everywhere, as a fraction of the mean density. It limits the
 # length of elements.
 _FLOOR = 0.15
-
 
 # Maximum number of elements per mesh period: in each of the first two mesh periods, and in each
 # further one, unless the flank is wavy or forked. Free forms have some 45 events in each mesh
@@ -35,6 +35,13 @@ _SPARED = 0.06
 # Growth of these numbers for each further slice of twisted rotors, as a fraction: each slice has
 # its own events.
 _SLICES = 0.5
+
+# Force, as a share of the pair's, below which errors are relative to this force.
+_WEAK = 1e-3
+
+# Derivative of the states (scaled) below which errors of derivatives are relative to this number,
+# for an orbit without contact.
+_LEAST = 1e-6
 
 
 def room_for(pair: RotorPair, periods: int) -> tuple[int, int]:
@@ -382,3 +389,30 @@ def from_pieces(
 PIECES = 40, GAUSS.nodes
 """Argument `pieces` of the transient (`strobe`) for `from_pieces`: number of elements per mesh
 period before events are known, and their Gauss points."""
+
+
+def differences(before: Orbit, after: Orbit, scale: Float[Array, ""]):
+    """Return two relative differences between the results on two meshes.
+
+    The first is the largest difference in mean, RMS and peak force and in the further measures, the
+    second that in the derivatives of the first three. Spectral lines are relative to the mean, and
+    weak forces to a share of `scale` (N), since rounding counts for flanks that only just touch.
+    For an orbit without contact, they are those of the state at φ1 = 0 (scaled), and of its
+    derivatives."""
+
+    def rms(values):
+        return values.at[1].set(jnp.sqrt(jnp.maximum(values[1], 0.0)))
+
+    one, other = rms(before.response), rms(after.response)
+    least = jnp.where(jnp.arange(other.shape[0]) < 3, 1e-30, jnp.abs(other[0]))
+    size = jnp.maximum(jnp.abs(other), jnp.maximum(least, _WEAK * scale))
+    error = jnp.max(jnp.abs(one - other) / size)
+    slopes = jnp.max(jnp.abs(before.sensitivity - after.sensitivity), axis=1, initial=0.0)
+    largest = jnp.max(jnp.abs(after.sensitivity), axis=1, initial=0.0)
+    weak = jnp.abs(other) / size
+    drift = jnp.max((weak * slopes / jnp.where(largest > 0, largest, 1.0))[:3])
+    moved = jnp.max(jnp.abs(before.moved - after.moved), initial=0.0)
+    # Rounding counts where the motion hardly depends on the directions.
+    moved /= jnp.maximum(jnp.max(jnp.abs(after.moved), initial=0.0), _LEAST)
+    apart = jnp.max(jnp.abs(before.state - after.state))
+    return choose(other[2] > 0, (error, drift), (apart, moved))

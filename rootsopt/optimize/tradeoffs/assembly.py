@@ -10,26 +10,33 @@ two neighbours. The *spacing* of terms is the distance between neighbouring refe
 
 import dataclasses
 import itertools
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rootsopt.config.units import words
+from rootsopt.optimize.infeasible import Infeasible
 from rootsopt.optimize.local import Certificate
 from rootsopt.optimize.tradeoffs.front import (
+    Front,
     FrontPoint,
     Gap,
+    Key,
     Scalar,
     Scale,
+    directions,
     dominated,
     ordered,
     rates,
     repeated,
 )
-from rootsopt.optimize.tradeoffs.study import Sample, Study
+from rootsopt.optimize.tradeoffs.study import Course, Sample, Seen, Study
 from rootsopt.status import Standing
+
+if TYPE_CHECKING:
+    from rootsopt.optimize.tradeoffs.trace import Tracer
 
 Pair = tuple[int, int]
 # Distance in terms (multiples of the spacing) above which two neighbours are bisected.
@@ -43,6 +50,20 @@ _CLOSE = 0.3
 # Distance from a neighbour (fraction of the distance between both neighbours) below which a point
 # found by bisection counts as that neighbour.
 _BACK = 0.1
+
+# Difference between the objectives of two searches (fraction of a term's range) below which a
+# search that has converged counts as the better one.
+_EQUAL = 1e-7
+
+# Gain in the objective (fraction of a term's range) above which a design evaluated earlier starts
+# another search.
+BETTER = 1e-4
+
+# Distance in the unit box above which two designs count as distant from each other.
+APART = 0.15
+
+# Accuracy (fraction of the gap's width) with which the sides of a gap are located.
+_SHARP = 0.01
 
 
 class Edge(NamedTuple):
@@ -303,3 +324,126 @@ def _limits(study: Study, certificate: Certificate) -> dict[str, float]:
             if multiplier > _HELD:
                 found[f"{side} bound of {words(key)}"] = float(multiplier)
     return found
+
+
+def better(best: Node | None, other: Node | None) -> Node | None:
+    """Return the node with the lower objective.
+
+    Of two that are equally good (`_EQUAL`), return one whose search has converged, or `best`."""
+    if best is None or other is None:
+        return other if best is None else best
+    gain = best.objective - other.objective
+    sooner = other.reason == "converged" != best.reason
+    return other if gain > (-_EQUAL if sooner else _EQUAL) else best
+
+
+def predictions(key: Key, ahead: bool, nodes: Mapping[Key, Node], course: Course):
+    """Yield (start (d,), orbit) for a `key` of the grid, from its neighbours among the `nodes`.
+
+    `ahead`: as in `Tracer._chain`; `course`: the searches from these starts. The first start is the
+    secant through two neighbours in line. If there is only one neighbour, or if the search from
+    the secant fails at once, the start is the nearest neighbour."""
+    steps = directions(len(key))
+    for step in steps if ahead else [tuple(-x for x in one) for one in steps]:
+        near = nodes.get(tuple(a - b for a, b in zip(key, step, strict=True)))
+        if near is None:
+            continue
+        far = nodes.get(tuple(a - 2 * b for a, b in zip(key, step, strict=True)))
+        before = course.evaluations
+        if far is not None and np.max(np.abs(near.point - far.point)) < 2 * APART:
+            secant = np.clip(2 * near.point - far.point, 0.0, 1.0)
+            yield secant, near.sample.evaluation.start
+            if course.evaluations > before + 1:  # The start had a steady state.
+                return
+        yield near.point, near.sample.evaluation.start
+        return
+
+
+def widest(edges: Sequence[Edge], spacing: Spacing, gaps: Bisections) -> Edge | None:
+    """Return the neighbours that lie farthest apart, out of those that may be bisected.
+
+    Return `None` if no neighbours are left to bisect."""
+    open_ones = []
+    for edge in edges:
+        if edge.pair in gaps.closed or spacing.excess(edge) <= 1:
+            continue
+        if spacing.close(edge):
+            gaps.closed[edge.pair] = "design"
+            continue
+        open_ones.append(edge)
+    return max(open_ones, key=spacing.excess, default=None)
+
+
+def starts_apart(
+    course: Course, scalar: Scalar, count: int, first: NDArray[np.float64]
+) -> list[Seen]:
+    """Return up to `count` designs evaluated earlier that are distant from each other.
+
+    They are in order of the objective `scalar`, the best first. Without such designs, return
+    the point `first` (d,)."""
+    chosen: list[Seen] = []
+    for one in sorted(course.seen, key=lambda one: scalar.value(one.values)):
+        apart = all(np.linalg.norm(one.point - other.point) > APART for other in chosen)
+        if apart and len(chosen) < count:
+            chosen.append(one)
+    return chosen or [Seen(first, np.zeros(0), None)]
+
+
+def front_of(
+    tracer: "Tracer", nodes: Sequence[Node], infeasible: Infeasible | None = None
+) -> Front:
+    """Return the front of the `nodes` of a `tracer`; `infeasible`: why there are none, if known."""
+    study, config = tracer.study, tracer.config
+    usable = study.usable
+    known: dict = {}
+    if nodes:
+        selection = selected(nodes, tracer.scale)
+        points, dropped = points_of(study, nodes, selection, tracer.scale)
+        spacing = tracer._spacing
+        if not np.isfinite(spacing.terms):  # Stopped early, or the terms do not conflict.
+            spacing = spacing_of(selection, [], len(study.aims), tracer._divisions)
+        edges, gaps = gaps_of(selection, tracer._gaps, spacing)
+        if tracer.stop.is_set():  # Neighbours may be far apart only because points are missing.
+            gaps = [gap for gap in gaps if gap.confirmed]
+        known = {"points": tuple(points), "dropped": tuple(dropped)}
+        known |= {"edges": tuple(edges), "gaps": tuple(gaps)}
+    return Front(
+        config=config,
+        aims=study.aims,
+        baseline=study.problem.baseline,
+        baseline_terms=study.term_values(study.problem.baseline) if usable else {},
+        limits_dropped=study.limits_dropped,
+        searches=tracer._searches,
+        evaluations=tracer._evaluations,
+        interrupted=tracer.stop.is_set(),
+        infeasible=infeasible,
+        **known,
+    )
+
+
+def sharpened(tracer: "Tracer", pair: Pair) -> Pair:
+    """Move the two sides of a gap towards each other, as far as the front continues.
+
+    The front has two terms. Each side improves its worse term, as long as it stays better than
+    the other side in the other term. Return the indices of the sides. A side that has moved has
+    a new index."""
+    first, second = sorted(pair, key=lambda k: tracer._scaled(k)[0])
+    for lead in (0, 1):
+        moving, fixed = (second, first) if lead == 0 else (first, second)
+        start, limit = tracer._scaled(moving), tracer._scaled(fixed)
+        apart = start[lead] - limit[lead]
+        direction = np.where(np.arange(2) == lead, 1.0, _SHARP)
+        reference = limit - np.where(np.arange(2) == lead, 0.0, _SHARP * apart)
+        node = tracer._all()[moving]
+        scalar = Scalar(tracer.scale, reference, (0, 1), direction)
+        orbit = node.sample.evaluation.start
+        best = tracer._solved(scalar, node.point, orbit, None, tracer._course)
+        if best is None or tracer.stop.is_set():
+            continue
+        found = tracer.scale.of(best.sample.values)
+        if found[lead] < start[lead] - BETTER and found[1 - lead] < limit[1 - lead]:
+            with tracer._lock:
+                tracer._nodes[(len(tracer._nodes),)] = best
+            moved = len(tracer._all()) - 1
+            first, second = (first, moved) if lead == 0 else (moved, second)
+    return min(first, second), max(first, second)

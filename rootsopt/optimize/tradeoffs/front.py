@@ -32,12 +32,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.config.units import words
 from rootsopt.optimize.infeasible import Infeasible
 from rootsopt.optimize.local import RESIDUAL, Certificate, Group, Linearization
 from rootsopt.optimize.tradeoffs.study import Aim, Sample
-from rootsopt.response.evaluation import Evaluation
+from rootsopt.response.result import Evaluation
 from rootsopt.status import Standing, Status
 
 EQUAL = 1e-6

@@ -9,28 +9,28 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.config.study import BASELINE
 from rootsopt.config.units import unit_of, words
 from rootsopt.errors import InputError
 from rootsopt.optimize.limits import (
     LIMITS,
     PEAK,
-    depends_on_forces,
     force_limits,
     limited,
     quantity_of,
+    settled_by,
     term_constraints,
 )
 from rootsopt.optimize.local import FEASIBLE, Group
-from rootsopt.optimize.problem import Problem, settled_by
-from rootsopt.response.evaluation import Evaluation, Evaluator
+from rootsopt.optimize.problem import Problem
+from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.journal import Checkpoint
 from rootsopt.response.reducers import HERE, Point, Runs
-from rootsopt.response.result import Seeds
+from rootsopt.response.result import Evaluation, Seeds
 from rootsopt.response.still import Still
-from rootsopt.response.terms import is_force, reporting, terms_of
-from rootsopt.scene import Scene
+from rootsopt.response.terms import depends_on_forces, is_force, reporting, terms_of
+from rootsopt.scene.build import Scene
 from rootsopt.scene.space import Space
 
 # Keys of `constraints` that may be absent; a floor of 0 has the same effect in the others.

@@ -24,23 +24,29 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.config import FAMILY_KEYS, Config
+from rootsopt.config.families import FAMILY_KEYS
+from rootsopt.config.reading import Config
 from rootsopt.errors import InputError
-from rootsopt.optimize.infeasible import Infeasible, explain
+from rootsopt.optimize.infeasible import explain
 from rootsopt.optimize.local import FEASIBLE, RESIDUAL, Linearization, certify
 from rootsopt.optimize.optimality import judged
 from rootsopt.optimize.sqp import Stops, descend
 from rootsopt.optimize.tradeoffs.assembly import (
+    APART,
+    BETTER,
     Bisections,
     Edge,
     Node,
-    Pair,
     Spacing,
+    better,
     divides,
-    gaps_of,
-    points_of,
+    front_of,
+    predictions,
     selected,
+    sharpened,
     spacing_of,
+    starts_apart,
+    widest,
 )
 from rootsopt.optimize.tradeoffs.front import (
     Front,
@@ -48,7 +54,6 @@ from rootsopt.optimize.tradeoffs.front import (
     Scalar,
     Scale,
     corners,
-    directions,
     end_scale,
     keys,
     links,
@@ -57,28 +62,15 @@ from rootsopt.optimize.tradeoffs.study import Course, Sample, Seen, Study
 from rootsopt.response.journal import Checkpoint
 from rootsopt.response.reducers import HERE, Runs, as_done
 from rootsopt.response.result import Seeds
-from rootsopt.response.sweeps.cluster import running
-from rootsopt.runtime.threads import one_thread
-from rootsopt.scene import check_geometry
 from rootsopt.scene.space import sobol
 from rootsopt.status import Standing
 
-# Gain in the objective (fraction of a term's range) above which a design evaluated earlier starts
-# another search.
-_BETTER = 1e-4
 # Excess over the best objective (fraction of a term's range) below which a design evaluated
 # earlier, far from the best one, starts another search.
 _PROMISING = 0.25
-# Distance in the unit box above which two designs count as distant from each other.
-_APART = 0.15
 # Minimum effort where no term needs a simulation: number of evaluations per search, of starts per
 # end, and of screened designs.
 _CHEAP_EVALUATIONS, _CHEAP_STARTS, _CHEAP_SCREENING = 300, 6, 64
-# Difference between the objectives of two searches (fraction of a term's range) below which a
-# search that has converged counts as the better one.
-_EQUAL = 1e-7
-# Accuracy (fraction of the gap's width) with which the sides of a gap are located.
-_SHARP = 0.01
 # Maximum number of points at which the search for the least violation of the constraints starts.
 _EXPLAINED = 8
 # Relative difference of a term between search and verification above which a point is dropped.
@@ -138,22 +130,22 @@ class Tracer:
         Return the front. If `stop` is set, the front has the points found so far."""
         study = self.study
         if not study.usable or self.stop.is_set():
-            return self._front([])
+            return front_of(self, [])
         points = self._feasible()
         if not points:
             reason = explain(study.problem, self._sample[:_EXPLAINED])
-            return self._front([], infeasible=reason)
+            return front_of(self, [], infeasible=reason)
         self._screen(points)
         if self._course.seen and self._ends(points[0]):
             self._trace()
             self._bisect()
-        return self._front(self._verified(self._all()))
+        return front_of(self, self._verified(self._all()))
 
     def so_far(self) -> Front:
         """Return the points found so far, without verification.
 
         Another thread can call this method during the search."""
-        return self._front(self._all())
+        return front_of(self, self._all())
 
     # The ends of the front.
 
@@ -205,7 +197,7 @@ class Tracer:
             starts = max(starts, _CHEAP_STARTS)
         self._expected = count * starts + 3 * (len(keys(count, self._divisions)) - count)
         scalars = [Scalar(self.scale, np.zeros(count), (number,)) for number in range(count)]
-        begins = [self._apart(scalar, starts, first) for scalar in scalars]
+        begins = [starts_apart(self._course, scalar, starts, first) for scalar in scalars]
         found = self._solved_from(
             [(number, one) for number in range(count) for one in begins[number]], scalars
         )
@@ -237,20 +229,8 @@ class Tracer:
         self._course.join([course for course, _ in done])
         best: list[Node | None] = [None] * len(scalars)
         for (number, _), (_, node) in zip(starts, done, strict=True):
-            best[number] = _better(best[number], node)
+            best[number] = better(best[number], node)
         return best
-
-    def _apart(self, scalar: Scalar, count: int, first: NDArray[np.float64]) -> list[Seen]:
-        """Return up to `count` designs evaluated earlier that are distant from each other.
-
-        They are in order of the objective `scalar`, the best first. Without such designs, return
-        the point `first` (d,)."""
-        chosen: list[Seen] = []
-        for one in sorted(self._course.seen, key=lambda one: scalar.value(one.values)):
-            apart = all(np.linalg.norm(one.point - other.point) > _APART for other in chosen)
-            if apart and len(chosen) < count:
-                chosen.append(one)
-        return chosen or [Seen(first, np.zeros(0), None)]
 
     # The points between the ends.
 
@@ -270,7 +250,7 @@ class Tracer:
         chains = self._side_by_side(lambda ahead: self._chain(inner, ends, ahead), (True, False))
         self._course.join([course for course, _ in chains])
         # In a fixed order: of two that are equally good, the first counts.
-        best = {key: _better(*(nodes.get(key) for _, nodes in chains)) for key in inner}
+        best = {key: better(*(nodes.get(key) for _, nodes in chains)) for key in inner}
         with self._lock:
             self._nodes = ends | {key: node for key, node in best.items() if node is not None}
 
@@ -297,7 +277,7 @@ class Tracer:
             if self.stop.is_set():
                 break
             scalar, best = self._scalar(key), None
-            for start, orbit in self._predictions(key, ahead, nodes, course):
+            for start, orbit in predictions(key, ahead, nodes, course):
                 best = self._solved(scalar, start, orbit, best, course)
             best = self._again(scalar, best, course)
             if best is not None:
@@ -307,30 +287,9 @@ class Tracer:
 
     def _keep(self, key: Key, node: Node | None) -> None:
         with self._lock:
-            best = _better(self._nodes.get(key), node)
+            best = better(self._nodes.get(key), node)
             if best is not None:
                 self._nodes[key] = best
-
-    def _predictions(self, key: Key, ahead: bool, nodes: Mapping[Key, Node], course: Course):
-        """Yield (start (d,), orbit) for a `key` of the grid, from its neighbours among the `nodes`.
-
-        `ahead`: as in `_chain`; `course`: the searches from these starts. The first start is the
-        secant through two neighbours in line. If there is only one neighbour, or if the search from
-        the secant fails at once, the start is the nearest neighbour."""
-        steps = directions(len(key))
-        for step in steps if ahead else [tuple(-x for x in one) for one in steps]:
-            near = nodes.get(tuple(a - b for a, b in zip(key, step, strict=True)))
-            if near is None:
-                continue
-            far = nodes.get(tuple(a - 2 * b for a, b in zip(key, step, strict=True)))
-            before = course.evaluations
-            if far is not None and np.max(np.abs(near.point - far.point)) < 2 * _APART:
-                secant = np.clip(2 * near.point - far.point, 0.0, 1.0)
-                yield secant, near.sample.evaluation.start
-                if course.evaluations > before + 1:  # The start had a steady state.
-                    return
-            yield near.point, near.sample.evaluation.start
-            return
 
     def _again(self, scalar: Scalar, best: Node | None, course: Course) -> Node | None:
         """Search from the best design seen in the `course`, if it beats `best`.
@@ -339,7 +298,7 @@ class Tracer:
         seen = min(course.seen, key=lambda one: scalar.value(one.values), default=None)
         if seen is None or self.stop.is_set():
             return best
-        if best is None or scalar.value(seen.values) < best.objective - _BETTER:
+        if best is None or scalar.value(seen.values) < best.objective - BETTER:
             return self._solved(scalar, seen.point, seen.orbit, best, course)
         return best
 
@@ -354,7 +313,7 @@ class Tracer:
         others = [
             one
             for one in course.seen
-            if np.linalg.norm(one.point - best.point) > _APART and scalar.value(one.values) < limit
+            if np.linalg.norm(one.point - best.point) > APART and scalar.value(one.values) < limit
         ]
         found = min(others, key=lambda one: scalar.value(one.values), default=None)
         if found is None:
@@ -402,7 +361,7 @@ class Tracer:
             return best
         sample = samples[found.point.tobytes()]
         node = Node(scalar, sample, found.certificate, found.reason)
-        return _better(best, node)
+        return better(best, node)
 
     def _count(self, evaluations: int = 0, searches: int = 0) -> None:
         """Count designs and searches, of all courses together, and report progress."""
@@ -426,25 +385,10 @@ class Tracer:
         for _ in range(self.config.pareto.refinements):
             nodes = self._all()
             selection = selected(nodes, self.scale)
-            wide = self._widest(selection.edges(self._gaps.pairs))
+            wide = widest(selection.edges(self._gaps.pairs), self._spacing, self._gaps)
             if wide is None or self.stop.is_set():
                 return
             self._divide(wide, nodes)
-
-    def _widest(self, edges: Sequence[Edge]) -> Edge | None:
-        """Return the neighbours that lie farthest apart, out of those that may be bisected.
-
-        Return `None` if no neighbours are left to bisect."""
-        spacing, gaps = self._spacing, self._gaps
-        open_ones = []
-        for edge in edges:
-            if edge.pair in gaps.closed or spacing.excess(edge) <= 1:
-                continue
-            if spacing.close(edge):
-                gaps.closed[edge.pair] = "design"
-                continue
-            open_ones.append(edge)
-        return max(open_ones, key=spacing.excess, default=None)
 
     def _divide(self, edge: Edge, nodes: Sequence[Node]) -> None:
         ends = [nodes[k] for k in edge.pair]
@@ -461,39 +405,12 @@ class Tracer:
         gaps.tried[edge.pair] = gaps.tried.get(edge.pair, 0) + 1
         if best is None or not divides(edge, self.scale.of(best.sample.values), *values):
             kind = self._spacing.kind(edge)
-            pair = self._sharpened(edge.pair) if kind == "terms" and len(middle) == 2 else edge.pair
+            pair = sharpened(self, edge.pair) if kind == "terms" and len(middle) == 2 else edge.pair
             gaps.closed[pair], gaps.tried[pair] = kind, gaps.tried[edge.pair]
             return
         with self._lock:
             self._nodes[(len(self._nodes),)] = best
         gaps.divided(edge.pair, len(nodes))
-
-    def _sharpened(self, pair: Pair) -> Pair:
-        """Move the two sides of a gap towards each other, as far as the front continues.
-
-        The front has two terms. Each side improves its worse term, as long as it stays better than
-        the other side in the other term. Return the indices of the sides. A side that has moved has
-        a new index."""
-        first, second = sorted(pair, key=lambda k: self._scaled(k)[0])
-        for lead in (0, 1):
-            moving, fixed = (second, first) if lead == 0 else (first, second)
-            start, limit = self._scaled(moving), self._scaled(fixed)
-            apart = start[lead] - limit[lead]
-            direction = np.where(np.arange(2) == lead, 1.0, _SHARP)
-            reference = limit - np.where(np.arange(2) == lead, 0.0, _SHARP * apart)
-            node = self._all()[moving]
-            scalar = Scalar(self.scale, reference, (0, 1), direction)
-            orbit = node.sample.evaluation.start
-            best = self._solved(scalar, node.point, orbit, None, self._course)
-            if best is None or self.stop.is_set():
-                continue
-            found = self.scale.of(best.sample.values)
-            if found[lead] < start[lead] - _BETTER and found[1 - lead] < limit[1 - lead]:
-                with self._lock:
-                    self._nodes[(len(self._nodes),)] = best
-                moved = len(self._all()) - 1
-                first, second = (first, moved) if lead == 0 else (moved, second)
-        return min(first, second), max(first, second)
 
     def _scaled(self, number: int) -> NDArray[np.float64]:
         return self.scale.of(self._all()[number].sample.values)
@@ -528,76 +445,3 @@ class Tracer:
         certified = reason == "converged"
         standing = Standing.CERTIFIED if certified else Standing.NOT_CERTIFIED
         return Node(scalar, sample, certificate, reason, node.end, standing)
-
-    def _front(self, nodes: Sequence[Node], infeasible: Infeasible | None = None) -> Front:
-        study, config = self.study, self.config
-        usable = study.usable
-        known: dict = {}
-        if nodes:
-            selection = selected(nodes, self.scale)
-            points, dropped = points_of(study, nodes, selection, self.scale)
-            spacing = self._spacing
-            if not np.isfinite(spacing.terms):  # Stopped early, or the terms do not conflict.
-                spacing = spacing_of(selection, [], len(study.aims), self._divisions)
-            edges, gaps = gaps_of(selection, self._gaps, spacing)
-            if self.stop.is_set():  # Neighbours may be far apart only because points are missing.
-                gaps = [gap for gap in gaps if gap.confirmed]
-            known = {"points": tuple(points), "dropped": tuple(dropped)}
-            known |= {"edges": tuple(edges), "gaps": tuple(gaps)}
-        return Front(
-            config=config,
-            aims=study.aims,
-            baseline=study.problem.baseline,
-            baseline_terms=study.term_values(study.problem.baseline) if usable else {},
-            limits_dropped=study.limits_dropped,
-            searches=self._searches,
-            evaluations=self._evaluations,
-            interrupted=self.stop.is_set(),
-            infeasible=infeasible,
-            **known,
-        )
-
-
-def _better(best: Node | None, other: Node | None) -> Node | None:
-    """Return the node with the lower objective.
-
-    Of two that are equally good (`_EQUAL`), return one whose search has converged, or `best`."""
-    if best is None or other is None:
-        return other if best is None else best
-    gain = best.objective - other.objective
-    sooner = other.reason == "converged" != best.reason
-    return other if gain > (-_EQUAL if sooner else _EQUAL) else best
-
-
-@one_thread
-def pareto_front(
-    config: Config,
-    progress: Progress | None = None,
-    *,
-    workers: int | None = None,
-    scheduler: str | None = None,
-) -> Front:
-    """Trace the front of best compromises between the terms of `config.pareto`.
-
-    `progress`: function called after each local search with (searches done, searches expected).
-    `workers`, `scheduler`: where the designs are simulated, as in `sweep_scenes`; by default in
-    this process, on all cores.
-
-    Return a `Front`. Its main fields are `points` (each with `terms`, `design`, `rates` and
-    `standing`), `gaps`, `dropped`, `baseline_terms` and `status`.
-
-    Raises `InputError` if the config cannot be optimised, or for unknown terms. Raises
-    `RuntimeError` if JAX is not set to double precision.
-
-    >>> import jax
-    >>> import rootsopt
-    >>> jax.config.update("jax_enable_x64", True)
-    >>> terms = "pareto.terms=[outer_radius_mm, area_efficiency]"
-    >>> quick = [terms, "pareto.points=3", "pareto.refinements=0"]
-    >>> front = rootsopt.pareto_front(rootsopt.load_config("cic_drawn", quick))
-    >>> [round(point.terms["outer_radius_mm"], 1) for point in front.points]
-    [39.0, 43.1, 47.8]
-    """
-    check_geometry(config)
-    with running(workers, scheduler) as runs:
-        return Tracer(config, progress, runs=runs).run()

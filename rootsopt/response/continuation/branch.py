@@ -23,7 +23,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike, NDArray
 
-from rootsopt.config import Config, parse
+from rootsopt.config.reading import Config, parse
 from rootsopt.dynamics.collocation.bordered import Followed, Line, Plane, followed
 from rootsopt.dynamics.collocation.mesh import PIECES, from_pieces
 from rootsopt.dynamics.collocation.motion import ACCURACY, UNREFINED
@@ -39,7 +39,8 @@ from rootsopt.response.continuation.arclength import (
     follow_curve,
 )
 from rootsopt.runtime.programs import CachedFunction
-from rootsopt.scene import Scene, along, design_vector
+from rootsopt.scene.build import Scene, along
+from rootsopt.scene.reading import design_vector
 
 LONGEST = 8
 """Longest orbit that can be followed (mesh periods), rounded up by `RotorPair.whole`."""

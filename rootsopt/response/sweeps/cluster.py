@@ -22,12 +22,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rootsopt.config import Config
-from rootsopt.config.families import import_named
+from rootsopt.config.reading import Config
+from rootsopt.config.sources import import_named
 from rootsopt.config.units import shown
 from rootsopt.errors import InputError
-from rootsopt.response.evaluation import Evaluation
 from rootsopt.response.reducers import HERE, Point, Runs
+from rootsopt.response.result import Evaluation
 from rootsopt.response.sweeps.points import Numbered, Row, at_once, lost
 from rootsopt.runtime import environment, programs
 from rootsopt.runtime.environment import versions

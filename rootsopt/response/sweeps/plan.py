@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.config import Config
 from rootsopt.config.document import read_document
 from rootsopt.config.explain import is_whole, tree
+from rootsopt.config.reading import Config
 from rootsopt.config.units import near, shown
 from rootsopt.errors import InputError
 from rootsopt.response.scatter import draw

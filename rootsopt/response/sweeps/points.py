@@ -11,16 +11,17 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from rootsopt.config import Config
-from rootsopt.config.families import families, family_of, find_installed, parameters
+from rootsopt.config.families import families, family_of, parameters
+from rootsopt.config.reading import Config
 from rootsopt.config.section import bare
-from rootsopt.config.sources import FILES
+from rootsopt.config.sources import FILES, find_installed
 from rootsopt.config.units import sentence
 from rootsopt.errors import InputError
-from rootsopt.response.evaluation import Evaluation, Evaluator
+from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.reducers import HERE
+from rootsopt.response.result import Evaluation
 from rootsopt.response.together import evaluate_together, pays
-from rootsopt.scene import check_geometry
+from rootsopt.scene.check import check_geometry
 from rootsopt.status import Status
 
 Row = dict[str, Any]

@@ -8,7 +8,7 @@ from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.config.sources import FILES
 from rootsopt.response.journal import Journal, header_of
 from rootsopt.response.reducers import HERE, as_done
@@ -27,7 +27,7 @@ import yaml
 import rootsopt
 from rootsopt.config.explain import tree
 from rootsopt.config.units import unit_of
-from rootsopt.response.records import RESPONSES
+from rootsopt.response.result import RESPONSES
 from rootsopt.response.sweeps.points import lost
 from rootsopt.status import Status
 

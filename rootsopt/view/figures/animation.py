@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from rootsopt.profiles import Profile, place_pair
-from rootsopt.response.records import Series
+from rootsopt.response.result import Series
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.view.figures.designs import draw_rotor
 from rootsopt.view.figures.drawing import Drawing

@@ -16,7 +16,7 @@ from rootsopt.config import DESIGN_KEYS
 from rootsopt.config.families import is_list
 from rootsopt.profiles import place_pair
 from rootsopt.profiles.departure import beyond, feet
-from rootsopt.response.records import Series
+from rootsopt.response.result import Series
 from rootsopt.view.figures.force import number
 from rootsopt.view.figures.style import BLUE, COLORS, GREY, ORANGE, SKY, VERMILION, beside, looks
 from rootsopt.view.names import brief, label

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.optimize import root_scalar
 
 import rootsopt
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.config.rotor import DrawingConfig
 from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry, Profile, geometry

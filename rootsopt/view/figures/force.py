@@ -10,7 +10,7 @@ from matplotlib.markers import CARETDOWN
 from matplotlib.patches import Ellipse
 from numpy.typing import ArrayLike, NDArray
 
-from rootsopt.response.records import Series
+from rootsopt.response.result import Series
 from rootsopt.view.comparison import label_of
 from rootsopt.view.figures.style import BLUE, COLORS, GREY, VERMILION, beside, figure, write
 from rootsopt.view.names import label, name_and_unit

@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from rootsopt.config import FAMILY_KEYS, Config
-from rootsopt.config.families import is_list
+from rootsopt.config.families import FAMILY_KEYS, is_list
+from rootsopt.config.reading import Config
 from rootsopt.measured.conjugacy import conjugacy, gaps_um
-from rootsopt.response.evaluation import Evaluation
-from rootsopt.scene import design_keys, outline_mm
+from rootsopt.response.result import Evaluation
+from rootsopt.scene.check import outline_mm
+from rootsopt.scene.reading import design_keys
 from rootsopt.view.figures.designs import (
     plot_conjugacy,
     plot_departure,

@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.response.attractors import Attractor, Basins
 from rootsopt.response.result import Part
 from rootsopt.response.sweeps.plan import Plan

@@ -6,10 +6,9 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 import numpy as np
 
-from rootsopt.config import Config
-from rootsopt.response.evaluation import Evaluation
-from rootsopt.response.records import Series
-from rootsopt.scene import Scene
+from rootsopt.config.reading import Config
+from rootsopt.response.result import Evaluation, Series
+from rootsopt.scene.build import Scene
 from rootsopt.view.figures import SOLID, cad
 from rootsopt.view.figures.cad import dxf_bytes
 from rootsopt.view.figures.drawing import Drawing, coordinates, svg_text

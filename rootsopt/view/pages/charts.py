@@ -11,11 +11,11 @@ from bokeh.plotting import figure
 from bokeh.themes import Theme
 from numpy.typing import ArrayLike, NDArray
 
-from rootsopt.config import Config
+from rootsopt.config.reading import Config
 from rootsopt.config.units import MM
 from rootsopt.profiles import Profile, outline
-from rootsopt.response.records import Series
-from rootsopt.scene import Scene
+from rootsopt.response.result import Series
+from rootsopt.scene.build import Scene
 from rootsopt.view.figures.animation import Contacts, frames_of
 from rootsopt.view.figures.comparisons import kinds
 from rootsopt.view.figures.style import BLUE, COLORS, GREY, ORANGE, VERMILION

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup, escape
 
-from rootsopt.config import Config, load
 from rootsopt.config.families import family_of
-from rootsopt.response.records import Series
+from rootsopt.config.reading import Config, load
+from rootsopt.response.result import Series
 from rootsopt.view.files import ResultFolder, design_file
-from rootsopt.view.names import brief, in_words, listed, name_and_unit, quantity, stated
-from rootsopt.view.tables import NAMES, records_of, varied
+from rootsopt.view.names import brief, in_words, listed, name_and_unit, quantity, stated, varied
+from rootsopt.view.tables import NAMES, records_of
 from rootsopt.view.terminal import Ending, ending
 
 # Columns of `response_*.csv`, by field of `Series`.

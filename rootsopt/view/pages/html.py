@@ -22,8 +22,8 @@ from markupsafe import Markup, escape
 from numpy.typing import NDArray
 
 import rootsopt
-from rootsopt.config import Config
-from rootsopt.response.evaluation import RESPONSES, Evaluation, Series
+from rootsopt.config.reading import Config
+from rootsopt.response.result import RESPONSES, Evaluation, Series
 from rootsopt.status import Status
 from rootsopt.view import tables
 from rootsopt.view.figures.style import BLUE, GREY, SKY, VERMILION

@@ -13,17 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic.fields import FieldInfo
 
-from rootsopt.config import Config
 from rootsopt.config.explain import is_whole, limits_of, tree
 from rootsopt.config.families import family_of
+from rootsopt.config.reading import Config
 from rootsopt.config.units import MM, unit_of, words
 from rootsopt.profiles import Geometry, Profile, geometry, outline
-from rootsopt.response.evaluation import Evaluation, Evaluator
-from rootsopt.response.records import Series, geometry_record
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.records import geometry_record
 from rootsopt.response.reducers import alone
-from rootsopt.response.result import Seeds
+from rootsopt.response.result import Evaluation, Seeds, Series
 from rootsopt.runtime.programs import CachedFunction
-from rootsopt.scene import Scene, check_geometry, design_vector
+from rootsopt.scene.build import Scene
+from rootsopt.scene.check import check_geometry
+from rootsopt.scene.reading import design_vector
 from rootsopt.scene.space import bounds_of
 from rootsopt.view.pages.charts import motion, rotor
 

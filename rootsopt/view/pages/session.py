@@ -9,9 +9,10 @@ import time
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
-from rootsopt.config import Config, notes
+from rootsopt.config.plausible import notes
+from rootsopt.config.reading import Config
 from rootsopt.errors import InputError
-from rootsopt.response.evaluation import Evaluation
+from rootsopt.response.result import Evaluation
 from rootsopt.view.pages.knobs import Engine, Shape, frames, same_motion
 
 if TYPE_CHECKING:

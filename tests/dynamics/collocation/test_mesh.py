@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rootsopt.dynamics.collocation.elements import GAUSS, POINTS, Elements, Mesh
-from rootsopt.dynamics.collocation.events import zero_of
+from rootsopt.dynamics.collocation.elements import GAUSS, POINTS, Elements, Mesh, zero_of
 from rootsopt.dynamics.collocation.mesh import aligned, counted, moved, needed, ordered
 
 ROOM = 32
