@@ -1,6 +1,7 @@
 """The house is in order: what lies in the package's root, late imports, long functions, rooms."""
 
 import ast
+import re
 from pathlib import Path
 
 import yaml
@@ -110,6 +111,14 @@ def test_imports_stand_at_the_top():
             late = {name for name in names if name.partition(".")[0] not in OPTIONAL | SLOW}
             wrong += [f"{path}:{node.lineno} imports {name}" for name in late - allowed]
     assert wrong == []
+
+
+def test_figures_loaded_in_the_background_exist():
+    """A thread imports them, so that a wrong name would only print a traceback."""
+    work = "".join(path.read_text(encoding="utf-8") for path in FILES if path.parent.name == "work")
+    names = set(re.findall(r'load_figures\(options, "(\w+)"\)', work))
+    assert names
+    assert names <= {path.stem for path in (PACKAGE / "view" / "figures").glob("*.py")}
 
 
 def test_long_functions_say_why():

@@ -20,7 +20,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
 
     Return the `Outcome`. Raises `InputError` if the config is invalid."""
     check_geometry(config)
-    cli.load_figures(options, "basins")
+    cli.load_figures(options, "sweep")
     with cli.waiting(Console(stderr=True), "compiling and simulating"):
         found = find(Evaluator.of(config), series=True)
     files.write_config(folder, config)

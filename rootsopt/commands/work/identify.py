@@ -22,7 +22,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     ):
         if not getattr(options, name):
             raise InputError(f"`--{name}` is missing; add it, as in --{name} {example}")
-    cli.load_figures(options, "identified")
+    cli.load_figures(options, "force")
     with cli.waiting(Console(stderr=True), "compiling and simulating") as progress:
         found = identify(
             config, options.data, options.fit, gains=[text.split(",") for text in options.gain],

@@ -19,7 +19,7 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     Return the `Outcome`. Raises `InputError` if the config is invalid."""
     began = time.perf_counter()
     check_geometry(config)
-    cli.load_figures(options, "front")
+    cli.load_figures(options, "comparisons")
     bar = partial(
         progress_bar, first="baseline and screening", then="tracing the front", counted="searches"
     )

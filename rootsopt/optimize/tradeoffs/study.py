@@ -105,8 +105,8 @@ def simulated(config: Config, scene: Scene) -> bool:
         )
     if config.objective.over != "nominal":
         raise InputError(
-            f"`objective.over` must be nominal for `pareto.terms` with forces ({forced[0]}), but is "
-            f"{config.objective.over}: a front is that of the nominal scene; set it to nominal"
+            f"`objective.over` must be nominal for `pareto.terms` with forces ({forced[0]}), but "
+            f"is {config.objective.over}: a front is that of the nominal scene; set it to nominal"
         )
     if config.tolerances is not None:
         raise InputError(
