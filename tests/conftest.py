@@ -52,8 +52,8 @@ settings.load_profile("rootsopt")
 
 
 _LONGEST_FIRST = (
-    *("response", "tradeoffs", "continuation", "basins", "start", "steady", "known", "reserve"),
-    *("improve", "families", "rattle", "cli", "robust", "leakage", "ensemble", "gradients"),
+    *("identify", "response", "tradeoffs", "continuation", "basins", "start", "steady", "known"),
+    *("reserve", "improve", "families", "rattle", "cli", "robust", "leakage", "ensemble"),
 )
 """The first two share few programs: neither process repeats what the other compiles."""
 

@@ -13,18 +13,18 @@ from unittest import mock
 
 ROOT = Path(__file__).parents[1]
 MOST = {
-    "statements of the package": 27_255,
-    "statements of the tests": 17_449,
-    "statements of the experiments": 5_087,
-    "packages": 19,
-    "files of the package": 232,
-    "lines of the longest file": 663,
-    "floors of packages": 15,
-    "depth of imports": 30,
+    "statements of the package": 27_128,
+    "statements of the tests": 17_469,
+    "statements of the experiments": 5_088,
+    "packages": 13,
+    "files of the package": 202,
+    "lines of the longest file": 450,
+    "floors of packages": 10,
+    "depth of imports": 24,
     "config keys": 134,
     "lines of the longest help": 59,
     "pages of docs": 45,
-    "words of docs": 34_472,
+    "words of docs": 31_501,
 }
 """Greatest values that are accepted. Lower them when the project becomes lighter. Whoever raises
 one gives the reason in the changelog: what users can do now that is worth the weight."""

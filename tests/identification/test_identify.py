@@ -124,14 +124,14 @@ def test_averages_over_speeds_lead_to_the_true_values_with_gaps(tmp_path):
     names = "peak_force_N", "mean_force_N", "rms_force_N"
     for speed in (1500.0, 3000.0):
         response = simulated(speed_rpm=speed).response
-        rows.append([speed, *(response[key] * (1 + 0.01 * rng.standard_normal())
+        rows.append([speed, *(response[key] * (1 + 1e-3 * rng.standard_normal())
                               for key in names)])  # fmt: skip
     rows[1][2] = ""
     with open(tmp_path / "record.csv", "w", newline="") as file:
         writer = csv.writer(file)
         writer.writerows([["scene.speed_rpm", *names], *rows])
     keys = [f"{BACKLASH}=0.05:0.3", f"{LOAD}=3:9"]
-    found = rootsopt.identify(CIC, str(tmp_path / "record.csv"), keys, starts=2)
+    found = rootsopt.identify(CIC, str(tmp_path / "record.csv"), keys, starts=1)
     assert found.fit["measured_values"] == 5
     for key, true in TRUE.items():
         low, high = found.parameters[key]["interval_95"]
@@ -147,17 +147,15 @@ def coexisting():
     return config, {one.reached: one.evaluation for one in reversed(found)}
 
 
-@pytest.mark.parametrize("kind", ["samples", "force", "averages"])
+@pytest.mark.parametrize("kind", ["force", "averages"])
 def test_a_motion_that_is_not_reached_from_rest_is_matched(kind):
     config, found = coexisting()
     quiet, rng = found[False], np.random.default_rng(0)
     assert quiet.response["peak_force_N"] < 0.8 * found[True].response["peak_force_N"]
-    names = ["relative_rotation_rad", "contact_force_N"][kind == "force" :]
     data = quiet.to_dataset()
     record = {"rotation_deg": data.rotation_deg.values[::20]}
-    for name in names:
-        values = data[name].values[::20]
-        record[name] = values + 0.03 * np.std(values) * rng.standard_normal(len(values))
+    values = data["contact_force_N"].values[::20]
+    record["contact_force_N"] = values + 0.03 * np.std(values) * rng.standard_normal(len(values))
     if kind == "averages":
         names = "mean_force_N", "peak_force_N", "rms_force_N", "line_1_force_N"
         record = {name: quiet.response[name] * (1 + 1e-3 * rng.standard_normal())
