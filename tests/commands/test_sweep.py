@@ -17,7 +17,7 @@ from rootsopt.commands.table import sweep
 from rootsopt.response.sweeps import points
 
 ROOT = Path(__file__).parents[2]
-WORKERS = ROOT / "tests" / "sweeps" / "workers.py"
+WORKERS = ROOT / "tests" / "response" / "workers.py"
 SPEEDS, FAMILIES = "--over=scene.speed_rpm=1000:2000:2", "--over=profile.family=cic,arc"
 
 

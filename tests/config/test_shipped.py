@@ -53,12 +53,12 @@ def test_an_installed_package_has_its_configs_and_types(tmp_path):
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(tmp_path / "site")
     assert (tmp_path / "site" / "rootsopt" / "py.typed").exists()
-    pages = tmp_path / "site" / "rootsopt" / "pages"
+    pages = tmp_path / "site" / "rootsopt" / "view" / "pages"
     for folder in ("report", "explore"):
-        own = ROOT / "rootsopt" / "pages" / folder
+        own = ROOT / "rootsopt" / "view" / "pages" / folder
         written = {file.name for file in (pages / folder).iterdir()}
         assert written == {file.name for file in own.iterdir()}
-    assert (pages.parent / "glossary.md").read_bytes() == GLOSSARY.read_bytes()
+    assert (pages.parents[1] / "glossary.md").read_bytes() == GLOSSARY.read_bytes()
     empty = tmp_path / "empty"
     empty.mkdir()
     program = (
