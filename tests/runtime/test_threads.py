@@ -17,7 +17,6 @@ import rootsopt
 from rootsopt.config import load
 from rootsopt.errors import InputError
 from rootsopt.optimize import design
-from rootsopt.optimize.tradeoffs import trace
 from rootsopt.runtime.environment import own_process
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.runtime.threads import on_all_cores, one_thread
@@ -98,7 +97,7 @@ def test_overlapping_contexts_keep_one_thread_to_the_end():
     ("room", "search", "run"),
     [
         (design, "search_of", rootsopt.optimize_design),
-        (trace, "Tracer", rootsopt.pareto_front),
+        (design, "Tracer", rootsopt.pareto_front),
     ],
 )
 def test_searches_from_python_use_one_thread_and_restore_the_others(monkeypatch, room, search, run):
