@@ -13,11 +13,11 @@ from unittest import mock
 
 ROOT = Path(__file__).parents[1]
 MOST = {
-    "statements of the package": 27_128,
-    "statements of the tests": 17_469,
+    "statements of the package": 27_132,
+    "statements of the tests": 17_468,
     "statements of the experiments": 5_088,
     "packages": 13,
-    "files of the package": 202,
+    "files of the package": 203,
     "lines of the longest file": 450,
     "floors of packages": 10,
     "depth of imports": 24,
