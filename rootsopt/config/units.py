@@ -1,4 +1,4 @@
-"""Units in the names of keys, and values and messages in words of limited length.
+"""Units in the names of keys, and values and messages as short text.
 
 Hints name a value that seems to be given in another unit. `NAMES` are the quantities of a scene on
 which the contact forces depend."""

@@ -67,8 +67,7 @@ _ROWS = 3
 _NARROW, _NARROWEST = 1 / 64, 1 / 8192
 _BESIDE = 0.01
 
-# Greatest number of design parameters for which a lower bound is looked for: if it is asked for,
-# and by default.
+# Greatest number of design parameters for a lower bound: with `optimizer.prove`, and by default.
 PARAMETERS, QUICK = 4, 3
 
 # Number of evaluations and of boxes of a lower bound that is asked for.

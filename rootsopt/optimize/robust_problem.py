@@ -207,7 +207,7 @@ class Stage:
     """What one stage of a search does in its own way. The base class is the usual search.
 
     `first`: index of the first local search; `apart`: distance between their starts in the unit
-    box; `bounded`: whether a lower bound may be looked for."""
+    box; `bounded`: whether the stage may look for a lower bound."""
 
     first = 0
     apart = 0.15

@@ -1,4 +1,4 @@
-"""Builds a rotor pair from a config and a design."""
+"""Config to numbers: the scene, its rotor pair, and the bounds and sizes of designs."""
 
 from rootsopt.scene.build import Scene as Scene
 from rootsopt.scene.build import along as along
