@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.optimize.local import FEASIBLE, Limits, Linearization, Rows
+from rootsopt.optimize.local import FEASIBLE, Limits, Linearization, Rows, onto
 from rootsopt.optimize.optimality import Bound
 from rootsopt.scene.space import sobol
 
@@ -32,8 +32,9 @@ FACTOR = 2.0
 FIRST = 6
 """Number of points spread over the feasible set, per parameter and once more."""
 
-# Number of points from which these are chosen.
-_DRAWN = 256
+# Number of points from which these are chosen, and of those that are first moved onto the feasible
+# set if few are feasible.
+_DRAWN, _MOVED = 256, 64
 
 # Factor on the deviations of constraints from their tangents.
 _DEVIATION = 1.5
@@ -66,6 +67,13 @@ _ROWS = 3
 # Half width of a box below which it is left: one that has no bound, and any other.
 _NARROW, _NARROWEST = 1 / 64, 1 / 8192
 _BESIDE = 0.01
+
+# Greatest magnitude of a slack that counts.
+_FAR = 1e9
+
+# Distance from the middle of a box (half widths) beyond which a feasible point says nothing about
+# it, and half width of a box that is void if no feasible point is found within this distance.
+_OUTSIDE, _SMALL_BOX = 2.0, 1 / 16
 
 # Greatest number of design parameters for a lower bound: with `optimizer.prove`, and by default.
 PARAMETERS, QUICK = 4, 3
@@ -211,6 +219,7 @@ class Bounding:
         self._seen, self._told, self._first = 0, 0, FIRST * (size + 1)
         self._known: dict[bytes, Rows] = {}
         self._numbers = itertools.count()
+        self._sample: list[NDArray[np.float64]] = []
         self._corners = np.array([*itertools.product((-1.0, 1.0), repeat=size)])
         middle = np.full(size, 0.5)
         self._push(-math.inf, middle, middle, self._look(middle)[0] * math.nan, size)
@@ -293,27 +302,48 @@ class Bounding:
         )
 
     def _next(self, box: Box, least: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Return a point (d,) of a `box` whose evaluation tells more than halving the box.
+        """Return a point (d,) in or beside a `box` whose evaluation tells more than halving it.
 
         `least` (d,): the point where the minorants are least. Return `None` if no point helps."""
-        room = self.surfaces[0].room(box)
-        worst = -_BESIDE if np.max(box.half) < _NARROW else -FEASIBLE
-        for point in (least, box.middle):
-            far = self.surfaces[0].near(point, self.surfaces[0].points) > room
-            if far and np.min(self._look(point)[0]) >= worst:
+        objective = self.surfaces[0]
+        room = objective.room(box)
+        for begin in (least, box.middle):
+            # A design that is not quite feasible is usable as a rule.
+            worst = -_BESIDE if np.max(box.half) < _NARROW else -FEASIBLE
+            known = np.min(self._look(begin)[0]) >= worst
+            point = begin if known else self._within(box, begin)
+            if point is None:
+                continue
+            away = objective.near(point, begin[None])
+            if objective.near(point, objective.points) > max(room, away):
                 return point
         return None
+
+    def _within(self, box: Box, begin: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """Return the feasible point (d,) that is found from a point `begin` (d,), `None` if it is
+        not within `_OUTSIDE` of a `box`."""
+        point = begin
+        for point in onto(self.limits, begin):
+            if np.max(np.abs(point - box.middle) / box.half) > _OUTSIDE:
+                return None
+        return point if np.min(self._look(point)[0]) >= -FEASIBLE else None
 
     def _spread(self, most: int) -> list[NDArray[np.float64]]:
         """Return up to `most` feasible points (d,), each far from the others and from all that are
         evaluated."""
-        drawn = [x for x in sobol(_DRAWN, 0, self.size) if np.min(self._look(x)[0]) >= 0]
+        if not self._sample:
+            drawn = sobol(_DRAWN, 0, self.size)
+            inside = np.array([np.min(self._look(x)[0]) >= 0 for x in drawn])
+            self._sample = [*drawn[inside]]
+            if len(self._sample) < self._first:
+                moved = ([*onto(self.limits, x)][-1] for x in drawn[~inside][:_MOVED])
+                self._sample += [x for x in moved if np.min(self._look(x)[0]) >= -FEASIBLE]
         taken = [*self.unusable, *self.surfaces[0].points]
         found: list[NDArray[np.float64]] = []
-        for _ in range(min(most, len(drawn))):
-            away = [min(np.linalg.norm(x - y) for y in [*taken, *found]) for x in drawn]
+        for _ in range(min(most, len(self._sample))):
+            away = [min(np.linalg.norm(x - y) for y in [*taken, *found]) for x in self._sample]
             if max(away) > _CLOSE:
-                found.append(drawn[int(np.argmax(away))])
+                found.append(self._sample[int(np.argmax(away))])
         return found
 
     def _bounded(self, box: Box) -> tuple[Box, NDArray[np.float64] | None]:
@@ -376,14 +406,20 @@ class Bounding:
         """Return a `box` with the deviations that are found at its corners.
 
         Return `None` if one constraint is violated at all corners by more than it varies among
-        them. Corners at which no profile can be made are left out: next to them, the gradients of
-        constraints may have no bound."""
+        them, or if no feasible point is found from the middle of a small box. Corners at which no
+        profile can be made are left out: next to them, the gradients of constraints may have no
+        bound."""
         slack, normals = self._look(box.middle)
         steps = self._corners * box.half
         tops, turned = zip(*[self._look(box.middle + step) for step in steps], strict=True)
         every = np.vstack([slack, *tops])
         high, low = np.fmax.reduce(every, axis=0), np.fmin.reduce(every, axis=0)
         if np.any(2 * high - low < 0):
+            return None
+        # A constraint may jump where a profile becomes unsound. Its tangents then say nothing.
+        inside = np.min(np.nan_to_num(every, nan=-1.0), axis=1) >= -FEASIBLE
+        small = np.max(box.half) <= _SMALL_BOX
+        if small and not np.any(inside) and self._within(box, box.middle) is None:
             return None
         with np.errstate(invalid="ignore"):
             rise = np.array(tops) - slack - steps @ normals.T
@@ -405,7 +441,13 @@ class Bounding:
         heapq.heappush(self._open, Box(bound, next(self._numbers), *rest))
 
     def _look(self, point: NDArray[np.float64]) -> Rows:
+        """Return slacks (m,) and their gradients (m, d) at a `point` (d,), mapped to -1 … 1.
+
+        A slack that grows without bound, such as one near an undercut, is nearly constant then."""
         key = point.tobytes()
         if key not in self._known:
-            self._known[key] = self.limits(point)
+            slack, normals = self.limits(point)
+            slack = np.clip(slack, -_FAR, _FAR)
+            scale = 1 + np.abs(slack)
+            self._known[key] = slack / scale, normals / scale[:, None] ** 2
         return self._known[key]

@@ -27,7 +27,7 @@ from rootsopt.optimize.limits import (
     settled_by,
     term_constraints,
 )
-from rootsopt.optimize.local import FEASIBLE, Certificate, Group, Linearization
+from rootsopt.optimize.local import FEASIBLE, Certificate, Group, Linearization, onto
 from rootsopt.optimize.optimality import Holder
 from rootsopt.response.reducers import counted
 from rootsopt.response.result import RESPONSES, Evaluation
@@ -352,25 +352,9 @@ class Problem:
         return bool(np.min(self.look(point)[2]) >= -FEASIBLE)
 
     def project(self, point) -> NDArray[np.float64]:
-        """Return `point` (d,) moved onto the feasible set by Gauss-Newton steps.
-
-        Each step is computed from the violated constraints. The result can still be infeasible, for
-        example if the constraints contradict the bounds."""
-        point = np.clip(np.asarray(point, dtype=np.float64), 0.0, 1.0)
-        for _ in range(30):
-            _, _, slack, jacobian = self.look(point)
-            violated = slack < 0
-            if not violated.any():
-                break
-            # Aim slightly inside, so that the constraint holds despite rounding. Coordinates held
-            # by their bound do not move.
-            # Where no profile exists, a margin may have no derivative, and does not move the point.
-            rows, want = np.nan_to_num(jacobian[violated]), 1e-7 - slack[violated]
-            push = rows.T @ want
-            held = ((point <= 0) & (push < 0)) | ((point >= 1) & (push > 0))
-            move = np.linalg.lstsq(np.where(held, 0.0, rows), want, rcond=1e-8)[0]
-            point = np.clip(point + np.clip(move, -0.3, 0.3), 0.0, 1.0)
-        return np.asarray(point, dtype=np.float64)
+        """Return `point` (d,) moved onto the feasible set if possible; see `onto`."""
+        *_, point = onto(self.limits_at, point)
+        return point
 
     def nearby(self, point, sizes: Sequence[float]) -> Iterator[NDArray[np.float64]]:
         """Yield points beside a feasible `point` (d,), towards the middle of the unit box.

@@ -193,6 +193,35 @@ def test_a_limited_force_is_bounded_too():
     assert bound.lower_bound == pytest.approx(0.4, abs=1e-4)
 
 
+def test_limits_that_grow_without_bound_are_no_obstacle():
+    """A limit like an undercut margin: -∞ beside the designs that cannot be made, NaN beyond."""
+
+    def limits(point):
+        edge, normal = point[0] - 0.3 - 0.2 * point[1], np.array([[1.0, -0.2]])
+        if edge <= 0:
+            return np.array([np.nan]), np.nan * normal
+        return np.array([1 - 0.05 / edge]), 0.05 / edge**2 * normal
+
+    def wave(y):
+        return 0.05 * np.cos(3 * np.pi * y) + 0.1 * y
+
+    def local(point):
+        x, y = point
+        slope = np.array([0.3, 0.1 - 0.15 * np.pi * np.sin(3 * np.pi * y)])
+        return Linearization(0.3 * x + wave(y), slope, (), *limits(point))
+
+    start, y = np.array([0.9, 0.9]), np.linspace(0, 1, 10_001)
+    least = np.min(0.3 * (0.35 + 0.2 * y) + wave(y))
+    found = bounding.Bounding(limits, 2, local(start).objective, boxes=1000)
+    found.tell(start, local(start))
+    while points := found.ask(8):
+        for point in points:
+            found.tell(point, local(point))
+    bound = found.bound(found.best)
+    assert bound.proven
+    assert bound.lower_bound == pytest.approx(least, abs=2e-5)
+
+
 def test_minorants_hold_across_a_corner_that_bends_downwards():
     """A roof: in small boxes minorants are below it, and the best is close to it.
 
