@@ -9,7 +9,7 @@ accurate to 1e-3:
 (e) the main job from a cold process, without and with cached programs.
 
 Each part runs in its own process, so that peak memory is measured for each part. This module does
-not load JAX. Build, compile and run are timed separately, and the error reached is listed next to
+not load JAX. Compilation and runs are timed separately, and the error reached is listed next to
 the time.
 """
 
@@ -33,9 +33,9 @@ from matplotlib.ticker import NullFormatter
 from experiments._common.driver import NoResultError, Run, start_process
 from experiments._common.scenes import CIC
 from experiments._common.style import BLUE, ORANGE, grid_below, sheet
-from experiments._common.tables import print_record, show
+from experiments._common.tables import Row, print_record, show
 from experiments._common.timing import MB, peak_memory
-from experiments.benchmark.job import ACCURACY, BATCH_SECONDS, Job, Row, row
+from experiments.benchmark.job import ACCURACY, BATCH_SECONDS, Job, row
 
 SIZES = (16, 256, 1024)
 
@@ -120,7 +120,7 @@ def draw_power(
 
 # Columns of the table, in order.
 COLUMNS = (
-    *("part", "tool", "what", "designs", "per_design_ms", "run_s", "build_s", "compile_s"),
+    *("part", "tool", "what", "designs", "per_design_ms", "run_s", "compile_s"),
     *("value_error", "gradient_error", "peak_memory_MB", "settings", "note"),
 )
 

@@ -9,7 +9,7 @@ closed orbits.
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -206,28 +206,45 @@ class Result:
     rhs_calls: int
     reached: float
 
-    @property
-    def response(self) -> NDArray[np.float64]:
-        """Mean, peak and RMS contact force (3,) in N."""
-        return np.array([self.mean, self.peak, self.rms])
+
+class Engine(Protocol):
+    """A simulator of a scene."""
+
+    def simulate(self, design: Design) -> Result:
+        """Start from ε = 0, dε/dt = 0 at φ = 0, settle, then average over the window."""
+        ...
+
+    def forces(self, design: Design) -> NDArray[np.float64]:
+        """Return mean and peak contact force (2,) in N."""
+        found = self.simulate(design)
+        return np.array([found.mean, found.peak])
 
 
 def central_differences(
-    simulate: Callable[[Design], Result], design: Design, steps: Sequence[float]
-) -> tuple[Result, NDArray[np.float64]]:
-    """Return the result at `design`, and d(mean, peak, RMS) / d(design) (3, 3) in N per config
-    unit.
+    forces: Callable[[Design], NDArray[np.float64]], design: Design, steps: Sequence[float]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the forces (n,) of a design (d,), and their derivatives (n, d) per config unit.
 
-    Central differences need six further simulations; `steps`: in config units."""
-    columns = []
-    for i, step in enumerate(steps):
-        ends = []
-        for sign in (1.0, -1.0):
-            moved = [float(value) for value in design]
-            moved[i] += sign * step
-            ends.append(simulate(moved).response)
-        columns.append((ends[0] - ends[1]) / (2 * step))
-    return simulate(design), np.stack(columns, axis=1)
+    Central differences need 2 d further simulations; `steps` (d,): in config units."""
+    base, ways = np.asarray(design), np.diag(steps)
+    ends = [(forces((base + way).tolist()), forces((base - way).tolist())) for way in ways]
+    columns = [(up - down) / (2 * step) for (up, down), step in zip(ends, steps, strict=True)]
+    return forces(design), np.stack(columns, axis=1)
+
+
+def best_steps(
+    forces: Callable[[Design], NDArray[np.float64]], design: Design, truth: NDArray[np.float64]
+) -> tuple[list[float], float]:
+    """Return the steps of the central differences, `FD_STEPS` or thrice those, that err less.
+
+    `truth` (n, d): the gradients of the forces. The second result is the factor, 1 or 3."""
+    tried = []
+    for factor in (1.0, 3.0):
+        steps = [factor * step for step in FD_STEPS]
+        off = np.abs(central_differences(forces, design, steps)[1] - truth).max(axis=1)
+        tried.append((float(np.max(off / np.abs(truth).max(axis=1))), factor, steps))
+    _, factor, steps = min(tried)
+    return steps, factor
 
 
 # The contact law and the rounded ends of the backlash

@@ -9,7 +9,6 @@ poses and signs.
 
 import dataclasses
 import math
-from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -18,15 +17,14 @@ from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from experiments._common.engines import (
-    FD_STEPS,
     Design,
+    Engine,
     Motion,
     Result,
     Rotor,
     Scene,
     balanced_ramp,
     balanced_step,
-    central_differences,
     impact,
     motion_of,
     ramp,
@@ -612,7 +610,7 @@ def _run(rotor, motion, table, settle, window, rtol):
 
 
 @dataclasses.dataclass(frozen=True)
-class NumbaPair:
+class NumbaPair(Engine):
     """Compiled simulator of a scene.
 
     `contact`: map or search; `rtol`: relative tolerance, also absolute tolerance of the scaled
@@ -632,7 +630,6 @@ class NumbaPair:
     deepest: float | None = None
 
     def simulate(self, design: Design) -> Result:
-        """Start from ε = 0, dε/dt = 0 at φ = 0, settle, then average over the window."""
         rotor = rotor_of(self.scene, design)
         motion = motion_of(self.scene, polar_area_moment(rotor))
         if self.contact == "search":
@@ -645,12 +642,6 @@ class NumbaPair:
                 break
             deepest = max(-1.3 * result.reached, 2 * deepest)
         return result
-
-    def gradient(
-        self, design: Design, steps: Sequence[float] = FD_STEPS
-    ) -> tuple[Result, NDArray[np.float64]]:
-        """Return the result and d(mean, peak, RMS) / d(design), N per config unit, (3, 3)."""
-        return central_differences(self.simulate, design, steps)
 
     def fitted(self, design: Design) -> "NumbaPair":
         """Return another simulator with a map just deep enough for the motion of `design`."""
