@@ -9,38 +9,18 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments._common.driver import NoResultError, Run
+from experiments._common.polygons import signed_distance
 from experiments._common.scenes import CIC, shipped
 from experiments._common.simulation import evaluate, objective, profile_of
 from experiments._common.style import BLUE, grid_below, sheet
 from experiments._common.tables import print_record, show
 from rootsopt.config import load
 from rootsopt.optimize.search import Search
-from rootsopt.profiles import Profile
+from rootsopt.profiles import Profile, outline
 from rootsopt.profiles.departure import departure, flank_points
 from rootsopt.scene.resemblance import likenesses
 
 MM, UM = 1e-3, 1e-6
-
-
-def signed_departures(profile: Profile, other: Profile) -> tuple[np.ndarray, np.ndarray]:
-    """Measure how far the flank of `profile` departs from the flank of `other`.
-
-    Returns radii (n,) in mm of points on the flank of `other`, and signed distances (n,) in µm from
-    these points along the normal. A distance is NaN if the normal does not meet `profile`.
-    """
-    points = flank_points(other) / MM @ [1, 1j]
-    line = flank_points(profile) / MM @ [1, 1j]
-    along = np.gradient(points)
-    normal = -1j * along / np.abs(along)
-    away = np.full(len(points), np.nan)
-    for k, (place, outward) in enumerate(zip(points, normal, strict=True)):
-        local = (line - place) * np.conj(outward)
-        cross = np.flatnonzero((local.imag[:-1] <= 0) != (local.imag[1:] <= 0))
-        if len(cross):
-            share = local.imag[cross] / (local.imag[cross] - local.imag[cross + 1])
-            height = local.real[cross] + share * (local.real[cross + 1] - local.real[cross])
-            away[k] = height[np.argmin(np.abs(height))] * MM / UM
-    return np.abs(points), away
 
 
 def comparison(start: Profile, found: Profile) -> Figure:
@@ -54,8 +34,10 @@ def comparison(start: Profile, found: Profile) -> Figure:
         axes[0, 0].plot(*(flank_points(profile) / MM).T, **line)
         axes[0, 1].plot(np.degrees(point.beta), np.degrees(point.psi), **line)
         axes[1, 0].plot(np.degrees(nu), 1 - np.asarray(profile.roll_rate(nu)), **line)
-    away = signed_departures(found, start)
-    axes[1, 1].plot(*away, color=BLUE, linewidth=1.8)
+    points = flank_points(start)
+    # The distance of a point from the free form is positive outside of it.
+    away = -signed_distance(points, np.asarray(outline(found, 2000))) / UM
+    axes[1, 1].plot(np.linalg.norm(points, axis=1) / MM, away, color=BLUE, linewidth=1.8)
     axes[1, 1].axhline(0, color="black", linewidth=0.9, linestyle="--")
     pitch = float(start.pitch_radius) / MM
     axes[1, 1].axvline(pitch, color="0.5", linewidth=0.9, linestyle=":")

@@ -28,8 +28,7 @@ Design = Sequence[float]
 FD_STEPS = (0.05, 0.025, 0.05)
 
 
-@dataclasses.dataclass(frozen=True)
-class Scene:
+class Scene(NamedTuple):
     """Everything except the design, in SI units.
 
     Rotors: lobes, pitch radius (m), rotor length (m), density (kg/m³). Contact: IMPACT stiffness
@@ -134,31 +133,22 @@ def rotor_of(scene: Scene, design: Design) -> Rotor:
 
 
 class Motion(NamedTuple):
-    """Constants of the equation of motion.
+    """Constants of the equation of motion in a `scene`.
 
-    `period`: mesh period (s), the unit of time; `angle_scale`: unit of ε (rad); `force_scale`: unit
-    of force (N); `turn`: rotation (rad) of rotor 1 in a mesh period; `agility`: scaled acceleration
-    per torque (1/(N·m)).
+    `period`: mesh period (s), the unit of time; `turn`: rotation (rad) of rotor 1 in a mesh period;
+    `angle_scale`: unit of ε (rad); `angle_limit`: |ε| (rad) above which a motion ends;
+    `force_scale`: unit of force (N); `agility`: scaled acceleration per torque (1/(N·m));
+    `gear_damping`: damping of the timing gear (N·m·s/rad).
     """
 
+    scene: Scene
     period: float
     turn: float
-    speed: float
     angle_scale: float
     angle_limit: float
     force_scale: float
     agility: float
-    load_torque: float
-    stiffness: float
-    exponent: float
-    damping: float
-    full_damping_depth: float
-    smoothing: float
-    clearance: float
-    gear_stiffness: float
     gear_damping: float
-    half_backlash: float
-    gear_rounding: float
 
 
 def motion_of(scene: Scene, polar_area_moment: float) -> Motion:
@@ -169,25 +159,15 @@ def motion_of(scene: Scene, polar_area_moment: float) -> Motion:
     depth = (force / scene.stiffness) ** (1 / scene.exponent)
     angle = depth / scene.pitch_radius + scene.half_backlash
     return Motion(
+        scene=scene,
         period=period,
         turn=2 * math.pi / scene.lobes,
-        speed=scene.speed,
         angle_scale=angle,
         angle_limit=math.pi / (8 * scene.lobes),
         force_scale=force,
         agility=period**2 / (angle * inertia),
-        load_torque=scene.load_torque,
-        stiffness=scene.stiffness,
-        exponent=scene.exponent,
-        damping=scene.damping,
-        full_damping_depth=scene.full_damping_depth,
-        smoothing=scene.smoothing,
-        clearance=scene.clearance,
-        gear_stiffness=scene.gear_stiffness,
         # The damping ratio refers to the reduced inertia of two equal rotors.
         gear_damping=2 * scene.gear_damping_ratio * math.sqrt(scene.gear_stiffness * inertia / 2),
-        half_backlash=scene.half_backlash,
-        gear_rounding=scene.gear_rounding,
     )
 
 
@@ -274,12 +254,23 @@ def balanced_step(x: float) -> float:
     return t * t * (18 - 32 * t + 15 * t * t)
 
 
-def impact(motion: Motion, depth: float, rate: float) -> float:
+def impact(scene: Scene, depth: float, rate: float) -> float:
     """Return the IMPACT force (N) at a penetration (m) that grows at `rate` (m/s)."""
     if depth <= 0:
         return 0.0
-    delta = ramp(depth, motion.smoothing)
-    elastic = motion.stiffness * delta**motion.exponent
-    damped = motion.damping * smooth_step(delta / motion.full_damping_depth) * rate
-    share = min(motion.smoothing / motion.full_damping_depth, 1.0)
+    delta = ramp(depth, scene.smoothing)
+    elastic = scene.stiffness * delta**scene.exponent
+    damped = scene.damping * smooth_step(delta / scene.full_damping_depth) * rate
+    share = min(scene.smoothing / scene.full_damping_depth, 1.0)
     return ramp(elastic + damped, share * elastic)
+
+
+def gear_torque(motion: Motion, relative: float, rate: float) -> float:
+    """Return the torque (N·m) of the timing gear against ε (rad) and its rate (rad/s)."""
+    scene = motion.scene
+    excess = abs(relative) - scene.half_backlash
+    if excess <= 0:
+        return 0.0
+    engaged = balanced_step(excess / scene.gear_rounding) if scene.gear_rounding > 0 else 1.0
+    spring = scene.gear_stiffness * balanced_ramp(excess, scene.gear_rounding)
+    return math.copysign(spring, relative) + motion.gear_damping * engaged * rate

@@ -8,6 +8,7 @@ poses and signs.
 """
 
 import dataclasses
+import functools
 import math
 from typing import Any, Literal, NamedTuple
 
@@ -25,6 +26,7 @@ from experiments._common.engines import (
     Scene,
     balanced_ramp,
     balanced_step,
+    gear_torque,
     impact,
     motion_of,
     ramp,
@@ -37,7 +39,7 @@ from experiments._common.engines import (
 _FAST = {"contract", "reassoc", "arcp", "nsz"}
 _compiled = njit(error_model="numpy", fastmath=_FAST)
 # Compiled code may call these functions, which remain functions of Python.
-for law in (ramp, smooth_step, balanced_ramp, balanced_step, impact):
+for law in (ramp, smooth_step, balanced_ramp, balanced_step, impact, gear_torque):
     register_jitable(error_model="numpy", fastmath=_FAST)(law)
 
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(24)
@@ -301,41 +303,22 @@ MARGIN = 3
 NO_TABLE = Table(np.zeros((4, 4)), 0.0, 1.0, 0.0, 1.0)
 
 
-@_compiled
-def _spline(values, out):
-    """Write the cubic B-spline coefficients (n + 2,) of `values` (n ≥ 8) at uniform knots to `out`.
+@functools.cache
+def _through(n: int) -> NDArray[np.float64]:
+    """Return the matrix (n + 2, n) from values at n uniform knots to cubic B-spline coefficients.
 
-    The ends are not-a-knot, which fixes c₂ = (8 v₁ - v₀ - v₂) / 6. Thomas' algorithm solves for the
-    interior.
-    """
-    n = values.size
-    out[2] = (8 * values[1] - values[0] - values[2]) / 6
-    out[n - 1] = (8 * values[n - 2] - values[n - 1] - values[n - 3]) / 6
-    ratios = np.empty(n)
-    ratio, carried = 0.0, out[2]
-    for i in range(3, n - 1):
-        ratio = 1 / (4 - ratio)
-        carried = (6 * values[i - 1] - carried) * ratio
-        ratios[i], out[i] = ratio, carried
-    for i in range(n - 2, 2, -1):
-        out[i] -= ratios[i] * out[i + 1]
-    out[1] = 6 * values[1] - 4 * out[2] - out[3]
-    out[0] = 6 * values[0] - 4 * out[1] - out[2]
-    out[n] = 6 * values[n - 2] - 4 * out[n - 1] - out[n - 2]
-    out[n + 1] = 6 * values[n - 1] - 4 * out[n] - out[n - 1]
+    The ends are not-a-knot: the fourth difference of five coefficients is 0 there."""
+    rows = np.zeros((n + 2, n + 2))
+    rows[0, :5] = rows[-1, -5:] = 1, -4, 6, -4, 1
+    for k, weight in enumerate((1 / 6, 2 / 3, 1 / 6)):
+        rows[1:-1, k : n + k] += weight * np.eye(n)
+    return np.linalg.inv(rows)[:, 1:-1].copy()
 
 
-@_compiled
-def spline_of(values):
-    """Return the coefficients (m + 2, n + 2) of the bicubic B-spline through `values` (m, n)."""
-    rolls, relatives = values.shape
-    half_way = np.empty((rolls, relatives + 2))
-    for i in range(rolls):
-        _spline(values[i], half_way[i])
-    coefficients = np.empty((relatives + 2, rolls + 2))
-    for j in range(relatives + 2):
-        _spline(half_way[:, j].copy(), coefficients[j])
-    return coefficients.T.copy()
+def table_of(rotor: Rotor, deepest: float, rolls: int, relatives: int) -> Table:
+    """Return the contact map down to ε = `deepest` < 0 from `rolls` × `relatives` points."""
+    values, *places = tabulate(rotor, deepest, rolls, relatives)
+    return Table(_through(rolls) @ values @ _through(relatives).T, *places)
 
 
 @_compiled
@@ -356,7 +339,7 @@ def tabulate(rotor, deepest, rolls, relatives):
                 # The land is passing: extend the gap at its end by a parabola.
                 gap = rotor.radius * (roll - rotor.land_end - relative / 2) ** 2
             values[i, j] = gap
-    return spline_of(values), first, roll_step, deepest, relative_step
+    return values, first, roll_step, deepest, relative_step
 
 
 @_compiled
@@ -417,17 +400,10 @@ def _slope(rotor, motion, table, search, tau, angle, rate):
         gap, lever1, lever2 = mapped(rotor.half_pitch, table, roll, side * relative)
     else:
         gap, lever1, lever2, _ = closest(rotor, search, roll, side * relative)
-    force = 0.0
-    depth = -gap - motion.clearance
-    if depth > 0:
-        closing = side * (lever1 * motion.speed - lever2 * (motion.speed + speed2))
-        force = impact(motion, depth, closing)
-    torque = side * lever2 * force - motion.load_torque
-    excess = abs(relative) - motion.half_backlash
-    if excess > 0:
-        engaged = balanced_step(excess / motion.gear_rounding) if motion.gear_rounding > 0 else 1.0
-        spring = -side * motion.gear_stiffness * balanced_ramp(excess, motion.gear_rounding)
-        torque -= spring + motion.gear_damping * engaged * speed2
+    scene = motion.scene
+    closing = side * (lever1 * scene.speed - lever2 * (scene.speed + speed2))
+    force = impact(scene, -gap - scene.clearance, closing)
+    torque = side * lever2 * force - scene.load_torque - gear_torque(motion, relative, speed2)
     return torque * motion.agility, force
 
 
@@ -636,7 +612,7 @@ class NumbaPair(Engine):
             return self._run(rotor, motion, NO_TABLE)
         deepest = self.deepest or self._expected(motion)
         for _ in range(5):
-            table = Table(*tabulate(rotor, deepest, self.rolls, self.relatives))
+            table = table_of(rotor, deepest, self.rolls, self.relatives)
             result = self._run(rotor, motion, table)
             if not result.reached > -deepest:
                 break
@@ -652,6 +628,7 @@ class NumbaPair(Engine):
         return Result(*_run(rotor, motion, table, self.settle, self.window, self.rtol))
 
     def _expected(self, motion: Motion) -> float:
-        depth = (20 * motion.force_scale / motion.stiffness) ** (1 / motion.exponent)
-        play = motion.clearance / self.scene.pitch_radius + motion.half_backlash
-        return -min(1.3 * play + 1.5 * depth / self.scene.pitch_radius, motion.angle_limit)
+        scene = self.scene
+        depth = (20 * motion.force_scale / scene.stiffness) ** (1 / scene.exponent)
+        play = scene.clearance / scene.pitch_radius + scene.half_backlash
+        return -min(1.3 * play + 1.5 * depth / scene.pitch_radius, motion.angle_limit)

@@ -24,8 +24,7 @@ from experiments._common.engines import (
     Result,
     Rotor,
     Scene,
-    balanced_ramp,
-    balanced_step,
+    gear_torque,
     impact,
     motion_of,
     rotor_of,
@@ -309,16 +308,6 @@ def _signed_distances(nodes, segments):
 # Equation of motion
 
 
-def _gear(motion: Motion, relative: float, rate: float) -> float:
-    """Return the torque (N·m) of the timing gear against ε."""
-    excess = abs(relative) - motion.half_backlash
-    if excess <= 0:
-        return 0.0
-    engaged = balanced_step(excess / motion.gear_rounding) if motion.gear_rounding > 0 else 1.0
-    spring = motion.gear_stiffness * balanced_ramp(excess, motion.gear_rounding)
-    return math.copysign(spring, relative) + motion.gear_damping * engaged * rate
-
-
 class _Equation:
     """Right-hand side of the equation of motion in scaled states.
 
@@ -339,7 +328,7 @@ class _Equation:
 
     def slope(self, tau: float, angle: float, rate: float) -> tuple[float, float]:
         """Return scaled acceleration and contact force (N)."""
-        motion = self.motion
+        motion, scene = self.motion, self.motion.scene
         relative = motion.angle_scale * angle
         speed2 = motion.angle_scale * rate / motion.period
         if abs(relative) >= motion.angle_limit:
@@ -347,9 +336,9 @@ class _Equation:
         side = 1.0 if relative < 0 else -1.0
         roll = -side * (motion.turn * tau + relative / 2)
         gap, lever1, lever2 = self.contact(roll, side * relative)
-        closing = side * (lever1 * motion.speed - lever2 * (motion.speed + speed2))
-        force = impact(motion, -gap - motion.clearance, closing)
-        torque = side * lever2 * force - motion.load_torque - _gear(motion, relative, speed2)
+        closing = side * (lever1 * scene.speed - lever2 * (scene.speed + speed2))
+        force = impact(scene, -gap - scene.clearance, closing)
+        torque = side * lever2 * force - scene.load_torque - gear_torque(motion, relative, speed2)
         return torque * motion.agility, force
 
 
