@@ -9,7 +9,6 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments._common.driver import NoResultError, Run
-from experiments._common.polygons import signed_distance
 from experiments._common.scenes import CIC, shipped
 from experiments._common.simulation import evaluate, objective, profile_of
 from experiments._common.style import BLUE, grid_below, sheet
@@ -19,6 +18,7 @@ from rootsopt.optimize.search import Search
 from rootsopt.profiles import Profile, outline
 from rootsopt.profiles.departure import departure, flank_points
 from rootsopt.scene.resemblance import likenesses
+from rootsopt.view.figures.designs import plot_departure
 
 MM, UM = 1e-3, 1e-6
 
@@ -34,24 +34,13 @@ def comparison(start: Profile, found: Profile) -> Figure:
         axes[0, 0].plot(*(flank_points(profile) / MM).T, **line)
         axes[0, 1].plot(np.degrees(point.beta), np.degrees(point.psi), **line)
         axes[1, 0].plot(np.degrees(nu), 1 - np.asarray(profile.roll_rate(nu)), **line)
-    points = flank_points(start)
-    # The distance of a point from the free form is positive outside of it.
-    away = -signed_distance(points, np.asarray(outline(found, 2000))) / UM
-    axes[1, 1].plot(np.linalg.norm(points, axis=1) / MM, away, color=BLUE, linewidth=1.8)
-    axes[1, 1].axhline(0, color="black", linewidth=0.9, linestyle="--")
-    pitch = float(start.pitch_radius) / MM
-    axes[1, 1].axvline(pitch, color="0.5", linewidth=0.9, linestyle=":")
-    axes[1, 1].annotate(
-        "pitch circle", (pitch, 0.02), (3, 0), xycoords=("data", "axes fraction"),
-        textcoords="offset points", fontsize=9,
-    )  # fmt: skip
+    outlines = (np.asarray(outline(one)) / MM for one in (start, found))
+    plot_departure(axes[1, 1], *outlines, start.lobes, float(start.pitch_radius) / MM)
     axes[0, 0].set(xlabel="x (mm)", ylabel="y (mm)", title="Flank, tip to root", aspect="equal")
     axes[0, 1].set(xlabel="roll angle β (°)", ylabel="pressure angle ψ (°)", ylim=(0, 95))
     axes[0, 1].set_title("Pressure angle")
     axes[1, 0].set(xlabel="normal angle ν (°)", ylabel="share τ = -dψ/dν")
     axes[1, 0].set_title("The share τ that the coefficients set")
-    axes[1, 1].set(xlabel="radius (mm)", ylabel="normal distance (µm)")
-    axes[1, 1].set_title("Departure from the best CIC, positive outwards")
     for ax in axes.ravel():
         grid_below(ax)
     handles, names = axes[0, 0].get_legend_handles_labels()
