@@ -16,7 +16,7 @@ import numpy as np
 from experiments._common.tables import Row
 from rootsopt import COMPILER_OPTIONS, Scene, steady_response
 
-# Number of designs that a thread of a CPU computes in one call.
+# Maximum number of designs that a thread of a CPU computes in one call.
 _PART = 32
 
 # Memory (bytes) for each design that is computed on a GPU.
@@ -67,7 +67,8 @@ def batches_of(
     row: designs in one call, time to compile (s), device."""
     device, size = jax.devices()[0], len(designs)
     cpu = device.platform == "cpu"
-    room = _PART if cpu else int((device.memory_stats() or {})["bytes_limit"] / _NEEDED)
+    shared = max(1, min(_PART, size // (os.cpu_count() or 1)))
+    room = shared if cpu else int((device.memory_stats() or {})["bytes_limit"] / _NEEDED)
     part = -(-size // -(-size // room))
     # Parts of equal size share a program. The last part is filled with the last design.
     rows = np.minimum(np.arange(-(-size // part) * part), size - 1).reshape(-1, part)

@@ -32,7 +32,7 @@ from matplotlib.ticker import NullFormatter
 
 from experiments._common.driver import NoResultError, Run, start_process
 from experiments._common.scenes import CIC
-from experiments._common.style import BLUE, ORANGE, grid_below, sheet
+from experiments._common.style import BLUE, ORANGE, sheet
 from experiments._common.tables import Row, print_record, show
 from experiments._common.timing import MB, peak_memory
 from experiments.benchmark.job import ACCURACY, BATCH_SECONDS, Job, row
@@ -94,8 +94,6 @@ def figure_of(rows: list[Row]) -> Figure:
             axis.set_minor_formatter(NullFormatter())
         if ax.lines:
             ax.legend(fontsize=8)
-    for ax in (bars, turns, batches):
-        grid_below(ax, axis="x" if ax is bars else "both", color="0.9")
     figure.suptitle(f"Shipped CIC scene; mean and peak force to {ACCURACY:g}", fontsize=11)
     return figure
 

@@ -7,7 +7,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter
 
-from experiments._common.style import BLUE, GREEN, ORANGE, VERMILION, grid_below, sheet
+from experiments._common.style import BLUE, GREEN, ORANGE, VERMILION, sheet
 from experiments.bifurcation.study import Diagram, beside, ranges
 from rootsopt.continuation import Bifurcation, Kind
 from rootsopt.status import Status
@@ -162,7 +162,6 @@ def draw_ranges(diagrams: list[Diagram]) -> Figure:
     ax.invert_yaxis()
     ax.set_xlim(lowest, diagrams[0].high)
     ax.set_xlabel(NAMES[diagrams[0].parameter])
-    grid_below(ax, color="0.9", axis="x", linewidth=0.8)
     handles = [
         Patch(facecolor=color, hatch=hatch, edgecolor="white", label=f"a stable {name} orbit")
         for name, (color, hatch, _) in styles.items()

@@ -16,7 +16,6 @@ from experiments._common.style import (
     PURPLE,
     SKY,
     VERMILION,
-    grid_below,
     sheet,
 )
 from experiments.families.study import HOUSINGS, Row, by_study, title
@@ -60,7 +59,6 @@ def ranking_figure(data: dict[str, Any]) -> Figure:
         ax.invert_yaxis()
         ax.set(xlabel="force / reference's", title=title(name, reference))
         ax.title.set_size(10)
-        grid_below(ax, axis="x", color="0.9")
     lines = (
         ("o", BLUE, BLUE, "mean force"),
         ("^", VERMILION, VERMILION, "peak force"),

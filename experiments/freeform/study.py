@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from experiments._common.driver import NoResultError, Run
 from experiments._common.scenes import CIC, shipped
 from experiments._common.simulation import evaluate, objective, profile_of
-from experiments._common.style import BLUE, grid_below, sheet
+from experiments._common.style import BLUE, sheet
 from experiments._common.tables import print_record, show
 from rootsopt.config import load
 from rootsopt.optimize.search import Search
@@ -41,8 +41,6 @@ def comparison(start: Profile, found: Profile) -> Figure:
     axes[0, 1].set_title("Pressure angle")
     axes[1, 0].set(xlabel="normal angle ν (°)", ylabel="share τ = -dψ/dν")
     axes[1, 0].set_title("The share τ that the coefficients set")
-    for ax in axes.ravel():
-        grid_below(ax)
     handles, names = axes[0, 0].get_legend_handles_labels()
     made.legend(handles, names, loc="outside lower center", ncols=2, frameon=False)
     return made

@@ -16,7 +16,7 @@ from matplotlib.lines import Line2D
 
 from experiments._common.driver import Run
 from experiments._common.scenes import FAIR
-from experiments._common.style import BLACK, COLORS, GREY, MARKS, grid_below, sheet
+from experiments._common.style import BLACK, COLORS, GREY, MARKS, sheet
 from experiments._common.tables import Row, show
 from rootsopt.config import Config, load
 from rootsopt.config.families import family_of
@@ -142,7 +142,6 @@ def fronts(rows: list[Row]) -> Figure:
             size = 11 if row["family"] == REFERENCE else 6
             ax.plot(*at, mark, color=color, markerfacecolor=fill, ms=size, zorder=3)
         ax.set(xlabel=_LABELS[x][0], ylabel=_LABELS[y][0])
-        grid_below(ax)
     _iso_efficiency(axes[1, 1])
     entries = [
         Line2D([], [], color=color, marker=mark, linestyle="", label=name.replace("_", " "))
