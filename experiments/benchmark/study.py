@@ -43,15 +43,6 @@ SIZES = (16, 256, 1024)
 COMPETITORS = "scipy", "numba"
 
 
-def exponent(points: Sequence[tuple[float, float]]) -> float | None:
-    """Return the exponent of a power law fitted to (size, time); `None` for fewer than two
-    points."""
-    if len(points) < 2:
-        return None
-    x, y = np.log(np.array(points)).T
-    return float(np.polyfit(x, y, 1)[0])
-
-
 def points_of(
     rows: Sequence[Row], part: str, what: str, size: str = "designs"
 ) -> list[tuple[float, float]]:
@@ -111,9 +102,10 @@ def draw_power(
     """
     if not points:
         return
-    slope = exponent(points)
-    name = label if slope is None else f"{label}: exponent {slope:.2f}"
-    ax.plot(*zip(*points, strict=True), marker=mark, color=color, lw=1.4, label=name)
+    if len(points) > 1:
+        x, y = np.log(np.array(points)).T
+        label += f": exponent {np.polyfit(x, y, 1)[0]:.2f}"
+    ax.plot(*zip(*points, strict=True), marker=mark, color=color, lw=1.4, label=label)
 
 
 # Columns of the table, in order.

@@ -106,7 +106,7 @@ def placed(
     there = found.points[found.efficiencies >= least]
     places = np.unique(np.linspace(0, len(there) - 1, 1 if quick else TRIED).astype(int))
     problem = problem_of(config)
-    tried = [config.with_design(problem.design(there[k])) for k in places]
+    tried = [config.with_design(np.asarray(problem.design(there[k]))) for k in places]
     marks = [objective(evaluate(one), reference.response) for one in tried]
     return tried[int(np.argmin(np.nan_to_num(marks, nan=np.inf)))], reached
 
