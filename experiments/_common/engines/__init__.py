@@ -175,15 +175,12 @@ def motion_of(scene: Scene, polar_area_moment: float) -> Motion:
 class Result:
     """Result of one simulation.
 
-    Fields: mean, peak and RMS contact force (N) over the window, number of accepted and rejected
-    solver steps, evaluations of the right-hand side, and the largest |ε| (rad) in the window.
+    Fields: mean, peak and RMS contact force (N) over the window, and the largest |ε| (rad) in it.
     """
 
     mean: float
     peak: float
     rms: float
-    steps: int
-    rhs_calls: int
     reached: float
 
 

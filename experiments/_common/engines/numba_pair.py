@@ -272,20 +272,6 @@ def closest(rotor, search, roll, relative):
     return gap, lever1, lever2, True
 
 
-@_compiled
-def gaps(rotor, rolls, relatives):
-    """Return gap and both levers (n, 3) in m at n poses, NaN without a common normal.
-
-    `rolls`, `relatives` (n,): roll coordinate and ε (rad)."""
-    search = Search(*search_of(rotor))
-    out = np.full((rolls.size, 3), np.nan)
-    for i in range(rolls.size):
-        gap, lever1, lever2, found = closest(rotor, search, rolls[i], relatives[i])
-        if found:
-            out[i] = gap, lever1, lever2
-    return out
-
-
 # Map of the gap
 
 
@@ -503,20 +489,18 @@ def integrate(rotor, motion, table, search, start, stop, angle, rate, rtol, stat
     """Integrate the scaled state from τ = `start` to `stop`.
 
     Returns the state with the integrals of force and force² (scaled; error-controlled with the
-    state if `statistics`), the peak force (N), the largest |ε| (scaled), steps and evaluations of
-    the right-hand side.
+    state if `statistics`), the peak force (N), and the largest |ε| (scaled).
     """
     ks = np.empty((2, 7))
     fs = np.empty(7)
     tau, h, previous = start, 1e-3, 1.0
     total = square = peak = reached = 0.0
-    steps, calls = 0, 1
+    steps = 0
     limit = motion.angle_limit / motion.angle_scale
     ks[0, 0] = rate
     ks[1, 0], fs[0] = _slope(rotor, motion, table, search, tau, angle, rate)
     while tau < stop and steps < _STEPS_PER_PERIOD * (stop - start) and abs(angle) < limit:
         steps += 1
-        calls += 6
         h = min(h, stop - tau)
         a, b = angle, rate
         for i in range(1, 7):
@@ -566,23 +550,23 @@ def integrate(rotor, motion, table, search, start, stop, angle, rate, rtol, stat
     if tau < stop:
         total = square = peak = math.nan
         reached = math.inf
-    return angle, rate, total, square, peak, reached, steps, calls
+    return angle, rate, total, square, peak, reached
 
 
 @_compiled
 def _run(rotor, motion, table, settle, window, rtol):
     """Integrate the transient, then return statistics over the window."""
     search = Search(*search_of(rotor))
-    angle, rate, _, _, _, _, steps, calls = integrate(
+    angle, rate, _, _, _, _ = integrate(
         rotor, motion, table, search, 0.0, float(settle), 0.0, 0.0, rtol, False
     )
     # Rotor and flanks repeat with the mesh period.
-    _, _, total, square, peak, reached, more, again = integrate(
+    _, _, total, square, peak, reached = integrate(
         rotor, motion, table, search, 0.0, float(window), angle, rate, rtol, True
     )
     mean = total / window * motion.force_scale
     rms = math.sqrt(square / window) * motion.force_scale
-    return mean, peak, rms, steps + more, calls + again, reached * motion.angle_scale
+    return mean, peak, rms, reached * motion.angle_scale
 
 
 @dataclasses.dataclass(frozen=True)

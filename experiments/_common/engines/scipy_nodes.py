@@ -315,12 +315,10 @@ class _Equation:
 
     def __init__(self, motion: Motion, contact: NodeContact):
         self.motion, self.contact = motion, contact
-        self.calls = 0
 
     def __call__(self, tau: float, y: NDArray[np.float64]) -> list[float]:
         angle, rate = y[:2].tolist()
         acceleration, force = self.slope(tau, angle, rate)
-        self.calls += 1
         if len(y) == 2:
             return [rate, acceleration]
         share = force / self.motion.force_scale
@@ -373,8 +371,6 @@ class ScipyNodes(Engine):
             mean=float(total) * motion.force_scale,
             peak=_peak(equation, run),
             rms=math.sqrt(square) * motion.force_scale,
-            steps=len(before.t) + len(run.t) - 2,
-            rhs_calls=equation.calls,
             reached=float(np.abs(run.y[0]).max()) * motion.angle_scale,
         )
 
