@@ -73,8 +73,9 @@ def batches_of(
     # Parts of equal size share a program. The last part is filled with the last design.
     rows = np.minimum(np.arange(-(-size // part) * part), size - 1).reshape(-1, part)
     parts = [jax.device_put(designs[some], device) for some in rows]
-    many = jax.jit(jax.vmap(lambda design, start: solve(design, start)[:3], (0, None)))
-    lowered = many.lower(parts[0], start)
+    many = jax.vmap(lambda design, start: solve(design, start)[:3], (0, None))
+    options = dict(COMPILER_OPTIONS) if cpu else {}
+    lowered = jax.jit(many, compiler_options=options).lower(parts[0], start)
     began = time.perf_counter()
     program = lowered.compile()
     row = {"together": part, "compile_s": time.perf_counter() - began}
