@@ -298,7 +298,7 @@ def _through(n: int) -> NDArray[np.float64]:
     rows[0, :5] = rows[-1, -5:] = 1, -4, 6, -4, 1
     for k, weight in enumerate((1 / 6, 2 / 3, 1 / 6)):
         rows[1:-1, k : n + k] += weight * np.eye(n)
-    return np.linalg.inv(rows)[:, 1:-1].copy()
+    return np.asarray(np.linalg.inv(rows)[:, 1:-1], np.float64, order="C")
 
 
 def table_of(rotor: Rotor, deepest: float, rolls: int, relatives: int) -> Table:
