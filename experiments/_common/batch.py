@@ -1,125 +1,89 @@
-"""Evaluate many designs at once, with one compiled program.
+"""Forces and gradients by `rootsopt.steady_response`: of one design, and of many at once.
 
-A batch is for surveys. Motions without an orbit are not examined further: give such a design to an
-`Evaluator`.
-"""
+On a GPU, all designs of a batch are computed together, or as many as fit its memory. On a CPU, each
+thread computes a part of the batch, one design after the other."""
 
-import dataclasses
-from typing import NamedTuple
+import os
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
+import jax
 import jax.numpy as jnp
-from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+import numpy as np
 
-from rootsopt.dynamics.closed import Start, steady_motion
-from rootsopt.dynamics.integrator import Integrator, Solver
-from rootsopt.runtime.programs import CachedFunction
-from rootsopt.runtime.threads import on_all_cores
-from rootsopt.scene import Scene
-from rootsopt.status import Status
+from experiments._common.tables import Row
+from rootsopt import COMPILER_OPTIONS, Scene, steady_response
 
+# Maximum number of designs that a thread of a CPU computes in one call.
+_PART = 32
 
-class Batch(NamedTuple):
-    """Responses of n designs with d parameters.
+# Memory (bytes) for each design that is computed on a GPU.
+_NEEDED = 3.5e6
 
-    `response` (n, 3): mean, peak and RMS force (N); `gradient` (n, 3, d): derivatives of `response`
-    (N per config unit); `state` (n, s): scaled state of the orbit at φ1 = 0, a start for
-    neighbouring designs; `period` (mesh periods); `multiplier`: greatest modulus of the Floquet
-    multipliers; `residual` of the closed orbit; `steps`: number of solver steps; `status`: codes of
-    `Status`. `response` and `gradient` are NaN where there is no periodic orbit.
-    """
-
-    response: Float[Array, "*n 3"]
-    gradient: Float[Array, "*n 3 d"]
-    state: Float[Array, "*n s"]
-    period: Int[Array, "*n"]
-    multiplier: Float[Array, "*n"]
-    residual: Float[Array, "*n"]
-    steps: Int[Array, "*n"]
-    status: Int[Array, "*n"]
-
-    @property
-    def usable(self) -> Bool[Array, "*n"]:
-        """Whether the pair settled on a stable periodic orbit, for each design."""
-        return self.status == Status.PERIODIC.code
+Solve = Callable[[Any, Any], tuple[Any, ...]]
 
 
-def coarse(
-    scene: Scene,
-    transient: Integrator,
-    orbit: Integrator,
-    max_periods: int = 64,
-    max_orbit: int = 8,
-) -> Solver:
-    """Return the settings with which a batch finds the steady motions of a `scene`.
+def solver_of(scene: Scene, gradient: bool = True) -> Solve:
+    """Return the function (design, start) -> (forces, gradients, status, next start).
 
-    `transient`, `orbit`: integrators of the transient and of the orbit; `max_periods`: maximum
-    length of the transient (mesh periods); `max_orbit`: longest period of an orbit to find (mesh
-    periods)."""
-    return dataclasses.replace(
-        scene.solver,
-        transient=transient,
-        orbit=orbit,
-        max_periods=jnp.asarray(float(max_periods)),
-        max_orbit=max_orbit,
-    )
+    The forces are mean and peak (2,) in N, the gradients (2, d) in N per config unit, or None
+    without `gradient`."""
 
+    def solve(design, start):
+        def forces(design):
+            found = steady_response(scene, design, start)
+            values = jnp.stack([found.mean, found.peak])
+            return values, (values, found.status, found.start)
 
-def respond(
-    scene: Scene,
-    design: Float[Array, " d"],
-    state: Float[Array, " s"],
-    solver: Solver,
-    gradient: bool = True,
-) -> Batch:
-    """Return the steady response of one design, started from a scaled state.
+        if gradient:
+            slopes, (values, *rest) = jax.jacfwd(forces, has_aux=True)(design)
+        else:
+            slopes, (values, *rest) = None, forces(design)[1]
+        return values, slopes, *rest
 
-    `design` (d,): in config units; `state` (s,): scaled state at φ1 = 0; `solver`: settings, such
-    as those of `coarse`; `gradient`: whether to compute derivatives. This is a pure function: JAX
-    can map it over `design`, `state` or the leaves of `scene`.
-    """
-    if gradient:
-        pair, tangents, _ = scene.pair_and_tangents(design)
-    else:
-        pair, tangents, _ = scene.pair_and_tangents(design, ())
-    start = Start.at(pair, pair.in_si(state), solver.max_orbit)
-    found = steady_motion(pair, tangents, start, scene.pitch_radius, solver)
-    orbit = found.orbit
-    mean, square, peak = found.forces[:3]
-    rms = jnp.sqrt(jnp.maximum(square, 0.0))
-    by_mean, by_square, by_peak = found.sensitivity[:3]
-    rows = jnp.stack([by_mean, by_peak, by_square / (2 * jnp.maximum(rms, 1e-30))])
-    usable = found.status == Status.PERIODIC.code
-    return Batch(
-        response=jnp.where(usable, jnp.stack([mean, peak, rms]), jnp.nan),
-        gradient=jnp.where(usable, rows, jnp.nan),
-        state=orbit.state,
-        period=found.period,
-        multiplier=orbit.multiplier,
-        residual=orbit.residual,
-        steps=found.steps,
-        status=found.status,
-    )
+    return solve
 
 
-def respond_many(
-    scene: Scene,
-    designs: Float[Array, "n d"],
-    states: Float[Array, "n s"],
-    solver: Solver,
-    gradient: bool = True,
-) -> Batch:
-    """Return the responses of n designs, each started from its own scaled state.
-
-    `designs` (n, d): in config units; `states` (n, s): scaled states at φ1 = 0; `solver`: see
-    `coarse`; `gradient`: whether to compute derivatives. One thread per core evaluates one design
-    at a time, so that no design waits for a slower one.
-    """
-    return on_all_cores(
-        lambda designs, states: _in_turn(scene, designs, states, solver, gradient), designs, states
-    )
+def compiled(solve: Solve) -> Solve:
+    """Return `solve` as one program, whose results are ready."""
+    program = jax.jit(solve, compiler_options=dict(COMPILER_OPTIONS))
+    return lambda design, start: jax.block_until_ready(program(design, start))
 
 
-@CachedFunction
-def _in_turn(scene, designs, states, *settings) -> Batch:
-    return lax.map(lambda at: respond(scene, *at, *settings), (designs, states))
+def rest_of(scene: Scene, design: Any) -> Any:
+    """Return a start at rest, in the form of `Response.start`."""
+    start = jax.eval_shape(lambda: steady_response(scene, design).start)
+    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), start)
+
+
+def batches_of(
+    solve: Solve, designs: np.ndarray, start: Any
+) -> Iterator[tuple[Callable[[Any], list[np.ndarray]], Row]]:
+    """Yield functions start -> (forces, gradients, statuses) of all `designs` (n, d).
+
+    There is one for a GPU, and two for a CPU: on one thread, and on one per core. With each comes a
+    row: designs in one call, time to compile (s), device."""
+    device, size = jax.devices()[0], len(designs)
+    cpu = device.platform == "cpu"
+    shared = max(1, min(_PART, size // (os.cpu_count() or 1)))
+    room = shared if cpu else int((device.memory_stats() or {})["bytes_limit"] / _NEEDED)
+    part = -(-size // -(-size // room))
+    # Parts of equal size share a program. The last part is filled with the last design.
+    rows = np.minimum(np.arange(-(-size // part) * part), size - 1).reshape(-1, part)
+    parts = [jax.device_put(designs[some], device) for some in rows]
+    many = jax.vmap(lambda design, start: solve(design, start)[:3], (0, None))
+    options = dict(COMPILER_OPTIONS) if cpu else {}
+    lowered = jax.jit(many, compiler_options=options).lower(parts[0], start)
+    began = time.perf_counter()
+    program = lowered.compile()
+    row = {"together": part, "compile_s": time.perf_counter() - began}
+    for threads in (1, os.cpu_count()) if cpu else (1,):
+
+        def in_parts(start, threads=threads):
+            with ThreadPoolExecutor(threads) as pool:
+                done = pool.map(lambda x: jax.device_get(program(x, start)), parts)
+                return jax.tree.map(lambda *x: np.concatenate(x)[:size], *done)
+
+        yield in_parts, row | {"device": f"{device.device_kind}" + f", {threads} threads" * cpu}

@@ -1,13 +1,15 @@
 """Calls into rootsopt's evaluators and models that several studies make."""
 
 import dataclasses
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from experiments._common.scenes import FORCES
+from experiments._common.tables import Row
 from rootsopt.config import Config
 from rootsopt.profiles import Profile
 from rootsopt.response.evaluation import Evaluation, Evaluator
@@ -54,3 +56,24 @@ def objective(evaluation: Evaluation, reference: dict[str, float]) -> float:
     if not evaluation.usable:
         return float("nan")
     return float(np.mean([evaluation.response[key] / reference[key] for key in FORCES]))
+
+
+def numbers_of(evaluation: Evaluation) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return mean and peak force (2,) in N, and their gradients (2, d), NaN if unknown."""
+    unknown = dict.fromkeys(evaluation.design, np.nan)
+    forces = [evaluation.response.get(key, np.nan) for key in FORCES]
+    slopes = [list(evaluation.gradient.get(key, unknown).values()) for key in FORCES]
+    return np.array(forces), np.array(slopes)
+
+
+def errors_of(found: Any, truth: Any) -> Row:
+    """Return the largest relative errors of forces and gradients, over all designs.
+
+    `found`, `truth`: forces (..., 2), and gradients (..., 2, d) or None. The error of a gradient is
+    relative to its largest entry."""
+    (forces, slopes), (force, slope) = found, truth
+    errors = {"value_error": float(np.max(np.abs(np.asarray(forces) / force - 1)))}
+    if slopes is not None:
+        off = np.max(np.abs(np.asarray(slopes) - slope), -1) / np.max(np.abs(slope), -1)
+        errors["gradient_error"] = float(np.max(off))
+    return errors

@@ -19,7 +19,7 @@ from experiments._common.driver import Run
 from experiments._common.scenes import CIC, shipped
 from experiments._common.shooting import closed
 from experiments._common.simulation import evaluator_of
-from experiments._common.style import BLACK, BLUE, VERMILION, grid_below, sheet
+from experiments._common.style import BLACK, BLUE, VERMILION, sheet
 from experiments._common.tables import Row, show
 from experiments._common.timing import processor_time
 from rootsopt.config import load
@@ -151,7 +151,6 @@ def errors(rows: list[Row]) -> Figure:
     right.set_ylim(bottom=0)
     for ax in (left, right):
         ax.invert_xaxis()
-        grid_below(ax)
     figure.suptitle(f"{table[0]['scenes']} random designs and scenes, from rest", fontsize=11)
     return figure
 

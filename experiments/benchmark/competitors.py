@@ -1,84 +1,44 @@
 """The competitors: SciPy and Numba."""
 
 import functools
-import math
-from collections.abc import Callable, Sequence
 from typing import Any
 
-from experiments._common.engines import FD_STEPS, Scene
-from experiments._common.engines.scipy_nodes import NODES_1E3, ScipyNodes
+from experiments._common.engines import Engine, Scene, best_steps, central_differences
+from experiments._common.engines.scipy_nodes import DOP853_1E3, NODES_1E3, ScipyNodes
 from experiments._common.scenes import CIC
+from experiments._common.simulation import errors_of
+from experiments._common.tables import Row
 from experiments._common.timing import first_and_warm, median_time
-from experiments.benchmark.job import (
-    ACCURACY,
-    BASELINE,
-    Job,
-    Row,
-    gradient_error,
-    row,
-    value_error,
-)
+from experiments.benchmark.job import BASELINE, Job, row
 from rootsopt.config import load
 
 
-def tuned(
-    make: Callable[..., Any], settings: Sequence[dict[str, Any]], truth: Any
-) -> tuple[dict[str, Any], Any]:
-    """Choose the fastest of `settings` that is accurate enough at the baseline.
-
-    If no setting is accurate enough, choose the most accurate. Returns the setting and the
-    simulator."""
-    tried = []
-    for one in settings:
-        tool = make(**one)
-        tool.simulate(BASELINE)
-        seconds, found = median_time(lambda tool=tool: tool.simulate(BASELINE), 3)
-        tried.append((value_error(found.response[:2], truth), seconds, one, tool))
-    good = [one for one in tried if one[0] <= ACCURACY]
-    best = min(good, key=lambda one: one[1]) if good else min(tried, key=lambda one: one[0])
-    return best[2], best[3]
-
-
 def competitor_rows(
-    name: str, tool: Any, settings: dict[str, Any], job: Job, more: Row, repeats: int
+    name: str, tool: Engine, settings: dict[str, Any], job: Job, more: Row, repeats: int
 ) -> list[Row]:
     """Time a competitor: forces alone, then forces with gradient. Return the rows."""
-    truth, slope = job.known["forces"][0], job.known["slopes"][0]
-    text = ", ".join(f"{key} {value}" for key, value in settings.items())
-    seconds, found = median_time(lambda: tool.simulate(BASELINE), repeats)
-    off = value_error(found.response[:2], truth)
-    told = f"told to settle {settings.get('settle', 4)} mesh periods; no check"
-    rows = [row(name, "value", seconds, value_error=off, settings=text, note=told, **more)]
-    best: tuple[float, float] | None = None
-    for factor in (1.0, 3.0):
-        steps = [factor * step for step in FD_STEPS]
-        _, slopes = tool.gradient(BASELINE, steps)
-        by = gradient_error(slopes[:2], slope)
-        best = min(best or (math.inf, 0.0), (by, factor))
-    assert best is not None
-    steps = [best[1] * step for step in FD_STEPS]
-    seconds, _ = median_time(lambda: tool.gradient(BASELINE, steps), repeats)
-    told = f"{told}; central differences, steps x {best[1]:g}"
-    shared: Row = {"value_error": off, "gradient_error": best[0], "settings": text, "note": told}
-    rows.append(row(name, "value+gradient", seconds, **shared, **more))
+    forces, slopes = (x[0] for x in job.truth(1))
+    steps, factor = best_steps(tool.forces, BASELINE, slopes)
+    differences = functools.partial(central_differences, tool.forces, BASELINE, steps)
+    rows = []
+    for what, call, note in (
+        ("value", lambda: (tool.forces(BASELINE), None), "no check"),
+        ("value+gradient", differences, f"no check; central differences, steps x {factor:g}"),
+    ):
+        seconds, found = median_time(call, repeats)
+        shared = errors_of(found, (forces, slopes)) | more
+        shared["settings"] = ", ".join(f"{key} {value}" for key, value in settings.items())
+        told = f"told to settle {settings.get('settle', 4)} mesh periods; {note}"
+        rows.append(row(name, what, seconds, note=told, **shared))
     return rows
 
 
 def part_scipy(job: Job) -> dict[str, Any]:
     """Measure part (a): SciPy with LSODA and DOP853."""
-    scene = Scene.of(load(CIC))
-    rows = []
-    choices = {
-        "LSODA": [NODES_1E3],
-        "DOP853": [
-            {"method": "DOP853", "nodes": 800, "rtol": rtol, "settle": 1}
-            for rtol in (1e-3, 3e-4, 1e-4, 1e-5)
-        ],
-    }
-    for method, settings in list(choices.items())[: 1 if job.quick else 2]:
-        used, tool = tuned(functools.partial(ScipyNodes, scene), settings, job.known["forces"][0])
-        name = f"(a) SciPy {method}"
-        rows += competitor_rows(name, tool, used, job, {}, 1 if job.quick else 5)
+    scene, rows = Scene.of(load(CIC)), []
+    for settings in (NODES_1E3,) if job.quick else (NODES_1E3, DOP853_1E3):
+        name, tool = f"(a) SciPy {settings['method']}", ScipyNodes(scene, **settings)
+        rows += competitor_rows(name, tool, settings, job, {}, 1 if job.quick else 5)
     return {"rows": rows}
 
 
@@ -87,7 +47,6 @@ def part_numba(job: Job) -> dict[str, Any]:
 
     The setting whose gradient is accurate to 1e-3 is measured too.
     """
-    from experiments._common.engines import motion_of, rotor_of
     from experiments._common.engines import numba_pair as numba
 
     scene, repeats = Scene.of(load(CIC)), 5 if job.quick else 51
@@ -101,14 +60,11 @@ def part_numba(job: Job) -> dict[str, Any]:
     }
     rows = []
     for name, settings in cases.items():
-        tool, more = numba.NumbaPair(scene, **settings), {}
+        tool = numba.NumbaPair(scene, **settings)
         extra, _, _ = first_and_warm(functools.partial(tool.simulate, BASELINE), 3)
         if tool.contact == "map":
             tool = tool.fitted(BASELINE)
-            rotor = rotor_of(scene, BASELINE)
-            deepest = tool.deepest or -motion_of(scene, 1e-6).angle_limit
-            build = functools.partial(numba.tabulate, rotor, deepest, tool.rolls, tool.relatives)
-            more["build_s"] = median_time(build, 5)[0]
-        more["compile_s"] = extra if "settle" not in name and "gradient" not in name else None
+        compiled_here = "settle" not in name and "gradient" not in name
+        more: Row = {"compile_s": extra} if compiled_here else {}
         rows += competitor_rows(name, tool, settings, job, more, repeats)
     return {"rows": rows}

@@ -1,12 +1,11 @@
 """What all parts of the benchmark share: the scene, required accuracies, rows."""
 
 import dataclasses
-import math
 from typing import Any
 
 import numpy as np
 
-from experiments._common.scenes import FORCES
+from experiments._common.tables import Row
 
 BASELINE = (36.43, 9.0, 4.0)
 
@@ -19,39 +18,23 @@ GRADIENT_ACCURACY = 0.1
 
 # Expected time (s) of all runs of a batch above which the batch is skipped.
 BATCH_SECONDS = 150.0
-Row = dict[str, Any]
 
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-    """Task of a part: its name, whether the run is reduced, a batch size, and earlier findings."""
+    """Task of a part: its name, whether the run is reduced, a batch size, and earlier findings.
+
+    `known`: `forces` (n, 2) in N and `slopes` (n, 2, 3), the reference for some designs, and
+    `batch_setting`."""
 
     part: str
     quick: bool
     size: int
     known: dict[str, Any]
 
-
-def forces_of(response: dict[str, float]) -> list[float]:
-    """Return mean and peak force (N) of a `response`, NaN if unknown."""
-    return [response.get(key, math.nan) for key in FORCES]
-
-
-def slopes_of(gradient: dict[str, dict[str, float]]) -> list[list[float]]:
-    """Return the gradients of mean and peak force (2, 3), NaN if unknown."""
-    return [list(gradient[key].values()) if key in gradient else [math.nan] * 3 for key in FORCES]
-
-
-def value_error(forces: Any, truth: Any) -> float:
-    """Return the largest relative error of mean and peak force."""
-    return float(np.max(np.abs(np.asarray(forces) / np.asarray(truth) - 1)))
-
-
-def gradient_error(slopes: Any, truth: Any) -> float:
-    """Return the largest error of the gradients, relative to the largest entry of each gradient."""
-    slopes, truth = np.asarray(slopes), np.asarray(truth)
-    off = np.abs(slopes - truth).max(axis=-1) / np.abs(truth).max(axis=-1)
-    return float(np.max(off))
+    def truth(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the reference's forces and gradients for the first `count` designs."""
+        return self.known["forces"][:count], self.known["slopes"][:count]
 
 
 def row(tool: str, what: str, seconds: float, **more: Any) -> Row:

@@ -9,7 +9,7 @@ accurate to 1e-3:
 (e) the main job from a cold process, without and with cached programs.
 
 Each part runs in its own process, so that peak memory is measured for each part. This module does
-not load JAX. Build, compile and run are timed separately, and the error reached is listed next to
+not load JAX. Compilation and runs are timed separately, and the error reached is listed next to
 the time.
 """
 
@@ -32,24 +32,15 @@ from matplotlib.ticker import NullFormatter
 
 from experiments._common.driver import NoResultError, Run, start_process
 from experiments._common.scenes import CIC
-from experiments._common.style import BLUE, ORANGE, grid_below, sheet
-from experiments._common.tables import print_record, show
+from experiments._common.style import BLUE, ORANGE, sheet
+from experiments._common.tables import Row, print_record, show
 from experiments._common.timing import MB, peak_memory
-from experiments.benchmark.job import ACCURACY, BATCH_SECONDS, Job, Row, row
+from experiments.benchmark.job import ACCURACY, BATCH_SECONDS, Job, row
 
 SIZES = (16, 256, 1024)
 
 # Parts without rootsopt.
 COMPETITORS = "scipy", "numba"
-
-
-def exponent(points: Sequence[tuple[float, float]]) -> float | None:
-    """Return the exponent of a power law fitted to (size, time); `None` for fewer than two
-    points."""
-    if len(points) < 2:
-        return None
-    x, y = np.log(np.array(points)).T
-    return float(np.polyfit(x, y, 1)[0])
 
 
 def points_of(
@@ -94,8 +85,6 @@ def figure_of(rows: list[Row]) -> Figure:
             axis.set_minor_formatter(NullFormatter())
         if ax.lines:
             ax.legend(fontsize=8)
-    for ax in (bars, turns, batches):
-        grid_below(ax, axis="x" if ax is bars else "both", color="0.9")
     figure.suptitle(f"Shipped CIC scene; mean and peak force to {ACCURACY:g}", fontsize=11)
     return figure
 
@@ -113,14 +102,15 @@ def draw_power(
     """
     if not points:
         return
-    slope = exponent(points)
-    name = label if slope is None else f"{label}: exponent {slope:.2f}"
-    ax.plot(*zip(*points, strict=True), marker=mark, color=color, lw=1.4, label=name)
+    if len(points) > 1:
+        x, y = np.log(np.array(points)).T
+        label += f": exponent {np.polyfit(x, y, 1)[0]:.2f}"
+    ax.plot(*zip(*points, strict=True), marker=mark, color=color, lw=1.4, label=label)
 
 
 # Columns of the table, in order.
 COLUMNS = (
-    *("part", "tool", "what", "designs", "per_design_ms", "run_s", "build_s", "compile_s"),
+    *("part", "tool", "what", "designs", "per_design_ms", "run_s", "compile_s"),
     *("value_error", "gradient_error", "peak_memory_MB", "settings", "note"),
 )
 

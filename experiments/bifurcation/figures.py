@@ -7,7 +7,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter
 
-from experiments._common.style import BLUE, GREEN, ORANGE, VERMILION, grid_below, sheet
+from experiments._common.style import BLUE, GREEN, ORANGE, VERMILION, sheet
 from experiments.bifurcation.study import Diagram, beside, ranges
 from rootsopt.continuation import Bifurcation, Kind
 from rootsopt.status import Status
@@ -59,7 +59,7 @@ def draw_branches(ax, diagram: Diagram, quantity: str, color: str) -> None:
             mfc=face, mew=1.3, zorder=4,
         )  # fmt: skip
     unsettled = chaotic(diagram)
-    height = 0.03 if diagram.family == "cic" else 0.07
+    height = 0.03 if diagram.names["family"] == "cic" else 0.07
     place = {"transform": ax.get_xaxis_transform()}
     ax.plot(unsettled, [height] * len(unsettled), "*", color=color, ms=9, **place)
 
@@ -81,7 +81,7 @@ def chaotic(diagram: Diagram) -> list[float]:
 
 def legend_handles(diagrams: list[Diagram]) -> list:
     """Return legend entries for the content of the diagrams."""
-    families = dict.fromkeys(diagram.family for diagram in diagrams)
+    families = dict.fromkeys(diagram.names["family"] for diagram in diagrams)
     handles: list = [Patch(color=COLORS[name], label=name.upper()) for name in families]
     handles += [
         Line2D([], [], color="black", lw=2.2, label="stable"),
@@ -101,11 +101,11 @@ def legend_handles(diagrams: list[Diagram]) -> list:
 
 def pictures(diagrams: list[Diagram]) -> dict[str, Figure]:
     """Draw all figures. Return them by name: over speed, over other parameters (if any), ranges."""
-    over_speed = [d for d in diagrams if d.parameter == "speed_rpm"]
+    over_speed = [d for d in diagrams if d.names["parameter"] == "speed_rpm"]
     scenes = list(dict.fromkeys(d.scene for d in over_speed))
     columns = [[d for d in over_speed if d.scene == scene] for scene in scenes]
     found = {"speed": draw_grid(columns, [TITLES[scene] for scene in scenes])}
-    others = [[d] for d in diagrams if d.parameter != "speed_rpm"]
+    others = [[d] for d in diagrams if d.names["parameter"] != "speed_rpm"]
     if others:
         found["scene"] = draw_grid(others, ["CIC, shipped scene, 3000 rpm"] * len(others))
     return found | {"ranges": draw_ranges(over_speed)}
@@ -119,20 +119,16 @@ def draw_grid(columns: list[list[Diagram]], titles: list[str]) -> Figure:
         for row, (quantity, name) in enumerate((("peak", "peak"), ("mean", "mean"))):
             ax = axes[row, column]
             for diagram in diagrams:
-                draw_branches(ax, diagram, quantity, COLORS[diagram.family])
+                draw_branches(ax, diagram, quantity, COLORS[diagram.names["family"]])
             ax.set_yscale("log")
-            for which in (ax.yaxis.set_major_formatter, ax.yaxis.set_minor_formatter):
-                which(
-                    FuncFormatter(
-                        lambda value, _: f"{value:g}" if f"{value:.0e}"[0] in "1235" else ""
-                    )
-                )
+            few = FuncFormatter(lambda x, _: f"{x:g}" if f"{x:.0e}"[0] in "1235" else "")
+            ax.yaxis.set(major_formatter=few, minor_formatter=few)
             ax.set_xlim(diagrams[0].low, diagrams[0].high)
             ax.grid(color="0.92", linewidth=0.6, which="both")
             if column == 0:
                 ax.set_ylabel(f"{name} contact force (N)")
         axes[0, column].set_title(title)
-        axes[1, column].set_xlabel(NAMES[diagrams[0].parameter])
+        axes[1, column].set_xlabel(NAMES[diagrams[0].names["parameter"]])
     handles = legend_handles([diagram for diagrams in columns for diagram in diagrams])
     figure.legend(handles=handles, loc="outside lower center", ncols=3 * count, frameon=False)
     return figure
@@ -158,11 +154,12 @@ def draw_ranges(diagrams: list[Diagram]) -> Figure:
             ax.broken_barh(
                 bars, (line - shift - 0.15, 0.3), facecolor=color, hatch=hatch, edgecolor="white"
             )
-    ax.set_yticks(range(len(diagrams)), [f"{d.family.upper()}, {d.scene}" for d in diagrams])
+    ax.set_yticks(
+        range(len(diagrams)), [f"{d.names['family'].upper()}, {d.scene}" for d in diagrams]
+    )
     ax.invert_yaxis()
     ax.set_xlim(lowest, diagrams[0].high)
-    ax.set_xlabel(NAMES[diagrams[0].parameter])
-    grid_below(ax, color="0.9", axis="x", linewidth=0.8)
+    ax.set_xlabel(NAMES[diagrams[0].names["parameter"]])
     handles = [
         Patch(facecolor=color, hatch=hatch, edgecolor="white", label=f"a stable {name} orbit")
         for name, (color, hatch, _) in styles.items()

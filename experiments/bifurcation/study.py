@@ -16,11 +16,11 @@ import numpy as np
 from experiments._common.driver import Run
 from experiments._common.scenes import shipped
 from experiments._common.simulation import evaluator_of
+from experiments._common.tables import Row
 from rootsopt.config import Config
 from rootsopt.continuation import Branch, End, Kind, StepSizes, follow, follow_doubled
 from rootsopt.errors import InputError
 
-Row = dict[str, Any]
 Say = Callable[[str], None]
 
 # Scaled initial states (ε, dε/dt) tried at every value of the parameter.
@@ -51,32 +51,12 @@ CELLS = 570
 
 @dataclasses.dataclass
 class Diagram:
-    """Branches of one pair in one scene over one parameter.
+    """Branches of one pair in one scene over one parameter, and what they are found from.
 
-    `key`: dotted key of the parameter; `seeds`: (value of the parameter, status) of each simulation
-    that searched for orbits.
-    """
-
-    scene: str
-    family: str
-    key: str
-    low: float
-    high: float
-    branches: list[Branch]
-    seeds: list[tuple[float, str]]
-
-    @property
-    def parameter(self) -> str:
-        """Name of the parameter: the last part of its key."""
-        return self.key.rpartition(".")[2]
-
-
-@dataclasses.dataclass(frozen=True)
-class Plan:
-    """Plan of a diagram: a pair in a scene, the dotted key of a parameter and its range.
-
-    Further fields: number of parameter values at which simulations start, and scaled initial states
-    tried at each value.
+    `scene`: its name; `key`: dotted key of the parameter, from `low` to `high`; `values`: number of
+    values of the parameter at which simulations begin; `starts`: scaled initial states tried at
+    each value; `branches`: those followed; `seeds`: (value of the parameter, status) of each
+    simulation that searched for orbits.
     """
 
     scene: str
@@ -84,12 +64,24 @@ class Plan:
     key: str
     low: float
     high: float
-    seeds: int
+    values: int
     starts: tuple[tuple[float, float], ...]
+    branches: list[Branch] = dataclasses.field(default_factory=list)
+    seeds: list[tuple[float, str]] = dataclasses.field(default_factory=list)
+
+    @property
+    def names(self) -> Row:
+        """Names of scene, family and parameter: the last part of its key."""
+        parameter = self.key.rpartition(".")[2]
+        return {
+            "scene": self.scene,
+            "family": self.config.profile.family,
+            "parameter": parameter,
+        }
 
 
-def plans(quick: bool) -> list[Plan]:
-    """Return the plans of all diagrams of a full or reduced run."""
+def plans(quick: bool) -> list[Diagram]:
+    """Return all diagrams of a full or reduced run, still empty."""
     configs = {
         (scene, family): shipped(family, *overrides)
         for scene, overrides in SCENES.items()
@@ -97,28 +89,26 @@ def plans(quick: bool) -> list[Plan]:
     }
     if quick:
         config = configs["livelier", "cic"]
-        return [Plan("livelier", config, SPEED, 3500, 4500, 1, STARTS[1:2])]
+        return [Diagram("livelier", config, SPEED, 3500, 4500, 1, STARTS[1:2])]
     cic = configs["shipped", "cic"]
     return [
         *(
-            Plan(scene, config, SPEED, SLOWEST[scene], 6000, 6, STARTS[:3])
+            Diagram(scene, config, SPEED, SLOWEST[scene], 6000, 6, STARTS[:3])
             for (scene, _), config in configs.items()
         ),
-        Plan("shipped", cic, TORQUE, 0.5, 10.0, 2, STARTS[:2]),
-        Plan("shipped", cic, "scene.timing_gear.backlash_mm", 0.02, 0.4, 4, STARTS[:2]),
-        Plan("shipped", cic, "profile.involute_length_mm", 1.0, 9.0, 2, STARTS[:2]),
+        Diagram("shipped", cic, TORQUE, 0.5, 10.0, 2, STARTS[:2]),
+        Diagram("shipped", cic, "scene.timing_gear.backlash_mm", 0.02, 0.4, 4, STARTS[:2]),
+        Diagram("shipped", cic, "profile.involute_length_mm", 1.0, 9.0, 2, STARTS[:2]),
     ]
 
 
-def explore(plan: Plan, say: Say) -> Diagram:
-    """Simulate from all starts of a plan, and follow every orbit found. Return the diagram."""
-    config, low, high = plan.config, plan.low, plan.high
-    diagram = Diagram(plan.scene, config.profile.family, plan.key, low, high, [], [])
-    for value in np.linspace(low, high, plan.seeds + 2)[1:-1]:
-        here = config.moved({plan.key: float(value)})
+def explore(diagram: Diagram, say: Say) -> None:
+    """Simulate from all starts of a diagram, and add the branch of every orbit found."""
+    for value in np.linspace(diagram.low, diagram.high, diagram.values + 2)[1:-1]:
+        here = diagram.config.moved({diagram.key: float(value)})
         patient, hasty = evaluator_of(here), evaluator_of(here, give_up_early=True)
         found: list[tuple[float, float]] = []
-        for number, start in enumerate(plan.starts):
+        for number, start in enumerate(diagram.starts):
             # A chaotic motion takes long to recognise, and one start is enough for that.
             evaluator = hasty if number else patient
             evaluation = evaluator(start=np.array(start), series=False)
@@ -131,7 +121,6 @@ def explore(plan: Plan, say: Say) -> Diagram:
             found.append(forces)
             period = evaluation.steady_state["period"]
             follow_on(diagram, (here, float(value)), evaluation.state, period, forces, say)
-    return diagram
 
 
 def follow_on(
@@ -203,7 +192,7 @@ def described(diagram: Diagram, branch: Branch) -> str:
     ends = " and ".join(end.name.lower().replace("_", " ") for end in branch.ends)
     values = [point.value for point in branch.points]
     return (
-        f"{diagram.scene} {diagram.family} {diagram.parameter}: period {branch.family.period}, "
+        f"{' '.join(diagram.names.values())}: period {branch.family.period}, "
         f"{len(values)} points in {min(values):.5g} … {max(values):.5g}, "
         f"{len(branch.bifurcations)} special, ends: {ends}"
     )
@@ -270,9 +259,8 @@ def special_rows(diagrams: list[Diagram]) -> list[Row]:
 def branches_of(diagrams: list[Diagram]) -> Iterator[tuple[Row, Branch]]:
     """Yield (columns that identify the branch, branch) for every branch."""
     for diagram in diagrams:
-        keys = {name: getattr(diagram, name) for name in ("scene", "family", "parameter")}
         for number, branch in enumerate(diagram.branches):
-            yield keys | {"branch": number}, branch
+            yield diagram.names | {"branch": number}, branch
 
 
 def orbit_row(point) -> Row:
@@ -297,10 +285,8 @@ def summary(diagrams: list[Diagram]) -> dict[str, Any]:
     return {
         "quiet_up_to_static_forces": QUIET,
         "diagrams": [
-            {
-                "scene": diagram.scene,
-                "family": diagram.family,
-                "parameter": diagram.parameter,
+            diagram.names
+            | {
                 "range": [diagram.low, diagram.high],
                 "stable": ranges(diagram),
                 "branches": [
@@ -326,12 +312,12 @@ def run(job: Run) -> None:
     from experiments.bifurcation import figures
 
     diagrams: list[Diagram] = []
-    for plan in plans(job.quick):
-        last = explore(plan, job.say)
-        diagrams.append(last)
+    for diagram in plans(job.quick):
+        explore(diagram, job.say)
+        diagrams.append(diagram)
         job.csv("bifurcation.csv", point_rows(diagrams))
         job.csv("special_points.csv", special_rows(diagrams))
         job.json("bifurcation.json", summary(diagrams))
         for name, figure in figures.pictures(diagrams).items():
             job.figure(f"bifurcation_{name}.png", figure)
-        print(f"{last.scene} {last.family} {last.parameter}: {ranges(last)}", flush=True)
+        print(f"{' '.join(diagram.names.values())}: {ranges(diagram)}", flush=True)

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 from experiments._common.driver import NoResultError, Run
 from experiments._common.scenes import shipped
-from experiments._common.style import BLACK, BLUE, GREEN, PURPLE, VERMILION, grid_below, sheet
+from experiments._common.style import BLACK, BLUE, GREEN, PURPLE, VERMILION, sheet
 from experiments._common.tables import print_record
 from rootsopt.config import Config
 from rootsopt.dynamics.flow import one_period
@@ -269,8 +269,6 @@ def panels(problem: Problem, result: Optimization, tables: dict[str, Rows]) -> F
     derivatives(b, tables["pathwise"], tables["gradients"])
     optimisation(c, problem, result)
     standard_errors(d, tables["members"], tables["gradients"])
-    for ax in axes.flat:
-        grid_below(ax)
     return figure
 
 

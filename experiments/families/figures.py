@@ -16,7 +16,6 @@ from experiments._common.style import (
     PURPLE,
     SKY,
     VERMILION,
-    grid_below,
     sheet,
 )
 from experiments.families.study import HOUSINGS, Row, by_study, title
@@ -60,7 +59,6 @@ def ranking_figure(data: dict[str, Any]) -> Figure:
         ax.invert_yaxis()
         ax.set(xlabel="force / reference's", title=title(name, reference))
         ax.title.set_size(10)
-        grid_below(ax, axis="x", color="0.9")
     lines = (
         ("o", BLUE, BLUE, "mean force"),
         ("^", VERMILION, VERMILION, "peak force"),
@@ -135,24 +133,24 @@ def overview() -> Figure:
 
 def _rotor(ax, profile: Profile, colors: dict[str, str]) -> None:
     """Draw a rotor with a lobe tip upwards; `colors` gets an entry for each new kind of piece."""
-    upwards = np.array([[0.0, 1.0], [-1.0, 0.0]])
-    points = np.asarray(outline(profile)) / MM @ upwards
-    ax.fill(*points.T, facecolor="0.9", edgecolor=BLACK, linewidth=0.8)
+    points = np.asarray(outline(profile)) / MM @ [1j, -1]
+    ax.fill(points.real, points.imag, facecolor="0.9", edgecolor=BLACK, linewidth=0.8)
     for piece in profile.segments():
         if not piece.stop > piece.start:
             continue
         color = BLACK if piece.land else _COLORS[len(colors) % len(_COLORS)]
         color = colors.setdefault("land about the axis" if piece.land else piece.name, color)
         nu = jnp.linspace(piece.start, piece.stop, _POINTS)
-        arc = np.asarray(profile.position(profile.addendum(nu))) / MM
-        dot = np.ptp(arc, axis=0).max() < 1.0
+        arc = np.asarray(profile.position(profile.addendum(nu))) / MM @ [1, 1j]
+        look = {
+            "linewidth": 2.5,
+            "marker": "o" if np.ptp([arc.real, arc.imag], 1).max() < 1 else "",
+            "markersize": 4,
+        }
         for turn in 2 * np.pi * np.arange(LOBES) / LOBES:
-            spin = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
-            for side in (1, -1):
-                line = (arc * [1, side]) @ spin @ upwards
-                ax.plot(
-                    *line.T, color=color, linewidth=2.5, marker="o" if dot else "", markersize=4
-                )
+            for side in (arc, arc.conj()):
+                line = side * np.exp(1j * turn) * 1j
+                ax.plot(line.real, line.imag, color=color, **look)
     angle = np.linspace(0, 2 * np.pi, 181)
     ax.plot(RADIUS_MM * np.cos(angle), RADIUS_MM * np.sin(angle), "--", color=GREY, linewidth=0.9)
     ax.plot(0, 0, "+", color=BLACK)

@@ -17,7 +17,6 @@ from concurrent.futures import ProcessPoolExecutor
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from experiments._common.driver import Run, start_process
 from experiments._common.scenes import FORCES
@@ -86,12 +85,7 @@ def optimised(config: Config, reference: dict[str, float]) -> Config:
     if not start.usable:
         return config
     best = Search(weighed(config, start.response, reference)).run().optimized
-    return config if best is None else with_values(config, list(best.design.values()))
-
-
-def with_values(config: Config, design: ArrayLike) -> Config:
-    """Return `config` with another `design` (d,), in config units."""
-    return config.with_design(np.asarray(design, float))
+    return config if best is None else config.with_design([*best.design.values()])
 
 
 def placed(
@@ -112,7 +106,7 @@ def placed(
     there = found.points[found.efficiencies >= least]
     places = np.unique(np.linspace(0, len(there) - 1, 1 if quick else TRIED).astype(int))
     problem = problem_of(config)
-    tried = [with_values(config, problem.design(there[k])) for k in places]
+    tried = [config.with_design(np.asarray(problem.design(there[k]))) for k in places]
     marks = [objective(evaluate(one), reference.response) for one in tried]
     return tried[int(np.argmin(np.nan_to_num(marks, nan=np.inf)))], reached
 
@@ -233,52 +227,13 @@ def title(name: str, reference: Row) -> str:
     )
 
 
-def print_tables(data: dict[str, Any]) -> None:
-    """Print the ranking for each housing, and designs with their forces in further scenes."""
-    for name, rows in by_study(data).items():
-        forces = "{mean_force_N:.2f} N mean, {peak_force_N:.1f} N peak"
-        reference = data["references"][name]
-        said = forces.format(**reference["response"])
-        ranked = sum(row["reached"] and not np.isnan(row["objective"]) for row in rows)
-        show(
-            f"### {title(name, reference)}; the reference has {said}",
-            [
-                {
-                    "": str(place) if place <= ranked else "-",
-                    "family": f"`{row['family']}`",
-                    "objective": row["status"]
-                    if np.isnan(row["objective"])
-                    else f"{row['objective']:.4f}",
-                    "forces": forces.format(**row),
-                    "area efficiency": f"{row['area_efficiency']:.4f}",
-                    "reachable": "{:.4f} to {:.4f}".format(
-                        *(row.get(f"{end}_efficiency", np.nan) for end in ("least", "most"))
-                    ),
-                    "seal, mm": f"{row['seal_width_mm']:.2f}",
-                    "undercut margin, mm": f"{row['undercut_margin_mm']:.2f}",
-                }
-                for place, row in enumerate(rows, 1)
-            ],
-        )
-        show(
-            "Designs, and their forces in further scenes",
-            [
-                {"family": f"`{row['family']}`", "design": _design_text(row)}
-                | {scene: f"{_forces_text(row, scene)}" for scene in SCENES}
-                for row in rows
-            ],
-        )
-
-
-def _design_text(row: Row) -> str:
-    if row["family"] == "free_form":
-        return f"started at `{row['begun_at']}`, {row['departure_um']:.0f} µm from it"
-    return ", ".join(f"{key} {value:.4g}" for key, value in row["design"].items()) or "(none)"
-
-
-def _forces_text(row: Row, scene: str) -> str:
-    mean, peak = (row[f"{scene}: {key}"] for key in FORCES)
-    return f"{mean:.2f}, {peak:.1f} N, {row[f'{scene}: status']}"
+# Columns of the printed tables.
+SHOWN = (
+    *("family", "objective", "status", *FORCES),
+    *(f"{scene}: {key}" for scene in SCENES for key in (*FORCES, "status")),
+    *("area_efficiency", "least_efficiency", "most_efficiency", "reached"),
+    *("seal_width_mm", "undercut_margin_mm", "begun_at", "departure_um"),
+)
 
 
 def run(job: Run) -> None:
@@ -318,4 +273,5 @@ def run(job: Run) -> None:
     job.figure("families.png", figures.ranking_figure(data))
     job.figure("families_profiles.png", figures.profiles_figure(data))
     job.figure("overview.png", figures.overview())
-    print_tables(data)
+    for name, ranked in by_study(data).items():
+        show(f"### {title(name, references[name])}", ranked, SHOWN)

@@ -11,36 +11,16 @@ from matplotlib.figure import Figure
 from experiments._common.driver import NoResultError, Run
 from experiments._common.scenes import CIC, shipped
 from experiments._common.simulation import evaluate, objective, profile_of
-from experiments._common.style import BLUE, grid_below, sheet
+from experiments._common.style import BLUE, sheet
 from experiments._common.tables import print_record, show
 from rootsopt.config import load
 from rootsopt.optimize.search import Search
-from rootsopt.profiles import Profile
+from rootsopt.profiles import Profile, outline
 from rootsopt.profiles.departure import departure, flank_points
 from rootsopt.scene.resemblance import likenesses
+from rootsopt.view.figures.designs import plot_departure
 
 MM, UM = 1e-3, 1e-6
-
-
-def signed_departures(profile: Profile, other: Profile) -> tuple[np.ndarray, np.ndarray]:
-    """Measure how far the flank of `profile` departs from the flank of `other`.
-
-    Returns radii (n,) in mm of points on the flank of `other`, and signed distances (n,) in µm from
-    these points along the normal. A distance is NaN if the normal does not meet `profile`.
-    """
-    points = flank_points(other) / MM @ [1, 1j]
-    line = flank_points(profile) / MM @ [1, 1j]
-    along = np.gradient(points)
-    normal = -1j * along / np.abs(along)
-    away = np.full(len(points), np.nan)
-    for k, (place, outward) in enumerate(zip(points, normal, strict=True)):
-        local = (line - place) * np.conj(outward)
-        cross = np.flatnonzero((local.imag[:-1] <= 0) != (local.imag[1:] <= 0))
-        if len(cross):
-            share = local.imag[cross] / (local.imag[cross] - local.imag[cross + 1])
-            height = local.real[cross] + share * (local.real[cross + 1] - local.real[cross])
-            away[k] = height[np.argmin(np.abs(height))] * MM / UM
-    return np.abs(points), away
 
 
 def comparison(start: Profile, found: Profile) -> Figure:
@@ -54,24 +34,13 @@ def comparison(start: Profile, found: Profile) -> Figure:
         axes[0, 0].plot(*(flank_points(profile) / MM).T, **line)
         axes[0, 1].plot(np.degrees(point.beta), np.degrees(point.psi), **line)
         axes[1, 0].plot(np.degrees(nu), 1 - np.asarray(profile.roll_rate(nu)), **line)
-    away = signed_departures(found, start)
-    axes[1, 1].plot(*away, color=BLUE, linewidth=1.8)
-    axes[1, 1].axhline(0, color="black", linewidth=0.9, linestyle="--")
-    pitch = float(start.pitch_radius) / MM
-    axes[1, 1].axvline(pitch, color="0.5", linewidth=0.9, linestyle=":")
-    axes[1, 1].annotate(
-        "pitch circle", (pitch, 0.02), (3, 0), xycoords=("data", "axes fraction"),
-        textcoords="offset points", fontsize=9,
-    )  # fmt: skip
+    before, after = (np.asarray(outline(one)) / MM for one in (start, found))
+    plot_departure(axes[1, 1], before, after, start.lobes, float(start.pitch_radius) / MM)
     axes[0, 0].set(xlabel="x (mm)", ylabel="y (mm)", title="Flank, tip to root", aspect="equal")
     axes[0, 1].set(xlabel="roll angle β (°)", ylabel="pressure angle ψ (°)", ylim=(0, 95))
     axes[0, 1].set_title("Pressure angle")
     axes[1, 0].set(xlabel="normal angle ν (°)", ylabel="share τ = -dψ/dν")
     axes[1, 0].set_title("The share τ that the coefficients set")
-    axes[1, 1].set(xlabel="radius (mm)", ylabel="normal distance (µm)")
-    axes[1, 1].set_title("Departure from the best CIC, positive outwards")
-    for ax in axes.ravel():
-        grid_below(ax)
     handles, names = axes[0, 0].get_legend_handles_labels()
     made.legend(handles, names, loc="outside lower center", ncols=2, frameon=False)
     return made

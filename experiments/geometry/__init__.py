@@ -1,7 +1,7 @@
 """How exact are area and inertia of every profile family?
 
 Writes geometry.csv (a row per family and number of lobes, with the largest relative errors and the
-design that has them) and geometry.png.
+design that has them).
 """
 
 from experiments._common.driver import Study

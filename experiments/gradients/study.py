@@ -248,8 +248,6 @@ def errors_of(rows: Sequence[Row]) -> Figure:
         ylim=(0, 100),
     )
     right.legend(fontsize=8)
-    for ax in (left, right):
-        ax.grid(alpha=0.3)
     return picture
 
 

@@ -16,7 +16,7 @@ from experiments._common.driver import Run
 from experiments._common.polygons import signed_distance
 from experiments._common.scenes import CIC
 from experiments._common.simulation import evaluate, profile_of
-from experiments._common.style import BLUE, GREY, grid_below, sheet
+from experiments._common.style import BLUE, GREY, sheet
 from experiments._common.tables import print_record
 from rootsopt.config import Config, load
 from rootsopt.measured.conjugacy import conjugacy, gaps_um
@@ -85,7 +85,6 @@ def deviations(design: Profile, profile: Profile, points: np.ndarray, gaps: Any)
         xycoords=("data", "axes fraction"), textcoords="offset points", fontsize=9,
     )  # fmt: skip
     left.set(xlabel="radius (mm)", ylabel="deviation, outwards (µm)", title="From the design")
-    grid_below(left)
     left.legend(frameon=False, loc="upper left")
     plot_conjugacy(right, {name: gaps_um(one) for name, one in gaps.items()})
     right.legend(frameon=False)

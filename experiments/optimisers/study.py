@@ -28,7 +28,7 @@ from rootsopt.optimize.local import FEASIBLE, Linearization, Look, certify
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.sqp import EndError, Stops, descend
 from rootsopt.response.evaluation import Evaluator
-from rootsopt.view.figures.style import COLORS, DASHES, figure
+from rootsopt.view.figures.style import figure, looks
 
 # Distance of the objective from the optimum below which a method has reached the optimum.
 REACHED = 1e-6
@@ -211,8 +211,7 @@ def moving_asymptotes(problem: Epigraph, stops: Stops) -> None:
 
     def value(z, slope):
         found, gradient = problem.value(z)
-        if slope.size:
-            slope[:] = gradient
+        slope[: slope.size] = gradient[: slope.size]
         return found
 
     def limits(result, z, slope):
@@ -246,8 +245,7 @@ class Recorder:
         self.problem = Problem.of(self.config, evaluator.scene, baseline)
         self.baseline = baseline
         self.evaluator = evaluator.relative_to(baseline).surveying().with_maxima()
-        point = self.problem.point(list(baseline.design.values()))
-        self.start = self.problem.project(point)
+        self.start = self.problem.project(self.problem.point([*baseline.design.values()]))
         self.reset()
 
     def reset(self) -> None:
@@ -302,8 +300,13 @@ def _met(row: dict[str, Any]) -> bool:
     return bool(np.isfinite(row["objective"]) and row["violation"] <= FEASIBLE)
 
 
-# Names of methods in the legend; others are written as words.
-_NAMES = {"slsqp": "SQP (default)", "mma": "MMA"}
+# Names of the methods in the legend.
+_NAMES = {
+    "slsqp": "SQP (default)",
+    "augmented_lagrangian": "augmented Lagrangian",
+    "interior_point": "interior point",
+    "mma": "MMA",
+}
 
 
 def solved(rows: list[dict[str, Any]]) -> Figure:
@@ -313,19 +316,16 @@ def solved(rows: list[dict[str, Any]]) -> Figure:
     made, axes = figure(6.5, 3.6)
     ax = axes[0, 0]
     problems = len({row["problem"] for row in rows})
-    styles = zip(dict.fromkeys(row["method"] for row in rows), COLORS, DASHES, strict=False)
-    for method, color, dashes in styles:
+    methods = dict.fromkeys(row["method"] for row in rows)
+    for method, look in zip(methods, looks(_NAMES[method] for method in methods), strict=True):
         own = [row["evaluations"] for row in rows if row["method"] == method]
         counts = np.sort([count for count in own if count is not None])
         number = np.arange(len(counts) + 1)
         x = np.concatenate([[0], counts, [EVALUATIONS]])
-        name = _NAMES.get(method, method.replace("_", " ").replace("lagrangian", "Lagrangian"))
         y = np.append(number, number[-1])
-        ax.step(x, y, where="post", label=name, color=color, linestyle=dashes)
-    ax.set_xlabel("designs simulated")
+        ax.step(x, y, where="post", **look)
+    ax.set(xlim=(0, EVALUATIONS), ylim=(0, problems + 0.3), xlabel="designs simulated")
     ax.set_ylabel(f"problems solved to 1e-6, of {problems}")
-    ax.set_ylim(0, problems + 0.3)
-    ax.set_xlim(0, EVALUATIONS)
     ax.legend(frameon=False, loc="center right")
     return made
 

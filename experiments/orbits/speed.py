@@ -8,21 +8,20 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
+from experiments._common.batch import compiled, rest_of, solver_of
 from experiments._common.driver import NoResultError
-from experiments._common.engines import FD_STEPS
 from experiments._common.engines import Scene as PlainScene
+from experiments._common.engines import best_steps, central_differences
 from experiments._common.engines.scipy_nodes import NODES_1E3, ScipyNodes
 from experiments._common.scenes import CIC
+from experiments._common.simulation import errors_of, numbers_of
+from experiments._common.tables import Row
 from experiments._common.timing import processor_time
-from rootsopt import COMPILER_OPTIONS, Scene, steady_response
-from rootsopt.config import load
+from rootsopt import Scene
+from rootsopt.config import Config, load
 from rootsopt.response.evaluation import Evaluator
-
-Row = dict[str, Any]
 
 # Relative difference between the parameters of a design and those of its neighbour.
 AWAY = 2e-3
@@ -31,22 +30,8 @@ AWAY = 2e-3
 EXACT = 1e-10
 
 
-def _numbers(evaluation) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and peak force (N), and their gradients (2, d)."""
-    names = "mean_force_N", "peak_force_N"
-    forces = np.array([evaluation.response[name] for name in names])
-    return forces, np.array([list(evaluation.gradient[name].values()) for name in names])
-
-
 def _row(tool: str, seconds: float, found: Any, truth: Any) -> Row:
-    forces, slopes = (np.asarray(x)[:2] for x in found)
-    apart = np.max(np.abs(slopes - truth[1]), axis=1) / np.max(np.abs(truth[1]), axis=1)
-    return {
-        "tool": tool,
-        "ms": 1e3 * seconds,
-        "force_error": float(np.max(np.abs(forces / truth[0] - 1))),
-        "gradient_error": float(np.max(apart)),
-    }
+    return {"tool": tool, "ms": 1e3 * seconds} | errors_of(found, truth)
 
 
 def rows_of(repeats: int, say: Callable[[str], None] = lambda text: None) -> list[Row]:
@@ -63,54 +48,25 @@ def rows_of(repeats: int, say: Callable[[str], None] = lambda text: None) -> lis
     exact = own.at_tolerance(EXACT)(design, series=False)
     if not (neighbour.usable and exact.usable):
         raise NoResultError(f"no orbit: {neighbour.status.label}, {exact.status.label}")
-    truth = _numbers(exact)
-    rows = _public(config, (base, design), truth, repeats)
+    truth = numbers_of(exact)
+    machine = Scene.from_config(config)
+    solve, rest = compiled(solver_of(machine)), rest_of(machine, base)
+    rows = []
+    for tool, start in (("neighbour", solve(base, rest)[3]), ("from rest", rest)):
+        call = functools.partial(solve, design, start)
+        seconds, found = processor_time(call, repeats)
+        rows.append(_row(tool, seconds, found[:2], truth))
     for tool, start in (("neighbour", neighbour.start), ("from rest", None)):
         say(f"evaluate, {tool}")
         call = functools.partial(own, design, start=start, series=False)
         seconds, found = processor_time(call, repeats)
-        rows.append(_row(f"evaluate, {tool}", seconds, _numbers(found), truth))
+        rows.append(_row(f"evaluate, {tool}", seconds, numbers_of(found), truth))
     return rows + _competitors(config, design, truth, repeats, say)
 
 
-def solver_of(machine: Scene) -> Callable[..., Any]:
-    """Return the function (design, start) -> mean and peak (N), their gradients, next start,
-    status."""
-
-    def solve(design, start):
-        def forces(design):
-            found = steady_response(machine, design, start)
-            values = jnp.stack([found.mean, found.peak])
-            return values, (values, found.start, found.status)
-
-        slopes, (values, begin, status) = jax.jacfwd(forces, has_aux=True)(design)
-        return values, slopes, begin, status
-
-    return solve
-
-
-def rest_of(machine: Scene, design: Any) -> Any:
-    """Return a start at rest, in the form of `Response.start`."""
-    start = jax.eval_shape(lambda: steady_response(machine, design).start)
-    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), start)
-
-
-def _public(config: Any, designs: Any, truth: Any, repeats: int) -> list[Row]:
-    """Measure `steady_response` under `jax.jit`, from a neighbour's orbit and from rest."""
-    machine, (base, design) = Scene.from_config(config), designs
-    solve = jax.jit(solver_of(machine), compiler_options=dict(COMPILER_OPTIONS))
-    rest = rest_of(machine, base)
-    known = solve(base, rest)[2]
-    rows = []
-    for tool, start in (("neighbour", known), ("from rest", rest)):
-        seconds, found = processor_time(
-            lambda start=start: jax.block_until_ready(solve(design, start)), repeats
-        )
-        rows.append(_row(tool, seconds, found[:2], truth))
-    return rows
-
-
-def _competitors(config: Any, design, truth, repeats: int, say: Callable[[str], None]) -> list[Row]:
+def _competitors(
+    config: Config, design: Any, truth: Any, repeats: int, say: Callable[[str], None]
+) -> list[Row]:
     """Measure SciPy and Numba with central differences."""
     from experiments._common.engines import numba_pair as numba
 
@@ -123,17 +79,8 @@ def _competitors(config: Any, design, truth, repeats: int, say: Callable[[str], 
     rows = []
     for name, tool in tools.items():
         say(name)
-        best: Row | None = None
-        for factor in (1.0, 3.0):
-            steps = [factor * step for step in FD_STEPS]
-            count = max(1, repeats // 10) if "SciPy" in name else repeats
-            seconds, (_, slopes) = processor_time(
-                lambda tool=tool, steps=steps: tool.gradient(tuple(design), steps), count
-            )
-            forces = tool.simulate(tuple(design)).response
-            row = _row(name, seconds, (forces, slopes), truth)
-            if best is None or row["gradient_error"] < best["gradient_error"]:
-                best = row
-        assert best is not None
-        rows.append(best)
+        steps, _ = best_steps(tool.forces, design, truth[1])
+        call = functools.partial(central_differences, tool.forces, design, steps)
+        count = max(1, repeats // 10) if "SciPy" in name else repeats
+        rows.append(_row(name, *processor_time(call, count), truth))
     return rows

@@ -272,4 +272,4 @@ def batched(job: Run) -> bool:
         rows.append(row)
         job.csv("batches.csv", rows)
     show("Batches of designs", rows)
-    return all(row["force_difference"] <= AGREE for row in rows)
+    return all(row["value_error"] <= AGREE for row in rows)

@@ -3,7 +3,7 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments._common.style import COLORS, grid_below, sheet
+from experiments._common.style import COLORS, sheet
 from experiments.paper.scene import FAMILIES, PAPER, QUANTITIES, Response, config_of
 from experiments.paper.study import Row
 from rootsopt.view.figures.force import plot_force, plot_spectrum
@@ -49,7 +49,6 @@ def uniqueness_figure(alone: list[Row], solved: list[Row]) -> Figure:
             xlabel="change of the quantity (%)", title=title, yscale="log", ylim=(LOWEST, HIGHEST)
         )
         ax.yaxis.set_major_formatter("{x:g}")
-        grid_below(ax)
     axes[0, 0].set_ylabel("largest error of the four forces (%)")
     axes[0, -1].legend(loc="upper left", bbox_to_anchor=(1.01, 1), frameon=False)
     return made

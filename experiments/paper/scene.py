@@ -1,31 +1,21 @@
 """The quantities that the paper does not state, as numbers to search and differentiate.
 
-`QUANTITIES` names them with plausible ranges. `Pairs` computes from their values the four forces of
-the paper's section 4, with derivatives on periodic orbits. `polished` uses these derivatives to
+`QUANTITIES` names them with plausible ranges. `respond` computes from their values the four forces
+of the paper's section 4, with derivatives on periodic orbits. `polished` uses these derivatives to
 solve for values that reproduce the paper's forces.
 """
 
 import dataclasses
-import functools
 from collections.abc import Sequence
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 from numpy.typing import ArrayLike, NDArray
 
 from experiments._common.scenes import FORCES, shipped
 from experiments._common.simulation import evaluator_of
 from rootsopt.config import Config
-from rootsopt.config.units import MM
-from rootsopt.dynamics.closed import Start, steady_motion
-from rootsopt.dynamics.orbit import Orbit
-from rootsopt.dynamics.pair import RotorPair
 from rootsopt.response.evaluation import Evaluation, Evaluator
-from rootsopt.runtime.programs import CachedFunction
-from rootsopt.scene import Scene, design_vector
+from rootsopt.response.sensitivity import by_scene
 from rootsopt.status import Status
 
 
@@ -66,20 +56,16 @@ def config_of(family: str, values: ArrayLike | None = None, *overrides: str) -> 
     """Load the shipped config of a pair, with other `values` (p,) of the quantities (config units).
 
     `overrides`: further changes, each `dotted.key=value`."""
-    at: list[str] = []
-    if values is not None:
-        numbers = np.asarray(values, float).tolist()
-        at = [f"{q.key}={value!r}" for q, value in zip(QUANTITIES, numbers, strict=True)]
-    return shipped(f"paper_{family}", *at, *overrides)
+    config = shipped(f"paper_{family}", *overrides)
+    if values is None:
+        return config
+    keys = [quantity.key for quantity in QUANTITIES]
+    return config.replaced(dict(zip(keys, np.asarray(values, float).tolist(), strict=True)))
 
 
 def values_of(config: Config) -> NDArray[np.float64]:
     """Read the values (p,) of the quantities from a config, in its units."""
-
-    def found(key: str) -> float:
-        return float(functools.reduce(getattr, key.split("."), config))  # pyright: ignore[reportArgumentType]
-
-    return np.array([found(quantity.key) for quantity in QUANTITIES])
+    return np.array([config.value(quantity.key) for quantity in QUANTITIES], float)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,79 +105,38 @@ class Response:
         return all(one.status is Status.PERIODIC for one in self.evaluations)
 
 
-class Pairs:
-    """Evaluates both pairs for values of the quantities, with shared compiled programs.
+def respond(
+    values: ArrayLike, slopes: bool = True, series: bool = False, give_up_early: bool = True
+) -> Response:
+    """Simulate both pairs from rest with `values` (p,) in config units.
 
-    `give_up_early`: whether to give up a motion that settles late.
-    """
-
-    def __init__(self, give_up_early: bool = False):
-        self.give_up_early = give_up_early
-
-    def __call__(
-        self,
-        values: ArrayLike,
-        slopes: bool = True,
-        series: bool = False,
-    ) -> Response:
-        """Simulate both pairs from rest with `values` (p,) in config units.
-
-        `slopes`, `series`: whether to compute derivatives and series."""
-        values = np.asarray(values, float)
-        evaluations, rows = [], []
-        for family in FAMILIES:
-            config = config_of(family, values)
-            evaluator = evaluator_of(config, self.give_up_early)
-            one = evaluator(series=series)
-            evaluations.append(one)
-            if slopes and one.usable:
-                rows.append(_slopes(evaluator, one, values))
-        complete = len(rows) == len(FAMILIES)
-        first, second = evaluations
-        return Response(values, (first, second), np.stack(rows) if complete else None)
+    `slopes`, `series`: whether to compute derivatives and series; `give_up_early`: whether to give
+    up a motion that settles late."""
+    values = np.asarray(values, float)
+    evaluations, rows = [], []
+    for family in FAMILIES:
+        evaluator = evaluator_of(config_of(family, values), give_up_early)
+        evaluations.append(evaluator(series=series))
+        usable = slopes and evaluations[-1].usable
+        rows.append(_slopes(evaluator, evaluations[-1], values) if usable else None)
+    first, second = evaluations
+    complete = not any(row is None for row in rows)
+    return Response(values, (first, second), np.array(rows) if complete else None)
 
 
-def _slopes(evaluator: Evaluator, one: Evaluation, values) -> NDArray[np.float64]:
-    """Differentiate log mean and log peak force with respect to the log quantities, (2, p)."""
-    design, state = design_vector(evaluator.config), jnp.asarray(one.state)
-    orbit = _orbit(evaluator.scene, design, jnp.asarray(values), state)
-    mean, _, peak = np.asarray(orbit.response)
-    by_mean, _, by_peak = np.asarray(orbit.sensitivity)
-    return np.stack([by_mean / mean, by_peak / peak]) * values
+def _slopes(evaluator: Evaluator, one: Evaluation, values) -> NDArray[np.float64] | None:
+    """Differentiate log mean and log peak force with respect to the log quantities, (2, p).
 
-
-def pair_of(model: Scene, design, values: Float[Array, " p"]) -> RotorPair:
-    """Return the rotor pair of a `design` with `values` (p,) of the quantities (config units)."""
-    length, torque, stiffness, damping_ratio, backlash, clearance = values
-    half = backlash * MM / (2 * model.pitch_radius)
-    gear = eqx.tree_at(lambda g: (g.stiffness, g.half_backlash), model.gear, (stiffness, half))
-    tuned = dataclasses.replace(
-        model,
-        length=length * MM,
-        load_torque=torque,
-        gear=gear,
-        gear_damping_ratio=damping_ratio,
-        clearance=clearance * MM,
-    )
-    return tuned.pair(design)
-
-
-@CachedFunction
-def _orbit(model: Scene, design, values: Float[Array, " p"], state) -> Orbit:
-    """Close the orbit, with derivatives with respect to the values."""
-
-    def arrays(values):
-        return eqx.filter(pair_of(model, design, values), eqx.is_inexact_array)
-
-    push = functools.partial(jax.jvp, arrays, (values,))
-    tangents = jax.vmap(lambda direction: push((direction,))[1])(jnp.eye(values.shape[0]))
-    pair, solver = pair_of(model, design, values), model.solver
-    start = Start.at(pair, pair.in_si(state), solver.max_orbit)
-    return steady_motion(pair, tangents, start, model.pitch_radius, solver).orbit
+    The result is None if the motion from the orbit's own start is not periodic."""
+    found = by_scene(evaluator, one)
+    if found is None:
+        return None
+    rows = [[found.gradient[name][q.key] for q in QUANTITIES] for name in FORCES]
+    forces = np.array([one.response[name] for name in FORCES])
+    return np.array(rows) * values / forces[:, None]
 
 
 def polished(
-    pairs: Pairs,
     values: ArrayLike,
     held: Sequence[int] = (),
     within: float = 1e-4,
@@ -207,7 +152,7 @@ def polished(
     """
     free = [i for i in range(len(QUANTITIES)) if i not in held]
     low, high = (np.log([getattr(q, end) for q in QUANTITIES]) for end in ("low", "high"))
-    best = pairs(values)
+    best = respond(values)
     for _ in range(steps):
         if best.slopes is None or best.misfit <= within:
             break
@@ -220,7 +165,7 @@ def polished(
         step *= min(1.0, _NEAR / max(np.max(np.abs(step)), 1e-12))
         for _ in range(5):
             at = np.clip(place + step, low, high)
-            tried = pairs(np.exp(at))
+            tried = respond(np.exp(at))
             if tried.slopes is not None and tried.misfit < best.misfit:
                 break
             step /= 2

@@ -22,11 +22,11 @@ from experiments.paper.scene import (
     FAMILIES,
     PAPER,
     QUANTITIES,
-    Pairs,
     Response,
     compensated,
     config_of,
     polished,
+    respond,
     values_of,
 )
 from rootsopt.dynamics.window import PERIODS
@@ -114,20 +114,19 @@ def definitions(values: ArrayLike) -> list[Row]:
     return rows
 
 
-def slices(pairs: Pairs, values: ArrayLike, changes: Sequence[float], say: Say) -> list[Row]:
+def slices(values: np.ndarray, changes: Sequence[float], say: Say) -> list[Row]:
     """Change each quantity alone by the relative `changes`; return a row per change."""
     rows = []
     for number, quantity in enumerate(QUANTITIES):
         for change in changes:
-            at = np.array(values, float)
-            at[number] *= 1 + change
-            rows.append({"changed": quantity.key, "change": change})
-            rows[-1] |= row_of(pairs(at, slopes=False))
+            at = values * (1 + change * (np.arange(len(QUANTITIES)) == number))
+            row = {"changed": quantity.key, "change": change}
+            rows.append(row | row_of(respond(at, slopes=False)))
         say(f"{quantity.key} changed alone")
     return rows
 
 
-def profile(pairs: Pairs, found: Response, say: Say) -> list[Row]:
+def profile(found: Response, say: Say) -> list[Row]:
     """Move each quantity away from its value, and solve for the other quantities again.
 
     Each solution starts from the last solution. A quantity moves by factors of 1 ± `STEP`, at most
@@ -142,7 +141,7 @@ def profile(pairs: Pairs, found: Response, say: Say) -> list[Row]:
                 if last.slopes is None or not quantity.low <= at <= quantity.high:
                     break
                 guess = compensated(last.values, last.slopes, number, factor)
-                last = polished(pairs, guess, held=[number], within=WITHIN, steps=4)
+                last = polished(guess, held=[number], within=WITHIN, steps=4)
                 change = last.values[number] / found.values[number] - 1
                 rows.append({"changed": quantity.key, "change": change} | row_of(last))
                 if last.misfit > LIMIT:
@@ -180,16 +179,16 @@ def reproduce(job: Run) -> bool:
     """
     from experiments.paper import figures
 
-    many = Pairs(give_up_early=True)
-    found = Pairs()(values_of(config_of("cic")), slopes=not job.quick, series=True)
+    values = values_of(config_of("cic"))
+    found = respond(values, not job.quick, series=True, give_up_early=False)
     if not found.usable:
         raise NoResultError("the shipped values must give two periodic motions, but do not")
     responses = {"shipped": found}
-    tables = {"slices": slices(many, found.values, CHANGES[job.quick], job.say)}
+    tables = {"slices": slices(found.values, CHANGES[job.quick], job.say)}
     if not job.quick:
-        responses |= {name: polished(many, start) for name, start in OTHERS.items()}
+        responses |= {name: polished(start) for name, start in OTHERS.items()}
         tables["motions"], tables["definitions"] = motions(found.values), definitions(found.values)
-        tables["profile"] = profile(many, found, job.say)
+        tables["profile"] = profile(found, job.say)
     record: dict[str, Any] = {name: row_of(one) for name, one in responses.items()}
     if found.slopes is not None:
         singular = np.linalg.svd(found.slopes.reshape(4, -1))
@@ -213,13 +212,12 @@ def search(job: Run) -> bool:
     It begins at the shipped values. A reduced run makes one local fit. Returns whether some values
     give all four forces within the relative error `TARGET`."""
     seed, least = job.options.seed, job.options.least_clearance
-    bounds = {q.key: (q.low, q.high) for q in QUANTITIES}
-    clearance = QUANTITIES[-1].key
-    bounds[clearance] = least or bounds[clearance][0], bounds[clearance][1]
+    *others, clearance = QUANTITIES
+    bounds = {q.key: (q.low, q.high) for q in others}
+    bounds[clearance.key] = least or clearance.low, clearance.high
     config = config_of("cic")
-    parameters = config.profile.parameters
     record: dict[str, Any] = {"profile.family": [*FAMILIES]}
-    record |= {f"profile.{key}": [x, None] for key, x in parameters.items()}
+    record |= {f"profile.{key}": [x, None] for key, x in config.profile.parameters.items()}
     record |= {name: PAPER[:, k] for k, name in enumerate(FORCES)}
     found = identify(
         config, record, bounds, starts=1 if job.quick else STARTS, seed=seed, progress=job.say

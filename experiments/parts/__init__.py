@@ -1,6 +1,6 @@
 """What does each part of a scene cost?
 
-Writes parts.csv (a row per part) and parts.png.
+Writes parts.csv (a row per part).
 """
 
 from experiments._common.driver import Study

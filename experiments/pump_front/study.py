@@ -9,7 +9,6 @@ width have no limits: displacement and leakage take their place.
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -17,15 +16,12 @@ from matplotlib.lines import Line2D
 
 from experiments._common.driver import Run
 from experiments._common.scenes import FAIR
-from experiments._common.simulation import profile_of
-from experiments._common.style import BLACK, COLORS, GREY, MARKS, grid_below, sheet
+from experiments._common.style import BLACK, COLORS, GREY, MARKS, sheet
 from experiments._common.tables import Row, show
 from rootsopt.config import Config, load
 from rootsopt.config.families import family_of
 from rootsopt.errors import InputError
 from rootsopt.optimize.design import pareto_front
-from rootsopt.profiles import geometry
-from rootsopt.pump import relative_flow
 from rootsopt.pump.sheet import sheet as pump_sheet
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.scene import Scene, design_vector
@@ -53,9 +49,6 @@ _PUMP = (
     "pareto.refinements=0",
 )
 
-# Number of angles of rotor 1 at which the flow is sampled.
-_POSES = 4096
-
 
 def config_of(family: str, divisions: int = DIVISIONS) -> Config:
     """Return the config of a `family`; `divisions`: steps between two ends of its front."""
@@ -64,14 +57,6 @@ def config_of(family: str, divisions: int = DIVISIONS) -> Config:
     }
     profile = {"family": family, "lobes": 3, "pitch_radius_mm": 33.0} | values
     return load(FAIR, [f"profile={profile!r}", *_PUMP, f"pareto.divisions={divisions}"])
-
-
-def sampled_ripple(config: Config) -> float:
-    """Return the ripple of the flow of a design, from samples of the flow over a lobe pitch."""
-    profile = profile_of(config)
-    phi = 2 * jnp.pi / profile.lobes * jnp.arange(_POSES) / _POSES
-    flow = np.asarray(relative_flow(profile, geometry(profile), phi))
-    return float(np.ptp(flow))
 
 
 def row_of(config: Config, terms: dict[str, float], geometry_of: dict[str, float]) -> Row:
@@ -85,7 +70,6 @@ def row_of(config: Config, terms: dict[str, float], geometry_of: dict[str, float
         terms
         | {"displaced_volume_cm3": found["displaced_volume_cm3"], "radius_ratio": ratio}
         | shape
-        | {"sampled_ripple": sampled_ripple(config)}
     )
 
 
@@ -158,7 +142,6 @@ def fronts(rows: list[Row]) -> Figure:
             size = 11 if row["family"] == REFERENCE else 6
             ax.plot(*at, mark, color=color, markerfacecolor=fill, ms=size, zorder=3)
         ax.set(xlabel=_LABELS[x][0], ylabel=_LABELS[y][0])
-        grid_below(ax)
     _iso_efficiency(axes[1, 1])
     entries = [
         Line2D([], [], color=color, marker=mark, linestyle="", label=name.replace("_", " "))

@@ -13,7 +13,6 @@ from experiments._common.style import (
     PURPLE,
     SKY,
     VERMILION,
-    grid_below,
     sheet,
 )
 from experiments.speed.study import OPTIMISED, Row, Study
@@ -69,7 +68,6 @@ def objectives(studies: dict[str, Study], listed: Sequence[float]) -> Figure:
             ax.plot(speeds[unsettled], values[unsettled], "x", color=color, markersize=7)
         ax.axhline(1, color="black", linewidth=0.8, linestyle=":")
         ax.set(title=TITLES[scene], xlabel="speed (rpm)")
-        grid_below(ax)
     axes[0, 0].set_ylabel("objective / CIC at the same speed")
     lines, names = axes[0, 0].get_legend_handles_labels()
     made.legend(lines, names, loc="outside lower center", ncols=3, frameon=False)

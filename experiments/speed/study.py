@@ -50,9 +50,6 @@ ORDERS = 6
 # maximum.
 PROMINENCE = 0.02
 
-# Relative difference of speed above which a maximum does not belong to a crossing.
-NEAR = 0.03
-
 
 def settings(scene: str, family: str, *more: str) -> Config:
     """Load the shipped config of a `family` in one of the scenes, with further overrides `more`."""
@@ -139,8 +136,8 @@ def crossings(found: dict[str, float], lobes: int, speeds) -> list[Row]:
         for order in range(1, ORDERS + 1):
             speed = 60 * found[mode] / (order * lobes)
             if speeds[0] <= speed <= speeds[-1]:
-                row = {"mode": mode, "frequency_Hz": found[mode], "order": order}
-                rows.append(row | {"speed_rpm": speed})
+                crossing = {"mode": mode, "frequency_Hz": found[mode], "order": order}
+                rows.append(crossing | {"speed_rpm": speed})
     return rows
 
 
@@ -167,14 +164,6 @@ def maxima(parts: tuple[Part, ...], rows: list[Row]) -> list[Row]:
                 }
             )
     return found
-
-
-def covered(rows: list[Row], speeds) -> float:
-    """Return the share of `speeds` at a crossing: the share of maxima expected there by chance.
-
-    `rows`: crossings."""
-    at = np.array([row["speed_rpm"] for row in rows])
-    return float(np.mean(np.min(np.abs(np.asarray(speeds)[:, None] / at - 1), axis=1) <= NEAR))
 
 
 def objective(config: Config, one: Evaluation, baseline: Evaluation) -> float:
@@ -262,7 +251,7 @@ def run(job: Run) -> None:
     rows: list[Row] = []
     crossed: list[Row] = []
     peaks: list[Row] = []
-    by_chance, statuses = 0.0, {}
+    statuses = {}
     for scene in list(SCENES)[: 1 if job.quick else None]:
         found = studies[scene] = study(scene, speeds, listed, job.quick)
         for name, parts in found.designs.items():
@@ -270,18 +259,13 @@ def run(job: Run) -> None:
             rows += [here | part.row(whole=True) for part in parts]
             across = crossings(found.linear[name], found.config.profile.lobes, speeds)
             crossed += [here | row for row in across]
-            tops = maxima(parts, across)
-            peaks += [here | row for row in tops]
-            by_chance += covered(across, speeds) * len(tops)
+            peaks += [here | row for row in maxima(parts, across)]
             labels = (part.evaluation.status.label for part in parts)
             statuses[f"{scene}, {name}"] = dict(Counter(labels))
         job.say(f"{scene}: {len(found.designs)} designs at {len(speeds)} speeds")
     record = {
         "linearised": {scene: found.linear for scene, found in studies.items()},
         "optimisations": [row for found in studies.values() for row in found.outcomes],
-        "maxima": len(peaks),
-        "maxima_at_a_crossing": sum(abs(row["apart"]) <= NEAR for row in peaks),
-        "maxima_at_a_crossing_by_chance": by_chance,
         "statuses": statuses,
     }
     job.csv("speed.csv", rows)

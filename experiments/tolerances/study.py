@@ -10,20 +10,15 @@ import math
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from experiments._common.driver import Run
-from experiments._common.scenes import FAIR
-from experiments._common.style import sheet
+from experiments._common.scenes import FAIR, FORCES
 from experiments._common.tables import show
 from rootsopt.config import Config, load
 from rootsopt.optimize.design import optimize_design
 from rootsopt.optimize.outcome import Optimization
 from rootsopt.optimize.robust import Robustness
-from rootsopt.view.figures.comparisons import PANELS, plot_distribution
-
-# Forces whose distributions are reported.
-FORCES = ("mean_force_N", "peak_force_N")
+from rootsopt.view.figures.comparisons import distributions
 
 # Statistics that are reported, as `rootsopt.optimize.robust.Scattered` names them.
 STATISTICS = ("mean", "sigma", "quantile_95", "worst")
@@ -93,18 +88,6 @@ def linear_of(config: Config, robustness: Robustness) -> list[dict[str, Any]]:
     return [*rows, {"key": "all, first order"} | total, {"key": "all, sampled"} | sampled]
 
 
-def panels(robustness: Robustness) -> Figure:
-    """Draw histograms of mean and peak force of baseline and optima."""
-    made, axes = sheet(11, 4.2, 1, len(PANELS))
-    for ax, (force, label) in zip(axes[0], PANELS.items(), strict=True):
-        designs = {name: one.values[force] for name, one in robustness.fresh.items()}
-        plot_distribution(ax, designs, label)
-    axes[0, 0].set_title("shipped scene, mean + 2 sigma", loc="left", fontsize=10)
-    lines, names = axes[0, 0].get_legend_handles_labels()
-    made.legend(lines, names, loc="outside lower center", ncols=3, frameon=False)
-    return made
-
-
 def run(job: Run) -> bool:
     """Find both optima and compare them in fresh scenes.
 
@@ -123,7 +106,8 @@ def run(job: Run) -> bool:
     job.folder.write_csv("tolerances_scenes.csv", columns)
     record = {"improvement": result.improvement, "robustness": robustness.record()}
     job.json("tolerances.json", record | {"first_order": linear})
-    job.figure("tolerances.png", panels(robustness))
+    forces = {name: one.values for name, one in robustness.fresh.items()}
+    job.figure("tolerances.png", distributions(forces, "shipped scene, mean + 2 sigma"))
     show("Baseline and optima over the fresh scenes", rows)
     show("Standard deviation, first-order and sampled", linear)
     problem, best = result.problem, result.optimized

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from experiments._common.driver import Run
 from experiments._common.scenes import shipped
-from experiments._common.style import COLORS, MARKS, grid_below, sheet
+from experiments._common.style import COLORS, MARKS, sheet
 from experiments._common.tables import Row, show
 from rootsopt.pump.sheet import sheet as pump_sheet
 from rootsopt.response.evaluation import Evaluator
@@ -73,7 +73,6 @@ def over_twist(rows: list[Row]) -> Figure:
             ax.plot(twists, values, color=color, marker=mark, ms=4, label=f"{lobes} lobes")
         ax.set_ylabel(label)
         ax.set_ylim(bottom=0)
-        grid_below(ax)
     for ax in axes[-1]:
         ax.set_xlabel("twist over the length (°)")
     handles, labels = axes[0, 0].get_legend_handles_labels()

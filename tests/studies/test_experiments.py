@@ -6,17 +6,13 @@ import os
 import subprocess
 import sys
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from experiments.__main__ import studies
 from experiments._common import engines
 from experiments._common.engines.scipy_nodes import ScipyNodes
-from experiments.paper.scene import config_of, pair_of
 from rootsopt.config import load
-from rootsopt.scene import Scene, design_vector
 
 pytest.importorskip("numba")
 
@@ -162,19 +158,6 @@ def test_paper_scene_is_shared():
     cic, ee = (load(f"configs/paper_{family}.yaml").model_dump() for family in ("cic", "ee"))
     assert cic.pop("profile") != ee.pop("profile")
     assert cic == ee
-
-
-def test_pair_of_quantities():
-    """The pair differentiated with respect to the quantities is that of the config with them."""
-    values = np.array([123.0, 4.5, 6.7e4, 0.21, 0.43, 0.065])
-    config = config_of("ee", values)
-    design = design_vector(config)
-    expected = jax.tree.leaves(Scene.from_config(config).pair(design))
-    shipped = Scene.from_config(config_of("ee"))
-    found = jax.tree.leaves(pair_of(shipped, design, jnp.asarray(values)))
-    assert len(found) == len(expected)
-    for one, other in zip(found, expected, strict=True):
-        assert np.asarray(one) == pytest.approx(np.asarray(other), rel=1e-12)
 
 
 @pytest.mark.long

@@ -9,7 +9,7 @@ closed orbits.
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +28,7 @@ Design = Sequence[float]
 FD_STEPS = (0.05, 0.025, 0.05)
 
 
-@dataclasses.dataclass(frozen=True)
-class Scene:
+class Scene(NamedTuple):
     """Everything except the design, in SI units.
 
     Rotors: lobes, pitch radius (m), rotor length (m), density (kg/m³). Contact: IMPACT stiffness
@@ -134,31 +133,22 @@ def rotor_of(scene: Scene, design: Design) -> Rotor:
 
 
 class Motion(NamedTuple):
-    """Constants of the equation of motion.
+    """Constants of the equation of motion in a `scene`.
 
-    `period`: mesh period (s), the unit of time; `angle_scale`: unit of ε (rad); `force_scale`: unit
-    of force (N); `turn`: rotation (rad) of rotor 1 in a mesh period; `agility`: scaled acceleration
-    per torque (1/(N·m)).
+    `period`: mesh period (s), the unit of time; `turn`: rotation (rad) of rotor 1 in a mesh period;
+    `angle_scale`: unit of ε (rad); `angle_limit`: |ε| (rad) above which a motion ends;
+    `force_scale`: unit of force (N); `agility`: scaled acceleration per torque (1/(N·m));
+    `gear_damping`: damping of the timing gear (N·m·s/rad).
     """
 
+    scene: Scene
     period: float
     turn: float
-    speed: float
     angle_scale: float
     angle_limit: float
     force_scale: float
     agility: float
-    load_torque: float
-    stiffness: float
-    exponent: float
-    damping: float
-    full_damping_depth: float
-    smoothing: float
-    clearance: float
-    gear_stiffness: float
     gear_damping: float
-    half_backlash: float
-    gear_rounding: float
 
 
 def motion_of(scene: Scene, polar_area_moment: float) -> Motion:
@@ -169,25 +159,15 @@ def motion_of(scene: Scene, polar_area_moment: float) -> Motion:
     depth = (force / scene.stiffness) ** (1 / scene.exponent)
     angle = depth / scene.pitch_radius + scene.half_backlash
     return Motion(
+        scene=scene,
         period=period,
         turn=2 * math.pi / scene.lobes,
-        speed=scene.speed,
         angle_scale=angle,
         angle_limit=math.pi / (8 * scene.lobes),
         force_scale=force,
         agility=period**2 / (angle * inertia),
-        load_torque=scene.load_torque,
-        stiffness=scene.stiffness,
-        exponent=scene.exponent,
-        damping=scene.damping,
-        full_damping_depth=scene.full_damping_depth,
-        smoothing=scene.smoothing,
-        clearance=scene.clearance,
-        gear_stiffness=scene.gear_stiffness,
         # The damping ratio refers to the reduced inertia of two equal rotors.
         gear_damping=2 * scene.gear_damping_ratio * math.sqrt(scene.gear_stiffness * inertia / 2),
-        half_backlash=scene.half_backlash,
-        gear_rounding=scene.gear_rounding,
     )
 
 
@@ -195,39 +175,53 @@ def motion_of(scene: Scene, polar_area_moment: float) -> Motion:
 class Result:
     """Result of one simulation.
 
-    Fields: mean, peak and RMS contact force (N) over the window, number of accepted and rejected
-    solver steps, evaluations of the right-hand side, and the largest |ε| (rad) in the window.
+    Fields: mean, peak and RMS contact force (N) over the window, and the largest |ε| (rad) in it.
     """
 
     mean: float
     peak: float
     rms: float
-    steps: int
-    rhs_calls: int
     reached: float
 
-    @property
-    def response(self) -> NDArray[np.float64]:
-        """Mean, peak and RMS contact force (3,) in N."""
-        return np.array([self.mean, self.peak, self.rms])
+
+class Engine(Protocol):
+    """A simulator of a scene."""
+
+    def simulate(self, design: Design) -> Result:
+        """Start from ε = 0, dε/dt = 0 at φ = 0, settle, then average over the window."""
+        ...
+
+    def forces(self, design: Design) -> NDArray[np.float64]:
+        """Return mean and peak contact force (2,) in N."""
+        found = self.simulate(design)
+        return np.array([found.mean, found.peak])
 
 
 def central_differences(
-    simulate: Callable[[Design], Result], design: Design, steps: Sequence[float]
-) -> tuple[Result, NDArray[np.float64]]:
-    """Return the result at `design`, and d(mean, peak, RMS) / d(design) (3, 3) in N per config
-    unit.
+    forces: Callable[[Design], NDArray[np.float64]], design: Design, steps: Sequence[float]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the forces (n,) of a design (d,), and their derivatives (n, d) per config unit.
 
-    Central differences need six further simulations; `steps`: in config units."""
-    columns = []
-    for i, step in enumerate(steps):
-        ends = []
-        for sign in (1.0, -1.0):
-            moved = [float(value) for value in design]
-            moved[i] += sign * step
-            ends.append(simulate(moved).response)
-        columns.append((ends[0] - ends[1]) / (2 * step))
-    return simulate(design), np.stack(columns, axis=1)
+    Central differences need 2 d further simulations; `steps` (d,): in config units."""
+    base, ways = np.asarray(design), np.diag(steps)
+    ends = [(forces((base + way).tolist()), forces((base - way).tolist())) for way in ways]
+    columns = [(up - down) / (2 * step) for (up, down), step in zip(ends, steps, strict=True)]
+    return forces(design), np.stack(columns, axis=1)
+
+
+def best_steps(
+    forces: Callable[[Design], NDArray[np.float64]], design: Design, truth: NDArray[np.float64]
+) -> tuple[list[float], float]:
+    """Return the steps of the central differences, `FD_STEPS` or thrice those, that err less.
+
+    `truth` (n, d): the gradients of the forces. The second result is the factor, 1 or 3."""
+    tried = []
+    for factor in (1.0, 3.0):
+        steps = [factor * step for step in FD_STEPS]
+        off = np.abs(central_differences(forces, design, steps)[1] - truth).max(axis=1)
+        tried.append((float(np.max(off / np.abs(truth).max(axis=1))), factor, steps))
+    _, factor, steps = min(tried)
+    return steps, factor
 
 
 # The contact law and the rounded ends of the backlash
@@ -257,12 +251,23 @@ def balanced_step(x: float) -> float:
     return t * t * (18 - 32 * t + 15 * t * t)
 
 
-def impact(motion: Motion, depth: float, rate: float) -> float:
+def impact(scene: Scene, depth: float, rate: float) -> float:
     """Return the IMPACT force (N) at a penetration (m) that grows at `rate` (m/s)."""
     if depth <= 0:
         return 0.0
-    delta = ramp(depth, motion.smoothing)
-    elastic = motion.stiffness * delta**motion.exponent
-    damped = motion.damping * smooth_step(delta / motion.full_damping_depth) * rate
-    share = min(motion.smoothing / motion.full_damping_depth, 1.0)
+    delta = ramp(depth, scene.smoothing)
+    elastic = scene.stiffness * delta**scene.exponent
+    damped = scene.damping * smooth_step(delta / scene.full_damping_depth) * rate
+    share = min(scene.smoothing / scene.full_damping_depth, 1.0)
     return ramp(elastic + damped, share * elastic)
+
+
+def gear_torque(motion: Motion, relative: float, rate: float) -> float:
+    """Return the torque (N·m) of the timing gear against ε (rad) and its rate (rad/s)."""
+    scene = motion.scene
+    excess = abs(relative) - scene.half_backlash
+    if excess <= 0:
+        return 0.0
+    engaged = balanced_step(excess / scene.gear_rounding) if scene.gear_rounding > 0 else 1.0
+    spring = scene.gear_stiffness * balanced_ramp(excess, scene.gear_rounding)
+    return math.copysign(spring, relative) + motion.gear_damping * engaged * rate

@@ -8,8 +8,8 @@ poses and signs.
 """
 
 import dataclasses
+import functools
 import math
-from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -18,15 +18,15 @@ from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from experiments._common.engines import (
-    FD_STEPS,
     Design,
+    Engine,
     Motion,
     Result,
     Rotor,
     Scene,
     balanced_ramp,
     balanced_step,
-    central_differences,
+    gear_torque,
     impact,
     motion_of,
     ramp,
@@ -39,7 +39,7 @@ from experiments._common.engines import (
 _FAST = {"contract", "reassoc", "arcp", "nsz"}
 _compiled = njit(error_model="numpy", fastmath=_FAST)
 # Compiled code may call these functions, which remain functions of Python.
-for law in (ramp, smooth_step, balanced_ramp, balanced_step, impact):
+for law in (ramp, smooth_step, balanced_ramp, balanced_step, impact, gear_torque):
     register_jitable(error_model="numpy", fastmath=_FAST)(law)
 
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(24)
@@ -272,20 +272,6 @@ def closest(rotor, search, roll, relative):
     return gap, lever1, lever2, True
 
 
-@_compiled
-def gaps(rotor, rolls, relatives):
-    """Return gap and both levers (n, 3) in m at n poses, NaN without a common normal.
-
-    `rolls`, `relatives` (n,): roll coordinate and ε (rad)."""
-    search = Search(*search_of(rotor))
-    out = np.full((rolls.size, 3), np.nan)
-    for i in range(rolls.size):
-        gap, lever1, lever2, found = closest(rotor, search, rolls[i], relatives[i])
-        if found:
-            out[i] = gap, lever1, lever2
-    return out
-
-
 # Map of the gap
 
 
@@ -303,41 +289,22 @@ MARGIN = 3
 NO_TABLE = Table(np.zeros((4, 4)), 0.0, 1.0, 0.0, 1.0)
 
 
-@_compiled
-def _spline(values, out):
-    """Write the cubic B-spline coefficients (n + 2,) of `values` (n ≥ 8) at uniform knots to `out`.
+@functools.cache
+def _through(n: int) -> NDArray[np.float64]:
+    """Return the matrix (n + 2, n) from values at n uniform knots to cubic B-spline coefficients.
 
-    The ends are not-a-knot, which fixes c₂ = (8 v₁ - v₀ - v₂) / 6. Thomas' algorithm solves for the
-    interior.
-    """
-    n = values.size
-    out[2] = (8 * values[1] - values[0] - values[2]) / 6
-    out[n - 1] = (8 * values[n - 2] - values[n - 1] - values[n - 3]) / 6
-    ratios = np.empty(n)
-    ratio, carried = 0.0, out[2]
-    for i in range(3, n - 1):
-        ratio = 1 / (4 - ratio)
-        carried = (6 * values[i - 1] - carried) * ratio
-        ratios[i], out[i] = ratio, carried
-    for i in range(n - 2, 2, -1):
-        out[i] -= ratios[i] * out[i + 1]
-    out[1] = 6 * values[1] - 4 * out[2] - out[3]
-    out[0] = 6 * values[0] - 4 * out[1] - out[2]
-    out[n] = 6 * values[n - 2] - 4 * out[n - 1] - out[n - 2]
-    out[n + 1] = 6 * values[n - 1] - 4 * out[n] - out[n - 1]
+    The ends are not-a-knot: the fourth difference of five coefficients is 0 there."""
+    rows = np.zeros((n + 2, n + 2))
+    rows[0, :5] = rows[-1, -5:] = 1, -4, 6, -4, 1
+    for k, weight in enumerate((1 / 6, 2 / 3, 1 / 6)):
+        rows[1:-1, k : n + k] += weight * np.eye(n)
+    return np.asarray(np.linalg.inv(rows)[:, 1:-1], np.float64, order="C")
 
 
-@_compiled
-def spline_of(values):
-    """Return the coefficients (m + 2, n + 2) of the bicubic B-spline through `values` (m, n)."""
-    rolls, relatives = values.shape
-    half_way = np.empty((rolls, relatives + 2))
-    for i in range(rolls):
-        _spline(values[i], half_way[i])
-    coefficients = np.empty((relatives + 2, rolls + 2))
-    for j in range(relatives + 2):
-        _spline(half_way[:, j].copy(), coefficients[j])
-    return coefficients.T.copy()
+def table_of(rotor: Rotor, deepest: float, rolls: int, relatives: int) -> Table:
+    """Return the contact map down to ε = `deepest` < 0 from `rolls` × `relatives` points."""
+    values, *places = tabulate(rotor, deepest, rolls, relatives)
+    return Table(_through(rolls) @ values @ _through(relatives).T, *places)
 
 
 @_compiled
@@ -358,7 +325,7 @@ def tabulate(rotor, deepest, rolls, relatives):
                 # The land is passing: extend the gap at its end by a parabola.
                 gap = rotor.radius * (roll - rotor.land_end - relative / 2) ** 2
             values[i, j] = gap
-    return spline_of(values), first, roll_step, deepest, relative_step
+    return values, first, roll_step, deepest, relative_step
 
 
 @_compiled
@@ -419,17 +386,10 @@ def _slope(rotor, motion, table, search, tau, angle, rate):
         gap, lever1, lever2 = mapped(rotor.half_pitch, table, roll, side * relative)
     else:
         gap, lever1, lever2, _ = closest(rotor, search, roll, side * relative)
-    force = 0.0
-    depth = -gap - motion.clearance
-    if depth > 0:
-        closing = side * (lever1 * motion.speed - lever2 * (motion.speed + speed2))
-        force = impact(motion, depth, closing)
-    torque = side * lever2 * force - motion.load_torque
-    excess = abs(relative) - motion.half_backlash
-    if excess > 0:
-        engaged = balanced_step(excess / motion.gear_rounding) if motion.gear_rounding > 0 else 1.0
-        spring = -side * motion.gear_stiffness * balanced_ramp(excess, motion.gear_rounding)
-        torque -= spring + motion.gear_damping * engaged * speed2
+    scene = motion.scene
+    closing = side * (lever1 * scene.speed - lever2 * (scene.speed + speed2))
+    force = impact(scene, -gap - scene.clearance, closing)
+    torque = side * lever2 * force - scene.load_torque - gear_torque(motion, relative, speed2)
     return torque * motion.agility, force
 
 
@@ -529,20 +489,18 @@ def integrate(rotor, motion, table, search, start, stop, angle, rate, rtol, stat
     """Integrate the scaled state from τ = `start` to `stop`.
 
     Returns the state with the integrals of force and force² (scaled; error-controlled with the
-    state if `statistics`), the peak force (N), the largest |ε| (scaled), steps and evaluations of
-    the right-hand side.
+    state if `statistics`), the peak force (N), and the largest |ε| (scaled).
     """
     ks = np.empty((2, 7))
     fs = np.empty(7)
     tau, h, previous = start, 1e-3, 1.0
     total = square = peak = reached = 0.0
-    steps, calls = 0, 1
+    steps = 0
     limit = motion.angle_limit / motion.angle_scale
     ks[0, 0] = rate
     ks[1, 0], fs[0] = _slope(rotor, motion, table, search, tau, angle, rate)
     while tau < stop and steps < _STEPS_PER_PERIOD * (stop - start) and abs(angle) < limit:
         steps += 1
-        calls += 6
         h = min(h, stop - tau)
         a, b = angle, rate
         for i in range(1, 7):
@@ -592,27 +550,27 @@ def integrate(rotor, motion, table, search, start, stop, angle, rate, rtol, stat
     if tau < stop:
         total = square = peak = math.nan
         reached = math.inf
-    return angle, rate, total, square, peak, reached, steps, calls
+    return angle, rate, total, square, peak, reached
 
 
 @_compiled
 def _run(rotor, motion, table, settle, window, rtol):
     """Integrate the transient, then return statistics over the window."""
     search = Search(*search_of(rotor))
-    angle, rate, _, _, _, _, steps, calls = integrate(
+    angle, rate, _, _, _, _ = integrate(
         rotor, motion, table, search, 0.0, float(settle), 0.0, 0.0, rtol, False
     )
     # Rotor and flanks repeat with the mesh period.
-    _, _, total, square, peak, reached, more, again = integrate(
+    _, _, total, square, peak, reached = integrate(
         rotor, motion, table, search, 0.0, float(window), angle, rate, rtol, True
     )
     mean = total / window * motion.force_scale
     rms = math.sqrt(square / window) * motion.force_scale
-    return mean, peak, rms, steps + more, calls + again, reached * motion.angle_scale
+    return mean, peak, rms, reached * motion.angle_scale
 
 
 @dataclasses.dataclass(frozen=True)
-class NumbaPair:
+class NumbaPair(Engine):
     """Compiled simulator of a scene.
 
     `contact`: map or search; `rtol`: relative tolerance, also absolute tolerance of the scaled
@@ -632,25 +590,18 @@ class NumbaPair:
     deepest: float | None = None
 
     def simulate(self, design: Design) -> Result:
-        """Start from ε = 0, dε/dt = 0 at φ = 0, settle, then average over the window."""
         rotor = rotor_of(self.scene, design)
         motion = motion_of(self.scene, polar_area_moment(rotor))
         if self.contact == "search":
             return self._run(rotor, motion, NO_TABLE)
         deepest = self.deepest or self._expected(motion)
         for _ in range(5):
-            table = Table(*tabulate(rotor, deepest, self.rolls, self.relatives))
+            table = table_of(rotor, deepest, self.rolls, self.relatives)
             result = self._run(rotor, motion, table)
             if not result.reached > -deepest:
                 break
             deepest = max(-1.3 * result.reached, 2 * deepest)
         return result
-
-    def gradient(
-        self, design: Design, steps: Sequence[float] = FD_STEPS
-    ) -> tuple[Result, NDArray[np.float64]]:
-        """Return the result and d(mean, peak, RMS) / d(design), N per config unit, (3, 3)."""
-        return central_differences(self.simulate, design, steps)
 
     def fitted(self, design: Design) -> "NumbaPair":
         """Return another simulator with a map just deep enough for the motion of `design`."""
@@ -661,6 +612,7 @@ class NumbaPair:
         return Result(*_run(rotor, motion, table, self.settle, self.window, self.rtol))
 
     def _expected(self, motion: Motion) -> float:
-        depth = (20 * motion.force_scale / motion.stiffness) ** (1 / motion.exponent)
-        play = motion.clearance / self.scene.pitch_radius + motion.half_backlash
-        return -min(1.3 * play + 1.5 * depth / self.scene.pitch_radius, motion.angle_limit)
+        scene = self.scene
+        depth = (20 * motion.force_scale / scene.stiffness) ** (1 / scene.exponent)
+        play = scene.clearance / scene.pitch_radius + scene.half_backlash
+        return -min(1.3 * play + 1.5 * depth / scene.pitch_radius, motion.angle_limit)
