@@ -17,7 +17,6 @@ from rootsopt.config.families import (
     Family,
     Parameter,
     families,
-    outside_modules,
     parameters,
     register_family,
 )
@@ -183,17 +182,3 @@ def test_incomplete_families_are_refused(change, words):
     with pytest.raises(ValueError, match=re.escape(words)):
         register_family(Family(**(GOOD | change)))
     assert families() == before
-
-
-def test_family_may_be_taken_back():
-    """A registered family can be removed, for tests; the config is then as before."""
-    text = ["profile={family: mine, lobes: 3, pitch_radius_mm: 33, depth_mm: 2}"]
-    with for_a_time():
-        register_family(Family(**GOOD))
-        assert load("configs/ee.yaml", text).profile.parameters == {"depth_mm": 2.0}
-        assert __name__ in outside_modules()
-    assert __name__ not in outside_modules()
-    with pytest.raises(InputError, match=r"`profile\.depth_mm` is not a known key"):
-        load("configs/ee.yaml", text)
-    with pytest.raises(InputError, match=r"'mine'; if that is a family of your own.*--import"):
-        load("configs/ee.yaml", ["profile.family=mine"])

@@ -72,16 +72,6 @@ def test_samples_lead_to_the_true_values_with_their_errors():
     assert next_[DAMPING] < error
 
 
-def test_an_interval_follows_the_valley_of_quantities_that_act_together():
-    """The gear stays on one flank, where load and backlash act together: T - k b / (2 r)."""
-    record = sampled(0.03, "relative_rotation_rad", "contact_force_N", step=20)
-    found = rootsopt.identify(CIC, record, BOUNDS, starts=1)
-    load, backlash = (found.parameters[key]["interval_95"] for key in (LOAD, BACKLASH))
-    assert load[1] == pytest.approx(9.0)
-    assert load[0] < 5.5
-    assert backlash[0] < 0.14 - 33e-3 * 2 * (8.0 - 5.5) / 20_000 * 1e3
-
-
 def test_channels_have_the_slopes_of_difference_quotients_and_the_torque_of_the_law():
     """The gear's torque is stiffness times what ε exceeds half the backlash by, plus damping."""
     config = CIC.replaced(TRUE)

@@ -1,6 +1,5 @@
 """A rotor from a file as baseline: where the search begins, what it finds, what is said of it."""
 
-import argparse
 import dataclasses
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,7 +8,6 @@ import numpy as np
 import pytest
 import yaml
 
-from rootsopt.commands.work.searching import checkpoint_of
 from rootsopt.config import load, parse
 from rootsopt.errors import InputError
 from rootsopt.optimize import infeasible as module
@@ -20,7 +18,6 @@ from rootsopt.scene import outline_mm
 from rootsopt.scene.check import shape_of
 from rootsopt.scene.resemblance import Likeness
 from rootsopt.scene.space import bounds_of, widened
-from rootsopt.view.runs import RunFolder
 from tests.measured.test_outline import cut
 from tests.standins import evaluation_of
 
@@ -149,19 +146,3 @@ def test_default_bounds_are_widened_and_given_ones_are_kept():
     given = parse(text, ["optimizer.bounds.pressure_angle_deg=[22,45]"])
     assert widened(given) == (given, ())
     assert widened(BASE) == (BASE, ())
-
-
-def test_a_search_is_not_resumed_with_other_points(tmp_path):
-    """The checkpoint knows the content of the file, and not only its name."""
-    config = load(measured(tmp_path, 0.0))
-    folder = RunFolder(tmp_path / "run", "optimize", overwrite=False)
-    options = argparse.Namespace(resume=False, imports=[])
-    first = checkpoint_of("optimize", config, options, folder)
-    first.keep((0, 0), np.zeros(1), evaluation_of())
-    first.close()
-    options.resume = True
-    checkpoint_of("optimize", config, options, folder).close()
-    rotor = tmp_path / "rotor.csv"
-    rotor.write_text(rotor.read_text().replace("0", "1", 1))
-    with pytest.raises(InputError, match=r"files: .*rotor\.csv \(then .*, now "):
-        checkpoint_of("optimize", config, options, folder)

@@ -232,21 +232,6 @@ def _stopped(after, patience, hinder=lambda search: None):
     return result or search.so_far(), search
 
 
-def test_a_stopped_search_keeps_the_best_so_far():
-    """If there is time, the best design is verified. Only running evaluations are completed."""
-    result, search = _stopped(8, patience=600.0)
-    assert result.interrupted
-    assert result.status is Status.INTERRUPTED
-    assert not result.status.usable
-    time.sleep(2)  # Nor does anything go on in the background.
-    assert 8 <= len(result.history) <= len(search._trials) <= 8 + os.cpu_count()
-    assert result.verification["holds_up"]
-    assert result.optimized.series is not None
-    best = min(row["objective"] for row in result.history if row["feasible"])
-    assert search.problem.objective(result.optimized) == pytest.approx(best, rel=0.01)
-    assert best < 1
-
-
 def test_a_stopped_search_without_time_to_verify():
     """The best trial itself is returned, and the result says that it was not verified."""
 

@@ -299,27 +299,6 @@ def test_fresh_scenes_from_the_neighbouring_orbit(spread):
         np.testing.assert_array_equal(values, found["nominal"].values[name])
 
 
-@pytest.mark.long
-def test_baseline_of_another_family():
-    """Forces of the baseline in the fresh scenes are those of the rotor simulated alone there."""
-    config = config_of(
-        "optimizer={family: arc_involute, screening: 0, starts: 1, iterations: 1, prove: false}",
-        "constraints={area_efficiency_min: 0.4, seal_width_min_mm: 0}",
-        "tolerances.samples=2",
-        "tolerances.check_samples=3",
-        "assumptions.scenes=0",
-    )
-    found = search_of(config).run().robustness
-    assert found is not None
-    assert np.isfinite(found.begun)
-    baseline = found.fresh["baseline"]
-    assert baseline.combined == 1
-    (widths,) = found.scenes.values()
-    for width, force in zip(widths, baseline.values["mean_force_N"], strict=True):
-        alone = Evaluator.of(without(config).replaced({"contact.clearance_mm": float(width)}))
-        assert force == pytest.approx(alone(series=False).response["mean_force_N"], rel=1e-6)
-
-
 def test_a_parameter_that_the_family_of_the_search_lacks_cannot_scatter():
     key, found = "profile.tip_arc_angle_deg", {"optimizer.family": "arc_involute"}
     config = config_of().replaced(found | {"tolerances.over": {key: {"normal": 1e-3}}})

@@ -194,28 +194,6 @@ def test_front_of_geometry_is_that_of_another_search(front):
         assert point.terms["outer_radius_mm"] == pytest.approx(best, abs=1e-3)
 
 
-def test_no_design_dominates_the_front(front):
-    """No random design that meets the constraints is better in both terms."""
-    found = _shapes(_random_designs(4_000), config())
-    valid = (np.asarray(found.seal_width) >= 2e-3) & (np.asarray(found.undercut_margin) >= 0)
-    radius, efficiency = 1e3 * np.asarray(found.outer_radius), np.asarray(found.area_efficiency)
-    assert valid.sum() > 1_000
-    for point in front.points:
-        better = (radius < point.terms["outer_radius_mm"] - 1e-6) & (
-            efficiency > point.terms["area_efficiency"] + 1e-9
-        )
-        assert not np.any(valid & better)
-
-
-def test_rates_are_slopes_of_the_front(front):
-    """The rate of each inner point lies between the slopes towards its neighbours."""
-    values = np.array([[*point.terms.values()] for point in front.points])
-    slopes = np.diff(values[:, 0]) / np.diff(values[:, 1])
-    for k, point in enumerate(front.points[1:-1]):
-        assert min(slopes[k : k + 2]) <= point.rates["area_efficiency"] <= max(slopes[k : k + 2])
-    assert all(np.isnan(front.points[k].rates["area_efficiency"]) for k in (0, -1))
-
-
 def test_floor_of_a_term_is_dropped_only_if_it_is_the_baselines(front):
     assert front.limits_dropped == ("area_efficiency",)
     least = min(point.terms["area_efficiency"] for point in front.points)

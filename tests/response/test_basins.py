@@ -182,15 +182,6 @@ def test_a_motion_that_is_not_told_is_no_steady_state(coexisting):
     assert dataclasses.replace(basins, attractors=mixed).status is Status.CHAOTIC
 
 
-def test_lost_motions_are_counted():
-    """Behind a weak timing gear all motions are lost, and no motion is reported."""
-    basins = find(Evaluator.of(config_of(*WEAK)))
-    assert basins.attractors == ()
-    assert basins.lost == {"passed_through": 1.0}
-    assert np.all(basins.leads_to == -1)
-    assert basins.status is Status.PASSED_THROUGH
-
-
 def test_command(tmp_path, capsys):
     """The command writes table, result file, a CSV of basins that agrees with it, and a picture.
 

@@ -5,7 +5,6 @@ import signal
 import sys
 from pathlib import Path
 
-import numpy as np
 import psutil
 import pytest
 
@@ -71,20 +70,6 @@ def test_a_point_that_kills_its_process_is_a_status(tmp_path, monkeypatch):
     statuses = [rows[number]["status"] for number in range(6)]
     assert statuses == ["invalid", "invalid", "failed", "invalid", "invalid", "invalid"]
     assert "may need more memory" in rows[2]["message"]
-
-
-@pytest.mark.long
-def test_simulated_points_are_those_of_one_process(tmp_path, monkeypatch):
-    """A worker is killed in mid-run; forces agree to rounding, as compiler options differ here."""
-    monkeypatch.delenv("TEST_SECONDS", raising=False)
-    config, plan = load("cic_drawn"), plan_of({SPEED: "1000:4000:24"})
-    swept(tmp_path / "points", plan, after=3)
-    axes = {SPEED: "1000:4000:24"}
-    found = rootsopt.sweep_scenes(config, axes, checkpoint=tmp_path / "points", resume=True)
-    here = rootsopt.sweep_scenes(config, axes)
-    assert found.status.identical(here.status)
-    np.testing.assert_allclose(found.mean_force_N, here.mean_force_N, rtol=1e-7)
-    np.testing.assert_allclose(found.gradient_mean_force_N, here.gradient_mean_force_N, rtol=1e-4)
 
 
 def test_workers_of_other_versions_are_refused(tmp_path, monkeypatch):

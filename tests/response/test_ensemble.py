@@ -2,7 +2,6 @@
 
 import csv
 import dataclasses
-import functools
 import itertools
 import json
 
@@ -11,7 +10,6 @@ import numpy as np
 import pytest
 
 from rootsopt import optimize
-from rootsopt.commands.table import simulate
 from rootsopt.config import DESIGN_KEYS, EnsembleConfig, load
 from rootsopt.response.ensemble import SIGNIFICANT, Ensemble, fitted_slope, independent, neighbours
 from rootsopt.response.evaluation import Evaluator
@@ -41,13 +39,6 @@ def averaged(*overrides, gradient=False, survey=True, design=None):
     if gradient:
         evaluator = dataclasses.replace(evaluator, differentiate=True)
     return evaluator(None if design is None else jnp.array(design), series=False)
-
-
-@functools.cache
-def chaotic(seed=0, members=32, periods=32):
-    """Return averages in the chaotic scene."""
-    size = f"ensemble.members={members}", f"ensemble.periods={periods}", f"ensemble.seed={seed}"
-    return averaged(*CHAOTIC, "ensemble.settle_periods=24", *size)
 
 
 def numbers(evaluation):
@@ -167,18 +158,6 @@ def test_chaos_is_averaged_and_named():
 
 
 @pytest.mark.long
-def test_standard_errors_are_honest():
-    """Independent ensembles differ by as much as their standard errors state."""
-    found = [numbers(chaotic(seed=seed, members=16)) for seed in range(3)]
-    apart = []
-    for (first, by_first), (second, by_second) in itertools.combinations(found, 2):
-        apart.append(np.abs(first - second) / np.hypot(by_first, by_second))
-    assert np.max(apart) < 4
-    # Neither are they far too large.
-    assert np.max(apart) > 0.3
-
-
-@pytest.mark.long
 def test_gradient_of_chaos_has_its_standard_error():
     """Estimates of two seeds differ by as much as their standard errors state."""
     size = "ensemble.members=4", "ensemble.settle_periods=16", "ensemble.periods=16"
@@ -215,17 +194,6 @@ def test_start_is_continued():
     assert on.response != first.response
     with pytest.raises(ValueError, match="start"):
         evaluator(start=np.zeros(2), series=False)
-
-
-def test_no_number_without_its_status():
-    """If a member fails, the ensemble fails, and has neither averages nor gradient."""
-    free = "scene.timing_gear.stiffness_N_m_per_rad=1", "scene.load.torque_N_m=40"
-    evaluation = averaged(*free, *PERIODIC, gradient=True)
-    assert evaluation.status is Status.PASSED_THROUGH
-    assert evaluation.message.startswith(evaluation.status.meaning + " Raise scene.timing_gear")
-    assert (evaluation.response, evaluation.gradient) == ({}, {})
-    assert evaluation.steady_state == {"kind": "transient"}
-    assert evaluation.series is None
 
 
 YES, NO = np.ones(4, bool), np.zeros(4, bool)
@@ -348,18 +316,3 @@ def test_optimize_a_chaotic_scene(tmp_path, capsys):
     else:
         assert "noise" in text
         assert result["optimized"] is None
-
-
-@pytest.mark.long
-def test_simulate_an_ensemble(tmp_path):
-    """The exit code is 0, and the run has averages, the series of one member, and figures."""
-    size = "ensemble.members=4", "ensemble.designs=12", "ensemble.periods=16"
-    options = itertools.chain.from_iterable(("--set", key) for key in (*CHAOTIC, *size))
-    assert simulate.main(["configs/cic_drawn.yaml", "-o", str(tmp_path), *options]) == 0
-    result = json.loads((tmp_path / "result.json").read_text())
-    assert result["status"] == "averaged"
-    assert set(result["steady_state"]["gradient_standard_error"]) == set(RESPONSES)
-    with open(tmp_path / "response_design.csv", newline="") as file:
-        force = [float(row["contact_force_N"]) for row in csv.DictReader(file)]
-    assert 0 < np.mean(force) < max(force)
-    assert (tmp_path / "figures" / "force.png").exists()

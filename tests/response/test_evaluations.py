@@ -11,7 +11,6 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from rootsopt.commands.table import optimize, pareto
 from rootsopt.commands.work.searching import runs_of
 from rootsopt.config import load
 from rootsopt.errors import InputError
@@ -148,14 +147,6 @@ def test_the_price_of_workers_is_said_before_they_start(capsys):
     """The context is not entered, so nothing has started yet."""
     runs_of(Namespace(workers=3, scheduler=None, imports=[], no_cache=False))
     assert "are no faster than this process" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("command", [optimize, pareto])
-def test_commands_refuse_both_kinds_of_workers(command, tmp_path, capsys):
-    options = ["--workers", "2", "--scheduler", "tcp://127.0.0.1:1", "-o", str(tmp_path / "run")]
-    assert command.main(["configs/cic_drawn.yaml", *options]) == 2
-    assert "exclude each other" in capsys.readouterr().err
-    assert [*tmp_path.iterdir()] == []
 
 
 @pytest.mark.long

@@ -308,11 +308,6 @@ def test_design_without_parameters():
     assert mean[1].speed.shape == ()
 
 
-def test_function_compiled_with_the_options_of_programs(scene):
-    response = jax.jit(lambda x: jnp.sin(x), compiler_options=rootsopt.COMPILER_OPTIONS)(1.0)
-    assert float(response) == pytest.approx(np.sin(1.0), rel=1e-15)
-
-
 def test_unknown_derivatives_are_not_numbers(scene):
     """Without an orbit, all derivatives are NaN.
 
@@ -344,14 +339,6 @@ def test_second_derivatives_are_refused(scene):
 def test_designs_of_another_size_are_refused(scene, design, message):
     with pytest.raises(ValueError, match=message):
         steady_response(scene, design)
-
-
-def test_import_loads_no_solver():
-    code = (
-        "import sys, rootsopt; print([m for m in ('jax', 'numpy', 'pydantic') if m in sys.modules])"
-    )
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert (found.stdout.strip(), found.stderr) == ("[]", "")
 
 
 def example_of(name):
@@ -412,11 +399,3 @@ def test_example_of_the_readme_runs():
     found = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, cwd=ROOT)
     assert (found.returncode, found.stderr) == (0, "")
     assert float(found.stdout.split()[0]) > 0
-
-
-def test_evaluation_as_a_dataset():
-    found = rootsopt.evaluate(scene_of()[0])
-    data = found.to_dataset()
-    assert data.contact_force_N.attrs["units"] == "N"
-    assert float(data.contact_force_N.mean()) == pytest.approx(76.247, rel=1e-3)
-    assert data.attrs["status"] == "periodic"

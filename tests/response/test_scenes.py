@@ -66,13 +66,6 @@ def test_wrong_keys_and_values_are_refused_before_anything_runs(config, monkeypa
             rootsopt.sweep_scenes(config, wrong)
 
 
-def test_point_that_cannot_be_built_is_a_status(config):
-    found = rootsopt.sweep_scenes(config, {ANGLE: "5,36.43"})
-    assert found.status.values.tolist() == ["invalid", "periodic"]
-    assert "profile.involute_length_mm" in str(found.message.values[0])
-    assert np.isnan(found.mean_force_N.values).tolist() == [True, False]
-
-
 def test_family_takes_its_own_parameters(config):
     """Those of another family, in the config or among the axes, are left out."""
     ellipse = {"profile.family": "EE", ANGLE: 30.0}

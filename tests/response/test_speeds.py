@@ -149,32 +149,6 @@ def test_each_speed_begins_on_its_own_orbit(baseline, moved, monkeypatch):
         assert periods[0] <= periods[1]
 
 
-def test_a_speed_without_steady_state_is_a_status():
-    """If one of two speeds does not settle, the status names that speed.
-
-    There is neither gradient nor objective."""
-    scene = (
-        "scene.timing_gear.backlash_mm=0.2",
-        "scene.timing_gear.damping_ratio=0.2",
-        "scene.speed_rpm=3900",
-        "solver.max_mesh_periods=64",
-    )
-    config = config_of(*scene, "objective.speeds_rpm=[2700, 3900]")
-    evaluator = Evaluator.of_objective(config).surveying()
-    found = evaluator(series=False)
-    assert [part.evaluation.status for part in found.speeds] == [
-        Status.NOT_SETTLED,
-        Status.PERIODIC,
-    ]
-    assert found.status is Status.NOT_SETTLED
-    assert found.message.startswith("At 2700 rpm: ")
-    assert found.gradient == {}
-    assert found.start is None
-    assert [row["status"] for row in found.record()["speeds"]] == ["not_settled", "periodic"]
-    problem = Problem.of(config_of(), evaluator.scene, found.speeds[1].evaluation)
-    assert np.isnan(problem.objective(found))
-
-
 def test_motions_that_coexist_at_every_speed():
     """`objective.motion: worst` over speeds uses the attractors at each speed.
 

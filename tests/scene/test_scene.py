@@ -18,7 +18,6 @@ from rootsopt.errors import InputError
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.scene import Scene, design_vector
 from rootsopt.status import Status
-from tests.conformance.parts import size
 from tests.planar import Planar
 
 MOTOR = ["scene.drive=torque", "scene.motor={slope_N_m_s_per_rad: 0.1}"]
@@ -204,29 +203,6 @@ def test_energy_balance_with_all_parts():
     assert np.all(abs(work) > 1e-6)  # Every part has done something.
     assert np.all(work[2:] < 0)
     assert float(stored) == pytest.approx(work.sum(), abs=1e-8 * abs(work[:2]).max())
-
-
-STATES = {"motor": 3, "supports": 10}
-
-
-def size_of(*overrides):
-    """Return the numbers of states, equations and constants of a scene's right-hand side."""
-    config = load("configs/cic_drawn.yaml", overrides)
-    return size(eqx.filter_eval_shape(Scene.pair, Scene.from_config(config), design_vector(config)))
-
-
-@pytest.mark.parametrize("part", PARTS)
-def test_an_absent_part_costs_nothing(part):
-    """A part adds its states, equations and constants; a gear without errors adds four numbers."""
-    states, length, numbers = size_of()
-    more = size_of(*PARTS[part])
-    assert (states, more[0]) == (2, STATES.get(part, 2))
-    assert more[1] > length
-    # The search's own centre distance is a number of every scene.
-    assert more[2] >= numbers + (part != "centre distance error")
-    _, shorter, fewer = size_of("scene.timing_gear=null")
-    assert shorter < length
-    assert numbers - fewer == 4
 
 
 @pytest.mark.long
