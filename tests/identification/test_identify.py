@@ -12,6 +12,7 @@ import pytest
 import rootsopt
 from rootsopt import InputError, Status, load_config
 from rootsopt.commands.table import identify as command
+from rootsopt.identification import fit as search
 from rootsopt.identification import model
 from rootsopt.identification.model import Point
 from rootsopt.identification.quantities import fitted
@@ -23,7 +24,15 @@ BACKLASH, LOAD = "scene.timing_gear.backlash_mm", "scene.load.torque_N_m"
 DAMPING = "scene.timing_gear.damping_ratio"
 TRUE = {BACKLASH: 0.14, LOAD: 5.5}
 BOUNDS = {BACKLASH: (0.05, 0.3), LOAD: (3.0, 9.0)}
-CIC = load_config("cic")
+GRID = "attractors.relatives=6", "attractors.rates=5"
+CIC = load_config("cic", GRID)
+
+
+@pytest.fixture(autouse=True)
+def few(monkeypatch):
+    """Try fewer scenes before local fits than the default."""
+    monkeypatch.setattr(search, "_TRIED", 3)
+    monkeypatch.setattr(search, "_MOST", 16)
 
 
 @functools.cache
@@ -132,7 +141,7 @@ def test_averages_over_speeds_lead_to_the_true_values_with_gaps(tmp_path):
 def coexisting():
     """Return (config, its motions) of a scene with quiet and noisy motions side by side."""
     moved = {"scene.speed_rpm": 4000.0, BACKLASH: 0.2, DAMPING: 0.2}
-    config = load_config("cic_drawn").replaced(moved)
+    config = load_config("cic_drawn", GRID).replaced(moved)
     found = find(Evaluator.of(config), series=True).attractors
     return config, {one.reached: one.evaluation for one in reversed(found)}
 

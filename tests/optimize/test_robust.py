@@ -1,7 +1,6 @@
 """Tests of robust optima: objective over many scenes, its gradient, both stages of the search."""
 
 import csv
-import dataclasses
 import json
 
 import numpy as np
@@ -144,14 +143,11 @@ def test_gradient_agrees_with_central_differences(spread):
     assert len(set(np.round(slopes, 4))) == 4
 
 
-def test_small_scatter_is_the_nominal_objective_and_its_sensitivity():
-    """With a tiny σ, mean + kσ is the nominal objective.
-
-    With a small one, the σ of each force is the force's derivative with respect to the clearance,
-    times the σ of the clearance. The derivative comes from the table of sensitivities, which shares
-    no code with the sample."""
-    width = 1e-5
-    config = config_of("solver.rtol=1e-10", "tolerances.samples=8", width=width)
+def test_a_small_scatter_is_that_of_the_sensitivity():
+    """The σ of each force is the force's derivative with respect to the clearance, times the σ of
+    the clearance. The derivative comes from the table of sensitivities, which shares no code with
+    the sample."""
+    config = config_of("solver.rtol=1e-10", "tolerances.samples=8", width=1e-5)
     single = Evaluator.of(config)
     evaluator = single.scattered()
     baseline = evaluator(series=False)
@@ -164,16 +160,6 @@ def test_small_scatter_is_the_nominal_objective_and_its_sensitivity():
         # The second derivative, about 1e5 N/mm², adds some 1e-3.
         assert np.std(forces) == pytest.approx(abs(slope) * np.std(sample), rel=3e-3)
         assert np.corrcoef(forces, np.sign(slope) * sample)[0, 1] > 0.99999
-    tiny = config_of("solver.rtol=1e-10", "tolerances.samples=8", width=1e-9)
-    evaluator = dataclasses.replace(single, config=tiny).scattered()
-    baseline = evaluator(series=False)
-    problem = RobustProblem.of(tiny, evaluator.scene, baseline)
-    nominal = Problem.of(tiny, evaluator.scene, baseline.nominal)
-    design = problem.design(POINT)
-    moved = evaluator(design, baseline.start, series=False)
-    assert problem.objective(moved) == pytest.approx(nominal.objective(moved.nominal), abs=1e-5)
-    slopes = problem.slope(moved, POINT), nominal.slope(moved.nominal, POINT)
-    np.testing.assert_allclose(*slopes, rtol=1e-3)
 
 
 def toy(monkeypatch, branches, *overrides):
@@ -294,9 +280,6 @@ def test_fresh_scenes_from_the_neighbouring_orbit(spread):
     alone = Evaluator.of(damped.moved(shifts(damped, drawn)[0].values))(series=False)
     peak = found["baseline"].values["peak_force_N"][0]
     assert peak == pytest.approx(alone.response["peak_force_N"], rel=1e-6)
-    again = compare(problem, designs, drawn)
-    for name, values in again["nominal"].values.items():
-        np.testing.assert_array_equal(values, found["nominal"].values[name])
 
 
 def test_a_parameter_that_the_family_of_the_search_lacks_cannot_scatter():

