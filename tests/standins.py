@@ -3,7 +3,9 @@
 A pair whose flanks never touch is a damped oscillator."""
 
 import contextlib
+from collections.abc import Callable
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -12,7 +14,10 @@ from rootsopt.contact.gap import Contact
 from rootsopt.contact.law import ImpactLaw
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.parts import ConstantLoad, PrescribedDrive, TimingGear
+from rootsopt.response import terms
+from rootsopt.response.evaluation import _build, _motion
 from rootsopt.response.result import RESPONSES, Evaluation
+from rootsopt.response.terms import Term, register_term
 from rootsopt.status import Status
 
 LOBES, SPEED, INERTIA, STIFFNESS, DAMPING, LOAD = 3, 300.0, 2e-3, 2e3, 1.5, 0.4
@@ -65,6 +70,30 @@ def evaluation_of(force=1.0, status=Status.PERIODIC, design=(), start=None) -> E
         series=None,
         start=np.zeros(2) if start is None else start,
     )
+
+
+class Own(Term):
+    """A term from outside: `formula(profile, shape, forces)`."""
+
+    formula: Callable = eqx.field(static=True)
+
+    def value(self, scene, profile, shape, forces):
+        return self.formula(profile, shape, forces)
+
+
+@contextlib.contextmanager
+def registered(**formulas):
+    """Register a term for each of the formulas in a `with` block."""
+    for name, formula in formulas.items():
+        register_term(name, Own(formula))
+    yield
+    for name in formulas:
+        del terms._terms[name]
+
+
+def programs() -> int:
+    """Return the number of programs that the evaluators have been compiled to."""
+    return sum(len(one._made) for one in (_build, _motion))
 
 
 @contextlib.contextmanager

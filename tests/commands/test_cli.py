@@ -209,7 +209,7 @@ def test_simulate_in_an_odd_environment_with_the_programs_of_a_plain_one(tmp_pat
 
     It has a copy of the cache, which no other process writes to. All variables are odd. Those that
     would change numbers or stop the run are named in a line on stderr."""
-    cache, kept, answers, tables = Path(os.environ["ROOTSOPT_CACHE"]), {}, [], []
+    cache, kept, answers = Path(os.environ["ROOTSOPT_CACHE"]), {}, []
     for run, variables in {"plain": {}, "odd": SET_ASIDE | HARMLESS}.items():
         if run == "odd":
             unfinished = shutil.ignore_patterns(".*")
@@ -224,19 +224,11 @@ def test_simulate_in_an_odd_environment_with_the_programs_of_a_plain_one(tmp_pat
         assert done.returncode == 0, done.stderr
         named = set(re.findall(r"\b([A-Z][A-Z0-9_]+)=", done.stderr))
         assert named == set(variables) & set(SET_ASIDE), done.stderr
-        told = done.stderr.splitlines()
-        assert all(line.startswith("rootsopt: ignored: ") for line in told), done.stderr
         record = json.loads((tmp_path / run / "result.json").read_text())
         answers.append({key: record[key] for key in ("design", "geometry", "gradient", "response")})
-        lines = done.stdout.splitlines()
-        tables.append([line for line in lines if re.search("force|radius", line)])
     assert {"motion_from", "pair_and_tangents"} <= {name.split("-")[0] for name in kept}
     assert kept == {path.name: path.stat().st_ino for path in cache.iterdir()}
     assert answers[0] == answers[1]
-    assert answers[0]["design"] == answers[0]["gradient"] == {}
-    assert answers[0]["response"]["peak_force_N"] > answers[0]["response"]["mean_force_N"] > 0
-    assert len(tables[0]) >= 4
-    assert tables[0] == tables[1]
 
 
 def test_no_programs_are_kept_if_told_so(tmp_path, monkeypatch, capsys):

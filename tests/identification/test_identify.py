@@ -31,7 +31,7 @@ CIC = load_config("cic", GRID)
 @pytest.fixture(autouse=True)
 def few(monkeypatch):
     """Try fewer scenes before local fits than the default."""
-    monkeypatch.setattr(search, "_TRIED", 3)
+    monkeypatch.setattr(search, "_TRIED", 4)
     monkeypatch.setattr(search, "_MOST", 16)
 
 
@@ -62,7 +62,7 @@ def test_samples_lead_to_the_true_values_with_their_errors():
     record = sampled(0.03, "relative_rotation_rad", "contact_force_N")
     config = CIC.replaced({LOAD: 5.5, DAMPING: 0.7})
     keys, true = {BACKLASH: (0.05, 0.3), DAMPING: (0.2, 0.9)}, {BACKLASH: 0.14, DAMPING: 0.5}
-    found = rootsopt.identify(config, record, keys, profiles=[DAMPING], starts=2)
+    found = rootsopt.identify(config, record, keys, profiles=[DAMPING], starts=1)
     assert found.status is Status.IDENTIFIED
     for key, value in true.items():
         one = found.parameters[key]
@@ -129,19 +129,18 @@ def test_averages_over_speeds_lead_to_the_true_values_with_gaps(tmp_path):
     with open(tmp_path / "record.csv", "w", newline="") as file:
         writer = csv.writer(file)
         writer.writerows([["scene.speed_rpm", *names], *rows])
-    keys = [f"{BACKLASH}=0.05:0.3", f"{LOAD}=3:9"]
-    found = rootsopt.identify(CIC, str(tmp_path / "record.csv"), keys, starts=1)
+    config, keys = CIC.replaced({LOAD: 5.5}), [f"{BACKLASH}=0.05:0.3"]
+    found = rootsopt.identify(config, str(tmp_path / "record.csv"), keys, starts=1)
     assert found.fit["measured_values"] == 5
-    for key, true in TRUE.items():
-        low, high = found.parameters[key]["interval_95"]
-        assert low < true < high
+    low, high = found.parameters[BACKLASH]["interval_95"]
+    assert low < 0.14 < high < low + 0.01
 
 
 @functools.cache
 def coexisting():
     """Return (config, its motions) of a scene with quiet and noisy motions side by side."""
     moved = {"scene.speed_rpm": 4000.0, BACKLASH: 0.2, DAMPING: 0.2}
-    config = load_config("cic_drawn", GRID).replaced(moved)
+    config = load_config("cic_drawn").replaced(moved)
     found = find(Evaluator.of(config), series=True).attractors
     return config, {one.reached: one.evaluation for one in reversed(found)}
 
@@ -160,17 +159,19 @@ def test_a_motion_that_is_not_reached_from_rest_is_matched(kind):
         record = {name: quiet.response[name] * (1 + 1e-3 * rng.standard_normal())
                   for name in names if name in quiet.response}  # fmt: skip
     keys = {BACKLASH: (0.1, 0.3)}
-    fit = rootsopt.identify(config.replaced({BACKLASH: 0.17}), record, keys, starts=1)
+    few = {"attractors.relatives": 6, "attractors.rates": 5, BACKLASH: 0.17}
+    fit = rootsopt.identify(config.replaced(few), record, keys, starts=1)
     assert fit.parameters[BACKLASH]["value"] == pytest.approx(0.2, rel=0.01)
     (motion,) = fit.motions
     assert (motion["period"], motion["reached_from_rest"]) == (1, False)
     assert "not reached from rest" in fit.message
     if kind == "averages":
-        assert motion["other_motions"] == 1
+        assert motion["other_motions"] >= 1
         assert "At 1 of 1 operating points other motions coexist" in fit.message
 
 
-def test_a_motion_of_two_mesh_periods_is_matched_whichever_comes_first():
+def test_a_motion_of_two_mesh_periods_is_matched_whichever_comes_first(monkeypatch):
+    monkeypatch.setattr(search, "_TRIED", 16)
     config, found = coexisting()
     data = found[True].to_dataset()
     record = {"rotation_deg": data.rotation_deg.values[::20] + 120}
@@ -190,7 +191,7 @@ def test_gain_offset_and_rotation_of_a_record_are_found():
     keys = {LOAD: (3.0, 9.0), "rotation_offset_deg": None}
     found = rootsopt.identify(
         CIC.replaced({BACKLASH: 0.14}), record, keys,
-        gains=[["contact_force_N"]], constants=["contact_force_N"], starts=2,
+        gains=[["contact_force_N"]], constants=["contact_force_N"], starts=1,
     )  # fmt: skip
     low, high = found.parameters[LOAD]["interval_95"]
     assert low < 5.5 < high

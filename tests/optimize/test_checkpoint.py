@@ -8,27 +8,15 @@ import pytest
 
 from rootsopt.commands.table import optimize as command
 from rootsopt.commands.work import optimize as work
-from rootsopt.config import parse
 from rootsopt.errors import InputError
 from rootsopt.optimize.search import Search
 from rootsopt.response.journal import Checkpoint
 from rootsopt.response.result import Evaluation, Seed
 from rootsopt.status import Status
 from rootsopt.view.runs import RunFolder
+from tests.optimize.test_optimize import config
 
-SCENE = """
-profile: {family: cic, lobes: 3, pitch_radius_mm: 33.0, pressure_angle_deg: 36.43,
-          involute_length_mm: 8.0, tip_arc_angle_deg: 4.0}
-rotor: {length_mm: 100.0, density_kg_m3: 7800.0}
-contact: {stiffness_N_per_mm_e: 2.0e5, exponent: 2.2, max_damping_N_s_per_mm: 0.25,
-          full_damping_depth_mm: 0.01}
-scene:
-  speed_rpm: 3000.0
-  load: {torque_N_m: 4.775}
-  timing_gear: {stiffness_N_m_per_rad: 2.0e4, damping_ratio: 0.5, backlash_mm: 0.1}
-constraints: {seal_width_min_mm: 2.0}
-optimizer: {screening: 2, starts: 1, iterations: 4, prove: false}
-"""
+SHORT = [f"optimizer.{one}" for one in ("screening=2", "starts=1", "iterations=4", "prove=false")]
 HEADER = {"config": {"a": 1}, "versions": {"jax": "1"}}
 
 
@@ -73,15 +61,15 @@ def test_the_command_keeps_its_checkpoint_until_the_run_is_in_place(tmp_path, mo
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
-SPEEDS = "objective: {speeds_rpm: [2700.0, 3300.0]}\n"
+SPEEDS = "objective.speeds_rpm=[2700, 3300]"
 
 
-@pytest.mark.parametrize("more", ["", pytest.param(SPEEDS, marks=pytest.mark.long)])
+@pytest.mark.parametrize("more", [(), pytest.param((SPEEDS,), marks=pytest.mark.long)])
 def test_a_resumed_search_equals_one_that_was_not_interrupted(tmp_path, more):
     """The file is cut at a random byte, as after a kill, and its lines are damaged at random.
 
     Orbits are closed from those of neighbours, which the file does not hold."""
-    settings, path = parse(SCENE + more), tmp_path / "c"
+    settings, path = config(*SHORT, *more), tmp_path / "c"
     full = Checkpoint(HEADER, path)
     expected = outcome(Search(settings, checkpoint=full).run())
     assert b"from_neighbour" in path.read_bytes()

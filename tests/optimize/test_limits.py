@@ -6,7 +6,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rootsopt.config import parse
 from rootsopt.dynamics.maxima import Maxima
 from rootsopt.errors import InputError
 from rootsopt.optimize.infeasible import explain
@@ -23,10 +22,10 @@ from rootsopt.profiles import geometry
 from rootsopt.pump import flow
 from rootsopt.response.records import geometry_record
 from rootsopt.response.result import Part
-from rootsopt.response.terms import Term, _terms, register_term
 from rootsopt.scene import Scene
 from rootsopt.scene.space import RangeConstraint
-from tests.optimize.test_optimize import SCENE, baseline
+from tests.optimize.test_optimize import baseline, config
+from tests.standins import registered
 
 PEAK = "constraints.terms.peak_force_N.max="
 LIMITED = (
@@ -34,10 +33,6 @@ LIMITED = (
     "constraints.terms.width.max=452",
     "constraints.terms.ratio.max=3",
 )
-
-
-def config(*overrides):
-    return parse(SCENE, overrides)
 
 
 def problem_of(*overrides):
@@ -57,32 +52,17 @@ def evaluation(mean=50.0, peak=200.0, maxima=None):
     )
 
 
-class _Width(Term):
-    """Ten times the outer radius (mm), as a term from outside."""
-
-    def value(self, scene, profile, shape, forces):
-        del scene, profile, forces
-        return 1e4 * shape.outer_radius
-
-
-class _Ratio(Term):
-    """Peak force over mean force, as a term from outside."""
-
-    def value(self, scene, profile, shape, forces):
-        del scene, profile, shape
-        return forces.peak / forces.mean
+@pytest.fixture(autouse=True)
+def outside():
+    """Ten times the outer radius (mm), and peak over mean force, as terms from outside."""
+    with registered(
+        width=lambda profile, shape, forces: 1e4 * shape.outer_radius,
+        ratio=lambda profile, shape, forces: forces.peak / forces.mean,
+    ):
+        yield
 
 
-@pytest.fixture
-def registered():
-    """Two terms from outside, for the duration of a test."""
-    register_term("width", _Width())
-    register_term("ratio", _Ratio())
-    yield
-    del _terms["width"], _terms["ratio"]
-
-
-def test_terms_without_forces_are_constraints_of_the_geometry(registered):
+def test_terms_without_forces_are_constraints_of_the_geometry():
     """Their slacks are those of the formulas, and projection moves designs onto them."""
     problem = problem_of(*LIMITED)
     assert [one.key for one in problem.limits] == ["ratio"]
@@ -101,7 +81,7 @@ def test_terms_without_forces_are_constraints_of_the_geometry(registered):
     assert problem.feasible(moved)
 
 
-def test_prices_are_per_unit_of_the_limits(registered):
+def test_prices_are_per_unit_of_the_limits():
     """A multiplier of a scaled slack, (V - 400) / 400 or 1 - F / 150, becomes a price per unit.
 
     A limit is relaxed by 1 % of it, to the nearest power of ten."""

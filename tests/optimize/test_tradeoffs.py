@@ -7,17 +7,12 @@ import itertools
 import threading
 import types
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import minimize
-from standins import evaluation_of
 
-import rootsopt
-from rootsopt import register_term
-from rootsopt.config import parse
 from rootsopt.config.study import BASELINE
 from rootsopt.config.units import words
 from rootsopt.errors import InputError
@@ -34,19 +29,9 @@ from rootsopt.response import terms
 from rootsopt.response.terms import needs_forces
 from rootsopt.scene import Scene
 from rootsopt.status import Standing, Status
+from tests.optimize.test_optimize import config
+from tests.standins import Own, evaluation_of, registered
 
-SCENE = """
-profile: {family: cic, lobes: 3, pitch_radius_mm: 33.0, pressure_angle_deg: 36.43,
-          involute_length_mm: 8.0, tip_arc_angle_deg: 4.0}
-rotor: {length_mm: 100.0, density_kg_m3: 7800.0}
-contact: {stiffness_N_per_mm_e: 2.0e5, exponent: 2.2, max_damping_N_s_per_mm: 0.25,
-          full_damping_depth_mm: 0.01}
-scene:
-  speed_rpm: 3000.0
-  load: {torque_N_m: 4.775}
-  timing_gear: {stiffness_N_m_per_rad: 2.0e4, damping_ratio: 0.5, backlash_mm: 0.1}
-constraints: {seal_width_min_mm: 2.0}
-"""
 RADIUS = "pareto.terms=[outer_radius_mm, area_efficiency]"
 ANGLES = (
     "pareto.terms=[first, second]",
@@ -58,15 +43,15 @@ ANGLES = (
 bound. An involute length other than 5 mm makes all of them worse."""
 
 
-class MadeUp(rootsopt.Term):
-    """Define a term as a function of a and b, plus a penalty on lengths other than 5 mm."""
+def made_up(value):
+    """Return the formula of a term: `value(a, b)`, plus a penalty on lengths other than 5 mm."""
 
-    kind: str = eqx.field(static=True)
-
-    def value(self, scene, profile, shape, forces):
+    def formula(profile, shape, forces):
         a = (jnp.degrees(profile.pressure_angle) - 30.0) / 15.0
         b = (jnp.degrees(profile.tip_arc_angle) - 0.5) / 7.5
-        return MADE_UP[self.kind](a, b) + (200 * profile.involute_length - 1) ** 2
+        return value(a, b) + (200 * profile.involute_length - 1) ** 2
+
+    return formula
 
 
 def _concave(a, b):
@@ -87,15 +72,6 @@ def _two_wells(a, b):
     return 3 - a + 40 * (b - 0.1) ** 2 * (b - 0.9) ** 2 + 0.4 * (a - 0.5) * (b - 0.5)
 
 
-MADE_UP = {
-    "first": lambda a, b: a + 1.0 + 0.0 * b,
-    "falling": lambda a, b: 2.0 - a + 0.0 * b,
-    "concave": _concave,
-    "stepped": _stepped,
-    "wells": _two_wells,
-}
-
-
 @pytest.fixture(scope="module", autouse=True)
 def few():
     """Return fewer starts and screened designs than the defaults."""
@@ -105,21 +81,10 @@ def few():
         yield
 
 
-@pytest.fixture
-def registered():
-    """Return a function that registers the terms `first` and `second` for one test."""
-
-    def add(second: str, first: str = "first") -> None:
-        register_term("first", MadeUp(first))
-        register_term("second", MadeUp(second))
-
-    yield add
-    for name in ("first", "second"):
-        del terms._terms[name]
-
-
-def config(*overrides):
-    return parse(SCENE, overrides)
+def front_of(points, second, first=lambda a, b: a + 1.0 + 0.0 * b):
+    """Return the front of two terms made up of a and b."""
+    with registered(first=made_up(first), second=made_up(second)):
+        return pareto_front(config(*ANGLES, f"pareto.points={points}"))
 
 
 @pytest.fixture(scope="module")
@@ -191,10 +156,9 @@ def test_floor_of_a_term_is_dropped_only_if_it_is_the_baselines(front):
     }
 
 
-def test_concave_front_is_reached_evenly(registered):
+def test_concave_front_is_reached_evenly():
     """A weighted sum finds nothing but the ends of a concave front."""
-    registered("concave")
-    front = pareto_front(config(*ANGLES, "pareto.points=7"))
+    front = front_of(7, _concave)
     values = np.array([[*point.terms.values()] for point in front.points])
     assert len(values) == 7
     assert front.certified == 7
@@ -207,9 +171,8 @@ def test_concave_front_is_reached_evenly(registered):
         assert point.rates["second"] == pytest.approx(-second / (3 * (first - 1)), rel=1e-2)
 
 
-def test_gap_is_that_of_a_dense_grid(registered):
-    registered("stepped")
-    front = pareto_front(config(*ANGLES, "pareto.points=11"))
+def test_gap_is_that_of_a_dense_grid():
+    front = front_of(9, _stepped)
     a = np.linspace(0, 1, 100_001)
     second = np.asarray(_stepped(a, 0.0))
     best = np.minimum.accumulate(second)
@@ -229,10 +192,9 @@ def test_gap_is_that_of_a_dense_grid(registered):
         assert x <= left - 1 + 5e-3 or x >= right - 1 - 5e-3
 
 
-def test_jump_of_the_designs_is_recognised(registered):
+def test_jump_of_the_designs_is_recognised():
     """A jump of the designs is found where the better of two wells changes."""
-    registered("wells")
-    front = pareto_front(config(*ANGLES, "pareto.points=7"))
+    front = front_of(5, _two_wells)
     (gap,) = front.gaps
     assert gap.kind == "design"
     sides = [front.points[k - 1] for k in (gap.first, gap.second)]
@@ -270,10 +232,9 @@ def test_domination_by_brute_force():
         np.testing.assert_array_equal(dominated(values), expected)
 
 
-def test_terms_without_conflict_have_one_best_design(registered):
+def test_terms_without_conflict_have_one_best_design():
     """Both terms are best at the upper bound of a."""
-    registered("concave", "falling")
-    front = pareto_front(config(*ANGLES))
+    front = front_of(5, _concave, lambda a, b: 2.0 - a + 0.0 * b)
     (point,) = front.points
     assert "not in conflict" in front.message
     assert (front.gaps, front.certified) == ((), 1)
@@ -345,15 +306,13 @@ def test_objective_refuses_terms_to_be_maximised():
 
 
 def test_only_terms_that_read_forces_need_a_simulation():
-    class Product(rootsopt.Term):
-        def value(self, scene, profile, shape, forces):
-            mean, _, _ = forces
-            return mean * shape.area
-
     scene, design = Scene.from_config(config()), jnp.asarray(config().design)
     for name in ("area_efficiency", "polar_inertia_kg_m2", "displaced_volume_cm3"):
         assert not needs_forces(scene, terms.terms_of([name])[0], design)
-    for term in (terms.terms_of(["rms_force_N"])[0], Product()):
+    for term in (
+        terms.terms_of(["rms_force_N"])[0],
+        Own(lambda profile, shape, f: f.mean * shape.area),
+    ):
         assert needs_forces(scene, term, design)
 
 

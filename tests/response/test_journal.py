@@ -90,32 +90,23 @@ def test_results_come_back_exactly(path, kind):
 def damaged(data, chance):
     """Return the content of a file after one to three damages, as any of them may happen."""
     for _ in range(chance.randint(1, 3)):
-        lines = data.split(b"\n")
-        place = chance.randrange(max(1, len(data)))
-        one, other = (chance.randrange(len(lines)) for _ in range(2))
-        kind = chance.choice(["bit", "bits", "cut", "hole", "swap", "twice", "lost", "text", "key"])
-        if kind.startswith("bit"):
-            many = bytearray(data)
-            for k in [place] if kind == "bit" else range(place, min(place + 9, len(many))):
-                many[k] ^= 1 << chance.randrange(8)
-            data = bytes(many)
-            continue
-        if kind in ("cut", "hole"):
-            data = data[:place] + (b"" if kind == "cut" else data[place + chance.randint(1, 90) :])
-            continue
-        if kind == "swap":
-            lines[one], lines[other] = lines[other], lines[one]
-        elif kind == "twice":
-            lines.insert(other, lines[one])
-        elif kind == "lost":
-            del lines[one]
-        elif kind == "text":
-            lines[one] = chance.choice(
-                [b"{}", b"[1]", b"null", b"\xff", b"NaN", b"[" * 9999, b"1 2"]
-            )
-        else:
-            lines[one] = lines[one].replace(b"[3, ", b"[99, ").replace(b"0.3", b"NaN")
-        data = b"\n".join(lines)
+        lines, place = data.split(b"\n"), chance.randrange(max(1, len(data)))
+        one, other = sorted(chance.randrange(len(lines)) for _ in range(2))
+        before, line, after = lines[:one], lines[one], lines[one + 1 :]
+        odd = [b"{}", b"[1]", b"null", b"\xff", b"NaN", b"[" * 9999, b"1 2"]
+        bit, many = 1 << chance.randrange(8), chance.choice([1, 9])
+        data = chance.choice([
+            bytes(x ^ bit * (0 <= k - place < many) for k, x in enumerate(data)),
+            data[:place],
+            data[:place] + data[place + chance.randint(1, 90) :],
+            *map(b"\n".join, (
+                [*lines[:one], *lines[one:other + 1][::-1], *lines[other + 1 :]],
+                [*lines[:other], line, *lines[other:]],
+                [*before, *after],
+                [*before, chance.choice(odd), *after],
+                [*before, line.replace(b"[3, ", b"[99, ").replace(b"0.3", b"NaN"), *after],
+            )),
+        ])  # fmt: skip
     return data
 
 

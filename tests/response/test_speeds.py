@@ -11,11 +11,11 @@ from rootsopt.errors import InputError
 from rootsopt.optimize.problem import Problem
 from rootsopt.response import reducers
 from rootsopt.response.attractors import Coexisting
-from rootsopt.response.evaluation import Evaluator, _build, _motion
+from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.reducers import overall
 from rootsopt.response.result import Part
 from rootsopt.status import Status
-from tests.standins import evaluation_of
+from tests.standins import evaluation_of, programs
 
 CIC = "configs/cic_drawn.yaml"
 SPEEDS = "objective.speeds_rpm=[4000, 2000]"
@@ -27,11 +27,6 @@ POINT = np.array([0.2, 0.3, 0.4])
 
 def config_of(*overrides):
     return load(CIC, overrides)
-
-
-def programs():
-    """Return the number of programs that the evaluators have been compiled to."""
-    return sum(len(one._made) for one in (_build, _motion))
 
 
 @pytest.fixture(scope="module")

@@ -10,12 +10,12 @@ import scipy.stats
 from rootsopt.config import load, parse
 from rootsopt.config.tolerances import scatterable
 from rootsopt.errors import InputError
-from rootsopt.response.evaluation import Evaluator, _build, _motion
+from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.journal import plain_evaluation, read_evaluation
 from rootsopt.response.scatter import draw, quantiles, shifts
 from rootsopt.scene import Scene
 from rootsopt.status import Status
-from tests.standins import evaluation_of
+from tests.standins import evaluation_of, programs
 
 CIC = "configs/cic_drawn.yaml"
 PLAY = "contact.clearance_mm=0.01"
@@ -28,11 +28,6 @@ SPREAD = (PLAY, CLEARANCE, BACKLASH, LOAD, TIP)
 
 def config_of(*overrides, file=CIC):
     return load(file, overrides)
-
-
-def programs():
-    """Return the number of programs that the evaluators have been compiled to."""
-    return sum(len(one._made) for one in (_build, _motion))
 
 
 def test_config_names_distributions_in_two_ways():

@@ -10,7 +10,6 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.optimize import minimize
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import rootsopt
@@ -49,23 +48,6 @@ def test_work_is_divided_among_the_cores(monkeypatch):
             assert [x.tobytes() for x in map(np.asarray, one)] == [
                 x.tobytes() for x in map(np.asarray, found[0])
             ]
-
-
-def wandering():
-    """Return the end of a search with SciPy, whose rounding depends on the number of threads."""
-    aim = np.random.default_rng(1).normal(size=9)
-    inside = {"type": "ineq", "fun": lambda x: 1 - np.sum(x**2)}
-    start = np.zeros(9)
-    found = minimize(lambda x: np.sum((x - aim) ** 4), start, method="SLSQP", constraints=[inside])
-    return found.x.tobytes()
-
-
-def test_dense_algebra_rounds_alike_on_any_number_of_threads():
-    found = set()
-    for threads in (1, 2, 16):
-        with threadpool_limits(threads):
-            found.add(one_thread(wandering)())
-    assert len(found) == 1
 
 
 def test_overlapping_contexts_keep_one_thread_to_the_end():
