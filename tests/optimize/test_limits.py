@@ -52,17 +52,20 @@ def evaluation(mean=50.0, peak=200.0, maxima=None):
     )
 
 
-@pytest.fixture(autouse=True)
+OUTSIDE = {
+    "width": lambda profile, shape, forces: 1e4 * shape.outer_radius,
+    "ratio": lambda profile, shape, forces: forces.peak / forces.mean,
+}
+"""Ten times the outer radius (mm), and peak over mean force, as terms from outside."""
+
+
+@pytest.fixture
 def outside():
-    """Ten times the outer radius (mm), and peak over mean force, as terms from outside."""
-    with registered(
-        width=lambda profile, shape, forces: 1e4 * shape.outer_radius,
-        ratio=lambda profile, shape, forces: forces.peak / forces.mean,
-    ):
+    with registered(**OUTSIDE):
         yield
 
 
-def test_terms_without_forces_are_constraints_of_the_geometry():
+def test_terms_without_forces_are_constraints_of_the_geometry(outside):
     """Their slacks are those of the formulas, and projection moves designs onto them."""
     problem = problem_of(*LIMITED)
     assert [one.key for one in problem.limits] == ["ratio"]
@@ -81,7 +84,7 @@ def test_terms_without_forces_are_constraints_of_the_geometry():
     assert problem.feasible(moved)
 
 
-def test_prices_are_per_unit_of_the_limits():
+def test_prices_are_per_unit_of_the_limits(outside):
     """A multiplier of a scaled slack, (V - 400) / 400 or 1 - F / 150, becomes a price per unit.
 
     A limit is relaxed by 1 % of it, to the nearest power of ten."""
