@@ -52,8 +52,9 @@ settings.load_profile("rootsopt")
 
 
 _LONGEST_FIRST = (
-    *("identify", "response", "tradeoffs", "continuation", "basins", "start", "steady", "known"),
-    *("reserve", "improve", "families", "rattle", "cli", "robust", "leakage", "ensemble"),
+    *("identify", "response", "continuation", "steady", "tradeoffs", "robust", "improve"),
+    *("rattle", "leakage", "reserve", "basins", "play", "assumptions", "export", "optimize"),
+    *("ensemble", "pages", "gradients", "known", "start", "outline", "families"),
 )
 """The first two share few programs: neither process repeats what the other compiles."""
 
