@@ -196,11 +196,6 @@ def test_search_improves_within_the_constraints():
     assert all(b <= a for a, b in itertools.pairwise(best))
     assert best[-1] == pytest.approx(result.problem.objective(result.optimized), rel=0.01)
     assert [done for done, _ in seen] == list(range(1, len(result.history) + 1))
-    gains = result.improvement
-    reduction = (
-        1 - result.optimized.response["mean_force_N"] / (result.baseline.response["mean_force_N"])
-    )
-    assert gains["mean_force_N"] == pytest.approx(reduction)
 
 
 SMALL = (

@@ -194,10 +194,8 @@ MOTOR = (
 @pytest.mark.parametrize(
     ("name", "changes", "key", "ends"),
     [
-        ("cic_drawn", (), SPEED, (2000, 4000)),
         ("cic_drawn", (), BACKLASH, (0.05, 0.4)),
         ("cic_drawn", (f"{ECCENTRICITY}=5",), ECCENTRICITY, (1, 20)),
-        ("cic_drawn", (), INVOLUTE, (5, 9)),
         ("free", (), "profile.coefficients_2", (0.2, 0.4)),
         ("ee", (), "contact.clearance_mm", (0.0, 0.01)),
         ("pump", (), "scene.load.pressure_difference_Pa", (1e4, 4e4)),
