@@ -85,6 +85,9 @@ def test_response_of_the_shipped_scene(known):
         [again.response[name] for name in ("mean_force_N", "peak_force_N", "rms_force_N")],
         rtol=1e-11,
     )
+    data = again.to_dataset()
+    assert (data.contact_force_N.attrs["units"], data.attrs["status"]) == ("N", "periodic")
+    assert float(data.contact_force_N.mean()) == pytest.approx(76.247, rel=1e-3)
     # In SI units, and on the orbit: begun there, it is found at once.
     assert abs(float(response.state[0])) < 2e-3
 
