@@ -272,3 +272,10 @@ def test_the_bound_of_a_real_problem_holds():
         values.append(found.problem.objective(one))
     assert min(values) >= bound.lower_bound
     assert min(values) < bound.lower_bound + 0.05
+
+
+@pytest.mark.long
+def test_seeds_agree():
+    found = [_real(seed)[1].optimality for seed in range(5)]
+    assert all(one.bound.proven for one in found)
+    assert np.ptp([one.optima[0].objective for one in found]) < 1e-6

@@ -18,12 +18,14 @@ from rootsopt.optimize.limits import (
 )
 from rootsopt.optimize.local import Certificate, Linearization
 from rootsopt.optimize.problem import Problem
+from rootsopt.optimize.search import Search
 from rootsopt.profiles import geometry
 from rootsopt.pump import flow
 from rootsopt.response.records import geometry_record
 from rootsopt.response.result import Part
 from rootsopt.scene import Scene
 from rootsopt.scene.space import RangeConstraint
+from rootsopt.status import Status
 from tests.optimize.test_optimize import baseline, config
 from tests.standins import registered
 
@@ -271,3 +273,25 @@ def test_limits_of_forces_in_conflict_are_explained():
     assert (peak.alone, mean.alone) == pytest.approx((170, 150), rel=1e-5)
     assert "peak force <= 150 N (possible with the others: 170 N)" in found.message
     assert share > 0
+
+
+@pytest.mark.long
+def test_prices_of_limits_by_solving_again():
+    """The mean force under a ceiling of the peak: met, certified, and its multiplier is the slope
+    of the optimum between two limits (trapezoidal rule)."""
+    few = "optimizer.screening=4", "optimizer.starts=1", "objective.peak_weight=0"
+    free = Search(config(*few)).run()
+    top = free.optimized.response["peak_force_N"]
+
+    def at(ceiling):
+        found = Search(config(*few, f"{PEAK}{ceiling}")).run()
+        assert found.status is Status.PERIODIC
+        (row,) = [row for row in found.constraints if row["name"] == "peak force"]
+        assert row["optimized"] == pytest.approx(ceiling, rel=1e-5)
+        assert row["unit"] == "N"
+        return found.problem.objective(found.optimized), row["multiplier"]
+
+    (low, first), (high, second) = at(0.97 * top), at(0.972 * top)
+    assert free.problem.objective(free.optimized) < high < low
+    slope = (high - low) / (0.002 * top)
+    assert slope == pytest.approx((first + second) / 2, rel=0.02)

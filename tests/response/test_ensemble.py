@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import functools
 import itertools
 import json
 
@@ -311,3 +312,22 @@ def test_optimize_a_chaotic_scene(tmp_path, capsys):
     else:
         assert "noise" in text
         assert result["optimized"] is None
+
+
+@functools.cache
+def chaotic(seed=0, members=32, periods=32):
+    """Return averages in the chaotic scene."""
+    size = f"ensemble.members={members}", f"ensemble.periods={periods}", f"ensemble.seed={seed}"
+    return averaged(*CHAOTIC, "ensemble.settle_periods=24", *size)
+
+
+@pytest.mark.long
+def test_standard_errors_are_honest():
+    """Independent ensembles differ by as much as their standard errors state."""
+    found = [numbers(chaotic(seed=seed, members=16)) for seed in range(3)]
+    apart = []
+    for (first, by_first), (second, by_second) in itertools.combinations(found, 2):
+        apart.append(np.abs(first - second) / np.hypot(by_first, by_second))
+    assert np.max(apart) < 4
+    # Neither are they far too large.
+    assert np.max(apart) > 0.3

@@ -14,7 +14,9 @@ from scipy.integrate import solve_ivp
 from rootsopt.config import load
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.errors import InputError
+from rootsopt.response.evaluation import Evaluator
 from rootsopt.scene import Scene, design_vector
+from rootsopt.status import Status
 from tests.planar import Planar
 
 MOTOR = ["scene.drive=torque", "scene.motor={slope_N_m_s_per_rad: 0.1}"]
@@ -144,3 +146,32 @@ def test_motion_of_all_parts_is_scipys():
 def test_parts_that_do_not_go_together_are_refused(overrides, words):
     with pytest.raises(InputError, match=words):
         load("configs/cic_drawn.yaml", overrides)
+
+
+@pytest.mark.long
+def test_orbit_and_gradient_of_all_parts():
+    """With all parts, eleven states, the orbit closes, and its gradient is that of differences."""
+    config = load("configs/cic_drawn.yaml", [*ALL, WITHIN, "solver.rtol=1e-10"])
+    evaluator = Evaluator.of(config)
+    found = evaluator(series=True)
+    assert found.status is Status.PERIODIC
+    assert found.steady_state["residual"] < 1e-9
+    assert len(found.steady_state["floquet_multipliers"]) == 11
+    # The motor's speed forgets slowest of all.
+    assert 0.5 < found.steady_state["floquet_multiplier"] < 1
+    # Time is that of the turning rotor, on the average that of its mean speed.
+    series = found.series
+    assert np.all(np.diff(series.time) > 0)
+    mean = np.trapezoid(series.force, series.time) / np.ptp(series.time)
+    assert found.response["mean_force_N"] == pytest.approx(mean, rel=2e-3)
+    assert found.response["peak_force_N"] == pytest.approx(series.force.max(), rel=2e-3)
+    # Along a direction in which all parameters count.
+    design, step, way = np.asarray(design_vector(config)), 1e-3, np.array([1.0, -0.7, 0.8])
+    ends = [
+        evaluator(jnp.asarray(design + s * step * way), start=found.start, series=False).response
+        for s in (-1, 1)
+    ]
+    for name in ("mean_force_N", "rms_force_N"):
+        slope = (ends[1][name] - ends[0][name]) / (2 * step)
+        along = np.array(list(found.gradient[name].values())) @ way
+        assert along == pytest.approx(slope, rel=1e-5), name
