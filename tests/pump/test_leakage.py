@@ -27,7 +27,6 @@ from rootsopt.pump.flow import (
 )
 from rootsopt.pump.gap import Allowances, mesh_gap, relative_curvature
 from rootsopt.pump.sheet import KEYS, missing, sheet, warnings
-from rootsopt.response.terms import terms_of
 from rootsopt.scene import Scene, design_vector
 from rootsopt.scene.reading import Gas
 from tests.conformance.families import LOBES, R, made, outline_of
@@ -347,17 +346,10 @@ def test_sheet_says_what_it_lacks_and_what_does_not_hold():
     assert rows["knudsen_number"] == pytest.approx(float(path) / 5e-5, rel=1e-9)
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        "pump.radial_allowance_mm=-0.1",
-        pytest.param("scene.center_distance_error_mm=-0.2", marks=pytest.mark.long),
-    ],
-)
-def test_interference_is_an_error(change):
+def test_interference_is_an_error():
     design = design_vector(load_config("configs/cic_drawn.yaml"))
     with pytest.raises(InputError, match=r"overlap by .*raise `contact.clearance_mm`"):
-        sheet(scene_of(*LIQUID, change), design)
+        sheet(scene_of(*LIQUID, "pump.radial_allowance_mm=-0.1"), design)
 
 
 def test_pressure_is_asked_for():
@@ -367,20 +359,3 @@ def test_pressure_is_asked_for():
     config = load_config("configs/cic_drawn.yaml", ["pump.viscosity_mPa_s=50", gas_load])
     assert config.pump is not None
     assert config.pump.pressure_difference_Pa == 3e4
-
-
-def test_terms_are_those_of_the_sheet():
-    """The share that leaks needs a section `pump`; the backlash does not."""
-    design = design_vector(load_config("configs/cic_drawn.yaml"))
-    loss, backlash = terms_of(["leakage_fraction", "gear_backlash_max_mm"])
-
-    def value(term, scene):
-        profile = scene.profile(design)
-        return float(eqx.filter_jit(term.value)(scene, profile, geometry(profile), None))
-
-    scene = scene_of(*LIQUID)
-    rows = sheet(scene, design)
-    assert value(loss, scene) == pytest.approx(1 - rows["volumetric_efficiency"], rel=1e-9)
-    assert value(backlash, scene) == pytest.approx(rows["gear_backlash_max_mm"], rel=1e-9)
-    with pytest.raises(InputError, match="needs the section `pump`"):
-        value(loss, scene_of())

@@ -18,7 +18,9 @@ from rootsopt.scene.families import margins_of
 from tests.conformance.families import LOBES, R, config_of, made, outline_of
 
 ROLLING = [
-    name for name, row in families().items() if row.example is not None and row.maker is not None
+    pytest.param(name, marks=[pytest.mark.long] * (name not in ("cic", "ee", "free_form")))
+    for name, row in families().items()
+    if row.example is not None and row.maker is not None
 ]
 
 
