@@ -25,7 +25,7 @@ from rootsopt.pump.flow import (
     slot_flow,
     tip_length,
 )
-from rootsopt.pump.gap import Allowances, mesh_gap, relative_curvature
+from rootsopt.pump.gap import Allowances, mesh_gap
 from rootsopt.pump.sheet import KEYS, missing, sheet, warnings
 from rootsopt.scene import Scene, design_vector
 from rootsopt.scene.reading import Gas
@@ -298,14 +298,6 @@ def test_tips_in_series_share_the_pressure_ratio():
 
     first = optimize.fsolve(uneven, [1.2e5, 1.1e5])[0]
     assert flux(up, first) < rate < 1.1 * flux(up, first)
-
-
-def test_curvature_of_circles():
-    """On the land, two circles about their axes touch: radii r_a and 2r - r_a."""
-    profile = made("five_arcs")
-    outer = float(jax.jit(geometry)(profile).outer_radius)
-    found = float(relative_curvature(profile, jnp.asarray(0.02)))
-    assert found == pytest.approx(1 / outer + 1 / (2 * R - outer), rel=1e-9)
 
 
 def test_sheet_has_the_rows_of_its_inputs():
