@@ -22,7 +22,6 @@ from rootsopt.pump.flow import (
     leakage,
     mean_free_path,
     nozzle_flux,
-    slot_flow,
     tip_length,
 )
 from rootsopt.pump.gap import Allowances, mesh_gap
@@ -47,18 +46,6 @@ def gaps(family, normal=0.0, center=0.0, radial=0.0):
 def parabolic_length(height, curvature):
     """Length (m) of a slot that passes as much as a gap h + x²/2R: h³ ∫ dx / (h + x²/2R)³."""
     return 3 * np.pi / 8 * np.sqrt(2 * np.asarray(height) / np.asarray(curvature))
-
-
-def test_parabolic_gap_by_quadrature():
-    """0.1 mm, relative radius 20 mm, 1 mPa·s, 1 bar: 3.5368e-3 m²/s per metre."""
-    h, curvature = 1e-4, 1 / 0.02
-    length = parabolic_length(h, curvature)
-    found = slot_flow(jnp.asarray(h), jnp.asarray(length), jnp.asarray(1e5), jnp.asarray(1e-3))
-    assert float(found) == pytest.approx(3.5368e-3, rel=2e-5)
-    resistance, _ = integrate.quad(
-        lambda x: 1 / (h + x**2 * curvature / 2) ** 3, -np.inf, np.inf, points=None
-    )
-    assert float(found) == pytest.approx(1e5 / (12e-3 * resistance), rel=1e-6)
 
 
 def test_nozzle_of_air():
