@@ -18,6 +18,7 @@ from rootsopt.view.figures.force import amplitude_spectrum, plot_force, plot_gap
 from rootsopt.view.figures.runs import optimization_figures, simulation_figures
 from rootsopt.view.figures.style import figure
 from rootsopt.view.names import table
+from tests.standins import refusal
 
 CONFIG = """
 profile: {family: cic, lobes: 3, pitch_radius_mm: 33.0, pressure_angle_deg: 36.43,
@@ -133,6 +134,14 @@ def test_json_has_null_for_what_is_not_finite(tmp_path):
         "a": None, "b": [None, 1.5], "c": [1, 2],
         "d": {"e": True, "f": None, "g": "chaotic"},
     }  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["", "nul\0byte", "x" * 300, "file", "file/x/y"])
+def test_places_where_no_folder_can_be_made(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("keep")
+    assert "output folder" in refusal(files.ResultFolder, name)
+    assert os.listdir(tmp_path) == ["file"]
 
 
 # --------------------------------------------------------------------------- tables
