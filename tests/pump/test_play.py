@@ -19,13 +19,13 @@ C = 5e-5
 
 
 @jax.jit
-def played(profile, clearance, distance, radial=0.0):
+def played(profile, clearance, distance, radial):
     return play(profile, clearance, distance, radial=radial)
 
 
 @functools.cache
 def of(family, error=0.0):
-    return played(made(family), jnp.asarray(C), jnp.asarray(2 * R + error))
+    return played(made(family), C, 2 * R + error, 0.0)
 
 
 def test_ee_and_involute():
@@ -96,7 +96,7 @@ def test_overlap_is_negative():
 
 def at_clearances(profile, clearances):
     """Return backlash, overlap (µm) and least play (mrad) at several clearances (µm)."""
-    found = [played(profile, jnp.asarray(1e-6 * c), jnp.asarray(2 * R)) for c in clearances]
+    found = [played(profile, 1e-6 * c, 2 * R, 0.0) for c in clearances]
     rows = [(1e6 * x.gear_backlash, 1e6 * x.overlap, 1e3 * jnp.min(x.total)) for x in found]
     return np.array(rows, float).T
 
@@ -125,7 +125,7 @@ def test_play_is_continuous_in_the_overlap(family):
 def test_smaller_rotors_have_the_play_of_their_gap():
     """A radius that is smaller everywhere: the gap of the flanks, over the lever r cos ψ."""
     profile, nothing = made("cic"), jnp.zeros(())
-    found = played(profile, nothing, jnp.asarray(2 * R), C)
+    found = played(profile, 0.0, 2 * R, C)
     gap = jax.jit(mesh_gap)(profile, Allowances(nothing, nothing, jnp.asarray(C)))
     lever = R * np.cos(profile.addendum(profile.normal_at(gap.roll)).psi)
     expected = 2 * R * np.min(np.asarray(gap.least) / lever)
