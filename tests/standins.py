@@ -1,4 +1,5 @@
-"""Stand-ins for a pair and an evaluation, with numbers made up for a test.
+"""Stand-ins for a pair and an evaluation, with numbers made up for a test, and
+the message of a refusal.
 
 A pair whose flanks never touch is a damped oscillator."""
 
@@ -8,17 +9,20 @@ from collections.abc import Callable
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from rootsopt.config import families
 from rootsopt.contact.gap import Contact
 from rootsopt.contact.law import ImpactLaw
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.parts import ConstantLoad, PrescribedDrive, TimingGear
+from rootsopt.errors import InputError
 from rootsopt.response import terms
 from rootsopt.response.evaluation import _build, _motion
 from rootsopt.response.result import RESPONSES, Evaluation
 from rootsopt.response.terms import Term, register_term
 from rootsopt.status import Status
+from tests.fuzz.verdict import wrong_message
 
 LOBES, SPEED, INERTIA, STIFFNESS, DAMPING, LOAD = 3, 300.0, 2e-3, 2e3, 1.5, 0.4
 HALF_BACKLASH, SCALE = 1e-3, 5e-3
@@ -109,3 +113,11 @@ def for_a_time():
         families._families.update(before)
         for name in families._origins.keys() - before.keys():
             del families._origins[name], families.FAMILY_KEYS[name]
+
+
+def refusal(work, *arguments, **named) -> str:
+    """Return the message with which a call rejects its arguments; it must be one line."""
+    with pytest.raises(InputError) as caught:
+        work(*arguments, **named)
+    assert wrong_message(str(caught.value)) is None
+    return str(caught.value)

@@ -17,17 +17,15 @@ from rootsopt.config.units import named, sentence, shown
 from rootsopt.errors import InputError
 from tests.config.test_config import MINIMAL
 from tests.fuzz import configs
-from tests.fuzz.verdict import LONGEST, wrong_message
+from tests.fuzz.verdict import LONGEST
+from tests.standins import refusal as refused
 
 
 def refusal(text, *overrides):
     """Return the message of a config that must be rejected soon, in one line of limited length."""
     began = time.process_time()
-    with pytest.raises(InputError) as caught:
-        parse(text, overrides)
+    message = refused(parse, text, overrides)
     assert time.process_time() - began < 2
-    message = str(caught.value)
-    assert wrong_message(message) is None
     return message
 
 
@@ -212,6 +210,9 @@ def test_merge_keys_work():
         ("1_000", 1000),
         ("+5.", 5.0),
         (".5e3", 500.0),
+        ("1e5", 1e5),
+        ("1.5E+5", 1.5e5),
+        ("+3e5", 3e5),
         ("-.inf", float("-inf")),
         ("!!float 3", 3.0),
         ("!!int '12'", 12),
@@ -238,9 +239,9 @@ def test_what_is_no_regular_file_is_refused(tmp_path):
     with socket.socket(socket.AF_UNIX) as server:
         server.bind(str(bound))
         for path in (pipe, bound, Path("/dev/zero"), Path("/dev/null")):
-            with pytest.raises(InputError, match="regular file") as caught:
-                load(path)
-            assert str(path) in str(caught.value)
+            message = refused(load, path)
+            assert str(path) in message
+            assert "regular file" in message
 
 
 @pytest.mark.parametrize(
@@ -255,10 +256,7 @@ def test_what_is_no_regular_file_is_refused(tmp_path):
 )
 def test_odd_path_is_refused(name, words):
     """A path that no file can have is rejected in one printable line."""
-    with pytest.raises(InputError) as caught:
-        load(name)
-    assert words in str(caught.value)
-    assert wrong_message(str(caught.value)) is None
+    assert words in refused(load, name)
 
 
 @pytest.mark.parametrize(
@@ -280,10 +278,7 @@ def test_bytes_that_are_no_config_are_refused(tmp_path, data, words):
     """Other encodings are rejected, and so are files too long for a config."""
     path = tmp_path / "x.yaml"
     path.write_bytes(data)
-    with pytest.raises(InputError) as caught:
-        load(path)
-    assert words in str(caught.value)
-    assert wrong_message(str(caught.value)) is None
+    assert words in refused(load, path)
 
 
 def test_byte_order_mark_of_utf8_is_taken(tmp_path):

@@ -6,12 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rootsopt.config import parse
 from rootsopt.contact.closest import FlankPair
-from rootsopt.errors import InputError
 from rootsopt.profiles import CIC, EE, FreeForm
 from rootsopt.profiles.geometry import margins
-from rootsopt.scene.families import check, profile_of
+from rootsopt.scene.families import profile_of
 
 R = 0.033
 DEG = np.pi / 180
@@ -122,16 +120,6 @@ def test_deeper_minimum_away_from_rolling_is_found(family, design):
     touching = found.found & (deepest < -1e-7) & (deepest > -1e-3)
     assert np.sum(touching & (count > 1)) > 5
     np.testing.assert_allclose(found.gap[touching], deepest[touching], rtol=0, atol=5e-8)
-
-
-def test_ellipse_that_turns_back_is_refused():
-    """An ellipse whose contact turns back, and whose gap has several minima, is not sound."""
-    with open("configs/cic_drawn.yaml", encoding="utf-8") as file:
-        rest = file.read().split("\nrotor:")[1]
-    keys = "family: ellipse, lobes: 3, pitch_radius_mm: 33.0, ellipse_center_mm: 30.55"
-    settings = parse(f"profile: {{{keys}, ellipse_height_mm: 18.90}}\nrotor:{rest}")
-    with pytest.raises(InputError, match="move the centre, or change the height"):
-        check(settings.profile)
 
 
 @pytest.mark.parametrize("name", ["paper", "short", "epicycloid"])

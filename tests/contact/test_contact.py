@@ -163,17 +163,6 @@ def test_ramp_lies_under_the_corner_and_meets_it(x, width):
     assert float(ramp(jnp.asarray(x), jnp.asarray(0.0))) == corner
 
 
-def test_ramp_rises_with_continuous_slope():
-    """The slope is 0 at the onset and 1 from the width on, and is continuous and ≥ 0 in between."""
-    x = jnp.linspace(-0.5, 1.5, 4001)
-    slope = np.asarray(jax.vmap(jax.grad(ramp), (0, None))(x, jnp.asarray(0.8)))
-    assert slope.min() >= 0
-    assert np.all(slope[np.asarray(x) < 0] == 0)
-    np.testing.assert_allclose(slope[np.asarray(x) > 0.8], 1, rtol=1e-12)
-    # Greatest second derivative 4 / width, over the sample spacing.
-    assert np.abs(np.diff(slope)).max() < 1.1 * 4 / 0.8 * 5e-4
-
-
 # The IMPACT law
 
 
@@ -267,14 +256,6 @@ def test_law_is_continuously_differentiable(exponent, rate):
         changes.append(max(np.ptp(s, axis=1).max() / np.abs(s).max() for s in table))
     assert changes[1] < 0.02
     assert changes[1] < 0.3 * changes[0] + 1e-9
-    # The slopes are those of the force itself.
-    depths = jnp.asarray(np.array(places) + 1e-9)
-    rates = jnp.full_like(depths, rate)
-    step = 1e-12
-    numeric = (forces(law, depths + step, rates) - forces(law, depths - step, rates)) / (2 * step)
-    by_depth, _ = force_slopes(law, depths, rates)
-    scale = float(np.abs(by_depth).max())
-    np.testing.assert_allclose(numeric, by_depth, rtol=1e-3, atol=1e-3 * scale)
 
 
 # The timing gear
@@ -302,20 +283,6 @@ def test_timing_gear_in_closed_form(rounding):
     for side in (1, -1):
         torque = gear_torques(gear, side * (7.5e-4 + excess), rates)
         np.testing.assert_allclose(torque, side * 2e4 * excess + 1.7 * rates, rtol=1e-8, atol=1e-9)
-
-
-def test_timing_gear_is_odd_and_rounded():
-    """T(-ε, -ε̇) = -T(ε, ε̇). Torque and slope are continuous over the rounding."""
-    gear = timing_gear()
-    relatives = 7.5e-4 + np.linspace(-2e-6, 5e-6, 7001)[:-1] + 0.5e-9
-    rates = np.full(7000, 0.4)
-    torque = gear_torques(gear, relatives, rates)
-    np.testing.assert_array_equal(gear_torques(gear, -relatives, -rates), -torque)
-    slope = jax.jit(jax.vmap(jax.grad(gear)))(jnp.asarray(relatives), jnp.asarray(rates))
-    # Greatest second derivatives, 9 k / w and 36 c ε̇ / w², over the sample spacing of 1e-9.
-    bend = 9 * 2e4 / 3e-6 + 36 * 1.7 * 0.4 / 3e-6**2
-    assert np.abs(np.diff(slope)).max() < 1.1 * bend * 1e-9
-    assert np.abs(np.diff(torque)).max() < 1.1 * np.abs(slope).max() * 1e-9
 
 
 def test_rounded_edges_of_the_gear_keep_their_integrals():

@@ -178,18 +178,3 @@ def test_margin_of_a_jump_is_zero_where_both_minima_are_equally_deep():
         lambda x: float(search(jnp.asarray(x))) - middle, *rolls[place : place + 2], xtol=1e-14
     )
     assert found == pytest.approx(jump, abs=1e-9)
-
-
-def test_force_and_margins_from_one_contact_are_those_of_two():
-    pair = _pair("pump")
-    tau, state = (x[0] for x in _states(pair, 1))
-
-    @eqx.filter_jit
-    def both(pair):
-        apart = *pair.derivative(tau, state), pair.margins(tau, state)
-        shared = pair.derivative_and_margins(tau, state)
-        return apart, shared
-
-    apart, shared = both(pair)
-    for x, y in zip(jax.tree.leaves(apart), jax.tree.leaves(shared), strict=True):
-        np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-12)

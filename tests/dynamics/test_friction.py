@@ -15,6 +15,10 @@ def friction():
     return Friction(*(jnp.asarray(x) for x in (STATIC, KINETIC, LOW, HIGH)))
 
 
+_law = jax.jit(lambda speed: friction()(speed))
+_slope = jax.jit(jax.grad(lambda speed: friction()(speed)))
+
+
 def test_named_points_of_the_curve():
     law = friction()
     speeds = jnp.asarray([0.0, LOW, (LOW + HIGH) / 2, HIGH, 50.0])
@@ -26,14 +30,12 @@ def test_named_points_of_the_curve():
 
 @given(st.floats(-3, 3))
 def test_friction_is_odd_bounded_and_smooth(speed):
-    law = friction()
     at = jnp.asarray(speed)
-    np.testing.assert_allclose(law(-at), -law(at), atol=1e-16)
-    assert abs(float(law(at))) <= STATIC + 1e-15
-    assert float(law(at)) * speed >= 0
-    slope = jax.grad(law)
+    np.testing.assert_allclose(_law(-at), -_law(at), atol=1e-16)
+    assert abs(float(_law(at))) <= STATIC + 1e-15
+    assert float(_law(at)) * speed >= 0
     # Of a cubic step the slope's greatest change is 6 h / w².
-    change = abs(float(slope(at + 1e-6) - slope(at - 1e-6)))
+    change = abs(float(_slope(at + 1e-6) - _slope(at - 1e-6)))
     assert change <= 2e-6 * 1.01 * 6 * 2 * STATIC / (2 * LOW) ** 2 + 1e-12
 
 

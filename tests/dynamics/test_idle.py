@@ -1,5 +1,6 @@
 """Tests of scenes and designs whose flanks never touch: `idle`, with forces of zero."""
 
+import dataclasses
 import json
 import math
 import re
@@ -15,7 +16,6 @@ from rootsopt.dynamics.steady import window_status
 from rootsopt.dynamics.window import Window
 from rootsopt.errors import InputError
 from rootsopt.optimize.problem import Problem
-from rootsopt.profiles import geometry
 from rootsopt.response.attractors import Attractor, Basins
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.records import apart_message, fading_note, message_of, unsettled
@@ -23,10 +23,12 @@ from rootsopt.response.reducers import mean, over_speeds
 from rootsopt.response.result import Evaluation, Part, Seed
 from rootsopt.scene import Scene, design_vector
 from rootsopt.status import Status
+from tests.standins import evaluation_of
 
 CIC = "configs/cic_drawn.yaml"
 FORCES = {"mean_force_N": 50.0, "peak_force_N": 200.0, "rms_force_N": 80.0}
 NONE = dict.fromkeys(FORCES, 0.0)
+LINE = "line_1_force_N"
 
 
 def config_of(*overrides):
@@ -35,21 +37,15 @@ def config_of(*overrides):
 
 def made_up(response, status=Status.PERIODIC, state=(0.1, 0.0)) -> Evaluation:
     """Return an evaluation of the shipped design with made-up forces."""
-    config = config_of()
     design = {"pressure_angle_deg": 36.43, "involute_length_mm": 9.0, "tip_arc_angle_deg": 4.0}
-    shape = geometry(Scene.from_config(config).profile(jnp.asarray(list(design.values()))))
     slope = 0.0 if status is Status.IDLE else 1.0
-    slopes = {name: dict.fromkeys(design, slope) for name in response}
-    return Evaluation(
+    return dataclasses.replace(
+        evaluation_of(status=status),
         design=design,
-        geometry={"area_efficiency": float(shape.area_efficiency)},
+        geometry={"area_efficiency": 0.43},
         response=dict(response),
-        gradient=slopes if status.usable else {},
+        gradient={name: dict.fromkeys(design, slope) for name in response if status.usable},
         steady_state={"kind": "periodic", "period": 1, "floquet_multiplier": 0.5},
-        status=status,
-        message=status.value,
-        statistics={"seconds": 0.0},
-        series=None,
         start=None if state is None else Seed(np.array(state)),
     )
 
@@ -199,13 +195,20 @@ def test_the_message_names_what_holds_the_flanks_apart():
 
 
 def test_a_design_that_never_touches_has_the_best_objective():
-    """Without contact all forces are 0, and so is an objective of forces."""
+    """Without contact all forces are 0, and so is an objective of forces.
+
+    It is finite down to the least number, whose inverse overflows; measures without a weight may
+    be 0."""
     problem = problem_of(config_of(), made_up(FORCES))
-    assert problem.objective(made_up(FORCES)) == pytest.approx(1)
     assert problem.objective(made_up(NONE, Status.IDLE)) == 0
-
-
-LINE = "line_1_force_N"
+    weights = "objective.mean_weight=1", "objective.peak_weight=0"
+    for changes, forces in (
+        ((), FORCES),
+        ((), {name: 1e-300 * value for name, value in FORCES.items()}),
+        (weights, FORCES | {"peak_force_N": 0.0, LINE: 0.0}),
+    ):
+        found = made_up(forces)
+        assert problem_of(config_of(*changes), found).objective(found) == pytest.approx(1)
 
 
 @pytest.mark.parametrize(
@@ -228,19 +231,6 @@ def test_nothing_is_relative_to_a_force_of_zero(overrides, response, words):
     config = config_of(*overrides)
     with pytest.raises(InputError, match=words):
         problem_of(config, made_up(response))
-
-
-def test_measures_without_weight_may_be_zero():
-    config = config_of("objective.mean_weight=1", "objective.peak_weight=0")
-    problem = problem_of(config, made_up(FORCES | {"peak_force_N": 0.0, LINE: 0.0}))
-    assert problem.objective(made_up(FORCES)) == 1
-
-
-def test_forces_of_any_size_have_a_finite_objective():
-    """The objective is finite down to the least number, whose inverse overflows."""
-    tiny = {name: 1e-300 * value for name, value in FORCES.items()}
-    problem = problem_of(config_of(), made_up(tiny))
-    assert problem.objective(made_up(tiny)) == pytest.approx(1)
 
 
 # Several speeds

@@ -36,32 +36,6 @@ def test_the_mean_gas_torque_is_the_displaced_volume(family, overrides):
     np.testing.assert_allclose(means, float(pair.load.torque), rtol=1e-6)
 
 
-@pytest.mark.parametrize("family", ["cic_drawn", "ee"])
-def test_gas_torque_follows_the_radius_of_contact(family):
-    """The torque is that of a vane from the contact point to the tip, found on the outline.
-
-    On the line of centres, the tip of one rotor seals and this rotor takes no torque."""
-    pair, config = pair_of(
-        [*GAS, *(["profile.involute_length_mm=7"] * (family == "cic_drawn"))], family
-    )
-    x, y = 1e-3 * outline_mm(config).T
-    points, outer = x + 1j * y, np.max(np.hypot(x, y))
-    radius, lobes = 0.033, 3
-    assert float(pair.load.torque1(0.0)) == pytest.approx(0, abs=1e-12)
-    assert float(pair.load.torque2(jnp.pi / lobes)) == pytest.approx(0, abs=1e-12)
-    for phi in (0.2, 0.5, 0.9, 1.3, 1.9):
-        # In contact, the two placed outlines are closest at a common point.
-        first = points * np.exp(1j * phi)
-        second = 2 * radius - np.conjugate(points * np.exp(1j * (phi + np.pi / lobes)))
-        apart = abs(first[:, None] - second[None, :])
-        i, j = np.unravel_index(np.argmin(apart), apart.shape)
-        assert apart[i, j] < 3e-4
-        for number, place in ((1, first[i]), (2, second[j] - 2 * radius)):
-            torque = 4e4 * LENGTH * (outer**2 - abs(place) ** 2) / 2
-            found = getattr(pair.load, f"torque{number}")(phi)
-            assert float(found) == pytest.approx(torque, abs=0.02 * float(pair.load.torque) + 1e-6)
-
-
 @pytest.mark.parametrize("length", [7.0, 8.893, 9.0])
 def test_gas_torque_has_no_jump_and_its_derivative_is_that_of_differences(length):
     """This also holds at and past the longest involute, where the whole tip arc meshes at once."""

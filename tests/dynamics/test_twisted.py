@@ -69,45 +69,6 @@ def test_slices_are_means_over_sections(straight):
     np.testing.assert_allclose(deepest, np.max(each), rtol=1e-4)
 
 
-def test_no_twist_is_straight(straight):
-    """To rounding; and a config without twist has no slices at all."""
-    pair, sections = straight
-    at = slice(None, None, 100)
-    for depth, section in zip(DEPTHS, sections, strict=True):
-        found = forces(twisted(pair, 0.0, 3), PHI[at], jnp.asarray(-depth))
-        for name in ("drive", "coast", "torque1", "torque2", "depth", "lever2"):
-            one = np.asarray(getattr(section, name))[at]
-            # The rounding of a gap of flanks 33 mm away, in penetrations of some micrometres.
-            np.testing.assert_allclose(getattr(found, name), one, rtol=1e-10, atol=1e-10)
-    assert isinstance(pair.contact, SearchContact)
-    assert pair.contact.slices is None
-    with_gas = scene_of("ee", "scene.load={pressure_difference_Pa: 5e4}", "rotor.helix_deg=0")
-    assert not isinstance(with_gas[0].pair(jnp.asarray(with_gas[1])).load, TwistedLoad)
-
-
-def test_contact_comes_from_a_potential(straight):
-    """Without damping, the torques do the work that the slices' springs store."""
-    pair, _ = straight
-    pair = twisted(eqx.tree_at(lambda p: p.law.damping, pair, jnp.zeros(())), 0.6, 4)
-
-    # Around a closed path in (φ1, ε), with both sides in contact.
-    turn = 2 * np.pi * (np.arange(4000) + 0.5) / 4000
-    path = jnp.stack([0.4 + 0.3 * np.cos(turn), -3e-4 + 4e-4 * np.sin(turn)], axis=1)
-    moves = 2 * np.pi / 4000 * np.stack([-0.3 * np.sin(turn), 4e-4 * np.cos(turn)], axis=1)
-
-    @jax.jit
-    def around(path, moves):
-        def power(both):
-            pose, move = both
-            found = pair.contact_force(pose[0], pose[1], jnp.zeros(()))
-            return found.torque1 * move[0] + found.torque2 * (move[0] + move[1])
-
-        return jax.lax.map(power, (path, moves))
-
-    done = np.asarray(around(path, jnp.asarray(moves)))
-    assert abs(np.sum(done)) < 1e-4 * np.sum(np.abs(done))
-
-
 def test_gas_torque_is_the_mean_over_sections():
     changes = ("scene.load={pressure_difference_Pa: 5e4}",)
     straight, design = scene_of("ee", *changes)
@@ -130,4 +91,9 @@ def test_number_of_slices_follows_the_error():
     assert 2 <= counts[0] < counts[2] < MOST
     assert slices_needed(*fixed, np.radians(10), 1e-2) <= counts[1]
     assert scene_of("ee", "rotor.helix_deg=60")[0].slices == counts[1]
+    # A config without twist has no slices at all.
+    straight, design = scene_of("ee", "scene.load={pressure_difference_Pa: 5e4}")
+    pair = straight.pair(jnp.asarray(design))
+    assert isinstance(pair.contact, SearchContact)
+    assert not isinstance(pair.load, TwistedLoad)
     assert scene_of("ee", "rotor.helix_deg=60", "solver.slices=5")[0].slices == 5

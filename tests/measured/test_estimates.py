@@ -16,10 +16,10 @@ from rootsopt.config import parse
 from rootsopt.errors import InputError
 from rootsopt.measured.estimates import Estimates, estimates, scatter, unit_of_size
 from rootsopt.measured.source import advice, outline_of
-from rootsopt.profiles import CIC, EE, outline
 from tests.fuzz import outlines
+from tests.measured.test_finding import write
 
-R = 0.033
+rotor = functools.partial(outlines.points, "cic", 240)
 CONFIG = """
 profile: {{family: outline, lobes: 3, pitch_radius_mm: 33.0, outline_file: "{}"{}}}
 rotor: {{length_mm: 100.0, density_kg_m3: 7800.0}}
@@ -29,22 +29,10 @@ scene: {{speed_rpm: 3000.0, load: {{torque_N_m: 4.775}}}}
 """
 
 
-@functools.cache
-def rotor(name="cic", count=240):
-    """Return points of a rotor (mm), without repeating the first."""
-    profile = CIC(3, R, np.deg2rad(36.43), 8.5e-3, np.deg2rad(4.0)) if name == "cic" else EE(3, R)
-    return np.asarray(outline(profile, count))[:-1] @ [1, 1j] * 1e3
-
-
 def scattered(points, size, seed=0):
     """Return points with normal scatter of standard deviation `size` (mm) in x and in y."""
     chance = np.random.default_rng(seed)
     return points + size * (chance.normal(size=(len(points), 2)) @ [1, 1j])
-
-
-def write(path, points):
-    np.savetxt(path, np.stack([points.real, points.imag], axis=1), fmt="%.10g", delimiter=",")
-    return path
 
 
 def read(path, **keys):
@@ -60,7 +48,7 @@ def test_scatter_and_centre_are_those_put_in(name, size):
     """Scatter is found to 15 %, the centre to four times the scatter over √n.
 
     The points are shifted and turned."""
-    points = scattered(rotor(name) * np.exp(0.4j), size) + (12 - 7j)
+    points = scattered(outlines.points(name, 240) * np.exp(0.4j), size) + (12 - 7j)
     found = estimates(points, 3)
     if size:
         assert found.scatter == pytest.approx(size, rel=0.15)

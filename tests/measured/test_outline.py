@@ -22,6 +22,7 @@ from rootsopt.optimize.design import optimize_design, pareto_front
 from rootsopt.profiles import CIC, EE, geometry, outline
 from rootsopt.scene import check_geometry
 from rootsopt.scene.families import free_form_of
+from tests.measured.test_finding import write
 
 R = 0.033
 CIC3 = CIC(3, R, np.deg2rad(36.43), 8.5e-3, np.deg2rad(4.0))
@@ -63,12 +64,6 @@ def cut(points, by):
     """Return points of an outline that is `by` mm smaller along its normals."""
     along = np.roll(points, -1) - np.roll(points, 1)
     return points + 1j * along / np.abs(along) * by
-
-
-def write(path, points):
-    points = closed(points)
-    np.savetxt(path, points, fmt="%.10g", delimiter=",", header="x_mm,y_mm", comments="")
-    return path
 
 
 @jax.jit

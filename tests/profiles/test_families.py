@@ -221,6 +221,12 @@ def test_five_arcs_have_their_land():
         ("hypo_epicycloid", {"tip_arc_angle_deg": 31.0}, "`profile.tip_arc_angle_deg` = 31"),
         ("extended_cycloid", {"trochoid_ratio": 1.5}, "folds back"),
         ("ellipse", {"ellipse_height_mm": 1.0}, "miss the pitch crossing"),
+        # Its contact turns back, and its gap has several minima.
+        (
+            "ellipse",
+            {"ellipse_center_mm": 30.55, "ellipse_height_mm": 18.9},
+            "move the centre, or change the height",
+        ),
     ],
 )
 def test_unsound_profiles_are_refused(family, changes, fault):

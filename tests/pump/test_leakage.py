@@ -22,12 +22,10 @@ from rootsopt.pump.flow import (
     leakage,
     mean_free_path,
     nozzle_flux,
-    slot_flow,
     tip_length,
 )
-from rootsopt.pump.gap import Allowances, mesh_gap, relative_curvature
+from rootsopt.pump.gap import Allowances, mesh_gap
 from rootsopt.pump.sheet import KEYS, missing, sheet, warnings
-from rootsopt.response.terms import terms_of
 from rootsopt.scene import Scene, design_vector
 from rootsopt.scene.reading import Gas
 from tests.conformance.families import LOBES, R, made, outline_of
@@ -48,18 +46,6 @@ def gaps(family, normal=0.0, center=0.0, radial=0.0):
 def parabolic_length(height, curvature):
     """Length (m) of a slot that passes as much as a gap h + x²/2R: h³ ∫ dx / (h + x²/2R)³."""
     return 3 * np.pi / 8 * np.sqrt(2 * np.asarray(height) / np.asarray(curvature))
-
-
-def test_parabolic_gap_by_quadrature():
-    """0.1 mm, relative radius 20 mm, 1 mPa·s, 1 bar: 3.5368e-3 m²/s per metre."""
-    h, curvature = 1e-4, 1 / 0.02
-    length = parabolic_length(h, curvature)
-    found = slot_flow(jnp.asarray(h), jnp.asarray(length), jnp.asarray(1e5), jnp.asarray(1e-3))
-    assert float(found) == pytest.approx(3.5368e-3, rel=2e-5)
-    resistance, _ = integrate.quad(
-        lambda x: 1 / (h + x**2 * curvature / 2) ** 3, -np.inf, np.inf, points=None
-    )
-    assert float(found) == pytest.approx(1e5 / (12e-3 * resistance), rel=1e-6)
 
 
 def test_nozzle_of_air():
@@ -301,14 +287,6 @@ def test_tips_in_series_share_the_pressure_ratio():
     assert flux(up, first) < rate < 1.1 * flux(up, first)
 
 
-def test_curvature_of_circles():
-    """On the land, two circles about their axes touch: radii r_a and 2r - r_a."""
-    profile = made("five_arcs")
-    outer = float(jax.jit(geometry)(profile).outer_radius)
-    found = float(relative_curvature(profile, jnp.asarray(0.02)))
-    assert found == pytest.approx(1 / outer + 1 / (2 * R - outer), rel=1e-9)
-
-
 def test_sheet_has_the_rows_of_its_inputs():
     config = load_config("configs/cic_drawn.yaml")
     design = design_vector(config)
@@ -347,17 +325,10 @@ def test_sheet_says_what_it_lacks_and_what_does_not_hold():
     assert rows["knudsen_number"] == pytest.approx(float(path) / 5e-5, rel=1e-9)
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        "pump.radial_allowance_mm=-0.1",
-        pytest.param("scene.center_distance_error_mm=-0.2", marks=pytest.mark.long),
-    ],
-)
-def test_interference_is_an_error(change):
+def test_interference_is_an_error():
     design = design_vector(load_config("configs/cic_drawn.yaml"))
     with pytest.raises(InputError, match=r"overlap by .*raise `contact.clearance_mm`"):
-        sheet(scene_of(*LIQUID, change), design)
+        sheet(scene_of(*LIQUID, "pump.radial_allowance_mm=-0.1"), design)
 
 
 def test_pressure_is_asked_for():
@@ -367,20 +338,3 @@ def test_pressure_is_asked_for():
     config = load_config("configs/cic_drawn.yaml", ["pump.viscosity_mPa_s=50", gas_load])
     assert config.pump is not None
     assert config.pump.pressure_difference_Pa == 3e4
-
-
-def test_terms_are_those_of_the_sheet():
-    """The share that leaks needs a section `pump`; the backlash does not."""
-    design = design_vector(load_config("configs/cic_drawn.yaml"))
-    loss, backlash = terms_of(["leakage_fraction", "gear_backlash_max_mm"])
-
-    def value(term, scene):
-        profile = scene.profile(design)
-        return float(eqx.filter_jit(term.value)(scene, profile, geometry(profile), None))
-
-    scene = scene_of(*LIQUID)
-    rows = sheet(scene, design)
-    assert value(loss, scene) == pytest.approx(1 - rows["volumetric_efficiency"], rel=1e-9)
-    assert value(backlash, scene) == pytest.approx(rows["gear_backlash_max_mm"], rel=1e-9)
-    with pytest.raises(InputError, match="needs the section `pump`"):
-        value(loss, scene_of())

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import rootsopt
-from rootsopt import InputError, Scene
+from rootsopt import Scene
 from rootsopt.config.units import DEG
 from rootsopt.dynamics.parts.load import tooth_force
 from rootsopt.profiles import geometry
 from rootsopt.pump.loads import BearingSet, static_loads
-from rootsopt.response.terms import Forces, needs_forces, terms_of
+from rootsopt.response.terms import needs_forces, terms_of
 from rootsopt.scene.reading import GRAVITY
 
 GAS, BEARINGS = "scene.load={pressure_difference_Pa: 5e4}", "scene.bearings={weight: true}"
@@ -171,10 +171,6 @@ def test_static_loads():
     np.testing.assert_allclose(equivalent, expected, rtol=1e-9)
 
 
-def test_term_needs_bearings():
-    (term,), (scene, design) = terms_of(["bearing_load_equivalent_N"]), scene_of()
-    profile = scene.profile(design)
-    values = profile, geometry(profile), Forces(*map(jnp.asarray, (1.0, 2.0, 3.0)))
-    with pytest.raises(InputError, match=r"needs the section `scene.bearings`"):
-        term.value(scene, *values)
-    assert needs_forces(scene_of(BEARINGS)[0], term, design)
+def test_term_needs_forces():
+    (term,), (scene, design) = terms_of(["bearing_load_equivalent_N"]), scene_of(BEARINGS)
+    assert needs_forces(scene, term, design)

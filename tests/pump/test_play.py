@@ -13,19 +13,19 @@ from rootsopt.measured.conjugacy import conjugacy
 from rootsopt.profiles import CIC, EE, place_pair
 from rootsopt.pump.gap import Allowances, mesh_gap, play
 from tests.conformance.families import LOBES, R, made, outline_of
-from tests.measured.test_outline import points_of, profile_of
+from tests.measured.test_outline import closed, cut, points_of, profile_of
 
 C = 5e-5
 
 
 @jax.jit
-def played(profile, clearance, distance):
-    return play(profile, clearance, distance)
+def played(profile, clearance, distance, radial):
+    return play(profile, clearance, distance, radial=radial)
 
 
 @functools.cache
 def of(family, error=0.0):
-    return played(made(family), jnp.asarray(C), jnp.asarray(2 * R + error))
+    return played(made(family), C, 2 * R + error, 0.0)
 
 
 def test_ee_and_involute():
@@ -65,21 +65,12 @@ def test_polygons_touch_where_the_play_ends(family):
             assert pair_gap(outline, LOBES, 2 * R, phi, phi + end / 2) > -0.99 * C
 
 
-def shrunk(outline, clearance):
-    """A polygon inside of another by a distance, from the directions of its sides."""
-    z = outline[:-1] @ [1, 1j]
-    side = np.roll(z, -1) - np.roll(z, 1)
-    return z + 1j * clearance * side / abs(side)
-
-
 @pytest.mark.parametrize("error", [pytest.param(0.0, marks=pytest.mark.long), 3e-5])
 def test_rotors_intersect_beyond_their_play(error):
     """Points of one polygon lie inside of the other just beyond the play, and none just within;
     also at another centre distance, where the flanks are not conjugate."""
     found = of("cic", error)
-    z = shrunk(outline_of("cic") / 1e3, C / 2)
-    polygon = np.stack([z.real, z.imag], axis=1)
-    polygon = np.concatenate([polygon, polygon[:1]])
+    polygon = closed(cut(outline_of("cic")[:-1] @ [1e-3, 1e-3j], C / 2))
     for k in (5, 44, 83):
         phi = float(found.phi[k])
         for end in (found.behind[k], found.ahead[k]):
@@ -105,7 +96,7 @@ def test_overlap_is_negative():
 
 def at_clearances(profile, clearances):
     """Return backlash, overlap (µm) and least play (mrad) at several clearances (µm)."""
-    found = [played(profile, jnp.asarray(1e-6 * c), jnp.asarray(2 * R)) for c in clearances]
+    found = [played(profile, 1e-6 * c, 2 * R, 0.0) for c in clearances]
     rows = [(1e6 * x.gear_backlash, 1e6 * x.overlap, 1e3 * jnp.min(x.total)) for x in found]
     return np.array(rows, float).T
 
@@ -134,7 +125,7 @@ def test_play_is_continuous_in_the_overlap(family):
 def test_smaller_rotors_have_the_play_of_their_gap():
     """A radius that is smaller everywhere: the gap of the flanks, over the lever r cos ψ."""
     profile, nothing = made("cic"), jnp.zeros(())
-    found = jax.jit(play)(profile, nothing, radial=jnp.asarray(C))
+    found = played(profile, 0.0, 2 * R, C)
     gap = jax.jit(mesh_gap)(profile, Allowances(nothing, nothing, jnp.asarray(C)))
     lever = R * np.cos(profile.addendum(profile.normal_at(gap.roll)).psi)
     expected = 2 * R * np.min(np.asarray(gap.least) / lever)

@@ -21,9 +21,8 @@ from rootsopt.scene import design_vector
 from rootsopt.status import Status
 
 BOOSTER = """
-profile: {family: five_arcs, lobes: 2, pitch_radius_mm: 62.5, outer_radius_mm: 100,
-  tip_arc_angle_deg: 3, tip_arc_radius_mm: 38, tip_arc_turn_deg: 45}
-rotor: {length_mm: 300, density_kg_m3: 7200}
+profile: {family: ee, lobes: 2, pitch_radius_mm: 62.5}
+rotor: {length_mm: 300, density_kg_m3: 8237}
 scene:
   speed_rpm: 3000
   load: {torque_N_m: 4}
@@ -31,6 +30,10 @@ scene:
 contact: {clearance_mm: 0.15, stiffness_N_per_mm_e: 2.0e5, exponent: 2.2,
   max_damping_N_s_per_mm: 0.25, full_damping_depth_mm: 0.01, smoothing_mm: 0}
 """
+FIVE_ARCS = (
+    "profile={family: five_arcs, lobes: 2, pitch_radius_mm: 62.5, outer_radius_mm: 100, "
+    "tip_arc_angle_deg: 3, tip_arc_radius_mm: 38, tip_arc_turn_deg: 45}"
+)
 RADIUS, SPEED, STIFFNESS, LOAD, HALF = 62.5e-3, 100 * np.pi, 1e5, 4.0, 0.05 / 125
 ECCENTRICITY = 16.0
 """Eccentricity (µm) at which a silent and a noisy motion coexist."""
@@ -49,10 +52,10 @@ def scene_of(*changes, **more):
 
 
 @functools.cache
-def inertia_and_damping():
-    scene, design = scene_of()
-    gear = scene.pair(design).gear
-    return float(scene.pair(design).inertia), float(gear.damping)
+def inertia_and_damping(*changes):
+    scene, design = scene_of(*changes)
+    pair = scene.pair(design)
+    return float(pair.inertia), float(pair.gear.damping)
 
 
 @functools.cache
@@ -67,18 +70,18 @@ def evaluations():
     ]
 
 
-def compliance(frequency):
+def compliance(frequency, *changes):
     """x (rad) over the transmission error, for teeth in permanent contact at constant speed."""
-    inertia, damping = inertia_and_damping()
+    inertia, damping = inertia_and_damping(*changes)
     inertial = -inertia * frequency**2
     return inertial / (inertial + 1j * damping * frequency + STIFFNESS)
 
 
 def test_silent_limit_in_closed_form():
     """x = T/k + Re(c e exp(iφ)) stays positive. The gradient agrees with differences."""
-    scene, design = scene_of(eccentricity=0)
+    scene, design = scene_of(FIVE_ARCS, eccentricity=0)
     limit = silent_limit(scene, design)
-    wanted = LOAD / STIFFNESS / abs(compliance(SPEED)) * RADIUS
+    wanted = LOAD / STIFFNESS / abs(compliance(SPEED, FIVE_ARCS)) * RADIUS
     assert float(limit.value) == pytest.approx(wanted, rel=1e-9)
     step = 1e-3 * np.eye(len(design))
     beside = [float(silent_limit(scene, design + s).value) for s in (*step, *-step)]
@@ -133,7 +136,6 @@ def test_silent_motion_is_the_linear_one():
     assert np.allclose(silent.series.relative, motion, rtol=0, atol=1e-6 * HALF)
     wanted = LOAD / STIFFNESS / abs(compliance(SPEED)) * RADIUS
     assert silent.response[SILENT] == pytest.approx(1e6 * wanted, rel=1e-6)
-    assert silent.gradient[SILENT].keys() == set(silent.design)
 
 
 def test_noisy_motion_coexists_with_the_silent_one():

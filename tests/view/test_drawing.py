@@ -11,21 +11,15 @@ import pytest
 from rootsopt.commands.table import profile as command
 from rootsopt.config import load
 from rootsopt.errors import InputError
-from rootsopt.profiles import CIC, EE, geometry
+from rootsopt.profiles import geometry
 from rootsopt.view.figures.cad import dxf_bytes
 from rootsopt.view.figures.drawing import coordinates
 from rootsopt.view.figures.pieces import Arc, outline_pieces, polyline
-from tests.view.test_export import drawing
+from tests.view.test_export import PROFILES, drawing
 
 ROOT = Path(__file__).parents[2]
 CONFIG = ROOT / "configs/cic_drawn.yaml"
-R = 0.033
-PROFILES = {
-    "cic 2, no land": CIC(2, R, 0.85, 5e-3, 0.0),
-    "cic 3": CIC(3, R, 0.6358, 8.5e-3, 0.07),
-    "cic 3, past the longest": CIC(3, R, 0.6358, 9.0e-3, 0.07),
-    "ee 3": EE(3, R),
-}
+DRAWN = "cic 2, no land", "cic 3", "cic 3, past the longest", "ee 3"
 
 
 def parsed(drawn):
@@ -40,7 +34,7 @@ def texts(document):
     return [entity.dxf.text for entity in document.modelspace().query("TEXT")]
 
 
-@pytest.mark.parametrize("name", PROFILES)
+@pytest.mark.parametrize("name", DRAWN)
 def test_dimensions_measure_the_rotor(name):
     """DIMENSION entities measure the geometry; the lobe width is that of a polygon."""
     shape = PROFILES[name]
@@ -64,7 +58,7 @@ def test_dimensions_measure_the_rotor(name):
     assert measured["lobe"] == pytest.approx(width, abs=2e-5)
 
 
-@pytest.mark.parametrize("name", PROFILES)
+@pytest.mark.parametrize("name", DRAWN)
 def test_coordinates_lie_on_the_flank(name):
     """Points lie between dense points of the outline, evenly spaced and symmetric.
 

@@ -18,10 +18,9 @@ from experiments._common.polygons import signed_distance
 from rootsopt.commands.table import profile
 from rootsopt.config import load
 from rootsopt.errors import InputError
-from rootsopt.profiles import CIC, EE, geometry, outline, place_pair
+from rootsopt.profiles import CIC, EE, FreeForm, geometry, outline, place_pair
 from rootsopt.response.result import Series
 from rootsopt.scene import Scene, check_geometry, design_vector
-from rootsopt.scene.families import profile_of
 from rootsopt.scene.space import Space
 from rootsopt.view.figures import cad, chosen
 from rootsopt.view.figures.animation import meshing_gif, rolling_contacts
@@ -51,6 +50,7 @@ PROFILES = {
 }
 SOLIDS = ("cic 2, no land", "cic 3", "cic 3, textbook, no land", "ee 3", "ee 4")
 every_profile = pytest.mark.parametrize("shape", PROFILES.values(), ids=PROFILES)
+FREE = FreeForm(3, R, np.radians(2.0), np.array([0.7, 0.9, 0.95, 0.8, 0.4, 0.1, -0.3]))
 
 
 def area_mm2(shape):
@@ -161,7 +161,7 @@ def test_textbook_cic_has_arcs_about_the_pitch_circle():
     assert len([piece for piece in pieces if isinstance(piece, Spline)]) == 12
 
 
-@every_profile
+@pytest.mark.parametrize("shape", [*PROFILES.values(), FREE], ids=[*PROFILES, "free form"])
 def test_dxf_read_back(shape):
     """The DXF is in millimetres, has the layers, and is closed to 1e-9 mm; its area is right to
     1e-6."""
@@ -185,80 +185,32 @@ def test_dxf_read_back(shape):
     assert abs(np.angle(run[np.argmin(np.abs(run - tip))])) < 1e-3
 
 
-OTHERS = {
-    "arcs_epicycloid": [27.0, 8.0, 1.0],
-    "extended_cycloid": [1.3],
-    "free_form": [2.0, 0.7, 0.9, 0.95, 0.8, 0.4, 0.1, -0.3],
-}
-
-
-@pytest.mark.parametrize(
-    "family",
-    [pytest.param(name, marks=[pytest.mark.long] * (name != "free_form")) for name in OTHERS],
-)
-def test_any_family_is_drawn(family, tmp_path):
-    """Arcs with an edge, a curve with a cusp and a free form are read back with an area right to
-    1e-6."""
-    shape = profile_of(family, 3, jnp.asarray(R), jnp.asarray(OTHERS[family]))
-    document = ezdxf.read(io.StringIO(dxf_bytes(drawing(shape)).decode()))
-    run, gap = chained(list(read(document)))
-    assert gap < 1e-9
-    assert green(run) == pytest.approx(area_mm2(shape), rel=1e-6)
-    if family == "arcs_epicycloid":
-        return  # A solid of arcs is among those below.
-    pytest.importorskip("build123d")
-    body = written(cad.rotor(outline_pieces(shape), LENGTH, None, 0.0), tmp_path)
-    assert body.is_valid
-    assert body.volume / LENGTH == pytest.approx(area_mm2(shape), rel=1e-6)
-
-
 @pytest.mark.parametrize("name", ["cic 2, no land", "cic 3", "ee 4"])
 def test_svg_read_back(name):
     """The drawing has true size, and its own curves enclose the area to 1e-6."""
+    svg = pytest.importorskip("svgpathtools")
     shape = PROFILES[name]
     text = svg_text(drawing(shape))
     size, unit = re.search(r'<svg [^>]*width="([\d.]+)(\w+)"', text).groups()
     assert unit == "mm"
     assert re.search(r'viewBox="(\S+) (\S+) (\S+) (\S+)"', text).group(3) == size
     assert "two &amp; &lt;three&gt;" in text
-    path = re.search(r'class="outline" d="([^"]+)"', text).group(1)
-    here, run = None, []
-    for command, body in re.findall(r"([MACZ])([^MACZ]*)", path):
-        numbers = list(map(float, body.split()))
-        share = np.linspace(0, 1, 4000, endpoint=False)
-        if command == "M":
-            first = here = complex(*numbers)
-        elif command == "C":
-            a, b, stop = (complex(*numbers[i : i + 2]) for i in (0, 2, 4))
-            rest = 1 - share
-            run.append(
-                rest**3 * here + 3 * rest**2 * share * a + 3 * rest * share**2 * b + share**3 * stop
-            )
-            here = stop
-        elif command == "A":
-            radius, large, sweep, stop = numbers[0], numbers[3], numbers[4], complex(*numbers[5:])
-            chord = stop - here
-            rise = np.sqrt(radius**2 - abs(chord) ** 2 / 4)
-            side = 1 if large != sweep else -1
-            center = (here + stop) / 2 + side * 1j * rise * chord / abs(chord)
-            # y points down: a sweep of 1 turns towards growing angles of (x, y).
-            turn = np.angle((stop - center) / (here - center)) % (2 * np.pi)
-            turn = turn if sweep else turn - 2 * np.pi
-            assert (abs(turn) > np.pi) == bool(large)
-            run.append(center + (here - center) * np.exp(1j * turn * share))
-            here = stop
-    assert abs(here - first) < 1e-9
+    path = svg.parse_path(re.search(r'class="outline" d="([^"]+)"', text).group(1))
+    assert path.iscontinuous()
+    assert path.isclosed()
+    share = np.linspace(0, 1, 1000, endpoint=False)
+    run = np.array([piece.point(x) for piece in path for x in share])
     # Counter-clockwise with y up is clockwise with y down.
-    assert -green(np.concatenate(run)) == pytest.approx(area_mm2(shape), rel=1e-6)
+    assert -green(run) == pytest.approx(area_mm2(shape), rel=1e-6)
 
 
-@pytest.mark.parametrize("name", SOLIDS)
+@pytest.mark.parametrize("name", [*SOLIDS, "free form"])
 def test_step_read_back(name, tmp_path):
     """Volume over length, and area of the section, are right to 1e-6; arcs are cylinders.
 
     This also holds with bore and twist."""
     build123d = pytest.importorskip("build123d")
-    shape = PROFILES[name]
+    shape = PROFILES.get(name, FREE)
     pieces = outline_pieces(shape)
     for bore, helix in ((None, 0.0), (10.0, -np.pi / 3)):
         made = cad.rotor(pieces, LENGTH, bore, helix)

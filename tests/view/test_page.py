@@ -3,7 +3,6 @@
 import dataclasses
 import queue
 import re
-import threading
 import time
 from pathlib import Path
 
@@ -30,6 +29,7 @@ from rootsopt.view.pages.session import (
     Session,
 )
 from tests.standins import evaluation_of
+from tests.view.test_server import serving
 
 pytest.importorskip("bokeh")
 ROOT = Path(__file__).parents[2]
@@ -268,19 +268,8 @@ def test_search_without_design_parameters_says_why(engine):
 
 @pytest.fixture(scope="module")
 def address(engine):
-    from rootsopt.view.pages.server import PageServer
-
-    found, up, stop = [], threading.Event(), threading.Event()
-
-    def serve():
-        PageServer(engine, "cic").run(stop, lambda url: (found.append(url), up.set()))
-
-    thread = threading.Thread(target=serve)
-    thread.start()
-    assert up.wait(60)
-    yield found[0]
-    stop.set()
-    thread.join(30)
+    with serving(engine) as found:
+        yield found
 
 
 @pytest.fixture

@@ -1,5 +1,6 @@
 """The explorer's server: its address, who may use it, how it ends, and what it needs."""
 
+import contextlib
 import http.client
 import re
 import signal
@@ -16,33 +17,33 @@ from pathlib import Path
 import pytest
 
 from rootsopt.commands.table import explore as command
+from rootsopt.config import load
+from rootsopt.errors import InputError
 from rootsopt.optimize.design import optimize_design
 from rootsopt.view import pages
+from rootsopt.view.pages.knobs import Engine
 
 pytest.importorskip("bokeh")
 ROOT = Path(__file__).parents[2]
 CIC = str(ROOT / "configs" / "cic_drawn.yaml")
 
 
-@pytest.fixture(scope="module")
-def address():
-    """Return the address of a running server."""
-    from rootsopt.config import load
-    from rootsopt.errors import InputError
-    from rootsopt.view.pages.knobs import Engine
+class Idle(Engine):
+    """An engine that never gets ready: the server is tested, not what it shows."""
+
+    def shape(self, config):
+        raise InputError("no shape")
+
+
+@contextlib.contextmanager
+def serving(engine):
+    """Serve the page of an engine, and yield its address."""
     from rootsopt.view.pages.server import PageServer
-
-    class Idle(Engine):
-        """An engine that never gets ready: the server is tested, not what it shows."""
-
-        def shape(self, config):
-            raise InputError("no shape")
 
     found, up, stop = [], threading.Event(), threading.Event()
 
     def serve():
-        server = PageServer(Idle(load(CIC), optimize_design), "cic")
-        server.run(stop, lambda url: (found.append(url), up.set()))
+        PageServer(engine, "cic").run(stop, lambda url: (found.append(url), up.set()))
 
     thread = threading.Thread(target=serve)
     thread.start()
@@ -51,6 +52,12 @@ def address():
     stop.set()
     thread.join(30)
     assert not thread.is_alive()
+
+
+@pytest.fixture(scope="module")
+def address():
+    with serving(Idle(load(CIC), optimize_design)) as found:
+        yield found
 
 
 def raw(address, text):

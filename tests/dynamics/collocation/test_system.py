@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rootsopt.dynamics.collocation.elements import BLOCK, GAUSS, Elements, Mesh, in_blocks
-from rootsopt.dynamics.collocation.system import Columns, Lines, chained, condensed, own_column
+from rootsopt.dynamics.collocation.system import Lines, chained, condensed, own_column
 
 STATES, POINTS = 3, 4
 TIMES = np.array([0.2, 0.5, 0.9, 1.2, 1.2])
@@ -81,26 +81,6 @@ def test_newton_step_solves_the_dense_equations():
     )
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
     np.testing.assert_array_equal(step.times[jnp.array([0, 2, 3, 4])], 0)
-
-
-def test_columns_are_independent():
-    draw = np.random.default_rng(1)
-    state = jnp.asarray(draw.normal(size=(6, STATES)))
-    slopes = jnp.asarray(draw.normal(size=(6, POINTS, STATES)))
-    elements = _elements(jnp.asarray(TIMES), state, slopes)
-    lines = Lines(
-        miss=jnp.zeros_like(slopes),
-        slopes=jnp.asarray(draw.normal(size=(6, POINTS, STATES, STATES + 1))),
-        margin=jnp.zeros(6),
-        bend=jnp.asarray(draw.normal(size=(6, STATES + 1))),
-    )
-    columns = Columns(*(jnp.asarray(draw.normal(size=shape)) for shape in (
-        (6, POINTS, STATES, 2), (6, STATES, 2), (6, 2))))  # fmt: skip
-    step = _stepped(elements, lines, columns)
-    for k in range(2):
-        one = Columns(*(x[..., k : k + 1] for x in columns))
-        alone = _stepped(elements, lines, one)
-        np.testing.assert_allclose(step.state[..., k], alone.state[..., 0], rtol=1e-9, atol=1e-12)
 
 
 def test_blocks_of_a_batch():
