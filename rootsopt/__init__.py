@@ -1,4 +1,4 @@
-"""Design of Roots rotors by the gradient of their dynamic contact force; see the README.
+"""Design Roots rotors by the gradient of their dynamic contact force; see the README.
 
 Public names are imported on first use. Importing the package is therefore fast, loads no solver,
 and changes no global setting. The first use of a name makes XLA compile loops as

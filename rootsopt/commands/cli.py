@@ -91,7 +91,7 @@ class _Help(argparse.Action):
 
 
 def _all_keys() -> str:
-    """Return the end of a long help."""
+    """Return the text below the options of `--help all`."""
     keys = (f" {group}\n{describe(Config, group)}" for group in GROUPS)
     listed = "\n".join(keys)
     curves = "\n".join(f"  {name:<18} {one.help}" for name, one in families().items())
@@ -103,7 +103,7 @@ def _all_keys() -> str:
 
 
 def _few_keys() -> str:
-    """Return the end of a short help."""
+    """Return the text below the options of `--help`."""
     names = textwrap.fill(", ".join(families()), 98, initial_indent="  ", subsequent_indent="  ")
     return (
         f"profile families (profile.family):\n{names}\n"
@@ -216,9 +216,10 @@ def run(command: Command, argv: Sequence[str] | None) -> int:
 
     Parse the arguments, load the config and select double precision. Then call the function `body`
     of the module `rootsopt.commands.work.COMMAND` with a new result folder, move the folder to its
-    final path and print the result. A command that writes nothing has a `body` without the folder,
-    which returns the exit code; that of a command that reads no config takes only the options.
-    `InputError` and `OSError` give exit code 2."""
+    final path and print the result. If the command writes nothing, its `body` takes no folder and
+    returns the exit code. If it also reads no config, its `body` takes only the options.
+    `InputError` and `OSError` give exit code 2.
+    """
     environment.own_process()
     try:
         _import_extensions(command.name, argv)
@@ -302,7 +303,7 @@ def _say(out: "Console", lines: Sequence[str]) -> None:
 def _report(folder: "RunFolder", options: argparse.Namespace, outcome: Outcome) -> None:
     """Write the report of a run that has written all its other files.
 
-    If it cannot be made, say so on stderr: the result of a long run must not be lost with it."""
+    If this fails, say so on stderr and go on, so that the result of a long run is not lost."""
     from rootsopt.view.pages.gather import Run
     from rootsopt.view.pages.html import report_text
 
@@ -340,7 +341,7 @@ def waiting(console: "Console", what: str) -> Iterator[Callable[[str], None]]:
 
 
 def use_cache(wanted: bool = True) -> None:
-    """Cache compiled programs between processes in the user's cache folder, unless not `wanted`.
+    """If `wanted`, cache compiled programs between processes in the user's cache folder.
 
     The environment variable ROOTSOPT_CACHE may name another folder, or turn the cache off. If the
     folder cannot be used, the cache is off. If other users could change the folder's content, the

@@ -1,4 +1,4 @@
-"""Registers the built-in profile families, by the same function as any other family."""
+"""Registers the built-in profile families in the same way as any other family."""
 
 import dataclasses
 import math

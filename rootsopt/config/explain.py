@@ -50,8 +50,8 @@ _IN_BLOCK = "write it as {heading: text} under `drawing.title_block`"
 _ONE_SEED = "set `optimizer.seed`, that of all samples"
 _BY_ACCURACY = "set `solver.accuracy` to trade accuracy for time"
 
-# Keys of former versions: (values that are still true, among them the default, which a resolved
-# config holds; what to do instead).
+# Keys of former versions, each with (values that are still accepted, what to do instead). The
+# accepted values include the old default, because a resolved config states it.
 _REMOVED: dict[str, tuple[tuple[Any, ...], str]] = {
     "solver.fidelity": (("search",), f"{_SEARCHED}; {_BY_ACCURACY}"),
     "solver.nodes": ((400,), f"{_SEARCHED}; {_BY_ACCURACY}"),
@@ -258,9 +258,9 @@ def _unknown(
 def _translated(
     known: Mapping[str, FieldInfo], prefix: str, name: str, value: Any, speed_rpm: Any
 ) -> str:
-    """Return the key, with the converted value, that a `name` of a catalogue stands for.
-
-    `prefix`: section of the unknown key. Return "" if there is none."""
+    """Return the key, with the converted value, for which a `name` from a catalogue stands. Return
+    "" if there is no such key. `prefix`: section of the unknown key.
+    """
     value, speed = number(value), number(speed_rpm)
     for stem, end, factor in readings(name):
         exact = [key for key in known if unit_of(key) and without_unit(key).endswith(f".{stem}")]
@@ -414,7 +414,7 @@ def describe(model: type[Section], group: str = "") -> str:
 
 
 def outline(model: type[Section]) -> str:
-    """Return one short line per key that is used most, by group."""
+    """Return one short line for each frequently used key, by group."""
     lines = []
     for group in GROUPS:
         lines.append(f" {group}")

@@ -181,8 +181,8 @@ class Family:
     `inherent`: names of margins from `MARGINS` that may be negative in this family.
 
     `limits`: function of the `ProfileConfig` that raises `InputError` if the profile violates a
-    closed-form limit. `by_limits`: whether a search stays at sound profiles by these limits, so
-    that the margins are not constraints of the search.
+    closed-form limit. `by_limits`: whether these limits keep a search at sound profiles, so that
+    the margins need no constraints.
 
     `ranges`: function of `lobes`, `pitch_radius_mm` and all parameters by key. It returns (low,
     high) by key for parameters whose range depends on the others: all values of sound profiles. The

@@ -1,8 +1,10 @@
-"""Notes on values that are allowed, but that usual machines do not have.
+"""Notes on values that are allowed but unusual.
 
 A value far outside the usual range is often one in another unit. The ranges are wide: they hold for
-micro pumps and for boosters of a metre. Many follow the size of the rotor, whose torque, speed and
-mass a unit changes by a factor of a thousand, where machines differ by a factor of ten."""
+micro pumps and for boosters of a metre. Many scale with the rotor's size: for rotors of one size,
+torque, speed and mass differ by a factor of ten between machines, but a wrong unit changes them a
+thousandfold.
+"""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -22,10 +24,11 @@ _BAR = 1e5
 def _sizes(config: "Config") -> dict[str, float]:
     """Return the sizes that usual ranges follow, by name, in the units of the keys that use them.
 
-    Mass and inertia are those of a solid cylinder on the pitch circle. A load of the config may be
-    0 or wrong itself, so that torques follow 1 bar; `force` at the pitch circle carries the load.
+    Mass and inertia are those of a solid cylinder on the pitch circle. Torques follow from 1 bar,
+    because the config's own load may be 0 or wrong; `force` at the pitch circle carries the load.
     `rolling`: speed at which the pitch circles roll at 1 m/s. `critical`: critical damping of a
-    rotor on its bearings; `impact`: that of the flanks, where their damping is full."""
+    rotor on its bearings; `impact`: that of the flanks, where their damping is full.
+    """
     radius, supports = config.profile.pitch_radius_mm, config.scene.supports
     law = config.contact
     steepness = law.exponent * law.full_damping_depth_mm ** (law.exponent - 1)
@@ -157,9 +160,9 @@ def usual_of(key: str) -> Usual | None:
 
 
 def notes(config: "Config") -> tuple[str, ...]:
-    """Return one sentence on each value of a config that is not usual, in the order of the config.
-
-    Defaults have no note, and neither has 0, which is the same in every unit."""
+    """Return one sentence on each unusual value of a config, in the order of the config. Defaults
+    have no note. Neither has 0, which is the same in every unit.
+    """
     given = dict(_numbers(config))
     found = [_note(config, key, key, value) for key, value in given.items()]
     return tuple(filter(None, (*found, *_listed(config, given))))
@@ -174,7 +177,7 @@ def notes_on_swept(config: "Config", values: Mapping[str, Any]) -> tuple[str, ..
 def _listed(config: "Config", given: Mapping[str, float]) -> Iterator[str]:
     """Yield notes on values in `tolerances.conditions` other than those `given`, by key.
 
-    Distributions are about the config's own value, and hardly reach another unit."""
+    Distributions are omitted: they are centred on the config's own value."""
     conditions = {} if config.tolerances is None else config.tolerances.conditions
     for name, values in conditions.items():
         for key, value in values.items():

@@ -44,7 +44,7 @@ _SPEED = "scene.speed_rpm"
 
 
 class Config(Section):
-    """The settings of a run: all sections of a config.
+    """All settings of a run: the sections of a config.
 
     >>> import rootsopt
     >>> config = rootsopt.load_config("cic")
@@ -99,7 +99,7 @@ class Config(Section):
     def twist_free(self) -> bool:
         """Whether the twist of the rotors is the last design parameter.
 
-        A rotor from a file has no design parameters; the one fitted to it has the twist."""
+        A rotor from a file has no design parameters; the profile fitted to it has the twist."""
         return TWIST in self.optimizer.bounds and not self.profile.from_file
 
     def with_design(self, design: Sequence[float] | NDArray[np.float64]) -> "Config":
@@ -141,7 +141,8 @@ class Config(Section):
 
         `values`: new values by dotted key; `profile.coefficients_3` is the third entry of a list of
         design parameters. Defaults that follow other keys are left out. Raises `InputError` if a
-        key is inside one that holds no keys."""
+        dotted key leads into a plain value.
+        """
         data = self.model_dump(mode="json", exclude_none=True)
         for name, key in _FOLLOWING:
             section = getattr(self, name)
@@ -152,7 +153,7 @@ class Config(Section):
         return data
 
     def _joined(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Return `values` by dotted key with whole lists instead of single entries of them.
+        """Return `values` by dotted key, with single entries of lists joined to whole lists.
 
         `profile.coefficients_3` names the third entry of `profile.coefficients`."""
         found: dict[str, Any] = {}
@@ -178,7 +179,7 @@ class Config(Section):
 
     @property
     def spans(self) -> tuple[Span, ...]:
-        """Ranges of what is assumed about the scene, without usual ones that leave what is allowed.
+        """Ranges of assumed scene values; usual ranges that exceed a key's limits are left out.
 
         Empty if `assumptions.scenes` is 0."""
         if not self.assumptions.scenes:
@@ -192,11 +193,13 @@ class Config(Section):
         )
 
     def _faults(self, key: str, values: Sequence[float]) -> Iterator[str]:
-        """Yield why the config is not valid with one of the `values` of a key."""
+        """Yield the reason for each of the `values` of a key that makes the config invalid."""
         return filter(None, (self._fault({key: value}) for value in values))
 
     def _fault(self, values: Mapping[str, Any]) -> str:
-        """Return why the config is not valid with other `values`, by dotted key; "" if it is."""
+        """Return why the config is invalid with other `values`, by dotted key; "" if it is
+        valid.
+        """
         alone = {"tolerances": None, "assumptions": AssumptionsConfig.model_validate({})}
         moved = self.model_copy(update=alone).moved(values)
         try:

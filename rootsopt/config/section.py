@@ -38,7 +38,7 @@ UNMET = "unmet"
 
 
 def require(holds: bool, message: str) -> None:
-    """Raise `ValueError` with this message unless keys fit each other, that is, `holds`."""
+    """Raise `ValueError` with this message if `holds` is false: the keys do not fit each other."""
     if not holds:
         raise ValueError(message)
 
@@ -73,9 +73,9 @@ Torque = Annotated[float, between(0, 1e7)]
 Seed = Annotated[int, Field(ge=0, le=2**31 - 1)]
 """Seed of random numbers."""
 Listed = Field(strict=False)
-"""Mark of a tuple that is given as a list, because YAML has no tuples."""
+"""Marks a tuple that is given as a list, because YAML has no tuples."""
 Increasing = such("two increasing numbers", lambda pair: len(pair) == 2 and pair[0] < pair[1])
-"""Mark of a pair (low, high)."""
+"""Marks a pair (low, high)."""
 
 
 class Section(BaseModel):

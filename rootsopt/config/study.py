@@ -254,9 +254,9 @@ _CHAINS = (
     ("root_radius_mm", "outer_radius_mm"),
 )
 
-# Amplitude of a spectral line above which no force without a negative value comes, as multiples
-# of these. The first is that of short pulses, the last that of a square wave. The second follows
-# from the first: mean² + amplitude² / 2 ≤ RMS².
+# Greatest amplitude of a spectral line of a force that is never negative, as multiples of these.
+# The first is that of short pulses, the last that of a square wave. The second follows from the
+# first: mean² + amplitude² / 2 ≤ RMS².
 _LINE_SHARES = {
     "mean_force_N": 2.0,
     "rms_force_N": 2 / math.sqrt(3),
@@ -268,7 +268,7 @@ _SIZES = {*_CHAINS[0], *_CHAINS[1], *_CHAINS[2], "axial_force_max_N", "tilting_m
 
 
 def _above(name: str) -> list[tuple[str, float]]:
-    """Return (other quantity, factor) for all upper bounds of a quantity by another one."""
+    """Return (other quantity, factor) for each quantity that bounds this one from above."""
     if _LINE.fullmatch(name):
         return [*_LINE_SHARES.items()]
     row = next((row for row in _CHAINS if name in row), (name,))
@@ -276,7 +276,7 @@ def _above(name: str) -> list[tuple[str, float]]:
 
 
 def limits_of(low: float | str | None, high: float | str | None) -> tuple[float, float]:
-    """Return a floor and a ceiling as numbers that two limits from the config can be compared by.
+    """Return a floor and a ceiling as numbers, so that two limits from the config can be compared.
 
     An absent limit is infinite, and so is one that is the baseline's value, not yet known."""
     return (

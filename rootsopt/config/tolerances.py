@@ -1,6 +1,6 @@
 """Config section `tolerances`: how far values of scene and design scatter in manufacture.
 
-The section `assumptions` is the spread of what is only assumed about where a pump runs."""
+The section `assumptions` gives the ranges of what is only assumed about a pump's operation."""
 
 import difflib
 import math
@@ -308,8 +308,8 @@ _FACTORS = {
     "contact.stiffness_N_per_mm_e": (0.7, 1.4),
 }
 
-# Half of the usual range of the clearance: the first number (mm), or the second one as a fraction
-# of the config's value, whichever is more.
+# Half of the usual range of the clearance: the greater of the first number (mm) and the second one
+# (fraction of the config's value).
 _CLEARANCES = 0.015, 0.5
 
 
@@ -352,7 +352,7 @@ class AssumptionsConfig(Section):
         return data | {"over": entries(over, kinds)} if isinstance(over, dict) else data
 
     def spans(self, values: Mapping[str, float], every: bool = True) -> tuple[Span, ...]:
-        """Return the ranges of the keys that the config has, those that it gives last.
+        """Return the ranges of the keys that the config has; those given in the config come last.
 
         `values`: the config's own value of each key that can vary; `every`: whether to include the
         usual ranges. A range without an extent is left out, such as a factor of 0."""

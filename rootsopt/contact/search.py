@@ -29,7 +29,7 @@ def contact_point(
 
 
 class _FlankContact(Contact):
-    """What contacts of a flank pair share."""
+    """Base class of the contacts of a flank pair."""
 
     pair: eqx.AbstractVar[FlankPair]
 

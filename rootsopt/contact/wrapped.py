@@ -1,6 +1,6 @@
-"""Contacts that change that of a section: twisted rotors, and flanks worn where they slide.
-
-The number of slices of twisted rotors keeps the error of the contact torque below a limit."""
+"""Contacts that modify the contact of a section: twisted rotors, and flanks worn where they slide.
+Also finds how many slices of twisted rotors keep the error of the contact torque below a limit.
+"""
 
 import equinox as eqx
 import jax
@@ -57,11 +57,12 @@ _POSES = 512
 
 
 class WornContact(WrappedContact):
-    """The contact of flanks that are worn by a depth w which follows the roll coordinate x.
+    """The contact of flanks that are worn to a depth w, a function of the roll coordinate x.
 
     `section`: the contact of new flanks; `coefficients` (k,): of w(x) = Σ a_k cos(2 N k x) in m;
-    `lobes`: N as an array. The gap grows by w. So that the force still has a potential, lever 1
-    grows by w'/2 and lever 2 falls by w'/2, because x = -(φ1 + φ2)/2."""
+    `lobes`: N as an array. The gap grows by w. Lever 1 grows by w'/2 and lever 2 falls by w'/2,
+    because x = -(φ1 + φ2)/2. The force therefore still has a potential.
+    """
 
     section: Contact
     coefficients: Float[Array, " k"]
@@ -87,7 +88,7 @@ def series_at(
 def wear_shape(profile: Profile, roll: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """Return the relative wear of both flanks together at the roll angle `roll` (rad).
 
-    Archard's law: a line contact wears off a depth proportional to F' u / v. F' is the force per
+    Archard's law: the depth worn by a line contact is proportional to F' u / v. F' is the force per
     length, v the speed of the contact over the surface, and u the sliding speed. Here u = 2 ω s,
     and v = ω dl/dβ on each flank: 2 |s| (dβ/dl1 + dβ/dl2), without unit. F' is taken as constant.
     """
@@ -99,7 +100,7 @@ def wear_shape(profile: Profile, roll: Float[Array, "*n"]) -> Float[Array, "*n"]
 
 
 def wear_series(profile: Profile, depth: Float[Array, ""]) -> Float[Array, " k"]:
-    """Return the coefficients (k,) of the wear in m whose greatest value is `depth` (m).
+    """Return the coefficients (k,) in m of a wear whose greatest value is `depth` (m).
 
     They are those of the Fourier series of `wear_shape`, damped after Fejér, so that the series has
     no ripples and is never negative."""
@@ -139,14 +140,14 @@ def slices_needed(
     twist: float,
     error: float,
 ) -> int:
-    """Return the least number of Gauss points with which the contact torque errs less than `error`.
-
-    The torque is that at rest. The rotors are turned towards each other until the `clearance` (m)
-    is closed and the penetration at the pitch radius is the static one, `depth` (m). The error is
-    the mean magnitude over a mesh period, as a fraction of the greatest torque. The greatest error
-    is not used: where a whole arc touches at once, the torque of a slice jumps, and no number of
-    slices makes this error small. `twist` (rad): over the rotor's length. The result is at most
-    `MOST`."""
+    """Return the least number of Gauss points for which the error of the contact torque is below
+    `error`. The torque is that at rest. The rotors are turned towards each other, through the
+    `clearance` (m), until the penetration at the pitch radius is the static one, `depth` (m). The
+    error is the mean magnitude over a mesh period, as a fraction of the greatest torque. The
+    greatest error is not used: where a whole arc touches at once, the torque of a slice jumps, and
+    no number of slices makes this error small. `twist` (rad): over the rotor's length. The result
+    is at most `MOST`.
+    """
     torque = np.asarray(_torques(profile, law, clearance, depth))
     wanted = sliced_mean(torque, twist * (np.arange(_REFERENCE) + 0.5) / _REFERENCE, profile.lobes)
     for count in _COUNTS:

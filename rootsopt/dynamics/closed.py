@@ -1,4 +1,4 @@
-"""The steady motion near an orbit that is already known, or that a state leads to.
+"""Finds the steady motion near a known orbit, or the one to which a state leads.
 
 The orbit is closed by collocation. If the orbit of a similar pair is known, the first attempt
 begins there. Otherwise, and if that attempt fails, a transient leads to the orbit. All attempts are
@@ -59,8 +59,8 @@ class Start(eqx.Module):
     """Where the search for an orbit begins.
 
     `state` (n,): at φ1 = 0, in SI units, where the transient begins if there is no known orbit or
-    it does not lead to another one; `known`: a closed orbit; `pair`: the numbers of its pair, with
-    `None` in place of all other leaves. The orbit is used if `known.sound`.
+    it does not lead to another one; `known`: a closed orbit; `pair`: the numbers of the orbit's
+    pair, with `None` in place of all other leaves. The orbit is used if `known.sound`.
     """
 
     state: Any
@@ -171,7 +171,7 @@ class _Attempts(eqx.Module):
         )
 
     def settled(self, now: _Loop) -> tuple[Transient, Int[Array, ""]]:
-        """Return the transient of an attempt that needs none, and -1."""
+        """Return an empty transient for an attempt that needs none, and the code -1."""
         nothing = jnp.zeros_like(now.shorter)
         known = jnp.round(self.start.known.elements.mesh.period).astype(int)
         period = jnp.where(now.near, known, now.shorter)
@@ -249,10 +249,10 @@ class _Attempts(eqx.Module):
         )
 
     def taken(self, found: Steady, made: Collocated, start, period, within) -> Steady:
-        """Return `found` with the orbit `made`, and with its status.
-
-        `start`: scaled state near which the orbit has to be; `period` of the orbit (mesh periods);
-        `within`: scaled distance to which the transient's states repeated."""
+        """Return `found` with the closed orbit `made` and its status. `start`: scaled state near
+        which the orbit must lie; `period` of the orbit (mesh periods); `within`: scaled distance to
+        which the transient's states repeated.
+        """
         limits = within, corrected(ACCURACY * self.solver.orbit.rtol)
         orbit = made.orbit
         verdict, status = judged(self.pair, self.solver, self.radius, orbit, start, limits)
@@ -295,9 +295,9 @@ def steady_motion(
 
 
 def examined(pair: RotorPair, found: Steady, solver: Solver) -> Steady:
-    """Return the motion `found` of `pair`; one without an orbit is judged by a window of it.
-
-    The window begins at the end of the transient, and distinguishes chaos from a long transient."""
+    """Return the motion `found` of `pair`; if it has no orbit, set its status by a window. The
+    window begins at the end of the transient, and distinguishes chaos from a long transient.
+    """
     state, integrator = found.settled.state, solver.transient
     unsettled = among(found.status, OPEN) & (solver.probe_chaos > 0)
     window = branch(
@@ -311,10 +311,10 @@ def examined(pair: RotorPair, found: Steady, solver: Solver) -> Steady:
 def seen(
     pair: RotorPair, found: Steady, window: Window | None, whole: Bool[Array, ""] | bool = True
 ) -> Steady:
-    """Return the motion `found` of `pair`, which has no orbit, with a `window` of it.
-
-    The status follows from the window, if it was integrated (`whole`). A motion that repeats is
-    NOT_CLOSED if the window shows neither chaos nor a failure."""
+    """Return a motion without an orbit, `found`, completed with a `window` of it. The window
+    determines the status if it was integrated (`whole`). A motion that repeats is NOT_CLOSED if the
+    window shows neither chaos nor a failure.
+    """
     status, repeats = found.status, found.settled.period > 0
     if window is not None:
         judged = window_status(pair, window)

@@ -94,8 +94,8 @@ _BEYOND = 1e-4
 _LATE = 10.0
 # Maximum length of the first step after an edge, in units of `_BEYOND`.
 _AFTER = 5.0
-# Distance (scaled ε) between the vertex of the parabola and an edge below which the next step ends
-# no later than at the vertex.
+# Distance (scaled ε) of the parabola's vertex from an edge below which the next step ends at the
+# vertex at the latest.
 _CLOSE = 0.05
 # Maximum step (mesh periods) where ε alone does not determine whether the flanks touch: beyond the
 # clearance, or with displaced axes.

@@ -1,4 +1,4 @@
-"""A closed periodic orbit, averages of the force over a motion, and branches that batches share.
+"""A closed periodic orbit, averages of the force over a motion, and branches for batches.
 
 Mean and mean square are always integrated along with the motion. Two kinds of average are computed
 on request: the Fourier coefficients of spectral lines, and the average of a power of the force,

@@ -52,8 +52,8 @@ class RotorPair(eqx.Module):
     design, None if it was not checked; `begins`: mesh periods from φ1 = 0 to the start of τ, None:
     0 (see `later`). An absent part is None and costs nothing.
 
-    Raises InputError if two parts let the axes move; if one part does but `two_sided` is False; if
-    the pair is two-sided but the contact is not (see `Contact.two_sided`).
+    Raises InputError if two parts let the axes move, or if one part does but `two_sided` is False.
+    Also raises it if the pair is two-sided but the contact is not (see `Contact.two_sided`).
     """
 
     lobes: int = eqx.field(static=True)
@@ -124,9 +124,9 @@ class RotorPair(eqx.Module):
         return orders if self.repeats == 1 else self.repeats * orders
 
     def later(self, periods: Int[Array, ""] | int) -> "RotorPair":
-        """Return the pair whose τ begins `periods` mesh periods later than that of this pair.
-
-        It is the pair itself if the equation repeats each mesh period."""
+        """Return the pair with τ starting `periods` mesh periods later. Return the pair itself if
+        the equation repeats each mesh period.
+        """
         if self.repeats == 1:
             return self
         begins = periods if self.begins is None else self.begins + periods

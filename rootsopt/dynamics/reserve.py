@@ -1,13 +1,12 @@
 """How far the flanks of an orbit are from touching, and the torque of its timing gear.
 
 The *contact reserve* of a motion is the least gap of its flanks. Where they touch, it is negative:
-the greatest penetration. The *backlash reserve* is the backlash by which that of the gear may grow
-until the flanks just touch. A gear with more backlash lets rotor 2 move further from the middle of
-its play. As long as the gear's torque stays the same, so does the rest of the motion. The reserve
-is therefore found by moving the motion outwards by s until the least gap is 0.
-
-Both are smooth through touching. Their derivatives are those at the instant of the least gap, which
-may move (envelope theorem), and of s by the implicit function theorem.
+the greatest penetration. The *backlash reserve* is the increase of the gear's backlash at which the
+flanks just touch. A gear with more backlash lets rotor 2 move further from the middle of its play.
+As long as the gear's torque stays the same, so does the rest of the motion. The reserve is
+therefore found by moving the motion outwards by s until the least gap is 0. Both reserves are
+smooth where the flanks begin to touch. Their derivatives are those at the instant of the least gap,
+even if it moves (envelope theorem). Those of s follow from the implicit function theorem.
 """
 
 import functools
@@ -27,7 +26,7 @@ from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import VariedOrbit
 
 RESERVES = "contact_reserve_um", "backlash_reserve_mm"
-"""Names of the least gap of the flanks along the motion, and of the backlash that would use it up.
+"""Names of the contact reserve and the backlash reserve.
 """
 GEAR = tuple(
     f"{which}gear_{what}" for what in ("torque_N_m", "force_N") for which in ("mean_", "", "rms_")
@@ -50,8 +49,9 @@ def smooth_pieces(
     corners: Float[Array, " k"],
     flags: Callable[[Any], Any],
 ) -> tuple[Float[Array, " pieces"], Float[Array, " pieces"], Int[Array, ""]]:
-    """Return starts and ends (mesh periods) of pieces of an orbit of `pair` in which a quantity is
-    smooth, and the number of pieces in use. The others, which are empty, come last.
+    """Return starts and ends (mesh periods) of the pieces of an orbit in which a quantity is
+    smooth, and the number of pieces in use. Unused pieces are empty and come last. `pair`: pair of
+    the orbit.
 
     `corners` (k,): times from 0 to 1 at which the quantity is not smooth, in each mesh period;
     `flags`: function that returns, at a time, flags (s,) that change where it is not smooth. Pieces
@@ -137,7 +137,7 @@ def reserve(
     """Return contact and backlash reserve of an `orbit`, and their derivatives, as in `Apart`."""
 
     def newton(moved, _):
-        """Return the next guess, then this one and where the flanks come closest with it."""
+        """Return the next guess, this guess, and the place where the flanks then come closest."""
 
         def gap(*at):
             contact = _contact(moved, *at)
@@ -177,8 +177,9 @@ def gaps(
     """Return the gaps (m) of drive and coast flanks at `INSTANTS` of an `orbit`, and their
     derivatives along the orbit's directions.
 
-    Each gap is smooth, while their least value has corners: it is that of another side, or at
-    another instant. The pair must be two-sided."""
+    Each gap is smooth, but their least value has corners where its side or its instant changes. The
+    pair must be two-sided.
+    """
     assert pair.two_sided
     times = orbit.elements.mesh.period * jnp.arange(INSTANTS) / INSTANTS
 

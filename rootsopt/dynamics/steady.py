@@ -1,7 +1,5 @@
-"""What is known of a steady motion: its status and its orbit.
-
-An orbit is checked: whether it is the steady motion, and whether its forces are known. The checks
-are the same for single designs and for batches.
+"""A steady motion: its status and its orbit. Checks whether an orbit is the steady motion, and
+whether its forces are accurate. The checks are the same for single designs and for batches.
 """
 
 from collections.abc import Callable
@@ -31,7 +29,7 @@ UNRESOLVED = 1e-2
 count as unresolved."""
 # Estimated error of an orbit (scaled) above which the orbit is rejected.
 _UNKNOWN = 0.1
-# Distance from 1 below which a Floquet multiplier counts as 1. A multiplier above 1 also does.
+# Distance from 1 below which a Floquet multiplier counts as 1. So does a multiplier above 1.
 _FREE = 1e-6
 # Estimated relative error of the derivatives above which they are uncertain. The limit is the first
 # number times the square root of the tolerance, at least the second number and at most the third.
@@ -218,9 +216,10 @@ def judged(
 ) -> tuple[Verdict, Int[Array, ""]]:
     """Return the `Verdict` on an orbit of `pair`, and a status code.
 
-    `radius`: pitch radius (m); `start`: scaled state near which the orbit has to be; `limits`:
+    `radius`: pitch radius (m); `start`: scaled state near which the orbit must lie; `limits`:
     scaled distance to which the transient's states repeated, and residual (scaled) above which the
-    orbit does not count as closed. The accuracy of the forces is checked later, by `final`."""
+    orbit does not count as closed. The accuracy of the forces is checked later, by `final`.
+    """
     rtols = solver.transient.tolerance, solver.orbit.tolerance
     scales = pair.law.exponent, radius, pair.force_scale
     found = verdict(orbit, start, limits, rtols, scales)
@@ -315,10 +314,9 @@ class VariedOrbit(NamedTuple):
         self, quantity: Callable[..., Any], tau: Float[Array, ""], model: Any, tangents: Any
     ) -> tuple[Float[Array, "*q"], Float[Array, "*q d"]]:
         """Return `quantity(model, tau, state)` at `tau` (mesh periods), and its derivatives along
-        the directions, at constant time.
-
-        `model`: a pair, or what else depends on the directions; `tangents`: its derivatives along
-        them, with a leading axis."""
+        the directions, at constant time. `model`: a pair, or another object that depends on the
+        directions; `tangents`: its derivatives along them, with a leading axis.
+        """
         dynamic, static = eqx.partition(model, eqx.is_inexact_array)
         state, _, changes = self.at(tau)
 

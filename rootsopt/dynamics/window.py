@@ -1,18 +1,18 @@
 """A window of a motion that has not settled: its forces, and its largest Lyapunov exponent.
 
 The exponent distinguishes chaos from a long transient. It is the mean logarithmic growth rate of
-the distance to a second motion, which is put back to a fixed distance every mesh period (Benettin
-et al., Meccanica 15 (1980) 9-20).
+the distance to a second motion. This motion is put back to a fixed distance every mesh period
+(Benettin et al., Meccanica 15 (1980) 9-20).
 
 A tangent vector instead of a second motion was tried. On coarse steps, products of linearised
 impacts grow although the motion repeats: at 1e-6, by a factor of 8 per mesh period beside an orbit
 with the multiplier 0.1. Two motions at a finite distance show what the motion does, provided that
 the distance exceeds the noise of steps and rounding. Every second batch therefore uses a distance
-eight times smaller: noise then makes the growth factor eight times greater, chaos does not.
-
-Before that, the transient is simulated until the motion repeats: the pair is forced with the mesh
-period, and the states at the end of each mesh period (the stroboscopic states) settle on a cycle of
-k points."""
+eight times smaller: noise then makes the growth factor eight times greater, chaos does not. Also
+simulates the transient, until the motion repeats. The pair is forced with the mesh period. The
+states at the end of each mesh period (the stroboscopic states) therefore settle on a cycle of k
+points.
+"""
 
 import dataclasses
 from typing import Any, NamedTuple
@@ -40,13 +40,13 @@ _APART = 1e4, 1e-2, 0.2
 _NEARER = 8.0
 # Rounding errors that replace the tolerance, if they exceed it, when the distance is chosen.
 _ROUNDINGS = 200.0
-# Difference between the growth rates at both distances above which noise or the finite distance,
-# not the motion, sets them.
+# Difference between the growth rates at both distances above which they show noise or the finite
+# distance rather than the motion.
 _ALIKE = float(np.log(3.0))
 # Number of states stored per mesh period.
 _KEPT = 105
 # Force, in units of the pair's `force_scale`, below which differences are relative to this force.
-# Flanks that only just touch push so little that the integration takes no account of it.
+# The integration does not resolve the small forces of flanks that barely touch.
 _FAINT = 1e-3
 # Array type of a window: JAX arrays, or NumPy arrays after a copy from the device.
 _Arrays = Array | np.ndarray
@@ -211,9 +211,10 @@ def integrated_difference(
     """Return the difference between a closed orbit and an integration over its period.
 
     `orbit`: its scaled state (n,) at φ1 = 0, and its forces (r,): mean (N), mean square (N²), and
-    others that do not count; `period` (mesh periods). The result is the greatest of the relative
+    others, which are ignored; `period` (mesh periods). The result is the greatest of the relative
     differences in mean and RMS force, and the scaled distance between start and end. It is inf if
-    the solver fails."""
+    the solver fails.
+    """
     state, forces = orbit
 
     def step(number: Any, carry):
@@ -285,10 +286,11 @@ def settle(  # 85 lines: its inner functions share the arguments.
     `integrator`: method and steps, with the tolerance at the start. The motion has settled if the
     last k + 1 states differ from the states k periods earlier by less than `tolerance` (scaled).
     For large states, the noise of the steps replaces `tolerance` if it is greater. k is the
-    smallest such period that the equation allows (`RotorPair.orders`), at most `max_orbit` ≤ 8,
-    rounded up where the equation repeats after several mesh periods. Steps become finer after
+    smallest such period that the equation allows (`RotorPair.orders`). It is at most `max_orbit` ≤
+    8, rounded up where the equation repeats after several mesh periods. Steps become finer after
     `_PATIENCE`. The transient ends unsettled after `max_periods` mesh periods. `pieces`: as for
-    `strobe`."""
+    `strobe`.
+    """
     orders, block = pair.orders(max_orbit), pair.whole(BLOCK)
     stored = max(_MEMORY, 2 * pair.whole(max_orbit) + _MORE)
     age = jnp.arange(stored)[::-1]

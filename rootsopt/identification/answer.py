@@ -1,4 +1,5 @@
-"""What a fit tells of the quantities: their errors, what the record cannot tell, what would.
+"""What a fit reveals about the quantities: their errors, what the record leaves open, and which
+further measurements would help.
 
 All covariances are those of linearised least squares on the scales of the quantities. Without given
 standard deviations they allow for errors that differ between samples (estimator HC3: J. G.
@@ -22,34 +23,36 @@ from rootsopt.identification.record import CHANNELS, Observed
 from rootsopt.identification.squares import TURN, Local, Problem
 from rootsopt.status import Status
 
-# Standard deviation of a combination, as a share of the range in which the search begins, above
-# which the record does not determine it. Share of a quantity in it below which it does not count.
+# Standard deviation of a combination (share of the range in which the search begins) above which
+# the record does not determine it. Share of a quantity in a combination below which the quantity is
+# ignored.
 _LOOSE, _PART = 0.3, 0.1
 
-# Distance from a bound, as a share of this range, up to which a quantity lies at it.
+# Distance from a bound (share of this range) below which a quantity counts as being at the bound.
 _NEAR = 1e-4
 STRUCTURED = 4.0
 """Value of `structure` above which residuals are not independent."""
 
-# Relative error of a simulated orbit, the same in all samples; relative misfit below which
-# residuals are such errors.
+# Relative error of a simulated orbit, the same in all samples. Relative misfit below which
+# residuals count as such errors.
 _EXACT, _NUMERICAL = 1e-5, 1e-4
 
-# Singular value of the derivatives, as a share of the greatest, below which it is an error of the
-# derivatives.
+# Singular value of the derivatives (share of the greatest) below which it counts as numerical
+# error.
 _SINGULAR = 1e-5
 
-# Error of the end of an interval, as a share of its distance from the best value, and factor by
-# which this distance grows until it holds the end.
+# Error (share of the distance from the best value) of the end of an interval. Factor by which this
+# distance grows until it encloses the end.
 _CLOSE, _WIDER = 0.03, 2.0
 
-# Degrees of freedom from which on the errors may differ between samples (HC3).
+# Number of degrees of freedom from which errors may differ between samples (HC3).
 _MANY = 50
 UNLIKELY = 0.01
-"""Probability of residuals this large, with the given standard deviations, below which these are
-taken for too small."""
+"""Probability of residuals this large below which the given standard deviations count as too
+small.
+"""
 
-# Relative difference of predictions up to which two motions are the same.
+# Relative difference of predictions below which two motions count as the same.
 _SAME = 1e-3
 
 # Speeds of further measurements, as multiples of the config's, and their relative error if the
@@ -109,7 +112,8 @@ class Spread:
         size = rows.measured.groupby(rows.column).transform(lambda x: np.sqrt(np.mean(x**2)))
         exact = share * (_EXACT * math.sqrt(count) * size.to_numpy() / best.deviation)
         covariance = covariance + exact @ exact.T
-        # HC3 scatters where few samples tell of a quantity: its errors are never the smaller ones.
+        # HC3 is unreliable where few samples depend on a quantity. The greater of both errors is
+        # therefore used.
         errors = np.sqrt(np.maximum(np.diag(covariance), factor * np.diag(plain)))
         factors = errors**2 / np.maximum(np.diag(plain), 1e-300)
         unknown = not known and freedom <= 0
@@ -152,7 +156,9 @@ def parameters(
 
 
 def combinations(problem: Problem, spread: Spread) -> list[dict[str, Any]]:
-    """Return the entry `combinations` of the result file, those that are not determined first."""
+    """Return the entry `combinations` of the result file; those that are not determined come
+    first.
+    """
     found, names = [], {one.key: one.name for one in problem.quantities}
     for row, deviation in zip(spread.combinations, spread.deviations, strict=True):
         row = row * np.sign(row[np.argmax(np.abs(row))])
@@ -168,15 +174,17 @@ def combinations(problem: Problem, spread: Spread) -> list[dict[str, Any]]:
 
 
 def relative_misfit(problem: Problem, best: Local) -> float:
-    """Return the RMS difference between fit and record as a share of the record's variation, or of
-    its averages, without the greatest 5 %."""
+    """Return the relative RMS difference between fit and record, without the greatest 5 %. It is a
+    share of the record's variation, or of its averages.
+    """
     away = np.sort(np.abs(best.residual * best.deviation / problem.rows.scale.to_numpy()))
     return float(np.sqrt(np.mean(away[: math.ceil(0.95 * len(away))] ** 2)))
 
 
 def structure(problem: Problem, best: Local) -> float:
-    """Return by how many standard errors neighbouring samples have residuals alike: where a scene
-    lacks something, or is the wrong one, they are not independent."""
+    """Return the correlation between residuals of neighbouring samples, in standard errors.
+    Residuals are not independent if the scene lacks something or is the wrong one.
+    """
     if relative_misfit(problem, best) < _NUMERICAL:
         return 0.0
     rows = problem.rows.assign(away=np.clip(best.residual, -TURN, TURN)).query("sampled")
@@ -204,8 +212,9 @@ def quality(problem: Problem, best: Local, spread: Spread) -> dict[str, Any]:
 
 
 def motions(problem: Problem, best: Local, others: Sequence[int | None]) -> list[dict[str, Any]]:
-    """Return the entry `motions` of the result file: the motion that fits at each point, whether it
-    is reached from rest, and how many `others` there are. An ensemble has none."""
+    """Return the entry `motions` of the result file, empty for an ensemble. For each point, it
+    states the motion that fits, whether it is reached from rest, and the number of `others`.
+    """
     found = []
     for point, begin, count in zip(problem.points, best.begins, others, strict=True):
         mine, rest = (point.predicted(problem.quantities, best.values, x) for x in (begin, REST))
@@ -269,7 +278,9 @@ def profile(
 
     @functools.cache
     def risen(away: float) -> float:
-        """Return the root of the increase at a distance from the best value, less its quantile."""
+        """Return the root of the increase at a distance from the best value, minus the root of the
+        quantile.
+        """
         if away == 0:
             return -spread.width
         place = best.place + away / error**2 * spread.covariance[:, number]
@@ -284,7 +295,7 @@ def profile(
     for side, room in ((-1, center - low), (1, high - center)):
         reach, inside = min(spread.width * error, room), 0.0
         if math.isfinite(error):
-            # A valley of the loss may be long and flat, and end at a wall.
+            # The loss may have a long, flat valley that ends at a steep wall.
             while risen(side * reach) < 0 and reach < room:
                 reach, inside = min(_WIDER * reach, room), reach
             if risen(side * reach) > 0:
@@ -339,10 +350,10 @@ class Identification:
     best: tuple[Problem, Local, Spread] | None = dataclasses.field(default=None, repr=False)
 
     def increase(self, values: Mapping[str, float]) -> float:
-        """Return by how much twice the loss is greater at other `values` (by key).
-
-        For the true values it is distributed as χ², with a degree of freedom for each combination
-        that is determined. It is infinite if there is no motion to trust."""
+        """Return the increase of twice the loss from its minimum to other `values` (by key). For
+        the true values it follows a χ² distribution, with one degree of freedom per combination
+        that is determined. It is infinite if there is no motion to trust.
+        """
         assert self.best is not None
         problem, best, spread = self.best
         place = np.array([one.scaled(values[one.key]) for one in problem.quantities])

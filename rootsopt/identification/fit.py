@@ -1,4 +1,6 @@
-"""Fits quantities of a scene to a record: many starts, local least squares, an honest answer."""
+"""Fits quantities of a scene to a record by local least squares from many starts, and reports what
+remains uncertain.
+"""
 
 import time
 from collections import Counter
@@ -23,8 +25,8 @@ from rootsopt.runtime.environment import check_precision
 from rootsopt.scene.space import sobol
 from rootsopt.status import Status
 
-# Scenes that are tried for each quantity before local fits, maximum number of simulations, and how
-# often at most both are done while no fit explains the record.
+# Number of scenes tried for each quantity before local fits. Maximum number of simulations. Maximum
+# number of rounds of both while no fit explains the record.
 _TRIED, _MOST, _ROUNDS = 16, 256, 4
 
 # Relative misfit of averages above which a fit does not explain them. Number of fits around which
@@ -34,11 +36,11 @@ _POOR, _PLACES = 0.05, 2
 # Relative misfit above which a scene does not explain the record.
 _NO_FIT = 0.7
 
-# Distance between places from which local fits begin, and up to which two optima are the same.
+# Distance between the starts of local fits. Distance below which two optima count as the same.
 _APART, _SAME = 0.15, 0.01
 
-# Ratio of misfits up to which another optimum fits nearly as well, and misfit up to which all
-# optima fit as well as the best.
+# Ratio of misfits below which another optimum fits nearly as well. Misfit below which all optima
+# fit as well as the best.
 _NEARLY, _EQUAL = 2.0, 1e-3
 _CHANCE = 1e-3
 
@@ -203,7 +205,7 @@ def _caveats(problem: Problem, entries: Mapping[str, Any]) -> Iterator[str]:
 
 
 class _Search:
-    """Looks for the scene that fits best, by local fits from the best of many scenes."""
+    """Finds the scene that fits best, by local fits that start from the best of many scenes."""
 
     def __init__(self, problem: Problem, starts: int, seed: int, progress: Callable[[str], None]):
         self.problem, self.starts, self.seed, self.progress = problem, starts, seed, progress
@@ -228,7 +230,7 @@ class _Search:
                 known += self._at(place, [None] * len(points))
             known.sort(key=lambda one: one.cost)
             for _ in range(min(self.starts, len(known))):
-                # A fit begins where none has begun or ended, as long as there is such a place.
+                # If possible, a fit begins at a place where no other fit has begun or ended.
                 self._fit(known[0])
                 begun = [known.pop(0).place, *(one.place for one in self.ends)]
                 near = [min(np.max(np.abs(one.place - x)) for x in begun) < _APART for one in known]
@@ -250,7 +252,7 @@ class _Search:
 
     @property
     def _explained(self) -> bool:
-        """Whether what the best fit leaves of samples looks random, and of averages is small."""
+        """Whether the residuals of the best fit look random (samples) or are small (averages)."""
         for one in self._best[:1]:
             random = structure(self.problem, one) < answer.STRUCTURED
             small = relative_misfit(self.problem, one) < _POOR
@@ -287,8 +289,9 @@ class _Search:
     def coexisting(self, best: Local) -> Sequence[int | None]:
         """Return how many other motions there are at each point of the `best` fit.
 
-        They are counted at the nearest scene where they were looked for; None where they were
-        not."""
+        They are counted at the nearest scene in which a search looked for them; None without such a
+        scene.
+        """
         near = sorted(self.others_at, key=lambda one: np.max(np.abs(one[0] - best.place)))
         return near[0][1] if near else [None] * len(best.begins)
 

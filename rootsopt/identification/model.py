@@ -1,4 +1,4 @@
-"""What the scene predicts for a record, with derivatives with respect to the quantities to fit."""
+"""Predictions of a scene for a record, with derivatives with respect to the quantities to fit."""
 
 import dataclasses
 import functools
@@ -25,15 +25,16 @@ from rootsopt.scene.check import check_geometry
 from rootsopt.status import Status
 
 Begin = Seed | NDArray[np.float64] | None
-"""Where the search for a motion begins: near a known one, or at ε (rad) and dε/dt (rad/s) at φ1 = 0
-as an array (2,); None: at the state that the record shows, or at rest if it shows none. Averages
-begin with the states (members, n) of an ensemble."""
+"""Start of the search for a motion: a known motion, or an array (2,) of ε (rad) and dε/dt (rad/s)
+at φ1 = 0. None: the state that the record shows, or rest if it shows none. For averages: states
+(members, n) of an ensemble.
+"""
 REST = np.zeros(2)
 """Where a motion from rest begins."""
 
 
 class Predicted(NamedTuple):
-    """What is predicted for the n rows and c columns that were measured at an operating point.
+    """Predictions for the n rows and c columns that were measured at an operating point.
 
     `status` of the motion; `values` (n, c) and `slopes` (n, c, p): None if there is no motion to
     trust, slopes with respect to the p quantities; `errors` (n, c): standard errors of averages, 0
@@ -124,8 +125,10 @@ class Point:
         return Predicted(status, value, slopes[..., places], np.zeros(value.shape), seed, orbit)
 
     def _sampled(self, pair, tangents, motion: Steady, turned, lead: int | None):
-        """Return samples (n, c), their derivatives (n, c, d + 1), and how many mesh periods the
-        motion leads the record: one that repeats after several may begin at any of them."""
+        """Return samples (n, c), their derivatives (n, c, d + 1), and the lead of the motion over
+        the record (mesh periods). A motion that repeats after several mesh periods may begin at any
+        of them.
+        """
         measured = self.seen.measured
         places = [CHANNELS.index(name) for name in self.seen.names]
         size = np.nansum(measured**2, axis=0)
@@ -153,8 +156,9 @@ class Point:
     def _averaged(
         self, quantities: Sequence[Fitted], values: NDArray[np.float64], begin: Begin
     ) -> Predicted:
-        """Return averages over an ensemble of motions; their derivatives are the least-squares
-        slopes through neighbours, all from the same states."""
+        """Return averages over an ensemble of motions, with derivatives. These are least-squares
+        slopes through neighbouring scenes, all simulated from the same states.
+        """
 
         def averaged(values: NDArray[np.float64], states: Any) -> Any:
             named = {one.key: float(x) for one, x in zip(quantities, values, strict=True)}

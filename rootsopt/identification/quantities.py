@@ -23,8 +23,8 @@ rotation of rotor 1 (°)."""
 # Ratio of bounds above which a search moves on a logarithmic scale.
 _WIDE = 30.0
 
-# Without bounds, a search begins between the config's value over and times the first number. For
-# a value of 0, it begins within this share (the second) of the allowed range.
+# Range in which a search begins without bounds. The config's value is divided and multiplied by the
+# first number. For a value of 0, the range is the second number, a share of the allowed range.
 _AROUND, _SMALL = 5.0, 0.02
 
 
@@ -71,7 +71,7 @@ class Fitted(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Name in words."""
+        """Name of the quantity in words."""
         return NAMES.get(self.key) or self.key.rpartition(".")[2].replace("_", " ")
 
 
@@ -81,7 +81,8 @@ def fitted(
     """Return (config that has all quantities, the quantities to fit).
 
     `keys`: see `identify`; `given`: keys whose values the record holds. Raises `InputError` for a
-    key that cannot be fitted, or bounds that it cannot have."""
+    key that cannot be fitted, or for bounds outside its range.
+    """
     wanted = {}
     for text, pair in keys.items() if isinstance(keys, Mapping) else ((key, None) for key in keys):
         key, equals, bounds = str(text).partition("=")

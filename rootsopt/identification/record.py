@@ -40,7 +40,8 @@ CHANNELS = (
 """Names of the sampled quantities: the columns of a response, then the torque of the timing gear on
 rotor 1 and that of the shaft that drives rotor 1."""
 
-# Number of samples computed by one call of the program: a record of any length needs one only.
+# Number of samples computed by one call of the program, so that one program serves records of any
+# length.
 _TOGETHER = 8 * BLOCK
 
 
@@ -49,9 +50,11 @@ def channels_at(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the `CHANNELS` (n, c) at the times `tau` (n,), in mesh periods, and their derivatives.
 
-    The derivatives (n, c, d + 1) are those along the directions to which the variation of the
-    `orbit` belongs (`tangents`), then that with respect to time."""
-    # The orbit and the rotors repeat together after this time; a late time would be rounded more.
+    The derivatives (n, c, d + 1) are those along the directions `tangents` of the variation of the
+    `orbit`, then that with respect to time.
+    """
+    # The orbit and the rotors repeat together after this time. Reducing the times by it keeps their
+    # rounding errors small.
     times = orbit.elements.mesh.times
     tau = np.mod(tau, pair.lobes * np.round(float(times[-1] - times[0])))
     padded = np.pad(tau, (0, -len(tau) % _TOGETHER))
@@ -113,7 +116,8 @@ _MOST = 4096
 # Rotation (°) in 1 s at 1 rpm.
 _DEGREES_PER_RPM = 6.0
 
-# Distance (mesh periods) from an instant up to which samples show its state, and how many do.
+# Distance (mesh periods) from an instant below which samples are used to find its state, and number
+# of samples needed.
 _BESIDE, _ENOUGH = 0.1, 6
 _AVERAGES = *RESERVES, *GEAR
 
@@ -172,7 +176,7 @@ class Observed:
         if np.count_nonzero(near) < _ENOUGH:
             return None
         most = pandas.Series(number[near]).value_counts()
-        # Samples that are few in each mesh period are taken together.
+        # Combine sparse samples from several mesh periods.
         near &= (number == most.index[0]) | (most.iloc[0] < _ENOUGH)
         *_, speed, angle = np.polyfit(away[near], relative[near], 3)
         near &= np.isfinite(rate)

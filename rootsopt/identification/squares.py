@@ -23,15 +23,15 @@ from rootsopt.status import Status
 TURN = 3.0
 """Residual, in standard deviations, above which the loss grows linearly."""
 
-# Least size of an average that its relative error refers to, and least variation of samples that
-# theirs refer to, as shares of their column's RMS.
+# Least size of an average, and least variation of samples, to which relative errors refer, as
+# shares of their column's RMS.
 _LEAST, _STILL = 0.1, 1e-4
 
 # Maximum number of scenes in a local fit. Number of times that residuals are clipped at `TURN`
 # standard deviations to estimate one.
 _STEPS, _CLIPS = 40, 8
 
-# Number of values of a column from which on it has a standard deviation of its own.
+# Number of values of a column from which it has a standard deviation of its own.
 _MANY = 30
 _FINEST = 1e-6
 
@@ -116,10 +116,10 @@ class Problem:
         return ends[:, 0], ends[:, 1]
 
     def estimated(self, away: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
-        """Return the standard deviations (n,): those given, else from the differences `away` (n,)
-        between prediction and record, or without these, the scale.
-
-        Columns of few values share one relative deviation."""
+        """Return the standard deviations (n,). Those not given are estimated from the differences
+        `away` (n,) between prediction and record; without these, they are the scale. Columns of few
+        values share one relative deviation.
+        """
         scale, found = self.rows.scale.to_numpy(), self.rows.given.to_numpy(copy=True)
         unknown = np.isnan(found)
         if away is None:

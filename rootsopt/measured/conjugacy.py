@@ -1,4 +1,4 @@
-"""Measures how far flanks are from being conjugate, and reports it of an imported outline.
+"""Measures how far flanks are from being conjugate, and reports it for an imported outline.
 
 The measure is the gap of the flanks in pure rolling."""
 

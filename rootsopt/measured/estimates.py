@@ -1,4 +1,5 @@
-"""Estimates of an outline's scatter, centre and unit from its points alone; what its checks report.
+"""Estimates of an outline's scatter, centre and unit from its points alone, and the report of its
+checks.
 
 Messages and results state the estimates. No estimate is used unless the config asks for it."""
 
@@ -294,8 +295,9 @@ def scatter(points: Complex128[np.ndarray, " n"]) -> tuple[float, float]:
     neighbours, neighbours farther apart are used.
 
     The deviations hold both scatter and the error of the polynomial. Only the latter grows with the
-    distance of the neighbours. The scatter is NaN if the deviations grow by `_GROWTH`; all of them
-    is then the error of interpolation. Otherwise, this error is what the growth leaves for it."""
+    distance of the neighbours. The scatter is NaN if the deviations grow by `_GROWTH`; all of the
+    deviation is then error of interpolation. Otherwise, the growth determines this error.
+    """
     spacing = float(np.median(np.abs(np.diff(points))))
     stride, found = 1, _across(points, 1)
     while found > stride * spacing / _CLEAR and len(points) / (2 * stride) >= _FEWEST:

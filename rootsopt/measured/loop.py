@@ -5,8 +5,9 @@ chain whose two ends are at different vertices.
 
 Calls to libraries that read a user's files are guarded: any exception they raise becomes an
 `InputError`, with the exception as its cause, and their log records and warnings stay off the
-console. Little else than such calls is guarded, because an error of this package would also read as
-a fault of the file."""
+console. Guards cover hardly more than such calls, because an error of this package would otherwise
+appear as a fault of the file.
+"""
 
 import contextlib
 import dataclasses
@@ -159,8 +160,9 @@ def joined(
     ends meet at a vertex of a possible outline. Raises `InputError` if too many ends are close
     together.
 
-    The library's `edgeminer` finds chains, too, but its time grows with the square of the number of
-    ends at a place (the lines of a dial), and it keeps dead ends."""
+    The library's `edgeminer` also finds chains, but keeps dead ends. Its time grows with the square
+    of the number of ends at one place (as in a dial).
+    """
     ends = np.array([chain.points[[0, -1]] for chain in chains]).reshape(-1, 2)
     vertex = _clusters(ends.ravel(), name, join).reshape(-1, 2)
     single = vertex[:, 0] == vertex[:, 1]
@@ -312,9 +314,10 @@ def _connected(parts: list[Loop]) -> Loop:
     """Return successive chains as a loop, as the last one ends where the first begins.
 
     Each gap between ends is closed from both sides in equal shares. Both chains are shifted by an
-    amount that varies linearly along their length, as surveyors do, because moving the end points
-    alone would bend the curve there. The point that two chains share is kept once, as a joint if
-    either chain has it as a joint."""
+    amount that varies linearly along their length, as in surveying. Moving the end points alone
+    would bend the curve there. The point that two chains share is kept once, as a joint if either
+    chain has it as a joint.
+    """
     ahead = parts[1:] + parts[:1]
     gaps = np.array([b.points[0] - a.points[-1] for a, b in zip(parts, ahead, strict=True)])
     points, joints = [], []

@@ -20,12 +20,12 @@ from rootsopt.measured.table import from_csv
 LOBES = range(2, 7)
 """Numbers of lobes that a rotor may have."""
 
-# Distances (mm) up to which ends are joined to find the value of the key that closes an outline.
-# The last one is the greatest value of the key.
+# Joining distances (mm) tried to find the value of the key that closes an outline. The last one is
+# the greatest value of the key.
 _JOINS = 2e-3, 5e-3, 1e-2, 2e-2, 5e-2, 0.1, 0.2, 0.5, 1.0
 
-# Number of loops, the largest first, among which the rotor is looked for; number of rotors that a
-# message names.
+# Number of loops, largest first, in which to search for the rotor. Number of rotors that a message
+# names.
 _LOOPS, _NAMED = 500, 4
 
 # Area (squared extents) below which a loop is a sliver, and area (areas of the convex hull) above
@@ -194,10 +194,10 @@ def _noted(loop: Loop, count: int, which: str) -> Loop:
 
 
 def _likely(loops: list[Loop], sought: Sought | None) -> Loop:
-    """Return the loop that the messages should be about if none fits the rotor.
-
-    It is the largest with the rotor's lobes and with its size in another unit, or the largest with
-    its lobes, or the largest of all."""
+    """Return the loop for the messages if none fits the rotor. It is the largest of the first group
+    with any loops: with the rotor's lobes and, in another unit, its size; with its lobes; all
+    loops.
+    """
     if sought is None or len(loops) == 1:
         return _noted(_largest(loops)[0], len(loops), "the largest")
     lobed, radius = _lobed(loops, sought), sought.pitch_radius_mm

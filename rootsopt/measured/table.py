@@ -23,7 +23,7 @@ _LONGEST = 100_000
 _TRIED = 100
 _REMEDY = "save the points as x,y in mm, one pair per line, as UTF-8 text"
 
-# Cells in which a spreadsheet or an instrument says that there is no number.
+# Cells by which a spreadsheet or an instrument marks a missing number.
 _LACKING = re.compile(
     r"#(?:n/?a|nv|div/0!|value!|wert!|ref!|bezug!|name\?|num!|zahl!|null!)|n/?a|nan|null|none|-+",
     re.IGNORECASE,
@@ -137,9 +137,9 @@ def titled(data: bytes, name: str, what: str) -> tuple[list[str], dict[int, list
 
 
 def measured_number(cell: str) -> float | None:
-    """Return the number in a cell, NaN if it is empty or says that there is none.
-
-    Return `None` for any other text."""
+    """Return the number in a cell; NaN if it is empty or marks a missing number. Return `None` for
+    any other text.
+    """
     if not cell.strip() or _LACKING.fullmatch(cell.strip()):
         return math.nan
     return _number(cell)
@@ -212,7 +212,7 @@ def _named(axis: str, header: list[str]) -> tuple[int, str | None] | None:
 
 
 def _counted(cells: list[str]) -> int:
-    """Return how many of the first two cells are numbers or say that a number is lacking."""
+    """Return how many of the first two cells are numbers or marks of a missing number."""
     return sum(_number(x) is not None or bool(_LACKING.fullmatch(x.strip())) for x in cells[:2])
 
 
@@ -243,7 +243,9 @@ def _angle(angles: NDArray[np.float64], name: str) -> str:
 
 
 def _parts(points: NDArray[np.complex128]) -> list[NDArray[np.complex128]]:
-    """Return the outlines in a table, one after the other: all `points` unless each is closed."""
+    """Return the successive outlines in a table; all `points` as one outline unless each is
+    closed.
+    """
     with np.errstate(all="ignore"):
         steps = np.abs(np.diff(points))
         cuts = np.flatnonzero(steps > _APART * np.median(steps)) + 1 if len(steps) else []

@@ -1,12 +1,13 @@
-"""An optimum beside the baseline over the spread of what is assumed about the scene.
+"""Compares an optimum with the baseline over the ranges of what is assumed about the scene.
 
 Both are simulated in the scenes of `assumptions`: at the ends of each range alone, and in random
-scenes. Where the optimum is worst, a local search looks for a design that is better there, and this
-design is simulated in all scenes, too.
+scenes. A local search then looks for a better design in the scene where the optimum is worst. This
+design is simulated in all scenes as well.
 
 Motions begin at rest. Beginning on the orbit of the config's own scene took three times as long:
 the scenes are too far apart. Motions that need more than a quarter of the allowed transient to
-settle are left out: one of these takes as long as a hundred others."""
+settle are left out, because one of them takes as long as a hundred others.
+"""
 
 import itertools
 import math
@@ -130,7 +131,9 @@ class _Comparison:
     def objectives(self, names: Iterable[str], scenes: Scenes) -> list[NDArray[np.float64]]:
         """Return the objectives (n,) of designs, relative to the baseline in the same scene.
 
-        They are NaN unless both have a usable motion, and where neither touches."""
+        They are NaN unless both have a usable motion, and NaN where the flanks of both stay
+        apart.
+        """
         bases, *found = self.evaluations([BASELINE, *names], scenes)
         return [np.array([*map(self._relative, bases, row)]) for row in found]
 
@@ -142,11 +145,11 @@ class _Comparison:
         return math.nan if nothing else found
 
     def pieces(self, span: Span, first: str, other: str) -> list[Piece]:
-        """Return the parts of a range in which design `first` is worse than the `other` one.
-
-        All else is as given. Both ends of the range and the config's own value are compared, and
-        changes between them are located. In place of an end without a usable motion, the last value
-        before it that has one is compared."""
+        """Return the parts of a range in which design `first` is worse than the `other` one. All
+        other values are those of the config. Both ends of the range and the config's own value are
+        compared, and changes between them are located. In place of an end without a usable motion,
+        the last value before it that has one is compared.
+        """
         key, own = span.key, self.config.value(span.key)
 
         def lead(value: float) -> float:
@@ -162,7 +165,7 @@ class _Comparison:
             if not max(one, two) > 0:
                 continue
             change = _change(lead, a, b) if one * two < 0 else None
-            # Where a motion is not known, nothing is said beyond the end that is.
+            # No statement is made beyond the last value with a known motion.
             start = a if one > 0 else b if change is None else change
             stop = b if two > 0 else a if change is None else change
             joined = bool(found) and found[-1][1] == start
@@ -185,9 +188,9 @@ class _Comparison:
     def _apart(
         self, designs: Iterable[dict[str, float]], most: int, least: float
     ) -> list[dict[str, float]]:
-        """Return the first of some `designs` that are farther than `least` from each other.
-
-        They are as far from the optimum; `most`: greatest number; lengths are in the unit box."""
+        """Return the first `most` of some `designs` that are farther than `least` from each other
+        and from the optimum. Distances are in the unit box.
+        """
         kept, found = [self._point(self.designs[OPTIMIZED])], []
         for one in designs:
             point = self._point(one)
@@ -202,7 +205,9 @@ class _Comparison:
     def _in_worst(self, scene: str) -> list[dict[str, float]]:
         """Return the optimum in one scene, as a list; empty if the search fails.
 
-        The search begins at the best there of other good designs of the config's own scene."""
+        The search begins at the design that is best in that scene, of other good designs in the
+        config's own scene.
+        """
         ((base,),) = self.evaluations([BASELINE], one := {scene: self.scenes[scene]})
         problem, keys = self.problem.beside(base), self.config.design_keys
         rows = [x for x in self.result.history if x["feasible"] and math.isfinite(x["objective"])]

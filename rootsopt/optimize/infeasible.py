@@ -4,9 +4,10 @@ A search minimises the greatest scaled violation of all constraints (elastic mod
 Wright, Numerical Optimization (2006), section 18.5. The constraints that keep this minimum above
 zero are in conflict. If the geometry alone rules out all designs, none is simulated.
 
-`beginning` says where a search begins if the baseline is a rotor from a file, or of another family.
-Such a rotor does not have the parameters that the search varies. It remains the baseline. The
-search begins at the member of the family `optimizer.family` that is nearest to it."""
+`beginning` finds the start of a search if the baseline is a rotor from a file, or of another
+family. Such a rotor lacks the parameters that the search varies. It remains the baseline. The
+search begins at the nearest member of the family `optimizer.family`.
+"""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -315,7 +316,7 @@ def beginning(config: Config) -> Beginning | None:
 
 
 def _cut(config: Config, inset: float) -> tuple[Config, float]:
-    """Return (config of a member with the flank gap of an outline, gap in mm that is too much).
+    """Return (config of a member with the flank gap of an outline, excess of its gap in mm).
 
     An `inset` (m) of both rotors widens the gap by twice as much. The outline's area efficiency
     and its outer radius include the inset, which no member has: limits of the geometry that are

@@ -79,11 +79,12 @@ class Bound(NamedTuple):
     `lower_bound`: the bound; `gap`: distance of the reported design from it; `evaluations`: number
     of designs from which it follows. `factor`, `curvature` (d,): estimated curvature of the
     objective along each parameter (unit box), already multiplied by the factor; `pairs`, `jumps`:
-    number of pairs of designs that are compared, and of those too steep for a curvature, because
-    the objective jumps or has a corner downwards between them. `unusable`: designs without a usable
-    motion. `regions_left`, `volume_left`: number and share of the unit box of the regions that may
-    hold a better design. `proven`: whether no design is better by more than 1e-4 (relative), if the
-    estimate holds."""
+    number of pairs of designs that are compared, and of those too steep for a curvature. Between
+    these, the objective jumps or has a concave corner. `unusable`: designs without a usable motion.
+    `regions_left`, `volume_left`: number and share of the unit box of the regions that may hold a
+    better design. `proven`: whether no design is better by more than 1e-4 (relative), if the
+    estimate holds.
+    """
 
     lower_bound: float
     gap: float
@@ -99,7 +100,7 @@ class Bound(NamedTuple):
 
     @property
     def assumption(self) -> str:
-        """What the bound takes for granted, in a sentence."""
+        """The assumption behind the bound, in a sentence."""
         listed = ", ".join(f"{one:.3g}" for one in self.curvature)
         steeper = (
             f" {self.jumps} pairs are steeper, as at a corner or a jump: across corners, bounds "
@@ -202,7 +203,7 @@ class Optimality:
 
 
 def judged(reason: str, holds: bool) -> str:
-    """Return why a search ended (`reason`), once its design has been simulated again from rest.
+    """Return why a search ended (`reason`), corrected by the simulation of its design from rest.
 
     `holds`: whether the first-order conditions hold there. Only a search that has converged can
     lose its verdict: conditions that hold say little about the value."""

@@ -1,6 +1,6 @@
-"""What a search returns: its trials, its gains over the baseline, and both over assumptions.
-
-Also holds what a search asks of its trials: which are near, apart, or best to begin from."""
+"""Outcome of a search: its trials, its gains over the baseline, and a comparison over assumptions.
+Also selects trials: those nearby, far apart, or best to begin from.
+"""
 
 import dataclasses
 import itertools
@@ -288,7 +288,8 @@ class Assumed:
     wins: dict[str, dict[str, list[Piece]]]
 
     def sample(self, regret: bool) -> tuple[Scenes, tuple[float, ...]]:
-        """Return the random scenes over which a search optimises, and what it adds there.
+        """Return the random scenes over which a search optimises, and the numbers added to the
+        objectives in them.
 
         They are those with a usable motion of all designs. `regret`: whether the least objective of
         all designs is subtracted in each scene; the greatest sum is 1 for the baseline."""

@@ -37,10 +37,12 @@ from rootsopt.scene.build import Scene
 from rootsopt.scene.space import Space, slacks_and_slopes
 from rootsopt.status import Status
 
-# Amplitude of the baseline's line (relative to its mean force) below which it can be no objective.
+# Amplitude of the baseline's line (relative to its mean force) below which it is rejected as an
+# objective.
 _NO_LINE = 1e-9
 
-# Share of a measure's nominal value below which the baseline's value in another scene is no unit.
+# Share of a measure's nominal value below which the baseline's value in another scene is too small
+# as a unit.
 _LEAST = 0.1
 
 # Maximum number of times that an infeasible point is moved halfway towards a feasible point.
@@ -113,9 +115,10 @@ class Problem:
         """Return the problem relative to another usable evaluation of the `baseline`.
 
         Its objective is 1 + Σ w (F - F_0) / max(F_0, F_n / 10) over the measures F with the weights
-        w, where F_0 is the baseline's value there and F_n that of `self.baseline`. Where the
-        baseline hardly strikes or not at all, a ratio to F_0 alone would say nothing. Designs and
-        constraints of the geometry are the same."""
+        w. F_0 is the baseline's value there, F_n that of `self.baseline`. If F_0 is small or 0, a
+        ratio to F_0 alone would mean nothing. Designs and constraints of the geometry are the
+        same.
+        """
         found = Problem(self.config, _in_units(baseline, self.baseline), self.space, self.limits)
         found.__dict__["_look_at"] = self._look_at  # Its results are costly, and the same.
         return dataclasses.replace(found, added=1 - found.objective(baseline))

@@ -1,5 +1,5 @@
 """The robust optimum: the best design if values of scene and design scatter (`tolerances`), or over
-the spread of what is assumed (`objective.over: assumptions`).
+ranges of assumed values (`objective.over: assumptions`).
 
 The search has two stages. The first one finds the nominal optimum, as without `tolerances`. In the
 second one, local searches begin at the optima of the first stage. Each of their designs is
@@ -182,9 +182,9 @@ class RobustStage(Stage):
 class StagedSearch:
     """The stages of a search, and the comparisons that follow.
 
-    The first stage finds the nominal optimum, the second one that over a sample of scenes, if there
-    are `tolerances` or the objective is over `assumptions`. The designs are then compared over
-    fresh scenes, and over what is assumed about the scene. Arguments: see `Search`.
+    The first stage finds the nominal optimum. With `tolerances`, or an objective over
+    `assumptions`, the second stage finds the optimum over a sample of scenes. The designs are then
+    compared over fresh scenes, and over what is assumed about the scene. Arguments: see `Search`.
 
     Raises `InputError` if `tolerances` name a parameter that the family of the search lacks."""
 

@@ -135,8 +135,9 @@ class RobustProblem(Problem):
     def walls(self, evaluation: Evaluation, jacobian: NDArray[np.float64]) -> tuple[Group, ...]:
         """Return one wall for each of `limits`, as `Problem.walls` does.
 
-        If limits hold for the combination of the scenes, a wall has this combination as its only
-        branch, with the gradient of the greatest branch in each scene."""
+        If limits hold for the combination of the scenes, this combination is the only branch of a
+        wall. Its gradient is that of the greatest branch in each scene.
+        """
         if not (evaluation.scenes and self._combines_limits):
             return super().walls(evaluation, jacobian)
         found = [

@@ -128,7 +128,7 @@ class Search:
         self._refuted: list[NDArray[np.float64]] = []
         self._found: dict[int, Found] = {}
         self._baseline: Evaluation | None = None
-        # A baseline that violates a limit may be better than every design that does not.
+        # A baseline that violates a limit may be better than every feasible design.
         self._bar = 1.0
 
     def run(self) -> Optimization:
@@ -227,8 +227,9 @@ class Search:
     def _bounded(self, trials: list[Trial], number: int) -> tuple[Bounding | None, list[Trial]]:
         """Look for a lower bound of the objective, and search again from each better design.
 
-        `trials`: those of the search so far; `number`: index of its next local search. Return what
-        is known of the bound, `None` if it is not asked for, and the trials of further searches."""
+        `trials`: those of the search so far; `number`: index of its next local search. Return the
+        bound (`None` if it is not requested), and the trials of further searches.
+        """
         candidates = [one for one in trials if one.candidate]
         size = len(trials[0].point) if trials else 0
         given = self.settings.prove
@@ -262,8 +263,10 @@ class Search:
         return bounding, further
 
     def _vertex(self, optimized: Evaluation, trials: list[Trial]) -> VertexOptimum | None:
-        """Return what is known of an optimum at a vertex of the limits, from as many designs as the
-        search had `trials`; `None` elsewhere, or where the objective is one over a sample."""
+        """Return the facts on an optimum at a vertex of the limits, from as many designs as the
+        search had `trials`. Return `None` for any other optimum, or if the objective is over a
+        sample.
+        """
         if not self.stage.bounded or len(optimized.design) > PARAMETERS:
             return None
         known = [one for one in trials if one.evaluation.usable]

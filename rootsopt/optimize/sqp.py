@@ -156,7 +156,7 @@ class _Descent:
                 return reason
 
     def _ended(self, step: NDArray[np.float64], decrease: float) -> str | None:
-        """Return why a search ends that can hardly move, or `None` if it goes on after all.
+        """Return why a search that can hardly move ends, or `None` if it continues.
 
         `step`, `decrease`: as `_step` returns them."""
         if self.promised > self.stops.enough and self.reach < _WIDE:
@@ -172,10 +172,10 @@ class _Descent:
         return "converged" if small or not self._polished(step, decrease) else None
 
     def _polished(self, step: NDArray[np.float64], decrease: float) -> bool:
-        """Return whether a step of negligible `decrease` leads to a point that is flatter.
-
-        `step`, `decrease`: as `_step` returns them. A step that fails corrects the models, so that
-        a few are tried while the first-order conditions do not hold."""
+        """Return whether a step of negligible `decrease` leads to a smaller first-order residual.
+        `step`, `decrease`: as `_step` returns them. A step that fails corrects the models. A few
+        steps are therefore tried while the first-order conditions do not hold.
+        """
         for _ in range(_TRIES if self.certificate.residual > _FLAT else 1):
             if decrease <= 0 or self._moves(step, decrease):
                 return decrease > 0

@@ -1,8 +1,8 @@
-"""The verification of a search: its best design once more, from rest, with a certificate.
-
-`surviving` tells what is left of the gain if the rotors are not exactly as drawn: baseline and
-optimised design are evaluated again with the same errors of manufacture, all flanks too full or too
-lean, and the axes too near or too far."""
+"""Verifies a search: simulates its best design again, from rest, with a certificate. `surviving`
+computes how much of the gain is left if the rotors are not exactly as drawn. Baseline and optimised
+design are evaluated again with the same errors of manufacture. All flanks are too full or too lean,
+or the axes too near or too far.
+"""
 
 import dataclasses
 import math
@@ -221,10 +221,11 @@ def surviving(result: Optimization, given: Config) -> list[dict[str, Any]]:
 
     `given`: config of the baseline, whose family may be another than that of the search.
 
-    A row holds the name of the `case`, the objectives `baseline` and `optimized` (relative to the
-    baseline as drawn), the relative `gain` between them, its `share` of the gain as drawn, and
-    their `statuses`. Numbers are NaN if one of the two has no steady state. Return [] without an
-    optimised design."""
+    A row holds the name of the `case`, and the objectives `baseline` and `optimized` (relative to
+    the baseline as drawn) with their `statuses`. It also holds the relative `gain` between them,
+    and its `share` of the gain as drawn. Numbers are NaN if one of the two has no steady state.
+    Return [] without an optimised design.
+    """
     problem = result.problem
     if problem is None or result.optimized is None:
         return []

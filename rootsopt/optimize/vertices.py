@@ -1,9 +1,9 @@
-"""Vertices of the feasible set: designs that as many limits hold as there are parameters.
-
-A limit is a constraint of the geometry, or a bound of the unit box. If it holds an optimum at a
-vertex, the forces only choose between vertices. The others are found by walking along the edges:
-one limit is let go, and the rest are kept by Newton steps until a further limit is reached. Limits
-of forces are not known without a simulation, so that they do not count."""
+"""Vertices of the feasible set: designs with as many active limits as parameters. A limit is a
+constraint of the geometry, or a bound of the unit box. If the optimum is at a vertex, the forces
+only choose between vertices. The others are found by walking along the edges. One limit is
+released, and Newton steps keep the rest active until a further limit is reached. Limits of forces
+are ignored, because they are not known without a simulation.
+"""
 
 import itertools
 from collections.abc import Callable
@@ -25,7 +25,8 @@ _STEPS = 60
 # Greatest number of Newton steps, and slack at which they end.
 _NEWTON, _EXACT = 12, 1e-10
 
-# Smallest singular value of the gradients of limits that meet at a point.
+# Smallest singular value of the gradients below which limits that meet at a point count as
+# dependent.
 _FLAT = 1e-6
 
 # Nodes per axis of a plane: to find the feasible part of the box, and in this part.
@@ -42,7 +43,7 @@ AT_VERTEX, DRAWN = 100_000, 40
 
 
 class Vertex(NamedTuple):
-    """A vertex: its `point` (d,) of the unit box, and the numbers (d,) of the limits that hold it.
+    """A vertex: its `point` (d,) in the unit box, and the numbers (d,) of its active `limits`.
 
     The m constraints come first, then the d lower and the d upper bounds."""
 
@@ -77,12 +78,12 @@ class Plane(NamedTuple):
 
 
 class VertexOptimum(NamedTuple):
-    """An optimum at a vertex of the limits.
-
-    `limits`: names of the limits that hold it. `others`: other vertices, best first, each with
-    `design` (config units by key), `limits` and `objective` (`None` without a usable motion).
-    `keys`: two parameters; `designs`: columns `x`, `y` (config units), `slack` and `objective` (NaN
-    where not simulated) of designs that differ from the optimum in these parameters only."""
+    """An optimum at a vertex of the limits. `limits`: names of its active limits. `others`: other
+    vertices, best first, each with `design` (config units by key), `limits` and `objective` (`None`
+    without a usable motion). `keys`: two parameters; `designs`: columns `x`, `y` (config units),
+    `slack` and `objective` (NaN where not simulated) of designs that differ from the optimum in
+    these parameters only.
+    """
 
     limits: list[str]
     others: list[dict[str, Any]]
@@ -114,9 +115,9 @@ class FeasibleSet:
         return np.concatenate([slack, point, 1 - point]), np.vstack([normals, one, -one])
 
     def vertex(self, point: NDArray[np.float64]) -> Vertex | None:
-        """Return the vertex at a `point` (d,), or `None` if fewer than d limits hold it.
-
-        Of more than d limits, the first that are independent count."""
+        """Return the vertex at a `point` (d,), or `None` if fewer than d limits are active. Of more
+        than d active limits, use the first independent ones.
+        """
         slack, normals = self.slacks(point)
         held: list[int] = []
         for number in np.flatnonzero(np.abs(slack) <= NEAR):
@@ -172,7 +173,7 @@ class FeasibleSet:
         return found
 
     def _other_end(self, vertex: Vertex, number: int) -> Vertex | None:
-        """Return the other end of the edge on which limit `number` of a `vertex` is let go.
+        """Return the other end of the edge on which limit `number` of a `vertex` is released.
 
         Return `None` if the edge is lost."""
         kept = [one for one in vertex.held if one != number]
@@ -219,7 +220,7 @@ def vertex_optimum(
     simulated: Callable[[list[NDArray[np.float64]]], list[float]],
     most: int,
 ) -> VertexOptimum | None:
-    """Return what is known of an optimum at a `point` (d,) if it is a vertex, else `None`.
+    """Return the facts on an optimum at a `point` (d,) if it is a vertex, else `None`.
 
     `simulated`: function that returns the objectives of points, NaN without a usable motion;
     `most`: number of designs that may be simulated."""

@@ -47,17 +47,18 @@ _COMMON = "ee", "arc", "cic"
 # free form is compared, too. Three times the scatter of the points is added to both.
 _EXACT, _FAR = 1e-6, 20e-6
 
-# Number of parameters that the limits take from a family. In pitch radii: distance of the fitted
-# profile from the outline above which it is rejected, and clearance that is assumed without a
-# gap. Room (mm, cm³) that limits leave for rounding.
+# Number of parameters that the limits take from a family. Distance (pitch radii) from the outline
+# above which a fitted profile is rejected. Clearance (pitch radii) that is assumed if none is
+# given. Room (mm, cm³) that limits leave for rounding.
 _HELD, _LOOSE, _GAP, _ROOM = 2, 0.01, 3e-3, 1e-6
 
 
 def config_of(options: argparse.Namespace) -> Config:
     """Return the config of a search for a better rotor than that of the file `options.config`.
 
-    `options.known` becomes what is known beside it, as in the result file. Raises `InputError` if
-    the file does not hold a rotor, or if an option does not suit it."""
+    Set `options.known` to what else is known of the rotor, as in the result file. Raises
+    `InputError` if the file does not hold a rotor, or if an option does not suit it.
+    """
     path, scene = options.config, options.scene
     given, rest = _given(options)
     base = load(scene or "cic_drawn", rest)
@@ -178,7 +179,7 @@ def _typical(base: Config, radius: float, own: set[str]) -> dict[str, Any]:
 
 
 def _aims(options: argparse.Namespace, config: Config) -> list[str]:
-    """Return the aims of the search, by default what matters more for flanks that touch or not.
+    """Return the aims of the search; the default depends on whether the flanks touch.
 
     Raises `InputError` if forces are to be lowered but the flanks never touch."""
     aims, gap = [*dict.fromkeys(options.aims)], config.contact.clearance_mm

@@ -114,7 +114,7 @@ def _answer(key: Key) -> str:
 
 
 def _missing(given: dict[str, Any], keys: list[Key]) -> list[str]:
-    """Return the options, in words, that are needed and not `given`."""
+    """Return the names of the required options that are not `given`."""
     found = [f"`{option(key.name)}`" for key in keys if key.required and key.name not in given]
     either = " or ".join(f"`{option(name)}`" for name in _POWERS)
     return found if {*_POWERS} & {*given} else [*found, either]

@@ -94,7 +94,7 @@ def _contradiction(config: Config, folder: RunFolder, result) -> cli.Outcome:
 def _alike(config: Config, result) -> dict:
     """Return {"resembles": classical profiles nearest to the optimised one, one row per family}.
 
-    Return {} if the optimised family is classical itself, or without an optimised design."""
+    Return {} if the optimised family is classical itself, or if there is no optimised design."""
     config = _searching(config, result)
     if family_of(config.profile.family).classical or result.optimized is None:
         return {}
@@ -127,7 +127,9 @@ def _searching(config: Config, result) -> Config:
 
 
 def _advice(result) -> str:
-    """Return the message of a result, preceded by what limits cost that the baseline violates."""
+    """Return the message of a result, preceded by the cost of the limits that the baseline
+    violates.
+    """
     return f"{result.cost} {_said(result)}".strip()
 
 

@@ -1,8 +1,8 @@
 """Periodic orbits along a curve: Newton's method for the orbit and for a parameter.
 
-The collocation equations and the times of the events have one unknown more here: a parameter of the
-pair. One more equation closes the system: the orbit's place (the state at φ1 = 0 and the parameter)
-lies in a plane. The matrix with this border is regular at folds too, where that for a fixed
+In addition to the motion and the times of the events, a parameter of the pair is unknown here. One
+further equation closes the system: the orbit's place (the state at φ1 = 0 and the parameter) lies
+in a plane. The matrix with this border is also regular at folds, where the matrix for a fixed
 parameter is singular (Keller 1977). Mesh and events are found as for single orbits (`closing`).
 """
 
@@ -46,8 +46,9 @@ _TURNS = 12
 _SMALL = 1e-10
 
 Family = Callable[[Float[Array, ""]], tuple[RotorPair, RotorPair]]
-"""Type of a function that maps a parameter to the pair, and to the pair's derivative with respect
-to this parameter, with a leading axis of length 1."""
+"""Type of a function that maps a parameter to (pair, its derivative with respect to the parameter).
+The derivative has a leading axis of length 1.
+"""
 
 
 class Plane(NamedTuple):

@@ -59,8 +59,8 @@ from rootsopt.dynamics.collocation.system import Step, chained, condensed, uncha
 from rootsopt.dynamics.orbit import Orbit, branch, choose
 from rootsopt.dynamics.pair import RotorPair
 
-# The first mesh that is aligned with events has this many elements for each of the mesh before, at
-# the usual accuracy, more at a finer one, and the second number per event.
+# Size of the first mesh that is aligned with events: elements for each element of the mesh before
+# (more at a finer than the usual accuracy), and further elements per event.
 _SHARE, _EVENT = 0.5, 1
 # Relative error of the forces (usual accuracy) for which `_SHARE` and `CORRECTED` hold.
 _USUAL = 1e-7
@@ -70,9 +70,9 @@ _ORDER = 2 * POINTS
 # roughness, which counts as at least the third number. In 45 random pairs, 95 % of the errors were
 # below 8e-6 and 1.5e-3 times the roughness.
 _UNCOMPARED = 1e-5, 1e-3, 0.1
-# Factor by which the number of elements grows when the mesh is refined, and least factor for which
-# a second or later mesh is refined that has less room than that. A mesh of nearly the same size
-# would have nearly the same error, and say nothing about it.
+# Factor by which the number of elements grows when the mesh is refined. If there is less room, a
+# second or later mesh is refined only if it grows by at least the other factor. A mesh of nearly
+# the same size would have nearly the same error, and say nothing about it.
 _FINER, _LAST = 1.4, 1.4**0.5
 # Maximum number of evaluations of the flags, and of Newton steps after each of them.
 _TURNS, _STEPS = 24, 16
@@ -89,17 +89,17 @@ _FAILURES = 4
 # is below the error of the forces to reach. Convergence is quadratic, so the next step, which is
 # made together with the derivatives, is about as small.
 _LARGEST = 3e-3
-# Correction (scaled) that does not count in the derivatives, at the usual accuracy, and the share
-# of the correction before above which it only follows rounding.
+# Correction (scaled, at the usual accuracy) below which its effect on the derivatives is
+# negligible. Ratio to the previous correction above which a correction only follows rounding.
 _NEGLIGIBLE, _STALLED = 3e-9, 0.5
 # Difference (rad) between the contact's normal angle in the solved orbit and that found by a
 # search, above which the orbit is solved again from the latter. Roots lag one Newton step behind,
 # and another minimum of the gap lies much further away.
 _FAR = 1e-3
-# Numbers by which the difference between two meshes is divided to estimate the error on the finer
-# one, if that has `_FINER` times as many elements: for forces and for derivatives. In theory, both
-# errors fall by 1.4⁸. Derivatives fall less evenly, and their estimate must be a bound. `gained`
-# returns the numbers for other meshes.
+# Divisors of the difference between two meshes that give the error on the finer one, for forces and
+# for derivatives. They hold if it has `_FINER` times as many elements. In theory, both errors fall
+# by 1.4⁸. Derivatives fall less evenly, and their estimate must be a bound. `gained` returns the
+# numbers for other meshes.
 _GAINS = 10.0, 0.2
 # Error of derivatives above which the mesh is refined: the first number times the error of the
 # forces to reach, at least the second and at most the third.
@@ -174,10 +174,11 @@ class Closer(eqx.Module):
     `neighbour` (m,): `numbers` of the pair whose orbit is the known one; `tolerance`: relative
     error of the forces to reach.
 
-    If the mesh of the known orbit is aligned with events, the new one is solved on it, and its
-    error follows from the known one. Otherwise, and if the events are others or the error is too
-    large, the mesh is changed until flags and events agree and the error is small enough. `start`
-    returns the initial state of the loop, `turn` makes one iteration."""
+    If the mesh of the known orbit is aligned with events, the new orbit is solved on it. Its error
+    then follows from that of the known orbit. Otherwise, or if the events differ or the error is
+    too large, the mesh is changed. This continues until flags and events agree and the error is
+    small enough. `start` returns the initial state of the loop, `turn` makes one iteration.
+    """
 
     equation: CollocatedEquation
     frozen: RotorPair
@@ -245,13 +246,13 @@ class Closer(eqx.Module):
     def step(self, now: Loop) -> tuple[CollocatedEquation, Points, Array, Step, Any]:
         """Solve the linearised equation for Newton's step and the directions of the parameters.
 
-        Return the equation, the equation along the motion, direct changes of its values in all
-        columns of the step (e, p, r, k), the step, and the new `Loop.line`.
-
-        If the motion is the orbit of a similar pair, the first step is along the tangent of the
-        family of orbits that leads to the equation's pair (predictor). Newton's first step would be
+        Return five results: the equation; the equation along the motion; direct changes of its
+        values in all columns of the step (e, p, r, k); the step; the new `Loop.line`. If the motion
+        is the orbit of a similar pair, the first step is a predictor. It goes along the tangent of
+        the family of orbits that leads to the equation's pair. Newton's first step would be
         evaluated at penetrations of the wrong size, since the flanks have moved. The tangent is
-        Newton's step for a pair a small way (`_WAY`) towards the new one, divided by this way."""
+        Newton's step for a pair a small way (`_WAY`) towards the new one, divided by this way.
+        """
         at = now.elements
         way = jnp.where(now.trusted & (now.tries == 0), _WAY, 1.0)
         pair = between(self.equation.pair, self.neighbour, way)
@@ -411,7 +412,7 @@ class Closer(eqx.Module):
         error, drift = choose(first, self.uncompared(size), compared)
         steep, least, most = _TURNING
         certain = drift <= jnp.clip(steep * self.tolerance, least, most)
-        # Without a comparison, a little finer mesh is better than none.
+        # Without a comparison, even a slightly finer mesh helps.
         full = jnp.where(first, 1.0, _LAST) * now.elements.mesh.used >= self.most(now)
         # Newton's method has converged, so the correction must be small. It is NaN where the time
         # derivative of a margin vanishes at its event. Derivatives are those before the correction:

@@ -271,13 +271,14 @@ def in_blocks(function: Any, used: Int[Array, ""], *arrays: Any) -> Any:
 
 
 def zero_of(margin, low, high, positive):
-    """Return the instant between `low` and `high` at which the sign of `margin` changes, and what
-    `margin` has returned besides just before and just after it.
+    """Return the instant between `low` and `high` at which the sign of `margin` changes. Also
+    return the second result of `margin` just before and just after this instant.
 
     `margin`: function of time (mesh periods), which returns the margin and another number;
     `positive`: whether the margin is positive at `low`. Chord and bisection are combined by the ITP
     method (Oliveira and Takahashi, ACM Trans. Math. Softw. 47 (2021) 5): a smooth margin takes
-    about ten evaluations, any other hardly more than bisection."""
+    about ten evaluations, any other margin hardly more than bisection.
+    """
     width = high - low
     most = jnp.ceil(jnp.log2(jnp.maximum(width / (2 * _LOCATED), 1.0))) + 1
 

@@ -1,10 +1,10 @@
 """Find the events of a motion, and check the events that a mesh assumes.
 
 An event is an instant at which a flag of the equation (`RotorPair.switches`) changes. The flags are
-evaluated at all Gauss points, on both sides of the end of each element, and where a short touch may
-begin or end: beside a zero of ε, or where ε is extreme. At each of these instants, the contact is
-found by a search (`SearchContact`), not from a closest approach already known (`NearContact`).
-Events inside elements are located by the zeros of their margins.
+evaluated at all Gauss points, and on both sides of the end of each element. They are also evaluated
+where a short touch may begin or end: beside a zero of ε, or where ε is extreme. At each of these
+instants, the contact is found by a search (`SearchContact`), not from a closest approach already
+known (`NearContact`). Events inside elements are located by the zeros of their margins.
 """
 
 import dataclasses
@@ -213,8 +213,9 @@ def extra(elements: Elements) -> Float[Array, "e 2"]:
     """Return two instants in each element, as fractions of its length, where a short touch shows.
 
     They lie beside the zero of ε, or else where ε is extreme and in the middle of the element.
-    Without clearance, flanks that are about to part may touch for a moment after ε has changed its
-    sign, and flanks that are about to meet, before."""
+    Without clearance, flanks may touch for a moment beside a change of sign of ε: after it if they
+    are about to part, before it if they are about to meet.
+    """
     begins, inside = elements.state[:, None, :2], elements.places[1][..., :2]
     relative, rate = jnp.moveaxis(jnp.concatenate([begins, inside], axis=1), -1, 0)
     (zero, crosses), (turn, turns) = (_zero(elements, x, k) for k, x in enumerate((relative, rate)))
@@ -246,11 +247,12 @@ def _zero(elements: Elements, values: Float[Array, "e q"], state: int):
 def rooted(pair: RotorPair, elements: Elements, seen: FlagScan) -> Elements:
     """Return `elements` with `roots` from `seen`, the result of `look`.
 
-    At the end of an element, the first root belongs to the side of the end on which the flanks
-    push, or to the instant before the end where the contact jumps. The second root, that of the
-    minimum to which the contact may jump, belongs to the instant after the end. Both are
-    extrapolated to the end: otherwise derivatives of a peak at a corner of the force would have a
-    relative error of about 5e-6."""
+    At the end of an element, the first root belongs to the side on which the flanks push. Where the
+    contact jumps, it belongs to the instant before the end. The second root, that of the minimum to
+    which the contact may jump, belongs to the instant after the end. Both are extrapolated to the
+    end: otherwise derivatives of a peak at a corner of the force would have a relative error of
+    about 5e-6.
+    """
     inside = len(GAUSS.nodes)
     mesh, number = elements.mesh, jnp.arange(elements.state.shape[0])
     following = jnp.where(number + 1 < mesh.used, number + 1, 0)
@@ -359,7 +361,7 @@ def _located(pair: RotorPair, elements: Elements, seen: FlagScan, compared: _Com
     fresh, later, held, gone = compared
     room = mesh.times.shape[0]
     most = _CHANGES * room
-    # Choose the instants first: to choose among all flags of all instants takes ten times as long.
+    # Choose the instants first: choosing among all flags of all instants takes ten times as long.
     some = jnp.nonzero(jnp.any(fresh, axis=1), size=most, fill_value=fresh.shape[0])[0]
     changes = fresh.at[some].get(mode="fill", fill_value=False)
     row, flag = jnp.nonzero(changes, size=most, fill_value=0)

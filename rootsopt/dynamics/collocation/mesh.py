@@ -24,9 +24,10 @@ _FLOOR = 0.15
 
 # Maximum number of elements per mesh period: in each of the first two mesh periods, and in each
 # further one, unless the flank is wavy or forked. Free forms have some 45 events in each mesh
-# period, four arcs up to 35. Others have fewer, and would pay for the room: sorting events takes
-# half of the time from rest with room for 64 events in each of eight mesh periods. Shorter orbits
-# can use the room of longer ones, up to the third number per mesh period at the usual accuracy.
+# period, four arcs up to 35. Other families have fewer, and more room would slow them down: with
+# room for 64 events in each of eight mesh periods, sorting events takes half of the time from rest.
+# Shorter orbits can use the room of longer ones, up to the third number per mesh period at the
+# usual accuracy.
 _MOST, _FINEST = (96, 48), 160
 # Number of events above which the search for the orbit fails, counted like elements.
 _TIMES = 64, 24
@@ -45,8 +46,9 @@ _LEAST = 1e-6
 
 
 def room_for(pair: RotorPair, periods: int) -> tuple[int, int]:
-    """Return the `sizes` for orbits of `pair` of up to this number of mesh periods, or the next
-    greater one after which the equation repeats."""
+    """Return the `sizes` for orbits of `pair` of up to this number of mesh periods. The number is
+    rounded up to one after which the equation repeats.
+    """
     contact = innermost(pair.contact)
     profile = contact.pair.profile if isinstance(contact, SearchContact) else None
     crowded = profile is not None and (profile.wavy or profile.forked)
@@ -78,7 +80,7 @@ def most_elements(mesh: Mesh, denser: Float[Array, ""], slices: int) -> Int[Arra
 
 
 def snug(used: Int[Array, ""]) -> Int[Array, ""]:
-    """Return a number of elements that is at most `_SPARED` below `used`, if it needs a block less.
+    """Return fewer elements than `used`, by at most the share `_SPARED`, if this saves a block.
 
     The equation is evaluated on one element more than are in use."""
     spare = (used + 1) % BLOCK
@@ -394,11 +396,12 @@ period before events are known, and their Gauss points."""
 def differences(before: Orbit, after: Orbit, scale: Float[Array, ""]):
     """Return two relative differences between the results on two meshes.
 
-    The first is the largest difference in mean, RMS and peak force and in the further measures, the
-    second that in the derivatives of the first three. Spectral lines are relative to the mean, and
-    weak forces to a share of `scale` (N), since rounding counts for flanks that only just touch.
-    For an orbit without contact, they are those of the state at φ1 = 0 (scaled), and of its
-    derivatives."""
+    The first is the largest difference in mean, RMS, peak and further measures of the force. The
+    second is the largest difference in the derivatives of mean, RMS and peak. Spectral lines are
+    relative to the mean. Weak forces are relative to a share of `scale` (N), since rounding
+    dominates the force of flanks that barely touch. For an orbit without contact, compare the state
+    at φ1 = 0 (scaled) and its derivatives instead.
+    """
 
     def rms(values):
         return values.at[1].set(jnp.sqrt(jnp.maximum(values[1], 0.0)))
@@ -412,7 +415,8 @@ def differences(before: Orbit, after: Orbit, scale: Float[Array, ""]):
     weak = jnp.abs(other) / size
     drift = jnp.max((weak * slopes / jnp.where(largest > 0, largest, 1.0))[:3])
     moved = jnp.max(jnp.abs(before.moved - after.moved), initial=0.0)
-    # Rounding counts where the motion hardly depends on the directions.
+    # Where the motion hardly depends on the directions, a relative difference would only show
+    # rounding.
     moved /= jnp.maximum(jnp.max(jnp.abs(after.moved), initial=0.0), _LEAST)
     apart = jnp.max(jnp.abs(before.state - after.state))
     return choose(other[2] > 0, (error, drift), (apart, moved))

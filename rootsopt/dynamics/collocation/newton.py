@@ -49,12 +49,13 @@ def evaluated(
 ) -> tuple[Points, Float[Array, "e p r d"]]:
     """Return the equation along `elements`, and its derivatives along d directions.
 
-    It is evaluated at the s Gauss points and the end of each element (p = s + 1), and at the
-    instants `rivals`, on the element after the last one in use. `at` (m,): `numbers` of the pair,
-    in place of those of the equation's pair; `tangents`: directions of the
+    It is evaluated at the s Gauss points and the end of each element (p = s + 1). The instants
+    `rivals` are evaluated too, as those of the element after the last one in use. `at` (m,):
+    `numbers` of the pair, in place of those of the equation's pair; `tangents`: directions of the
     pair's parameters, stacked along a leading axis; `whole`: whether derivatives along them are
     needed. Otherwise they have no meaning. The arrays of the mesh must have room for one more
-    element."""
+    element.
+    """
     mesh, extra = elements.mesh, elements.mesh.used
     tau, state = (
         x.at[extra].set(y) for x, y in zip(elements.places, rivals.places(elements), strict=True)

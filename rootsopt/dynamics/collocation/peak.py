@@ -1,9 +1,9 @@
 """The greatest contact force of an orbit on elements.
 
-Inside an element the force is smooth. Its values and its slopes along the orbit at the Gauss points
-determine a polynomial of degree 2s - 1, whose maxima show where to evaluate the equation next. The
-peak follows from force and slope there. A peak at a corner of the force lies at the end of an
-element, which is an event, and moves with this event.
+Inside an element the force is smooth. Its values and slopes along the orbit at the Gauss points
+determine a polynomial of degree 2s - 1. The equation is evaluated next at the maxima of this
+polynomial. The peak follows from force and slope there. A peak at a corner of the force lies at the
+end of an element, which is an event, and moves with this event.
 
 At the event itself, rounding decides from which side of the corner the derivatives are. Both sides
 give the same change of the peak, since the force is continuous and the event moves with them. If
@@ -153,7 +153,7 @@ def rivals_of(
 
     def closer(_, share):
         _, slope, bend = _derivatives(rows, share)
-        # A greater error than this is not that of a polynomial: the motion is not yet a solution.
+        # A greater error means that the motion is not yet a solution.
         error = jnp.where(jnp.abs(wrong) < _BESIDE * jnp.abs(bend), wrong, 0.0)
         return jnp.clip(share + _to_vertex(slope + error, bend), _INSIDE, 1.0 - _INSIDE)
 

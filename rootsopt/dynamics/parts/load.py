@@ -221,7 +221,7 @@ MIRROR = np.array([-1.0, 1.0])
 
 
 def contact_place(profile: Profile, phi: Float[Array, ""]) -> Float[Array, "2"]:
-    """Return the place (m) where the rotors touch in perfect rolling, x and y from rotor 1's axis.
+    """Return the point (m) where the rotors touch in perfect rolling, x and y from rotor 1's axis.
 
     `phi`: φ1 (rad). Where a whole arc touches at once, the place moves along it while φ1 changes by
     a short angle. `GasLoad` spreads the jump of its torque over the same angle."""
@@ -310,9 +310,9 @@ class GasResultant(eqx.Module):
         return jnp.mod(opening, pitch)
 
     def corners(self) -> Float[Array, " k"]:
-        """Return the angles φ1 (rad, in one mesh period) at which the forces are not smooth.
-
-        Pockets open there, or the contact of a slice passes the end of a segment."""
+        """Return the angles φ1 (rad, in one mesh period) at which the forces are not smooth. At
+        these angles, a pocket opens, or the contact of a slice passes the end of a segment.
+        """
         pitch = 2 * jnp.pi / self.profile.lobes
         rolls = [jnp.zeros(1), pitch / 4 * jnp.ones(1)]
         for segment in self.profile.segments():

@@ -159,8 +159,8 @@ class Supports(Part):
 class GearErrors(eqx.Module):
     """How the play between the teeth moves and changes over a turn of rotor 1.
 
-    `eccentricity` (2,), `angle` (2,) in rad: distance of each gear's centre from the axis of its
-    rotor, divided by the pitch radius, and its direction at φ1 = 0, from the line to the other axis
+    `eccentricity` (2,), `angle` (2,) in rad: eccentricity of each gear, divided by the pitch
+    radius, and its direction at φ1 = 0. The direction is measured from the line to the other axis,
     in the rotor's sense of rotation. `tooth_angle` (rad): pressure angle of the teeth; None: the
     change of the backlash is neglected. `knots` (n,) of φ1 (rad, from 0 on) and `measured` (6, n):
     powers, highest first, of polynomials that continue each knot: a measured transmission error

@@ -67,7 +67,7 @@ _SHARP = 0.01
 
 
 class Edge(NamedTuple):
-    """Two neighbours on a front, and the distances between them.
+    """Two neighbours on a front, with the distances between them.
 
     `pair`: indices of the neighbours; `distance`: Euclidean distance in scaled terms;
     `design_distance`: greatest difference of a coordinate of the unit box."""
@@ -255,8 +255,9 @@ def points_of(
 ) -> tuple[list[FrontPoint], list[FrontPoint]]:
     """Return (points of the front in order, points that were dropped) for all `nodes`.
 
-    `study`: evaluates their designs; `selection`: nodes that form the front; `scale`: that of the
-    terms."""
+    `study`: evaluates their designs; `selection`: nodes that form the front; `scale`: scale of the
+    terms.
+    """
     number = {k: place for place, k in enumerate(selection.kept, start=1)}
     every = [
         _point(study, node, number.get(k, 0), standing, scale)

@@ -13,9 +13,10 @@ opposite order. Several local optima can exist side by side, so the better of th
 counts. Two kinds of designs evaluated earlier start further searches: one that is better than the
 result, and the best one that lies far from it. Finally, neighbours that lie far apart are bisected.
 
-Searches that do not need each other's results run side by side: those of the ends, both chains, the
-further searches of all points, those of one bisection. Each has its own `Course`, so that the
-result does not depend on which ends first, or where designs are evaluated (`Runs`)."""
+Independent searches run side by side: those of the ends, both chains, the further searches of all
+points, and those of one bisection. Each has its own `Course`, so that the result does not depend on
+which ends first, or where designs are evaluated (`Runs`).
+"""
 
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -236,7 +237,7 @@ class Tracer:
 
     @property
     def _divisions(self) -> int:
-        """Number of steps from one end to another."""
+        """Number of steps between two ends of the front."""
         wanted = self.config.pareto
         return wanted.points - 1 if len(wanted.terms) == 2 else wanted.divisions
 
