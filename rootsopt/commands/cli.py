@@ -218,8 +218,7 @@ def run(command: Command, argv: Sequence[str] | None) -> int:
     of the module `rootsopt.commands.work.COMMAND` with a new result folder, move the folder to its
     final path and print the result. If the command writes nothing, its `body` takes no folder and
     returns the exit code. If it also reads no config, its `body` takes only the options.
-    `InputError` and `OSError` give exit code 2.
-    """
+    `InputError` and `OSError` give exit code 2."""
     environment.own_process()
     try:
         _import_extensions(command.name, argv)

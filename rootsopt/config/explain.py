@@ -258,9 +258,9 @@ def _unknown(
 def _translated(
     known: Mapping[str, FieldInfo], prefix: str, name: str, value: Any, speed_rpm: Any
 ) -> str:
-    """Return the key, with the converted value, for which a `name` from a catalogue stands. Return
-    "" if there is no such key. `prefix`: section of the unknown key.
-    """
+    """Return the key, with the converted value, for which a `name` from a catalogue stands.
+
+    Return "" if there is no such key. `prefix`: section of the unknown key."""
     value, speed = number(value), number(speed_rpm)
     for stem, end, factor in readings(name):
         exact = [key for key in known if unit_of(key) and without_unit(key).endswith(f".{stem}")]

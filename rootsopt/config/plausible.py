@@ -3,8 +3,7 @@
 A value far outside the usual range is often one in another unit. The ranges are wide: they hold for
 micro pumps and for boosters of a metre. Many scale with the rotor's size: for rotors of one size,
 torque, speed and mass differ by a factor of ten between machines, but a wrong unit changes them a
-thousandfold.
-"""
+thousandfold."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -27,8 +26,7 @@ def _sizes(config: "Config") -> dict[str, float]:
     Mass and inertia are those of a solid cylinder on the pitch circle. Torques follow from 1 bar,
     because the config's own load may be 0 or wrong; `force` at the pitch circle carries the load.
     `rolling`: speed at which the pitch circles roll at 1 m/s. `critical`: critical damping of a
-    rotor on its bearings; `impact`: that of the flanks, where their damping is full.
-    """
+    rotor on its bearings; `impact`: that of the flanks, where their damping is full."""
     radius, supports = config.profile.pitch_radius_mm, config.scene.supports
     law = config.contact
     steepness = law.exponent * law.full_damping_depth_mm ** (law.exponent - 1)
@@ -160,9 +158,9 @@ def usual_of(key: str) -> Usual | None:
 
 
 def notes(config: "Config") -> tuple[str, ...]:
-    """Return one sentence on each unusual value of a config, in the order of the config. Defaults
-    have no note. Neither has 0, which is the same in every unit.
-    """
+    """Return one sentence on each unusual value of a config, in the order of the config.
+
+    Defaults have no note. Neither has 0, which is the same in every unit."""
     given = dict(_numbers(config))
     found = [_note(config, key, key, value) for key, value in given.items()]
     return tuple(filter(None, (*found, *_listed(config, given))))

@@ -141,8 +141,7 @@ class Config(Section):
 
         `values`: new values by dotted key; `profile.coefficients_3` is the third entry of a list of
         design parameters. Defaults that follow other keys are left out. Raises `InputError` if a
-        dotted key leads into a plain value.
-        """
+        dotted key leads into a plain value."""
         data = self.model_dump(mode="json", exclude_none=True)
         for name, key in _FOLLOWING:
             section = getattr(self, name)
@@ -197,9 +196,7 @@ class Config(Section):
         return filter(None, (self._fault({key: value}) for value in values))
 
     def _fault(self, values: Mapping[str, Any]) -> str:
-        """Return why the config is invalid with other `values`, by dotted key; "" if it is
-        valid.
-        """
+        """Return why other `values`, by dotted key, make the config invalid; "" if they do not."""
         alone = {"tolerances": None, "assumptions": AssumptionsConfig.model_validate({})}
         moved = self.model_copy(update=alone).moved(values)
         try:

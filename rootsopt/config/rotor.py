@@ -129,9 +129,9 @@ class ProfileConfig(Section):
         )
 
     def alone(self, key: str, value: Any) -> dict[str, Any]:
-        """Return the plain section of a rotor of this size that has a parameter `key`. If this
-        family does not have the key, the rotor belongs to another family.
-        """
+        """Return the plain section of a rotor of this size that has a parameter `key`.
+
+        If this family does not have the key, the rotor belongs to another family."""
         data = self.model_dump(mode="json", exclude_none=True) | {key: value}
         names = users_of(key) or ["outline"] * (key in _OUTLINE)
         if not names or self.family in names or value is None:
@@ -211,10 +211,10 @@ def _restored(family: str, state: dict[str, Any]) -> ProfileConfig:
 
 def _require_own(family: Family, data: Mapping[str, Any], given: set[str]) -> None:
     """Raise `ValueError` if `given` keys do not belong to a family, or if keys of it are missing.
+
     The message lists the overrides that complete the section `data`. They set missing keys to the
     values of the family's example at this pitch radius. Keys shared with another family are set as
-    well, because that family's values may not fit.
-    """
+    well, because that family's values may not fit."""
     from_file = family.maker is None
     own, required = (_OUTLINE, _OUTLINE[:1]) if from_file else (family.keys, family.keys)
     foreign = [key for key in (*parameters(), *_OUTLINE) if key in given and key not in own]

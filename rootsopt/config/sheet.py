@@ -44,8 +44,7 @@ MEDIA = {
 TEETH, FACE, TOOTH_ANGLE, MESH = 50, 0.3, 20.0, 20.0
 """A usual timing gear: teeth per gear, face width (pitch diameters), pressure angle (°), mesh
 stiffness (N/(mm·µm)). The stiffness is that of steel spur gears by ISO 6336-1, which gives 14 to 25
-for usual gears.
-"""
+for usual gears."""
 LINE = 10 / 9
 """Exponent of the force between two cylinders that touch along a line."""
 
@@ -169,8 +168,8 @@ class Sheet(Section):
     @property
     def greatest(self) -> float:
         """Outer diameter (mm) below which all rotors lie: E (1 + sin(π/2N)) at a centre distance E.
-        The flanks of a larger rotor would fold back, seen from its axis.
-        """
+
+        The flanks of a larger rotor would fold back, seen from its axis."""
         return self.centre_distance_mm * (1 + math.sin(math.pi / (2 * self.lobes)))
 
     def text(

@@ -25,8 +25,7 @@ FILES = {
     "scene.timing_gear.transmission_error_file": ("transmission_error", "a table"),
 }
 """Keys that hold the path of a file, each with two texts: the stem of its copy in a result folder,
-and the name of its content in messages.
-"""
+and the name of its content in messages."""
 
 MOST_BYTES = 50_000_000
 """Size (bytes) above which a file that a config names is refused."""

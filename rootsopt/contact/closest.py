@@ -2,10 +2,12 @@
 
 The pose is the pair of roll coordinate x and relative rotation ε = φ2 - φ1 (rad). The *drive* flank
 of rotor 1 pushes rotor 2 forward; it has x = -φ, where φ = (φ1 + φ2)/2 is the mean angle. At ε = 0
-the pair touches at roll angle β = x, 0 ≤ x ≤ π/N. The normal angle of an addendum point describes
-both flanks. On rotor 1 this angle is ν1. On rotor 2, ν2 denotes the dedendum point that meshes with
-the addendum point ν2 in perfect rolling. If the two normals are parallel, ν1 = ν2 - 2(β(ν2) - x),
-and with the pressure angle λ of their common direction
+the pair touches at roll angle β = x, 0 ≤ x ≤ π/N.
+
+The normal angle of an addendum point describes both flanks. On rotor 1 this angle is ν1. On
+rotor 2, ν2 denotes the dedendum point that meshes with the addendum point ν2 in perfect rolling. If
+the two normals are parallel, ν1 = ν2 - 2(β(ν2) - x), and with the pressure angle λ of their common
+direction
 
     T = E cos λ - q1(ν1) - q2(ν2)      tangential offset of the two points,
     G = E sin λ - h1(ν1) - h2(ν2)      normal gap (negative: penetration),
@@ -336,10 +338,11 @@ class FlankPair(eqx.Module):
         )
 
     def _direct(self, roll, relative):
-        """Return the start of Newton's method at perfect rolling, and two flags. The first tells
-        whether its result may be trusted, the second whether the flanks cannot touch yet. `roll`,
-        `relative`: as in `_mesh`. The start has the form of the result of `bracket_of`.
-        """
+        """Return the start of Newton's method at perfect rolling, and two flags.
+
+        The first tells whether its result may be trusted, the second whether the flanks cannot
+        touch yet. `roll`, `relative`: as in `_mesh`. The start has the form of the result of
+        `bracket_of`."""
         low, high = self.nodes.normal[0], self.nodes.normal[-1]
         absent = roll < contact_begins(relative)
         start = (low, high), jnp.clip(self.profile.normal_at(roll), low, high), ~absent, ~absent

@@ -1,6 +1,6 @@
 """Contacts that modify the contact of a section: twisted rotors, and flanks worn where they slide.
-Also finds how many slices of twisted rotors keep the error of the contact torque below a limit.
-"""
+
+Also finds how many slices of twisted rotors keep the error of the contact torque below a limit."""
 
 import equinox as eqx
 import jax
@@ -61,8 +61,7 @@ class WornContact(WrappedContact):
 
     `section`: the contact of new flanks; `coefficients` (k,): of w(x) = Σ a_k cos(2 N k x) in m;
     `lobes`: N as an array. The gap grows by w. Lever 1 grows by w'/2 and lever 2 falls by w'/2,
-    because x = -(φ1 + φ2)/2. The force therefore still has a potential.
-    """
+    because x = -(φ1 + φ2)/2. The force therefore still has a potential."""
 
     section: Contact
     coefficients: Float[Array, " k"]
@@ -140,14 +139,14 @@ def slices_needed(
     twist: float,
     error: float,
 ) -> int:
-    """Return the least number of Gauss points for which the error of the contact torque is below
-    `error`. The torque is that at rest. The rotors are turned towards each other, through the
-    `clearance` (m), until the penetration at the pitch radius is the static one, `depth` (m). The
-    error is the mean magnitude over a mesh period, as a fraction of the greatest torque. The
-    greatest error is not used: where a whole arc touches at once, the torque of a slice jumps, and
-    no number of slices makes this error small. `twist` (rad): over the rotor's length. The result
-    is at most `MOST`.
-    """
+    """Return the least number of Gauss points with an error of the contact torque below `error`.
+
+    The torque is that at rest. The rotors are turned towards each other, through the `clearance`
+    (m), until the penetration at the pitch radius is the static one, `depth` (m). The error is the
+    mean magnitude over a mesh period, as a fraction of the greatest torque. The greatest error is
+    not used: where a whole arc touches at once, the torque of a slice jumps, and no number of
+    slices makes this error small. `twist` (rad): over the rotor's length. The result is at most
+    `MOST`."""
     torque = np.asarray(_torques(profile, law, clearance, depth))
     wanted = sliced_mean(torque, twist * (np.arange(_REFERENCE) + 0.5) / _REFERENCE, profile.lobes)
     for count in _COUNTS:

@@ -249,10 +249,10 @@ class _Attempts(eqx.Module):
         )
 
     def taken(self, found: Steady, made: Collocated, start, period, within) -> Steady:
-        """Return `found` with the closed orbit `made` and its status. `start`: scaled state near
-        which the orbit must lie; `period` of the orbit (mesh periods); `within`: scaled distance to
-        which the transient's states repeated.
-        """
+        """Return `found` with the closed orbit `made` and its status.
+
+        `start`: scaled state near which the orbit must lie; `period` of the orbit (mesh periods);
+        `within`: scaled distance to which the transient's states repeated."""
         limits = within, corrected(ACCURACY * self.solver.orbit.rtol)
         orbit = made.orbit
         verdict, status = judged(self.pair, self.solver, self.radius, orbit, start, limits)
@@ -295,9 +295,9 @@ def steady_motion(
 
 
 def examined(pair: RotorPair, found: Steady, solver: Solver) -> Steady:
-    """Return the motion `found` of `pair`; if it has no orbit, set its status by a window. The
-    window begins at the end of the transient, and distinguishes chaos from a long transient.
-    """
+    """Return the motion `found` of `pair`; if it has no orbit, set its status by a window.
+
+    The window begins at the end of the transient, and distinguishes chaos from a long transient."""
     state, integrator = found.settled.state, solver.transient
     unsettled = among(found.status, OPEN) & (solver.probe_chaos > 0)
     window = branch(
@@ -311,10 +311,10 @@ def examined(pair: RotorPair, found: Steady, solver: Solver) -> Steady:
 def seen(
     pair: RotorPair, found: Steady, window: Window | None, whole: Bool[Array, ""] | bool = True
 ) -> Steady:
-    """Return a motion without an orbit, `found`, completed with a `window` of it. The window
-    determines the status if it was integrated (`whole`). A motion that repeats is NOT_CLOSED if the
-    window shows neither chaos nor a failure.
-    """
+    """Return a motion without an orbit, `found`, completed with a `window` of it.
+
+    The window determines the status if it was integrated (`whole`). A motion that repeats is
+    NOT_CLOSED if the window shows neither chaos nor a failure."""
     status, repeats = found.status, found.settled.period > 0
     if window is not None:
         judged = window_status(pair, window)

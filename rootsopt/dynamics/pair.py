@@ -124,9 +124,9 @@ class RotorPair(eqx.Module):
         return orders if self.repeats == 1 else self.repeats * orders
 
     def later(self, periods: Int[Array, ""] | int) -> "RotorPair":
-        """Return the pair with τ starting `periods` mesh periods later. Return the pair itself if
-        the equation repeats each mesh period.
-        """
+        """Return the pair with τ starting `periods` mesh periods later.
+
+        Return the pair itself if the equation repeats each mesh period."""
         if self.repeats == 1:
             return self
         begins = periods if self.begins is None else self.begins + periods

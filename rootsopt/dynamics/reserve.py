@@ -4,9 +4,11 @@ The *contact reserve* of a motion is the least gap of its flanks. Where they tou
 the greatest penetration. The *backlash reserve* is the increase of the gear's backlash at which the
 flanks just touch. A gear with more backlash lets rotor 2 move further from the middle of its play.
 As long as the gear's torque stays the same, so does the rest of the motion. The reserve is
-therefore found by moving the motion outwards by s until the least gap is 0. Both reserves are
-smooth where the flanks begin to touch. Their derivatives are those at the instant of the least gap,
-even if it moves (envelope theorem). Those of s follow from the implicit function theorem.
+therefore found by moving the motion outwards by s until the least gap is 0.
+
+Both reserves are smooth where the flanks begin to touch. Their derivatives are those at the instant
+of the least gap, even if it moves (envelope theorem). Those of s follow from the implicit function
+theorem.
 """
 
 import functools
@@ -178,8 +180,7 @@ def gaps(
     derivatives along the orbit's directions.
 
     Each gap is smooth, but their least value has corners where its side or its instant changes. The
-    pair must be two-sided.
-    """
+    pair must be two-sided."""
     assert pair.two_sided
     times = orbit.elements.mesh.period * jnp.arange(INSTANTS) / INSTANTS
 

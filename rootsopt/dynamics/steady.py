@@ -1,5 +1,7 @@
-"""A steady motion: its status and its orbit. Checks whether an orbit is the steady motion, and
-whether its forces are accurate. The checks are the same for single designs and for batches.
+"""A steady motion: its status and its orbit.
+
+Checks whether an orbit is the steady motion, and whether its forces are accurate. The checks are
+the same for single designs and for batches.
 """
 
 from collections.abc import Callable
@@ -218,8 +220,7 @@ def judged(
 
     `radius`: pitch radius (m); `start`: scaled state near which the orbit must lie; `limits`:
     scaled distance to which the transient's states repeated, and residual (scaled) above which the
-    orbit does not count as closed. The accuracy of the forces is checked later, by `final`.
-    """
+    orbit does not count as closed. The accuracy of the forces is checked later, by `final`."""
     rtols = solver.transient.tolerance, solver.orbit.tolerance
     scales = pair.law.exponent, radius, pair.force_scale
     found = verdict(orbit, start, limits, rtols, scales)
@@ -313,10 +314,10 @@ class VariedOrbit(NamedTuple):
     def pushed(
         self, quantity: Callable[..., Any], tau: Float[Array, ""], model: Any, tangents: Any
     ) -> tuple[Float[Array, "*q"], Float[Array, "*q d"]]:
-        """Return `quantity(model, tau, state)` at `tau` (mesh periods), and its derivatives along
-        the directions, at constant time. `model`: a pair, or another object that depends on the
-        directions; `tangents`: its derivatives along them, with a leading axis.
-        """
+        """Return `quantity(model, tau, state)`, and its derivatives along the directions.
+
+        Time is held constant. `tau`: in mesh periods; `model`: a pair, or another object that depends on the directions; `tangents`: its
+        derivatives along them, with a leading axis."""
         dynamic, static = eqx.partition(model, eqx.is_inexact_array)
         state, _, changes = self.at(tau)
 

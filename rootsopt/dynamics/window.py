@@ -8,11 +8,11 @@ A tangent vector instead of a second motion was tried. On coarse steps, products
 impacts grow although the motion repeats: at 1e-6, by a factor of 8 per mesh period beside an orbit
 with the multiplier 0.1. Two motions at a finite distance show what the motion does, provided that
 the distance exceeds the noise of steps and rounding. Every second batch therefore uses a distance
-eight times smaller: noise then makes the growth factor eight times greater, chaos does not. Also
-simulates the transient, until the motion repeats. The pair is forced with the mesh period. The
+eight times smaller: noise then makes the growth factor eight times greater, chaos does not.
+
+Also simulates the transient, until the motion repeats. The pair is forced with the mesh period. The
 states at the end of each mesh period (the stroboscopic states) therefore settle on a cycle of k
-points.
-"""
+points."""
 
 import dataclasses
 from typing import Any, NamedTuple
@@ -213,8 +213,7 @@ def integrated_difference(
     `orbit`: its scaled state (n,) at φ1 = 0, and its forces (r,): mean (N), mean square (N²), and
     others, which are ignored; `period` (mesh periods). The result is the greatest of the relative
     differences in mean and RMS force, and the scaled distance between start and end. It is inf if
-    the solver fails.
-    """
+    the solver fails."""
     state, forces = orbit
 
     def step(number: Any, carry):
@@ -289,8 +288,7 @@ def settle(  # 85 lines: its inner functions share the arguments.
     smallest such period that the equation allows (`RotorPair.orders`). It is at most `max_orbit` ≤
     8, rounded up where the equation repeats after several mesh periods. Steps become finer after
     `_PATIENCE`. The transient ends unsettled after `max_periods` mesh periods. `pieces`: as for
-    `strobe`.
-    """
+    `strobe`."""
     orders, block = pair.orders(max_orbit), pair.whole(BLOCK)
     stored = max(_MEMORY, 2 * pair.whole(max_orbit) + _MORE)
     age = jnp.arange(stored)[::-1]

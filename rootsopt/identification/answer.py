@@ -1,5 +1,4 @@
-"""What a fit reveals about the quantities: their errors, what the record leaves open, and which
-further measurements would help.
+"""Errors of fitted quantities, what the record leaves open, and which measurements would help.
 
 All covariances are those of linearised least squares on the scales of the quantities. Without given
 standard deviations they allow for errors that differ between samples (estimator HC3: J. G.
@@ -49,8 +48,7 @@ _CLOSE, _WIDER = 0.03, 2.0
 _MANY = 50
 UNLIKELY = 0.01
 """Probability of residuals this large below which the given standard deviations count as too
-small.
-"""
+small."""
 
 # Relative difference of predictions below which two motions count as the same.
 _SAME = 1e-3
@@ -156,9 +154,7 @@ def parameters(
 
 
 def combinations(problem: Problem, spread: Spread) -> list[dict[str, Any]]:
-    """Return the entry `combinations` of the result file; those that are not determined come
-    first.
-    """
+    """Return the entry `combinations` of the result file, undetermined ones first."""
     found, names = [], {one.key: one.name for one in problem.quantities}
     for row, deviation in zip(spread.combinations, spread.deviations, strict=True):
         row = row * np.sign(row[np.argmax(np.abs(row))])
@@ -175,16 +171,14 @@ def combinations(problem: Problem, spread: Spread) -> list[dict[str, Any]]:
 
 def relative_misfit(problem: Problem, best: Local) -> float:
     """Return the relative RMS difference between fit and record, without the greatest 5 %. It is a
-    share of the record's variation, or of its averages.
-    """
+    share of the record's variation, or of its averages."""
     away = np.sort(np.abs(best.residual * best.deviation / problem.rows.scale.to_numpy()))
     return float(np.sqrt(np.mean(away[: math.ceil(0.95 * len(away))] ** 2)))
 
 
 def structure(problem: Problem, best: Local) -> float:
     """Return the correlation between residuals of neighbouring samples, in standard errors.
-    Residuals are not independent if the scene lacks something or is the wrong one.
-    """
+    Residuals are not independent if the scene lacks something or is the wrong one."""
     if relative_misfit(problem, best) < _NUMERICAL:
         return 0.0
     rows = problem.rows.assign(away=np.clip(best.residual, -TURN, TURN)).query("sampled")
@@ -213,8 +207,7 @@ def quality(problem: Problem, best: Local, spread: Spread) -> dict[str, Any]:
 
 def motions(problem: Problem, best: Local, others: Sequence[int | None]) -> list[dict[str, Any]]:
     """Return the entry `motions` of the result file, empty for an ensemble. For each point, it
-    states the motion that fits, whether it is reached from rest, and the number of `others`.
-    """
+    states the motion that fits, whether it is reached from rest, and the number of `others`."""
     found = []
     for point, begin, count in zip(problem.points, best.begins, others, strict=True):
         mine, rest = (point.predicted(problem.quantities, best.values, x) for x in (begin, REST))
@@ -278,9 +271,7 @@ def profile(
 
     @functools.cache
     def risen(away: float) -> float:
-        """Return the root of the increase at a distance from the best value, minus the root of the
-        quantile.
-        """
+        """Return √(increase) - √(quantile) at a distance from the best value."""
         if away == 0:
             return -spread.width
         place = best.place + away / error**2 * spread.covariance[:, number]
@@ -350,10 +341,10 @@ class Identification:
     best: tuple[Problem, Local, Spread] | None = dataclasses.field(default=None, repr=False)
 
     def increase(self, values: Mapping[str, float]) -> float:
-        """Return the increase of twice the loss from its minimum to other `values` (by key). For
-        the true values it follows a χ² distribution, with one degree of freedom per combination
-        that is determined. It is infinite if there is no motion to trust.
-        """
+        """Return the increase of twice the loss from its minimum to other `values` (by key).
+
+        For the true values it follows a χ² distribution, with one degree of freedom per combination
+        that is determined. It is infinite if there is no motion to trust."""
         assert self.best is not None
         problem, best, spread = self.best
         place = np.array([one.scaled(values[one.key]) for one in problem.quantities])

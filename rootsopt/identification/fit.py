@@ -1,6 +1,4 @@
-"""Fits quantities of a scene to a record by local least squares from many starts, and reports what
-remains uncertain.
-"""
+"""Fits quantities of a scene to a record by local least squares from many starts."""
 
 import time
 from collections import Counter
@@ -290,8 +288,7 @@ class _Search:
         """Return how many other motions there are at each point of the `best` fit.
 
         They are counted at the nearest scene in which a search looked for them; None without such a
-        scene.
-        """
+        scene."""
         near = sorted(self.others_at, key=lambda one: np.max(np.abs(one[0] - best.place)))
         return near[0][1] if near else [None] * len(best.begins)
 

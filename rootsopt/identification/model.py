@@ -27,8 +27,7 @@ from rootsopt.status import Status
 Begin = Seed | NDArray[np.float64] | None
 """Start of the search for a motion: a known motion, or an array (2,) of ε (rad) and dε/dt (rad/s)
 at φ1 = 0. None: the state that the record shows, or rest if it shows none. For averages: states
-(members, n) of an ensemble.
-"""
+(members, n) of an ensemble."""
 REST = np.zeros(2)
 """Where a motion from rest begins."""
 
@@ -127,8 +126,7 @@ class Point:
     def _sampled(self, pair, tangents, motion: Steady, turned, lead: int | None):
         """Return samples (n, c), their derivatives (n, c, d + 1), and the lead of the motion over
         the record (mesh periods). A motion that repeats after several mesh periods may begin at any
-        of them.
-        """
+        of them."""
         measured = self.seen.measured
         places = [CHANNELS.index(name) for name in self.seen.names]
         size = np.nansum(measured**2, axis=0)
@@ -157,8 +155,7 @@ class Point:
         self, quantities: Sequence[Fitted], values: NDArray[np.float64], begin: Begin
     ) -> Predicted:
         """Return averages over an ensemble of motions, with derivatives. These are least-squares
-        slopes through neighbouring scenes, all simulated from the same states.
-        """
+        slopes through neighbouring scenes, all simulated from the same states."""
 
         def averaged(values: NDArray[np.float64], states: Any) -> Any:
             named = {one.key: float(x) for one, x in zip(quantities, values, strict=True)}

@@ -81,8 +81,7 @@ def fitted(
     """Return (config that has all quantities, the quantities to fit).
 
     `keys`: see `identify`; `given`: keys whose values the record holds. Raises `InputError` for a
-    key that cannot be fitted, or for bounds outside its range.
-    """
+    key that cannot be fitted, or for bounds outside its range."""
     wanted = {}
     for text, pair in keys.items() if isinstance(keys, Mapping) else ((key, None) for key in keys):
         key, equals, bounds = str(text).partition("=")

@@ -51,8 +51,7 @@ def channels_at(
     """Return the `CHANNELS` (n, c) at the times `tau` (n,), in mesh periods, and their derivatives.
 
     The derivatives (n, c, d + 1) are those along the directions `tangents` of the variation of the
-    `orbit`, then that with respect to time.
-    """
+    `orbit`, then that with respect to time."""
     # The orbit and the rotors repeat together after this time. Reducing the times by it keeps their
     # rounding errors small.
     times = orbit.elements.mesh.times

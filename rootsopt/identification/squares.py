@@ -116,10 +116,11 @@ class Problem:
         return ends[:, 0], ends[:, 1]
 
     def estimated(self, away: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
-        """Return the standard deviations (n,). Those not given are estimated from the differences
-        `away` (n,) between prediction and record; without these, they are the scale. Columns of few
-        values share one relative deviation.
-        """
+        """Return the standard deviations (n,).
+
+        Those not given are estimated from the differences `away` (n,) between prediction and
+        record; without these, they are the scale. Columns of few values share one relative
+        deviation."""
         scale, found = self.rows.scale.to_numpy(), self.rows.given.to_numpy(copy=True)
         unknown = np.isnan(found)
         if away is None:

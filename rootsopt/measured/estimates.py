@@ -1,5 +1,4 @@
-"""Estimates of an outline's scatter, centre and unit from its points alone, and the report of its
-checks.
+"""Estimates of an outline's scatter, centre and unit from its points alone; report of its checks.
 
 Messages and results state the estimates. No estimate is used unless the config asks for it."""
 
@@ -296,8 +295,7 @@ def scatter(points: Complex128[np.ndarray, " n"]) -> tuple[float, float]:
 
     The deviations hold both scatter and the error of the polynomial. Only the latter grows with the
     distance of the neighbours. The scatter is NaN if the deviations grow by `_GROWTH`; all of the
-    deviation is then error of interpolation. Otherwise, the growth determines this error.
-    """
+    deviation is then error of interpolation. Otherwise, the growth determines this error."""
     spacing = float(np.median(np.abs(np.diff(points))))
     stride, found = 1, _across(points, 1)
     while found > stride * spacing / _CLEAR and len(points) / (2 * stride) >= _FEWEST:

@@ -6,8 +6,7 @@ chain whose two ends are at different vertices.
 Calls to libraries that read a user's files are guarded: any exception they raise becomes an
 `InputError`, with the exception as its cause, and their log records and warnings stay off the
 console. Guards cover hardly more than such calls, because an error of this package would otherwise
-appear as a fault of the file.
-"""
+appear as a fault of the file."""
 
 import contextlib
 import dataclasses
@@ -161,8 +160,7 @@ def joined(
     together.
 
     The library's `edgeminer` also finds chains, but keeps dead ends. Its time grows with the square
-    of the number of ends at one place (as in a dial).
-    """
+    of the number of ends at one place (as in a dial)."""
     ends = np.array([chain.points[[0, -1]] for chain in chains]).reshape(-1, 2)
     vertex = _clusters(ends.ravel(), name, join).reshape(-1, 2)
     single = vertex[:, 0] == vertex[:, 1]
@@ -316,8 +314,7 @@ def _connected(parts: list[Loop]) -> Loop:
     Each gap between ends is closed from both sides in equal shares. Both chains are shifted by an
     amount that varies linearly along their length, as in surveying. Moving the end points alone
     would bend the curve there. The point that two chains share is kept once, as a joint if either
-    chain has it as a joint.
-    """
+    chain has it as a joint."""
     ahead = parts[1:] + parts[:1]
     gaps = np.array([b.points[0] - a.points[-1] for a, b in zip(parts, ahead, strict=True)])
     points, joints = [], []

@@ -1,9 +1,9 @@
-"""Makes a profile from the outline file of a config, and finds the rotor's data in the file. Unit,
-lobes, axis and centre distance follow from the file alone. The centre distance follows from the
-mesh. Two rotors that roll on each other have a uniform gap at one distance only, whether or not
+"""Makes a profile from the outline file of a config, and finds the rotor's data in the file.
+
+Unit, lobes, axis and centre distance follow from the file alone. The centre distance follows from
+the mesh. Two rotors that roll on each other have a uniform gap at one distance only, whether or not
 they are cut by a clearance. The number of lobes follows from the symmetry, the unit from the
-size.
-"""
+size."""
 
 import dataclasses
 import functools
@@ -73,10 +73,10 @@ def _kept(path: Path, stamp, how: tuple[str | None, Sought, float], smoothing: f
 
 
 def check_center(config: "ProfileConfig") -> None:
-    """Raise `InputError` if lobes lie so far from the axis that a simulation is useless. Do not
-    check a config that gives `outline_center`. Such a rotor has flanks that overlap or differ by
-    about this distance; its motion takes minutes and means nothing.
-    """
+    """Raise `InputError` if lobes lie so far from the axis that a simulation is useless.
+
+    Do not check a config that gives `outline_center`. Such a rotor has flanks that overlap or
+    differ by about this distance; its motion takes minutes and means nothing."""
     if not config.from_file or config.outline_center is not None:
         return
     seen = outline_of(config)[1].seen
@@ -156,8 +156,7 @@ def found(path: Path, given: Mapping[str, Any], ask: Callable[[str, Any], Any]) 
 
     `given`: what the user knows, by key of the section `profile`; `ask`: called with a question and
     the assumed answer if the unit is uncertain. Raises `InputError` if the file does not contain a
-    rotor that rolls on another one like it.
-    """
+    rotor that rolls on another one like it."""
     loop = _loop(path, given)
     lobes = given.get("lobes") or lobes_of(loop)
     if lobes is None:

@@ -137,9 +137,9 @@ def titled(data: bytes, name: str, what: str) -> tuple[list[str], dict[int, list
 
 
 def measured_number(cell: str) -> float | None:
-    """Return the number in a cell; NaN if it is empty or marks a missing number. Return `None` for
-    any other text.
-    """
+    """Return the number in a cell;
+
+    NaN if it is empty or marks a missing number. Return `None` for any other text."""
     if not cell.strip() or _LACKING.fullmatch(cell.strip()):
         return math.nan
     return _number(cell)
@@ -243,9 +243,7 @@ def _angle(angles: NDArray[np.float64], name: str) -> str:
 
 
 def _parts(points: NDArray[np.complex128]) -> list[NDArray[np.complex128]]:
-    """Return the successive outlines in a table; all `points` as one outline unless each is
-    closed.
-    """
+    """Return the successive outlines in a table; all `points` if not each of them is closed."""
     with np.errstate(all="ignore"):
         steps = np.abs(np.diff(points))
         cuts = np.flatnonzero(steps > _APART * np.median(steps)) + 1 if len(steps) else []

@@ -6,8 +6,7 @@ design is simulated in all scenes as well.
 
 Motions begin at rest. Beginning on the orbit of the config's own scene took three times as long:
 the scenes are too far apart. Motions that need more than a quarter of the allowed transient to
-settle are left out, because one of them takes as long as a hundred others.
-"""
+settle are left out, because one of them takes as long as a hundred others."""
 
 import itertools
 import math
@@ -132,8 +131,7 @@ class _Comparison:
         """Return the objectives (n,) of designs, relative to the baseline in the same scene.
 
         They are NaN unless both have a usable motion, and NaN where the flanks of both stay
-        apart.
-        """
+        apart."""
         bases, *found = self.evaluations([BASELINE, *names], scenes)
         return [np.array([*map(self._relative, bases, row)]) for row in found]
 
@@ -145,11 +143,11 @@ class _Comparison:
         return math.nan if nothing else found
 
     def pieces(self, span: Span, first: str, other: str) -> list[Piece]:
-        """Return the parts of a range in which design `first` is worse than the `other` one. All
-        other values are those of the config. Both ends of the range and the config's own value are
-        compared, and changes between them are located. In place of an end without a usable motion,
-        the last value before it that has one is compared.
-        """
+        """Return the parts of a range in which design `first` is worse than the `other` one.
+
+        All other values are those of the config. Both ends of the range and the config's own value
+        are compared, and changes between them are located. In place of an end without a usable
+        motion, the last value before it that has one is compared."""
         key, own = span.key, self.config.value(span.key)
 
         def lead(value: float) -> float:
@@ -188,9 +186,9 @@ class _Comparison:
     def _apart(
         self, designs: Iterable[dict[str, float]], most: int, least: float
     ) -> list[dict[str, float]]:
-        """Return the first `most` of some `designs` that are farther than `least` from each other
-        and from the optimum. Distances are in the unit box.
-        """
+        """Return the first `most` of some `designs` that are far from each other.
+
+        They are farther than `least` in the unit box, also from the optimum."""
         kept, found = [self._point(self.designs[OPTIMIZED])], []
         for one in designs:
             point = self._point(one)
@@ -206,8 +204,7 @@ class _Comparison:
         """Return the optimum in one scene, as a list; empty if the search fails.
 
         The search begins at the design that is best in that scene, of other good designs in the
-        config's own scene.
-        """
+        config's own scene."""
         ((base,),) = self.evaluations([BASELINE], one := {scene: self.scenes[scene]})
         problem, keys = self.problem.beside(base), self.config.design_keys
         rows = [x for x in self.result.history if x["feasible"] and math.isfinite(x["objective"])]

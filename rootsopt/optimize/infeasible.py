@@ -6,8 +6,7 @@ zero are in conflict. If the geometry alone rules out all designs, none is simul
 
 `beginning` finds the start of a search if the baseline is a rotor from a file, or of another
 family. Such a rotor lacks the parameters that the search varies. It remains the baseline. The
-search begins at the nearest member of the family `optimizer.family`.
-"""
+search begins at the nearest member of the family `optimizer.family`."""
 
 import dataclasses
 from collections.abc import Callable, Sequence

@@ -1,8 +1,8 @@
-"""Limits of any quantity (`constraints.terms`), and the report's rows on all constraints. A term
-that does not depend on forces becomes a `Constraint` of the design space. It costs no simulation,
-and designs are moved onto it. A force, or a term that depends on forces, becomes a `ForceLimit`,
-which an evaluation satisfies or not. `constraint_rows` are the rows of the report.
-"""
+"""Limits of any quantity (`constraints.terms`), and the report's rows on all constraints.
+
+A term that does not depend on forces becomes a `Constraint` of the design space. It costs no
+simulation, and designs are moved onto it. A force, or a term that depends on forces, becomes a
+`ForceLimit`, which an evaluation satisfies or not. `constraint_rows` are the rows of the report."""
 
 import math
 import re
@@ -209,8 +209,7 @@ def needs_maxima(config: Config, limits: Sequence[ForceLimit]) -> bool:
     """Return whether evaluations need all local maxima of the force.
 
     They do if the objective of `config` contains the peak force of single motions. They also do if
-    one of its `limits` is a ceiling of this force.
-    """
+    one of its `limits` is a ceiling of this force."""
     cornered = PEAK in objective_weights(config) or any(one.cornered for one in limits)
     return cornered and of_motions(config)
 

@@ -83,8 +83,7 @@ class Bound(NamedTuple):
     these, the objective jumps or has a concave corner. `unusable`: designs without a usable motion.
     `regions_left`, `volume_left`: number and share of the unit box of the regions that may hold a
     better design. `proven`: whether no design is better by more than 1e-4 (relative), if the
-    estimate holds.
-    """
+    estimate holds."""
 
     lower_bound: float
     gap: float

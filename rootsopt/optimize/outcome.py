@@ -1,6 +1,6 @@
 """Outcome of a search: its trials, its gains over the baseline, and a comparison over assumptions.
-Also selects trials: those nearby, far apart, or best to begin from.
-"""
+
+Also selects trials: those nearby, far apart, or best to begin from."""
 
 import dataclasses
 import itertools
@@ -288,8 +288,7 @@ class Assumed:
     wins: dict[str, dict[str, list[Piece]]]
 
     def sample(self, regret: bool) -> tuple[Scenes, tuple[float, ...]]:
-        """Return the random scenes over which a search optimises, and the numbers added to the
-        objectives in them.
+        """Return the random scenes over which a search optimises, with the offsets of their objectives.
 
         They are those with a usable motion of all designs. `regret`: whether the least objective of
         all designs is subtracted in each scene; the greatest sum is 1 for the baseline."""

@@ -117,8 +117,7 @@ class Problem:
         Its objective is 1 + Σ w (F - F_0) / max(F_0, F_n / 10) over the measures F with the weights
         w. F_0 is the baseline's value there, F_n that of `self.baseline`. If F_0 is small or 0, a
         ratio to F_0 alone would mean nothing. Designs and constraints of the geometry are the
-        same.
-        """
+        same."""
         found = Problem(self.config, _in_units(baseline, self.baseline), self.space, self.limits)
         found.__dict__["_look_at"] = self._look_at  # Its results are costly, and the same.
         return dataclasses.replace(found, added=1 - found.objective(baseline))

@@ -136,8 +136,7 @@ class RobustProblem(Problem):
         """Return one wall for each of `limits`, as `Problem.walls` does.
 
         If limits hold for the combination of the scenes, this combination is the only branch of a
-        wall. Its gradient is that of the greatest branch in each scene.
-        """
+        wall. Its gradient is that of the greatest branch in each scene."""
         if not (evaluation.scenes and self._combines_limits):
             return super().walls(evaluation, jacobian)
         found = [

@@ -228,8 +228,7 @@ class Search:
         """Look for a lower bound of the objective, and search again from each better design.
 
         `trials`: those of the search so far; `number`: index of its next local search. Return the
-        bound (`None` if it is not requested), and the trials of further searches.
-        """
+        bound (`None` if it is not requested), and the trials of further searches."""
         candidates = [one for one in trials if one.candidate]
         size = len(trials[0].point) if trials else 0
         given = self.settings.prove
@@ -265,8 +264,7 @@ class Search:
     def _vertex(self, optimized: Evaluation, trials: list[Trial]) -> VertexOptimum | None:
         """Return the facts on an optimum at a vertex of the limits, from as many designs as the
         search had `trials`. Return `None` for any other optimum, or if the objective is over a
-        sample.
-        """
+        sample."""
         if not self.stage.bounded or len(optimized.design) > PARAMETERS:
             return None
         known = [one for one in trials if one.evaluation.usable]

@@ -173,9 +173,9 @@ class _Descent:
 
     def _polished(self, step: NDArray[np.float64], decrease: float) -> bool:
         """Return whether a step of negligible `decrease` leads to a smaller first-order residual.
+
         `step`, `decrease`: as `_step` returns them. A step that fails corrects the models. A few
-        steps are therefore tried while the first-order conditions do not hold.
-        """
+        steps are therefore tried while the first-order conditions do not hold."""
         for _ in range(_TRIES if self.certificate.residual > _FLAT else 1):
             if decrease <= 0 or self._moves(step, decrease):
                 return decrease > 0

@@ -1,8 +1,8 @@
-"""Verifies a search: simulates its best design again, from rest, with a certificate. `surviving`
-computes how much of the gain is left if the rotors are not exactly as drawn. Baseline and optimised
-design are evaluated again with the same errors of manufacture. All flanks are too full or too lean,
-or the axes too near or too far.
-"""
+"""Verifies a search: simulates its best design again, from rest, with a certificate.
+
+`surviving` computes how much of the gain is left if the rotors are not exactly as drawn. Baseline
+and optimised design are evaluated again with the same errors of manufacture. All flanks are too
+full or too lean, or the axes too near or too far."""
 
 import dataclasses
 import math
@@ -224,8 +224,7 @@ def surviving(result: Optimization, given: Config) -> list[dict[str, Any]]:
     A row holds the name of the `case`, and the objectives `baseline` and `optimized` (relative to
     the baseline as drawn) with their `statuses`. It also holds the relative `gain` between them,
     and its `share` of the gain as drawn. Numbers are NaN if one of the two has no steady state.
-    Return [] without an optimised design.
-    """
+    Return [] without an optimised design."""
     problem = result.problem
     if problem is None or result.optimized is None:
         return []

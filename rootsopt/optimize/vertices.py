@@ -1,9 +1,9 @@
-"""Vertices of the feasible set: designs with as many active limits as parameters. A limit is a
-constraint of the geometry, or a bound of the unit box. If the optimum is at a vertex, the forces
-only choose between vertices. The others are found by walking along the edges. One limit is
-released, and Newton steps keep the rest active until a further limit is reached. Limits of forces
-are ignored, because they are not known without a simulation.
-"""
+"""Vertices of the feasible set: designs with as many active limits as parameters.
+
+A limit is a constraint of the geometry, or a bound of the unit box. If the optimum is at a vertex,
+the forces only choose between vertices. The others are found by walking along the edges. One limit
+is released, and Newton steps keep the rest active until a further limit is reached. Limits of
+forces are ignored, because they are not known without a simulation."""
 
 import itertools
 from collections.abc import Callable
@@ -78,12 +78,12 @@ class Plane(NamedTuple):
 
 
 class VertexOptimum(NamedTuple):
-    """An optimum at a vertex of the limits. `limits`: names of its active limits. `others`: other
-    vertices, best first, each with `design` (config units by key), `limits` and `objective` (`None`
-    without a usable motion). `keys`: two parameters; `designs`: columns `x`, `y` (config units),
-    `slack` and `objective` (NaN where not simulated) of designs that differ from the optimum in
-    these parameters only.
-    """
+    """An optimum at a vertex of the limits.
+
+    `limits`: names of its active limits. `others`: other vertices, best first, each with `design`
+    (config units by key), `limits` and `objective` (`None` without a usable motion). `keys`: two
+    parameters; `designs`: columns `x`, `y` (config units), `slack` and `objective` (NaN where not
+    simulated) of designs that differ from the optimum in these parameters only."""
 
     limits: list[str]
     others: list[dict[str, Any]]
@@ -115,9 +115,9 @@ class FeasibleSet:
         return np.concatenate([slack, point, 1 - point]), np.vstack([normals, one, -one])
 
     def vertex(self, point: NDArray[np.float64]) -> Vertex | None:
-        """Return the vertex at a `point` (d,), or `None` if fewer than d limits are active. Of more
-        than d active limits, use the first independent ones.
-        """
+        """Return the vertex at a `point` (d,), or `None` if fewer than d limits are active.
+
+        Of more than d active limits, use the first independent ones."""
         slack, normals = self.slacks(point)
         held: list[int] = []
         for number in np.flatnonzero(np.abs(slack) <= NEAR):

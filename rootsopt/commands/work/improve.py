@@ -57,8 +57,7 @@ def config_of(options: argparse.Namespace) -> Config:
     """Return the config of a search for a better rotor than that of the file `options.config`.
 
     Set `options.known` to what else is known of the rotor, as in the result file. Raises
-    `InputError` if the file does not hold a rotor, or if an option does not suit it.
-    """
+    `InputError` if the file does not hold a rotor, or if an option does not suit it."""
     path, scene = options.config, options.scene
     given, rest = _given(options)
     base = load(scene or "cic_drawn", rest)

@@ -127,9 +127,7 @@ def _searching(config: Config, result) -> Config:
 
 
 def _advice(result) -> str:
-    """Return the message of a result, preceded by the cost of the limits that the baseline
-    violates.
-    """
+    """Return a result's message, preceded by the cost of limits that the baseline violates."""
     return f"{result.cost} {_said(result)}".strip()
 
 

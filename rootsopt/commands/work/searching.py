@@ -45,9 +45,7 @@ J = TypeVar("J", bound=Journal)
 
 
 def runs_of(options: argparse.Namespace) -> contextlib.AbstractContextManager[Runs]:
-    """Return a context manager for the workers that run the evaluations of a search with these
-    `options`.
-    """
+    """Return a context manager for what runs evaluations, according to the `options`."""
     if options.workers is not None:
         say(
             f"`--workers {options.workers}` starts processes that load everything again, some 10 s "

@@ -47,8 +47,7 @@ _SMALL = 1e-10
 
 Family = Callable[[Float[Array, ""]], tuple[RotorPair, RotorPair]]
 """Type of a function that maps a parameter to (pair, its derivative with respect to the parameter).
-The derivative has a leading axis of length 1.
-"""
+The derivative has a leading axis of length 1."""
 
 
 class Plane(NamedTuple):

@@ -177,8 +177,7 @@ class Closer(eqx.Module):
     If the mesh of the known orbit is aligned with events, the new orbit is solved on it. Its error
     then follows from that of the known orbit. Otherwise, or if the events differ or the error is
     too large, the mesh is changed. This continues until flags and events agree and the error is
-    small enough. `start` returns the initial state of the loop, `turn` makes one iteration.
-    """
+    small enough. `start` returns the initial state of the loop, `turn` makes one iteration."""
 
     equation: CollocatedEquation
     frozen: RotorPair
@@ -247,12 +246,13 @@ class Closer(eqx.Module):
         """Solve the linearised equation for Newton's step and the directions of the parameters.
 
         Return five results: the equation; the equation along the motion; direct changes of its
-        values in all columns of the step (e, p, r, k); the step; the new `Loop.line`. If the motion
-        is the orbit of a similar pair, the first step is a predictor. It goes along the tangent of
-        the family of orbits that leads to the equation's pair. Newton's first step would be
-        evaluated at penetrations of the wrong size, since the flanks have moved. The tangent is
-        Newton's step for a pair a small way (`_WAY`) towards the new one, divided by this way.
-        """
+        values in all columns of the step (e, p, r, k); the step; the new `Loop.line`.
+
+        If the motion is the orbit of a similar pair, the first step is a predictor. It goes along
+        the tangent of the family of orbits that leads to the equation's pair. Newton's first step
+        would be evaluated at penetrations of the wrong size, since the flanks have moved. The
+        tangent is Newton's step for a pair a small way (`_WAY`) towards the new one, divided by
+        this way."""
         at = now.elements
         way = jnp.where(now.trusted & (now.tries == 0), _WAY, 1.0)
         pair = between(self.equation.pair, self.neighbour, way)

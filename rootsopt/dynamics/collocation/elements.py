@@ -277,8 +277,7 @@ def zero_of(margin, low, high, positive):
     `margin`: function of time (mesh periods), which returns the margin and another number;
     `positive`: whether the margin is positive at `low`. Chord and bisection are combined by the ITP
     method (Oliveira and Takahashi, ACM Trans. Math. Softw. 47 (2021) 5): a smooth margin takes
-    about ten evaluations, any other margin hardly more than bisection.
-    """
+    about ten evaluations, any other margin hardly more than bisection."""
     width = high - low
     most = jnp.ceil(jnp.log2(jnp.maximum(width / (2 * _LOCATED), 1.0))) + 1
 

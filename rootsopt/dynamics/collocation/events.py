@@ -214,8 +214,7 @@ def extra(elements: Elements) -> Float[Array, "e 2"]:
 
     They lie beside the zero of ε, or else where ε is extreme and in the middle of the element.
     Without clearance, flanks may touch for a moment beside a change of sign of ε: after it if they
-    are about to part, before it if they are about to meet.
-    """
+    are about to part, before it if they are about to meet."""
     begins, inside = elements.state[:, None, :2], elements.places[1][..., :2]
     relative, rate = jnp.moveaxis(jnp.concatenate([begins, inside], axis=1), -1, 0)
     (zero, crosses), (turn, turns) = (_zero(elements, x, k) for k, x in enumerate((relative, rate)))
@@ -251,8 +250,7 @@ def rooted(pair: RotorPair, elements: Elements, seen: FlagScan) -> Elements:
     contact jumps, it belongs to the instant before the end. The second root, that of the minimum to
     which the contact may jump, belongs to the instant after the end. Both are extrapolated to the
     end: otherwise derivatives of a peak at a corner of the force would have a relative error of
-    about 5e-6.
-    """
+    about 5e-6."""
     inside = len(GAUSS.nodes)
     mesh, number = elements.mesh, jnp.arange(elements.state.shape[0])
     following = jnp.where(number + 1 < mesh.used, number + 1, 0)

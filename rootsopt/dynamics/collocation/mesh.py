@@ -47,8 +47,7 @@ _LEAST = 1e-6
 
 def room_for(pair: RotorPair, periods: int) -> tuple[int, int]:
     """Return the `sizes` for orbits of `pair` of up to this number of mesh periods. The number is
-    rounded up to one after which the equation repeats.
-    """
+    rounded up to one after which the equation repeats."""
     contact = innermost(pair.contact)
     profile = contact.pair.profile if isinstance(contact, SearchContact) else None
     crowded = profile is not None and (profile.wavy or profile.forked)
@@ -400,8 +399,7 @@ def differences(before: Orbit, after: Orbit, scale: Float[Array, ""]):
     second is the largest difference in the derivatives of mean, RMS and peak. Spectral lines are
     relative to the mean. Weak forces are relative to a share of `scale` (N), since rounding
     dominates the force of flanks that barely touch. For an orbit without contact, compare the state
-    at φ1 = 0 (scaled) and its derivatives instead.
-    """
+    at φ1 = 0 (scaled) and its derivatives instead."""
 
     def rms(values):
         return values.at[1].set(jnp.sqrt(jnp.maximum(values[1], 0.0)))

@@ -54,8 +54,7 @@ def evaluated(
     `numbers` of the pair, in place of those of the equation's pair; `tangents`: directions of the
     pair's parameters, stacked along a leading axis; `whole`: whether derivatives along them are
     needed. Otherwise they have no meaning. The arrays of the mesh must have room for one more
-    element.
-    """
+    element."""
     mesh, extra = elements.mesh, elements.mesh.used
     tau, state = (
         x.at[extra].set(y) for x, y in zip(elements.places, rivals.places(elements), strict=True)

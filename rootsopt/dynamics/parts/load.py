@@ -310,9 +310,9 @@ class GasResultant(eqx.Module):
         return jnp.mod(opening, pitch)
 
     def corners(self) -> Float[Array, " k"]:
-        """Return the angles φ1 (rad, in one mesh period) at which the forces are not smooth. At
-        these angles, a pocket opens, or the contact of a slice passes the end of a segment.
-        """
+        """Return the angles φ1 (rad, in one mesh period) at which the forces are not smooth.
+
+        At these angles, a pocket opens, or the contact of a slice passes the end of a segment."""
         pitch = 2 * jnp.pi / self.profile.lobes
         rolls = [jnp.zeros(1), pitch / 4 * jnp.ones(1)]
         for segment in self.profile.segments():

@@ -256,8 +256,7 @@ def points_of(
     """Return (points of the front in order, points that were dropped) for all `nodes`.
 
     `study`: evaluates their designs; `selection`: nodes that form the front; `scale`: scale of the
-    terms.
-    """
+    terms."""
     number = {k: place for place, k in enumerate(selection.kept, start=1)}
     every = [
         _point(study, node, number.get(k, 0), standing, scale)

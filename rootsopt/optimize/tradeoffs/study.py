@@ -122,10 +122,10 @@ def reported(config: Config) -> Config:
 
 
 def freed(config: Config) -> tuple[Config, tuple[str, ...]]:
-    """Return a copy of a `config` without the limits that would cut off a side of the front. These
-    are limits of terms of `config.pareto` with the value `baseline`. A limit that is a number is
-    kept. Also return the names of the quantities that lost a limit.
-    """
+    """Return a copy of a `config` without the limits that would cut off a side of the front.
+
+    These are limits of terms of `config.pareto` with the value `baseline`. A limit that is a number
+    is kept. Also return the names of the quantities that lost a limit."""
     limits = config.constraints
     keys = [key for key, limit in limits if limit == BASELINE]
     keys = [key for key in keys if quantity_of(key) in config.pareto.terms]

@@ -15,8 +15,7 @@ result, and the best one that lies far from it. Finally, neighbours that lie far
 
 Independent searches run side by side: those of the ends, both chains, the further searches of all
 points, and those of one bisection. Each has its own `Course`, so that the result does not depend on
-which ends first, or where designs are evaluated (`Runs`).
-"""
+which ends first, or where designs are evaluated (`Runs`)."""
 
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
