@@ -36,7 +36,7 @@ GEAR = tuple(
 """Names of mean, greatest and RMS torque of the timing gear, and of its force at the pitch circle.
 """
 LONGEST = 8
-"""Maximum length of an orbit (mesh periods), rounded up by `RotorPair.whole`."""
+"""Maximum period of an orbit (mesh periods), rounded up by `RotorPair.whole`."""
 # Minimum number of pieces into which one mesh period is divided.
 _EVEN = 128
 # Maximum number of instants at which flags change, and number of bisections that locate them.

@@ -316,8 +316,8 @@ class VariedOrbit(NamedTuple):
     ) -> tuple[Float[Array, "*q"], Float[Array, "*q d"]]:
         """Return `quantity(model, tau, state)`, and its derivatives along the directions.
 
-        Time is held constant. `tau`: in mesh periods; `model`: a pair, or another object that depends on the directions; `tangents`: its
-        derivatives along them, with a leading axis."""
+        Time is held constant. `tau`: in mesh periods; `model`: a pair, or another object that
+        depends on the directions; `tangents`: its derivatives along them, with a leading axis."""
         dynamic, static = eqx.partition(model, eqx.is_inexact_array)
         state, _, changes = self.at(tau)
 

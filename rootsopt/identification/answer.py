@@ -47,8 +47,7 @@ _CLOSE, _WIDER = 0.03, 2.0
 # Number of degrees of freedom from which errors may differ between samples (HC3).
 _MANY = 50
 UNLIKELY = 0.01
-"""Probability of residuals this large below which the given standard deviations count as too
-small."""
+"""Probability of the residuals below which the given standard deviations count as too small."""
 
 # Relative difference of predictions below which two motions count as the same.
 _SAME = 1e-3

@@ -288,7 +288,7 @@ class Assumed:
     wins: dict[str, dict[str, list[Piece]]]
 
     def sample(self, regret: bool) -> tuple[Scenes, tuple[float, ...]]:
-        """Return the random scenes over which a search optimises, with the offsets of their objectives.
+        """Return the random scenes over which a search optimises, with offsets of the objectives.
 
         They are those with a usable motion of all designs. `regret`: whether the least objective of
         all designs is subtracted in each scene; the greatest sum is 1 for the baseline."""

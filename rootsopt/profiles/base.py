@@ -47,9 +47,9 @@ _keeping = ContextVar("_keeping", default=False)
 
 @contextlib.contextmanager
 def computed_once() -> Iterator[None]:
-    """Have cosines and sines that are traced inside this context computed once.
+    """Compute cosines and sines that are traced inside this context only once.
 
-    The program runs faster if it evaluates many points with derivatives, but takes longer to
+    A program that evaluates many points with derivatives runs faster, but takes longer to
     compile."""
     token = _keeping.set(True)
     try:
@@ -322,10 +322,10 @@ class Profile(eqx.Module):
     def single_turn(self) -> float:
         """Relative rotation (rad) below which the gap is trusted to have no second, deeper minimum.
 
-        Down to ε = -`single_turn`, and at the nominal centre distance, the contact search accepts
-        the minimum near the point of perfect rolling, if Newton's method converges to it. A
-        fraction of the flank next to a cusp, about √|ε|, is excluded, and one next to the joints of
-        a `forked` flank, proportional to ε. Tests confirm the value."""
+        The contact search accepts the minimum near the point of perfect rolling if Newton's method
+        converges to it. This holds down to ε = -`single_turn`, at the nominal centre distance.
+        Excluded are a fraction of the flank next to a cusp, about √|ε|, and one next to the joints
+        of a `forked` flank, proportional to ε. Tests confirm the value."""
         return 1e-3
 
     @property

@@ -135,12 +135,12 @@ def arc_involute(
 class CIC(Profile):
     """The CIC rotor: tip land, tip arc, involute, and their conjugates.
 
-    The involute is the paper's Eq. 2: ψ = α, s = ℓ cot α for -u ≤ ℓ ≤ u. One arc joins the tip
-    land of half angle θ1 (Eq. 1) to the involute's end B, tangent to both. The arc's centre C lies
-    on the ray θ1 at radius c = r cos α / cos(α - δ), with δ = β_u - θ1 and
-    β_u = π/2N - u/(r sin α). The arc's radius is ρ = |B - C|. Hence (α, u, θ1) are independent, and
-    the outer radius c + ρ follows from them. For u = `longest_involute` the arc is centred on the
-    pitch circle (c = r), as in the textbook CIC.
+    The involute is the paper's Eq. 2: ψ = α, s = ℓ cot α for -u ≤ ℓ ≤ u. One arc joins the tip land
+    of half angle θ1 (Eq. 1) to the involute's end B, tangent to both. The arc's centre C lies on
+    the ray θ1 at radius c = r cos α / cos(α - δ). Here, δ = β_u - θ1 and β_u = π/2N - u/(r sin α).
+    The arc's radius is ρ = |B - C|. Hence (α, u, θ1) are independent, and the outer radius c + ρ
+    follows from them. For u = `longest_involute` the arc is centred on the pitch circle (c = r), as
+    in the textbook CIC.
 
     `longest_involute`: u_max = r sin α (π/2N - θ1) (m); with a longer involute, the roll angle
     turns back.

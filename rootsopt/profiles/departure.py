@@ -62,7 +62,7 @@ def departures(
     """Return the distances between the closed outlines of two profiles with equal lobes.
 
     `nodes`: least number of points on each side of the pitch circle of a flank; `inset`: distance
-    (m) by which `other` is made smaller along its normals before."""
+    (m) by which `other` is first made smaller along its normals."""
     first, second = (flank_points(one, nodes) for one in (profile, other))
     there, back = (
         np.abs(feet(points, beyond(line, profile.lobes), smooth=True).away + shift)

@@ -56,14 +56,13 @@ class EE(Profile):
 class TippedEpicycloid(Profile):
     """An epicycloid from the pitch crossing to a joint, and a circular arc over the tip.
 
-    On the epicycloid of rolling radius r_e, with κ = r / 2 r_e, the pressure angle is
-    ψ = κ (π/2N - β) and s = 2 r_e sin ψ, so that ds/dβ = -r cos ψ. Its conjugate is the hypocycloid
-    of the same circle. EE is the case r_e = r / 2N, in which ψ reaches π/2 on the lobe's axis. The
-    tip arc is tangent to the epicycloid at the joint, and its centre C lies on the lobe's axis.
-    With normal ν and pressure angle ψ at the joint, C lies at the distance c = r cos ψ / sin ν from
-    the rotor's axis. No epicycloid with r_e < r is undercut: the arc length of its conjugate per ν
-    is 4 r_e (r - r_e) sin ψ / (r + 2 r_e). These formulas are derived here, because no source was
-    available.
+    On the epicycloid of rolling radius r_e, the pressure angle is ψ = κ (π/2N - β) with
+    κ = r / 2 r_e. There, s = 2 r_e sin ψ, so that ds/dβ = -r cos ψ. Its conjugate is the
+    hypocycloid of the same circle. EE is the case r_e = r / 2N, in which ψ reaches π/2 on the
+    lobe's axis. The tip arc is tangent to the epicycloid at the joint, and its centre C lies on the
+    lobe's axis. If ν and ψ are normal and pressure angle at the joint, C lies at the distance
+    c = r cos ψ / sin ν from the rotor's axis. No epicycloid with r_e < r is undercut: the arc
+    length of its conjugate per ν is 4 r_e (r - r_e) sin ψ / (r + 2 r_e). These formulas are derived here, because no source was available.
 
     `rolling_radius`: r_e (m). `joint`: normal angle (rad) at which the tip arc ends.
     `arc_center_radius`: c (m). `arc_radius`: radius of the tip arc (m). `land`: whether the arc is

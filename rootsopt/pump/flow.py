@@ -73,8 +73,8 @@ def ripple(profile: Profile, shape: Geometry) -> Float[Array, ""]:
 
     The distance s is 0 at the pitch crossing and r_a - r at the tip. The ripple is therefore (r_a -
     r)² / (η r_a²), with the area efficiency η. At a given r_a / r and η, no shape of the flank
-    changes it. The formula holds for conjugate profiles whose roll angle never turns back; for a
-    measured outline it is as exact as the outline is conjugate."""
+    changes it. The formula holds for conjugate profiles whose roll angle never turns back. For a
+    measured outline, its error grows with the deviation from conjugate flanks."""
     return (shape.outer_radius - profile.pitch_radius) ** 2 / _mean(shape)
 
 
@@ -151,7 +151,7 @@ def play_of(scene: Scene, profile: Profile) -> Play:
 
 
 def radial_allowance(scene: Scene) -> Float[Array, ""]:
-    """Return the radius (m) by which both rotors are smaller everywhere."""
+    """Return the radial allowance (m) by which each rotor is smaller all round."""
     medium = scene.medium
     return jnp.zeros_like(scene.clearance) if medium is None else medium.radial_allowance
 
@@ -314,8 +314,8 @@ def leakage(scene: Scene, medium: Medium, profile: Profile, shape: Geometry) -> 
 def _per_width(medium: Medium, height, length, series: int):
     """Return the flow (m²/s) per width through `series` equal gaps in series.
 
-    `height`, `length` (m): of one of them; with one of each per roll angle (n,), the flow is the
-    mean over the rotation. The flow of a gas is that at suction pressure."""
+    `height`, `length` (m): those of one gap; if they are arrays (n,) over roll angles, the flow is
+    the mean over the rotation. The flow of a gas is that at suction pressure."""
     across = medium.pressure_difference
     length = series * jnp.where(height > 0, length, 1.0)
     height = jnp.maximum(height, 0.0)
@@ -335,7 +335,7 @@ def _lesser(slow, fast):
     """Return the lesser of two flows, or its mean over the rotation of flows (n,) at roll angles.
 
     Between roll angles, the flows are linear. A mean over the angles alone would have a gradient
-    that jumps whenever one of them passes from one limit to the other."""
+    that jumps whenever the flow at one angle passes from one limit to the other."""
     if not slow.ndim:
         return jnp.minimum(slow, fast)
     excess = slow - fast

@@ -170,8 +170,8 @@ def _lengths(profile: Profile, nu: Float[Array, " n"], gap: Float[Array, " n"]):
     step = jnp.abs(jnp.diff(lobe.point))
 
     def seen(curve: Flank, point: RollPoint):
-        """Return places along the tangent at the contact (m), depths behind it (m), and directions
-        of the normals as complex numbers, with that of the contact's normal as real axis."""
+        """Return positions along the tangent at the contact (m), depths behind it (m), and normals.
+        The normals are complex numbers whose real axis is the contact's normal."""
         beta, psi, s = point
         turn = jnp.exp(1j * beta)
         place = turn * (profile.pitch_radius + s * (jnp.sin(psi) + 1j * jnp.cos(psi)))
@@ -209,8 +209,8 @@ def _part(cosine):
 
 
 POINTS = 1000
-"""Number of points per segment of a flank. The angles are then accurate to about 1e-6 rad, and
-mostly to 1e-8 rad."""
+"""Number of points per segment of a flank. It makes the angles accurate to about 1e-6 rad, mostly
+1e-8 rad."""
 # Least clearance that is added to separate rotors that overlap, beyond their greatest depth: in
 # pitch radii, and as a share of this depth. It is trebled until they are apart.
 _STEP, _SHARE = 3e-8, 1e-2
@@ -229,8 +229,8 @@ class Play(eqx.Module):
 
     `overlap`: greatest depth (m), along the normal, by which the rotors overlap at ε = 0;
     `overlap_at`: φ1 (rad) there. No turn lifts a tip out of a root. With an overlap, `behind` and
-    `ahead` are therefore those at the least further clearance without overlap, each moved inwards
-    by this clearance over the greatest lever. They are continuous in the overlap."""
+    `ahead` are therefore computed with the least additional clearance that removes it. Each is then
+    moved inwards by this clearance over the greatest lever. They are continuous in the overlap."""
 
     phi: Float[Array, " n"]
     behind: Float[Array, " n"]
@@ -353,7 +353,8 @@ def play(
         flank = flank._replace(point=flank.point * (1 - radial / jnp.abs(flank.point)))
     pair = _Pair(flank, both_flanks(flank), clearance, distance, lobes)
 
-    # Where a limit is reached is found without derivatives; three neighbours there give its value.
+    # The place of each limit is found without derivatives; three neighbouring points give its
+    # value.
     still = lax.stop_gradient(pair)
 
     def least(extra):

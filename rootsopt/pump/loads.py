@@ -24,9 +24,9 @@ from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene.build import Scene, along
 
 EQUIVALENT = "bearing_load_equivalent_N"
-"""Name of the greatest equivalent dynamic load of the bearings."""
+"""Name of the bearings' greatest equivalent dynamic load in result files."""
 BEARING = (*(EQUIVALENT, "bearing_load_max_N", "axial_force_max_N", "tilting_moment_max_N_m"),)
-"""Names of what an evaluation takes from the bearing loads along the motion."""
+"""Names of the quantities that an evaluation takes from the bearing loads along the motion."""
 
 
 def equivalent_load(force: Inexact[Array, "*k n"], exponent: float) -> Float[Array, "*k"]:
@@ -140,8 +140,8 @@ class BearingSet(eqx.Module):
     def _from_flanks(self, pushes, heights):
         """Return forces and first moments (rotor, x and y) and axial forces (rotor) of flanks.
 
-        `heights` (slices,): z of the slices (m). The first moment is ∫ z dF - P A, where A is the
-        axial force and P the place at which it acts, seen from the rotor's axis."""
+        `heights` (slices,): z of the slices (m). The first moment is ∫ z dF - P A. A is the axial
+        force, and P its point of action relative to the rotor's axis."""
         axis = jnp.stack([2 * self.loads.radius, jnp.zeros_like(self.loads.radius)])
         place = jnp.stack([pushes.place, pushes.place - axis], axis=2)
         forces = jnp.stack([-pushes.force, pushes.force], axis=2)
@@ -233,7 +233,8 @@ def orbit_loads(scene: Scene, design: Float[Array, " d"], orbit: VariedOrbit) ->
         """Return the quantities, and their derivatives along the design, at constant time."""
         return orbit.pushed(quantities, tau, bearings, tangents)
 
-    # The loads have corners that the motion does not have, as where the gear's torque changes sign.
+    # The loads have corners where the motion has none, for example where the gear's torque changes
+    # sign.
     corners, flags = loads_corners(bearings), bearings.flags(orbit)
     begins, ends, count = smooth_pieces(bearings.pair, orbit.elements, corners, flags)
     leaps, moves = _leaps(scene, orbit, (dynamic, static, moved))
@@ -316,7 +317,7 @@ def _channels(loads: BearingLoads, scene: Scene) -> Float[Array, "*n k"]:
 
 @CachedFunction
 def static_loads(scene: Scene, design: Float[Array, " d"]) -> tuple[Array, Array]:
-    """Return (equivalent, greatest) loads (4,) in N of the bearings if the gear carries the load.
+    """Return the bearings' (equivalent, greatest) loads (4,) in N if the gear carries the load.
 
     The flanks do not touch, and nothing oscillates. `design` (d,): in config units."""
     profile = scene.profile(design)

@@ -28,16 +28,17 @@ SILENT = "silent_eccentricity_um"
 _PLACES = (np.arange(8) + 0.5) / 8
 # Number of angles over a turn for the linear motion, and for its check that no flank touches.
 _ANGLES, _POSES = 2880, 360
-# Ratio of the eccentricities in place of that of gears without any: only the first gear's.
+# Ratio of the eccentricities that is assumed if both are 0: only the first gear is eccentric.
 _FIRST = np.array([1.0, 0.0])
 
 
 class SilentLimit(NamedTuple):
-    """Eccentricity up to which the teeth stay in contact.
+    """Eccentricity below which the teeth stay in contact.
 
-    `value` (m): that of the more eccentric gear, if both grow in proportion; `slopes` (d,): its
-    derivatives with respect to the design; `depth` (m): greatest penetration of the flanks in the
-    motion at the limit, negative where they stay apart. If they do not, the limit has no meaning.
+    `value` (m): eccentricity of the more eccentric gear if both grow in proportion; `slopes` (d,):
+    its derivatives with respect to the design; `depth` (m): greatest penetration of the flanks in
+    the motion at the limit, negative where they stay apart. If the flanks touch, the limit has no
+    meaning.
     """
 
     value: Float[Array, ""]
@@ -48,8 +49,8 @@ class SilentLimit(NamedTuple):
 def rattle_record(pair: RotorPair, found: Steady) -> dict[str, dict[str, float]]:
     """Return the result file's entries for the rattle of the timing gear in the motion `found`.
 
-    They are the share of time without contact of its teeth, the number of impacts per turn, and
-    the greatest torque (N·m) between the teeth if there are impacts, else 0. There are no entries
+    They are the share of time without contact of its teeth, the number of impacts per turn, and the
+    greatest torque (N·m) between the teeth. Without impacts, this torque is 0. There are no entries
     without a motion to report."""
     status, window = Status.of(found.status), found.window
     held = status in CLOSED or bool(found.held)
@@ -64,7 +65,7 @@ def rattle_record(pair: RotorPair, found: Steady) -> dict[str, dict[str, float]]
     else:
         return {}
     touch, torque, time = teeth
-    # A window does not repeat: what lies between its end and its start is no impact.
+    # A window does not repeat, so a flight across its end does not count as an impact.
     before = np.roll(touch, 1) if held else np.append(touch[:1], touch[:-1])
     impacts = int(np.sum(touch & ~before))
     entries = {
@@ -134,10 +135,10 @@ def silent_eccentricity(
 ) -> tuple[Float[Array, ""], Float[Array, " angles"]]:
     """Return the limit of silent running (m), and ε (rad) over a turn in the motion at the limit.
 
-    `profile` and `shape`: those of a design, in a scene whose gear has errors. The limit is that of
-    the linear motion in permanent contact: load, drive, gear and inertia count. The deflection of
-    the teeth is a sum: that of load and measured error, and that of the eccentricities, which is
-    proportional to them. The limit is 0 if the former alone parts the teeth."""
+    `profile` and `shape`: those of a design, in a scene whose gear has errors. The limit follows
+    from the linear motion in permanent contact, under load, drive, gear and inertia. The deflection
+    of the teeth has two parts. One is due to load and measured error, the other is proportional to
+    the eccentricities. The limit is 0 if the first part alone separates the teeth."""
     inertia, load = scene.inertia(shape), scene.load(profile, shape)
     gear = scene.gear_of(inertia)
     assert gear is not None
@@ -151,7 +152,7 @@ def silent_eccentricity(
     on_1 = 0 * phi if on_1 is None else on_1
     frequency = scene.speed * jnp.arange(_ANGLES // 2 + 1)
     stiffness, inertial = gear.stiffness + 1j * gear.damping * frequency, -inertia * frequency**2
-    # How much further than rotor 2 a torque at this frequency turns rotor 1.
+    # Response of rotor 1 to a torque at this frequency, as a multiple of that of rotor 2.
     follows = jnp.zeros_like(stiffness)
     if scene.motor is not None:
         turning = (inertia + scene.motor.inertia) * frequency - 1j * scene.motor.slope

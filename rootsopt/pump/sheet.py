@@ -18,7 +18,7 @@ from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene.build import Scene
 from rootsopt.scene.reading import Medium, design_vector
 
-# Overlap (m) of the flanks up to which it counts as rounding of an outline.
+# Overlap (m) of the flanks below which it counts as rounding of an outline.
 _ROUNDING = 1e-8
 LINES = 4
 """Number of lines of the flow in the sheet."""
@@ -64,7 +64,7 @@ def sheet(scene: Scene, design: Float[Array, " d"]) -> dict[str, Any]:
 
 
 def warnings(rows: Mapping[str, Any]) -> list[str]:
-    """Return sentences on what in a sheet cannot be taken at face value.
+    """Return caveats on the values of a sheet, as sentences.
 
     `rows`: the sheet."""
     found = []

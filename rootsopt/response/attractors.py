@@ -67,7 +67,7 @@ class Attractor:
 
 @dataclasses.dataclass(frozen=True)
 class Basins:
-    """The motions that a grid of initial states leads to.
+    """The motions to which a grid of initial states leads.
 
     `relative` (rad) and `rate` (rad/s): axes of the grid; `leads_to` (rates, relatives): index of
     the attractor for each initial state, or -1 if it leads to none; `attractors`: closed orbits
@@ -89,7 +89,7 @@ class Basins:
     @property
     def status(self) -> Status:
         """PERIODIC if every initial state leads to a stable periodic motion, IDLE if no flank
-        touches in any of them. Otherwise, the status of a motion for which this is not true."""
+        touches in any of these motions. Otherwise, the status of a motion that is neither."""
         for status in _LOST:
             if self.lost.get(status.label):
                 return status

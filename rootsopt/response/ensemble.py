@@ -1,4 +1,4 @@
-"""One design in one scene, averaged over an ensemble of motions: for chaotic scenes.
+"""Evaluates one design in a chaotic scene, averaged over an ensemble of motions.
 
 In a chaotic scene, a single motion cannot guide an optimisation. Its average over a finite window
 jumps between designs that hardly differ, and its derivative grows with the window. The average over

@@ -52,8 +52,8 @@ from rootsopt.scene.reading import design_keys, design_vector
 from rootsopt.status import Status
 
 # Difference between an orbit closed by collocation and an integration over its period (see
-# `integrated_difference`) above which the orbit is rejected: the first number, at least the second
-# times the tolerance of orbits.
+# `integrated_difference`) above which the orbit is rejected. It is the first number, or the second
+# times the tolerance of orbits if that is greater.
 _APART = 1e-4, 1e3
 # Greatest tolerance of this integration.
 _FINE = 1e-8
@@ -61,7 +61,7 @@ _FINE = 1e-8
 
 @dataclasses.dataclass(frozen=True)
 class Motions:
-    """Which steady motions of a design count: base class, for the motion that a start leads to."""
+    """The steady motions of a design to evaluate; base class, for the motion from a start."""
 
     def evaluated(
         self, evaluator: "Evaluator", design: Any, start: Any, series: bool
@@ -81,9 +81,9 @@ class Evaluator:
     An evaluator is immutable. Methods that return "another evaluator" do not change the evaluator
     on which they are called.
 
-    `motions`: which motions of a design count; `speeds`: pairs (speed in rpm, its share in the
-    objective), including the scene's own speed; empty: only the latter; `shifts`: scenes of a
-    sample, in addition to the nominal one; `runs`: where the sample is evaluated.
+    `motions`: the motions of a design that are evaluated; `speeds`: pairs (speed in rpm, its share
+    in the objective), including the scene's own speed; empty: only the latter; `shifts`: scenes of
+    a sample, in addition to the nominal one; `runs`: where the sample is evaluated.
 
     `survey`: whether the evaluator is for a search over many designs (see `surveying`);
     `references`: for each speed, the response by which forces are divided when coexisting motions
@@ -132,7 +132,7 @@ class Evaluator:
 
     @property
     def single(self) -> bool:
-        """Whether an evaluation is that of one motion at one speed in one scene."""
+        """Whether an evaluation covers one motion at one speed in one scene."""
         return self.motions == Motions() and not (self.speeds or self.shifts)
 
     @property
@@ -212,7 +212,7 @@ class Evaluator:
     def __call__(
         self, design: ArrayLike | None = None, start: Seeds = None, series: bool = True
     ) -> Evaluation:
-        """Evaluate `design` (config units; default: the config's own) at all points that count.
+        """Evaluate `design` (config units; default: the config's own) at all speeds and scenes.
 
         `start`: where to begin, the `start` of a neighbouring design's evaluation, or a scaled
         state (n,) at φ1 = 0; by default at rest (ε = 0, dε/dt = 0). `series`: whether to compute
@@ -279,8 +279,8 @@ class Evaluator:
         start: Seed | ArrayLike | None = None,
         series: bool = True,
     ) -> Evaluation:
-        """Evaluate the motion of `design` (config units; default: the config's own) that `start`
-        leads to, at the scene's speed. Arguments: see `__call__`."""
+        """Evaluate the motion to which `start` leads, at the scene's speed. `design`: in config
+        units, by default the config's own. Arguments: see `__call__`."""
         began = time.perf_counter()
         design = design_vector(self.config) if design is None else jnp.asarray(design)
         pair, tangents, shape = _build(self.scene, design)
@@ -301,11 +301,11 @@ class Evaluator:
         return dataclasses.replace(self.scene.solver, variation=True)
 
     def motion(self, pair: RotorPair, tangents: RotorPair, start: Start) -> Steady:
-        """Return the steady motion of `pair` that `start` leads to, in arrays of NumPy.
+        """Return the steady motion of `pair` to which `start` leads, in arrays of NumPy.
 
         It has derivatives along `tangents`; `start`: result of `starts.begun`."""
         found = _motion(pair, tangents, start, self.scene.pitch_radius, self.solver)
-        found = jax.device_get(found)  # To fetch a hundred arrays one by one takes a millisecond.
+        found = jax.device_get(found)  # Fetching a hundred arrays one by one takes a millisecond.
         return self._examined(pair, found)
 
     def _examined(self, pair: RotorPair, found: Steady) -> Steady:
@@ -325,8 +325,9 @@ class Evaluator:
     ) -> Steady:
         """Return the motion `found` from `start`, if an integration over its period confirms it.
 
-        An orbit near a known one may lack a touch of the flanks. It is searched for once more,
-        without the known orbit. Any other that is not confirmed is NOT_CLOSED."""
+        An orbit closed from a known one may have missed a touch of the flanks. In that case, search
+        once more without the known orbit. If the orbit is still not confirmed, its status is
+        NOT_CLOSED."""
         if Status.of(found.status) not in CLOSED:
             return found
         orbit, integrator = found.orbit, self.scene.solver.orbit

@@ -325,7 +325,7 @@ def plain_evaluation(evaluation: Evaluation) -> dict[str, Any]:
 def read_evaluation(found: Mapping[str, Any]) -> Evaluation:
     """Return the evaluation from the plain values that `plain_evaluation` returned.
 
-    Raises `ValueError`, `LookupError` or `TypeError` if they are none."""
+    Raises `ValueError`, `LookupError` or `TypeError` if they are not valid."""
     values = dict(found)
     parts, scenes = values.pop("parts", ()), values.pop("scenes", ())
     for name, kind in _KINDS.items():

@@ -1,6 +1,6 @@
-"""What is reported of one evaluation: series, entries of the result file, and advice.
+"""The report on one evaluation: series, entries of the result file, and advice.
 
-`reported` makes the evaluation of a known motion from them."""
+`reported` combines them to the evaluation of a known motion."""
 
 import dataclasses
 import functools
@@ -96,7 +96,7 @@ def sampled(elements: Elements) -> Float[Array, "samples n"]:
 
 # Floquet multiplier above which a message says how slowly disturbances fade.
 _SLOW = 0.999
-# Fraction of itself to which a disturbance is said to fade.
+# Fraction to which a disturbance fades in the time that the message states.
 _FADED = 0.01
 # Kinds of motions without an orbit, by status; all others are transient.
 _KINDS = {Status.CHAOTIC: "chaotic", Status.IDLE: "idle"}
@@ -211,10 +211,10 @@ def unsettled(
 
 
 def message_of(config: Config, status: Status) -> str:
-    """Return what a `status` means, and advice that fits the scene of a `config`.
+    """Return the meaning of a `status`, with advice that fits the scene of a `config`.
 
-    The advice names only what the scene has or lacks: no timing gear where there is one, and no
-    value to lower that is 0."""
+    The advice never recommends a timing gear that the scene already has, or lowering a value that
+    is 0."""
     ways = _ways(config).get(status)
     if ways is None:
         return status.value
@@ -250,7 +250,7 @@ def _ways(config: Config) -> dict[Status, list[str]]:
     damping = damping or change("raise", "contact.max_damping_N_s_per_mm", lambda _: True)
     held = change("raise", "scene.timing_gear.stiffness_N_m_per_rad")
     phased = change("bring closer to 0", "scene.phase_error_mrad")
-    # What presses the rotors into each other comes first.
+    # Causes that press the rotors into each other come first.
     near = change("raise", "scene.center_distance_error_mm", lambda error: error < 0)
     near += change("raise", "contact.wear.offset_mm", lambda offset: offset < 0)
     near += ["raise contact.clearance_mm"] if near else []
@@ -275,11 +275,11 @@ def _ways(config: Config) -> dict[Status, list[str]]:
 
 
 def apart_message(config: Config, depth: float, backlash: float | None = None) -> str:
-    """Return what it means that no flank touches, and how far the flanks are from it.
+    """Return the message for flanks that never touch, with their distance from touching.
 
     `depth` (m): greatest penetration, the negative of the least gap; `backlash` (mm) by which that
-    of the timing gear may grow, `None` if it is not known. Without it, the clearance is named: the
-    motion does not depend on it as long as nothing touches."""
+    of the timing gear may grow, `None` if it is not known. Without it, the message names the
+    clearance, because the motion does not depend on the clearance as long as nothing touches."""
     geared = config.scene.timing_gear is not None
     said = Status.IDLE.value
     if geared:

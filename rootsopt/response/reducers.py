@@ -98,7 +98,7 @@ def over_scenes(parts: Sequence[Part]) -> Evaluation:
 def _together(head: Evaluation, parts: Sequence[Part], counts: dict[str, int]) -> Evaluation:
     """Return the evaluation `head` as that of all `parts`; add `counts` to its statistics.
 
-    Only if all parts are usable, the result has a gradient, and a start with one entry for each."""
+    The result has a gradient, and a start with one entry per part, only if all parts are usable."""
     status, message = overall(parts)
     seconds = sum(part.evaluation.statistics.get("seconds", 0.0) for part in parts)
     return dataclasses.replace(
@@ -205,7 +205,7 @@ Found = TypeVar("Found")
 
 
 class Point(NamedTuple):
-    """What is evaluated: `evaluator(design, start, series)`.
+    """A point to evaluate, as `evaluator(design, start, series)`.
 
     The first three are the `Evaluator`, the design (d,) in config units, and where to begin;
     `series`: whether to compute the series."""
@@ -224,7 +224,7 @@ class Runs(Protocol):
 
     @property
     def slots(self) -> int:
-        """Number of evaluations that should be asked for at a time."""
+        """Number of evaluations that may be requested at a time."""
         ...
 
     def evaluated(self, point: Point) -> Evaluation:

@@ -1,6 +1,6 @@
-"""What is known about one design: at one point, or at several speeds or in several scenes.
+"""The evaluation of one design, at one point or at several speeds or in several scenes.
 
-A `Seed` is where an evaluation begins: on the closed orbit of a similar design or scene, or at a
+An evaluation begins at a `Seed`: on the closed orbit of a similar design or scene, or at a
 state."""
 
 import base64
@@ -90,7 +90,7 @@ def plain(start: Seeds) -> Any:
 def read(value: Any) -> Seeds:
     """Return the start from the plain value that `plain` returned.
 
-    Raises `ValueError`, `LookupError` or `TypeError` if it is none."""
+    Raises `ValueError`, `LookupError` or `TypeError` if it is not valid."""
     if not isinstance(value, dict):
         return None if value is None else np.asarray(value, np.float64)
     if "parts" in value:
@@ -136,8 +136,8 @@ class Series:
     `time` (s): uniform unless rotor 1 is free; `rotation` of rotor 1 (rad), uniform; `relative`: ε
     (rad); `rate`: dε/dt (rad/s); `drive_force`, `coast_force`: normal force (N) on each flank;
     `depth`: greatest penetration (m; negative: gap); `bearing_loads` (samples, 4): loads (N) on the
-    bearings, None without `scene.bearings` or without an orbit. The bearings are that of rotor 1 at
-    the timing gear's end, its other one, and those of rotor 2."""
+    bearings, None without `scene.bearings` or without an orbit. Order of the bearings: rotor 1 at
+    the timing gear's end, rotor 1 at the other end, then rotor 2 likewise."""
 
     time: NDArray[np.float64]
     rotation: NDArray[np.float64]

@@ -5,10 +5,10 @@ quantity, and the forces depend on the pair. The derivatives of the forces come 
 the same compiled program as the derivatives with respect to the design.
 
 The gaps of drive and coast flanks at fixed instants of the motion are smooth functions of the
-values that scatter (`tolerances.over`), while the least of them has corners. Their gradients at the
-nominal values, and at each value moved by one standard deviation to either side, give models of
-second order. The share of machines whose flanks touch follows from these for many machines, and
-some are simulated as a check.
+values that scatter (`tolerances.over`). Their least value has corners. Models of second order
+follow from their gradients at the nominal values, and at each value moved by one standard deviation
+to either side. These models give the share of many machines whose flanks touch. Some machines are
+simulated as a check.
 """
 
 import dataclasses
@@ -114,12 +114,12 @@ def motions_along(
     directions: Sequence[tuple[Scene, NDArray[np.float64]]],
     start: Seeds = None,
 ) -> Iterator[tuple[int, RotorPair, RotorPair, Steady]]:
-    """Yield the steady motion of a `design` (d,) in config units, with its derivatives along some
-    of the `directions` at a time, as (number of these, pair, its derivatives, motion).
+    """Yield the steady motion with derivatives along some of the `directions` at a time.
 
-    `directions`: results of `direction`; `start`: where the first search begins. There are as many
-    directions at a time as design parameters, to reuse the compiled programs; the last ones may be
-    padded."""
+    Each result is (number of these directions, pair, its derivatives, motion). `design` (d,): in
+    config units; `directions`: results of `direction`; `start`: where the first search begins.
+    There are as many directions at a time as design parameters, to reuse the compiled programs; the
+    last ones may be padded."""
     size, longest = max(1, len(design)), evaluator.scene.solver.max_orbit
     for begin in range(0, len(directions), size):
         some = directions[begin : begin + size]
@@ -178,15 +178,14 @@ _gaps = CachedFunction(gaps)
 
 
 def touching(config: Config) -> dict[str, Any] | None:
-    """Return how the reserve of the design of a `config` with `tolerances` scatters, as the record
-    for the result file.
+    """Return the scatter of a design's reserve under `tolerances`, for the result file.
 
     The reserve, its standard deviation, and the least one if all values are as bad as they can be
     (to first order) are in µm; the share of `MACHINES` that touch is that by models of first and
     second order. `SIMULATED` of them check the latter. The key that costs most comes first.
 
-    Return None without a timing gear, without `tolerances.over`, or if the motion at the nominal
-    values, or at a value moved by a standard deviation, is not known."""
+    Return None without a timing gear or without `tolerances.over`. Also return None if the motion
+    at the nominal values, or at a value moved by a standard deviation, is not known."""
     assert config.tolerances is not None
     if config.scene.timing_gear is None or not config.tolerances.over:
         return None

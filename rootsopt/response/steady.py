@@ -87,8 +87,8 @@ def steady_response(
 
     `start`: `Response.start` of a similar design or scene, near whose orbit this one is closed in a
     few milliseconds; or a state (n,) at φ1 = 0 from which the motion begins (SI units, as
-    `Response.state`); by default at rest. An orbit that is of no use is not used: the motion then
-    begins at its state. All values of `start` that lead to the same motion give the same response.
+    `Response.state`); by default at rest. If the orbit cannot be used, the motion begins at its
+    state. All values of `start` that lead to the same motion give the same response.
 
     This is a pure function. It works under `jit`, `vmap`, `grad`, `jvp`, `jacfwd` and `jacrev`,
     with respect to the design and to every physical quantity of the scene. The derivatives of

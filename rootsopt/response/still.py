@@ -1,4 +1,4 @@
-"""Evaluations without a motion, for all that does not depend on forces.
+"""Evaluates designs without simulating a motion, for quantities that do not depend on forces.
 
 No equation of motion is compiled: geometry, flow, leakage, play and static loads follow from the
 profile alone."""
@@ -26,7 +26,7 @@ from rootsopt.status import Status
 
 @dataclasses.dataclass(frozen=True)
 class Still(Motions):
-    """No motion counts. The response of an evaluation has the further terms of the objective."""
+    """Evaluates no motion. The response holds only the objective's further terms."""
 
     def evaluated(self, evaluator: Evaluator, design: Any, start: Any, series: bool) -> Evaluation:
         """Evaluate a `design` (d,) in config units; the other arguments have no effect."""

@@ -35,8 +35,8 @@ from rootsopt.scene.build import Scene
 class Forces(NamedTuple):
     """Mean, peak and RMS of the contact force (N), in the fields `mean`, `peak`, `rms`.
 
-    `of_motion`: what an evaluation takes from the motion itself, such as loads of the bearings and
-    the torque of the timing gear, so that it is NaN here."""
+    `of_motion`: NaN, in place of quantities that an evaluation takes from the motion itself.
+    Examples are bearing loads and the torque of the timing gear."""
 
     mean: Float[Array, ""]
     peak: Float[Array, ""]
@@ -188,7 +188,8 @@ _MORE: dict[str, Callable[[_At], Any]] = {
     "displaced_volume_cm3": lambda at: flow.displaced_volume(at.shape, at.scene.length) / CM3,
     "theoretical_flow_l_min": _flow,
     "delivered_flow_l_min": lambda at: _flow(at) * _leakage(at, "delivered_flow_l_min").efficiency,
-    # Backlash up to which a timing gear keeps the flanks apart; negative where the rotors overlap.
+    # Greatest backlash at which a timing gear keeps the flanks apart; negative where the rotors
+    # overlap.
     "gear_backlash_max_mm": lambda at: play_of(at.scene, at.profile).gear_backlash / MM,
     "flank_gap_min_um": lambda at: jnp.min(_gaps(at, "flank_gap_min_um")) / UM,
     "flank_gap_mean_um": lambda at: jnp.mean(_gaps(at, "flank_gap_mean_um")) / UM,
@@ -319,7 +320,7 @@ def is_force(config: Config, name: str, key: str) -> bool:
 
 
 def depends_on_forces(config: Config, scene: Scene, name: str, key: str) -> bool:
-    """Return whether the quantity `name` is a force, or a term that reads forces.
+    """Return whether the quantity `name` is a force, or a term that depends on forces.
 
     `key`: config key that holds the name. Raises `InputError` if no quantity has this name."""
     if is_force(config, name, key):

@@ -1,7 +1,8 @@
 """Evaluate many scenes at once as arrays, where that is faster than one after the other.
 
 On an accelerator, the motions of all scenes of one structure are computed together (`vmap`). On a
-CPU they would then take as many iterations as the longest, and all branches that one of them takes.
+CPU, all motions would then take as many iterations as the longest one, and all branches that any of
+them takes.
 
 The motions of one design from different initial states are computed in the same way, and averaged.
 """

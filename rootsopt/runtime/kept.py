@@ -16,7 +16,7 @@ from jax.custom_batching import custom_vmap
 
 T = TypeVar("T")
 
-# Number of values from which they are kept. It costs more to keep fewer than to repeat them.
+# Number of values below which they are not kept, because repeating them costs less.
 _MANY = 32
 
 

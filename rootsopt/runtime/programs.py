@@ -83,13 +83,13 @@ generator for fused operations.
 """
 _PACKAGE = Path(__file__).parents[1]
 
-# Parts of this package on which any program may depend, beside the one that defines it.
+# Parts of this package on which any program may depend, in addition to the module that defines it.
 _INNER = (
     *("config", "contact", "dynamics", "profiles", "pump", "response", "runtime", "scene"),
     *("errors.py", "status.py"),
 )
 
-# Texts for people: docstrings and comments. Groups: other texts, which stay.
+# Pattern of docstrings and comments. Its groups match other strings, which stay.
 _WORDS = re.compile(
     rb"""^[ \t]*[rR]?\"{3}(?:\\.|(?!\"{3})[^\\])*\"{3}[ \t]*$"""
     rb"""|(\"{3}(?:\\.|[^\\])*?\"{3}|'{3}(?:\\.|[^\\])*?'{3})"""

@@ -1,6 +1,6 @@
 """Divides work among the cores of the machine, with results that do not depend on their number.
 
-Also holds what spares time and memory while programs are compiled on these cores."""
+Also saves time and memory while programs are compiled."""
 
 import contextlib
 import ctypes

@@ -174,9 +174,9 @@ class Scene(eqx.Module):
         return families.profile_of(self.family, self.lobes, self.pitch_radius, design)
 
     def at(self, design: Float[Array, " d"]) -> "Scene":
-        """Return this scene with what a `design` (d,), in config units, sets beside the profile.
+        """Return this scene with the twist of a `design` (d,) in config units.
 
-        This is the twist if it is a design parameter. Otherwise, the scene is returned as it is."""
+        If the twist is not a design parameter, return the scene unchanged."""
         if not self.twist_free:
             return self
         return dataclasses.replace(self, helix=design[-1] * DEG)

@@ -16,7 +16,7 @@ from rootsopt.profiles.geometry import Soundness, margins, soundness
 from rootsopt.runtime.environment import say
 from rootsopt.runtime.programs import CachedFunction
 
-# Number of operations for a point of a flank above which a family has a note.
+# Number of operations per point of a flank above which a family gets a note.
 _MOST_OPERATIONS = 1500
 # Units of margins that are not lengths: name of the unit, and its SI value.
 _UNITS = {"turning": ("deg", DEG), "order": ("deg", DEG), "rolling": ("", 1.0), "limits": ("", 1.0)}
@@ -120,7 +120,7 @@ def check(config: ProfileConfig) -> None:
 def note_program(config: ProfileConfig) -> None:
     """Print a note on a family from outside whose programs would take long to compile.
 
-    A simulation has dozens of copies of what computes a point of a flank."""
+    A simulation contains dozens of copies of the code that computes a point of a flank."""
     if is_shipped(config.family) or config.from_file:
         return
     profile = profile_of(

@@ -66,7 +66,7 @@ class Likeness(NamedTuple):
     `family`: name of the family; `design`: the member's parameters by key, in config units;
     `departure`: Hausdorff distance (m) between the outlines of the member and the profile; `rms`:
     root mean square of the distances (m) of the profile's points from the member; `inset`: distance
-    (m) by which the member is made smaller along its normals before, 0 unless an outline shows an
+    (m) by which the member is first made smaller along its normals, 0 unless an outline shows an
     inset."""
 
     family: str
@@ -274,7 +274,7 @@ class _Look:
     def __call__(self, design) -> _Comparison:
         *own, inset = map(float, design)
         seen = self._at(tuple(own))
-        # Outside the member cut by the inset, all points lie farther out by it.
+        # Relative to the member reduced by the inset, all distances grow by the inset.
         slopes = (
             np.insert(slope, len(own), by, axis=1)
             for slope, by in ((seen.distance_slope, 1.0), (seen.margin_slope, 0.0))

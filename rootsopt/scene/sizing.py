@@ -20,8 +20,8 @@ from rootsopt.scene.check import shape_of
 from rootsopt.scene.families import check
 from rootsopt.scene.space import Space, slacks_and_slopes, sobol
 
-# Number of sampled members, and of searches that begin at the best of them; magnitude (mm) that
-# stands for values that are not finite.
+# Number of sampled members. Number of searches that begin at the best of them. Magnitude (mm) that
+# replaces values that are not finite.
 _SAMPLE, _STARTS, _FAR = 64, 3, 1e3
 # Least margin of a member, as a fraction of the greatest one in the sample, and its tolerance;
 # deviation (mm) of the outer radius up to which it counts as met.
@@ -56,7 +56,7 @@ def sized(config: Config) -> Config | list[float]:
 
     sound.sort(key=radius)
     if not radius(sound[0]) <= limit <= radius(sound[-1]):
-        # Without this, searches for what no member has would take long.
+        # Without this limit, a search for an outer radius that no member has would take long.
         ends = [search(point, side) for side in (-1.0, 1.0) for point in (sound[0], sound[-1])]
         sound += [one for one in ends if np.all((at(*one)[1] - room)[~outer] >= -_SLACK)]
     radii = [radius(point) for point in sound]
@@ -84,7 +84,7 @@ def _met(config: Config, design) -> Config | None:
 def _space(config: Config) -> Space:
     profile, bounds = config.profile, {}
     for one in family_of(profile.family).parameters:
-        # Bounds about the example would not hold the members of other numbers of lobes.
+        # Bounds around the example would exclude members with other numbers of lobes.
         if one.usual is None and one.default_bounds is None and not one.floor:
             least, most = one.limits(profile.pitch_radius_mm) or one.bounds_range
             low, high = one.usually(profile.pitch_radius_mm, profile.lobes)

@@ -1,7 +1,7 @@
-"""Tables and sentences of an optimum: beside its baseline, its limits, certificate and likeness.
+"""Tables and sentences on an optimum: comparison with the baseline, limits, certificate.
 
-Also of what fits a record (`rootsopt identify`), and of an optimum over what is assumed about the
-scene."""
+Also on the nearest profiles, on a fit to a record (`rootsopt identify`), and on an optimum over
+assumed values of the scene."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -165,7 +165,7 @@ def label_of(key: str) -> str:
 
 
 WORTH = 1e-4
-"""Relative change of the objective below which no rotor counts as a better one."""
+"""Relative decrease of the objective below which a rotor does not count as better."""
 NOTHING_BETTER = (
     "With the same displacement, outer diameter and seal width, the family of the search has no "
     "better rotor: try `--set optimizer.family=free_form`, or allow a narrower tip land with "
@@ -182,7 +182,7 @@ _ROWS = (
 
 
 def better_tables(result: Mapping[str, Any]) -> Iterator[Table | None]:
-    """Yield the comparison of a rotor from a file with a better one, and what errors leave of it.
+    """Yield the comparison of a file's rotor with a better one, and the gain left after errors.
 
     Yield nothing unless the run is one of `rootsopt improve` that has found a better rotor."""
     told, pair = result.get("improve"), [result.get(key) or {} for key in ("baseline", "optimized")]
@@ -221,7 +221,7 @@ def better_tables(result: Mapping[str, Any]) -> Iterator[Table | None]:
 
 
 def identified_tables(result: Mapping[str, Any]) -> Iterator[Table | None]:
-    """Yield the fitted quantities, what the record does not tell, and what would."""
+    """Yield fitted quantities, what the record leaves open, and helpful further measurements."""
     known = result.get("parameters")
     if not known:
         return

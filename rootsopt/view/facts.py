@@ -1,4 +1,4 @@
-"""What came out of a run: what it gained and costs, and how sure that is.
+"""The outcome of a run: its gains, their price, and how certain they are.
 
 Each command has a function that takes the content of the result file and the rows of a sweep, and
 returns facts."""
@@ -31,13 +31,13 @@ Facts = list[tuple[str, str]]
 STEADY = Status.PERIODIC.label, Status.AVERAGED.label, Status.IDLE.label
 """Statuses of a motion with a steady state."""
 FEW = 6
-"""Number of quantities above which a sentence leaves out the others."""
+"""Maximum number of quantities that a sentence names."""
 _PEAK, _RESERVE = "peak_force_N", RESERVES[0]
 
 # Absolute change (%) below which a quantity counts as unchanged.
 _SMALL = 0.05
 
-# Quantities that other words tell: displaced volume, area efficiency, outer radius, reserve.
+# Quantities that other sentences cover: displaced volume, area efficiency, outer radius, reserve.
 _TOLD = "theoretical_flow_l_min", "area_mm2", "root_radius_mm", _RESERVE
 
 
@@ -81,7 +81,7 @@ def _sentence(parts: Sequence[str]) -> str:
 
 
 def _gains(result: Record) -> Iterator[str]:
-    """Yield what is known of the objective."""
+    """Yield sentences on the change of the objective."""
     member = "that of the nominal member of the family, fitted to the baseline"
     for entry, whose in ("improvement", "the baseline's"), ("improvement_over_nominal", member):
         gain = (result.get(entry) or {}).get("objective")
@@ -139,7 +139,7 @@ def _prices(result: Record) -> Iterator[str]:
 
 
 def _certified(result: Record) -> Iterator[str]:
-    """Yield what is known of certificate, agreement of the check from rest, and fresh scenes."""
+    """Yield sentences on the certificate, on the simulation from rest, and on fresh scenes."""
     found, check = result.get("optimality") or {}, result.get("verification") or {}
     optima = found.get("optima") or ()
     if found:
@@ -170,7 +170,7 @@ def _certified(result: Record) -> Iterator[str]:
 
 
 def _at_vertex(known: Record) -> Iterator[str]:
-    """Yield that limits alone hold an optimum, and which vertex comes next; `known`: the entry."""
+    """Yield sentences on an optimum at a vertex, and on the next best one; `known`: the entry."""
     if not known:
         return
     yield (
@@ -184,7 +184,7 @@ def _at_vertex(known: Record) -> Iterator[str]:
 
 
 def _bounded(known: Record) -> Iterator[str]:
-    """Yield what the lower bound `known` says of all designs within the bounds."""
+    """Yield what the lower bound `known` says about all designs within the bounds."""
     if known.get("lower_bound") is None:
         return
     gap, count = brief(known["gap"], 2), known["evaluations"]
@@ -246,7 +246,7 @@ def _touching(result: Record) -> list[str]:
 
 
 def _trust(steady: Record, record: Record) -> Iterator[str]:
-    """Yield what the numbers of a simulated design rest on; `steady`: its steady state."""
+    """Yield how reliable the numbers of a simulated design are; `steady`: its steady state."""
     if steady.get("residual") is not None and steady.get("floquet_multiplier") is not None:
         yield f"the orbit is closed to a residual of {brief(steady['residual'], 2)}"
         yield f"its largest Floquet multiplier is {brief(abs(steady['floquet_multiplier']), 3)}"
@@ -262,7 +262,7 @@ def _trust(steady: Record, record: Record) -> Iterator[str]:
 
 
 def _advice_of(record: Record) -> list[str]:
-    """Return the caveats in the message of a usable record, after what its status means."""
+    """Return the caveats in a usable record's message, which follow the meaning of the status."""
     status = record.get("status") or record.get("evaluation_status")
     caveats = str(record.get("message") or "").partition(". ")[2]
     return [caveats] if caveats and status in STEADY else []
@@ -297,7 +297,7 @@ def traced(result: Record, rows: Sequence[Record]) -> Facts:
 def ranked(rows: Sequence[Record]) -> tuple[str, list[Record]]:
     """Return the quantity that ranks the rows of a sweep, and the rows that have it, worst first.
 
-    It is the peak force, or where no flanks touch, the contact reserve."""
+    It is the peak force or, if no flanks touch, the contact reserve."""
 
     def known(key: str, falling: bool) -> list[Record]:
         given = [(row, row.get(key)) for row in rows]

@@ -1,4 +1,4 @@
-"""Result files in a folder that is checked beforehand, by file operations that tests can break.
+"""Writes result files into a checked folder, by file operations that tests can make fail.
 
 Commands write a folder under a temporary name and rename it when it is whole
 (`rootsopt.view.runs`). Each operation is a small function on purpose: tests make each call fail in
@@ -109,7 +109,7 @@ class ResultFolder:
 
         `figure` has a canvas of the Agg backend, as those of `figures.style.figure` have; its
         resolution is changed. Raises `InputError` if the file cannot be written."""
-        from PIL import Image  # As matplotlib, only for figures.
+        from PIL import Image  # Like matplotlib, only for figures.
 
         file, canvas = io.BytesIO(), cast("FigureCanvasAgg", figure.canvas)
         # `savefig` would lay out and draw everything twice.

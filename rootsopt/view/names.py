@@ -83,8 +83,8 @@ def scalars(values: Mapping[str, Any]) -> dict[str, Any]:
 def value(given: Any) -> str:
     """Return a value as it is printed, numbers with five significant digits.
 
-    Truth values become `yes` or `no`; None, and numbers that are not finite, become a dash. Whole
-    numbers are not rounded."""
+    Booleans become `yes` or `no`; None and non-finite numbers become a dash. Whole numbers are not
+    rounded."""
     if isinstance(given, bool):
         return "yes" if given else "no"
     if isinstance(given, list | tuple):

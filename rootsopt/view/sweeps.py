@@ -37,8 +37,8 @@ def rows_of(plan: Plan, records: Mapping[int, Row]) -> list[dict[str, Any]]:
 def outcome(plan: Plan, records: Mapping[int, Row]) -> tuple[Status, str]:
     """Return status and message of a whole sweep.
 
-    They are those of the first usable point, or of the first point if none is usable. If points are
-    missing, the sweep was interrupted."""
+    These are taken from the first usable point, or from the first point if none is usable. If
+    points are missing, the sweep was interrupted."""
     first = sorted(records)
     known = [number for number in first if Status[records[number]["status"].upper()].usable]
     counts = f"{len(known)} of {plan.count} points have a usable result."

@@ -62,7 +62,7 @@ _SHEET_FORCES = (
     "tilting_moment_max_N_m",
 )
 
-# Number of motions above which the numbers that all of them share are omitted.
+# Number of motions above which numbers that are equal for all of them are omitted.
 _WIDEST = 6
 
 
@@ -236,8 +236,8 @@ def _range(key: str, rows: Sequence[Record]) -> Row:
 def _list_table(title: str, rows: Sequence[Record], note: str) -> Table | None:
     """Return a table of rows {key: value}, with a column for each key that has a value.
 
-    The status is the second column, so that it stands beside the first on a narrow terminal.
-    Below the table stand the values of other keys than the first that are the same in all rows."""
+    The status is the second column, so that it stands beside the first on a narrow terminal. Values
+    that are equal in all rows are listed below the table, except those of the first key."""
     rows = [scalars(row) for row in rows]
     order = dict.fromkeys([*[*rows[0]][:1], "status", *(key for row in rows for key in row)])
     found = {key: [row.get(key) for row in rows] for key in order}
@@ -411,7 +411,7 @@ def _gaps(result: Record) -> Iterator[str]:
 
 
 def effort_table(result: Record) -> Table | None:
-    """Return effort and accuracy of the run, and the versions it was made with."""
+    """Return effort and accuracy of the run, and the versions of its software."""
     records = {} if "points" in result else records_of(result)
     own = {} if "design" in records else {"run": result}
     groups = [

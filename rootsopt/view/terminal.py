@@ -1,4 +1,4 @@
-"""Tables for the terminal, and how a run ends: gains, costs, confidence and next commands.
+"""Tables for the terminal, and the end of a run: gains, costs, confidence and next commands.
 
 Tables are plain ASCII in 80 columns, the same in a pipe or a log. Terminal and report show the same
 sentences and commands, made from the content of the result file."""
@@ -22,7 +22,7 @@ from rootsopt.view.files import design_file
 from rootsopt.view.names import Record, Table, brief, in_words, name_and_unit, stated
 from rootsopt.view.tables import records_of
 
-# What came out of a run, by command.
+# Function that returns the facts of a run, by command.
 _FACTS = {
     "optimize": facts.optimised,
     "simulate": facts.simulated,
@@ -39,7 +39,7 @@ _ALIKE = {"improve": "optimize"}
 # Statuses of a run that need no explanation.
 _SAID = *facts.STEADY, Status.GEOMETRY_ONLY.label, Status.IDENTIFIED.label
 
-# Blanks between the sentences of a message: what came out, and then advice.
+# Pattern of blanks between the sentences of a message: the outcome, then advice.
 _SENTENCES = re.compile(r"(?<=[.!?]) (?=[A-Z])(?!In conflict)")
 _STOPPED = Status.INTERRUPTED.label, Status.NOT_SIMULATED.label
 _DRAW, _SIMULATE = ("Draw the rotor", "profile"), ("Simulate this design", "simulate")
@@ -68,8 +68,8 @@ _APART = {
 class Ending(NamedTuple):
     """The end of a run in words.
 
-    `facts`: (heading, sentences) of what came out; `steps`: (purpose, command) of what to do next.
-    The command is "" if the purpose is advice that no single command follows."""
+    `facts`: (heading, sentences) on the outcome; `steps`: (purpose, command) of the next steps. The
+    command is "" if no single command follows from the purpose."""
 
     facts: list[tuple[str, str]]
     steps: list[tuple[str, str]]
@@ -109,7 +109,7 @@ def ending(
 
 
 def _usable(command: str, status: str, result: Record, rows: Sequence[Record]) -> bool:
-    """Return whether a run needs no explanation of its status: its facts say how sure they are."""
+    """Return whether a run's status needs no explanation, because its facts suffice."""
     several = {"sweep": rows, "attractors": result.get("attractors")}
     found = [row.get("status") for row in several.get(command) or ()]
     explained = command == "optimize" and result.get("optimized")
@@ -117,7 +117,7 @@ def _usable(command: str, status: str, result: Record, rows: Sequence[Record]) -
 
 
 def _quoted(path: Path) -> str:
-    """Return a path for a shell; one that begins with a hyphen would be taken for an option."""
+    """Return a path for a shell, with `./` if it would look like an option."""
     text = str(path)
     return shlex.quote(f"./{text}" if text.startswith("-") else text)
 
@@ -175,7 +175,7 @@ def _steepest(record: Record) -> str:
 
 
 WIDTH = 80
-"""Width (characters) above which the columns of a table go to several tables."""
+"""Width (characters) above which a table is split into several tables."""
 
 # Length (characters) above which a text may be folded inside its column.
 _LONGEST = 20
@@ -225,7 +225,7 @@ def _parts(table: Table) -> Iterator[rich.table.Table | Text]:
 
 
 def _split(table: Table) -> Iterator[dict[int, int]]:
-    """Yield {index: width} of the columns that fit side by side, the first column each time."""
+    """Yield {index: width} of the columns of each part, which repeats the first column."""
     wanted = [*map(len, map(ascii_text, table.heads))]
     least = [max(map(len, ascii_text(head).split()), default=0) for head in table.heads]
     body = (row for _, rows in table.groups for row in rows)
@@ -249,7 +249,7 @@ def _total(widths: Mapping[int, int]) -> int:
 
 
 def _widened(widths: dict[int, int], wanted: list[int]) -> dict[int, int]:
-    """Return `widths` with the remaining space given to the columns that lack most."""
+    """Return `widths` with the remaining space given to the columns that need most."""
     spare = min(WIDTH - _total(widths), sum(wanted[k] - width for k, width in widths.items()))
     for _ in range(spare):
         widths[max(widths, key=lambda k: wanted[k] - widths[k])] += 1

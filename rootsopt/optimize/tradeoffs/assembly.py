@@ -253,7 +253,7 @@ def spacing_of(selection: Selection, pairs: Sequence[Pair], ends: int, divisions
 def points_of(
     study: Study, nodes: Sequence[Node], selection: Selection, scale: Scale
 ) -> tuple[list[FrontPoint], list[FrontPoint]]:
-    """Return (points of the front in order, points that were dropped) for all `nodes`.
+    """Return (points of the front in order, dropped points) for all `nodes`.
 
     `study`: evaluates their designs; `selection`: nodes that form the front; `scale`: scale of the
     terms."""

@@ -111,8 +111,9 @@ class OrbitFamily:
     The attribute `share` is the config's own place in the range; `periods` are all periods that an
     orbit of this config can have.
 
-    Raises `InputError` for an unknown key, a value that the config cannot have, a key on which
-    scene and design do not depend linearly, and a config whose orbits collocation does not close.
+    Raises `InputError` for an unknown key, or a value that the config cannot have. Also raises it
+    for a key on which scene and design do not depend linearly, and for a config whose orbits
+    collocation does not close.
     """
 
     def __init__(self, config: Config, key: str, period: int, limits: StepSizes):

@@ -40,7 +40,7 @@ _MISSING = (
 # Number of chunks per worker into which a sweep is divided, so that all workers end together, and
 # maximum number of points in a chunk: a worker that is killed loses at most this many.
 _CHUNKS, _LARGEST = 8, 32
-# Time (s) within which a scheduler must answer, and within which it must have a worker.
+# Maximum time (s) until a scheduler answers, and until it has a worker.
 _ANSWER, _WORKERS = 10.0, 60.0
 # Time (s) after which a lost connection, the end of the search and a request to stop are noticed.
 _POLL = 0.5
@@ -56,7 +56,7 @@ _one = threading.Lock()
 
 
 class Settings(NamedTuple):
-    """What a worker must agree on with the process that collects the results.
+    """Settings that a worker must share with the process that collects the results.
 
     `versions` (name, version); `imports`: names of files and modules to import first; `cache`:
     whether to keep compiled programs between runs."""
@@ -180,7 +180,7 @@ class DaskRunner:
 
     def _run(self, stop: threading.Event, function: Callable[..., Any], *arguments: Any) -> Any:
         """Return `function(*arguments)`, computed by a worker; `None` if it ends its processes."""
-        import cloudpickle  # Comes with distributed; takes classes of a script or notebook along.
+        import cloudpickle  # Installed with distributed; serialises a script's classes.
 
         if stop.is_set() or self._closed.is_set():
             raise ClosedError

@@ -23,7 +23,7 @@ from rootsopt.scene.space import sobol as sobol_points
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _RANGE = re.compile(rf"({_NUMBER}):({_NUMBER})(?::(\d+))?(:log)?")
-# Texts that are meant to be a range.
+# Pattern of texts that the user means as a range.
 _MEANT = re.compile(r"[-+\d.][-+\d.eE]*:[-+\d.eE:]*[-+\d.eE:](?:log)?")
 MOST = 1_000_000
 """Number of values above which an axis is rejected, and of points above which a sweep is."""
@@ -49,7 +49,7 @@ class Interval:
         assert self.points is not None
         space = np.geomspace if self.log else np.linspace
         found = space(self.low, self.high, self.points).tolist()
-        # Whole ends may still have values in between that are not whole: the config refuses those.
+        # Values between whole ends may not be whole; the config rejects these.
         return [int(x) if self.whole and x.is_integer() else x for x in found]
 
     def at(self, levels: NDArray[np.float64]) -> list[Any]:
@@ -332,9 +332,7 @@ def check_values(config: Config, plan: Plan) -> None:
 
 
 def _telling(values: Sequence[Any]) -> list[Any]:
-    """Return the values that stand for all others in a check.
-
-    They are the extremes of the numbers, and all texts."""
+    """Return the values to check in place of all: the extremes of the numbers, and all texts."""
     found: list[Any] = []
     for kind in (int, float):
         numbers = [value for value in values if type(value) is kind]
@@ -345,7 +343,7 @@ def _telling(values: Sequence[Any]) -> list[Any]:
 
 
 def _meant(key: str, message: str) -> str:
-    """Return the end of a message: the known key that is most similar to an unknown one."""
+    """Return the known key that is most similar to an unknown one, as the end of a message."""
     if "is not a known key" not in message or "did you mean" in message:
         return ""
     known = {one.rpartition(".")[2]: one for one in reversed([*tree(Config)])}

@@ -119,7 +119,7 @@ class _Grid:
         return (*self.dims, *last), array.reshape(shape), {"units": units, "long_name": long}
 
     def words(self, values: Sequence[str], long: str) -> tuple:
-        """Return a variable of texts, with the type object: many points share one long message."""
+        """Return a variable of texts, of type object: many points share one long message."""
         return self.dims, np.array(values, dtype=object).reshape(self.shape), {"long_name": long}
 
 
@@ -257,13 +257,13 @@ def sweep_scenes(  # Keywords of the public interface, each independent of the o
     - `floquet_multiplier`: greatest modulus (NaN if there is no closed orbit), and real and
       imaginary parts of all multipliers, with the further dimension `multiplier`;
     - geometry, such as `outer_radius_mm`;
-    - `gradient_…` of each response per config unit, with the further dimension `design_key` (NaN
-      without a gradient, and for parameters that the family of the point does not have).
+    - `gradient_…` of each response per config unit, with the further dimension `design_key`. It is
+      NaN without a gradient, and for parameters that the family of the point lacks.
 
-    Raises `InputError` for a key or value that a config cannot have, before anything is simulated,
-    if there are no axes, if an axis has no values, too many or one of them twice, and if `resume`
-    finds no file or that of another sweep. Raises RuntimeError if JAX is not set to the
-    precision of the config.
+    Raises `InputError` for a key or value that a config cannot have, before anything is simulated.
+    Also raises it if there are no axes, or if an axis has no values, too many, or a repeated one.
+    Also raises it if `resume` finds no file, or that of another sweep. Raises RuntimeError if JAX
+    is not set to the precision of the config.
 
     >>> import jax
     >>> import rootsopt

@@ -91,7 +91,7 @@ def add_dimensions(space: Any, drawing: Drawing) -> None:
     if drawing.bore is not None:
         radii["bore"] = drawing.bore / 2
     for row, (name, radius) in enumerate(reversed(radii.items())):
-        # One below the other on the left, the smallest nearest to the rotor.
+        # The dimensions are stacked on the left, the smallest nearest to the rotor.
         left = -1.3 * outer - 4.2 * letter(drawing) * row
         space.add_linear_dim(
             base=(left, 0), p1=(0, -radius), p2=(0, radius), angle=90, text=f"%%c<> {name}",

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from rootsopt.view.files import ResultFolder
 
 
-# Look of each kind of point.
+# Colour and marker of each kind of point.
 _LOOKS: dict[str, dict[str, Any]] = {
     "certified": {"marker": "o", "color": BLUE, "markersize": 6.5},
     "not certified": {"marker": "o", "color": BLUE, "markersize": 6.5, "markerfacecolor": "white"},
@@ -50,7 +50,7 @@ def kinds(result: Mapping[str, Any]) -> dict[str, list[Mapping[str, Any]]]:
     """Return the points of each kind that a front has, in the order of drawing.
 
     `result`: content of the result file, as from `Front.record`. A side of a gap, and the best
-    point in a term, are of another kind, too."""
+    point in a term, also appear as their usual kind."""
     points, base = result["points"], result.get("baseline") or {}
     sides = {gap[end] for gap in result.get("gaps") or () for end in ("first", "second")}
     sure = Standing.CERTIFIED.label

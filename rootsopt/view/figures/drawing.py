@@ -32,7 +32,7 @@ class Coordinates(NamedTuple):
     """Points on one lobe, from the root before it to the root behind it, counter-clockwise.
 
     `point` (n,): x + iy (mm), with the lobe's tip on +x; `normal` (n,): outward unit normals, at a
-    corner that of the part behind it; `along` (n,): distance along the outline from the tip (mm).
+    corner that of the following piece; `along` (n,): distance along the outline from the tip (mm).
     """
 
     point: NDArray[np.complex128]
@@ -80,7 +80,7 @@ def widest(pieces: Sequence[DrawnPiece], lobes: int) -> complex:
     """Return the point (mm) on the upper flank of the lobe on +x at which the lobe is widest.
 
     Its width is twice the point's y coordinate. If the lobe widens all the way down to the root,
-    the point is that on the pitch circle, at the angle π / (2 `lobes`)."""
+    return the point on the pitch circle, at the angle π / (2 `lobes`)."""
     found = []
     for piece in pieces:
         for share in _falls(lambda x, piece=piece: np.imag(piece.heading(x))):

@@ -75,7 +75,7 @@ def plot_gap(
         least = float(np.min(gap))
         label = f"least gap {number(least)} µm"
         ax.axhline(least, color="black", linestyle="--", linewidth=1.1, label=label)
-        # Between two lobes, the gap is as wide as the rotors: only its narrow part tells something.
+        # Between two lobes, the gap is as wide as the rotors. Only its narrow part is informative.
         high = min(1.12 * float(np.max(gap)), 4 * least)
         ax.set(title=name, ylabel="gap (µm)", xlim=(0, time[-1]), ylim=(0, high))
         beside(ax)
@@ -152,7 +152,7 @@ def plot_spectrum(
         ax.set_yscale("log")
         ax.set_ylim(*((1e-4 * top, 2 * top) if top > 0 else (1e-4, 1)))
     for ax in axes:  # Panels that share an axis get its ticks back with the scale of each.
-        ax.minorticks_off()  # Ticks between decades took a third of the time of this figure.
+        ax.minorticks_off()  # Minor ticks would take a third of the time.
     per_mesh = mesh_frequency_Hz / 1e3
     orders = axes[0].secondary_xaxis(
         "top",
@@ -175,8 +175,8 @@ _ORDERS = 24
 # Least amplitude that is drawn, as a share of the greatest sample.
 _FLOOR = 1e-5
 
-# Half axes of the region of two quantities that holds the true ones with 95 %, in standard
-# deviations: root of the quantile of χ².
+# Half axes (standard deviations) of the 95 % confidence region of two quantities: root of the
+# quantile of χ².
 _INSIDE = 2.448
 
 
@@ -203,7 +203,7 @@ def plot_orders(ax: Axes, turned: NDArray, measured: NDArray, fitted: NDArray) -
 
 
 def plot_region(ax: Axes, found: "Identification", first: int, second: int) -> Axes:
-    """Draw the region of two quantities that holds the true ones with 95 %. Return `ax`."""
+    """Draw the 95 % confidence region of two quantities. Return `ax`."""
     keys, one = [*found.parameters], found.covariance[np.ix_([first, second], [first, second])]
     sizes, axes = np.linalg.eigh(one)
     middle = [found.parameters[keys[k]]["value"] for k in (first, second)]

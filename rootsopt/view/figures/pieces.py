@@ -165,8 +165,8 @@ def outline_pieces(profile: Profile, inset: float = 0.0) -> list[DrawnPiece]:
     lobe on +x. If the arcs on both sides of this root are joined, the outline starts at the start
     of the joined arc.
 
-    Raises `InputError` if a segment of the flank needs too many nodes to come within `TOLERANCE` of
-    the true flank, or if its radius of curvature is less than the inset.
+    Raises `InputError` if a segment needs too many nodes to come within `TOLERANCE` of the true
+    flank. Also raises it if the segment's radius of curvature is less than the inset.
     """
     flank = _flank(profile, inset)
     lobe = [piece.mirrored() for piece in reversed(flank)] + flank

@@ -45,7 +45,7 @@ def lay_grid(axes: NDArray) -> None:
 
 
 def looks(names: Iterable[str]) -> Iterator[dict[str, Any]]:
-    """Yield colour, line style and label of the curve of each name."""
+    """Yield (colour, line style, label) of each named curve."""
     for name, color, dashes in zip(names, cycle(COLORS), cycle(DASHES)):
         yield {"color": color, "linestyle": dashes, "label": name}
 
@@ -56,7 +56,7 @@ def write(
 ) -> None:  # fmt: skip
     """Write a figure with its `title` and a legend below all panels as figures/NAME.png.
 
-    `entries`: entries of the legend, in at most so many `columns`."""
+    `entries`: entries of the legend; `columns`: maximum number of its columns."""
     for count in range(min(len(entries), columns), 0, -1):
         legend = made.legend(handles=entries, loc="outside lower center", ncols=count,
                              frameon=False)  # fmt: skip

@@ -73,7 +73,7 @@ class Run:
 
     @property
     def end(self) -> Ending:
-        """What came out and what to do next, as on the terminal."""
+        """Outcome and next commands, as on the terminal."""
         return ending(self.result, self.path, self.source, self.imports, self.rows)
 
     @classmethod
@@ -284,7 +284,7 @@ _PACKAGE = Path(__file__).parents[2]
 # The page of the glossary: in an installed package, and in the source tree.
 _PLACES = _PACKAGE / "glossary.md", _PACKAGE.parent / "docs" / "glossary.md"
 
-# Ending of a common word that is linked only where it is the label of a margin.
+# Suffix in the glossary of a common word that is linked only as the label of a margin.
 _MARGIN = " (margin)"
 
 

@@ -1,4 +1,4 @@
-"""Lays out pages, and pictures, texts and tables of the explorer, as HTML.
+"""Makes the HTML of pages, and of pictures, texts and tables of the explorer.
 
 The report of a run and the page of a front open without a network: they are Jinja2 templates, and
 Bokeh's script is part of them. Everything that comes from a config or a result is escaped."""
@@ -271,7 +271,7 @@ class ForcePicture:
         self.figure.title.text = f"Contact force over time: {words}"
 
 
-# Numbers of the kind of motion that the page has room for.
+# Numbers on the kind of motion that the page shows.
 _STEADY = "period", "floquet_multiplier", "lyapunov_exponent_per_mesh_period"
 
 
@@ -319,7 +319,7 @@ def notes_lines(notes: Iterable[str]) -> str:
 def motion_line(motion: NewMotion, rest: FromRest | None) -> str:
     """Return the status of a motion, with whether it is the one that starts at rest.
 
-    `rest`: what is known of the motion from rest; `None`: nothing yet."""
+    `rest`: the motion from rest; `None`: not known yet."""
     found = motion.evaluation
     if not motion.final:
         words = "Near the motion of the last values, no steady motion was found."
@@ -380,7 +380,7 @@ def _improved(found: "Optimization") -> str:
 
 
 def _certified(found: "Optimization") -> str:
-    """Return the certificate of an optimum: first-order conditions, and the limits that hold it."""
+    """Return the certificate of an optimum: first-order conditions and active limits."""
     if found.optimality is None:
         return "Without a certificate."
     held = [in_words(row["name"]) for row in found.constraints if row.get("active")]

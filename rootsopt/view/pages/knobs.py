@@ -186,7 +186,7 @@ def _step(width: float) -> float:
 # Number of points of a drawn outline, as in the CSV files of the other commands.
 _POINTS = 240
 
-# Greatest number of revolutions shown of a motion.
+# Maximum number of revolutions of a motion that are shown.
 _TURNS = 4
 
 # Relative difference of mean, peak and RMS force below which two motions count as the same.
@@ -209,8 +209,8 @@ class Shape(NamedTuple):
 class Engine:
     """Evaluates configs that differ little from a first one, `given`.
 
-    `optimize`: the main job, `rootsopt.optimize_design`; handed in, as what is shown of a run does
-    not depend on how designs are searched.
+    `optimize`: the main job, `rootsopt.optimize_design`; passed as an argument, so that pages do
+    not depend on the search.
 
     Several sessions in several threads can share an engine. `ready` is set once the first config
     has been evaluated, so that its programs are compiled."""
@@ -244,8 +244,8 @@ class Engine:
     def near(self, config: Config, start: Seeds) -> Evaluation:
         """Return the evaluation of a `config` from the `start` of a similar one.
 
-        It is quick: the motion is not confirmed by an integration, and a motion that does not
-        settle is given up after a quarter of the allowed transient."""
+        This is quick: no integration confirms the motion, and a motion that does not settle is
+        abandoned after a quarter of the allowed transient."""
         return Evaluator.of(config).surveying().unconfirmed()(start=start)
 
     def from_rest(self, config: Config) -> Evaluation:

@@ -64,7 +64,7 @@ def text(content: str = "", name: str | None = None, **options: Any) -> Div:
 
 
 def fade(models: Sequence[LayoutDOM], faded: bool) -> None:
-    """Fade what does not belong to the present values, or show it again."""
+    """Fade elements that do not belong to the present values, or show them again."""
     styles = {"opacity": "0.35" if faded else "1"}
     for one in models:
         if one.styles != styles:

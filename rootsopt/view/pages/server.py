@@ -1,4 +1,4 @@
-"""Serves the explorer's page on the loopback address, to those who know its secret address."""
+"""Serves the explorer's page on the loopback address, under a secret path."""
 
 # The models of Bokeh accept more than their annotations say.
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
@@ -28,15 +28,15 @@ ADDRESS = "127.0.0.1"
 # Bytes of the secret in the page's address.
 _TOKEN = 24
 
-# Interval (ms) at which the server looks whether it is to end.
+# Interval (ms) at which the server checks whether to end.
 _POLL = 100
 
-# Time (ms) for which a session is kept whose tab is closed or out of reach.
+# Time (ms) for which the session of a closed or unreachable tab is kept.
 _LIFETIME = 30_000
 
 
 class _OneLine(logging.Handler):
-    """Prints an error of the libraries as one line: a malformed request is no reason for more."""
+    """Prints an error of the libraries as one line; a malformed request needs no traceback."""
 
     def emit(self, record: logging.LogRecord) -> None:
         error = record.exc_info[1] if record.exc_info else None
@@ -60,8 +60,8 @@ class PageServer:
 
     `engine`: computes what the pages show; `source`: name of the config; `port`: of the server, 0
     for any free one. `url` is the address of the page, with its token: all paths of the server
-    begin with the token. A page elsewhere, even one whose name leads to this machine (DNS
-    rebinding), does not know it.
+    begin with the token. Pages of other sites do not know it, not even one whose name resolves to
+    this machine (DNS rebinding).
 
     Raises `InputError` if the port cannot be used."""
 

@@ -1,6 +1,6 @@
-"""The state of one page of the explorer: values, what is computed for them, and a search.
+"""The state of one page of the explorer: values, results for them, and a search.
 
-A session knows nothing of the page. It tells it what is new by messages, from several threads."""
+A session does not depend on the page. It reports changes by messages, from several threads."""
 
 import dataclasses
 import sys
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 class Latest:
     """Runs jobs one at a time in a thread of its own; the newest waiting job replaces all others.
 
-    A slider can ask for work faster than it can be done. A job that has not begun when a newer one
-    arrives never begins. `failed` is called with the exception of a job that raises one."""
+    A slider can request jobs faster than they run. If a newer job arrives, a waiting job is
+    dropped. `failed` is called with the exception of a job that raises one."""
 
     def __init__(self, failed: Callable[[Exception], None]):
         self._failed = failed
@@ -89,7 +89,7 @@ _IDLE = 0.4
 
 @dataclasses.dataclass(frozen=True)
 class Message:
-    """What is new for the values with this `number`; the first values have the number 0."""
+    """A change for the values with this `number`; the first values have the number 0."""
 
     number: int
 
@@ -296,7 +296,7 @@ class Session:
     def _submit(
         self, lane: Latest, number: int, work: Callable[[], object], delay: float = 0.0
     ) -> None:
-        """Let a `lane` do `work` after a `delay` (s); if the values are refused, say so."""
+        """Run `work` in a `lane` after a `delay` (s); if the values are rejected, show why."""
 
         def refusing() -> None:
             try:
