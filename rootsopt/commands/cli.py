@@ -48,7 +48,7 @@ os.environ.setdefault("EQX_ON_ERROR", "off")
 class Outcome(NamedTuple):
     """The result of a command.
 
-    `code`: exit code; `lines`: what the terminal says below the tables, `head`: above them; `rows`:
+    `code`: exit code; `lines`, `head`: text on the terminal below and above the tables; `rows`:
     rows of a sweep that the result file does not hold; `most`: number of them above which their
     table is truncated; `tables`: tables for the terminal, by default all of the result."""
 

@@ -219,7 +219,7 @@ def _wanted(kind: str, value: Any, context: dict, message: str, field: FieldInfo
 
 
 def _advice(place: str, kind: str, value: Any, field: FieldInfo | None) -> str:
-    """Return a guess at what the user meant, as the end of a message, or "" without a guess."""
+    """Return a guess at the intended key, as the end of a message, or "" without a guess."""
     if field is None:
         return ""
     if kind in ("greater_than_equal", "less_than_equal", "less_than") and _is_number(value):
@@ -387,7 +387,7 @@ GROUPS = {
     ),
     "expert": ("solver",),
 }  # fmt: skip
-"""Sections of the config in each group of keys in `--help`. The longest name counts."""
+"""Sections in each group of keys in `--help`; of several that hold a key, the longest applies."""
 
 # Keys that a short help lists; the choices of `profile.family` stand above them.
 _USED_MOST = {

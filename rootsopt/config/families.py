@@ -317,7 +317,7 @@ def is_shipped(name: str) -> bool:
 
 
 def outside_modules() -> set[str]:
-    """Return the names of modules outside this package that profiles may depend on.
+    """Return the names of modules outside this package on which profiles may depend.
 
     These are the modules that register families or define their functions, and all modules imported
     from the folders of these modules."""

@@ -167,7 +167,7 @@ def notes(config: "Config") -> tuple[str, ...]:
 
 
 def notes_on_swept(config: "Config", values: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return notes on the `values` of a sweep, by dotted key. The greatest one of each counts."""
+    """Return notes on the greatest of the `values` of each dotted key of a sweep."""
     found = (_note(config, key, f"--over {key}", _greatest(many)) for key, many in values.items())
     return tuple(filter(None, found))
 
@@ -200,7 +200,7 @@ def _note(config: "Config", key: str, shown: str, value: float) -> str:
 def _numbers(section: Any, prefix: str = "") -> Iterator[tuple[str, float]]:
     """Yield (dotted key, number) of all keys in a `section` whose value is not the default.
 
-    Of several numbers, such as bounds, the one with the greatest magnitude counts."""
+    Of several numbers, such as bounds, yield the one with the greatest magnitude."""
     for name, field in type(section).model_fields.items():
         value, key = getattr(section, name), prefix + name
         if hasattr(type(value), "model_fields"):

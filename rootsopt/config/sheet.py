@@ -151,7 +151,7 @@ class Sheet(Section):
         return (self.power_kW or 0.0) * 1e3 / (2 * self.speed_rpm * RPM)
 
     def compared(self, efficiency: float) -> str:
-        """Return a sentence on the load: what is used, and what it amounts to."""
+        """Return a sentence on the load that is used, with its torque and power."""
         power, pressure = self.power_kW or 0.0, self.pressure_difference_bar
         if pressure is None:
             most = power / self.power_of(1.0, efficiency)

@@ -127,7 +127,7 @@ def place_files(data: dict, folder: Path) -> None:
 
 
 def advice(path: Path) -> str:
-    """Return what to give instead of a `path` that does not exist."""
+    """Return advice on a `path` that does not exist."""
     near = difflib.get_close_matches(path.stem[:80], shipped(), n=1)
     meant = f"; did you mean {near[0]!r}?" if near else ""
     names = ", ".join(shipped())

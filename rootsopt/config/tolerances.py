@@ -1,4 +1,4 @@
-"""Config section `tolerances`: how far values of scene and design scatter in manufacture.
+"""Config section `tolerances`: scatter of values of scene and design in manufacture.
 
 The section `assumptions` gives the ranges of what is only assumed about a pump's operation."""
 
@@ -297,7 +297,7 @@ _Spread = Annotated[
 ]
 _CLEARANCE = "contact.clearance_mm"
 
-# Usual ranges, as multiples of the config's value, of what a designer seldom knows.
+# Usual ranges, as multiples of the config's value, of quantities that a designer seldom knows.
 _FACTORS = {
     "scene.speed_rpm": (0.8, 1.2),
     "scene.load.torque_N_m": (0.6, 1.6),

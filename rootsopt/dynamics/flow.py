@@ -285,7 +285,7 @@ def one_period(pair: RotorPair, start: Float[Array, " n"], integrator: Integrato
     def sample(top, number):
         """Return the sample with this `number`, and time and force of the greatest uniform one.
 
-        Those that follow the uniform ones lie around the greatest of these."""
+        Samples after the uniform ones lie around the greatest uniform sample."""
         place, height = top
         share, beside = number / SAMPLES, 2 * (number - SAMPLES) / _BESIDE - 1
         share = jnp.where(share < 1, share, jnp.clip(place + beside / SAMPLES, 0.0, 1.0))

@@ -140,7 +140,7 @@ def shoulders(places: NDArray[np.float64], forces: NDArray[np.float64]) -> NDArr
 
     `places`, `forces` (m,): as for `candidates`. A shoulder is a sample at which the slope of the
     force comes closest to 0, without a change of sign. Only shoulders close to the greatest force
-    count (`_SHOULDER`). The shoulder with the greatest force comes first."""
+    are returned (`_SHOULDER`). The shoulder with the greatest force comes first."""
     times, forces = places[:-1], forces[:-1]
     period = places[-1] - places[0]
     room = np.mod(np.roll(times, -1) - np.roll(times, 1), period)
@@ -156,7 +156,7 @@ def shoulders(places: NDArray[np.float64], forces: NDArray[np.float64]) -> NDArr
 def _dip(forces: NDArray[np.float64], one: int, other: int) -> float:
     """Return the least force between the samples `one` and `other` of a cycle.
 
-    There are two ways around the cycle. The one with the greater least force counts."""
+    There are two ways around the cycle. Return the greater of their least forces."""
     low, high = sorted((one, other))
     inner, outer = forces[low : high + 1], np.concatenate([forces[high:], forces[: low + 1]])
     return float(max(inner.min(), outer.min()))

@@ -25,7 +25,7 @@ from rootsopt.dynamics.window import NOISE, Transient, Window
 from rootsopt.status import Status
 
 TOO_DEEP = 0.02
-"""Penetration (pitch radii) above which the forces of an orbit are not valid."""
+"""Penetration (pitch radii) above which the forces of an orbit are invalid."""
 UNRESOLVED = 1e-2
 """Relative error of the greatest force, from rounding of the gap, above which an orbit's forces
 count as unresolved."""

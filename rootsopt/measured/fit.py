@@ -224,7 +224,7 @@ def _check_lobes(loop: Loop, lobes: int, radius: float, smoothing: float, seen: 
     around = np.angle(np.roll(points, -1) / points)
     if round(np.sum(around) / (2 * np.pi)) != 1:
         raise away
-    # Noise may turn back a little. Measure how far the angle falls behind its maximum so far.
+    # Noise may make the angle decrease. Measure how far it falls below its maximum so far.
     angle = np.cumsum(around)
     back = np.max(np.maximum.accumulate(angle) - angle)
     wander = _WANDER * seen.scatter if smoothing > 0 and seen.scatter < _OFF * radius else 0.0

@@ -115,7 +115,8 @@ def advice(config: "ProfileConfig", checks: Checks) -> list[str]:
     return [f"outline: {text}" for text in found]
 
 
-# Range (mm) in which the pitch radius of a rotor usually lies. Outside it, the unit is another.
+# Usual range (mm) of a rotor's pitch radius. Outside it, the file's unit is assumed to be another
+# one.
 _USUAL = USUAL["profile.pitch_radius_mm"]
 
 # Units in the order in which they are tried.

@@ -50,7 +50,7 @@ _RTOL = 1e-6
 # Greatest number of other designs that are compared.
 _RIVALS = 2
 
-# Number of values tried to find the last one at which a design has a usable motion.
+# Number of values tried in the search for the last value at which a design has a usable motion.
 _HALVINGS = 4
 
 # Accuracy of the value at which a design becomes better or worse, as a share of its range.

@@ -132,7 +132,7 @@ class Optimum(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Optimality:
-    """What is known about the optimum of a search.
+    """Facts about the optimum of a search.
 
     `method`: method of the local searches. `certificate`: first-order conditions at the verified
     design. `reason`: "converged", or a word for why the search had not. `promised`: relative

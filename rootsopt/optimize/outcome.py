@@ -256,7 +256,7 @@ def apart(
 
 
 BASELINE, OPTIMIZED, RIVAL = "baseline", "optimized", "design"
-"""Names of the compared designs; that of another one ends with its number."""
+"""Names of the compared designs; a rival's name ends with its number."""
 WINS = 1e-3
 """Difference of two objectives below which neither design counts as better."""
 

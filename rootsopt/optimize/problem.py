@@ -119,7 +119,7 @@ class Problem:
         ratio to F_0 alone would mean nothing. Designs and constraints of the geometry are the
         same."""
         found = Problem(self.config, _in_units(baseline, self.baseline), self.space, self.limits)
-        found.__dict__["_look_at"] = self._look_at  # Its results are costly, and the same.
+        found.__dict__["_look_at"] = self._look_at  # Its results are expensive and stay valid.
         return dataclasses.replace(found, added=1 - found.objective(baseline))
 
     def objective(self, evaluation: Evaluation) -> float:
@@ -417,7 +417,7 @@ class Problem:
 
 
 def _in_units(evaluation: Evaluation, other: Evaluation) -> Evaluation:
-    """Return an `evaluation` in which no measure is below `_LEAST` of its value in the `other`."""
+    """Return an `evaluation` with each measure at least `_LEAST` of its value in the `other`."""
     least = {key: _LEAST * value for key, value in other.response.items()}
     response = {k: max(value, least.get(k, value)) for k, value in evaluation.response.items()}
     speeds = tuple(

@@ -269,7 +269,7 @@ class StagedSearch:
         return config, RobustStage(nominal, starts, others, offsets)
 
     def so_far(self) -> Optimization | None:
-        """Return what the search has found so far, as `Search.so_far` does."""
+        """Return the results of the search so far, as `Search.so_far` does."""
         found = self._stage.so_far()
         if found is None:
             return self._nominal

@@ -204,7 +204,9 @@ class RobustProblem(Problem):
 
 
 class Stage:
-    """What one stage of a search does in its own way. The base class is the usual search.
+    """The steps in which one stage of a search differs.
+
+    The base class is the usual search.
 
     `first`: index of the first local search; `apart`: distance between their starts in the unit
     box; `bounded`: whether the stage may look for a lower bound."""

@@ -300,7 +300,7 @@ class Search:
         return Verification(self.problem, self.exact, tolerance, *outcome)
 
     def so_far(self) -> Optimization | None:
-        """Return what the search has found so far, without verification.
+        """Return the results of the search so far, without verification.
 
         Return `None` until the baseline has been simulated. Another thread can call this method
         during the search."""

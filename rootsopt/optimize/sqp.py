@@ -208,8 +208,8 @@ class _Descent:
     def _moves(self, step: NDArray[np.float64], decrease: float) -> bool:
         """Try a `step` (d,), and return whether it leads to a better point.
 
-        `decrease`: what the models promise. The trust region follows from the share of it that is
-        found, unless rounding decides."""
+        `decrease`: decrease that the models promise. The achieved share of it sets the trust
+        region, unless rounding dominates."""
         point, length = np.clip(self.models.point + step, 0.0, 1.0), float(np.max(np.abs(step)))
         found = self._at(point)
         share, better = -np.inf, False

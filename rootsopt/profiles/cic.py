@@ -30,7 +30,7 @@ _CLEAR = 1e-6
 LEAST = 0.002
 """Involute length (fraction of the longest) below which a config is rejected. A shorter involute
 has no effect, and its length was probably given in metres."""
-# Undercut (mm) up to which a config is accepted: a search may end at such a design.
+# Undercut (mm) above which a config is rejected. A search may end at a design with less.
 _TOUCHING = 1e-6
 # Factor by which a search stays away from the lower limits of a config.
 _INSIDE = 1 + 1e-6

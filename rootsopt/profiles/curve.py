@@ -302,8 +302,8 @@ def extended_cycloid(
     The normal makes the angle η = arctan(X δ / Y) with the tangent of the pitch circle at θ. For a
     constant λ the normal passes through the pitch point at θ, and ψ = η. Otherwise it misses this
     point by e, with e = r_e² λ′ (cos 2Nδ - λ) / (δ M). Then cos ψ = cos η + e / r. Hence
-    sin²(ψ/2) = sin²(η/2) - e / 2r, of second order in δ, and β = θ - η + ψ. These formulas are derived here,
-    not taken from a source."""
+    sin²(ψ/2) = sin²(η/2) - e / 2r, of second order in δ, and β = θ - η + ψ. These formulas are
+    derived here, not taken from a source."""
     r, ratio = jnp.asarray(pitch_radius), jnp.asarray(trochoid_ratio)
     half, n = jnp.pi / (2 * lobes), lobes
     rolling = r / (2 * lobes)

@@ -221,8 +221,8 @@ angle."""
 # Number of points at which margins are evaluated, per smooth part of a flank and per knot span of a
 # wavy flank.
 _POINTS = 400, 100
-# Violations up to which a design counts as sound: of an angle (rad) or ratio, and of a length (m).
-# A search ends at such points, because it lets constraints be violated by a millionth of their
+# Violations above which a design counts as unsound: of an angle (rad) or ratio, and of a length
+# (m). A search ends at such points, because it lets constraints be violated by a millionth of their
 # scale.
 _ROUNDING = 1e-7, 1e-9
 

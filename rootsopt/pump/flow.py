@@ -151,7 +151,7 @@ def play_of(scene: Scene, profile: Profile) -> Play:
 
 
 def radial_allowance(scene: Scene) -> Float[Array, ""]:
-    """Return the radial allowance (m) by which each rotor is smaller all round."""
+    """Return the distance (m) by which each rotor's outline lies inside its profile, radially."""
     medium = scene.medium
     return jnp.zeros_like(scene.clearance) if medium is None else medium.radial_allowance
 

@@ -63,7 +63,7 @@ def half_valley(flank: Flank, lobes: int, radius: Float[Array, "*n"]) -> Float[A
     `lobes`: N. Beyond the tip there is no lobe: the result is infinite. Below the root it is
     negative."""
     point, normal = flank.point[::-1], flank.normal[::-1]
-    # A measured root or land is not quite round: its first point that rises to the radius counts.
+    # A measured root or land is not quite round. Use its first point that rises to the radius.
     away, across = lax.cummax(jnp.abs(point)), jnp.angle(point)
     # Cubics between the points: with chords, the play would ripple as points slide past each other.
     # Where the flank runs nearly along a circle about the axis, its slope is not finite: a chord.
@@ -203,7 +203,7 @@ def _lengths(profile: Profile, nu: Float[Array, " n"], gap: Float[Array, " n"]):
 
 
 def _part(cosine):
-    """Return how much of a point counts as part of the gap, a smooth function of its `cosine`."""
+    """Return the weight of a point in the gap, a smooth function of its `cosine`."""
     share = jnp.clip((cosine - _TURNED) / (_FACING - _TURNED), 0.0, 1.0)
     return share**2 * (3 - 2 * share)
 

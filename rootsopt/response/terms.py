@@ -159,7 +159,7 @@ def _of_gear(at: _At, name: str) -> Any:
 
 
 OF_MOTION = (*BEARING, *RESERVES, *GEAR)
-"""Names of all terms that an evaluation takes from the motion itself."""
+"""Names of all terms whose values come from the motion itself."""
 # Formulas of the terms that are to be minimised, and to be maximised.
 _LESS: dict[str, Callable[[_At], Any]] = {
     "mean_force_N": lambda at: at.forces.mean,

@@ -13,8 +13,8 @@ from rootsopt.scene import families
 from rootsopt.scene.build import Scene
 from rootsopt.scene.reading import design_vector
 
-# Distance (mm) by which a bore may be wider than the root circle of a design: a search may end
-# there.
+# Excess (mm) of the bore over the root circle above which a design is rejected. A search may end at
+# less.
 _TOUCHING = 1e-6
 
 

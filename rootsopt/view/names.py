@@ -123,7 +123,7 @@ def stated(key: str, given: Any, named: bool = False) -> str:
 
 
 def signed(given: float, unit: str) -> str:
-    """Return a number of three digits with its sign, followed by its `unit`."""
+    """Return a number with its sign and three digits, followed by its `unit`."""
     return f"{'0' if given == 0 else _printed(f'{given:+.3g}')} {unit}".strip()
 
 

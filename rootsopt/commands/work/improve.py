@@ -54,7 +54,7 @@ _HELD, _LOOSE, _GAP, _ROOM = 2, 0.01, 3e-3, 1e-6
 
 
 def config_of(options: argparse.Namespace) -> Config:
-    """Return the config of a search for a better rotor than that of the file `options.config`.
+    """Return the config of a search for a rotor better than that in the file `options.config`.
 
     Set `options.known` to what else is known of the rotor, as in the result file. Raises
     `InputError` if the file does not hold a rotor, or if an option does not suit it."""
@@ -107,7 +107,7 @@ def config_of(options: argparse.Namespace) -> Config:
 
 
 def _given(options: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
-    """Return (what is known of the file, by key of the section `profile`; other overrides).
+    """Return (known values of the file's rotor, by key of the section `profile`; other overrides).
 
     Raises `InputError` for a value that its key cannot have, or for a key that the file decides."""
     distance = options.centre_distance_mm

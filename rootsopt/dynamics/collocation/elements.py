@@ -223,9 +223,8 @@ number."""
 def greatest(count: Int[Array, ""]) -> Int[Array, ""]:
     """Return `count` or, in a batch, the greatest of the batch.
 
-    A loop with one number of iterations for all motions of a batch only writes what is new. With a
-    number for each motion, every iteration would copy all arrays, to keep those of motions that are
-    done."""
+    If all motions of a batch have the same number of iterations, a loop writes only new values.
+    Otherwise, every iteration would copy all arrays, to keep those of finished motions."""
     return count
 
 

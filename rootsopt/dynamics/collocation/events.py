@@ -275,8 +275,8 @@ def rooted(pair: RotorPair, elements: Elements, seen: FlagScan) -> Elements:
 def apart(elements: Elements, seen: FlagScan) -> Float[Array, ""]:
     """Return the greatest difference (rad) between the roots of `elements` and those of a search.
 
-    Roots are normal angles of the closest approach. Only Gauss points at which the flanks push
-    count. `seen`: result of `look`."""
+    Roots are normal angles of the closest approach. Gauss points at which the flanks do not push
+    are ignored. `seen`: result of `look`."""
     inside = len(GAUSS.nodes)
     used = jnp.arange(elements.state.shape[0]) < elements.mesh.used
     counts = seen.pushes[:, :inside] & used[:, None, None]

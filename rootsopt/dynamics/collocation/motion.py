@@ -82,11 +82,11 @@ def closed_orbit(
 def _repeats(
     pair: RotorPair, closed: Loop, longest: int, tolerance: Float[Array, ""]
 ) -> Int[Array, ""]:
-    """Return the least fraction of the period (mesh periods) of the orbit `closed` after which it
-    repeats, or 0.
+    """Return the true period (mesh periods) of an orbit `closed` over several, or 0.
 
-    Only a fraction after which the equation of `pair` repeats counts. `longest`: longest period of
-    an orbit (mesh periods); `tolerance`: that of the orbit's integrator."""
+    It is the least fraction of the period after which the orbit repeats. Fractions after which the
+    equation of `pair` does not repeat are ignored. `longest`: longest period of an orbit (mesh
+    periods); `tolerance`: that of the orbit's integrator."""
     motion, state = closed.known.elements, closed.orbit.state
     shorter, period = pair.orders(max(longest // 2, 1)), jnp.round(motion.mesh.period).astype(int)
     states = motion.motion(shorter.astype(state.dtype))

@@ -86,7 +86,7 @@ class Spacing(NamedTuple):
     def excess(self, edge: Edge) -> float:
         """Return the distance of two neighbours divided by that above which they are bisected.
 
-        The greater of the quotients in terms and in the unit box counts."""
+        It is the greater of the quotients in terms and in the unit box."""
         jump = edge.design_distance / max(_WIDE_DESIGN * self.design, _LEAST_DESIGN)
         return max(edge.distance / (_WIDE_TERMS * self.terms), jump)
 

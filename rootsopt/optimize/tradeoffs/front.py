@@ -1,4 +1,4 @@
-"""The front of a trade-off as a result: points, what was dropped, gaps, status.
+"""The front of a trade-off as a result: points, dropped points, gaps and status.
 
 Turns several terms into one objective, whose optimum is one point of the front.
 

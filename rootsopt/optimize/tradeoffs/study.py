@@ -315,8 +315,8 @@ class Seen(NamedTuple):
 class Course:
     """A course of searches, one after the other, that begins with what is `known`.
 
-    Several courses run side by side without knowing of each other, so that the result does not
-    depend on which of them is faster. `seen`: feasible designs, in the order of their evaluation;
+    Several courses run side by side. They do not exchange results, so that the outcome does not
+    depend on their speed. `seen`: feasible designs, in the order of their evaluation;
     `evaluations`: number of designs evaluated in this course."""
 
     def __init__(self, known: Sequence[Seen] = ()):

@@ -330,7 +330,7 @@ class Tracer:
     ) -> Node | None:
         """Search from `start` (d,) for the optimum of a `scalar` objective.
 
-        `orbit`: first guess of the orbit; `course`: what the search adds its designs to. Return the
+        `orbit`: first guess of the orbit; `course`: receives the designs of the search. Return the
         better one of the outcome and `best`."""
         if self.stop.is_set():
             return best

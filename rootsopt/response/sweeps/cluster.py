@@ -179,7 +179,7 @@ class DaskRunner:
         return [(points[0][0], lost(Status.FAILED, why))]
 
     def _run(self, stop: threading.Event, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Return `function(*arguments)`, computed by a worker; `None` if it ends its processes."""
+        """Return `function(*arguments)`, computed by a worker; `None` if it kills the workers."""
         import cloudpickle  # Installed with distributed; serialises a script's classes.
 
         if stop.is_set() or self._closed.is_set():

@@ -183,7 +183,7 @@ def plot_scenes(ax: Axes, key: str, columns: Mapping[str, Sequence[Any]]) -> Axe
     ax.axhline(1, color="black", linewidth=0.8, label="baseline")
     places = np.concatenate([np.column_stack(line.get_data()) for line in ax.get_lines()[:-1]])
     places = places[np.isfinite(places).all(axis=1)].reshape(-1, 2)
-    # A baseline nearly without force would leave no room for the other scenes.
+    # Scenes with almost no baseline force would otherwise stretch the axis.
     high = _WIDE * max(1.0, np.quantile(places[:, 1], 0.9)) if len(places) else np.inf
     beyond = places[places[:, 1] > high]
     if len(beyond):

@@ -373,7 +373,7 @@ def searched_line(ended: Searched) -> str:
 
 
 def _improved(found: "Optimization") -> str:
-    """Return how much the optimum is below the design at which the search began."""
+    """Return the improvement of the optimum over the design at which the search began."""
     gains = found.improvement.items()
     changes = (f"{name_and_unit(key)[0]} {percent(1, 1 - gain)}" for key, gain in gains)
     return f"Against the start of the search: {', '.join(changes)}."
