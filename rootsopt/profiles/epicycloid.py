@@ -62,8 +62,8 @@ class TippedEpicycloid(Profile):
     lobe's axis. The tip arc is tangent to the epicycloid at the joint, and its centre C lies on the
     lobe's axis. If ν and ψ are normal and pressure angle at the joint, C lies at the distance
     c = r cos ψ / sin ν from the rotor's axis. No epicycloid with r_e < r is undercut: the arc
-    length of its conjugate per ν is 4 r_e (r - r_e) sin ψ / (r + 2 r_e). These formulas are derived here, because
-    no source was available.
+    length of its conjugate per ν is 4 r_e (r - r_e) sin ψ / (r + 2 r_e). These formulas are
+    derived here, because no source was available.
 
     `rolling_radius`: r_e (m). `joint`: normal angle (rad) at which the tip arc ends.
     `arc_center_radius`: c (m). `arc_radius`: radius of the tip arc (m). `land`: whether the arc is
