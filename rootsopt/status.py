@@ -127,7 +127,7 @@ class Status(enum.Enum):
 
     @property
     def usable(self) -> bool:
-        """Whether a result with this status is what was asked for, with a gradient."""
+        """Whether a result with this status is the requested one, with a gradient."""
         found = Status.PERIODIC, Status.AVERAGED, Status.IDLE, Status.GEOMETRY_ONLY
         return self in (*found, Status.IDENTIFIED)
 

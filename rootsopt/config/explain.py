@@ -197,7 +197,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _wanted(kind: str, value: Any, context: dict, message: str, field: FieldInfo | None) -> str:
-    """Return what the value of a key must be."""
+    """Return a description of the values that a key accepts."""
     if kind in ("float_type", "int_type") and _is_number(value) and abs(value) > 2**53:
         return "a number of ordinary size"
     if kind in _WANTED or kind == UNMET:

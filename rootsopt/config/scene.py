@@ -1,4 +1,4 @@
-"""Config sections that define what is simulated beside the rotor: contact, scene, pump.
+"""Config sections for everything that is simulated except the rotor: contact, scene, pump.
 
 The smoothing length of a scene follows from its values if the config gives none (`following_mm`).
 """

@@ -278,7 +278,7 @@ def _above(name: str) -> list[tuple[str, float]]:
 def limits_of(low: float | str | None, high: float | str | None) -> tuple[float, float]:
     """Return a floor and a ceiling as numbers, so that two limits from the config can be compared.
 
-    An absent limit is infinite, and so is one that is the baseline's value, not yet known."""
+    Absent limits, and limits that are the baseline's still unknown value, are infinite."""
     return (
         low if isinstance(low, float) else -math.inf,
         high if isinstance(high, float) else math.inf,

@@ -1,6 +1,6 @@
 """Config section `tolerances`: scatter of values of scene and design in manufacture.
 
-The section `assumptions` gives the ranges of what is only assumed about a pump's operation."""
+The section `assumptions` gives the ranges of assumed values of a pump's operation."""
 
 import difflib
 import math

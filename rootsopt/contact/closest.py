@@ -46,7 +46,7 @@ _MANY = 32
 # Marks a finished search: this is added to the number of attempts.
 _DONE = 16
 # On a wavy flank: maximum number of minima of the gap that are compared, and number of jumps
-# between neighbouring minima that have a flag of their own.
+# between neighbouring minima with separate flags.
 _MINIMA = 8
 RANKS = 3
 # Distance of x (rad) from a joint's roll angle, in relative rotations |ε|, below which the gap of a

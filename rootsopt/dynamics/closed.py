@@ -46,8 +46,8 @@ from rootsopt.status import Status
 # Scaled difference below which states nearly repeat. Newton's method then decides whether there is
 # an orbit, possibly of a shorter period.
 _NEARLY = 0.05
-# Tolerance of the first transient, unless that of the solver is coarser: it only has to lead to the
-# neighbourhood of the orbit. Each further attempt is ten times finer.
+# Tolerance of the first transient, unless that of the solver is coarser. The transient only has to
+# reach the neighbourhood of the orbit. Each further attempt is ten times finer.
 _COARSE = 1e-5
 # Maximum number of attempts to close an orbit at the end of a transient, and maximum number of mesh
 # periods by which the transient continues before each further attempt. The states of the transient

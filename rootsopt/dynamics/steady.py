@@ -145,7 +145,7 @@ sample falls on the end of each mesh period."""
 
 
 class Steady(NamedTuple):
-    """The steady motion that a state leads to.
+    """The steady motion to which a state leads.
 
     `status`: code of a `Status`; `orbit`: the orbit found, or the last one tried; `period` (mesh
     periods) and `verdict`: length of this orbit, and the results of its checks; `window` of a

@@ -108,7 +108,7 @@ class Window(NamedTuple):
     def after(self, out: Period) -> "Window":
         """Return the window after one more integration over a mesh period; `out`: its flow.
 
-        The two motions take turns: the second one is then put back beside the first."""
+        The two motions take turns; the second one is then put back to its fixed distance."""
         row, every = self.done, out.states.shape[0] // _KEPT
 
         def first(new, old):
@@ -161,8 +161,8 @@ class Window(NamedTuple):
     def chaotic(self) -> Bool[_Arrays, ""]:
         """Whether motions diverge at both distances alike.
 
-        The exponent must exceed three standard errors, and the rate at each distance two of its
-        own, which are √2 times greater."""
+        The exponent must exceed three standard errors. The rate at each distance must exceed two
+        standard errors of this rate, which are √2 times greater."""
         xp = _numpy_of(self.growth)
         far, near = xp.mean(self._rates, axis=1)
         alike = xp.abs(near - far) < _ALIKE

@@ -223,7 +223,8 @@ def motions(problem: Problem, best: Local, others: Sequence[int | None]) -> list
 def further(problem: Problem, best: Local, spread: Spread) -> list[dict[str, Any]]:
     """Return the entry `further` of the result file: measurements that would help, best first.
 
-    Each is a column over one turn, at one of some speeds, with the relative error of the record."""
+    Each is a column over one turn, at one of several speeds, with the relative error of the
+    record."""
     estimated = len(problem.rows) > problem.lost
     relative = float((best.deviation / problem.rows.scale).median()) if estimated else _USUAL
     known = best.slopes.T @ best.slopes / spread.factor

@@ -50,7 +50,7 @@ class Predicted(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Point:
-    """An operating point of the record: its `config`, and what was measured there (`seen`)."""
+    """An operating point of the record: its `config`, and the measurements there (`seen`)."""
 
     config: Config
     seen: Observed
@@ -88,7 +88,7 @@ class Point:
     def predicted(
         self, quantities: Sequence[Fitted], values: NDArray[np.float64], begin: Begin
     ) -> Predicted:
-        """Return what is predicted with the `values` (p,) of the quantities; see `Predicted`."""
+        """Return the predictions for the `values` (p,) of the quantities; see `Predicted`."""
         if self.config.objective.motion == "ensemble":
             return self._averaged(quantities, values, begin)
         named = {one.key: float(x) for one, x in zip(quantities, values, strict=True)}
@@ -184,7 +184,7 @@ def predict(
     values: NDArray[np.float64],
     begins: Sequence[Begin],
 ) -> list[Predicted]:
-    """Return what is predicted at each of the `points` with the `values` (p,) of the quantities.
+    """Return the predictions at each of the `points` for the `values` (p,) of the quantities.
 
     `begins`: where the search for each motion begins."""
 

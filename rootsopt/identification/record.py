@@ -1,4 +1,4 @@
-"""A measured record: what was measured, at which operating points.
+"""A measured record: measured values at operating points.
 
 A record is one table or several. Columns named after config keys, such as `scene.speed_rpm`, say at
 which operating point a row was measured. A table with rotations or times holds samples of a motion:
@@ -165,8 +165,8 @@ class Observed:
     ) -> NDArray[np.float64] | None:
         """Return ε (rad) and dε/dt (rad/s) at a φ1 that is a multiple of `turns` mesh periods.
 
-        They are those of cubics through the samples beside it; None unless enough of ε were
-        measured. `lobes` of a rotor; `period` (s) of the mesh; `offset` (°): rotation at φ1 = 0."""
+        They follow from cubics through neighbouring samples; None unless enough samples of ε are
+        known. `lobes` of a rotor; `period` (s) of the mesh; `offset` (°): rotation at φ1 = 0."""
         place, relative, rate = map(self.column, (_ROTATION, *CHANNELS[:2]))
         place = (place - offset) * lobes / 360
         number = np.round(place / turns)
@@ -185,7 +185,7 @@ class Observed:
 
 
 def observed(config: Config, data: Any) -> list[Observed]:
-    """Return what was measured at each operating point.
+    """Return the measurements at each operating point.
 
     `data`: path of a CSV file, columns by name (a mapping or an `xarray.Dataset`), or a list of
     these. Raises `InputError` if a table cannot be read, or if a column or a value is wrong."""

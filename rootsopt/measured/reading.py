@@ -196,8 +196,8 @@ def _noted(loop: Loop, count: int, which: str) -> Loop:
 def _likely(loops: list[Loop], sought: Sought | None) -> Loop:
     """Return the loop for the messages if none fits the rotor.
 
-    It is the largest of the first group with any loops: with the rotor's lobes and, in another
-    unit, its size; with its lobes; all loops."""
+    If possible, it has the rotor's lobes and, in another unit, its size. Otherwise, if possible, it
+    has the lobes alone. Of several loops, return the largest."""
     if sought is None or len(loops) == 1:
         return _noted(_largest(loops)[0], len(loops), "the largest")
     lobed, radius = _lobed(loops, sought), sought.pitch_radius_mm

@@ -88,7 +88,7 @@ def check_center(config: "ProfileConfig") -> None:
 
 
 def advice(config: "ProfileConfig", checks: Checks) -> list[str]:
-    """Return notes on flanks that differ, how a file was read, and what the config ignores.
+    """Return notes on differing flanks, on how a file was read, and on ignored data.
 
     `config`: the profile's config; `checks`: those of its outline. Flanks that differ by `_NOTABLE`
     or more need a note because the profile is made from one flank."""

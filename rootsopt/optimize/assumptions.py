@@ -1,4 +1,4 @@
-"""Compares an optimum with the baseline over the ranges of what is assumed about the scene.
+"""Compares an optimum with the baseline over ranges of assumed values of the scene.
 
 Both are simulated in the scenes of `assumptions`: at the ends of each range alone, and in random
 scenes. A local search then looks for a better design in the scene where the optimum is worst. This
@@ -82,7 +82,7 @@ class _Comparison:
         self.config, self.scenes = own, assumed(own)
         self.result, self.runs, self.stop, self.tick = result, runs, stop, tick
         self.designs = {BASELINE: result.baseline.design, OPTIMIZED: optimized.design}
-        # A rotor from a file, or of another family, has a config of its own.
+        # A rotor from a file, or of another family, has a separate config.
         self.shared = given.design_keys == own.design_keys
         configs = {self._varied(BASELINE): given, True: own}
         self.exact = {

@@ -342,7 +342,7 @@ class Search:
         """Run `work(*task)` for all tasks in parallel, and return all trials.
 
         The trials are in the order of the tasks. If `stop` is set before all tasks end, return an
-        empty list at once: evaluations that are still running are not waited for."""
+        empty list at once, without waiting for running evaluations."""
         pool = ThreadPoolExecutor(self.runs.slots)
         tasks = tasks if not self.stop.is_set() else []
         done = [pool.submit(work, *task) for task in tasks]

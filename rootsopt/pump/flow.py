@@ -224,7 +224,7 @@ def mean_free_path(
 FACES = 4
 """Number of end faces of the two rotors."""
 _NODES, _WEIGHTS = (x / 2 for x in np.polynomial.legendre.leggauss(64))
-# Nodes and weights of the rule of Gauss and Legendre on [0, 1], for the gap beside a tip.
+# Nodes and weights of the Gauss-Legendre rule on [0, 1], for the gap beside a tip.
 _SHARES = _NODES + 0.5
 
 

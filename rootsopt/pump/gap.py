@@ -228,9 +228,10 @@ class Play(eqx.Module):
     is behind, rotor 1 pushes it; if it is ahead, it pushes rotor 1. `pitch_radius`: r (m).
 
     `overlap`: greatest depth (m), along the normal, by which the rotors overlap at ε = 0;
-    `overlap_at`: φ1 (rad) there. No turn lifts a tip out of a root. With an overlap, `behind` and
-    `ahead` are therefore computed with the least additional clearance that removes it. Each is then
-    moved inwards by this clearance over the greatest lever. They are continuous in the overlap."""
+    `overlap_at`: φ1 (rad) there. No rotation moves a tip out of a root. With an overlap, `behind`
+    and `ahead` are therefore computed with the least additional clearance that removes it. Each is
+    then moved inwards by this clearance over the greatest lever. They are continuous in the
+    overlap."""
 
     phi: Float[Array, " n"]
     behind: Float[Array, " n"]

@@ -183,8 +183,8 @@ class Evaluator:
     def shifted(self, shift: Scene | None) -> "Evaluator":
         """Return another evaluator whose scene's arrays are moved by those of `shift`.
 
-        `shift`: change in SI units, as a `Scene` with None in place of all that is not moved; None:
-        no change."""
+        `shift`: change in SI units, as a `Scene` with None in place of unchanged fields; None: no
+        change."""
         if shift is None:
             return self
         moved = eqx.apply_updates(self.scene, jax.tree.map(jnp.asarray, shift))
@@ -311,7 +311,7 @@ class Evaluator:
     def _examined(self, pair: RotorPair, found: Steady) -> Steady:
         """Return the motion `found`, with the status that `closed.examined` would give it.
 
-        The window has a program of its own, which few motions need."""
+        The window has a separate program, which few motions need."""
         if Status.of(found.status) not in OPEN:
             return found
         window = None
@@ -414,7 +414,7 @@ def _at_rest(pair: RotorPair, longest: int) -> Start:
 
 
 def motion_from(pair: RotorPair, tangents: RotorPair, start: Start, radius, solver) -> Steady:
-    """Return the steady motion that a `start` with a scaled state leads to."""
+    """Return the steady motion to which a `start` with a scaled state leads."""
     start = eqx.tree_at(lambda start: start.state, start, pair.in_si(start.state))
     return steady_motion(pair, tangents, start, radius, solver)
 

@@ -129,7 +129,7 @@ def in_conditions(config: Config, scenes: Mapping[str, Mapping[str, float]], **r
 
 
 def _difference(before: Scene, after: Scene) -> Scene:
-    """Return the change of a scene's arrays, as a `Scene` with None in place of all else."""
+    """Return the change of a scene's arrays, as a `Scene` with None in all other fields."""
 
     def change(x: Any, y: Any) -> Any:
         found = np.asarray(x) - np.asarray(y)

@@ -216,7 +216,7 @@ def _solved(scene: Scene, design, start, along: tuple[int, ...]) -> tuple[Respon
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arguments)):
         return _inline(*arguments)
     found = _compiled(*arguments, False)
-    # Rare: a window has a program of its own, which is compiled only now.
+    # Rare: a window has a separate program, which is compiled only now.
     status = Status.of(found[0].status)
     return _compiled(*arguments, True) if status in OPEN else found
 

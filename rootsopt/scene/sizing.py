@@ -70,7 +70,7 @@ def sized(config: Config) -> Config | list[float]:
 
 
 def _met(config: Config, design) -> Config | None:
-    """Return a config with a design (d,) as it is written, `None` unless it fills the housing."""
+    """Return a config with a rounded design (d,); `None` unless it fills the housing."""
     # Ten digits keep the outer radius.
     config = config.with_design([float(f"{value:.10g}") for value in design])
     try:

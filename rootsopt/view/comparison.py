@@ -72,7 +72,7 @@ def _cell(objective: float | None) -> Cell:
 
 
 def elsewhere(result: Mapping[str, Any]) -> Iterator[str]:
-    """Yield sentences on an optimum over what is assumed; none without a comparison."""
+    """Yield sentences on an optimum over assumed values; no sentence without a comparison."""
     found = result.get("assumptions")
     if not found:
         return

@@ -92,7 +92,7 @@ def _gains(result: Record) -> Iterator[str]:
 
 
 def _changes(before: Record, after: Record) -> Iterator[tuple[str, float, bool]]:
-    """Yield (words, size of the change in %, whether it is better) of all that differs."""
+    """Yield (words, size of the change in %, whether it is better) of each change."""
     parts = "response", "pump", "geometry"
     first, last = (
         {key: x for part in parts for key, x in scalars(one.get(part) or {}).items()}
@@ -200,7 +200,7 @@ def _bounded(known: Record) -> Iterator[str]:
 
 
 def _caveats(result: Record, after: Record) -> Iterator[str]:
-    """Yield why a design is not an optimum, and what the message of its motion adds."""
+    """Yield why a design is not an optimum, and further advice from the message of its motion."""
     found = result.get("optimality") or {}
     if found and not found["converged"]:
         yield str(found["message"])

@@ -37,7 +37,7 @@ _SCALED = {
     "scene.timing_gear.backlash_mm": 1,
 }  # fmt: skip
 
-# The section `pump` that is assumed, without its clearances.
+# The assumed section `pump`, without its clearances.
 _AIR = {"viscosity_mPa_s": 0.018, "pressure_difference_Pa": 2e4, "gas": {"inlet_pressure_Pa": 1e5}}
 
 # Families that are compared first, because they are common or fitted quickly.

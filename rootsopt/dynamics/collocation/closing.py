@@ -215,7 +215,7 @@ class Closer(eqx.Module):
 
     @property
     def ease(self) -> Float[Array, ""]:
-        """Factor by which the errors to reach exceed those at the usual accuracy, at least 1."""
+        """Factor by which the requested errors exceed those at the usual accuracy, at least 1."""
         return jnp.maximum(self.tolerance / _USUAL, 1.0)
 
     @property

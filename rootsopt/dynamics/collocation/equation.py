@@ -53,11 +53,11 @@ class CollocatedEquation(eqx.Module):
     def near(self, dynamic: Any, static: Any, roots: Float[Array, "flanks 2"]) -> RotorPair:
         """Return the pair with a contact evaluated near known `roots` (see `NearContact`).
 
-        `dynamic`, `static`: the pair's floating-point arrays, and the rest of the pair. Another
-        contact than a `SearchContact` is evaluated as it is."""
+        `dynamic`, `static`: the pair's floating-point arrays, and the rest of the pair. Any contact
+        other than a `SearchContact` is evaluated unchanged."""
         pair: RotorPair = eqx.combine(dynamic, static)
         searched = innermost(pair.contact)
-        if type(searched) is not SearchContact:  # A subclass may find something else.
+        if type(searched) is not SearchContact:  # A subclass may search differently.
             return pair
         if pair.contact.slices is not None:
             roots = roots.reshape(pair.contact.sections, -1, 2)

@@ -100,7 +100,7 @@ def _roots(pair: RotorPair, found: Margins) -> Float[Array, " flanks"]:
 
 
 class Kinds(NamedTuple):
-    """What a change of each of the f flags means.
+    """The meaning of a change of each of the f flags.
 
     `rank` (f,): if several flags change at one instant, that with the least rank determines the
     event. Flags of parts have rank 0, since the zeros of their margins are most accurate. Rank 1 is
@@ -120,7 +120,7 @@ class Kinds(NamedTuple):
 
 
 def kinds(pair: RotorPair) -> Kinds:
-    """Return what changes of the flags of `pair` mean."""
+    """Return the meaning of changes of the flags of `pair`."""
     of_flank, others = _owners(pair)
     own, rest = (
         np.array([not has for has, count in some for _ in range(count)], bool)

@@ -108,7 +108,7 @@ def between(
 def numbers(pair: Any) -> Float[Array, " m"]:
     """Return all floating-point numbers of a `pair` as one vector.
 
-    XLA compiles a loop of its own for each array that it chooses, copies or mixes."""
+    XLA compiles a separate loop for each array that it selects, copies or mixes."""
     return ravel_pytree(eqx.filter(pair, eqx.is_inexact_array))[0]
 
 
@@ -243,8 +243,8 @@ def _by_height(equation: CollocatedEquation, elements: Elements, peak: Peak, eva
     value, bend = points.values[peak.place], points.slopes[peak.place]
     time, state = moved_at(elements, step, k, share)
     here = bend[:, :1] * time + bend[:, 1:] @ state + direct[peak.place]
-    # The peak may be a little beside the instant of the evaluation. The changes here and at the
-    # Gauss points lie on one polynomial.
+    # The peak may lie slightly off the instant of the evaluation. The changes here and at the Gauss
+    # points lie on one polynomial.
     rows = change[k].reshape(len(GAUSS.nodes), -1)
     away = share - GAUSS.nodes
     bends = jnp.sum(away / (away**2 + _COINCIDE**2))

@@ -77,9 +77,9 @@ class Rivals(NamedTuple):
         return Rivals(element, share, _roots(new.roots, element, share))
 
     def rooted(self, before: Elements, after: Elements) -> "Rivals":
-        """Return the same instants with their roots moved as those of the elements have been.
+        """Return the same instants, with roots that follow those of the elements.
 
-        Interpolated roots alone have a greater error than those that follow Newton's steps."""
+        Interpolated roots alone have a greater error than roots that follow Newton's steps."""
         one, other = (_roots(x.roots, self.element, self.share) for x in (before, after))
         return self._replace(roots=self.roots + (other - one))
 

@@ -329,7 +329,7 @@ class Course:
         return Course(self.seen)
 
     def join(self, others: Sequence["Course"]) -> None:
-        """Add what `others` have seen, in their order. All must be branches of this course."""
+        """Add the designs that `others`, branches of this course, have seen, in their order."""
         for other in others:
             self.seen += other.seen[other._first :]
             self.evaluations += other.evaluations

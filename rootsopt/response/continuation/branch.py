@@ -87,7 +87,7 @@ class _Range(NamedTuple):
     """Scenes and designs over the range of a parameter.
 
     `low`: scene and design (d,) at its low end; `change`: their change over the range, with `None`
-    in place of all that is not a number; `unit` (rad): unit of ε, the same for the whole curve.
+    in place of anything but numbers; `unit` (rad): unit of ε, the same for the whole curve.
     """
 
     low: tuple[Scene, Array]

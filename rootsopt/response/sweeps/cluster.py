@@ -44,7 +44,8 @@ _CHUNKS, _LARGEST = 8, 32
 _ANSWER, _WORKERS = 10.0, 60.0
 # Time (s) after which a lost connection, the end of the search and a request to stop are noticed.
 _POLL = 0.5
-# Time (s) after which a scheduler without workers is given up: a new one takes 10 to 60 s.
+# Time (s) without workers after which a scheduler is abandoned. A new worker takes 10 to 60 s to
+# start.
 _DESERTED = 600.0
 # Dask's settings for processes started here. By default, Dask gives up a process that was killed
 # unless its successor is ready in 15 s. On a busy machine, it takes longer to import everything.
@@ -114,7 +115,7 @@ class ClosedError(Exception):
 class DaskRunner:
     """Runs evaluations, and points of a sweep, on the workers of a Dask `client`, for many threads.
 
-    `dask`: the package distributed; `settings`: what the workers must agree on."""
+    `dask`: the package distributed; `settings`: settings that the workers must share."""
 
     def __init__(self, dask: Any, client: Any, settings: Settings):
         self._dask, self._client, self._settings = dask, client, settings

@@ -1,6 +1,6 @@
 """Figures of profiles, of meshing and conjugacy, and of a search.
 
-A search shows its history, its optimum beside the baseline, and the designs that the limits leave.
+Figures of a search: its history, the optimum with the baseline, and the feasible designs.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

@@ -68,5 +68,5 @@ def write(
 
 
 def beside(ax: Axes) -> None:
-    """Place the legend of a panel at its right."""
+    """Place the legend of a panel to its right."""
     ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1), frameon=False)

@@ -17,7 +17,7 @@ from rootsopt.view.files import ResultFolder
 POINTS = "rotor_points.csv"
 """Name of the table of coordinates, which is written beside the DXF drawing."""
 
-# Number of points over one lobe in this table, beside the ends of all pieces.
+# Number of points over one lobe in this table, in addition to the ends of all pieces.
 _COUNT = 361
 
 

@@ -1,6 +1,6 @@
 """Reads the files of a run back into the data and words that the report shows.
 
-The words are the task of the run in sentences, and the glossary they lead to."""
+The words are the run's task in sentences, and the glossary."""
 
 import csv
 import dataclasses

@@ -230,7 +230,7 @@ class Page:
         self.session.cancel()
 
     def _lock(self, locked: bool) -> None:
-        """Lock the sliders during a search, whose result they take."""
+        """Lock the sliders during a search, whose optimum then sets them."""
         self.cancel.visible = locked
         buttons = self.optimize, self.save, self.reset
         for one in (*buttons, *self.sliders.values(), *self.fields.values()):
