@@ -67,7 +67,7 @@ It takes the config, the options and the result folder, and writes the files."""
 
 
 class _Format(argparse.RawDescriptionHelpFormatter):
-    """Help with short lines: most options take one."""
+    """Formats the help of most options in one line each."""
 
     def __init__(self, prog: str):
         super().__init__(prog, max_help_position=30, width=min(100, _columns()))

@@ -25,7 +25,7 @@ from rootsopt.errors import InputError
 # Turn (rad) at a point above which the outline runs back there.
 _CUSP = 2.0
 
-# Distance between two cusps (fraction of the path between them) below which they are no tail.
+# Distance between two cusps (fraction of the path between them) below which they form no tail.
 _STRAIGHT = 0.8
 
 # Number of points on each side of a tail that are searched for its crossing.

@@ -42,12 +42,12 @@ _MEETS = 1e-4
 
 @dataclasses.dataclass(frozen=True)
 class Verification:
-    """How the results of a search are verified.
+    """Verifies the results of a search.
 
     `problem`: design problem; `exact`: evaluator from rest; `tolerance` of its orbits; `method` of
     the local searches; `bar`: objective that a design must be below; `asked`: whether the search
     should end; `found`: what each local search by sequential quadratic programming has found;
-    `refuted`: points that did not hold up, to which more are added.
+    `refuted`: points that did not hold up, extended by the verification.
     """
 
     problem: Problem

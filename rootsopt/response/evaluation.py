@@ -52,8 +52,8 @@ from rootsopt.scene.reading import design_keys, design_vector
 from rootsopt.status import Status
 
 # Difference between an orbit closed by collocation and an integration over its period (see
-# `integrated_difference`) above which the orbit is rejected. It is the first number, or the second
-# times the tolerance of orbits if that is greater.
+# `integrated_difference`) above which the orbit is rejected: the greater of the first number and
+# the second times the tolerance of orbits.
 _APART = 1e-4, 1e3
 # Greatest tolerance of this integration.
 _FINE = 1e-8
@@ -325,9 +325,8 @@ class Evaluator:
     ) -> Steady:
         """Return the motion `found` from `start`, if an integration over its period confirms it.
 
-        An orbit closed from a known one may have missed a touch of the flanks. In that case, search
-        once more without the known orbit. If the orbit is still not confirmed, its status is
-        NOT_CLOSED."""
+        An orbit closed from a known one may lack a touch of the flanks. If so, search once more
+        without the known orbit. An orbit that is still not confirmed is NOT_CLOSED."""
         if Status.of(found.status) not in CLOSED:
             return found
         orbit, integrator = found.orbit, self.scene.solver.orbit
