@@ -10,10 +10,10 @@ Source: Breiman and Cutler, A deterministic algorithm for global optimization, M
 Programming 58 (1993) 179-199. Limits of forces have minorants, too.
 
 A box is halved until a linear program shows that the objective is nowhere in it below the target,
-or that no point of it is feasible. Points are evaluated where the minorants are least. The
-curvatures κ are estimates: the least that agree with all pairs of evaluated points, times `FACTOR`.
-Constraints of the geometry cost little. In each box they are replaced by their tangents, plus
-`_DEVIATION` times the deviation from these that is found at the corners."""
+or that no point of it is feasible. Points are evaluated where the minorants are least, or at the
+next feasible point. The curvatures κ are estimates: the least that agree with all pairs of points,
+times `FACTOR`. Constraints of the geometry cost little. In each box they are replaced by their
+tangents, plus `_DEVIATION` times the deviation from these that is found at the corners."""
 
 import heapq
 import itertools
@@ -23,9 +23,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.optimize.local import FEASIBLE, Limits, Linearization, Rows, onto
+from rootsopt.optimize.local import FEASIBLE, Limits, Linearization, Rows
 from rootsopt.optimize.optimality import Bound
-from rootsopt.scene.space import sobol
+from rootsopt.scene.space import onto, sobol
 
 FACTOR = 2.0
 """Factor on the least curvatures that agree with all pairs."""
@@ -68,12 +68,10 @@ _ROWS = 3
 _NARROW, _NARROWEST = 1 / 64, 1 / 8192
 _BESIDE = 0.01
 
-# Greatest magnitude of a slack that counts.
-_FAR = 1e9
-
 # Distance from the middle of a box (half widths) beyond which a feasible point says nothing about
-# it, and half width of a box that is void if no feasible point is found within this distance.
-_OUTSIDE, _SMALL_BOX = 2.0, 1 / 16
+# it; half width of a box that is void if no feasible point is found within this distance; greatest
+# magnitude of a slack that counts.
+_OUTSIDE, _SMALL_BOX, _FAR = 2.0, 1 / 16, 1e9
 
 # Greatest number of design parameters for a lower bound: with `optimizer.prove`, and by default.
 PARAMETERS, QUICK = 4, 3
@@ -306,16 +304,15 @@ class Bounding:
 
         `least` (d,): the point where the minorants are least. Return `None` if no point helps."""
         objective = self.surfaces[0]
-        room = objective.room(box)
         for begin in (least, box.middle):
-            # A design that is not quite feasible is usable as a rule.
+            # A design that is not quite feasible is usable as a rule, and costs no steps.
             worst = -_BESIDE if np.max(box.half) < _NARROW else -FEASIBLE
             known = np.min(self._look(begin)[0]) >= worst
             point = begin if known else self._within(box, begin)
             if point is None:
                 continue
             away = objective.near(point, begin[None])
-            if objective.near(point, objective.points) > max(room, away):
+            if objective.near(point, objective.points) > max(objective.room(box), away):
                 return point
         return None
 
@@ -418,8 +415,8 @@ class Bounding:
             return None
         # A constraint may jump where a profile becomes unsound. Its tangents then say nothing.
         inside = np.min(np.nan_to_num(every, nan=-1.0), axis=1) >= -FEASIBLE
-        small = np.max(box.half) <= _SMALL_BOX
-        if small and not np.any(inside) and self._within(box, box.middle) is None:
+        empty = np.max(box.half) <= _SMALL_BOX and not np.any(inside)
+        if empty and self._within(box, box.middle) is None:
             return None
         with np.errstate(invalid="ignore"):
             rise = np.array(tops) - slack - steps @ normals.T

@@ -29,7 +29,7 @@ Constraints of the geometry need no simulation. A step therefore meets them exac
 models. Along the curved edges of the feasible set, this saves most of the simulations that
 linearised constraints cost."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -48,9 +48,6 @@ FEASIBLE = 1e-6
 distance from a bound of the unit box above which the bound counts as inactive."""
 # Weight, in the least-squares problem, of the condition that the shares of a maximum sum to 1.
 _WEIGHT = 1e4
-
-# Maximum number of steps onto the feasible set.
-_STEPS = 30
 
 # Norm of a constraint's scaled gradient below which the constraint counts as inactive.
 _NEGLIGIBLE = 1e-6
@@ -239,30 +236,6 @@ Rows = tuple[NDArray[np.float64], NDArray[np.float64]]
 Limits = Callable[[NDArray[np.float64]], Rows]
 """Function that returns slacks (m,) and their gradients (m, d) at a point (d,), without a
 simulation."""
-
-
-def onto(limits: Limits, point: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
-    """Yield points (d,) on the way from a `point` onto the feasible set, by Gauss-Newton steps.
-
-    `limits`: function that returns the slacks (m,) at a point and their gradients (m, d). Each step
-    is computed from the violated constraints. The last point can still be infeasible, for example
-    if the constraints contradict the bounds."""
-    point = np.clip(np.asarray(point, dtype=np.float64), 0.0, 1.0)
-    yield point
-    for _ in range(_STEPS):
-        slack, normals = limits(point)
-        violated = slack < 0
-        if not violated.any():
-            return
-        # Aim slightly inside, so that the constraint holds despite rounding. Coordinates held by
-        # their bound do not move.
-        # Where no profile exists, a margin may have no derivative, and does not move the point.
-        rows, want = np.nan_to_num(normals[violated]), 1e-7 - slack[violated]
-        push = rows.T @ want
-        held = ((point <= 0) & (push < 0)) | ((point >= 1) & (push > 0))
-        move = np.linalg.lstsq(np.where(held, 0.0, rows), want, rcond=1e-8)[0]
-        point = np.clip(point + np.clip(move, -0.3, 0.3), 0.0, 1.0)
-        yield point
 
 
 class Models:

@@ -27,14 +27,14 @@ from rootsopt.optimize.limits import (
     settled_by,
     term_constraints,
 )
-from rootsopt.optimize.local import FEASIBLE, Certificate, Group, Linearization, onto
+from rootsopt.optimize.local import FEASIBLE, Certificate, Group, Linearization
 from rootsopt.optimize.optimality import Holder
 from rootsopt.response.reducers import counted
 from rootsopt.response.result import RESPONSES, Evaluation
 from rootsopt.response.terms import objective_weights
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene.build import Scene
-from rootsopt.scene.space import Space, slacks_and_slopes
+from rootsopt.scene.space import Space, onto, slacks_and_slopes
 from rootsopt.status import Status
 
 # Amplitude of the baseline's line (relative to its mean force) below which it is rejected as an

@@ -8,6 +8,7 @@ profile, the margins of `rootsopt.profiles.geometry` are further constraints.
 
 import importlib
 import threading
+from collections.abc import Callable, Iterator
 from functools import partial
 
 import equinox as eqx
@@ -120,6 +121,9 @@ _SOUND = (
     ("tangents clear of the axis", "star", "mm", 0.0, MM, MM),
     ("root radius", "root", "mm", 0.0, MM, MM),
 )
+
+# Maximum number of steps onto the feasible set.
+_STEPS = 30
 
 # Greatest lower bound of a parameter in `Space.ranges`, as a fraction of its upper bound.
 _NARROW = 0.999
@@ -357,3 +361,30 @@ def sobol(count: int, seed: int, dimension: int = 3) -> NDArray[np.float64]:
     sampler = qmc.Sobol(dimension, rng=np.random.default_rng(seed))
     power = max(0, int(np.ceil(np.log2(max(count, 1)))))
     return sampler.random_base2(power)[:count]
+
+
+def onto(
+    limits: Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], ...]],
+    point: NDArray[np.float64],
+) -> Iterator[NDArray[np.float64]]:
+    """Yield points (d,) on the way from a `point` onto the feasible set, by Gauss-Newton steps.
+
+    `limits`: function that returns the slacks (m,) at a point and their gradients (m, d). Each step
+    is computed from the violated constraints. The last point can still be infeasible, for example
+    if the constraints contradict the bounds."""
+    point = np.clip(np.asarray(point, dtype=np.float64), 0.0, 1.0)
+    yield point
+    for _ in range(_STEPS):
+        slack, normals = limits(point)
+        violated = slack < 0
+        if not violated.any():
+            return
+        # Aim slightly inside, so that the constraint holds despite rounding. Coordinates held by
+        # their bound do not move.
+        # Where no profile exists, a margin may have no derivative, and does not move the point.
+        rows, want = np.nan_to_num(normals[violated]), 1e-7 - slack[violated]
+        push = rows.T @ want
+        held = ((point <= 0) & (push < 0)) | ((point >= 1) & (push > 0))
+        move = np.linalg.lstsq(np.where(held, 0.0, rows), want, rcond=1e-8)[0]
+        point = np.clip(point + np.clip(move, -0.3, 0.3), 0.0, 1.0)
+        yield point
