@@ -178,9 +178,9 @@ def orbit_statistics(found: Steady, solver: Solver) -> dict[str, int | float]:
     }
     if not int(found.used):
         statistics["from_neighbour"] = 1
-    if np.isfinite(orbit.disagreement):  # Infinite: there was no room for a comparison.
-        statistics["gradient_disagreement"] = float(orbit.disagreement)
-    return statistics
+    errors = {"force_error": found.known.error, "gradient_disagreement": orbit.disagreement}
+    # Infinite: there was no room for a comparison.
+    return statistics | {name: float(x) for name, x in errors.items() if np.isfinite(x)}
 
 
 def window_record(window: Window) -> dict[str, Any]:

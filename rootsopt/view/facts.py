@@ -250,7 +250,10 @@ def _trust(steady: Record, record: Record) -> Iterator[str]:
     if steady.get("residual") is not None and steady.get("floquet_multiplier") is not None:
         yield f"the orbit is closed to a residual of {brief(steady['residual'], 2)}"
         yield f"its largest Floquet multiplier is {brief(abs(steady['floquet_multiplier']), 3)}"
-    away = (record.get("statistics") or {}).get("gradient_disagreement")
+    statistics = record.get("statistics") or {}
+    if (error := statistics.get("force_error")) is not None and error > 0:
+        yield f"its forces are known to {brief(error, 2)} (relative)"
+    away = statistics.get("gradient_disagreement")
     if away is not None and record.get("gradient"):
         yield f"halving the steps changes its derivatives by {brief(away, 2)} (relative)"
     errors = {name: steady[key] for name, key in ERRORS.items() if steady.get(key) is not None}

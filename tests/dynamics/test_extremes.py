@@ -309,3 +309,15 @@ def test_motion_of_many_swings_agrees_with_scipy():
     # At the ends of its steps the force is near its greatest value, but never above it.
     forces = jax.vmap(rates)(jnp.asarray(done.t), jnp.asarray(done.y[:2].T))[:, 2]
     assert 0.98 * peak < np.max(forces) < peak * (1 + 1e-5)
+
+
+def test_a_tightened_tolerance_does_no_worse():
+    """At the cusp of EE, finer meshes gain nothing. The forces are reported with their error."""
+    usual, tight = (
+        Evaluator.of(load("configs/paper_ee.yaml", [f"solver.rtol={rtol}"]))(series=False)
+        for rtol in (1e-8, 1e-10)
+    )
+    assert tight.status is usual.status is Status.PERIODIC
+    for name, force in usual.response.items():
+        assert tight.response[name] == pytest.approx(force, rel=1e-6), name
+    assert 1e-9 < tight.statistics["force_error"] < 1e-6

@@ -62,8 +62,8 @@ from rootsopt.dynamics.pair import RotorPair
 # Size of the first mesh that is aligned with events: elements for each element of the mesh before
 # (more at a finer than the usual accuracy), and further elements per event.
 _SHARE, _EVENT = 0.5, 1
-# Relative error of the forces (usual accuracy) for which `_SHARE` and `CORRECTED` hold.
-_USUAL = 1e-7
+USUAL = 1e-7
+"""Relative error of the forces (usual accuracy) for which `_SHARE` and `CORRECTED` hold."""
 # Order of the forces' error in the length of the elements.
 _ORDER = 2 * POINTS
 # Estimated relative errors of forces and of their derivatives on a first mesh, as multiples of its
@@ -154,7 +154,7 @@ def corrected(tolerance: Float[Array, ""]) -> Float[Array, ""]:
 
     `tolerance`: relative error of the forces to reach. Derivatives are those before this
     correction."""
-    return CORRECTED * jnp.sqrt(jnp.maximum(tolerance / _USUAL, 1.0))
+    return CORRECTED * jnp.sqrt(jnp.maximum(tolerance / USUAL, 1.0))
 
 
 def gained(coarse: Int[Array, ""], fine: Int[Array, ""]) -> tuple[Array, Array]:
@@ -216,12 +216,12 @@ class Closer(eqx.Module):
     @property
     def ease(self) -> Float[Array, ""]:
         """Factor by which the requested errors exceed those at the usual accuracy, at least 1."""
-        return jnp.maximum(self.tolerance / _USUAL, 1.0)
+        return jnp.maximum(self.tolerance / USUAL, 1.0)
 
     @property
     def denser(self) -> Float[Array, ""]:
         """Factor by which meshes are denser than at the usual accuracy, at least 1."""
-        return jnp.maximum(_USUAL / self.tolerance, 1.0) ** (1 / _ORDER)
+        return jnp.maximum(USUAL / self.tolerance, 1.0) ** (1 / _ORDER)
 
     def most(self, now: Loop) -> Int[Array, ""]:
         """Return the number of elements above which the mesh is not refined."""
@@ -360,7 +360,7 @@ class Closer(eqx.Module):
 
         def goes_on() -> Loop:
             rivals = rivals_of(at, points, *along, now.rivals)
-            found = is_settled(now.rivals, rivals, peak, self.tolerance / _USUAL)
+            found = is_settled(now.rivals, rivals, peak, self.tolerance / USUAL)
             after = now._replace(elements=moved, rivals=rivals, line=line)
             return self.judged(now, after, size, found)
 

@@ -4,9 +4,10 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import lax
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from rootsopt.dynamics.collocation.closing import Closer, Loop
+from rootsopt.dynamics.collocation.closing import USUAL, Closer, Loop
 from rootsopt.dynamics.collocation.equation import CollocatedEquation
 from rootsopt.dynamics.collocation.mesh import KnownOrbit
 from rootsopt.dynamics.flow import Pieces
@@ -16,16 +17,22 @@ from rootsopt.dynamics.pair import RotorPair
 
 ACCURACY = 10.0
 """Requested relative error of the forces, in tolerances of the orbit's integrator."""
-UNREFINED, _ROUNDED = 10.0, 5e-9
-"""Estimated error of the forces above which an orbit is rejected, in multiples of the requested
-error, but at least the second number. The estimate exceeds the request if the mesh has no room for
-refinement, or if rounding of the gap hides it: beside the cusp of EE, forces round at some 1e-9."""
+# Estimated error of the forces above which an orbit is rejected, in multiples of the requested one.
+_UNREFINED = 10.0
 # Scaled difference between the states at φ1 = 0 and after a fraction of the period, below which
 # this fraction is the orbit's true period. The limit is the first number (tolerances), but at least
 # the second.
 _REPEATS = 1e3, 1e-5
 # Number of instants per mesh period at which an orbit is compared with the transient.
 _ALONG = 8
+
+
+def greatest_error(tolerance: ArrayLike) -> Float[Array, ""]:
+    """Return the estimated relative error of the forces above which an orbit is rejected.
+
+    `tolerance`: that of the orbit's integrator. A tightened one must not reject what the usual one
+    accepts: the mesh may have no room for refinement, or rounding of the gap may hide its effect."""
+    return _UNREFINED * jnp.maximum(ACCURACY * jnp.asarray(tolerance), USUAL)
 
 
 class Collocated(NamedTuple):
@@ -64,7 +71,7 @@ def closed_orbit(
     frozen, accuracy = lax.stop_gradient(pair), ACCURACY * tolerance
     closed = Closer(equation, frozen, tangents, known, neighbour, accuracy).run()
     orbit, found, sound = closed.orbit, closed.known, closed.known.sound & known.sound
-    verified = sound & (found.error <= jnp.maximum(UNREFINED * ACCURACY * tolerance, _ROUNDED))
+    verified = sound & (found.error <= greatest_error(tolerance))
     # The transient may have mistaken several periods of the orbit for one.
     shorter = _repeats(pair, closed, settings.max_orbit, tolerance) * sound
     verified &= shorter == 0

@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 from rootsopt.config.reading import Config, parse
 from rootsopt.dynamics.collocation.bordered import Followed, Line, Plane, followed
 from rootsopt.dynamics.collocation.mesh import PIECES, from_pieces
-from rootsopt.dynamics.collocation.motion import ACCURACY, UNREFINED
+from rootsopt.dynamics.collocation.motion import greatest_error
 from rootsopt.dynamics.flow import strobe
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import TOO_DEEP
@@ -185,7 +185,7 @@ class OrbitFamily:
         scene, line, known = self.range.low[0], made.line, made.known
         if not sound:
             raise StoppedError(End.NO_GEOMETRY)
-        if not (known.sound and known.error <= ACCURACY * UNREFINED * scene.solver.orbit.rtol):
+        if not (known.sound and known.error <= greatest_error(scene.solver.orbit.rtol)):
             raise StoppedError(End.STEP_TOO_SMALL)
         if lost:
             raise StoppedError(End.LOST_MESH)
