@@ -141,7 +141,8 @@ _EVERY = [
                                                      backlash="0.05")),
     Case("two mesh periods, shaky", "cic_drawn", _SHAKY),
     Case("two mesh periods, shaky, at 1e-9", "cic_drawn", [*_SHAKY, *_sections(rtol="1e-9")]),
-    Case("two mesh periods", "cic_drawn", _sections(backlash="0.2", damping="0.2", speed="4000")),
+    # At 4000 rpm, three motions coexist, and rounding decides which one is reached from rest.
+    Case("two mesh periods", "cic_drawn", _sections(backlash="0.2", damping="0.2", speed="4100")),
     Case("three mesh periods", "cic_drawn", _sections(damping="0.05", load="2", speed="6000")),
     Case("noisy", "cic_drawn", _sections(damping="0.05", speed="6000")),
     Case("four mesh periods", "cic_drawn", _sections(backlash="0.2415")),
