@@ -66,7 +66,6 @@ _ROWS = 3
 
 # Half width of a box below which it is left: one that has no bound, and any other.
 _NARROW, _NARROWEST = 1 / 64, 1 / 8192
-_BESIDE = 0.01
 
 # Distance from the middle of a box (half widths) beyond which a feasible point says nothing about
 # it; half width of a box that is void if no feasible point is found within this distance; greatest
@@ -305,11 +304,7 @@ class Bounding:
         `least` (d,): the point where the minorants are least. Return `None` if no point helps."""
         objective = self.surfaces[0]
         for begin in (least, box.middle):
-            # A design that is not quite feasible is usable as a rule, and costs no steps.
-            worst = -_BESIDE if np.max(box.half) < _NARROW else -FEASIBLE
-            known = np.min(self._look(begin)[0]) >= worst
-            point = begin if known else self._within(box, begin)
-            if point is None:
+            if (point := self._within(box, begin)) is None:
                 continue
             away = objective.near(point, begin[None])
             if objective.near(point, objective.points) > max(objective.room(box), away):
