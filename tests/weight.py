@@ -13,9 +13,9 @@ from unittest import mock
 
 ROOT = Path(__file__).parents[1]
 MOST = {
-    "statements of the package": 27_132,
-    "statements of the tests": 17_468,
-    "statements of the experiments": 5_088,
+    "statements of the package": 27_168,
+    "statements of the tests": 16_435,
+    "statements of the experiments": 4_759,
     "packages": 13,
     "files of the package": 203,
     "lines of the longest file": 450,
@@ -24,7 +24,7 @@ MOST = {
     "config keys": 134,
     "lines of the longest help": 59,
     "pages of docs": 45,
-    "words of docs": 31_501,
+    "words of docs": 31_482,
 }
 """Greatest values that are accepted. Lower them when the project becomes lighter. Whoever raises
 one gives the reason in the changelog: what users can do now that is worth the weight."""

@@ -324,7 +324,7 @@ def chaotic(seed=0, members=32, periods=32):
 @pytest.mark.long
 def test_standard_errors_are_honest():
     """Independent ensembles differ by as much as their standard errors state."""
-    found = [numbers(chaotic(seed=seed, members=16)) for seed in range(3)]
+    found = [numbers(chaotic(seed=seed, members=16)) for seed in range(5)]
     apart = []
     for (first, by_first), (second, by_second) in itertools.combinations(found, 2):
         apart.append(np.abs(first - second) / np.hypot(by_first, by_second))
