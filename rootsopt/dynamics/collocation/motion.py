@@ -31,7 +31,7 @@ def greatest_error(tolerance: ArrayLike) -> Float[Array, ""]:
     """Return the estimated relative error of the forces above which an orbit is rejected.
 
     `tolerance`: that of the orbit's integrator. A tightened one must not reject what the usual one
-    accepts: the mesh may have no room for refinement, or rounding of the gap may hide its effect."""
+    accepts: the mesh may lack room for refinement, or rounding of the gap may hide its effect."""
     return _UNREFINED * jnp.maximum(ACCURACY * jnp.asarray(tolerance), USUAL)
 
 
