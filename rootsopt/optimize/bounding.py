@@ -68,9 +68,8 @@ _ROWS = 3
 _NARROW, _NARROWEST = 1 / 64, 1 / 8192
 
 # Distance from the middle of a box (half widths) beyond which a feasible point says nothing about
-# it; half width of a box that is void if no feasible point is found within this distance; greatest
-# magnitude of a slack that counts.
-_OUTSIDE, _SMALL_BOX, _FAR = 2.0, 1 / 16, 1e9
+# it; half width of a box that is void if no feasible point is found within this distance.
+_OUTSIDE, _SMALL_BOX = 2.0, 1 / 16
 
 # Greatest number of design parameters for a lower bound: with `optimizer.prove`, and by default.
 PARAMETERS, QUICK = 4, 3
@@ -433,13 +432,7 @@ class Bounding:
         heapq.heappush(self._open, Box(bound, next(self._numbers), *rest))
 
     def _look(self, point: NDArray[np.float64]) -> Rows:
-        """Return slacks (m,) and their gradients (m, d) at a `point` (d,), mapped to -1 … 1.
-
-        A slack that grows without bound, such as one near an undercut, is nearly constant then."""
         key = point.tobytes()
         if key not in self._known:
-            slack, normals = self.limits(point)
-            slack = np.clip(slack, -_FAR, _FAR)
-            scale = 1 + np.abs(slack)
-            self._known[key] = slack / scale, normals / scale[:, None] ** 2
+            self._known[key] = self.limits(point)
         return self._known[key]

@@ -222,6 +222,36 @@ def test_limits_that_grow_without_bound_are_no_obstacle():
     assert bound.lower_bound == pytest.approx(least, abs=2e-5)
 
 
+@pytest.mark.parametrize("width", [1e-2, 1e-3, 1e-4])
+def test_a_thin_feasible_set_is_searched_too(width):
+    """Designs within `width` of a curved surface, against grids; hardly a drawn one is feasible."""
+
+    def wave(y):
+        return 0.05 * np.cos(3 * np.pi * y) + 0.1 * y
+
+    def limits(point):
+        away, normal = point[0] - 0.2 - 0.5 * point[1] ** 2, np.array([1.0, -point[1], 0.0])
+        return np.array([width - away, width + away]) / width, np.array([-normal, normal]) / width
+
+    def local(point):
+        slope = 0.1 - 0.15 * np.pi * np.sin(3 * np.pi * point)
+        slope[0] = 0.3
+        return Linearization(0.3 * point[0] + np.sum(wave(point[1:])), slope, (), *limits(point))
+
+    start, y = np.array([0.325, 0.5, 0.5]), np.linspace(0, 1, 100_001)
+    least = np.min(0.3 * (0.2 + 0.5 * y**2 - width) + wave(y)) + np.min(wave(y))
+    found = bounding.Bounding(limits, 3, local(start).objective)
+    found.tell(start, local(start))
+    while points := found.ask(8):
+        assert all(np.min(limits(point)[0]) >= -FEASIBLE for point in points)
+        for point in points:
+            found.tell(point, local(point))
+    bound = found.bound(found.best)
+    assert bound.proven
+    assert bound.evaluations < 150
+    assert bound.lower_bound == pytest.approx(least, abs=2e-5)
+
+
 def test_minorants_hold_across_a_corner_that_bends_downwards():
     """A roof: in small boxes minorants are below it, and the best is close to it.
 
