@@ -13,8 +13,8 @@ from unittest import mock
 
 ROOT = Path(__file__).parents[1]
 MOST = {
-    "statements of the package": 27_168,
-    "statements of the tests": 16_435,
+    "statements of the package": 27_164,
+    "statements of the tests": 16_461,
     "statements of the experiments": 4_759,
     "packages": 13,
     "files of the package": 203,
@@ -24,7 +24,7 @@ MOST = {
     "config keys": 134,
     "lines of the longest help": 59,
     "pages of docs": 45,
-    "words of docs": 31_503,
+    "words of docs": 31_485,
 }
 """Greatest values that are accepted. Lower them when the project becomes lighter. Whoever raises
 one gives the reason in the changelog: what users can do now that is worth the weight."""

@@ -242,10 +242,13 @@ def test_a_thin_feasible_set_is_searched_too(width):
     least = np.min(0.3 * (0.2 + 0.5 * y**2 - width) + wave(y)) + np.min(wave(y))
     found = bounding.Bounding(limits, 3, local(start).objective)
     found.tell(start, local(start))
-    while points := found.ask(8):
+    points = found.ask(8)
+    assert len(points) == 8
+    while points:
         assert all(np.min(limits(point)[0]) >= -FEASIBLE for point in points)
         for point in points:
             found.tell(point, local(point))
+        points = found.ask(8)
     bound = found.bound(found.best)
     assert bound.proven
     assert bound.evaluations < 150
