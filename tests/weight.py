@@ -13,7 +13,7 @@ from unittest import mock
 
 ROOT = Path(__file__).parents[1]
 MOST = {
-    "statements of the package": 27_164,
+    "statements of the package": 27_165,
     "statements of the tests": 16_461,
     "statements of the experiments": 4_759,
     "packages": 13,

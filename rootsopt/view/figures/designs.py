@@ -333,8 +333,10 @@ def plot_departure(
     if inside.any():
         place = along[np.argmax(inside)]
         ax.axvline(place, color=GREY, linewidth=0.9, linestyle=":")
+        # On the side that the curve beyond the pitch circle leaves free.
+        height = 0.93 if np.mean(away[inside]) < 0 else 0.02
         ax.annotate(
-            "pitch circle", (place, 0.02), (3, 0), xycoords=("data", "axes fraction"),
+            "pitch circle", (place, height), (3, 0), xycoords=("data", "axes fraction"),
             textcoords="offset points", fontsize=9,
         )  # fmt: skip
     greatest = away[np.argmax(np.abs(away))]
