@@ -303,6 +303,9 @@ class Bounding:
         `least` (d,): the point where the minorants are least. Return `None` if no point helps."""
         objective = self.surfaces[0]
         for begin in (least, box.middle):
+            # Most boxes have an evaluated point near `begin`: do not look for a feasible one there.
+            if objective.near(begin, objective.points) <= objective.room(box):
+                continue
             if (point := self._within(box, begin)) is None:
                 continue
             away = objective.near(point, begin[None])
@@ -314,7 +317,7 @@ class Bounding:
         """Return the feasible point (d,) that is found from a point `begin` (d,), `None` if it is
         not within `_OUTSIDE` of a `box`."""
         point = begin
-        for point in onto(self.limits, begin):
+        for point in onto(self._look, begin):
             if np.max(np.abs(point - box.middle) / box.half) > _OUTSIDE:
                 return None
         return point if np.min(self._look(point)[0]) >= -FEASIBLE else None
@@ -326,9 +329,12 @@ class Bounding:
             drawn = sobol(_DRAWN, 0, self.size)
             inside = np.array([np.min(self._look(x)[0]) >= 0 for x in drawn])
             self._sample = [*drawn[inside]]
-            if len(self._sample) < self._first:
-                moved = ([*onto(self.limits, x)][-1] for x in drawn[~inside][:_MOVED])
-                self._sample += [x for x in moved if np.min(self._look(x)[0]) >= -FEASIBLE]
+            for begin in drawn[~inside][:_MOVED]:
+                if len(self._sample) >= most:
+                    break
+                *_, point = onto(self._look, begin)
+                if np.min(self._look(point)[0]) >= -FEASIBLE:
+                    self._sample.append(point)
         taken = [*self.unusable, *self.surfaces[0].points]
         found: list[NDArray[np.float64]] = []
         for _ in range(min(most, len(self._sample))):
