@@ -26,7 +26,7 @@ from experiments.families.reach import Reach, changed, in_housing, of_family, pr
 from rootsopt.config import Config, load, parse
 from rootsopt.errors import InputError
 from rootsopt.optimize.search import Search
-from rootsopt.profiles.departure import departure
+from rootsopt.profiles.geometry import departure
 from rootsopt.response.result import Evaluation
 from rootsopt.scene import check_geometry, design_vector, outline_mm
 from rootsopt.scene.families import classical, free_form_of

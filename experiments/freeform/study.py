@@ -16,7 +16,7 @@ from experiments._common.tables import print_record, show
 from rootsopt.config import load
 from rootsopt.optimize.search import Search
 from rootsopt.profiles import Profile, outline
-from rootsopt.profiles.departure import departure, flank_points
+from rootsopt.profiles.geometry import departure, flank_points
 from rootsopt.scene.resemblance import likenesses
 from rootsopt.view.figures.designs import plot_departure
 

@@ -22,7 +22,7 @@ from rootsopt.config.families import family_of, parameters
 from rootsopt.config.units import DEG, MM
 from rootsopt.profiles import Curve, FreeForm, geometry
 from rootsopt.profiles.cic import CIC
-from rootsopt.profiles.geometry import PURE, margins
+from rootsopt.profiles.soundness import PURE, margins
 from rootsopt.scene.families import profile_of
 
 RADIUS_MM = 33.0

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 MARGINS = (
     *("turning", "convexity", "reach", "fall", "rolling", "order", "undercut", "star", "root"),
 )
-"""Names of the margins that are ≥ 0 in a sound profile (see `rootsopt.profiles.geometry`)."""
+"""Names of the margins that are ≥ 0 in a sound profile (see `rootsopt.profiles.soundness`)."""
 FREE_FORM = "free_form"
 """Name of the family whose members can approximate any profile."""
 EXAMPLE_RADIUS = 33.0

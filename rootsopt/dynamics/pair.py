@@ -34,7 +34,7 @@ from rootsopt.dynamics.parts.base import Loads, Motion, Part, Timescales, Units
 from rootsopt.dynamics.parts.load import Load
 from rootsopt.dynamics.parts.machine import Drive, Friction, Supports, TimingGear
 from rootsopt.errors import InputError
-from rootsopt.profiles.geometry import Soundness
+from rootsopt.profiles.soundness import Soundness
 
 STALLED = 0.05
 """Speed of rotor 1, as a fraction of the drive's speed, below which the motor counts as stalled."""

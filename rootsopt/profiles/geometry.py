@@ -1,16 +1,18 @@
-"""Integral and extreme properties of a profile: area, inertia, radii, outline, margins.
+"""Integral and extreme properties of a profile, its outline, and distances between two outlines.
 
-Margins measure how far a profile, or a design, is from being unsound."""
+Two profiles of equal lobes have the same mirror lines: the axes of the lobes and of the valleys. A
+flank from tip to root lies in the sector between two neighbouring mirror lines. Mirroring a point
+never brings it closer to a point of the other outline in the same sector. The distances between the
+flanks are therefore those between the closed outlines."""
 
 import functools
-import itertools
 from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from rootsopt.profiles.base import Profile, Quadrature
@@ -215,123 +217,135 @@ def _rotate(points: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
     return points @ np.array([[cos, sin], [-sin, cos]])
 
 
-PURE = ("turning", "rolling", "order", "limits")
-"""Names of the margins that are angles or ratios. All other margins are lengths, or lengths per
-angle."""
-# Number of points at which margins are evaluated, per smooth part of a flank and per knot span of a
-# wavy flank.
-_POINTS = 400, 100
-# Violations above which a design counts as unsound: of an angle (rad) or ratio, and of a length
-# (m). A search ends at such points, because it lets constraints be violated by a millionth of their
-# scale.
-_ROUNDING = 1e-7, 1e-9
+# Default of `nodes`, the least number of points of a flank on each side of the pitch circle.
+_NODES = 400
+# Number of points of each neighbouring flank that are appended to the ends of a flank.
+_BEYOND = 8
+# Angle (rad) between successive segments of a polygonal line above which their joint is a corner.
+_CORNER = 0.1
 
 
-class Soundness(NamedTuple):
-    """Margins of all checks of a design; it is sound if none of them is negative (`sound`).
+class Departure(NamedTuple):
+    """Distances (m) between the closed outlines of two profiles.
 
-    The first nine are least values along a flank (`margins`). A margin is inf if the family or the
-    scene has no such check.
+    `greatest`: Hausdorff distance, the greatest distance of a point of either outline from the
+    other outline. `rms`: root mean square, over the arc length of the first outline, of the
+    distances of its points from the second outline."""
 
-    `turning`: range of normal angles of a segment (rad), negative where joints are out of order.
-    `convexity`: radius of curvature of the addendum (m).
-    `reach`: pitch radius minus |lever| of a normal (m), negative where a normal misses the pitch
-    circle.
-    `fall`: lever (m), negative where the outline rises again beyond the tip.
-    `rolling`: dβ/dν, negative where two points of a flank mesh at once and carry over the gas
-    between them. The centre of curvature then lies outside the pitch circle.
-    `order`: β (rad), negative where a flank meshes before its tip, together with the lobe's other
-    flank.
-    `undercut`: speed of the dedendum (m/rad, `Profile.speeds`).
-    `star`: distance of a tangent of addendum or dedendum from the axis (m), negative where the
-    outline folds back as seen from the axis. While it is positive, the two flanks of a lobe, or of
-    a valley, do not cross.
-    `root`: root radius (m).
-    `limits`: least distance of a ratio of the family from its limits (`Profile.limit_margin`).
-    `bore`: root radius minus the radius of the bore (m).
-    """
-
-    turning: Float[Array, ""]
-    convexity: Float[Array, ""]
-    reach: Float[Array, ""]
-    fall: Float[Array, ""]
-    rolling: Float[Array, ""]
-    order: Float[Array, ""]
-    undercut: Float[Array, ""]
-    star: Float[Array, ""]
-    root: Float[Array, ""]
-    limits: Float[Array, ""]
-    bore: Float[Array, ""]
-
-    @property
-    def of_flank(self) -> dict[str, Float[Array, ""]]:
-        """The margins of a flank by name: all but `limits` and `bore`."""
-        return dict(itertools.islice(self._asdict().items(), 9))
-
-    @property
-    def sound(self) -> Bool[Array, ""]:
-        """Whether the design is sound. A margin that is not a number counts as negative."""
-        slack, length = _ROUNDING
-        least = [-slack if name in PURE else -length for name in self._fields]
-        return jnp.all(jnp.stack(self) >= jnp.asarray(least, self.root.dtype))
-
-    @property
-    def failed(self) -> str:
-        """Name of the first check that fails, or "" if all hold; not for traced margins."""
-        for name, value in self._asdict().items():
-            if not float(value) >= -_ROUNDING[name not in PURE]:
-                return name
-        return ""
+    greatest: float
+    rms: float
 
 
-def soundness(
-    profile: Profile, bore: Float[Array, ""] | None, inherent: frozenset[str]
-) -> Soundness:
-    """Return the margins of all checks of a design.
+class Feet(NamedTuple):
+    """The points of a polygonal line that are nearest to given points.
 
-    `bore`: radius of the bore (m), `None` without a bore; `inherent`: names of margins that may be
-    negative in the family. Of an outline from a file, only the root radius and the bore are
-    checked. The margins are constants to JAX, with derivative 0."""
-    profile, bore = lax.stop_gradient((profile, bore))
-    free = jnp.full_like(profile.pitch_radius, jnp.inf)
-    if isinstance(profile, Outline):
-        found = Soundness._make([*[free] * 8, profile.root_radius, free, free])
-    else:
-        found = margins(profile)
-    room = free if bore is None else found.root - bore
-    own = jnp.asarray(profile.limit_margin(), free.dtype)
-    return found._replace(**dict.fromkeys(inherent, free), limits=own, bore=room)
+    `away` (n,): signed distances of the given points, positive to the right of the line (outside,
+    if the line runs counter-clockwise); `toward` (n, 2): unit vectors along which the signed
+    distances are measured; `segment` (n,): indices of the segments with the nearest points; `share`
+    (n,): places of the nearest points, as fractions of the segments."""
+
+    away: NDArray[np.float64]
+    toward: NDArray[np.float64]
+    segment: NDArray[np.intp]
+    share: NDArray[np.float64]
+
+
+def departure(profile: Profile, other: Profile, nodes: int = _NODES) -> float:
+    """Return the Hausdorff distance (m) between the closed outlines of two profiles.
+
+    `nodes`: least number of points on each side of the pitch circle of a flank."""
+    return departures(profile, other, nodes).greatest
+
+
+def departures(
+    profile: Profile, other: Profile, nodes: int = _NODES, inset: float = 0.0
+) -> Departure:
+    """Return the distances between the closed outlines of two profiles with equal lobes.
+
+    `nodes`: least number of points on each side of the pitch circle of a flank; `inset`: distance
+    (m) by which `other` is first made smaller along its normals."""
+    first, second = (flank_points(one, nodes) for one in (profile, other))
+    there, back = (
+        np.abs(feet(points, beyond(line, profile.lobes), smooth=True).away + shift)
+        for points, line, shift in ((first, second, inset), (second, first, -inset))
+    )
+    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(first, axis=0), axis=1))])
+    rms = np.sqrt(np.trapezoid(there**2, arc) / arc[-1])
+    return Departure(float(max(there.max(), back.max())), float(rms))
+
+
+def flank_points(profile: Profile, nodes: int = _NODES) -> NDArray[np.float64]:
+    """Return points (n, 2) in m on a flank of `profile` from tip to root.
+
+    The points are evenly spaced in normal angle; the ends of segments are further points. `nodes`:
+    least number of points on each side of the pitch circle."""
+    stop = float(profile.pitch_normal)
+    ends = [float(s.stop) for s in profile.segments()]
+    return np.asarray(_points(profile, np.union1d(np.linspace(0, stop, nodes), ends)))
 
 
 @CachedFunction
-def margins(profile: Profile) -> Soundness:
-    """Return the margins of a profile, without `limits` and `bore`.
+def _points(profile: Profile, nu):
+    addendum, dedendum = (profile.position(f(nu)) for f in (profile.addendum, profile.dedendum))
+    return jnp.concatenate([addendum, dedendum[::-1]])
 
-    Least values along the flank are taken over `_POINTS` of each smooth part: a segment, or a
-    knot span of a wavy flank. Both sides of a joint are evaluated. Between the points, a minimum is
-    that of the parabola through three points. No parabola crosses a joint or a knot, where it might
-    fall below all values of the flank."""
-    parts = profile.stretches() if profile.wavy else profile.segments()
-    start = jnp.stack([s.start for s in parts])[:, None]
-    length = jnp.stack([s.stop for s in parts])[:, None] - start
-    nu = start + length * jnp.linspace(1e-9, 1 - 1e-9, _POINTS[profile.wavy])
-    point, addendum, dedendum = profile.speeds(nu)
-    r = profile.pitch_radius
-    sliding = r * jnp.sin(point.psi)
-    lever = profile.lever(nu)
-    present = length > 0
 
-    star = jnp.minimum(sliding + point.s, sliding - point.s)
-    rate = profile.roll_rate(nu)
-    values = jnp.stack([addendum, r - jnp.abs(lever), lever, rate, point.beta, dedendum, star])
-    # Include minima between the points, from the parabola through three points.
-    before, here, after = values[..., :-2], values[..., 1:-1], values[..., 2:]
-    bend = before - 2 * here + after
-    low = (here <= before) & (here <= after) & (bend > 0)
-    dip = (after - before) ** 2 / (8 * jnp.where(low, bend, 1.0))
-    values = values.at[..., 1:-1].add(-jnp.where(low, dip, 0.0))
-    least = jnp.min(jnp.where(present, values, jnp.inf), axis=(1, 2))
-    turning = jnp.min(jnp.stack([s.stop - s.start for s in profile.segments()]))
-    root = r - profile.contact_distance(jnp.zeros_like(r))
-    free = jnp.full_like(r, jnp.inf)
-    return Soundness._make([turning, *least, root, free, free])
+def beyond(flank: Float[np.ndarray, "n 2 *d"], lobes: int) -> NDArray[np.float64]:
+    """Return a `flank`, from tip to root, with pieces of both neighbouring flanks at its ends.
+
+    `flank`: points in a first axis, coordinates in a second; further axes hold derivatives of the
+    points. `lobes`: number of lobes. The neighbours are mirror images, `_BEYOND` points of each:
+    the tip of a measured flank need not lie on the lobe's axis exactly."""
+    turn = 2 * np.pi / lobes
+    tip = np.array([[1.0, 0.0], [0.0, -1.0]])
+    root = np.array([[np.cos(turn), np.sin(turn)], [np.sin(turn), -np.cos(turn)]])
+    before, after = flank[_BEYOND:0:-1], flank[-2 : -2 - _BEYOND : -1]
+    before = np.einsum("jk,nk...->nj...", tip, before)
+    after = np.einsum("jk,nk...->nj...", root, after)
+    return np.concatenate([before, flank, after])
+
+
+def feet(
+    points: Float[np.ndarray, "n 2"], line: Float[np.ndarray, "m 2"], smooth: bool = False
+) -> Feet:
+    """Return the nearest point of a polygonal `line` to each of the `points`.
+
+    Points, line and distances have the same unit of length. `smooth`: whether the line's vertices
+    lie on a smooth curve. The distances are then those from this curve. Their relative error is at
+    most an eighth of the squared turn (rad) of the curve along a segment."""
+    start, step = line[:-1], np.diff(line, axis=0)
+    squares = np.maximum(np.sum(step**2, axis=1), np.finfo(float).tiny)
+    # One coordinate at a time: a third axis of length 2 takes four times as long.
+    x, y = (points[:, None, k] - start[:, k] for k in (0, 1))
+    share = np.clip((x * step[:, 0] + y * step[:, 1]) / squares, 0.0, 1.0)
+    x -= share * step[:, 0]
+    y -= share * step[:, 1]
+    segment = np.argmin(x**2 + y**2, axis=1)
+    every = np.arange(len(points))
+    toward = np.stack([x[every, segment], y[every, segment]], axis=1)
+    away, share = np.linalg.norm(toward, axis=1), share[every, segment]
+    along = step[segment] / np.sqrt(squares[segment])[:, None]
+    normal = np.stack([along[:, 1], -along[:, 0]], axis=1)
+    sign = np.where(np.sum(toward * normal, axis=1) < 0, -1.0, 1.0)
+    # Beside a corner, the distance is not measured along a normal of the line.
+    corner = ((share <= 0) | (share >= 1)) & (away > 0)
+    toward = np.where(corner[:, None], toward / np.where(away > 0, away, 1.0)[:, None], normal)
+    toward[corner] *= sign[corner, None]
+    away = sign * away
+    if smooth:
+        away = away - share * (1 - share) * _bulge(step)[segment]
+    return Feet(away, toward, segment, share)
+
+
+def _bulge(step: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return four times the height (n,) of a smooth curve over each segment of a polygonal line.
+
+    `step` (n, 2): the segments. The curve passes through the vertices, and turns along a segment by
+    the mean of the turns at both of its ends. A turn by more than `_CORNER` is a corner of the
+    curve. Heights are positive to the right of the line."""
+    along = step @ np.array([1, 1j])
+    ahead = along[1:] * np.conj(along[:-1])
+    turn = np.where(ahead == 0, 0.0, np.angle(ahead))
+    turn = np.where(np.abs(turn) < _CORNER, turn, 0.0)
+    ends = np.concatenate([turn[:1], turn, turn[-1:]])
+    return np.abs(along) * (ends[1:] + ends[:-1]) / 4

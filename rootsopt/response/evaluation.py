@@ -43,7 +43,7 @@ from rootsopt.response.reducers import (
 )
 from rootsopt.response.result import Evaluation, Part, Seed, Seeds, begun
 from rootsopt.response.scatter import Shift, at_speed, draw, shifts
-from rootsopt.response.terms import OF_MOTION, terms_of, values_of
+from rootsopt.response.terms import OF_MOTION, terms_of, values_of, with_terms
 from rootsopt.runtime.environment import check_precision
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene.build import Scene
@@ -289,7 +289,7 @@ class Evaluator:
         found = self.motion(pair, tangents, begin)
         if series and self.confirm:
             found = self._confirmed(pair, tangents, begin, found)
-        report = reported(self, design, (pair, tangents, shape), found, began, series)
+        report = self._reported(design, (pair, tangents, shape), found, began, series)
         if self.maxima and report.usable:
             maxima = local_maxima(pair, tangents, varied(found))
             report = dataclasses.replace(report, maxima=maxima)
@@ -362,7 +362,8 @@ class Evaluator:
         """Compile the programs of `reached` in the background. Arguments: see `prepare`."""
         pair, tangents, _ = _build.result_shape(self.scene, design)
         dtype, solver = pair.angle_scale.dtype, self.solver
-        begin = eqx.filter_eval_shape(_at_rest, pair, solver.max_orbit)
+        rest = jax.ShapeDtypeStruct((pair.states,), dtype)
+        begin = eqx.filter_eval_shape(Start.at, pair, rest, solver.max_orbit)
 
         def then(found: Steady) -> None:
             orbit = varied(found)
@@ -404,12 +405,11 @@ class Evaluator:
 
         `built`: result of `assembled`; `found`: its motion; `began`: time at the start (s,
         `perf_counter`)."""
-        return reported(self, design_vector(self.config), built, found, began, False)
+        return self._reported(design_vector(self.config), built, found, began, False)
 
-
-def _at_rest(pair: RotorPair, longest: int) -> Start:
-    """Return a start at rest; `longest`: longest period of an orbit (mesh periods)."""
-    return Start.at(pair, jnp.zeros(pair.states, pair.angle_scale.dtype), longest)
+    def _reported(self, design: Any, *known: Any) -> Evaluation:
+        """Return the evaluation of a known motion; arguments as of `reported`."""
+        return with_terms(reported(self, design, *known), self.scene, design, names_of(self))
 
 
 def motion_from(pair: RotorPair, tangents: RotorPair, start: Start, radius, solver) -> Steady:

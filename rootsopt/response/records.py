@@ -27,7 +27,6 @@ from rootsopt.profiles import Geometry
 from rootsopt.pump.loads import BEARING, EQUIVALENT, OrbitLoads, orbit_loads
 from rootsopt.pump.rattle import rattle_record, silent_limit, silent_record
 from rootsopt.response.result import RESPONSES, Evaluation, Seed, Series
-from rootsopt.response.terms import terms_of, values_of
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene.build import Scene
 from rootsopt.scene.families import fault_of
@@ -332,13 +331,9 @@ def reported(
         motion = window_series(pair, found.window) if series else None
     response = {name: value for name, (value, _) in named.items()}
     gradient = _named(evaluator, {name: row for name, (_, row) in named.items()}) if known else {}
-    if status in CLOSED or idle:
-        terms, slopes = _terms(evaluator, design, response, gradient)
-        response |= terms
-        gradient |= slopes if known else {}
-    elif status is Status.UNSOUND and pair.soundness is not None:
+    if status is Status.UNSOUND and pair.soundness is not None:
         hint = f" Here, {fault_of(pair.soundness)}."
-    elif found.window is not None:
+    elif found.window is not None and not idle and status not in CLOSED:
         steady, response, motion = unsettled(pair, status, found.window, series)
     elif status is Status.SOLVER_FAILED and pair.timescales is not None:
         swings = pair.mesh_period / (2 * np.pi * pair.timescales.swing)
@@ -417,25 +412,6 @@ def geared(evaluator: "Evaluator", series: bool) -> bool:
 def names_of(evaluator: "Evaluator") -> tuple[str, ...]:
     """Return the names of the further terms of the objective."""
     return tuple(evaluator.config.objective.terms)
-
-
-def _terms(evaluator: "Evaluator", design, response, gradient):
-    """Return the values of the objective's further terms, and their gradients.
-
-    The gradient of a term is NaN if it depends on gradients of the forces that are not known.
-    """
-    names = [name for name in names_of(evaluator) if name not in response]
-    if not names:
-        return {}, {}
-    forces = np.array([response[name] for name in RESPONSES])
-    slopes = np.full((3, len(evaluator.keys)), np.nan)
-    if gradient:
-        slopes = np.array([list(gradient[name].values()) for name in RESPONSES])
-    found = values_of(evaluator.scene, terms_of(names), design, forces, slopes)
-    values, rows = map(np.asarray, found)
-    return dict(zip(names, map(float, values), strict=True)), _named(
-        evaluator, dict(zip(names, rows, strict=True))
-    )
 
 
 def _named(evaluator: "Evaluator", rows: dict[str, Any]) -> dict[str, dict[str, float]]:

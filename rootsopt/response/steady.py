@@ -23,7 +23,7 @@ from rootsopt.dynamics.linear import eigenvalues
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.reserve import reserve
 from rootsopt.dynamics.steady import CLOSED, OPEN, Steady, among, varied
-from rootsopt.profiles.geometry import Soundness
+from rootsopt.profiles.soundness import Soundness
 from rootsopt.runtime.environment import check_precision
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene.build import Scene, along

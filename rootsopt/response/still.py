@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from rootsopt.config.reading import Config
 from rootsopt.profiles import Geometry, geometry
-from rootsopt.profiles.geometry import Soundness
+from rootsopt.profiles.soundness import Soundness
 from rootsopt.response.evaluation import Evaluator, Motions
 from rootsopt.response.records import geometry_record, message_of
 from rootsopt.response.result import Evaluation

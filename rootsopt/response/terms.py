@@ -6,6 +6,7 @@ of the forces.
 """
 
 import abc
+import dataclasses
 import re
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -21,15 +22,17 @@ from rootsopt.config.reading import Config
 from rootsopt.config.units import MM, UM
 from rootsopt.dynamics.orbit import PEAK_NORM, line_name
 from rootsopt.dynamics.reserve import GEAR, RESERVES
+from rootsopt.dynamics.steady import CLOSED
 from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry, Profile, geometry
 from rootsopt.pump import flow
 from rootsopt.pump.flow import CM3, L_MIN, MRAD, play_of, ripple_of
 from rootsopt.pump.loads import BEARING, still_loads
 from rootsopt.pump.rattle import SILENT, silent_eccentricity
-from rootsopt.response.result import RESPONSES
+from rootsopt.response.result import RESPONSES, Evaluation
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene.build import Scene
+from rootsopt.status import Status
 
 
 class Forces(NamedTuple):
@@ -317,6 +320,28 @@ def is_force(config: Config, name: str, key: str) -> bool:
             f"1000, as in line_2_force_N, but names {name}"
         )
     return True
+
+
+def with_terms(found: Evaluation, scene: Scene, design, names: Sequence[str]) -> Evaluation:
+    """Return an evaluation of a `design` (d,) with the terms in `names` that it lacks.
+
+    They have gradients if the forces have. Without an orbit, the evaluation stays as it is."""
+    names = [name for name in names if name not in found.response]
+    if not names or not (found.status in CLOSED or found.status is Status.IDLE):
+        return found
+    keys, known = [*found.design], RESPONSES[0] in found.gradient
+    forces = np.array([found.response[name] for name in RESPONSES])
+    slopes = np.zeros((len(RESPONSES), len(keys)))
+    if known:
+        slopes[:] = [[*found.gradient[name].values()] for name in RESPONSES]
+    values, rows = map(np.asarray, values_of(scene, terms_of(names), design, forces, slopes))
+    response = found.response | dict(zip(names, map(float, values), strict=True))
+    further = {
+        name: dict(zip(keys, map(float, row), strict=True))
+        for name, row in zip(names, rows, strict=True)
+    }
+    gradient = found.gradient | (further if known else {})
+    return dataclasses.replace(found, response=response, gradient=gradient)
 
 
 def depends_on_forces(config: Config, scene: Scene, name: str, key: str) -> bool:

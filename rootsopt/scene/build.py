@@ -49,7 +49,7 @@ from rootsopt.dynamics.parts.machine import (
     TimingGear,
 )
 from rootsopt.profiles import Geometry, Outline, Profile, geometry
-from rootsopt.profiles.geometry import Soundness, soundness
+from rootsopt.profiles.soundness import Soundness, soundness
 from rootsopt.runtime.environment import check_precision
 from rootsopt.scene import families, reading
 from rootsopt.scene.reading import GRAVITY, Bearings, Medium, bearings_of, medium_of

@@ -11,8 +11,8 @@ from rootsopt.config.units import DEG, MM, shown
 from rootsopt.errors import InputError
 from rootsopt.measured.conjugacy import conjugacy
 from rootsopt.profiles import Outline, Profile, project
-from rootsopt.profiles.departure import departure
-from rootsopt.profiles.geometry import Soundness, margins, soundness
+from rootsopt.profiles.geometry import departure
+from rootsopt.profiles.soundness import Soundness, margins, soundness
 from rootsopt.runtime.environment import say
 from rootsopt.runtime.programs import CachedFunction
 

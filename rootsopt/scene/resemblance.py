@@ -29,8 +29,8 @@ from rootsopt.config.units import DEG, MM
 from rootsopt.errors import InputError
 from rootsopt.measured.conjugacy import conjugacy
 from rootsopt.profiles import Outline, Profile, project
-from rootsopt.profiles.departure import beyond, departures, feet, flank_points
-from rootsopt.profiles.geometry import PURE, margins
+from rootsopt.profiles.geometry import beyond, departures, feet, flank_points
+from rootsopt.profiles.soundness import PURE, margins
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene.families import check, classical, profile_of
 from rootsopt.scene.space import sobol

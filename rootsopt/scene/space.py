@@ -3,7 +3,7 @@
 Each design parameter is mapped linearly from its bounds to the range 0 … 1. If its range depends on
 the other parameters, the part of this range within the bounds is mapped instead. Constraints depend
 on the geometry alone and are cheap. For families whose closed-form limits do not ensure a sound
-profile, the margins of `rootsopt.profiles.geometry` are further constraints.
+profile, the margins of `rootsopt.profiles.soundness` are further constraints.
 """
 
 import importlib
@@ -24,7 +24,7 @@ from rootsopt.config.study import BASELINE, TWIST
 from rootsopt.config.units import DEG, MM, si_unit, unit_of, words
 from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry, Profile, geometry
-from rootsopt.profiles.geometry import Soundness, margins
+from rootsopt.profiles.soundness import Soundness, margins
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene.build import Scene
 

@@ -22,7 +22,7 @@ from rootsopt.config.families import families, family_of
 from rootsopt.contact.closest import FlankPair
 from rootsopt.errors import InputError
 from rootsopt.profiles import geometry
-from rootsopt.profiles.geometry import margins
+from rootsopt.profiles.soundness import margins
 from rootsopt.scene import Scene
 from rootsopt.scene.families import check, design_of, profile_of
 from rootsopt.scene.space import Space, sobol

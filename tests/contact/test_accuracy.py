@@ -8,7 +8,7 @@ import pytest
 
 from rootsopt.contact.closest import FlankPair
 from rootsopt.profiles import CIC, EE, FreeForm
-from rootsopt.profiles.geometry import margins
+from rootsopt.profiles.soundness import margins
 from rootsopt.scene.families import profile_of
 
 R = 0.033

@@ -24,7 +24,7 @@ from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.robust_problem import Stage
 from rootsopt.optimize.search import Search
 from rootsopt.profiles import geometry
-from rootsopt.profiles.geometry import margins
+from rootsopt.profiles.soundness import margins
 from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.runtime.threads import until_stopped
 from rootsopt.scene import Scene

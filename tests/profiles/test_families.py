@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 from rootsopt.config.families import families, family_of
 from rootsopt.errors import InputError
 from rootsopt.profiles import CIC, EE, arc
-from rootsopt.profiles.geometry import margins, soundness
+from rootsopt.profiles.soundness import margins, soundness
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene.families import check, profile_of
 from tests.conformance import families as suite

@@ -12,7 +12,7 @@ from rootsopt.config import parse
 from rootsopt.errors import InputError
 from rootsopt.optimize.problem import Problem
 from rootsopt.profiles import CIC, EE, FreeForm, geometry, project
-from rootsopt.profiles.departure import departure
+from rootsopt.profiles.geometry import departure
 from rootsopt.scene import Scene, design_vector
 from rootsopt.scene.families import check, free_form_of, profile_of
 from rootsopt.scene.space import sobol

@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 from rootsopt.commands.table import profile as command
 from rootsopt.commands.work import profile as work
 from rootsopt.profiles import CIC, EE, arc, ellipse, five_arcs, outline, project
-from rootsopt.profiles.departure import beyond, departure, departures, feet
+from rootsopt.profiles.geometry import beyond, departure, departures, feet
 from rootsopt.scene import resemblance
 from rootsopt.scene.families import profile_of
 from rootsopt.scene.resemblance import free_likeness, likeness

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rootsopt.config import DESIGN_KEYS
 from rootsopt.config.families import is_list
 from rootsopt.profiles import place_pair
-from rootsopt.profiles.departure import beyond, feet
+from rootsopt.profiles.geometry import beyond, feet
 from rootsopt.response.result import Series
 from rootsopt.view.figures.force import number
 from rootsopt.view.figures.style import BLUE, COLORS, GREY, ORANGE, SKY, VERMILION, beside, looks
