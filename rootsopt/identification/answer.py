@@ -16,8 +16,7 @@ import pandas
 from numpy.typing import NDArray
 
 from rootsopt.config.reading import Config
-from rootsopt.identification.model import REST, Point
-from rootsopt.identification.quantities import OFFSET
+from rootsopt.identification.model import OFFSET, REST, Point
 from rootsopt.identification.record import CHANNELS, Observed
 from rootsopt.identification.squares import TURN, Local, Problem
 from rootsopt.status import Status

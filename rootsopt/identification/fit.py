@@ -13,8 +13,7 @@ from rootsopt.config.reading import Config
 from rootsopt.errors import InputError
 from rootsopt.identification import answer
 from rootsopt.identification.answer import Identification, Spread, relative_misfit, structure
-from rootsopt.identification.model import Begin, Point
-from rootsopt.identification.quantities import OFFSET, fitted
+from rootsopt.identification.model import OFFSET, Begin, Point, fitted
 from rootsopt.identification.record import observed
 from rootsopt.identification.squares import TURN, Local, Problem
 from rootsopt.response.attractors import closed, find

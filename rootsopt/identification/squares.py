@@ -16,8 +16,7 @@ import pandas
 from numpy.typing import NDArray
 
 from rootsopt.errors import InputError
-from rootsopt.identification.model import Begin, Point, predict
-from rootsopt.identification.quantities import Fitted, values_at
+from rootsopt.identification.model import Begin, Fitted, Point, predict, values_at
 from rootsopt.status import Status
 
 TURN = 3.0

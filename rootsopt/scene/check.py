@@ -1,17 +1,27 @@
-"""Checks a config's geometry, and computes its outline."""
+"""Checks a config's geometry, computes its outline, and finds the member of a given outer radius.
+
+In the unit box of the family's parameters, `sized` minimises the distance from a reference design.
+The outer radius is an equality constraint; the margins of a sound profile must keep some room.
+Gradients are exact, and the searches (SciPy's SLSQP) begin at members of a Sobol sample."""
+
+import functools
 
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rootsopt.config.families import family_of
 from rootsopt.config.reading import Config
+from rootsopt.config.study import limits_of
 from rootsopt.config.units import MM
 from rootsopt.errors import InputError
 from rootsopt.profiles import Geometry, geometry, outline
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import families
 from rootsopt.scene.build import Scene
+from rootsopt.scene.families import check
 from rootsopt.scene.reading import design_vector
+from rootsopt.scene.space import Space, slacks_and_slopes, sobol
 
 # Excess (mm) of the bore over the root circle above which a design is rejected. A search may end at
 # less.
@@ -60,3 +70,115 @@ def outline_mm(config: Config, design: ArrayLike | None = None) -> NDArray[np.fl
 
 
 _profile = CachedFunction(Scene.profile)
+
+
+# Number of sampled members. Number of searches that begin at the best of them. Magnitude (mm) that
+# replaces values that are not finite.
+_SAMPLE, _STARTS, _FAR = 64, 3, 1e3
+# Least margin of a member, as a fraction of the greatest one in the sample, and its tolerance;
+# deviation (mm) of the outer radius up to which it counts as met.
+#
+# A margin that is 0 in every member, such as the lever at the tip, needs no room.
+_ROOM, _SLACK, _CLOSE = 0.02, 1e-6, 1e-6
+
+
+def sized(config: Config) -> Config | list[float]:
+    """Return the config with a member of its family that fills the housing.
+
+    Its outer radius is `constraints.outer_radius_max_mm` to 1e-6 mm. Among such members, it is the
+    one nearest to the config's own profile, in the unit box of the family's default bounds. If none
+    is found, return outer radii (mm) of sound members, among them the least and the greatest."""
+    limit = limits_of(None, config.constraints.outer_radius_max_mm)[1]
+    if not family_of(config.profile.family).keys:
+        own = float(shape_of(config).outer_radius) / MM
+        return _met(config, config.design) or [own]
+    space = _space(config)
+    outer = np.array([row.quantity == "outer_radius" for row in space.constraints])
+    home = np.asarray(space.point(jnp.asarray(config.design)))
+    at = functools.lru_cache(maxsize=4096)(lambda *point: _seen(space, point))
+    sample = [*sobol(_SAMPLE, 0, len(home)), home]
+    sound = [point for point in sample if np.min(at(*point)[1][~outer]) >= 0]
+    if not sound:
+        return []
+    room = _ROOM * np.max([at(*point)[1] for point in sound], axis=0) - _SLACK
+    search = functools.partial(_searched, at, outer, room, home)
+
+    def radius(point):
+        return limit - float(at(*point)[1][outer][0])
+
+    sound.sort(key=radius)
+    if not radius(sound[0]) <= limit <= radius(sound[-1]):
+        # Without this limit, a search for an outer radius that no member has would take long.
+        ends = [search(point, side) for side in (-1.0, 1.0) for point in (sound[0], sound[-1])]
+        sound += [one for one in ends if np.all((at(*one)[1] - room)[~outer] >= -_SLACK)]
+    radii = [radius(point) for point in sound]
+    if min(radii) <= limit <= max(radii):
+        sound.sort(key=lambda point: abs(radius(point) - limit))
+        found = [search(point, 0.0) for point in sound[:_STARTS]]
+        for point in sorted(found, key=lambda one: float(np.sum((one - home) ** 2))):
+            if (met := _met(config, at(*point)[0])) is not None:
+                return met
+    return radii
+
+
+def _met(config: Config, design) -> Config | None:
+    """Return a config with a rounded design (d,); `None` unless it fills the housing."""
+    # Ten digits keep the outer radius.
+    config = config.with_design([float(f"{value:.10g}") for value in design])
+    try:
+        check(config.profile)
+    except InputError:
+        return None
+    limit = limits_of(None, config.constraints.outer_radius_max_mm)[1]
+    return config if abs(float(shape_of(config).outer_radius) / MM - limit) <= _CLOSE else None
+
+
+def _space(config: Config) -> Space:
+    profile, bounds = config.profile, {}
+    for one in family_of(profile.family).parameters:
+        # Bounds around the example would exclude members with other numbers of lobes.
+        if one.usual is None and one.default_bounds is None and not one.floor:
+            least, most = one.limits(profile.pitch_radius_mm) or one.bounds_range
+            low, high = one.usually(profile.pitch_radius_mm, profile.lobes)
+            bounds[f"optimizer.bounds.{one.key}"] = [max(low, least), min(high, most)]
+    free = config.replaced(bounds)
+    return Space.of(free, Scene.from_config(free))
+
+
+def _seen(space: Space, point) -> tuple[NDArray[np.float64], ...]:
+    """Return (design (d,), slacks (m,), their derivatives (m, d)) at a point of the unit box."""
+    design, _, *slacks = slacks_and_slopes(space, np.asarray(point))
+    finite = (
+        np.nan_to_num(np.asarray(one), nan=-_FAR, posinf=_FAR, neginf=-_FAR) for one in slacks
+    )
+    return np.asarray(design), *finite
+
+
+def _searched(at, outer, room, home, start, side: float) -> NDArray[np.float64]:
+    """Return the point (d,) nearest to `home` whose outer radius is the limit.
+
+    With a `side` of -1 or 1, return that of the greatest or least outer radius instead. `at`:
+    function of the coordinates that returns what `_seen` does; `outer` (m,): whether a constraint
+    is that of the outer radius; `room` (m,): least slacks of the others; `start` (d,): where the
+    search begins."""
+    from scipy.optimize import minimize
+
+    def seen(x):
+        return at(*x)
+
+    rows = [
+        {"type": "ineq", "fun": lambda x: (seen(x)[1] - room)[~outer],
+         "jac": lambda x: seen(x)[2][~outer]},
+        {"type": "eq", "fun": lambda x: seen(x)[1][outer], "jac": lambda x: seen(x)[2][outer]},
+    ]  # fmt: skip
+    goals = (
+        (lambda x: np.sum((x - home) ** 2) / 2, lambda x: x - home)
+        if not side
+        else (lambda x: -side * seen(x)[1][outer][0] / _FAR,
+              lambda x: -side * seen(x)[2][outer][0] / _FAR)
+    )  # fmt: skip
+    found = minimize(
+        goals[0], start, jac=goals[1], bounds=[(0, 1)] * len(home), method="SLSQP",
+        constraints=rows[:1] if side else rows, options={"maxiter": 100, "ftol": 1e-13},
+    )  # fmt: skip
+    return found.x

@@ -14,8 +14,7 @@ from rootsopt import InputError, Status, load_config
 from rootsopt.commands.table import identify as command
 from rootsopt.identification import fit as search
 from rootsopt.identification import model
-from rootsopt.identification.model import Point
-from rootsopt.identification.quantities import fitted
+from rootsopt.identification.model import Point, fitted
 from rootsopt.identification.record import CHANNELS, observed
 from rootsopt.response.attractors import find
 from rootsopt.response.evaluation import Evaluator

@@ -5,7 +5,7 @@ import pytest
 import xarray
 
 from rootsopt import InputError, load_config
-from rootsopt.identification.quantities import fitted
+from rootsopt.identification.model import fitted
 from rootsopt.identification.record import observed
 from rootsopt.scene.space import bounds_of
 

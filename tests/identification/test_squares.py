@@ -8,8 +8,7 @@ from scipy.optimize import brentq, curve_fit, least_squares
 from rootsopt import load_config
 from rootsopt.identification import squares
 from rootsopt.identification.answer import Spread, combinations, profile, structure
-from rootsopt.identification.model import Point, Predicted
-from rootsopt.identification.quantities import Fitted
+from rootsopt.identification.model import Fitted, Point, Predicted
 from rootsopt.identification.record import Observed
 from rootsopt.identification.squares import Problem
 from rootsopt.status import Status

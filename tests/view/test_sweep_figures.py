@@ -2,6 +2,7 @@
 
 import pytest
 
+from rootsopt.commands.work.sweep import outcome, rows_of, summary
 from rootsopt.config import load
 from rootsopt.response.sweeps.plan import plan_of
 from rootsopt.response.sweeps.points import lost
@@ -11,7 +12,6 @@ from rootsopt.view.facts import swept
 from rootsopt.view.figures import sweep as drawing
 from rootsopt.view.figures.sweep import MARKERS
 from rootsopt.view.files import ResultFolder
-from rootsopt.view.sweeps import outcome, rows_of, summary
 from rootsopt.view.tables import scene_tables
 from tests.view.test_optimum_figures import overlaps
 

@@ -22,8 +22,7 @@ from rootsopt.config.sources import regular_file
 from rootsopt.config.units import placed, sentence
 from rootsopt.errors import InputError
 from rootsopt.runtime.environment import say
-from rootsopt.scene.check import shape_of
-from rootsopt.scene.sizing import sized
+from rootsopt.scene.check import shape_of, sized
 from rootsopt.view import files
 
 _POWERS = "power_kW", "pressure_difference_bar"

@@ -1,10 +1,13 @@
-"""The work of `rootsopt sweep`."""
+"""The work of `rootsopt sweep`, and its files: rows, summary, and the dataset as netCDF."""
 
 import argparse
+import io
 import time
+from collections import Counter
+from collections.abc import Mapping
 from contextlib import closing
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.console import Console
@@ -14,13 +17,83 @@ from rootsopt.commands.work.searching import opened, progress_bar
 from rootsopt.config.plausible import notes_on_swept
 from rootsopt.config.reading import Config
 from rootsopt.errors import InputError
+from rootsopt.response.result import RESPONSES
 from rootsopt.response.sweeps.cluster import running
 from rootsopt.response.sweeps.plan import Plan, parse_over, plan_of, scattered
-from rootsopt.response.sweeps.scenes import Points, checked, complete, dataset_of
+from rootsopt.response.sweeps.points import Row
+from rootsopt.response.sweeps.scenes import (
+    Points,
+    checked,
+    complete,
+    dataset_of,
+    is_numeric,
+    written,
+)
 from rootsopt.runtime.environment import say
 from rootsopt.status import Status
-from rootsopt.view import files, sweeps
+from rootsopt.view import files
+from rootsopt.view.files import ResultFolder
 from rootsopt.view.runs import RunFolder
+
+if TYPE_CHECKING:
+    import xarray
+
+
+def rows_of(plan: Plan, records: Mapping[int, Row]) -> list[dict[str, Any]]:
+    """Return one row per simulated point: its number, values, forces, kind of motion, status."""
+    found = []
+    for number in sorted(records):
+        record, values = records[number], plan.at(number)
+        plain = {key: v if is_numeric([v]) else written(v) for key, v in values.items()}
+        steady = record["steady_state"]
+        response = record["response"]
+        found.append(
+            {"point": number}
+            | plain
+            | {name: response.get(name) for name in (*RESPONSES, *response)}
+            | {name: steady.get(name) for name in ("kind", "period", "floquet_multiplier")}
+            | {"status": record["status"]}
+        )
+    return found
+
+
+def outcome(plan: Plan, records: Mapping[int, Row]) -> tuple[Status, str]:
+    """Return status and message of a whole sweep.
+
+    These are taken from the first usable point, or from the first point if none is usable. If
+    points are missing, the sweep was interrupted."""
+    first = sorted(records)
+    known = [number for number in first if Status[records[number]["status"].upper()].usable]
+    counts = f"{len(known)} of {plan.count} points have a usable result."
+    if len(records) < plan.count:
+        return Status.INTERRUPTED, (
+            f"The sweep was stopped: {len(records)} of {plan.count} points are done. Run it again "
+            "with --resume for the others."
+        )
+    record = records[(known or first)[0]]
+    status = Status[record["status"].upper()]
+    return status, counts if known else f"{counts} The first one: {record['message']}"
+
+
+def summary(plan: Plan, records: Mapping[int, Row]) -> dict[str, Any]:
+    """Return the record of a sweep for the result file."""
+    status, message = outcome(plan, records)
+    counts = Counter(records[number]["status"] for number in sorted(records))
+    missing = plan.count - len(records)
+    return {
+        "sweep": plan.record() | {"points": plan.count},
+        "statuses": dict(counts) | ({"not_simulated": missing} if missing else {}),
+        "status": status.label,
+        "message": message,
+    }
+
+
+def write_dataset(folder: ResultFolder, name: str, dataset: "xarray.Dataset") -> None:
+    """Write a dataset as netCDF into `folder`; raise `InputError` if that fails."""
+    data = io.BytesIO()
+    dataset.to_netcdf(data, engine="h5netcdf")
+    folder.write_bytes(name, data.getvalue())
+
 
 _DATA = "sweep.nc"
 
@@ -56,12 +129,12 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     seconds = time.perf_counter() - began
     dataset = dataset_of(config, plan, records)
     files.write_config(folder, config)
-    rows = sweeps.rows_of(plan, records)
+    rows = rows_of(plan, records)
     folder.write_csv("sweep.csv", files.row_columns(rows))
-    sweeps.write_dataset(folder, _DATA, dataset)
+    write_dataset(folder, _DATA, dataset)
     statistics: dict[str, Any] = {"seconds": seconds, "resumed_points": known}
     statistics["points_per_second"] = (len(records) - known) / seconds
-    record = sweeps.summary(plan, records) | {"data": _DATA, "statistics": statistics}
+    record = summary(plan, records) | {"data": _DATA, "statistics": statistics}
     folder.write_json("result.json", record | {"versions": files.versions()})
     if not options.no_figures:
         from rootsopt.view.figures.sweep import sweep_figure

@@ -24,9 +24,9 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike, NDArray
 
 from rootsopt.config.reading import Config, parse
+from rootsopt.dynamics.closed import ACCURACY, greatest_error
 from rootsopt.dynamics.collocation.bordered import Followed, Line, Plane, followed
 from rootsopt.dynamics.collocation.mesh import PIECES, from_pieces
-from rootsopt.dynamics.collocation.motion import ACCURACY, greatest_error
 from rootsopt.dynamics.flow import strobe
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import TOO_DEEP
