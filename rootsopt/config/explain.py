@@ -31,7 +31,7 @@ _WANTED = {
 _UNKNOWN_WORD = "literal_error", ("[key]",)
 _TORQUE, _OUTER = "scene.load.torque_N_m", "profile.outer_radius_mm"
 
-# Keys and factors for names that catalogues use, without their units.
+# Names in catalogues, without units: (key that the user means, factor to its value).
 _SYNONYMS = {
     "center_distance": ("profile.pitch_radius_mm", 0.5),
     "centre_distance": ("profile.pitch_radius_mm", 0.5),

@@ -245,7 +245,7 @@ _Finite = _Own | Annotated[float, between(-1e12, 1e12)]
 
 _LINE = re.compile(r"line_.+_force_N")
 
-# Quantities that are never above the next one of their row.
+# Rows of quantities in ascending order: none exceeds the next one.
 _CHAINS = (
     ("mean_force_N", "rms_force_N", "peak_norm_force_N", "peak_force_N"),
     ("bearing_load_equivalent_N", "bearing_load_max_N"),

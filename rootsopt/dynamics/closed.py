@@ -361,7 +361,7 @@ class _Attempts(eqx.Module):
         verdict, status = judged(self.pair, self.solver, self.radius, orbit, start, limits)
         unsure = among(status, (Status.PERIODIC, Status.INACCURATE)) & ~made.verified
         if self.pair.repeats > 1:
-            # Turns of a gear that rattles, while the flanks stay apart.
+            # The flanks stay apart, but the gear rattles over several revolutions.
             unsure |= (status == Status.IDLE.code) & (made.shorter > 0)
         status = jnp.where(unsure | ~made.sound, Status.NOT_SETTLED.code, status)
         found = found._replace(

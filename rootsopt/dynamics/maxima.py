@@ -239,7 +239,7 @@ def located(
         def push(time, state_change, change):
             return jax.jvp(value_at, (tau, state, dynamic), (time, state_change, change))
 
-        # One direction more, along the motion: the quantity is traced only once.
+        # Append the direction along the motion, so that the quantity is traced only once.
         times = jnp.append(1.0, jnp.zeros(along.shape[-1]))
         still = jax.tree.map(lambda x: jnp.pad(x, ((1, 0),) + ((0, 0),) * (x.ndim - 1)), moved)
         changes = jnp.concatenate([rate[:, None], along], axis=1)

@@ -236,7 +236,7 @@ class Bounding:
         rows = [local.minorants, *((wall.values, wall.slopes) for wall in local.walls)]
         self.surfaces = self.surfaces or [Surface(self.size) for _ in rows]
         if any([one.add(point, row) for one, row in zip(self.surfaces, rows, strict=True)]):
-            # Bounds were made with other curvatures.
+            # Existing bounds rest on the old curvatures: compute them again.
             boxes, self._open, self._closed = [*self._open, *self._closed], [], []
             for box in boxes:
                 self._push(-math.inf, *box[2:])
@@ -255,7 +255,7 @@ class Bounding:
         while self._open and len(wanted) < most and self._seen < self.boxes:
             box, least = self._bounded(heapq.heappop(self._open))
             if box.bound >= self.target:
-                # That no point is feasible depends on curvatures only if forces have limits.
+                # Curvatures decide whether a box is feasible only if forces have limits.
                 if box.bound < math.inf or len(self.surfaces) > 1:
                     self._closed.append(box)
                 continue

@@ -109,7 +109,7 @@ class Search:
             )
         evaluator = needed_motion(config)
         if isinstance(evaluator.motions, Still):
-            # Nothing moves, so that no choice of motions matters.
+            # No motion is simulated, so the choice of motions has no effect.
             config = config.replaced({"objective.motion": "reached"})
             self.given = self.given.replaced({"objective.motion": "reached"})
         self.config = config

@@ -160,7 +160,7 @@ class _Descent:
 
         `step`, `decrease`: as `_step` returns them."""
         if self.promised > self.stops.enough and self.reach < _WIDE:
-            # Steps may have failed by rounding: ask the models of the whole neighbourhood.
+            # Steps may have failed because of rounding: use the models in the whole neighbourhood.
             self.reach = _WIDE
             step, decrease = self._step()
         if self.violated and self.promised <= self.stops.enough and self.price < _MOST:

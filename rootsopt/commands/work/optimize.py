@@ -213,7 +213,7 @@ def _write(folder, config, options, result, alike, sheets, compiled, ran) -> Non
         data["assumptions"] = result.assumptions.record()
         folder.write_csv("assumptions.csv", result.assumptions.columns())
     data["verification"] = result.verification
-    # `improve` has asked for more than the search.
+    # Entries that `improve` adds, such as its own status, take precedence.
     data = {"status": result.status.label, "message": _advice(result)} | data
     data["statistics"] = {
         "evaluations": len(rows),

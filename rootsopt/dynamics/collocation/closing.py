@@ -412,7 +412,7 @@ class Closer(eqx.Module):
         error, drift = choose(first, self.uncompared(size), compared)
         steep, least, most = _TURNING
         certain = drift <= jnp.clip(steep * self.tolerance, least, most)
-        # Without a comparison, even a slightly finer mesh helps.
+        # Until two meshes have been compared, even a slightly finer mesh helps.
         full = jnp.where(first, 1.0, _LAST) * now.elements.mesh.used >= self.most(now)
         # Newton's method has converged, so the correction must be small. It is NaN where the time
         # derivative of a margin vanishes at its event. Derivatives are those before the correction:

@@ -113,7 +113,7 @@ class Tracer:
         self.progress = progress or (lambda done, expected: None)
         self.stop = threading.Event() if stop is None else stop
         self.study = Study.of(config, runs, checkpoint)
-        # Those of the grid, then those found by bisection, which have keys of one number.
+        # Nodes of the grid, then those found by bisection, whose keys have one number.
         self._nodes: dict[Key, Node] = {}
         self._gaps = Bisections([])
         self._spacing = Spacing(np.inf, np.inf)
