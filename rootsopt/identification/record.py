@@ -111,8 +111,6 @@ _SPREAD = "_std"
 _MOST = 4096
 
 # Rotation (°) in 1 s at 1 rpm.
-
-# Rotation (°) in 1 s at 1 rpm.
 _DEGREES_PER_RPM = 6.0
 
 # Distance (mesh periods) from an instant below which samples are used to find its state, and number
