@@ -13,11 +13,11 @@ from unittest import mock
 
 ROOT = Path(__file__).parents[1]
 MOST = {
-    "statements of the package": 27_129,
-    "statements of the tests": 16_459,
+    "statements of the package": 27_133,
+    "statements of the tests": 16_462,
     "statements of the experiments": 4_759,
     "packages": 13,
-    "files of the package": 198,
+    "files of the package": 199,
     "lines of the longest file": 450,
     "floors of packages": 10,
     "depth of imports": 22,

@@ -32,8 +32,8 @@ FACTOR = 2.0
 FIRST = 6
 """Number of points spread over the feasible set, per parameter and once more."""
 
-# Number of points from which these are chosen, and of those that are first moved onto the feasible
-# set if few are feasible.
+# Number of points from which these are chosen, and greatest number of them that are moved onto the
+# feasible set if few are feasible.
 _DRAWN, _MOVED = 256, 64
 
 # Factor on the deviations of constraints from their tangents.

@@ -6,7 +6,7 @@ import subprocess
 
 import pytest
 
-from rootsopt.commands import console
+from rootsopt.commands import completion
 from rootsopt.commands.console import COMMANDS, main
 
 pytest.importorskip("shtab")
@@ -14,7 +14,7 @@ pytest.importorskip("shtab")
 
 @pytest.fixture(scope="module")
 def bash():
-    return console.script("bash")
+    return completion.script("bash")
 
 
 def completed(script, words):
@@ -53,7 +53,7 @@ def test_every_option_of_the_help_is_in_the_script(command, bash, capsys):
 
 
 def test_zsh_has_a_script():
-    text = console.script("zsh")
+    text = completion.script("zsh")
     assert text.startswith("#compdef rootsopt")
     assert "scene.timing_gear.backlash_mm=" in text
 
@@ -61,6 +61,6 @@ def test_zsh_has_a_script():
 def test_unknown_shell_and_missing_library(monkeypatch, capsys):
     assert main(["--completion", "tcsh"]) == 2
     assert "bash or zsh" in capsys.readouterr().err
-    monkeypatch.setattr(console.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(completion.importlib.util, "find_spec", lambda name: None)
     assert main(["--completion", "bash"]) == 2
     assert "rootsopt[completion]" in capsys.readouterr().err
