@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.artist import setp
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
@@ -53,20 +54,15 @@ def points_of(
 
 def figure_of(rows: list[Row]) -> Figure:
     """Draw the time per design by tool, and the times over revolutions and over batch size."""
-    figure, axes = sheet(15, 5.6, 1, 3, width_ratios=(1.5, 1, 1))
-    bars, turns, batches = axes[0]
+    figure, ((bars, turns, batches),) = sheet(15, 5.6, 1, 3, width_ratios=(1.5, 1, 1))
     timed = [r for r in rows if r["what"] in ("value", "value+gradient")]
     names = list(dict.fromkeys(r["tool"] for r in timed))
     for shift, (what, color) in enumerate((("value", ORANGE), ("value+gradient", BLUE))):
         chosen = [r for r in timed if r["what"] == what]
         place = [names.index(r["tool"]) + 0.38 * (shift - 0.5) for r in chosen]
-        label = what.replace("+", " + ")
-        bars.barh(place, [r["per_design_ms"] for r in chosen], 0.36, color=color, label=label)
-        for y, r in zip(place, chosen, strict=True):
-            bars.annotate(
-                short(r["per_design_ms"]), (r["per_design_ms"], y), (3, 0),
-                textcoords="offset points", va="center", fontsize=7,
-            )  # fmt: skip
+        label, times = what.replace("+", " + "), [r["per_design_ms"] for r in chosen]
+        drawn = bars.barh(place, times, 0.36, color=color, label=label)
+        bars.bar_label(drawn, fmt=short, padding=3, fontsize=7)
     bars.set_yticks(range(len(names)), names, fontsize=8)
     bars.invert_yaxis()
     bars.margins(x=0.15)
@@ -80,9 +76,7 @@ def figure_of(rows: list[Row]) -> Figure:
     batches.set(xlabel="designs in a batch", ylabel="time of the batch (s)")
     for ax in (turns, batches):
         ax.set(xscale="log", yscale="log")
-        for axis in (ax.xaxis, ax.yaxis):
-            axis.set_major_formatter("{x:g}")
-            axis.set_minor_formatter(NullFormatter())
+        setp([ax.xaxis, ax.yaxis], major_formatter="{x:g}", minor_formatter=NullFormatter())
         if ax.lines:
             ax.legend(fontsize=8)
     figure.suptitle(f"Shipped CIC scene; mean and peak force to {ACCURACY:g}", fontsize=11)

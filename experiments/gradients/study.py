@@ -27,8 +27,9 @@ from rootsopt.response.evaluation import Evaluation, Evaluator
 
 TOLERANCES = (1e-8, 1e-9, 1e-10)
 
-# Names of the forces whose gradients are compared.
+# Names of the forces whose gradients are compared, and of further columns.
 MEASURES = (*FORCES, "rms_force_N")
+FACTS = "residual", "floquet_multiplier", "gradient_disagreement", "orbit_elements", "seconds"
 
 # Greatest relative step of the central differences, and number of steps, each half of the one
 # before. Longer steps pass the grazing of orbits that almost touch once more.
@@ -167,10 +168,8 @@ def rows_of(
     for rtol, one in found.items():
         row: dict[str, Any] = {"kind": kind, "rtol": rtol, "status": one.status.label}
         row |= {"period": one.steady_state.get("period"), "scene": " ".join(overrides)}
-        for name in ("residual", "floquet_multiplier"):
-            row[name] = one.steady_state.get(name)
-        for name in ("gradient_disagreement", "orbit_elements", "seconds"):
-            row[name] = one.statistics.get(name)
+        facts = one.steady_state | one.statistics
+        row |= {name: facts.get(name) for name in FACTS}
         if one.usable:
             errors = np.abs(np.sum(slopes_of(one), axis=1) - truth) / size
             for k, measure in enumerate(MEASURES):
@@ -200,28 +199,23 @@ def pairs_of_kind(
         if lively + plain >= wanted or (kind == LONG and number > PATIENCE * wanted):
             break
         # Wait for rare longer periods, but only for a limited number of scenes.
-        patient = number < 6 * wanted
+        waiting = number < 6 * wanted and kind != FULL and plain >= (1 - SHARE) * wanted
+        least = 5 if kind == LONG else 2 if waiting else 1
         evaluator = evaluator_of(load(CIC, overrides), give_up_early=True)
         series = evaluated(evaluator)
         first = next(series)
-        scout = int(first[1].steady_state.get("period", 0)) if first[1].usable else 0
-        if (
-            not scout
-            or (kind == LONG and scout < 5)
-            or (scout == 1 and patient and kind != FULL and plain >= (1 - SHARE) * wanted)
-        ):
-            continue
-        new = rows_of(evaluator, kind, overrides, dict([first, *series]))
-        lively, plain = lively + (scout > 1), plain + (scout == 1)
-        found = {row["rtol"]: (row["status"], row.get("mean_force_N_error")) for row in new}
-        say(f"{kind} {lively} {plain} period {new[0]['period']} {found}")
-        yield new
+        period = int(first[1].steady_state.get("period", 0)) if first[1].usable else 0
+        if period >= least:
+            new = rows_of(evaluator, kind, overrides, dict([first, *series]))
+            lively, plain = lively + (period > 1), plain + (period == 1)
+            found = {row["rtol"]: (row["status"], row.get("mean_force_N_error")) for row in new}
+            say(f"{kind} {lively} {plain} period {period} {found}")
+            yield new
 
 
 def errors_of(rows: Sequence[Row]) -> Figure:
     """Draw the gradient error over the estimate of its check, and its distribution by tolerance."""
-    picture, axes = sheet(10, 4.2, 1, 2)
-    left, right = axes[0]
+    picture, ((left, right),) = sheet(10, 4.2, 1, 2)
     for rtol, color, marker in zip(TOLERANCES, COLORS[:3], "os^", strict=True):
         good = [r for r in rows if r["rtol"] == rtol and r["status"] == "periodic"]
         off = np.array([[r[f"{name}_error"] for name in MEASURES] for r in good]).ravel()
@@ -232,8 +226,8 @@ def errors_of(rows: Sequence[Row]) -> Figure:
             errors = np.sort([r[f"{name}_error"] for r in good])
             errors = errors[np.isfinite(errors)]
             share = 100 * (np.arange(errors.size) + 1) / errors.size
-            what = name.split("_")[0]
-            right.semilogx(errors, share, style, color=color, label=f"{what}, rtol {rtol:g}")
+            label = f"{name.split('_')[0]}, rtol {rtol:g}"
+            right.semilogx(errors, share, style, color=color, label=label)
     left.plot([1e-9, 1e-2], [1e-9, 1e-2], "k:", lw=1, label="equal")
     left.set(
         xlabel="gradient_disagreement (relative)",
@@ -280,10 +274,9 @@ def judge(rows: Sequence[Row]) -> tuple[list[Row], list[str]]:
         mine = [row for row in rows if row["rtol"] == rtol]
         good = [row for row in mine if row["status"] == "periodic"]
         off, noise = (
-            np.array([row[f"{name}_{what}"] for row in good for name in MEASURES])
+            np.reshape([row[f"{name}_{what}"] for row in good for name in MEASURES], (-1, 3))
             for what in ("error", "noise")
         )
-        off, noise = off.reshape(-1, len(MEASURES)), noise.reshape(-1, len(MEASURES))
         limit = float(agreement(jnp.asarray(rtol)))
         for row, beyond in zip(good, np.maximum(off - noise, 0.0), strict=True):
             ratios += (beyond / row["gradient_disagreement"]).tolist()
@@ -299,8 +292,7 @@ def judge(rows: Sequence[Row]) -> tuple[list[Row], list[str]]:
         ends = [row["status"] for row in rows if row["scene"] == scene]
         if ends[0] == "periodic" and set(ends) != {"periodic"}:
             broken.append(f"WORSE {ends} {scene}")
-    known = [ratio for ratio in ratios if np.isfinite(ratio)]
-    if known and np.mean(np.array(known) > 1) > BEYOND:
-        share = 100 * np.mean(np.array(known) > 1)
-        broken.append(f"UNBOUNDED {share:.1f} % of {len(known)} gradients")
+    known = np.array(ratios)[np.isfinite(ratios)]
+    if np.sum(known > 1) > BEYOND * known.size:
+        broken.append(f"UNBOUNDED {np.mean(known > 1):.1%} of {known.size} gradients")
     return table, broken

@@ -26,7 +26,7 @@ _SLOTS = 4
 # Difference between phases above which branches at neighbouring points count as different.
 _SAME = 0.1
 
-# Amount by which the value of a point without an objective exceeds the best objective.
+# Amount by which the value of a point without an objective exceeds the first objective.
 _UNUSABLE = 1e3
 
 
@@ -41,7 +41,8 @@ class Epigraph:
         self.look, self.stops, self.size = look, stops, len(start)
         self.evaluations = 1
         self.known: dict[bytes, Linearization | None] = {start.tobytes(): first}
-        self.good, self.best = first, (start, first)
+        self.begin, self.first = start, first
+        self.good = first
         slots = [2 * len(group.values) + _SLOTS for group in (*first.groups, *first.walls)]
         self.slots = [np.full((count, 2), np.nan) for count in slots]
         self.used = [np.zeros(count) for count in slots]
@@ -66,29 +67,25 @@ class Epigraph:
 
     def start(self) -> NDArray[np.float64]:
         """Return the variables at the start."""
-        point, local = self.best
-        return np.concatenate([point / SCALE, [group.top for group in local.groups]])
+        return np.concatenate([self.begin / SCALE, [group.top for group in self.first.groups]])
 
     def value(self, z) -> tuple[float, NDArray[np.float64]]:
         """Return the smooth objective and its gradient at the variables `z`.
 
-        The value is far above the best objective if the point is not usable."""
+        The value is far above the first objective if the point is not usable."""
         found = self.at(self.point(z))
-        steps = np.ones(len(z) - self.size)
+        self.good = self.good if found is None else found
+        slope = np.append(SCALE * self.good.slope, np.ones(len(z) - self.size))
         if found is None:
-            gradient = np.concatenate([SCALE * self.good.slope, steps])
-            return self.best[1].objective + _UNUSABLE, gradient
-        self.good = found
-        total = found.smooth + float(np.sum(z[self.size :]))
-        return total, np.concatenate([SCALE * found.slope, steps])
+            return self.first.objective + _UNUSABLE, slope
+        return found.smooth + float(np.sum(z[self.size :])), slope
 
     def constraints(self, z) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the values (≥ 0 if satisfied) and gradients of all constraints at `z`.
 
         First come t - b_i for the branches b_i of each maximum t, then -w_i for those of each
         wall, then the constraints of the problem."""
-        found = self.at(self.point(z))
-        found = self.good if found is None else found
+        found = self.at(self.point(z)) or self.good
         values, rows = [], []
         tops = len(found.groups)
         for k, group in enumerate((*found.groups, *found.walls)):

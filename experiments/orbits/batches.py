@@ -29,7 +29,7 @@ _CHECKED = 8
 _REPEATS, _SECONDS = 5, 10.0
 
 
-def rows_of(sizes: Sequence[int], say: Callable[[str], None] = lambda text: None) -> Iterator[Row]:
+def rows_of(sizes: Sequence[int], say: Callable[[str], None]) -> Iterator[Row]:
     """Yield a row for each of `sizes` and each start."""
     config = load(CIC, [])
     machine, base = Scene.from_config(config), np.asarray(config.design, float)

@@ -8,8 +8,10 @@ Forces, their derivatives along one direction of design, speed and load, and the
 are compared. If it repeats, but its orbit is not known, the pair is listed.
 """
 
+import contextlib
 import dataclasses
 import functools
+import itertools
 import json
 import os
 import time
@@ -91,25 +93,23 @@ def pairs(seed: int, kind: str) -> Iterator[list[str]]:
         longest = 33.0 * np.sin(np.radians(angle)) * (np.pi / 2 / lobes - np.radians(tip))
         length = draw.uniform(0.3, 0.95) * longest
         profile: Row = {"family": family, "lobes": lobes, "pitch_radius_mm": 33.0}
-        if family not in ("ee", "four_arcs"):
-            profile |= {
-                "pressure_angle_deg": round(angle, 2),
-                "involute_length_mm": round(length, 3),
-            }
-        if family in ("cic", "free_form"):
-            profile["tip_arc_angle_deg"] = round(tip, 2)
-        if family == "free_form":  # It follows a CIC profile.
-            near = ProfileConfig.model_validate(profile | {"family": "cic"})
+        flank = {"pressure_angle_deg": round(angle, 2), "involute_length_mm": round(length, 3)}
+        land = {"tip_arc_angle_deg": round(tip, 2)}
+        if family == "arc_involute":
+            profile |= flank
+        elif family == "cic":
+            profile |= flank | land
+        elif family == "free_form":  # It follows a CIC profile.
+            near = ProfileConfig.model_validate(profile | flank | land | {"family": "cic"})
             profile = free_form_of(near, COEFFICIENTS)[0].model_dump(exclude_none=True)
-        if family == "four_arcs":
+        elif family == "four_arcs":
             profile |= {
                 "arc_center_mm": round(draw.uniform(23, 31), 3),
                 "tip_arc_radius_mm": round(draw.uniform(12, 21), 3),
                 "tip_arc_turn_deg": round(draw.uniform(30, 60), 2),
             }
-        if family == "five_arcs":
-            profile = {key: profile[key] for key in ("family", "lobes", "pitch_radius_mm")} | {
-                "tip_arc_angle_deg": round(tip, 2),
+        elif family == "five_arcs":
+            profile |= land | {
                 "outer_radius_mm": round(draw.uniform(43.5, 45.5), 2),
                 "tip_arc_radius_mm": round(draw.uniform(11.5, 13.5), 2),
                 "tip_arc_turn_deg": round(draw.uniform(45, 65), 1),
@@ -118,13 +118,12 @@ def pairs(seed: int, kind: str) -> Iterator[list[str]]:
         torque = draw.uniform(0.8, 5.0) if lively else 10 ** draw.uniform(-0.2, 1.2)
         play = draw.uniform(0.15, 0.4) if lively else draw.uniform(0.02, 0.3)
         damping = draw.uniform(0.05, 0.35) if lively else 10 ** draw.uniform(-1.0, -0.2)
-        stiffness = 10 ** draw.uniform(3.6, 4.8)
         values = {
             "scene.speed_rpm": f"{speed:.1f}",
             "scene.load.torque_N_m": f"{torque:.3f}",
             "scene.timing_gear.backlash_mm": f"{play:.3f}",
             "scene.timing_gear.damping_ratio": f"{damping:.3f}",
-            "scene.timing_gear.stiffness_N_m_per_rad": f"{stiffness:.0f}",
+            "scene.timing_gear.stiffness_N_m_per_rad": f"{10 ** draw.uniform(3.6, 4.8):.0f}",
         }
         if "scene.load" in "".join(fixed):
             values.pop("scene.load.torque_N_m")
@@ -166,8 +165,8 @@ def row_of(kind: str, overrides: list[str]) -> Row:
     config = load(CIC, overrides)
     check_geometry(config)
     family, lobes, fixed = KINDS[kind]
-    solve = _solver((family, lobes, *fixed))
-    return {"kind": kind, "scene": " ".join(overrides)} | compared(config, solve)
+    row = {"kind": kind, "scene": " ".join(overrides)}
+    return row | compared(config, _solver((family, lobes, *fixed)))
 
 
 def compared(config: Config, solve: Callable[..., Any] | None = None) -> Row:
@@ -206,18 +205,16 @@ def run(job: Run) -> bool:
     """Compare orbits, or time them (`--speed`, `--batches`).
 
     Returns whether the forces agree, or whether all tools have a time."""
-    if job.options.speed:
-        return timed(job)
-    if job.options.batches:
-        return batched(job)
+    if job.options.speed or job.options.batches:
+        return timed(job) if job.options.speed else batched(job)
     rows = differences_of(job)
     periodic = [row for row in rows if row["status"] == "periodic"]
     names = [f"{name}_{what}" for what in ("difference", "gradient_difference") for name in FORCES]
     table = []
     for name in [*names, "multiplier_difference"]:
         # The noise of the differences that give a gradient is no error of the gradient.
-        noise = name.replace("gradient_difference", "gradient_noise")
-        off = [max(row[name] - (row[noise] if noise != name else 0.0), 0.0) for row in periodic]
+        noise = name.replace("difference", "noise")
+        off = [max(row[name] - row.get(noise, 0.0), 0.0) for row in periodic]
         table.append({"of": name, "median": float(np.median(off)), "greatest": max(off)})
     show(f"{len(periodic)} orbits by collocation and by shooting", table)
     for row in rows:
@@ -236,18 +233,16 @@ def differences_of(job: Run) -> list[Row]:
     rows: list[Row] = []
     for kind in kinds:
         done = 0
-        for number, overrides in enumerate(pairs(job.options.seed, kind)):
-            if done >= each or number >= PATIENCE * each:
-                break
-            try:
+        for overrides in itertools.islice(pairs(job.options.seed, kind), PATIENCE * each):
+            with contextlib.suppress(InputError):  # The drawn profile is not sound.
                 row = row_of(kind, overrides)
-            except InputError:  # The drawn profile is not sound.
-                continue
-            if row["status"] in ("periodic", *LEFT):
-                done += row["status"] == "periodic"
-                rows.append(row)
-                job.csv("orbits.csv", rows)
-            job.say(f"{kind}: {done} of {each}")
+                if row["status"] in ("periodic", *LEFT):
+                    done += row["status"] == "periodic"
+                    rows.append(row)
+                    job.csv("orbits.csv", rows)
+                job.say(f"{kind}: {done} of {each}")
+            if done >= each:
+                break
     return rows
 
 
@@ -257,7 +252,7 @@ def timed(job: Run) -> bool:
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     from experiments.orbits import speed
 
-    rows = speed.rows_of(3 if job.quick else 20, job.say)
+    rows = [*speed.rows_of(3 if job.quick else 20, job.say)]
     job.csv("speed.csv", rows)
     show("Value and gradient", rows)
     return True

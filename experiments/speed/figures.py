@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
+from matplotlib.artist import setp
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
@@ -36,7 +37,7 @@ def over_speed(studies: dict[str, Study]) -> Figure:
             forces = (p.evaluation.response.get(force, 0) for d in designs.values() for p in d)
             top[force] = max(top[force], *forces)
         axes[0, column].set_title(TITLES[scene])
-        axes[1, column].set_xlabel("speed (rpm)")
+    setp(axes[1], xlabel="speed (rpm)")
     for ax, force in zip(axes[:, 0], LABELS, strict=True):
         ax.set_ylim(0, 1.05 * top[force])
     made.legend(handles=list(entries.values()), loc="outside lower center", ncols=4, frameon=False)
@@ -59,8 +60,7 @@ def objectives(studies: dict[str, Study], listed: Sequence[float]) -> Figure:
             values = found.over(parts)
             at = [3000.0] if name == "at 3000 rpm" else listed
             ax.plot(speeds, values, color=color, linestyle=dashes, label=f"optimised {name}")
-            heights = np.interp(at, speeds, values)
-            ax.plot(at, heights, marker, color=color, markersize=5)
+            ax.plot(at, np.interp(at, speeds, values), marker, color=color, markersize=5)
             unsettled = np.array(
                 [not (p.evaluation.usable and b.evaluation.usable)
                  for p, b in zip(parts, base, strict=True)]
@@ -69,8 +69,8 @@ def objectives(studies: dict[str, Study], listed: Sequence[float]) -> Figure:
         ax.axhline(1, color="black", linewidth=0.8, linestyle=":")
         ax.set(title=TITLES[scene], xlabel="speed (rpm)")
     axes[0, 0].set_ylabel("objective / CIC at the same speed")
-    lines, names = axes[0, 0].get_legend_handles_labels()
-    made.legend(lines, names, loc="outside lower center", ncols=3, frameon=False)
+    entries = axes[0, 0].get_legend_handles_labels()
+    made.legend(*entries, loc="outside lower center", ncols=3, frameon=False)
     made.suptitle("Objective of each optimum at other speeds (markers: speeds of its objective)")
     return made
 
@@ -91,8 +91,7 @@ def resonances(studies: dict[str, Study], rows: list[Row], peaks: list[Row]) -> 
                 continue
             here = {"scene": scene, "design": name}.items()
             parts = found.designs[name]
-            for line in plot_speeds(ax, {name: parts}, "peak_force_N").lines:
-                line.set_color(color)
+            setp(plot_speeds(ax, {name: parts}, "peak_force_N").lines, color=color)
             ax.axhline(found.linear[name]["static_peak_N"], color="black", linewidth=0.9)
             top = 1.25 * max(part.evaluation.response.get("peak_force_N", 0) for part in parts)
             for row in rows:
@@ -107,19 +106,15 @@ def resonances(studies: dict[str, Study], rows: list[Row], peaks: list[Row]) -> 
                 if here <= peak.items() and peak["force"] == "peak_force_N":
                     ax.plot(peak["speed_rpm"], 1.03 * peak["value_N"], "v", color="black", ms=5)
             ax.set(title=f"{name}, {TITLES[scene]}", ylim=(0, top))
-    for ax in axes[-1]:
-        ax.set_xlabel("speed (rpm)")
-
-    def entry(label, **style):
-        return Line2D([], [], label=label, **style)
-
+    setp(axes[-1], xlabel="speed (rpm)")
+    black = {"color": "black", "linestyle": ""}
     made.legend(
         handles=[
-            *(entry(f"k × mesh frequency = {mode} frequency", color=c, linestyle=d)
+            *(Line2D([], [], label=f"k × mesh frequency = {mode} frequency", color=c, linestyle=d)
               for mode, (c, d) in modes.items()),
-            entry("peak at standstill", color="black", linewidth=0.9),
-            entry("local maximum", color="black", linestyle="", marker="v", markersize=5),
-            entry("chaotic, or not settled (+)", color="black", linestyle="", marker="x"),
+            Line2D([], [], label="peak at standstill", color="black", linewidth=0.9),
+            Line2D([], [], label="local maximum", marker="v", markersize=5, **black),
+            Line2D([], [], label="chaotic, or not settled (+)", marker="x", **black),
         ],
         loc="outside lower center", ncols=3, frameon=False,
     )  # fmt: skip

@@ -8,9 +8,11 @@ equals a natural frequency.
 """
 
 import dataclasses
+import itertools
 import math
 import time
 from collections import Counter
+from collections.abc import Iterator
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +29,6 @@ from rootsopt.optimize.search import Search
 from rootsopt.response.result import Evaluation, Part
 from rootsopt.response.terms import objective_weights
 from rootsopt.runtime.programs import CachedFunction
-from rootsopt.scene import design_vector
 from rootsopt.view.figures.sweep import LABELS
 
 SCENES = {"shipped": (), "light": ("scene.timing_gear.damping_ratio=0.1",)}
@@ -63,9 +64,8 @@ def equilibria(pair: RotorPair, phases):
     Returns four arrays (n,): stiffness of the pair and of the flanks alone (N·m/rad), torque of the
     flanks (N·m), and contact force (N).
     """
-    gear = pair.gear
+    gear, still = pair.gear, jnp.asarray(0.0)
     assert gear is not None
-    still = jnp.asarray(0.0)
 
     def flank(phase, relative):
         # At zero penetration rate, so that there is no damping force.
@@ -80,10 +80,9 @@ def equilibria(pair: RotorPair, phases):
 
     def equilibrium(phase):
         def halve(_, ends):
-            low, high = ends
-            middle = (low + high) / 2
+            middle = sum(ends) / 2
             carries = torque(phase, middle) > pair.load.torque
-            return jnp.where(carries, middle, low), jnp.where(carries, high, middle)
+            return jnp.where(carries, middle, ends[0]), jnp.where(carries, ends[1], middle)
 
         low = -2 * (gear.half_backlash + pair.load.torque / gear.stiffness) - pair.angle_scale
         relative, _ = jax.lax.fori_loop(0, 60, halve, (low, jnp.zeros(())))
@@ -98,10 +97,9 @@ def linearised(pair: RotorPair) -> dict[str, float]:
     """Find the natural frequencies (Hz) of a pair about its static equilibrium, with rotor 1 fixed.
 
     Keys of the result. `contact`: frequency of rotor 2 on the flanks, whose stiffness is averaged
-    over the phases in which they carry most of the load; `contact_share`: share of these phases;
-    `gear`: frequency of rotor 2 on the gear; `average`: mean over all phases of the local frequency
-    on flanks and gear; `both_share`: share of the phases in which flanks and gear both carry;
-    `static_peak_N`, `static_mean_N`: contact force.
+    over the phases in which they carry most of the load; `gear`: frequency of rotor 2 on the gear;
+    `average`: mean over all phases of the local frequency on flanks and gear; `gear_damping`: share
+    of critical damping; `static_peak_N`: contact force.
     """
     phases = (np.arange(PHASES) + 0.5) / PHASES
     stiffness, on_flank, torque, force = map(np.asarray, equilibria(pair, phases))
@@ -111,59 +109,35 @@ def linearised(pair: RotorPair) -> dict[str, float]:
     def frequency(k):
         return np.sqrt(np.maximum(k, 0) / inertia) / (2 * np.pi)
 
-    carries = torque > load / 2
     return {
-        "contact": float(frequency(np.mean(on_flank[carries]))),
+        "contact": float(frequency(np.mean(on_flank[torque > load / 2]))),
         "gear": float(frequency(gear)),
         "average": float(np.mean(frequency(stiffness))),
-        "contact_share": float(np.mean(carries)),
-        "both_share": float(np.mean((torque > 0.01 * load) & (torque < 0.99 * load))),
         "gear_damping": float(pair.gear.damping) / (2 * math.sqrt(gear * inertia)),
         "static_peak_N": float(np.max(force)),
-        "static_mean_N": float(np.mean(force)),
     }
 
 
-def crossings(found: dict[str, float], lobes: int, speeds) -> list[Row]:
-    """Find the crossings: speeds (rpm) at which a harmonic of the mesh frequency equals a natural
-    frequency.
+def crossings(found: dict[str, float], lobes: int, speeds) -> Iterator[Row]:
+    """Yield a row for each crossing: a speed (rpm) at which a harmonic of the mesh frequency equals
+    a natural frequency.
 
-    `found`: result of `linearised`; `speeds`: speeds (rpm) of the sweep. Returns a row per
-    crossing.
+    `found`: result of `linearised`; `speeds`: speeds (rpm) of the sweep.
     """
-    rows = []
-    for mode in ("contact", "gear", "average"):
-        for order in range(1, ORDERS + 1):
-            speed = 60 * found[mode] / (order * lobes)
-            if speeds[0] <= speed <= speeds[-1]:
-                crossing = {"mode": mode, "frequency_Hz": found[mode], "order": order}
-                rows.append(crossing | {"speed_rpm": speed})
-    return rows
+    for mode, order in itertools.product(("contact", "gear", "average"), range(1, ORDERS + 1)):
+        speed = 60 * found[mode] / (order * lobes)
+        if speeds[0] <= speed <= speeds[-1]:
+            row = {"mode": mode, "frequency_Hz": found[mode], "order": order}
+            yield row | {"speed_rpm": speed}
 
 
-def maxima(parts: tuple[Part, ...], rows: list[Row]) -> list[Row]:
-    """Find the local maxima of mean and peak force over speed.
-
-    `rows`: crossings. Returns a row per maximum, with the nearest crossing."""
-    speeds = np.array([part.speed_rpm for part in parts])
-    found = []
+def maxima(parts: tuple[Part, ...]) -> Iterator[Row]:
+    """Yield a row for each local maximum of mean and peak force over speed."""
     for force in LABELS:
         values = np.array([part.evaluation.response.get(force, 0.0) for part in parts])
         for k in find_peaks(values, prominence=PROMINENCE * np.max(values))[0]:
-            near = min(rows, key=lambda row: abs(math.log(row["speed_rpm"] / speeds[k])))
-            found.append(
-                {
-                    "force": force,
-                    "speed_rpm": speeds[k],
-                    "value_N": values[k],
-                    "status": parts[k].evaluation.status.label,
-                    "nearest_mode": near["mode"],
-                    "order": near["order"],
-                    "crossing_rpm": near["speed_rpm"],
-                    "apart": speeds[k] / near["speed_rpm"] - 1,
-                }
-            )
-    return found
+            row = {"force": force, "speed_rpm": parts[k].speed_rpm, "value_N": values[k]}
+            yield row | {"status": parts[k].evaluation.status.label}
 
 
 def objective(config: Config, one: Evaluation, baseline: Evaluation) -> float:
@@ -190,8 +164,7 @@ class Study:
         """Return the objective (n,) along a sweep, relative to a `baseline` sweep.
 
         `parts`: the sweep; `baseline`: by default the sweep of CIC."""
-        base = self.designs["CIC"] if baseline is None else baseline
-        pairs = zip(parts, base, strict=True)
+        pairs = zip(parts, baseline or self.designs["CIC"], strict=True)
         return np.array([objective(self.config, p.evaluation, b.evaluation) for p, b in pairs])
 
 
@@ -205,8 +178,7 @@ def study(scene: str, speeds, listed, quick: bool) -> Study:
     found = Study(evaluators["cic"].config, {}, {}, [])
     for family, evaluator in evaluators.items():
         found.designs[family.upper()] = evaluator.swept(speeds)
-        pair = evaluator.pair(design_vector(evaluator.config))
-        found.linear[family.upper()] = linearised(pair)
+        found.linear[family.upper()] = linearised(evaluator.pair(evaluator.config.design))
     for name, keys in list(OPTIMISED.items())[slice(1, 2) if quick else slice(None)]:
         over = (f"objective.speeds_rpm={list(listed)}", *keys) if keys else ()
         began = time.perf_counter()
@@ -214,31 +186,21 @@ def study(scene: str, speeds, listed, quick: bool) -> Study:
         outcome: Row = {"scene": scene, "optimised": name}
         if result.problem is not None and result.optimized is not None:
             design = np.array(list(result.optimized.design.values()))
-            own = result.problem.objective(result.optimized)
-            outcome |= result.optimized.design | {"own_objective": own}
-            label = f"CIC, optimised {name}"
-            found.linear[label] = linearised(evaluators["cic"].pair(jnp.asarray(design)))
-            found.designs[label] = evaluators["cic"].swept(speeds, design)
-            outcome |= worth(found.over(found.designs[label]), speeds)
-            at = evaluators["cic"].swept(listed, design)
-            those = found.over(at, evaluators["cic"].swept(listed))
-            outcome |= {
+            label, cic = f"CIC, optimised {name}", evaluators["cic"]
+            found.linear[label] = linearised(cic.pair(design))
+            found.designs[label] = cic.swept(speeds, design)
+            along = found.over(found.designs[label])
+            those = found.over(cic.swept(listed, design), cic.swept(listed))
+            outcome |= result.optimized.design | {
+                "own_objective": result.problem.objective(result.optimized),
+                "at_3000_rpm": along[int(np.argmin(np.abs(np.asarray(speeds) - 3000)))],
+                "worst_over_sweep": float(np.nanmax(along)),
+                "share_of_speeds_better": float(np.mean(along < 1)),
                 "mean_over_listed": float(np.mean(those)),
                 "worst_over_listed": float(np.max(those)),
             }
         found.outcomes.append(outcome | {"seconds": time.perf_counter() - began})
     return found
-
-
-def worth(along: np.ndarray, speeds) -> Row:
-    """Return a summary of an objective (n,) over the speeds (rpm) of the sweep."""
-    return {
-        "at_3000_rpm": along[int(np.argmin(np.abs(np.asarray(speeds) - 3000)))],
-        "mean_over_sweep": float(np.nanmean(along)),
-        "worst_over_sweep": float(np.nanmax(along)),
-        "worst_rpm": speeds[int(np.nanargmax(along))],
-        "share_of_speeds_better": float(np.mean(along < 1)),
-    }
 
 
 def run(job: Run) -> None:
@@ -248,10 +210,8 @@ def run(job: Run) -> None:
     speeds = np.linspace(300, 6000, 5 if job.quick else 115).tolist()
     listed = (2000.0, 4000.0) if job.quick else tuple(np.arange(500.0, 6001.0, 500.0).tolist())
     studies: dict[str, Study] = {}
-    rows: list[Row] = []
-    crossed: list[Row] = []
-    peaks: list[Row] = []
-    statuses = {}
+    tables: dict[str, list[Row]] = {"speed": [], "speed_resonances": [], "speed_maxima": []}
+    rows, crossed, peaks = tables.values()
     for scene in list(SCENES)[: 1 if job.quick else None]:
         found = studies[scene] = study(scene, speeds, listed, job.quick)
         for name, parts in found.designs.items():
@@ -259,18 +219,15 @@ def run(job: Run) -> None:
             rows += [here | part.row(whole=True) for part in parts]
             across = crossings(found.linear[name], found.config.profile.lobes, speeds)
             crossed += [here | row for row in across]
-            peaks += [here | row for row in maxima(parts, across)]
-            labels = (part.evaluation.status.label for part in parts)
-            statuses[f"{scene}, {name}"] = dict(Counter(labels))
+            peaks += [here | row for row in maxima(parts)]
         job.say(f"{scene}: {len(found.designs)} designs at {len(speeds)} speeds")
     record = {
         "linearised": {scene: found.linear for scene, found in studies.items()},
         "optimisations": [row for found in studies.values() for row in found.outcomes],
-        "statuses": statuses,
+        "statuses": Counter("{scene}, {design}, {status}".format(**row) for row in rows),
     }
-    job.csv("speed.csv", rows)
-    job.csv("speed_resonances.csv", crossed)
-    job.csv("speed_maxima.csv", peaks)
+    for name, table in tables.items():
+        job.csv(f"{name}.csv", table)
     job.json("speed.json", record)
     job.figure("speed.png", figures.over_speed(studies))
     job.figure("speed_objective.png", figures.objectives(studies, listed))
