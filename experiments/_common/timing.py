@@ -38,11 +38,8 @@ def median_time(call: Callable[[], Any], repeats: int, *limits: Any) -> tuple[fl
 
     `limits`: see `times_of`."""
     results = []
-
-    def keep() -> None:
-        results[:] = [call()]
-
-    return statistics.median(times_of(keep, repeats, *limits)), results[0]
+    times = times_of(lambda: results.append(call()), repeats, *limits)
+    return statistics.median(times), results[-1]
 
 
 def processor_time(call: Callable[[], Any], repeats: int) -> tuple[float, Any]:

@@ -27,7 +27,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.artist import setp
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
@@ -76,7 +75,8 @@ def figure_of(rows: list[Row]) -> Figure:
     batches.set(xlabel="designs in a batch", ylabel="time of the batch (s)")
     for ax in (turns, batches):
         ax.set(xscale="log", yscale="log")
-        setp([ax.xaxis, ax.yaxis], major_formatter="{x:g}", minor_formatter=NullFormatter())
+        for axis in (ax.xaxis, ax.yaxis):
+            axis.set(major_formatter="{x:g}", minor_formatter=NullFormatter())
         if ax.lines:
             ax.legend(fontsize=8)
     figure.suptitle(f"Shipped CIC scene; mean and peak force to {ACCURACY:g}", fontsize=11)

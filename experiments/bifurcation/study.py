@@ -8,7 +8,7 @@ where a stable noisy orbit exists, and where both do.
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np

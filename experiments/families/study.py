@@ -97,10 +97,10 @@ def placed(
     reaches the reference's efficiency.
     """
     floor, land = (reference.geometry[key] for key in ("area_efficiency", "seal_width_mm"))
-    reached = bool(found.efficiencies[-1] >= floor - EQUAL)
-    least = (floor if reached else found.efficiencies[-1]) - EQUAL
+    most = float(found.efficiencies[-1])
+    reached, least = most >= floor - EQUAL, min(floor, most) - EQUAL
     few = {"screening": 2, "starts": 1, "iterations": 3} if quick else SEARCH
-    config = changed(in_housing(base, bore, float(least), land), optimizer=few)
+    config = changed(in_housing(base, bore, least, land), optimizer=few)
     if not found.points.shape[1]:
         return config, reached
     there = found.points[found.efficiencies >= least]
@@ -125,14 +125,13 @@ def row_of(study: str, config: Config, reference: dict[str, float]) -> dict[str,
         "status": here.status.label,
         **{key: here.geometry[key] for key in ("outer_radius_mm", "area_efficiency")},
         **{key: here.geometry[key] for key in ("seal_width_mm", "undercut_margin_mm")},
+        "design": here.design,
+        "outline_mm": outline_mm(config, design_vector(config)).tolist(),
     }
     for name, change in SCENES.items():
         there = evaluate(changed(config, scene=change))
-        for key in FORCES:
-            row[f"{name}: {key}"] = there.response.get(key, float("nan"))
+        row |= {f"{name}: {key}": there.response.get(key, float("nan")) for key in FORCES}
         row[f"{name}: status"] = there.status.label
-    row["design"] = here.design
-    row["outline_mm"] = outline_mm(config, design_vector(config)).tolist()
     return row
 
 
@@ -186,13 +185,9 @@ def free_form(name: str, start: tuple[Row, Config, Config], quick: bool) -> Row:
     """Optimise a free form from one of the `free_starts`. Return its row."""
     _, base = reference_of(name)
     best, given, config = start
-    settings: dict[str, Any] = {"bounds": {"tip_arc_angle_deg": (0.0, 45 / given.profile.lobes)}}
-    settings |= SEARCH_FREE | ({"iterations": 2} if quick else {})
-    config = changed(
-        config,
-        optimizer=settings,
-    )
-    config = optimised(config, base.response)
+    bounds = {"bounds": {"tip_arc_angle_deg": (0.0, 45 / given.profile.lobes)}}
+    settings = SEARCH_FREE | bounds | ({"iterations": 2} if quick else {})
+    config = optimised(changed(config, optimizer=settings), base.response)
     return {
         **row_of(name, config, base.response),
         "reached": best["reached"],

@@ -101,12 +101,11 @@ def draw(family: str, lobes: int, count: int, random: np.random.Generator, size:
     allows, with a concentration at its limits. `size`: number of coefficients of a free form.
     """
     usual, wide = [np.zeros((count, 0))], [np.zeros((count, 0))]
-    half = 90.0 / lobes
-    for key in FAMILY_KEYS[family]:
+    half, keys = 90.0 / lobes, FAMILY_KEYS[family]
+    for key in keys:
         shape = (count, size) if key == "coefficients" else (count, 1)
-        share = random.random(shape)
         low, high = parameters()[key].usually(RADIUS_MM, lobes)
-        usual.append(low + (high - low) * share)
+        usual.append(low + (high - low) * random.random(shape))
         share = random.random(shape)
         if key == "coefficients":
             # Around an epicycloid, which has constant coefficients; many of these are valid.
@@ -123,7 +122,6 @@ def draw(family: str, lobes: int, count: int, random: np.random.Generator, size:
             wide.append(RADIUS_MM * 3.0 * _crowded(share, 1e-4))
     first = random.random((count, 1)) < 0.5
     design = np.where(first, np.hstack(usual), np.hstack(wide))
-    keys = FAMILY_KEYS[family]
     if "involute_length_mm" in keys:
         # Relative to the longest possible: no longer involute can be made.
         angle, length = keys.index("pressure_angle_deg"), keys.index("involute_length_mm")
@@ -208,17 +206,14 @@ def row_of(family: str, lobes: int, size: int, designs: np.ndarray, found: np.nd
 
     `found` (n, 3): result of `compared`; `size`: number of coefficients of a free form, else 0.
     """
-    row: Row = {
-        "family": f"{family} {size}" if size else family,
-        "lobes": lobes,
-        "sound": len(designs),
-    }
-    for k, name in enumerate(("area", "polar_moment", "reference")):
-        row[f"{name}_error"] = float(np.max(found[:, k])) if len(found) else np.nan
-    worst = int(np.argmax(np.max(found[:, :2], axis=1))) if len(found) else None
-    values = [] if worst is None else designs[worst]
-    row["worst_design"] = " ".join(f"{x:.9g}" for x in values) if FAMILY_KEYS[family] else ""
-    return row
+    label = f"{family} {size}" if size else family
+    row: Row = {"family": label, "lobes": lobes, "sound": len(designs)}
+    # Without a valid design, the errors are NaN.
+    largest = np.max(found, axis=0) if len(found) else np.full(3, np.nan)
+    names = "area_error", "polar_moment_error", "reference_error"
+    row |= dict(zip(names, largest.tolist(), strict=True))
+    worst = designs[np.argsort(np.max(found[:, :2], axis=1))[-1:]]
+    return row | {"worst_design": " ".join(f"{x:.9g}" for x in worst.ravel())}
 
 
 def study(

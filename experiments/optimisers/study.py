@@ -9,7 +9,7 @@ import contextlib
 import importlib.util
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -22,7 +22,7 @@ from scipy.optimize import BFGS, NonlinearConstraint, minimize
 
 from experiments._common.driver import Run
 from experiments._common.scenes import shipped
-from experiments._common.tables import show
+from experiments._common.tables import Row, show
 from experiments.optimisers.epigraph import SCALE, Epigraph
 from rootsopt.config import Config
 from rootsopt.optimize.local import FEASIBLE, Linearization, Look, certify
@@ -257,9 +257,8 @@ class Recorder:
         return found
 
 
-def summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return evaluations and time to the optimum, by problem and method."""
-    found = []
+def summary(rows: list[Row]) -> Iterator[Row]:
+    """Yield evaluations and time to the optimum, by problem and method."""
     for task in dict.fromkeys(row["problem"] for row in rows):
         here = [row for row in rows if row["problem"] == task]
         best = min((row["objective"] for row in here if _met(row)), default=np.nan)
@@ -267,25 +266,22 @@ def summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
             own = [row for row in here if row["method"] == method]
             met = [row for row in own if _met(row)]
             hits = [row for row in met if row["objective"] <= best + REACHED]
-            found.append(
-                {
-                    "problem": task,
-                    "method": method,
-                    "evaluations": hits[0]["evaluation"] if hits else None,
-                    "seconds": hits[0]["seconds"] if hits else None,
-                    "above_best": min((r["objective"] for r in met), default=np.nan) - best,
-                    "residual": min((r["residual"] for r in met), default=np.nan),
-                    "designs": len(own),
-                }
-            )
-    return found
+            yield {
+                "problem": task,
+                "method": method,
+                "evaluations": hits[0]["evaluation"] if hits else None,
+                "seconds": hits[0]["seconds"] if hits else None,
+                "above_best": min((r["objective"] for r in met), default=np.nan) - best,
+                "residual": min((r["residual"] for r in met), default=np.nan),
+                "designs": len(own),
+            }
 
 
-def _met(row: dict[str, Any]) -> bool:
+def _met(row: Row) -> bool:
     return bool(np.isfinite(row["objective"]) and row["violation"] <= FEASIBLE)
 
 
-def solved(rows: list[dict[str, Any]]) -> Figure:
+def solved(rows: list[Row]) -> Figure:
     """Draw, for each method, the number of problems whose optimum it has reached.
 
     `rows`: those of `summary`."""
@@ -314,7 +310,7 @@ def run(job: Run) -> bool:
         del methods["mma"]
     # So tight that a method ends at its own criterion, or when the evaluations run out.
     stops = Stops(feasibility=FEASIBLE, evaluations=QUICK if job.quick else EVALUATIONS)
-    rows: list[dict[str, Any]] = []
+    rows: list[Row] = []
     for task in list(TASKS)[: QUICK_TASKS if job.quick else None]:
         look = Recorder(shipped(*TASKS[task]))
         look(look.start)  # Compiles.
@@ -323,7 +319,7 @@ def run(job: Run) -> bool:
             method(look, look.start, stops)
             rows += [{"problem": task, "method": name, **row} for row in look.rows]
             job.say(f"{task}: {name}, {len(look.rows)} designs")
-    table = summary(rows)
+    table = [*summary(rows)]
     reached = Counter(row["method"] for row in table if row["evaluations"] is not None)
     job.csv("optimisers.csv", rows)
     job.json("optimisers.json", {"summary": table, "solved": reached})

@@ -8,7 +8,7 @@ others solved for again. `search` searches for other values in the box of plausi
 """
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -73,20 +73,18 @@ STARTS = 8
 Say = Callable[[str], None]
 
 
-def motions(values: ArrayLike) -> list[Row]:
-    """Find the coexisting motions with these values; return a row per motion."""
-    rows = []
+def motions(values: ArrayLike) -> Iterator[Row]:
+    """Find the coexisting motions with these values; yield a row per motion."""
     for family in FAMILIES:
         found = attractors.find(evaluator_of(config_of(family, values, *GRID)))
-        rows += [{"pair": family} | row for row in found.summary()]
-        rows += [{"pair": family, "status": k, "share": v} for k, v in found.lost.items()]
-    return rows
+        lost = ({"status": k, "share": v} for k, v in found.lost.items())
+        yield from ({"pair": family} | row for row in (*found.summary(), *lost))
 
 
-def definitions(values: ArrayLike) -> list[Row]:
+def definitions(values: ArrayLike) -> Iterator[Row]:
     """Apply definitions of mean and maximum to one motion from rest, with and without start-up.
 
-    Returns a row per window and sampling rate.
+    Yields a row per window and sampling rate.
     """
     runs = []
     for family in FAMILIES:
@@ -98,7 +96,6 @@ def definitions(values: ArrayLike) -> list[Row]:
         *_, series = unsettled(pair, status, window, series=True)
         assert series is not None
         runs.append(series)
-    rows = []
     for (begin, end), thinning in itertools.product(WINDOWS, THINNINGS):
         rate = 1 / (thinning * (runs[0].time[1] - runs[0].time[0]))
         row: Row = {"begin_s": begin, "end_s": end, "rate_Hz": rate, "misfit": 0.0}
@@ -107,29 +104,24 @@ def definitions(values: ArrayLike) -> list[Row]:
             own = np.array([np.mean(force), np.max(force)])
             row |= dict(zip((f"{family}_mean_force_N", f"{family}_max_force_N"), own, strict=True))
             row["misfit"] = np.maximum(row["misfit"], np.max(np.abs(own / paper - 1)))
-        rows.append(row)
-    return rows
+        yield row
 
 
-def slices(values: np.ndarray, changes: Sequence[float], say: Say) -> list[Row]:
-    """Change each quantity alone by the relative `changes`; return a row per change."""
-    rows = []
-    for number, quantity in enumerate(QUANTITIES):
+def slices(values: np.ndarray, changes: Sequence[float], say: Say) -> Iterator[Row]:
+    """Change each quantity alone by the relative `changes`; yield a row per change."""
+    for quantity, unit in zip(QUANTITIES, np.eye(len(QUANTITIES)), strict=True):
         for change in changes:
-            at = values * (1 + change * (np.arange(len(QUANTITIES)) == number))
             row = {"changed": quantity.key, "change": change}
-            rows.append(row | row_of(respond(at, slopes=False)))
+            yield row | row_of(respond(values * (1 + change * unit), slopes=False))
         say(f"{quantity.key} changed alone")
-    return rows
 
 
-def profile(found: Response, say: Say) -> list[Row]:
+def profile(found: Response, say: Say) -> Iterator[Row]:
     """Move each quantity away from its value, and solve for the other quantities again.
 
     Each solution starts from the last solution. A quantity moves by factors of 1 ± `STEP`, at most
-    `COUNT` times in each direction, until the misfit stays above `LIMIT`. Returns a row per point.
+    `COUNT` times in each direction, until the misfit stays above `LIMIT`. Yields a row per point.
     """
-    rows = []
     for number, quantity in enumerate(QUANTITIES):
         for factor in (1 / (1 + STEP), 1 + STEP):
             last = found
@@ -140,11 +132,10 @@ def profile(found: Response, say: Say) -> list[Row]:
                 guess = compensated(last.values, last.slopes, number, factor)
                 last = polished(guess, held=[number], within=WITHIN, steps=4)
                 change = last.values[number] / found.values[number] - 1
-                rows.append({"changed": quantity.key, "change": change} | row_of(last))
+                yield {"changed": quantity.key, "change": change} | row_of(last)
                 if last.misfit > LIMIT:
                     break
         say(f"{quantity.key} changed, the others solved for again")
-    return rows
 
 
 def row_of(response: Response) -> Row:
@@ -181,11 +172,12 @@ def reproduce(job: Run) -> bool:
     if not all(one.status is Status.PERIODIC for one in found.evaluations):
         raise NoResultError("the shipped values must give two periodic motions, but do not")
     responses = {"shipped": found}
-    tables = {"slices": slices(found.values, CHANGES[job.quick], job.say)}
+    tables = {"slices": [*slices(found.values, CHANGES[job.quick], job.say)]}
     if not job.quick:
         responses |= {name: polished(start) for name, start in OTHERS.items()}
-        tables["motions"], tables["definitions"] = motions(found.values), definitions(found.values)
-        tables["profile"] = profile(found, job.say)
+        tables["motions"] = [*motions(found.values)]
+        tables["definitions"] = [*definitions(found.values)]
+        tables["profile"] = [*profile(found, job.say)]
     record: dict[str, Any] = {name: row_of(one) for name, one in responses.items()}
     if found.slopes is not None:
         singular = np.linalg.svd(found.slopes.reshape(4, -1))

@@ -1,6 +1,7 @@
 """Figures of contact force, objective and resonances over speed."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.artist import setp
@@ -84,14 +85,17 @@ def resonances(studies: dict[str, Study], rows: list[Row], peaks: list[Row]) -> 
         f"CIC, optimised {next(iter(OPTIMISED))}": SKY,
     }
     made, axes = sheet(13, 10.5, len(shown), len(studies), sharex=True)
-    modes = {"contact": (GREEN, "--"), "gear": (PURPLE, ":"), "average": ("0.45", "-.")}
+    modes: dict[str, tuple[str, Any]] = {
+        "contact": (GREEN, "--"), "gear": (PURPLE, ":"), "average": ("0.45", "-."),
+    }  # fmt: skip
     for column, (scene, found) in enumerate(studies.items()):
         for ax, (name, color) in zip(axes[:, column], shown.items(), strict=True):
             if name not in found.designs:
                 continue
             here = {"scene": scene, "design": name}.items()
             parts = found.designs[name]
-            setp(plot_speeds(ax, {name: parts}, "peak_force_N").lines, color=color)
+            for line in plot_speeds(ax, {name: parts}, "peak_force_N").lines:
+                line.set_color(color)
             ax.axhline(found.linear[name]["static_peak_N"], color="black", linewidth=0.9)
             top = 1.25 * max(part.evaluation.response.get("peak_force_N", 0) for part in parts)
             for row in rows:
@@ -107,7 +111,7 @@ def resonances(studies: dict[str, Study], rows: list[Row], peaks: list[Row]) -> 
                     ax.plot(peak["speed_rpm"], 1.03 * peak["value_N"], "v", color="black", ms=5)
             ax.set(title=f"{name}, {TITLES[scene]}", ylim=(0, top))
     setp(axes[-1], xlabel="speed (rpm)")
-    black = {"color": "black", "linestyle": ""}
+    black: dict[str, Any] = {"color": "black", "linestyle": ""}
     made.legend(
         handles=[
             *(Line2D([], [], label=f"k × mesh frequency = {mode} frequency", color=c, linestyle=d)
