@@ -87,12 +87,9 @@ def main() -> int:
         return OK
     try:
         kept = conduct(options.name, known[options.name][1], options)
-    except InputError as error:
+    except (InputError, NoResultError) as error:
         print(f"{COMMAND} {options.name}: {' '.join(str(error).split())}", file=sys.stderr)
-        return BAD_INPUT
-    except NoResultError as error:
-        print(f"{COMMAND} {options.name}: {error}", file=sys.stderr)
-        return NO_RESULT
+        return BAD_INPUT if isinstance(error, InputError) else NO_RESULT
     return OK if kept else NO_RESULT
 
 

@@ -137,10 +137,11 @@ def draw_ranges(diagrams: list[Diagram]) -> Figure:
         if diagram.low > lowest:
             unknown = {"facecolor": "0.93", "hatch": "xx", "edgecolor": "0.8", "linewidth": 0}
             ax.broken_barh([(lowest, diagram.low - lowest)], (line - 0.32, 0.64), **unknown)
-            text = f"not followed below {diagram.low:g}"
-            box = {"facecolor": "white", "edgecolor": "none", "pad": 2}
-            middle = (lowest + diagram.low) / 2
-            ax.text(middle, line, text, ha="center", va="center", fontsize=9, bbox=box)
+            ax.text(
+                (lowest + diagram.low) / 2, line, f"not followed below {diagram.low:g}",
+                ha="center", va="center", fontsize=9,
+                bbox={"facecolor": "white", "edgecolor": "none", "pad": 2},
+            )  # fmt: skip
         found = ranges(diagram)
         for name, (color, hatch, shift) in styles.items():
             bars = [(low, high - low) for low, high in found[name]]

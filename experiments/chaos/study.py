@@ -185,9 +185,8 @@ def designs_between(problem: Problem, result: Optimization, count: int) -> np.nd
     Without a significant optimum (as in a reduced run) the line ends at the last design.
     """
     first = problem.point(list(result.baseline.design.values()))
-    end = list((result.optimized or result.baseline).design.values())
-    if result.optimized is None:
-        end = [result.history[-1][key] for key in result.baseline.design]
+    found = result.history[-1] if result.optimized is None else result.optimized.design
+    end = [found[key] for key in result.baseline.design]
     shares = np.linspace(0, 1, count)[:, None]
     points = (1 - shares) * first + shares * problem.point(end)
     return np.array([problem.design(point) for point in points])
@@ -198,16 +197,18 @@ def summary(problem: Problem, result: Optimization) -> dict[str, Any]:
 
     The record includes the significance of the gain."""
     record = result.verification
-    found: dict[str, Any] = {"verification": record}
-    for name, one in (("baseline", result.baseline), ("optimized", result.optimized)):
-        if one is not None:
-            found[name] = {
-                "design": one.design,
-                **one.response,
-                **one.steady_state,
-                "objective": problem.objective(one),
-                "objective_standard_error": standard_error(problem, one),
-            }
+    ends = {"baseline": result.baseline, "optimized": result.optimized}
+    found: dict[str, Any] = {"verification": record} | {
+        name: {
+            "design": one.design,
+            **one.response,
+            **one.steady_state,
+            "objective": problem.objective(one),
+            "objective_standard_error": standard_error(problem, one),
+        }
+        for name, one in ends.items()
+        if one is not None
+    }
     if "combined_standard_error" in record:
         gain = 1 - record["verified_objective"]
         found["gain_in_standard_errors"] = gain / record["combined_standard_error"]

@@ -67,10 +67,10 @@ def ranking_figure(data: dict[str, Any]) -> Figure:
         ("D", "black", "white", "the same, with less area efficiency than required"),
     )
     handles = [
-        Line2D([], [], marker=marker, color=color, markerfacecolor=face, ls="", label=label)
-        for marker, color, face, label in lines
-    ]
-    handles.append(Line2D([], [], color="black", ls=":", lw=0.9, label="reference"))
+        *(Line2D([], [], marker=marker, color=color, markerfacecolor=face, ls="", label=label)
+          for marker, color, face, label in lines),
+        Line2D([], [], color="black", ls=":", lw=0.9, label="reference"),
+    ]  # fmt: skip
     made.legend(handles=handles, loc="outside lower center", ncols=5, frameon=False, fontsize=9)
     return made
 
@@ -94,8 +94,10 @@ def profiles_figure(data: dict[str, Any]) -> Figure:
             text = f"{row['family'].replace('_', ' ')}, bore {2 * HOUSINGS[name]:.1f} mm"
             ax.set_title(text, fontsize=9)
     lines = (BLUE, "-", "this family"), (VERMILION, (0, (5, 1.5)), "best of this housing")
-    handles = [Line2D([], [], color=color, ls=ls, label=label) for color, ls, label in lines]
-    handles.append(Line2D([], [], color=GREY, ls="--", lw=0.9, label="pitch circle"))
+    handles = [
+        *(Line2D([], [], color=color, ls=ls, label=label) for color, ls, label in lines),
+        Line2D([], [], color=GREY, ls="--", lw=0.9, label="pitch circle"),
+    ]
     made.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
     return made
 
@@ -124,9 +126,11 @@ def overview() -> Figure:
         radius, share = float(shape.outer_radius) / MM, float(shape.area_efficiency)
         text = f"{family.name}\nr_a {radius:.2f} mm, area efficiency {share:.3f}"
         ax.set_title(text, fontsize=9)
-    handles = [Line2D([], [], color=color, lw=2.5, label=kind) for kind, color in colors.items()]
-    handles.append(Line2D([], [], color=BLACK, lw=0.8, label="conjugate dedendum"))
-    handles.append(Line2D([], [], color=GREY, ls="--", lw=0.9, label="pitch circle, 33 mm"))
+    handles = [
+        *(Line2D([], [], color=color, lw=2.5, label=kind) for kind, color in colors.items()),
+        Line2D([], [], color=BLACK, lw=0.8, label="conjugate dedendum"),
+        Line2D([], [], color=GREY, ls="--", lw=0.9, label="pitch circle, 33 mm"),
+    ]
     axes[-1, -1].legend(handles=handles, loc="center", frameon=False)
     return made
 

@@ -203,14 +203,11 @@ def by_study(data: dict[str, Any]) -> dict[str, list[Row]]:
     Designs that reach the reference's area efficiency come first, then designs that do not, then
     designs without a periodic motion.
     """
-    studies: dict[str, list[Row]] = {name: [] for name in data["references"]}
-    for row in data["rows"]:
-        studies[row["study"]].append(row)
-    for rows in studies.values():
-        rows.sort(
-            key=lambda row: (np.isnan(row["objective"]), not row["reached"], row["objective"])
-        )
-    return studies
+    ranked = sorted(
+        data["rows"],
+        key=lambda row: (np.isnan(row["objective"]), not row["reached"], row["objective"]),
+    )
+    return {name: [row for row in ranked if row["study"] == name] for name in data["references"]}
 
 
 def title(name: str, reference: Row) -> str:
@@ -245,19 +242,17 @@ def run(job: Run) -> None:
     with ProcessPoolExecutor(
         2, mp_context=context, initializer=start_process, initargs=(True,)
     ) as pool:
-        pending = [pool.submit(one_family, *task, quick) for task in tasks]
         rows: list[Row] = []
-        for (name, family), future in zip(tasks, pending, strict=True):
-            row = future.result()
+        made = pool.map(one_family, *zip(*tasks, strict=True), itertools.repeat(quick))
+        for (name, family), row in zip(tasks, made, strict=True):
             found = "does not fit" if row is None else f"{row['objective']:.4f}, {row['status']}"
             job.say(f"{name:8s} {family:18s} {found}")
             rows += [row] if row else []
         for name in names:
             own = [row for row in rows if row["study"] == name and row["reached"]]
             own = [row for row in own if not np.isnan(row["objective"])]
-            starts = free_starts(own, 1 if quick else STARTS) if own else []
-            free = [pool.submit(free_form, name, start, quick) for start in starts]
-            made = [future.result() for future in free]
+            starts = free_starts(own, 1 if quick else STARTS)
+            made = [*pool.map(free_form, [name] * len(starts), starts, itertools.repeat(quick))]
             for row in made:
                 job.say(f"{row['study']:8s} free_form {row['objective']:.4f}, {row['begun_at']}")
             rows += sorted(made, key=lambda row: np.nan_to_num(row["objective"], nan=np.inf))[:1]

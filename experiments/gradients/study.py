@@ -157,16 +157,15 @@ def slopes_of(found: Evaluation) -> np.ndarray:
 
 def rows_of(
     evaluator: Evaluator, kind: str, overrides: list[str], found: dict[float, Evaluation]
-) -> list[dict[str, Any]]:
-    """Return the evaluations and their errors, one row per tolerance.
+) -> Iterator[Row]:
+    """Yield the evaluations and their errors, one row per tolerance.
 
     Errors are relative to the greatest term of the derivative."""
     usable = [one for one in found.values() if one.usable]
     size = np.max(np.abs(slopes_of(usable[-1])), axis=1)
     truth, noise = differences(evaluator, usable[-1])
-    rows = []
     for rtol, one in found.items():
-        row: dict[str, Any] = {"kind": kind, "rtol": rtol, "status": one.status.label}
+        row: Row = {"kind": kind, "rtol": rtol, "status": one.status.label}
         row |= {"period": one.steady_state.get("period"), "scene": " ".join(overrides)}
         facts = one.steady_state | one.statistics
         row |= {name: facts.get(name) for name in FACTS}
@@ -175,8 +174,7 @@ def rows_of(
             for k, measure in enumerate(MEASURES):
                 row[measure], row[f"{measure}_error"] = one.response[measure], errors[k]
                 row[f"{measure}_noise"] = noise[k] / size[k]
-        rows.append(row)
-    return rows
+        yield row
 
 
 def wanted_of(quick: bool, count: int) -> dict[str, int]:
@@ -206,7 +204,7 @@ def pairs_of_kind(
         first = next(series)
         period = int(first[1].steady_state.get("period", 0)) if first[1].usable else 0
         if period >= least:
-            new = rows_of(evaluator, kind, overrides, dict([first, *series]))
+            new = [*rows_of(evaluator, kind, overrides, dict([first, *series]))]
             lively, plain = lively + (period > 1), plain + (period == 1)
             found = {row["rtol"]: (row["status"], row.get("mean_force_N_error")) for row in new}
             say(f"{kind} {lively} {plain} period {period} {found}")

@@ -89,40 +89,36 @@ class Epigraph:
         values, rows = [], []
         tops = len(found.groups)
         for k, group in enumerate((*found.groups, *found.walls)):
-            places = self._places(k, group)
+            branches, places = self._places(k, group)
             value, row = np.ones(len(self.slots[k])), np.zeros((len(self.slots[k]), len(z)))
-            for place, b, slope in zip(places, group.values, group.slopes, strict=True):
-                if place >= 0:
-                    value[place] = -b
-                    row[place, : self.size] = -SCALE * slope
-                if place >= 0 and k < tops:
-                    value[place] += z[self.size + k]
-                    row[place, self.size + k] = 1.0
+            value[places] = -group.values[branches]
+            row[places, : self.size] = -SCALE * group.slopes[branches]
+            if k < tops:
+                value[places] += z[self.size + k]
+                row[places, self.size + k] = 1.0
             values.append(value)
             rows.append(row)
         wide = np.zeros((len(found.slack), len(z)))
         wide[:, : self.size] = SCALE * found.normals
         return np.concatenate([*values, found.slack]), np.concatenate([*rows, wide])
 
-    def _places(self, k: int, group: Group) -> list[int]:
-        """Return the index, within its group, of the constraint that each branch of group `k` uses.
+    def _places(self, k: int, group: Group) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Return branches of group `k`, and the index, within its group, of each one's constraint.
 
-        A branch keeps its index from point to point, so that a method sees smooth constraints. The
-        index is -1 if all constraints of the group are taken."""
+        A branch keeps its index from point to point, so that a method sees smooth constraints. It
+        is left out if all constraints of the group are taken."""
         slots = self.slots[k]
         apart = np.abs(group.tags[:, None, 1] - slots[None, :, 1])
         apart = np.minimum(apart % 1.0, -apart % 1.0)
         other = group.tags[:, None, 0] != slots[None, :, 0]
         cost = np.where(other | ~(apart <= _SAME), 10.0, apart)
-        places = [-1] * len(group.values)
-        for branch, slot in zip(*linear_sum_assignment(cost), strict=True):
-            if cost[branch, slot] < 10.0:
-                places[branch] = int(slot)
+        branches, places = linear_sum_assignment(cost)
+        same = cost[branches, places] < 10.0
+        branches, places = branches[same], places[same]
         free = [s for s in np.argsort(self.used[k], kind="stable") if s not in places]
-        for branch in np.argsort(-group.values, kind="stable"):
-            if places[branch] < 0 and free:
-                places[branch] = int(free.pop(0))
-        for branch, place in enumerate(places):
-            if place >= 0:
-                slots[place], self.used[k][place] = group.tags[branch], self.evaluations
-        return places
+        new = [b for b in np.argsort(-group.values, kind="stable") if b not in branches]
+        count = min(len(new), len(free))
+        branches = np.append(branches, new[:count]).astype(int)
+        places = np.append(places, free[:count]).astype(int)
+        slots[places], self.used[k][places] = group.tags[branches], self.evaluations
+        return branches, places

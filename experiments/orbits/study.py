@@ -202,11 +202,9 @@ def compared(config: Config, solve: Callable[..., Any] | None = None) -> Row:
 
 
 def run(job: Run) -> bool:
-    """Compare orbits, or time them (`--speed`, `--batches`).
-
-    Returns whether the forces agree, or whether all tools have a time."""
+    """Compare orbits, or time them (`--speed`, `--batches`); return whether the forces agree."""
     if job.options.speed or job.options.batches:
-        return timed(job) if job.options.speed else batched(job)
+        return timed(job)
     rows = differences_of(job)
     periodic = [row for row in rows if row["status"] == "periodic"]
     names = [f"{name}_{what}" for what in ("difference", "gradient_difference") for name in FORCES]
@@ -247,24 +245,20 @@ def differences_of(job: Run) -> list[Row]:
 
 
 def timed(job: Run) -> bool:
-    """Time an orbit from a neighbour's on one core; write and print a row for each tool."""
-    if hasattr(os, "sched_setaffinity"):  # before JAX starts its threads
+    """Time batches of designs, or with `--speed` an orbit from a neighbour's on one core.
+
+    Writes and prints a row for each size and start, or for each tool. Returns whether the forces of
+    the batches agree with those of single designs."""
+    one_core = job.options.speed
+    if one_core and hasattr(os, "sched_setaffinity"):  # before JAX starts its threads
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
-    from experiments.orbits import speed
+    from experiments.orbits import batches, speed
 
-    rows = [*speed.rows_of(3 if job.quick else 20, job.say)]
-    job.csv("speed.csv", rows)
-    show("Value and gradient", rows)
-    return True
-
-
-def batched(job: Run) -> bool:
-    """Time batches of designs; write and print a row for each size and start."""
-    from experiments.orbits import batches
-
+    sizes = batches.SIZES[: 1 if job.quick else None]
+    repeats = 3 if job.quick else 20
     rows: list[Row] = []
-    for row in batches.rows_of(batches.SIZES[: 1 if job.quick else None], job.say):
+    for row in speed.rows_of(repeats, job.say) if one_core else batches.rows_of(sizes, job.say):
         rows.append(row)
-        job.csv("batches.csv", rows)
-    show("Batches of designs", rows)
-    return all(row["value_error"] <= AGREE for row in rows)
+        job.csv("speed.csv" if one_core else "batches.csv", rows)
+    show("Value and gradient", rows)
+    return one_core or all(row["value_error"] <= AGREE for row in rows)

@@ -187,10 +187,9 @@ def reproduce(job: Run) -> bool:
         job.csv(f"paper_{name}.csv", rows)
     job.csv("paper.csv", [row_of(found)])
     job.json("paper.json", record)
-    for name, made in zip(("force", "spectrum"), figures.force_figures(found), strict=True):
-        job.figure(f"paper_{name}.png", made)
     made = figures.uniqueness_figure(tables["slices"], tables.get("profile", []))
-    job.figure("paper_uniqueness.png", made)
+    for name, one in zip(job.published, (*figures.force_figures(found), made), strict=True):
+        job.figure(name, one)
     show("Values, forces and motions", [{"": k} | row_of(one) for k, one in responses.items()])
     return True
 
