@@ -69,12 +69,12 @@ def figure_of(rows: list[Row]) -> Figure:
     bars.legend(fontsize=8, loc="lower right")
     turned = points_of(rows, "revolutions", "", "revolutions")
     draw_power(turns, turned, "from rest, no statistics", BLUE, "o")
-    turns.set(xlabel="revolutions", ylabel="time (s)")
     for what, color, mark in (("value", ORANGE, "s"), ("value+gradient", BLUE, "o")):
         draw_power(batches, points_of(rows, "batch ", what), what.replace("+", " + "), color, mark)
-    batches.set(xlabel="designs in a batch", ylabel="time of the batch (s)")
-    for ax in (turns, batches):
-        ax.set(xscale="log", yscale="log")
+    for ax, size, time_of in (
+        (turns, "revolutions", "time"), (batches, "designs in a batch", "time of the batch"),
+    ):  # fmt: skip
+        ax.set(xscale="log", yscale="log", xlabel=size, ylabel=f"{time_of} (s)")
         for axis in (ax.xaxis, ax.yaxis):
             axis.set(major_formatter="{x:g}", minor_formatter=NullFormatter())
         if ax.lines:
@@ -94,12 +94,10 @@ def draw_power(
     """Draw (size, seconds) points on logarithmic axes, with the exponent of a power law in the
     label.
     """
-    if not points:
-        return
     if len(points) > 1:
-        x, y = np.log(np.array(points)).T
-        label += f": exponent {np.polyfit(x, y, 1)[0]:.2f}"
-    ax.plot(*zip(*points, strict=True), marker=mark, color=color, lw=1.4, label=label)
+        label += f": exponent {np.polyfit(*np.log(points).T, 1)[0]:.2f}"
+    if points:
+        ax.plot(*zip(*points, strict=True), marker=mark, color=color, lw=1.4, label=label)
 
 
 # Columns of the table, in order.
@@ -176,8 +174,8 @@ class Parts:
             # wait4 has collected the exit status, which Popen does not know.
             child.returncode = os.waitstatus_to_exitcode(status)
             note = f"exit {child.returncode}"
-            one = row("rootsopt", f"{job.split('.')[1]}, {case}", seconds, note=note)
-            self.rows.append({"part": "main job", **one, "peak_memory_MB": memory})
+            more = {"note": note, "part": "main job", "peak_memory_MB": memory}
+            self.rows.append(row("rootsopt", f"{job.split('.')[1]}, {case}", seconds, **more))
             if child.returncode != 0:
                 self.failed[f"main job, {case}"] = note
             self.job.say(f"main job, {case}: {seconds:.1f} s")

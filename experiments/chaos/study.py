@@ -8,6 +8,7 @@
 
 import dataclasses
 from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -59,30 +60,18 @@ QUICK = (
 )
 
 
-@dataclasses.dataclass(frozen=True)
-class Size:
-    """Sizes of all parts of the study except the optimisation.
-
-    `line`: number of designs along the line; `members`, `window`: members and mesh periods of an
-    average; `pathwise`: mesh periods of the single motion that is differentiated; `large`: members
-    of the ensemble that is divided into `groups`; `slopes`: (designs, members) of each gradient.
-    """
-
-    line: int
-    members: int
-    window: int
-    pathwise: int
-    large: int
-    groups: tuple[int, ...]
-    slopes: tuple[tuple[int, int], ...]
-
-
-# Sizes (designs, members) of the gradients: first more members, then more designs.
-SLOPES = (16, 4), (16, 8), (16, 16), (16, 32), (32, 4), (64, 4), (128, 4)
+# Sizes of all parts of the study except the optimisation; keys: whether the run is reduced.
+# `line`: number of designs along the line; `members`, `window`: members and mesh periods of an
+# average; `pathwise`: mesh periods of the single motion that is differentiated; `large`: members
+# of the ensemble that is divided into `groups`; `slopes`: (designs, members) of each gradient,
+# first more members, then more designs.
 SIZES = {
-    False: Size(25, 32, 128, 96, 512, (4, 8, 16, 32, 64), SLOPES),
-    True: Size(3, 4, 8, 8, 16, (4, 8), ((8, 4),)),
-}
+    False: SimpleNamespace(
+        line=25, members=32, window=128, pathwise=96, large=512, groups=(4, 8, 16, 32, 64),
+        slopes=((16, 4), (16, 8), (16, 16), (16, 32), (32, 4), (64, 4), (128, 4))),
+    True: SimpleNamespace(
+        line=3, members=4, window=8, pathwise=8, large=16, groups=(4, 8), slopes=((8, 4),)),
+}  # fmt: skip
 
 
 def resized(config: Config, model: Scene, **changes) -> Evaluator:
@@ -92,7 +81,7 @@ def resized(config: Config, model: Scene, **changes) -> Evaluator:
     return Evaluator(config, model, Ensemble()).surveying().without_gradient()
 
 
-def line(config: Config, model: Scene, designs: np.ndarray, size: Size) -> Iterator[Row]:
+def line(config: Config, model: Scene, designs: np.ndarray, size: SimpleNamespace) -> Iterator[Row]:
     """Average the force along a line of designs (n, d), over the motion from rest and an
     ensemble."""
     evaluator = resized(config, model, members=size.members, periods=size.window)
@@ -127,7 +116,7 @@ def _pathwise(model: Scene, design, periods, how):
     return jax.jacfwd(means)(design)
 
 
-def pathwise(evaluator: Evaluator, design, size: Size) -> list[Row]:
+def pathwise(evaluator: Evaluator, design, size: SimpleNamespace) -> list[Row]:
     """Measure how the derivative of a single motion's mean force grows with the averaging
     window."""
     scene = evaluator.scene
@@ -138,7 +127,7 @@ def pathwise(evaluator: Evaluator, design, size: Size) -> list[Row]:
     ]
 
 
-def errors_by_members(config: Config, model: Scene, design, size: Size) -> Iterator[Row]:
+def errors_by_members(config: Config, model: Scene, design, size: SimpleNamespace) -> Iterator[Row]:
     """Compare the stated standard error of the mean force with the scatter of independent groups.
 
     The groups are parts of one large ensemble. The standard error of the scatter is listed too.
@@ -161,7 +150,7 @@ def errors_by_members(config: Config, model: Scene, design, size: Size) -> Itera
         }
 
 
-def gradients(config: Config, model: Scene, design, size: Size) -> Iterator[Row]:
+def gradients(config: Config, model: Scene, design, size: SimpleNamespace) -> Iterator[Row]:
     """Estimate the slope of the mean force over the pressure angle, with its standard error.
 
     Yields a row for each size in `size.slopes`: more members, or more designs.

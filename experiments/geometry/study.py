@@ -227,9 +227,9 @@ def study(
         sizes = COEFFICIENTS if family == "free_form" else (0,)
         for size, number in itertools.product(sizes, lobes):
             found = errors(family, number, draws, random, size)
-            worst = np.max(found[1], initial=0.0)
-            say(f"{family} {size}, {number} lobes: {len(found[0])} sound, {worst:.1e}")
-            yield row_of(family, number, size, *found)
+            row, worst = row_of(family, number, size, *found), np.max(found[1], initial=0.0)
+            say(f"{row['family']}, {number} lobes: {row['sound']} sound, {worst:.1e}")
+            yield row
 
 
 def run(job: Run) -> None:

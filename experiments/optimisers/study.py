@@ -46,9 +46,9 @@ _OUTER, _INNER = 30, 25
 # maximum.
 _PENALTY, _GROWTH, _MOST = 10.0, 4.0, 1e6
 
-# Share of the predicted decrease that a step must reach, share of a step that is tried last, and
+# Share of the predicted decrease that a step must reach, shares of a step that are tried, and
 # decrease below which L-BFGS ends.
-_ARMIJO, _SHORTEST, _FLAT = 1e-4, 1e-6, 1e-11
+_ARMIJO, _SHARES, _FLAT = 1e-4, 0.5 ** np.arange(20), 1e-11
 
 # Greatest sine at the start of L-BFGS: at 1, on a bound, its gradient would be zero.
 _INSIDE = 0.98
@@ -147,12 +147,10 @@ def _lbfgs(
         step = -np.asarray(direction)
         if step @ slope >= 0:
             step = -slope
-        share = 1.0
-        while share > _SHORTEST:
+        for share in _SHARES:
             found, gradient = merit(z + share * step)
             if found <= value + _ARMIJO * share * (step @ slope):
                 break
-            share /= 2
         else:
             return z
         gained = value - found

@@ -29,18 +29,14 @@ def over_speed(studies: dict[str, Study]) -> Figure:
     *shown, _ = OPTIMISED
     labels = ["CIC", "EE", *(f"CIC, optimised {name}" for name in shown)]
     entries = {}
-    top = dict.fromkeys(LABELS, 0.0)
     for column, (scene, found) in enumerate(studies.items()):
         designs = {k: found.designs[k] for k in labels if k in found.designs}
         entries |= {entry.get_label(): entry for entry in legend_entries(designs)}
         for ax, force in zip(axes[:, column], LABELS, strict=True):
             plot_speeds(ax, designs, force)
-            forces = (p.evaluation.response.get(force, 0) for d in designs.values() for p in d)
-            top[force] = max(top[force], *forces)
         axes[0, column].set_title(TITLES[scene])
+    setp(axes, ylim=(0, None))
     setp(axes[1], xlabel="speed (rpm)")
-    for ax, force in zip(axes[:, 0], LABELS, strict=True):
-        ax.set_ylim(0, 1.05 * top[force])
     made.legend(handles=list(entries.values()), loc="outside lower center", ncols=4, frameon=False)
     made.suptitle("Contact force over speed, from rest")
     return made
