@@ -97,11 +97,8 @@ def pair_gap(
     outer = np.max(np.hypot(outline[:, 0], outline[:, 1]))
     reach = 0.05 * outer if reach is None else reach
 
-    def near(points, center):
-        return points[np.hypot(*(points - center).T) < outer + reach]
-
-    nodes = near(first[:-1], np.array([center_distance, 0.0]))
-    return _least(nodes, second, refine)
+    away = np.linalg.norm(first[:-1] - [center_distance, 0.0], axis=1)
+    return _least(first[:-1][away < outer + reach], second, refine)
 
 
 def _least(nodes, outline, refine):

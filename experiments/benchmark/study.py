@@ -95,7 +95,8 @@ def draw_power(
     label.
     """
     if len(points) > 1:
-        label += f": exponent {np.polyfit(*np.log(points).T, 1)[0]:.2f}"
+        x, y = np.log(points).T
+        label += f": exponent {np.polyfit(x, y, 1)[0]:.2f}"
     if points:
         ax.plot(*zip(*points, strict=True), marker=mark, color=color, lw=1.4, label=label)
 

@@ -154,5 +154,4 @@ def _extreme(problem: Problem, start, sign: float) -> NDArray[np.float64]:
         },
         options={"maxiter": 60},
     )
-    finite = np.all(np.isfinite(found.x))
-    return problem.project(found.x) if finite else np.asarray(start)
+    return problem.project(found.x if np.all(np.isfinite(found.x)) else start)

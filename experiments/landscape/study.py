@@ -24,7 +24,6 @@ from experiments._common.simulation import feasible
 from experiments._common.style import VERMILION, sheet
 from experiments._common.tables import Row, show
 from rootsopt.config import load
-from rootsopt.optimize.outcome import Optimization
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.search import Search
 from rootsopt.scene.space import sobol
@@ -150,12 +149,6 @@ SHOWN = (
 )
 
 
-def searched(quick: bool, *overrides: str) -> tuple[Search, Optimization]:
-    """Optimise the shipped pair with `overrides`. Return the search and its result."""
-    search = Search(load(FAIR, [*(QUICK if quick else ()), *overrides]))
-    return search, search.run()
-
-
 def compared(name: str, quick: bool) -> tuple[Row, list[Row]]:
     """Optimise in the scene `name`, and simulate grids of designs.
 
@@ -163,7 +156,8 @@ def compared(name: str, quick: bool) -> tuple[Row, list[Row]]:
     is better than the baseline, which is not quite feasible itself, the best one of the search is
     compared. Raises `NoResultError` if the search has none.
     """
-    search, result = searched(quick, *CASES[name])
+    search = Search(load(FAIR, [*(QUICK if quick else ()), *CASES[name]]))
+    result = search.run()
     problem, optimum, known = result.problem, result.optimized, result.optimality
     rows = [row for row in result.history if row["feasible"] and np.isfinite(row["objective"])]
     if problem is None or not rows:
@@ -246,7 +240,8 @@ def run(job: Run) -> bool:
         job.say(f"{name}: {record['grid_best']:.6f}, optimiser {record['optimizer']:.6f}")
     seeds = []
     for seed in range(QUICK_SEEDS if job.quick else SEEDS):
-        _, result = searched(job.quick, f"optimizer.seed={seed}")
+        few = QUICK if job.quick else ()
+        result = Search(load(FAIR, [*few, f"optimizer.seed={seed}"])).run()
         own = 1 - result.improvement.get("objective", np.nan)
         seeds.append({"seed": seed, "objective": own, "designs": len(result.history)})
     values = [row["objective"] for row in seeds]

@@ -203,9 +203,11 @@ def search(job: Run) -> bool:
     bounds = {q.key: (q.low, q.high) for q in QUANTITIES}
     bounds[QUANTITIES[-1].key] = least or QUANTITIES[-1].low, QUANTITIES[-1].high
     config = config_of("cic")
-    record: dict[str, Any] = {"profile.family": [*FAMILIES]}
-    record |= {f"profile.{key}": [x, None] for key, x in config.profile.parameters.items()}
-    record |= {name: PAPER[:, k] for k, name in enumerate(FORCES)}
+    record = {
+        "profile.family": [*FAMILIES],
+        **{f"profile.{key}": [x, None] for key, x in config.profile.parameters.items()},
+        **dict(zip(FORCES, PAPER.T, strict=True)),
+    }
     found = identify(
         config, record, bounds, starts=1 if job.quick else STARTS, seed=seed, progress=job.say
     )

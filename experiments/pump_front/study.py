@@ -55,7 +55,7 @@ def config_of(family: str, divisions: int = DIVISIONS) -> Config:
     values = {
         key: [*v] if isinstance(v, tuple) else v for key, v in family_of(family).example.items()
     }
-    profile = {"family": family, "lobes": 3, "pitch_radius_mm": 33.0} | values
+    profile = {"family": family, "lobes": 3, "pitch_radius_mm": 33.0, **values}
     return load(FAIR, [f"profile={profile!r}", *_PUMP, f"pareto.divisions={divisions}"])
 
 
@@ -64,13 +64,12 @@ def row_of(config: Config, terms: dict[str, float], geometry_of: dict[str, float
 
     `terms`, `geometry_of`: its terms, and its geometry with the keys of the result file."""
     found = pump_sheet(Scene.from_config(config), design_vector(config))
-    shape = {key: geometry_of[key] for key in ("area_efficiency", "seal_width_mm")}
-    ratio = geometry_of["outer_radius_mm"] / config.profile.pitch_radius_mm
-    return (
-        terms
-        | {"displaced_volume_cm3": found["displaced_volume_cm3"], "radius_ratio": ratio}
-        | shape
-    )
+    return {
+        **terms,
+        "displaced_volume_cm3": found["displaced_volume_cm3"],
+        "radius_ratio": geometry_of["outer_radius_mm"] / config.profile.pitch_radius_mm,
+        **{key: geometry_of[key] for key in ("area_efficiency", "seal_width_mm")},
+    }
 
 
 def front_of(

@@ -35,7 +35,8 @@ def over_speed(studies: dict[str, Study]) -> Figure:
         for ax, force in zip(axes[:, column], LABELS, strict=True):
             plot_speeds(ax, designs, force)
         axes[0, column].set_title(TITLES[scene])
-    setp(axes, ylim=(0, None))
+    for ax in axes.flat:
+        ax.set_ylim(0, None)
     setp(axes[1], xlabel="speed (rpm)")
     made.legend(handles=list(entries.values()), loc="outside lower center", ncols=4, frameon=False)
     made.suptitle("Contact force over speed, from rest")

@@ -10,7 +10,6 @@ equals a natural frequency.
 import dataclasses
 import itertools
 import math
-import time
 from collections import Counter
 from collections.abc import Iterator
 
@@ -50,11 +49,6 @@ ORDERS = 6
 # Prominence of a point of a force curve (relative to the force) above which it counts as a
 # maximum.
 PROMINENCE = 0.02
-
-
-def settings(scene: str, family: str, *more: str) -> Config:
-    """Load the shipped config of a `family` in one of the scenes, with further overrides `more`."""
-    return shipped(family, *SCENES[scene], *more)
 
 
 @CachedFunction
@@ -173,16 +167,15 @@ def study(scene: str, speeds, listed, quick: bool) -> Study:
 
     `speeds`: speeds (rpm) of the sweep; `listed`: speeds (rpm) of the objective; `quick`: whether
     the run is reduced."""
-    small = QUICK if quick else ()
-    evaluators = {f: evaluator_of(settings(scene, f, *small)) for f in ("cic", "ee")}
+    here = (*SCENES[scene], *(QUICK if quick else ()))
+    evaluators = {f: evaluator_of(shipped(f, *here)) for f in ("cic", "ee")}
     found = Study(evaluators["cic"].config, {}, {}, [])
     for family, evaluator in evaluators.items():
         found.designs[family.upper()] = evaluator.swept(speeds)
         found.linear[family.upper()] = linearised(evaluator.pair(evaluator.config.design))
     for name, keys in list(OPTIMISED.items())[slice(1, 2) if quick else slice(None)]:
         over = (f"objective.speeds_rpm={list(listed)}", *keys) if keys else ()
-        began = time.perf_counter()
-        result = Search(settings(scene, "cic", *small, *over)).run()
+        result = Search(shipped("cic", *here, *over)).run()
         outcome: Row = {"scene": scene, "optimised": name}
         if result.problem is not None and result.optimized is not None:
             design = np.array(list(result.optimized.design.values()))
@@ -199,7 +192,7 @@ def study(scene: str, speeds, listed, quick: bool) -> Study:
                 "mean_over_listed": float(np.mean(those)),
                 "worst_over_listed": float(np.max(those)),
             }
-        found.outcomes.append(outcome | {"seconds": time.perf_counter() - began})
+        found.outcomes.append(outcome)
     return found
 
 

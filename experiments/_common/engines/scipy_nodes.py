@@ -182,9 +182,7 @@ class NodeContact:
         phi1, phi2 = -roll - relative / 2, -roll + relative / 2
         # Rotor 1's nodes in rotor 2's frame, mirrored so that both flanks have one direction.
         onto = cmath.exp(1j * (phi2 + 2 * half))
-        turn = onto * cmath.exp(1j * phi1)
-        shift = 2 * self.rotor.radius * onto
-        return self._search(shift, turn)
+        return self._search(2 * self.rotor.radius * onto, onto * cmath.exp(1j * phi1))
 
     def _search(self, shift: complex, turn: complex) -> tuple[float, float, float]:
         """Return gap (m) and both levers (m).
