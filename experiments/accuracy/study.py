@@ -17,7 +17,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments._common.driver import Run
-from experiments._common.scenes import CIC, shipped
+from experiments._common.scenes import CIC, MEASURES, shipped
 from experiments._common.shooting import closed
 from experiments._common.simulation import evaluator_of
 from experiments._common.style import BLACK, BLUE, VERMILION, sheet
@@ -37,7 +37,6 @@ SHARP, CHECKED = "solver.rtol=1e-12", 1e-7
 
 # Number of scenes of a full and of a reduced run, and number of timed evaluations.
 COUNT, QUICK_COUNT, REPEATS = 60, 1, 5
-NAMES = ("mean_force_N", "peak_force_N", "rms_force_N")
 
 
 def scenes(seed: int) -> Iterator[tuple[str, list[str]]]:
@@ -69,8 +68,8 @@ def error(found: Evaluation, truth: Evaluation) -> float:
     """Return the largest relative error of forces and derivatives, inf if there are none."""
     if found.status is not Status.PERIODIC:
         return np.inf
-    off = [abs(found.response[name] / truth.response[name] - 1) for name in NAMES]
-    for name in NAMES:
+    off = [abs(found.response[name] / truth.response[name] - 1) for name in MEASURES]
+    for name in MEASURES:
         if name in truth.gradient:  # EE has no parameters
             one, other = (np.array(list(x.gradient[name].values())) for x in (found, truth))
             off.append(np.max(np.abs(one - other)) / np.max(np.abs(other)))
@@ -86,7 +85,7 @@ def measure(family: str, overrides: list[str]) -> Iterator[Row]:
     if not (truth.status is near.status is Status.PERIODIC):
         return
     pair, period = sharp.pair([*truth.design.values()]), int(truth.steady_state["period"])
-    forces = np.array([truth.response[name] for name in NAMES])
+    forces = np.array([truth.response[name] for name in MEASURES])
     if np.max(np.abs(closed(pair, truth.state, period).forces / forces - 1)) > CHECKED:
         return
     for wanted in REQUESTS:

@@ -48,12 +48,11 @@ def part_numba(job: Job) -> dict[str, Any]:
     from experiments._common.engines import numba_pair as numba
 
     scene, repeats = Scene.of(load(CIC)), 5 if job.quick else 51
-    four = {"settle": 4}
     cases = {
         "(b) Numba search": numba.SEARCH_1E3,
         "(b) Numba map": numba.MAP_1E3,
-        "(b) Numba search, settle 4": numba.SEARCH_1E3 | four,
-        "(b) Numba map, settle 4": numba.MAP_1E3 | four,
+        "(b) Numba search, settle 4": numba.SEARCH_1E3 | {"settle": 4},
+        "(b) Numba map, settle 4": numba.MAP_1E3 | {"settle": 4},
         "(b) Numba search, gradient to 1e-3": numba.SEARCH_GRADIENT_1E3,
     }
     rows = []

@@ -47,8 +47,11 @@ def points_of(
     rows: Sequence[Row], part: str, what: str, size: str = "designs"
 ) -> list[tuple[float, float]]:
     """Return (size, seconds) of the rows of a part with the task `what`, or with any."""
-    found = [r for r in rows if r["part"].startswith(part) and what in ("", r["what"])]
-    return [(r[size], r["run_s"]) for r in found]
+    return [
+        (row[size], row["run_s"])
+        for row in rows
+        if row["part"].startswith(part) and what in ("", row["what"])
+    ]
 
 
 def figure_of(rows: list[Row]) -> Figure:
@@ -131,17 +134,17 @@ class Parts:
     def part(self, name: str, size: int = 0) -> bool:
         """Run a part in its own process; return whether it gave a result."""
         said = name + (f" {size}" if size else "")
-        task = Job(name, self.job.quick, size, self.known)
         context = multiprocessing.get_context("spawn")
         try:
             with ProcessPoolExecutor(1, mp_context=context) as pool:
+                task = Job(name, self.job.quick, size, self.known)
                 found, memory = pool.submit(measured, task).result()
         except Exception as error:  # The other parts can still be measured.
             self.failed[said] = f"{type(error).__name__}: {error}"
             self.job.say(f"{said} failed: {self.failed[said]}")
             return False
-        for one in found.pop("rows", []):
-            self.rows.append({"part": said, **one, "peak_memory_MB": memory})
+        about = {"part": said, "peak_memory_MB": memory}
+        self.rows += [about | one for one in found.pop("rows", [])]
         self.known |= found
         self.job.say(said)
         return True

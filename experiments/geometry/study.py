@@ -202,14 +202,18 @@ def row_of(family: str, lobes: int, size: int, designs: np.ndarray, found: np.nd
 
     `found` (n, 3): result of `compared`; `size`: number of coefficients of a free form, else 0.
     """
-    label = f"{family} {size}" if size else family
-    row: Row = {"family": label, "lobes": lobes, "sound": len(designs)}
     # Without a valid design, the errors are NaN.
-    largest = np.max(found, axis=0) if len(found) else np.full(3, np.nan)
-    names = "area_error", "polar_moment_error", "reference_error"
-    row |= dict(zip(names, largest.tolist(), strict=True))
+    area, moment, reference = np.max(found, axis=0) if len(found) else np.full(3, np.nan)
     worst = designs[np.argsort(np.max(found[:, :2], axis=1))[-1:]]
-    return row | {"worst_design": " ".join(f"{x:.9g}" for x in worst.ravel())}
+    return {
+        "family": f"{family} {size}" if size else family,
+        "lobes": lobes,
+        "sound": len(designs),
+        "area_error": area,
+        "polar_moment_error": moment,
+        "reference_error": reference,
+        "worst_design": " ".join(f"{x:.9g}" for x in worst.ravel()),
+    }
 
 
 def study(

@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments._common.driver import Run
-from experiments._common.scenes import CIC, FORCES
+from experiments._common.scenes import CIC, FORCES, MEASURES
 from experiments._common.shooting import closed, differentiated
 from experiments._common.simulation import evaluator_of
 from experiments._common.style import COLORS, sheet
@@ -27,8 +27,7 @@ from rootsopt.response.evaluation import Evaluation, Evaluator
 
 TOLERANCES = (1e-8, 1e-9, 1e-10)
 
-# Names of the forces whose gradients are compared, and of further columns.
-MEASURES = (*FORCES, "rms_force_N")
+# Further columns.
 FACTS = "residual", "floquet_multiplier", "gradient_disagreement", "orbit_elements", "seconds"
 
 # Greatest relative step of the central differences, and number of steps, each half of the one
@@ -272,7 +271,7 @@ def judge(rows: Sequence[Row]) -> tuple[list[Row], list[str]]:
         mine = [row for row in rows if row["rtol"] == rtol]
         good = [row for row in mine if row["status"] == "periodic"]
         off, noise = (
-            np.reshape([row[f"{name}_{what}"] for row in good for name in MEASURES], (-1, 3))
+            np.reshape([[row[f"{name}_{what}"] for name in MEASURES] for row in good], (-1, 3))
             for what in ("error", "noise")
         )
         limit = float(agreement(jnp.asarray(rtol)))

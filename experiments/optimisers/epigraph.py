@@ -98,8 +98,7 @@ class Epigraph:
                 row[places, self.size + k] = 1.0
             values.append(value)
             rows.append(row)
-        wide = np.zeros((len(found.slack), len(z)))
-        wide[:, : self.size] = SCALE * found.normals
+        wide = np.pad(SCALE * found.normals, ((0, 0), (0, len(z) - self.size)))
         return np.concatenate([*values, found.slack]), np.concatenate([*rows, wide])
 
     def _places(self, k: int, group: Group) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

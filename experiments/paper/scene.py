@@ -101,8 +101,8 @@ def respond(
         row = _slopes(evaluator, one, values) if slopes and one.usable else None
         evaluations.append(one)
         rows += [] if row is None else [row]
-    complete = len(rows) == len(FAMILIES)
-    return Response(values, (*evaluations,), np.array(rows) if complete else None)
+    known = np.array(rows) if len(rows) == len(FAMILIES) else None
+    return Response(values, tuple(evaluations), known)
 
 
 def _slopes(evaluator: Evaluator, one: Evaluation, values) -> NDArray[np.float64] | None:
