@@ -91,8 +91,14 @@ def measure(family: str, overrides: list[str]) -> Iterator[Row]:
     for wanted in REQUESTS:
         tool = evaluator_of(shipped(family, *overrides, f"solver.accuracy={wanted}"))
         seconds, found = processor_time(functools.partial(tool, series=False), REPEATS)
-        row = {"family": family, "scene": " ".join(overrides), "accuracy": wanted}
-        yield row | {"status": found.status.label, "error": error(found, truth), "seconds": seconds}
+        yield {
+            "family": family,
+            "scene": " ".join(overrides),
+            "accuracy": wanted,
+            "status": found.status.label,
+            "error": error(found, truth),
+            "seconds": seconds,
+        }
 
 
 def summary(rows: list[Row]) -> list[Row]:

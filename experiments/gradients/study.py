@@ -282,9 +282,18 @@ def judge(rows: Sequence[Row]) -> tuple[list[Row], list[str]]:
         worst = np.nanmax(off, axis=1)
         worst = worst[np.isfinite(worst)]
         shares = np.quantile(worst, [0.5, 0.75, 0.95, 1.0]).tolist() if worst.size else [np.nan] * 4
-        names = "median", "75_%_below", "95_%_below", "maximum"
-        counts = {"rtol": f"{rtol:g}", "pairs": len(mine), "periodic": len(good)}
-        table.append(counts | dict(zip(names, shares, strict=True)))
+        median, most, nearly_all, greatest = shares
+        table.append(
+            {
+                "rtol": f"{rtol:g}",
+                "pairs": len(mine),
+                "periodic": len(good),
+                "median": median,
+                "75_%_below": most,
+                "95_%_below": nearly_all,
+                "maximum": greatest,
+            }
+        )
     for scene in dict.fromkeys(row["scene"] for row in rows):
         ends = [row["status"] for row in rows if row["scene"] == scene]
         if ends[0] == "periodic" and set(ends) != {"periodic"}:

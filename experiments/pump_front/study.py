@@ -84,10 +84,14 @@ def front_of(
     front = pareto_front(config)
     say(f"{family}: {front.searches} searches, {front.evaluations} designs. {front.message}")
     for point in front.points:
-        row = {"family": family, "point": point.number, "status": point.standing.label}
-        row |= row_of(front.config_of(point), point.terms, point.evaluation.geometry)
-        row["peak_force_N"] = point.evaluation.response["peak_force_N"]
-        yield row | point.design
+        yield {
+            "family": family,
+            "point": point.number,
+            "status": point.standing.label,
+            **row_of(front.config_of(point), point.terms, point.evaluation.geometry),
+            "peak_force_N": point.evaluation.response["peak_force_N"],
+            **point.design,
+        }
 
 
 def reference() -> Row:

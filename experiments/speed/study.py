@@ -121,8 +121,12 @@ def crossings(found: dict[str, float], lobes: int, speeds) -> Iterator[Row]:
     for mode, order in itertools.product(("contact", "gear", "average"), range(1, ORDERS + 1)):
         speed = 60 * found[mode] / (order * lobes)
         if speeds[0] <= speed <= speeds[-1]:
-            row = {"mode": mode, "frequency_Hz": found[mode], "order": order}
-            yield row | {"speed_rpm": speed}
+            yield {
+                "mode": mode,
+                "frequency_Hz": found[mode],
+                "order": order,
+                "speed_rpm": speed,
+            }
 
 
 def maxima(parts: tuple[Part, ...]) -> Iterator[Row]:
@@ -130,8 +134,12 @@ def maxima(parts: tuple[Part, ...]) -> Iterator[Row]:
     for force in LABELS:
         values = np.array([part.evaluation.response.get(force, 0.0) for part in parts])
         for k in find_peaks(values, prominence=PROMINENCE * np.max(values))[0]:
-            row = {"force": force, "speed_rpm": parts[k].speed_rpm, "value_N": values[k]}
-            yield row | {"status": parts[k].evaluation.status.label}
+            yield {
+                "force": force,
+                "speed_rpm": parts[k].speed_rpm,
+                "value_N": values[k],
+                "status": parts[k].evaluation.status.label,
+            }
 
 
 def objective(config: Config, one: Evaluation, baseline: Evaluation) -> float:
