@@ -40,8 +40,9 @@ def parser_of(known: dict[str, tuple[str, Study]]) -> argparse.ArgumentParser:
     _add_common(parser, RESULTS, "small sizes")
     inner = parser.add_subparsers(dest="name", metavar="NAME", prog=COMMAND)
     for name, (text, study) in known.items():
-        form = argparse.RawDescriptionHelpFormatter
-        one = inner.add_parser(name, description=text, formatter_class=form)
+        one = inner.add_parser(
+            name, description=text, formatter_class=argparse.RawDescriptionHelpFormatter
+        )
         _add_common(one, RESULTS / name, study.quick)
         for option, settings in study.options.items():
             one.add_argument(option, **settings)
@@ -49,11 +50,14 @@ def parser_of(known: dict[str, tuple[str, Study]]) -> argparse.ArgumentParser:
 
 
 def _add_common(parser: argparse.ArgumentParser, folder: Path, quick: str) -> None:
-    said = "folder of the results (default: %(default)s)"
-    parser.add_argument("-o", "--output", type=Path, metavar="DIR", default=folder, help=said)
+    parser.add_argument(
+        "-o", "--output", type=Path, metavar="DIR", default=folder,
+        help="folder of the results (default: %(default)s)",
+    )  # fmt: skip
     parser.add_argument("--quick", action="store_true", help=f"reduced run: {quick}")
-    said = "also write the published figures into docs/"
-    parser.add_argument("--docs", action="store_true", help=said)
+    parser.add_argument(
+        "--docs", action="store_true", help="also write the published figures into docs/"
+    )
 
 
 def run_all(known: dict[str, tuple[str, Study]], options: argparse.Namespace) -> int:
@@ -87,12 +91,9 @@ def main() -> int:
         return OK
     try:
         kept = conduct(options.name, known[options.name][1], options)
-    except InputError as error:
+    except (InputError, NoResultError) as error:
         print(f"{COMMAND} {options.name}: {' '.join(str(error).split())}", file=sys.stderr)
-        return BAD_INPUT
-    except NoResultError as error:
-        print(f"{COMMAND} {options.name}: {error}", file=sys.stderr)
-        return NO_RESULT
+        return BAD_INPUT if isinstance(error, InputError) else NO_RESULT
     return OK if kept else NO_RESULT
 
 

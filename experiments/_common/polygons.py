@@ -26,20 +26,17 @@ def signed_distance(nodes: Points, outline: Points, refine: bool = True) -> NDAr
     corners = outline[:-1] if np.allclose(outline[0], outline[-1], atol=0) else outline
     count = len(corners)
     nearest = KDTree(corners).query(nodes)[1]
-    best = np.full(len(nodes), np.inf)
-    sign = np.ones(len(nodes))
     tangents = _tangents(corners) if refine else None
+    # Distances from the segments on both sides of the nearest corner, with their signs.
+    distances = []
     for shift in (-1, 0):
         start = (nearest + shift) % count
-        stop = (start + 1) % count
-        point, direction = _project(nodes, corners, start, stop, tangents)
+        point, direction = _project(nodes, corners, start, (start + 1) % count, tangents)
         offset = nodes - point
-        distance = np.hypot(offset[:, 0], offset[:, 1])
         outside = direction[:, 0] * offset[:, 1] - direction[:, 1] * offset[:, 0] < 0
-        closer = distance < best
-        best = np.where(closer, distance, best)
-        sign = np.where(closer, np.where(outside, 1.0, -1.0), sign)
-    return sign * best
+        distances.append(np.where(outside, 1.0, -1.0) * np.hypot(offset[:, 0], offset[:, 1]))
+    before, after = distances
+    return np.where(np.abs(after) < np.abs(before), after, before)
 
 
 def _tangents(corners):
@@ -100,11 +97,8 @@ def pair_gap(
     outer = np.max(np.hypot(outline[:, 0], outline[:, 1]))
     reach = 0.05 * outer if reach is None else reach
 
-    def near(points, center):
-        return points[np.hypot(*(points - center).T) < outer + reach]
-
-    nodes = near(first[:-1], np.array([center_distance, 0.0]))
-    return _least(nodes, second, refine)
+    away = np.linalg.norm(first[:-1] - [center_distance, 0.0], axis=1)
+    return _least(first[:-1][away < outer + reach], second, refine)
 
 
 def _least(nodes, outline, refine):
@@ -113,12 +107,8 @@ def _least(nodes, outline, refine):
     if not refine or i in (0, len(nodes) - 1):
         return float(distance[i])
     # Vertex of the parabola through the three nodes around the least distance.
-    left, middle, right = distance[i - 1 : i + 2]
-    before = np.linalg.norm(nodes[i] - nodes[i - 1])
-    after = np.linalg.norm(nodes[i + 1] - nodes[i])
-    slopes = (middle - left) / before, (right - middle) / after
-    curvature = (slopes[1] - slopes[0]) / (before + after)
+    before, after = np.linalg.norm(np.diff(nodes[i - 1 : i + 2], axis=0), axis=1)
+    curvature, slope, _ = np.polyfit([-before, 0.0, after], distance[i - 1 : i + 2], 2)
     if curvature <= 0 or max(before, after) > 3 * min(before, after):
-        return float(middle)
-    tangent = (slopes[0] * after + slopes[1] * before) / (before + after)
-    return float(middle - tangent**2 / (4 * curvature))
+        return float(distance[i])
+    return float(distance[i] - slope**2 / (4 * curvature))

@@ -8,8 +8,9 @@ CIC = "configs/cic_drawn.yaml"
 # The same pair with a clearance, and with limits that make every design pump and seal as it does.
 FAIR = "configs/cic.yaml"
 
-# Names of the forces that most studies compare.
+# Names of the forces that most studies compare, and of all forces with a gradient.
 FORCES = ("mean_force_N", "peak_force_N")
+MEASURES = (*FORCES, "rms_force_N")
 
 # Overrides that give a stable orbit of two mesh periods which is sensitive to changes.
 SHAKY = (

@@ -1,6 +1,7 @@
 """Calls into rootsopt's evaluators and models that several studies make."""
 
 import dataclasses
+from collections.abc import Iterable
 from typing import Any
 
 import equinox as eqx
@@ -11,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from experiments._common.scenes import FORCES
 from experiments._common.tables import Row
 from rootsopt.config import Config
+from rootsopt.optimize.problem import Problem
 from rootsopt.profiles import Profile
 from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.scene import Scene, design_vector
@@ -56,6 +58,12 @@ def objective(evaluation: Evaluation, reference: dict[str, float]) -> float:
     if not evaluation.usable:
         return float("nan")
     return float(np.mean([evaluation.response[key] / reference[key] for key in FORCES]))
+
+
+def feasible(problem: Problem, points: Iterable[Any]) -> list[NDArray[np.float64]]:
+    """Move `points` (d,) of the unit box onto the constraints; return those that are feasible."""
+    moved = [problem.project(point) for point in points]
+    return [point for point in moved if problem.feasible(point)]
 
 
 def numbers_of(evaluation: Evaluation) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

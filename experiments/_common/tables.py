@@ -19,10 +19,9 @@ def show(
     if not rows:
         return
     keys = list(rows[0] if columns is None else columns)
-    lines = [[key.replace("_", " ") for key in keys], ["---"] * len(keys)]
-    lines += [[_cell(row.get(key)) for key in keys] for row in rows]
+    body = [[_cell(row.get(key)) for key in keys] for row in rows]
     print(f"\n{title}\n")
-    for line in lines:
+    for line in ([key.replace("_", " ") for key in keys], ["---"] * len(keys), *body):
         print(f"| {' | '.join(line)} |")
 
 

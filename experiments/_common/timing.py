@@ -23,26 +23,24 @@ def times_of(
     repeats: int,
     at_most: float = math.inf,
     clock: Callable[[], float] = time.perf_counter,
-) -> list[float]:
-    """Return the times (s) of up to `repeats` calls; start no call after `at_most` seconds."""
-    times: list[float] = []
+) -> tuple[list[float], Any]:
+    """Return the times (s) of up to `repeats` calls, and the last result.
+
+    No call starts after `at_most` seconds."""
+    times, found = [], None
     while not times or (len(times) < repeats and sum(times) < at_most):
         began = clock()
-        call()
+        found = call()
         times.append(clock() - began)
-    return times
+    return times, found
 
 
 def median_time(call: Callable[[], Any], repeats: int, *limits: Any) -> tuple[float, Any]:
     """Return the median time (s) of up to `repeats` calls, and the last result.
 
     `limits`: see `times_of`."""
-    results = []
-
-    def keep() -> None:
-        results[:] = [call()]
-
-    return statistics.median(times_of(keep, repeats, *limits)), results[0]
+    times, found = times_of(call, repeats, *limits)
+    return statistics.median(times), found
 
 
 def processor_time(call: Callable[[], Any], repeats: int) -> tuple[float, Any]:

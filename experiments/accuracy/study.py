@@ -8,6 +8,7 @@ by shooting (`experiments._common.shooting`). Scenes without a reference are rep
 random scenes.
 """
 
+import contextlib
 import functools
 from collections.abc import Iterator
 from typing import Any
@@ -16,7 +17,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments._common.driver import Run
-from experiments._common.scenes import CIC, shipped
+from experiments._common.scenes import CIC, MEASURES, shipped
 from experiments._common.shooting import closed
 from experiments._common.simulation import evaluator_of
 from experiments._common.style import BLACK, BLUE, VERMILION, sheet
@@ -36,7 +37,6 @@ SHARP, CHECKED = "solver.rtol=1e-12", 1e-7
 
 # Number of scenes of a full and of a reduced run, and number of timed evaluations.
 COUNT, QUICK_COUNT, REPEATS = 60, 1, 5
-NAMES = ("mean_force_N", "peak_force_N", "rms_force_N")
 
 
 def scenes(seed: int) -> Iterator[tuple[str, list[str]]]:
@@ -68,89 +68,80 @@ def error(found: Evaluation, truth: Evaluation) -> float:
     """Return the largest relative error of forces and derivatives, inf if there are none."""
     if found.status is not Status.PERIODIC:
         return np.inf
-    off = [abs(found.response[name] / truth.response[name] - 1) for name in NAMES]
-    for name in NAMES:
+    off = [abs(found.response[name] / truth.response[name] - 1) for name in MEASURES]
+    for name in MEASURES:
         if name in truth.gradient:  # EE has no parameters
             one, other = (np.array(list(x.gradient[name].values())) for x in (found, truth))
             off.append(np.max(np.abs(one - other)) / np.max(np.abs(other)))
     return float(max(off))
 
 
-def measure(family: str, overrides: list[str]) -> list[Row]:
-    """Measure one scene. Return a row for each accuracy; none if the scene has no reference."""
+def measure(family: str, overrides: list[str]) -> Iterator[Row]:
+    """Measure one scene. Yield a row for each accuracy; none if the scene has no reference."""
     finest = evaluator_of(shipped(family, *overrides, f"solver.accuracy={REQUESTS[-1]}"))
     near = finest(series=False)
     sharp = evaluator_of(shipped(family, *overrides, SHARP))
     truth = sharp(start=near.start, series=False)
     if not (truth.status is near.status is Status.PERIODIC):
-        return []
+        return
     pair, period = sharp.pair([*truth.design.values()]), int(truth.steady_state["period"])
-    forces = np.array([truth.response[name] for name in NAMES])
+    forces = np.array([truth.response[name] for name in MEASURES])
     if np.max(np.abs(closed(pair, truth.state, period).forces / forces - 1)) > CHECKED:
-        return []
-    rows = []
+        return
     for wanted in REQUESTS:
         tool = evaluator_of(shipped(family, *overrides, f"solver.accuracy={wanted}"))
         seconds, found = processor_time(functools.partial(tool, series=False), REPEATS)
-        rows.append(
-            {
-                "family": family,
-                "scene": " ".join(overrides),
-                "accuracy": wanted,
-                "status": found.status.label,
-                "error": error(found, truth),
-                "seconds": seconds,
-                "elements": found.statistics.get("orbit_elements", 0),
-                "solver_steps": found.statistics["solver_steps"],
-                "newton_steps": found.statistics["newton_steps"],
-            }
-        )
-    return rows
+        yield {
+            "family": family,
+            "scene": " ".join(overrides),
+            "accuracy": wanted,
+            "status": found.status.label,
+            "error": error(found, truth),
+            "seconds": seconds,
+        }
 
 
 def summary(rows: list[Row]) -> list[Row]:
     """Return, for each accuracy: share of scenes within it, errors, and time."""
-    usual = np.array([row["seconds"] for row in rows if row["accuracy"] == 1e-5])
-    table = []
-    for wanted in REQUESTS:
-        mine = [row for row in rows if row["accuracy"] == wanted]
-        errors = np.array([row["error"] for row in mine])
-        seconds = np.array([row["seconds"] for row in mine])
-        table.append(
-            {
-                "accuracy": wanted,
-                "scenes": len(mine),
-                "within": float(np.mean(errors <= wanted)),
-                "median_error": float(np.median(errors)),
-                "error_of_95_percent": float(np.quantile(errors, 0.95, method="lower")),
-                "median_ms": 1e3 * float(np.median(seconds)),
-                "time_over_usual": float(np.median(seconds / usual)),
-            }
-        )
-    return table
+    # Arrays of shape (accuracies, scenes).
+    pairs = np.reshape([(row["error"], row["seconds"]) for row in rows], (-1, len(REQUESTS), 2))
+    errors, seconds = pairs.T
+    usual = seconds[REQUESTS.index(1e-5)]
+    return [
+        {
+            "accuracy": wanted,
+            "scenes": off.size,
+            "within": float(np.mean(off <= wanted)),
+            "median_error": float(np.median(off)),
+            "error_of_95_percent": float(np.quantile(off, 0.95, method="lower")),
+            "median_ms": 1e3 * float(np.median(times)),
+            "time_over_usual": float(np.median(times / usual)),
+        }
+        for wanted, off, times in zip(REQUESTS, errors, seconds, strict=True)
+    ]
 
 
-def errors(rows: list[Row]) -> Figure:
-    """Draw the errors of all scenes, and the time relative to the usual accuracy."""
-    figure, axes = sheet(10.0, 4.4, columns=2)
-    left, right = axes[0]
-    spread = np.random.default_rng(0)
+def errors(rows: list[Row], table: list[Row]) -> Figure:
+    """Draw the errors of all scenes, and the time relative to the usual accuracy.
+
+    `table`: summary of the `rows`."""
+    figure, ((left, right),) = sheet(10.0, 4.4, columns=2)
     asked = np.array([row["accuracy"] for row in rows])
     reached = np.clip([row["error"] for row in rows], 1e-12, 1.0)
-    shifted = asked * 10 ** spread.uniform(-0.2, 0.2, len(asked))
+    shifted = asked * 10 ** np.random.default_rng(0).uniform(-0.2, 0.2, len(asked))
     left.loglog(shifted, reached, "o", color=BLUE, mfc="none", ms=4, label="a scene")
-    line = np.array([REQUESTS[-1], REQUESTS[0]])
+    line = REQUESTS[-1], REQUESTS[0]
     left.loglog(line, line, "-", color=BLACK, lw=1, label="accuracy asked for")
-    left.set_xlabel("solver.accuracy (points spread for legibility)")
-    left.set_ylabel("relative error of forces and gradient, the largest")
+    left.set(
+        xlabel="solver.accuracy (points spread for legibility)", xlim=left.get_xlim()[::-1],
+        ylabel="relative error of forces and gradient, the largest",
+    )  # fmt: skip
     left.legend(fontsize=8)
-    table = summary(rows)
     right.semilogx(REQUESTS, [row["time_over_usual"] for row in table], "s-", color=VERMILION)
-    right.set_xlabel("solver.accuracy")
-    right.set_ylabel("time of an evaluation, over that at 1e-5 (median)")
-    right.set_ylim(bottom=0)
-    for ax in (left, right):
-        ax.invert_xaxis()
+    right.set(
+        xlabel="solver.accuracy", xlim=right.get_xlim()[::-1],
+        ylabel="time of an evaluation, over that at 1e-5 (median)", ylim=(0, None),
+    )  # fmt: skip
     figure.suptitle(f"{table[0]['scenes']} random designs and scenes, from rest", fontsize=11)
     return figure
 
@@ -160,20 +151,17 @@ def run(job: Run) -> bool:
 
     Returns whether 95 % of the errors are within each accuracy."""
     rows: list[Row] = []
-    done, count = 0, QUICK_COUNT if job.quick else COUNT
-    for family, overrides in scenes(0):
-        try:
-            new = measure(family, overrides)
-        except InputError:
-            continue  # an impossible geometry
-        rows += new
-        done += bool(new)
-        job.say(f"{done}/{count} {family} " + " ".join(f"{row['error']:.0e}" for row in new))
-        if done >= count:
-            break
+    done, count, drawn = 0, QUICK_COUNT if job.quick else COUNT, scenes(0)
+    while done < count:
+        family, overrides = next(drawn)
+        with contextlib.suppress(InputError):  # an impossible geometry
+            new = [*measure(family, overrides)]
+            rows += new
+            done += bool(new)
+            job.say(f"{done}/{count} {family} " + " ".join(f"{row['error']:.0e}" for row in new))
     table = summary(rows)
     job.csv("accuracy.csv", rows)
     job.json("accuracy.json", {"table": table})
-    job.figure("accuracy.png", errors(rows))
+    job.figure("accuracy.png", errors(rows, table))
     show("Accuracy asked for and reached", table)
     return all(row["within"] >= 0.95 for row in table)

@@ -1,6 +1,7 @@
 """The competitors: SciPy and Numba."""
 
 import functools
+from collections.abc import Iterator
 from typing import Any
 
 from experiments._common.engines import Engine, Scene, best_steps, central_differences
@@ -15,22 +16,19 @@ from rootsopt.config import load
 
 def competitor_rows(
     name: str, tool: Engine, settings: dict[str, Any], job: Job, more: Row, repeats: int
-) -> list[Row]:
-    """Time a competitor: forces alone, then forces with gradient. Return the rows."""
+) -> Iterator[Row]:
+    """Time a competitor: forces alone, then forces with gradient. Yield the rows."""
     forces, slopes = (x[0] for x in job.truth(1))
     steps, factor = best_steps(tool.forces, BASELINE, slopes)
     differences = functools.partial(central_differences, tool.forces, BASELINE, steps)
-    rows = []
+    told = f"told to settle {settings.get('settle', 4)} mesh periods; no check"
+    more = more | {"settings": ", ".join(f"{key} {value}" for key, value in settings.items())}
     for what, call, note in (
-        ("value", lambda: (tool.forces(BASELINE), None), "no check"),
-        ("value+gradient", differences, f"no check; central differences, steps x {factor:g}"),
+        ("value", lambda: (tool.forces(BASELINE), None), told),
+        ("value+gradient", differences, f"{told}; central differences, steps x {factor:g}"),
     ):
         seconds, found = median_time(call, repeats)
-        shared = errors_of(found, (forces, slopes)) | more
-        shared["settings"] = ", ".join(f"{key} {value}" for key, value in settings.items())
-        told = f"told to settle {settings.get('settle', 4)} mesh periods; {note}"
-        rows.append(row(name, what, seconds, note=told, **shared))
-    return rows
+        yield row(name, what, seconds, note=note, **errors_of(found, (forces, slopes)), **more)
 
 
 def part_scipy(job: Job) -> dict[str, Any]:
@@ -50,12 +48,11 @@ def part_numba(job: Job) -> dict[str, Any]:
     from experiments._common.engines import numba_pair as numba
 
     scene, repeats = Scene.of(load(CIC)), 5 if job.quick else 51
-    four = {"settle": 4}
     cases = {
         "(b) Numba search": numba.SEARCH_1E3,
         "(b) Numba map": numba.MAP_1E3,
-        "(b) Numba search, settle 4": numba.SEARCH_1E3 | four,
-        "(b) Numba map, settle 4": numba.MAP_1E3 | four,
+        "(b) Numba search, settle 4": numba.SEARCH_1E3 | {"settle": 4},
+        "(b) Numba map, settle 4": numba.MAP_1E3 | {"settle": 4},
         "(b) Numba search, gradient to 1e-3": numba.SEARCH_GRADIENT_1E3,
     }
     rows = []
@@ -64,7 +61,7 @@ def part_numba(job: Job) -> dict[str, Any]:
         extra, _, _ = first_and_warm(functools.partial(tool.simulate, BASELINE), 3)
         if tool.contact == "map":
             tool = tool.fitted(BASELINE)
-        compiled_here = "settle" not in name and "gradient" not in name
-        more: Row = {"compile_s": extra} if compiled_here else {}
+        # The other cases use the same program.
+        more = {} if "settle" in name or "gradient" in name else {"compile_s": extra}
         rows += competitor_rows(name, tool, settings, job, more, repeats)
     return {"rows": rows}

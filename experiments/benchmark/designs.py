@@ -114,17 +114,9 @@ def part_single(job: Job) -> dict[str, Any]:
         solve = compiled(solver_of(scene, what != "value"))
         call = functools.partial(solve, jnp.asarray(BASELINE), rest)
         extra, seconds, found = first_and_warm(call, repeats)
-        rows.append(
-            row(
-                "rootsopt, one program",
-                what,
-                seconds,
-                compile_s=extra,
-                **errors_of(found[:2], truth),
-                settings=best["settings"],
-                note="steady_response: settlement checked, orbit closed",
-            )
-        )
+        more = errors_of(found[:2], truth) | {"compile_s": extra, "settings": best["settings"]}
+        note = "steady_response: settlement checked, orbit closed"
+        rows.append(row("rootsopt, one program", what, seconds, note=note, **more))
     return {"rows": rows}
 
 
@@ -209,17 +201,16 @@ def part_orbit(job: Job) -> dict[str, Any]:
             neighbour = here(design * 1.002, series=False).start
             call = functools.partial(here, design, neighbour, series=False)
             seconds, found = median_time(call, 15)
-            more = errors_of(numbers_of(found), truth) | {"settings": f"rtol {rtol:g}"}
-            tried.append(row("orbit", what, seconds, note=forgets, **more))
+            more = {"note": forgets, "settings": f"rtol {rtol:g}"}
+            tried.append(row("orbit", what, seconds, **more, **errors_of(numbers_of(found), truth)))
             how = dataclasses.replace(tool.scene.solver.orbit, rtol=jnp.asarray(rtol))
             for settle in ORBIT_SETTLES:
                 call = functools.partial(averaged, tool.scene, design, jnp.asarray(settle), how)
                 error = errors_of((ready(call())[0], None), truth)["value_error"]
                 if error <= ORBIT_ACCURACY or settle == ORBIT_SETTLES[-1]:
                     seconds, found = median_time(lambda call=call: ready(call()), 15)
-                    settings = f"rtol {rtol:g}, {settle} + 1 mesh periods"
-                    more = errors_of(found, truth) | {"settings": settings}
-                    tried.append(row("transient", what, seconds, note=forgets, **more))
+                    more["settings"] += f", {settle} + 1 mesh periods"
+                    tried.append(row("transient", what, seconds, **more, **errors_of(found, truth)))
                     break
         for method in ("orbit", "transient"):
             every = [one for one in tried if one["tool"] == method]
@@ -231,25 +222,15 @@ def part_orbit(job: Job) -> dict[str, Any]:
 def part_revolutions(job: Job) -> dict[str, Any]:
     """Time plain integration from rest over an increasing number of revolutions."""
     config = load(CIC)
-    model = Scene.from_config(config)
-    pair = eqx.filter_jit(Scene.pair)(model, jnp.asarray(BASELINE))
-    how = integrators(config)[0]
-    compiled = eqx.filter_jit(strobe)
+    pair, how = evaluator_of(config).pair(BASELINE), integrators(config)[0]
+    program = eqx.filter_jit(strobe)
     rows = []
     for count in REVOLUTIONS[:2] if job.quick else REVOLUTIONS:
-        call = functools.partial(compiled, pair, jnp.zeros(2), MESH_PERIODS * count, how)
+        call = functools.partial(program, pair, jnp.zeros(2), MESH_PERIODS * count, how)
         extra, seconds, out = first_and_warm(lambda call=call: ready(call()), 5, 10.0)
-        rows.append(
-            row(
-                "rootsopt",
-                f"{count} revolutions",
-                seconds,
-                compile_s=extra,
-                revolutions=count,
-                settings=f"rtol {float(how.rtol):g}",
-                note=f"{int(out.steps)} steps, {'solved' if bool(out.solved) else 'failed'}",
-            )
-        )
+        more = {"compile_s": extra, "revolutions": count, "settings": f"rtol {float(how.rtol):g}"}
+        note = f"{int(out.steps)} steps, {'solved' if bool(out.solved) else 'failed'}"
+        rows.append(row("rootsopt", f"{count} revolutions", seconds, note=note, **more))
     return {"rows": rows}
 
 
@@ -263,11 +244,9 @@ def averaged(model: Scene, design: Any, settle: Any, how: Integrator) -> tuple[A
 
     def forces(design: Any) -> tuple[Any, Any]:
         pair = model.pair(design)
-
-        def pass_by(_: Any, state: Any) -> Any:
-            return strobe(pair, state, 1, how).states[-1]
-
-        state = lax.fori_loop(0, settle, pass_by, jnp.zeros(2))
+        state = lax.fori_loop(
+            0, settle, lambda _, state: strobe(pair, state, 1, how).states[-1], jnp.zeros(2)
+        )
         found = one_period(pair, state, how).response[::2]
         return found, found
 

@@ -39,7 +39,7 @@ class Job:
 
 def row(tool: str, what: str, seconds: float, **more: Any) -> Row:
     """Return a row of the result; `seconds`: time of one call, for all its designs."""
-    designs = more.pop("designs", 1)
+    designs = more.get("designs", 1)
     start: Row = {"tool": tool, "what": what, "designs": designs, "run_s": seconds}
     return start | {"per_design_ms": 1e3 * seconds / designs} | more
 

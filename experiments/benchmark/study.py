@@ -47,26 +47,24 @@ def points_of(
     rows: Sequence[Row], part: str, what: str, size: str = "designs"
 ) -> list[tuple[float, float]]:
     """Return (size, seconds) of the rows of a part with the task `what`, or with any."""
-    found = [r for r in rows if r["part"].startswith(part) and what in ("", r["what"])]
-    return [(r[size], r["run_s"]) for r in found]
+    return [
+        (row[size], row["run_s"])
+        for row in rows
+        if row["part"].startswith(part) and what in ("", row["what"])
+    ]
 
 
 def figure_of(rows: list[Row]) -> Figure:
     """Draw the time per design by tool, and the times over revolutions and over batch size."""
-    figure, axes = sheet(15, 5.6, 1, 3, width_ratios=(1.5, 1, 1))
-    bars, turns, batches = axes[0]
+    figure, ((bars, turns, batches),) = sheet(15, 5.6, 1, 3, width_ratios=(1.5, 1, 1))
     timed = [r for r in rows if r["what"] in ("value", "value+gradient")]
     names = list(dict.fromkeys(r["tool"] for r in timed))
     for shift, (what, color) in enumerate((("value", ORANGE), ("value+gradient", BLUE))):
         chosen = [r for r in timed if r["what"] == what]
         place = [names.index(r["tool"]) + 0.38 * (shift - 0.5) for r in chosen]
-        label = what.replace("+", " + ")
-        bars.barh(place, [r["per_design_ms"] for r in chosen], 0.36, color=color, label=label)
-        for y, r in zip(place, chosen, strict=True):
-            bars.annotate(
-                short(r["per_design_ms"]), (r["per_design_ms"], y), (3, 0),
-                textcoords="offset points", va="center", fontsize=7,
-            )  # fmt: skip
+        label, times = what.replace("+", " + "), [r["per_design_ms"] for r in chosen]
+        drawn = bars.barh(place, times, 0.36, color=color, label=label)
+        bars.bar_label(drawn, fmt=short, padding=3, fontsize=7)
     bars.set_yticks(range(len(names)), names, fontsize=8)
     bars.invert_yaxis()
     bars.margins(x=0.15)
@@ -74,15 +72,14 @@ def figure_of(rows: list[Row]) -> Figure:
     bars.legend(fontsize=8, loc="lower right")
     turned = points_of(rows, "revolutions", "", "revolutions")
     draw_power(turns, turned, "from rest, no statistics", BLUE, "o")
-    turns.set(xlabel="revolutions", ylabel="time (s)")
     for what, color, mark in (("value", ORANGE, "s"), ("value+gradient", BLUE, "o")):
         draw_power(batches, points_of(rows, "batch ", what), what.replace("+", " + "), color, mark)
-    batches.set(xlabel="designs in a batch", ylabel="time of the batch (s)")
-    for ax in (turns, batches):
-        ax.set(xscale="log", yscale="log")
+    for ax, size, time_of in (
+        (turns, "revolutions", "time"), (batches, "designs in a batch", "time of the batch"),
+    ):  # fmt: skip
+        ax.set(xscale="log", yscale="log", xlabel=size, ylabel=f"{time_of} (s)")
         for axis in (ax.xaxis, ax.yaxis):
-            axis.set_major_formatter("{x:g}")
-            axis.set_minor_formatter(NullFormatter())
+            axis.set(major_formatter="{x:g}", minor_formatter=NullFormatter())
         if ax.lines:
             ax.legend(fontsize=8)
     figure.suptitle(f"Shipped CIC scene; mean and peak force to {ACCURACY:g}", fontsize=11)
@@ -100,12 +97,11 @@ def draw_power(
     """Draw (size, seconds) points on logarithmic axes, with the exponent of a power law in the
     label.
     """
-    if not points:
-        return
     if len(points) > 1:
-        x, y = np.log(np.array(points)).T
+        x, y = np.log(points).T
         label += f": exponent {np.polyfit(x, y, 1)[0]:.2f}"
-    ax.plot(*zip(*points, strict=True), marker=mark, color=color, lw=1.4, label=label)
+    if points:
+        ax.plot(*zip(*points, strict=True), marker=mark, color=color, lw=1.4, label=label)
 
 
 # Columns of the table, in order.
@@ -138,17 +134,17 @@ class Parts:
     def part(self, name: str, size: int = 0) -> bool:
         """Run a part in its own process; return whether it gave a result."""
         said = name + (f" {size}" if size else "")
-        task = Job(name, self.job.quick, size, self.known)
         context = multiprocessing.get_context("spawn")
         try:
             with ProcessPoolExecutor(1, mp_context=context) as pool:
+                task = Job(name, self.job.quick, size, self.known)
                 found, memory = pool.submit(measured, task).result()
         except Exception as error:  # The other parts can still be measured.
             self.failed[said] = f"{type(error).__name__}: {error}"
             self.job.say(f"{said} failed: {self.failed[said]}")
             return False
-        for one in found.pop("rows", []):
-            self.rows.append({"part": said, **one, "peak_memory_MB": memory})
+        about = {"part": said, "peak_memory_MB": memory}
+        self.rows += [about | one for one in found.pop("rows", [])]
         self.known |= found
         self.job.say(said)
         return True
@@ -182,8 +178,8 @@ class Parts:
             # wait4 has collected the exit status, which Popen does not know.
             child.returncode = os.waitstatus_to_exitcode(status)
             note = f"exit {child.returncode}"
-            one = row("rootsopt", f"{job.split('.')[1]}, {case}", seconds, note=note)
-            self.rows.append({"part": "main job", **one, "peak_memory_MB": memory})
+            more = {"note": note, "part": "main job", "peak_memory_MB": memory}
+            self.rows.append(row("rootsopt", f"{job.split('.')[1]}, {case}", seconds, **more))
             if child.returncode != 0:
                 self.failed[f"main job, {case}"] = note
             self.job.say(f"main job, {case}: {seconds:.1f} s")

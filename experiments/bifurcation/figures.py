@@ -37,12 +37,10 @@ def draw_branches(ax, diagram: Diagram, quantity: str, color: str) -> None:
 
     `quantity`: force to draw, a field of `BranchPoint`."""
     for branch in diagram.branches:
-        points = branch.points
-        for stable, part in itertools.groupby(
-            itertools.pairwise(points), lambda pair: pair[0].stable and pair[1].stable
-        ):
-            pairs = list(part)
-            line = [pairs[0][0], *(pair[1] for pair in pairs)]
+        pairs = itertools.pairwise(branch.points)
+        for stable, part in itertools.groupby(pairs, lambda pair: all(p.stable for p in pair)):
+            (first, second), *rest = part
+            line = [first, second, *(pair[1] for pair in rest)]
             ax.plot(
                 [p.value for p in line],
                 [getattr(p, quantity) for p in line],
@@ -53,15 +51,13 @@ def draw_branches(ax, diagram: Diagram, quantity: str, color: str) -> None:
             )
     for special in drawn_specials(diagram):
         marker, _ = MARKS[special.kind]
-        face = "white" if marker != "x" else color
         ax.plot(
             special.point.value, getattr(special.point, quantity), marker, color=color, ms=5.5,
-            mfc=face, mew=1.3, zorder=4,
+            mfc="white", mew=1.3, zorder=4,
         )  # fmt: skip
     unsettled = chaotic(diagram)
-    height = 0.03 if diagram.names["family"] == "cic" else 0.07
-    place = {"transform": ax.get_xaxis_transform()}
-    ax.plot(unsettled, [height] * len(unsettled), "*", color=color, ms=9, **place)
+    height = [0.03 if diagram.names["family"] == "cic" else 0.07] * len(unsettled)
+    ax.plot(unsettled, height, "*", color=color, ms=9, transform=ax.get_xaxis_transform())
 
 
 def drawn_specials(diagram: Diagram) -> list[Bifurcation]:
@@ -82,21 +78,21 @@ def chaotic(diagram: Diagram) -> list[float]:
 def legend_handles(diagrams: list[Diagram]) -> list:
     """Return legend entries for the content of the diagrams."""
     families = dict.fromkeys(diagram.names["family"] for diagram in diagrams)
-    handles: list = [Patch(color=COLORS[name], label=name.upper()) for name in families]
-    handles += [
-        Line2D([], [], color="black", lw=2.2, label="stable"),
-        Line2D([], [], color="black", lw=0.9, ls=(0, (3, 2)), label="unstable"),
-    ]
     drawn = {special.kind for diagram in diagrams for special in drawn_specials(diagram)}
-    for kind, (marker, label) in MARKS.items():
-        if kind in drawn:
-            handles.append(
-                Line2D([], [], color="black", marker=marker, ls="", mfc="white", label=label)
-            )
+    styles = [
+        {"lw": 2.2, "label": "stable"},
+        {"lw": 0.9, "ls": (0, (3, 2)), "label": "unstable"},
+        *(
+            {"marker": marker, "ls": "", "mfc": "white", "label": label}
+            for kind, (marker, label) in MARKS.items()
+            if kind in drawn
+        ),
+    ]
     if any(map(chaotic, diagrams)):
         label = "on the lower axis: chaotic when simulated there"
-        handles.append(Line2D([], [], color="black", marker="*", ls="", ms=9, label=label))
-    return handles
+        styles.append({"marker": "*", "ls": "", "ms": 9, "label": label})
+    patches = [Patch(color=COLORS[name], label=name.upper()) for name in families]
+    return [*patches, *(Line2D([], [], color="black", **style) for style in styles)]
 
 
 def pictures(diagrams: list[Diagram]) -> dict[str, Figure]:
@@ -115,20 +111,18 @@ def draw_grid(columns: list[list[Diagram]], titles: list[str]) -> Figure:
     """Draw peak force above and mean force below, one column per list of diagrams."""
     count = len(columns)
     figure, axes = sheet(1.5 + 5.2 * count, 7.4, 2, count, sharey="row", sharex="col")
-    for column, (diagrams, title) in enumerate(zip(columns, titles, strict=True)):
-        for row, (quantity, name) in enumerate((("peak", "peak"), ("mean", "mean"))):
-            ax = axes[row, column]
+    for place, (diagrams, title) in enumerate(zip(columns, titles, strict=True)):
+        for ax, quantity in zip(axes[:, place], ("peak", "mean"), strict=True):
             for diagram in diagrams:
                 draw_branches(ax, diagram, quantity, COLORS[diagram.names["family"]])
-            ax.set_yscale("log")
             few = FuncFormatter(lambda x, _: f"{x:g}" if f"{x:.0e}"[0] in "1235" else "")
+            ax.set(yscale="log", xlim=(diagrams[0].low, diagrams[0].high))
             ax.yaxis.set(major_formatter=few, minor_formatter=few)
-            ax.set_xlim(diagrams[0].low, diagrams[0].high)
             ax.grid(color="0.92", linewidth=0.6, which="both")
-            if column == 0:
-                ax.set_ylabel(f"{name} contact force (N)")
-        axes[0, column].set_title(title)
-        axes[1, column].set_xlabel(NAMES[diagrams[0].names["parameter"]])
+        axes[0, place].set_title(title)
+        axes[1, place].set_xlabel(NAMES[diagrams[0].names["parameter"]])
+    axes[0, 0].set_ylabel("peak contact force (N)")
+    axes[1, 0].set_ylabel("mean contact force (N)")
     handles = legend_handles([diagram for diagrams in columns for diagram in diagrams])
     figure.legend(handles=handles, loc="outside lower center", ncols=3 * count, frameon=False)
     return figure
@@ -136,18 +130,18 @@ def draw_grid(columns: list[list[Diagram]], titles: list[str]) -> Figure:
 
 def draw_ranges(diagrams: list[Diagram]) -> Figure:
     """Draw bars where a stable quiet and a stable noisy orbit exist."""
-    figure, axes = sheet(10, 1.2 + 0.75 * len(diagrams), 1, 1)
-    ax = axes[0, 0]
+    figure, ((ax,),) = sheet(10, 1.2 + 0.75 * len(diagrams), 1, 1)
     styles = {"quiet": (GREEN, "", 0.17), "noisy": (ORANGE, "//", -0.17)}
     lowest = min(diagram.low for diagram in diagrams)
     for line, diagram in enumerate(diagrams):
         if diagram.low > lowest:
             unknown = {"facecolor": "0.93", "hatch": "xx", "edgecolor": "0.8", "linewidth": 0}
             ax.broken_barh([(lowest, diagram.low - lowest)], (line - 0.32, 0.64), **unknown)
-            text = f"not followed below {diagram.low:g}"
-            box = {"facecolor": "white", "edgecolor": "none", "pad": 2}
-            middle = (lowest + diagram.low) / 2
-            ax.text(middle, line, text, ha="center", va="center", fontsize=9, bbox=box)
+            ax.text(
+                (lowest + diagram.low) / 2, line, f"not followed below {diagram.low:g}",
+                ha="center", va="center", fontsize=9,
+                bbox={"facecolor": "white", "edgecolor": "none", "pad": 2},
+            )  # fmt: skip
         found = ranges(diagram)
         for name, (color, hatch, shift) in styles.items():
             bars = [(low, high - low) for low, high in found[name]]
@@ -158,8 +152,7 @@ def draw_ranges(diagrams: list[Diagram]) -> Figure:
         range(len(diagrams)), [f"{d.names['family'].upper()}, {d.scene}" for d in diagrams]
     )
     ax.invert_yaxis()
-    ax.set_xlim(lowest, diagrams[0].high)
-    ax.set_xlabel(NAMES[diagrams[0].names["parameter"]])
+    ax.set(xlim=(lowest, diagrams[0].high), xlabel=NAMES[diagrams[0].names["parameter"]])
     handles = [
         Patch(facecolor=color, hatch=hatch, edgecolor="white", label=f"a stable {name} orbit")
         for name, (color, hatch, _) in styles.items()

@@ -8,7 +8,7 @@ where a stable noisy orbit exists, and where both do.
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -72,29 +72,25 @@ class Diagram:
     @property
     def names(self) -> Row:
         """Names of scene, family and parameter: the last part of its key."""
-        parameter = self.key.rpartition(".")[2]
-        return {
-            "scene": self.scene,
-            "family": self.config.profile.family,
-            "parameter": parameter,
-        }
+        family, parameter = self.config.profile.family, self.key.rpartition(".")[2]
+        return {"scene": self.scene, "family": family, "parameter": parameter}
+
+    @property
+    def title(self) -> str:
+        """The names in one line."""
+        return " ".join(self.names.values())
 
 
 def plans(quick: bool) -> list[Diagram]:
     """Return all diagrams of a full or reduced run, still empty."""
-    configs = {
-        (scene, family): shipped(family, *overrides)
-        for scene, overrides in SCENES.items()
-        for family in ("cic", "ee")
-    }
     if quick:
-        config = configs["livelier", "cic"]
+        config = shipped("cic", *LIVELY)
         return [Diagram("livelier", config, SPEED, 3500, 4500, 1, STARTS[1:2])]
-    cic = configs["shipped", "cic"]
+    cic = shipped("cic")
     return [
         *(
-            Diagram(scene, config, SPEED, SLOWEST[scene], 6000, 6, STARTS[:3])
-            for (scene, _), config in configs.items()
+            Diagram(scene, shipped(name, *more), SPEED, SLOWEST[scene], 6000, 6, STARTS[:3])
+            for (scene, more), name in itertools.product(SCENES.items(), ("cic", "ee"))
         ),
         Diagram("shipped", cic, TORQUE, 0.5, 10.0, 2, STARTS[:2]),
         Diagram("shipped", cic, "scene.timing_gear.backlash_mm", 0.02, 0.4, 4, STARTS[:2]),
@@ -106,11 +102,10 @@ def explore(diagram: Diagram, say: Say) -> None:
     """Simulate from all starts of a diagram, and add the branch of every orbit found."""
     for value in np.linspace(diagram.low, diagram.high, diagram.values + 2)[1:-1]:
         here = diagram.config.moved({diagram.key: float(value)})
-        patient, hasty = evaluator_of(here), evaluator_of(here, give_up_early=True)
         found: list[tuple[float, float]] = []
         for number, start in enumerate(diagram.starts):
             # A chaotic motion takes long to recognise, and one start is enough for that.
-            evaluator = hasty if number else patient
+            evaluator = evaluator_of(here, give_up_early=number > 0)
             evaluation = evaluator(start=np.array(start), series=False)
             diagram.seeds.append((float(value), evaluation.status.label))
             if not evaluation.usable or evaluation.state is None:
@@ -153,18 +148,17 @@ def follow_on(
         if branch is None or (branch is not first and already(branch)):
             continue
         diagram.branches.append(branch)
-        say(described(diagram, branch))
+        say(f"{diagram.title}: {described(branch)}")
+        half, twice = branch.family.period // 2, 2 * branch.family.period
         for special in branch.bifurcations:
-            doubling = special.kind is Kind.PERIOD_DOUBLING
             # If the orbit of single period was unstable before, the doubled orbit is unstable too.
-            if 2 * branch.family.period > DOUBLED or not doubling:
-                continue
-            if any(point.stable for point in beside(branch, special)):
-                queue.append(follow_doubled(branch, special, points(2 * branch.family.period)))
+            stable = any(point.stable for point in beside(branch, special))
+            if twice <= DOUBLED and special.kind is Kind.PERIOD_DOUBLING and stable:
+                queue.append(follow_doubled(branch, special, points(twice)))
         for end, point in zip(branch.ends, (branch.points[0], branch.points[-1]), strict=True):
             if end is End.HALVED:
                 here = config.moved({diagram.key: point.value})
-                queue.append(followed(here, point.state, branch.family.period // 2))
+                queue.append(followed(here, point.state, half))
 
 
 def beside(branch: Branch, special) -> tuple:
@@ -187,12 +181,12 @@ def known(branches: list[Branch], value: float, period: int, forces) -> bool:
     )
 
 
-def described(diagram: Diagram, branch: Branch) -> str:
+def described(branch: Branch) -> str:
     """Describe a branch in one line."""
     ends = " and ".join(end.name.lower().replace("_", " ") for end in branch.ends)
     values = [point.value for point in branch.points]
     return (
-        f"{' '.join(diagram.names.values())}: period {branch.family.period}, "
+        f"period {branch.family.period}, "
         f"{len(values)} points in {min(values):.5g} … {max(values):.5g}, "
         f"{len(branch.bifurcations)} special, ends: {ends}"
     )
@@ -204,20 +198,19 @@ def ranges(diagram: Diagram) -> dict[str, list[list[float]]]:
     Keys: `quiet`, `noisy`, `both`, `none`, and `several` for more than one, quiet or noisy."""
     edges = np.linspace(diagram.low, diagram.high, CELLS + 1)
     centres = (edges[1:] + edges[:-1]) / 2
-    quiet, noisy = np.zeros(CELLS, bool), np.zeros(CELLS, bool)
-    count = np.zeros(CELLS, int)
+    # Numbers of stable orbits in each cell: quiet and noisy ones.
+    counts = np.zeros((2, CELLS), int)
     for branch in diagram.branches:
-        for old, new in itertools.pairwise(branch.points):
-            if not (old.stable and new.stable):
-                continue
-            (low, a), (high, b) = sorted((p.value, peak_ratio(branch, p)) for p in (old, new))
-            inside = (centres > low) & (centres <= high)
-            ratio = np.interp(centres[inside], [low, high], [a, b])
-            quiet[inside] |= ratio <= QUIET
-            noisy[inside] |= ratio > QUIET
-            count += inside
+        for pair in itertools.pairwise(branch.points):
+            if all(point.stable for point in pair):
+                (low, a), (high, b) = sorted((p.value, peak_ratio(branch, p)) for p in pair)
+                inside = (centres > low) & (centres <= high)
+                noise = np.interp(centres, [low, high], [a, b]) > QUIET
+                counts += inside & np.stack([~noise, noise])
+    quiet, noisy = counts > 0
     found = {"quiet": quiet, "noisy": noisy, "both": quiet & noisy, "none": ~(quiet | noisy)}
-    return {k: list(runs(mask, edges)) for k, mask in (found | {"several": count > 1}).items()}
+    found["several"] = counts.sum(axis=0) > 1
+    return {name: runs(mask, edges) for name, mask in found.items()}
 
 
 def peak_ratio(branch: Branch, point) -> float:
@@ -228,44 +221,33 @@ def peak_ratio(branch: Branch, point) -> float:
     return point.peak / (torque / (config.profile.pitch_radius_mm * 1e-3))
 
 
-def runs(mask: np.ndarray, edges: np.ndarray) -> Iterator[list[float]]:
-    """Yield both ends of every run of true cells; `edges`: ends of all cells."""
-    change = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]])))
-    for begin, end in change.reshape(-1, 2):
-        yield [float(edges[begin]), float(edges[end])]
+def runs(mask: np.ndarray, edges: np.ndarray) -> list[list[float]]:
+    """Return both ends of every run of true cells; `edges`: ends of all cells."""
+    change = np.flatnonzero(np.diff(mask, prepend=False, append=False))
+    return edges[change].reshape(-1, 2).tolist()
 
 
 # Rows and record
 
 
-def point_rows(diagrams: list[Diagram]) -> list[Row]:
-    """Return a row for every point of every branch."""
-    return [
-        {**where, **orbit_row(point)}
-        for where, branch in branches_of(diagrams)
-        for point in branch.points
-    ]
-
-
-def special_rows(diagrams: list[Diagram]) -> list[Row]:
-    """Return a row for every bifurcation and corner."""
-    return [
-        {**where, "kind": special.kind.name.lower(), **orbit_row(special.point)}
-        for where, branch in branches_of(diagrams)
-        for special in branch.bifurcations
-    ]
-
-
-def branches_of(diagrams: list[Diagram]) -> Iterator[tuple[Row, Branch]]:
-    """Yield (columns that identify the branch, branch) for every branch."""
+def tables_of(diagrams: list[Diagram]) -> tuple[list[Row], list[Row]]:
+    """Return a row for every point of every branch, and for every bifurcation and corner."""
+    points, specials = [], []
     for diagram in diagrams:
         for number, branch in enumerate(diagram.branches):
-            yield diagram.names | {"branch": number}, branch
+            where = diagram.names | {"branch": number}
+            points += [where | orbit_row(point) for point in branch.points]
+            for special in branch.bifurcations:
+                kind = {"kind": special.kind.name.lower()}
+                specials.append(where | kind | orbit_row(special.point))
+    return points, specials
 
 
 def orbit_row(point) -> Row:
     """Return the columns of a row that describe an orbit."""
-    row = {
+    parts = np.stack([np.real(point.multipliers), np.imag(point.multipliers)], axis=1).ravel()
+    names = (f"multiplier_{k}_{x}" for k in range(1, 1 + len(parts) // 2) for x in ("real", "imag"))
+    return {
         "value": point.value,
         "period": point.period,
         "mean_force_N": point.mean,
@@ -273,15 +255,14 @@ def orbit_row(point) -> Row:
         "rms_force_N": point.rms,
         "stable": point.stable,
         "residual": point.residual,
+        **dict(zip(names, parts.tolist(), strict=True)),
     }
-    for number, multiplier in enumerate(point.multipliers, 1):
-        row |= {f"multiplier_{number}_real": multiplier.real}
-        row |= {f"multiplier_{number}_imag": multiplier.imag}
-    return row
 
 
-def summary(diagrams: list[Diagram]) -> dict[str, Any]:
-    """Return ranges, branches, and the simulations that led to no periodic orbit."""
+def summary(diagrams: list[Diagram], points: list[Row]) -> dict[str, Any]:
+    """Return ranges, branches, and the simulations that led to no periodic orbit.
+
+    `points`: rows of all points."""
     return {
         "quiet_up_to_static_forces": QUIET,
         "diagrams": [
@@ -303,7 +284,7 @@ def summary(diagrams: list[Diagram]) -> dict[str, Any]:
             }
             for diagram in diagrams
         ],
-        "largest_residual": max((row["residual"] for row in point_rows(diagrams)), default=None),
+        "largest_residual": max((row["residual"] for row in points), default=None),
     }
 
 
@@ -315,9 +296,10 @@ def run(job: Run) -> None:
     for diagram in plans(job.quick):
         explore(diagram, job.say)
         diagrams.append(diagram)
-        job.csv("bifurcation.csv", point_rows(diagrams))
-        job.csv("special_points.csv", special_rows(diagrams))
-        job.json("bifurcation.json", summary(diagrams))
+        points, specials = tables_of(diagrams)
+        job.csv("bifurcation.csv", points)
+        job.csv("special_points.csv", specials)
+        job.json("bifurcation.json", summary(diagrams, points))
         for name, figure in figures.pictures(diagrams).items():
             job.figure(f"bifurcation_{name}.png", figure)
-        print(f"{' '.join(diagram.names.values())}: {ranges(diagram)}", flush=True)
+        print(f"{diagram.title}: {ranges(diagram)}", flush=True)

@@ -7,6 +7,8 @@
 """
 
 import dataclasses
+from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -17,9 +19,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from experiments._common.driver import NoResultError, Run
-from experiments._common.scenes import shipped
+from experiments._common.scenes import FORCES, shipped
 from experiments._common.style import BLACK, BLUE, GREEN, PURPLE, VERMILION, sheet
-from experiments._common.tables import print_record
+from experiments._common.tables import Row, print_record
 from rootsopt.config import Config
 from rootsopt.dynamics.flow import one_period
 from rootsopt.optimize.noise import standard_error
@@ -58,30 +60,18 @@ QUICK = (
 )
 
 
-@dataclasses.dataclass(frozen=True)
-class Size:
-    """Sizes of all parts of the study except the optimisation.
-
-    `line`: number of designs along the line; `members`, `window`: members and mesh periods of an
-    average; `pathwise`: mesh periods of the single motion that is differentiated; `large`: members
-    of the ensemble that is divided into `groups`; `slopes`: (designs, members) of each gradient.
-    """
-
-    line: int
-    members: int
-    window: int
-    pathwise: int
-    large: int
-    groups: tuple[int, ...]
-    slopes: tuple[tuple[int, int], ...]
-
-
-# Sizes (designs, members) of the gradients: first more members, then more designs.
-SLOPES = (16, 4), (16, 8), (16, 16), (16, 32), (32, 4), (64, 4), (128, 4)
+# Sizes of all parts of the study except the optimisation; keys: whether the run is reduced.
+# `line`: number of designs along the line; `members`, `window`: members and mesh periods of an
+# average; `pathwise`: mesh periods of the single motion that is differentiated; `large`: members
+# of the ensemble that is divided into `groups`; `slopes`: (designs, members) of each gradient,
+# first more members, then more designs.
 SIZES = {
-    False: Size(25, 32, 128, 96, 512, (4, 8, 16, 32, 64), SLOPES),
-    True: Size(3, 4, 8, 8, 16, (4, 8), ((8, 4),)),
-}
+    False: SimpleNamespace(
+        line=25, members=32, window=128, pathwise=96, large=512, groups=(4, 8, 16, 32, 64),
+        slopes=((16, 4), (16, 8), (16, 16), (16, 32), (32, 4), (64, 4), (128, 4))),
+    True: SimpleNamespace(
+        line=3, members=4, window=8, pathwise=8, large=16, groups=(4, 8), slopes=((8, 4),)),
+}  # fmt: skip
 
 
 def resized(config: Config, model: Scene, **changes) -> Evaluator:
@@ -91,26 +81,19 @@ def resized(config: Config, model: Scene, **changes) -> Evaluator:
     return Evaluator(config, model, Ensemble()).surveying().without_gradient()
 
 
-def line(config: Config, model: Scene, designs: np.ndarray, size: Size) -> list[dict]:
+def line(config: Config, model: Scene, designs: np.ndarray, size: SimpleNamespace) -> Iterator[Row]:
     """Average the force along a line of designs (n, d), over the motion from rest and an
     ensemble."""
     evaluator = resized(config, model, members=size.members, periods=size.window)
-    settle = config.ensemble.settle_periods
-    rest = np.zeros((1, 2))
-    rows = []
+    how, settle = integrator(evaluator.scene), config.ensemble.settle_periods
     for share, design in zip(np.linspace(0, 1, len(designs)), designs, strict=True):
-        evaluation = evaluator(jnp.asarray(design), series=False)
-        pair = _pair(evaluator.scene, jnp.asarray(design))
-        (single,) = run_members([pair], rest, settle, size.window, integrator(evaluator.scene))
-        row = {"share": share, **evaluation.design, "single_mean_force_N": single.means[0, 0]}
-        for name in ("mean_force_N", "peak_force_N"):
-            row[name] = evaluation.response.get(name, np.nan)
-            row[ERRORS[name]] = evaluation.steady_state.get(ERRORS[name], np.nan)
-        rows.append(row)
-    return rows
-
-
-_pair = CachedFunction(Scene.pair)
+        found = evaluator(jnp.asarray(design), series=False)
+        pair = evaluator.pair(design)
+        (single,) = run_members([pair], np.zeros((1, 2)), settle, size.window, how)
+        row = {"share": share, **found.design, "single_mean_force_N": single.means[0, 0]}
+        row |= {name: found.response.get(name, np.nan) for name in FORCES}
+        errors = (ERRORS[name] for name in FORCES)
+        yield row | {name: found.steady_state.get(name, np.nan) for name in errors}
 
 
 @CachedFunction
@@ -133,67 +116,56 @@ def _pathwise(model: Scene, design, periods, how):
     return jax.jacfwd(means)(design)
 
 
-def pathwise(evaluator: Evaluator, design, size: Size) -> list[dict]:
+def pathwise(evaluator: Evaluator, design, size: SimpleNamespace) -> list[Row]:
     """Measure how the derivative of a single motion's mean force grows with the averaging
     window."""
-    slopes = np.asarray(
-        _pathwise(evaluator.scene, jnp.asarray(design), size.pathwise, integrator(evaluator.scene))
-    )
+    scene = evaluator.scene
+    slopes = np.asarray(_pathwise(scene, jnp.asarray(design), size.pathwise, integrator(scene)))
     return [
         {"window_mesh_periods": n, "mean_force_by_pressure_angle_N_per_deg": slope}
         for n, slope in enumerate(slopes[:, 0], 1)
     ]
 
 
-def errors_by_members(config: Config, model: Scene, design, size: Size) -> list[dict]:
+def errors_by_members(config: Config, model: Scene, design, size: SimpleNamespace) -> Iterator[Row]:
     """Compare the stated standard error of the mean force with the scatter of independent groups.
 
     The groups are parts of one large ensemble. The standard error of the scatter is listed too.
     """
     evaluator = resized(config, model, members=size.large)
-    design = jnp.asarray(design)
-    start = evaluator(design, series=False)
-    pair, how = _pair(evaluator.scene, design), integrator(evaluator.scene)
-    (large,) = run_members([pair], np.asarray(start.start), 0, config.ensemble.periods, how)
+    start = np.asarray(evaluator(jnp.asarray(design), series=False).start)
+    pair, how = evaluator.pair(design), integrator(evaluator.scene)
+    (large,) = run_members([pair], start, 0, config.ensemble.periods, how)
     means = np.asarray(large.means)[:, 0]
-    rows = []
     for members in size.groups:
         groups = means[: len(means) // members * members].reshape(-1, members)
         stated = np.std(groups, axis=1, ddof=1) / np.sqrt(members)
         scatter = np.std(np.mean(groups, axis=1), ddof=1)
-        rows.append(
-            {
-                "members": members,
-                "groups": len(groups),
-                "stated_standard_error_N": np.sqrt(np.mean(stated**2)),
-                "scatter_of_groups_N": scatter,
-                "error_of_scatter_N": scatter / np.sqrt(2 * max(len(groups) - 1, 1)),
-            }
-        )
-    return rows
+        yield {
+            "members": members,
+            "groups": len(groups),
+            "stated_standard_error_N": np.sqrt(np.mean(stated**2)),
+            "scatter_of_groups_N": scatter,
+            "error_of_scatter_N": scatter / np.sqrt(2 * max(len(groups) - 1, 1)),
+        }
 
 
-def gradients(config: Config, model: Scene, design, size: Size) -> list[dict]:
+def gradients(config: Config, model: Scene, design, size: SimpleNamespace) -> Iterator[Row]:
     """Estimate the slope of the mean force over the pressure angle, with its standard error.
 
-    Returns a row for each size in `size.slopes`: more members, or more designs.
+    Yields a row for each size in `size.slopes`: more members, or more designs.
     """
-    rows = []
     for designs, members in size.slopes:
         evaluator = resized(config, model, members=members, designs=designs)
         evaluator = dataclasses.replace(evaluator, differentiate=True)
         found = evaluator(jnp.asarray(design), series=False)
         errors = found.steady_state["gradient_standard_error"]
-        row, column = "mean_force_N", "pressure_angle_deg"
-        rows.append(
-            {
-                "designs": designs,
-                "members": members,
-                "gradient_N_per_deg": found.gradient[row][column],
-                "standard_error_N_per_deg": errors[row][column],
-            }
-        )
-    return rows
+        yield {
+            "designs": designs,
+            "members": members,
+            "gradient_N_per_deg": found.gradient["mean_force_N"]["pressure_angle_deg"],
+            "standard_error_N_per_deg": errors["mean_force_N"]["pressure_angle_deg"],
+        }
 
 
 def designs_between(problem: Problem, result: Optimization, count: int) -> np.ndarray:
@@ -202,9 +174,8 @@ def designs_between(problem: Problem, result: Optimization, count: int) -> np.nd
     Without a significant optimum (as in a reduced run) the line ends at the last design.
     """
     first = problem.point(list(result.baseline.design.values()))
-    end = list((result.optimized or result.baseline).design.values())
-    if result.optimized is None:
-        end = [result.history[-1][key] for key in result.baseline.design]
+    found = result.history[-1] if result.optimized is None else result.optimized.design
+    end = [found[key] for key in result.baseline.design]
     shares = np.linspace(0, 1, count)[:, None]
     points = (1 - shares) * first + shares * problem.point(end)
     return np.array([problem.design(point) for point in points])
@@ -215,16 +186,18 @@ def summary(problem: Problem, result: Optimization) -> dict[str, Any]:
 
     The record includes the significance of the gain."""
     record = result.verification
-    found: dict[str, Any] = {"verification": record}
-    for name, one in (("baseline", result.baseline), ("optimized", result.optimized)):
-        if one is not None:
-            found[name] = {
-                "design": one.design,
-                **one.response,
-                **one.steady_state,
-                "objective": problem.objective(one),
-                "objective_standard_error": standard_error(problem, one),
-            }
+    ends = {"baseline": result.baseline, "optimized": result.optimized}
+    found: dict[str, Any] = {"verification": record} | {
+        name: {
+            "design": one.design,
+            **one.response,
+            **one.steady_state,
+            "objective": problem.objective(one),
+            "objective_standard_error": standard_error(problem, one),
+        }
+        for name, one in ends.items()
+        if one is not None
+    }
     if "combined_standard_error" in record:
         gain = 1 - record["verified_objective"]
         found["gain_in_standard_errors"] = gain / record["combined_standard_error"]
@@ -246,10 +219,13 @@ def run(job: Run) -> None:
     job.say("optimised")
     model = search.exact.scene
     designs = designs_between(problem, result, size.line)
-    tables = {"history": result.history, "line": line(config, model, designs, size)}
-    tables["pathwise"] = pathwise(resized(config, model), designs[0], size)
-    tables["members"] = errors_by_members(config, model, designs[0], size)
-    tables["gradients"] = gradients(config, model, designs[0], size)
+    tables = {
+        "history": result.history,
+        "line": [*line(config, model, designs, size)],
+        "pathwise": pathwise(resized(config, model), designs[0], size),
+        "members": [*errors_by_members(config, model, designs[0], size)],
+        "gradients": [*gradients(config, model, designs[0], size)],
+    }
     for name, rows in tables.items():
         job.csv(f"chaos_{name}.csv", rows)
     record = summary(problem, result) | {"ensemble": config.ensemble.model_dump()}
@@ -258,13 +234,9 @@ def run(job: Run) -> None:
     print_record(record)
 
 
-Rows = list[dict]
-
-
-def panels(problem: Problem, result: Optimization, tables: dict[str, Rows]) -> Figure:
+def panels(problem: Problem, result: Optimization, tables: dict[str, list[Row]]) -> Figure:
     """Draw the four panels of the figure: averages, derivatives, optimisation, standard errors."""
-    figure, axes = sheet(12.5, 9, 2, 2)
-    (a, b), (c, d) = axes
+    figure, ((a, b), (c, d)) = sheet(12.5, 9, 2, 2)
     averages(a, tables["line"])
     derivatives(b, tables["pathwise"], tables["gradients"])
     optimisation(c, problem, result)
@@ -272,33 +244,36 @@ def panels(problem: Problem, result: Optimization, tables: dict[str, Rows]) -> F
     return figure
 
 
-def column(rows: Rows, key: str) -> np.ndarray:
+def column(rows: list[Row], key: str) -> np.ndarray:
     """Return the column `key` (n,) of `rows`, with NaN for entries that are not numbers."""
     return np.array([np.nan if row[key] is None else row[key] for row in rows], float)
 
 
-def averages(ax: Axes, rows: Rows) -> None:
+def averages(ax: Axes, rows: list[Row]) -> None:
     """Draw the averages of one motion and of an ensemble along the line of designs."""
     share = column(rows, "share")
     ax.plot(share, column(rows, "single_mean_force_N"), ".-", color=VERMILION, lw=0.8,
            label="one motion from rest")  # fmt: skip
     ax.errorbar(share, column(rows, "mean_force_N"), column(rows, ERRORS["mean_force_N"]), fmt="o",
                color=BLUE, ms=4, capsize=2, label="ensemble, ± standard error")  # fmt: skip
-    ax.set(xlabel="fraction of the way from baseline to optimum", ylabel="mean contact force (N)")
-    ax.set_ylim(0, None)
-    ax.set_title("(a) Average along a line of designs")
+    ax.set(
+        xlabel="fraction of the way from baseline to optimum", ylabel="mean contact force (N)",
+        ylim=(0, None), title="(a) Average along a line of designs",
+    )  # fmt: skip
     ax.legend(frameon=False)
 
 
-def derivatives(ax: Axes, rows: Rows, estimates: Rows) -> None:
+def derivatives(ax: Axes, rows: list[Row], estimates: list[Row]) -> None:
     """Draw the growing derivative of one motion over the window, and the ensemble's slope."""
     window = column(rows, "window_mesh_periods")
     by_angle = np.abs(column(rows, "mean_force_by_pressure_angle_N_per_deg"))
     ax.semilogy(window, by_angle, "-", color=VERMILION, label="one motion, differentiated")
     slope, error = (estimates[-1][k] for k in ("gradient_N_per_deg", "standard_error_N_per_deg"))
     ax.axhline(abs(slope), color=BLUE, label=f"ensemble: {slope:.1f} ± {error:.1f} N/deg")
-    ax.set(xlabel="window (mesh periods)", ylabel="|d mean force / d pressure angle| (N/deg)")
-    ax.set_title("(b) Derivative at the baseline")
+    ax.set(
+        xlabel="window (mesh periods)", ylabel="|d mean force / d pressure angle| (N/deg)",
+        title="(b) Derivative at the baseline",
+    )  # fmt: skip
     ax.legend(frameon=False)
 
 
@@ -311,21 +286,18 @@ def optimisation(ax: Axes, problem: Problem, result: Optimization) -> None:
     for chosen, color, label in ((screened, "0.55", "screening"), (~screened, BLUE, "descent")):
         ax.errorbar(number[chosen], objective[chosen], error[chosen], fmt="o", color=color, ms=4,
                    capsize=2, label=f"{label}, ± standard error")  # fmt: skip
-    last = number[-1] + 2
     verified = [("baseline, verified", result.baseline, BLACK, "s")]
     verified += [("optimum, verified", result.optimized, GREEN, "D")] if result.optimized else []
-    for offset, (label, one, color, mark) in enumerate(verified):
-        ax.errorbar([last + offset], [problem.objective(one)],
-                   [standard_error(problem, one)], fmt=mark, color=color, ms=7, capsize=3,
-                   label=label)  # fmt: skip
+    for place, (label, one, color, mark) in enumerate(verified, int(number[-1]) + 2):
+        ax.errorbar([place], [problem.objective(one)], [standard_error(problem, one)], fmt=mark,
+                    color=color, ms=7, capsize=3, label=label)  # fmt: skip
     ax.axhline(1, color=BLACK, lw=0.8, ls=":")
-    ax.set(xlabel="evaluation", ylabel="objective (baseline = 1)")
-    ax.set_ylim(0, None)
+    ax.set(xlabel="evaluation", ylabel="objective (baseline = 1)", ylim=(0, None))
     ax.set_title("(c) Optimisation of the ensemble's average")
     ax.legend(frameon=False, ncols=2, loc="lower left")
 
 
-def standard_errors(ax: Axes, members: Rows, estimates: Rows) -> None:
+def standard_errors(ax: Axes, members: list[Row], estimates: list[Row]) -> None:
     """Draw the standard errors of average and gradient over the number of motions."""
     count = column(members, "members")
     stated = column(members, "stated_standard_error_N")
@@ -342,13 +314,11 @@ def standard_errors(ax: Axes, members: Rows, estimates: Rows) -> None:
          "more designs"),
     ):  # fmt: skip
         motions = column(chosen, "designs") * column(chosen, "members")
-        errors = column(chosen, "standard_error_N_per_deg")
-        said = f"gradient (N/deg): {label}"
+        errors, said = column(chosen, "standard_error_N_per_deg"), f"gradient (N/deg): {label}"
         ax.loglog(motions, errors, mark, color=color, ms=5, lw=1, label=said)
         ax.loglog(motions, errors[0] * np.sqrt(motions[0] / motions), ":", color="0.4", lw=1)
     ax.set(
-        xlabel="motions: members, or designs × members", ylabel="standard error of the mean force"
-    )
-    ax.set_ylim(0.3, None)
-    ax.set_title("(d) Standard error of average and gradient")
+        xlabel="motions: members, or designs × members", ylabel="standard error of the mean force",
+        ylim=(0.3, None), title="(d) Standard error of average and gradient",
+    )  # fmt: skip
     ax.legend(frameon=False)

@@ -1,12 +1,16 @@
 """Figures of the ranking of profile families, and of the optimised flanks."""
 
+import itertools
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from experiments._common.scenes import FORCES
 from experiments._common.style import (
     BLACK,
     BLUE,
@@ -20,18 +24,16 @@ from experiments._common.style import (
 )
 from experiments.families.study import HOUSINGS, Row, by_study, title
 from rootsopt.config.families import families
-from rootsopt.config.units import MM, si_unit
+from rootsopt.config.units import MM
 from rootsopt.profiles import Profile, geometry
 from rootsopt.profiles.geometry import outline
 from rootsopt.view.figures.designs import plot_flank
 
+# Number of panels in a row.
 _COLUMNS = 4
 
 # Number of lobes and pitch radius of the families' examples.
 LOBES, RADIUS_MM = 3, 33.0
-
-# Panels in a row of the overview.
-_PANELS = 4
 _COLORS = BLUE, ORANGE, PURPLE, GREEN, SKY, VERMILION, "#7a5c00", "#888888"
 
 # Points drawn on a piece of an addendum.
@@ -45,20 +47,19 @@ def ranking_figure(data: dict[str, Any]) -> Figure:
     made, axes = sheet(6.2 * len(studies), 2.0 + 0.34 * longest, 1, len(studies))
     for ax, (name, rows) in zip(axes[0], studies.items(), strict=True):
         reference = data["references"][name]
-        forces = reference["response"]
         kept = [row for row in rows if not np.isnan(row["objective"])]
         for place, row in enumerate(kept):
-            shares = [row[key] / forces[key] for key in ("mean_force_N", "peak_force_N")]
+            mean, peak = (row[key] / reference["response"][key] for key in FORCES)
             face = "black" if row["reached"] else "white"
-            ax.plot(shares, [place, place], color="0.8", lw=2, zorder=1)
-            ax.plot(shares[0], place, "o", color=BLUE, ms=7)
-            ax.plot(shares[1], place, "^", color=VERMILION, ms=7)
+            ax.plot([mean, peak], [place, place], color="0.8", lw=2, zorder=1)
+            ax.plot(mean, place, "o", color=BLUE, ms=7)
+            ax.plot(peak, place, "^", color=VERMILION, ms=7)
             ax.plot(row["objective"], place, "D", color="black", ms=6, markerfacecolor=face)
         ax.axvline(1, color="black", lw=0.9, ls=":")
         ax.set_yticks(range(len(kept)), list(map(_panel_name, kept)))
         ax.invert_yaxis()
-        ax.set(xlabel="force / reference's", title=title(name, reference))
-        ax.title.set_size(10)
+        ax.set_xlabel("force / reference's")
+        ax.set_title(title(name, reference), fontsize=10)
     lines = (
         ("o", BLUE, BLUE, "mean force"),
         ("^", VERMILION, VERMILION, "peak force"),
@@ -66,10 +67,10 @@ def ranking_figure(data: dict[str, Any]) -> Figure:
         ("D", "black", "white", "the same, with less area efficiency than required"),
     )
     handles = [
-        Line2D([], [], marker=marker, color=color, markerfacecolor=face, ls="", label=label)
-        for marker, color, face, label in lines
-    ]
-    handles.append(Line2D([], [], color="black", ls=":", lw=0.9, label="reference"))
+        *(Line2D([], [], marker=marker, color=color, markerfacecolor=face, ls="", label=label)
+          for marker, color, face, label in lines),
+        Line2D([], [], color="black", ls=":", lw=0.9, label="reference"),
+    ]  # fmt: skip
     made.legend(handles=handles, loc="outside lower center", ncols=5, frameon=False, fontsize=9)
     return made
 
@@ -84,50 +85,53 @@ def profiles_figure(data: dict[str, Any]) -> Figure:
     studies = by_study(data)
     heights = [-(-len(rows) // _COLUMNS) for rows in studies.values()]
     made, axes = sheet(3.0 * _COLUMNS, 2.15 * sum(heights) + 0.4, sum(heights), _COLUMNS)
-    begin = 0
-    for (name, rows), height in zip(studies.items(), heights, strict=True):
-        panels = axes[begin : begin + height].ravel()
-        begin += height
+    lines_of_panels = np.split(axes, np.cumsum(heights)[:-1])
+    for (name, rows), panels in zip(studies.items(), lines_of_panels, strict=True):
         best = np.array(rows[0]["outline_mm"])
-        for ax in panels[len(rows) :]:
-            ax.axis("off")
-        for place, (ax, row) in enumerate(zip(panels, rows, strict=False)):
+        for ax, row in _panels(panels, rows):
             lines = {"family": np.array(row["outline_mm"]), "best": best}
             plot_flank(ax, lines, row["lobes"], row["pitch_radius_mm"])
             text = f"{row['family'].replace('_', ' ')}, bore {2 * HOUSINGS[name]:.1f} mm"
             ax.set_title(text, fontsize=9)
-            ax.set(xlabel="x (mm)" if place + _COLUMNS >= len(rows) else "")
-            ax.set(ylabel="" if place % _COLUMNS else "y (mm)")
     lines = (BLUE, "-", "this family"), (VERMILION, (0, (5, 1.5)), "best of this housing")
-    handles = [Line2D([], [], color=color, ls=ls, label=label) for color, ls, label in lines]
-    handles.append(Line2D([], [], color=GREY, ls="--", lw=0.9, label="pitch circle"))
+    handles = [
+        *(Line2D([], [], color=color, ls=ls, label=label) for color, ls, label in lines),
+        Line2D([], [], color=GREY, ls="--", lw=0.9, label="pitch circle"),
+    ]
     made.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
     return made
 
 
+def _panels(axes, things: Sequence[Any]) -> Iterator[tuple[Axes, Any]]:
+    """Yield a panel of `axes` (n, 4) with each of the `things`; hide the panels that are left."""
+    for place, (ax, thing) in enumerate(itertools.zip_longest(axes.ravel(), things)):
+        if thing is None:
+            ax.axis("off")
+            continue
+        yield ax, thing
+        ax.set(xlabel="x (mm)" if place + _COLUMNS >= len(things) else "")
+        ax.set(ylabel="" if place % _COLUMNS else "y (mm)")
+
+
 def overview() -> Figure:
     """Draw one rotor per family, its example, with the pieces of the addendum in colours."""
-    shown = {name: family for name, family in families().items() if family.classical}
-    made, axes = sheet(12.2, 9.4, -(-(len(shown) + 1) // _PANELS), _PANELS)
-    panels = axes.ravel()
+    shown = [family for family in families().values() if family.classical]
+    made, axes = sheet(12.2, 9.4, -(-(len(shown) + 1) // _COLUMNS), _COLUMNS)
     colors: dict[str, str] = {}
-    for place, (ax, (name, family)) in enumerate(zip(panels, shown.items(), strict=False)):
-        units = {key: si_unit(key) for key in family.keys}
-        values = [family.example[key] * unit for key, unit in units.items()]
-        names = [parameter.argument for parameter in family.parameters]
-        profile = family.make(LOBES, RADIUS_MM * MM, **dict(zip(names, values, strict=True)))
+    for ax, family in _panels(axes, shown):
+        values = {p.argument: family.example[p.key] * p.unit for p in family.parameters}
+        profile = family.make(LOBES, RADIUS_MM * MM, **values)
         _rotor(ax, profile, colors)
         shape = geometry(profile)
         radius, share = float(shape.outer_radius) / MM, float(shape.area_efficiency)
-        ax.set_title(f"{name}\nr_a {radius:.2f} mm, area efficiency {share:.3f}", fontsize=9)
-        ax.set(xlabel="x (mm)" if place + _PANELS >= len(shown) else "")
-        ax.set(ylabel="" if place % _PANELS else "y (mm)")
-    for ax in panels[len(shown) :]:
-        ax.axis("off")
-    handles = [Line2D([], [], color=color, lw=2.5, label=kind) for kind, color in colors.items()]
-    handles.append(Line2D([], [], color=BLACK, lw=0.8, label="conjugate dedendum"))
-    handles.append(Line2D([], [], color=GREY, ls="--", lw=0.9, label="pitch circle, 33 mm"))
-    panels[-1].legend(handles=handles, loc="center", frameon=False)
+        text = f"{family.name}\nr_a {radius:.2f} mm, area efficiency {share:.3f}"
+        ax.set_title(text, fontsize=9)
+    handles = [
+        *(Line2D([], [], color=color, lw=2.5, label=kind) for kind, color in colors.items()),
+        Line2D([], [], color=BLACK, lw=0.8, label="conjugate dedendum"),
+        Line2D([], [], color=GREY, ls="--", lw=0.9, label="pitch circle, 33 mm"),
+    ]
+    axes[-1, -1].legend(handles=handles, loc="center", frameon=False)
     return made
 
 
@@ -142,15 +146,10 @@ def _rotor(ax, profile: Profile, colors: dict[str, str]) -> None:
         color = colors.setdefault("land about the axis" if piece.land else piece.name, color)
         nu = jnp.linspace(piece.start, piece.stop, _POINTS)
         arc = np.asarray(profile.position(profile.addendum(nu))) / MM @ [1, 1j]
-        look = {
-            "linewidth": 2.5,
-            "marker": "o" if np.ptp([arc.real, arc.imag], 1).max() < 1 else "",
-            "markersize": 4,
-        }
-        for turn in 2 * np.pi * np.arange(LOBES) / LOBES:
-            for side in (arc, arc.conj()):
-                line = side * np.exp(1j * turn) * 1j
-                ax.plot(line.real, line.imag, color=color, **look)
+        marker = "o" if np.ptp([arc.real, arc.imag], 1).max() < 1 else ""
+        for turn in np.exp(2j * np.pi * np.arange(LOBES) / LOBES):
+            lines = np.stack([arc, arc.conj()], axis=1) * turn * 1j
+            ax.plot(lines.real, lines.imag, color=color, lw=2.5, marker=marker, ms=4)
     angle = np.linspace(0, 2 * np.pi, 181)
     ax.plot(RADIUS_MM * np.cos(angle), RADIUS_MM * np.sin(angle), "--", color=GREY, linewidth=0.9)
     ax.plot(0, 0, "+", color=BLACK)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from experiments._common.simulation import profile_of
+from experiments._common.simulation import feasible, profile_of
 from rootsopt.config import Config
 from rootsopt.config.families import family_of
 from rootsopt.config.study import limits_of
@@ -52,9 +52,8 @@ def of_family(reference: Config, family: str) -> Config:
     bounds: dict[str, Any] = {}
     for parameter in family_of(family).parameters:
         low, high = parameter.usually(*size)
-        bounds[parameter.key] = (max(low, _LEAST_SHARE * high), high)
-    if "tip_arc_angle_deg" in bounds:
-        bounds["tip_arc_angle_deg"] = (0.0, bounds["tip_arc_angle_deg"][1])
+        least = 0.0 if parameter.key == "tip_arc_angle_deg" else max(low, _LEAST_SHARE * high)
+        bounds[parameter.key] = (least, high)
     middle = {key: sum(pair) / 2 for key, pair in bounds.items()}
     return changed(
         reference,
@@ -105,8 +104,7 @@ def reach(config: Config, sample: int = SAMPLE) -> Reach | None:
     if size == 0:
         return _only(config)
     problem = problem_of(config)
-    points = [problem.project(point) for point in sobol(sample, 0, size)]
-    points = [point for point in points if problem.feasible(point)]
+    points = feasible(problem, sobol(sample, 0, size))
     if not points:
         return None
     order = np.argsort([_efficiency(problem, point) for point in points])
@@ -156,5 +154,4 @@ def _extreme(problem: Problem, start, sign: float) -> NDArray[np.float64]:
         },
         options={"maxiter": 60},
     )
-    finite = np.all(np.isfinite(found.x))
-    return problem.project(found.x) if finite else np.asarray(start)
+    return problem.project(found.x if np.all(np.isfinite(found.x)) else start)

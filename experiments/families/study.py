@@ -97,10 +97,10 @@ def placed(
     reaches the reference's efficiency.
     """
     floor, land = (reference.geometry[key] for key in ("area_efficiency", "seal_width_mm"))
-    reached = bool(found.efficiencies[-1] >= floor - EQUAL)
-    least = (floor if reached else found.efficiencies[-1]) - EQUAL
+    most = float(found.efficiencies[-1])
+    reached, least = most >= floor - EQUAL, min(floor, most) - EQUAL
     few = {"screening": 2, "starts": 1, "iterations": 3} if quick else SEARCH
-    config = changed(in_housing(base, bore, float(least), land), optimizer=few)
+    config = changed(in_housing(base, bore, least, land), optimizer=few)
     if not found.points.shape[1]:
         return config, reached
     there = found.points[found.efficiencies >= least]
@@ -125,14 +125,13 @@ def row_of(study: str, config: Config, reference: dict[str, float]) -> dict[str,
         "status": here.status.label,
         **{key: here.geometry[key] for key in ("outer_radius_mm", "area_efficiency")},
         **{key: here.geometry[key] for key in ("seal_width_mm", "undercut_margin_mm")},
+        "design": here.design,
+        "outline_mm": outline_mm(config, design_vector(config)).tolist(),
     }
     for name, change in SCENES.items():
         there = evaluate(changed(config, scene=change))
-        for key in FORCES:
-            row[f"{name}: {key}"] = there.response.get(key, float("nan"))
+        row |= {f"{name}: {key}": there.response.get(key, float("nan")) for key in FORCES}
         row[f"{name}: status"] = there.status.label
-    row["design"] = here.design
-    row["outline_mm"] = outline_mm(config, design_vector(config)).tolist()
     return row
 
 
@@ -186,13 +185,9 @@ def free_form(name: str, start: tuple[Row, Config, Config], quick: bool) -> Row:
     """Optimise a free form from one of the `free_starts`. Return its row."""
     _, base = reference_of(name)
     best, given, config = start
-    settings: dict[str, Any] = {"bounds": {"tip_arc_angle_deg": (0.0, 45 / given.profile.lobes)}}
-    settings |= SEARCH_FREE | ({"iterations": 2} if quick else {})
-    config = changed(
-        config,
-        optimizer=settings,
-    )
-    config = optimised(config, base.response)
+    bounds = {"bounds": {"tip_arc_angle_deg": (0.0, 45 / given.profile.lobes)}}
+    settings = SEARCH_FREE | bounds | ({"iterations": 2} if quick else {})
+    config = optimised(changed(config, optimizer=settings), base.response)
     return {
         **row_of(name, config, base.response),
         "reached": best["reached"],
@@ -208,14 +203,11 @@ def by_study(data: dict[str, Any]) -> dict[str, list[Row]]:
     Designs that reach the reference's area efficiency come first, then designs that do not, then
     designs without a periodic motion.
     """
-    studies: dict[str, list[Row]] = {name: [] for name in data["references"]}
-    for row in data["rows"]:
-        studies[row["study"]].append(row)
-    for rows in studies.values():
-        rows.sort(
-            key=lambda row: (np.isnan(row["objective"]), not row["reached"], row["objective"])
-        )
-    return studies
+    ranked = sorted(
+        data["rows"],
+        key=lambda row: (np.isnan(row["objective"]), not row["reached"], row["objective"]),
+    )
+    return {name: [row for row in ranked if row["study"] == name] for name in data["references"]}
 
 
 def title(name: str, reference: Row) -> str:
@@ -250,19 +242,17 @@ def run(job: Run) -> None:
     with ProcessPoolExecutor(
         2, mp_context=context, initializer=start_process, initargs=(True,)
     ) as pool:
-        pending = [pool.submit(one_family, *task, quick) for task in tasks]
         rows: list[Row] = []
-        for (name, family), future in zip(tasks, pending, strict=True):
-            row = future.result()
+        made = pool.map(one_family, *zip(*tasks, strict=True), itertools.repeat(quick))
+        for (name, family), row in zip(tasks, made, strict=True):
             found = "does not fit" if row is None else f"{row['objective']:.4f}, {row['status']}"
             job.say(f"{name:8s} {family:18s} {found}")
             rows += [row] if row else []
         for name in names:
             own = [row for row in rows if row["study"] == name and row["reached"]]
             own = [row for row in own if not np.isnan(row["objective"])]
-            starts = free_starts(own, 1 if quick else STARTS) if own else []
-            free = [pool.submit(free_form, name, start, quick) for start in starts]
-            made = [future.result() for future in free]
+            starts = free_starts(own, 1 if quick else STARTS)
+            made = [*pool.map(free_form, [name] * len(starts), starts, itertools.repeat(quick))]
             for row in made:
                 job.say(f"{row['study']:8s} free_form {row['objective']:.4f}, {row['begun_at']}")
             rows += sorted(made, key=lambda row: np.nan_to_num(row["objective"], nan=np.inf))[:1]

@@ -37,12 +37,16 @@ def comparison(start: Profile, found: Profile) -> Figure:
     before, after = (np.asarray(outline(one)) / MM for one in (start, found))
     plot_departure(axes[1, 1], before, after, start.lobes, float(start.pitch_radius) / MM)
     axes[0, 0].set(xlabel="x (mm)", ylabel="y (mm)", title="Flank, tip to root", aspect="equal")
-    axes[0, 1].set(xlabel="roll angle β (°)", ylabel="pressure angle ψ (°)", ylim=(0, 95))
-    axes[0, 1].set_title("Pressure angle")
-    axes[1, 0].set(xlabel="normal angle ν (°)", ylabel="share τ = -dψ/dν")
-    axes[1, 0].set_title("The share τ that the coefficients set")
-    handles, names = axes[0, 0].get_legend_handles_labels()
-    made.legend(handles, names, loc="outside lower center", ncols=2, frameon=False)
+    axes[0, 1].set(
+        xlabel="roll angle β (°)", ylabel="pressure angle ψ (°)", ylim=(0, 95),
+        title="Pressure angle",
+    )  # fmt: skip
+    axes[1, 0].set(
+        xlabel="normal angle ν (°)", ylabel="share τ = -dψ/dν",
+        title="The share τ that the coefficients set",
+    )  # fmt: skip
+    entries = axes[0, 0].get_legend_handles_labels()
+    made.legend(*entries, loc="outside lower center", ncols=2, frameon=False)
     return made
 
 

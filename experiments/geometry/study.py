@@ -8,7 +8,7 @@ polygons, each with half the spacing of the last, are extrapolated (Romberg).
 
 import functools
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -59,13 +59,11 @@ def by_polygons(profile):
 
     Returns area and moment (2,), and an estimate of the larger of their relative errors.
     """
-    x = np.arange(_SHORT + 1) / _SHORT
     if isinstance(profile, Curve):
-        ends = profile.node
+        x, ends = np.arange(_SHORT + 1) / _SHORT, profile.node
     elif isinstance(profile, FreeForm):
-        x = np.arange(_SPAN + 1) / _SPAN
-        ends = jnp.append(0.0, jnp.stack([s.start for s in profile.stretches()[1:]]))
-        ends = jnp.append(ends, profile.pitch_normal)
+        starts = [one.start for one in profile.stretches()[1:]]
+        x, ends = np.arange(_SPAN + 1) / _SPAN, jnp.stack([0.0, *starts, profile.pitch_normal])
     else:
         x = np.arange(_WHOLE + 1) / _WHOLE
         x = x**_GRADED / (x**_GRADED + (1 - x) ** _GRADED)
@@ -80,8 +78,7 @@ def by_polygons(profile):
     before = after = levels
     for power in range(1, _LEVELS):
         before, after = after, (4.0**power * after[:-1] - after[1:]) / (4.0**power - 1)
-    rest = jnp.max(jnp.abs(after[0] / before[0] - 1))
-    return 2 * profile.lobes * after[0], rest
+    return 2 * profile.lobes * after[0], jnp.max(jnp.abs(after[0] / before[0] - 1))
 
 
 def _polygon(places):
@@ -101,29 +98,27 @@ def draw(family: str, lobes: int, count: int, random: np.random.Generator, size:
     allows, with a concentration at its limits. `size`: number of coefficients of a free form.
     """
     usual, wide = [np.zeros((count, 0))], [np.zeros((count, 0))]
-    half = 90.0 / lobes
-    for key in FAMILY_KEYS[family]:
+    half, keys = 90.0 / lobes, FAMILY_KEYS[family]
+    # Greatest value in a config, and least distance from the ends as a fraction of it.
+    limits = {"tip_arc_angle_deg": (min(half, 45.0), 1e-4), "tip_arc_turn_deg": (180.0, 1e-3)}
+    for key in keys:
         shape = (count, size) if key == "coefficients" else (count, 1)
-        share = random.random(shape)
         low, high = parameters()[key].usually(RADIUS_MM, lobes)
-        usual.append(low + (high - low) * share)
+        usual.append(low + (high - low) * random.random(shape))
         share = random.random(shape)
         if key == "coefficients":
             # Around an epicycloid, which has constant coefficients; many of these are valid.
             level = random.uniform(-0.5, 1.0, (count, 1))
             spread = 10.0 ** random.uniform(-3, 0, (count, 1))
             wide.append(np.clip(level + spread * (2 * share - 1), -1.0, 1.0))
-        elif key == "tip_arc_angle_deg":
-            wide.append(min(half, 45.0) * _crowded(share, 1e-4))
-        elif key.endswith("_deg"):
-            wide.append((180.0 if key == "tip_arc_turn_deg" else 90.0) * _crowded(share, 1e-3))
         elif key == "trochoid_ratio":
             wide.append(10.0 ** (4 * share - 3))
         else:
-            wide.append(RADIUS_MM * 3.0 * _crowded(share, 1e-4))
+            usually = (90.0, 1e-3) if key.endswith("_deg") else (RADIUS_MM * 3.0, 1e-4)
+            most, least = limits.get(key, usually)
+            wide.append(most * _crowded(share, least))
     first = random.random((count, 1)) < 0.5
     design = np.where(first, np.hstack(usual), np.hstack(wide))
-    keys = FAMILY_KEYS[family]
     if "involute_length_mm" in keys:
         # Relative to the longest possible: no longer involute can be made.
         angle, length = keys.index("pressure_angle_deg"), keys.index("involute_length_mm")
@@ -153,12 +148,11 @@ def _sound(family: str, lobes: int, design):
     if family_of(family).by_limits:
         alpha, length = design[0] * DEG, design[1]
         tip = design[2] * DEG if family == "cic" else 0.0
-        half = jnp.pi / (2 * lobes)
-        edge = RADIUS_MM * jnp.sin(alpha)
-        longest = edge * (half - tip) * _LONGEST_INVOLUTE
-        shortest = edge * (half - tip - 2 * alpha) + 1e-6 * RADIUS_MM
+        free, edge = jnp.pi / (2 * lobes) - tip, RADIUS_MM * jnp.sin(alpha)
+        shortest = edge * (free - 2 * alpha) + 1e-6 * RADIUS_MM
         uncut = edge * jnp.tan(alpha) * (1 + 1e-9)
-        good = (length <= longest) & (length >= shortest) & (length <= uncut) & (length > 0)
+        longest = jnp.minimum(edge * free * _LONGEST_INVOLUTE, uncut)
+        good = (length <= longest) & (length >= shortest) & (length > 0)
         assert isinstance(profile, CIC)
         return good & (profile.arc_radius > 0) & (profile.arc_center_radius > 0)
     good = jnp.ones((), bool)
@@ -208,17 +202,18 @@ def row_of(family: str, lobes: int, size: int, designs: np.ndarray, found: np.nd
 
     `found` (n, 3): result of `compared`; `size`: number of coefficients of a free form, else 0.
     """
-    row: Row = {
+    # Without a valid design, the errors are NaN.
+    area, moment, reference = np.max(found, axis=0) if len(found) else np.full(3, np.nan)
+    worst = designs[np.argsort(np.max(found[:, :2], axis=1))[-1:]]
+    return {
         "family": f"{family} {size}" if size else family,
         "lobes": lobes,
         "sound": len(designs),
+        "area_error": area,
+        "polar_moment_error": moment,
+        "reference_error": reference,
+        "worst_design": " ".join(f"{x:.9g}" for x in worst.ravel()),
     }
-    for k, name in enumerate(("area", "polar_moment", "reference")):
-        row[f"{name}_error"] = float(np.max(found[:, k])) if len(found) else np.nan
-    worst = int(np.argmax(np.max(found[:, :2], axis=1))) if len(found) else None
-    values = [] if worst is None else designs[worst]
-    row["worst_design"] = " ".join(f"{x:.9g}" for x in values) if FAMILY_KEYS[family] else ""
-    return row
 
 
 def study(
@@ -227,24 +222,22 @@ def study(
     families: Sequence[str] = FAMILIES,
     lobes: Sequence[int] = LOBES,
     say: Callable[[str], None] = lambda text: None,
-) -> list[Row]:
-    """Compare families; return a row per family, number of coefficients and number of lobes.
+) -> Iterator[Row]:
+    """Compare families; yield a row per family, number of coefficients and number of lobes.
 
     `draws`: number of designs drawn for each row."""
     random = np.random.default_rng(seed)
-    rows: list[Row] = []
     for family in families:
         sizes = COEFFICIENTS if family == "free_form" else (0,)
         for size, number in itertools.product(sizes, lobes):
             found = errors(family, number, draws, random, size)
-            rows.append(row_of(family, number, size, *found))
-            worst = np.max(found[1], initial=0.0)
-            say(f"{rows[-1]['family']}, {number} lobes: {len(found[0])} sound, {worst:.1e}")
-    return rows
+            row, worst = row_of(family, number, size, *found), np.max(found[1], initial=0.0)
+            say(f"{row['family']}, {number} lobes: {row['sound']} sound, {worst:.1e}")
+            yield row
 
 
 def run(job: Run) -> None:
     """Compare all families, or in a reduced run those of `QUICK`; write and print the rows."""
-    rows = study(QUICK_DRAWS, 0, *QUICK, job.say) if job.quick else study(DRAWS, say=job.say)
+    rows = [*(study(QUICK_DRAWS, 0, *QUICK, job.say) if job.quick else study(DRAWS, say=job.say))]
     job.csv("geometry.csv", rows)
     show("Area and inertia against polygons", rows)

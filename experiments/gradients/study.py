@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments._common.driver import Run
-from experiments._common.scenes import CIC, FORCES
+from experiments._common.scenes import CIC, FORCES, MEASURES
 from experiments._common.shooting import closed, differentiated
 from experiments._common.simulation import evaluator_of
 from experiments._common.style import COLORS, sheet
@@ -27,8 +27,8 @@ from rootsopt.response.evaluation import Evaluation, Evaluator
 
 TOLERANCES = (1e-8, 1e-9, 1e-10)
 
-# Names of the forces whose gradients are compared.
-MEASURES = (*FORCES, "rms_force_N")
+# Further columns.
+FACTS = "residual", "floquet_multiplier", "gradient_disagreement", "orbit_elements", "seconds"
 
 # Greatest relative step of the central differences, and number of steps, each half of the one
 # before. Longer steps pass the grazing of orbits that almost touch once more.
@@ -156,28 +156,24 @@ def slopes_of(found: Evaluation) -> np.ndarray:
 
 def rows_of(
     evaluator: Evaluator, kind: str, overrides: list[str], found: dict[float, Evaluation]
-) -> list[dict[str, Any]]:
-    """Return the evaluations and their errors, one row per tolerance.
+) -> Iterator[Row]:
+    """Yield the evaluations and their errors, one row per tolerance.
 
     Errors are relative to the greatest term of the derivative."""
     usable = [one for one in found.values() if one.usable]
     size = np.max(np.abs(slopes_of(usable[-1])), axis=1)
     truth, noise = differences(evaluator, usable[-1])
-    rows = []
     for rtol, one in found.items():
-        row: dict[str, Any] = {"kind": kind, "rtol": rtol, "status": one.status.label}
+        row: Row = {"kind": kind, "rtol": rtol, "status": one.status.label}
         row |= {"period": one.steady_state.get("period"), "scene": " ".join(overrides)}
-        for name in ("residual", "floquet_multiplier"):
-            row[name] = one.steady_state.get(name)
-        for name in ("gradient_disagreement", "orbit_elements", "seconds"):
-            row[name] = one.statistics.get(name)
+        facts = one.steady_state | one.statistics
+        row |= {name: facts.get(name) for name in FACTS}
         if one.usable:
             errors = np.abs(np.sum(slopes_of(one), axis=1) - truth) / size
             for k, measure in enumerate(MEASURES):
                 row[measure], row[f"{measure}_error"] = one.response[measure], errors[k]
                 row[f"{measure}_noise"] = noise[k] / size[k]
-        rows.append(row)
-    return rows
+        yield row
 
 
 def wanted_of(quick: bool, count: int) -> dict[str, int]:
@@ -200,28 +196,23 @@ def pairs_of_kind(
         if lively + plain >= wanted or (kind == LONG and number > PATIENCE * wanted):
             break
         # Wait for rare longer periods, but only for a limited number of scenes.
-        patient = number < 6 * wanted
+        waiting = number < 6 * wanted and kind != FULL and plain >= (1 - SHARE) * wanted
+        least = 5 if kind == LONG else 2 if waiting else 1
         evaluator = evaluator_of(load(CIC, overrides), give_up_early=True)
         series = evaluated(evaluator)
         first = next(series)
-        scout = int(first[1].steady_state.get("period", 0)) if first[1].usable else 0
-        if (
-            not scout
-            or (kind == LONG and scout < 5)
-            or (scout == 1 and patient and kind != FULL and plain >= (1 - SHARE) * wanted)
-        ):
-            continue
-        new = rows_of(evaluator, kind, overrides, dict([first, *series]))
-        lively, plain = lively + (scout > 1), plain + (scout == 1)
-        found = {row["rtol"]: (row["status"], row.get("mean_force_N_error")) for row in new}
-        say(f"{kind} {lively} {plain} period {new[0]['period']} {found}")
-        yield new
+        period = int(first[1].steady_state.get("period", 0)) if first[1].usable else 0
+        if period >= least:
+            new = [*rows_of(evaluator, kind, overrides, dict([first, *series]))]
+            lively, plain = lively + (period > 1), plain + (period == 1)
+            found = {row["rtol"]: (row["status"], row.get("mean_force_N_error")) for row in new}
+            say(f"{kind} {lively} {plain} period {period} {found}")
+            yield new
 
 
 def errors_of(rows: Sequence[Row]) -> Figure:
     """Draw the gradient error over the estimate of its check, and its distribution by tolerance."""
-    picture, axes = sheet(10, 4.2, 1, 2)
-    left, right = axes[0]
+    picture, ((left, right),) = sheet(10, 4.2, 1, 2)
     for rtol, color, marker in zip(TOLERANCES, COLORS[:3], "os^", strict=True):
         good = [r for r in rows if r["rtol"] == rtol and r["status"] == "periodic"]
         off = np.array([[r[f"{name}_error"] for name in MEASURES] for r in good]).ravel()
@@ -232,8 +223,8 @@ def errors_of(rows: Sequence[Row]) -> Figure:
             errors = np.sort([r[f"{name}_error"] for r in good])
             errors = errors[np.isfinite(errors)]
             share = 100 * (np.arange(errors.size) + 1) / errors.size
-            what = name.split("_")[0]
-            right.semilogx(errors, share, style, color=color, label=f"{what}, rtol {rtol:g}")
+            label = f"{name.split('_')[0]}, rtol {rtol:g}"
+            right.semilogx(errors, share, style, color=color, label=label)
     left.plot([1e-9, 1e-2], [1e-9, 1e-2], "k:", lw=1, label="equal")
     left.set(
         xlabel="gradient_disagreement (relative)",
@@ -280,10 +271,9 @@ def judge(rows: Sequence[Row]) -> tuple[list[Row], list[str]]:
         mine = [row for row in rows if row["rtol"] == rtol]
         good = [row for row in mine if row["status"] == "periodic"]
         off, noise = (
-            np.array([row[f"{name}_{what}"] for row in good for name in MEASURES])
+            np.reshape([[row[f"{name}_{what}"] for name in MEASURES] for row in good], (-1, 3))
             for what in ("error", "noise")
         )
-        off, noise = off.reshape(-1, len(MEASURES)), noise.reshape(-1, len(MEASURES))
         limit = float(agreement(jnp.asarray(rtol)))
         for row, beyond in zip(good, np.maximum(off - noise, 0.0), strict=True):
             ratios += (beyond / row["gradient_disagreement"]).tolist()
@@ -292,15 +282,23 @@ def judge(rows: Sequence[Row]) -> tuple[list[Row], list[str]]:
         worst = np.nanmax(off, axis=1)
         worst = worst[np.isfinite(worst)]
         shares = np.quantile(worst, [0.5, 0.75, 0.95, 1.0]).tolist() if worst.size else [np.nan] * 4
-        names = "median", "75_%_below", "95_%_below", "maximum"
-        counts = {"rtol": f"{rtol:g}", "pairs": len(mine), "periodic": len(good)}
-        table.append(counts | dict(zip(names, shares, strict=True)))
+        median, most, nearly_all, greatest = shares
+        table.append(
+            {
+                "rtol": f"{rtol:g}",
+                "pairs": len(mine),
+                "periodic": len(good),
+                "median": median,
+                "75_%_below": most,
+                "95_%_below": nearly_all,
+                "maximum": greatest,
+            }
+        )
     for scene in dict.fromkeys(row["scene"] for row in rows):
         ends = [row["status"] for row in rows if row["scene"] == scene]
         if ends[0] == "periodic" and set(ends) != {"periodic"}:
             broken.append(f"WORSE {ends} {scene}")
-    known = [ratio for ratio in ratios if np.isfinite(ratio)]
-    if known and np.mean(np.array(known) > 1) > BEYOND:
-        share = 100 * np.mean(np.array(known) > 1)
-        broken.append(f"UNBOUNDED {share:.1f} % of {len(known)} gradients")
+    known = np.array(ratios)[np.isfinite(ratios)]
+    if np.sum(known > 1) > BEYOND * known.size:
+        broken.append(f"UNBOUNDED {np.mean(known > 1):.1%} of {known.size} gradients")
     return table, broken

@@ -5,8 +5,7 @@ columns with normal noise, whose standard deviation is a share of the column's R
 no standard deviations, so `identify` estimates the noise. The true values should lie in the joint
 95 % region of 95 % of the fits, and each of them in 95 % of its intervals."""
 
-import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -62,32 +61,28 @@ def fitted(
         values = data[name].values[chosen]
         size = np.sqrt(np.mean(values**2))
         record[name] = values + noise * size * rng.standard_normal(SAMPLES)
-    began = time.perf_counter()
     found = identify(config, record, RANGES, starts=STARTS)
     row: Row = {"noise": noise, "status": found.status.label}
     if not found.parameters:
         return row | {"inside": False, "determined": 0}, found
     increase = found.increase(dict(zip(RANGES, true.tolist(), strict=True)))
     sure = sum(one["determined"] for one in found.combinations)
-    row |= {"inside": sure == 0 or increase < chi2.ppf(0.95, sure), "increase": increase}
-    row["determined"] = sure
+    row["inside"] = sure == 0 or increase < chi2.ppf(0.95, sure)
+    row |= {"increase": increase, "determined": sure, "optima": len(found.optima)}
     for key, value, one in zip(RANGES, true, found.parameters.values(), strict=True):
         low, high = one["interval_95"]
         row |= {key: value, f"{key} found": one["value"], f"{key} inside": low <= value <= high}
-    row |= {"optima": len(found.optima), "seconds": time.perf_counter() - began}
     return row, found
 
 
-def coverage(rows: Sequence[Row]) -> list[Row]:
-    """Return the share of regions and intervals that hold the true values, by noise."""
-    table: list[Row] = []
+def coverage(rows: Sequence[Row]) -> Iterator[Row]:
+    """Yield the share of regions and intervals that hold the true values, by noise."""
     for noise in sorted({row["noise"] for row in rows}):
         mine = [row for row in rows if row["noise"] == noise]
         shares = {key.split(".")[-1]: np.mean([row.get(f"{key} inside", False) for row in mine])
                   for key in RANGES}  # fmt: skip
         inside = np.mean([row["inside"] for row in mine])
-        table.append({"noise": noise, "fits": len(mine), "region": inside} | shares)
-    return table
+        yield {"noise": noise, "fits": len(mine), "region": inside} | shares
 
 
 def run(job: Run) -> bool:
@@ -105,7 +100,7 @@ def run(job: Run) -> bool:
             rows.append({"scene": number} | row)
             if number == 1 and noise == NOISES[1]:
                 job.figure("identify.png", drawn(found))
-        table = coverage(rows)
+        table = [*coverage(rows)]
         job.csv("identify.csv", rows)
         job.json("identify.json", {"coverage": table})
         if number % 10 == 0:

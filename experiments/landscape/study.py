@@ -15,17 +15,15 @@ from typing import Any
 
 import jax
 import numpy as np
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from experiments._common.driver import NoResultError, Run
 from experiments._common.scenes import FAIR
+from experiments._common.simulation import feasible
 from experiments._common.style import VERMILION, sheet
 from experiments._common.tables import Row, show
 from rootsopt.config import load
-from rootsopt.optimize.outcome import Optimization
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.search import Search
 from rootsopt.scene.space import sobol
@@ -71,14 +69,13 @@ def feasible_grid(problem: Problem, wanted: int) -> tuple[np.ndarray, NDArray[np
     if the constraints exclude nearly all designs.
     """
     look = jax.jit(jax.vmap(problem.space.slacks))
-    moved = [problem.project(point) for point in sobol(SAMPLE, 0, 3)]
-    moved = [point for point in moved if problem.feasible(point)]
+    moved = feasible(problem, sobol(SAMPLE, 0, 3))
     for count in range(GRID, MOST if moved else 0):
         axes = np.linspace(np.min(moved, axis=0), np.max(moved, axis=0), count).T
         points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-        feasible = points[np.asarray(look(points)).min(axis=1) >= 0]
-        if len(feasible) >= wanted:
-            return feasible, np.ptp(moved, axis=0) / (count - 1)
+        inside = points[np.asarray(look(points)).min(axis=1) >= 0]
+        if len(inside) >= wanted:
+            return inside, np.ptp(moved, axis=0) / (count - 1)
     raise NoResultError("the constraints leave hardly any design; relax them")
 
 
@@ -121,9 +118,8 @@ def finer(
         if far and len(chosen) < CENTERS and not np.isnan(values[place]):
             chosen.append(points[place])
     around = [np.array(shift) for shift in itertools.product((-1, 0, 1), repeat=3) if any(shift)]
-    tried = [problem.project(center + spacing * shift) for center in chosen for shift in around]
-    found = [point for point in tried if problem.feasible(point)]
-    return np.unique(np.round(np.array(found).reshape(-1, 3), 12), axis=0)
+    found = feasible(problem, [at + spacing * shift for at in chosen for shift in around])
+    return np.unique(np.round(np.reshape(found, (-1, 3)), 12), axis=0)
 
 
 NAMES = {
@@ -153,12 +149,6 @@ SHOWN = (
 )
 
 
-def searched(quick: bool, *overrides: str) -> tuple[Search, Optimization]:
-    """Optimise the shipped pair with `overrides`. Return the search and its result."""
-    search = Search(load(FAIR, [*(QUICK if quick else ()), *overrides]))
-    return search, search.run()
-
-
 def compared(name: str, quick: bool) -> tuple[Row, list[Row]]:
     """Optimise in the scene `name`, and simulate grids of designs.
 
@@ -166,7 +156,8 @@ def compared(name: str, quick: bool) -> tuple[Row, list[Row]]:
     is better than the baseline, which is not quite feasible itself, the best one of the search is
     compared. Raises `NoResultError` if the search has none.
     """
-    search, result = searched(quick, *CASES[name])
+    search = Search(load(FAIR, [*(QUICK if quick else ()), *CASES[name]]))
+    result = search.run()
     problem, optimum, known = result.problem, result.optimized, result.optimality
     rows = [row for row in result.history if row["feasible"] and np.isfinite(row["objective"])]
     if problem is None or not rows:
@@ -221,23 +212,20 @@ def _scene(figure: Figure, record: Row, rows: list[Row], axes: Any) -> None:
     order = np.argsort(-np.where(np.isnan(values), np.inf, values))
     good = ~np.isnan(values[order])
     star = {"marker": "*", "ms": 15, "mfc": "none", "mec": VERMILION, "mew": 1.8}
-    marks = ("optimizer", star), ("grid", {"marker": "+", "ms": 9, "color": "black"})
-    labels = (
-        f"optimiser: {record['optimizer']:.4f}",
-        f"best of the grids: {record['grid_best']:.4f}",
-    )
+    star["label"] = f"optimiser: {record['optimizer']:.4f}"
+    cross = {"marker": "+", "ms": 9, "color": "black"}
+    cross["label"] = f"best of the grids: {record['grid_best']:.4f}"
     for ax, (x, y) in zip(axes, itertools.combinations(NAMES, 2), strict=True):
         px, py = (np.array([row[k] for row in rows])[order] for k in (x, y))
         if not good.all():
             ax.plot(px[~good], py[~good], "x", color="0.6", ms=3, label="no steady state")
-        ax.scatter(px[good], py[good], c=values[order][good], s=9, vmin=low, vmax=high)
-        for (name, style), label in zip(marks, labels, strict=True):
+        shades = ax.scatter(px[good], py[good], c=values[order][good], s=9, vmin=low, vmax=high)
+        for name, style in (("optimizer", star), ("grid", cross)):
             best = record[f"{name}_design"]
-            ax.plot(best[x], best[y], ls="", label=label, **style)
+            ax.plot(best[x], best[y], ls="", **style)
         ax.set_ylabel(NAMES[y])
     axes[0].set_title(record["scene"], loc="left", fontsize=10)
     axes[0].legend(loc="best", fontsize=7)
-    shades = ScalarMappable(Normalize(low, high), "viridis")
     figure.colorbar(shades, ax=axes[-1], label="objective")
 
 
@@ -252,7 +240,8 @@ def run(job: Run) -> bool:
         job.say(f"{name}: {record['grid_best']:.6f}, optimiser {record['optimizer']:.6f}")
     seeds = []
     for seed in range(QUICK_SEEDS if job.quick else SEEDS):
-        _, result = searched(job.quick, f"optimizer.seed={seed}")
+        few = QUICK if job.quick else ()
+        result = Search(load(FAIR, [*few, f"optimizer.seed={seed}"])).run()
         own = 1 - result.improvement.get("objective", np.nan)
         seeds.append({"seed": seed, "objective": own, "designs": len(result.history)})
     values = [row["objective"] for row in seeds]

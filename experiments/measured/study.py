@@ -72,8 +72,7 @@ def deviations(design: Profile, profile: Profile, points: np.ndarray, gaps: Any)
     """Draw the deviation from the design over the radius, and the gap in rolling.
 
     `profile`: that of the measured `points` (complex, mm); `gaps`: gaps in rolling, by name."""
-    made, axes = sheet(11, 4.2, 1, 2)
-    left, right = axes[0]
+    made, ((left, right),) = sheet(11, 4.2, 1, 2)
     left.plot(np.abs(points), off_um(points, design), ".", color=GREY, ms=2, label="points")
     fitted = complex_points(profile, 240)
     fitted = fitted[(np.angle(fitted) >= 0) & (np.angle(fitted) <= np.pi / design.lobes)]
@@ -110,8 +109,7 @@ def run(job: Run) -> None:
         "form_found_um": float(np.max(off_um(complex_points(profile, 240), design))),
         "form_given_um": FORM / MM,
     }
-    simulated = {} if job.quick else {"design": settings, "measured": other}
-    for name, one in simulated.items():
+    for name, one in {} if job.quick else {"design": settings, "measured": other}.items():
         found = evaluate(one)
         record[name] = {"status": found.status.label} | found.response
     own = points * np.exp(1j * np.radians(checks.turned_deg))

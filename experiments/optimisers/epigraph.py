@@ -26,7 +26,7 @@ _SLOTS = 4
 # Difference between phases above which branches at neighbouring points count as different.
 _SAME = 0.1
 
-# Amount by which the value of a point without an objective exceeds the best objective.
+# Amount by which the value of a point without an objective exceeds the first objective.
 _UNUSABLE = 1e3
 
 
@@ -41,7 +41,8 @@ class Epigraph:
         self.look, self.stops, self.size = look, stops, len(start)
         self.evaluations = 1
         self.known: dict[bytes, Linearization | None] = {start.tobytes(): first}
-        self.good, self.best = first, (start, first)
+        self.begin, self.first = start, first
+        self.good = first
         slots = [2 * len(group.values) + _SLOTS for group in (*first.groups, *first.walls)]
         self.slots = [np.full((count, 2), np.nan) for count in slots]
         self.used = [np.zeros(count) for count in slots]
@@ -66,66 +67,57 @@ class Epigraph:
 
     def start(self) -> NDArray[np.float64]:
         """Return the variables at the start."""
-        point, local = self.best
-        return np.concatenate([point / SCALE, [group.top for group in local.groups]])
+        return np.concatenate([self.begin / SCALE, [group.top for group in self.first.groups]])
 
     def value(self, z) -> tuple[float, NDArray[np.float64]]:
         """Return the smooth objective and its gradient at the variables `z`.
 
-        The value is far above the best objective if the point is not usable."""
+        The value is far above the first objective if the point is not usable."""
         found = self.at(self.point(z))
-        steps = np.ones(len(z) - self.size)
+        self.good = self.good if found is None else found
+        slope = np.append(SCALE * self.good.slope, np.ones(len(z) - self.size))
         if found is None:
-            gradient = np.concatenate([SCALE * self.good.slope, steps])
-            return self.best[1].objective + _UNUSABLE, gradient
-        self.good = found
-        total = found.smooth + float(np.sum(z[self.size :]))
-        return total, np.concatenate([SCALE * found.slope, steps])
+            return self.first.objective + _UNUSABLE, slope
+        return found.smooth + float(np.sum(z[self.size :])), slope
 
     def constraints(self, z) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the values (≥ 0 if satisfied) and gradients of all constraints at `z`.
 
         First come t - b_i for the branches b_i of each maximum t, then -w_i for those of each
         wall, then the constraints of the problem."""
-        found = self.at(self.point(z))
-        found = self.good if found is None else found
+        found = self.at(self.point(z)) or self.good
         values, rows = [], []
         tops = len(found.groups)
         for k, group in enumerate((*found.groups, *found.walls)):
-            places = self._places(k, group)
+            branches, places = self._places(k, group)
             value, row = np.ones(len(self.slots[k])), np.zeros((len(self.slots[k]), len(z)))
-            for place, b, slope in zip(places, group.values, group.slopes, strict=True):
-                if place >= 0:
-                    value[place] = -b
-                    row[place, : self.size] = -SCALE * slope
-                if place >= 0 and k < tops:
-                    value[place] += z[self.size + k]
-                    row[place, self.size + k] = 1.0
+            value[places] = -group.values[branches]
+            row[places, : self.size] = -SCALE * group.slopes[branches]
+            if k < tops:
+                value[places] += z[self.size + k]
+                row[places, self.size + k] = 1.0
             values.append(value)
             rows.append(row)
-        wide = np.zeros((len(found.slack), len(z)))
-        wide[:, : self.size] = SCALE * found.normals
+        wide = np.pad(SCALE * found.normals, ((0, 0), (0, len(z) - self.size)))
         return np.concatenate([*values, found.slack]), np.concatenate([*rows, wide])
 
-    def _places(self, k: int, group: Group) -> list[int]:
-        """Return the index, within its group, of the constraint that each branch of group `k` uses.
+    def _places(self, k: int, group: Group) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Return branches of group `k`, and the index, within its group, of each one's constraint.
 
-        A branch keeps its index from point to point, so that a method sees smooth constraints. The
-        index is -1 if all constraints of the group are taken."""
+        A branch keeps its index from point to point, so that a method sees smooth constraints. It
+        is left out if all constraints of the group are taken."""
         slots = self.slots[k]
         apart = np.abs(group.tags[:, None, 1] - slots[None, :, 1])
         apart = np.minimum(apart % 1.0, -apart % 1.0)
         other = group.tags[:, None, 0] != slots[None, :, 0]
         cost = np.where(other | ~(apart <= _SAME), 10.0, apart)
-        places = [-1] * len(group.values)
-        for branch, slot in zip(*linear_sum_assignment(cost), strict=True):
-            if cost[branch, slot] < 10.0:
-                places[branch] = int(slot)
+        branches, places = linear_sum_assignment(cost)
+        same = cost[branches, places] < 10.0
+        branches, places = branches[same], places[same]
         free = [s for s in np.argsort(self.used[k], kind="stable") if s not in places]
-        for branch in np.argsort(-group.values, kind="stable"):
-            if places[branch] < 0 and free:
-                places[branch] = int(free.pop(0))
-        for branch, place in enumerate(places):
-            if place >= 0:
-                slots[place], self.used[k][place] = group.tags[branch], self.evaluations
-        return places
+        new = [b for b in np.argsort(-group.values, kind="stable") if b not in branches]
+        count = min(len(new), len(free))
+        branches = np.append(branches, new[:count]).astype(int)
+        places = np.append(places, free[:count]).astype(int)
+        slots[places], self.used[k][places] = group.tags[branches], self.evaluations
+        return branches, places

@@ -9,8 +9,8 @@ import contextlib
 import importlib.util
 import time
 from collections import Counter
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,9 +21,10 @@ from numpy.typing import NDArray
 from scipy.optimize import BFGS, NonlinearConstraint, minimize
 
 from experiments._common.driver import Run
-from experiments._common.tables import show
+from experiments._common.scenes import shipped
+from experiments._common.tables import Row, show
 from experiments.optimisers.epigraph import SCALE, Epigraph
-from rootsopt.config import load
+from rootsopt.config import Config
 from rootsopt.optimize.local import FEASIBLE, Linearization, Look, certify
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.sqp import EndError, Stops, descend
@@ -45,40 +46,32 @@ _OUTER, _INNER = 30, 25
 # maximum.
 _PENALTY, _GROWTH, _MOST = 10.0, 4.0, 1e6
 
-# Share of the predicted decrease that a step must reach, share of a step that is tried last, and
+# Share of the predicted decrease that a step must reach, shares of a step that are tried, and
 # decrease below which L-BFGS ends.
-_ARMIJO, _SHORTEST, _FLAT = 1e-4, 1e-6, 1e-11
+_ARMIJO, _SHARES, _FLAT = 1e-4, 0.5 ** np.arange(20), 1e-11
 
 # Greatest sine at the start of L-BFGS: at 1, on a bound, its gradient would be zero.
 _INSIDE = 0.98
 
 
-class Task(NamedTuple):
-    """A problem: `name`, `config` and overrides."""
-
-    name: str
-    config: str
-    overrides: tuple[str, ...] = ()
-
-
-TASKS = (
-    Task("cic", "configs/cic_drawn.yaml"),
-    Task("cic, peak alone", "configs/cic_drawn.yaml", (_PEAK,)),
-    Task("cic, mean alone", "configs/cic_drawn.yaml", ("objective.peak_weight=0",)),
-    Task("cic, RMS alone", "configs/cic_drawn.yaml", (
-        _PEAK, "objective.peak_weight=0", "objective.rms_weight=1")),
-    Task("cic, 2000 rpm", "configs/cic_drawn.yaml", ("scene.speed_rpm=2000",)),
-    Task("cic, 5000 rpm", "configs/cic_drawn.yaml", ("scene.speed_rpm=5000",)),
-    Task("cic, half the load", "configs/cic_drawn.yaml", ("scene.load.torque_N_m=2.4",)),
-    Task("cic, wide backlash", "configs/cic_drawn.yaml", ("scene.timing_gear.backlash_mm=0.2",)),
-    Task("cic, narrow bore of the housing", "configs/cic_drawn.yaml", (
-        "constraints.outer_radius_max_mm=44.8", "constraints.area_efficiency_min=0.43")),
-    Task("cic, wide seal", "configs/cic_drawn.yaml", ("constraints.seal_width_min_mm=5",)),
-    Task("cic, two speeds", "configs/cic_drawn.yaml", ("objective.speeds_rpm=[2500, 3500]",)),
-    Task("cic, worst of two speeds", "configs/cic_drawn.yaml", (
-        "objective.speeds_rpm=[2500, 3500]", "objective.over_speeds=worst")),
-    Task("free form", "configs/free.yaml"),
-)  # fmt: skip
+# Shipped config and overrides of each problem.
+TASKS: dict[str, tuple[str, ...]] = {
+    "cic": ("cic",),
+    "cic, peak alone": ("cic", _PEAK),
+    "cic, mean alone": ("cic", "objective.peak_weight=0"),
+    "cic, RMS alone": ("cic", _PEAK, "objective.peak_weight=0", "objective.rms_weight=1"),
+    "cic, 2000 rpm": ("cic", "scene.speed_rpm=2000"),
+    "cic, 5000 rpm": ("cic", "scene.speed_rpm=5000"),
+    "cic, half the load": ("cic", "scene.load.torque_N_m=2.4"),
+    "cic, wide backlash": ("cic", "scene.timing_gear.backlash_mm=0.2"),
+    "cic, narrow bore of the housing": (
+        "cic", "constraints.outer_radius_max_mm=44.8", "constraints.area_efficiency_min=0.43"),
+    "cic, wide seal": ("cic", "constraints.seal_width_min_mm=5"),
+    "cic, two speeds": ("cic", "objective.speeds_rpm=[2500, 3500]"),
+    "cic, worst of two speeds": (
+        "cic", "objective.speeds_rpm=[2500, 3500]", "objective.over_speeds=worst"),
+    "free form": ("free",),
+}  # fmt: skip
 
 # Number of problems in a reduced run.
 QUICK_TASKS = 2
@@ -119,15 +112,13 @@ def augmented_lagrangian(problem: Epigraph, _stops: Stops) -> None:
     penalty, before = _PENALTY, np.inf
 
     def bounded(w):
-        z, slope = np.array(w), np.ones(len(w))
-        z[:size] = (1 + np.sin(w[:size])) / (2 * SCALE)
-        slope[:size] = np.cos(w[:size]) / (2 * SCALE)
-        return z, slope
+        sines, cosines = (1 + np.sin(w)) / (2 * SCALE), np.cos(w) / (2 * SCALE)
+        inside = np.arange(len(w)) < size
+        return np.where(inside, sines, w), np.where(inside, cosines, 1.0)
 
     def merit(w) -> tuple[float, NDArray[np.float64]]:
         z, by_free = bounded(w)
-        value, slope = problem.value(z)
-        slack, normals = problem.constraints(z)
+        (value, slope), (slack, normals) = problem.value(z), problem.constraints(z)
         short = np.maximum(weights / penalty - slack, 0.0)
         slope = slope - penalty * short @ normals
         return float(value + penalty / 2 * short @ short), slope * by_free
@@ -156,12 +147,10 @@ def _lbfgs(
         step = -np.asarray(direction)
         if step @ slope >= 0:
             step = -slope
-        share = 1.0
-        while share > _SHORTEST:
+        for share in _SHARES:
             found, gradient = merit(z + share * step)
             if found <= value + _ARMIJO * share * (step @ slope):
                 break
-            share /= 2
         else:
             return z
         gained = value - found
@@ -182,7 +171,6 @@ def interior_point(problem: Epigraph, _stops: Stops) -> None:
         jac=lambda z: problem.constraints(z)[1],  # pyright: ignore[reportArgumentType]
         hess=BFGS(),
     )
-    options = {"maxiter": 10_000, "gtol": 1e-12, "xtol": 1e-12, "barrier_tol": 1e-10}
     minimize(
         problem.value,
         z,
@@ -191,7 +179,7 @@ def interior_point(problem: Epigraph, _stops: Stops) -> None:
         method="trust-constr",
         bounds=_bounds(problem, len(z)),
         constraints=limits,
-        options=options,
+        options={"maxiter": 10_000, "gtol": 1e-12, "xtol": 1e-12, "barrier_tol": 1e-10},
     )
 
 
@@ -227,23 +215,22 @@ def moving_asymptotes(problem: Epigraph, stops: Stops) -> None:
         search.optimize(z)
 
 
-METHODS: dict[str, Method] = {
-    "slsqp": sqp,
-    "augmented_lagrangian": augmented_lagrangian,
-    "interior_point": interior_point,
-    "mma": moving_asymptotes,
+# Each method, with its name in the legend.
+METHODS: dict[str, tuple[Method, str]] = {
+    "slsqp": (sqp, "SQP (default)"),
+    "augmented_lagrangian": (augmented_lagrangian, "augmented Lagrangian"),
+    "interior_point": (interior_point, "interior point"),
+    "mma": (moving_asymptotes, "MMA"),
 }
 
 
 class Recorder:
     """A problem as the methods see it. It records every evaluation."""
 
-    def __init__(self, task: Task):
-        self.config = load(task.config, list(task.overrides))
-        evaluator = Evaluator.of_objective(self.config)
-        baseline = evaluator(series=False)
-        self.problem = Problem.of(self.config, evaluator.scene, baseline)
-        self.baseline = baseline
+    def __init__(self, config: Config):
+        evaluator = Evaluator.of_objective(config)
+        self.baseline = baseline = evaluator(series=False)
+        self.problem = Problem.of(config, evaluator.scene, baseline)
         self.evaluator = evaluator.relative_to(baseline).surveying().with_maxima()
         self.start = self.problem.project(self.problem.point([*baseline.design.values()]))
         self.reset()
@@ -258,23 +245,18 @@ class Recorder:
         design = self.problem.design(point)
         evaluation = self.evaluator(design, start=self.near, series=False)
         found = self.problem.local(evaluation, point)
+        row = {"evaluation": len(self.rows) + 1, "seconds": time.perf_counter() - self.began}
+        row |= dict.fromkeys(("objective", "violation", "residual"), np.nan)
         if found is not None:
             self.near = evaluation.start
-        self.rows.append(
-            {
-                "evaluation": len(self.rows) + 1,
-                "seconds": time.perf_counter() - self.began,
-                "objective": np.nan if found is None else found.objective,
-                "violation": np.nan if found is None else found.violation,
-                "residual": np.nan if found is None else certify(found, point).residual,
-            }
-        )
+            row |= {"objective": found.objective, "violation": found.violation}
+            row["residual"] = certify(found, point).residual
+        self.rows.append(row)
         return found
 
 
-def summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return evaluations and time to the optimum, by problem and method."""
-    found = []
+def summary(rows: list[Row]) -> Iterator[Row]:
+    """Yield evaluations and time to the optimum, by problem and method."""
     for task in dict.fromkeys(row["problem"] for row in rows):
         here = [row for row in rows if row["problem"] == task]
         best = min((row["objective"] for row in here if _met(row)), default=np.nan)
@@ -282,50 +264,37 @@ def summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
             own = [row for row in here if row["method"] == method]
             met = [row for row in own if _met(row)]
             hits = [row for row in met if row["objective"] <= best + REACHED]
-            found.append(
-                {
-                    "problem": task,
-                    "method": method,
-                    "evaluations": hits[0]["evaluation"] if hits else None,
-                    "seconds": hits[0]["seconds"] if hits else None,
-                    "above_best": min((r["objective"] for r in met), default=np.nan) - best,
-                    "residual": min((r["residual"] for r in met), default=np.nan),
-                    "designs": len(own),
-                }
-            )
-    return found
+            yield {
+                "problem": task,
+                "method": method,
+                "evaluations": hits[0]["evaluation"] if hits else None,
+                "seconds": hits[0]["seconds"] if hits else None,
+                "above_best": min((r["objective"] for r in met), default=np.nan) - best,
+                "residual": min((r["residual"] for r in met), default=np.nan),
+                "designs": len(own),
+            }
 
 
-def _met(row: dict[str, Any]) -> bool:
+def _met(row: Row) -> bool:
     return bool(np.isfinite(row["objective"]) and row["violation"] <= FEASIBLE)
 
 
-# Names of the methods in the legend.
-_NAMES = {
-    "slsqp": "SQP (default)",
-    "augmented_lagrangian": "augmented Lagrangian",
-    "interior_point": "interior point",
-    "mma": "MMA",
-}
-
-
-def solved(rows: list[dict[str, Any]]) -> Figure:
+def solved(rows: list[Row]) -> Figure:
     """Draw, for each method, the number of problems whose optimum it has reached.
 
     `rows`: those of `summary`."""
-    made, axes = figure(6.5, 3.6)
-    ax = axes[0, 0]
+    made, ((ax,),) = figure(6.5, 3.6)
     problems = len({row["problem"] for row in rows})
     methods = dict.fromkeys(row["method"] for row in rows)
-    for method, look in zip(methods, looks(_NAMES[method] for method in methods), strict=True):
+    for method, look in zip(methods, looks(METHODS[name][1] for name in methods), strict=True):
         own = [row["evaluations"] for row in rows if row["method"] == method]
         counts = np.sort([count for count in own if count is not None])
-        number = np.arange(len(counts) + 1)
-        x = np.concatenate([[0], counts, [EVALUATIONS]])
-        y = np.append(number, number[-1])
-        ax.step(x, y, where="post", **look)
-    ax.set(xlim=(0, EVALUATIONS), ylim=(0, problems + 0.3), xlabel="designs simulated")
-    ax.set_ylabel(f"problems solved to 1e-6, of {problems}")
+        ax.step([0, *counts, EVALUATIONS], [*range(len(counts) + 1), len(counts)], where="post",
+                **look)  # fmt: skip
+    ax.set(
+        xlim=(0, EVALUATIONS), ylim=(0, problems + 0.3), xlabel="designs simulated",
+        ylabel=f"problems solved to 1e-6, of {problems}",
+    )  # fmt: skip
     ax.legend(frameon=False, loc="center right")
     return made
 
@@ -339,16 +308,16 @@ def run(job: Run) -> bool:
         del methods["mma"]
     # So tight that a method ends at its own criterion, or when the evaluations run out.
     stops = Stops(feasibility=FEASIBLE, evaluations=QUICK if job.quick else EVALUATIONS)
-    rows: list[dict[str, Any]] = []
-    for task in TASKS[: QUICK_TASKS if job.quick else None]:
-        look = Recorder(task)
+    rows: list[Row] = []
+    for task in list(TASKS)[: QUICK_TASKS if job.quick else None]:
+        look = Recorder(shipped(*TASKS[task]))
         look(look.start)  # Compiles.
-        for name, method in methods.items():
+        for name, (method, _) in methods.items():
             look.reset()
             method(look, look.start, stops)
-            rows += [{"problem": task.name, "method": name, **row} for row in look.rows]
-            job.say(f"{task.name}: {name}, {len(look.rows)} designs")
-    table = summary(rows)
+            rows += [{"problem": task, "method": name, **row} for row in look.rows]
+            job.say(f"{task}: {name}, {len(look.rows)} designs")
+    table = [*summary(rows)]
     reached = Counter(row["method"] for row in table if row["evaluations"] is not None)
     job.csv("optimisers.csv", rows)
     job.json("optimisers.json", {"summary": table, "solved": reached})

@@ -29,12 +29,12 @@ _CHECKED = 8
 _REPEATS, _SECONDS = 5, 10.0
 
 
-def rows_of(sizes: Sequence[int], say: Callable[[str], None] = lambda text: None) -> Iterator[Row]:
+def rows_of(sizes: Sequence[int], say: Callable[[str], None]) -> Iterator[Row]:
     """Yield a row for each of `sizes` and each start."""
     config = load(CIC, [])
     machine, base = Scene.from_config(config), np.asarray(config.design, float)
-    draw = np.random.default_rng(0)
-    designs = base * (1 + AWAY * draw.uniform(-1, 1, (max(sizes), *base.shape)))
+    changes = np.random.default_rng(0).uniform(-1, 1, (max(sizes), *base.shape))
+    designs = base * (1 + AWAY * changes)
     solve = solver_of(machine)
     say("compiling for single designs")
     with jax.default_device(jax.devices("cpu")[0]):

@@ -5,7 +5,7 @@ processes on the machine hardly change. The neighbour is a design whose paramete
 fraction."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -34,15 +34,14 @@ def _row(tool: str, seconds: float, found: Any, truth: Any) -> Row:
     return {"tool": tool, "ms": 1e3 * seconds} | errors_of(found, truth)
 
 
-def rows_of(repeats: int, say: Callable[[str], None] = lambda text: None) -> list[Row]:
-    """Measure all tools in the shipped scene; return a row for each.
+def rows_of(repeats: int, say: Callable[[str], None]) -> Iterator[Row]:
+    """Measure all tools in the shipped scene; yield a row for each.
 
     Raises `NoResultError` if a design has no orbit."""
     config = load(CIC)
     own = Evaluator.of(config)
     base = np.asarray(config.design, float)
-    draw = np.random.default_rng(0)
-    design = base * (1 + AWAY * draw.uniform(-1, 1, base.shape))
+    design = base * (1 + AWAY * np.random.default_rng(0).uniform(-1, 1, base.shape))
     say("compiling")
     neighbour = own(base, series=False)
     exact = own.at_tolerance(EXACT)(design, series=False)
@@ -51,22 +50,21 @@ def rows_of(repeats: int, say: Callable[[str], None] = lambda text: None) -> lis
     truth = numbers_of(exact)
     machine = Scene.from_config(config)
     solve, rest = compiled(solver_of(machine)), rest_of(machine, base)
-    rows = []
     for tool, start in (("neighbour", solve(base, rest)[3]), ("from rest", rest)):
         call = functools.partial(solve, design, start)
         seconds, found = processor_time(call, repeats)
-        rows.append(_row(tool, seconds, found[:2], truth))
+        yield _row(tool, seconds, found[:2], truth)
     for tool, start in (("neighbour", neighbour.start), ("from rest", None)):
         say(f"evaluate, {tool}")
         call = functools.partial(own, design, start=start, series=False)
         seconds, found = processor_time(call, repeats)
-        rows.append(_row(f"evaluate, {tool}", seconds, numbers_of(found), truth))
-    return rows + _competitors(config, design, truth, repeats, say)
+        yield _row(f"evaluate, {tool}", seconds, numbers_of(found), truth)
+    yield from _competitors(config, design, truth, repeats, say)
 
 
 def _competitors(
     config: Config, design: Any, truth: Any, repeats: int, say: Callable[[str], None]
-) -> list[Row]:
+) -> Iterator[Row]:
     """Measure SciPy and Numba with central differences."""
     from experiments._common.engines import numba_pair as numba
 
@@ -76,11 +74,9 @@ def _competitors(
         "Numba, differences": numba.NumbaPair(scene, **numba.SEARCH_1E3),
         "Numba, gradient to 1e-3": numba.NumbaPair(scene, **numba.SEARCH_GRADIENT_1E3),
     }
-    rows = []
     for name, tool in tools.items():
         say(name)
         steps, _ = best_steps(tool.forces, design, truth[1])
         call = functools.partial(central_differences, tool.forces, design, steps)
         count = max(1, repeats // 10) if "SciPy" in name else repeats
-        rows.append(_row(name, *processor_time(call, count), truth))
-    return rows
+        yield _row(name, *processor_time(call, count), truth)

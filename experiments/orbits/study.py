@@ -8,11 +8,12 @@ Forces, their derivatives along one direction of design, speed and load, and the
 are compared. If it repeats, but its orbit is not known, the pair is listed.
 """
 
+import contextlib
 import dataclasses
 import functools
+import itertools
 import json
 import os
-import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -91,25 +92,23 @@ def pairs(seed: int, kind: str) -> Iterator[list[str]]:
         longest = 33.0 * np.sin(np.radians(angle)) * (np.pi / 2 / lobes - np.radians(tip))
         length = draw.uniform(0.3, 0.95) * longest
         profile: Row = {"family": family, "lobes": lobes, "pitch_radius_mm": 33.0}
-        if family not in ("ee", "four_arcs"):
-            profile |= {
-                "pressure_angle_deg": round(angle, 2),
-                "involute_length_mm": round(length, 3),
-            }
-        if family in ("cic", "free_form"):
-            profile["tip_arc_angle_deg"] = round(tip, 2)
-        if family == "free_form":  # It follows a CIC profile.
-            near = ProfileConfig.model_validate(profile | {"family": "cic"})
+        flank = {"pressure_angle_deg": round(angle, 2), "involute_length_mm": round(length, 3)}
+        land = {"tip_arc_angle_deg": round(tip, 2)}
+        if family == "arc_involute":
+            profile |= flank
+        elif family == "cic":
+            profile |= flank | land
+        elif family == "free_form":  # It follows a CIC profile.
+            near = ProfileConfig.model_validate(profile | flank | land | {"family": "cic"})
             profile = free_form_of(near, COEFFICIENTS)[0].model_dump(exclude_none=True)
-        if family == "four_arcs":
+        elif family == "four_arcs":
             profile |= {
                 "arc_center_mm": round(draw.uniform(23, 31), 3),
                 "tip_arc_radius_mm": round(draw.uniform(12, 21), 3),
                 "tip_arc_turn_deg": round(draw.uniform(30, 60), 2),
             }
-        if family == "five_arcs":
-            profile = {key: profile[key] for key in ("family", "lobes", "pitch_radius_mm")} | {
-                "tip_arc_angle_deg": round(tip, 2),
+        elif family == "five_arcs":
+            profile |= land | {
                 "outer_radius_mm": round(draw.uniform(43.5, 45.5), 2),
                 "tip_arc_radius_mm": round(draw.uniform(11.5, 13.5), 2),
                 "tip_arc_turn_deg": round(draw.uniform(45, 65), 1),
@@ -118,13 +117,12 @@ def pairs(seed: int, kind: str) -> Iterator[list[str]]:
         torque = draw.uniform(0.8, 5.0) if lively else 10 ** draw.uniform(-0.2, 1.2)
         play = draw.uniform(0.15, 0.4) if lively else draw.uniform(0.02, 0.3)
         damping = draw.uniform(0.05, 0.35) if lively else 10 ** draw.uniform(-1.0, -0.2)
-        stiffness = 10 ** draw.uniform(3.6, 4.8)
         values = {
             "scene.speed_rpm": f"{speed:.1f}",
             "scene.load.torque_N_m": f"{torque:.3f}",
             "scene.timing_gear.backlash_mm": f"{play:.3f}",
             "scene.timing_gear.damping_ratio": f"{damping:.3f}",
-            "scene.timing_gear.stiffness_N_m_per_rad": f"{stiffness:.0f}",
+            "scene.timing_gear.stiffness_N_m_per_rad": f"{10 ** draw.uniform(3.6, 4.8):.0f}",
         }
         if "scene.load" in "".join(fixed):
             values.pop("scene.load.torque_N_m")
@@ -166,8 +164,8 @@ def row_of(kind: str, overrides: list[str]) -> Row:
     config = load(CIC, overrides)
     check_geometry(config)
     family, lobes, fixed = KINDS[kind]
-    solve = _solver((family, lobes, *fixed))
-    return {"kind": kind, "scene": " ".join(overrides)} | compared(config, solve)
+    row = {"kind": kind, "scene": " ".join(overrides)}
+    return row | compared(config, _solver((family, lobes, *fixed)))
 
 
 def compared(config: Config, solve: Callable[..., Any] | None = None) -> Row:
@@ -176,14 +174,8 @@ def compared(config: Config, solve: Callable[..., Any] | None = None) -> Row:
     `solve`: result of `_solver`, absent if no other config shares it."""
     solve = _solver.__wrapped__(()) if solve is None else solve
     scene, design = Scene.from_config(config), design_vector(config)
-    jax.block_until_ready(solve(scene, design))
-    began = time.perf_counter()
-    slopes, found = jax.block_until_ready(solve(scene, design))
-    row: Row = {
-        "seconds": time.perf_counter() - began,
-        "status": Status.of(int(found.status)).label,
-        "period": int(found.period),
-    }
+    slopes, found = solve(scene, design)
+    row: Row = {"status": Status.of(int(found.status)).label, "period": int(found.period)}
     if row["status"] != "periodic":
         return row
     here = _pair(scene, design, jnp.zeros(()))
@@ -203,21 +195,17 @@ def compared(config: Config, solve: Callable[..., Any] | None = None) -> Row:
 
 
 def run(job: Run) -> bool:
-    """Compare orbits, or time them (`--speed`, `--batches`).
-
-    Returns whether the forces agree, or whether all tools have a time."""
-    if job.options.speed:
+    """Compare orbits, or time them (`--speed`, `--batches`); return whether the forces agree."""
+    if job.options.speed or job.options.batches:
         return timed(job)
-    if job.options.batches:
-        return batched(job)
     rows = differences_of(job)
     periodic = [row for row in rows if row["status"] == "periodic"]
     names = [f"{name}_{what}" for what in ("difference", "gradient_difference") for name in FORCES]
     table = []
     for name in [*names, "multiplier_difference"]:
         # The noise of the differences that give a gradient is no error of the gradient.
-        noise = name.replace("gradient_difference", "gradient_noise")
-        off = [max(row[name] - (row[noise] if noise != name else 0.0), 0.0) for row in periodic]
+        noise = name.replace("difference", "noise")
+        off = [max(row[name] - row.get(noise, 0.0), 0.0) for row in periodic]
         table.append({"of": name, "median": float(np.median(off)), "greatest": max(off)})
     show(f"{len(periodic)} orbits by collocation and by shooting", table)
     for row in rows:
@@ -236,40 +224,34 @@ def differences_of(job: Run) -> list[Row]:
     rows: list[Row] = []
     for kind in kinds:
         done = 0
-        for number, overrides in enumerate(pairs(job.options.seed, kind)):
-            if done >= each or number >= PATIENCE * each:
-                break
-            try:
+        for overrides in itertools.islice(pairs(job.options.seed, kind), PATIENCE * each):
+            with contextlib.suppress(InputError):  # The drawn profile is not sound.
                 row = row_of(kind, overrides)
-            except InputError:  # The drawn profile is not sound.
-                continue
-            if row["status"] in ("periodic", *LEFT):
-                done += row["status"] == "periodic"
-                rows.append(row)
-                job.csv("orbits.csv", rows)
-            job.say(f"{kind}: {done} of {each}")
+                if row["status"] in ("periodic", *LEFT):
+                    done += row["status"] == "periodic"
+                    rows.append(row)
+                    job.csv("orbits.csv", rows)
+                job.say(f"{kind}: {done} of {each}")
+            if done >= each:
+                break
     return rows
 
 
 def timed(job: Run) -> bool:
-    """Time an orbit from a neighbour's on one core; write and print a row for each tool."""
-    if hasattr(os, "sched_setaffinity"):  # before JAX starts its threads
+    """Time batches of designs, or with `--speed` an orbit from a neighbour's on one core.
+
+    Writes and prints a row for each size and start, or for each tool. Returns whether the forces of
+    the batches agree with those of single designs."""
+    one_core = job.options.speed
+    if one_core and hasattr(os, "sched_setaffinity"):  # before JAX starts its threads
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
-    from experiments.orbits import speed
+    from experiments.orbits import batches, speed
 
-    rows = speed.rows_of(3 if job.quick else 20, job.say)
-    job.csv("speed.csv", rows)
-    show("Value and gradient", rows)
-    return True
-
-
-def batched(job: Run) -> bool:
-    """Time batches of designs; write and print a row for each size and start."""
-    from experiments.orbits import batches
-
+    sizes = batches.SIZES[: 1 if job.quick else None]
+    repeats = 3 if job.quick else 20
     rows: list[Row] = []
-    for row in batches.rows_of(batches.SIZES[: 1 if job.quick else None], job.say):
+    for row in speed.rows_of(repeats, job.say) if one_core else batches.rows_of(sizes, job.say):
         rows.append(row)
-        job.csv("batches.csv", rows)
-    show("Batches of designs", rows)
-    return all(row["value_error"] <= AGREE for row in rows)
+        job.csv("speed.csv" if one_core else "batches.csv", rows)
+    show("Value and gradient", rows)
+    return one_core or all(row["value_error"] <= AGREE for row in rows)

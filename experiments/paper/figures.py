@@ -16,10 +16,7 @@ MARKS = "os^Dvp"
 def force_figures(found: Response) -> tuple[Figure, Figure]:
     """Draw the contact force over time and over frequency, EE above CIC as in the paper."""
     series, responses = {}, {}
-    for family in ("ee", "cic"):
-        number = FAMILIES.index(family)
-        one = found.evaluations[number]
-        mean, peak = PAPER[number]
+    for family, one, (mean, peak) in [*zip(FAMILIES, found.evaluations, PAPER, strict=True)][::-1]:
         title = f"{family.upper()}; the paper: mean {mean:.1f} N, maximum {peak:.1f} N"
         series[title], responses[title] = one.series, one.response
     over_time, axes = sheet(10, 6, 2)
@@ -27,8 +24,7 @@ def force_figures(found: Response) -> tuple[Figure, Figure]:
     over_frequency, axes = sheet(10, 6, 2)
     series = {title.split(";")[0]: run for title, run in series.items()}
     config = config_of("cic")
-    frequency = config.scene.speed_rpm / 60 * config.profile.lobes
-    plot_spectrum(axes[:, 0], series, frequency)
+    plot_spectrum(axes[:, 0], series, config.scene.speed_rpm / 60 * config.profile.lobes)
     return over_time, over_frequency
 
 
@@ -41,9 +37,8 @@ def uniqueness_figure(alone: list[Row], solved: list[Row]) -> Figure:
             own = [row for row in rows if row["changed"] == quantity.key]
             own = [(100 * row["change"], 100 * row["misfit"]) for row in own]
             change, misfit = np.array(sorted([*own, (0.0, LOWEST)])).T
-            label = quantity.label.split(" (")[0]
-            shown = np.clip(misfit, LOWEST, HIGHEST)
-            ax.plot(change, shown, marker=mark, color=color, label=label, clip_on=False)
+            style = {"marker": mark, "color": color, "label": quantity.label}
+            ax.plot(change, np.clip(misfit, LOWEST, HIGHEST), clip_on=False, **style)
         ax.axhline(10, color="black", linestyle="--", linewidth=1)
         ax.set(
             xlabel="change of the quantity (%)", title=title, yscale="log", ylim=(LOWEST, HIGHEST)

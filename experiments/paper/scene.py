@@ -12,37 +12,35 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from experiments._common.scenes import FORCES, shipped
-from experiments._common.simulation import evaluator_of
+from experiments._common.simulation import evaluator_of, numbers_of
 from rootsopt.config import Config
 from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.response.sensitivity import by_scene
-from rootsopt.status import Status
 
 
 @dataclasses.dataclass(frozen=True)
 class Quantity:
     """A quantity that the paper does not state.
 
-    Fields: its key in the config, the plausible range in the config's unit, whether it is searched
-    on a logarithmic scale, and its name in figures.
+    Fields: its key in the config, the plausible range in the config's unit, its name in figures.
     """
 
     key: str
     low: float
     high: float
-    logarithmic: bool
     label: str
 
 
 # The p quantities, in the order of all vectors of values (p,). docs/paper.md explains the ranges.
 QUANTITIES = (
-    Quantity("rotor.length_mm", 30.0, 400.0, False, "rotor length (mm)"),
-    Quantity("scene.load.torque_N_m", 0.2, 9.55, False, "load torque (N·m)"),
-    Quantity("scene.timing_gear.stiffness_N_m_per_rad", 1e3, 1e6, True, "gear stiffness (N·m/rad)"),
-    Quantity("scene.timing_gear.damping_ratio", 0.01, 1.0, True, "gear damping ratio"),
-    Quantity("scene.timing_gear.backlash_mm", 0.02, 1.5, True, "gear backlash (mm)"),
-    Quantity("contact.clearance_mm", 0.005, 0.5, True, "flank clearance (mm)"),
+    Quantity("rotor.length_mm", 30.0, 400.0, "rotor length"),
+    Quantity("scene.load.torque_N_m", 0.2, 9.55, "load torque"),
+    Quantity("scene.timing_gear.stiffness_N_m_per_rad", 1e3, 1e6, "gear stiffness"),
+    Quantity("scene.timing_gear.damping_ratio", 0.01, 1.0, "gear damping ratio"),
+    Quantity("scene.timing_gear.backlash_mm", 0.02, 1.5, "gear backlash"),
+    Quantity("contact.clearance_mm", 0.005, 0.5, "flank clearance"),
 )
+LOW, HIGH = np.array([(quantity.low, quantity.high) for quantity in QUANTITIES]).T
 FAMILIES = ("cic", "ee")
 
 # Mean and maximum contact force (N), a row per pair (`FAMILIES`), from the paper's section 4.
@@ -63,11 +61,6 @@ def config_of(family: str, values: ArrayLike | None = None, *overrides: str) -> 
     return config.replaced(dict(zip(keys, np.asarray(values, float).tolist(), strict=True)))
 
 
-def values_of(config: Config) -> NDArray[np.float64]:
-    """Read the values (p,) of the quantities from a config, in its units."""
-    return np.array([config.value(quantity.key) for quantity in QUANTITIES], float)
-
-
 @dataclasses.dataclass(frozen=True)
 class Response:
     """Response of both pairs with one set of `values` (p,).
@@ -78,31 +71,19 @@ class Response:
     """
 
     values: NDArray[np.float64]
-    evaluations: tuple[Evaluation, Evaluation]
+    evaluations: tuple[Evaluation, ...]
     slopes: NDArray[np.float64] | None
 
     @property
     def forces(self) -> NDArray[np.float64]:
         """Mean and peak force (N) by pair (2, 2), NaN if unknown."""
-        return np.array(
-            [[one.response.get(name, np.nan) for name in FORCES] for one in self.evaluations]
-        )
+        return np.array([numbers_of(one)[0] for one in self.evaluations])
 
     @property
     def misfit(self) -> float:
         """Largest relative difference from the paper's forces; infinite without forces."""
         worst = np.max(np.abs(self.forces / PAPER - 1))
         return float(worst) if np.isfinite(worst) else np.inf
-
-    @property
-    def periods(self) -> tuple[int, ...]:
-        """Number of mesh periods after which the motion of each pair repeats; 0: no repetition."""
-        return tuple(int(one.steady_state.get("period", 0)) for one in self.evaluations)
-
-    @property
-    def usable(self) -> bool:
-        """Whether both motions are stable periodic orbits."""
-        return all(one.status is Status.PERIODIC for one in self.evaluations)
 
 
 def respond(
@@ -116,12 +97,12 @@ def respond(
     evaluations, rows = [], []
     for family in FAMILIES:
         evaluator = evaluator_of(config_of(family, values), give_up_early)
-        evaluations.append(evaluator(series=series))
-        usable = slopes and evaluations[-1].usable
-        rows.append(_slopes(evaluator, evaluations[-1], values) if usable else None)
-    first, second = evaluations
-    complete = not any(row is None for row in rows)
-    return Response(values, (first, second), np.array(rows) if complete else None)
+        one = evaluator(series=series)
+        row = _slopes(evaluator, one, values) if slopes and one.usable else None
+        evaluations.append(one)
+        rows += [] if row is None else [row]
+    known = np.array(rows) if len(rows) == len(FAMILIES) else None
+    return Response(values, tuple(evaluations), known)
 
 
 def _slopes(evaluator: Evaluator, one: Evaluation, values) -> NDArray[np.float64] | None:
@@ -132,8 +113,7 @@ def _slopes(evaluator: Evaluator, one: Evaluation, values) -> NDArray[np.float64
     if found is None:
         return None
     rows = [[found.gradient[name][q.key] for q in QUANTITIES] for name in FORCES]
-    forces = np.array([one.response[name] for name in FORCES])
-    return np.array(rows) * values / forces[:, None]
+    return np.array(rows) * values / numbers_of(one)[0][:, None]
 
 
 def polished(
@@ -141,9 +121,8 @@ def polished(
     held: Sequence[int] = (),
     within: float = 1e-4,
     steps: int = 12,
-    target: NDArray[np.float64] = PAPER,
 ) -> Response:
-    """Solve for the values nearest to `values` (p,) that give the `target` forces (2, 2) in N.
+    """Solve for the values nearest to `values` (p,) that give the paper's forces.
 
     `held`: indices of quantities that do not change. The method is Gauss-Newton steps of minimum
     length in the logarithms. A step is halved until the misfit falls and both motions, from rest,
@@ -151,21 +130,20 @@ def polished(
     the best response found, inside the plausible ranges.
     """
     free = [i for i in range(len(QUANTITIES)) if i not in held]
-    low, high = (np.log([getattr(q, end) for q in QUANTITIES]) for end in ("low", "high"))
+    low, high = np.log(LOW), np.log(HIGH)
     best = respond(values)
     for _ in range(steps):
         if best.slopes is None or best.misfit <= within:
             break
-        wanted = np.log(target / best.forces).ravel()
+        slopes, wanted = best.slopes.reshape(4, -1), np.log(PAPER / best.forces).ravel()
         place = np.log(best.values)
-        step = _least_step(best.slopes.reshape(4, -1), wanted, free)
+        step = _least_step(slopes, wanted, free)
         # Keep a quantity at an end of its range if the step would leave the range.
         inside = [i for i in free if low[i] < place[i] + step[i] * 1e-3 < high[i]]
-        step = _least_step(best.slopes.reshape(4, -1), wanted, inside)
+        step = _least_step(slopes, wanted, inside)
         step *= min(1.0, _NEAR / max(np.max(np.abs(step)), 1e-12))
         for _ in range(5):
-            at = np.clip(place + step, low, high)
-            tried = respond(np.exp(at))
+            tried = respond(np.exp(np.clip(place + step, low, high)))
             if tried.slopes is not None and tried.misfit < best.misfit:
                 break
             step /= 2
@@ -188,8 +166,7 @@ def compensated(
     flat = slopes.reshape(-1, len(values))
     step = _least_step(flat, -flat[:, number] * np.log(factor), others)
     step[number] = np.log(factor)
-    low, high = ([getattr(q, end) for q in QUANTITIES] for end in ("low", "high"))
-    return np.clip(values * np.exp(step), low, high)
+    return np.clip(values * np.exp(step), LOW, HIGH)
 
 
 def _least_step(slopes, wanted, free: Sequence[int]) -> NDArray[np.float64]:

@@ -7,7 +7,8 @@ and applies other definitions of mean and maximum. It changes each quantity alon
 others solved for again. `search` searches for other values in the box of plausible ones.
 """
 
-from collections.abc import Callable, Sequence
+import itertools
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -27,7 +28,6 @@ from experiments.paper.scene import (
     config_of,
     polished,
     respond,
-    values_of,
 )
 from rootsopt.dynamics.window import PERIODS
 from rootsopt.identification.fit import identify
@@ -73,20 +73,18 @@ STARTS = 8
 Say = Callable[[str], None]
 
 
-def motions(values: ArrayLike) -> list[Row]:
-    """Find the coexisting motions with these values; return a row per motion."""
-    rows = []
+def motions(values: ArrayLike) -> Iterator[Row]:
+    """Find the coexisting motions with these values; yield a row per motion."""
     for family in FAMILIES:
         found = attractors.find(evaluator_of(config_of(family, values, *GRID)))
-        rows += [{"pair": family} | row for row in found.summary()]
-        rows += [{"pair": family, "status": k, "share": v} for k, v in found.lost.items()]
-    return rows
+        lost = ({"status": k, "share": v} for k, v in found.lost.items())
+        yield from ({"pair": family} | row for row in (*found.summary(), *lost))
 
 
-def definitions(values: ArrayLike) -> list[Row]:
+def definitions(values: ArrayLike) -> Iterator[Row]:
     """Apply definitions of mean and maximum to one motion from rest, with and without start-up.
 
-    Returns a row per window and sampling rate.
+    Yields a row per window and sampling rate.
     """
     runs = []
     for family in FAMILIES:
@@ -98,41 +96,32 @@ def definitions(values: ArrayLike) -> list[Row]:
         *_, series = unsettled(pair, status, window, series=True)
         assert series is not None
         runs.append(series)
-    rows = []
-    for begin, end in WINDOWS:
-        for thinning in THINNINGS:
-            forces = []
-            for run in runs:
-                inside = (run.time >= begin) & (run.time < end)
-                force = run.force[inside][::thinning]
-                forces.append([np.mean(force), np.max(force)])
-            rate = 1 / (thinning * (runs[0].time[1] - runs[0].time[0]))
-            row: dict[str, Any] = {"begin_s": begin, "end_s": end, "rate_Hz": rate}
-            for family, (mean, peak) in zip(FAMILIES, forces, strict=True):
-                row |= {f"{family}_mean_force_N": mean, f"{family}_max_force_N": peak}
-            rows.append(row | {"misfit": np.max(np.abs(np.array(forces) / PAPER - 1))})
-    return rows
+    for (begin, end), thinning in itertools.product(WINDOWS, THINNINGS):
+        rate = 1 / (thinning * (runs[0].time[1] - runs[0].time[0]))
+        row: Row = {"begin_s": begin, "end_s": end, "rate_Hz": rate, "misfit": 0.0}
+        for family, run, paper in zip(FAMILIES, runs, PAPER, strict=True):
+            force = run.force[(run.time >= begin) & (run.time < end)][::thinning]
+            own = np.array([np.mean(force), np.max(force)])
+            row |= dict(zip((f"{family}_mean_force_N", f"{family}_max_force_N"), own, strict=True))
+            row["misfit"] = np.maximum(row["misfit"], np.max(np.abs(own / paper - 1)))
+        yield row
 
 
-def slices(values: np.ndarray, changes: Sequence[float], say: Say) -> list[Row]:
-    """Change each quantity alone by the relative `changes`; return a row per change."""
-    rows = []
-    for number, quantity in enumerate(QUANTITIES):
+def slices(values: np.ndarray, changes: Sequence[float], say: Say) -> Iterator[Row]:
+    """Change each quantity alone by the relative `changes`; yield a row per change."""
+    for quantity, unit in zip(QUANTITIES, np.eye(len(QUANTITIES)), strict=True):
         for change in changes:
-            at = values * (1 + change * (np.arange(len(QUANTITIES)) == number))
             row = {"changed": quantity.key, "change": change}
-            rows.append(row | row_of(respond(at, slopes=False)))
+            yield row | row_of(respond(values * (1 + change * unit), slopes=False))
         say(f"{quantity.key} changed alone")
-    return rows
 
 
-def profile(found: Response, say: Say) -> list[Row]:
+def profile(found: Response, say: Say) -> Iterator[Row]:
     """Move each quantity away from its value, and solve for the other quantities again.
 
     Each solution starts from the last solution. A quantity moves by factors of 1 ± `STEP`, at most
-    `COUNT` times in each direction, until the misfit stays above `LIMIT`. Returns a row per point.
+    `COUNT` times in each direction, until the misfit stays above `LIMIT`. Yields a row per point.
     """
-    rows = []
     for number, quantity in enumerate(QUANTITIES):
         for factor in (1 / (1 + STEP), 1 + STEP):
             last = found
@@ -143,22 +132,21 @@ def profile(found: Response, say: Say) -> list[Row]:
                 guess = compensated(last.values, last.slopes, number, factor)
                 last = polished(guess, held=[number], within=WITHIN, steps=4)
                 change = last.values[number] / found.values[number] - 1
-                rows.append({"changed": quantity.key, "change": change} | row_of(last))
+                yield {"changed": quantity.key, "change": change} | row_of(last)
                 if last.misfit > LIMIT:
                     break
         say(f"{quantity.key} changed, the others solved for again")
-    return rows
 
 
 def row_of(response: Response) -> Row:
     """Return a row with values, forces, periods and misfit of a response."""
     row: Row = {q.key: v for q, v in zip(QUANTITIES, response.values, strict=True)}
-    for family, (mean, peak), period, one in zip(
-        FAMILIES, response.forces, response.periods, response.evaluations, strict=True
+    for family, (mean, peak), one in zip(
+        FAMILIES, response.forces, response.evaluations, strict=True
     ):
         row |= {
             f"{family}_status": one.status.label,
-            f"{family}_period": period,
+            f"{family}_period": int(one.steady_state.get("period", 0)),
             f"{family}_multiplier": one.steady_state.get("floquet_multiplier"),
             f"{family}_mean_force_N": mean,
             f"{family}_peak_force_N": peak,
@@ -179,16 +167,17 @@ def reproduce(job: Run) -> bool:
     """
     from experiments.paper import figures
 
-    values = values_of(config_of("cic"))
+    values = [config_of("cic").value(quantity.key) for quantity in QUANTITIES]
     found = respond(values, not job.quick, series=True, give_up_early=False)
-    if not found.usable:
+    if not all(one.status is Status.PERIODIC for one in found.evaluations):
         raise NoResultError("the shipped values must give two periodic motions, but do not")
     responses = {"shipped": found}
-    tables = {"slices": slices(found.values, CHANGES[job.quick], job.say)}
+    tables = {"slices": [*slices(found.values, CHANGES[job.quick], job.say)]}
     if not job.quick:
         responses |= {name: polished(start) for name, start in OTHERS.items()}
-        tables["motions"], tables["definitions"] = motions(found.values), definitions(found.values)
-        tables["profile"] = profile(found, job.say)
+        tables["motions"] = [*motions(found.values)]
+        tables["definitions"] = [*definitions(found.values)]
+        tables["profile"] = [*profile(found, job.say)]
     record: dict[str, Any] = {name: row_of(one) for name, one in responses.items()}
     if found.slopes is not None:
         singular = np.linalg.svd(found.slopes.reshape(4, -1))
@@ -198,10 +187,9 @@ def reproduce(job: Run) -> bool:
         job.csv(f"paper_{name}.csv", rows)
     job.csv("paper.csv", [row_of(found)])
     job.json("paper.json", record)
-    for name, made in zip(("force", "spectrum"), figures.force_figures(found), strict=True):
-        job.figure(f"paper_{name}.png", made)
     made = figures.uniqueness_figure(tables["slices"], tables.get("profile", []))
-    job.figure("paper_uniqueness.png", made)
+    for name, one in zip(job.published, (*figures.force_figures(found), made), strict=True):
+        job.figure(name, one)
     show("Values, forces and motions", [{"": k} | row_of(one) for k, one in responses.items()])
     return True
 
@@ -212,21 +200,20 @@ def search(job: Run) -> bool:
     It begins at the shipped values. A reduced run makes one local fit. Returns whether some values
     give all four forces within the relative error `TARGET`."""
     seed, least = job.options.seed, job.options.least_clearance
-    *others, clearance = QUANTITIES
-    bounds = {q.key: (q.low, q.high) for q in others}
-    bounds[clearance.key] = least or clearance.low, clearance.high
+    bounds = {q.key: (q.low, q.high) for q in QUANTITIES}
+    bounds[QUANTITIES[-1].key] = least or QUANTITIES[-1].low, QUANTITIES[-1].high
     config = config_of("cic")
-    record: dict[str, Any] = {"profile.family": [*FAMILIES]}
-    record |= {f"profile.{key}": [x, None] for key, x in config.profile.parameters.items()}
-    record |= {name: PAPER[:, k] for k, name in enumerate(FORCES)}
+    record = {
+        "profile.family": [*FAMILIES],
+        **{f"profile.{key}": [x, None] for key, x in config.profile.parameters.items()},
+        **dict(zip(FORCES, PAPER.T, strict=True)),
+    }
     found = identify(
         config, record, bounds, starts=1 if job.quick else STARTS, seed=seed, progress=job.say
     )
-    rows: list[Row] = []
-    if found.parameters:
-        best = {key: one["value"] for key, one in found.parameters.items()}
-        rows = [{"misfit": found.fit["relative_misfit"]} | best]
-        rows += [{"misfit": one["relative_misfit"]} | one["values"] for one in found.optima]
+    best = {key: one["value"] for key, one in found.parameters.items()}
+    rows = [{"misfit": found.fit["relative_misfit"]} | best] if best else []
+    rows += [{"misfit": one["relative_misfit"]} | one["values"] for one in found.optima]
     job.json("paper_search.json", {"seed": seed, "solved": rows} | found.record())
     show("Values that give the paper's forces", rows)
     return any(row["misfit"] <= TARGET for row in rows)

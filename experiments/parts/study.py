@@ -52,7 +52,7 @@ def right_hand_side(config: Config, calls: int) -> dict[str, float]:
 
     work = functools.partial(many, pair, jnp.full(pair.states, 0.05))
     ready(work())
-    times = times_of(lambda: ready(work()), 5)
+    times, _ = times_of(lambda: ready(work()), 5)
     return {"states": pair.states, "rhs_us": 1e6 * min(times) / calls}
 
 

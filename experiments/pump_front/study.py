@@ -6,7 +6,7 @@ displacement. Every design displaces at least the volume of the EE rotor. Area e
 width have no limits: displacement and leakage take their place.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -55,7 +55,7 @@ def config_of(family: str, divisions: int = DIVISIONS) -> Config:
     values = {
         key: [*v] if isinstance(v, tuple) else v for key, v in family_of(family).example.items()
     }
-    profile = {"family": family, "lobes": 3, "pitch_radius_mm": 33.0} | values
+    profile = {"family": family, "lobes": 3, "pitch_radius_mm": 33.0, **values}
     return load(FAIR, [f"profile={profile!r}", *_PUMP, f"pareto.divisions={divisions}"])
 
 
@@ -64,32 +64,34 @@ def row_of(config: Config, terms: dict[str, float], geometry_of: dict[str, float
 
     `terms`, `geometry_of`: its terms, and its geometry with the keys of the result file."""
     found = pump_sheet(Scene.from_config(config), design_vector(config))
-    shape = {key: geometry_of[key] for key in ("area_efficiency", "seal_width_mm")}
-    ratio = geometry_of["outer_radius_mm"] / config.profile.pitch_radius_mm
-    return (
-        terms
-        | {"displaced_volume_cm3": found["displaced_volume_cm3"], "radius_ratio": ratio}
-        | shape
-    )
+    return {
+        **terms,
+        "displaced_volume_cm3": found["displaced_volume_cm3"],
+        "radius_ratio": geometry_of["outer_radius_mm"] / config.profile.pitch_radius_mm,
+        **{key: geometry_of[key] for key in ("area_efficiency", "seal_width_mm")},
+    }
 
 
-def front_of(family: str, volume: float, divisions: int, say: Callable[[str], None]) -> list[Row]:
-    """Return the rows of the best compromises of a `family`.
+def front_of(
+    family: str, volume: float, divisions: int, say: Callable[[str], None]
+) -> Iterator[Row]:
+    """Yield the rows of the best compromises of a `family`; none if it cannot displace the volume.
 
-    `volume`: least volume (cm³) displaced per revolution; `say`: function that reports progress.
-    The list is empty for a family that cannot displace it."""
+    `volume`: least volume (cm³) displaced per revolution; `say`: function that reports progress."""
     config = config_of(family, divisions).replaced(
         {"constraints.terms": {"displaced_volume_cm3": {"min": volume}}}
     )
     front = pareto_front(config)
     say(f"{family}: {front.searches} searches, {front.evaluations} designs. {front.message}")
-    rows = []
     for point in front.points:
-        one = front.config_of(point)
-        peak = {"peak_force_N": point.evaluation.response["peak_force_N"]}
-        row = {"family": family, "point": point.number, "status": point.standing.label}
-        rows.append(row | row_of(one, point.terms, point.evaluation.geometry) | peak | point.design)
-    return rows
+        yield {
+            "family": family,
+            "point": point.number,
+            "status": point.standing.label,
+            **row_of(front.config_of(point), point.terms, point.evaluation.geometry),
+            "peak_force_N": point.evaluation.response["peak_force_N"],
+            **point.design,
+        }
 
 
 def reference() -> Row:
@@ -132,24 +134,23 @@ def fronts(rows: list[Row]) -> Figure:
     The last panel shows that outer radius and area efficiency fix the ripple."""
     made, axes = sheet(11, 8.6, 2, 2)
     families = [*dict.fromkeys(row["family"] for row in rows if row["family"] != REFERENCE)]
-    styles = {name: (COLORS[k % 6], MARKS[k % 7]) for k, name in enumerate(families)}
-    styles[REFERENCE] = BLACK, "*"
+    styles = {name: (COLORS[k % 6], MARKS[k % 7], 6) for k, name in enumerate(families)}
+    styles[REFERENCE] = BLACK, "*", 11
     for ax, (x, y) in zip(axes.ravel(), _PANELS, strict=True):
         for row in rows:
-            color, mark = styles[row["family"]]
+            color, mark, size = styles[row["family"]]
             at = [_LABELS[key][1] * row[key] for key in (x, y)]
             fill = color if row["best_of_all"] else "none"
-            size = 11 if row["family"] == REFERENCE else 6
             ax.plot(*at, mark, color=color, markerfacecolor=fill, ms=size, zorder=3)
         ax.set(xlabel=_LABELS[x][0], ylabel=_LABELS[y][0])
     _iso_efficiency(axes[1, 1])
-    entries = [
-        Line2D([], [], color=color, marker=mark, linestyle="", label=name.replace("_", " "))
-        for name, (color, mark) in styles.items()
-    ]
     plain: dict[str, Any] = {"color": GREY, "marker": "o", "linestyle": ""}
-    entries.append(Line2D([], [], label="best of all families", **plain))
-    entries.append(Line2D([], [], label="best of its family", markerfacecolor="none", **plain))
+    entries = [
+        *(Line2D([], [], color=color, marker=mark, linestyle="", label=name.replace("_", " "))
+          for name, (color, mark, _) in styles.items()),
+        Line2D([], [], label="best of all families", **plain),
+        Line2D([], [], label="best of its family", markerfacecolor="none", **plain),
+    ]  # fmt: skip
     made.legend(handles=entries, loc="outside lower center", ncols=6, frameon=False)
     return made
 

@@ -7,13 +7,13 @@ sensitivities and the standard deviation of each key.
 """
 
 import math
-from typing import Any
+from collections.abc import Iterator
 
 import numpy as np
 
 from experiments._common.driver import Run
 from experiments._common.scenes import FAIR, FORCES
-from experiments._common.tables import show
+from experiments._common.tables import Row, show
 from rootsopt.config import Config, load
 from rootsopt.optimize.design import optimize_design
 from rootsopt.optimize.outcome import Optimization
@@ -50,24 +50,21 @@ QUICK = (
 )
 
 
-def rows_of(result: Optimization, robustness: Robustness) -> list[dict[str, Any]]:
-    """Return a row for each design: its parameters, and statistics over the fresh scenes."""
+def rows_of(result: Optimization, robustness: Robustness) -> Iterator[Row]:
+    """Yield a row for each design: its parameters, and statistics over the fresh scenes."""
     nominal = robustness.nominal.optimized
     known = {"baseline": result.baseline, "nominal": nominal, "robust": result.optimized}
-    rows = []
     for name, one in robustness.fresh.items():
         evaluation = known[name]
         assert evaluation is not None
-        row: dict[str, Any] = {"design": name, **evaluation.design}
-        row["robust_objective"] = one.combined
+        row = {"design": name, **evaluation.design, "robust_objective": one.combined}
         for force in ("objective", *FORCES):
             statistics = one.statistics(force)
             row |= {f"{force}_{key}": statistics[key] for key in STATISTICS}
-        rows.append(row | {"failed_share": float(np.mean(~one.usable))})
-    return rows
+        yield row | {"failed_share": float(np.mean(~one.usable))}
 
 
-def linear_of(config: Config, robustness: Robustness) -> list[dict[str, Any]]:
+def linear_of(config: Config, robustness: Robustness) -> list[Row]:
     """Return the standard deviation of each force of the nominal optimum, by key and in total.
 
     To first order, it is |derivative| times the standard deviation of the key. The total is the
@@ -77,7 +74,7 @@ def linear_of(config: Config, robustness: Robustness) -> list[dict[str, Any]]:
     by_key = {} if optimality is None else {row["key"]: row for row in optimality.sensitivities}
     if not all(scatter.key in by_key for scatter in config.scatters):
         return []
-    rows: list[dict[str, Any]] = []
+    rows: list[Row] = []
     for scatter in config.scatters:
         row, width = by_key[scatter.key], scatter.width * DEVIATIONS[scatter.kind]
         parts = {force: abs(row[force] / row["step"]) * width for force in FORCES}
@@ -98,7 +95,7 @@ def run(job: Run) -> bool:
     robustness = result.robustness
     assert robustness is not None
     job.say(result.status.label)
-    rows, linear = rows_of(result, robustness), linear_of(config, robustness)
+    rows, linear = [*rows_of(result, robustness)], linear_of(config, robustness)
     columns = dict(robustness.scenes)
     for name, one in robustness.fresh.items():
         columns |= {f"{name}_{force}": one.values[force] for force in FORCES}

@@ -9,6 +9,7 @@ degree.
 import itertools
 
 import numpy as np
+from matplotlib.artist import setp
 from matplotlib.figure import Figure
 
 from experiments._common.driver import Run
@@ -71,12 +72,10 @@ def over_twist(rows: list[Row]) -> Figure:
             values = [np.nan if row[key] is None else factor * row[key] for row in own]
             twists = [row["twist_deg"] for row in own]
             ax.plot(twists, values, color=color, marker=mark, ms=4, label=f"{lobes} lobes")
-        ax.set_ylabel(label)
-        ax.set_ylim(bottom=0)
-    for ax in axes[-1]:
-        ax.set_xlabel("twist over the length (°)")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
+        ax.set(ylabel=label, ylim=(0, None))
+    setp(axes[-1], xlabel="twist over the length (°)")
+    entries = axes[0, 0].get_legend_handles_labels()
+    figure.legend(*entries, loc="outside lower center", ncols=3, frameon=False)
     return figure
 
 

@@ -215,13 +215,14 @@ def best_steps(
     """Return the steps of the central differences, `FD_STEPS` or thrice those, that err less.
 
     `truth` (n, d): the gradients of the forces. The second result is the factor, 1 or 3."""
-    tried = []
-    for factor in (1.0, 3.0):
-        steps = [factor * step for step in FD_STEPS]
-        off = np.abs(central_differences(forces, design, steps)[1] - truth).max(axis=1)
-        tried.append((float(np.max(off / np.abs(truth).max(axis=1))), factor, steps))
-    _, factor, steps = min(tried)
-    return steps, factor
+    choices = {factor: [factor * step for step in FD_STEPS] for factor in (1.0, 3.0)}
+
+    def error(factor: float) -> float:
+        off = np.abs(central_differences(forces, design, choices[factor])[1] - truth)
+        return float(np.max(off.max(axis=1) / np.abs(truth).max(axis=1)))
+
+    factor = min(choices, key=error)
+    return choices[factor], factor
 
 
 # The contact law and the rounded ends of the backlash

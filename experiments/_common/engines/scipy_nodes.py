@@ -1,7 +1,7 @@
 """SciPy's `solve_ivp` with a node-to-segment contact in NumPy (competitor a).
 
 Contact is the paper's Eq. 9: nodes of rotor 1's flank against segments of the mating flank of
-rotor 2. Segments are straight, or bulge with the flank's curvature, which is as fast and far more
+rotor 2. Segments bulge with the flank's curvature, which is as fast as straight ones and far more
 accurate. Only one flank pair can touch at a pose. The search covers a window around the last
 contact; a coarse search along the whole flank finds a contact elsewhere. Gradients are central
 differences. `rootsopt.contact.closest` defines poses and signs. Points are complex numbers.
@@ -153,20 +153,19 @@ def _segments(corners: NDArray[np.complex128], curved: bool) -> _Segments:
 class NodeContact:
     """Gap between a flank of rotor 1 and the mating flank of rotor 2, each of about `nodes` nodes.
 
-    If `curved`, the segments bulge by the flank's curvature, and the deepest point is the vertex of
-    the parabola through three nodes: the gap is more accurate and smoother. Otherwise segments are
-    straight and the gap is that of the deepest node, as in Eq. 9.
+    Eq. 9 has straight segments and takes the gap of the deepest node. Here segments bulge by the
+    flank's curvature, and the deepest point is the vertex of the parabola through three nodes: the
+    gap is more accurate and smoother.
     """
 
-    def __init__(self, rotor: Rotor, nodes: int, curved: bool = True):
-        self.curved = curved
+    def __init__(self, rotor: Rotor, nodes: int):
         self.rotor = rotor
         flank = _flank(rotor, nodes)
         # Rotor 1 or rotor 2 may touch with the end of its tip land, never with its root land.
         self.land = round(nodes * rotor.land_end)
         turns = np.linspace(0, rotor.land_end, self.land, endpoint=False)
         self.points = np.concatenate([abs(flank[0]) * np.exp(1j * turns), flank])
-        self.segments = _segments(self.points[::-1], curved)
+        self.segments = _segments(self.points[::-1], True)
         self.stride = max(len(self.points) // _COARSE, 1)
         self.coarse = _segments(self.points[:: -self.stride], False)
         self.mates = len(self.points) - self.land
@@ -183,9 +182,7 @@ class NodeContact:
         phi1, phi2 = -roll - relative / 2, -roll + relative / 2
         # Rotor 1's nodes in rotor 2's frame, mirrored so that both flanks have one direction.
         onto = cmath.exp(1j * (phi2 + 2 * half))
-        turn = onto * cmath.exp(1j * phi1)
-        shift = 2 * self.rotor.radius * onto
-        return self._search(shift, turn)
+        return self._search(2 * self.rotor.radius * onto, onto * cmath.exp(1j * phi1))
 
     def _search(self, shift: complex, turn: complex) -> tuple[float, float, float]:
         """Return gap (m) and both levers (m).
@@ -232,7 +229,7 @@ class NodeContact:
             return 1.0, 0.0, 0.0
         self.last = window.node, window.segment(i)
         lever1, lever2 = self._levers(window, i, shift)
-        if self.curved and window.enclosed:
+        if window.enclosed:
             left, right = window.gaps[i - 1 : i + 2 : 2].tolist()
             bend = left - 2 * gap + right
             if bend > 0:
@@ -248,10 +245,9 @@ class NodeContact:
         i."""
         segment, point = window.segment(i), complex(window.nodes[i])
         towards = complex(self.segments.towards[segment])
-        if self.curved:
-            middle = float(self.segments.lengths[segment]) / 2
-            lean = float(self.segments.bends[segment]) * (float(window.feet[i]) - middle)
-            towards *= complex(math.cos(lean), -math.sin(lean))
+        middle = float(self.segments.lengths[segment]) / 2
+        lean = float(self.segments.bends[segment]) * (float(window.feet[i]) - middle)
+        towards *= complex(math.cos(lean), -math.sin(lean))
         return ((shift - point) * towards).real, (point * towards).real
 
 
@@ -344,14 +340,13 @@ class _Equation:
 class ScipyNodes(Engine):
     """Simulator of a scene with SciPy.
 
-    `nodes` (per flank), `curved`: see `NodeContact`; `method` of `solve_ivp`; `rtol`: relative
+    `nodes` (per flank): see `NodeContact`; `method` of `solve_ivp`; `rtol`: relative
     tolerance, also absolute tolerance of the scaled state; `settle`, `window`: mesh periods before
     and in the window; `max_step`: longest step (mesh periods).
     """
 
     scene: Scene
     nodes: int = 800
-    curved: bool = True
     method: Literal["LSODA", "DOP853", "RK45"] = "LSODA"
     rtol: float = 1e-5
     settle: int = 2
@@ -361,7 +356,7 @@ class ScipyNodes(Engine):
     def simulate(self, design: Design) -> Result:
         rotor = rotor_of(self.scene, design)
         motion = motion_of(self.scene, polar_area_moment(rotor))
-        equation = _Equation(motion, NodeContact(rotor, self.nodes, self.curved))
+        equation = _Equation(motion, NodeContact(rotor, self.nodes))
         before = self._solve(equation, self.settle, np.zeros(2), False)
         start = np.append(before.y[:, -1], [0.0, 0.0])
         # Rotor and flanks repeat with the mesh period.
