@@ -70,14 +70,14 @@ def by_hand(scene, name):
 
 
 def test_scenes_agree_with_configs_one_by_one():
-    """Every scene gives what `evaluate` gives for a config with these values, from rest.
+    """Ends and drawn scenes give what `evaluate` gives for a config with these values, from rest.
 
     With a clearance of 60 µm, no flanks touch: there is nothing to compare."""
     _, _, found = spread()
     assert [*found.scenes][:5] == [
         "as given", f"{LOAD}=2.865", f"{LOAD}=7.64", f"{CLEARANCE}=0", f"{CLEARANCE}=0.06"
     ]  # fmt: skip
-    for k, scene in enumerate(found.scenes):
+    for k, scene in enumerate([*found.scenes][:8]):
         for name in (BASELINE, OPTIMIZED):
             assert found.statuses[name][k] == alone(scene, name).status.label
         # The length that smooths the contact follows load and stiffness in a config of its own.
