@@ -14,7 +14,7 @@ import pytest
 from rootsopt.commands.table import improve
 from rootsopt.commands.work import improve as work
 from rootsopt.view.comparison import NOTHING_BETTER, WORTH
-from tests.measured.test_finding import cut_cic, cycloids, write
+from tests.measured.test_finding import POSES, cut_cic, cycloids, write
 from tests.standins import evaluation_of
 
 DESIGN = {"pressure_angle_deg": 36.43, "involute_length_mm": 8.5, "tip_arc_angle_deg": 4.0}
@@ -43,7 +43,9 @@ def file_of(folder, inset, unit=25.4):
         pytest.param("tighter", (), marks=pytest.mark.long),
     ],
 )
-def test_a_better_rotor_takes_the_place_of_that_of_a_file(aim, least, tmp_path, capsys):
+def test_a_better_rotor_takes_the_place_of_that_of_a_file(aim, least, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(*POSES)
+    monkeypatch.setattr(work, "_COMMON", ("ee", "cic"))
     file, folder = file_of(tmp_path, 0.02), tmp_path / "run"
     scene = ["scene.timing_gear.backlash_mm=0.3", *QUICK, *least]
     sets = [word for one in scene for word in ("--set", one)]
@@ -136,7 +138,8 @@ REFUSED = {
     "name",
     [pytest.param(n, marks=[pytest.mark.long] * ("never" in n)) for n in REFUSED],
 )
-def test_what_does_not_suit_the_file_is_refused_in_one_sentence(name, tmp_path, capsys):
+def test_what_does_not_suit_the_file_is_refused_in_one_sentence(name, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(*POSES)
     options, message = REFUSED[name]
     assert improve.main([file_of(tmp_path, 0.1), "-o", str(tmp_path / "run"), *options]) == 2
     told = capsys.readouterr().err.strip()
