@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from rootsopt.commands.console import main
+from rootsopt.commands.work import optimize as work
 from rootsopt.config import load
 from rootsopt.errors import InputError
 from rootsopt.optimize.design import search_of
@@ -209,7 +210,7 @@ def test_local_search_finds_the_minimum_over_scenes_with_corners(name, monkeypat
         for _ in range(6)
     ]
     problem, evaluate = toy(monkeypatch, branches, *RULES[name])
-    grid = np.linspace(0, 1, 4001)
+    grid = np.linspace(0, 1, 801)
     values = [problem.objective(evaluate(x)) for x in grid]
     shares = problem.shares(problem.combined(evaluate(0.2)).weights)
 
@@ -296,13 +297,13 @@ def test_without_tolerances_the_search_is_the_plain_one():
     assert "tolerances" not in config.to_yaml()
 
 
-def test_optimize_command(tmp_path, capsys):
+def test_optimize_command(tmp_path, capsys, monkeypatch):
     """A short run gives both optima, certificates, tables, files and a picture."""
     overrides = [
         PLAY,
         "tolerances.over={contact.clearance_mm: {normal: 0.002}}",
         "tolerances.samples=2",
-        "tolerances.check_samples=4",
+        "tolerances.check_samples=2",
         "assumptions.scenes=0",
         "optimizer.screening=0",
         "optimizer.starts=1",
@@ -311,14 +312,17 @@ def test_optimize_command(tmp_path, capsys):
         "solver.rtol=1e-7",
     ]
     options = [f"--set={one}" for one in overrides]
+    asked = []
+    monkeypatch.setattr(work, "touching", asked.append)
     assert main(["optimize", CIC, "-o", str(tmp_path), *options]) == 0
-    assert "Designs in 4 fresh scenes" in capsys.readouterr().out
+    assert "Designs in 2 fresh scenes" in capsys.readouterr().out
     result = json.loads((tmp_path / "result.json").read_text())
     record = result["robustness"]
     assert set(record["fresh"]) == {"baseline", "nominal", "robust"}
     assert record["nominal"]["optimality"]["residual"] >= 0
     assert result["optimality"]["residual"] >= 0
     assert len(result["optimized"]["samples"]) == 2
+    assert [*asked[0].design] == pytest.approx([*result["optimized"]["design"].values()])
     (row,) = (r for r in result["optimality"]["sensitivities"] if "clearance" in r["quantity"])
     assert row["peak_force_N"] != 0
     assert "objective_percent" not in row
