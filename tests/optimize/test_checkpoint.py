@@ -16,7 +16,7 @@ from rootsopt.status import Status
 from rootsopt.view.runs import RunFolder
 from tests.optimize.test_optimize import config
 
-SHORT = [f"optimizer.{one}" for one in ("screening=2", "starts=1", "iterations=4", "prove=false")]
+SHORT = [f"optimizer.{one}" for one in ("screening=2", "starts=1", "iterations=2", "prove=false")]
 HEADER = {"config": {"a": 1}, "versions": {"jax": "1"}}
 
 
