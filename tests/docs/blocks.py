@@ -2,10 +2,14 @@
 
 import os
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import NamedTuple
+
+from rootsopt.commands.console import main
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -29,6 +33,20 @@ def in_shell(text: str, folder: Path) -> subprocess.CompletedProcess:
     """Run shell commands in a folder, where `rootsopt` is the package of this tree."""
     program = f'set -e\nrootsopt() {{ "{sys.executable}" -m rootsopt "$@"; }}\n{text}'
     return _run(["bash", "-c", program], folder)
+
+
+def in_process(text: str, folder: Path, capsys, monkeypatch) -> SimpleNamespace:
+    """Run the `rootsopt` commands of a shell block in this process, as if in a folder.
+
+    Return `returncode`, `stdout` and `stderr` of the last one. Other commands are left out."""
+    monkeypatch.chdir(folder)
+    capsys.readouterr()
+    code = 0
+    for line in text.replace("\\\n", " ").splitlines():
+        if line.startswith("rootsopt "):
+            code = main(shlex.split(line)[1:])
+    out, err = capsys.readouterr()
+    return SimpleNamespace(returncode=code, stdout=out, stderr=err)
 
 
 def in_python(text: str, folder: Path) -> subprocess.CompletedProcess:
