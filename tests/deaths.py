@@ -69,14 +69,8 @@ def full_disk(name: str, do: Callable[[], Any]) -> None:
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-def die_before(name: str, do: Callable[[], Any]) -> None:
-    """End the process without any clean-up."""
-    os._exit(9)
-
-
-def die_after(name: str, do: Callable[[], Any]) -> None:
-    """Do the operation, then end the process without any clean-up."""
-    do()
+def die(name: str, do: Callable[[], Any]) -> None:
+    """End the process without any clean-up, before the operation."""
     os._exit(9)
 
 
@@ -120,7 +114,7 @@ def scratch() -> Path:
 
 
 def failures(place: Path, kind: str, before: str, at: int):
-    """Let operation number `at` of a run fail (`full`), or the process end before or after it.
+    """Let operation number `at` of a run fail (`full`), or the process end before it (`dead`).
 
     Return whether there was such an operation, and what is wrong afterwards."""
     new = digest_of("new")
@@ -167,7 +161,6 @@ def _tried(target: Path, kind: str, before: str, at: int):
     child = os.fork()
     if not child:
         try:
-            die = die_before if kind == "before" else die_after
             with faulty((*WRITING, *REMOVING), at, die):
                 write_run(target, "new", overwrite)
         finally:
@@ -203,7 +196,7 @@ def every_operation(kind: str) -> tuple[int, list[str]]:
 
 
 if __name__ == "__main__":
-    for kind in ("full", "before", "after"):
+    for kind in ("full", "dead"):
         tried, wrong = every_operation(kind)
         print(f"{kind}: {tried} operations, {len(wrong)} wrong", *wrong, sep="\n")
         assert tried > 40
