@@ -143,9 +143,7 @@ PATIENT = """
             while not stop.is_set() or "{twice}": time.sleep(0.01)"""
 
 
-@pytest.mark.parametrize(
-    ("wait", "number"), [(AT_ONCE, signal.SIGINT), (COMPILED, signal.SIGTERM)]
-)
+@pytest.mark.parametrize(("wait", "number"), [(AT_ONCE, signal.SIGINT), (COMPILED, signal.SIGTERM)])
 def test_a_signal_stops_a_run_at_once(tmp_path, wait, number):
     """A signal also stops compiled code, which Python cannot interrupt; nothing is left behind."""
     process = python(WAITING.format(wait=wait), str(tmp_path / "run"))
