@@ -43,7 +43,9 @@ def file_of(folder, inset, unit=25.4):
         pytest.param("tighter", (), marks=pytest.mark.long),
     ],
 )
-def test_a_better_rotor_takes_the_place_of_that_of_a_file(aim, least, tmp_path, capsys, monkeypatch):
+def test_a_better_rotor_takes_the_place_of_that_of_a_file(
+    aim, least, tmp_path, capsys, monkeypatch
+):
     monkeypatch.setattr(*POSES)
     monkeypatch.setattr(work, "_COMMON", ("ee", "cic"))
     file, folder = file_of(tmp_path, 0.02), tmp_path / "run"
@@ -138,7 +140,9 @@ REFUSED = {
     "name",
     [pytest.param(n, marks=[pytest.mark.long] * ("never" in n)) for n in REFUSED],
 )
-def test_what_does_not_suit_the_file_is_refused_in_one_sentence(name, tmp_path, capsys, monkeypatch):
+def test_what_does_not_suit_the_file_is_refused_in_one_sentence(
+    name, tmp_path, capsys, monkeypatch
+):
     monkeypatch.setattr(*POSES)
     options, message = REFUSED[name]
     assert improve.main([file_of(tmp_path, 0.1), "-o", str(tmp_path / "run"), *options]) == 2
