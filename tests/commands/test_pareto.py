@@ -3,13 +3,13 @@
 import csv
 import json
 from pathlib import Path
+from unittest import mock
 
 import pytest
 
 import rootsopt
 from rootsopt.commands.table import pareto
 from rootsopt.config import load
-from rootsopt.optimize.tradeoffs import trace
 from rootsopt.profiles import geometry
 from rootsopt.response.records import geometry_record
 from rootsopt.scene import Scene, design_vector
@@ -25,9 +25,8 @@ FEW = [*RADIUS, "--set", "pareto.points=3", "--set", "optimizer.starts=1"]
 def folder(tmp_path_factory):
     """Return the folder of a finished run without a simulation."""
     place = tmp_path_factory.mktemp("front") / "run"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(trace, "_CHEAP_STARTS", 2)
-        patch.setattr(trace, "_CHEAP_SCREENING", 8)
+    module = "rootsopt.optimize.tradeoffs.trace"
+    with mock.patch.multiple(module, _CHEAP_STARTS=2, _CHEAP_SCREENING=8):
         assert pareto.main([CIC, "-o", str(place), *FEW]) == 0
     return place
 
