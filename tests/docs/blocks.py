@@ -6,7 +6,6 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 from typing import NamedTuple
 
 from rootsopt.commands.console import main
@@ -35,18 +34,12 @@ def in_shell(text: str, folder: Path) -> subprocess.CompletedProcess:
     return _run(["bash", "-c", program], folder)
 
 
-def in_process(text: str, folder: Path, capsys, monkeypatch) -> SimpleNamespace:
-    """Run the `rootsopt` commands of a shell block in this process, as if in a folder.
-
-    Return `returncode`, `stdout` and `stderr` of the last one. Other commands are left out."""
+def in_process(text: str, folder: Path, capsys, monkeypatch) -> subprocess.CompletedProcess:
+    """Run the `rootsopt` commands of a shell block in this process and in a folder."""
     monkeypatch.chdir(folder)
-    capsys.readouterr()
-    code = 0
-    for line in text.replace("\\\n", " ").splitlines():
-        if line.startswith("rootsopt "):
-            code = main(shlex.split(line)[1:])
-    out, err = capsys.readouterr()
-    return SimpleNamespace(returncode=code, stdout=out, stderr=err)
+    lines = text.replace("\\\n", " ").splitlines()
+    codes = [main(shlex.split(line)[1:]) for line in lines if line.startswith("rootsopt ")]
+    return subprocess.CompletedProcess(text, codes[-1], *capsys.readouterr())
 
 
 def in_python(text: str, folder: Path) -> subprocess.CompletedProcess:
