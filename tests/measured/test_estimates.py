@@ -69,7 +69,7 @@ def test_scatter_of_points_closer_than_they_scatter(size):
     assert scatter(scattered(dense, size))[0] == pytest.approx(size, rel=0.15)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(
     turn=st.floats(-3.1, 3.1),
     start=st.integers(0, 2891),
@@ -145,7 +145,7 @@ def test_a_wrong_pitch_radius_is_told_from_a_wrong_unit(tmp_path):
         read(path)
 
 
-@pytest.mark.parametrize("size", [5, 20])
+@pytest.mark.parametrize("size", [pytest.param(5, marks=pytest.mark.long), 20])
 def test_refused_points_are_said_to_be_scattered(tmp_path, size):
     """The message states the scatter, without smoothing and with too little.
 
