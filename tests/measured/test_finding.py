@@ -8,8 +8,8 @@ from rootsopt.errors import InputError
 from rootsopt.measured.source import found
 from rootsopt.profiles import CIC, outline
 
+# Fewer roll angles at which the gap is measured, as `setattr` takes them.
 POSES = "rootsopt.measured.conjugacy._POSES", 91
-"""Fewer roll angles at which the gap is measured, as `setattr` takes them."""
 LENGTHS = {"mm": 1.0, "inch": 25.4, "um": 1e-3, "m": 1e3}
 
 
