@@ -22,7 +22,7 @@ from rootsopt.optimize.design import optimize_design, pareto_front
 from rootsopt.profiles import CIC, EE, geometry, outline
 from rootsopt.scene import check_geometry
 from rootsopt.scene.families import free_form_of
-from tests.measured.test_finding import write
+from tests.measured.test_finding import POSES, write
 
 R = 0.033
 CIC3 = CIC(3, R, np.deg2rad(36.43), 8.5e-3, np.deg2rad(4.0))
@@ -173,10 +173,9 @@ def test_lobes_off_the_axis_are_refused_before_anything_is_compiled(tmp_path, mo
 
 def test_turned_and_clockwise_outlines_are_put_right():
     points = points_of(CIC3, 240)
-    _, checks = profile_of(points[::-1] * np.exp(0.3j))
+    found, checks = profile_of(points[::-1] * np.exp(0.3j))
     assert checks.reversed
     assert checks.turned_deg == pytest.approx(-np.degrees(0.3), abs=1e-6)
-    found, _ = profile_of(points[::-1] * np.exp(0.3j))
     assert conjugacy(found).least > -1e-9
 
 
@@ -215,9 +214,7 @@ FAULTS = {
 @pytest.mark.parametrize("fault", FAULTS)
 def test_faults_are_named(tmp_path, fault):
     change, message = FAULTS[fault]
-    path = tmp_path / "points.csv"
-    z = change(points_of(CIC3, 240))
-    np.savetxt(path, np.stack([z.real, z.imag], axis=1), fmt="%.10g", delimiter=",")
+    path = write(tmp_path / "points.csv", change(points_of(CIC3, 240)))
     with pytest.raises(InputError, match=message):
         check_geometry(parse(CONFIG.format(path)))
 
@@ -241,8 +238,9 @@ def test_config_keys(tmp_path):
         load(tmp_path / "scene.yaml", ["optimizer.family=ee"])
 
 
-def test_profile_command_reads_its_own_files(tmp_path):
+def test_profile_command_reads_its_own_files(tmp_path, monkeypatch):
     """`profile` reads the CSV that it copies and the DXF that it draws; the folder is complete."""
+    monkeypatch.setattr(*POSES)
     path = write(tmp_path / "points.csv", points_of(CIC3, 240))
     (tmp_path / "scene.yaml").write_text(CONFIG.format(path))
     drawn = "dxf" if importlib.util.find_spec("ezdxf") else "none"
