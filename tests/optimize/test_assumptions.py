@@ -223,13 +223,9 @@ def test_nothing_without_a_motion_or_after_a_stop():
     """Searches without a motion, averages over many, and stopped ones have no comparison."""
     config, result, _ = spread()
     assert compared(config, result, stop=lambda: True) is None
-    still = load(
-        "cic_drawn", ["objective={mean_weight: 0, peak_weight: 0, terms: {flow_ripple: 1}}"]
-    )
+    still = "objective={mean_weight: 0, peak_weight: 0, terms: {flow_ripple: 1}}"
     small = ("optimizer.screening=0", "optimizer.starts=1", "optimizer.iterations=2")
-    found = search_of(
-        load("cic_drawn", [*small, f"objective={still.objective.model_dump_json()}"])
-    ).run()
+    found = search_of(load("cic_drawn", [*small, still])).run()
     assert found.assumptions is None
     assert type(search_of(load("cic_drawn", [*QUICK, "assumptions.scenes=0"]))) is Search
 
