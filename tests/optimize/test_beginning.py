@@ -18,6 +18,7 @@ from rootsopt.scene import outline_mm
 from rootsopt.scene.check import shape_of
 from rootsopt.scene.resemblance import Likeness
 from rootsopt.scene.space import bounds_of, widened
+from tests.measured.test_finding import write
 from tests.measured.test_outline import cut
 from tests.standins import evaluation_of
 
@@ -31,9 +32,7 @@ def measured(folder: Path, scatter: float, inset: float = 0.0, **optimizer) -> P
     points = cut(outline_mm(BASE)[:-1] @ [1, 1j], inset)
     chance = np.random.default_rng(5)
     off = chance.normal(size=(len(points), 2)) @ [1, 1j]
-    points = np.roll((points + scatter * off)[::-1] * np.exp(0.3j), 321)
-    table = np.stack([points.real, points.imag], axis=1)
-    np.savetxt(folder / "rotor.csv", table, fmt="%.10g", delimiter=",")
+    write(folder / "rotor.csv", np.roll((points + scatter * off)[::-1] * np.exp(0.3j), 321))
     data = yaml.safe_load(Path(CIC).read_text())
     data["profile"] = {"family": "outline", "lobes": 3, "pitch_radius_mm": 33.0}
     data["profile"]["outline_file"] = "rotor.csv"
