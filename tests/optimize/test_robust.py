@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from rootsopt.commands.console import main
-from rootsopt.commands.work import optimize as work
 from rootsopt.config import load
 from rootsopt.errors import InputError
 from rootsopt.optimize.design import search_of
@@ -313,7 +312,7 @@ def test_optimize_command(tmp_path, capsys, monkeypatch):
     ]
     options = [f"--set={one}" for one in overrides]
     asked = []
-    monkeypatch.setattr(work, "touching", asked.append)
+    monkeypatch.setattr("rootsopt.commands.work.optimize.touching", asked.append)
     assert main(["optimize", CIC, "-o", str(tmp_path), *options]) == 0
     assert "Designs in 2 fresh scenes" in capsys.readouterr().out
     result = json.loads((tmp_path / "result.json").read_text())
