@@ -9,7 +9,6 @@ from scipy.spatial import HalfspaceIntersection
 
 from rootsopt.commands.console import main
 from rootsopt.config import load
-from rootsopt.optimize import vertices
 from rootsopt.optimize.vertices import FeasibleSet
 from rootsopt.scene.check import shape_of
 from rootsopt.view.names import brief
@@ -65,7 +64,7 @@ def test_an_optimum_at_a_vertex_says_so(tmp_path, capsys, monkeypatch):
     out = tmp_path / "run"
     monkeypatch.setattr("rootsopt.view.figures.runs.optimization_figures", lambda *_: None)
     for nodes in ("_COARSE", "_NODES"):
-        monkeypatch.setattr(vertices, nodes, 9)
+        monkeypatch.setattr(f"rootsopt.optimize.vertices.{nodes}", 9)
     assert main(["optimize", "cic_drawn", "-o", str(out), "--set", OBJECTIVE, *SPARED]) == 0
     said = " ".join(capsys.readouterr().out.split())
     result = json.loads((out / "result.json").read_text())
