@@ -48,7 +48,7 @@ PROFILES = {
     "ee 3": EE(3, R),
     "ee 4": EE(4, R),
 }
-SOLIDS = ("cic 2, no land", "cic 3", "cic 3, textbook, no land", "ee 3", "ee 4")
+SOLIDS = ("cic 2, no land", "cic 3", "cic 3, textbook, no land", "ee 4")
 every_profile = pytest.mark.parametrize("shape", PROFILES.values(), ids=PROFILES)
 FREE = FreeForm(3, R, np.radians(2.0), np.array([0.7, 0.9, 0.95, 0.8, 0.4, 0.1, -0.3]))
 
@@ -243,11 +243,11 @@ def test_pair_meshes_along_its_length(tmp_path):
         for rotor, placed in zip(
             back.solids(), place_pair(points, 3, 66.0, turn, turn), strict=True
         ):
-            distances = [rotor.distance_to(build123d.Vertex(x, y, z)) for x, y in placed[::9]]
+            distances = [rotor.distance_to(build123d.Vertex(x, y, z)) for x, y in placed[::29]]
             assert max(distances) < 1e-4
             middle = placed[:-1].mean(axis=0)
             # And the points are on its surface, not inside.
-            outward = middle + (placed[::9] - middle) * (1 + 1e-4)
+            outward = middle + (placed[::29] - middle) * (1 + 1e-4)
             outside = [rotor.distance_to(build123d.Vertex(x, y, z)) for x, y in outward]
             assert min(outside) > 1e-4
     data = cad.stl_bytes(back.solids()[0])
