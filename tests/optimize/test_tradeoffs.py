@@ -446,6 +446,37 @@ def test_a_point_divides_neighbours_if_it_lies_between_them():
         assert not assembly.divides(edge, np.array(outside), one, other)
 
 
+def _shapes(designs, settings):
+    """Return the geometry of many designs, and whether each meets the seal width."""
+    scene = Scene.from_config(settings)
+    many = jax.vmap(lambda design: geometry(scene.profile(design)))
+    return jax.jit(many)(jnp.asarray(designs))
+
+
+def _random_designs(count):
+    """Return valid designs within the default bounds.
+
+    Columns: pressure angle, involute length, tip arc angle."""
+    shares = np.random.default_rng(0).uniform(size=(count, 3))
+    angle, land = 25 + 20 * shares[:, 0], 0.5 + 7.5 * shares[:, 2]
+    # The longest involute of three lobes, with the pitch radius of 33 mm.
+    longest = 33 * np.sin(np.radians(angle)) * (np.pi / 6 - np.radians(land))
+    return np.stack([angle, (0.1 + 0.9 * shares[:, 1]) * longest, land], axis=1)
+
+
+def test_no_design_dominates_the_front(front):
+    """No random design that meets the constraints is better in both terms."""
+    found = _shapes(_random_designs(4_000), config())
+    valid = (np.asarray(found.seal_width) >= 2e-3) & (np.asarray(found.undercut_margin) >= 0)
+    radius, efficiency = 1e3 * np.asarray(found.outer_radius), np.asarray(found.area_efficiency)
+    assert valid.sum() > 1_000
+    for point in front.points:
+        better = (radius < point.terms["outer_radius_mm"] - 1e-6) & (
+            efficiency > point.terms["area_efficiency"] + 1e-9
+        )
+        assert not np.any(valid & better)
+
+
 def test_rates_are_slopes_of_the_front(front):
     """The rate of each inner point lies between the slopes towards its neighbours."""
     values = np.array([[*point.terms.values()] for point in front.points])
