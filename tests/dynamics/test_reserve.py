@@ -160,13 +160,14 @@ def test_share_of_machines_that_touch_has_a_closed_form(monkeypatch):
 
     The narrower of two uniform distributions does not change the share of the wider one's tail."""
     over = "contact.clearance_mm: {uniform: 0.14}, scene.timing_gear.backlash_mm: {uniform: 0.01}"
-    config = load("ee", [*APART, f"tolerances={{over: {{{over}}}}}"])
+    config = load("cic_drawn", [*APART, f"tolerances={{over: {{{over}}}}}"])
     monkeypatch.setattr(sensitivity, "SIMULATED", 8)
     found = touching(config)
     clearance, backlash = found["keys"]
     reserve = found["contact_reserve_um"]
-    # The longest lever of EE is the pitch radius.
-    overlap = 1e3 * config.profile.pitch_radius_mm * swing(config)
+    # The longest lever is that of the involute, at the pressure angle.
+    lever = config.profile.pitch_radius_mm * np.cos(np.deg2rad(config.design[0]))
+    overlap = 1e3 * lever * swing(config)
     assert reserve == pytest.approx(150 - overlap, rel=1e-3)
     assert clearance["contact_reserve_um_per_unit"] == pytest.approx(1e3, rel=1e-6)
     share = (140 - reserve) / 280
