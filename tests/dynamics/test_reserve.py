@@ -14,7 +14,7 @@ import rootsopt
 from experiments._common.shooting import differentiated
 from rootsopt import steady_response
 from rootsopt.config import load
-from rootsopt.pump.flow import play_of
+from rootsopt.pump.sheet import sheet
 from rootsopt.response import evaluation, sensitivity
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.sensitivity import touching
@@ -72,7 +72,7 @@ def test_reserve_is_the_distance_of_polygons():
 def test_backlash_reserve_is_that_of_the_play():
     """The gear may have as much backlash as the play allows, less its deflection under the load."""
     config, scene = evaluator().config, evaluator().scene
-    most = float(play_of(scene, scene.profile(jnp.asarray(config.design))).gear_backlash) / 1e-3
+    most = sheet(scene, jnp.asarray(config.design))["gear_backlash_max_mm"]
     used = 2 * config.profile.pitch_radius_mm * swing(config)
     assert held().response["backlash_reserve_mm"] == pytest.approx(most - used, rel=1e-4)
 
