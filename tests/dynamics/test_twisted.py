@@ -16,6 +16,7 @@ from rootsopt.dynamics.parts import TwistedLoad
 
 TIGHT = "solver.rtol=1e-11", "solver.accuracy=1e-6"
 pair_of = eqx.filter_jit(Scene.pair)
+torques = eqx.filter_jit(lambda load, phi: jax.vmap(load.torque2)(phi))
 PHI, DEPTHS = np.linspace(0, 2 * np.pi / 3, 1200, endpoint=False), (2e-4, -3e-4)
 
 
@@ -28,11 +29,6 @@ def scene_of(name: str, *changes: str) -> tuple[Scene, np.ndarray]:
 def forces(pair, phi, relative):
     rate = jnp.asarray(0.3)
     return jax.lax.map(lambda x: pair.contact_force(x, relative, rate), phi)
-
-
-@eqx.filter_jit
-def torques(load, phi):
-    return jax.vmap(load.torque2)(phi)
 
 
 @pytest.fixture(scope="module")
