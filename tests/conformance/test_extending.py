@@ -67,6 +67,7 @@ def test_law_of_the_roll_angle_gives_the_closed_form(early_fall):
     """With an even fall, the family is the blunt cycloid, to 1e-9 pitch radii."""
     nu = jnp.linspace(0.0, 1.5, 7)
 
+    @functools.partial(jax.jit, static_argnums=0)
     def values(name, *design):
         profile = profile_of(name, 3, jnp.asarray(1.0), jnp.asarray(design))
         return jax.vmap(lambda nu: jnp.stack([profile.lever(nu), profile.support(nu)]))(nu)

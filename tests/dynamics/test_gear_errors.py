@@ -65,11 +65,12 @@ def slope(time, state, size=SIZE):
     return [rate, (-LOAD - torque) / INERTIA]
 
 
-@pytest.mark.parametrize(
-    "lobes", [2, *(pytest.param(count, marks=pytest.mark.long) for count in (3, 4, 5, 6))]
-)
+@pytest.mark.long
+@pytest.mark.parametrize("lobes", [2, 3, 4, 5, 6])
 def test_orbit_is_closed_after_a_turn(lobes):
-    """The silent orbit is the linear motion at every number of lobes, and stops at one turn."""
+    """The silent orbit is the linear motion at every number of lobes, and stops at one turn.
+
+    `tests/pump/test_rattle.py` has two lobes in a quicker test."""
     pair = erring(lobes)
     number = jnp.asarray(8.0)
     solver = Solver(HOW, HOW, Measures(), 40 * number, 0 * number, 8)

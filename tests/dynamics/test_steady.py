@@ -39,7 +39,7 @@ SCENES = {
     "noisy": (gear(backlash=0.1, damping=0.05, load=4.775, speed=6000), Status.PERIODIC),
     # An exponent of 0.7 per mesh period. Where it is 0.1, half of all windows do not show it.
     "chaotic": (
-        [*gear(backlash=0.4, damping=0.1, load=1.0), "contact.exponent=2.2"],
+        [*gear(backlash=0.4, damping=0.1, load=1.0), "solver.max_mesh_periods=64"],
         Status.CHAOTIC,
     ),
     "impatient": (

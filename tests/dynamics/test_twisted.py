@@ -15,6 +15,8 @@ from rootsopt.contact.wrapped import MOST, TwistedContact, sliced_mean, slices_n
 from rootsopt.dynamics.parts import TwistedLoad
 
 TIGHT = "solver.rtol=1e-11", "solver.accuracy=1e-6"
+pair_of = eqx.filter_jit(Scene.pair)
+torques = eqx.filter_jit(lambda load, phi: jax.vmap(load.torque2)(phi))
 PHI, DEPTHS = np.linspace(0, 2 * np.pi / 3, 1200, endpoint=False), (2e-4, -3e-4)
 
 
@@ -33,7 +35,7 @@ def forces(pair, phi, relative):
 def straight():
     """Contact of straight EE rotors over a mesh period, for a drive and a coast contact."""
     scene, design = scene_of("ee")
-    pair = scene.pair(jnp.asarray(design))
+    pair = pair_of(scene, jnp.asarray(design))
     return pair, [forces(pair, PHI, jnp.asarray(-depth)) for depth in DEPTHS]
 
 
@@ -73,12 +75,12 @@ def test_gas_torque_is_the_mean_over_sections():
     changes = ("scene.load={pressure_difference_Pa: 5e4}",)
     straight, design = scene_of("ee", *changes)
     turned, _ = scene_of("ee", *changes, "rotor.helix_deg=50", "solver.slices=12")
-    one, other = (s.pair(jnp.asarray(design)).load for s in (straight, turned))
+    one, other = (pair_of(s, jnp.asarray(design)).load for s in (straight, turned))
     angles = PHI[::4]
-    section = np.asarray(jax.vmap(one.torque2)(angles))
+    section = np.asarray(torques(one, angles))
     offsets = np.radians(50) * ((np.arange(500) + 0.5) / 500 - 0.5)
     expected = sliced_mean(section, offsets, 3)
-    np.testing.assert_allclose(jax.vmap(other.torque2)(angles), expected, rtol=2e-3)
+    np.testing.assert_allclose(torques(other, angles), expected, rtol=2e-3)
     assert float(other.torque) == pytest.approx(np.mean(section), rel=1e-4)
 
 
@@ -93,7 +95,7 @@ def test_number_of_slices_follows_the_error():
     assert scene_of("ee", "rotor.helix_deg=60")[0].slices == counts[1]
     # A config without twist has no slices at all.
     straight, design = scene_of("ee", "scene.load={pressure_difference_Pa: 5e4}")
-    pair = straight.pair(jnp.asarray(design))
+    pair = pair_of(straight, jnp.asarray(design))
     assert isinstance(pair.contact, SearchContact)
     assert not isinstance(pair.load, TwistedLoad)
     assert scene_of("ee", "rotor.helix_deg=60", "solver.slices=5")[0].slices == 5

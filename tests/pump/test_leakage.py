@@ -327,8 +327,9 @@ def test_sheet_says_what_it_lacks_and_what_does_not_hold():
 
 def test_interference_is_an_error():
     design = design_vector(load_config("configs/cic_drawn.yaml"))
-    with pytest.raises(InputError, match=r"overlap by .*raise `contact.clearance_mm`"):
-        sheet(scene_of(*LIQUID, "pump.radial_allowance_mm=-0.1"), design)
+    scene = dataclasses.replace(scene_of(*LIQUID), clearance=jnp.asarray(-1e-4))
+    with pytest.raises(InputError, match=r"overlap by 100 um; raise `contact.clearance_mm`"):
+        sheet(scene, design)
 
 
 def test_pressure_is_asked_for():

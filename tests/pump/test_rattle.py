@@ -3,6 +3,7 @@
 import functools
 import math
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -54,7 +55,7 @@ def scene_of(*changes, **more):
 @functools.cache
 def inertia_and_damping(*changes):
     scene, design = scene_of(*changes)
-    pair = scene.pair(design)
+    pair = eqx.filter_jit(Scene.pair)(scene, design)
     return float(pair.inertia), float(pair.gear.damping)
 
 

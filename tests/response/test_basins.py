@@ -23,7 +23,7 @@ COEXIST = (
     "scene.speed_rpm=6000",
 )
 WEAK = "scene.timing_gear.stiffness_N_m_per_rad=1", "scene.load.torque_N_m=40"
-GRID = "attractors.relatives=6", "attractors.rates=5"
+GRID = "attractors.relatives=3", "attractors.rates=3"
 FORCES = ("mean_force_N", "peak_force_N", "rms_force_N")
 
 
@@ -38,7 +38,7 @@ def coexisting():
     return evaluator, find(evaluator, series=True)
 
 
-long_run = CachedFunction(lambda pair, state, how: strobe(pair, state, 160, how).states)
+long_run = CachedFunction(lambda pair, state, how: strobe(pair, state, 48, how).states)
 
 
 def test_motions_that_coexist_are_told_apart(coexisting):
@@ -66,20 +66,20 @@ def test_motions_that_coexist_are_told_apart(coexisting):
 def test_initial_states_lead_where_a_long_simulation_ends(coexisting):
     """Cells of the grid lead to the attractor that a long simulation reaches.
 
-    It runs for 160 mesh periods at another tolerance with another method."""
+    It runs for 48 mesh periods at another tolerance with another method."""
     evaluator, basins = coexisting
     pair = evaluator.pair(jnp.array([36.43, 9.0, 4.0]))
-    how = Integrator("dopri8", jnp.asarray(1e-9), 4096)
-    agree = []
-    for row, column in [(0, 0), (1, 4), (2, 2), (3, 5), (4, 1)]:
+    how, reached = Integrator("dopri8", jnp.asarray(1e-9), 4096), set()
+    for row, column in [(0, 0), (1, 1), (2, 1)]:
         start = jnp.array([basins.relative[column], basins.rate[row] * basins.mesh_period])
         ends = np.asarray(long_run(pair, start / basins.angle_scale, how))[-8:]
-        cycle = basins.attractors[basins.leads_to[row, column]].cycle
-        apart = np.max(np.abs(ends[:, None] - cycle[None]), axis=2)
+        number = int(basins.leads_to[row, column])
+        apart = np.max(np.abs(ends[:, None] - basins.attractors[number].cycle[None]), axis=2)
         # Every point of the end lies on the cycle and every point of the cycle is visited.
-        agree.append(np.max(np.min(apart, axis=1)) < 0.02 and np.max(np.min(apart, axis=0)) < 0.02)
-    # Next to a boundary of the basins the tolerance decides.
-    assert sum(agree) >= 4
+        assert np.max(np.min(apart, axis=1)) < 1e-3
+        assert np.max(np.min(apart, axis=0)) < 1e-3
+        reached.add(number)
+    assert len(reached) > 1
 
 
 def test_a_known_motion_is_not_lost_on_a_coarse_grid(coexisting):
@@ -150,8 +150,7 @@ def test_a_chaotic_basin_is_no_steady_state():
         "scene.timing_gear.damping_ratio=0.05",
         "scene.load.torque_N_m=2",
         "scene.speed_rpm=6000",
-        "attractors.relatives=3",
-        "attractors.rates=3",
+        "attractors.rates=1",
     )
     found = Evaluator.of_objective(config_of(*scene, "objective.motion=worst"))(series=False)
     assert found.status is Status.CHAOTIC
@@ -191,8 +190,8 @@ def test_command(tmp_path, capsys):
     assert len(shares) >= 2
     with open(tmp_path / "basins.csv", newline="") as file:
         numbers = [int(row["attractor"]) for row in csv.DictReader(file)]
-    assert len(numbers) == 30
-    assert [numbers.count(k + 1) / 30 for k in range(len(shares))] == pytest.approx(shares)
+    assert len(numbers) == 9
+    assert [numbers.count(k + 1) / 9 for k in range(len(shares))] == pytest.approx(shares)
     assert (tmp_path / "figures" / "basins.png").read_bytes()[:4] == b"\x89PNG"
     assert (tmp_path / "response_2.csv").exists()
     weak = (f"--set={key}" for key in WEAK)

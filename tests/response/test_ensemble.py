@@ -19,7 +19,7 @@ from rootsopt.response.together import Members
 from rootsopt.status import Status
 from rootsopt.view import tables
 
-PERIODIC = ("ensemble.members=8", "ensemble.settle_periods=48", "ensemble.periods=8")
+PERIODIC = ("ensemble.members=4", "ensemble.settle_periods=48", "ensemble.periods=8")
 GEAR = "scene.timing_gear={stiffness_N_m_per_rad: 2.0e4, damping_ratio: 0.1, backlash_mm: 0.4}"
 CHAOTIC = (GEAR, "scene.load.torque_N_m=1", "objective.motion=ensemble")
 INSIDE = (30.0, 4.0, 3.0)
@@ -143,9 +143,8 @@ def test_standard_error_of_the_slope_is_honest():
 
 def test_chaos_is_averaged_and_named():
     """A chaotic result is usable, and has the kind of motion and standard errors."""
-    evaluation = averaged(
-        *CHAOTIC, "ensemble.members=8", "ensemble.periods=16", survey=False, gradient=False
-    )
+    size = "ensemble.members=4", "ensemble.settle_periods=16", "ensemble.periods=16"
+    evaluation = averaged(*CHAOTIC, *size, survey=False)
     assert evaluation.status is Status.AVERAGED
     assert evaluation.usable
     steady = evaluation.steady_state
@@ -187,8 +186,8 @@ def test_same_seed_same_numbers():
 
 def test_start_is_continued():
     """Members continue from the last states of a neighbour; other shapes are refused."""
-    settings = config_of(*CHAOTIC, "ensemble.members=4", "ensemble.periods=4")
-    evaluator = ensemble(settings)
+    size = "ensemble.members=4", "ensemble.settle_periods=4", "ensemble.periods=4"
+    evaluator = ensemble(config_of(*CHAOTIC, *size))
     first = evaluator(series=False)
     on = evaluator(start=first.start, series=False)
     assert on.status is Status.AVERAGED
