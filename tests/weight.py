@@ -14,8 +14,8 @@ from unittest import mock
 ROOT = Path(__file__).parents[1]
 MOST = {
     "statements of the package": 27_133,
-    "statements of the tests": 16_462,
-    "statements of the experiments": 4_759,
+    "statements of the tests": 16_481,
+    "statements of the experiments": 4_489,
     "packages": 13,
     "files of the package": 199,
     "lines of the longest file": 450,
@@ -24,7 +24,7 @@ MOST = {
     "config keys": 134,
     "lines of the longest help": 59,
     "pages of docs": 45,
-    "words of docs": 31_485,
+    "words of docs": 31_491,
 }
 """Greatest values that are accepted. Lower them when the project becomes lighter. Whoever raises
 one gives the reason in the changelog: what users can do now that is worth the weight."""
