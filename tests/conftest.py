@@ -76,6 +76,7 @@ def pytest_collection_modifyitems(items):
 
 def pytest_sessionfinish(session):
     """Remove the cache folder at the end of the first process, from which the others inherit it."""
+    gc.freeze()  # pytest looks for garbage several times at the end: in all objects of JAX.
     if not hasattr(session.config, "workerinput"):
         shutil.rmtree(os.environ["ROOTSOPT_TEST_CACHE"], ignore_errors=True)
 

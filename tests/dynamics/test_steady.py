@@ -34,7 +34,7 @@ SCENES = {
     # A multiplier close to 1.
     "slow": (["solver.rtol=1e-12", *gear(damping=0.02, load=2.0)], Status.PERIODIC),
     "periodic": ([], Status.PERIODIC),
-    "doubled": (gear(backlash=0.2, damping=0.2, load=4.775, speed=4000), Status.PERIODIC),
+    "doubled": (gear(backlash=0.2, damping=0.2, load=4.775, speed=4100), Status.PERIODIC),
     "tripled": (gear(backlash=0.1, damping=0.05, load=2.0, speed=6000), Status.PERIODIC),
     "noisy": (gear(backlash=0.1, damping=0.05, load=4.775, speed=6000), Status.PERIODIC),
     # An exponent of 0.7 per mesh period. Where it is 0.1, half of all windows do not show it.

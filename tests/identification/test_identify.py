@@ -139,7 +139,7 @@ def test_averages_over_speeds_lead_to_the_true_values_with_gaps(tmp_path):
 @functools.cache
 def coexisting():
     """Return (config, its motions) of a scene with quiet and noisy motions side by side."""
-    moved = {"scene.speed_rpm": 4000.0, BACKLASH: 0.2, DAMPING: 0.2}
+    moved = {"scene.speed_rpm": 4100.0, BACKLASH: 0.2, DAMPING: 0.2}
     config = load_config("cic_drawn", FEW).replaced(moved)
     found = find(Evaluator.of(config), series=True).attractors
     return config, {one.reached: one.evaluation for one in reversed(found)}
