@@ -1,5 +1,6 @@
 """Tests of resemblance: the distance is correct, and no optimiser finds a nearer member."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -18,9 +19,9 @@ R, DEG = 0.033, np.pi / 180
 PROFILES = {
     "cic": CIC(3, R, 36.43 * DEG, 8.5e-3, 4 * DEG),
     "ee": EE(3, R),
-    "arc": arc(3, jnp.asarray(R), 0.0297),
-    "ellipse": ellipse(3, jnp.asarray(R), 0.027, 0.018),
-    "five arcs": five_arcs(3, jnp.asarray(R), 0.045, 3 * DEG, 0.013, 60 * DEG),
+    "arc": jax.jit(arc, static_argnums=0)(3, R, 0.0297),
+    "ellipse": jax.jit(ellipse, static_argnums=0)(3, R, 0.027, 0.018),
+    "five arcs": jax.jit(five_arcs, static_argnums=0)(3, R, 0.045, 3 * DEG, 0.013, 60 * DEG),
 }
 
 

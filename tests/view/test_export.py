@@ -35,8 +35,7 @@ LENGTH = 100.0
 
 def textbook(lobes, alpha, tip):
     """Return a CIC whose tip arc is centred on the pitch circle: every flank has two arcs."""
-    longest = float(CIC(lobes, R, alpha, 1e-3, tip).longest_involute)
-    return CIC(lobes, R, alpha, longest, tip)
+    return CIC(lobes, R, alpha, R * np.sin(alpha) * (np.pi / (2 * lobes) - tip), tip)
 
 
 PROFILES = {
