@@ -5,8 +5,6 @@ import http.client
 import re
 import signal
 import socket
-import subprocess
-import sys
 import threading
 import urllib.error
 import urllib.parse
@@ -22,6 +20,7 @@ from rootsopt.errors import InputError
 from rootsopt.optimize.design import optimize_design
 from rootsopt.view import pages
 from rootsopt.view.pages.knobs import Engine
+from tests.commands.test_door import python
 
 pytest.importorskip("bokeh")
 ROOT = Path(__file__).parents[2]
@@ -202,8 +201,8 @@ def test_port_in_use_is_named(capsys):
 
 def test_ctrl_c_ends_with_success():
     """The address is printed on standard output; Ctrl-C ends with exit code 0 and one line."""
-    run = [sys.executable, "-m", "rootsopt", "explore", CIC, "--no-browser"]
-    process = subprocess.Popen(run, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    code = "import runpy; runpy.run_module('rootsopt', run_name='__main__')"
+    process = python(code, "explore", CIC, "--no-browser")
     first = process.stdout.readline()
     assert get(first.split()[-1])[0] == 200
     process.send_signal(signal.SIGINT)
