@@ -4,9 +4,13 @@ import ast
 import re
 from pathlib import Path
 
+import numpy as np
+import pytest
 import yaml
+from jaxtyping import TypeCheckError
 
 import rootsopt
+from rootsopt.profiles.geometry import feet
 from tests.weight import MOST, measured
 
 ROOT = Path(__file__).parents[1]
@@ -148,6 +152,11 @@ def test_every_package_has_a_room_of_tests():
 def test_citation_names_this_version():
     found = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
     assert str(found["version"]) == rootsopt.__version__
+
+
+def test_shapes_are_checked_while_tests_run():
+    with pytest.raises(TypeCheckError, match="points"):
+        feet(np.zeros((3, 3)), np.zeros((4, 2)))
 
 
 def test_project_is_not_heavier_than_agreed():
