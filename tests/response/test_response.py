@@ -17,7 +17,7 @@ import rootsopt
 from experiments._common.shooting import differentiated
 from rootsopt import Scene, Status, steady_response
 from rootsopt.response import terms
-from tests.standins import for_a_time
+from tests.standins import for_a_time, registered
 
 TIGHT = "solver.rtol=1e-11", "solver.accuracy=1e-6"
 QUANTITIES = {
@@ -386,3 +386,17 @@ def test_example_of_the_readme_runs():
     found = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, cwd=ROOT)
     assert (found.returncode, found.stderr) == (0, "")
     assert float(found.stdout.split()[0]) > 0
+
+
+def test_an_evaluation_adds_terms_with_their_gradients():
+    """A term of forces and profile follows the quotient rule; 1° is π/180 rad."""
+    with registered(crest=lambda profile, shape, force: force.peak / force.mean
+                    + profile.pressure_angle):  # fmt: skip
+        found = rootsopt.evaluate(rootsopt.load_config("cic", ["objective.terms={crest: 0.1}"]))
+    mean, peak = (found.response[name] for name in ("mean_force_N", "peak_force_N"))
+    slopes = found.gradient
+    for key, angle in (("pressure_angle_deg", np.pi / 180), ("involute_length_mm", 0.0)):
+        rise = slopes["peak_force_N"][key] * mean - peak * slopes["mean_force_N"][key]
+        assert slopes["crest"][key] == pytest.approx(rise / mean**2 + angle, rel=1e-9)
+    own = np.radians(found.design["pressure_angle_deg"])
+    assert found.response["crest"] == pytest.approx(peak / mean + own, rel=1e-12)
