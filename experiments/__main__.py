@@ -6,10 +6,12 @@ Without a name, the studies are listed. Exit code 0: success. 2: bad input, one 
 
 import argparse
 import importlib
+import os
 import pkgutil
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from experiments._common.driver import NoResultError, Study, conduct
@@ -36,7 +38,7 @@ def studies() -> dict[str, tuple[str, Study]]:
 def parser_of(known: dict[str, tuple[str, Study]]) -> argparse.ArgumentParser:
     """Return a parser with a subcommand for each of the `known` studies."""
     parser = argparse.ArgumentParser(prog=COMMAND, description=f"{__doc__}".split("\n")[0])
-    parser.add_argument("--all", action="store_true", help="run all studies, one after the other")
+    parser.add_argument("--all", action="store_true", help="run all studies")
     _add_common(parser, RESULTS, "small sizes")
     inner = parser.add_subparsers(dest="name", metavar="NAME", prog=COMMAND)
     for name, (text, study) in known.items():
@@ -61,16 +63,30 @@ def _add_common(parser: argparse.ArgumentParser, folder: Path, quick: str) -> No
 
 
 def run_all(known: dict[str, tuple[str, Study]], options: argparse.Namespace) -> int:
-    """Run all studies, each in a process of its own; print time and exit code of each."""
+    """Run all studies, each in a process of its own; print output, time and exit code of each.
+
+    There is one process at a time for every core, except for studies that must run alone."""
     flags = ["--quick"] * options.quick + ["--docs"] * options.docs
-    ends = []
-    for name, (_, study) in known.items():
-        for more in ((), *study.further):
-            began = time.perf_counter()
-            folder = options.output / " ".join([name, *more]).replace(" --", "_").replace(" ", "_")
-            command = [sys.executable, "-m", "experiments", name, *more, "-o", str(folder), *flags]
-            code = subprocess.run(command, check=False).returncode
-            ends.append((code, f"{time.perf_counter() - began:8.0f} s  {' '.join([name, *more])}"))
+
+    def one(words: tuple[str, ...]) -> tuple[int, str]:
+        began, said = time.perf_counter(), " ".join(words)
+        print(f"started {said}", file=sys.stderr, flush=True)
+        folder = options.output / said.replace(" --", "_").replace(" ", "_")
+        command = [sys.executable, "-m", "experiments", *words, "-o", str(folder), *flags]
+        done = subprocess.run(
+            command, check=False, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        )
+        print(f"\n{said}\n\n{done.stdout}", flush=True)
+        return done.returncode, f"{time.perf_counter() - began:8.0f} s  {said}"
+
+    runs = [
+        (study.alone, (name, *more))
+        for name, (_, study) in known.items()
+        for more in ((), *study.further)
+    ]
+    with ThreadPoolExecutor(max_workers=os.cpu_count()) as processes:
+        ends = [*processes.map(one, [words for alone, words in runs if not alone])]
+    ends += [one(words) for alone, words in runs if alone]
     for code, text in ends:
         print(f"exit code {code} {text}")
     return NO_RESULT if any(code for code, _ in ends) else OK

@@ -35,8 +35,9 @@ class Study:
     `quick`: what a reduced run omits; `published`: for each published figure, its name in the
     result folder and its name in `docs/`; `options`: for each option of its own, the settings that
     `argparse` takes; `further`: options of further runs that `--all` makes; `cache`: whether
-    compiled programs are kept between processes. If `precision` is False, JAX is not started: the
-    study does that in its own processes.
+    compiled programs are kept between processes; `alone`: whether no other study may run beside
+    it, because it measures times or uses all cores. If `precision` is False, JAX is not started:
+    the study does that in its own processes.
     """
 
     quick: str
@@ -44,6 +45,7 @@ class Study:
     options: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
     further: tuple[tuple[str, ...], ...] = ()
     cache: bool = True
+    alone: bool = False
     precision: bool = True
 
 

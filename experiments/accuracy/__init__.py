@@ -6,4 +6,9 @@ Writes accuracy.csv (a row per scene and accuracy), accuracy.json and accuracy.p
 
 from experiments._common.driver import Study
 
-STUDY = Study(quick="one scene", published={"accuracy.png": "accuracy.png"}, cache=False)
+STUDY = Study(
+    quick="one scene",
+    published={"accuracy.png": "accuracy.png"},
+    cache=False,
+    alone=True,
+)

@@ -5,4 +5,9 @@ Writes benchmark.csv, benchmark.json and benchmark.png.
 
 from experiments._common.driver import Study
 
-STUDY = Study(quick="small sizes", published={"benchmark.png": "benchmark.png"}, precision=False)
+STUDY = Study(
+    quick="small sizes",
+    published={"benchmark.png": "benchmark.png"},
+    precision=False,
+    alone=True,
+)

@@ -13,4 +13,5 @@ STUDY = Study(
         "families_profiles.png": "ranking_profiles.png",
         "overview.png": "families.png",
     },
+    alone=True,
 )

@@ -5,4 +5,8 @@ Writes parts.csv (a row per part).
 
 from experiments._common.driver import Study
 
-STUDY = Study(quick="right-hand sides of three scenes, few calls", cache=False)
+STUDY = Study(
+    quick="right-hand sides of three scenes, few calls",
+    cache=False,
+    alone=True,
+)

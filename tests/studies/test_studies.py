@@ -53,6 +53,24 @@ def test_published_figures_are_those_of_the_docs():
     }
 
 
+def test_all_studies_run(monkeypatch, tmp_path, capsys):
+    """`--all` runs every study with its further runs; those that must run alone come last."""
+    begun = []
+
+    def run(words, **_):
+        begun.append(" ".join(words[3 : words.index("-o")]))
+        return subprocess.CompletedProcess(words, 3 * ("chaos" in words), "its output")
+
+    monkeypatch.setattr(command.subprocess, "run", run)
+    monkeypatch.setattr(sys, "argv", ["experiments", "--all", "-o", str(tmp_path)])
+    assert command.main() == 3
+    alone = [name for name in STUDIES if KNOWN[name][1].alone]
+    assert {*begun} == {*STUDIES, "paper --search", "orbits --speed"}
+    assert [*dict.fromkeys(name.split()[0] for name in begun)][-len(alone) :] == alone
+    said = capsys.readouterr().out
+    assert [line.split()[-1] for line in said.splitlines() if "code 3" in line] == ["chaos"]
+
+
 HELP = """
 import sys
 from experiments.__main__ import main
