@@ -214,7 +214,7 @@ class _Search:
         self.others_at: list[tuple[NDArray[np.float64], list[int]]] = []
 
     def run(self) -> Local | None:
-        """Return the best fit; None if no scene has a motion to trust at all points."""
+        """Return the best fit; None if no scene has a usable motion at all points."""
         points, p, known = self.problem.points, len(self.problem.quantities), []
         count = int(np.clip(_MOST // len(points), 8, _TRIED * p))
         first = np.array([one.first for one in self.problem.quantities])

@@ -1,4 +1,4 @@
-"""Quantities to fit, and predictions of a scene for a record with derivatives by them."""
+"""Quantities to fit, and predictions of the record with derivatives with respect to them."""
 
 import dataclasses
 import functools

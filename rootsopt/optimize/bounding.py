@@ -64,11 +64,11 @@ _STEEP, _SHARP = 100.0, 10.0
 # Number of minorants in a linear program for the middle of a box and for each of its corners.
 _ROWS = 3
 
-# Half width of a box below which it is left: one that has no bound, and any other.
+# Half width below which a box is not halved: a box without a bound, and any other box.
 _NARROW, _NARROWEST = 1 / 64, 1 / 8192
 
 # Distance from the middle of a box (half widths) beyond which a feasible point says nothing about
-# it; half width of a box that is void if no feasible point is found within this distance.
+# it; half width below which a box counts as empty if no feasible point is that near.
 _OUTSIDE, _SMALL_BOX = 2.0, 1 / 16
 
 # Greatest number of design parameters for a lower bound: with `optimizer.prove`, and by default.
@@ -151,12 +151,12 @@ class Surface:
         return True
 
     def _told(self, far: NDArray[np.float64], rises: NDArray[np.float64]):
-        """Return what pairs at the distances `far` tell, given the `rises` by which minorants are
-        too high there (arrays of one shape).
+        """Return what pairs of points show about curvature, corners and jumps.
 
-        (rises that curvature explains, 0 for others; whether a pair is too steep for that; where
-        minorants end: in half its distance, (2, ...): the paraboloid's, and the cone's; the
-        greatest rise per distance that only a corner explains)"""
+        `far`: distances of the pairs; `rises`: amounts by which minorants are too high there (an
+        array of the same shape). Return four results: the rises that curvature explains, 0 for
+        others; whether a pair is too steep for that; distances (2, ...) at which paraboloid and
+        cone end, half of `far` or inf; the greatest slope that only a corner explains."""
         extent = max(float(np.max(np.ptp(self.points, axis=0))), _CLOSE)
         steep = max(float(np.ptp(self.tops)), _GAP) / extent
         rises = rises - _NOISE
@@ -193,13 +193,12 @@ class Surface:
         return float(0.5 * box.half**2 @ self.curved)
 
     def near(self, point: NDArray[np.float64], others: NDArray[np.float64]) -> float:
-        """Return the least value (of the paraboloid) by which a `point` (d,) differs from `others`
-        (n, d)."""
+        """Return the least ½ Σ κ_j (x_j - p_j)² from a `point` p (d,) to `others` (n, d)."""
         return float(np.min(0.5 * (others - point) ** 2 @ self.curved, initial=np.inf))
 
 
 class Bounding:
-    """The search for a lower bound. It asks for points, which the caller evaluates and tells.
+    """The search for a lower bound: `ask` returns points to evaluate, `tell` takes the results.
 
     `limits`: function that returns the slacks (m,) of the constraints of the geometry, and their
     gradients (m, d); `size`: number d of coordinates; `best`: least known objective of a feasible
@@ -277,7 +276,7 @@ class Bounding:
         return wanted
 
     def bound(self, reached: float) -> Bound:
-        """Return what is known; `reached`: objective of the design that is reported."""
+        """Return the lower bound found so far; `reached`: objective of the reported design."""
         boxes = [self._bounded(box)[0] for box in self._open] + self._left
         known = [box.bound for box in [*boxes, *self._closed] if box.bound > -math.inf]
         lower = float(min([*known, self.best, reached])) if known else -math.inf

@@ -204,8 +204,8 @@ class Optimality:
 def judged(reason: str, holds: bool) -> str:
     """Return why a search ended (`reason`), corrected by the simulation of its design from rest.
 
-    `holds`: whether the first-order conditions hold there. Only a search that has converged can
-    lose its verdict: conditions that hold say little about the value."""
+    `holds`: whether the first-order conditions hold there. If they do not, a
+    search that seemed to have converged has not; any other reason stays."""
     return reason if holds or reason != "converged" else "verification"
 
 

@@ -202,7 +202,9 @@ class FeasibleSet:
         return None
 
     def _on(self, held: list[int], point: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Return the point next to `point` (d,) at which limits `held` have no slack."""
+        """Return a point near `point` (d,) at which the limits `held` are active.
+
+        Return `None` if Newton's method does not find one."""
         for _ in range(_NEWTON):
             slack, normals = self.slacks(point)
             rest = slack[held]
