@@ -141,7 +141,7 @@ class Window(NamedTuple):
 
     @property
     def _rates(self) -> Float[_Arrays, "2 b"]:
-        """Mean growth in the batches with even numbers, and in those with odd numbers."""
+        """Mean `growth` in each batch: row 0 at the far distance, row 1 at the near one."""
         xp = _numpy_of(self.growth)
         return xp.mean(self.growth.reshape(_BATCHES // 2, 2, -1), axis=2).T
 

@@ -50,10 +50,12 @@ _NOISE = 1e-6
 # also the curvature before any pair is known.
 _CLOSE = 1e-3
 
-# Least curvature along a coordinate, relative to that which all coordinates would need alike.
+# Least curvature along a coordinate, relative to the curvature that agrees with all pairs if it is
+# the same along all coordinates.
 _LEAST = 0.1
 
-# Share of a rise that the curvatures must agree with, so that they do not change all the time.
+# Share of a rise that the curvatures must explain. With the whole rise, almost every new point
+# would change them, and all bounds would have to be computed again.
 _SLACK = 0.9
 
 # Curvature and slope above which a pair counts as a corner, and as a jump. They are relative to the

@@ -196,7 +196,9 @@ def _lines(folder: ResultFolder, axes, plan: Plan, dataset: "xarray.Dataset") ->
 
 
 def _drawn(dataset: "xarray.Dataset") -> dict[str, str]:
-    """Return {variable: label} of two panels: forces, unless the flanks stay apart everywhere."""
+    """Return {variable: label} of the two panels.
+
+    They show the forces or, if no flank touches at any point, contact reserve and gear force."""
     if any(np.any(dataset[name].values > 0) for name in LABELS) or _APART[0] not in dataset:
         return LABELS
     return {name: label(name) for name in _APART}
