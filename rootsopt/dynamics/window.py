@@ -135,7 +135,7 @@ class Window(NamedTuple):
         )
 
     def _distance(self, period: Int[Array, ""]) -> Float[Array, ""]:
-        """Return the distance of both motions at the start of the mesh period number `period`."""
+        """Return the scaled distance of both motions at the start of the mesh period `period`."""
         batch = period * _BATCHES // max(self.growth.shape[0], 1)
         return jnp.where(batch % 2 == 0, self.apart, self.apart / _NEARER)
 

@@ -267,7 +267,7 @@ class _Search:
         self.ends += [] if end is None else [end]
 
     def _fit_other_motions(self, one: Local) -> None:
-        """Fit from the scene of a fit again, with the other motions that coexist there."""
+        """Repeat the fit `one` from its scene, with the other motions that coexist there."""
         named = zip(self.problem.quantities, one.values, strict=True)
         values = {q.key: float(x) for q, x in named if q.key != OFFSET}
         each: list[list[Any]] = []

@@ -93,7 +93,7 @@ class Problem:
         size: Any = measured.transform(lambda x: np.sqrt(np.mean(x**2)))
         varies = measured.transform(lambda x: np.std(x.to_numpy()))
         scale = size.where(~rows.sampled, varies.clip(lower=_STILL * size))
-        # A column of zeros has the scale of the others with its unit.
+        # A column of zeros takes the greatest scale of the columns with its unit.
         like = scale.groupby(rows.column.str.rpartition("_")[2]).transform("max")
         scale = scale.mask(scale == 0, like).replace(0.0, 1.0)
         # Averages have relative errors, samples those of their column.

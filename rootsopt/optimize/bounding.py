@@ -127,8 +127,8 @@ class Surface:
         self.points, self.tops = np.vstack([self.points, point]), np.append(self.tops, top)
         ends = np.full((2, len(values)), np.inf)
         if count:
-            # By how much each minorant of this point is too high at the others, and each of theirs
-            # at this one.
+            # Excess of each minorant of this point over the values at the others, and of each of
+            # theirs over the value at this one.
             ahead = values[:, None] + slopes @ away.T - self.tops[:-1]
             back = self.values - np.sum(self.slopes * away[self.owner], axis=1) - top
             over, bent, reach, lean = self._told(np.broadcast_to(distance, ahead.shape), ahead)

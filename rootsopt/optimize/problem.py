@@ -119,7 +119,7 @@ class Problem:
         ratio to F_0 alone would mean nothing. Designs and constraints of the geometry are the
         same."""
         found = Problem(self.config, _in_units(baseline, self.baseline), self.space, self.limits)
-        found.__dict__["_look_at"] = self._look_at  # Its results are expensive and stay valid.
+        found.__dict__["_look_at"] = self._look_at  # Expensive, independent of `baseline`.
         return dataclasses.replace(found, added=1 - found.objective(baseline))
 
     def objective(self, evaluation: Evaluation) -> float:

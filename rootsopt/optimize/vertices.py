@@ -175,7 +175,7 @@ class FeasibleSet:
     def _other_end(self, vertex: Vertex, number: int) -> Vertex | None:
         """Return the other end of the edge on which limit `number` of a `vertex` is released.
 
-        Return `None` if the edge is lost."""
+        Return `None` if the edge cannot be followed to its end."""
         kept = [one for one in vertex.held if one != number]
         point, last = vertex.point, np.zeros(self.size)
         slack, normals = self.slacks(point)

@@ -128,7 +128,7 @@ def reserves(*records: Record) -> Iterator[str]:
 
 
 def _prices(result: Record) -> Iterator[str]:
-    """Yield the limits whose relaxation lowers the objective, the dearest first."""
+    """Yield a phrase on the limits whose relaxation lowers the objective most."""
     found = [row for row in result.get("constraints") or ()
              if (row.get("relaxed_objective_percent") or 0.0) < 0]  # fmt: skip
     found.sort(key=lambda row: row["relaxed_objective_percent"])
