@@ -118,8 +118,8 @@ class Problem:
         """Return the standard deviations (n,).
 
         Those not given are estimated from the differences `away` (n,) between prediction and
-        record; without these, they are the scale. Columns of few values share one relative
-        deviation."""
+        record. If `away` is `None`, they are set to `scale`. Columns of few values share one
+        relative deviation."""
         scale, found = self.rows.scale.to_numpy(), self.rows.given.to_numpy(copy=True)
         unknown = np.isnan(found)
         if away is None:

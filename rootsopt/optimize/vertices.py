@@ -143,8 +143,8 @@ class FeasibleSet:
     def plane(self, point: NDArray[np.float64], most: int) -> Plane | None:
         """Return the feasible part of a plane through a `point` (d,) along two coordinates.
 
-        The plane with most feasible points is chosen; `most`: number of points that
-        `Plane.some` returns at most. Return `None` if there are fewer than four."""
+        The plane with most feasible points is chosen. `most`: as for `Plane.some`. Return `None` if
+        that method would return fewer than `_CORNERS` nodes."""
         ends = np.linspace(0, 1, _COARSE)
         planes = [self._plane(point, axes, ends, ends)
                   for axes in itertools.combinations(range(self.size), 2)]  # fmt: skip

@@ -1,4 +1,4 @@
-"""The work of `rootsopt explore`."""
+"""`rootsopt explore`: serve the page with sliders, and open it in the browser."""
 
 import argparse
 import html
