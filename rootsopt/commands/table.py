@@ -38,7 +38,7 @@ class Command(NamedTuple):
         return door.through(self.name, lambda: self._run(argv), own=argv is None)
 
     def begin(self, module: str) -> None:
-        """Run the command, and end the process, if `module` is the name of its main program."""
+        """Run the command and end the process, if `module` is "__main__"."""
         if module == "__main__":
             door.leave(self.main())
 

@@ -201,7 +201,7 @@ class Sheet(Section):
         density, modulus, poisson, densities, moduli, source = MATERIALS[self.material]
         name = f"--material {self.material}"
         stiffness = line_stiffness(modulus, poisson, self.length_mm)
-        # Two solid cylinders that move against each other, seen at the pitch circle.
+        # Effective mass at the pitch circle of two solid cylinders that turn against each other.
         mass = density * math.pi * profile.pitch_radius_mm**2 * self.length_mm * 1e-9 / 4
         damping = 2 * _RATIO * math.sqrt(stiffness * LINE * _DEPTH ** (LINE - 1) * 1e3 * mass)
         chosen = "--family" if self.family else "first of the table that meets the outer diameter"

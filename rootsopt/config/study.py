@@ -254,7 +254,7 @@ _CHAINS = (
     ("root_radius_mm", "outer_radius_mm"),
 )
 
-# Greatest amplitude of a spectral line of a force that is never negative, as multiples of these.
+# Greatest amplitude of a spectral line of a force ≥ 0, as multiples of mean, RMS and peak force.
 # The first is that of short pulses, the last that of a square wave. The second follows from the
 # first: mean² + amplitude² / 2 ≤ RMS².
 _LINE_SHARES = {

@@ -51,7 +51,7 @@ class Scatter(NamedTuple):
     """Distribution of one key of the config. It is symmetric about the config's own value.
 
     `key`: dotted key; `kind`: `normal`, `uniform` or `triangular`; `nominal`: the config's value;
-    `width`: standard deviation of a normal distribution before it is cut off, else half the width;
+    `width`: standard deviation of a normal distribution before it is cut off, else half its range;
     `half`: distance from the nominal value beyond which no value lies. All numbers are in the
     key's unit.
     """

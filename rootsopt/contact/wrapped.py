@@ -181,7 +181,9 @@ def sliced_mean(
 
 @CachedFunction
 def _torques(profile: Profile, law: ContactLaw, clearance, depth) -> Float[Array, " n"]:
-    """Return the contact torques (n,) in N·m on rotor 2 at `_TORQUES` angles of rotor 1."""
+    """Return the contact torques (n,) in N·m on rotor 2 at `_TORQUES` angles of rotor 1.
+
+    `clearance`, `depth`: clearance and static penetration (m)."""
     contact = SearchContact.of(profile)
     relative = -(clearance + depth) / profile.pitch_radius
     phi = 2 * jnp.pi / profile.lobes * jnp.arange(_TORQUES) / _TORQUES

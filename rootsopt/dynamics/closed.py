@@ -301,7 +301,7 @@ class _Attempts(eqx.Module):
         return now._replace(found=found, state=settled.state, over=jnp.ones((), bool))
 
     def counted(self, found: Steady, settled: Transient) -> Steady:
-        """Return `found` after a further transient."""
+        """Return `found` after a further transient: its end replaced, its effort added up."""
         used, steps = found.used + settled.periods, found.steps + settled.steps
         return found._replace(settled=settled, used=used, steps=steps)
 

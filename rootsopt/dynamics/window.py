@@ -135,13 +135,13 @@ class Window(NamedTuple):
         )
 
     def _distance(self, period: Int[Array, ""]) -> Float[Array, ""]:
-        """Return the distance of both motions at the start of the mesh period number `period`."""
+        """Return the scaled distance of both motions at the start of the mesh period `period`."""
         batch = period * _BATCHES // max(self.growth.shape[0], 1)
         return jnp.where(batch % 2 == 0, self.apart, self.apart / _NEARER)
 
     @property
     def _rates(self) -> Float[_Arrays, "2 b"]:
-        """Mean growth in the batches with even numbers, and in those with odd numbers."""
+        """Mean `growth` in each batch: row 0 at the far distance, row 1 at the near one."""
         xp = _numpy_of(self.growth)
         return xp.mean(self.growth.reshape(_BATCHES // 2, 2, -1), axis=2).T
 

@@ -57,7 +57,7 @@ _SPEEDS, _USUAL = (0.5, 1.0, 2.0), 0.01
 ENTRIES = "parameters", "combinations", "fit", "motions", "optima", "further", "profiles"
 """Entries of the result file."""
 
-# Columns of further measurements.
+# Columns of the samples that further measurements may record.
 _FURTHER = CHANNELS[0], CHANNELS[1], CHANNELS[4], *CHANNELS[6:]
 
 
@@ -258,10 +258,11 @@ def further(problem: Problem, best: Local, spread: Spread) -> list[dict[str, Any
 def profile(
     problem: Problem, best: Local, spread: Spread, number: int, fine: bool
 ) -> dict[str, Any]:
-    """Return an entry of `profiles` of the result file: the quantity `number` at several values,
-    all others fitted again. Twice the loss rises by less than a quantile of χ² in its interval.
+    """Return the profile likelihood of quantity `number`, an entry `profiles` of the result file.
 
-    `fine`: whether to fit at further values, from which the course of the loss can be drawn."""
+    At each of several values of the quantity, all others are fitted again. In the confidence
+    interval, twice the loss exceeds its minimum by less than a quantile of χ². `fine`: whether to
+    fit at further values, for a smooth curve of the loss."""
     from scipy.optimize import root_scalar  # Slow import (0.5 s).
 
     one, (low, high) = problem.quantities[number], (side[number] for side in problem.box)
@@ -276,7 +277,7 @@ def profile(
         place = best.place + away / error**2 * spread.covariance[:, number]
         place[number] = center + away
         found = problem.fitted(place, best.begins, best.deviation, held=[number])
-        if found is None:  # Without a motion to trust, the interval ends.
+        if found is None:  # Without a usable motion, the interval ends.
             return spread.width
         rise = max(0.0, float(2 * (found.cost - best.cost) / factor))
         rows.append({"increase": rise, "values": named(problem, found.values)})
@@ -343,7 +344,7 @@ class Identification:
         """Return the increase of twice the loss from its minimum to other `values` (by key).
 
         For the true values it follows a χ² distribution, with one degree of freedom per combination
-        that is determined. It is infinite if there is no motion to trust."""
+        that is determined. It is infinite without a usable motion."""
         assert self.best is not None
         problem, best, spread = self.best
         place = np.array([one.scaled(values[one.key]) for one in problem.quantities])

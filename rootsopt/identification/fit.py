@@ -214,7 +214,7 @@ class _Search:
         self.others_at: list[tuple[NDArray[np.float64], list[int]]] = []
 
     def run(self) -> Local | None:
-        """Return the best fit; None if no scene has a motion to trust at all points."""
+        """Return the best fit; None if no scene has a usable motion at all points."""
         points, p, known = self.problem.points, len(self.problem.quantities), []
         count = int(np.clip(_MOST // len(points), 8, _TRIED * p))
         first = np.array([one.first for one in self.problem.quantities])
@@ -267,7 +267,7 @@ class _Search:
         self.ends += [] if end is None else [end]
 
     def _fit_other_motions(self, one: Local) -> None:
-        """Fit from the scene of a fit again, with the other motions that coexist there."""
+        """Repeat the fit `one` from its scene, with the other motions that coexist there."""
         named = zip(self.problem.quantities, one.values, strict=True)
         values = {q.key: float(x) for q, x in named if q.key != OFFSET}
         each: list[list[Any]] = []

@@ -1,4 +1,4 @@
-"""Quantities to fit, and predictions of a scene for a record with derivatives by them."""
+"""Quantities to fit, and predictions of the record with derivatives with respect to them."""
 
 import dataclasses
 import functools
@@ -195,8 +195,8 @@ REST = np.zeros(2)
 class Predicted(NamedTuple):
     """Predictions for the n rows and c columns that were measured at an operating point.
 
-    `status` of the motion; `values` (n, c) and `slopes` (n, c, p): None if there is no motion to
-    trust, slopes with respect to the p quantities; `errors` (n, c): standard errors of averages, 0
+    `status` of the motion; `values` (n, c) and `slopes` (n, c, p): None without a usable motion,
+    slopes with respect to the p quantities; `errors` (n, c): standard errors of averages, 0
     for orbits; `begin`: where the search for the motion of a neighbouring scene begins; `orbit`:
     its period, multipliers and residual, as in the result file."""
 

@@ -93,7 +93,7 @@ class Problem:
         size: Any = measured.transform(lambda x: np.sqrt(np.mean(x**2)))
         varies = measured.transform(lambda x: np.std(x.to_numpy()))
         scale = size.where(~rows.sampled, varies.clip(lower=_STILL * size))
-        # A column of zeros has the scale of the others with its unit.
+        # A column of zeros takes the greatest scale of the columns with its unit.
         like = scale.groupby(rows.column.str.rpartition("_")[2]).transform("max")
         scale = scale.mask(scale == 0, like).replace(0.0, 1.0)
         # Averages have relative errors, samples those of their column.
@@ -118,8 +118,8 @@ class Problem:
         """Return the standard deviations (n,).
 
         Those not given are estimated from the differences `away` (n,) between prediction and
-        record; without these, they are the scale. Columns of few values share one relative
-        deviation."""
+        record. If `away` is `None`, they are set to `scale`. Columns of few values share one
+        relative deviation."""
         scale, found = self.rows.scale.to_numpy(), self.rows.given.to_numpy(copy=True)
         unknown = np.isnan(found)
         if away is None:

@@ -151,7 +151,7 @@ def notes(config: Config) -> list[str]:
     centre is not the rotor's axis. They also say whether a clearance was drawn into it."""
     if not config.profile.from_file:
         return []
-    from rootsopt.measured.source import advice, outline_of  # As in `record`.
+    from rootsopt.measured.source import advice, outline_of  # Slow import, as in `record`.
 
     profile, checks = outline_of(config.profile)
     found = advice(config.profile, checks)

@@ -225,7 +225,7 @@ def _exploded(inserts: list[Any], name: str) -> list[Any]:
             single = depth <= _DEEPEST and insert.mcount == 1
             own = list(insert.virtual_entities(skipped_entity_callback=skipped)) if single else []
             for entity in (e for e in own if e.dxf.layer == "0"):
-                entity.dxf.layer = insert.dxf.layer  # As in CAD.
+                entity.dxf.layer = insert.dxf.layer  # CAD does so for layer 0.
         handled += 1 + len(own)
         if not single or handled > _ENTITIES:
             raise InputError(

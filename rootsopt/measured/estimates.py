@@ -165,7 +165,7 @@ class Estimates:
 
     @property
     def few(self) -> str:
-        """Say that the scatter is unknown."""
+        """Clause for messages: the scatter is unknown."""
         return (
             "the points are too few to tell scatter from shape (between them, the curve is known "
             f"to about {_two(self.interpolation)} um)"

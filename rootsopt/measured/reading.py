@@ -194,7 +194,7 @@ def _noted(loop: Loop, count: int, which: str) -> Loop:
 
 
 def _likely(loops: list[Loop], sought: Sought | None) -> Loop:
-    """Return the loop for the messages if none fits the rotor.
+    """Return the loop to go on with if none fits the rotor: later checks report what is wrong.
 
     If possible, it has the rotor's lobes and, in another unit, its size. Otherwise, if possible, it
     has the lobes alone. Of several loops, return the largest."""

@@ -169,7 +169,7 @@ def found(path: Path, given: Mapping[str, Any], ask: Callable[[str, Any], Any]) 
     known = given.get("pitch_radius_mm")
     loop, seen, said = _sized(loop, lobes, given.get("outline_unit"), known, ask)
     stride = seen.stride(float(np.median(np.abs(np.diff(loop.points)))))
-    if seen.rough(0.0) and stride > 1:  # So close together that they cannot be smoothed.
+    if seen.rough(0.0) and stride > 1:  # Points too close together to be smoothed.
         points, joints = loop.points[::stride], loop.joints[::stride]
         notes = (*loop.notes, f"one in {stride} points is used")
         loop = dataclasses.replace(loop, points=points, joints=joints, notes=notes)

@@ -203,8 +203,8 @@ class _Comparison:
     def _in_worst(self, scene: str) -> list[dict[str, float]]:
         """Return the optimum in one scene, as a list; empty if the search fails.
 
-        The search begins at the design that is best in that scene, of other good designs in the
-        config's own scene."""
+        The best designs of the config's own scene are simulated in that scene. The search begins at
+        the one that is best there."""
         ((base,),) = self.evaluations([BASELINE], one := {scene: self.scenes[scene]})
         problem, keys = self.problem.beside(base), self.config.design_keys
         rows = [x for x in self.result.history if x["feasible"] and math.isfinite(x["objective"])]
@@ -235,9 +235,9 @@ class _Comparison:
 
 
 def _known(lead: Callable[[float], float], end: float, other: float) -> float:
-    """Return the value nearest to `end`, seen from the `other` one, for which `lead` is known.
+    """Return the last value on the way from `other` to `end` at which `lead` is not NaN.
 
-    It is `end` itself if `lead` is known there, or nowhere."""
+    Return `end` itself if `lead` is a number there, or at neither of the two."""
     if not math.isnan(lead(end)) or math.isnan(lead(other)):
         return end
     inside = other
@@ -248,7 +248,7 @@ def _known(lead: Callable[[float], float], end: float, other: float) -> float:
 
 
 def _change(lead: Callable[[float], float], low: float, high: float) -> float | None:
-    """Return where `lead` changes its sign between two values; `None` if a motion is not known."""
+    """Return where `lead` changes its sign between two values; `None` if it is NaN on the way."""
     from scipy.optimize import brentq  # Slow import (0.3 s).
 
     try:

@@ -50,10 +50,12 @@ _NOISE = 1e-6
 # also the curvature before any pair is known.
 _CLOSE = 1e-3
 
-# Least curvature along a coordinate, relative to that which all coordinates would need alike.
+# Least curvature along a coordinate, relative to the curvature that agrees with all pairs if it is
+# the same along all coordinates.
 _LEAST = 0.1
 
-# Share of a rise that the curvatures must agree with, so that they do not change all the time.
+# Share of a rise that the curvatures must explain. With the whole rise, almost every new point
+# would change them, and all bounds would have to be computed again.
 _SLACK = 0.9
 
 # Curvature and slope above which a pair counts as a corner, and as a jump. They are relative to the
@@ -64,11 +66,11 @@ _STEEP, _SHARP = 100.0, 10.0
 # Number of minorants in a linear program for the middle of a box and for each of its corners.
 _ROWS = 3
 
-# Half width of a box below which it is left: one that has no bound, and any other.
+# Half width below which a box is not halved: a box without a bound, and any other box.
 _NARROW, _NARROWEST = 1 / 64, 1 / 8192
 
 # Distance from the middle of a box (half widths) beyond which a feasible point says nothing about
-# it; half width of a box that is void if no feasible point is found within this distance.
+# it; half width below which a box counts as empty if no feasible point is that near.
 _OUTSIDE, _SMALL_BOX = 2.0, 1 / 16
 
 # Greatest number of design parameters for a lower bound: with `optimizer.prove`, and by default.
@@ -125,8 +127,8 @@ class Surface:
         self.points, self.tops = np.vstack([self.points, point]), np.append(self.tops, top)
         ends = np.full((2, len(values)), np.inf)
         if count:
-            # By how much each minorant of this point is too high at the others, and each of theirs
-            # at this one.
+            # Excess of each minorant of this point over the values at the others, and of each of
+            # theirs over the value at this one.
             ahead = values[:, None] + slopes @ away.T - self.tops[:-1]
             back = self.values - np.sum(self.slopes * away[self.owner], axis=1) - top
             over, bent, reach, lean = self._told(np.broadcast_to(distance, ahead.shape), ahead)
@@ -151,12 +153,12 @@ class Surface:
         return True
 
     def _told(self, far: NDArray[np.float64], rises: NDArray[np.float64]):
-        """Return what pairs at the distances `far` tell, given the `rises` by which minorants are
-        too high there (arrays of one shape).
+        """Return what pairs of points show about curvature, corners and jumps.
 
-        (rises that curvature explains, 0 for others; whether a pair is too steep for that; where
-        minorants end: in half its distance, (2, ...): the paraboloid's, and the cone's; the
-        greatest rise per distance that only a corner explains)"""
+        `far`: distances of the pairs; `rises`: amounts by which minorants are too high there (an
+        array of the same shape). Return four results: the rises that curvature explains, 0 for
+        others; whether a pair is too steep for that; distances (2, ...) at which paraboloid and
+        cone end, half of `far` or inf; the greatest slope that only a corner explains."""
         extent = max(float(np.max(np.ptp(self.points, axis=0))), _CLOSE)
         steep = max(float(np.ptp(self.tops)), _GAP) / extent
         rises = rises - _NOISE
@@ -193,13 +195,12 @@ class Surface:
         return float(0.5 * box.half**2 @ self.curved)
 
     def near(self, point: NDArray[np.float64], others: NDArray[np.float64]) -> float:
-        """Return the least value (of the paraboloid) by which a `point` (d,) differs from `others`
-        (n, d)."""
+        """Return the least ½ Σ κ_j (x_j - p_j)² from a `point` p (d,) to `others` (n, d)."""
         return float(np.min(0.5 * (others - point) ** 2 @ self.curved, initial=np.inf))
 
 
 class Bounding:
-    """The search for a lower bound. It asks for points, which the caller evaluates and tells.
+    """The search for a lower bound: `ask` returns points to evaluate, `tell` takes the results.
 
     `limits`: function that returns the slacks (m,) of the constraints of the geometry, and their
     gradients (m, d); `size`: number d of coordinates; `best`: least known objective of a feasible
@@ -277,7 +278,7 @@ class Bounding:
         return wanted
 
     def bound(self, reached: float) -> Bound:
-        """Return what is known; `reached`: objective of the design that is reported."""
+        """Return the lower bound found so far; `reached`: objective of the reported design."""
         boxes = [self._bounded(box)[0] for box in self._open] + self._left
         known = [box.bound for box in [*boxes, *self._closed] if box.bound > -math.inf]
         lower = float(min([*known, self.best, reached])) if known else -math.inf

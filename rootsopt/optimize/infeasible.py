@@ -267,7 +267,7 @@ class Beginning:
 
     @property
     def _inset(self) -> str:
-        """Say how the members get the gap that the outline has by its inset."""
+        """Sentence on the clearance that gives the members the gap of the inset outline."""
         size, gap = self.likeness.inset * 1e3, self.config.contact.clearance_mm
         text = f"The outline is cut, inset {size:.3g} mm: the members of the family have the same "
         text += f"flank gap with `--set contact.clearance_mm={gap:.6g}`"

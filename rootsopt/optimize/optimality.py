@@ -34,10 +34,9 @@ class StartOutcome(NamedTuple):
     """Outcome of one local search.
 
     `start`: index of the search; `objective`: best objective, NaN if no usable design satisfied
-    all constraints;
-    `residual`: first-order residual, NaN if not known; `reason`: word for why the search ended;
-    `evaluations`: number of evaluated designs; `design`: best design, in config units by key;
-    `point` (d,): this design in the unit box."""
+    all constraints; `residual`: first-order residual, NaN if not known; `reason`: word for why the
+    search ended; `evaluations`: number of evaluated designs; `design`: best design, in config units
+    by key; `point` (d,): this design in the unit box."""
 
     start: int
     objective: float
@@ -204,8 +203,8 @@ class Optimality:
 def judged(reason: str, holds: bool) -> str:
     """Return why a search ended (`reason`), corrected by the simulation of its design from rest.
 
-    `holds`: whether the first-order conditions hold there. Only a search that has converged can
-    lose its verdict: conditions that hold say little about the value."""
+    `holds`: whether the first-order conditions hold there. If they do not, a search that
+    seemed to have converged has not; any other reason stays."""
     return reason if holds or reason != "converged" else "verification"
 
 

@@ -164,7 +164,7 @@ class Optimization:
 
     @property
     def cost(self) -> str:
-        """Sentence for a design that is worse than the baseline, because this violates limits.
+        """Sentence for a design worse than the baseline, which is then one that violates limits.
 
         It is empty for a better design, and without an optimised one."""
         gain = self.improvement.get("objective", 0.0)

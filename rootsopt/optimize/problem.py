@@ -119,7 +119,7 @@ class Problem:
         ratio to F_0 alone would mean nothing. Designs and constraints of the geometry are the
         same."""
         found = Problem(self.config, _in_units(baseline, self.baseline), self.space, self.limits)
-        found.__dict__["_look_at"] = self._look_at  # Its results are expensive and stay valid.
+        found.__dict__["_look_at"] = self._look_at  # Expensive, independent of `baseline`.
         return dataclasses.replace(found, added=1 - found.objective(baseline))
 
     def objective(self, evaluation: Evaluation) -> float:
@@ -417,7 +417,9 @@ class Problem:
 
 
 def _in_units(evaluation: Evaluation, other: Evaluation) -> Evaluation:
-    """Return an `evaluation` with each measure at least `_LEAST` of its value in the `other`."""
+    """Return an `evaluation` with each measure raised to at least `_LEAST` of that in the `other`.
+
+    Measures are divided by these values, and a ratio to a value near 0 would mean nothing."""
     least = {key: _LEAST * value for key, value in other.response.items()}
     response = {k: max(value, least.get(k, value)) for k, value in evaluation.response.items()}
     speeds = tuple(

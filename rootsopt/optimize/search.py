@@ -158,8 +158,8 @@ class Search:
             return Optimization(None, baseline, None, [], {}, self.stop.is_set())
         # Forces of coexisting motions are compared relative to the baseline's.
         self.exact = exact = exact.relative_to(baseline)
-        # Screening and descent need a ranking of designs and gradients, but only a few digits.
-        # `source` is the baseline's, which may be of another family.
+        # A coarse tolerance suffices to rank designs and for a descent. The baseline may be of
+        # another family, so it has an evaluator of its own (`source`).
         rtol = max(1e-6, self.config.solver.orbit_tolerance)
         self.fast, self.source = (
             one.at_tolerance(rtol).surveying() for one in (exact, source.relative_to(baseline))
@@ -262,9 +262,10 @@ class Search:
         return bounding, further
 
     def _vertex(self, optimized: Evaluation, trials: list[Trial]) -> VertexOptimum | None:
-        """Return the facts on an optimum at a vertex of the limits, from as many designs as the
-        search had `trials`. Return `None` for any other optimum, or if the objective is over a
-        sample."""
+        """Return the facts on an optimum at a vertex of the limits; `None` for any other optimum.
+
+        Simulate at most as many designs as the search had `trials`. Return `None` also for an
+        objective over a sample, and with more than `PARAMETERS` parameters."""
         if not self.stage.bounded or len(optimized.design) > PARAMETERS:
             return None
         known = [one for one in trials if one.evaluation.usable]

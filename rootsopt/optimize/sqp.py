@@ -55,8 +55,8 @@ _NOISE = 1e-7
 # Least magnitude of the objective to which decreases are related.
 _SMALL = 0.1
 
-# Price of a violation: its first value, plus twice the sum of all multipliers; and its greatest
-# value.
+# Price of a violation: the least (at the start, and later above twice the sum of all multipliers),
+# and the greatest.
 _PRICE, _MOST = 2.0, 1e5
 
 

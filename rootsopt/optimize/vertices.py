@@ -143,8 +143,8 @@ class FeasibleSet:
     def plane(self, point: NDArray[np.float64], most: int) -> Plane | None:
         """Return the feasible part of a plane through a `point` (d,) along two coordinates.
 
-        The plane with most feasible points is chosen; `most`: number of points that
-        `Plane.some` returns at most. Return `None` if there are fewer than four."""
+        The plane with most feasible points is chosen. `most`: as for `Plane.some`. Return `None` if
+        that method would return fewer than `_CORNERS` nodes."""
         ends = np.linspace(0, 1, _COARSE)
         planes = [self._plane(point, axes, ends, ends)
                   for axes in itertools.combinations(range(self.size), 2)]  # fmt: skip
@@ -175,7 +175,7 @@ class FeasibleSet:
     def _other_end(self, vertex: Vertex, number: int) -> Vertex | None:
         """Return the other end of the edge on which limit `number` of a `vertex` is released.
 
-        Return `None` if the edge is lost."""
+        Return `None` if the edge cannot be followed to its end."""
         kept = [one for one in vertex.held if one != number]
         point, last = vertex.point, np.zeros(self.size)
         slack, normals = self.slacks(point)
@@ -202,7 +202,9 @@ class FeasibleSet:
         return None
 
     def _on(self, held: list[int], point: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Return the point next to `point` (d,) at which limits `held` have no slack."""
+        """Return a point near `point` (d,) at which the limits `held` are active.
+
+        Return `None` if Newton's method does not find one."""
         for _ in range(_NEWTON):
             slack, normals = self.slacks(point)
             rest = slack[held]

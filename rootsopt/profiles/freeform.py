@@ -30,8 +30,8 @@ _POLISH = 3
 _NODES_PER_SPAN = 6
 # Number of points per knot span in the least-squares fit of a free form.
 _SAMPLES = 40
-# Factor on the row of the pitch crossing in the least-squares fit of a free form. All other rows
-# have the factor 1.
+# Factor on the row of the pitch crossing in the least-squares fit of a free form, which makes the
+# fit almost exact there. All other rows have the factor 1.
 _FIRMLY = 1e3
 # Value of dβ/dν below which a Newton step divides by this constant instead of by dβ/dν. The
 # derivative is 0 on an arc centred on the pitch circle.

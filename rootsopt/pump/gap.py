@@ -372,7 +372,7 @@ def play(
         return 3 * more, *least(start + more)
 
     first = least(jnp.zeros_like(r))
-    # The gap of conjugate flanks is smooth. That of others may have an overlap between the poses.
+    # The gap of conjugate flanks is smooth. Others may overlap between the sampled poses.
     clear = jnp.min(first[1]) >= 0 if profile.conjugate else jnp.zeros((), bool)
     nothing = jnp.zeros_like(r), jnp.zeros_like(r)
     overlap, pose = lax.cond(clear, lambda: nothing, lambda: pair.overlap())

@@ -293,7 +293,7 @@ class Part(NamedTuple):
 
     @property
     def speed_rpm(self) -> float:
-        """Speed of rotor 1; NaN unless the points are speeds."""
+        """Speed of rotor 1 (rpm); NaN unless the points are speeds."""
         return self.values.get("speed_rpm", math.nan)
 
     def row(self, whole: bool = False) -> dict[str, Any]:

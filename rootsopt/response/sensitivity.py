@@ -180,9 +180,10 @@ _gaps = CachedFunction(gaps)
 def touching(config: Config) -> dict[str, Any] | None:
     """Return the scatter of a design's reserve under `tolerances`, for the result file.
 
-    The reserve, its standard deviation, and the least one if all values are as bad as they can be
-    (to first order) are in µm; the share of `MACHINES` that touch is that by models of first and
-    second order. `SIMULATED` of them check the latter. The key that costs most comes first.
+    The entries are the reserve, its standard deviation and its least value over all values that can
+    occur, each to first order (µm); the share of `MACHINES` machines that touch, by models of first
+    and second order; a check of the latter, for which `SIMULATED` machines are simulated; and the
+    cost of each key, the costliest first.
 
     Return None without a timing gear or without `tolerances.over`. Also return None if the motion
     at the nominal values, or at a value moved by a standard deviation, is not known."""

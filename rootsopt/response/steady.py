@@ -100,7 +100,7 @@ def steady_response(
     `jax.jit` of a function that calls this one compiles twice as fast with the option
     `compiler_options=rootsopt.COMPILER_OPTIONS`.
 
-    Without a periodic orbit to trust, forces are those of a window of the motion, and derivatives
+    Without a usable orbit, forces are those of a window of the motion, and derivatives
     are NaN.
 
     Raises ValueError if the design has the wrong shape, or if `start` belongs to another kind of

@@ -26,7 +26,7 @@ from rootsopt.status import Status
 
 @dataclasses.dataclass(frozen=True)
 class Still(Motions):
-    """Evaluates no motion. The response holds only the objective's further terms."""
+    """Evaluates the objective's further terms from the geometry alone, without a motion."""
 
     def evaluated(self, evaluator: Evaluator, design: Any, start: Any, series: bool) -> Evaluation:
         """Evaluate a `design` (d,) in config units; the other arguments have no effect."""

@@ -383,10 +383,10 @@ def along(
 ) -> tuple[Any, Any, Any]:
     """Return (pair, derivatives of the pair along `directions`, geometry) of `build(primal)`.
 
-    `build`: function that returns a rotor pair and the geometry of one rotor, or another module and
-    a result without derivatives. `directions`: tree
-    with the structure of `primal` and a leading axis, which may have length 0. The derivatives have
-    the pair's own structure with the same leading axis."""
+    `build`: function that returns a rotor pair, or another module, and a result that needs no
+    derivatives, such as the geometry of one rotor. `directions`: tree with the structure of
+    `primal` and a leading axis, which may have length 0. The derivatives have the pair's own
+    structure with the same leading axis."""
 
     def parted(primal):
         pair, shape = build(primal)

@@ -90,7 +90,7 @@ def profile_from_file(config: ProfileConfig) -> Outline | None:
 def check_axis(config: ProfileConfig) -> None:
     """Raise `InputError` if an outline from a file does not lie around its axis."""
     if config.from_file:
-        from rootsopt.measured.source import check_center  # As in `profile_from_file`.
+        from rootsopt.measured.source import check_center  # Slow import, for outlines only.
 
         check_center(config)
 

@@ -108,8 +108,8 @@ _LIMITED = (
     ("outer_radius_min_mm", "outer radius", "outer_radius", "mm", MM, MM),
 )
 
-# Constraints that keep a profile sound, in addition to the constraint on the undercut margin. The
-# columns are name, margin, unit, limit, scale and factor (see `Constraint`).
+# Constraints that keep a profile sound, in addition to the constraint on the undercut margin. For
+# the columns, see `Constraint`.
 _SOUND = (
     # name, margin, unit, limit, scale, factor
     ("least turn of a flank segment", "turning", "deg", 0.0, 0.1, DEG),

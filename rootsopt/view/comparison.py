@@ -72,7 +72,9 @@ def _cell(objective: float | None) -> Cell:
 
 
 def elsewhere(result: Mapping[str, Any]) -> Iterator[str]:
-    """Yield sentences on an optimum over assumed values; no sentence without a comparison."""
+    """Yield sentences that compare the optimum with the baseline in other scenes.
+
+    The scenes are those of `assumptions`. Yield nothing if the result has no such comparison."""
     found = result.get("assumptions")
     if not found:
         return
@@ -120,7 +122,7 @@ def _row(key: str, found: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def _sense(row: Mapping[str, Any]) -> str:
-    """Return in which direction a quantity changes an objective, with its rank correlation."""
+    """Return the change of a quantity that raises the objective, with the rank correlation."""
     rank = row["rank_correlation"] or 0.0
     word = "more" if rank > 0 else "less"
     return f"{word} {named(row['key'])} (rank correlation {brief(rank, 2)})"
@@ -159,7 +161,7 @@ def named(key: str) -> str:
 
 
 def label_of(key: str) -> str:
-    """Return this name with the unit in parentheses."""
+    """Return the name of an assumed quantity, with its unit in parentheses."""
     unit = name_and_unit(key)[1]
     return f"{named(key)} ({unit})" if unit else named(key)
 
@@ -171,7 +173,7 @@ NOTHING_BETTER = (
     "better rotor: try `--set optimizer.family=free_form`, or allow a narrower tip land with "
     "`--set constraints.seal_width_min_mm`."
 )
-"""Message if there is none."""
+"""Message of a search that has found no better rotor."""
 
 # Quantities that are compared, by the entry of a record that holds them.
 _ROWS = (

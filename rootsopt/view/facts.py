@@ -75,7 +75,7 @@ def optimised(result: Record, rows: Sequence[Record]) -> Facts:
 
 
 def _sentence(parts: Sequence[str]) -> str:
-    """Return parts of a sentence as one."""
+    """Join parts to one sentence, with semicolons between them."""
     joined = "; ".join(parts)
     return f"{joined[:1].upper()}{joined[1:]}."
 
@@ -119,7 +119,7 @@ def _sense(key: str) -> str:
 
 
 def reserves(*records: Record) -> Iterator[str]:
-    """Yield how far the flanks stay apart, if the records know it."""
+    """Yield a phrase on the contact reserve, if any of the `records` holds it."""
     found = [(one.get("response") or {}).get("contact_reserve_um") for one in records]
     known = [quantity(x, "µm") for x in found if x is not None]
     if known:
@@ -128,7 +128,7 @@ def reserves(*records: Record) -> Iterator[str]:
 
 
 def _prices(result: Record) -> Iterator[str]:
-    """Yield the limits whose relaxation lowers the objective, the dearest first."""
+    """Yield a phrase on the limits whose relaxation lowers the objective most."""
     found = [row for row in result.get("constraints") or ()
              if (row.get("relaxed_objective_percent") or 0.0) < 0]  # fmt: skip
     found.sort(key=lambda row: row["relaxed_objective_percent"])

@@ -109,7 +109,7 @@ class ResultFolder:
 
         `figure` has a canvas of the Agg backend, as those of `figures.style.figure` have; its
         resolution is changed. Raises `InputError` if the file cannot be written."""
-        from PIL import Image  # Like matplotlib, only for figures.
+        from PIL import Image  # Imported here: only figures need it.
 
         file, canvas = io.BytesIO(), cast("FigureCanvasAgg", figure.canvas)
         # `savefig` would lay out and draw everything twice.

@@ -109,7 +109,9 @@ def ending(
 
 
 def _usable(command: str, status: str, result: Record, rows: Sequence[Record]) -> bool:
-    """Return whether a run's status needs no explanation, because its facts suffice."""
+    """Return whether a run has a result to report, so that its status needs no explanation.
+
+    A sweep, or a search for coexisting motions, has one if any of its motions has."""
     several = {"sweep": rows, "attractors": result.get("attractors")}
     found = [row.get("status") for row in several.get(command) or ()]
     explained = command == "optimize" and result.get("optimized")

@@ -116,7 +116,7 @@ def _leaves(scene):
 
 @pytest.mark.long
 def test_gradient_of_forces_is_that_of_differences():
-    """Flanks in contact: derivatives by eccentricities, angles, backlash and pressure angle."""
+    """Flanks in contact: derivatives with respect to eccentricities, angles, backlash and more."""
     changes = ["eccentricity_um=[10, 4]", "eccentricity_angle_deg=[30, -50]"]
     config = rootsopt.load_config(
         "cic_drawn", [f"scene.timing_gear.{change}" for change in changes]

@@ -1,4 +1,4 @@
-"""The work of `rootsopt attractors`."""
+"""`rootsopt attractors`: find the coexisting motions of one scene, and write their files."""
 
 import argparse
 

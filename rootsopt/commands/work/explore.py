@@ -1,4 +1,4 @@
-"""The work of `rootsopt explore`."""
+"""`rootsopt explore`: serve the page with sliders, and open it in the browser."""
 
 import argparse
 import html
@@ -33,7 +33,7 @@ def body(config: Config, options: argparse.Namespace) -> int:
         try:
             engine.prepare()
         except Exception as error:
-            engine.ready.set()  # Pages compute the same, and show the error.
+            engine.ready.set()  # Pages meet the same error, and show it.
             environment.say(f"the programs could not be prepared: {error}")
 
     def started(url: str) -> None:

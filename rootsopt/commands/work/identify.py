@@ -1,4 +1,4 @@
-"""The work of `rootsopt identify`."""
+"""`rootsopt identify`: fit quantities of a scene to a measured record, and write the files."""
 
 import argparse
 

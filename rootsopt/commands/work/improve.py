@@ -1,4 +1,4 @@
-"""The work of `rootsopt improve`: from the file of a rotor to a better one."""
+"""`rootsopt improve`: from the file of a rotor to a better one."""
 
 import argparse
 import sys

@@ -1,4 +1,4 @@
-"""The work of `rootsopt new`."""
+"""`rootsopt new`: write a config from a catalogue sheet, asking for what is missing."""
 
 import argparse
 import os

@@ -1,4 +1,4 @@
-"""The work of `rootsopt optimize`."""
+"""`rootsopt optimize`: search for the best design, and write its files and figures."""
 
 import argparse
 import time

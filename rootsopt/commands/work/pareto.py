@@ -1,4 +1,4 @@
-"""The work of `rootsopt pareto`."""
+"""`rootsopt pareto`: trace a front of best compromises, and write its files."""
 
 import argparse
 import time

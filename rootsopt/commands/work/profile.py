@@ -1,4 +1,4 @@
-"""The work of `rootsopt profile`."""
+"""`rootsopt profile`: compute the geometry of one design, and write drawings and figures."""
 
 import argparse
 from typing import Any

@@ -45,7 +45,7 @@ J = TypeVar("J", bound=Journal)
 
 
 def runs_of(options: argparse.Namespace) -> contextlib.AbstractContextManager[Runs]:
-    """Return a context manager for what runs evaluations, according to the `options`."""
+    """Return a context manager of the `Runs` that the `options` name: this process, or workers."""
     if options.workers is not None:
         say(
             f"`--workers {options.workers}` starts processes that load everything again, some 10 s "

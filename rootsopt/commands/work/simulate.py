@@ -1,4 +1,4 @@
-"""The work of `rootsopt simulate`."""
+"""`rootsopt simulate`: simulate one design, and write its motion, forces and figures."""
 
 import argparse
 

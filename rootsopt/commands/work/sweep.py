@@ -1,4 +1,4 @@
-"""The work of `rootsopt sweep`, and its files: rows, summary, and the dataset as netCDF."""
+"""`rootsopt sweep`: simulate all points, and write rows, summary and a netCDF dataset."""
 
 import argparse
 import io

@@ -337,8 +337,8 @@ def known_events(pair: RotorPair, mesh: Mesh) -> Events:
 def found_events(pair: RotorPair, elements: Elements, seen: FlagScan) -> Events:
     """Return the events of the motion `elements`, whose flags are `seen`.
 
-    If the flags change exactly at the events of the mesh, these are not listed: they are its
-    `known_events`."""
+    If the flags change exactly at the events of the mesh, return a placeholder, to save the time of
+    locating them: `known_events` returns these events."""
     compared = _compared(pair, elements, seen)
     changed = jnp.any(compared.fresh) | (compared.gone > 0)
 

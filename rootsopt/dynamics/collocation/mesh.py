@@ -294,7 +294,7 @@ class KnownOrbit(NamedTuple):
 
     @classmethod
     def empty(cls, sizes: tuple[int, int], states: int, flanks: int) -> "KnownOrbit":
-        """Return a placeholder.
+        """Return a placeholder for an orbit that is not known: arrays of its shapes, not `sound`.
 
         `sizes`: room for elements and for times of the mesh; `states`: number of states; `flanks`:
         number of flanks that can touch at once (`RotorPair.flanks`)."""

@@ -222,7 +222,9 @@ def _roots(roots, element, share) -> Float[Array, "p flanks 2"]:
 
 
 def _to_vertex(slope: Float[Array, " p"], bend: Float[Array, " p"]) -> Float[Array, " p"]:
-    """Return the distance to the vertex of a parabola, or the greatest allowed one uphill."""
+    """Return the step to the maximum of a parabola, at most `_NEAREST` (fractions of an element).
+
+    `slope`, `bend`: first and second derivative. Without a maximum, step uphill by `_NEAREST`."""
     bends = bend < 0
     step = -slope / jnp.where(bends, bend, -1.0)
     step = jnp.where(bends, step, jnp.sign(slope) * _NEAREST)

@@ -33,7 +33,7 @@ from rootsopt.response.terms import depends_on_forces, is_force, reporting, term
 from rootsopt.scene.build import Scene
 from rootsopt.scene.space import Space
 
-# Keys of `constraints` that may be absent; a floor of 0 has the same effect in the others.
+# Keys of `constraints` that can be left out. All others are floors: 0 has the same effect.
 _OPTIONAL = "outer_radius_min_mm", "outer_radius_max_mm"
 # Config key that names the terms.
 _KEY = "pareto.terms"

@@ -124,9 +124,7 @@ class OrbitFamily:
         moved = [resolved.replaced({key: float(value)}) for value in values]
         ends = [(scene.renewed(one), design_vector(one)) for one in (config, *moved)]
         (own, _), (low, tree), (middle, _), (high, _) = (
-            # The numbers as a vector, and the function that undoes this.
-            ravel_pytree(eqx.filter(end, eqx.is_inexact_array))
-            for end in ends
+            ravel_pytree(eqx.filter(end, eqx.is_inexact_array)) for end in ends
         )
         change = high - low if own.shape == low.shape == high.shape else jnp.zeros(1)
         most = np.nanargmax(np.abs(change))
@@ -231,6 +229,8 @@ def _seed(over: _Range, guess: Float[Array, " m"], period: int):
 @CachedFunction
 def _follow(over: _Range, start: Any, guess: Float[Array, " m"], across: Float[Array, " m"]):
     """Return the orbit whose place lies in the plane through `guess` (m,) normal to `across` (m,).
+
+    A place is a vector of unknowns of an `OrbitFamily`.
 
     `start`: motion to start from, direction of the curve there, and distance to go along it. The
     second result is a tuple: `BranchPoint.half_way`; the pair's own unit of ε (rad); whether the

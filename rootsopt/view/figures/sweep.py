@@ -169,8 +169,8 @@ def sweep_figure(folder: ResultFolder, plan: Plan, dataset: "xarray.Dataset") ->
 def _lines(folder: ResultFolder, axes, plan: Plan, dataset: "xarray.Dataset") -> None:
     """Draw the forces over one key, with a line for each value of the other key, if there is one.
 
-    The first key is on the axis, unless the second one has too many values, or only the second one
-    has numbers."""
+    The first key is on the axis. The keys change places if the second one has more than `_FEW`
+    values, or if only the second one has numbers and the first one has at most `_FEW` values."""
     across, along = axes[0], axes[1] if len(axes) == 2 else None
     few, numbers = [size <= _FEW for size in plan.shape], [axis.numeric for axis in axes]
     swapped = along is not None and (not few[1] or (few[0] and numbers == [False, True]))
@@ -196,7 +196,9 @@ def _lines(folder: ResultFolder, axes, plan: Plan, dataset: "xarray.Dataset") ->
 
 
 def _drawn(dataset: "xarray.Dataset") -> dict[str, str]:
-    """Return {variable: label} of two panels: forces, unless the flanks stay apart everywhere."""
+    """Return {variable: label} of the two panels.
+
+    They show the forces or, if no flank touches at any point, contact reserve and gear force."""
     if any(np.any(dataset[name].values > 0) for name in LABELS) or _APART[0] not in dataset:
         return LABELS
     return {name: label(name) for name in _APART}

@@ -207,7 +207,7 @@ def motion(profile: Profile, series: Series | None = None, period: int | None = 
 
 
 def _contacts(flank: Contacts) -> dict[str, list]:
-    """Return the contact points (mm) and normals of a flank, and where it touches in rolling."""
+    """Return contact points (mm), normals, and flags of contact in perfect rolling, of a flank."""
     parts = (*flank.point.T, *flank.normal.T)
     found = {
         name: _rounded(part, 5) for name, part in zip(("x", "y", "nx", "ny"), parts, strict=True)

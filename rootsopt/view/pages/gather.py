@@ -303,7 +303,10 @@ def anchor(word: str) -> str:
 
 @functools.cache
 def _pattern() -> re.Pattern[str]:
-    """Return a pattern of tags, which are skipped, labels of margins (1) and other words (2)."""
+    """Return a pattern of the words to link.
+
+    Group 1 matches labels of margins, group 2 other words. Tags match without a group, to be
+    skipped."""
     words = sorted(map(re.escape, glossary()), key=len, reverse=True)
     end = re.escape(_MARGIN)
     margins = "|".join(word.removesuffix(end) for word in words if word.endswith(end))

@@ -209,8 +209,8 @@ class Shape(NamedTuple):
 class Engine:
     """Evaluates configs that differ little from a first one, `given`.
 
-    `optimize`: the main job, `rootsopt.optimize_design`; passed as an argument, so that pages do
-    not depend on the search.
+    `optimize`: the function `rootsopt.optimize_design`, passed as an argument, so that pages do not
+    import the search.
 
     Several sessions in several threads can share an engine. `ready` is set once the first config
     has been evaluated, so that its programs are compiled."""

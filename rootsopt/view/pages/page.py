@@ -319,7 +319,7 @@ class Page:
     # What is shown
 
     def _tell_pair(self, **facts: Any) -> None:
-        """Let the page draw the pair with some new `facts`: rotor, motion, dim."""
+        """Send new `facts` (rotor, motion, dim) to the script that draws the pair."""
         self.facts |= facts
         self.pair.text = json.dumps(self.facts)
 

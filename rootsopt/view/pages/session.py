@@ -262,10 +262,11 @@ class Session:
         self.show(motion)
 
     def _from_rest(self, number: int, forced: bool) -> Evaluation | None:
-        """Compute the motion from rest of the values with this `number`, and compare it.
+        """Compute the motion from rest for the values with this `number`, and return it.
 
-        `forced`: whether to show it even if it is not the one that is shown. It is shown in any
-        case if the one that is shown has no steady state."""
+        Show it if the page shows no final motion for these values. Otherwise, report whether it is
+        the motion that the page shows. `forced`: whether to show it also if they differ. Return
+        `None` if newer values have replaced these."""
         if number != self.number:
             return None
         shown, known = self._shown, self._rest
