@@ -4,10 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rootsopt import InputError, load_config
+from rootsopt import InputError, Scene, load_config
 from rootsopt.pump.sheet import sheet
 from rootsopt.response.terms import terms_of, values_of
-from rootsopt.scene import Scene
 
 NAMES = (
     *("displaced_volume_cm3", "theoretical_flow_l_min", "flow_ripple", "gear_backlash_max_mm"),

@@ -25,8 +25,7 @@ def curve_of(residual, jacobian):
             miss = np.array([residual(*place), across @ (place - guess)])
             if np.max(np.abs(miss)) < 1e-12:
                 tangent = np.linalg.svd(matrix[:1])[2][-1]
-                turn = np.sign(np.linalg.det([matrix[0], tangent]))
-                return Spot(place, tangent, turn, None)
+                return Spot(place, tangent, np.sign(np.linalg.det([matrix[0], tangent])), None)
             if abs(np.linalg.det(matrix)) < 1e-12:
                 break
             place = place - np.linalg.solve(matrix, miss)
@@ -41,8 +40,7 @@ FOLD = {"FOLD": lambda spot: float(spot.tangent[-1])}
 
 
 def start_of(curve, x, p, way=1.0):
-    spot = curve(np.array([x, p]), np.array([0.0, 1.0]), None)
-    return spot.along(np.array([0.0, way]))
+    return curve(np.array([x, p]), np.array([0.0, 1.0]), None).along(np.array([0.0, way]))
 
 
 def test_circle_is_closed_with_a_fold_on_either_side():

@@ -10,13 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rootsopt import optimize
+from rootsopt import Status, optimize
 from rootsopt.config import DESIGN_KEYS, EnsembleConfig, load
 from rootsopt.response.ensemble import SIGNIFICANT, Ensemble, fitted_slope, independent, neighbours
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.result import ERRORS, RESPONSES
 from rootsopt.response.together import Members
-from rootsopt.status import Status
 from rootsopt.view import tables
 
 PERIODIC = ("ensemble.members=4", "ensemble.settle_periods=48", "ensemble.periods=8")

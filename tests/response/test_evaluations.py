@@ -12,9 +12,8 @@ from unittest import mock
 import numpy as np
 import pytest
 
+from rootsopt import InputError, load_config
 from rootsopt.commands.work.searching import runs_of
-from rootsopt.config import load
-from rootsopt.errors import InputError
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.reducers import HERE, Point
 from rootsopt.response.sweeps import cluster
@@ -26,7 +25,7 @@ from tests.response.workers import DEADLY
 @pytest.mark.long
 def test_a_design_that_kills_its_process_ends_the_search(monkeypatch):
     monkeypatch.setenv("TEST_SECONDS", "0.01")
-    evaluator = Evaluator.of(load("cic_drawn", [f"scene.speed_rpm={DEADLY}"]))
+    evaluator = Evaluator.of(load_config("cic_drawn", [f"scene.speed_rpm={DEADLY}"]))
     with (
         running(1, imports=(IMPORT,)) as runs,
         pytest.raises(InputError, match=r"several times.*--resume"),
@@ -35,7 +34,7 @@ def test_a_design_that_kills_its_process_ends_the_search(monkeypatch):
 
 
 def point():
-    return Point(Evaluator.of(load("cic_drawn")), np.ones(3))
+    return Point(Evaluator.of(load_config("cic_drawn")), np.ones(3))
 
 
 def runs_of_silence(status="running", threads=(2, 1)):
@@ -77,7 +76,7 @@ def test_a_scheduler_that_does_not_work_is_given_up(monkeypatch, status, threads
 
 @pytest.mark.parametrize("motion", ["reached", "worst", "ensemble"])
 def test_every_evaluator_travels(motion):
-    sent = Evaluator.of_objective(load("cic_drawn", [f"objective.motion={motion}"]))
+    sent = Evaluator.of_objective(load_config("cic_drawn", [f"objective.motion={motion}"]))
     found = pickle.loads(pickle.dumps(sent))
     assert (type(found), found.config) == (type(sent), sent.config)
     assert float(found.scene.speed) == float(sent.scene.speed)

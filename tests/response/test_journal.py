@@ -7,9 +7,8 @@ import random
 import numpy as np
 import pytest
 
-from rootsopt.config import load
+from rootsopt import InputError, Status, load_config
 from rootsopt.dynamics.maxima import Maxima
-from rootsopt.errors import InputError
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.journal import (
     Checkpoint,
@@ -24,13 +23,12 @@ from rootsopt.response.result import Part
 from rootsopt.response.sweeps.plan import plan_of
 from rootsopt.response.sweeps.points import lost
 from rootsopt.response.sweeps.scenes import Points
-from rootsopt.status import Status
 from tests.optimize.test_checkpoint import evaluation
 
 ROW = lost(Status.INVALID) | {"response": {"mean_force_N": 0.1 + 0.2, "peak_force_N": float("nan")}}
 SPEED = "scene.speed_rpm"
 PLAN = plan_of({SPEED: "1,2,3,4,5,6,7,8"})
-CIC = load("cic_drawn")
+CIC = load_config("cic_drawn")
 
 
 @pytest.fixture
@@ -175,8 +173,7 @@ def test_an_evaluation_is_known_by_its_stage_point_and_start(path):
         journal.close()
         assert len(asked) == 4
     assert numbers[0] == numbers[1] == [1 / 3, 0.25 / 3, 0.5 / 3, 1 / 3]
-    other = search(path, resume=True)
-    other.evaluated(run, "search", Point(one, point), point + 0.25)
+    search(path, resume=True).evaluated(run, "search", Point(one, point), point + 0.25)
     assert len(asked) == 5
 
 

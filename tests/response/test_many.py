@@ -24,8 +24,7 @@ def late(number, *_):
 @pytest.mark.parametrize("runs", [IN_TURN, LocalRunner(3)])
 def test_results_are_in_the_order_of_the_points(runs):
     done = []
-    points = [Point(late, number) for number in range(7)]
-    found = evaluate_many(points, runs, done.append)
+    found = evaluate_many([Point(late, number) for number in range(7)], runs, done.append)
     assert [one.response["mean_force_N"] for one in found] == [*range(7)]
     assert done == [*range(1, 8)]
     assert evaluate_many([], runs) == []

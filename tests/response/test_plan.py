@@ -4,8 +4,7 @@ import json
 
 import pytest
 
-from rootsopt.config import load
-from rootsopt.errors import InputError
+from rootsopt import InputError, load_config
 from rootsopt.response.scatter import draw
 from rootsopt.response.sweeps.plan import Plan, check_values, plan_of, scattered
 
@@ -103,23 +102,23 @@ def test_wrong_plans(axes, options, words):
 )
 def test_bad_keys_and_values(axes, words):
     with pytest.raises(InputError, match=words):
-        check_values(load("cic_drawn"), plan_of(axes))
+        check_values(load_config("cic_drawn"), plan_of(axes))
 
 
 def test_values_that_only_clash_are_accepted():
-    check_values(load("cic_drawn"), plan_of({"profile.family": "cic,ee", ANGLE: "5,36"}))
+    check_values(load_config("cic_drawn"), plan_of({"profile.family": "cic,ee", ANGLE: "5,36"}))
 
 
 def test_scenes_of_tolerances():
     """Those of the fresh sample, each of which is a config of its own."""
     over = {SPEED: {"uniform": 30.0}, ANGLE: {"normal": 0.01}}
-    config = load("cic_drawn").replaced({"tolerances": {"over": over}})
+    config = load_config("cic_drawn").replaced({"tolerances": {"over": over}})
     plain, plan = scattered(config, 8)
     assert (plain.tolerances, plan.method, plan.count) == (None, "tolerances", 8)
     assert [*map(list, zip(*plan.dimensions[0].columns.values(), strict=True))] == draw(
         config, 8, fresh=True
     ).tolist()
     check_values(plain, plan)
-    for wrong in ((load("cic_drawn"), 8), (config, 0)):
+    for wrong in ((load_config("cic_drawn"), 8), (config, 0)):
         with pytest.raises(InputError, match="--tolerances"):
             scattered(*wrong)

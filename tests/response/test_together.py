@@ -46,8 +46,7 @@ def test_points_keep_their_places(config, in_turn):
     found = simulated_together(config, POINTS)
     assert in_turn == [3]
     assert [row["status"] for row in found] == ["periodic", "invalid", "periodic", "passed_through"]
-    alone = [simulated(config, values) for values in POINTS]
-    assert found == alone
+    assert found == [simulated(config, values) for values in POINTS]
 
 
 def test_structures_are_told_apart(config):
@@ -66,8 +65,7 @@ def test_a_batch_that_fails_is_done_one_by_one(config, monkeypatch):
         raise MemoryError
 
     monkeypatch.setattr("rootsopt.response.sweeps.points.evaluate_together", broken)
-    found = simulated_together(config, POINTS[:1])
-    assert found == [simulated(config, POINTS[0])]
+    assert simulated_together(config, POINTS[:1]) == [simulated(config, POINTS[0])]
 
 
 def test_accelerators_take_batches(config, monkeypatch):

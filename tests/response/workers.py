@@ -9,10 +9,9 @@ import time
 
 import numpy as np
 
-from rootsopt.errors import InputError
+from rootsopt import InputError, Status
 from rootsopt.response.evaluation import Evaluation, Evaluator
 from rootsopt.response.sweeps import points
-from rootsopt.status import Status
 
 DEADLY = 666.0
 

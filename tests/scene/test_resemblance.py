@@ -35,8 +35,7 @@ def hausdorff(one, other):
 
     No code is shared with the package. If the other polygon has steps `h`, the distance of a vertex
     is too great by at most h² / 8d, where d is the distance."""
-    there = KDTree(one).query(other)[0].max()
-    return max(there, KDTree(other).query(one)[0].max())
+    return max(KDTree(one).query(other)[0].max(), KDTree(other).query(one)[0].max())
 
 
 def denser(points):
@@ -80,8 +79,7 @@ def test_smooth_feet_see_the_curve_and_not_its_chords():
 
 def test_flanks_are_continued_by_their_mirror_images():
     points = polygon(PROFILES["cic"], 40)
-    flank = points[: len(points) // 6 + 1]
-    whole = beyond(flank, 3)
+    whole = beyond(points[: len(points) // 6 + 1], 3)
     assert np.max(KDTree(points).query(whole)[0]) < 1e-12
     assert np.all(np.diff(np.unwrap(np.arctan2(*whole.T[::-1]))) > 0)
 
