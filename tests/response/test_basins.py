@@ -159,9 +159,6 @@ def test_a_motion_that_is_not_told_is_no_steady_state(coexisting):
 
 
 def test_command(tmp_path, capsys):
-    """The command writes table, result file, a CSV of basins that agrees with it, and a picture.
-
-    The exit codes are checked too."""
 
     def run(folder, *keys, options=()):
         sets = (f"--set={key}" for key in (*GRID, *keys))

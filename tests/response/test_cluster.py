@@ -21,7 +21,6 @@ SPEED = "scene.speed_rpm"
 
 
 def kill_a_worker() -> None:
-    """Kill one of the processes that a cluster has started, if there is one."""
     for child in psutil.Process().children(recursive=True):
         if "spawn_main" in " ".join(child.cmdline()):
             child.send_signal(signal.SIGKILL)

@@ -134,7 +134,6 @@ def test_standard_error_of_the_slope_is_honest():
 
 
 def test_chaos_is_averaged_and_named():
-    """A chaotic result is usable, and has the kind of motion and standard errors."""
     size = "ensemble.members=4", "ensemble.settle_periods=16", "ensemble.periods=16"
     evaluation = averaged(*CHAOTIC, *size, survey=False)
     steady = evaluation.steady_state
@@ -167,7 +166,6 @@ def test_gradient_of_chaos_has_its_standard_error():
 
 
 def test_same_seed_same_numbers():
-    """The same seed gives the same numbers to the last digit; another seed gives others."""
     size = "ensemble.members=4", "ensemble.settle_periods=8", "ensemble.periods=8"
     first, again, other = (averaged(*CHAOTIC, *size, f"ensemble.seed={seed}") for seed in (5, 5, 6))
     assert first.response == again.response
@@ -186,7 +184,6 @@ ONE = np.array([True, False, False, False])
 
 
 def sound(level=1.0):
-    """Return four members of a motion without a failure."""
     few = level * np.ones(4)
     means = np.column_stack([few, few**2, 2 * few + np.arange(4)])
     return Members(
@@ -196,7 +193,6 @@ def sound(level=1.0):
 
 
 def test_one_member_that_fails_is_enough():
-    """The status of an ensemble is that of its worst member."""
     failures = {
         Status.AVERAGED: {},
         Status.PASSED_THROUGH: {"lost": ONE},
@@ -215,7 +211,6 @@ def told(monkeypatch, run, gradient=False):
 
 
 def test_responses_stand_where_they_belong(monkeypatch):
-    """Mean, peak and RMS of given members are in their columns, with the peaks' standard error."""
     evaluation = told(monkeypatch, lambda number: sound(3.0))
     assert evaluation.status is Status.AVERAGED
     assert evaluation.response == {"mean_force_N": 3, "peak_force_N": 7.5, "rms_force_N": 3}
@@ -231,7 +226,6 @@ def test_members_that_never_touch_are_idle(monkeypatch):
 
 
 def test_too_deep_is_no_average(monkeypatch):
-    """One member beyond the validity of the contact law makes the result unusable."""
     depth = np.array([-1.0, 1.0, 1.0, 1.0]) * 0.0201 * 0.033
     evaluation = told(monkeypatch, lambda number: sound()._replace(depth=depth), gradient=True)
     assert evaluation.status is Status.TOO_DEEP
@@ -297,14 +291,12 @@ def test_optimize_a_chaotic_scene(tmp_path, capsys):
 
 @functools.cache
 def chaotic(seed=0, members=32, periods=32):
-    """Return averages in the chaotic scene."""
     size = f"ensemble.members={members}", f"ensemble.periods={periods}", f"ensemble.seed={seed}"
     return averaged(*CHAOTIC, "ensemble.settle_periods=24", *size)
 
 
 @pytest.mark.long
 def test_standard_errors_are_honest():
-    """Independent ensembles differ by as much as their standard errors state."""
     found = [numbers(chaotic(seed=seed, members=16)) for seed in range(5)]
     apart = []
     for (first, by_first), (second, by_second) in itertools.combinations(found, 2):

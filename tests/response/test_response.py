@@ -294,7 +294,6 @@ def test_batch_on_a_gpu_is_that_of_single_motions(scene, monkeypatch):
 
 
 def test_design_without_parameters():
-    """The derivative with respect to an empty design is empty; the one of the scene is not."""
     config = rootsopt.load_config("configs/ee.yaml")
     slopes = jax.grad(lambda design, scene: steady_response(scene, design).mean, (0, 1))
     by_design, by_scene = jax.eval_shape(slopes, config.design, Scene.from_config(config))
@@ -368,7 +367,6 @@ def test_precision_is_asked_for_in_words():
 
 @pytest.mark.long
 def test_example_of_the_readme_runs():
-    """The README's example runs unchanged, in a process of its own."""
     (text,) = re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(), re.M | re.S)
     found = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, cwd=ROOT)
     assert (found.returncode, found.stderr) == (0, "")

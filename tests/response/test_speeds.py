@@ -87,7 +87,6 @@ def test_parts_are_the_evaluations_at_one_speed(baseline, singles):
 
 
 def test_objective_is_the_weighted_mean_or_the_worst(baseline, singles, moved):
-    """The objective equals combinations of single-speed evaluations."""
     evaluator, base, problem = baseline
     values = [relative(*pair[::-1]) for pair in singles.values()]
     assert values[0] != pytest.approx(values[1], rel=1e-3)
@@ -121,7 +120,6 @@ def test_slope_agrees_with_central_differences(baseline, moved):
 
 
 def test_each_speed_begins_on_its_own_orbit(baseline, moved):
-    """The state of an evaluation starts each speed on that speed's own motion."""
     evaluator, found, _ = baseline
     reached = Evaluator.reached
     with mock.patch.object(Evaluator, "reached", autospec=True, side_effect=reached) as spy:
@@ -184,9 +182,6 @@ def run(command, folder, *overrides, options=()):
 
 
 def test_optimize_over_speeds(tmp_path, capsys):
-    """A short run improves over the speeds.
-
-    Table, records and picture have each speed."""
     short = ["optimizer.screening=0", "optimizer.starts=1", "optimizer.iterations=2",
              "assumptions.scenes=0"]  # fmt: skip
     assert run("optimize", tmp_path, SPEEDS, WEIGHTS, *short) == 0
@@ -205,7 +200,6 @@ def test_optimize_over_speeds(tmp_path, capsys):
 
 
 def test_simulate_stays_at_the_scene(tmp_path, baseline):
-    """`simulate` uses the scene's own speed, whatever the objective."""
     assert run("simulate", tmp_path, SPEEDS, TIGHT, options=["--no-figures"]) == 0
     record = json.loads((tmp_path / "result.json").read_text())
     assert "speeds" not in record

@@ -54,7 +54,6 @@ def first(scene, respond):
 
 
 def same(one, other, forces=1e-8, slopes=1e-6):
-    """Compare responses at all speeds, and their derivatives."""
     (by_one, found), (by_other, usual) = one, other
     assert {*found.status.tolist(), *usual.status.tolist()} == {Status.PERIODIC.code}
     for name in ("mean", "rms", "peak"):
@@ -69,6 +68,11 @@ def test_neighbour_gives_the_response_from_rest(scene, respond, first):
     assert np.all(found[1].start.known.sound)
     # Without a transient, the states come from the orbit of the neighbour.
     np.testing.assert_allclose(found[1].state, usual[1].state, rtol=1e-6)
+    # Each point of the sweep begins on the orbit before, and is that from rest.
+    for factor, *forces in zip(SPEEDS, found[1].mean, found[1].peak, strict=True):
+        moved = eqx.tree_at(lambda s: s.speed, scene, factor * scene.speed)
+        alone = steady_response(moved, NEAR, np.zeros(2))
+        np.testing.assert_allclose(forces, [alone.mean, alone.peak], rtol=1e-8)
 
 
 def unused(start):
@@ -97,28 +101,19 @@ def test_start_of_no_use_does_not_change_the_response(scene, respond, first, dam
 
 
 def test_start_survives_a_file(scene, respond, first):
-    """A start that was stored gives the same bits."""
     again = pickle.loads(pickle.dumps(jax.device_get(first.start)))
     one, other = (respond(scene, NEAR, start) for start in (first.start, again))
-    for x, y in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
-        np.testing.assert_array_equal(x, y)
-
-
-def test_start_travels_through_scan(scene, respond, first):
-    """Each point of a sweep begins on the orbit before, and is that from rest."""
-    _, found = respond(scene, NEAR, first.start)
-    for factor, *forces in zip(SPEEDS, found.mean, found.peak, strict=True):
-        moved = eqx.tree_at(lambda s: s.speed, scene, factor * scene.speed)
-        alone = steady_response(moved, NEAR, np.zeros(2))
-        np.testing.assert_allclose(forces, [alone.mean, alone.peak], rtol=1e-8)
+    jax.tree.map(np.testing.assert_array_equal, one, other)
 
 
 def test_start_of_another_kind_is_refused(scene, first):
     other = rootsopt.load_config("configs/ee.yaml")
-    with pytest.raises(ValueError, match="same kind of scene"):
-        steady_response(Scene.from_config(other), other.design, first.start)
-    with pytest.raises(ValueError, match=r"state \(2,\) of this scene"):
-        steady_response(scene, DESIGN, np.zeros(3))
+    for arguments, words in (
+        ((Scene.from_config(other), other.design, first.start), "same kind of scene"),
+        ((scene, DESIGN, np.zeros(3)), r"state \(2,\) of this scene"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            steady_response(*arguments)
 
 
 @pytest.mark.long

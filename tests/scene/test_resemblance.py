@@ -80,7 +80,6 @@ def test_smooth_feet_see_the_curve_and_not_its_chords():
 
 
 def test_members_of_a_family_are_found_again():
-    """Parameters are found to 1e-3 of their size; the distance is below 0.1 µm."""
     found = likeness(PROFILES["cic"], "cic")
     assert list(found.design.values()) == pytest.approx([36.43, 8.5, 4.0], rel=1e-3)
     assert found.departure < 0.1e-6
