@@ -150,25 +150,17 @@ def test_orbit_to_which_its_neighbour_does_not_lead(branch, monkeypatch, wrong):
     Other reasons to stop are final."""
     family, start = branch.family, branch.spots[0]
     way, guess = start.tangent, start.place + 1e-3 * start.tangent
-    right, closed, asked = family(guess, way, start), family._closed, []
-    aside = 1e-4 * np.cross(way, [0.0, 0.0, 1.0])
-    end = End.STEP_TOO_SMALL
-
-    def misled(known, *rest):
-        asked.append(float(known[2]))
-        if len(asked) > 1:
-            return closed(known, *rest)
-        if wrong and end is End.STEP_TOO_SMALL:
-            return right._replace(place=right.place + aside)
-        raise StoppedError(end)
-
-    monkeypatch.setattr(family, "_closed", misled)
+    right = family(guess, way, start)
+    aside = right._replace(place=right.place + 1e-4 * np.cross(way, [0.0, 0.0, 1.0]))
+    first = aside if wrong else StoppedError(End.STEP_TOO_SMALL)
+    misled = [first, mock.DEFAULT, StoppedError(End.TOO_DEEP)]
+    closed = mock.Mock(wraps=family._closed, side_effect=misled)
+    monkeypatch.setattr(family, "_closed", closed)
     again = family(guess, way, start)
+    asked = [float(call.args[0][2]) for call in closed.call_args_list]
     assert asked == [pytest.approx(1e-3, abs=1e-9), 0.0]
     np.testing.assert_allclose(again.place, right.place, atol=1e-9)
     np.testing.assert_allclose(np.abs(again.tangent @ right.tangent), 1, atol=1e-9)
-    end = End.TOO_DEEP
-    asked.clear()
     with pytest.raises(StoppedError, match="too deep"):
         family(guess, way, start)
 

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import random
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -113,15 +114,15 @@ def test_damage_costs_results_but_never_changes_them(path, kind):
     for _ in range(100):
         path.write_bytes(damaged(data, chance))
         journal = kind(path, resume=True)
-        found = texts(journal)
-        assert found.items() <= known.items()
+        assert texts(journal).items() <= known.items()
         assert bool(journal.dropped) == bool(journal.damage)
-        counts.append((len(found), journal.dropped))
+        counts.append((len(journal.rows), journal.dropped > 0))
         journal.add(rows_of(kind))
         journal.close()
         assert sorted(path.read_bytes().splitlines()) == whole
-    assert sum(dropped > 0 for _, dropped in counts) > 50
-    assert np.mean([rows for rows, _ in counts]) > 0.5 * len(known)
+    kept, dropped = np.mean(counts, axis=0)
+    assert dropped > 0.5
+    assert kept > 0.5 * len(known)
 
 
 def appended(path, kind, rows):
@@ -198,14 +199,9 @@ def test_a_file_without_results_is_not_left_behind(path):
     assert not [*path.parent.iterdir()]
 
 
-def test_a_full_disk_does_not_end_the_run(path, monkeypatch):
+def test_a_full_disk_does_not_end_the_run(path):
     journal = sweep(path)
-
-    def full(_):
-        raise OSError(28, "No space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr("os.fsync", full)
+    with mock.patch("os.fsync", side_effect=OSError(28, "No space left on device")):
         journal.add([(1, ROW)])
     journal.add([(2, ROW)])
     assert [*journal.rows] == [1, 2]
