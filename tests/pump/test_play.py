@@ -36,6 +36,7 @@ def test_ee_and_involute():
     assert float(found.gear_backlash) == pytest.approx(2 * R * angle, rel=1e-6)
     # Rotor 1's drive flank touches on the involute where 0 ≤ -φ1 - π/2N, as far as it reaches.
     near = np.abs(np.asarray(found.phi) - 2 * np.pi / LOBES + np.pi / 6) < 0.2
+    assert np.sum(near) > 5
     np.testing.assert_allclose(np.asarray(found.behind)[near], -angle, rtol=1e-5)
 
 

@@ -1,7 +1,6 @@
 """Sweeps over real processes: nothing is lost or duplicated if one of them is killed."""
 
 import pickle
-import signal
 import sys
 from pathlib import Path
 
@@ -20,11 +19,10 @@ IMPORT = str(Path(__file__).with_name("workers.py"))
 SPEED = "scene.speed_rpm"
 
 
-def kill_a_worker() -> None:
-    for child in psutil.Process().children(recursive=True):
-        if "spawn_main" in " ".join(child.cmdline()):
-            child.send_signal(signal.SIGKILL)
-            return
+def spawned():
+    """Return the processes that a cluster has started."""
+    every = psutil.Process().children(recursive=True)
+    return [one for one in every if "spawn_main" in " ".join(one.cmdline())]
 
 
 def swept(path, plan, after=0):
@@ -34,7 +32,7 @@ def swept(path, plan, after=0):
     def progress(done, expected):
         if after and done >= after and not killed:
             killed.append(done)
-            kill_a_worker()
+            spawned()[0].kill()
 
     journal = Points(config, plan, (), path)
     with running(2, imports=(IMPORT,)) as runs:
@@ -50,8 +48,7 @@ def test_a_killed_worker_loses_and_duplicates_nothing(tmp_path, monkeypatch):
     found = sorted((number, row["message"].rpartition("at ")[2]) for number, row in rows.items())
     assert found == [(number, str(100 * (number + 1))) for number in range(20)]
     assert len((tmp_path / "points").read_bytes().splitlines()) == 1 + 20
-    left = psutil.Process().children(recursive=True)
-    assert not any("spawn_main" in " ".join(one.cmdline()) for one in left)
+    assert spawned() == []
 
 
 @pytest.mark.long
