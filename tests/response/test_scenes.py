@@ -165,6 +165,10 @@ def test_points_of_two_families_have_all_parameters():
 
 
 def test_single_precision_of_jax_is_refused(config, monkeypatch):
-    monkeypatch.setattr("jax.config.read", lambda name: False)
-    with pytest.raises(RuntimeError, match="jax_enable_x64"):
-        rootsopt.sweep_scenes(config, {LOAD: [1.0]})
+    monkeypatch.setattr("jax.config.read", lambda name: name != "jax_enable_x64")
+    for refused, arguments in (
+        (rootsopt.sweep_scenes, (config, {LOAD: [1.0]})),
+        (rootsopt.Scene.from_config, (config,)),
+    ):
+        with pytest.raises(RuntimeError, match=r'jax.config.update\("jax_enable_x64", True\)'):
+            refused(*arguments)
