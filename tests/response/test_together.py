@@ -74,7 +74,7 @@ def test_accelerators_take_batches(config, monkeypatch):
     here, given = points.InProcess(), [(number, {SPEED: number + 1.0}) for number in range(2)]
     assert (here.slots, here.share(3)) == (1, 2)
     assert here.simulated(config, given, threading.Event()) == given
-    batch.assert_called_once_with(config, [values for _, values in given])
+    batch.assert_called_once_with(config, tuple(values for _, values in given))
 
 
 @pytest.mark.long
