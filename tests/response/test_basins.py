@@ -156,6 +156,10 @@ def test_a_motion_that_is_not_told_is_no_steady_state(coexisting):
         ({"non_finite": 0.1}, Status.NON_FINITE),
     ):
         assert dataclasses.replace(basins, lost=lost).status is status
+    first, *others = basins.attractors
+    wild = dataclasses.replace(first.evaluation, status=Status.CHAOTIC)
+    mixed = dataclasses.replace(first, evaluation=wild), *others
+    assert dataclasses.replace(basins, attractors=mixed).status is Status.CHAOTIC
 
 
 def test_command(tmp_path, capsys):

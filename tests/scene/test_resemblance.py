@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 from rootsopt.commands.table import profile as command
 from rootsopt.commands.work import profile as work
 from rootsopt.profiles import CIC, EE, arc, ellipse, five_arcs, outline, project
-from rootsopt.profiles.geometry import departure, departures, feet
+from rootsopt.profiles.geometry import beyond, departure, departures, feet
 from rootsopt.scene import resemblance
 from rootsopt.scene.families import profile_of
 from rootsopt.scene.resemblance import free_likeness, likeness
@@ -77,6 +77,13 @@ def test_smooth_feet_see_the_curve_and_not_its_chords():
         assert found.away == pytest.approx(np.full(30, radius - 1), abs=2.5e-5)
         assert np.sum(found.toward * points, axis=1) == pytest.approx(np.full(30, radius), rel=2e-3)
         assert np.max(np.abs(np.abs(feet(points, line).away) - 0.02)) > 5e-4
+
+
+def test_flanks_are_continued_by_their_mirror_images():
+    points = polygon(PROFILES["cic"], 40)
+    whole = beyond(points[: len(points) // 6 + 1], 3)
+    assert np.max(KDTree(points).query(whole)[0]) < 1e-12
+    assert np.all(np.diff(np.unwrap(np.arctan2(*whole.T[::-1]))) > 0)
 
 
 def test_members_of_a_family_are_found_again():
