@@ -31,8 +31,7 @@ bearing_set = eqx.filter_jit(BearingSet.of)
 @pytest.fixture(scope="module")
 def twisted():
     """Twisted rotors in some poses: loads, and the flanks' forces in every slice."""
-    scene, design = scene_of(GAS, BEARINGS, "rotor.helix_deg=50", "solver.slices=4")
-    bearings = bearing_set(scene, design)
+    bearings = bearing_set(*scene_of(GAS, BEARINGS, "rotor.helix_deg=50", "solver.slices=4"))
     pair = bearings.pair
 
     @jax.jit
@@ -41,19 +40,17 @@ def twisted():
         return bearings.at(tau, state), pair.pushes(motion), pair.contact_at(tau, state), motion
 
     poses = [(0.13, 0.4), (0.31, -0.9), (0.62, 1.1), (0.9, -0.6)]
-    found = [at(jnp.asarray(t), jnp.asarray([x, 0.3])) for t, x in poses]
-    return scene, bearings, found
+    return bearings, [at(jnp.asarray(t), jnp.asarray([x, 0.3])) for t, x in poses]
 
 
 def test_push_acts_on_its_line(twisted):
     """The moment of the force at its place is the torque, on either rotor."""
-    _, bearings, found = twisted
+    bearings, found = twisted
     for _, pushes, contact, _ in found:
         force, place = (np.asarray(x) @ [1, 1j] for x in (pushes.force, pushes.place))
-        axis = 2 * float(bearings.loads.radius)
         on_1 = (np.conj(place) * -force).imag
         # Rotor 2 turns clockwise.
-        on_2 = -(np.conj(place - axis) * force).imag
+        on_2 = -(np.conj(place - 2 * float(bearings.loads.radius)) * force).imag
         np.testing.assert_allclose(on_1, pushes.torque[..., 0], rtol=1e-9, atol=1e-12)
         # To first order in the penetration: the force is one, its places on the rotors are two.
         np.testing.assert_allclose(on_2, pushes.torque[..., 1], rtol=1e-2, atol=1e-9)
@@ -63,37 +60,35 @@ def test_push_acts_on_its_line(twisted):
 
 def test_axial_force_does_the_work_of_a_shift(twisted):
     """A shift of rotor 1 along its axis turns each of its sections: the energy of the slices."""
-    scene, bearings, found = twisted
+    bearings, found = twisted
     pair = dataclasses.replace(bearings.pair, contact=bearings.pair.contact.section)
-    slices, length = bearings.pair.contact.slices, float(bearings.length)
+    slices, step = bearings.pair.contact.slices, 1e-6
 
+    @jax.jit
+    @jax.vmap
     def depth(phi, other):
         return pair.contact_force(phi, other - phi, jnp.zeros(())).depth
 
-    depth = jax.jit(jax.vmap(depth))
     contact_only = eqx.tree_at(lambda s: s.loads.gas, bearings, None, is_leaf=lambda x: x is None)
     for _, pushes, _, motion in found:
         sections = np.asarray(motion.phi + slices.offsets)
         others = sections + float(motion.relative)
-        step = 1e-6
-        turned = step * float(slices.twist) / length
+        turned = step * float(slices.twist) / float(bearings.length)
         slope = (depth(sections - turned, others) - depth(sections + turned, others)) / (2 * step)
         size = np.linalg.norm(np.asarray(pushes.force)[:, 0], axis=-1)
         axial = contact_only._from_flanks(pushes, jnp.zeros(4))[2]
         assert float(axial[0]) == pytest.approx(-np.sum(size * np.asarray(slope)), rel=1e-6)
         # What one rotor feels, the other feels in the opposite sense, but for the penetration.
         assert float(axial[1]) == pytest.approx(-float(axial[0]), rel=2e-2)
-    assert scene.straight is False
 
 
 def test_bearings_balance_all_forces(twisted):
     """Sum and moments of the bearing loads, from the forces one by one."""
-    scene, bearings, found = twisted
+    bearings, found = twisted
     gas, loads = bearings.loads.gas, bearings.loads
     length, slices = float(bearings.length), gas.slices
-    heights = length * np.asarray(slices.places)
+    heights, rate = length * np.asarray(slices.places), float(slices.twist) / length
     slice_forces, chords = eqx.filter_jit(gas.slice_forces), eqx.filter_jit(gas.chords)
-    mirror = np.stack([np.ones(2), [-1, 1]])
     for out, pushes, _, motion in found:
         pressed = np.asarray(slice_forces(motion.phi))
         torque = float(loads.gear(motion.relative, motion.rate))
@@ -101,13 +96,11 @@ def test_bearings_balance_all_forces(twisted):
         teeth = np.array([-teeth, teeth])
         force = np.asarray(pushes.force).sum(1)
         flank = np.stack([-force, force], axis=1)
-        weight = np.array([0, -float(loads.weight)])
-        total = (flank + pressed).sum(0) + teeth + weight
+        total = (flank + pressed).sum(0) + teeth + [0, -float(loads.weight)]
         np.testing.assert_allclose(np.asarray(out.radial).sum(1), total, rtol=1e-9)
         place = np.asarray(pushes.place)[:, 0]
         places = np.stack([place, place - [2 * float(loads.radius), 0]], axis=1)
-        contact, tip = (np.asarray(x) * mirror for x in chords(motion.phi))
-        rate = float(slices.twist) / length
+        contact, tip = (np.asarray(x) * [[1, 1], [-1, 1]] for x in chords(motion.phi))
         axial = -rate * np.asarray(pushes.torque)[:, 0]
         against = (np.sum(tip**2, -1) - np.sum(contact**2, -1)) / 2
         across = rate * float(gas.pressure_length) * np.asarray(slices.weights)[:, None] * against
@@ -130,9 +123,8 @@ def test_bearings_balance_all_forces(twisted):
                 for z, x in zip(ends, np.asarray(out.radial)[rotor], strict=True)
             )
             np.testing.assert_allclose(carried[:2], moment[rotor, :2], rtol=1e-9, atol=1e-12)
-    assert float(bearings.bearing) == pytest.approx(0.07)
-    assert float(bearings.gear) == pytest.approx(0.1)
-    area = float(geometry(scene.profile(jnp.asarray([36.43, 9.0, 4.0]))).area)
+    assert (float(bearings.bearing), float(bearings.gear)) == pytest.approx((0.07, 0.1))
+    area = float(geometry(scene_of()[0].profile(jnp.asarray([36.43, 9.0, 4.0]))).area)
     assert float(loads.weight) == pytest.approx(GRAVITY * 7800 * 0.1 * area)
 
 
@@ -159,12 +151,14 @@ def test_static_loads():
     bearings = bearing_set(scene, design)
     phi = 2 * np.pi / 3 * (np.arange(720) + 0.5) / 720
     gas = bearings.loads.gas
-    forces = np.asarray(jax.jit(jax.vmap(gas.slice_forces))(phi))[:, 0] @ [1, 1j]
+    first, second = (np.asarray(jax.jit(jax.vmap(gas.slice_forces))(phi))[:, 0] @ [1, 1j]).T
     torque = np.asarray(jax.jit(jax.vmap(bearings.pair.load.torque2))(phi))
     teeth = tooth_force(*map(jnp.asarray, (torque, 0.033, np.radians(20.0)))) @ np.array([1, 1j])
     # Half of the gas, and the gear 50 mm beyond a bearing of two that are 100 mm apart.
-    each = [forces.T[0] / 2 - 1.5 * teeth, forces.T[0] / 2 + 0.5 * teeth]
-    each += [forces.T[1] / 2 + 1.5 * teeth, forces.T[1] / 2 - 0.5 * teeth]
+    each = [
+        *(first / 2 - 1.5 * teeth, first / 2 + 0.5 * teeth),
+        *(second / 2 + 1.5 * teeth, second / 2 - 0.5 * teeth),
+    ]
     equivalent, greatest = static_loads(scene, design)
     np.testing.assert_allclose(greatest, np.max(np.abs(each), axis=1), rtol=1e-9)
     expected = np.mean(np.abs(each) ** 3, axis=1) ** (1 / 3)

@@ -1,6 +1,7 @@
 """Play against polygons that are pushed into each other, and closed forms."""
 
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -18,21 +19,18 @@ from tests.measured.test_outline import closed, cut, points_of, profile_of
 C = 5e-5
 
 
-@jax.jit
-def played(profile, clearance, distance, radial):
-    return play(profile, clearance, distance, radial=radial)
+played = jax.jit(play)
 
 
 @functools.cache
 def of(family, error=0.0):
-    return played(made(family), C, 2 * R + error, 0.0)
+    return played(made(family), C, 2 * R + error, radial=0.0)
 
 
 def test_ee_and_involute():
     """At the pitch crossing of EE the lever is r; on an involute it is r cos α, and stays so."""
-    found = of("ee")
-    assert float(found.gear_backlash) == pytest.approx(2 * C, rel=1e-4)
-    assert np.min(found.total) > 2 * C / R
+    assert float(of("ee").gear_backlash) == pytest.approx(2 * C, rel=1e-4)
+    assert np.min(of("ee").total) > 2 * C / R
     found = of("cic")
     angle = C / (R * np.cos(np.radians(36.43)))
     assert float(found.gear_backlash) == pytest.approx(2 * R * angle, rel=1e-6)
@@ -55,9 +53,8 @@ def test_ee_and_involute():
 def test_polygons_touch_where_the_play_ends(family):
     """The rotors' polygons, with nominal flanks, overlap there by the clearance; half the way they
     do by less."""
-    found = of(family)
-    outline = outline_of(family) / 1e3
-    for k in (3, 20, 41, 70, 88):
+    found, outline = of(family), outline_of(family) / 1e3
+    for k in (3, 41, 70):
         phi, behind, ahead = (float(x[k]) for x in (found.phi, found.behind, found.ahead))
         for end in (behind, ahead):
             gap = pair_gap(outline, LOBES, 2 * R, phi, phi + end)
@@ -71,12 +68,11 @@ def test_rotors_intersect_beyond_their_play(error):
     also at another centre distance, where the flanks are not conjugate."""
     found = of("cic", error)
     polygon = closed(cut(outline_of("cic")[:-1:4] @ [1e-3, 1e-3j], C / 2))
-    for k in (5, 44, 83):
-        phi = float(found.phi[k])
-        for end in (found.behind[k], found.ahead[k]):
-            for share, expected in ((0.97, False), (1.03, True)):
-                pair = place_pair(polygon, LOBES, 2 * R + error, phi, phi + share * float(end))
-                assert intersect(*pair, 2 * R) == expected
+    for k, end in itertools.product((5, 44, 83), (found.behind, found.ahead)):
+        for share, expected in ((0.97, False), (1.03, True)):
+            turned = float(found.phi[k] + share * end[k])
+            pair = place_pair(polygon, LOBES, 2 * R + error, float(found.phi[k]), turned)
+            assert intersect(*pair, 2 * R) == expected
 
 
 def intersect(first, second, distance):
@@ -96,7 +92,7 @@ def test_overlap_is_negative():
 
 def at_clearances(profile, clearances):
     """Return backlash, overlap (µm) and least play (mrad) at several clearances (µm)."""
-    found = [played(profile, 1e-6 * c, 2 * R, 0.0) for c in clearances]
+    found = [played(profile, 1e-6 * c, 2 * R, radial=0.0) for c in clearances]
     rows = [(1e6 * x.gear_backlash, 1e6 * x.overlap, 1e3 * jnp.min(x.total)) for x in found]
     return np.array(rows, float).T
 
@@ -125,7 +121,7 @@ def test_play_is_continuous_in_the_overlap(family):
 def test_smaller_rotors_have_the_play_of_their_gap():
     """A radius that is smaller everywhere: the gap of the flanks, over the lever r cos ψ."""
     profile, nothing = made("cic"), jnp.zeros(())
-    found = played(profile, 0.0, 2 * R, C)
+    found = played(profile, 0.0, 2 * R, radial=C)
     gap = jax.jit(mesh_gap)(profile, Allowances(nothing, nothing, jnp.asarray(C)))
     lever = R * np.cos(profile.addendum(profile.normal_at(gap.roll)).psi)
     expected = 2 * R * np.min(np.asarray(gap.least) / lever)

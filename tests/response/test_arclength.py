@@ -25,8 +25,7 @@ def curve_of(residual, jacobian):
             miss = np.array([residual(*place), across @ (place - guess)])
             if np.max(np.abs(miss)) < 1e-12:
                 tangent = np.linalg.svd(matrix[:1])[2][-1]
-                turn = np.sign(np.linalg.det([matrix[0], tangent]))
-                return Spot(place, tangent, turn, None)
+                return Spot(place, tangent, np.sign(np.linalg.det([matrix[0], tangent])), None)
             if abs(np.linalg.det(matrix)) < 1e-12:
                 break
             place = place - np.linalg.solve(matrix, miss)
@@ -41,41 +40,35 @@ FOLD = {"FOLD": lambda spot: float(spot.tangent[-1])}
 
 
 def start_of(curve, x, p, way=1.0):
-    spot = curve(np.array([x, p]), np.array([0.0, 1.0]), None)
-    return spot.along(np.array([0.0, way]))
+    return curve(np.array([x, p]), np.array([0.0, 1.0]), None).along(np.array([0.0, way]))
 
 
 def test_circle_is_closed_with_a_fold_on_either_side():
     """Every point lies on the circle, the folds are at ±1, and the curve ends at its start."""
     path = follow_curve(CIRCLE, start_of(CIRCLE, 1.0, 0.0), StepSizes(-2, 2, 0.02, 1e-6, 0.1), FOLD)
     assert path.end is End.CLOSED
-    places = np.array([spot.place for spot in path.spots])
-    np.testing.assert_allclose(np.hypot(*places.T), 1, atol=1e-10)
-    turned = np.unwrap(np.arctan2(places[:, 1], places[:, 0]))[-1]
-    assert turned == pytest.approx(2 * np.pi, abs=0.2)
+    x, p = np.transpose([spot.place for spot in path.spots])
+    np.testing.assert_allclose(np.hypot(x, p), 1, atol=1e-10)
+    assert np.unwrap(np.arctan2(p, x))[-1] == pytest.approx(2 * np.pi, abs=0.2)
     assert [name for _, name, _ in path.crossings] == ["FOLD", "FOLD"]
     found = [spot.place for _, _, spot in path.crossings]
     np.testing.assert_allclose(found, [[0, 1], [0, -1]], atol=1e-8)
 
 
 def test_cubic_passes_both_folds_to_the_end_of_the_range():
-    """λ = x - x³ has folds at x = ±1/√3; three points at λ = 0 are on one curve."""
+    """λ = x - x³ has folds at x = ±1/√3."""
     path = follow_curve(CUBIC, start_of(CUBIC, -1.4, 1.3, -1), StepSizes(-1.5, 1.5), FOLD)
-    assert path.end is End.RANGE_END
-    assert path.spots[-1].place[-1] == -1.5
-    x, p = np.array([spot.place for spot in path.spots]).T
-    assert np.count_nonzero(np.diff(np.sign(p))) == 3
-    folds = np.array([spot.place for _, _, spot in path.crossings])
+    assert (path.end, path.spots[-1].place[-1]) == (End.RANGE_END, -1.5)
+    folds = [spot.place for _, _, spot in path.crossings]
     top = 1 / np.sqrt(3)
     np.testing.assert_allclose(folds, [[-top, -top + top**3], [top, top - top**3]], atol=1e-8)
     assert all(spot.tangent @ after.tangent > 0.9 for spot, after in itertools.pairwise(path.spots))
     assert len({spot.orientation for spot in path.spots}) == 1
     for index, _, spot in path.crossings:
-        assert x[index] <= spot.place[0] <= x[index + 1]
+        assert path.spots[index].place[0] <= spot.place[0] <= path.spots[index + 1].place[0]
 
 
-def test_steps_follow_the_rate_of_convergence():
-    """Steps grow to the maximum on a straight stretch."""
+def test_steps_grow_to_the_maximum_on_a_straight_stretch():
     line = curve_of(lambda x, p: x - p, lambda x, p: [1.0, -1.0])
     path = follow_curve(line, start_of(line, 0.0, 0.0), StepSizes(-1, 1, 1e-3, 1e-6, 0.05), {})
     strides = [np.linalg.norm(b.place - a.place) for a, b in itertools.pairwise(path.spots)]

@@ -10,13 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rootsopt import optimize
+from rootsopt import Status, optimize
 from rootsopt.config import DESIGN_KEYS, EnsembleConfig, load
 from rootsopt.response.ensemble import SIGNIFICANT, Ensemble, fitted_slope, independent, neighbours
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.result import ERRORS, RESPONSES
 from rootsopt.response.together import Members
-from rootsopt.status import Status
 from rootsopt.view import tables
 
 PERIODIC = ("ensemble.members=4", "ensemble.settle_periods=48", "ensemble.periods=8")
@@ -29,23 +28,19 @@ def config_of(*overrides):
     return load("configs/cic_drawn.yaml", overrides)
 
 
-def ensemble(config, survey=True):
-    found = dataclasses.replace(Evaluator.of(config), motions=Ensemble()).without_gradient()
-    return found.surveying() if survey else found
-
-
-def averaged(*overrides, gradient=False, survey=True, design=None):
+def averaged(*overrides, gradient=False, survey=True, design=None, start=None):
     """Evaluate an ensemble, without the Lyapunov exponent unless asked for."""
-    evaluator = ensemble(config_of(*overrides), survey)
-    if gradient:
-        evaluator = dataclasses.replace(evaluator, differentiate=True)
-    return evaluator(None if design is None else jnp.array(design), series=False)
+    evaluator = dataclasses.replace(
+        Evaluator.of(config_of(*overrides)), motions=Ensemble(), differentiate=gradient
+    )
+    evaluator = evaluator.surveying() if survey else evaluator
+    return evaluator(None if design is None else jnp.array(design), start, series=False)
 
 
 def numbers(evaluation):
     """Return (responses, their standard errors)."""
-    errors = [evaluation.steady_state[ERRORS[name]] for name in RESPONSES]
-    return np.array([evaluation.response[name] for name in RESPONSES]), np.array(errors)
+    response, steady = evaluation.response, evaluation.steady_state
+    return np.array([(response[name], steady[ERRORS[name]]) for name in RESPONSES]).T
 
 
 def rows(gradient):
@@ -64,16 +59,15 @@ def orbit():
 def test_periodic_averages_are_those_of_the_orbit(orbit):
     """All members end on the one orbit: its mean, RMS and peak, with nearly no standard error."""
     evaluation = averaged(*PERIODIC, survey=False, design=INSIDE)
-    assert evaluation.status is Status.AVERAGED
     steady = evaluation.steady_state
-    assert (steady["kind"], steady["period"]) == ("periodic", 1)
+    assert evaluation.status is Status.AVERAGED
+    assert (steady["kind"], steady["period"], evaluation.gradient) == ("periodic", 1, {})
     values, errors = numbers(evaluation)
     closed = np.array([orbit.response[name] for name in RESPONSES])
     np.testing.assert_allclose(values, closed, rtol=3e-5)
     assert np.all(errors < 3e-5 * closed)
     assert steady["greatest_force_N"] == pytest.approx(closed[1], rel=1e-4)
     assert abs(steady["mean_force_drift_N"]) < 1e-4 * closed[0]
-    assert evaluation.gradient == {}
 
 
 def test_gradient_is_that_of_the_orbit(orbit):
@@ -85,8 +79,7 @@ def test_gradient_is_that_of_the_orbit(orbit):
     found, truth = rows(evaluation.gradient), rows(orbit.gradient)
     errors = rows(evaluation.steady_state["gradient_standard_error"])
     size = np.max(np.abs(truth), axis=1, keepdims=True)
-    assert np.all(errors > 0)
-    assert np.all(errors < 0.05 * size)
+    assert np.all((errors > 0) & (errors < 0.05 * size))
     assert np.all(np.abs(found - truth) < 4 * errors + 1e-3 * size)
 
 
@@ -103,19 +96,18 @@ def test_neighbours_are_in_pairs_inside_the_box():
         np.testing.assert_allclose(middle, np.clip(point, 0.1, 0.9) + 0 * steps, atol=1e-12)
         np.testing.assert_allclose(points[:32] - middle, steps, atol=1e-12)
         assert np.linalg.matrix_rank(steps) == 3
-    _, steps = neighbours(np.full(3, 0.5), settings.model_copy(update={"designs": 2048}))
-    np.testing.assert_allclose(np.cov(steps.T), 0.01 * np.eye(3), atol=5e-4)
-    _, others = neighbours(
-        np.full(3, 0.5), settings.model_copy(update={"seed": 4, "designs": 2048})
+    steps, others = (
+        neighbours(np.full(3, 0.5), EnsembleConfig(designs=2048, spread=0.1, seed=seed))[1]
+        for seed in (3, 4)
     )
+    np.testing.assert_allclose(np.cov(steps.T), 0.01 * np.eye(3), atol=5e-4)
     assert not np.any(steps == others)
 
 
 def test_slope_of_a_quadratic_is_exact():
     """Curvature cancels between opposite neighbours, and the stated error is zero."""
     rng = np.random.default_rng(0)
-    slope, bend = rng.normal(size=(2, 3)), rng.normal(size=(2, 3, 3))
-    steps = 0.1 * rng.normal(size=(8, 3))
+    slope, bend, steps = (rng.normal(size=shape) for shape in ((2, 3), (2, 3, 3), (8, 3)))
     both = np.concatenate([steps, -steps])
     values = 5 + both @ slope.T + np.einsum("ni,rij,nj->nr", both, bend, both)
     found, covariance = fitted_slope(values, steps)
@@ -142,12 +134,10 @@ def test_standard_error_of_the_slope_is_honest():
 
 
 def test_chaos_is_averaged_and_named():
-    """A chaotic result is usable, and has the kind of motion and standard errors."""
     size = "ensemble.members=4", "ensemble.settle_periods=16", "ensemble.periods=16"
     evaluation = averaged(*CHAOTIC, *size, survey=False)
-    assert evaluation.status is Status.AVERAGED
-    assert evaluation.usable
     steady = evaluation.steady_state
+    assert (evaluation.status, evaluation.usable) == (Status.AVERAGED, True)
     assert steady["kind"] == "chaotic"
     exponent = steady["lyapunov_exponent_per_mesh_period"]
     assert exponent > 3 * steady["lyapunov_standard_error"] > 0
@@ -176,24 +166,17 @@ def test_gradient_of_chaos_has_its_standard_error():
 
 
 def test_same_seed_same_numbers():
-    """The same seed gives the same numbers to the last digit; another seed gives others."""
     size = "ensemble.members=4", "ensemble.settle_periods=8", "ensemble.periods=8"
     first, again, other = (averaged(*CHAOTIC, *size, f"ensemble.seed={seed}") for seed in (5, 5, 6))
     assert first.response == again.response
     np.testing.assert_array_equal(first.start, again.start)
     assert first.response != other.response
-
-
-def test_start_is_continued():
-    """Members continue from the last states of a neighbour; other shapes are refused."""
-    size = "ensemble.members=4", "ensemble.settle_periods=4", "ensemble.periods=4"
-    evaluator = ensemble(config_of(*CHAOTIC, *size))
-    first = evaluator(series=False)
-    on = evaluator(start=first.start, series=False)
+    # Members continue from the last states of a neighbour; other shapes are refused.
+    on = averaged(*CHAOTIC, *size, "ensemble.seed=5", start=first.start)
     assert on.status is Status.AVERAGED
     assert on.response != first.response
     with pytest.raises(ValueError, match="start"):
-        evaluator(start=np.zeros(2), series=False)
+        averaged(*CHAOTIC, *size, start=np.zeros(2))
 
 
 YES, NO = np.ones(4, bool), np.zeros(4, bool)
@@ -201,7 +184,6 @@ ONE = np.array([True, False, False, False])
 
 
 def sound(level=1.0):
-    """Return four members of a motion without a failure."""
     few = level * np.ones(4)
     means = np.column_stack([few, few**2, 2 * few + np.arange(4)])
     return Members(
@@ -211,13 +193,14 @@ def sound(level=1.0):
 
 
 def test_one_member_that_fails_is_enough():
-    """The status of an ensemble is that of its worst member."""
-    members = sound()
-    assert members.status is Status.AVERAGED
-    assert members._replace(lost=ONE).status is Status.PASSED_THROUGH
-    assert members._replace(lost=ONE, stalled=ONE).status is Status.STALLED
-    assert members._replace(solved=~ONE).status is Status.SOLVER_FAILED
-    assert members._replace(means=np.full((4, 3), np.nan)).status is Status.NON_FINITE
+    failures = {
+        Status.AVERAGED: {},
+        Status.PASSED_THROUGH: {"lost": ONE},
+        Status.STALLED: {"lost": ONE, "stalled": ONE},
+        Status.NON_FINITE: {"means": np.full((4, 3), np.nan), "stalled": ONE},
+        Status.SOLVER_FAILED: {"means": np.full((4, 3), np.nan), "solved": ~ONE},
+    }
+    assert [sound()._replace(**one).status for one in failures.values()] == [*failures]
 
 
 def told(monkeypatch, run, gradient=False):
@@ -228,27 +211,21 @@ def told(monkeypatch, run, gradient=False):
 
 
 def test_responses_stand_where_they_belong(monkeypatch):
-    """Mean, peak and RMS of given members are in their columns, with the peaks' standard error."""
     evaluation = told(monkeypatch, lambda number: sound(3.0))
-    response, steady = evaluation.response, evaluation.steady_state
-    assert response == {"mean_force_N": 3, "peak_force_N": 7.5, "rms_force_N": 3}
-    expected = np.std(np.arange(4), ddof=1) / 2
-    assert steady[ERRORS["peak_force_N"]] == pytest.approx(expected)
-    assert steady[ERRORS["mean_force_N"]] == 0
-    assert steady["greatest_force_N"] == 27
+    assert evaluation.status is Status.AVERAGED
+    assert evaluation.response == {"mean_force_N": 3, "peak_force_N": 7.5, "rms_force_N": 3}
+    steady = [evaluation.steady_state[key] for key in (*ERRORS.values(), "greatest_force_N")]
+    assert steady == pytest.approx([0, np.std(np.arange(4), ddof=1) / 2, 0, 27])
 
 
 def test_members_that_never_touch_are_idle(monkeypatch):
-    """Members without contact have no averages; one member with contact is enough for them."""
     evaluation = told(monkeypatch, lambda number: sound(0.0)._replace(means=np.zeros((4, 3))))
     assert evaluation.status is Status.IDLE
     assert set(evaluation.response.values()) == {0.0}
     assert {x for row in evaluation.gradient.values() for x in row.values()} == {0.0}
-    assert told(monkeypatch, lambda number: sound(3.0)).status is Status.AVERAGED
 
 
 def test_too_deep_is_no_average(monkeypatch):
-    """One member beyond the validity of the contact law makes the result unusable."""
     depth = np.array([-1.0, 1.0, 1.0, 1.0]) * 0.0201 * 0.033
     evaluation = told(monkeypatch, lambda number: sound()._replace(depth=depth), gradient=True)
     assert evaluation.status is Status.TOO_DEEP
@@ -261,9 +238,9 @@ def test_a_neighbour_that_fails_leaves_no_gradient(monkeypatch):
     """A neighbour that fails leaves neither gradient nor averages.
 
     The averages are those of the whole neighbourhood."""
-    failed = sound()._replace(lost=ONE)
-    runs = lambda number: failed if number == 7 else sound()  # noqa: E731
-    evaluation = told(monkeypatch, runs, gradient=True)
+    evaluation = told(
+        monkeypatch, lambda number: sound()._replace(lost=ONE & (number == 7)), gradient=True
+    )
     assert evaluation.status is Status.PASSED_THROUGH
     assert (evaluation.response, evaluation.gradient, evaluation.start) == ({}, {}, None)
     whole = told(monkeypatch, lambda number: sound(), gradient=True)
@@ -278,8 +255,7 @@ def test_evaluator_of_a_motion():
     assert (evaluator.motions, evaluator.single) == (Ensemble(), False)
     other = independent(evaluator, 2)
     assert (evaluator.survey, other.survey) == (True, False)
-    members = other.config.ensemble.members, evaluator.config.ensemble.members
-    assert members[0] == 4 * members[1]
+    assert other.config.ensemble.members == 4 * evaluator.config.ensemble.members
 
 
 # Commands
@@ -315,14 +291,12 @@ def test_optimize_a_chaotic_scene(tmp_path, capsys):
 
 @functools.cache
 def chaotic(seed=0, members=32, periods=32):
-    """Return averages in the chaotic scene."""
     size = f"ensemble.members={members}", f"ensemble.periods={periods}", f"ensemble.seed={seed}"
     return averaged(*CHAOTIC, "ensemble.settle_periods=24", *size)
 
 
 @pytest.mark.long
 def test_standard_errors_are_honest():
-    """Independent ensembles differ by as much as their standard errors state."""
     found = [numbers(chaotic(seed=seed, members=16)) for seed in range(5)]
     apart = []
     for (first, by_first), (second, by_second) in itertools.combinations(found, 2):

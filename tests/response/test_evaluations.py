@@ -7,13 +7,13 @@ import sys
 import threading
 from argparse import Namespace
 from concurrent.futures import ThreadPoolExecutor
+from unittest import mock
 
 import numpy as np
 import pytest
 
+from rootsopt import InputError, load_config
 from rootsopt.commands.work.searching import runs_of
-from rootsopt.config import load
-from rootsopt.errors import InputError
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.reducers import HERE, Point
 from rootsopt.response.sweeps import cluster
@@ -25,7 +25,7 @@ from tests.response.workers import DEADLY
 @pytest.mark.long
 def test_a_design_that_kills_its_process_ends_the_search(monkeypatch):
     monkeypatch.setenv("TEST_SECONDS", "0.01")
-    evaluator = Evaluator.of(load("cic_drawn", [f"scene.speed_rpm={DEADLY}"]))
+    evaluator = Evaluator.of(load_config("cic_drawn", [f"scene.speed_rpm={DEADLY}"]))
     with (
         running(1, imports=(IMPORT,)) as runs,
         pytest.raises(InputError, match=r"several times.*--resume"),
@@ -34,77 +34,51 @@ def test_a_design_that_kills_its_process_ends_the_search(monkeypatch):
 
 
 def point():
-    return Point(Evaluator.of(load("cic_drawn")), np.ones(3))
+    return Point(Evaluator.of(load_config("cic_drawn")), np.ones(3))
 
 
-class Client:
-    """Stands in for a Dask client whose workers never answer."""
-
-    status = "running"
-
-    def __init__(self):
-        self.futures = []
-        self.asked = threading.Event()
-
-    def nthreads(self):
-        return {"a": 2, "b": 1}
-
-    def submit(self, function, *arguments, pure):
-        self.futures.append(Future())
-        self.asked.set()
-        return self.futures[-1]
-
-
-class Future:
-    """Stands in for a future that never ends."""
-
-    cancelled = False
-
-    def add_done_callback(self, call):
-        pass
-
-    def cancel(self):
-        self.cancelled = True
+def runs_of_silence(status="running", threads=(2, 1)):
+    """Return (runner, its client): a client of Dask whose workers never answer."""
+    client = mock.Mock(status=status)
+    client.nthreads.return_value = dict(enumerate(threads))
+    return DaskRunner(None, client, Settings(())), client
 
 
 def test_threads_that_wait_end_with_the_search(monkeypatch):
     monkeypatch.setattr(cluster, "_POLL", 0.01)
-    client = Client()
-    runs = DaskRunner(None, client, Settings(()))
+    (runs, client), asked = runs_of_silence(), threading.Event()
+    client.submit.return_value.add_done_callback = lambda call: asked.set()
     assert runs.slots == 6
     with ThreadPoolExecutor(1) as pool:
         waiting = pool.submit(runs.evaluated, point())
-        assert client.asked.wait(10)
+        assert asked.wait(10)
         runs.close()
         with pytest.raises(ClosedError):
             waiting.result(10)
-    assert client.futures[0].cancelled
+    client.submit.return_value.cancel.assert_called()
     with pytest.raises(ClosedError):
         runs.evaluated(point())
 
 
-def test_a_lost_connection_is_named(monkeypatch):
-    monkeypatch.setattr(cluster, "_POLL", 0.01)
-    monkeypatch.setattr(Client, "status", "closed")
-    with pytest.raises(InputError, match="connection to the scheduler was lost"):
-        DaskRunner(None, Client(), Settings(())).evaluated(point())
-
-
-def test_a_scheduler_without_workers_is_given_up(monkeypatch):
+@pytest.mark.parametrize(
+    ("status", "threads", "words"),
+    [
+        ("closed", (2, 1), "connection to the scheduler was lost"),
+        ("running", (), r"no worker for 0\.05 s"),
+    ],
+)
+def test_a_scheduler_that_does_not_work_is_given_up(monkeypatch, status, threads, words):
     monkeypatch.setattr(cluster, "_POLL", 0.01)
     monkeypatch.setattr(cluster, "_DESERTED", 0.05)
-    monkeypatch.setattr(Client, "nthreads", lambda self: {})
-    with pytest.raises(InputError, match=r"no worker for 0\.05 s"):
-        DaskRunner(None, Client(), Settings(())).evaluated(point())
+    with pytest.raises(InputError, match=words):
+        runs_of_silence(status, threads)[0].evaluated(point())
 
 
 @pytest.mark.parametrize("motion", ["reached", "worst", "ensemble"])
 def test_every_evaluator_travels(motion):
-    config = load("cic_drawn", [f"objective.motion={motion}"])
-    sent = Evaluator.of_objective(config)
+    sent = Evaluator.of_objective(load_config("cic_drawn", [f"objective.motion={motion}"]))
     found = pickle.loads(pickle.dumps(sent))
-    assert type(found) is type(sent)
-    assert found.config == config
+    assert (type(found), found.config) == (type(sent), sent.config)
     assert float(found.scene.speed) == float(sent.scene.speed)
 
 

@@ -46,21 +46,19 @@ def test_averages_of_a_member(monkeypatch):
     averages = averages_from(jnp.zeros(2))
     for periods in (1, 2, 7, 12):
         found = averages(settle, periods)
-        window = means[settle : settle + periods]
         at = settle + np.arange(periods)
+        window = means[at]
         peaks = 3 * window + at % 2
         expected = [np.mean(window), np.mean(2 * window**2), np.mean(peaks)]
         np.testing.assert_allclose(found.means, expected, rtol=1e-12)
         half = periods // 2
         drift = np.mean(window[-half:]) - np.mean(window[:half]) if half else 0.0
         assert float(found.drift) == pytest.approx(drift, rel=1e-12)
-        assert half == 0 or drift > 0
         assert float(found.greatest) == pytest.approx(np.max(peaks))
         assert float(found.depth) == pytest.approx(np.max(-window))
         assert float(found.states[0]) == settle + periods
         assert not np.any(found.repeats)
-        assert not bool(found.stalled)
-        assert bool(found.solved)
+        assert (bool(found.stalled), bool(found.solved)) == (False, True)
 
 
 def averages_from(state):
@@ -88,28 +86,22 @@ def test_a_member_repeats_after_its_period(monkeypatch):
 
 def of_means(means) -> Members:
     """Return members of which only the means are given."""
-    count = len(means)
-    zero, no = np.zeros(count), np.zeros(count, bool)
-    return Members(
-        means, zero, zero, zero, np.zeros((count, 2)), np.zeros((count, 8), bool), no, no, ~no
-    )
+    zero, no = np.zeros(len(means)), np.zeros(len(means), bool)
+    return Members(means, zero, zero, zero, zero[:, None], no[:, None], no, no, ~no)
 
 
 def test_standard_errors_of_members_are_their_scatter():
     """Mean, peak and RMS of 4000 ensembles of independent members scatter as stated."""
-    rng = np.random.default_rng(7)
-    samples, count = 4000, 24
-    level = 5 + rng.normal(size=(samples, count))
-    square = level**2 + rng.gamma(4.0, 1.5, size=(samples, count))
-    peak = 20 + 3 * rng.normal(size=(samples, count))
+    rng, size = np.random.default_rng(7), (4000, 24)
+    level = 5 + rng.normal(size=size)
+    square = level**2 + rng.gamma(4.0, 1.5, size=size)
+    peak = 20 + 3 * rng.normal(size=size)
     every = np.stack([level, square, peak], axis=-1)
-    found = np.array([of_means(one).responses for one in every])
-    values, errors = found[..., 0], found[..., 1]
+    values, errors = np.moveaxis([of_means(one).responses for one in every], -1, 0)
     np.testing.assert_allclose(values[0, :2], [np.mean(level[0]), np.mean(peak[0])])
     np.testing.assert_allclose(values[0, 2], np.sqrt(np.mean(square[0])))
-    scatter = np.std(values, axis=0, ddof=1)
     stated = np.sqrt(np.mean(errors**2, axis=0))
-    np.testing.assert_allclose(stated, scatter, rtol=0.05)
+    np.testing.assert_allclose(stated, np.std(values, axis=0, ddof=1), rtol=0.05)
     assert of_means(np.zeros((3, 3))).responses.tolist() == np.zeros((3, 2)).tolist()
 
 
@@ -126,7 +118,7 @@ def test_slopes_and_errors_per_config_unit():
     for k in range(2):
         drawn = rng.multivariate_normal(slope[k], covariance[k], size=40_000)
         # One solution for each: x jacobian = drawn.
-        moved = np.linalg.solve(jacobian.T, drawn.T).T
-        scatter = np.std(moved, axis=0)
+        moved = np.linalg.solve(jacobian.T, drawn.T)
+        scatter = np.std(moved, axis=1)
         np.testing.assert_allclose(errors[k], scatter, rtol=0.03)
-        assert np.all(np.abs(found[k] - np.mean(moved, axis=0)) < 5 * scatter / 200)
+        assert np.all(np.abs(found[k] - np.mean(moved, axis=1)) < 5 * scatter / 200)

@@ -4,29 +4,27 @@ import json
 
 import pytest
 
-from rootsopt.config import load
-from rootsopt.errors import InputError
+from rootsopt import InputError, load_config
 from rootsopt.response.scatter import draw
-from rootsopt.response.sweeps.plan import Plan, check_values, plan_of, scattered
+from rootsopt.response.sweeps.plan import check_values, plan_of, scattered
 
 SPEED, LOAD, ANGLE = "scene.speed_rpm", "scene.load.torque_N_m", "profile.pressure_angle_deg"
 
 
-def points(plan: Plan):
-    return [plan.at(number) for number in range(plan.count)]
+@pytest.mark.parametrize(
+    ("zipped", "shape", "values"),
+    [
+        (False, (2, 2), [(1, 4.0), (1, 5.0), (2, 4.0), (2, 5.0)]),
+        (True, (2,), [(1, 4.0), (2, 5.0)]),
+    ],
+)
+def test_keys_are_crossed_or_advance_together(zipped, shape, values):
+    plan = plan_of({SPEED: "1,2", LOAD: [4.0, 5.0]}, zipped=zipped)
+    assert (plan.shape, plan.count, plan.keys) == (shape, len(values), (SPEED, LOAD))
+    assert [tuple(plan.at(number).values()) for number in range(plan.count)] == values
 
 
-def test_grid_is_the_cross_product():
-    plan = plan_of({SPEED: "1,2,3", LOAD: [4.0, 5.0]})
-    assert (plan.shape, plan.count, plan.keys) == ((3, 2), 6, (SPEED, LOAD))
-    assert [tuple(p.values()) for p in points(plan)] == [
-        *((1, 4.0), (1, 5.0), (2, 4.0), (2, 5.0), (3, 4.0), (3, 5.0))
-    ]
-
-
-def test_zipped_keys_advance_together():
-    whole = plan_of({SPEED: "1,2", LOAD: "4,5"}, zipped=True)
-    assert [tuple(p.values()) for p in points(whole)] == [(1, 4), (2, 5)]
+def test_groups_of_keys_advance_together():
     part = plan_of({SPEED: "1,2", ANGLE: "7,8,9", LOAD: "4,5"}, zipped=[[SPEED, LOAD]])
     assert part.shape == (2, 3)
     assert [one.name for one in part.dimensions] == ["point", ANGLE]
@@ -80,46 +78,35 @@ def test_sobol_fills_every_part():
         ({"scene.timing_gear": [None, {"a": 1}, {"a": 1}]}, {}, "`scene.timing_gear`: values"),
         ({SPEED: "1:2:3,1.5"}, {}, "1.5 is given twice"),
         ({SPEED: "1,1", LOAD: "2,2"}, {"zipped": True}, "`scene.load.torque_N_m`: values must"),
+        ({"scene.sped_rpm": "1"}, {}, "`scene.sped_rpm` is not a known key; did you mean `scene.s"),
+        ({"sped_rpm": "1"}, {}, "did you mean `scene.speed_rpm`"),
+        ({"zzz": "1"}, {}, "`zzz` is not a known key; valid here"),
+        ({SPEED: "1:2:3,-5"}, {}, "greater than 0 .*-5"),
+        ({SPEED: "1,.nan"}, {}, "finite"),
+        ({SPEED: "1,true"}, {}, "a number, but is True"),
+        ({"profile.lobes": "2:3:3"}, {}, "whole number, but is 2.5"),
+        ({"profile.family": "cic,eee"}, {}, "'eee'"),
+        ({"scene.timing_gear": "null,{backlash: 1}"}, {}, "timing_gear.backlash"),
     ],
 )
 def test_wrong_plans(axes, options, words):
     with pytest.raises(InputError, match=words):
-        plan_of(axes, **options)
-
-
-@pytest.mark.parametrize(
-    ("axes", "words"),
-    [
-        ({"scene.sped_rpm": "1"}, "`scene.sped_rpm` is not a known key; did you mean `scene.s"),
-        ({"sped_rpm": "1"}, "did you mean `scene.speed_rpm`"),
-        ({"zzz": "1"}, "`zzz` is not a known key; valid here"),
-        ({SPEED: "1:2:3,-5"}, "greater than 0 .*-5"),
-        ({SPEED: "1,.nan"}, "finite"),
-        ({SPEED: "1,true"}, "a number, but is True"),
-        ({"profile.lobes": "2:3:3"}, "whole number, but is 2.5"),
-        ({"profile.family": "cic,eee"}, "'eee'"),
-        ({"scene.timing_gear": "null,{backlash: 1}"}, "timing_gear.backlash"),
-    ],
-)
-def test_bad_keys_and_values(axes, words):
-    with pytest.raises(InputError, match=words):
-        check_values(load("cic_drawn"), plan_of(axes))
+        check_values(load_config("cic_drawn"), plan_of(axes, **options))
 
 
 def test_values_that_only_clash_are_accepted():
-    check_values(load("cic_drawn"), plan_of({"profile.family": "cic,ee", ANGLE: "5,36"}))
+    check_values(load_config("cic_drawn"), plan_of({"profile.family": "cic,ee", ANGLE: "5,36"}))
 
 
 def test_scenes_of_tolerances():
     """Those of the fresh sample, each of which is a config of its own."""
     over = {SPEED: {"uniform": 30.0}, ANGLE: {"normal": 0.01}}
-    config = load("cic_drawn").replaced({"tolerances": {"over": over}})
+    config = load_config("cic_drawn").replaced({"tolerances": {"over": over}})
     plain, plan = scattered(config, 8)
     assert (plain.tolerances, plan.method, plan.count) == (None, "tolerances", 8)
-    assert [*map(list, zip(*plan.dimensions[0].columns.values(), strict=True))] == draw(
-        config, 8, fresh=True
-    ).tolist()
+    columns = [*map(list, plan.dimensions[0].columns.values())]
+    assert columns == draw(config, 8, fresh=True).T.tolist()
     check_values(plain, plan)
-    for wrong in ((load("cic_drawn"), 8), (config, 0)):
+    for wrong in ((load_config("cic_drawn"), 8), (config, 0)):
         with pytest.raises(InputError, match="--tolerances"):
             scattered(*wrong)

@@ -10,6 +10,7 @@ import pytest
 from rootsopt import InputError, Scene, load_config, register_term
 from rootsopt.config.sources import import_named
 from rootsopt.optimize.problem import Problem
+from rootsopt.pump.sheet import sheet
 from rootsopt.response import terms
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.result import RESPONSES
@@ -19,6 +20,19 @@ from tests.standins import Own
 PAGE = Path(__file__).parents[2] / "docs" / "extending.md"
 CIC = "configs/cic_drawn.yaml"
 OUTSIDE = "revolutions_per_litre"
+NAMES = (
+    *("displaced_volume_cm3", "theoretical_flow_l_min", "flow_ripple", "gear_backlash_max_mm"),
+    *("angular_play_min_mrad", "flank_gap_min_um", "flank_gap_mean_um"),
+    *("static_bearing_load_max_N", "static_bearing_load_equivalent_N", "leakage_fraction"),
+    "delivered_flow_l_min",
+)
+PUMP = (
+    "pump={viscosity_mPa_s: 0.018, tip_clearance_mm: 0.08, radial_allowance_mm: 0.01}",
+    "contact.clearance_mm=0.05",
+    "scene.load={pressure_difference_Pa: 5e4}",
+    "scene.bearings={}",
+    "scene.center_distance_error_mm=0.02",
+)
 
 
 @pytest.fixture(scope="module")
@@ -54,21 +68,15 @@ def test_gradients_of_terms_are_those_of_differences(outside, scene, name):
     design, forces = np.array([36.43, 9.0, 4.0]), np.array([76.0, 242.0, 113.0])
     slopes = np.array([[-1.7, 7.9, -0.1], [-6.9, 4.7, 1.1], [-1.7, 6.3, 0.0]])
     wanted = terms.terms_of([name])
-    _, gradient = values_of(scene, wanted, design, forces, slopes)
-    step = 1e-4
-    for k in range(3):
-        move = step * np.eye(3)[k]
-        above, below = (
-            float(
-                values_of(scene, wanted, design + s * move, forces + s * slopes @ move, slopes)[0][
-                    0
-                ]
-            )
+    _, (gradient,) = values_of(scene, wanted, design, forces, slopes)
+    expected = []
+    for move in 1e-4 * np.eye(3):
+        (above, _), (below, _) = (
+            values_of(scene, wanted, design + s * move, forces + s * slopes @ move, slopes)
             for s in (1, -1)
         )
-        expected = (above - below) / (2 * step)
-        scale = max(abs(float(g)) for g in gradient[0])
-        assert float(gradient[0][k]) == pytest.approx(expected, abs=1e-6 * scale)
+        expected.append(float(above[0] - below[0]) / 2e-4)
+    np.testing.assert_allclose(gradient, expected, atol=1e-6 * np.max(np.abs(gradient)), rtol=0)
 
 
 def test_outside_term_is_in_results_and_objective(outside):
@@ -79,8 +87,7 @@ def test_outside_term_is_in_results_and_objective(outside):
     config = load_config(CIC, only)
     evaluator = Evaluator.of(config)
     found = evaluator(series=False)
-    geometry = found.geometry
-    area = np.pi * geometry["outer_radius_mm"] ** 2 - geometry["area_mm2"]
+    area = np.pi * found.geometry["outer_radius_mm"] ** 2 - found.geometry["area_mm2"]
     litres = 2e-6 * config.rotor.length_mm * area
     assert found.response[OUTSIDE] == pytest.approx(1 / litres, rel=1e-12)
     assert list(found.response) == [*RESPONSES, OUTSIDE]
@@ -92,15 +99,55 @@ def test_outside_term_is_in_results_and_objective(outside):
     np.testing.assert_allclose(problem.slope(found, point), slope @ jacobian, rtol=1e-12)
 
 
-def test_unknown_terms_are_refused(scene):
+def test_unknown_terms_are_refused():
     with pytest.raises(InputError, match="names noise; correct it, or register it"):
         Evaluator.of(load_config(CIC, ["objective.terms.noise=1"]))
     with pytest.raises(InputError, match="belong to a periodic motion"):
         load_config(CIC, ["objective.terms.area_mm2=1", "objective.motion=ensemble"])
 
 
-def test_table_keeps_names_apart():
-    with pytest.raises(ValueError, match="'area_mm2' is that of `Formula`"):
-        register_term("area_mm2", Own(lambda *_: jnp.ones(())))
-    with pytest.raises(ValueError, match="must be a word"):
-        register_term("two words", Own(lambda *_: jnp.ones(())))
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("area_mm2", "'area_mm2' is that of `Formula`"), ("two words", "must be a word")],
+)
+def test_table_keeps_names_apart(name, words):
+    with pytest.raises(ValueError, match=words):
+        register_term(name, Own(lambda *_: jnp.ones(())))
+
+
+@pytest.mark.long
+def test_terms_are_the_rows_of_the_sheet_and_have_gradients():
+    config = load_config("cic_drawn", PUMP)
+    scene, design = Scene.from_config(config), jnp.asarray(config.design)
+    wanted, *nothing = terms.terms_of(NAMES), jnp.zeros(3), jnp.zeros((3, 3))
+    values, slopes = map(np.asarray, values_of(scene, wanted, design, *nothing))
+    rows = sheet(scene, design)
+    rows["leakage_fraction"] = 1 - rows["volumetric_efficiency"]
+    rows["delivered_flow_l_min"] = rows["theoretical_flow_l_min"] * rows["volumetric_efficiency"]
+    np.testing.assert_allclose(values, [rows[name] for name in NAMES], rtol=1e-9)
+    steps = np.diag([1e-4, 1e-4, 1e-4])
+    ends = [[values_of(scene, wanted, design + k * s, *nothing)[0] for k in (1, -1)] for s in steps]
+    expected = np.stack([(np.asarray(a) - np.asarray(b)) / 2e-4 for a, b in ends], axis=1)
+    # Slopes below a tenth of the value count by this. Longer steps pass corners of the least play.
+    scale = np.maximum(np.abs(expected), 0.1 * np.abs(values)[:, None])
+    assert np.max(np.abs(slopes - expected) / scale) < 2e-4
+
+
+@pytest.mark.parametrize(
+    ("changes", "name", "words"),
+    [
+        ((), "axial_force_max_N", "needs the section `scene.bearings`"),
+        ((), "static_bearing_load_max_N", "needs the section `scene.bearings`"),
+        ((), "flank_gap_min_um", "needs the section `pump`"),
+        (
+            ("scene.bearings={}",),
+            "tilting_moment_max_N_m",
+            r"needs twisted rotors.*optimizer.bounds.helix_deg",
+        ),
+    ],
+)
+def test_terms_name_the_section_they_need(changes, name, words):
+    config = load_config(CIC, changes)
+    arguments = jnp.asarray(config.design), jnp.zeros(3), jnp.zeros((3, 3))
+    with pytest.raises(InputError, match=words):
+        values_of(Scene.from_config(config), terms.terms_of([name]), *arguments)
