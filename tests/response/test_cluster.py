@@ -1,7 +1,6 @@
 """Sweeps over real processes: nothing is lost or duplicated if one of them is killed."""
 
 import pickle
-import signal
 import sys
 from pathlib import Path
 
@@ -9,8 +8,7 @@ import psutil
 import pytest
 
 import rootsopt
-from rootsopt.config import load
-from rootsopt.errors import InputError
+from rootsopt import InputError, load_config
 from rootsopt.response.sweeps import cluster
 from rootsopt.response.sweeps.cluster import running
 from rootsopt.response.sweeps.plan import plan_of
@@ -21,22 +19,20 @@ IMPORT = str(Path(__file__).with_name("workers.py"))
 SPEED = "scene.speed_rpm"
 
 
-def kill_a_worker() -> None:
-    """Kill one of the processes that a cluster has started, if there is one."""
-    for child in psutil.Process().children(recursive=True):
-        if "spawn_main" in " ".join(child.cmdline()):
-            child.send_signal(signal.SIGKILL)
-            return
+def spawned():
+    """Return the processes that a cluster has started."""
+    every = psutil.Process().children(recursive=True)
+    return [one for one in every if "spawn_main" in " ".join(one.cmdline())]
 
 
 def swept(path, plan, after=0):
     """Sweep with two workers, and kill one after the first `after` points; return the journal."""
-    config, killed = load("cic_drawn"), []
+    config, killed = load_config("cic_drawn"), []
 
     def progress(done, expected):
         if after and done >= after and not killed:
             killed.append(done)
-            kill_a_worker()
+            spawned()[0].kill()
 
     journal = Points(config, plan, (), path)
     with running(2, imports=(IMPORT,)) as runs:
@@ -48,23 +44,19 @@ def swept(path, plan, after=0):
 
 def test_a_killed_worker_loses_and_duplicates_nothing(tmp_path, monkeypatch):
     monkeypatch.setenv("TEST_SECONDS", "0.1")
-    plan = plan_of({SPEED: "100:2000:20"})
-    rows = swept(tmp_path / "points", plan, after=4)
-    assert sorted(rows) == [*range(20)]
+    rows = swept(tmp_path / "points", plan_of({SPEED: "100:2000:20"}), after=4)
+    found = sorted((number, row["message"].rpartition("at ")[2]) for number, row in rows.items())
+    assert found == [(number, str(100 * (number + 1))) for number in range(20)]
     assert len((tmp_path / "points").read_bytes().splitlines()) == 1 + 20
-    for number, row in rows.items():
-        assert row["message"].endswith(f"at {100 * (number + 1)}")
-    left = psutil.Process().children(recursive=True)
-    assert not any("spawn_main" in " ".join(one.cmdline()) for one in left)
+    assert spawned() == []
 
 
 @pytest.mark.long
 def test_a_point_that_kills_its_process_is_a_status(tmp_path, monkeypatch):
     monkeypatch.setenv("TEST_SECONDS", "0.01")
-    plan = plan_of({SPEED: f"100,200,{DEADLY},300,400,500"})
-    rows = swept(tmp_path / "points", plan)
-    statuses = [rows[number]["status"] for number in range(6)]
-    assert statuses == ["invalid", "invalid", "failed", "invalid", "invalid", "invalid"]
+    rows = swept(tmp_path / "points", plan_of({SPEED: f"100,200,{DEADLY},300,400,500"}))
+    statuses = {number: row["status"] for number, row in rows.items()}
+    assert statuses == dict.fromkeys(range(6), "invalid") | {2: "failed"}
     assert "may need more memory" in rows[2]["message"]
 
 
@@ -79,20 +71,19 @@ def test_missing_package_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     for options in ({"workers": 2}, {"scheduler": "tcp://127.0.0.1:1"}):
         with pytest.raises(InputError, match=r"pip install 'rootsopt\[cluster\]'"):
-            rootsopt.sweep_scenes(load("cic_drawn"), {SPEED: "1,2"}, **options)
+            rootsopt.sweep_scenes(load_config("cic_drawn"), {SPEED: "1,2"}, **options)
 
 
 @pytest.mark.parametrize(
-    ("workers", "scheduler", "words"),
-    [(0, None, "from 1 to"), (2, "tcp://127.0.0.1:1", "exclude each other")],
+    ("options", "words"),
+    [
+        ({"workers": 0}, "from 1 to"),
+        ({"workers": 2, "scheduler": "tcp://127.0.0.1:1"}, "exclude each other"),
+        ({"scheduler": "tcp://127.0.0.1:9"}, "'tcp://127.0.0.1:9' cannot be used"),
+        ({"scheduler": "nonsense://x"}, "'nonsense://x' cannot be used"),
+    ],
 )
-def test_wrong_clusters(workers, scheduler, words):
-    with pytest.raises(InputError, match=words), running(workers, scheduler):
-        pass
-
-
-def test_scheduler_that_is_none(monkeypatch):
+def test_wrong_clusters(monkeypatch, options, words):
     monkeypatch.setattr("rootsopt.response.sweeps.cluster._ANSWER", 0.3)
-    for address in ("tcp://127.0.0.1:9", "nonsense://x"):
-        with pytest.raises(InputError, match=rf"'{address}' cannot be used"):
-            rootsopt.sweep_scenes(load("cic_drawn"), {SPEED: "1,2"}, scheduler=address)
+    with pytest.raises(InputError, match=words):
+        rootsopt.sweep_scenes(load_config("cic_drawn"), {SPEED: "1,2"}, **options)

@@ -1,6 +1,7 @@
 """Tests of periodic orbits of the rotor pair, followed through folds and period doublings."""
 
 import types
+from unittest import mock
 
 import diffrax
 import equinox as eqx
@@ -9,14 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rootsopt.config import load
+from rootsopt import InputError, Status, load_config
 from rootsopt.continuation import End, Kind, StepSizes, follow, follow_doubled
-from rootsopt.errors import InputError
 from rootsopt.response.continuation.arclength import StoppedError
 from rootsopt.response.continuation.branch import OrbitFamily
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.scene import Scene, design_vector
-from rootsopt.status import Status
 
 SPEED, BACKLASH = "scene.speed_rpm", "scene.timing_gear.backlash_mm"
 ECCENTRICITY = "scene.timing_gear.eccentricity_um"
@@ -30,7 +29,7 @@ START = (-0.235, -1.809)
 
 
 def config_at(speed):
-    return load("configs/cic_drawn.yaml", [*SCENE, f"scene.speed_rpm={speed!r}"])
+    return load_config("configs/cic_drawn.yaml", [*SCENE, f"scene.speed_rpm={speed!r}"])
 
 
 @pytest.fixture(scope="module")
@@ -38,14 +37,8 @@ def branch():
     """Return orbits over speed, beginning with a stable one at 4000 rpm."""
     config = config_at(4000.0)
     found = Evaluator.of(config)(start=np.array(START), series=False)
-    assert found.status is Status.PERIODIC
-    assert found.steady_state["period"] == 1
+    assert (found.status, found.steady_state["period"]) == (Status.PERIODIC, 1)
     return follow(config, SPEED, found.state, 1, RANGE)
-
-
-def start_of(branch):
-    """Return the orbit at which the branch began, far from any grazing contact."""
-    return min(branch.spots, key=lambda spot: np.max(np.abs(spot.data.state - START)))
 
 
 @jax.jit
@@ -58,11 +51,10 @@ def _ends(scene, design, states):
     control = diffrax.PIDController(rtol=1e-11, atol=1e-11, dtmax=1 / 256)
 
     def end(state):
-        solver = diffrax.Dopri8(scan_kind="lax")
-        out = diffrax.diffeqsolve(
-            term, solver, 0.0, 1.0, 1e-3, state, stepsize_controller=control, max_steps=100_000
-        )
-        return out.ys[-1]
+        return diffrax.diffeqsolve(
+            term, diffrax.Dopri8(scan_kind="lax"), 0.0, 1.0, 1e-3, state,
+            stepsize_controller=control, max_steps=100_000,
+        ).ys[-1]  # fmt: skip
 
     return jax.lax.map(end, states)
 
@@ -72,10 +64,10 @@ def by_integration(point):
     the start, by central differences.
 
     Noise of the integration, 1e-9, and curvature both stay below 1e-4 of it."""
-    config, step = config_at(point.value), 1e-4
-    states = point.state + step * np.vstack([np.zeros(2), np.eye(2), -np.eye(2)])
-    end, *ends = np.asarray(_ends(Scene.from_config(config), design_vector(config), states))
-    return end, (np.array(ends[:2]) - np.array(ends[2:])).T / (2 * step)
+    config = config_at(point.value)
+    states = point.state + 1e-4 * np.vstack([np.zeros(2), np.eye(2), -np.eye(2)])
+    ends = np.asarray(_ends(Scene.from_config(config), design_vector(config), states))
+    return ends[0], (ends[1:3] - ends[3:]).T / 2e-4
 
 
 def test_points_agree_with_orbits_closed_for_themselves(branch):
@@ -91,8 +83,8 @@ def test_points_agree_with_orbits_closed_for_themselves(branch):
         point, near = stable[number], sizes[max(number - 1, 0) : number + 2]
         alone = Evaluator.of(config_at(point.value))(start=0.999 * point.state, series=False)
         assert alone.status is Status.PERIODIC
-        found = [alone.response[f"{name}_force_N"] for name in ("mean", "peak", "rms")]
-        np.testing.assert_allclose([point.mean, point.peak, point.rms], found, rtol=1e-6)
+        found = {f"{name}_force_N": getattr(point, name) for name in ("mean", "peak", "rms")}
+        assert found == pytest.approx(alone.response, rel=1e-6)
         largest = alone.steady_state["floquet_multiplier"]
         if np.ptp(near) < 0.1 * largest:
             steady += 1
@@ -123,10 +115,8 @@ def test_branch_turns_back_at_folds(branch):
     """At a fold, a multiplier is +1 and stability is lost; several orbits have the same speed."""
     assert branch.ends == (End.RANGE_END, End.RANGE_END)
     folds = [one for one in branch.bifurcations if one.kind is Kind.FOLD]
-    assert len(folds) == 2
     for fold in folds:
-        near = np.min(np.abs(fold.point.multipliers - 1))
-        assert near < 1e-3
+        assert np.min(np.abs(fold.point.multipliers - 1)) < 1e-3
         assert abs(fold.spot.tangent[-1]) < 1e-4
         before, after = branch.spots[fold.after : fold.after + 2]
         assert before.tangent[-1] * after.tangent[-1] < 0
@@ -134,17 +124,16 @@ def test_branch_turns_back_at_folds(branch):
     values = sorted(fold.point.value for fold in folds)
     assert values == pytest.approx([3804.646, 4133.342], abs=0.01)
     orbits = branch.at(4000.0)
-    assert len(orbits) == 3
-    assert [orbit.stable for orbit in orbits].count(True) == 2
-    assert all(orbit.value == pytest.approx(4000) for orbit in orbits)
-    peaks = sorted(orbit.peak for orbit in orbits)
-    assert np.min(np.diff(peaks)) > 10
+    assert sorted(orbit.stable for orbit in orbits) == [False, True, True]
+    assert [orbit.value for orbit in orbits] == pytest.approx([4000] * 3)
+    assert np.min(np.diff(sorted(orbit.peak for orbit in orbits))) > 10
     assert branch.at(9000.0) == []
 
 
 def test_plane_holds_the_place(branch):
     """The orbit lies in the plane that was asked for, at a fixed parameter or across the curve."""
-    start = start_of(branch)
+    # The orbit at which the branch began, far from any grazing contact.
+    start = min(branch.spots, key=lambda spot: np.max(np.abs(spot.data.state - START)))
     guess = start.place + 0.008 * start.tangent
     for across in (start.tangent, np.eye(3)[-1], np.eye(3)[1]):
         spot = branch.family(guess, across, start)
@@ -161,25 +150,17 @@ def test_orbit_to_which_its_neighbour_does_not_lead(branch, monkeypatch, wrong):
     Other reasons to stop are final."""
     family, start = branch.family, branch.spots[0]
     way, guess = start.tangent, start.place + 1e-3 * start.tangent
-    right, closed, asked = family(guess, way, start), family._closed, []
-    aside = 1e-4 * np.cross(way, [0.0, 0.0, 1.0])
-    end = End.STEP_TOO_SMALL
-
-    def misled(known, *rest):
-        asked.append(float(known[2]))
-        if len(asked) > 1:
-            return closed(known, *rest)
-        if wrong and end is End.STEP_TOO_SMALL:
-            return right._replace(place=right.place + aside)
-        raise StoppedError(end)
-
-    monkeypatch.setattr(family, "_closed", misled)
+    right = family(guess, way, start)
+    aside = right._replace(place=right.place + 1e-4 * np.cross(way, [0.0, 0.0, 1.0]))
+    first = aside if wrong else StoppedError(End.STEP_TOO_SMALL)
+    misled = [first, mock.DEFAULT, StoppedError(End.TOO_DEEP)]
+    closed = mock.Mock(wraps=family._closed, side_effect=misled)
+    monkeypatch.setattr(family, "_closed", closed)
     again = family(guess, way, start)
+    asked = [float(call.args[0][2]) for call in closed.call_args_list]
     assert asked == [pytest.approx(1e-3, abs=1e-9), 0.0]
     np.testing.assert_allclose(again.place, right.place, atol=1e-9)
     np.testing.assert_allclose(np.abs(again.tangent @ right.tangent), 1, atol=1e-9)
-    end = End.TOO_DEEP
-    asked.clear()
     with pytest.raises(StoppedError, match="too deep"):
         family(guess, way, start)
 
@@ -205,34 +186,28 @@ MOTOR = (
 )
 def test_scenes_along_a_curve_are_those_of_the_configs(monkeypatch, name, changes, key, ends):
     """Scene and design at 30 % of the range are those of a config with this value."""
-    pair = types.SimpleNamespace(angle_scale=jnp.asarray(1e-3), smooth=True, repeats=1)
-    pair.whole = lambda periods: periods
+    pair = types.SimpleNamespace(
+        angle_scale=jnp.asarray(1e-3), smooth=True, repeats=1, whole=lambda periods: periods
+    )
     monkeypatch.setattr("rootsopt.response.continuation.branch._pair", lambda *scene: pair)
-    config = load(f"configs/{name}.yaml", list(changes))
+    config = load_config(f"configs/{name}.yaml", list(changes))
     family = OrbitFamily(config, key, 1, StepSizes(*ends))
     value = 0.7 * ends[0] + 0.3 * ends[1]
     assert family.value(0.3) == pytest.approx(value)
-    own = family.value(family.share)
-    moved = config.moved({key: own})
-    np.testing.assert_allclose(moved.design, config.design, rtol=1e-9)
-    scenes = [
-        Scene.from_config(config).renewed(one)
-        for one in (moved, config, config.moved({key: value}))
-    ]
+    own, there = (config.moved({key: x}) for x in (family.value(family.share), value))
+    np.testing.assert_allclose(own.design, config.design, rtol=1e-9)
+    scenes = [Scene.from_config(config).renewed(one) for one in (own, config, there)]
     change = jax.tree.map(lambda x: 0.3 * x, family.range.change)
     scene, design = eqx.apply_updates(family.range.low, change)
-    np.testing.assert_allclose(design, config.moved({key: value}).design, rtol=1e-12)
+    np.testing.assert_allclose(design, there.design, rtol=1e-12)
     for one, other in ((scene, scenes[2]), (scenes[0], scenes[1])):
-        assert jax.tree.structure(one) == jax.tree.structure(other)
-        for x, y in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
-            np.testing.assert_allclose(x, y, rtol=1e-9)
+        jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-9), one, other)
 
 
 def test_units_of_the_state_are_those_of_each_config(branch):
     """States can be used as a start even if the scale of the angle changes with the parameter."""
-    point = branch.at(4000.0)[0]
     config = config_at(4000.0)
-    other = follow(config, BACKLASH, point.state, 1, StepSizes(0.19, 0.21))
+    other = follow(config, BACKLASH, branch.at(4000.0)[0].state, 1, StepSizes(0.19, 0.21))
     end = other.points[0]
     assert (end.value, other.points[-1].value) == (0.19, 0.21)
     assert other.ends == (End.RANGE_END, End.RANGE_END)
@@ -256,21 +231,16 @@ def test_period_doubling_is_found(branch, below, monkeypatch):
     A doubled orbit is looked for on both sides; there may be none."""
     found, doubling = below
     assert np.min(np.abs(doubling.point.multipliers + 1)) < 1e-6
-    multipliers = np.linalg.eigvals(by_integration(doubling.point)[1])
-    assert np.min(np.abs(multipliers + 1)) < 1e-3
+    assert np.min(np.abs(np.linalg.eigvals(by_integration(doubling.point)[1]) + 1)) < 1e-3
     assert doubling.point.value == pytest.approx(3650.528, abs=0.01)
-    assert not found.points[doubling.after].stable
-    assert found.points[doubling.after + 1].stable
-    sides = []
-
-    def none(family, place, across):
-        sides.append(across)
-        raise StoppedError(End.STEP_TOO_SMALL)
-
+    around = found.points[doubling.after : doubling.after + 2]
+    assert [point.stable for point in around] == [False, True]
+    none = mock.Mock(side_effect=StoppedError(End.STEP_TOO_SMALL))
     monkeypatch.setattr(OrbitFamily, "from_integration", none)
     assert follow_doubled(found, doubling, points=6) is None
-    assert np.linalg.norm(sides[1]) == pytest.approx(1)
-    np.testing.assert_array_equal(sides[1], -sides[0])
+    first, second = (call.args[1] for call in none.call_args_list)
+    assert np.linalg.norm(second) == pytest.approx(1)
+    np.testing.assert_array_equal(second, -first)
     with pytest.raises(ValueError, match="period doubling"):
         follow_doubled(branch, next(one for one in branch.bifurcations if one.kind is Kind.FOLD))
 
@@ -279,7 +249,6 @@ def test_period_doubling_is_found(branch, below, monkeypatch):
 def test_period_doubling_leads_to_the_doubled_orbit(below):
     """An orbit of twice the period is born, which is another one than those of the single."""
     doubled = follow_doubled(*below, points=6)
-    assert doubled is not None
     assert doubled.ends[1] is not End.HALVED
     assert doubled.family.period == 2
     assert max(point.residual for point in doubled.points) < 1e-9
@@ -305,20 +274,20 @@ def test_wrong_input_is_explained(branch):
     ):
         with pytest.raises(InputError, match=said):
             follow(config, key, state, 1, limits)
-    with pytest.raises(InputError, match="period"):
-        follow(config, SPEED, state, 0, RANGE)
-    bare = load("configs/ee.yaml", ["scene.timing_gear=null"])
-    with pytest.raises(InputError, match="timing_gear"):
-        follow(bare, BACKLASH, state, 1, StepSizes(0.1, 0.3))
-    with pytest.raises(InputError, match="no orbit of 1 mesh periods"):
-        follow(config, SPEED, [40.0, 300.0], 1, RANGE)
+    bare = load_config("configs/ee.yaml", ["scene.timing_gear=null"])
+    for arguments, said in (
+        ((config, SPEED, state, 0, RANGE), "period"),
+        ((bare, BACKLASH, state, 1, StepSizes(0.1, 0.3)), "timing_gear"),
+        ((config, SPEED, [40.0, 300.0], 1, RANGE), "no orbit of 1 mesh periods"),
+    ):
+        with pytest.raises(InputError, match=said):
+            follow(*arguments)
 
 
 def test_a_design_ends_where_no_profile_can_be_made(branch):
     """The branch ends where the roll angle allows no longer involute."""
-    config = config_at(4000.0)
     state = branch.at(4000.0)[0].state
-    path = follow(config, INVOLUTE, state, 1, StepSizes(8.9, 9.5))
+    path = follow(config_at(4000.0), INVOLUTE, state, 1, StepSizes(8.9, 9.5))
     assert path.ends[1] is End.NO_GEOMETRY
     assert path.points[-1].value == pytest.approx(9.071, abs=2e-3)
     assert max(point.residual for point in path.points) < 1e-9

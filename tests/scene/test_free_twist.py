@@ -27,8 +27,9 @@ def test_twist_is_the_last_parameter(name):
     fixed, free = rootsopt.load_config(name), rootsopt.load_config(name, FREE)
     assert free.design_keys == (*fixed.design_keys, "helix_deg")
     np.testing.assert_array_equal(free.design, [*fixed.design, 20.0])
-    moved = free.with_design([*(fixed.design * 0.99), 33.0])
-    np.testing.assert_array_equal(moved.design, [*(fixed.design * 0.99), 33.0])
+    wanted = [*(fixed.design * 0.99), 33.0]
+    moved = free.with_design(wanted)
+    np.testing.assert_array_equal(moved.design, wanted)
     assert moved.rotor.helix_deg == 33.0
     assert fixed.with_design(fixed.design) == fixed
     assert bounds_of(free) == [*bounds_of(fixed), (0.0, 90.0)]
@@ -42,26 +43,24 @@ def test_twist_is_the_last_parameter(name):
 def test_derivatives_are_those_of_the_scene():
     """The pair's derivatives along the last parameter are those with respect to `scene.helix`."""
     free, design = scene_of("ee", *GAS, *FREE)
+    assert free.at(design).helix == pytest.approx(20 * DEG)
     pair, tangents, _ = free.pair_and_tangents(design)
     # What depends on the twist alone, and only on it.
     np.testing.assert_allclose(tangents.contact.twist, [DEG], rtol=1e-12)
-    offsets = np.asarray(pair.load.offsets) / float(free.at(design).helix)
-    np.testing.assert_allclose(tangents.load.offsets[0], offsets * DEG, rtol=1e-12)
-    assert free.at(design).helix == pytest.approx(20 * DEG)
+    np.testing.assert_allclose(tangents.load.offsets[0], pair.load.offsets / 20, rtol=1e-12)
 
 
 def test_terms_and_sheet_follow_the_twist():
     """EE: one line of the flow, whose ripple 2/13 falls with sin(NΦ)/(NΦ)."""
     scene, _ = scene_of("ee", *FREE)
-    nothing = jnp.zeros(3), jnp.zeros((3, 1))
+    terms, *nothing = terms_of(["flow_ripple"]), jnp.zeros(3), jnp.zeros((3, 1))
     for degrees in (30.0, 50.0):
-        design = jnp.asarray([degrees])
-        values, slopes = values_of(scene, terms_of(["flow_ripple"]), design, *nothing)
-        turn = 3 * degrees * DEG
-        share, rise = np.sin(turn) / turn, (np.cos(turn) - np.sin(turn) / turn) / degrees
-        assert float(values[0]) == pytest.approx(2 / 13 * share, rel=1e-9)
-        assert float(slopes[0, 0]) == pytest.approx(2 / 13 * rise, rel=1e-9)
-        assert sheet(scene, design)["flow_ripple"] == pytest.approx(2 / 13 * share, rel=1e-9)
+        design, turn = jnp.asarray([degrees]), 3 * degrees * DEG
+        values, slopes = values_of(scene, terms, design, *nothing)
+        found = float(values[0]), sheet(scene, design)["flow_ripple"], float(slopes[0, 0])
+        share = np.sin(turn) / turn
+        wanted = 2 / 13 * np.array([share, share, (np.cos(turn) - share) / degrees])
+        assert found == pytest.approx(wanted, rel=1e-9)
 
 
 def test_slices_suffice_for_the_greatest_twist():
@@ -74,28 +73,24 @@ def test_a_fixed_twist_costs_nothing():
     for changes in ((), FREE[1:]):
         scene, design = scene_of("cic_drawn", *changes)
         assert scene.at(design) is scene
-        assert not scene.twist_free
     # A rotor from a file has no design parameters.
     outline = "profile={family: outline, lobes: 3, pitch_radius_mm: 33, outline_file: x.csv}"
     assert not rootsopt.load_config("cic_drawn", [outline, FREE[0]]).twist_free
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("name", "changes", "words"),
     [
-        ("optimizer.bounds.helix_deg=[30, 20]", "two increasing numbers"),
-        ("optimizer.bounds.helix_deg=[0, 400]", r"in \[-360, 360\]"),
-        ("optimizer.bounds.helix_deg=30", "helix_deg"),
+        ("cic_drawn", ["optimizer.bounds.helix_deg=[30, 20]"], "two increasing numbers"),
+        ("cic_drawn", ["optimizer.bounds.helix_deg=[0, 400]"], r"in \[-360, 360\]"),
+        ("cic_drawn", ["optimizer.bounds.helix_deg=30"], "helix_deg"),
+        ("ee", [], r"or make the twist one with `optimizer.bounds.helix_d"),
     ],
 )
-def test_impossible_bounds_are_refused(change, words):
+def test_impossible_bounds_are_refused(name, changes, words):
+    """So is a search without parameters."""
     with pytest.raises(InputError, match=words):
-        rootsopt.load_config("cic_drawn", [change])
-
-
-def test_no_parameters_are_refused():
-    with pytest.raises(InputError, match=r"or make the twist one with `optimizer.bounds.helix_d"):
-        Search(rootsopt.load_config("ee"))
+        Search(rootsopt.load_config(name, changes))
 
 
 @pytest.mark.long
@@ -106,12 +101,12 @@ def test_gradients_against_differences():
     evaluator = rootsopt.response.evaluation.Evaluator.of(config)
     here = evaluator()
     assert here.status is rootsopt.Status.PERIODIC
+    names = (
+        *("mean_force_N", "rms_force_N", "bearing_load_equivalent_N", "bearing_load_max_N"),
+        *("axial_force_max_N", "tilting_moment_max_N_m"),
+    )
     for key, step in (("helix_deg", 2e-3), ("pressure_angle_deg", 1e-3)):
         move = step * (np.array(config.design_keys) == key)
         ahead, behind = (evaluator(config.design + k * move).response for k in (1, -1))
-        for name in (
-            *("mean_force_N", "rms_force_N", "bearing_load_equivalent_N", "bearing_load_max_N"),
-            *("axial_force_max_N", "tilting_moment_max_N_m"),
-        ):
-            slope = (ahead[name] - behind[name]) / (2 * step)
-            assert here.gradient[name][key] == pytest.approx(slope, rel=1e-3), (key, name)
+        slopes = {name: (ahead[name] - behind[name]) / (2 * step) for name in names}
+        assert {name: here.gradient[name][key] for name in names} == pytest.approx(slopes, rel=1e-3)

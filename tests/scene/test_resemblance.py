@@ -1,5 +1,7 @@
 """Tests of resemblance: the distance is correct, and no optimiser finds a nearer member."""
 
+import json
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -35,8 +37,7 @@ def hausdorff(one, other):
 
     No code is shared with the package. If the other polygon has steps `h`, the distance of a vertex
     is too great by at most h² / 8d, where d is the distance."""
-    there = KDTree(one).query(other)[0].max()
-    return max(there, KDTree(other).query(one)[0].max())
+    return max(KDTree(one).query(other)[0].max(), KDTree(other).query(one)[0].max())
 
 
 def denser(points):
@@ -56,8 +57,8 @@ def test_departure_is_the_hausdorff_distance_of_the_closed_outlines(pair):
     # The root mean square, over evenly spaced vertices of the whole outline.
     points = polygon(one)
     arc_length = np.append(0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
-    even = np.linspace(0, arc_length[-1], 40_000)
-    even = np.stack([np.interp(even, arc_length, x) for x in points.T], axis=1)
+    places = np.linspace(0, arc_length[-1], 40_000)
+    even = np.stack([np.interp(places, arc_length, x) for x in points.T], axis=1)
     away = KDTree(polygon(other)).query(even)[0]
     assert found.rms == pytest.approx(np.sqrt(np.mean(away**2)), rel=2e-3)
 
@@ -80,16 +81,13 @@ def test_smooth_feet_see_the_curve_and_not_its_chords():
 
 def test_flanks_are_continued_by_their_mirror_images():
     points = polygon(PROFILES["cic"], 40)
-    flank = points[: len(points) // 6 + 1]
-    whole = beyond(flank, 3)
+    whole = beyond(points[: len(points) // 6 + 1], 3)
     assert np.max(KDTree(points).query(whole)[0]) < 1e-12
     assert np.all(np.diff(np.unwrap(np.arctan2(*whole.T[::-1]))) > 0)
 
 
 def test_members_of_a_family_are_found_again():
-    """Parameters are found to 1e-3 of their size; the distance is below 0.1 µm."""
     found = likeness(PROFILES["cic"], "cic")
-    assert found is not None
     assert list(found.design.values()) == pytest.approx([36.43, 8.5, 4.0], rel=1e-3)
     assert found.departure < 0.1e-6
     assert found.record()["departure_um"] == found.departure * 1e6
@@ -102,12 +100,10 @@ def test_no_optimiser_finds_a_nearer_member():
     It uses the independent distance."""
     target = denser(polygon(PROFILES["ellipse"], 300))
     found = likeness(PROFILES["ellipse"], "cic")
-    assert found is not None
-    radius, keys = jnp.asarray(R), [*found.design]
-    best = np.array([found.design[key] for key in keys])
+    best = np.array([*found.design.values()])
 
     def away(design):
-        shape = outline(profile_of("cic", 3, radius, jnp.asarray(design)), 300)
+        shape = outline(profile_of("cic", 3, jnp.asarray(R), jnp.asarray(design)), 300)
         return hausdorff(denser(np.asarray(shape)), target) if design[1] > 0.1 else 1.0
 
     assert away(best) == pytest.approx(found.departure, rel=0.01)
@@ -123,18 +119,12 @@ def test_free_form_comes_closer(monkeypatch):
     neighbour."""
     monkeypatch.setattr(resemblance, "_PROGRAMS", 12)
     target = project(PROFILES["arc"], 12)
-    near = likeness(target, "arc")
-    assert near is not None
-    found = free_likeness(target, near)
-    assert found is not None
+    found = free_likeness(target, likeness(target, "arc"))
     assert found.departure < 0.1e-6
-    assert found.family == "free_form"
-    assert len(found.design) == 13
+    assert (found.family, len(found.design)) == ("free_form", 13)
 
 
 def test_profile_command_names_the_family(tmp_path, monkeypatch, capsys):
-    import json
-
     monkeypatch.setattr(resemblance, "classical", lambda: ("arc",))
     monkeypatch.setattr(work, "free_likeness", lambda profile, *near: None)
     where = ["-o", str(tmp_path / "out"), "--no-figures", "--export", "none"]

@@ -11,12 +11,10 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from rootsopt.config import load
+from rootsopt import InputError, Status, load_config
 from rootsopt.dynamics.integrator import Integrator
-from rootsopt.errors import InputError
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.scene import Scene, design_vector
-from rootsopt.status import Status
 from tests.planar import Planar
 
 MOTOR = ["scene.drive=torque", "scene.motor={slope_N_m_s_per_rad: 0.1}"]
@@ -42,18 +40,15 @@ def build(model, design):
 
 
 def pair_of(overrides, family="cic_drawn"):
-    config = load(f"configs/{family}.yaml", list(overrides))
+    config = load_config(f"configs/{family}.yaml", list(overrides))
     return build(Scene.from_config(config), design_vector(config))[0], config
 
 
 def planar_of(pair, config):
-    """Return the same scene in plain coordinates."""
-    mass = None if pair.supports is None else float(pair.supports.mass)
-    gas = None
-    if config.scene.load.pressure_difference_Pa is not None:
-        torques = jax.jit(lambda phi: jnp.stack([pair.load.torque1(phi), pair.load.torque2(phi)]))
-        gas = lambda phi: np.asarray(torques(phi))  # noqa: E731
-    return Planar(config, float(pair.inertia), mass, gas)
+    """Return the same scene, which has all parts, in plain coordinates."""
+    torques = jax.jit(lambda phi: jnp.stack([pair.load.torque1(phi), pair.load.torque2(phi)]))
+    mass = float(pair.supports.mass)
+    return Planar(config, float(pair.inertia), mass, lambda phi: np.asarray(torques(phi)))
 
 
 def plain(pair, tau, state):
@@ -77,8 +72,8 @@ def test_forces_of_all_parts_are_newtons(family):
     and closer than nominal, and flanks, tips and roots touch."""
     # Rounding of the geometry is some 1e-17 m of a depth of 1e-6 m.
     for error in (0.02, -0.02):
-        more = [f"scene.center_distance_error_mm={error}", "contact.clearance_mm=0.002"]
-        more += [WITHIN] * (family == "cic_drawn")
+        more = [f"scene.center_distance_error_mm={error}", "contact.clearance_mm=0.002",
+                *[WITHIN] * (family == "cic_drawn")]  # fmt: skip
         pair, config = pair_of([*ALL, *more], family)
         reference = planar_of(pair, config)
         rng = np.random.default_rng(3)
@@ -89,10 +84,9 @@ def test_forces_of_all_parts_are_newtons(family):
         found = contacts(pair, jnp.asarray(tau), jnp.asarray(states))
         got = np.column_stack([found.torque1, found.torque2, found.push, found.total])
         expected = []
-        for k in range(len(tau)):
-            torques, pushes, total, _ = reference.forces(plain(pair, tau[k], states[k]))
+        for at in zip(tau, states, strict=True):
+            torques, pushes, total, _ = reference.forces(plain(pair, *at))
             expected.append([*torques, pushes[1].real, pushes[1].imag, total])
-            assert pushes[0] == -pushes[1]
         expected = np.array(expected)
         scale = np.max(abs(expected), axis=0)
         np.testing.assert_array_less(0, scale)
@@ -117,15 +111,12 @@ def test_motion_of_all_parts_is_scipys():
             max_steps=how.max_steps, adjoint=diffrax.ForwardMode(),
         ).ys[-1]  # fmt: skip
 
-    period = float(pair.mesh_period)
-
     # With the angle as what runs on: an event in time would be found by interpolation.
-    scale = 1e-5 * np.array([1, 1, 1, 1, 1, 1, *np.full(6, 1 / period)])
-    solution = solve_ivp(
+    scale = 1e-5 * np.array([1, 1, 1, 1, 1, 1, *np.full(6, 1 / float(pair.mesh_period))])
+    end = solve_ivp(
         lambda phi, y: reference(0, y) / y[6], (0, SHARE * 2 * np.pi / 3), plain(pair, 0.0, start),
         "DOP853", rtol=1e-13, atol=1e-13 * scale, max_step=0.06,
-    )  # fmt: skip
-    end = solution.y[:, -1]
+    ).y[:, -1]  # fmt: skip
     got = plain(pair, SHARE, run(jnp.asarray(start)))
     moved = np.max(abs(end - plain(pair, SHARE, start)) / scale)
     assert moved > 1  # Otherwise closeness would be that of a pair at rest.
@@ -145,13 +136,13 @@ def test_motion_of_all_parts_is_scipys():
 )  # fmt: skip
 def test_parts_that_do_not_go_together_are_refused(overrides, words):
     with pytest.raises(InputError, match=words):
-        load("configs/cic_drawn.yaml", overrides)
+        load_config("configs/cic_drawn.yaml", overrides)
 
 
 @pytest.mark.long
 def test_orbit_and_gradient_of_all_parts():
     """With all parts, eleven states, the orbit closes, and its gradient is that of differences."""
-    config = load("configs/cic_drawn.yaml", [*ALL, WITHIN, "solver.rtol=1e-10"])
+    config = load_config("configs/cic_drawn.yaml", [*ALL, WITHIN, "solver.rtol=1e-10"])
     evaluator = Evaluator.of(config)
     found = evaluator(series=True)
     assert found.status is Status.PERIODIC
