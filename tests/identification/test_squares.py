@@ -40,10 +40,6 @@ def wave(values, x):
     return values[0] * np.exp(-values[1] * x)
 
 
-def curve(x, *values):
-    return wave(values, x)
-
-
 def noisy(size, values=(1.5, 0.8)):
     return wave(values, X) + size * np.random.default_rng(0).standard_normal(len(X))
 
@@ -58,7 +54,9 @@ def test_errors_are_those_of_known_standard_deviations(monkeypatch):
     data = noisy(deviation)
     problem = problem_of(wave, data, monkeypatch, deviation)
     best = solved(problem)
-    values, covariance = curve_fit(curve, X, data, [1, 1], sigma=deviation, absolute_sigma=True)
+    values, covariance = curve_fit(
+        lambda x, *v: wave(v, x), X, data, [1, 1], sigma=deviation, absolute_sigma=True
+    )
     spread = Spread.of(problem, best)
     np.testing.assert_allclose(best.values, values, rtol=1e-5)
     np.testing.assert_allclose(spread.covariance, covariance, rtol=1e-3)
@@ -97,7 +95,7 @@ def test_outliers_hardly_count(monkeypatch):
     for _ in range(3):
         deviation = problem.estimated(best.fit - problem.rows.measured.to_numpy())
         best = problem.fitted(best.place, [None], deviation)
-    plain, _ = curve_fit(curve, X, data, [1, 1])
+    plain, _ = curve_fit(lambda x, *v: wave(v, x), X, data, [1, 1])
     assert np.abs(best.values - [1.5, 0.8]).max() < 0.1 * np.abs(plain - [1.5, 0.8]).max()
     assert 0.015 < deviation[0] < 0.05
 

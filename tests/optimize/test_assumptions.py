@@ -87,7 +87,6 @@ def test_scenes_agree_with_configs_one_by_one():
 
 
 def test_record_counts_the_scenes():
-    """Shares, quantiles and ranks are those that SciPy finds; lost scenes are named."""
     _, _, found = spread()
     record, values = found.record(), found.objectives[OPTIMIZED]
     drawn = values[5:]
@@ -101,8 +100,7 @@ def test_record_counts_the_scenes():
     )
     assert record["worst"]["objective"] == np.nanmax(values)
     lost = {one["scene"]: one["status_baseline"] for one in record["not_compared"]}
-    assert lost[f"{CLEARANCE}=0.06"] == "idle"
-    assert len(lost) == np.sum(~np.isfinite(values))
+    assert (lost[f"{CLEARANCE}=0.06"], len(lost)) == ("idle", np.sum(~np.isfinite(values)))
     x = np.array([found.scenes[name][LOAD] for name in [*found.scenes][5:]])
     expected = scipy.stats.spearmanr(x[known], some).statistic
     assert record["keys"][0]["rank_correlation"] == pytest.approx(expected)
@@ -111,7 +109,6 @@ def test_record_counts_the_scenes():
 
 
 def test_where_it_is_worse_and_which_design_wins():
-    """Beside each reported change of sign, configs of their own agree on which design is better."""
     _, result, found = spread()
     rivals = found.record()["rivals"]
     assert rivals
@@ -225,11 +222,10 @@ def test_nothing_without_a_motion_or_after_a_stop():
 
 @pytest.mark.long
 def test_command_optimises_over_assumptions(tmp_path, capsys):
-    """The command writes tables, figure and rows; its optimum has the least mean objective."""
     sets = [f"--set={one}" for one in (*QUICK, "objective.over=assumptions")]
     assert main(["optimize", "cic_drawn", "-o", str(tmp_path), *sets]) == 0
-    text = " ".join(capsys.readouterr().out.split())
-    assert "Other scenes: The optimum is better than the baseline in" in text
+    said = "Other scenes: The optimum is better than the baseline in"
+    assert said in " ".join(capsys.readouterr().out.split())
     result = json.loads((tmp_path / "result.json").read_text())
     with open(tmp_path / "assumptions.csv", newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["scene"].startswith("random")]

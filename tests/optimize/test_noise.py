@@ -45,7 +45,9 @@ def test_a_lucky_trial_is_no_candidate_on_its_own(problem):
     good = [trial([0.2, 0.2, 0.2 + 0.01 * k], 0.7) for k in range(4)]
     lucky = [trial([0.8, 0.8, 0.8 + 0.01 * k], 0.9 if k else 0.5) for k in range(3)]
     worst = dataclasses.replace(trial([0.2, 0.8, 0.8], 0.3), feasible=False)
-    (first, place), (second, _) = noise.candidates(problem, [worst, *lucky, lucky[0], lucky[0], *good])[:2]
+    (first, place), (second, _) = noise.candidates(
+        problem, [worst, *lucky, lucky[0], lucky[0], *good]
+    )[:2]
     assert (first, second) == pytest.approx((0.7, (0.5 + 0.9 + 0.9) / 3))
     assert place[:2] == pytest.approx([0.2, 0.2])
     assert noise.candidates(problem, [trial([0.5, 0.5, 0.5], 1.2)]) == []

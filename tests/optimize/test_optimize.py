@@ -91,10 +91,8 @@ def test_bounds_of_the_involute_replace_its_default_floor():
 
 
 def test_bound_above_the_longest_involute_is_a_constraint():
-    """Where the longest involute is below its lower bound, the design is infeasible."""
     problem = problem_of(f"{INVOLUTE}=[11, 30]")
-    names = [one.name for one in problem.space.constraints]
-    place = names.index("greatest involute length")
+    place = [one.name for one in problem.space.constraints].index("greatest involute length")
     lengths = []
     for point in sobol(16, 5):
         slack = problem.look(point)[2][place]
@@ -166,8 +164,6 @@ def test_contradicting_constraints_are_explained():
 
 
 def test_search_improves_within_the_constraints():
-    """A small run is better than the baseline, feasible and verified; its best-so-far is
-    monotone."""
     seen = []
     result = Search(config(*SMALL), lambda done, expected, best: seen.append(done)).run()
     assert result.verification["holds_up"]
@@ -288,7 +284,6 @@ door.leave(command.main())
     ],
 )
 def test_signals_to_the_command(tmp_path, after, number):
-    """After a signal, status and exit code are right, and the folder is complete."""
     path = tmp_path / "scene.yaml"
     path.write_text(SCENE)
     overrides = [f"--set={text}" for text in SMALL]

@@ -201,15 +201,13 @@ def test_the_worst_scenes_hold_the_optimum(monkeypatch):
     branches = [[(1, 1, 0.25)], [(1, 1, 0.75)], [(0.1, 1, 0.5)]]
     problem, evaluate = toy(monkeypatch, branches, "tolerances.combine=worst")
     found = descend(lambda x: problem.local(evaluate(float(x[0])), x), np.array([0.1]))
-    assert found.converged
-    assert found.point[0] == pytest.approx(0.5, abs=1e-6)
+    assert (found.converged, found.point[0]) == (True, pytest.approx(0.5, abs=1e-6))
     held = problem.held_by(evaluate(0.5), found.certificate)
     assert [one.record()["scene"] for one in held] == [0, 1]
     assert [one.share for one in held] == pytest.approx([0.5, 0.5], abs=1e-3)
 
 
 def test_statistics_of_fresh_scenes():
-    """Scenes without a usable motion are counted, and left out of the statistics."""
     values = np.array([1.0, 2.0, np.nan, 3.0, 4.0])
     names = "objective", "mean_force_N", "peak_force_N", "rms_force_N"
     one = Scattered(dict.fromkeys(names, values), {"periodic": 4, "chaotic": 1}, 2.5)
@@ -255,7 +253,6 @@ def test_a_parameter_that_the_family_of_the_search_lacks_cannot_scatter():
 
 
 def test_optimize_command(tmp_path, capsys, monkeypatch):
-    """A short run gives both optima, certificates, tables, files and a picture."""
     overrides = [
         PLAY,
         "tolerances.over={contact.clearance_mm: {normal: 0.002}}",

@@ -24,7 +24,6 @@ from tests.standins import evaluation_of
 
 
 def trial_of(point, objective, feasible=True) -> Trial:
-    """Return a trial at a point of the unit box."""
     evaluation = evaluation_of(objective, design=point)
     return Trial(np.asarray(point, float), 0, 0, evaluation, objective, feasible)
 

@@ -79,7 +79,6 @@ def few():
 
 
 def front_of(points, second, first=lambda a, b: a + 1.0 + 0.0 * b, starts=1):
-    """Return the front of two terms made up of a and b."""
     several = *ANGLES, f"pareto.points={points}", f"optimizer.starts={starts}"
     with registered(first=made_up(first), second=made_up(second)):
         return pareto_front(config(*several))
@@ -190,7 +189,6 @@ def test_jump_of_the_designs_is_recognised():
 
 @pytest.mark.long
 def test_three_terms():
-    """All points are certified, and none dominates another."""
     names = "outer_radius_mm", "area_efficiency", "seal_width_mm"
     front = pareto_front(config(f"pareto.terms=[{', '.join(names)}]", "pareto.divisions=3"))
     assert front.certified == len(front.points) >= 8
@@ -244,8 +242,7 @@ def test_interrupted_front_keeps_its_points():
     assert front.status is Status.INTERRUPTED
     assert 2 <= len(front.points) < 11
     assert {point.standing for point in front.points} == {Standing.NOT_VERIFIED}
-    again = tracer.so_far()
-    assert [p.design for p in again.points] == [p.design for p in front.points]
+    assert [p.design for p in tracer.so_far().points] == [p.design for p in front.points]
 
 
 @pytest.mark.parametrize(
@@ -286,8 +283,9 @@ def test_peaks_are_branches_of_one_group():
     assert scalar.value(sample.values) == pytest.approx(local.objective, abs=1e-15)
     assert local.objective == pytest.approx(0.5 + RHO * 2.0)
     assert len(local.groups) == 2
-    weights = scalar.weights(sample, certify(local, point))
-    assert weights == pytest.approx([2 / 3, 1 / 3], abs=2 * RHO)
+    assert scalar.weights(sample, certify(local, point)) == pytest.approx(
+        [2 / 3, 1 / 3], abs=2 * RHO
+    )
 
 
 def test_rates_have_the_signs_of_the_terms_themselves():
