@@ -55,7 +55,7 @@ def test_errors_are_those_of_known_standard_deviations(monkeypatch):
     problem = problem_of(wave, data, monkeypatch, deviation)
     best = solved(problem)
     values, covariance = curve_fit(
-        lambda x, *v: wave(v, x), X, data, [1, 1], sigma=deviation, absolute_sigma=True
+        lambda x, *v: wave(v, x), X, data, [1.0, 1.0], sigma=deviation, absolute_sigma=True
     )
     spread = Spread.of(problem, best)
     np.testing.assert_allclose(best.values, values, rtol=1e-5)
@@ -70,7 +70,7 @@ def test_errors_without_standard_deviations_are_those_of_leaving_out_one_value(m
     problem = problem_of(wave, data, monkeypatch)
     best = solved(problem, turn=1e9)
     kept = [np.arange(len(X)) != k for k in range(len(X))]
-    moved = np.array([np.linalg.lstsq(best.slopes[k], -best.residual[k])[0] for k in kept])
+    moved = np.array([np.linalg.lstsq(best.slopes[k], -best.residual[k], None)[0] for k in kept])
     np.testing.assert_allclose(Spread.of(problem, best).covariance, moved.T @ moved, rtol=2e-3)
 
 
@@ -95,7 +95,7 @@ def test_outliers_hardly_count(monkeypatch):
     for _ in range(3):
         deviation = problem.estimated(best.fit - problem.rows.measured.to_numpy())
         best = problem.fitted(best.place, [None], deviation)
-    plain, _ = curve_fit(lambda x, *v: wave(v, x), X, data, [1, 1])
+    plain, _ = curve_fit(lambda x, *v: wave(v, x), X, data, [1.0, 1.0])
     assert np.abs(best.values - [1.5, 0.8]).max() < 0.1 * np.abs(plain - [1.5, 0.8]).max()
     assert 0.015 < deviation[0] < 0.05
 

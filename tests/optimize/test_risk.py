@@ -33,7 +33,8 @@ def test_weights_are_the_gradient(name):
     The error of these is the third derivative times step²/6, about 1e-10, plus rounding 1e-16 /
     step."""
     one, expected = RULES[name]
-    found, step = combine(one, VALUES), 1e-5
+    found = combine(one, VALUES)
+    step = 1e-5
     assert found.value == pytest.approx(expected, rel=1e-12)
     for weight, moved in zip(found.weights, step * np.eye(len(VALUES)), strict=True):
         upper, lower = (combine(one, VALUES + sign * moved).value for sign in (1, -1))

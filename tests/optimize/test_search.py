@@ -52,10 +52,13 @@ def searching(truth=lambda point: 1.0, tight=None, **settings) -> Search:
     search = object.__new__(Search)
     search.stop, search._refuted, search._trials = threading.Event(), [], []
     search._found, search.checkpoint, search.noisy, search.runs = {}, None, True, HERE
-    config, given = load("configs/cic_drawn.yaml"), {"screening": 0, "starts": 2} | settings
+    config = load("configs/cic_drawn.yaml")
+    given = {"screening": 0, "starts": 2} | settings
     search.settings = config.optimizer.model_copy(update=given)
     search.config = config.model_copy(update={"optimizer": search.settings})
-    search.method, search.stage, search._lock = "slsqp", Stage(), threading.Lock()
+    search.method = "slsqp"
+    search.stage = Stage()
+    search._lock = threading.Lock()
     search._bar = search._best = 1.0
     search.expected, search.progress = 0, lambda *numbers: None
     search.problem = object.__new__(Problem)

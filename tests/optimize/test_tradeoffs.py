@@ -168,7 +168,8 @@ def test_gap_is_that_of_a_dense_grid():
     left, right = a[sides[0] - 1] + 1, a[sides[-1] + 1] + 1
     assert right - left > 0.2
     (gap,) = front.gaps
-    assert (gap.kind, gap.confirmed, gap.tried >= 1) == ("terms", True, True)
+    assert (gap.kind, gap.confirmed) == ("terms", True)
+    assert gap.tried >= 1
     found = [front.points[k - 1].terms["first"] for k in (gap.first, gap.second)]
     np.testing.assert_allclose(found, [left, right], atol=5e-3)
     assert (gap.first, gap.second) not in front.edges

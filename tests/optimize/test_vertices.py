@@ -25,7 +25,8 @@ def test_all_vertices_of_a_polytope_are_found(size):
     rng = np.random.default_rng(size)
     normals = rng.normal(size=(3, size))
     normals /= np.linalg.norm(normals, axis=1)[:, None]
-    depth, middle = rng.uniform(0.2, 0.4, 3), np.full(size, 0.5)
+    depth = rng.uniform(0.2, 0.4, 3)
+    middle = np.full(size, 0.5)
 
     def limits(point):
         return depth - normals @ (point - middle), -normals
