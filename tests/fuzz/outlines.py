@@ -79,10 +79,13 @@ def drawing(draw, version: str = "R2000", units: int = 4, fmt: str = "asc") -> b
     ezdxf.options.write_fixed_meta_data_for_testing = True
     document = ezdxf.new(version, units=units)
     draw(document)
-    data = io.BytesIO() if fmt == "bin" else io.StringIO()
-    document.write(data, fmt=fmt)
-    found = data.getvalue()
-    return found if fmt == "bin" else document.encode(found)
+    if fmt == "bin":
+        data = io.BytesIO()
+        document.write(data, fmt="bin")
+        return data.getvalue()
+    text = io.StringIO()
+    document.write(text)
+    return document.encode(text.getvalue())
 
 
 def lines(z: np.ndarray, random: random.Random):
@@ -123,8 +126,9 @@ def good() -> dict[str, bytes]:
 
     def own(document):
         for entity in entities:
-            if entity.dxftype() != "DIMENSION":  # ezdxf cannot copy these between documents.
-                document.modelspace().add_foreign_entity(entity)
+            if entity.dxftype() == "DIMENSION":
+                continue  # ezdxf cannot copy these between documents.
+            document.modelspace().add_foreign_entity(entity)
 
     cic, ee = points("cic"), points("ee")
     return {
@@ -241,7 +245,9 @@ def malformed(chance: random.Random) -> tuple[bytes, str]:
             return drawing(draw, fmt=chance.choice(["asc", "asc", "bin"])), ".dxf"
         return table(z), ".csv"
     name = chance.choice(list(good()))
-    kinds = [damaged_bytes] if name.endswith(".dxf") else [damaged_bytes, damaged_cells]
+    kinds = [damaged_bytes]
+    if not name.endswith(".dxf"):
+        kinds.append(damaged_cells)
     return chance.choice(kinds)(good()[name], chance), Path(name).suffix
 
 
