@@ -21,8 +21,8 @@ def problem_of(model, data, monkeypatch, deviation=None, count=2, gains=(), cons
     """Return the problem of fitting `model(θ, x)` to `data`, with difference quotients as slopes.
 
     The scale of a quantity is the quantity itself."""
-    columns = {"rotation_deg": X, NAME: data}
-    columns |= {} if deviation is None else {f"{NAME}_std": deviation}
+    given = {} if deviation is None else {f"{NAME}_std": deviation}
+    columns = {"rotation_deg": X, NAME: data} | given
     seen = Observed("test", {}, pandas.DataFrame(columns), (NAME,), True)
     quantities = [Fitted(f"q{k}", -50.0, 50.0, 0.0, 1.0, 0.5, False) for k in range(count)]
 
@@ -30,7 +30,7 @@ def problem_of(model, data, monkeypatch, deviation=None, count=2, gains=(), cons
         steps = 1e-6 * np.eye(count)
         slopes = [(model(values + h, X) - model(values - h, X)) / 2e-6 for h in steps]
         value, slope = model(values, X)[:, None], np.stack(slopes, axis=-1)[:, None]
-        return [Predicted(Status.PERIODIC, value, slope, np.zeros(value.shape))]
+        return [Predicted(Status.PERIODIC, value, slope, 0.0 * value)]
 
     monkeypatch.setattr(squares, "predict", predict)
     return Problem.of([Point(load_config("cic"), seen)], quantities, gains, constants)
@@ -40,18 +40,22 @@ def wave(values, x):
     return values[0] * np.exp(-values[1] * x)
 
 
-def noisy(values, size, seed=0):
-    rng = np.random.default_rng(seed)
-    return wave(np.array(values), X) + size * rng.standard_normal(len(X))
+def noisy(size, values=(1.5, 0.8)):
+    return wave(values, X) + size * np.random.default_rng(0).standard_normal(len(X))
+
+
+def solved(problem, *start, **settings):
+    """Return the end of a local fit from a place, by default (1, 1)."""
+    return problem.fitted(np.array(start or (1.0, 1.0)), [None], problem.estimated(), **settings)
 
 
 def test_errors_are_those_of_known_standard_deviations(monkeypatch):
     deviation = 0.02 + 0.02 * X
-    data = noisy([1.5, 0.8], deviation)
+    data = noisy(deviation)
     problem = problem_of(wave, data, monkeypatch, deviation)
-    best = problem.fitted(np.array([1.0, 1.0]), [None], problem.estimated())
+    best = solved(problem)
     values, covariance = curve_fit(
-        lambda x, a, b: wave([a, b], x), X, data, [1.0, 1.0], sigma=deviation, absolute_sigma=True
+        lambda x, *v: wave(v, x), X, data, [1.0, 1.0], sigma=deviation, absolute_sigma=True
     )
     spread = Spread.of(problem, best)
     np.testing.assert_allclose(best.values, values, rtol=1e-5)
@@ -62,25 +66,21 @@ def test_errors_are_those_of_known_standard_deviations(monkeypatch):
 
 def test_errors_without_standard_deviations_are_those_of_leaving_out_one_value(monkeypatch):
     """HC3 is the sum over all values of what leaving one out changes, to first order."""
-    data = noisy([1.5, 0.8], 0.05 * (X > 1.5))
+    data = noisy(0.05 * (X > 1.5))
     problem = problem_of(wave, data, monkeypatch)
-    best = problem.fitted(np.array([1.0, 1.0]), [None], problem.estimated(), turn=1e9)
-    moved = []
-    for k in range(len(X)):
-        kept = np.arange(len(X)) != k
-        step, *_ = np.linalg.lstsq(best.slopes[kept], -best.residual[kept], rcond=None)
-        moved.append(step)
-    expected = np.array(moved).T @ np.array(moved)
-    np.testing.assert_allclose(Spread.of(problem, best).covariance, expected, rtol=2e-3)
+    best = solved(problem, turn=1e9)
+    kept = [np.arange(len(X)) != k for k in range(len(X))]
+    moved = np.array([np.linalg.lstsq(best.slopes[k], -best.residual[k], None)[0] for k in kept])
+    np.testing.assert_allclose(Spread.of(problem, best).covariance, moved.T @ moved, rtol=2e-3)
 
 
 def test_gain_and_constant_are_eliminated(monkeypatch):
-    data = 7.0 * noisy([1.0, 0.8], 0.02) - 2.0
+    data = 7.0 * noisy(0.02, (1.0, 0.8)) - 2.0
     problem = problem_of(
         lambda values, x: wave([1.0, values[0]], x), data, monkeypatch, 0.3 + 0 * X, 1,
         [[NAME]], [NAME],
     )  # fmt: skip
-    best = problem.fitted(np.array([0.3]), [None], problem.estimated())
+    best = solved(problem, 0.3)
     whole = least_squares(lambda v: (v[1] * wave([1.0, v[0]], X) + v[2] - data) / 0.3, [1, 1, 0])
     np.testing.assert_allclose([*best.values, *best.gains], whole.x, rtol=1e-5)
     covariance = np.linalg.inv(whole.jac.T @ whole.jac)
@@ -88,23 +88,23 @@ def test_gain_and_constant_are_eliminated(monkeypatch):
 
 
 def test_outliers_hardly_count(monkeypatch):
-    data = noisy([1.5, 0.8], 0.02)
+    data = noisy(0.02)
     data[::20] += 3.0
     problem = problem_of(wave, data, monkeypatch)
-    best = problem.fitted(np.array([1.0, 1.0]), [None], problem.estimated(), turn=1.0)
+    best = solved(problem, turn=1.0)
     for _ in range(3):
         deviation = problem.estimated(best.fit - problem.rows.measured.to_numpy())
         best = problem.fitted(best.place, [None], deviation)
-    plain = curve_fit(lambda x, a, b: wave([a, b], x), X, data, [1.0, 1.0])[0]
+    plain, _ = curve_fit(lambda x, *v: wave(v, x), X, data, [1.0, 1.0])
     assert np.abs(best.values - [1.5, 0.8]).max() < 0.1 * np.abs(plain - [1.5, 0.8]).max()
     assert 0.015 < deviation[0] < 0.05
 
 
 def test_an_interval_ends_where_the_loss_has_risen(monkeypatch):
     deviation = 0.2 + 0 * X
-    data = noisy([1.5, 0.8], deviation)
+    data = noisy(deviation)
     problem = problem_of(wave, data, monkeypatch, deviation)
-    best = problem.fitted(np.array([1.0, 1.0]), [None], problem.estimated())
+    best = solved(problem)
     found = profile(problem, best, Spread.of(problem, best), 1, fine=True)
 
     def rise(b):
@@ -112,7 +112,7 @@ def test_an_interval_ends_where_the_loss_has_risen(monkeypatch):
         a = shape @ data / (shape @ shape)
         return np.sum(((a * shape - data) / 0.2) ** 2) - 2 * best.cost - 1.96**2
 
-    ends = brentq(rise, 0.1, best.values[1]), brentq(rise, best.values[1], 3.0)
+    ends = [brentq(rise, end, best.values[1]) for end in (0.1, 3.0)]
     np.testing.assert_allclose(found["interval_95"], ends, rtol=0.04)
     assert len(found["points"]) > 8
 
@@ -122,12 +122,11 @@ def test_what_the_record_cannot_tell_is_named(count, monkeypatch):
     """A sum of two quantities, from many values or from a single one."""
     data = np.where(np.arange(80) < count, 1 + X + 0.01 * np.sin(1e3 * X), np.nan)
     problem = problem_of(lambda v, x: v[0] + v[1] + x, data, monkeypatch)
-    best = problem.fitted(np.array([0.1, 0.2]), [None], problem.estimated())
+    best = solved(problem, 0.1, 0.2)
     assert np.sum(best.values) == pytest.approx(1.0, abs=0.01)
     spread = Spread.of(problem, best)
     first, second = combinations(problem, spread)
-    assert first["determined"] is False
+    assert (first["determined"], second["words"]) == (False, "q0 and q1 together")
     assert first["words"] in ("q0, against q1", "q1, against q0")
-    assert second["words"] == "q0 and q1 together"
     assert np.isinf(spread.errors).all()
     assert profile(problem, best, spread, 0, fine=False)["interval_95"] == [-50, 50]

@@ -1,9 +1,7 @@
 """Tests of the lower bound of all designs: made-up problems of several basins, and real ones."""
 
-import dataclasses
 import functools
 import math
-import threading
 
 import numpy as np
 import pytest
@@ -11,13 +9,8 @@ import pytest
 from rootsopt import load_config
 from rootsopt.optimize import bounding
 from rootsopt.optimize.local import FEASIBLE, Group, Linearization
-from rootsopt.optimize.problem import Problem
-from rootsopt.optimize.robust_problem import Stage
 from rootsopt.optimize.search import Search
-from rootsopt.response.evaluation import Evaluator
-from rootsopt.response.reducers import HERE
-from rootsopt.status import Status
-from tests.standins import evaluation_of
+from tests.optimize.test_search import searching
 
 
 class Made:
@@ -57,6 +50,11 @@ class Made:
         group = Group(np.zeros((len(values), 2)), values, slopes)
         return Linearization(0.0, np.zeros(self.size), (group,), *self.limits(point))
 
+    def truth(self, point):
+        point = np.asarray(point)
+        usable = np.max(np.abs(point - self.hole)) > 0.1
+        return self.local(point).objective if usable else math.nan
+
     @functools.cached_property
     def least(self) -> float:
         """Least feasible objective, on a grid and on finer ones around its best points."""
@@ -81,45 +79,18 @@ class Made:
         return found
 
 
-@dataclasses.dataclass(frozen=True)
-class _Told(Evaluator):
-    """An evaluator that knows the objective of a made-up problem."""
-
-    made: Made | None = None
-
-    def __call__(self, design=None, start=None, series=True):
-        assert self.made is not None
-        point = np.asarray(design)
-        usable = np.max(np.abs(point - self.made.hole)) > 0.1
-        status = Status.PERIODIC if usable else Status.INACCURATE
-        return evaluation_of(self.made.local(point).objective, status, point)
-
-
-def bounded(made: Made, **settings):
+def bounded(made: Made):
     """Return (bound, best objective found before it, and with it) of a made-up problem.
 
     A search begins at one random feasible point, so that it often ends in a wrong basin."""
-    search = object.__new__(Search)
-    search.stop, search._lock, search._trials = threading.Event(), threading.Lock(), []
-    search._found, search._best, search.expected = {}, math.nan, 0
-    search.checkpoint, search.noisy, search.runs, search.stage = None, False, HERE, Stage()
-    search.progress, search.config = lambda *numbers: None, load_config("configs/cic_drawn.yaml")
-    given = {"prove": True, "iterations": 60} | settings
-    search.settings = search.config.optimizer.model_copy(update=given)
-    search.config = search.config.model_copy(update={"optimizer": search.settings})
-    search.problem = object.__new__(Problem)
+    search = searching(made.truth, prove=True, iterations=60)
+    search.noisy = False
     vars(search.problem).update(
-        design=lambda point: point,
-        objective=lambda one: one.response.get("mean_force_N", math.nan),
         feasible=lambda point: bool(made.limits(point)[0] >= -FEASIBLE),
         toward=lambda point, inside: np.clip(point, 0.0, 1.0),
-        excess=lambda one: 0.0,
         limits_at=made.limits,
         local=lambda one, point: made.local(point) if one.usable else None,
     )
-    known = Evaluator.of(search.config)
-    told = {field.name: getattr(known, field.name) for field in dataclasses.fields(known)}
-    search.sharp = _Told(**told, made=made)
     drawn = np.random.default_rng(1).random((100, made.size))
     start = next(x for x in drawn if search.problem.feasible(x) and abs(x[0] - made.hole) > 0.2)
     trials = search._solve(0, start)
@@ -129,8 +100,14 @@ def bounded(made: Made, **settings):
     return (None if found is None else found.bound(best)), before, best
 
 
-def _checked(seeds) -> tuple[int, int]:
-    """Check bounds of made-up problems; return how many are proven, and how many begin wrong."""
+@pytest.mark.parametrize(
+    ("seeds", "sure", "begun"),
+    [(range(5), 5, 1), pytest.param(range(9, 59), 45, 10, marks=pytest.mark.long)],
+)
+def test_a_wrong_basin_is_never_proven(seeds, sure, begun):
+    """Problems of one to three parameters, with corners and limits, against grids.
+
+    `sure`, `begun`: how many at least are proven, and begin in a wrong basin."""
     proven = wrong = 0
     for seed in seeds:
         made = Made(seed)
@@ -140,21 +117,21 @@ def _checked(seeds) -> tuple[int, int]:
         if bound.proven:
             assert best <= made.least + 1.2e-4 * max(1.0, abs(best)), seed
         proven, wrong = proven + bound.proven, wrong + (before > made.least + 1e-3)
-    return proven, wrong
+    assert proven >= sure
+    assert wrong >= begun
 
 
-def test_a_wrong_basin_is_never_proven():
-    """Problems of one to three parameters, with corners and limits, against grids."""
-    proven, wrong = _checked(range(5))
-    assert proven == 5
-    assert wrong >= 1
-
-
-@pytest.mark.long
-def test_a_wrong_basin_is_never_proven_in_fifty_problems():
-    proven, wrong = _checked(range(9, 59))
-    assert proven >= 45
-    assert wrong >= 10
+def proven(found, local, starts):
+    """Return the bound, which must be proven, and the numbers of designs that were asked for."""
+    points, asked = starts, []
+    while points:
+        for point in points:
+            found.tell(point, local(point))
+        points = found.ask(8)
+        asked.append(len(points))
+    bound = found.bound(found.best)
+    assert bound.proven
+    return bound, asked
 
 
 def test_jumps_and_holes_are_counted():
@@ -183,14 +160,12 @@ def test_a_limited_force_is_bounded_too():
         return one._replace(walls=(wall,))
 
     found = bounding.Bounding(lambda point: (np.ones(1), np.zeros((1, 2))), 2, 0.4)
-    for point in np.array([[0.4, 0.0], [0.9, 0.9], [0.1, 0.6]]):
-        found.tell(point, local(point))
-    while points := found.ask(8):
-        for point in points:
-            found.tell(point, local(point))
-    bound = found.bound(0.4)
-    assert bound.proven
+    bound, _ = proven(found, local, [*np.array([[0.4, 0.0], [0.9, 0.9], [0.1, 0.6]])])
     assert bound.lower_bound == pytest.approx(0.4, abs=1e-4)
+
+
+def wave(y):
+    return 0.05 * np.cos(3 * np.pi * y) + 0.1 * y
 
 
 def test_limits_that_grow_without_bound_are_no_obstacle():
@@ -202,9 +177,6 @@ def test_limits_that_grow_without_bound_are_no_obstacle():
             return np.array([np.nan]), np.nan * normal
         return np.array([1 - 0.05 / edge]), 0.05 / edge**2 * normal
 
-    def wave(y):
-        return 0.05 * np.cos(3 * np.pi * y) + 0.1 * y
-
     def local(point):
         x, y = point
         slope = np.array([0.3, 0.1 - 0.15 * np.pi * np.sin(3 * np.pi * y)])
@@ -213,27 +185,19 @@ def test_limits_that_grow_without_bound_are_no_obstacle():
     start, y = np.array([0.9, 0.9]), np.linspace(0, 1, 10_001)
     least = np.min(0.3 * (0.35 + 0.2 * y) + wave(y))
     found = bounding.Bounding(limits, 2, local(start).objective, boxes=1000)
-    found.tell(start, local(start))
-    while points := found.ask(8):
-        for point in points:
-            found.tell(point, local(point))
-    bound = found.bound(found.best)
-    assert bound.proven
-    assert bound.lower_bound == pytest.approx(least, abs=2e-5)
+    assert proven(found, local, [start])[0].lower_bound == pytest.approx(least, abs=2e-5)
 
 
 @pytest.mark.parametrize("width", [1e-2, pytest.param(1e-3, marks=pytest.mark.long), 1e-4])
 def test_a_thin_feasible_set_is_searched_too(width):
     """Designs within `width` of a curved surface, against grids; hardly a drawn one is feasible."""
 
-    def wave(y):
-        return 0.05 * np.cos(3 * np.pi * y) + 0.1 * y
-
     def limits(point):
         away, normal = point[0] - 0.2 - 0.5 * point[1] ** 2, np.array([1.0, -point[1], 0.0])
         return np.array([width - away, width + away]) / width, np.array([-normal, normal]) / width
 
     def local(point):
+        assert np.min(limits(point)[0]) >= -FEASIBLE
         slope = 0.1 - 0.15 * np.pi * np.sin(3 * np.pi * point)
         slope[0] = 0.3
         return Linearization(0.3 * point[0] + np.sum(wave(point[1:])), slope, (), *limits(point))
@@ -241,16 +205,8 @@ def test_a_thin_feasible_set_is_searched_too(width):
     start, y = np.array([0.325, 0.5, 0.5]), np.linspace(0, 1, 100_001)
     least = np.min(0.3 * (0.2 + 0.5 * y**2 - width) + wave(y)) + np.min(wave(y))
     found = bounding.Bounding(limits, 3, local(start).objective)
-    found.tell(start, local(start))
-    points = found.ask(8)
-    assert len(points) == 8
-    while points:
-        assert all(np.min(limits(point)[0]) >= -FEASIBLE for point in points)
-        for point in points:
-            found.tell(point, local(point))
-        points = found.ask(8)
-    bound = found.bound(found.best)
-    assert bound.proven
+    bound, asked = proven(found, local, [start])
+    assert asked[0] == 8
     assert bound.evaluations < 150
     assert bound.lower_bound == pytest.approx(least, abs=2e-5)
 
@@ -303,8 +259,7 @@ def test_the_bound_of_a_real_problem_holds():
         one = search.exact(found.problem.design(point), series=False)
         assert found.problem.feasible(point)
         values.append(found.problem.objective(one))
-    assert min(values) >= bound.lower_bound
-    assert min(values) < bound.lower_bound + 0.05
+    assert bound.lower_bound <= min(values) < bound.lower_bound + 0.05
 
 
 @pytest.mark.long

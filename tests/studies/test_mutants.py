@@ -20,19 +20,16 @@ FOLDERS = "contact continuation design dynamics optimize profiles pump tradeoffs
 
 
 def test_every_numerical_module_has_its_tests():
-    """`tests/mutants/rooms.py` names the tests of each numerical module."""
-    package = ROOT / "rootsopt"
     found = {
         path.relative_to(ROOT).as_posix()
         for folder in FOLDERS.split()
-        for path in (package / folder).rglob("[!_]*.py")
+        for path in (ROOT / "rootsopt" / folder).rglob("[!_]*.py")
     }
     assert found <= set(ROOMS)
     assert all((ROOT / file).exists() for file in ROOMS)
 
 
 def test_choice_of_mistakes():
-    """The choice depends on the seed alone, and each mistake is valid Python."""
     pytest.importorskip("cosmic_ray")
     found = chosen(1, 8)
     assert found == chosen(1, 8) != chosen(2, 8)
