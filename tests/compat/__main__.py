@@ -52,7 +52,7 @@ LEFT = (
     "tests/view/test_runs.py::test_nothing_is_written_outside_of_the_runs_own_folder",
 )
 """Tests that need the package's source, compiled programs or the extra `cad`."""
-IMPORTS = "distributed", "bokeh", "jinja2", "shtab", "h5netcdf"
+IMPORTS = "distributed, bokeh, jinja2, shtab, h5netcdf"
 _JOB_SECONDS = 1500
 
 
@@ -60,7 +60,7 @@ def bounds() -> list[str]:
     """Return `name==version` for the lower bound of every dependency and tried extra."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     extras = (project["optional-dependencies"][extra] for extra in EXTRAS.split(","))
-    wanted = {*project["dependencies"], *(one for extra in extras for one in extra)}
+    wanted = {*project["dependencies"]}.union(*extras)
     return [re.sub(r"^([\w.-]+)>=([\w.]+)$", r"\1==\2", one) for one in sorted(wanted)]
 
 
@@ -88,22 +88,30 @@ def job(interpreter: str, newest: bool, place: Path, package: Path, tree: Path) 
     python, script = str(folder / "python"), str(folder / "rootsopt")
     constraints = Path(f"{place}.txt")
     constraints.write_text("" if newest else "\n".join(bounds()))
-    imports = [*IMPORTS, *(["build123d"] if newest else [])]
-    wanted = f"{package}[{EXTRAS},{CAD}]" if newest else f"{package}[{EXTRAS}]"
+    imports, extras = (f"{IMPORTS}, build123d", f"{EXTRAS},{CAD}") if newest else (IMPORTS, EXTRAS)
     search = ["--set", "optimizer.starts=1", "--set", "optimizer.screening=0"]
     steps = {
         "environment": [interpreter, "-m", "venv", str(place)],
-        "install": [python, "-m", "pip", "install", "-c", str(constraints), wanted, *TOOLS],
-        "import": [python, "-c", f"import rootsopt, {', '.join(imports)}"],
+        "install": [
+            python,
+            "-m",
+            "pip",
+            "install",
+            "-c",
+            str(constraints),
+            f"{package}[{extras}]",
+            *TOOLS,
+        ],
+        "import": [python, "-c", f"import rootsopt, {imports}"],
         "main job": [script, "optimize", "cic", "-o", str(place / "run"), *search],
         "tests": [python, "-m", "pytest", *TESTS, *(f"--deselect={one}" for one in LEFT)],
     }
-    own = {"ROOTSOPT_CACHE": str(place / "cache")}
+    environment = os.environ | {"ROOTSOPT_CACHE": str(place / "cache")}
     end = time.monotonic() + _JOB_SECONDS
     with open(f"{place}.log", "w") as log:
         for name, command in steps.items():
             print("==", name, file=log, flush=True)
-            how = {"cwd": tree, "env": os.environ | own, "stdout": log, "stderr": log}
+            how = {"cwd": tree, "env": environment, "stdout": log, "stderr": log}
             try:
                 subprocess.run(command, **how, timeout=end - time.monotonic(), check=True)
             except (subprocess.SubprocessError, OSError) as error:

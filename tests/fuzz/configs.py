@@ -131,30 +131,16 @@ def _text(draw: random.Random) -> Case:
 def _leaf(draw: random.Random) -> Any:
     whole = draw.choice((0, 1, -1, 3, 2**63, -(2**70), 10 ** draw.choice((5, 20, 308, 309, 400))))
     real = draw.uniform(-1, 1) * 10 ** draw.uniform(-320, 308)
-    leaves = (
-        None,
-        True,
-        False,
-        whole,
-        real,
-        float("nan"),
-        float("inf"),
-        "",
-        "x",
-        "x" * 5000,
-        [],
-        {},
-    )
-    return draw.choice((*leaves, draw.choice(WORDS), draw.choice(NUMBERS), [real, whole], {"a": 1}))
+    numbers = whole, real, float("nan"), float("inf"), [real, whole], draw.choice(NUMBERS)
+    words = "", "x", "x" * 5000, draw.choice(WORDS)
+    return draw.choice((None, True, False, *numbers, *words, [], {}, {"a": 1}))
 
 
 def _structure(draw: random.Random) -> Case:
     data = _tree(draw)
     for _ in range(draw.choice(_ONES)):
         target: Any = data
-        while True:
-            if not target:
-                break
+        while target:
             key = draw.choice(list(target) if isinstance(target, dict) else range(len(target)))
             if isinstance(target[key], dict | list) and draw.random() < 0.8:
                 target = target[key]
@@ -181,10 +167,9 @@ def _structure(draw: random.Random) -> Case:
 
 
 def _values(draw: random.Random) -> Case:
-    overrides = []
-    for _ in range(draw.choice(_ONES)):
-        overrides.append(f"{draw.choice(_keys())}={_scalar(draw)[:50_000]}")
-    return _shipped(draw).encode(), tuple(overrides)
+    count = draw.choice(_ONES)
+    pairs = (f"{draw.choice(_keys())}={_scalar(draw)[:50_000]}" for _ in range(count))
+    return _shipped(draw).encode(), tuple(pairs)
 
 
 CLASSES: dict[str, Callable[[random.Random], Case]] = {

@@ -79,13 +79,10 @@ def drawing(draw, version: str = "R2000", units: int = 4, fmt: str = "asc") -> b
     ezdxf.options.write_fixed_meta_data_for_testing = True
     document = ezdxf.new(version, units=units)
     draw(document)
-    if fmt == "bin":
-        data = io.BytesIO()
-        document.write(data, fmt="bin")
-        return data.getvalue()
-    text = io.StringIO()
-    document.write(text)
-    return document.encode(text.getvalue())
+    data = io.BytesIO() if fmt == "bin" else io.StringIO()
+    document.write(data, fmt=fmt)
+    found = data.getvalue()
+    return found if fmt == "bin" else document.encode(found)
 
 
 def lines(z: np.ndarray, random: random.Random):
@@ -126,9 +123,8 @@ def good() -> dict[str, bytes]:
 
     def own(document):
         for entity in entities:
-            if entity.dxftype() == "DIMENSION":
-                continue  # ezdxf cannot copy these between documents.
-            document.modelspace().add_foreign_entity(entity)
+            if entity.dxftype() != "DIMENSION":  # ezdxf cannot copy these between documents.
+                document.modelspace().add_foreign_entity(entity)
 
     cic, ee = points("cic"), points("ee")
     return {
@@ -245,9 +241,7 @@ def malformed(chance: random.Random) -> tuple[bytes, str]:
             return drawing(draw, fmt=chance.choice(["asc", "asc", "bin"])), ".dxf"
         return table(z), ".csv"
     name = chance.choice(list(good()))
-    kinds = [damaged_bytes]
-    if not name.endswith(".dxf"):
-        kinds.append(damaged_cells)
+    kinds = [damaged_bytes] if name.endswith(".dxf") else [damaged_bytes, damaged_cells]
     return chance.choice(kinds)(good()[name], chance), Path(name).suffix
 
 

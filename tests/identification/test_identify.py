@@ -198,11 +198,10 @@ def test_more_quantities_than_values_are_not_determined():
     keys = {**BOUNDS, "contact.stiffness_N_per_mm_e": (1e5, 4e5)}
     record = {name: simulated().response[name] for name in ("mean_force_N", "peak_force_N")}
     found = rootsopt.identify(CIC.replaced({LOAD: 12.0}), record, keys, starts=1)
-    assert found.status is Status.IDENTIFIED
-    assert f"{LOAD} is 12 in the config, outside its bounds" in found.message
+    assert (found.status, found.combinations[0]["determined"]) == (Status.IDENTIFIED, False)
     assert found.fit["relative_misfit"] < 1e-4
-    assert not found.combinations[0]["determined"]
-    assert "leaves nothing to estimate errors from" in found.message
+    for said in (f"{LOAD} is 12 in the config, outside its", "nothing to estimate errors from"):
+        assert said in found.message
     assert found.record()["parameters"][LOAD]["interval_95"] == [3.0, 9.0]
 
 
@@ -218,9 +217,8 @@ def test_averages_of_chaos_are_fitted_over_an_ensemble(monkeypatch):
 
     monkeypatch.setattr(model.Ensemble, "evaluated", evaluated)
     config = CIC.replaced({"objective.motion": "ensemble"})
-    record = {"mean_force_N": 110.3, "peak_force_N": 55.4}
     _, quantities = fitted(config, {LOAD: (3.0, 9.0)}, [])
-    (seen,) = observed(config, record)
+    (seen,) = observed(config, {"mean_force_N": 110.3, "peak_force_N": 55.4})
     found = Point.of(config, seen).predicted(quantities, np.array([5.0]), None)
     np.testing.assert_allclose(found.slopes[0, :, 0], [20, 1], rtol=1e-6)
     np.testing.assert_allclose((found.values, found.errors), ([[100, 55]], [[0.1, 0.1]]))
@@ -231,8 +229,7 @@ def test_averages_of_chaos_are_fitted_over_an_ensemble(monkeypatch):
 def test_command_writes_the_fit_and_says_what_is_wrong(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     record = sampled(0.03, "relative_rotation_rad", "contact_force_N", step=20)
-    table = np.column_stack([*record.values()])
-    np.savetxt("record.csv", table, delimiter=",", header=",".join(record), comments="")
+    pandas.DataFrame(record).to_csv("record.csv", index=False)
     options = ["cic", "--data", "record.csv", "--starts", "1", "-o", "run", "--set", f"{LOAD}=5.5"]
     assert command.main([*options, "--fit", f"{BACKLASH}=0.05:0.3"]) == 0
     out = capsys.readouterr().out
@@ -254,9 +251,8 @@ def test_command_writes_the_fit_and_says_what_is_wrong(tmp_path, capsys, monkeyp
         (["--data", "record.csv", "--fit", f"{BACKLASH}=0:1", "--profile", "x"], "a fitted key"),
     ):
         assert command.main(["cic", "-o", "wrong", *wrong]) == 2
-        message = capsys.readouterr().err
+        (message,) = capsys.readouterr().err.splitlines()
         assert said in message
-        assert len(message.splitlines()) == 1
     # A load of no use for a record of another size ends without a usable fit.
     (tmp_path / "other.csv").write_text("mean_force_N,mean_force_N_std\n1e6,1\n")
     options = ["cic", "--data", "other.csv", "--starts", "1", "-o", "none", "--no-figures"]
@@ -265,6 +261,4 @@ def test_command_writes_the_fit_and_says_what_is_wrong(tmp_path, capsys, monkeyp
 
 
 def test_function_and_door_share_a_name():
-    function = rootsopt.identify
-    assert importlib.import_module("rootsopt.identify") is function
-    assert rootsopt.identify is function
+    assert importlib.import_module("rootsopt.identify") is rootsopt.identify

@@ -1,6 +1,5 @@
 """A rotor from a file as baseline: where the search begins, what it finds, what is said of it."""
 
-import dataclasses
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,6 +13,7 @@ from rootsopt.optimize import infeasible as module
 from rootsopt.optimize.infeasible import beginning
 from rootsopt.optimize.outcome import Optimization
 from rootsopt.optimize.search import Search
+from rootsopt.response.result import RESPONSES
 from rootsopt.scene import outline_mm
 from rootsopt.scene.check import shape_of
 from rootsopt.scene.resemblance import Likeness
@@ -30,8 +30,7 @@ def measured(folder: Path, scatter: float, inset: float = 0.0, **optimizer) -> P
     """A config in `folder` whose baseline is the rotor of `CIC`, with `scatter` (mm) of its points,
     clockwise, turned and from another first point; `inset` (mm) smaller along its normals."""
     points = cut(outline_mm(BASE)[:-1] @ [1, 1j], inset)
-    chance = np.random.default_rng(5)
-    off = chance.normal(size=(len(points), 2)) @ [1, 1j]
+    off = np.random.default_rng(5).normal(size=(len(points), 2)) @ [1, 1j]
     write(folder / "rotor.csv", np.roll((points + scatter * off)[::-1] * np.exp(0.3j), 321))
     data = yaml.safe_load(Path(CIC).read_text())
     data["profile"] = {"family": "outline", "lobes": 3, "pitch_radius_mm": 33.0}
@@ -49,20 +48,19 @@ def test_members_get_the_gap_of_an_inset(tmp_path):
     floor of the area efficiency is that of the member."""
     config = load(measured(tmp_path, 1e-3, 0.1, family="cic"), ["contact.clearance_mm=0.03"])
     found = beginning(config)
-    assert found is not None
     assert found.likeness.inset == pytest.approx(1e-4, abs=0.5e-6)
     assert found.likeness.rms < found.likeness.departure < 2e-6
-    assert found.record()["departure_rms_um"] == found.likeness.rms * 1e6
     assert (found.config.profile.family, found.widened) == ("cic", ())
-    for key, value in BASE.profile.parameters.items():
-        assert getattr(found.config.profile, key) == pytest.approx(value, rel=0.01)
+    parameters = found.config.profile.parameters
+    assert parameters == pytest.approx(BASE.profile.parameters, rel=0.01)
     gap = found.config.contact.clearance_mm
     assert gap == pytest.approx(0.03 + 2e3 * found.likeness.inset, abs=1e-6)
-    assert f"--set contact.clearance_mm={gap:.6g}`" in found.message
-    assert "inset 0.1 mm" in found.message
+    for said in (f"--set contact.clearance_mm={gap:.6g}`", "inset 0.1 mm"):
+        assert said in found.message
     floor = found.config.constraints.area_efficiency_min
     assert floor == pytest.approx(float(shape_of(BASE).area_efficiency), rel=1e-3)
-    assert found.record()["inset_um"] == found.likeness.inset * 1e6
+    record = [found.record()[key] for key in ("departure_rms_um", "inset_um")]
+    assert record == [found.likeness.rms * 1e6, found.likeness.inset * 1e6]
     # An outline that overlaps has members that just touch.
     other, more = module._cut(config, -5e-5)
     assert (other.contact.clearance_mm, more) == (0.0, pytest.approx(0.07))
@@ -71,21 +69,13 @@ def test_members_get_the_gap_of_an_inset(tmp_path):
 
 def test_improvement_over_the_nominal_member():
     """A third less than the nominal member, which is a quarter quieter than the measured rotor."""
-
-    forces = dict.fromkeys(("mean_force_N", "peak_force_N", "rms_force_N"), 1.0)
-    blank = evaluation_of()
-    measured, member, best = (
-        dataclasses.replace(blank, response={key: force * x for key, x in forces.items()})
-        for force in (100.0, 75.0, 50.0)
-    )
     problem = SimpleNamespace(
-        objective=lambda found: found.response["mean_force_N"] / 100, config=load(CIC)
+        objective=lambda found: found.response["mean_force_N"] / 100, config=BASE
     )
-    found = SimpleNamespace(problem=problem, optimized=best)
-    gain = Optimization._gains(found, measured, 1.0)  # type: ignore[arg-type]
-    over = Optimization._gains(found, member, 0.75)  # type: ignore[arg-type]
-    assert gain == pytest.approx({"objective": 0.5} | dict.fromkeys(forces, 0.5))
-    assert over == pytest.approx({"objective": 1 / 3} | dict.fromkeys(forces, 1 / 3))
+    found = SimpleNamespace(problem=problem, optimized=evaluation_of(50.0))
+    for force, expected in ((100.0, 1 / 2), (75.0, 1 / 3)):
+        gain = Optimization._gains(found, evaluation_of(force), force / 100)  # type: ignore[arg-type]
+        assert gain == pytest.approx(dict.fromkeys(("objective", *RESPONSES), expected))
 
 
 def test_a_search_in_the_own_family_has_no_beginning():
@@ -106,7 +96,6 @@ def test_the_nearest_family_begins(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "classical", lambda: ("ee", "arc", "cic"))
     monkeypatch.setattr(module, "likeness", fitted)
     found = beginning(config)
-    assert found is not None
     assert found.likeness.family == "arc"
     assert "optimizer.family=free_form" in found.message
     with pytest.raises(InputError, match=r"`optimizer.family` must be a family with a sound"):
@@ -127,8 +116,6 @@ def test_default_bounds_are_widened_and_given_ones_are_kept():
     config = parse(text)
     other, keys = widened(config)
     assert keys == ("pressure_angle_deg",)
-    assert bounds_of(other)[0] == (19.0, 45.0)
-    assert bounds_of(other)[1:] == bounds_of(config)[1:]
-    given = parse(text, ["optimizer.bounds.pressure_angle_deg=[22,45]"])
-    assert widened(given) == (given, ())
-    assert widened(BASE) == (BASE, ())
+    assert bounds_of(other) == [(19.0, 45.0), *bounds_of(config)[1:]]
+    for kept in (parse(text, ["optimizer.bounds.pressure_angle_deg=[22,45]"]), BASE):
+        assert widened(kept) == (kept, ())

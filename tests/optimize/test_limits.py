@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from rootsopt.config.units import words
 from rootsopt.dynamics.maxima import Maxima
 from rootsopt.errors import InputError
 from rootsopt.optimize.infeasible import explain
@@ -26,7 +27,7 @@ from rootsopt.response.result import Part
 from rootsopt.scene import Scene
 from rootsopt.scene.space import RangeConstraint
 from rootsopt.status import Status
-from tests.optimize.test_optimize import baseline, config
+from tests.optimize.test_optimize import baseline, config, problem_of
 from tests.standins import registered
 
 PEAK = "constraints.terms.peak_force_N.max="
@@ -37,9 +38,15 @@ LIMITED = (
 )
 
 
-def problem_of(*overrides):
+def drawn(*overrides):
+    """Return a config with limits, its scene, the own design's volume (cm³) and evaluation."""
     settings = limited(config(*overrides))
-    return Problem.of(settings, Scene.from_config(settings), baseline(settings))
+    scene = Scene.from_config(settings)
+    shape = geometry(scene.profile(jnp.asarray(settings.design)))
+    volume = 1e6 * float(flow.displaced_volume(shape, scene.length))
+    terms = {"area_efficiency": float(shape.area_efficiency), "displaced_volume_cm3": volume}
+    one = dataclasses.replace(evaluation(), geometry=geometry_record(scene, shape))
+    return settings, scene, volume, dataclasses.replace(one, response=one.response | terms)
 
 
 def evaluation(mean=50.0, peak=200.0, maxima=None):
@@ -80,10 +87,9 @@ def test_terms_without_forces_are_constraints_of_the_geometry(outside):
     volume = 1e6 * float(flow.displaced_volume(shape, scene.length))
     expected = [(volume - 400) / 400, (452 - 1e4 * float(shape.outer_radius)) / 452]
     np.testing.assert_allclose(problem.look(point)[2][-2:], expected, rtol=1e-9)
-    outside = np.array([0.1, 0.9, 0.2])
-    assert not problem.feasible(outside)
-    moved = problem.project(outside)
-    assert problem.feasible(moved)
+    beyond = np.array([0.1, 0.9, 0.2])
+    feasible = [problem.feasible(one) for one in (beyond, problem.project(beyond))]
+    assert feasible == [False, True]
 
 
 def test_prices_are_per_unit_of_the_limits(outside):
@@ -104,35 +110,32 @@ def test_prices_are_per_unit_of_the_limits(outside):
     walls = np.zeros(1), np.array([0.25, 0.5])
     proof = Certificate(0.0, 0.0, held, np.zeros(3), np.zeros(3), (), walls)
     rows = {row["name"]: row for row in constraint_rows(problem, found, proof)}
-    volume, force = rows["displaced volume"], rows["mean force"]
     # The objective, 0.8, rises with the least volume and falls with the greatest force.
-    assert volume["multiplier"] == pytest.approx(2 / 400)
-    assert force["multiplier"] == pytest.approx(-0.75 / 150)
-    assert (volume["relaxed_by"], force["relaxed_by"]) == (-10.0, 1.0)
-    for row in (volume, force):
-        change = row["multiplier"] * row["relaxed_by"]
-        assert row["relaxed_objective_percent"] == pytest.approx(100 * change / 0.8)
+    keys = "multiplier", "relaxed_by", "relaxed_objective_percent"
+    for name, price, change in (
+        ("displaced volume", 2 / 400, -10.0),
+        ("mean force", -0.75 / 150, 1.0),
+    ):
+        expected = [price, change, 100 * price * change / 0.8]
+        assert [rows[name][key] for key in keys] == pytest.approx(expected)
 
 
 def test_forces_are_limited_at_every_speed_that_counts():
     """One branch per speed and local maximum, with scaled slopes; the worst one is the excess."""
     problem = problem_of(PEAK + "180", "constraints.terms.mean_force_N.min=40")
-    settings = problem.config
     peaks = Maxima(np.array([0.5, 1.5]), np.array([190.0, 200.0]), np.ones((2, 3)))
     slow, fast, unused = evaluation(60.0, 200.0, peaks), evaluation(30.0, 150.0), evaluation(1.0)
     shares = (2000.0, slow, 0.5), (3000.0, fast, 0.5), (4000.0, unused, 0.0)
     parts = tuple(Part({"speed_rpm": rpm}, one, share) for rpm, one, share in shares)
     whole = dataclasses.replace(slow, speeds=parts)
-    jacobian = np.diag([1.0, 2.0, 3.0])
-    high, low = problem.walls(whole, jacobian)
+    high, low = problem.walls(whole, np.diag([1.0, 2.0, 3.0]))
     np.testing.assert_allclose(high.values, np.array([10, 20, -30]) / 180)
     np.testing.assert_allclose(high.tags, [[0, 0.25], [0, 0.75], [1, 0]])
     np.testing.assert_allclose(high.slopes[0], np.array([1.0, 2.0, 3.0]) / 180)
     np.testing.assert_allclose(low.values, np.array([-20, 10]) / 40)
     np.testing.assert_allclose(low.slopes[1], -np.array([1.0, 4.0, -3.0]) / 40)
     assert problem.excess(whole) == pytest.approx(0.25)
-    ceiling, floor = force_limits(settings, problem.space.scene)
-    assert (problem.worst(whole, ceiling), problem.worst(whole, floor)) == (200.0, 30.0)
+    assert [problem.worst(whole, one) for one in problem.limits] == [200.0, 30.0]
     assert problem.broken(whole) == ["peak force", "mean force"]
     assert problem.broken(evaluation(45.0, 170.0)) == []
     assert problem_of().excess(whole) == 0.0
@@ -151,22 +154,11 @@ def test_forces_are_limited_at_every_speed_that_counts():
     ],
 )
 def test_the_baseline_breaks_limits_of_any_key(key, name):
-    """All keys are told alike, and each column of the report has its own verdict."""
-    settings = limited(config(f"constraints.{key}"))
-    scene = Scene.from_config(settings)
-    shape = geometry(scene.profile(jnp.asarray(settings.design)))
-    volume = 1e6 * float(flow.displaced_volume(shape, scene.length))
-    terms = {"area_efficiency": float(shape.area_efficiency), "displaced_volume_cm3": volume}
-    one = dataclasses.replace(
-        evaluation(),
-        geometry=geometry_record(scene, shape),
-        response=evaluation().response | terms,
-    )
+    settings, scene, _, one = drawn(f"constraints.{key}")
     problem = Problem.of(settings, scene, one)
     assert problem.broken(one) == [name]
-    rows = {row["name"]: row for row in constraint_rows(problem, one)}
-    assert not rows[name]["baseline_satisfied"]
-    assert sum(row["baseline_satisfied"] is False for row in rows.values()) == 1
+    rows = constraint_rows(problem, one)
+    assert [row["name"] for row in rows if row["baseline_satisfied"] is False] == [name]
 
 
 def test_every_limit_can_be_the_baselines_own_value():
@@ -175,15 +167,11 @@ def test_every_limit_can_be_the_baselines_own_value():
         "area_efficiency_min", "undercut_margin_min_mm", "seal_width_min_mm",
         "outer_radius_max_mm", "terms.peak_force_N.max", "terms.displaced_volume_cm3.min",
     )  # fmt: skip
-    settings = limited(config(*(f"constraints.{key}=baseline" for key in limits)))
-    scene = Scene.from_config(settings)
-    shape = geometry(scene.profile(jnp.asarray(settings.design)))
-    volume = 1e6 * float(flow.displaced_volume(shape, scene.length))
-    one = dataclasses.replace(evaluation(), geometry=geometry_record(scene, shape))
+    settings, scene, volume, one = drawn(*(f"constraints.{key}=baseline" for key in limits))
     slow, fast = (
-        dataclasses.replace(one, response=one.response | {"peak_force_N": peak} | {
-            "displaced_volume_cm3": volume}) for peak in (150.0, 180.0)
-    )  # fmt: skip
+        dataclasses.replace(one, response=one.response | {"peak_force_N": peak})
+        for peak in (150.0, 180.0)
+    )
     speeds = tuple(Part({"speed_rpm": rpm}, e, 0.5) for rpm, e in ((2e3, slow), (3e3, fast)))
     whole = dataclasses.replace(slow, speeds=speeds)
     problem = Problem.of(settings, scene, whole)
@@ -191,21 +179,15 @@ def test_every_limit_can_be_the_baselines_own_value():
     rows = {row["name"]: row for row in constraint_rows(problem, whole)}
     assert rows["peak force"]["limit"] == 180.0
     assert rows["displaced volume"]["limit"] == pytest.approx(volume, rel=1e-12)
-    for name, key in (
-        ("area efficiency", "area_efficiency"),
-        ("undercut margin", "undercut_margin_mm"),
-        ("seal width", "seal_width_mm"),
-        ("outer radius", "outer_radius_mm"),
-    ):
-        assert rows[name]["limit"] == pytest.approx(one.geometry[key], rel=1e-12)
-        assert rows[name]["active"]
+    for key in ("area_efficiency", "undercut_margin_mm", "seal_width_mm", "outer_radius_mm"):
+        row = rows[words(key)]
+        assert row["limit"] == pytest.approx(one.geometry[key], rel=1e-12)
+        assert row["active"]
 
 
 def test_a_baseline_of_another_family_breaks_no_limit_of_parameters_that_it_lacks():
-    settings = config("optimizer.bounds.involute_length_mm=[1, 8]")
-    scene = Scene.from_config(settings)
-    shape = geometry_record(scene, geometry(scene.profile(jnp.asarray(settings.design))))
-    one = dataclasses.replace(evaluation(), geometry=shape, design={"arc_center_mm": 29.0})
+    settings, scene, _, own = drawn("optimizer.bounds.involute_length_mm=[1, 8]")
+    one = dataclasses.replace(own, design={"arc_center_mm": 29.0})
     problem = Problem.of(settings, scene, one)
     assert any(isinstance(row, RangeConstraint) for row in problem.space.constraints)
     assert problem.broken(one) == []
@@ -251,28 +233,27 @@ def test_limits_of_forces_in_conflict_are_explained():
     def look(point):
         share = point[0]
         found = evaluation(100 * (2 - share), 100 * (1 + share))
-        walls = []
-        for limit, row in zip(problem.limits, (100.0, -100.0), strict=True):
-            slope = np.array([[row, 0.0, 0.0]]) / limit.scale
-            (wall,) = [w for w, one in zip(problem.walls(found, np.eye(3)), problem.limits,
-                                           strict=True) if one is limit]  # fmt: skip
-            walls.append(wall._replace(slopes=slope))
+        walls = (
+            wall._replace(slopes=np.array([[row, 0.0, 0.0]]) / limit.scale)
+            for wall, limit, row in zip(problem.walls(found, np.eye(3)), problem.limits,
+                                        (100.0, -100.0), strict=True)
+        )  # fmt: skip
         return Linearization(0.0, np.zeros(3), (), *problem.look(point)[2:], tuple(walls))
 
-    start = problem.project(np.full(3, 0.5))
-    found = explain(problem, [start], look)
-    excess = found.violation
-    share = found.design["pressure_angle_deg"]
-    by_name = {one.name: one for one in found.conflicts}
-    assert by_name.keys() == {"peak force", "mean force"}
-    peak, mean = by_name["peak force"], by_name["mean force"]
-    assert peak.together == pytest.approx(150 * (1 + excess), rel=1e-6)
-    assert mean.together == pytest.approx(130 * (1 + excess), rel=1e-6)
+    found = explain(problem, [problem.project(np.full(3, 0.5))], look)
     # 130 (1 + v) + 150 (1 + v) = 300, whatever the share.
-    assert excess == pytest.approx(300 / 280 - 1, rel=1e-5)
-    assert (peak.alone, mean.alone) == pytest.approx((170, 150), rel=1e-5)
+    assert found.violation == pytest.approx(300 / 280 - 1, rel=1e-5)
+    assert found.design["pressure_angle_deg"] > 0
+
+    def together(limit):
+        return pytest.approx(limit * (1 + found.violation), rel=1e-6)
+
+    values = {one.name: [one.together, one.alone] for one in found.conflicts}
+    assert values == {
+        "peak force": [together(150), pytest.approx(170, rel=1e-5)],
+        "mean force": [together(130), pytest.approx(150, rel=1e-5)],
+    }
     assert "peak force <= 150 N (possible with the others: 170 N)" in found.message
-    assert share > 0
 
 
 @pytest.mark.long
@@ -287,11 +268,9 @@ def test_prices_of_limits_by_solving_again():
         found = Search(config(*few, f"{PEAK}{ceiling}")).run()
         assert found.status is Status.PERIODIC
         (row,) = [row for row in found.constraints if row["name"] == "peak force"]
-        assert row["optimized"] == pytest.approx(ceiling, rel=1e-5)
-        assert row["unit"] == "N"
+        assert (row["optimized"], row["unit"]) == (pytest.approx(ceiling, rel=1e-5), "N")
         return found.problem.objective(found.optimized), row["multiplier"]
 
     (low, first), (high, second) = at(0.97 * top), at(0.972 * top)
     assert free.problem.objective(free.optimized) < high < low
-    slope = (high - low) / (0.002 * top)
-    assert slope == pytest.approx((first + second) / 2, rel=0.02)
+    assert (high - low) / (0.002 * top) == pytest.approx((first + second) / 2, rel=0.02)
