@@ -65,10 +65,9 @@ def held():
 
 def test_a_pair_held_by_its_gear_is_idle(held):
     """The orbit is known and stable; the forces and their derivatives are exactly zero."""
-    assert held.status is Status.IDLE
+    assert (held.status, held.usable) == (Status.IDLE, True)
     assert held.steady_state["kind"] == "idle"
     assert held.steady_state["floquet_multiplier"] < 0.1
-    assert held.usable
     assert NONE.items() <= held.response.items()
     assert not any(np.any([*held.gradient[name].values()]) for name in NONE)
     assert np.all(held.series.force == 0)
@@ -82,16 +81,13 @@ def test_a_pair_held_by_its_gear_is_idle(held):
 ])  # fmt: skip
 def test_flanks_touch_where_the_reserve_is_used_up(held, key, name):
     """Just before the reserve is used up the pair is idle; just beyond it there is a force."""
-    unit, sign = (1e-3, -1) if name.endswith("um") else (1.0, 1)
-    config = config_of("contact.clearance_mm=0.3")
-    end = held.response[name] * unit * sign + config.value(key)
-    before, beyond = (
-        Evaluator.of(config_of("contact.clearance_mm=0.3", f"{key}={end + sign * step}"))
-        for step in (-2e-4, 2e-4)
-    )
-    before, beyond = before(series=False), beyond(series=False)
-    assert (before.status, beyond.status) == (Status.IDLE, Status.PERIODIC)
-    assert 0 < beyond.response["mean_force_N"] < 5
+    unit, sign = (-1e-3, -1) if name.endswith("um") else (1.0, 1)
+    end = held.response[name] * unit + config_of("contact.clearance_mm=0.3").value(key)
+    for step, status in ((-2e-4, Status.IDLE), (2e-4, Status.PERIODIC)):
+        config = config_of("contact.clearance_mm=0.3", f"{key}={end + sign * step}")
+        found = Evaluator.of(config)(series=False)
+        assert found.status is status
+    assert 0 < found.response["mean_force_N"] < 5
 
 
 def test_optimize_says_what_to_minimise_instead(tmp_path, capsys):
@@ -109,10 +105,9 @@ def test_optimize_says_what_to_minimise_instead(tmp_path, capsys):
 def window(peak, exponent):
     """Return a window of 16 mesh periods with these peaks (N) and this exponent, known to about
     0.01."""
-    growth = exponent + 0.04 * (-1.0) ** np.arange(16) * np.arange(16) / 16
-    empty = Window.empty(jnp.zeros(2), 16, jnp.asarray(1e-6))
-    return empty._replace(
-        growth=jnp.asarray(growth - np.mean(growth) + exponent),
+    scatter = 0.04 * (-1.0) ** np.arange(16) * np.arange(16) / 16
+    return Window.empty(jnp.zeros(2), 16, jnp.asarray(1e-6))._replace(
+        growth=jnp.asarray(scatter - np.mean(scatter) + exponent),
         response=jnp.asarray(np.column_stack([peak, peak**2, peak])),
         depth=jnp.asarray(-1.0),
         done=jnp.asarray(16),
@@ -124,17 +119,15 @@ def test_a_motion_without_contact_that_does_not_repeat_is_idle(exponent):
     """The motion is idle whether or not the gear's backlash makes it chaotic."""
     evaluator = Evaluator.of(config_of())
     pair = evaluator.pair(design_vector(evaluator.config))
-    still = window(np.zeros(16), exponent)
-    assert 1e-3 < float(still.error) < 0.05
-    status = Status.of(int(window_status(pair, still)))
-    steady, response, _ = unsettled(pair, status, jax.device_get(still), False)
-    assert (status, steady["kind"], response) == (Status.IDLE, "idle", NONE)
-    touching = window(np.eye(16)[2], exponent)
-    status = Status.of(int(window_status(pair, touching)))
-    assert status is (Status.CHAOTIC if exponent else Status.NOT_SETTLED)
-    steady, response, _ = unsettled(pair, status, jax.device_get(touching), False)
-    assert steady["kind"] == ("chaotic" if exponent else "transient")
-    assert response["peak_force_N"] == 1
+    touching = (Status.CHAOTIC, "chaotic") if exponent else (Status.NOT_SETTLED, "transient")
+    for peaks, expected in ((np.zeros(16), (Status.IDLE, "idle")), (np.eye(16)[2], touching)):
+        seen = window(peaks, exponent)
+        assert 1e-3 < float(seen.error) < 0.05
+        status = Status.of(int(window_status(pair, seen)))
+        steady, response, _ = unsettled(pair, status, jax.device_get(seen), False)
+        assert (status, steady["kind"]) == expected
+        assert response["peak_force_N"] == np.max(peaks)
+        assert (response == NONE) == (not np.any(peaks))
 
 
 @pytest.mark.parametrize(
@@ -177,18 +170,21 @@ def test_slowly_fading_disturbances_are_named():
 
 def test_the_message_names_what_holds_the_flanks_apart():
     """It names the backlash at which they touch, or the clearance if that is not known."""
-    wide, tight = config_of("contact.clearance_mm=0.3"), config_of("contact.clearance_mm=0.01")
-    said = apart_message(wide, -0.1e-3, 0.25)
-    assert said.startswith("The timing gear keeps the flanks apart")
-    most = wide.scene.timing_gear.backlash_mm + 0.25
-    assert said.endswith(f"100 µm; they touch with scene.timing_gear.backlash_mm above {most:.4g}.")
-    assert apart_message(wide, -0.1e-3).endswith("contact.clearance_mm below 0.2.")
-    assert apart_message(tight, -0.1e-3).endswith("100 µm.")
-    free = config_of("scene.timing_gear=null", "contact.clearance_mm=0.01")
-    assert apart_message(free, -0.1e-3).startswith("No flank touches")
+    wide, tight = "contact.clearance_mm=0.3", "contact.clearance_mm=0.01"
+    most = config_of().scene.timing_gear.backlash_mm + 0.25
+    held, above = "The timing gear keeps the flanks apart", "scene.timing_gear.backlash_mm above"
+    for changes, known, begin, end in (
+        ([wide], [0.25], held, f"100 µm; they touch with {above} {most:.4g}."),
+        ([wide], [], held, "contact.clearance_mm below 0.2."),
+        ([tight], [], held, "100 µm."),
+        ([tight, "scene.timing_gear=null"], [], "No flank touches", ""),
+    ):
+        said = apart_message(config_of(*changes), -0.1e-3, *known)
+        assert said.startswith(begin)
+        assert said.endswith(end)
     # Nothing was found where the gap is a pitch radius.
-    assert apart_message(wide, -0.033) == apart_message(wide, math.nan)
-    assert "gap" not in apart_message(wide, math.nan)
+    for gap in (-0.033, math.nan):
+        assert "gap" not in apart_message(config_of(wide), gap)
 
 
 # Objectives
@@ -228,32 +224,26 @@ def test_a_design_that_never_touches_has_the_best_objective():
 def test_nothing_is_relative_to_a_force_of_zero(overrides, response, words):
     """There is one message for every measure with a weight; measures without a weight do not
     count."""
-    config = config_of(*overrides)
     with pytest.raises(InputError, match=words):
-        problem_of(config, made_up(response))
+        problem_of(config_of(*overrides), made_up(response))
 
 
 # Several speeds
 
 
-def status_of(response):
-    return Status.PERIODIC if any(response.values()) else Status.IDLE
-
-
 def several(*responses, shares=(0.0, 1.0)):
     """Return an evaluation at two speeds, idle where the response is zero."""
-    parts = tuple(
-        Part({"speed_rpm": 1000.0 * k}, made_up(r, status_of(r)), share)
-        for k, (share, r) in enumerate(zip(shares, responses, strict=True), 1)
-    )
-    return over_speeds(parts, 1000.0)
+    parts = []
+    for k, (share, response) in enumerate(zip(shares, responses, strict=True), 1):
+        one = made_up(response, Status.PERIODIC if any(response.values()) else Status.IDLE)
+        parts.append(Part({"speed_rpm": 1000.0 * k}, one, share))
+    return over_speeds(tuple(parts), 1000.0)
 
 
 def test_an_idle_speed_counts_as_zero():
-    found = several(FORCES, NONE, shares=(0.5, 0.5))
+    found, both = (several(FORCES, other, shares=(0.5, 0.5)) for other in (NONE, FORCES))
     assert found.status is Status.PERIODIC
-    config = config_of("objective.speeds_rpm=[1000, 2000]")
-    problem = problem_of(config, several(FORCES, FORCES, shares=(0.5, 0.5)))
+    problem = problem_of(config_of("objective.speeds_rpm=[1000, 2000]"), both)
     assert problem.objective(found) == pytest.approx(0.5)
 
 
@@ -274,22 +264,20 @@ def test_a_speed_without_share_has_nothing_to_be_relative_to():
 # Motions that coexist
 
 
-def basins_of(*evaluations, lost=None):
-    share = 1 / len(evaluations)
+def basins_of(*evaluations):
+    axis, none, share = np.zeros(1), np.zeros((1, 1), int), 1 / len(evaluations)
     motions = tuple(
         Attractor(e, share, k == 0, np.zeros((1, 2))) for k, e in enumerate(evaluations)
     )
-    axis, none = np.zeros(1), np.zeros((1, 1), int)
-    return Basins(axis, axis, none, motions, evaluations[0], lost or {}, 1.0, 1.0)
+    return Basins(axis, axis, none, motions, evaluations[0], {}, 1.0, 1.0)
 
 
 def test_a_motion_without_contact_beside_others_counts_as_zero(monkeypatch):
     """A motion held by the gear counts like others; a floating pair does not count."""
     noisy, quiet = made_up(FORCES), made_up(NONE, Status.IDLE)
     floating = made_up(NONE, Status.IDLE, state=None)
-    assert basins_of(noisy, quiet).status is Status.PERIODIC
-    assert basins_of(quiet).status is Status.IDLE
-    assert basins_of(noisy, floating).status is Status.IDLE
+    found = [basins_of(*them).status for them in ((noisy, quiet), (quiet,), (noisy, floating))]
+    assert found == [Status.PERIODIC, Status.IDLE, Status.IDLE]
     averaged = mean(noisy, [noisy, quiet], [0.5, 0.5])
     assert averaged.response == pytest.approx({k: v / 2 for k, v in FORCES.items()})
     assert averaged.gradient["mean_force_N"]["tip_arc_angle_deg"] == 0.5
