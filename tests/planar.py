@@ -71,8 +71,7 @@ class Flank:
 
     def __call__(self, p, number):
         """Return the point and the outward normal at p, on piece `number` or its continuation."""
-        count = len(self.pieces)
-        if number < count:
+        if number < len(self.pieces):
             beta, psi, s = self.pieces[number](p - number)
         else:
             # The dedendum meshes with the addendum in reverse.
@@ -238,8 +237,7 @@ class Planar:
             depth = -touch.gap - self.clearance
             normal = self.normal_force(depth, dot(touch.normal, slip))
             along = 1j * touch.normal
-            drag = self.coefficient(dot(along, slip)) * normal
-            force = normal * touch.normal + drag * along
+            force = normal * (touch.normal + self.coefficient(dot(along, slip)) * along)
             torques += cross(arm1, -force), -cross(arm2, force)
             pushes += [-force, force]
             total, deepest = total + normal, max(deepest, depth)
@@ -258,8 +256,8 @@ class Planar:
             # Cubic roundings, and as much of t² (1 - t)² as restores the integral.
             bump = t**2 * (1 - t) ** 2
             taken_up = self.ramp(excess, width) + 2.5 * width * bump
-            engaged = t**2 * (3 - 2 * t) + 15 * bump
             hold = self.gear.stiffness_N_m_per_rad * np.sign(aside) * taken_up
+            engaged = t**2 * (3 - 2 * t) + 15 * bump
             hold += self.gear_damping * engaged * rate
             torques += hold, -hold
         accelerations = torques / self.inertia

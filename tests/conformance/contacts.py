@@ -86,9 +86,8 @@ def _check_place(contact, roll, relative):
         found = contact.approach(roll, relative)
         point = contact.point(roll, relative, found)
         there = lambda distance: contact.at_distance(distance)(roll, relative)[0]  # noqa: E731
-        by_distance = jax.grad(there)(contact.center_distance)
         gap = contact.center_distance * point.radial - point.support1 - point.support2
-        return found.gap - gap, by_distance - point.radial
+        return found.gap - gap, jax.grad(there)(contact.center_distance) - point.radial
 
     try:
         errors = jax.jit(known)(jnp.asarray(roll), jnp.asarray(relative))

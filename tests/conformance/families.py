@@ -176,10 +176,9 @@ def area_and_moment_are_those_of_the_outline(family):
     """Compare area and polar moment with the shoelace formula for the outline's polygon."""
     here, there = outline_of(family)[:-1] @ [1, 1j], outline_of(family)[1:] @ [1, 1j]
     cross = (np.conj(here) * there).imag
-    square = abs(here) ** 2 + (np.conj(here) * there).real + abs(there) ** 2
     shape = measure(made(family))
     assert float(shape.area) * 1e6 == pytest.approx(np.sum(cross) / 2, rel=2e-6)
-    moment = np.sum(cross * square) / 12
+    moment = np.sum(cross * (abs(here) ** 2 + (np.conj(here) * there).real + abs(there) ** 2)) / 12
     assert float(shape.polar_area_moment) * 1e12 == pytest.approx(moment, rel=4e-6)
 
 
@@ -247,8 +246,7 @@ def slopes_of_geometry_are_those_of_differences(family):
     for way in jnp.diag(design):
         value, slope = look(design, way)
         up, down = (look(design + step * way, way)[0] for step in (1e-5, -1e-5))
-        difference = (up - down) / 2e-5
-        np.testing.assert_allclose(slope / value, difference / value, rtol=0, atol=1e-8)
+        np.testing.assert_allclose(slope / value, (up - down) / 2e-5 / value, rtol=0, atol=1e-8)
 
 
 def designs_are_points_of_the_unit_box_and_back(family):

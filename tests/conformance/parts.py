@@ -174,9 +174,8 @@ def check_in_pair(pair, part, reach=2.0):
     The part must add its own states and numbers. The motion must have a derivative with respect to
     each of these numbers."""
     with_part = dataclasses.replace(pair, parts=(*pair.parts, part))
-    added = len(part.states) + (part.free and not pair.free)
     before, after = size(pair), size(with_part)
-    assert after[0] == before[0] + added
+    assert after[0] == before[0] + len(part.states) + (part.free and not pair.free)
     assert after[1] > before[1]
     assert after[2] == before[2] + len(jax.tree.leaves(part))
     assert len(with_part.state_names) == with_part.states

@@ -28,8 +28,7 @@ paired = jax.jit(FlankPair.of)
 
 def cic(lobes, alpha, fraction, tip):
     """Return a CIC profile with u given as a fraction of u_max."""
-    longest = R * np.sin(alpha) * (np.pi / (2 * lobes) - tip)
-    return CIC(lobes, R, alpha, fraction * longest, tip)
+    return CIC(lobes, R, alpha, fraction * R * np.sin(alpha) * (np.pi / (2 * lobes) - tip), tip)
 
 
 def results(design, roll, relative):
@@ -205,8 +204,7 @@ def test_no_root_is_lost_on_a_node():
     minimum."""
     deepest = -0.00859830772827668
     first = -2 * np.sqrt(-deepest) - 0.02
-    step = (np.pi / 6 - first) / 124
-    roll = first + step * jnp.arange(128)
+    roll = first + (np.pi / 6 - first) / 124 * jnp.arange(128)
     relative = deepest - deepest / 20 * jnp.arange(24)
     flank = np.asarray(roll) > 0.2
     design = jnp.asarray([27.305899038181646, 0.7591908244251282, 1.267598407749901])

@@ -66,8 +66,7 @@ def test_margins_have_the_sign_of_the_flags(name):
     @eqx.filter_jit
     def both(pair, tau, state):
         searched = pair.margins(tau, state)
-        near = _near(pair, searched.places.normal2).margins(tau, state)
-        return searched, near
+        return searched, _near(pair, searched.places.normal2).margins(tau, state)
 
     jumps = set(kinds(pair).jump) - {-1}
     assert len(jumps) == (pair.flanks if pair.jumps else 0)
@@ -105,8 +104,7 @@ def test_equation_near_a_root_is_that_of_the_search(name):
     )
     for tau, state in zip(*_states(pair, 25), strict=True):
         for one, other in zip(slopes(pair, tau, state), nearly(pair, tau, state), strict=True):
-            size = np.max(np.abs(one))
-            np.testing.assert_allclose(other, one, rtol=0, atol=2e-6 * size)
+            np.testing.assert_allclose(other, one, rtol=0, atol=2e-6 * np.max(np.abs(one)))
 
 
 def test_root_at_the_end_of_a_segment_has_one_slope():

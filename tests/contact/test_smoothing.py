@@ -55,8 +55,7 @@ def test_smoothing_length_follows_the_scene():
     shipped = sorted(Path("configs").glob("*.yaml"))
     assert len(shipped) >= 6
     assert {load(path).contact.rounding_mm for path in shipped} == {1e-4}
-    twist = 2.09 / 4.2e5 * 33
-    assert length_of(*STIFF) == pytest.approx(0.05 * twist, rel=0.05)
+    assert length_of(*STIFF) == pytest.approx(0.05 * 2.09 / 4.2e5 * 33, rel=0.05)
     stiff = "contact.stiffness_N_per_mm_e=1e7"
     depth = (4.775 / 0.033 / 1e7) ** (1 / 2.2)
     assert length_of(stiff) == pytest.approx(min(1e-4, 0.02 * depth), rel=0.05)

@@ -27,8 +27,7 @@ def scene_of(*changes: str) -> tuple[rootsopt.Config, Scene]:
 def test_ee_wears_evenly(lobes):
     """s, dl1/dβ and dl2/dβ of EE are proportional to sin ψ: 8N / (4N² - 1) everywhere."""
     roll = jnp.linspace(0.02, 0.98, 20) * np.pi / (2 * lobes)
-    expected = 8 * lobes / (4 * lobes**2 - 1)
-    np.testing.assert_allclose(shape(EE(lobes, R), roll), expected, rtol=1e-9)
+    np.testing.assert_allclose(shape(EE(lobes, R), roll), 8 * lobes / (4 * lobes**2 - 1), rtol=1e-9)
 
 
 def test_shape_from_the_ways_of_the_contact():

@@ -40,8 +40,7 @@ def test_inertia_of_a_motor_turns_with_rotor_1():
     motor = MotorDrive(*(jnp.asarray(x) for x in (SPEED, torque, slope, own)))
     pair = oscillator(drive=motor, gear=None)
     period = 2 * np.pi / (LOBES * SPEED)
-    share = over * period / SCALE
-    found, _ = pair.derivative(jnp.asarray(0.2), jnp.array([0.1, 0.3, share]))
+    found, _ = pair.derivative(jnp.asarray(0.2), jnp.array([0.1, 0.3, over * period / SCALE]))
     first = (torque - slope * over) / (INERTIA + own)
     lapse = SPEED / (SPEED + over)
     unit = lapse * period**2 / SCALE

@@ -195,8 +195,7 @@ def test_a_design_that_never_touches_has_the_best_objective():
 
     It is finite down to the least number, whose inverse overflows; measures without a weight may
     be 0."""
-    problem = problem_of(config_of(), made_up(FORCES))
-    assert problem.objective(made_up(NONE, Status.IDLE)) == 0
+    assert problem_of(config_of(), made_up(FORCES)).objective(made_up(NONE, Status.IDLE)) == 0
     weights = "objective.mean_weight=1", "objective.peak_weight=0"
     for changes, forces in (
         ((), FORCES),

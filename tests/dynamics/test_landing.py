@@ -64,8 +64,7 @@ def test_the_next_step_ends_just_beyond_the_edge(place, bend):
     roots = np.roots([bend / 2, rate, place]) if bend else np.array([-place / rate])
     meets = min(float(r.real) for r in roots if abs(r.imag) < 1e-12 and r.real > 0)
     found = adapted(*(parabola(place, rate, bend, t) for t in (0.0, step)), step)
-    expected = True, step, min(meets + 1e-4, step + 1 / 32)
-    assert found == pytest.approx(expected, rel=1e-9)
+    assert found == pytest.approx((True, step, min(meets + 1e-4, step + 1 / 32)), rel=1e-9)
 
 
 def test_a_step_that_passed_an_edge_far_is_taken_again():

@@ -1,5 +1,7 @@
 """Tests of the reserve of flanks that stay apart, of the torque of the gear that keeps them apart,
-and of searches that simulate nothing."""
+and of searches that simulate nothing.
+
+`test_idle` finds where the reserve is used up."""
 
 import functools
 
@@ -7,18 +9,15 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from matplotlib.path import Path
-from scipy.spatial import cKDTree
 
 import rootsopt
 from experiments._common.shooting import differentiated
 from rootsopt import steady_response
 from rootsopt.config import load
-from rootsopt.pump.sheet import sheet
 from rootsopt.response import evaluation, sensitivity
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.sensitivity import touching
-from rootsopt.scene import Scene, outline_mm
+from rootsopt.scene import Scene
 from rootsopt.status import Status
 
 APART = ["contact.clearance_mm=0.15", "scene.timing_gear.backlash_mm=0.04"]
@@ -45,37 +44,6 @@ def swing(config):
     gear = config.scene.timing_gear
     half = gear.backlash_mm / (2 * config.profile.pitch_radius_mm)
     return half + config.scene.load.torque_N_m / gear.stiffness_N_m_per_rad
-
-
-def test_reserve_is_the_distance_of_polygons():
-    """Without clearance, the outlines would overlap: the least gap is what the clearance leaves."""
-    config, outline = evaluator().config, outline_mm(evaluator().config)
-    points, lobes = outline @ [1, 1j], config.profile.lobes
-    tree, path, depths = cKDTree(outline), Path(outline), []
-    edges = np.roll(outline, -1, axis=0) - outline
-    normals = edges[:, ::-1] / np.hypot(*edges.T)[:, None] * [-1, 1]
-    for phi in np.linspace(0, 2 * np.pi / lobes, 90, endpoint=False):
-        # Rotor 2 turns against rotor 1, with a valley towards it at φ = 0, and lags by |ε|. It is
-        # seen from rotor 1.
-        other = points * np.exp(1j * (np.pi - np.pi / lobes - (phi - swing(config))))
-        seen = (other + 2 * config.profile.pitch_radius_mm) * np.exp(-1j * phi)
-        seen = np.column_stack([seen.real, seen.imag])
-        seen = seen[path.contains_points(seen)]
-        _, near = tree.query(seen)
-        across = [
-            np.abs(np.sum((seen - outline[k]) * normals[k], axis=1)) for k in (near, near - 1)
-        ]
-        depths.append(np.max(np.min(across, axis=0), initial=0.0))
-    expected = 1e3 * (config.contact.clearance_mm - max(depths))
-    assert held().response["contact_reserve_um"] == pytest.approx(expected, abs=0.5)
-
-
-def test_backlash_reserve_is_that_of_the_play():
-    """The gear may have as much backlash as the play allows, less its deflection under the load."""
-    config = evaluator().config
-    most = sheet(evaluator().scene, jnp.asarray(config.design))["gear_backlash_max_mm"]
-    used = 2 * config.profile.pitch_radius_mm * swing(config)
-    assert held().response["backlash_reserve_mm"] == pytest.approx(most - used, rel=1e-4)
 
 
 @pytest.mark.parametrize("clearance", [0.15, 0.02])
@@ -141,10 +109,9 @@ def test_pure_response_has_a_reserve_with_derivatives():
     slopes, found = eqx.filter_jacfwd(both, has_aux=True)(scene)
     assert (Status.of(found.status), int(found.period)) == (Status.IDLE, 1)
     assert np.all(np.abs(found.multipliers) < 1)
-    expected = [held().response[name] for name in RESERVES]
     width = 2 * config.profile.pitch_radius_mm
     said = found.contact_reserve * 1e6, found.backlash_reserve * width
-    assert said == pytest.approx(expected, rel=1e-6)
+    assert said == pytest.approx([held().response[name] for name in RESERVES], rel=1e-6)
     by_play, by_load = (np.asarray(x) for x in (slopes.gear.half_backlash, slopes.load_torque))
     assert np.asarray(slopes.clearance)[::2] == pytest.approx([1, 0], abs=1e-9)
     # Less stiffness or more load uses up the reserve as more backlash does.
@@ -196,8 +163,7 @@ def test_a_reserve_limits_a_search():
     """The limit holds at the optimum, where it has a price."""
     least = held().response["contact_reserve_um"] + 1.0
     limit = f"constraints.terms={{contact_reserve_um: {{min: {least}}}}}"
-    config = load("cic_drawn", [*QUICK, "optimizer.iterations=12", limit])
-    found = rootsopt.optimize_design(config)
+    found = rootsopt.optimize_design(load("cic_drawn", [*QUICK, "optimizer.iterations=12", limit]))
     assert found.optimized.response["contact_reserve_um"] > least - 1e-3
     (row,) = [row for row in found.constraints if row["name"] == "contact reserve"]
     assert (row["satisfied"], row["baseline_satisfied"]) == (True, False)

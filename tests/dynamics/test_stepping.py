@@ -23,8 +23,7 @@ def swing(tau, y, gravity):
     """Return the slope of a pendulum's state `y` (2,), which is known up to 1 rad.
 
     `gravity`: square of the angular frequency of small oscillations."""
-    known = jnp.where(jnp.abs(y[0]) < 1, y[0], jnp.nan)
-    return jnp.stack([y[1], -gravity * jnp.sin(known)])
+    return jnp.stack([y[1], -gravity * jnp.sin(jnp.where(jnp.abs(y[0]) < 1, y[0], jnp.nan))])
 
 
 def both(method, gravity, max_steps):
@@ -51,8 +50,7 @@ def both(method, gravity, max_steps):
             throw=False,
         )
         inside = jax.vmap(lambda share: interpolated(ours, solver, share)[0])
-        solved = theirs.result == diffrax.RESULTS.successful
-        shown = theirs.ts, theirs.ys, theirs.stats, solved
+        shown = theirs.ts, theirs.ys, theirs.stats, theirs.result == diffrax.RESULTS.successful
         return ours, inside(jnp.minimum(theirs.ts, 1.0)), shown
 
     # Angle (rad) and speed (rad per unit of time) at the start.

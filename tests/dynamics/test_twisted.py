@@ -78,8 +78,7 @@ def test_gas_torque_is_the_mean_over_sections():
     one, other = (pair_of(s, jnp.asarray(design)).load for s in (straight, turned))
     angles = PHI[::4]
     section = np.asarray(torques(one, angles))
-    offsets = np.radians(50) * ((np.arange(500) + 0.5) / 500 - 0.5)
-    expected = sliced_mean(section, offsets, 3)
+    expected = sliced_mean(section, np.radians(50) * ((np.arange(500) + 0.5) / 500 - 0.5), 3)
     np.testing.assert_allclose(torques(other, angles), expected, rtol=2e-3)
     assert float(other.torque) == pytest.approx(np.mean(section), rel=1e-4)
 

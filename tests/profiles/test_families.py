@@ -29,6 +29,13 @@ from tests.conformance.families import (
 )
 
 DEG = np.pi / 180
+
+
+def longest(lobes, alpha):
+    """Return the CIC profile without a land whose involute is longest, of radius 1."""
+    return CIC(lobes, 1.0, alpha, np.sin(alpha) * np.pi / (2 * lobes), 0.0)
+
+
 FAMILIES = [name for name, family in families().items() if family.maker is not None]
 _ALIKE = {
     suite.search_finds_the_closest_approach: (
@@ -48,16 +55,14 @@ _ALIKE = {
 They are checked in long runs."""
 
 
-def every_check():
-    """Return all pairs of a family and a check."""
-    pairs = []
-    for family, one in itertools.product(FAMILIES, suite.CHECKS):
-        marks = [pytest.mark.long] if family in _ALIKE.get(one, ()) else []
-        pairs.append(pytest.param(family, one, marks=marks, id=f"{family}-{one.__name__}"))
-    return pairs
+def case(family, one):
+    marks = [pytest.mark.long] if family in _ALIKE.get(one, ()) else []
+    return pytest.param(family, one, marks=marks, id=f"{family}-{one.__name__}")
 
 
-@pytest.mark.parametrize(("family", "holds"), every_check())
+@pytest.mark.parametrize(
+    ("family", "holds"), itertools.starmap(case, itertools.product(FAMILIES, suite.CHECKS))
+)
 def test_conforms(family, holds):
     """Every family that the package registers passes the suite."""
     holds(family)
@@ -67,13 +72,26 @@ def test_conforms(family, holds):
 
 
 @pytest.mark.parametrize(
-    ("lobes", "center", "tip_radius", "efficiency"),
-    [(2, 0.8, 1.51318, 0.51382), (3, 0.9, 1.40115, 0.45679)],
+    ("kind", "numbers", "tip_radius", "efficiency", "within"),
+    [
+        # In closed form: r (1 + 1/N), and 1 - A/(π r_a²).
+        (EE, (2, 1.0), 1 + 1 / 2, 0.5, 1e-12),
+        (EE, (3, 1.0), 1 + 1 / 3, 0.40625, 1e-12),
+        (EE, (4, 1.0), 1 + 1 / 4, 0.34, 1e-12),
+        # Textbook CIC: tan α = π/2N, the longest involute, no land.
+        (longest, (2, np.arctan(np.pi / 4)), 1.61767, 0.56926, 5.1e-6),
+        (longest, (3, np.arctan(np.pi / 6)), 1.46386, 0.49987, 5.1e-6),
+        (longest, (4, np.arctan(np.pi / 8)), 1.36552, 0.43982, 5.1e-6),
+        (arc, (2, 1.0, 0.8), 1.51318, 0.51382, 5e-6),
+        (arc, (3, 1.0, 0.9), 1.40115, 0.45679, 5e-6),
+    ],
 )
-def test_single_arc(lobes, center, tip_radius, efficiency):
-    found = measure(arc(lobes, 1.0, center))
-    assert float(found.outer_radius) == pytest.approx(tip_radius, abs=5e-6)
-    assert float(found.area_efficiency) == pytest.approx(efficiency, abs=5e-6)
+def test_known_tip_radii_and_area_efficiencies(kind, numbers, tip_radius, efficiency, within):
+    shape = measure(kind(*numbers))
+    assert float(shape.outer_radius) == pytest.approx(tip_radius, abs=within)
+    assert float(shape.root_radius) == pytest.approx(2 - tip_radius, abs=within)
+    assert float(shape.area_efficiency) == pytest.approx(efficiency, abs=within)
+    assert float(shape.seal_width) == pytest.approx(0, abs=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -91,50 +109,23 @@ def test_largest_single_arc_without_undercut(lobes, center, efficiency):
     assert float(found.area_efficiency) == pytest.approx(efficiency, abs=1e-5)
 
 
-def test_margins_are_the_least_between_the_places_too():
-    """Margins are least values over the whole segment, not only at sampled points.
-
-    Undercut and star margin of an arc are least inside a segment. With 400 samples they are up to
-    1e-5 too great; the parabola through three samples is right to 3e-7."""
-    sampled = []
-    for center in (0.89, 0.9, 0.92):
-        profile, fine, coarse = arc(3, 1.0, center), [], []
-        for segment in profile.segments():
-            share = np.linspace(1e-9, 1 - 1e-9, 1 + 399 * 200)
-            nu = float(segment.start) + float(segment.stop - segment.start) * share
-            point, _, dedendum = profile.speeds(jnp.asarray(nu))
-            sliding = np.sin(point.psi)
-            both = np.stack([dedendum, np.minimum(sliding + point.s, sliding - point.s)])
-            fine.append(np.min(both, axis=1))
-            coarse.append(np.min(both[:, ::200], axis=1))
-        least = np.min(fine, axis=0)
-        sampled.append(np.min(coarse, axis=0) - least)
-        found = margins(profile)
-        np.testing.assert_allclose([found.undercut, found.star], least, rtol=0, atol=3e-7)
-    assert np.all(np.max(sampled, axis=0) > 2e-6)
-
-
 def test_ranges_of_the_arc_and_involute_patent():
     """The ranges of the arc and involute profile are those of US 7,320,579, claim 1.
 
     With centre distance L and two lobes, the base radius is above L / 2√2 and the arc above √2 π L
     / 16, where the involute is longest, at 45°. The arc is below (27 - 5√2) L / 56, where there is
-    no involute and the tip lies at 3 L / 4."""
-    distance = 1.0
-    r = distance / 2
-    longest = r * np.sin(np.pi / 4) * np.pi / 4
-    least = profile_of("arc_involute", 2, jnp.asarray(r), jnp.asarray([45.0, longest * 1e3]))
+    no involute and the tip lies at 3 L / 4. Here, L = 1."""
+    longest = 0.5 * np.sin(np.pi / 4) * np.pi / 4
+    least = profile_of("arc_involute", 2, jnp.asarray(0.5), jnp.asarray([45.0, longest * 1e3]))
     assert isinstance(least, CIC)
-    assert float(least.base_radius) == pytest.approx(distance / (2 * np.sqrt(2)), rel=1e-12)
-    assert float(least.arc_radius) == pytest.approx(np.sqrt(2) / 16 * np.pi * distance, rel=1e-12)
-    assert float(least.arc_radius) == pytest.approx(0.27768, abs=5e-6)
+    assert float(least.base_radius) == pytest.approx(1 / (2 * np.sqrt(2)), rel=1e-12)
+    assert float(least.arc_radius) == pytest.approx(np.sqrt(2) / 16 * np.pi, rel=1e-12)
 
     def tip(b):
-        return float(measure(arc(2, r, b)).outer_radius) - 0.75 * distance
+        return float(measure(arc(2, 0.5, b)).outer_radius) - 0.75
 
-    radius = float(arc(2, r, brentq(tip, 0.3, 0.45, xtol=1e-12)).radius[0])
-    assert radius == pytest.approx((27 - 5 * np.sqrt(2)) / 56 * distance, rel=1e-9)
-    assert radius == pytest.approx(0.35587, abs=5e-6)
+    radius = float(arc(2, 0.5, brentq(tip, 0.3, 0.45, xtol=1e-12)).radius[0])
+    assert radius == pytest.approx((27 - 5 * np.sqrt(2)) / 56, rel=1e-9)
 
 
 def test_families_that_become_another():
@@ -169,38 +160,23 @@ def test_extended_cycloid_is_the_curve_drawn(ratio):
         return R * np.exp(1j * theta) * (7 / 6 + away / 6 * np.exp(6j * theta))
 
     theta = np.linspace(0, np.pi / 6, COUNT + 2)[1:-1]
-    normal = (drawn(theta + 1e-6) - drawn(theta - 1e-6)) / 1j
-    nu = jnp.asarray(np.angle(normal))
+    nu = jnp.asarray(np.angle((drawn(theta + 1e-6) - drawn(theta - 1e-6)) / 1j))
     place = np.asarray(looked_at(profile, nu)["addendum"]) @ [1, 1j]
     np.testing.assert_allclose(place, drawn(theta), rtol=0, atol=1e-9 * R)
 
 
-def test_edge_describes_an_extended_epicycloid():
-    """The mate of an edge lies at the edge's radius from the curve of its centre.
-
-    That is the curve that the centre draws on the partner, an extended epicycloid. The contact
-    moves backwards along the mate."""
-    profile = made("arcs_epicycloid")
-    nu, found = sampled("arcs_epicycloid")
-    edge = np.flatnonzero((nu > profile.joints[1]) & (nu < profile.joints[2]))[::40]
-    mate = found["dedendum"][edge]
-    center, theta = np.hypot(*profile.center[1]), float(profile.joints[1])
-    # The rotor rolls on the partner's pitch circle; a space of the partner lies at π/3.
-    turn = np.linspace(-0.5, 0.5, 20001)
-    path = 2 * R * np.exp(1j * turn) - center * np.exp(1j * (2 * turn - theta))
-    path = np.conj(path) * np.exp(1j * np.pi / 3)
-    distance = np.abs(path[:, None] - np.asarray(mate) @ [1, 1j])
-    np.testing.assert_allclose(np.min(distance, axis=0), 1e-3, rtol=0, atol=1e-9)
-    assert len(edge) == 5
-    assert np.all(found["rate"][edge] < 0)
-    assert float(margins(profile).rolling) < 0 < float(margins(profile).undercut)
-
-
 def test_five_arcs_have_their_land():
-    """Five arcs have a tip land; the suite checks tangents and the pitch crossing."""
+    """The suite checks tangents and the pitch crossing."""
     shape = measure(made("five_arcs"))
     assert float(shape.outer_radius) == pytest.approx(0.045, rel=1e-12)
     assert float(shape.seal_width) == pytest.approx(2 * 3 * DEG * 0.045)
+
+
+def test_contact_moves_backwards_along_the_mate_of_an_edge():
+    nu, found = sampled("arcs_epicycloid")
+    joints = made("arcs_epicycloid").joints
+    assert np.all(found["rate"][(nu > joints[1]) & (nu < joints[2])] < 0)
+    assert float(margins(made("arcs_epicycloid")).rolling) < 0
 
 
 # Use by name
@@ -230,9 +206,8 @@ def test_five_arcs_have_their_land():
     ],
 )
 def test_unsound_profiles_are_refused(family, changes, fault):
-    config = config_of(family, **changes)
     with pytest.raises(InputError, match=fault):
-        check(config)
+        check(config_of(family, **changes))
 
 
 @CachedFunction
@@ -257,8 +232,7 @@ def test_margins_find_what_closed_forms_refuse(family):
         found = _margins_of(family, design)
         if any(0 < abs(float(value)) < 1e-6 for value in (*found[1:3], *found[6:])):
             return
-        config = config_of(family).with_design(design.tolist())
         if bool(found.sound):
-            row.check(config)
+            row.check(config_of(family).with_design(design.tolist()))
 
     agree()

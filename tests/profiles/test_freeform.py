@@ -57,16 +57,14 @@ def test_shares_and_pressure_angle_are_the_spline(profile):
 
     So are the ends of the addendum."""
     spans = len(SHARES) - 2
-    knots = np.concatenate([[0, 0], np.arange(spans + 1), [spans, spans]])
-    spline = BSpline(knots, SHARES, 2)
+    spline = BSpline(np.concatenate([[0, 0], np.arange(spans + 1), [spans, spans]]), SHARES, 2)
     half = np.pi / 6
     length = (half - TIP) / (1 - spline.integrate(0, spans) / spans)
     assert float(profile.pitch_normal) == pytest.approx(TIP + length, rel=1e-14)
     for share in (0.0, 0.13, 0.5, 0.77, 0.999):
         nu = jnp.asarray(TIP + share * length)
         turned = spline.integrate(0, share * spans) / spans * length
-        point = profile.addendum(nu)
-        assert float(point.psi) == pytest.approx(np.pi / 2 - turned, abs=1e-13)
+        assert float(profile.addendum(nu).psi) == pytest.approx(np.pi / 2 - turned, abs=1e-13)
         assert float(profile.roll_rate(nu)) == pytest.approx(1 - spline(share * spans), abs=1e-12)
     assert float(profile.roll_angle(profile.pitch_normal)) == pytest.approx(half, rel=1e-14)
     assert float(profile.contact_distance(profile.pitch_normal)) == pytest.approx(0, abs=1e-17)
@@ -89,8 +87,7 @@ def test_ee_is_a_free_form_of_equal_coefficients():
     for lobes in (2, 5):
         same = FreeForm(lobes, R, 0.0, np.full(5, lobes / (1 + lobes)))
         nu = jnp.linspace(0.01, 1.05 * float(same.pitch_normal), 20)
-        other = EE(lobes, R)
-        for one, two in zip(looked(same, nu), looked(other, nu), strict=True):
+        for one, two in zip(looked(same, nu), looked(EE(lobes, R), nu), strict=True):
             np.testing.assert_allclose(one, two, rtol=1e-13, atol=1e-15)
 
 

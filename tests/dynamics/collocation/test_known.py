@@ -90,8 +90,7 @@ def test_orbit_varies_at_constant_time():
     def moves(tau):
         """Return how places that move with the mesh change their times."""
         k = jnp.broadcast_to(number.reshape(-1, *(1,) * (tau.ndim - 1)), tau.shape)
-        step = still._replace(times=times)
-        return moved_at(elements, step, k, elements.share(k, tau))[0][..., 0]
+        return moved_at(elements, still._replace(times=times), k, elements.share(k, tau))[0][..., 0]
 
     # There, the state and its slope change along the motion as well.
     state = jnp.cos(TURN * begin) * (1 + TURN * moves(begin))
@@ -147,13 +146,11 @@ def test_peak_is_located(place, corner):
     force, rate = (jnp.asarray(x) for x in _bump(np.asarray(elements.places[0]), place, corner))
     # The corner is an event: the element before it has the slope of its own side at its end.
     nothing = jnp.zeros((*force.shape, 1))
-    roots = jnp.zeros((*force.shape, 1, 2))
-    points = Points(nothing, nothing[..., None], roots, force, force)
+    points = Points(nothing, nothing[..., None], jnp.zeros((*force.shape, 1, 2)), force, force)
     rivals = Rivals.anywhere(elements)
     for _ in range(2):
         rivals = jax.jit(rivals_of)(elements, points, force, rate, rivals)
-        there = np.asarray(rivals.places(elements)[0]) - 1e-12
-        new = _bump(there, place, corner)
+        new = _bump(np.asarray(rivals.places(elements)[0]) - 1e-12, place, corner)
         force, rate = (x.at[USED].set(y) for x, y in zip((force, rate), new, strict=True))
     found = jax.jit(peak_of)(elements, rivals, force, rate)
     begin, length = elements.mesh.ends[0][found.element], elements.mesh.lengths[found.element]
@@ -241,11 +238,10 @@ def test_a_jump_of_the_contact_is_an_event():
         jnp.tile(share[1:], 2),
         mesh.used,
     )
-    ends = jnp.repeat(cut.ends[1], 2)
     roots = jnp.zeros((count, POINTS + 2, 1)).at[:, -2:, 0].set(jnp.asarray([1.0, 2.0]))
     pushes = jnp.zeros(roots.shape, bool).at[:, -1].set(True)
     empty = jnp.zeros((2 * count, 1), bool)
-    seen = FlagScan(ends, empty, empty, roots, pushes, jnp.asarray(2 * count))
+    seen = FlagScan(jnp.repeat(cut.ends[1], 2), empty, empty, roots, pushes, jnp.asarray(2 * count))
     own = rooted(pair, elements._replace(mesh=cut), seen).roots[:, -1, 0, 0]
     np.testing.assert_array_equal(np.flatnonzero(own == 1.0), [half - 1])
 

@@ -18,9 +18,8 @@ def _elements(function, slope, edges, start=0.0):
     """Return elements on fixed edges whose motion is a known function."""
     edges = np.asarray(edges)
     count = len(edges) - 1
-    length = edges[-1] - edges[0]
     pad = ROOM - count
-    share = (edges - edges[0]) / length
+    share = (edges - edges[0]) / (edges[-1] - edges[0])
     mesh = Mesh(
         times=jnp.full(8, edges[-1]).at[0].set(start),
         which=jnp.full(8, -1),

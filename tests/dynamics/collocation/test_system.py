@@ -72,8 +72,7 @@ def test_newton_step_solves_the_dense_equations():
         margin=jax.vmap(_margin)(tau[:, -1], z[:, -1]),
         bend=bend(tau[:, -1], z[:, -1]),
     )
-    columns = own_column(elements, lines)
-    step = _stepped(elements, lines, columns)
+    step = _stepped(elements, lines, own_column(elements, lines))
     unknown = jnp.concatenate([state[:USED].ravel(), slopes[:USED].ravel(), TIMES[1:2]])
     expected = np.linalg.solve(jax.jit(jax.jacfwd(_misses))(unknown), -jax.jit(_misses)(unknown))
     found = np.concatenate(
