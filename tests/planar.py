@@ -102,13 +102,9 @@ class Planar:
         self.radius, self.lobes = self.flank.radius, config.profile.lobes
         self.inertia, self.mass = inertia, mass
         self.distance = 2 * self.radius + 1e-3 * (scene.center_distance_error_mm or 0.0)
-        self.exponent = law.exponent
-        self.stiffness = law.stiffness_N_per_mm_e * 1e3**law.exponent
-        self.damping = law.max_damping_N_s_per_mm * 1e3
-        self.full = law.full_damping_depth_mm * 1e-3
+        self.law = law
         self.rounding = law.smoothing_mm * 1e-3
         self.clearance = law.clearance_mm * 1e-3
-        self.friction = law.friction
         self.speed = scene.speed_rpm * 2 * np.pi / 60
         # Torques against the rotors at φ1.
         self.load = load or (lambda phi: (0.0, scene.load.torque_N_m))
@@ -128,15 +124,16 @@ class Planar:
 
     def normal_force(self, depth, closing):
         delta = self.ramp(depth, self.rounding)
+        full = self.law.full_damping_depth_mm * 1e-3
         if delta == 0:
             return 0.0
-        x = min(delta / self.full, 1.0)
-        spring = self.stiffness * delta**self.exponent
-        kept = 1 + self.damping * (3 * x**2 - 2 * x**3) * closing / spring
-        return spring * self.ramp(kept, min(self.rounding / self.full, 1.0))
+        x = min(delta / full, 1.0)
+        spring = self.law.stiffness_N_per_mm_e * (1e3 * delta) ** self.law.exponent
+        damping = 1e3 * self.law.max_damping_N_s_per_mm * (3 * x**2 - 2 * x**3)
+        return spring * self.ramp(1 + damping * closing / spring, min(self.rounding / full, 1.0))
 
     def coefficient(self, sliding):
-        law = self.friction
+        law = self.law.friction
         if law is None:
             return 0.0
         low, high = 1e-3 * law.stiction_speed_mm_s, 1e-3 * law.friction_speed_mm_s
@@ -180,16 +177,13 @@ class Planar:
 
         places, nodes, normals = self.flank.nodes
         z1, z2 = axes[0] + first(nodes), axes[1] + second(nodes)
-        n2 = second(normals)
-        apart = z1[:, None] - z2[None, :]
-        nearest = np.argmin(abs(apart), axis=1)
-        apart = apart[np.arange(len(z1)), nearest]
-        signed = dot(n2[nearest], apart)
-        signed[abs(cross(n2[nearest], apart)) > 0.05 * self.radius] = np.inf
+        nearest = np.argmin(abs(z1[:, None] - z2[None, :]), axis=1)
+        apart, n2 = z1 - z2[nearest], second(normals)[nearest]
+        signed = np.where(abs(cross(n2, apart)) > 0.05 * self.radius, np.inf, dot(n2, apart))
         # Each local minimum along rotor 1 may be the least distance; far ones do not touch.
-        reach = self.clearance + 5e-4 * self.radius
         around = np.pad(signed, 1, constant_values=np.inf)
-        dips = (signed <= around[:-2]) & (signed <= around[2:]) & (signed < reach)
+        dips = (signed <= around[:-2]) & (signed <= around[2:])
+        dips &= signed < self.clearance + 5e-4 * self.radius
 
         def at(p, pieces):
             (a, m), (b, n) = self.flank(p[0], pieces[0]), self.flank(p[1], pieces[1])
@@ -247,9 +241,8 @@ class Planar:
         """Return d(state)/dt."""
         torques, pushes, _, _ = self.forces(state)
         torques = torques - np.array(self.load(state[0]))
-        relative, rate = state[1] - state[0], state[7] - state[6]
         if self.gear is not None:
-            aside = relative - self.middle
+            aside = state[1] - state[0] - self.middle
             excess = abs(aside) - self.play
             width = self.rounding / self.radius
             t = np.clip(excess / width, 0, 1)
@@ -258,7 +251,7 @@ class Planar:
             taken_up = self.ramp(excess, width) + 2.5 * width * bump
             hold = self.gear.stiffness_N_m_per_rad * np.sign(aside) * taken_up
             engaged = t**2 * (3 - 2 * t) + 15 * bump
-            hold += self.gear_damping * engaged * rate
+            hold += self.gear_damping * engaged * (state[7] - state[6])
             torques += hold, -hold
         accelerations = torques / self.inertia
         if self.motor is None:
@@ -269,7 +262,7 @@ class Planar:
             accelerations[0] = (torques[0] + motor) / (self.inertia + self.motor.inertia_kg_m2)
         along = np.zeros(4)
         if self.supports is not None:
-            along[::2], along[1::2] = pushes.real, pushes.imag
+            along = np.stack([pushes.real, pushes.imag], axis=1).ravel()
             along -= 1e3 * self.supports.stiffness_N_per_mm * state[2:6]
             along -= 1e3 * self.supports.damping_N_s_per_mm * state[8:12]
             along /= self.mass

@@ -50,6 +50,6 @@ def _check_kinks(law, depth, rate):
         lines.append(((-0.3 * depth, speed), (1.7 * depth, 1.3 * speed)))
     found = along(lambda at: (law(*at)[None], law.switches(*at)), lines)
     for line, (values, slopes, flags) in zip(lines, found, strict=True):
-        missed, _ = unmarked(values, slopes, flags)
+        missed = unmarked(values, slopes, flags)
         assert missed.size == 0, f"kinks that no switch marks, on {line}: {missed}"
         assert np.any(flags[1:] != flags[:-1]), "a line through onset or release without a switch"

@@ -200,7 +200,8 @@ LAW = {"stiffness": 2.0e10, "exponent": 1.5, "loss": 0.4}
 @pytest.fixture(scope="module")
 def page(tmp_path_factory):
     """Return the page's modules of a part and a law by name."""
-    folder, names = tmp_path_factory.mktemp("outside"), ("coupling", "law")
+    folder = tmp_path_factory.mktemp("outside")
+    names = ("coupling", "law")
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(folder))
         for name in names:

@@ -43,7 +43,8 @@ over_designs = jax.jit(jax.vmap(jax.vmap(results, (None, 0, 0)), (0, None, None)
 
 def test_involute_contact_in_closed_form():
     """Where involute meets involute, both levers are the base radius and the gap is r cos α · ε."""
-    profile, base = cic(3, 0.62, 0.6, 0.06), R * np.cos(0.62)
+    profile = cic(3, 0.62, 0.6, 0.06)
+    base = R * np.cos(0.62)
     start, half = float(profile.involute_start), float(profile.half_pitch)
     designs = jnp.tile(jnp.array([0.62, profile.involute_length, 0.06]), (6, 1))
     rolls = jnp.linspace(start + 0.02, 2 * half - start - 0.02, 41)
@@ -248,7 +249,8 @@ def test_root_is_found_to_twelve_digits(name, error_mm):
     """T vanishes to 1e-12 of the pitch radius over ±20 mrad and ±0.3 mm of centre distance.
 
     This holds wherever T crosses zero smoothly. The two normals are parallel by construction."""
-    profile, rng = PROFILES[name], np.random.default_rng(0)
+    profile = PROFILES[name]
+    rng = np.random.default_rng(0)
     pair = paired(profile, 2 * R + error_mm * 1e-3)
     x = jnp.asarray(rng.uniform(0, float(profile.half_pitch), 4000))
     relative = jnp.asarray(rng.uniform(-0.02, 0.02, 4000))
@@ -324,7 +326,9 @@ slope, bend = jax.jit(gap_slope), jax.jit(jax.jacfwd(gap_slope))
 def test_second_derivatives_are_those_of_the_gap(name):
     """The Hessian of the gap in pose and centre distance equals differences of the first
     derivative."""
-    profile, step, scale = PROFILES[name], np.array([1e-6, 1e-6, 1e-9]), np.array([R, R, 1.0])
+    profile = PROFILES[name]
+    step = np.array([1e-6, 1e-6, 1e-9])
+    scale = np.array([R, R, 1.0])
     for roll in (0.3, 0.4, 0.62, 0.8):
         at = jnp.array([roll, -3e-4, 2 * R])
         found = np.asarray(bend(at, profile)) * R / np.outer(scale, scale)

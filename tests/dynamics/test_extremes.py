@@ -96,7 +96,8 @@ def test_steps_follow_the_scene(speed, stiffness):
     Steps of that length do not use up the allowed number."""
     config = config_of(scene__speed_rpm=speed, contact__stiffness_N_per_mm_e=stiffness)
     pair = pair_of(Scene.from_config(config), design_vector(config))
-    control, times = Integrator("tsit5", jnp.asarray(1e-8), 4096).controller(pair), pair.timescales
+    control = Integrator("tsit5", jnp.asarray(1e-8), 4096).controller(pair)
+    times = pair.timescales
     first, longest = float(control.first), float(control.base.dtmax)
     assert first == pytest.approx(min(1e-3, float(times.swing / pair.mesh_period) / 20))
     fall = float(times.fall / pair.mesh_period)

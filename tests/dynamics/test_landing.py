@@ -60,7 +60,8 @@ def parabola(place, rate, bend, time):
 def test_the_next_step_ends_just_beyond_the_edge(place, bend):
     """The next step ends just beyond the edge ε = 0; steps of 1/32 mesh period would pass it by
     far."""
-    step, rate = 0.004, -12.0 * np.sign(place)
+    step = 0.004
+    rate = -12.0 * np.sign(place)
     roots = np.roots([bend / 2, rate, place]) if bend else np.array([-place / rate])
     meets = min(float(r.real) for r in roots if abs(r.imag) < 1e-12 and r.real > 0)
     found = adapted(*(parabola(place, rate, bend, t) for t in (0.0, step)), step)
@@ -84,7 +85,8 @@ def test_a_step_ends_at_a_turn_beside_an_edge():
         assert keep
         stops.append(stop)
     # Far from every edge, the step is not limited.
-    assert stops[0] == pytest.approx(turn) < stops[1]
+    assert stops[0] == pytest.approx(turn)
+    assert stops[1] > turn
 
 
 @pytest.mark.parametrize("rtol", [1e-4, 1e-11])
@@ -133,7 +135,8 @@ def test_two_changes_at_one_instant():
     assert found.status is Status.PERIODIC
     assert found.statistics["gradient_disagreement"] < 1e-4
     # At the default tolerance, rounding alone changes the mean by 1e-8, and the difference by 1e-2.
-    sharp, slope = evaluator.at_tolerance(1e-11), 0.0
+    sharp = evaluator.at_tolerance(1e-11)
+    slope = 0.0
     for change in (step, -step):
         design = jnp.asarray([35.23, 5.77, 1.68] + change * way)
         end = sharp(design, start=found.state, series=False)

@@ -36,7 +36,8 @@ def test_the_mean_gas_torque_is_the_displaced_volume(family, overrides):
 
 def along(model, design, phi):
     """Return the torque on rotor 2, and the margins."""
-    gas, rest = model.pair(design).load, jnp.zeros(())
+    gas = model.pair(design).load
+    rest = jnp.zeros(())
 
     def each(phi):
         return gas.torque2(phi), gas.margins(Motion(phi, rest, rest, rest), jnp.zeros(0))

@@ -82,7 +82,8 @@ def test_objective_takes_the_lines_and_the_norm_as_weighted():
     baseline = evaluator(series=False)
     problem = Problem.of(config, evaluator.scene, baseline)
     assert problem.objective(baseline) == pytest.approx(1)
-    point, unit = problem.point(list(baseline.design.values())) * 0.99, np.array([1.0, -0.5, 0.5])
+    point = problem.point(list(baseline.design.values())) * 0.99
+    unit = np.array([1.0, -0.5, 0.5])
     down, here, up = (
         evaluator(problem.design(point + h * unit), series=False) for h in (-1e-4, 0.0, 1e-4)
     )
@@ -155,7 +156,8 @@ def test_gradients_are_those_of_differences(evaluator, found):
 
 def test_candidates_are_told_apart():
     """Three maxima, one of them at the seam, are distinguished from ripple on a plateau."""
-    places, ripple = np.linspace(0, 1, 201), 1e-9 * np.random.default_rng(0).normal(size=201)
+    places = np.linspace(0, 1, 201)
+    ripple = 1e-9 * np.random.default_rng(0).normal(size=201)
     ripple[-1] = ripple[0]
     forces = 2 + np.cos(2 * np.pi * places) + np.cos(6 * np.pi * places)
     for force in (forces, forces + ripple):

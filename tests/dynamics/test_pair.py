@@ -56,7 +56,8 @@ def test_limits_are_those_that_are_told():
 def test_friction_is_made_of_cubic_steps():
     """From -static to static, and on to kinetic: odd, bounded and smooth."""
     static, kinetic, low, high = 0.2, 0.1, 0.1, 1.0
-    law, speed = Friction(*map(jnp.asarray, (static, kinetic, low, high))), np.linspace(0, 3, 601)
+    law = Friction(*map(jnp.asarray, (static, kinetic, low, high)))
+    speed = np.linspace(0, 3, 601)
     shares = np.clip([(speed / low + 1) / 2, (speed - low) / (high - low)], 0, 1)
     rise, fall = 3 * shares**2 - 2 * shares**3
     expected = static * (2 * rise - 1) - (static - kinetic) * fall

@@ -84,7 +84,8 @@ def test_torque_of_a_gear_of_flanks_that_strike():
     """Mean, greatest and RMS torque are those of the formula of the gear along the series."""
     config = load("cic_drawn")
     found = Evaluator.of(config).at_tolerance(1e-10)()
-    gear, inertia = config.scene.timing_gear, float(evaluator().pair(config.design).inertia) / 2
+    gear = config.scene.timing_gear
+    inertia = float(evaluator().pair(config.design).inertia) / 2
     damping = 2 * gear.damping_ratio * np.sqrt(gear.stiffness_N_m_per_rad * inertia)
     beyond = np.abs(found.series.relative) - gear.backlash_mm / 2 / config.profile.pitch_radius_mm
     spring = gear.stiffness_N_m_per_rad * np.sign(found.series.relative) * np.maximum(beyond, 0)

@@ -106,7 +106,8 @@ def test_series_is_the_motion_over_one_revolution():
     """Uniform times cover a revolution and repeat with the mesh; forces act where flanks
     overlap. Mean, peak and RMS are those of the samples."""
     evaluation = settled("sharp")
-    series, force, count = evaluation.series, evaluation.series.force, len(evaluation.series.time)
+    series, force = evaluation.series, evaluation.series.force
+    count = len(series.time)
     np.testing.assert_allclose(series.time, 0.02 * np.arange(count) / count, rtol=1e-12)
     np.testing.assert_allclose(series.rotation, 2 * np.pi * np.arange(count) / count, rtol=1e-12)
     for part in (series.relative, series.rate):
@@ -164,7 +165,8 @@ def test_the_least_period_is_named(name, period):
 
     In the noisy scene the transient, at its coarser tolerance, never repeats to the settling
     threshold, and first seems to repeat after four periods."""
-    evaluation, series = settled(name), settled(name).series
+    evaluation = settled(name)
+    series = evaluation.series
     assert evaluation.steady_state["period"] == period
     # A gap of some 1e-5 m is the difference of lengths of 0.1 m: forces round at 1e-12.
     assert evaluation.steady_state["residual"] < 1e-11
