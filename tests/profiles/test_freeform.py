@@ -26,7 +26,6 @@ TIP = 2 * DEG
 SHARES = np.array([0.7, 0.9, 0.95, 0.8, 0.4, 0.1, -0.3])
 CIC_KEYS = "pressure_angle_deg: 36.43,\n          involute_length_mm: 8.0, tip_arc_angle_deg: 4.0"
 measure = jax.jit(geometry)
-looked = jax.jit(lambda profile, nu: (profile.support(nu), profile.lever(nu)))
 
 
 def made(family, *design):
@@ -80,15 +79,6 @@ def test_inverse_of_the_roll_angle_is_one_whatever_the_coefficients(profile):
         return made.normal_at(made.roll_angle(nu))
 
     np.testing.assert_allclose(slopes(jnp.asarray(SHARES)), 0, atol=1e-12)
-
-
-def test_ee_is_a_free_form_of_equal_coefficients():
-    """For any number of lobes, EE has the coefficients N / (1 + N) throughout."""
-    for lobes in (2, 5):
-        same = FreeForm(lobes, R, 0.0, np.full(5, lobes / (1 + lobes)))
-        nu = jnp.linspace(0.01, 1.05 * float(same.pitch_normal), 20)
-        for one, two in zip(looked(same, nu), looked(EE(lobes, R), nu), strict=True):
-            np.testing.assert_allclose(one, two, rtol=1e-13, atol=1e-15)
 
 
 @pytest.mark.parametrize(

@@ -60,12 +60,6 @@ def test_rule_integrates_polynomials():
         np.testing.assert_allclose(GAUSS.weights @ GAUSS.nodes**degree, 1 / (degree + 1))
 
 
-def test_motion_is_that_of_the_polynomials():
-    tau = jnp.asarray([0.0, 0.111, 0.5, 0.99, 1.3])
-    found = jax.vmap(_wave(np.linspace(0, 1, 13)).motion)(tau)[:, 0]
-    np.testing.assert_allclose(found, np.sin(2 * np.pi * tau), atol=1e-6)
-
-
 def test_motion_moves_to_another_mesh():
     """Elements aligned with events begin at the events, start away from them, and keep the
     motion."""
@@ -82,7 +76,7 @@ def test_motion_moves_to_another_mesh():
         assert np.min(np.abs(places - event)) < 1e-12
     assert np.min(np.abs(np.mod(begin[0] - np.array([0.1, 0.62, 1.0]), 1.0))) > 0.1
     assert set(np.asarray(new.mesh.which).tolist()) == {-1, 4, 5, 6}
-    tau = np.random.default_rng(0).uniform(0, 1, 20)
+    tau = np.random.default_rng(0).uniform(0, 1.3, 20)
     found = jax.jit(jax.vmap(new.motion))(tau)[:, 0]
     np.testing.assert_allclose(found, np.sin(2 * np.pi * tau), atol=2e-6)
     back = jax.jit(moved)(new, elements.mesh)
