@@ -51,8 +51,7 @@ def check_contact(contact, profile, outline, deepest, gap_error, lever_error=1e-
     _, *again, _ = _look(contact, rolls + 4 * half, relatives)
     _, *other, _ = _look(contact, 2 * half - rolls, relatives)
     for found, first in ((again, (gap, lever1, lever2)), (other, (gap, lever2, lever1))):
-        difference = np.subtract(found, first)[:, deep]
-        np.testing.assert_allclose(difference, 0, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(np.subtract(found, first)[:, deep], 0, rtol=0, atol=1e-9)
     wild = _look(contact, rng.uniform(-50, 50, 80), rng.uniform(-0.3, 0.3, 80))
     assert all(np.all(np.isfinite(x)) for x in wild)
     if contact.smooth:

@@ -1,5 +1,5 @@
-"""Tests of integrations: their steps and methods, what they compile, what a batch shares, where steps
-end in free flight, and the check of derivatives."""
+"""Tests of integrations: steps and methods, what they compile, what a batch shares, where steps end
+in free flight, and the check of derivatives."""
 
 import dataclasses
 import functools

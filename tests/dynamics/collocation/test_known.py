@@ -184,8 +184,7 @@ def test_a_jump_of_the_contact_is_an_event():
     Other changes of segment are events of their own. The events are those of a search at many
     instants."""
     config = rootsopt.load_config("cic_drawn", ARCS)
-    design = jnp.asarray(config.design, float)
-    pair = eqx.filter_jit(Scene.pair)(Scene.from_config(config), design)
+    pair = eqx.filter_jit(Scene.pair)(Scene.from_config(config), jnp.asarray(config.design, float))
     count = 240
     edges = jnp.linspace(0.0, 1.0, count + 1)
     mesh = Mesh(
@@ -273,8 +272,7 @@ def test_a_mesh_is_refined_only_if_the_finer_one_says_something_new(used, meshes
         **{"orbit": orbit, "known": start._replace(elements=coarse)},
         **{"elements": motion, "meshes": jnp.asarray(meshes)},
     }
-    equation = SimpleNamespace(top=jnp.ones(()))
-    loop = _Crowded(equation, None, None, start, None, jnp.asarray(1e-7))
+    loop = _Crowded(SimpleNamespace(top=jnp.ones(())), None, None, start, None, jnp.asarray(1e-7))
     assert bool(loop.keep(Loop(**now), finer, motion).over) is ends
 
 
