@@ -44,7 +44,6 @@ def _check_inverse(law, depth, sharp):
 
 
 def _check_kinks(law, depth, rate):
-    """Check that every kink along lines through onset and release is marked."""
     lines = [((0.8 * depth, -4 * rate), (0.9 * depth, 3 * rate))]
     for speed in rate * np.array([-3.0, -1.0, 0.0, 1.0]):
         lines.append(((-0.3 * depth, speed), (1.7 * depth, 1.3 * speed)))

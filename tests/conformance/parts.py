@@ -121,7 +121,6 @@ def _check_power(part, cases, energy, supply, losses):
 
 
 def _check_kinks(part, rng, reach, axes):
-    """Check that every kink of the part's actions along lines through its states is marked."""
     lines = [[draw(part, rng, 2 * reach, axes) for _ in range(2)] for _ in range(6)]
 
     def function(point):
@@ -134,7 +133,6 @@ def _check_kinks(part, rng, reach, axes):
 
 
 def _check_drag(part):
-    """Check that drag opposes the sliding and that its kinks are marked."""
     speeds = np.random.default_rng(2).normal(size=50) * np.geomspace(1e-3, 10, 50)
     drag = jax.jit(jax.vmap(lambda v: part.drag(jnp.asarray(100.0), v)))(jnp.asarray(speeds))
     assert np.all(np.asarray(drag) * speeds >= 0)

@@ -135,8 +135,6 @@ class Absent(Part):
 
 
 def test_what_a_part_leaves_alone_costs_nothing():
-    """A part without overrides adds no state, equation or number: the program is that without
-    it."""
     pair = oscillator()
     assert size(dataclasses.replace(pair, parts=(Absent(), Absent()))) == size(pair)
 

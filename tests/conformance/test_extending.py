@@ -93,7 +93,6 @@ def test_family_given_by_its_law_conforms(early_fall, holds):
 
 @pytest.mark.parametrize("holds", suite.CHECKS, ids=lambda one: one.__name__)
 def test_family_conforms(blunt_cycloid, holds):
-    """A family from outside passes the checks of the package's own families."""
     holds(blunt_cycloid.stem)
 
 
@@ -104,7 +103,6 @@ DESIGN = (
 
 
 def test_family_is_known_to_a_command_by_its_file(blunt_cycloid, tmp_path):
-    """A new process knows the family with the option `--import`, and does not know it without."""
     call = [sys.executable, "-m", "rootsopt.profile", "configs/ee.yaml", "--no-figures", *DESIGN]
     call += ["-o", str(tmp_path / "out")]
     run = functools.partial(subprocess.run, capture_output=True, text=True, cwd=ROOT, check=False)
@@ -138,7 +136,6 @@ def test_file_that_fails_is_one_line(tmp_path, text, words):
 
 
 def test_installed_package_is_found_by_its_entry_point(tmp_path, monkeypatch):
-    """A config that names an unknown family loads the installed package that offers it."""
     (tmp_path / "offered.py").write_text(
         block_of("blunt_cycloid.py", 60).replace("blunt_cycloid", "offered_cycloid"),
         encoding="utf-8",

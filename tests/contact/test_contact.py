@@ -56,7 +56,6 @@ def test_involute_contact_in_closed_form():
 
 @pytest.mark.parametrize("involute", [8.0e-3, 6.0e-3])
 def test_design_derivatives_of_gap_and_levers(involute):
-    """Derivatives in (α, u, θ1) agree with central differences, and forward with reverse mode."""
     design = jnp.array([36.43 * DEG, involute, 4.0 * DEG])
     rolls = jnp.linspace(0.085, np.pi / 3 - 0.085, 41)
     relatives = jnp.asarray(-(10.0 ** np.random.default_rng(6).uniform(-5, -2, 41)))
@@ -324,8 +323,6 @@ slope, bend = jax.jit(gap_slope), jax.jit(jax.jacfwd(gap_slope))
 
 @pytest.mark.parametrize("name", ["paper", "short", "epicycloid"])
 def test_second_derivatives_are_those_of_the_gap(name):
-    """The Hessian of the gap in pose and centre distance equals differences of the first
-    derivative."""
     profile = PROFILES[name]
     step = np.array([1e-6, 1e-6, 1e-9])
     scale = np.array([R, R, 1.0])

@@ -64,7 +64,6 @@ def held():
 
 
 def test_a_pair_held_by_its_gear_is_idle(held):
-    """The orbit is known and stable; the forces and their derivatives are exactly zero."""
     assert (held.status, held.usable) == (Status.IDLE, True)
     assert held.steady_state["kind"] == "idle"
     assert held.steady_state["floquet_multiplier"] < 0.1
@@ -80,7 +79,6 @@ def test_a_pair_held_by_its_gear_is_idle(held):
     ("scene.timing_gear.backlash_mm", "backlash_reserve_mm"),
 ])  # fmt: skip
 def test_flanks_touch_where_the_reserve_is_used_up(held, key, name):
-    """Just before the reserve is used up the pair is idle; just beyond it there is a force."""
     unit, sign = (-1e-3, -1) if name.endswith("um") else (1.0, 1)
     end = held.response[name] * unit + config_of("contact.clearance_mm=0.3").value(key)
     for step, status in ((-2e-4, Status.IDLE), (2e-4, Status.PERIODIC)):
@@ -91,7 +89,6 @@ def test_flanks_touch_where_the_reserve_is_used_up(held, key, name):
 
 
 def test_optimize_says_what_to_minimise_instead(tmp_path, capsys):
-    """A force that is 0 cannot be an objective; the message names those that can."""
     arguments = [CIC, "-o", str(tmp_path / "out"), "--set", "contact.clearance_mm=0.3"]
     assert optimize.main([*arguments, "--no-figures"]) == 2
     said = " ".join(capsys.readouterr().err.split())
@@ -116,7 +113,6 @@ def window(peak, exponent):
 
 @pytest.mark.parametrize("exponent", [0.5, 0.0])
 def test_a_motion_without_contact_that_does_not_repeat_is_idle(exponent):
-    """The motion is idle whether or not the gear's backlash makes it chaotic."""
     evaluator = Evaluator.of(config_of())
     pair = evaluator.pair(design_vector(evaluator.config))
     touching = (Status.CHAOTIC, "chaotic") if exponent else (Status.NOT_SETTLED, "transient")
@@ -169,7 +165,6 @@ def test_slowly_fading_disturbances_are_named():
 
 
 def test_the_message_names_what_holds_the_flanks_apart():
-    """It names the backlash at which they touch, or the clearance if that is not known."""
     wide, tight = "contact.clearance_mm=0.3", "contact.clearance_mm=0.01"
     most = config_of().scene.timing_gear.backlash_mm + 0.25
     held, above = "The timing gear keeps the flanks apart", "scene.timing_gear.backlash_mm above"
@@ -247,7 +242,6 @@ def test_an_idle_speed_counts_as_zero():
 
 
 def test_a_speed_without_share_has_nothing_to_be_relative_to():
-    """A line that is 0 at a speed without share causes no error there, and has no objective."""
     config = config_of("objective.speeds_rpm=[2000]", "objective.line_weights={1: 1}")
     with_line, without = FORCES | {LINE: 3.0}, FORCES | {LINE: 0.0}
     baseline = several(without, with_line)

@@ -100,7 +100,6 @@ def test_a_line_the_baseline_has_not_got_is_refused():
 
 @given(st.integers(1, 5), st.integers(0, 2**32 - 1))
 def test_spectral_radius(count, seed):
-    """The result agrees with NumPy's eigenvalues, for any number of states."""
     matrix = np.random.default_rng(seed).normal(size=(count, count))
     expected = np.max(np.abs(np.linalg.eigvals(matrix)))
     assert float(spectral_radius(jnp.asarray(matrix))) == pytest.approx(expected, rel=1e-8)

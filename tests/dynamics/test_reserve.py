@@ -81,7 +81,6 @@ def test_torque_of_a_gear_that_carries_a_constant_load():
 
 
 def test_torque_of_a_gear_of_flanks_that_strike():
-    """Mean, greatest and RMS torque are those of the formula of the gear along the series."""
     config = load("cic_drawn")
     found = Evaluator.of(config).at_tolerance(1e-10)()
     gear = config.scene.timing_gear
@@ -146,7 +145,6 @@ def test_share_of_machines_that_touch_has_a_closed_form(monkeypatch):
 
 
 def test_a_search_without_forces_simulates_nothing(monkeypatch):
-    """It compiles no equation of motion, and finds a design with less ripple."""
 
     def moved(*arguments, **named):
         raise AssertionError("nothing may move")
@@ -161,7 +159,6 @@ def test_a_search_without_forces_simulates_nothing(monkeypatch):
 
 @pytest.mark.long
 def test_a_reserve_limits_a_search():
-    """The limit holds at the optimum, where it has a price."""
     least = held().response["contact_reserve_um"] + 1.0
     limit = f"constraints.terms={{contact_reserve_um: {{min: {least}}}}}"
     found = rootsopt.optimize_design(load("cic_drawn", [*QUICK, "optimizer.iterations=12", limit]))

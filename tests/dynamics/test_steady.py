@@ -26,7 +26,6 @@ NAMES = {
 
 
 def gear(**changes):
-    """Return overrides for a scene with another gear, load or speed."""
     return [f"scene.{NAMES[key]}={value}" for key, value in changes.items()]
 
 

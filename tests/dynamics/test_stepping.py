@@ -94,7 +94,6 @@ def test_an_integration_that_does_not_reach_the_end_says_so(gravity, max_steps):
 
 
 def test_solvers_agree():
-    """All methods give the same mean, peak and RMS force on the CIC orbit."""
     config = load("configs/cic_drawn.yaml")
     found = []
     pair = eqx.filter_jit(Scene.pair)(Scene.from_config(config), design_vector(config))
@@ -142,7 +141,6 @@ def test_no_callback_to_python_in_an_integration():
 
 @pytest.mark.parametrize("taken", [[True] * 3, [False] * 3, [True, False, True]])
 def test_branches_of_a_batch_on_a_gpu(monkeypatch, taken):
-    """A batch computes only the branches that one of its motions takes."""
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     made = set()
 

@@ -69,7 +69,6 @@ def case(family, one):
     ("family", "holds"), itertools.starmap(case, itertools.product(FAMILIES, suite.CHECKS))
 )
 def test_conforms(family, holds):
-    """Every family that the package registers passes the suite."""
     holds(family)
 
 
@@ -324,7 +323,6 @@ def test_land_is_equation_1_and_its_mate_the_circle_that_touches_it(profile):
 
 @pytest.mark.parametrize("profile", [PAPER, cic(2, 0.75, 0.8, 0.08), EE(3, R)])
 def test_outline_is_closed_counter_clockwise_and_starts_at_a_tip(profile):
-    """Contract of the outline: closed, counter-clockwise, the first vertex the tip on +x."""
     points = np.asarray(outline(profile, 150))
     np.testing.assert_array_equal(points[0], points[-1])
     assert points[0] == pytest.approx([float(measure(profile).outer_radius), 0], abs=1e-15)

@@ -130,9 +130,6 @@ def test_what_is_wrong_with_a_config_is_said(override, words):
 
 
 def test_profile_that_does_not_mesh_is_refused():
-    """Profiles that do not mesh are refused before anything is simulated.
-
-    Examples are a dent, and a pressure angle that falls below 0."""
     for shares, word in (([1, 1, 1, 1, 1, 1, -1], "convex"), ([0.8] * 7, "sound")):
         with pytest.raises(InputError, match=word):
             check(free(f"profile.coefficients={shares}").profile)
@@ -172,7 +169,6 @@ def test_profile_command_projects(tmp_path, capsys):
 
 @pytest.mark.parametrize("family", [pytest.param("four_arcs", marks=pytest.mark.long), "free_form"])
 def test_points_of_any_box_become_sound_profiles(family):
-    """Every sample inside the bounds is moved to a profile that can be made."""
     limits = "constraints.area_efficiency_min=0.42", "constraints.seal_width_min_mm=0"
     settings = free(*limits, family=family)
     model, design = Scene.from_config(settings), design_vector(settings)
