@@ -14,7 +14,7 @@ from rootsopt.profiles.epicycloid import EE
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.sensitivity import by_scene
 from rootsopt.status import Status
-from tests.dynamics.test_measures import ALL
+from tests.dynamics.test_steady import ALL
 
 FORCES = ("mean_force_N", "peak_force_N", "rms_force_N")
 SHARP = ("solver.rtol=1e-12", *ALL)
