@@ -4,7 +4,7 @@ Every body has three coordinates. Contact is a pair of points on two curves, and
 that act there. State: φ1, φ2 (rad, each in its own sense of rotation), the displacements x1, y1,
 x2, y2 of the axes (m), then the six rates; time in seconds. The laws are those of DESIGN.md."""
 
-from typing import NamedTuple
+from collections import namedtuple
 
 import numpy as np
 
@@ -83,14 +83,8 @@ class Flank:
         return turn * place, turn * np.exp(1j * (np.pi / 2 - psi))
 
 
-class Touch(NamedTuple):
-    """Hold a closest approach: a point on each rotor, the normal from rotor 1 to rotor 2, the
-    gap."""
-
-    first: complex
-    second: complex
-    normal: complex
-    gap: float
+# A closest approach: a point on each rotor, the normal from rotor 1 to rotor 2, the gap.
+Touch = namedtuple("Touch", "first second normal gap")
 
 
 class Planar:
