@@ -40,7 +40,7 @@ PROFILES = {
 )
 def test_contacts(two_sided, family, graded_outline):
     profile = PROFILES[family]
-    distance = 2 * R if two_sided else None
+    distance = jnp.asarray(2 * R) if two_sided else None
     contact = eqx.filter_jit(SearchContact.of)(profile, distance, two_sided=two_sided)
     check_contact(contact, profile, graded_outline(profile, 1000), -2e-3, 2e-8, 1e-9)
 

@@ -121,7 +121,8 @@ def test_gradient_of_forces_is_that_of_differences():
     def found(change, start):
         def forces(change):
             by = change * units
-            moved = [x + d for x, d in zip(_leaves(scene), (by[:2], by[2:4], by[4]), strict=True)]
+            changed = zip(_leaves(scene), (by[:2], by[2:4], by[4]), strict=True)
+            moved = tuple(x + d for x, d in changed)
             response = rootsopt.steady_response(
                 eqx.tree_at(_leaves, scene, moved), design.at[0].add(by[5]), start
             )
