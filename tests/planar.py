@@ -4,7 +4,7 @@ Every body has three coordinates. Contact is a pair of points on two curves, and
 that act there. State: φ1, φ2 (rad, each in its own sense of rotation), the displacements x1, y1,
 x2, y2 of the axes (m), then the six rates; time in seconds. The laws are those of DESIGN.md."""
 
-from typing import NamedTuple
+from collections import namedtuple
 
 import numpy as np
 
@@ -71,8 +71,7 @@ class Flank:
 
     def __call__(self, p, number):
         """Return the point and the outward normal at p, on piece `number` or its continuation."""
-        count = len(self.pieces)
-        if number < count:
+        if number < len(self.pieces):
             beta, psi, s = self.pieces[number](p - number)
         else:
             # The dedendum meshes with the addendum in reverse.
@@ -84,14 +83,8 @@ class Flank:
         return turn * place, turn * np.exp(1j * (np.pi / 2 - psi))
 
 
-class Touch(NamedTuple):
-    """Hold a closest approach: a point on each rotor, the normal from rotor 1 to rotor 2, the
-    gap."""
-
-    first: complex
-    second: complex
-    normal: complex
-    gap: float
+# A closest approach: a point on each rotor, the normal from rotor 1 to rotor 2, the gap.
+Touch = namedtuple("Touch", "first second normal gap")
 
 
 class Planar:
@@ -103,13 +96,9 @@ class Planar:
         self.radius, self.lobes = self.flank.radius, config.profile.lobes
         self.inertia, self.mass = inertia, mass
         self.distance = 2 * self.radius + 1e-3 * (scene.center_distance_error_mm or 0.0)
-        self.exponent = law.exponent
-        self.stiffness = law.stiffness_N_per_mm_e * 1e3**law.exponent
-        self.damping = law.max_damping_N_s_per_mm * 1e3
-        self.full = law.full_damping_depth_mm * 1e-3
+        self.law = law
         self.rounding = law.smoothing_mm * 1e-3
         self.clearance = law.clearance_mm * 1e-3
-        self.friction = law.friction
         self.speed = scene.speed_rpm * 2 * np.pi / 60
         # Torques against the rotors at φ1.
         self.load = load or (lambda phi: (0.0, scene.load.torque_N_m))
@@ -129,15 +118,16 @@ class Planar:
 
     def normal_force(self, depth, closing):
         delta = self.ramp(depth, self.rounding)
+        full = self.law.full_damping_depth_mm * 1e-3
         if delta == 0:
             return 0.0
-        x = min(delta / self.full, 1.0)
-        spring = self.stiffness * delta**self.exponent
-        kept = 1 + self.damping * (3 * x**2 - 2 * x**3) * closing / spring
-        return spring * self.ramp(kept, min(self.rounding / self.full, 1.0))
+        x = min(delta / full, 1.0)
+        spring = self.law.stiffness_N_per_mm_e * (1e3 * delta) ** self.law.exponent
+        damping = 1e3 * self.law.max_damping_N_s_per_mm * (3 * x**2 - 2 * x**3)
+        return spring * self.ramp(1 + damping * closing / spring, min(self.rounding / full, 1.0))
 
     def coefficient(self, sliding):
-        law = self.friction
+        law = self.law.friction
         if law is None:
             return 0.0
         low, high = 1e-3 * law.stiction_speed_mm_s, 1e-3 * law.friction_speed_mm_s
@@ -181,16 +171,13 @@ class Planar:
 
         places, nodes, normals = self.flank.nodes
         z1, z2 = axes[0] + first(nodes), axes[1] + second(nodes)
-        n2 = second(normals)
-        apart = z1[:, None] - z2[None, :]
-        nearest = np.argmin(abs(apart), axis=1)
-        apart = apart[np.arange(len(z1)), nearest]
-        signed = dot(n2[nearest], apart)
-        signed[abs(cross(n2[nearest], apart)) > 0.05 * self.radius] = np.inf
+        nearest = np.argmin(abs(z1[:, None] - z2[None, :]), axis=1)
+        apart, n2 = z1 - z2[nearest], second(normals)[nearest]
+        signed = np.where(abs(cross(n2, apart)) > 0.05 * self.radius, np.inf, dot(n2, apart))
         # Each local minimum along rotor 1 may be the least distance; far ones do not touch.
-        reach = self.clearance + 5e-4 * self.radius
         around = np.pad(signed, 1, constant_values=np.inf)
-        dips = (signed <= around[:-2]) & (signed <= around[2:]) & (signed < reach)
+        dips = (signed <= around[:-2]) & (signed <= around[2:])
+        dips &= signed < self.clearance + 5e-4 * self.radius
 
         def at(p, pieces):
             (a, m), (b, n) = self.flank(p[0], pieces[0]), self.flank(p[1], pieces[1])
@@ -238,8 +225,7 @@ class Planar:
             depth = -touch.gap - self.clearance
             normal = self.normal_force(depth, dot(touch.normal, slip))
             along = 1j * touch.normal
-            drag = self.coefficient(dot(along, slip)) * normal
-            force = normal * touch.normal + drag * along
+            force = normal * (touch.normal + self.coefficient(dot(along, slip)) * along)
             torques += cross(arm1, -force), -cross(arm2, force)
             pushes += [-force, force]
             total, deepest = total + normal, max(deepest, depth)
@@ -249,18 +235,17 @@ class Planar:
         """Return d(state)/dt."""
         torques, pushes, _, _ = self.forces(state)
         torques = torques - np.array(self.load(state[0]))
-        relative, rate = state[1] - state[0], state[7] - state[6]
         if self.gear is not None:
-            aside = relative - self.middle
+            aside = state[1] - state[0] - self.middle
             excess = abs(aside) - self.play
             width = self.rounding / self.radius
             t = np.clip(excess / width, 0, 1)
             # Cubic roundings, and as much of t² (1 - t)² as restores the integral.
             bump = t**2 * (1 - t) ** 2
             taken_up = self.ramp(excess, width) + 2.5 * width * bump
-            engaged = t**2 * (3 - 2 * t) + 15 * bump
             hold = self.gear.stiffness_N_m_per_rad * np.sign(aside) * taken_up
-            hold += self.gear_damping * engaged * rate
+            engaged = t**2 * (3 - 2 * t) + 15 * bump
+            hold += self.gear_damping * engaged * (state[7] - state[6])
             torques += hold, -hold
         accelerations = torques / self.inertia
         if self.motor is None:
@@ -271,7 +256,7 @@ class Planar:
             accelerations[0] = (torques[0] + motor) / (self.inertia + self.motor.inertia_kg_m2)
         along = np.zeros(4)
         if self.supports is not None:
-            along[::2], along[1::2] = pushes.real, pushes.imag
+            along = np.stack([pushes.real, pushes.imag], axis=1).ravel()
             along -= 1e3 * self.supports.stiffness_N_per_mm * state[2:6]
             along -= 1e3 * self.supports.damping_N_s_per_mm * state[8:12]
             along /= self.mass

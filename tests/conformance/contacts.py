@@ -39,22 +39,19 @@ def check_contact(contact, profile, outline, deepest, gap_error, lever_error=1e-
     relatives = deepest * rng.uniform(0.05, 1, 80)
     _, gap, lever1, lever2, slopes = (np.asarray(x) for x in _look(contact, rolls, relatives))
     deep = gap < -1e-7
-    assert np.mean(deep) > 0.4
     distance = 2 * float(profile.pitch_radius)
-    expected = [
-        pair_gap(outline, lobes, distance, -x - e / 2, -x + e / 2)
-        for x, e in zip(rolls[deep][:25], relatives[deep][:25], strict=True)
-    ]
-    np.testing.assert_allclose(gap[deep][:25], expected, rtol=0, atol=gap_error)
+    assert np.mean(deep) > 0.4
+    for x, e, found in np.stack([rolls, relatives, gap], 1)[deep][:25]:
+        expected = pair_gap(outline, lobes, distance, -x - e / 2, -x + e / 2)
+        assert found == pytest.approx(expected, abs=gap_error, rel=0)
     # Virtual work: d gap = -lever1 dφ1 + lever2 dφ2.
     np.testing.assert_allclose(-lever1[deep], slopes[deep, 0], rtol=0, atol=lever_error)
     np.testing.assert_allclose(lever2[deep], slopes[deep, 1], rtol=0, atol=lever_error)
     # The gap is the same one mesh period later, and with the rotors exchanged.
-    again = [np.asarray(x) for x in _look(contact, rolls + 4 * half, relatives)[1:4]]
-    other = [np.asarray(x) for x in _look(contact, 2 * half - rolls, relatives)[1:4]]
-    for found in (again, [other[0], other[2], other[1]]):
-        for one, first in zip(found, (gap, lever1, lever2), strict=True):
-            np.testing.assert_allclose(one[deep], first[deep], rtol=0, atol=1e-9)
+    _, *again, _ = _look(contact, rolls + 4 * half, relatives)
+    _, *other, _ = _look(contact, 2 * half - rolls, relatives)
+    for found, first in ((again, (gap, lever1, lever2)), (other, (gap, lever2, lever1))):
+        np.testing.assert_allclose(np.subtract(found, first)[:, deep], 0, rtol=0, atol=1e-9)
     wild = _look(contact, rng.uniform(-50, 50, 80), rng.uniform(-0.3, 0.3, 80))
     assert all(np.all(np.isfinite(x)) for x in wild)
     if contact.smooth:
@@ -73,9 +70,8 @@ def _check_kinks(contact, half, deepest):
 
     lines = [((0.0, share * deepest), (2 * half, 0.9 * share * deepest)) for share in (0.3, 0.9)]
     for values, slopes, flags in along(function, lines):
-        touches = flags[:, -1]
-        missed, _ = unmarked(values, slopes, flags)
-        missed = missed[touches[missed] & touches[missed + 1]]
+        missed = unmarked(values, slopes, flags)
+        missed = missed[flags[missed, -1] & flags[missed + 1, -1]]
         assert missed.size == 0, f"kinks of the levers that no switch marks: {missed}"
 
 
@@ -85,10 +81,9 @@ def _check_place(contact, roll, relative):
     def known(roll, relative):
         found = contact.approach(roll, relative)
         point = contact.point(roll, relative, found)
-        there = lambda distance: contact.at_distance(distance)(roll, relative)[0]  # noqa: E731
-        by_distance = jax.grad(there)(contact.center_distance)
         gap = contact.center_distance * point.radial - point.support1 - point.support2
-        return found.gap - gap, by_distance - point.radial
+        by_distance = jax.grad(lambda distance: contact.at_distance(distance)(roll, relative)[0])
+        return found.gap - gap, by_distance(contact.center_distance) - point.radial
 
     try:
         errors = jax.jit(known)(jnp.asarray(roll), jnp.asarray(relative))

@@ -50,9 +50,8 @@ def kinks(values, slopes):
 
 
 def unmarked(values, slopes, flags):
-    """Return the indices of kinks without a change of flags, and the number of kinks with one."""
-    seen = kinks(values, slopes)
+    """Return the indices of kinks without a change of flags."""
     marked = np.any(flags[1:] != flags[:-1], axis=1)
     # A kink exactly on a point appears in the neighbouring interval.
     near = marked | np.roll(marked, 1) | np.roll(marked, -1)
-    return np.flatnonzero(seen & ~near), int(np.sum(seen & near))
+    return np.flatnonzero(kinks(values, slopes) & ~near)

@@ -33,32 +33,16 @@ PROFILES = {
     "cic": CIC(3, R, np.radians(36.43), 8.0e-3, np.radians(4.0)),
     "ee": EE(3, R),
 }
-DEEPEST = -2e-3
-CONTACTS = {
-    # Name: (maker, error of the gap (m), error of the levers as its derivatives (m)).
-    "search": (SearchContact.of, 2e-8, 1e-9),
-    "two-sided search": (
-        lambda profile: SearchContact.of(profile, 2 * profile.pitch_radius, two_sided=True),
-        2e-8,
-        1e-9,
-    ),
-}
-
-
-@eqx.filter_jit
-def built(make, profile):
-    return make(profile)
 
 
 @pytest.mark.parametrize(
-    ("name", "family"),
-    [("search", "cic"), ("two-sided search", "cic"), ("two-sided search", "ee")],
+    ("two_sided", "family"), [(False, "cic"), (True, "cic"), (True, "ee")], ids=str
 )
-def test_contacts(name, family, graded_outline):
-    make, gap_error, lever_error = CONTACTS[name]
+def test_contacts(two_sided, family, graded_outline):
     profile = PROFILES[family]
-    contact = built(make, profile)
-    check_contact(contact, profile, graded_outline(profile, 1000), DEEPEST, gap_error, lever_error)
+    distance = jnp.asarray(2 * R) if two_sided else None
+    contact = eqx.filter_jit(SearchContact.of)(profile, distance, two_sided=two_sided)
+    check_contact(contact, profile, graded_outline(profile, 1000), -2e-3, 2e-8, 1e-9)
 
 
 def law(exponent, smoothing):
@@ -99,16 +83,16 @@ def against(part, motion, own):
     return -first * motion.speed - part.torque2(motion.phi) * (motion.speed + motion.rate)
 
 
-def gas(family):
-    profile = PROFILES[family]
-    return GasLoad(*arrays(4e3), profile, geometry(profile).outer_radius, *arrays(5))
-
-
 PARTS = {
     "prescribed drive": (lambda: PrescribedDrive(*arrays(SPEED)), {}),
     "motor": (lambda: MotorDrive(*arrays(SPEED, 5, 0.1, 1e-3)), {"supply": driven}),
     "load": (lambda: ConstantLoad(*arrays(5)), {"supply": against}),
-    "gas": (lambda: gas("cic"), {"supply": against}),
+    "gas": (
+        lambda: GasLoad(
+            *arrays(4e3), PROFILES["cic"], geometry(PROFILES["cic"]).outer_radius, *arrays(5)
+        ),
+        {"supply": against},
+    ),
     "sharp gear": (
         lambda: TimingGear(*arrays(2e4, 1.7, 1.5e-3, 0, 4e-4)),
         {"energy": held, "losses": rubbed},
@@ -135,8 +119,6 @@ class Absent(Part):
 
 
 def test_what_a_part_leaves_alone_costs_nothing():
-    """A part without overrides adds no state, equation or number: the program is that without
-    it."""
     pair = oscillator()
     assert size(dataclasses.replace(pair, parts=(Absent(), Absent()))) == size(pair)
 

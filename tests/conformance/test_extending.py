@@ -1,17 +1,24 @@
-"""Tests that execute docs/extending.md: its files pass the suites of the package's own objects."""
+"""Tests that execute docs/extending.md: its files pass the suites of the package's own objects.
+
+Motions with its part and its law conserve energy and have correct gradients."""
 
 import functools
+import importlib
 import json
 import re
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from experiments._common.shooting import closed, differentiated
+from rootsopt import steady_response
 from rootsopt.config import load
 from rootsopt.config.families import (
     Family,
@@ -21,26 +28,33 @@ from rootsopt.config.families import (
     register_family,
 )
 from rootsopt.config.sources import import_named
+from rootsopt.dynamics.parts import Context
 from rootsopt.errors import InputError
+from rootsopt.scene import Scene
 from rootsopt.scene.families import profile_of
+from rootsopt.status import Status
 from tests.conformance import families as suite
+from tests.conformance.laws import check_law
+from tests.conformance.parts import check_in_pair, check_part
 from tests.standins import for_a_time
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
-MOST_LINES = 60, 35
+BLOCK = re.compile(r"^```python ?(\S*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 
 
-def block_of(name):
-    """Return the code block of the page that begins with a file's name."""
-    blocks = re.findall(r"^```python\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
-    return next(block for block in blocks if block.startswith(f'"""{name}'))
+def block_of(name, most):
+    """Return the code block of the page that is a file, of no more lines than `most`."""
+    blocks = BLOCK.findall(PAGE)
+    text = next(text for title, text in blocks if title == name or text.startswith(f'"""{name}'))
+    assert len(text.splitlines()) <= most
+    return text
 
 
-def imported(name, folder):
+def imported(name, folder, most):
     """Write the file `name` of the page into a folder, import it and return its path."""
     path = folder / name
-    path.write_text(block_of(name), encoding="utf-8")
+    path.write_text(block_of(name, most), encoding="utf-8")
     import_named(str(path))
     return path
 
@@ -49,18 +63,13 @@ def imported(name, folder):
 def blunt_cycloid(tmp_path_factory):
     """Return the path of the family's file, after importing it."""
     with for_a_time():
-        yield imported("blunt_cycloid.py", tmp_path_factory.mktemp("family"))
+        yield imported("blunt_cycloid.py", tmp_path_factory.mktemp("family"), 60)
 
 
 @pytest.fixture(scope="module")
 def early_fall(blunt_cycloid):
     """Return the path of the file of the family given by its law, after importing it."""
-    return imported("early_fall.py", blunt_cycloid.parent)
-
-
-def test_families_are_short(blunt_cycloid, early_fall):
-    for path, most in zip((blunt_cycloid, early_fall), MOST_LINES, strict=True):
-        assert len(path.read_text(encoding="utf-8").splitlines()) <= most
+    return imported("early_fall.py", blunt_cycloid.parent, 35)
 
 
 def test_law_of_the_roll_angle_gives_the_closed_form(early_fall):
@@ -72,13 +81,9 @@ def test_law_of_the_roll_angle_gives_the_closed_form(early_fall):
         profile = profile_of(name, 3, jnp.asarray(1.0), jnp.asarray(design))
         return jax.vmap(lambda nu: jnp.stack([profile.lever(nu), profile.support(nu)]))(nu)
 
-    np.testing.assert_allclose(
-        values("early_fall", 3.0, 20.0, 0.0), values("blunt_cycloid", 3.0, 20.0), atol=1e-9
-    )
-    assert (
-        np.max(np.abs(values("early_fall", 3.0, 20.0, 0.3) - values("blunt_cycloid", 3.0, 20.0)))
-        > 1e-2
-    )
+    even, other = (values("early_fall", 3.0, 20.0, fall) for fall in (0.0, 0.3))
+    np.testing.assert_allclose(even, values("blunt_cycloid", 3.0, 20.0), atol=1e-9)
+    assert np.max(np.abs(other - even)) > 1e-2
 
 
 @pytest.mark.parametrize("holds", [one for one in suite.CHECKS if "curve" in one.__name__])
@@ -88,7 +93,6 @@ def test_family_given_by_its_law_conforms(early_fall, holds):
 
 @pytest.mark.parametrize("holds", suite.CHECKS, ids=lambda one: one.__name__)
 def test_family_conforms(blunt_cycloid, holds):
-    """A family from outside passes the checks of the package's own families."""
     holds(blunt_cycloid.stem)
 
 
@@ -99,7 +103,6 @@ DESIGN = (
 
 
 def test_family_is_known_to_a_command_by_its_file(blunt_cycloid, tmp_path):
-    """A new process knows the family with the option `--import`, and does not know it without."""
     call = [sys.executable, "-m", "rootsopt.profile", "configs/ee.yaml", "--no-figures", *DESIGN]
     call += ["-o", str(tmp_path / "out")]
     run = functools.partial(subprocess.run, capture_output=True, text=True, cwd=ROOT, check=False)
@@ -133,9 +136,9 @@ def test_file_that_fails_is_one_line(tmp_path, text, words):
 
 
 def test_installed_package_is_found_by_its_entry_point(tmp_path, monkeypatch):
-    """A config that names an unknown family loads the installed package that offers it."""
     (tmp_path / "offered.py").write_text(
-        block_of("blunt_cycloid.py").replace("blunt_cycloid", "offered_cycloid"), encoding="utf-8"
+        block_of("blunt_cycloid.py", 60).replace("blunt_cycloid", "offered_cycloid"),
+        encoding="utf-8",
     )
     folder = tmp_path / "offered-1.0.dist-info"
     folder.mkdir()
@@ -183,3 +186,112 @@ def test_incomplete_families_are_refused(change, words):
     with pytest.raises(ValueError, match=re.escape(words)):
         register_family(Family(**(GOOD | change)))
     assert families() == before
+
+
+# A part and a contact law
+
+COUPLING = {"stiffness": 8000.0, "damping": 6.0, "buffer": 4000.0, "stop": 7.0e-4}
+LAW = {"stiffness": 2.0e10, "exponent": 1.5, "loss": 0.4}
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    """Return the page's modules of a part and a law by name."""
+    folder = tmp_path_factory.mktemp("outside")
+    names = ("coupling", "law")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(folder))
+        for name in names:
+            (folder / f"{name}.py").write_text(block_of(f"{name}.py", 60), "utf-8")
+        yield SimpleNamespace(**{name: importlib.import_module(name) for name in names})
+    for name in names:
+        sys.modules.pop(name, None)
+
+
+def test_scripts_of_the_page_run(page, monkeypatch, capsys):
+    monkeypatch.chdir(ROOT)
+    scripts = [text for name, text in BLOCK.findall(PAGE) if name == "run"]
+    assert len(scripts) == 2
+    for script in scripts:
+        exec(compile(script, "extending.md", "exec"), {})
+    said = capsys.readouterr().out
+    assert "twist of the coupling (rad)" in said
+    assert float(said.splitlines()[-1]) > 0
+
+
+@pytest.fixture(scope="module")
+def model():
+    """Return a scene of the paper's pair with a part and a law from outside the package."""
+    return Scene.from_config(load("configs/cic_drawn.yaml", ["solver.accuracy=1e-7"]))
+
+
+DESIGN_OF_PAIR = np.array([36.43, 8.0, 4.0])
+built = eqx.filter_jit(Scene.pair)
+
+
+def stored(part, motion, own):
+    """Return the energy (J) of the coupling."""
+    excess = jnp.maximum(jnp.abs(own[0]) - part.stop, 0)
+    return (part.stiffness * own[0] ** 2 + part.buffer * excess**2) / 2
+
+
+def transmitted(part, motion, own):
+    """Return the power (W) that the drive supplies at its own speed."""
+    return part.torque_on_1(motion, own) * part.speed
+
+
+def damped(part, motion, own):
+    return part.damping * (part.speed - motion.speed) ** 2
+
+
+def test_the_coupling_conforms(page, model):
+    numbers = (2e-3, 3.0, 0.033, 1.5e-3, 4.8, 314.0)
+    (coupling,) = model.with_parts(page.coupling.FlexibleCoupling(**COUPLING)).extra
+    coupling = coupling.prepare(Context(*(jnp.asarray(x) for x in numbers)))
+    check_part(coupling, energy=stored, supply=transmitted, losses=damped)
+    check_in_pair(built(model, DESIGN_OF_PAIR), coupling)
+
+
+def test_the_law_conforms(page, model):
+    check_law(model.with_law(page.law.HuntCrossley(**LAW)).law, 2e-5, 3.0)
+
+
+@pytest.mark.long
+def test_gradient_with_respect_to_numbers_of_ones_own(page, model):
+    """Gradients of mean and RMS force agree with central differences of orbits by shooting.
+
+    They are with respect to stiffness and stop of the coupling, stiffness of the law, and load. The
+    orbit crosses the stop, a kink."""
+    scene = model.with_parts(page.coupling.FlexibleCoupling(**COUPLING))
+    scene = scene.with_law(page.law.HuntCrossley(**LAW))
+
+    def entries(scene):
+        (coupling,) = scene.extra
+        return coupling.stiffness, scene.law.stiffness, coupling.stop, scene.load_torque
+
+    def varied(factors):
+        values = [x * f for x, f in zip(entries(scene), factors, strict=True)]
+        return eqx.tree_at(entries, scene, values)
+
+    @jax.jit
+    def forces(factors):
+        found = steady_response(varied(factors), jnp.asarray(DESIGN_OF_PAIR))
+        return jnp.stack([found.mean, found.rms]), found
+
+    slopes, here = jax.jacfwd(forces, has_aux=True)(jnp.ones(4))
+    assert Status.of(here.status) is Status.PERIODIC
+    pair, period = built(scene, DESIGN_OF_PAIR), int(here.period)
+    motion = here.start.known.elements.motion(period * jnp.arange(2000) / 2000)[:, 3]
+    twist = motion * float(pair.angle_scale) + float(pair.parts[0].start(None)[0])
+    assert np.min(twist) < COUPLING["stop"] < np.max(twist)
+    assert 0.1 < np.max(np.abs(motion)) < 10
+    # Along two directions in which all four count.
+    for way in (np.array([1.0, 0.6, 0.8, 0.3]), np.array([-0.4, 1.0, 0.5, -0.2])):
+
+        def shot(change, way=way):
+            moved = built(varied(jnp.asarray(1 + change * way)), DESIGN_OF_PAIR)
+            return closed(moved, pair.scaled(here.state), period).forces[::2]
+
+        assert slopes @ way == pytest.approx(differentiated(shot, 1e-3)[0], rel=5e-6)
+    sizes = np.abs(np.asarray(slopes)[0])
+    assert np.min(sizes) > 1e-3 * np.max(sizes)

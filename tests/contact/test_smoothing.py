@@ -55,13 +55,15 @@ def test_smoothing_length_follows_the_scene():
     shipped = sorted(Path("configs").glob("*.yaml"))
     assert len(shipped) >= 6
     assert {load(path).contact.rounding_mm for path in shipped} == {1e-4}
-    twist = 2.09 / 4.2e5 * 33
-    assert length_of(*STIFF) == pytest.approx(0.05 * twist, rel=0.05)
-    stiff = "contact.stiffness_N_per_mm_e=1e7"
+    assert length_of(*STIFF) == pytest.approx(0.05 * 2.09 / 4.2e5 * 33, rel=0.05)
     depth = (4.775 / 0.033 / 1e7) ** (1 / 2.2)
-    assert length_of(stiff) == pytest.approx(min(1e-4, 0.02 * depth), rel=0.05)
-    assert length_of("contact.full_damping_depth_mm=2e-4") == pytest.approx(2e-5)
-    assert length_of("scene.load.torque_N_m=0") == pytest.approx(1e-6)
-    for given, found in (("auto", 1e-4), ("3e-5", 3e-5), ("0", 0.0)):
-        assert length_of(f"contact.smoothing_mm={given}") == found
+    for changes, found, within in (
+        ("contact.stiffness_N_per_mm_e=1e7", min(1e-4, 0.02 * depth), 0.05),
+        ("contact.full_damping_depth_mm=2e-4", 2e-5, 1e-6),
+        ("scene.load.torque_N_m=0", 1e-6, 1e-6),
+        ("contact.smoothing_mm=auto", 1e-4, 0),
+        ("contact.smoothing_mm=3e-5", 3e-5, 0),
+        ("contact.smoothing_mm=0", 0.0, 0),
+    ):
+        assert length_of(changes) == pytest.approx(found, rel=within, abs=0)
     assert f"smoothing_mm: {length_of(*STIFF)!r}" in load("configs/cic_drawn.yaml", STIFF).to_yaml()

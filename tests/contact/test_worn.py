@@ -27,8 +27,7 @@ def scene_of(*changes: str) -> tuple[rootsopt.Config, Scene]:
 def test_ee_wears_evenly(lobes):
     """s, dl1/dβ and dl2/dβ of EE are proportional to sin ψ: 8N / (4N² - 1) everywhere."""
     roll = jnp.linspace(0.02, 0.98, 20) * np.pi / (2 * lobes)
-    expected = 8 * lobes / (4 * lobes**2 - 1)
-    np.testing.assert_allclose(shape(EE(lobes, R), roll), expected, rtol=1e-9)
+    np.testing.assert_allclose(shape(EE(lobes, R), roll), 8 * lobes / (4 * lobes**2 - 1), rtol=1e-9)
 
 
 def test_shape_from_the_ways_of_the_contact():
@@ -36,13 +35,11 @@ def test_shape_from_the_ways_of_the_contact():
     profile = made("cic")
     roll = np.linspace(0.3, 0.7, 400) * np.pi / (2 * LOBES)
     nu = profile.normal_at(jnp.asarray(roll))
-    lengths = []
+    expected = 0.0
     for curve in (profile.addendum, profile.dedendum):
         beta, psi, s = map(np.asarray, eqx.filter_jit(curve)(nu))
-        points = np.exp(1j * beta) * (float(profile.pitch_radius) + s * 1j * np.exp(-1j * psi))
-        lengths.append(np.abs(np.diff(points)) / np.diff(roll))
-    s = np.abs(np.asarray(profile.addendum(nu)[2]))
-    expected = (s[1:] + s[:-1]) * (1 / lengths[0] + 1 / lengths[1])
+        points = np.exp(1j * beta) * (R + s * 1j * np.exp(-1j * psi))
+        expected += np.abs(s[1:] + s[:-1]) * np.diff(roll) / np.abs(np.diff(points))
     found = np.asarray(shape(profile, jnp.asarray((roll[1:] + roll[:-1]) / 2)))
     np.testing.assert_allclose(found, expected, rtol=1e-3)
 
@@ -53,8 +50,7 @@ def test_series_has_the_depth_and_no_ripples(family):
     roll = np.linspace(0, np.pi / LOBES, 512)
     series = jax.jit(wear_series)(profile, depth)
     at = jax.jit(jax.vmap(lambda x: series_at(series, jnp.asarray(float(LOBES)), x)))
-    values, rates = at(roll)
-    values = np.asarray(values)
+    values, rates = map(np.asarray, at(roll))
     assert np.max(values) == pytest.approx(2e-5, rel=1e-3)
     assert np.min(values) >= 0
     np.testing.assert_allclose(values, values[::-1], atol=1e-12)
@@ -63,9 +59,8 @@ def test_series_has_the_depth_and_no_ripples(family):
 
 def test_worn_gap_has_a_potential():
     """Gap and levers: d gap = -lever1 dφ1 + lever2 dφ2, and the gap grows by the wear."""
-    _, scene = scene_of("contact.wear.depth_mm=0.03")
-    design = jnp.array([36.43, 9.0, 4.0])
-    worn = eqx.filter_jit(lambda design: scene.contact(scene.profile(design)))(design)
+    config, scene = scene_of("contact.wear.depth_mm=0.03")
+    worn = eqx.filter_jit(lambda design: scene.contact(scene.profile(design)))(config.design)
     assert isinstance(worn, WornContact)
 
     def gap(contact, first, second):
@@ -111,8 +106,8 @@ def test_conditions_are_scenes():
     assert config.tolerances.samples == 3
     keys = [one.key for one in config.scatters]
     rows = [dict(zip(keys, row, strict=True)) for row in draw(config, 3)]
-    assert rows[0] == dict.fromkeys(keys, 0.0)
-    assert rows[1] == rows[0] | {"scene.heat.rotor_warming_K": 60.0}
+    new = dict.fromkeys(keys, 0.0)
+    assert rows[:2] == [new, new | {"scene.heat.rotor_warming_K": 60.0}]
     assert rows[2]["contact.wear.depth_mm"] == 0.02
     moved = [one.scene for one in shifts(config, draw(config, 3))]
     assert float(moved[1].center_distance_error) == pytest.approx(-0.066 * 1.1e-5 * 60)

@@ -1,7 +1,6 @@
 """Tests of the drives: a motor's characteristic, and its effect on time and averages."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -26,8 +25,7 @@ def test_a_motor_without_torque_of_its_own_balances_the_load():
 def test_a_stalled_motor_keeps_creeping():
     """τ and the integration can reach their end."""
     pair, _ = pair_of(MOTOR)
-    share = pair.angle_scale / pair.mesh_period / pair.drive.speed
-    stalled = jnp.asarray([0.0, 0.0, -2 / share])
+    stalled = -2 * pair.mesh_period * pair.drive.speed / pair.angle_scale * jnp.eye(3)[2]
     assert bool(pair.stalled(stalled))
     assert bool(pair.lost(stalled))
     assert float(pair.lapse(stalled)) == pytest.approx(40.0)
@@ -42,20 +40,17 @@ def test_inertia_of_a_motor_turns_with_rotor_1():
     motor = MotorDrive(*(jnp.asarray(x) for x in (SPEED, torque, slope, own)))
     pair = oscillator(drive=motor, gear=None)
     period = 2 * np.pi / (LOBES * SPEED)
-    share = over * period / SCALE
-    state = jnp.array([0.1, 0.3, share])
-    found, _ = jax.jit(lambda state: pair.derivative(jnp.asarray(0.2), state))(state)
+    found, _ = pair.derivative(jnp.asarray(0.2), jnp.array([0.1, 0.3, over * period / SCALE]))
     first = (torque - slope * over) / (INERTIA + own)
-    second = -LOAD / INERTIA
     lapse = SPEED / (SPEED + over)
     unit = lapse * period**2 / SCALE
-    expected = [lapse * 0.3, unit * (second - first), unit * first]
+    expected = [lapse * 0.3, unit * (-LOAD / INERTIA - first), unit * first]
     np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
 def test_motor_of_a_config_is_that_of_its_pair():
-    motor = "{slope_N_m_s_per_rad: 0.3, torque_N_m: 6, inertia_kg_m2: 0.004}"
-    config = load("configs/cic_drawn.yaml", ["scene.drive=torque", f"scene.motor={motor}"])
+    motor = "scene.motor={slope_N_m_s_per_rad: 0.3, torque_N_m: 6, inertia_kg_m2: 0.004}"
+    config = load("configs/cic_drawn.yaml", ["scene.drive=torque", motor])
     drive = Scene.from_config(config)._drive(ConstantLoad(jnp.asarray(LOAD)))
     assert isinstance(drive, MotorDrive)
     numbers = [float(x) for x in (drive.speed, drive.torque, drive.slope, drive.inertia)]

@@ -35,82 +35,57 @@ pair_of = eqx.filter_jit(Scene.pair)
 # The contact law at the ends of its ranges
 
 
-def extreme_laws():
-    """Return the parameters (n, 5; SI units) of laws at every combination of limits."""
-    stiffness, exponents = (1e3, 1e6, 1e9), (1.0, 1.5, 2.0, 3.0, 5.0)
-    damping, depths, smoothing = (0.0, 1e-4, 10.0), (1e-5, 1e-2, 1.0), (0.0, 1e-6, 1e-4, 0.1)
-    rows = [
-        (k * 1e3**e, e, c * 1e3, d * 1e-3, h * 1e-3)
-        for k, e, c, d, h in itertools.product(stiffness, exponents, damping, depths, smoothing)
-    ]
-    return np.array(rows)
-
-
+LIMITS = (1e3, 1e9), (1.0, 1.5, 2.0, 5.0), (0.0, 1e-4, 10.0), (1e-5, 1e-2, 1.0), (0.0, 1e-6, 0.1)
+"""Of stiffness, exponent, damping, depth and smoothing, in the units of a config."""
 DEPTHS = np.concatenate([[-1e-3, 0.0], np.geomspace(1e-36, 1e-2, 58)])
 RATES = np.concatenate([-np.geomspace(1e-9, 1e3, 9), [0.0], np.geomspace(1e-9, 1e3, 5)])
 
 
 @jax.jit
 def values_and_slopes(rows, depths, rates):
-    def force(row, depth, rate):
-        return ImpactLaw(*row)(depth, rate)
-
-    def at(*x):
-        value, (by_row, by_depth, by_rate) = jax.value_and_grad(force, (0, 1, 2))(*x)
-        return jnp.concatenate([jnp.stack([value, by_depth, by_rate]), by_row])
-
-    def one(row):
-        return jax.vmap(lambda d: jax.vmap(lambda r: at(row, d, r))(rates))(depths)
-
-    return jax.lax.map(one, rows)
+    slopes = jax.value_and_grad(lambda row, *at: ImpactLaw(*row)(*at), (0, 1, 2))
+    each = jax.vmap(jax.vmap(slopes, (None, None, 0)), (None, 0, None))
+    return jax.lax.map(lambda row: each(row, depths, rates), rows)
 
 
 def test_law_and_its_slopes_are_finite_at_every_limit():
     """Force and derivatives in depth, rate and parameters are finite, from 1e-36 m to 10 mm of
     depth."""
-    rows = extreme_laws()
-    found = values_and_slopes(*map(jnp.asarray, (rows, DEPTHS, RATES)))
-    wrong = np.argwhere(~np.isfinite(found))
-    assert len(wrong) == 0, [(rows[i], DEPTHS[j], RATES[k], n) for i, j, k, n in wrong[:3]]
-    assert np.all(np.asarray(found[..., 0]) >= 0)
+    laws = itertools.product(*LIMITS)
+    rows = np.array([(k * 1e3**e, e, c * 1e3, d * 1e-3, h * 1e-3) for k, e, c, d, h in laws])
+    force, slopes = values_and_slopes(*map(jnp.asarray, (rows, DEPTHS, RATES)))
+    assert np.all(np.isfinite(slopes[0]))
+    assert np.all(np.isfinite(slopes[1:]))
+    assert np.all(force >= 0)
 
 
 # Steps from the scene
 
 
-def timescales(play=1e-3, torque=5.0, inertia=2e-3, exponent=1.0, stiffness=1e7):
+def timescales(play, exponent, stiffness):
     """Return timescales of a pair of 33 mm pitch radius, a gear of 2e4 N·m/rad, and its parts."""
     law = ImpactLaw(*(jnp.asarray(x) for x in (stiffness, exponent, 0.0, 1e-5, 0.0)))
     gear = TimingGear(*(jnp.asarray(x) for x in (2e4, 0.0, play / 2, 0.0)))
-    radius = 0.033
-    force = jnp.asarray(torque / radius)
-    return Timescales.of(
-        law, (gear,), jnp.asarray(inertia), force, jnp.asarray(radius), jnp.asarray(0.0)
-    )
+    inertia, force, radius, axis = map(jnp.asarray, (2e-3, 5 / 0.033, 0.033, 0.0))
+    return Timescales.of(law, (gear,), inertia, force, radius, axis)
 
 
-def test_pace_in_closed_form():
-    """A linear contact beside the gear is a spring; the fall through the backlash is s = a t²/2."""
-    found = timescales()
-    spring = 1e7 * 0.033**2 + 2e4
+@pytest.mark.parametrize(
+    ("play", "exponent", "stiffness", "depth", "fall"),
+    [
+        # A linear contact beside the gear is a spring; the fall through the backlash is s = a t²/2.
+        (1e-3, 1.0, 1e7, 1.0, np.sqrt(2 * 1e-3 * 2e-3 / 5)),
+        # The work of the load over the backlash equals K δ³/3, in a deeper, stiffer contact.
+        (5e-3, 2.0, 1e12, (3 * 5 * 5e-3 / 1e12) ** (1 / 3), np.sqrt(2 * 5e-3 * 2e-3 / 5)),
+        # Without backlash, the static depth counts and there is no free flight.
+        (0.0, 2.0, 1e12, (5 / 0.033 / 1e12) ** 0.5, np.inf),
+    ],
+)
+def test_pace_in_closed_form(play, exponent, stiffness, depth, fall):
+    found = timescales(play, exponent, stiffness)
+    spring = exponent * stiffness * depth ** (exponent - 1) * 0.033**2 + 2e4
     assert float(found.swing) == pytest.approx(np.sqrt(2e-3 / spring), rel=1e-12)
-    assert float(found.fall) == pytest.approx(np.sqrt(2 * 1e-3 * 2e-3 / 5.0), rel=1e-12)
-
-
-def test_impact_after_a_fall_sets_the_pace():
-    """With e = 2, the work of the load over the backlash equals K δ³/3, in a deeper, stiffer
-    contact.
-
-    Without backlash, the static depth counts and there is no free flight."""
-    found, radius, torque = timescales(play=5e-3, exponent=2.0, stiffness=1e12), 0.033, 5.0
-    depth = (3 * torque * 5e-3 / 1e12) ** (1 / 3)
-    assert depth > (torque / radius / 1e12) ** 0.5
-    spring = 2 * 1e12 * depth * radius**2 + 2e4
-    assert float(found.swing) == pytest.approx(np.sqrt(2e-3 / spring), rel=1e-12)
-    still = timescales(play=0.0, exponent=2.0, stiffness=1e12)
-    spring = 2 * 1e12 * (torque / radius / 1e12) ** 0.5 * radius**2 + 2e4
-    assert float(still.swing) == pytest.approx(np.sqrt(2e-3 / spring), rel=1e-12)
-    assert np.isinf(float(still.fall))
+    assert float(found.fall) == pytest.approx(fall, rel=1e-12)
 
 
 @pytest.mark.parametrize(("speed", "stiffness"), [(3000, 2e5), (1, 1e9), (60_000, 1e3)])
@@ -121,13 +96,11 @@ def test_steps_follow_the_scene(speed, stiffness):
     Steps of that length do not use up the allowed number."""
     config = config_of(scene__speed_rpm=speed, contact__stiffness_N_per_mm_e=stiffness)
     pair = pair_of(Scene.from_config(config), design_vector(config))
-    how = Integrator("tsit5", jnp.asarray(1e-8), 4096)
-    swing, fall = (
-        float(t / pair.mesh_period) for t in (pair.timescales.swing, pair.timescales.fall)
-    )
-    control = how.controller(pair)
+    control = Integrator("tsit5", jnp.asarray(1e-8), 4096).controller(pair)
+    times = pair.timescales
     first, longest = float(control.first), float(control.base.dtmax)
-    assert first == pytest.approx(min(1e-3, swing / 20))
+    assert first == pytest.approx(min(1e-3, float(times.swing / pair.mesh_period) / 20))
+    fall = float(times.fall / pair.mesh_period)
     assert longest == pytest.approx(min(1 / 32, max(fall / 8, 4 / 4096)))
     if speed == 1:
         assert first < 1e-7
@@ -137,79 +110,79 @@ def test_steps_follow_the_scene(speed, stiffness):
 # What counts as a result
 
 
-def orbit_of(multipliers=(0.5, 0.1), size=1.0, residual=0.0, peak=1.0, depth=1e-5, mean=1.0):
+def orbit_of(multipliers=(0.5, 0.1), size=1.0, residual=0.0, peak=1.0, mean=1.0):
     """Return a closed orbit with a diagonal monodromy matrix and little else."""
-    blank = Orbit.empty(jnp.array([size, 0.0]), 0, 3)
-    return blank._replace(
+    return Orbit.empty(jnp.array([size, 0.0]), 0, 3)._replace(
         residual=jnp.asarray(residual),
         monodromy=jnp.diag(jnp.array(multipliers)),
         multiplier=jnp.max(jnp.abs(jnp.array(multipliers))),
         response=jnp.array([mean, 0.0, peak]),
-        depth=jnp.asarray(depth),
+        depth=jnp.asarray(1e-5),
     )
 
 
 judgement = jax.jit(is_steady)
 
 
-def accepted(orbit, rtol=1e-8, moved=0.0, residual=1e-9):
-    state = orbit.state + moved
-    return bool(judgement(orbit, state, (1e-3, residual), (1e-8, rtol)))
-
-
-def test_an_orbit_that_multiplies_errors_is_none():
-    """Errors grow by 1/(1 - multiplier). If that is too large, the orbit is rejected."""
-    near = orbit_of((1 - 1e-5, 0.1))
-    assert accepted(near, 1e-8)
-    assert not accepted(near, 1e-3)
-    assert accepted(orbit_of(), 1e-3)
-    assert not accepted(orbit_of((1.01, 0.1)))
-
-
-def test_distances_are_relative_to_large_states():
-    """With a residual of 3e-8, an orbit of size 1 is open and one of size 400 is closed."""
-    assert not accepted(orbit_of(residual=3e-8))
-    assert accepted(orbit_of(residual=3e-8, size=400.0))
-    assert accepted(orbit_of(), moved=1e-3)
-    assert not accepted(orbit_of(), moved=0.1)
+@pytest.mark.parametrize(
+    ("orbit", "rtol", "moved", "accepted"),
+    [
+        # Errors grow by 1/(1 - multiplier). If that is too large, the orbit is rejected.
+        ({"multipliers": (1 - 1e-5, 0.1)}, 1e-8, 0.0, True),
+        ({"multipliers": (1 - 1e-5, 0.1)}, 1e-3, 0.0, False),
+        ({}, 1e-3, 0.0, True),
+        ({"multipliers": (1.01, 0.1)}, 1e-8, 0.0, False),
+        # Distances are relative to large states: of size 1 the orbit is open, of 400 closed.
+        ({"residual": 3e-8}, 1e-8, 0.0, False),
+        ({"residual": 3e-8, "size": 400.0}, 1e-8, 0.0, True),
+        ({}, 1e-8, 1e-3, True),
+        ({}, 1e-8, 0.1, False),
+    ],
+)
+def test_what_counts_as_a_closed_orbit(orbit, rtol, moved, accepted):
+    found = orbit_of(**orbit)
+    assert bool(judgement(found, found.state + moved, (1e-3, 1e-9), (1e-8, rtol))) is accepted
 
 
 def test_rounding_of_the_gap():
     """The gap has a rounding error of the pitch radius, and the force is a power of the gap."""
-    radius, exponent = jnp.asarray(0.033), jnp.asarray(2.0)
-    eps = np.finfo(float).eps
-    found = float(force_rounding(jnp.asarray(1e-9), exponent, radius))
-    assert found == pytest.approx(2 * eps * 0.033 / 1e-9)
-    assert float(force_rounding(jnp.asarray(-0.03), exponent, radius)) == 0
+    for depth, expected in ((1e-9, 2 * np.finfo(float).eps * 0.033 / 1e-9), (-0.03, 0.0)):
+        found = force_rounding(*map(jnp.asarray, (depth, 2.0, 0.033)))
+        assert float(found) == pytest.approx(expected)
 
 
-def test_mean_rms_and_peak_must_not_contradict_each_other():
+@pytest.mark.parametrize(
+    ("numbers", "consistent"),
+    [
+        ((3.0, 10.0, 4.0), True),
+        ((3.0, 9.0, 3.0), True),
+        ((3.0, -1.0, 4.0), False),
+        ((3.0, 10.0, 0.0), False),
+        ((-3.0, 10.0, 4.0), False),
+        ((1e-4, -1e-8, 1e-4), True),
+    ],
+)
+def test_mean_rms_and_peak_must_not_contradict_each_other(numbers, consistent):
     """mean ≤ RMS ≤ peak, except for 1 % and for forces below the least force."""
-
-    def consistent(mean, square, peak, least=1e-3):
-        orbit = orbit_of(mean=mean, peak=peak)
-        numbers = jnp.array([mean, square, peak])
-        return bool(is_consistent(orbit._replace(response=numbers), jnp.asarray(least)))
-
-    assert consistent(3.0, 10.0, 4.0)
-    assert consistent(3.0, 9.0, 3.0)
-    assert not consistent(3.0, -1.0, 4.0)
-    assert not consistent(3.0, 10.0, 0.0)
-    assert not consistent(-3.0, 10.0, 4.0)
-    assert consistent(1e-4, -1e-8, 1e-4)
+    orbit = orbit_of()._replace(response=jnp.array(numbers))
+    assert bool(is_consistent(orbit, jnp.asarray(1e-3))) is consistent
 
 
-def test_idle_is_without_force():
+@pytest.mark.parametrize(
+    ("multipliers", "mean", "peak", "others", "idle"),
+    [
+        ((1.0, 1.0), 0.0, 0.0, (), True),
+        ((np.nan, 1.0), 0.0, 0.0, (), True),
+        ((0.5, 0.1), 0.0, 0.0, (), False),
+        ((0.5, 0.1), 0.0, 0.0, (0.0, True), True),
+        ((0.5, 0.1), 1.0, 1.0, (0.0, True), False),
+        ((1.0, 1.0), 1e-50, 1e-48, (1e-18,), True),
+        ((1.0, 1.0), 1.0, 1.0, (), False),
+    ],
+)
+def test_idle_is_without_force(multipliers, mean, peak, others, idle):
     """An idle orbit has no force, and drifts freely (multiplier 1 or unknown) or is steady."""
-    nothing = {"mean": 0.0, "peak": 0.0}
-    assert bool(is_idle(orbit_of((1.0, 1.0), **nothing)))
-    assert bool(is_idle(orbit_of((np.nan, 1.0), **nothing)))
-    assert not bool(is_idle(orbit_of(**nothing)))
-    assert bool(is_idle(orbit_of(**nothing), 0.0, True))
-    assert not bool(is_idle(orbit_of(), 0.0, True))
-    rounding = {"mean": 1e-50, "peak": 1e-48}
-    assert bool(is_idle(orbit_of((1.0, 1.0), **rounding), 1e-18))
-    assert not bool(is_idle(orbit_of((1.0, 1.0))))
+    assert bool(is_idle(orbit_of(multipliers, mean=mean, peak=peak), *others)) is idle
 
 
 # Whole scenes; one compiled program serves them all
@@ -246,9 +219,8 @@ def test_a_pair_with_a_motor_that_floats_is_idle():
     """Newton's equations are then singular, and the state is kept."""
     scene = {"scene__drive": "torque", "scene__motor": "{slope_N_m_s_per_rad: 0.1}"}
     scene |= {"scene__timing_gear": "null", "scene__load__torque_N_m": 0}
-    contact = {"contact__clearance_mm": 0.01}
-    evaluation = Evaluator.of(config_of(**scene, **contact))(series=False)
-    assert evaluation.status is Status.IDLE
+    config = config_of(**scene, contact__clearance_mm=0.01)
+    assert Evaluator.of(config)(series=False).status is Status.IDLE
 
 
 def test_a_force_lost_in_rounding_is_no_result(monkeypatch):
@@ -262,9 +234,8 @@ def test_a_force_lost_in_rounding_is_no_result(monkeypatch):
     monkeypatch.setattr("rootsopt.dynamics.steady.UNRESOLVED", 1e-14)
     monkeypatch.setattr("rootsopt.response.evaluation._motion", stricter)
     evaluation = Evaluator.of(config_of())(series=False)
-    assert evaluation.status is Status.UNRESOLVED
-    assert not evaluation.usable
-    assert evaluation.gradient == {}
+    found = evaluation.status, evaluation.usable, evaluation.gradient
+    assert found == (Status.UNRESOLVED, False, {})
     assert 1e-14 < evaluation.statistics["force_rounding"] < 1e-11
 
 
@@ -272,7 +243,7 @@ def test_motion_of_many_swings_agrees_with_scipy():
     """A stiff pair at low speed has hundreds of oscillations in a mesh period.
 
     SciPy returns to the orbit's state and gives the same mean, peak and RMS force."""
-    changes = {
+    config = config_of(**{
         "contact__stiffness_N_per_mm_e": 4.29e7,
         "contact__max_damping_N_s_per_mm": 0.00424,
         "contact__full_damping_depth_mm": 1.53e-5,
@@ -286,8 +257,7 @@ def test_motion_of_many_swings_agrees_with_scipy():
         "profile__pressure_angle_deg": 42.1,
         "profile__involute_length_mm": 0.502,
         "profile__tip_arc_angle_deg": 20.9,
-    }
-    config = config_of(**changes)
+    })  # fmt: skip
     evaluation = Evaluator.of(config)(series=False)
     assert evaluation.status is Status.PERIODIC
     pair = pair_of(Scene.from_config(config), design_vector(config))
@@ -297,11 +267,10 @@ def test_motion_of_many_swings_agrees_with_scipy():
         slope, contact = pair.derivative(tau, state)
         return jnp.stack([*slope, contact.total, contact.total**2])
 
-    start = np.append(evaluation.state, [0.0, 0.0])
-    scales = np.array([1e-9, 1e-9, 1e-7, 1e-5])
     done = solve_ivp(
         lambda tau, y: np.asarray(rates(tau, y[:2])),
-        (0, 1), start, "DOP853", rtol=1e-9, atol=scales, max_step=1 / 32,
+        (0, 1), [*evaluation.state, 0.0, 0.0], "DOP853",
+        rtol=1e-9, atol=np.array([1e-9, 1e-9, 1e-7, 1e-5]), max_step=1 / 32,
     )  # fmt: skip
     np.testing.assert_allclose(done.y[:2, -1], evaluation.state, rtol=1e-5, atol=1e-5)
     mean, peak, rms = (evaluation.response[f"{name}_force_N"] for name in ("mean", "peak", "rms"))

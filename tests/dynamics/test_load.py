@@ -12,7 +12,6 @@ from rootsopt.scene import Scene, design_vector, outline_mm
 from tests.scene.test_scene import pair_of
 
 GAS = ["scene.load={pressure_difference_Pa: 4e4}"]
-LENGTH = 0.1
 
 
 @pytest.mark.parametrize(
@@ -25,15 +24,29 @@ def test_the_mean_gas_torque_is_the_displaced_volume(family, overrides):
     The volume is twice the difference of the bore and the rotor, from the outline's polygon."""
     pair, config = pair_of([*GAS, *overrides], family)
     phi = np.linspace(0, 2 * np.pi, 60001)[:-1] + 1e-6
-    both = [np.asarray(jax.jit(jax.vmap(f))(phi)) for f in (pair.load.torque1, pair.load.torque2)]
+    torques = pair.load.torque1, pair.load.torque2
+    means = [np.mean(jax.jit(jax.vmap(torque))(phi)) for torque in torques]
     x, y = 1e-3 * outline_mm(config).T
     area = abs(np.sum(x[:-1] * y[1:] - x[1:] * y[:-1])) / 2
-    volume = 2 * (np.pi * np.max(np.hypot(x, y)) ** 2 - area) * LENGTH
-    expected = 4e4 * volume / (2 * np.pi)
+    volume = 2 * (np.pi * np.max(np.hypot(x, y)) ** 2 - area) * 0.1
     # A polygon of some hundred corners a lobe has its area to 1e-5.
-    assert np.mean(both[0] + both[1]) == pytest.approx(expected, rel=3e-5)
-    means = [np.mean(torque) for torque in both]
+    assert sum(means) == pytest.approx(4e4 * volume / (2 * np.pi), rel=3e-5)
     np.testing.assert_allclose(means, float(pair.load.torque), rtol=1e-6)
+
+
+def along(model, design, phi):
+    """Return the torque on rotor 2, and the margins."""
+    gas = model.pair(design).load
+    rest = jnp.zeros(())
+
+    def each(phi):
+        return gas.torque2(phi), gas.margins(Motion(phi, rest, rest, rest), jnp.zeros(0))
+
+    return jax.vmap(each)(phi)
+
+
+_along = eqx.filter_jit(along)
+_slopes = eqx.filter_jit(jax.jacfwd(lambda m, d, phi: along(m, d, phi)[0], 1))
 
 
 @pytest.mark.parametrize("length", [7.0, 8.893, 9.0])
@@ -43,38 +56,25 @@ def test_gas_torque_has_no_jump_and_its_derivative_is_that_of_differences(length
     model, design = Scene.from_config(config), design_vector(config)
     phi = jnp.linspace(0.001, 1.04, 4001)
 
-    @eqx.filter_jit
-    def torque(model, design):
-        return jax.vmap(model.pair(design).load.torque2)(phi)
-
-    here = np.asarray(torque(model, design))
+    here, margins = (np.asarray(x) for x in _along(model, design, phi))
     # It rises by its mean in no less than a quarter of a brief stretch, 0.01 rad.
     assert np.max(abs(np.diff(here))) < np.mean(here) * 1.2 * np.ptp(phi) / 4000 / 0.0025
     # Margins must not jump where they change their sign: they locate and move events.
-    rest = jnp.zeros_like(phi)
-    gas = eqx.filter_jit(lambda model, design: model.pair(design).load)(model, design)
-    motion = Motion(phi, rest, rest, rest)
-    margins = np.asarray(jax.vmap(gas.margins, (0, None))(motion, rest[:0]))
     assert np.max(abs(np.diff(margins, axis=0))) < 200 * float(phi[1] - phi[0])
     if length == 8.893:
         return  # The longest to within rounding of its own difference.
-    for index, step in enumerate((1e-5, 1e-5, 1e-5)):
-        unit = jnp.zeros(3).at[index].set(1.0)
-        slope = eqx.filter_jit(lambda m, d, u: jax.jvp(lambda d: torque(m, d), (d,), (u,))[1])
-        found = np.asarray(slope(model, design, unit))
-        ends = [np.asarray(torque(model, design + way * step * unit)) for way in (-1, 1)]
-        expected = (ends[1] - ends[0]) / (2 * step)
+    for unit, found in zip(jnp.eye(3), _slopes(model, design, phi).T, strict=True):
+        ends = [np.asarray(_along(model, design + way * unit, phi)[0]) for way in (-1e-5, 1e-5)]
+        expected = (ends[1] - ends[0]) / 2e-5
         # Where pieces meet the difference straddles a kink.
-        off = abs(found - expected) > 1e-5 * np.max(abs(expected))
-        assert np.mean(off) < 0.002
+        assert np.mean(abs(found - expected) > 1e-5 * np.max(abs(expected))) < 0.002
 
 
 @pytest.mark.parametrize("length", [8.89, 9.0])
 def test_steps_end_where_a_spread_jump_begins_and_ends(length):
     """Wherever the slope of the torque has a kink, a flag changes. The kinks are found in the
     torque."""
-    config = load("configs/cic_drawn.yaml", [*GAS, f"profile.involute_length_mm={length}"])
-    pair = eqx.filter_jit(Scene.pair)(Scene.from_config(config), design_vector(config))
+    pair, _ = pair_of([*GAS, f"profile.involute_length_mm={length}"])
     phi = jnp.linspace(0.02, 1.02, 10001)
 
     def flags(phi):
@@ -82,9 +82,8 @@ def test_steps_end_where_a_spread_jump_begins_and_ends(length):
         return pair.load.switches(Motion(phi, still, still, jnp.ones(())), np.zeros(0))
 
     bend = np.asarray(jax.jit(jax.vmap(jax.grad(jax.grad(pair.load.torque2))))(phi))
-    changed = np.any(np.diff(np.asarray(jax.jit(jax.vmap(flags))(phi)), axis=0), axis=1)
+    places = np.flatnonzero(np.any(np.diff(jax.jit(jax.vmap(flags))(phi), axis=0), axis=1))
     # The ramp over 0.01 rad bends a hundred times more than the smooth torque beside it.
     jumps = np.flatnonzero(abs(np.diff(bend)) > 0.3 * np.max(abs(bend)))
     assert len(jumps) >= 2
-    places = np.flatnonzero(changed)
     assert all(np.min(abs(places - jump)) <= 1 for jump in jumps)

@@ -1,31 +1,43 @@
-"""Integration over the unit interval takes the steps that `diffrax.diffeqsolve` takes."""
+"""Tests of integrations: steps and methods, what they compile, what a batch shares, where steps end
+in free flight, and the check of derivatives."""
+
+import dataclasses
+import functools
+import os
+import subprocess
+import sys
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import lax
 
-from rootsopt.dynamics.flow import integrated, interpolated
-from rootsopt.dynamics.integrator import Integrator
-
-START = (0.3, -1.2)
-"""Angle (rad) and speed (rad per unit of time) of the pendulum at the start."""
+from experiments._common.shooting import closed, differentiated
+from rootsopt.config import load
+from rootsopt.dynamics.flow import integrated, interpolated, one_period
+from rootsopt.dynamics.integrator import METHODS, Integrator, LandingControl
+from rootsopt.dynamics.orbit import Orbit, branch
+from rootsopt.dynamics.steady import agreement, verdict
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.scene import Scene, design_vector
+from rootsopt.status import Status
 
 
 def swing(tau, y, gravity):
     """Return the slope of a pendulum's state `y` (2,), which is known up to 1 rad.
 
     `gravity`: square of the angular frequency of small oscillations."""
-    known = jnp.where(jnp.abs(y[0]) < 1, y[0], jnp.nan)
-    return jnp.stack([y[1], -gravity * jnp.sin(known)])
+    return jnp.stack([y[1], -gravity * jnp.sin(jnp.where(jnp.abs(y[0]) < 1, y[0], jnp.nan))])
 
 
-def both(method, gravity=4000.0, max_steps=512):
-    """Return the integration by this loop and by diffrax."""
-    integrator = Integrator(method, jnp.asarray(1e-6), max_steps)
-    solver, control = integrator.solver(), diffrax.PIDController(1e-6, 1e-6, dtmax=1 / 32)
-    term = diffrax.ODETerm(swing)
+def both(method, gravity, max_steps):
+    """Return the integration by this loop, its states at the ends of diffrax's steps, and that by
+    diffrax."""
+    solver = Integrator(method, jnp.asarray(1e-6), max_steps).solver()
+    term, control = diffrax.ODETerm(swing), diffrax.PIDController(1e-6, 1e-6, dtmax=1 / 32)
 
     @jax.jit
     def run(start, gravity):
@@ -45,18 +57,11 @@ def both(method, gravity=4000.0, max_steps=512):
             throw=False,
         )
         inside = jax.vmap(lambda share: interpolated(ours, solver, share)[0])
-        return (
-            ours,
-            inside(jnp.minimum(theirs.ts, 1.0)),
-            (
-                theirs.ts,
-                theirs.ys,
-                theirs.stats,
-                theirs.result == diffrax.RESULTS.successful,
-            ),
-        )
+        shown = theirs.ts, theirs.ys, theirs.stats, theirs.result == diffrax.RESULTS.successful
+        return ours, inside(jnp.minimum(theirs.ts, 1.0)), shown
 
-    return run(jnp.array(START), jnp.asarray(gravity))
+    # Angle (rad) and speed (rad per unit of time) at the start.
+    return run(jnp.array((0.3, -1.2)), jnp.asarray(gravity))
 
 
 @pytest.mark.parametrize(
@@ -79,10 +84,282 @@ def test_steps_are_those_of_diffrax(method, gravity):
 
 
 @pytest.mark.parametrize(
-    ("gravity", "max_steps"), [(4000.0, 20), (np.nan, 512)], ids=["too few steps", "not a number"]
+    ("gravity", "max_steps"), [(4000.0, 20), (np.nan, 2048)], ids=["too few steps", "not a number"]
 )
 def test_an_integration_that_does_not_reach_the_end_says_so(gravity, max_steps):
     ours, _, (_, _, stats, solved) = both("tsit5", gravity, max_steps)
     assert not solved
     assert not ours.solved
     assert int(ours.steps) == int(stats["num_steps"])
+
+
+def test_solvers_agree():
+    config = load("configs/cic_drawn.yaml")
+    found = []
+    pair = eqx.filter_jit(Scene.pair)(Scene.from_config(config), design_vector(config))
+    period = eqx.filter_jit(one_period)
+    for method, rtol in (("tsit5", 1e-11), *((method, 1e-8) for method in METHODS)):
+        how, state = Integrator(method, jnp.asarray(rtol), 20000), jnp.zeros(2)
+        # The orbit's multiplier is 0.004: six periods leave 1e-14 of the start.
+        for _ in range(7):
+            out = period(pair, state, how)
+            assert bool(out.solved)
+            state = out.end
+        mean, square, peak = out.response
+        found.append([mean, peak, np.sqrt(square)])
+    np.testing.assert_allclose(found[1:], [found[0]] * len(METHODS), rtol=1e-5)
+
+
+_COUNT = """
+import jax, jax.numpy as jnp, rootsopt
+from rootsopt.dynamics.flow import one_period, strobe
+from rootsopt.dynamics.integrator import Integrator
+
+jax.config.update("jax_enable_x64", True)
+config = rootsopt.load_config("configs/ee.yaml")
+pair = rootsopt.Scene.from_config(config).pair(config.design)
+how = Integrator("tsit5", jnp.asarray(1e-8), 1024)
+state = jnp.zeros(2)
+programs = (
+    lambda state: strobe(pair, state, 4, how),
+    lambda state: one_period(pair, state, how),
+)
+print([str(jax.make_jaxpr(program)(state)).count("callback") for program in programs])
+"""
+
+
+def test_no_callback_to_python_in_an_integration():
+    """An integration has no callback to Python, because programs with callbacks cannot be cached.
+
+    Equinox's checks of the arguments of diffrax would be such callbacks. A command turns them off,
+    but a caller from Python does not."""
+    variables = {name: x for name, x in os.environ.items() if name != "EQX_ON_ERROR"}
+    command = [sys.executable, "-c", _COUNT]
+    done = subprocess.run(command, env=variables, check=True, capture_output=True, text=True)
+    assert done.stdout == "[0, 0]\n"
+
+
+@pytest.mark.parametrize("taken", [[True] * 3, [False] * 3, [True, False, True]])
+def test_branches_of_a_batch_on_a_gpu(monkeypatch, taken):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    made = set()
+
+    def told(name, value):
+        jax.debug.callback(lambda: made.add(name))
+        return value
+
+    def one(taken, x):
+        return branch(taken, lambda: told("then", 2 * x), lambda: told("otherwise", -x))
+
+    values = jnp.arange(1.0, 4.0)
+    found = jax.jit(jax.vmap(one))(jnp.asarray(taken), values)
+    jax.effects_barrier()
+    np.testing.assert_array_equal(found, jnp.where(jnp.asarray(taken), 2 * values, -values))
+    assert made == {"then" if now else "otherwise" for now in taken}
+    # A condition that is the same for the whole batch, and a branch without batched values.
+    shared = jax.jit(jax.vmap(one, (None, 0)))(taken[1], values)
+    np.testing.assert_array_equal(shared, 2 * values if taken[1] else -values)
+    fixed = jax.vmap(lambda now: branch(now, lambda: jnp.ones(2), lambda: jnp.zeros(2)))
+    np.testing.assert_array_equal(fixed(jnp.asarray(taken))[:, 0], taken)
+
+
+def test_loops_of_a_branch_end_with_the_motions_that_take_it(monkeypatch):
+    """In a batch on a GPU, a motion that does not take a branch does not prolong its loops."""
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    turns = []
+    count = jnp.zeros((), int)
+
+    def counted(k):
+        jax.debug.callback(lambda: turns.append(1))
+        return k + 1
+
+    def one(limit):
+        def loop():
+            return lax.while_loop(lambda k: k < limit, counted, count)
+
+        return branch(limit < 10, loop, lambda: count)
+
+    found = jax.jit(jax.vmap(one))(jnp.asarray([3, 500, 5]))
+    jax.effects_barrier()
+    np.testing.assert_array_equal(found, [3, 0, 5])
+    assert len(turns) <= 3 * 5
+
+
+# Free flight
+
+
+@functools.cache
+def landing(*changes) -> tuple[LandingControl, float]:
+    """Return the control of steps of a scene, and its unit of angle (rad)."""
+    own = ["contact.clearance_mm=0", "scene.timing_gear.backlash_mm=0.2", *changes]
+    config = load("configs/cic_drawn.yaml", own)
+    pair = Evaluator.of(config).pair(config.design)
+    found = Integrator("tsit5", jnp.asarray(1e-8), 4096).controller(pair)
+    assert isinstance(found, LandingControl)
+    return found, float(pair.angle_scale)
+
+
+def test_edges_are_those_of_clearance_and_backlash():
+    half, gap = 0.1 / 33, 0.03 / 33
+    control, unit = landing()
+    assert np.sort(control.edges) * unit == pytest.approx([-half, 0, 0, half], abs=1e-15)
+    assert np.isinf(control.inside)
+    control, unit = landing("contact.clearance_mm=0.03")
+    assert np.sort(control.edges) * unit == pytest.approx([-half, -gap, gap, half])
+    assert float(control.inside) * unit == pytest.approx(gap)
+    # With displaced axes, the flanks may touch at any ε.
+    assert float(landing("scene.center_distance_error_mm=0.01")[0].inside) == 0
+
+
+def adapted(before, after, step):
+    """Return whether a step between these states, with no error, is kept, and where the next one
+    ends."""
+    begin = jnp.asarray(0.2)
+    args = begin, begin + step, jnp.asarray(before), jnp.asarray(after), None, jnp.zeros(2), 5.0
+    state = jnp.asarray(1.0), jnp.asarray(1.0), jnp.asarray(False)
+    keep, start, stop, *_ = landing()[0].adapt_step_size(*args, state)
+    return bool(keep), float(start - begin), float(stop - begin)
+
+
+def parabola(place, rate, bend, time):
+    return [place + rate * time + bend / 2 * time**2, rate + bend * time]
+
+
+@pytest.mark.parametrize("bend", [-30.0, 0.0, 40.0])
+@pytest.mark.parametrize("place", [0.3, -0.2])
+def test_the_next_step_ends_just_beyond_the_edge(place, bend):
+    """The next step ends just beyond the edge ε = 0; steps of 1/32 mesh period would pass it by
+    far."""
+    step = 0.004
+    rate = -12.0 * np.sign(place)
+    roots = np.roots([bend / 2, rate, place]) if bend else np.array([-place / rate])
+    meets = min(float(r.real) for r in roots if abs(r.imag) < 1e-12 and r.real > 0)
+    found = adapted(*(parabola(place, rate, bend, t) for t in (0.0, step)), step)
+    assert found == pytest.approx((True, step, min(meets + 1e-4, step + 1 / 32)), rel=1e-9)
+
+
+def test_a_step_that_passed_an_edge_far_is_taken_again():
+    assert adapted([0.05, -10.0], [-0.2, -10.0], 0.025) == pytest.approx((False, 0, 0.005 + 1e-4))
+    # A step that passes the edge as intended is kept; the next one starts short.
+    found = adapted([0.05, -10.0], [-0.001, -10.0], 0.0051)
+    assert found == pytest.approx((True, 0.0051, 0.0051 + 5e-4))
+
+
+def test_a_step_ends_at_a_turn_beside_an_edge():
+    """A step ends where a parabola turns 0.01 before the edge, because it might reach the edge."""
+    bend, turn, step = 100.0, 0.02, 0.002
+    stops = []
+    for beyond in (0.0, 0.3):
+        begin = 0.01 + beyond + bend / 2 * turn**2, -bend * turn
+        keep, _, stop = adapted(begin, parabola(*begin, bend, step), step)
+        assert keep
+        stops.append(stop)
+    # Far from every edge, the step is not limited.
+    assert stops[0] == pytest.approx(turn)
+    assert stops[1] > turn
+
+
+@pytest.mark.parametrize("rtol", [1e-4, 1e-11])
+def test_a_touch_between_two_stages_is_met(rtol):
+    """A touch is found in a free fall onto a stiff floor at ε = 0, from a height at which steps are
+    long."""
+    base = diffrax.PIDController(rtol=rtol, atol=rtol, dtmax=1.0)
+    control = dataclasses.replace(landing()[0], base=base)
+
+    def field(t, y, args):
+        return jnp.stack([y[1], -1.0 + jnp.where(y[0] < 0, 4e6 * y[0] ** 2, 0.0)])
+
+    found = eqx.filter_jit(diffrax.diffeqsolve)(
+        diffrax.ODETerm(field),
+        diffrax.Tsit5(),
+        t0=0.0,
+        t1=3.0,
+        dt0=1e-3,
+        y0=jnp.asarray([0.5, 0.0]),
+        stepsize_controller=control,
+        throw=False,
+    )
+    # The floor gives back what it takes, and is left by t = 2.
+    ((place, rate),) = np.asarray(found.ys)
+    assert place + rate**2 / 2 == pytest.approx(0.5, abs=max(300 * rtol, 1e-9))
+
+
+@pytest.mark.long
+def test_two_changes_at_one_instant():
+    """Gradients are correct if seal and contact pass the same joint 1e-9 mesh periods apart.
+
+    Otherwise each would be at the end of a step without length, and the gradient wrong by 6e-4 at
+    any tolerance."""
+    scene = [
+        "scene.speed_rpm=3831.1",
+        "scene.timing_gear.backlash_mm=0.276",
+        "scene.timing_gear.damping_ratio=0.06",
+        "scene.timing_gear.stiffness_N_m_per_rad=44582",
+        "scene.load={pressure_difference_Pa: 2.0e4}",
+        "profile.pressure_angle_deg=35.23",
+        "profile.involute_length_mm=5.77",
+        "profile.tip_arc_angle_deg=1.68",
+    ]
+    evaluator = Evaluator.of(load("configs/cic_drawn.yaml", scene)).surveying()
+    step, way, found = 5e-5, np.array([1.0, -0.7, 0.8]), evaluator(series=False)
+    assert found.status is Status.PERIODIC
+    assert found.statistics["gradient_disagreement"] < 1e-4
+    # At the default tolerance, rounding alone changes the mean by 1e-8, and the difference by 1e-2.
+    sharp = evaluator.at_tolerance(1e-11)
+    slope = 0.0
+    for change in (step, -step):
+        design = jnp.asarray([35.23, 5.77, 1.68] + change * way)
+        end = sharp(design, start=found.state, series=False)
+        slope += end.response["mean_force_N"] / (2 * change)
+    row = np.array(list(found.gradient["mean_force_N"].values()))
+    assert row @ way == pytest.approx(slope, abs=1e-5 * np.max(np.abs(row)))
+
+
+JOINT = (
+    "scene.speed_rpm=1015.7",
+    "scene.load.torque_N_m=3",
+    "scene.timing_gear.backlash_mm=0.055",
+    "scene.timing_gear.damping_ratio=0.515",
+    "scene.timing_gear.stiffness_N_m_per_rad=11307",
+)
+CORNER = ("scene.load.torque_N_m=4.775",)
+
+
+@pytest.mark.parametrize(
+    ("scene", "design"), [(JOINT, (39.33, 8.83, 1.32)), (CORNER, (34.0, 7.0, 3.0))]
+)
+def test_the_check_bounds_the_error(scene, design):
+    """The disagreement bounds the errors of all gradients, at any tolerance.
+
+    In the first scene, the contact passes a joint within 1e-4 mesh periods, where derivatives jump.
+    With steps around the joint of the same length on both grids, the mean was 1e-5 off at any
+    tolerance, and the disagreement 1e-8. In both scenes, the peak is on a corner of the force. In
+    the second, with rates from differences of the force, its gradient was 2e-5 off. With values
+    4e-8 mesh periods beside the corner, it was 2e-7 off in both. With values 1e-4 of an element
+    beside the corner, extrapolated by a cubic, it was 2e-5 off in the second."""
+    design, way = np.array(design), np.array([1.0, -0.7, 0.8])
+    evaluator = Evaluator.of(load("configs/cic_drawn.yaml", scene)).surveying()
+    found = {rtol: evaluator.at_tolerance(rtol)(design, series=False) for rtol in (1e-8, 1e-10)}
+    state, period = found[1e-10].state, found[1e-10].steady_state["period"]
+
+    def forces(change):
+        return closed(evaluator.pair(design * (1 + change * way)), state, period).forces
+
+    truth, noise = differentiated(forces, 1e-3)
+    for rtol, one in found.items():
+        rows = [list(one.gradient[f"{name}_force_N"].values()) for name in ("mean", "peak", "rms")]
+        slopes = np.array(rows) * design * way
+        size = np.max(np.abs(slopes), axis=1)
+        error = np.maximum(np.abs(np.sum(slopes, axis=1) - truth) - noise, 0.0) / size
+        assert np.max(noise / size) < 1e-6
+        assert np.max(error) < one.statistics["gradient_disagreement"] < 1e-4, rtol
+        # The mesh for 1e-8 leaves 1.3e-7 in the first scene.
+        assert np.max(error) < {1e-8: 2e-7, 1e-10: 1e-7}[rtol]
+
+
+def test_what_is_not_certain_has_no_derivatives():
+    rtol, scales = jnp.asarray(1e-8), tuple(map(jnp.asarray, (1.5, 0.033, 100.0)))
+    for share, certain in ((0.9, True), (1.1, False), (np.nan, False)):
+        orbit = Orbit.empty(jnp.zeros(2), 3, 3)._replace(disagreement=share * agreement(rtol))
+        found = verdict(orbit, jnp.zeros(2), (1e-3, 1e-9), (rtol, rtol), scales)
+        assert bool(found.certain) is certain

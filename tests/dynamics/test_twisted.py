@@ -48,19 +48,16 @@ def twisted(pair, twist, count):
 def test_slices_are_means_over_sections(straight):
     """Gauss points against equally many degrees of a midpoint rule; error falls as n grows."""
     pair, sections = straight
-    twist, at = np.radians(25.0), slice(None, None, 60)
+    twist = np.radians(25.0)
     offsets = twist * ((np.arange(600) + 0.5) / 600 - 0.5)
     for depth, section in zip(DEPTHS, sections, strict=True):
-        errors = []
-        for count in (2, 4, 8):
-            found = forces(twisted(pair, twist, count), PHI[at], jnp.asarray(-depth))
-            gaps = []
-            for name in ("drive", "coast", "torque1", "torque2", "lever2"):
-                expected = sliced_mean(np.asarray(getattr(section, name)), offsets, 3)[at]
-                away = np.abs(np.asarray(getattr(found, name)) - expected)
-                gaps.append(np.max(away) / max(np.max(np.abs(expected)), 1e-9))
-            errors.append(gaps)
-        worst = np.max(np.asarray(errors)[:, :4], axis=1)
+        worst = np.zeros(3)
+        for k, count in enumerate((2, 4, 8)):
+            found = forces(twisted(pair, twist, count), PHI[::60], jnp.asarray(-depth))
+            for name in ("drive", "coast", "torque1", "torque2"):
+                expected = sliced_mean(np.asarray(getattr(section, name)), offsets, 3)[::60]
+                off = np.max(np.abs(np.asarray(getattr(found, name)) - expected))
+                worst[k] = max(worst[k], off / max(np.max(np.abs(expected)), 1e-9))
         assert worst[1] < worst[0] / 4
         assert worst[2] < worst[1] / 4
         assert worst[2] < 2e-3
@@ -78,8 +75,7 @@ def test_gas_torque_is_the_mean_over_sections():
     one, other = (pair_of(s, jnp.asarray(design)).load for s in (straight, turned))
     angles = PHI[::4]
     section = np.asarray(torques(one, angles))
-    offsets = np.radians(50) * ((np.arange(500) + 0.5) / 500 - 0.5)
-    expected = sliced_mean(section, offsets, 3)
+    expected = sliced_mean(section, np.radians(50) * ((np.arange(500) + 0.5) / 500 - 0.5), 3)
     np.testing.assert_allclose(torques(other, angles), expected, rtol=2e-3)
     assert float(other.torque) == pytest.approx(np.mean(section), rel=1e-4)
 
@@ -89,8 +85,8 @@ def test_number_of_slices_follows_the_error():
     profile = scene.profile(jnp.asarray(design))
     fixed = profile, scene.law, scene.clearance, jnp.asarray(scene.static_depth)
     counts = [slices_needed(*fixed, np.radians(60), error) for error in (0.1, 1e-2, 1e-3)]
-    assert counts == sorted(counts)
-    assert 2 <= counts[0] < counts[2] < MOST
+    assert 2 <= counts[0] <= counts[1] <= counts[2] < MOST
+    assert counts[0] < counts[2]
     assert slices_needed(*fixed, np.radians(10), 1e-2) <= counts[1]
     assert scene_of("ee", "rotor.helix_deg=60")[0].slices == counts[1]
     # A config without twist has no slices at all.

@@ -1,7 +1,10 @@
-"""Profile families pass the conformance suite, have known numbers, and refuse bad designs."""
+"""Profile families pass the conformance suite, have known numbers, and refuse bad designs.
+
+CIC agrees with the paper's equations; areas of every family with polygons of its own outline."""
 
 import itertools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -9,9 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
+from experiments.geometry import study
+from rootsopt.config import FAMILY_KEYS
 from rootsopt.config.families import families, family_of
 from rootsopt.errors import InputError
-from rootsopt.profiles import CIC, EE, arc
+from rootsopt.profiles import CIC, EE, arc, outline
 from rootsopt.profiles.soundness import margins, soundness
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene.families import check, profile_of
@@ -29,6 +34,13 @@ from tests.conformance.families import (
 )
 
 DEG = np.pi / 180
+
+
+def cic(lobes, alpha, fraction, tip):
+    """Return a CIC profile with u given as a fraction of u_max."""
+    return CIC(lobes, R, alpha, fraction * R * np.sin(alpha) * (np.pi / (2 * lobes) - tip), tip)
+
+
 FAMILIES = [name for name, family in families().items() if family.maker is not None]
 _ALIKE = {
     suite.search_finds_the_closest_approach: (
@@ -48,18 +60,15 @@ _ALIKE = {
 They are checked in long runs."""
 
 
-def every_check():
-    """Return all pairs of a family and a check."""
-    pairs = []
-    for family, one in itertools.product(FAMILIES, suite.CHECKS):
-        marks = [pytest.mark.long] if family in _ALIKE.get(one, ()) else []
-        pairs.append(pytest.param(family, one, marks=marks, id=f"{family}-{one.__name__}"))
-    return pairs
+def case(family, one):
+    marks = [pytest.mark.long] if family in _ALIKE.get(one, ()) else []
+    return pytest.param(family, one, marks=marks, id=f"{family}-{one.__name__}")
 
 
-@pytest.mark.parametrize(("family", "holds"), every_check())
+@pytest.mark.parametrize(
+    ("family", "holds"), itertools.starmap(case, itertools.product(FAMILIES, suite.CHECKS))
+)
 def test_conforms(family, holds):
-    """Every family that the package registers passes the suite."""
     holds(family)
 
 
@@ -67,13 +76,26 @@ def test_conforms(family, holds):
 
 
 @pytest.mark.parametrize(
-    ("lobes", "center", "tip_radius", "efficiency"),
-    [(2, 0.8, 1.51318, 0.51382), (3, 0.9, 1.40115, 0.45679)],
+    ("kind", "numbers", "tip_radius", "efficiency", "within"),
+    [
+        # In closed form: r (1 + 1/N), and 1 - A/(π r_a²).
+        (EE, (2, R), 1 + 1 / 2, 0.5, 1e-12),
+        (EE, (3, R), 1 + 1 / 3, 0.40625, 1e-12),
+        (EE, (4, R), 1 + 1 / 4, 0.34, 1e-12),
+        # Textbook CIC: tan α = π/2N, the longest involute, no land.
+        (cic, (2, np.arctan(np.pi / 4), 1.0, 0.0), 1.61767, 0.56926, 5.1e-6),
+        (cic, (3, np.arctan(np.pi / 6), 1.0, 0.0), 1.46386, 0.49987, 5.1e-6),
+        (cic, (4, np.arctan(np.pi / 8), 1.0, 0.0), 1.36552, 0.43982, 5.1e-6),
+        (arc, (2, R, 0.8 * R), 1.51318, 0.51382, 5e-6),
+        (arc, (3, R, 0.9 * R), 1.40115, 0.45679, 5e-6),
+    ],
 )
-def test_single_arc(lobes, center, tip_radius, efficiency):
-    found = measure(arc(lobes, 1.0, center))
-    assert float(found.outer_radius) == pytest.approx(tip_radius, abs=5e-6)
-    assert float(found.area_efficiency) == pytest.approx(efficiency, abs=5e-6)
+def test_known_tip_radii_and_area_efficiencies(kind, numbers, tip_radius, efficiency, within):
+    shape = measure(kind(*numbers))
+    assert float(shape.outer_radius) / R == pytest.approx(tip_radius, abs=within)
+    assert float(shape.root_radius) / R == pytest.approx(2 - tip_radius, abs=within)
+    assert float(shape.area_efficiency) == pytest.approx(efficiency, abs=within)
+    assert float(shape.seal_width) == pytest.approx(0, abs=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -91,27 +113,21 @@ def test_largest_single_arc_without_undercut(lobes, center, efficiency):
     assert float(found.area_efficiency) == pytest.approx(efficiency, abs=1e-5)
 
 
-def test_margins_are_the_least_between_the_places_too():
-    """Margins are least values over the whole segment, not only at sampled points.
+@pytest.mark.parametrize("center", [0.89, 0.9, 0.92])
+def test_margins_are_the_least_between_the_places_too(center):
+    """Undercut and star margin of an arc are least inside a segment.
 
-    Undercut and star margin of an arc are least inside a segment. With 400 samples they are up to
-    1e-5 too great; the parabola through three samples is right to 3e-7."""
-    sampled = []
-    for center in (0.89, 0.9, 0.92):
-        profile, fine, coarse = arc(3, 1.0, center), [], []
-        for segment in profile.segments():
-            share = np.linspace(1e-9, 1 - 1e-9, 1 + 399 * 200)
-            nu = float(segment.start) + float(segment.stop - segment.start) * share
-            point, _, dedendum = profile.speeds(jnp.asarray(nu))
-            sliding = np.sin(point.psi)
-            both = np.stack([dedendum, np.minimum(sliding + point.s, sliding - point.s)])
-            fine.append(np.min(both, axis=1))
-            coarse.append(np.min(both[:, ::200], axis=1))
-        least = np.min(fine, axis=0)
-        sampled.append(np.min(coarse, axis=0) - least)
-        found = margins(profile)
-        np.testing.assert_allclose([found.undercut, found.star], least, rtol=0, atol=3e-7)
-    assert np.all(np.max(sampled, axis=0) > 2e-6)
+    With 400 samples they are up to 1e-5 too great; the parabola through three samples is right to
+    3e-7."""
+    profile, least = arc(3, 1.0, center), []
+    for segment in profile.segments():
+        share = jnp.linspace(1e-9, 1 - 1e-9, 1 + 399 * 200)
+        point, _, dedendum = profile.speeds(segment.start + (segment.stop - segment.start) * share)
+        star = jnp.sin(point.psi) - jnp.abs(point.s)
+        least.append([jnp.min(dedendum), jnp.min(star)])
+    found = margins(profile)
+    expected = np.min(least, axis=0)
+    np.testing.assert_allclose([found.undercut, found.star], expected, rtol=0, atol=3e-7)
 
 
 def test_ranges_of_the_arc_and_involute_patent():
@@ -119,22 +135,18 @@ def test_ranges_of_the_arc_and_involute_patent():
 
     With centre distance L and two lobes, the base radius is above L / 2√2 and the arc above √2 π L
     / 16, where the involute is longest, at 45°. The arc is below (27 - 5√2) L / 56, where there is
-    no involute and the tip lies at 3 L / 4."""
-    distance = 1.0
-    r = distance / 2
-    longest = r * np.sin(np.pi / 4) * np.pi / 4
-    least = profile_of("arc_involute", 2, jnp.asarray(r), jnp.asarray([45.0, longest * 1e3]))
+    no involute and the tip lies at 3 L / 4. Here, L = 1."""
+    longest = 0.5 * np.sin(np.pi / 4) * np.pi / 4
+    least = profile_of("arc_involute", 2, jnp.asarray(0.5), jnp.asarray([45.0, longest * 1e3]))
     assert isinstance(least, CIC)
-    assert float(least.base_radius) == pytest.approx(distance / (2 * np.sqrt(2)), rel=1e-12)
-    assert float(least.arc_radius) == pytest.approx(np.sqrt(2) / 16 * np.pi * distance, rel=1e-12)
-    assert float(least.arc_radius) == pytest.approx(0.27768, abs=5e-6)
+    assert float(least.base_radius) == pytest.approx(1 / (2 * np.sqrt(2)), rel=1e-12)
+    assert float(least.arc_radius) == pytest.approx(np.sqrt(2) / 16 * np.pi, rel=1e-12)
 
     def tip(b):
-        return float(measure(arc(2, r, b)).outer_radius) - 0.75 * distance
+        return float(measure(arc(2, 0.5, b)).outer_radius) - 0.75
 
-    radius = float(arc(2, r, brentq(tip, 0.3, 0.45, xtol=1e-12)).radius[0])
-    assert radius == pytest.approx((27 - 5 * np.sqrt(2)) / 56 * distance, rel=1e-9)
-    assert radius == pytest.approx(0.35587, abs=5e-6)
+    radius = float(arc(2, 0.5, brentq(tip, 0.3, 0.45, xtol=1e-12)).radius[0])
+    assert radius == pytest.approx((27 - 5 * np.sqrt(2)) / 56, rel=1e-9)
 
 
 def test_families_that_become_another():
@@ -169,38 +181,23 @@ def test_extended_cycloid_is_the_curve_drawn(ratio):
         return R * np.exp(1j * theta) * (7 / 6 + away / 6 * np.exp(6j * theta))
 
     theta = np.linspace(0, np.pi / 6, COUNT + 2)[1:-1]
-    normal = (drawn(theta + 1e-6) - drawn(theta - 1e-6)) / 1j
-    nu = jnp.asarray(np.angle(normal))
+    nu = jnp.asarray(np.angle((drawn(theta + 1e-6) - drawn(theta - 1e-6)) / 1j))
     place = np.asarray(looked_at(profile, nu)["addendum"]) @ [1, 1j]
     np.testing.assert_allclose(place, drawn(theta), rtol=0, atol=1e-9 * R)
 
 
-def test_edge_describes_an_extended_epicycloid():
-    """The mate of an edge lies at the edge's radius from the curve of its centre.
-
-    That is the curve that the centre draws on the partner, an extended epicycloid. The contact
-    moves backwards along the mate."""
-    profile = made("arcs_epicycloid")
-    nu, found = sampled("arcs_epicycloid")
-    edge = np.flatnonzero((nu > profile.joints[1]) & (nu < profile.joints[2]))[::40]
-    mate = found["dedendum"][edge]
-    center, theta = np.hypot(*profile.center[1]), float(profile.joints[1])
-    # The rotor rolls on the partner's pitch circle; a space of the partner lies at π/3.
-    turn = np.linspace(-0.5, 0.5, 20001)
-    path = 2 * R * np.exp(1j * turn) - center * np.exp(1j * (2 * turn - theta))
-    path = np.conj(path) * np.exp(1j * np.pi / 3)
-    distance = np.abs(path[:, None] - np.asarray(mate) @ [1, 1j])
-    np.testing.assert_allclose(np.min(distance, axis=0), 1e-3, rtol=0, atol=1e-9)
-    assert len(edge) == 5
-    assert np.all(found["rate"][edge] < 0)
-    assert float(margins(profile).rolling) < 0 < float(margins(profile).undercut)
-
-
 def test_five_arcs_have_their_land():
-    """Five arcs have a tip land; the suite checks tangents and the pitch crossing."""
+    """The suite checks tangents and the pitch crossing."""
     shape = measure(made("five_arcs"))
     assert float(shape.outer_radius) == pytest.approx(0.045, rel=1e-12)
     assert float(shape.seal_width) == pytest.approx(2 * 3 * DEG * 0.045)
+
+
+def test_contact_moves_backwards_along_the_mate_of_an_edge():
+    nu, found = sampled("arcs_epicycloid")
+    joints = made("arcs_epicycloid").joints
+    assert np.all(found["rate"][(nu > joints[1]) & (nu < joints[2])] < 0)
+    assert float(margins(made("arcs_epicycloid")).rolling) < 0
 
 
 # Use by name
@@ -230,9 +227,8 @@ def test_five_arcs_have_their_land():
     ],
 )
 def test_unsound_profiles_are_refused(family, changes, fault):
-    config = config_of(family, **changes)
     with pytest.raises(InputError, match=fault):
-        check(config)
+        check(config_of(family, **changes))
 
 
 @CachedFunction
@@ -257,8 +253,146 @@ def test_margins_find_what_closed_forms_refuse(family):
         found = _margins_of(family, design)
         if any(0 < abs(float(value)) < 1e-6 for value in (*found[1:3], *found[6:])):
             return
-        config = config_of(family).with_design(design.tolist())
         if bool(found.sound):
-            row.check(config)
+            row.check(config_of(family).with_design(design.tolist()))
 
     agree()
+
+
+# The paper's pair
+
+
+PAPER = CIC(3, R, 36.43 * DEG, 9.0e-3, 4.0 * DEG)
+every_cic = pytest.mark.parametrize(
+    "profile",
+    [PAPER, cic(3, 0.6, 0.8, 0.0), cic(3, 0.62, 1.0, 0.05), cic(5, 0.45, 0.9, 0.02)],
+    ids=["paper", "no land", "longest involute", "five lobes"],
+)
+
+
+@jax.jit
+def both_flanks(profile, nu):
+    """Return positions on the addendum and on the dedendum at the normal angles `nu`."""
+    return profile.position(profile.addendum(nu)), profile.position(profile.dedendum(nu))
+
+
+# Numbers from literature and closed forms
+
+
+@pytest.mark.parametrize("lobes", [2, 3, 4])
+def test_undercut_margin_changes_sign_at_the_canonical_pressure_angle(lobes):
+    """Undercut starts at tan α = π/2N: margin zero there, r (sin α - cos α π/2N) around it."""
+    canonical = np.arctan(np.pi / (2 * lobes))
+    for change in (-0.01, 0.0, 0.01):
+        alpha = canonical + change
+        margin = float(measure(cic(lobes, alpha, 1.0, 0.0)).undercut_margin)
+        # The margin is the involute's end value, seen from 1e-9 of the segment inside.
+        closed_form = R * (np.sin(alpha) - np.cos(alpha) * np.pi / (2 * lobes))
+        assert margin == pytest.approx(closed_form, abs=1e-8 * R)
+        assert np.sign(round(margin / R, 7)) == np.sign(change)
+
+
+def test_printed_design_of_the_paper():
+    """Table 1's α, u, θ1 give r_a 45.103 mm, efficiency 0.4345 and u 1.2 % past u_max."""
+    shape = measure(PAPER)
+    assert float(shape.outer_radius) * 1e3 == pytest.approx(45.103, abs=5e-4)
+    assert float(shape.area_efficiency) == pytest.approx(0.4345, abs=5e-5)
+    assert float(PAPER.longest_involute) * 1e3 == pytest.approx(8.893, abs=5e-4)
+    assert float(shape.outer_radius + shape.root_radius) == pytest.approx(2 * R, rel=1e-14)
+    assert float(shape.seal_width) == pytest.approx(float(shape.outer_radius) * 8 * DEG)
+    assert float(shape.undercut_margin) > 0
+
+
+# The paper's equations
+
+
+@every_cic
+def test_involute_is_equation_2(profile):
+    """-u ≤ ℓ ≤ u of the paper's Eq. 2: addendum and dedendum points coincide with it."""
+    alpha, u = float(profile.pressure_angle), float(profile.involute_length)
+    length = np.linspace(0, 1, 41)[:-1] * u
+    beta = float(profile.half_pitch) - length / (R * np.sin(alpha))
+    positions = both_flanks(profile, jnp.asarray(beta + np.pi / 2 - alpha))
+    for ell, computed in zip((length, -length), positions, strict=True):
+        beta = np.pi / (2 * profile.lobes) - ell / (R * np.sin(alpha))
+        across = ell * np.cos(alpha) / np.tan(alpha)
+        x = (R + ell * np.cos(alpha)) * np.cos(beta) - across * np.sin(beta)
+        y = ell * np.cos(beta - alpha) / np.tan(alpha) + R * np.sin(beta)
+        np.testing.assert_allclose(computed, np.stack([x, y], -1), rtol=0, atol=1e-14)
+
+
+@every_cic
+def test_land_is_equation_1_and_its_mate_the_circle_that_touches_it(profile):
+    """Tip land: radius r_a over 0 … θ1 (Eq. 1); its conjugate: radius 2 r - r_a."""
+    tip = float(profile.tip_arc_angle)
+    theta = np.linspace(0, tip, 9)
+    outer = float(measure(profile).outer_radius)
+    sides = (theta, outer), (np.pi / profile.lobes - theta, 2 * R - outer)
+    for (angle, radius), found in zip(sides, both_flanks(profile, theta), strict=True):
+        expected = radius * np.stack([np.cos(angle), np.sin(angle)], -1)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-14)
+    bend = profile.speeds(jnp.asarray(theta))[2] / (2 * profile.roll_rate(jnp.asarray(theta)) - 1)
+    np.testing.assert_allclose(bend[theta < tip], 2 * R - outer, rtol=1e-12)
+
+
+# The outline
+
+
+@pytest.mark.parametrize("profile", [PAPER, cic(2, 0.75, 0.8, 0.08), EE(3, R)])
+def test_outline_is_closed_counter_clockwise_and_starts_at_a_tip(profile):
+    points = np.asarray(outline(profile, 150))
+    np.testing.assert_array_equal(points[0], points[-1])
+    assert points[0] == pytest.approx([float(measure(profile).outer_radius), 0], abs=1e-15)
+    polar = np.unwrap(np.angle(points @ [1, 1j]))
+    assert polar[-1] - polar[0] == pytest.approx(2 * np.pi)
+    assert np.min(np.hypot(*np.diff(points, axis=0).T)) > 1e-6 * R
+
+
+# The inverse of the roll angle
+
+
+def test_involute_is_preferred_where_the_roll_angle_turns_back():
+    """For u > u_max, ψ = α from the start of the involute, which lies before the end of the arc."""
+    start, tip = float(PAPER.involute_start), float(PAPER.tip_arc_angle)
+    assert start < tip
+    beta, land = jnp.linspace(start, tip, 21), jnp.linspace(0, start - 1e-9, 21)
+    psi = beta + np.pi / 2 - PAPER.normal_at(beta)
+    np.testing.assert_allclose(psi, PAPER.pressure_angle, atol=1e-12)
+    np.testing.assert_array_equal(PAPER.normal_at(land), land)
+
+
+# Areas
+
+ERROR = 1e-11
+"""Relative error allowed; the study in experiments/geometry finds 1e-13."""
+HARD = {
+    # The normals of the arc all but touch the pitch circle, at its end or inside of it.
+    "cic": (5, [[36.43, 6.0, 4.0], [9.90309962, 4.61058857e-06, 0.00440706401]]),
+    "ee": (4, [[]]),
+    "arc": (5, [[30.0], [31.9750552], [32.99]]),
+    "arcs_epicycloid": (5, [[32.2328279, 4.52872269, 1.31231773]]),
+    "arc_involute": (5, [[30.0, 4.0], [9.57156265, 2.03155703e-06], [86.07009, 4.82898416]]),
+    "four_arcs": (5, [[32.7457584, 9.9455844, 26.4908313]]),
+    "five_arcs": (5, [[38.6977037, 3.82052582, 10.6338733, 36.9061107]]),
+    "circle_epicycloid": (5, [[10.5861275, 89.9968733]]),
+    "hypo_epicycloid": (5, [[3.0], [17.9924375]]),
+    # The pressure angle is steep.
+    "extended_cycloid": (5, [[1.0], [0.3835], [0.238601779]]),
+    "ellipse": (5, [[9.46007216, 27.8267607]]),
+    "free_form": (3, [[4.0, 0.8, 0.7, 0.75], [5.04175591, 0.98336944, 0.83837998, -0.4203177]]),
+}
+"""Number of lobes and designs (config units) of each family."""
+
+
+@pytest.mark.parametrize("family", HARD)
+def test_area_and_moment_are_those_of_the_outline(family):
+    lobes, designs = HARD[family]
+    designs = np.array(designs).reshape(len(designs), -1)
+    area, moment, reference = np.asarray(study.compared(family, lobes, designs)).T
+    assert np.max(reference) < ERROR / 10
+    assert np.max(area) < ERROR
+    assert np.max(moment) < ERROR
+
+
+def test_every_family_is_looked_at():
+    assert set(HARD) == {*FAMILY_KEYS} - {"outline"}

@@ -1,4 +1,5 @@
-"""Tests of the Gauss rule, elements and meshes."""
+"""Tests of the Gauss rule, elements and meshes, and of the condensed linear equations against a
+dense solution of the same equations."""
 
 import jax
 import jax.numpy as jnp
@@ -7,8 +8,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rootsopt.dynamics.collocation.elements import GAUSS, POINTS, Elements, Mesh, zero_of
+from rootsopt.dynamics.collocation.elements import (
+    BLOCK,
+    GAUSS,
+    POINTS,
+    Elements,
+    Mesh,
+    in_blocks,
+    zero_of,
+)
 from rootsopt.dynamics.collocation.mesh import aligned, counted, moved, needed, ordered
+from rootsopt.dynamics.collocation.system import Lines, chained, condensed, own_column
 
 ROOM = 32
 EVENT = 0.3071
@@ -16,11 +26,9 @@ EVENT = 0.3071
 
 def _elements(function, slope, edges, start=0.0):
     """Return elements on fixed edges whose motion is a known function."""
-    edges = np.asarray(edges)
     count = len(edges) - 1
-    length = edges[-1] - edges[0]
     pad = ROOM - count
-    share = (edges - edges[0]) / length
+    share = (edges - edges[0]) / (edges[-1] - edges[0])
     mesh = Mesh(
         times=jnp.full(8, edges[-1]).at[0].set(start),
         which=jnp.full(8, -1),
@@ -52,13 +60,6 @@ def test_rule_integrates_polynomials():
         np.testing.assert_allclose(GAUSS.weights @ GAUSS.nodes**degree, 1 / (degree + 1))
 
 
-def test_motion_is_that_of_the_polynomials():
-    elements = _wave(np.linspace(0, 1, 13))
-    for tau in (0.0, 0.111, 0.5, 0.99, 1.3):
-        expected = np.sin(2 * np.pi * tau)
-        np.testing.assert_allclose(elements.motion(jnp.asarray(tau)), expected, atol=1e-6)
-
-
 def test_motion_moves_to_another_mesh():
     """Elements aligned with events begin at the events, start away from them, and keep the
     motion."""
@@ -75,28 +76,23 @@ def test_motion_moves_to_another_mesh():
         assert np.min(np.abs(places - event)) < 1e-12
     assert np.min(np.abs(np.mod(begin[0] - np.array([0.1, 0.62, 1.0]), 1.0))) > 0.1
     assert set(np.asarray(new.mesh.which).tolist()) == {-1, 4, 5, 6}
-    tau = np.random.default_rng(0).uniform(0, 1, 20)
+    tau = np.random.default_rng(0).uniform(0, 1.3, 20)
     found = jax.jit(jax.vmap(new.motion))(tau)[:, 0]
     np.testing.assert_allclose(found, np.sin(2 * np.pi * tau), atol=2e-6)
     back = jax.jit(moved)(new, elements.mesh)
     np.testing.assert_allclose(back.state[:16], elements.state[:16], atol=2e-6)
 
 
-def _times(times, which):
-    mesh = _wave(np.linspace(0, 1, 5)).mesh
-    count = mesh.times.shape[0] - len(times)
-    times = jnp.asarray([*times, *[times[-1]] * count])
-    return mesh._replace(times=times, which=jnp.asarray([*which, *[-1] * count]))
-
-
 @given(st.lists(st.floats(0, 1), min_size=1, max_size=6))
 def test_order_of_events_is_mended(events):
-    times = _times([0.0, *events, 1.0], [-1, *[2] * len(events), -1])
-    mesh, rising = ordered(times)
+    count = len(events)
+    times = jnp.asarray([0.0, *events, *(7 - count) * [1.0]])
+    which = jnp.asarray([-1, *count * [2], *(7 - count) * [-1]])
+    mesh, rising = ordered(_wave(np.linspace(0, 1, 5)).mesh._replace(times=times, which=which))
     assert np.all(np.diff(mesh.times) >= 0)
     assert bool(rising) == (sorted(events) == events)
     if rising:
-        np.testing.assert_array_equal(mesh.times, times.times)
+        np.testing.assert_array_equal(mesh.times, times)
 
 
 def test_elements_of_the_right_length_have_equal_errors():
@@ -148,5 +144,87 @@ def test_event_is_located(margin, most):
     assert before <= found <= after
     assert after - before < 7e-10
     assert len(places) <= most
-    assert min(places) >= 0.3
-    assert max(places) <= 0.32
+    assert 0.3 <= min(places) <= max(places) <= 0.32
+
+
+# The linear equations
+
+STATES = 3
+TIMES = np.array([0.2, 0.5, 0.9, 1.2, 1.2])
+"""Times of the mesh: start, an event, a fixed time, and the end twice."""
+WHICH = np.array([-1, 0, -1, -1, -1])
+INTERVAL = np.array([0, 0, 1, 2, 2, 3])
+LEFT = np.array([0, 0.3, 0, 0, 0.6, 1.0])
+RIGHT = np.array([0.3, 1, 1, 0.6, 1, 1.0])
+USED = 5
+
+
+def _equation(tau, z):
+    """Return the slope of a smooth equation with strong coupling."""
+    a = jnp.array([[0.0, 1.0, 0.2], [-3.0, -0.4, 0.5], [0.3, 0.1, -1.0]])
+    return a @ z + 0.3 * jnp.sin(z) + jnp.stack([0.0, jnp.cos(2 * jnp.pi * tau), tau])
+
+
+def _margin(tau, z):
+    return z[0] - 0.4 * z[1] + 0.7 * tau
+
+
+@jax.jit
+def _stepped(elements, lines, columns):
+    return chained(elements, lines, columns, condensed(elements, lines, columns))
+
+
+def _misses(unknown):
+    """Return the residuals of the equations of the used elements, written one by one."""
+    z = unknown[: USED * STATES].reshape(USED, STATES)
+    k = unknown[USED * STATES : USED * STATES * (POINTS + 1)].reshape(USED, POINTS, STATES)
+    times = jnp.asarray(TIMES).at[1].set(unknown[-1])
+    rows = []
+    for e in range(USED):
+        begin, end = times[INTERVAL[e]], times[INTERVAL[e] + 1]
+        first = begin + LEFT[e] * (end - begin)
+        length = (RIGHT[e] - LEFT[e]) * (end - begin)
+        for i in range(POINTS):
+            at = z[e] + length * sum(GAUSS.integral[i, j] * k[e, j] for j in range(POINTS))
+            rows.append(k[e, i] - _equation(first + GAUSS.nodes[i] * length, at))
+        reached = z[e] + length * sum(GAUSS.weights[j] * k[e, j] for j in range(POINTS))
+        rows.append(reached - z[(e + 1) % USED])
+    rows.append(_margin(times[1], z[2])[None])
+    return jnp.concatenate(rows)
+
+
+def test_newton_step_solves_the_dense_equations():
+    draw = np.random.default_rng(0)
+    state = jnp.asarray(draw.normal(size=(6, STATES)))
+    slopes = jnp.asarray(draw.normal(size=(6, POINTS, STATES)))
+    mesh = Mesh(*map(jnp.asarray, (TIMES, WHICH, INTERVAL, LEFT, RIGHT, USED)))
+    elements = Elements(mesh, state, slopes, jnp.zeros((6, POINTS + 1, 1, 2)))
+    tau, z = elements.places
+    each = jax.jit(jax.vmap(jax.vmap(lambda t, y: jax.jacfwd(
+        lambda p: _equation(p[0], p[1:]))(jnp.append(t, y)))))  # fmt: skip
+    bend = jax.vmap(lambda t, y: jax.jacfwd(lambda p: _margin(p[0], p[1:]))(jnp.append(t, y)))
+    lines = Lines(
+        miss=jax.vmap(jax.vmap(_equation))(tau, z)[:, :POINTS] - slopes,
+        slopes=each(tau, z)[:, :POINTS],
+        margin=jax.vmap(_margin)(tau[:, -1], z[:, -1]),
+        bend=bend(tau[:, -1], z[:, -1]),
+    )
+    step = _stepped(elements, lines, own_column(elements, lines))
+    unknown = jnp.concatenate([state[:USED].ravel(), slopes[:USED].ravel(), TIMES[1:2]])
+    expected = np.linalg.solve(jax.jit(jax.jacfwd(_misses))(unknown), -jax.jit(_misses)(unknown))
+    found = np.concatenate(
+        [step.state[:USED, :, 0].ravel(), step.slopes[:USED, ..., 0].ravel(), step.times[1]]
+    )
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+    np.testing.assert_array_equal(step.times[jnp.array([0, 2, 3, 4])], 0)
+
+
+def test_blocks_of_a_batch():
+    """A batch with meshes of different sizes does not copy all its arrays for every block."""
+    used = jnp.asarray([5, BLOCK + 1, 3 * BLOCK])
+    values = jnp.arange(9.0 * BLOCK).reshape(3, -1)
+    made = jax.vmap(lambda used, values: in_blocks(lambda x: 2 * x, used, values))
+    for count, value, found in zip(used, values, made(used, values), strict=True):
+        np.testing.assert_array_equal(found[:count], 2 * value[:count])
+    # A loop with a condition for each mesh would choose between old and new arrays.
+    assert "bool[3] = lt" not in str(jax.make_jaxpr(made)(used, values))
