@@ -28,9 +28,8 @@ def test_departure_of_a_scaled_rotor_is_that_of_its_supporting_lines():
     ax = plot_departure(axes[0, 0], outline, 1.001 * outline, 3, 33.0)
     along, away = drawn(ax, 1).T
     radius = np.hypot(*outline.T)
-    assert away[0] == pytest.approx(radius.max(), rel=1e-3)
-    assert away[-1] == pytest.approx(radius.min(), rel=1e-3)
-    assert along[-1] > radius.max() - radius.min()
+    assert away[[0, -1]] == pytest.approx([radius.max(), radius.min()], rel=1e-3)
+    assert along[-1] > np.ptp(radius)
     assert "outwards" in ax.get_title()
     _, axes = figure(6, 4)
     same = plot_departure(axes[0, 0], outline, outline, 3, 33.0)
@@ -39,20 +38,17 @@ def test_departure_of_a_scaled_rotor_is_that_of_its_supporting_lines():
 
 def test_forces_begin_at_the_same_rotation():
     """A force that depends only on the rotor's angle coincides, wherever its series begins."""
-    turn = 2 * np.pi / 3
 
     def run(first):
         rotation = first + np.linspace(0, 2 * np.pi, 601)
-        force = 1 + np.sin(3 * rotation)
-        zero = np.zeros_like(force)
+        force, zero = 1 + np.sin(3 * rotation), 0 * rotation
         return Series(rotation / 314, rotation, zero, zero, force, zero, zero)
 
     _, axes = figure(6, 4)
-    ax = plot_forces_together(axes[0, 0], {"a": run(0.0), "b": run(5.0)}, turn)
+    ax = plot_forces_together(axes[0, 0], {"a": run(0.0), "b": run(5.0)}, 2 * np.pi / 3)
     first, second = (drawn(ax, k) for k in (0, 1))
     assert ax.get_xlim() == pytest.approx((0, 120))
-    there = np.interp(second[:, 0], *first.T)
-    np.testing.assert_allclose(there, second[:, 1], atol=1e-3)
+    np.testing.assert_allclose(np.interp(second[:, 0], *first.T), second[:, 1], atol=1e-3)
 
 
 def overlaps(figure):
@@ -73,17 +69,13 @@ def overlaps(figure):
     return left + [(a, b) for (a, one), (b, other) in pairs if one.overlaps(other)]
 
 
-def histories(keys):
-    """Return rows whose numbers have long tick labels."""
-    shared = {"start": 1, "feasible": True, "residual": 1e-9}
-    return [
-        shared | {"evaluation": k, "iteration": k, "objective": 1 - 1e-5 * k}
-        | {"best_objective": 1 - 1e-5 * k} | dict.fromkeys(keys, -123.45 + 0.12 * k)
-        for k in range(9)
-    ]  # fmt: skip
-
-
 def test_long_labels_have_room():
     """Small differences between large numbers, and many parameters fit."""
     keys = [f"radius_of_arc_{k}_mm" for k in range(5)]
-    assert overlaps(runs._history(histories(keys), keys)) == []
+    rows = [
+        {"start": 1, "feasible": True, "residual": 1e-9, "evaluation": k, "iteration": k}
+        | dict.fromkeys(("objective", "best_objective"), 1 - 1e-5 * k)
+        | dict.fromkeys(keys, -123.45 + 0.12 * k)
+        for k in range(9)
+    ]
+    assert overlaps(runs._history(rows, keys)) == []

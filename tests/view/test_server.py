@@ -11,6 +11,7 @@ import urllib.parse
 import urllib.request
 import webbrowser
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -18,7 +19,6 @@ from rootsopt.commands.table import explore as command
 from rootsopt.config import load
 from rootsopt.errors import InputError
 from rootsopt.optimize.design import optimize_design
-from rootsopt.view import pages
 from rootsopt.view.pages.knobs import Engine
 from tests.commands.test_door import python
 
@@ -102,8 +102,7 @@ def test_page_is_served_to_those_who_know_the_token(address):
     ],
 )
 def test_requests_without_the_token_are_refused(address, path):
-    base = address.split("/", 3)
-    assert get(f"{base[0]}//{base[2]}/{path}")[0] == 404
+    assert get(f"{address[:-33]}{path}")[0] == 404
 
 
 @pytest.mark.parametrize(("origin", "status"), [("http://example.org", 403), (None, 101)])
@@ -151,20 +150,17 @@ def test_browser_is_given_no_secret(monkeypatch):
     """Its arguments, which all users can list, name a file that only this user can read."""
     opened, ready = [], threading.Event()
 
-    class Serving:
-        def __init__(self, *_):
-            pass
-
-        def run(self, stop, started):
-            started("http://127.0.0.1:1/secret/")
-            assert ready.wait(60)
+    def run(stop, started):
+        started("http://127.0.0.1:1/secret/")
+        assert ready.wait(60)
 
     def browse(address):
         file = Path(urllib.request.url2pathname(urllib.parse.urlparse(address).path))
         opened.extend((address, file, file.read_text(), file.parent.stat().st_mode & 0o777))
         ready.set()
 
-    monkeypatch.setattr("rootsopt.view.pages.server.PageServer", Serving)
+    server = SimpleNamespace(run=run)
+    monkeypatch.setattr("rootsopt.view.pages.server.PageServer", lambda *_: server)
     monkeypatch.setattr("rootsopt.view.pages.knobs.Engine.prepare", lambda self: None)
     monkeypatch.setattr(webbrowser, "open", browse)
     assert command.main([CIC]) == 0
@@ -183,13 +179,6 @@ def test_server_listens_on_the_loopback_address_only(address):
             assert probe.connect_ex((one, port)) != 0
 
 
-def test_library_is_named_if_it_is_missing(monkeypatch, capsys):
-    monkeypatch.setattr(pages.importlib.util, "find_spec", lambda name: None)
-    assert command.main([CIC]) == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    assert "pip install 'rootsopt[explore]'" in line
-
-
 def test_port_in_use_is_named(capsys):
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
@@ -203,12 +192,8 @@ def test_ctrl_c_ends_with_success():
     """The address is printed on standard output; Ctrl-C ends with exit code 0 and one line."""
     code = "import runpy; runpy.run_module('rootsopt', run_name='__main__')"
     process = python(code, "explore", CIC, "--no-browser")
-    first = process.stdout.readline()
-    assert get(first.split()[-1])[0] == 200
+    assert get(process.stdout.readline().split()[-1])[0] == 200
     process.send_signal(signal.SIGINT)
-    rest, errors = process.communicate(timeout=60)
+    _, errors = process.communicate(timeout=60)
     assert process.returncode == 0
-    assert errors.strip() == (
-        "rootsopt explore: Ctrl-C: the page closes (once more to stop at once)"
-    )
-    assert "Traceback" not in rest
+    assert errors == "rootsopt explore: Ctrl-C: the page closes (once more to stop at once)\n"
