@@ -20,41 +20,34 @@ from rootsopt.view.runs import RunFolder
 
 WRITING = ("open", "write", "fsync", "mkdir", "rename", "replace", "ftruncate", "pwrite")
 """Operations that a full disk makes fail."""
-REMOVING = ("unlink", "rmdir")
+REMOVING = ("unlink", "rmdir", "rmtree")
 MEMORY = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
 BEFORE = ("absent", "empty", "run", "overwritten")
 """Content of the target: nothing, an empty folder, a run to be moved aside, or one to be
 replaced."""
 
 
-class _System:
-    """The `os` of a module, in which operation number `at` calls `fail` instead."""
+@contextlib.contextmanager
+def faulty(operations: tuple[str, ...], at: int, fail: Callable[[], Any]) -> Iterator[list]:
+    """Call `fail` instead of operation number `at` of the file layer in a `with` block.
 
-    def __init__(self, operations: tuple[str, ...], at: int, fail: Callable[[], Any]):
-        self.operations, self.at, self.fail, self.count = operations, at, fail, 0
+    Yield the list of the operations so far."""
+    calls: list[str] = []
 
-    def __getattr__(self, name: str) -> Any:
-        real = getattr(os, name)
-        return self.counted(real) if name in self.operations else real
-
-    def counted(self, real: Callable) -> Callable:
+    def counted(real: Callable) -> Callable:
         def call(*arguments, **options):
-            self.count += 1
-            return self.fail() if self.count == self.at else real(*arguments, **options)
+            calls.append(real.__name__)
+            return fail() if len(calls) == at else real(*arguments, **options)
 
         return call
 
-
-@contextlib.contextmanager
-def faulty(operations: tuple[str, ...], at: int, fail: Callable[[], Any]) -> Iterator[_System]:
-    """Call `fail` instead of operation number `at` of the file layer in a `with` block."""
-    system, before = _System(operations, at, fail), (files.os, files.shutil)
-    files.os = system  # type: ignore[assignment]
-    if "unlink" in operations:
-        removed = system.counted(shutil.rmtree)
-        files.shutil = SimpleNamespace(rmtree=removed)  # type: ignore[assignment]
+    before = files.os, files.shutil
+    changed = {name: counted(real) for name, real in vars(os).items() if name in operations}
+    files.os = SimpleNamespace(**vars(os) | changed)  # type: ignore[assignment]
+    if "rmtree" in operations:
+        files.shutil = SimpleNamespace(rmtree=counted(shutil.rmtree))  # type: ignore[assignment]
     try:
-        yield system
+        yield calls
     finally:
         files.os, files.shutil = before
 
@@ -128,14 +121,14 @@ def failures(place: Path, kind: str, before: str, at: int) -> tuple[bool, list[s
 
 def _tried(target: Path, kind: str, before: str, at: int) -> tuple[bool, str | None]:
     """Return whether the operation was reached, and the message of the run that failed."""
-    overwrite = before == "overwritten"
+    overwrite, reported = before == "overwritten", None
     if kind == "full":
-        with faulty(WRITING, at, full_disk) as system:
+        with faulty(WRITING, at, full_disk) as calls:
             try:
                 write_run(target, "new", overwrite)
             except InputError as error:
-                return system.count >= at, str(error)
-        return system.count >= at, None
+                reported = str(error)
+        return len(calls) >= at, reported
     child = os.fork()
     if not child:
         try:

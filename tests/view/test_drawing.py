@@ -79,10 +79,12 @@ STATED = {
 
 
 def test_title_block_states_the_config(tmp_path):
-    """The command writes texts, scene and table into the file, and coordinates beside it."""
+    """The command writes texts, scene and table into the DXF; SVG and coordinates beside it."""
     given = [part for key, text in STATED.items() for part in ("--set", f"{key}={text}")]
     place = tmp_path / "run"
     assert command.main([str(CONFIG), "-o", str(place), "--no-figures", *given]) == 0
+    assert (place / "rotor.svg").is_file()
+    assert "outer radius 45.102855 mm" in (place / "rotor.dxf").read_text()
     document = ezdxf.readfile(place / "rotor.dxf")
     assert {entity.dxf.text for entity in document.modelspace().query("TEXT")} >= {
         "Blower rotor", "EN-GJS-500-7", "0.02 mm (ISO 1101)", "ISO 2768-mK", "4711",

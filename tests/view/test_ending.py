@@ -193,50 +193,54 @@ def test_the_reserve_is_part_of_what_was_gained():
     assert "contact goes from 12.5 µm to 20 µm" in facts_of(given)["Gained"]
 
 
-def front():
-    aims = [{"name": "peak_force_N", "sense": "min"}, {"name": "area_efficiency", "sense": "max"}]
-    points = [
+FRONT = run_of(
+    "pareto",
+    terms=[
+        {"name": "peak_force_N", "sense": "min"}, {"name": "area_efficiency", "sense": "max"}
+    ],
+    points=[
         {"point": k, "terms": {"peak_force_N": 100.0 * k, "area_efficiency": 0.4 + 0.01 * k},
          "rates": {"area_efficiency": rate}, "design": DESIGN}
         for k, rate in ((1, None), (2, 2500.0), (3, None))
-    ]  # fmt: skip
-    return run_of("pareto", terms=aims, points=points, baseline=record(), message="Certified.")
-
-
-def sweep():
-    return [{"scene.speed_rpm": 1e3 * k, "peak_force_N": 50.0 + 10 * (k == 2) if k < 3 else None,
-               "status": "chaotic" if k == 3 else "periodic"} for k in (1, 2, 3)]  # fmt: skip
-
-
-def motions():
-    rows = [record(share=share, reached=share > 0.5) for share in (0.75, 0.2)]
-    return run_of("attractors", attractors=rows, lost={"chaotic": 0.05})
-
-
-def geometry():
-    sheet = {"displaced_volume_cm3": 555.0, "flow_ripple": 0.16}
-    shape = {"outer_radius_mm": 45.0, "area_efficiency": 0.4345}
-    return run_of("profile", design=DESIGN, geometry=shape, pump=sheet, status="geometry_only")
+    ],
+    baseline=record(),
+    message="Certified.",
+)  # fmt: skip
+SWEEP = [{"scene.speed_rpm": 1e3 * k, "peak_force_N": force, "status": status}
+         for k, force, status in ((1, 50.0, "periodic"), (2, 60.0, "periodic"),
+                                  (3, None, "chaotic"))]  # fmt: skip
+MOTIONS = run_of(
+    "attractors",
+    attractors=[record(share=share, reached=share > 0.5) for share in (0.75, 0.2)],
+    lost={"chaotic": 0.05},
+)
+GEOMETRY = run_of(
+    "profile",
+    design=DESIGN,
+    geometry={"outer_radius_mm": 45.0, "area_efficiency": 0.4345},
+    pump={"displaced_volume_cm3": 555.0, "flow_ripple": 0.16},
+    status="geometry_only",
+)
 
 
 def test_short_endings():
-    assert facts_of(front()) == {
+    assert facts_of(FRONT) == {
         "Best compromises": "3 points: peak force from 100 to 300 N and area efficiency from 0.41 "
         "to 0.43.",
         "Costs": "The peak force at point 2: +25 N for +0.01 of area efficiency.",
         "How sure": "Certified.",
     }
-    assert facts_of(run_of("sweep", status="chaotic"), rows=sweep()) == {
+    assert facts_of(run_of("sweep", status="chaotic"), rows=SWEEP) == {
         "Peak force": "It is lowest, 50 N, at speed 1000 rpm; highest, 60 N, at speed 2000 rpm.",
         "How sure": "2 of 3 scenes have a steady state. The others: 1 chaotic.",
     }
-    assert facts_of(motions()) == {
+    assert facts_of(MOTIONS) == {
         "Motions": "2 motions coexist; motion 1 (periodic): peak force 100 N, 75 % of the initial "
         "states, reached from rest; motion 2 (periodic): peak force 100 N, 20 % of the initial "
         "states.",
         "How sure": "5 % of the initial states lead to no reported motion.",
     }
-    assert facts_of(geometry()) == {
+    assert facts_of(GEOMETRY) == {
         "Rotor": "Outer radius 45 mm; 43.45 % of the circle of this radius pumps; displaced volume "
         "555 cm³; flow ripple 0.16.",
         "How sure": "Found.",
@@ -252,11 +256,11 @@ ROWS = [{"point": 0, **ODD, "peak_force_N": 9.0, "status": "periodic"}]
     [
         (optimum(), (), 3),
         (run_of("simulate", **record()), (), 3),
-        (front(), (), 2),
-        (motions(), (), 1),
-        (geometry(), (), 2),
+        (FRONT, (), 2),
+        (MOTIONS, (), 1),
+        (GEOMETRY, (), 2),
         (run_of("sweep"), ROWS, 2),
-        (run_of("sweep"), sweep(), 2),
+        (run_of("sweep"), SWEEP, 2),
         (run_of("pareto", status="interrupted"), (), 1),
     ],
 )
@@ -279,8 +283,8 @@ def test_commands_set_what_they_are_about():
     assert shlex.split(first)[3:] == [
         "--set", "scene.load.torque_N_m=4.8", "--set", "profile.family=it's"
     ]  # fmt: skip
-    assert "--set scene.speed_rpm=2000" in steps_of(run_of("sweep"), rows=sweep())[0][1]
-    assert steps_of(motions())[0][1].endswith("config.yaml --set objective.motion=worst")
+    assert "--set scene.speed_rpm=2000" in steps_of(run_of("sweep"), rows=SWEEP)[0][1]
+    assert steps_of(MOTIONS)[0][1].endswith("config.yaml --set objective.motion=worst")
     assert "optimize" not in str(steps_of(run_of("simulate", **record(design={}))))
 
 

@@ -7,7 +7,6 @@ import os
 
 import numpy as np
 import pytest
-from PIL import Image
 from rich.console import Console
 
 from rootsopt.config import parse
@@ -16,7 +15,6 @@ from rootsopt.status import Status
 from rootsopt.view import files, names, tables, terminal
 from rootsopt.view.figures import runs
 from rootsopt.view.figures.force import amplitude_spectrum, plot_force, plot_gap
-from rootsopt.view.figures.runs import optimization_figures, simulation_figures
 from rootsopt.view.figures.style import figure
 from rootsopt.view.names import table
 from tests.standins import refusal
@@ -70,17 +68,6 @@ def _failed():
         message=Status.PASSED_THROUGH.value,
         series=None,
     )
-
-
-def _history():
-    rows = [
-        DESIGN | {"evaluation": i, "start": -1 if i < 4 else i // 8, "iteration": i,
-                  "objective": 1.2 - 0.05 * i, "best_objective": min(1.0, 1.2 - 0.05 * i),
-                  "feasible": i != 6, "status": "periodic"}
-        for i in range(12)
-    ]  # fmt: skip
-    rows[5]["objective"] = float("nan")
-    return rows
 
 
 def _read(path):
@@ -373,20 +360,7 @@ def test_gap_panel_shows_the_least_gap():
     )
 
 
-def test_optimization_figures(tmp_path):
-    better = _evaluation(design=DESIGN | {"involute_length_mm": 8.0})
-    folder = files.ResultFolder(tmp_path)
-    optimization_figures(folder, _evaluation(), better, _history(), parse(CONFIG))
-    names = "comparison", "force", "history", "meshing", "profiles", "spectrum"
-    assert sorted(os.listdir(tmp_path / "figures")) == [f"{name}.png" for name in names]
-    for file in (tmp_path / "figures").iterdir():
-        with Image.open(file) as picture:
-            assert picture.format == "PNG"
-            assert min(picture.width - 1400, picture.height - 700) >= 0
-        assert file.stat().st_size > 20_000
-
-
 def test_simulation_figures_without_a_series(tmp_path):
-    simulation_figures(files.ResultFolder(tmp_path), _failed(), parse(CONFIG))
+    runs.simulation_figures(files.ResultFolder(tmp_path), _failed(), parse(CONFIG))
     assert sorted(os.listdir(tmp_path / "figures")) == ["meshing.png", "profiles.png"]
     assert "pyplot" not in vars(runs)

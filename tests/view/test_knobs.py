@@ -36,16 +36,17 @@ def test_every_knob_can_be_set(name):
 @pytest.mark.parametrize("family", [name for name, one in families().items() if one.maker])
 def test_every_family_has_a_knob_per_design_parameter(family):
     """Design parameters come first, and span the bounds of an optimisation."""
-    example = families()[family].example
-    rows = "\n".join(f"  {key}: {list(x) if isinstance(x, tuple) else x}"
-                     for key, x in example.items())  # fmt: skip
+    rows = "".join(f"\n  {key}: {list(x) if isinstance(x, tuple) else x}"
+                   for key, x in families()[family].example.items())  # fmt: skip
     text = (ROOT / "configs" / "ee.yaml").read_text().replace("family: ee", f"family: {family}")
-    text = text.replace("  lobes: 3", f"  lobes: 3\n{rows}")
-    knobs = knobs_of(config := parse(text))
+    config = parse(text.replace("  lobes: 3", f"  lobes: 3{rows}"))
+    knobs = knobs_of(config)
     design = [knob for knob in knobs if knob.group == "Design"]
-    assert [knob.key for knob in design] == [f"profile.{key}" for key in config.design_keys]
+    assert [(knob.key, knob.value) for knob in design] == [
+        (f"profile.{key}", value)
+        for key, value in zip(config.design_keys, config.design, strict=True)
+    ]
     assert knobs[: len(design)] == design
-    assert [knob.value for knob in design] == list(config.design)
     assert all(math.isfinite(knob.low) and math.isfinite(knob.high) for knob in design)
 
 
@@ -63,15 +64,14 @@ def test_only_parts_of_the_scene_have_knobs():
 
 def test_spans_units_and_texts():
     knobs = by_key(load("cic_drawn"))
-    speed = knobs["scene.speed_rpm"]
+    speed, angle = knobs["scene.speed_rpm"], knobs["profile.pressure_angle_deg"]
     assert (speed.low, speed.high, speed.step, speed.unit) == (600, 6000, 20, "rpm")
     assert (speed.least, speed.most) == (1e-2, 1e6)
     assert "speed of rotor 1" in speed.help
-    angle = knobs["profile.pressure_angle_deg"]
     assert (angle.low, angle.high, angle.unit, angle.name) == (25, 45, "°", "pressure angle")
-    clearance = knobs["contact.clearance_mm"]
+    clearance, helix = knobs["contact.clearance_mm"], knobs["rotor.helix_deg"]
     assert clearance.low == clearance.value == 0 < clearance.high
-    assert knobs["rotor.helix_deg"].low == -knobs["rotor.helix_deg"].high
+    assert helix.low == -helix.high
     assert knobs["profile.lobes"].whole
     far = by_key(load("cic_drawn", ["profile.tip_arc_angle_deg=12"]))["profile.tip_arc_angle_deg"]
     assert far.high == 12  # beyond its bounds

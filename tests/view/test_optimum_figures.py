@@ -4,6 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from rootsopt.config import load
 from rootsopt.response.result import Series
@@ -11,6 +12,7 @@ from rootsopt.scene import outline_mm
 from rootsopt.view.figures import runs
 from rootsopt.view.figures.designs import plot_departure, plot_forces_together
 from rootsopt.view.figures.style import figure
+from rootsopt.view.files import ResultFolder
 
 CIC = load("configs/cic_drawn.yaml")
 
@@ -69,13 +71,21 @@ def overlaps(figure):
     return left + [(a, b) for (a, one), (b, other) in pairs if one.overlaps(other)]
 
 
-def test_long_labels_have_room():
-    """Small differences between large numbers, and many parameters fit."""
+def test_long_labels_have_room(tmp_path):
+    """Small differences between large numbers, and many parameters fit; a picture is large.
+
+    Screening, trials without a result and infeasible ones are part of the history."""
     keys = [f"radius_of_arc_{k}_mm" for k in range(5)]
     rows = [
-        {"start": 1, "feasible": True, "residual": 1e-9, "evaluation": k, "iteration": k}
-        | dict.fromkeys(("objective", "best_objective"), 1 - 1e-5 * k)
+        {"start": k // 4 - 1, "feasible": k != 6, "residual": 1e-9, "evaluation": k, "iteration": k}
+        | {"objective": 1 - 1e-5 * k if k != 5 else np.nan, "best_objective": 1 - 1e-5 * k}
         | dict.fromkeys(keys, -123.45 + 0.12 * k)
-        for k in range(9)
+        for k in range(12)
     ]
-    assert overlaps(runs._history(rows, keys)) == []
+    made = runs._history(rows, keys)
+    assert overlaps(made) == []
+    file = ResultFolder(tmp_path).write_figure("figures/history.png", made)
+    assert file.stat().st_size > 20_000
+    with Image.open(file) as picture:
+        assert picture.format == "PNG"
+        assert min(picture.width - 1400, picture.height - 700) >= 0

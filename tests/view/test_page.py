@@ -17,13 +17,13 @@ from rootsopt.profiles import EE
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.status import Status
 from rootsopt.view.pages import html as texts
-from rootsopt.view.pages import session as sessions
 from rootsopt.view.pages.knobs import Engine, Shape, same_motion
 from rootsopt.view.pages.session import (
     FromRest,
     NewMotion,
     NewShape,
     Problem,
+    Progress,
     Saved,
     Searched,
     Session,
@@ -229,7 +229,7 @@ def test_search_can_be_cancelled_and_its_design_is_taken(told, monkeypatch):
     monkeypatch.setattr(told.engine, "optimize", search)
     number = told.move({SPEED: 3010.0})
     told.optimize()
-    assert told.next(sessions.Progress, number).best == 0.9
+    assert told.next(Progress, number).best == 0.9
     told.cancel()
     assert searched(told).values == {"profile.pressure_angle_deg": 40.0}
     assert not told.searching.is_set()
