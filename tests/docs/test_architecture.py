@@ -30,14 +30,15 @@ def code_in(text):
 @functools.cache
 def names_of(package):
     """Return all names of classes, functions, methods and fields that a package defines."""
-    found = set()
-    for path in package.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.ClassDef | ast.FunctionDef):
-                found.add(node.name)
-            elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
-                found.add(node.target.id)
-    return found
+    nodes = [
+        node
+        for path in package.rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+    ]
+    fields = [node.target for node in nodes if isinstance(node, ast.AnnAssign)]
+    return {node.name for node in nodes if isinstance(node, ast.ClassDef | ast.FunctionDef)} | {
+        field.id for field in fields if isinstance(field, ast.Name)
+    }
 
 
 def is_module(path):

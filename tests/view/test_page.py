@@ -104,10 +104,9 @@ def test_rest_waits_until_the_slider_rests(told):
 
     One that is not known near the last one is simulated from rest at once."""
     for _ in range(3):
-        number = told.move({SPEED: 3100.0, "profile.lobes": 4.0})
+        number = told.move({SPEED: 3100.0})
         told.next(NewMotion, number)
     told.next(FromRest, number)
-    assert type(told.config().profile.lobes) is int
     names, times = zip(*told.engine.calls, strict=True)
     assert (names[0], names[1], names[-1]) == ("rest", "near", "rest")
     assert times[-1] - times[-2] >= 0.3
@@ -127,6 +126,11 @@ def test_motion_from_rest_is_shown_when_asked(told):
     assert shown.evaluation.response["mean_force_N"] == 2
     told.show_from_rest()
     assert told.next(FromRest, number).same
+
+
+def test_sliders_of_whole_numbers_give_whole_numbers(told):
+    told.move({"profile.lobes": 4.0})
+    assert type(told.config().profile.lobes) is int
 
 
 def test_motions_are_the_same_if_all_their_forces_agree():

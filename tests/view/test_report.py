@@ -207,12 +207,10 @@ def test_names_that_are_no_text_are_shown(tmp_path):
     [("periodic", True, "good"), ("not_converged", True, "bad"), ("chaotic", False, "bad")],
 )
 def test_header_marks_a_result_that_is_not_to_be_trusted(status, usable, mark, tmp_path):
-    page = report_text(run_of(tmp_path, result_of(status=status), usable=usable))
+    """And numbers stay with their units."""
+    result = result_of(status=status, message="Yes. 5 N at 3000 rpm and 2 Newtons.")
+    page = report_text(run_of(tmp_path, result, usable=usable))
     assert f'<span class="status {mark}">' in page
-
-
-def test_numbers_stay_with_their_units(tmp_path):
-    page = report_text(run_of(tmp_path, result_of(message="Yes. 5 N at 3000 rpm and 2 Newtons.")))
     assert "5\N{NO-BREAK SPACE}N at 3000\N{NO-BREAK SPACE}rpm and 2 Newtons" in page
 
 
@@ -355,27 +353,19 @@ def test_failing_report_does_not_lose_the_run(tmp_path, monkeypatch, capfd):
     given = [CIC, "-o", str(tmp_path / "run"), "--report", "--no-figures", "--export", "none"]
     assert profile.main(given) == 0
     assert "no idea" in capfd.readouterr().err
-    assert sorted(os.listdir(tmp_path / "run")) == ["config.yaml", "result.json"]
+    assert {"result.json", pages.REPORT} & {*os.listdir(tmp_path / "run")} == {"result.json"}
 
 
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    """Return a function (page, options) → (standard output, console messages) of Chromium.
+def browsed(file, *options):
+    """Return (standard output, console messages) of Chromium that shows a file.
 
     It runs headless with scripts, without a network and without a display."""
-    found = chromium()
-
-    def run(file, *options):
-        profile = tmp_path_factory.mktemp("browser")
-        flags = [*FLAGS, f"--user-data-dir={profile}", "--enable-logging=stderr"]
-        flags += ["--virtual-time-budget=8000", "--window-size=1280,900", *options]
-        command = [found, *flags, file.as_uri()]
-        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
-        told = [line for line in done.stderr.splitlines() if "CONSOLE" in line]
-        told = [line for line in told if "[bokeh" not in line]  # what Bokeh says of its own work
-        return done.stdout, told
-
-    return run
+    flags = [*FLAGS, f"--user-data-dir={file.parent / 'profile'}", "--enable-logging=stderr"]
+    flags += ["--virtual-time-budget=8000", "--window-size=1280,900", *options]
+    command = [chromium(), *flags, file.as_uri()]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    told = [line for line in done.stderr.splitlines() if "CONSOLE" in line]
+    return done.stdout, [line for line in told if "[bokeh" not in line]  # Bokeh's own work
 
 
 # A headless browser draws frames when it likes, so the page's frames are driven by a timer here.
@@ -419,13 +409,13 @@ window.addEventListener("load", probe);
 
 
 @pytest.mark.parametrize("width", [1280, 800])
-def test_slider_moves_the_rotors_in_a_browser(browser, page, tmp_path, width):
+def test_slider_moves_the_rotors_in_a_browser(page, tmp_path, width):
     """Slider and button turn both rotors, in opposite senses.
 
     There is no message on the console, and nothing is wider than the window."""
     file = tmp_path / "page.html"
     file.write_text(page.replace("</body>", _PROBE + "</body>"), "utf-8")
-    out, told = browser(file, f"--window-size={width},900", "--dump-dom")
+    out, told = browsed(file, f"--window-size={width},900", "--dump-dom")
     assert told == []
     (found,) = re.findall(r'<pre id="seen">(.*?)</pre>', out)
     seen = json.loads(entities.unescape(found))
@@ -445,13 +435,13 @@ def test_slider_moves_the_rotors_in_a_browser(browser, page, tmp_path, width):
     assert "<title>taken</title>" not in out
 
 
-def test_page_prints(browser, page, tmp_path):
+def test_page_prints(page, tmp_path):
     """The page prints as a PDF of several pages, with charts."""
-    file, printed = tmp_path / "page.html", tmp_path / "page.pdf"
+    file = tmp_path / "page.html"
     file.write_text(page, "utf-8")
-    _, told = browser(file, f"--print-to-pdf={printed}")
+    _, told = browsed(file, f"--print-to-pdf={tmp_path / 'page.pdf'}")
     assert told == []
-    content = printed.read_bytes()
+    content = (tmp_path / "page.pdf").read_bytes()
     assert content.startswith(b"%PDF")
     assert len(re.findall(rb"/Type\s*/Page\b", content)) >= 4
 
