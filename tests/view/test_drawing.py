@@ -1,7 +1,6 @@
 """Dimensions, title block and coordinates of the drawing, read back from the DXF file."""
 
 import io
-from pathlib import Path
 
 import ezdxf
 import numpy as np
@@ -16,8 +15,7 @@ from rootsopt.view.figures.drawing import coordinates
 from rootsopt.view.figures.pieces import Arc, outline_pieces, polyline
 from tests.view.test_export import PROFILES, drawing
 
-ROOT = Path(__file__).parents[2]
-CONFIG = ROOT / "configs/cic_drawn.yaml"
+CONFIG = "cic_drawn"
 DRAWN = "cic 2, no land", "cic 3", "cic 3, past the longest", "ee 3"
 
 
@@ -82,7 +80,7 @@ def test_title_block_states_the_config(tmp_path):
     """The command writes texts, scene and table into the DXF; SVG and coordinates beside it."""
     given = [part for key, text in STATED.items() for part in ("--set", f"{key}={text}")]
     place = tmp_path / "run"
-    assert command.main([str(CONFIG), "-o", str(place), "--no-figures", *given]) == 0
+    assert command.main([CONFIG, "-o", str(place), "--no-figures", *given]) == 0
     assert (place / "rotor.svg").is_file()
     assert "outer radius 45.102855 mm" in (place / "rotor.dxf").read_text()
     document = ezdxf.readfile(place / "rotor.dxf")

@@ -4,7 +4,6 @@ import io
 import itertools
 import re
 from collections import Counter, defaultdict
-from pathlib import Path
 
 import ezdxf
 import jax
@@ -26,7 +25,6 @@ from rootsopt.view.figures.animation import meshing_gif, rolling_contacts
 from rootsopt.view.figures.drawing import Drawing, svg_text
 from rootsopt.view.figures.pieces import Arc, outline_pieces, polyline
 
-ROOT = Path(__file__).parents[2]
 R = 0.033
 LENGTH = 100.0
 
@@ -266,7 +264,7 @@ def frames_of(file, numbers):
 def test_profile_writes_an_animation(tmp_path, few_frames):
     """The GIF has one frame per step and moves."""
     folder = tmp_path / "out"
-    given = [str(ROOT / "configs/cic_drawn.yaml"), "-o", str(folder), "--no-figures"]
+    given = ["cic_drawn", "-o", str(folder), "--no-figures"]
     assert profile.main([*given, "--export", "gif", "--set", "rotor.helix_deg=40"]) == 0
     gif = folder / "figures/meshing.gif"
     assert gif.stat().st_size < 2e6 / 5
@@ -313,9 +311,7 @@ def test_bore_takes_mass_and_inertia():
     """A bore removes π ρ L r² and π/2 ρ L r⁴; derivatives with respect to the design do not change.
 
     An optimisation keeps the root circle outside the bore."""
-    plain, bored = (
-        load(ROOT / "configs/cic_drawn.yaml", sets) for sets in ([], ["rotor.bore_mm=20"])
-    )
+    plain, bored = (load("cic_drawn", sets) for sets in ([], ["rotor.bore_mm=20"]))
     one, other = Scene.from_config(plain), Scene.from_config(bored)
     design = design_vector(plain)
     shape = geometry(one.profile(design))
@@ -339,5 +335,5 @@ def test_bore_takes_mass_and_inertia():
 
 def test_bore_must_fit():
     with pytest.raises(InputError, match=r"`rotor.bore_mm` must be less than 44 .* but is 44"):
-        check_geometry(load(ROOT / "configs/ee.yaml", ["rotor.bore_mm=44.0"]))
-    check_geometry(load(ROOT / "configs/ee.yaml", ["rotor.bore_mm=43.9"]))
+        check_geometry(load("ee", ["rotor.bore_mm=44.0"]))
+    check_geometry(load("ee", ["rotor.bore_mm=43.9"]))

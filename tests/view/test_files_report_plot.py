@@ -1,4 +1,4 @@
-"""Tests of result files, tables and figures, from made-up evaluations."""
+"""Tests of result files and tables, from made-up evaluations."""
 
 import dataclasses
 import json
@@ -8,28 +8,16 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from rootsopt.config import parse
 from rootsopt.response.result import Evaluation, Series
 from rootsopt.status import Status
 from rootsopt.view import files, names, tables, terminal
-from rootsopt.view.figures import runs
-from rootsopt.view.figures.force import amplitude_spectrum, plot_force, plot_gap
-from rootsopt.view.figures.style import figure
 from rootsopt.view.names import table
 from tests.standins import refusal
 
-CONFIG = """
-profile: {family: cic, lobes: 3, pitch_radius_mm: 33.0, pressure_angle_deg: 36.43,
-          involute_length_mm: 8.5, tip_arc_angle_deg: 4.0}
-rotor: {length_mm: 100.0, density_kg_m3: 7800.0}
-contact: {stiffness_N_per_mm_e: 2.0e5, exponent: 2.2, max_damping_N_s_per_mm: 0.25,
-          full_damping_depth_mm: 0.01}
-scene: {speed_rpm: 3000.0, load: {torque_N_m: 1.0}}
-"""
 DESIGN = {"pressure_angle_deg": 36.43, "involute_length_mm": 8.5, "tip_arc_angle_deg": 4.0}
 
 
-def _series(periods=3, samples=64):
+def made_up(periods=3, samples=64):
     tau = np.arange(periods * samples) / samples
     wave, none = np.cos(2 * np.pi * tau), 0 * tau
     return Series(
@@ -53,12 +41,12 @@ def _evaluation(mean=14.830332, peak=83.824854, **changes):
         status=Status.PERIODIC,
         message=Status.PERIODIC.value,
         statistics={"solver_steps": 3055, "seconds": 21.16},
-        series=_series(),
+        series=made_up(),
     )
     return dataclasses.replace(made, **changes)
 
 
-def _failed():
+def failed():
     return _evaluation(
         response={},
         gradient={},
@@ -73,7 +61,7 @@ def _failed():
 
 
 def test_csv_keeps_ten_digits(tmp_path):
-    series = _series()
+    series = made_up()
     columns = files.response_columns(series)
     path = files.ResultFolder(tmp_path).write_csv("response_baseline.csv", columns)
     assert path == tmp_path / "response_baseline.csv"
@@ -180,7 +168,7 @@ def test_numbers_of_two_designs_are_compared():
 
 
 def test_numbers_without_a_usable_result():
-    result = _compared(_evaluation(), _failed(), objective=float("nan"))
+    result = _compared(_evaluation(), failed(), objective=float("nan"))
     made = tables.numbers_table(result)
     _check(made, {
         "relative to the baseline": ["–", "–", ""],
@@ -304,54 +292,3 @@ def test_changes():
     assert names.percent(1.0, 1.0 - 1e-9) == "0.00 %"
     assert names.percent(0.001, 3.0) == "+3 × 10⁵ %"
     assert names.percent(0.0, 1.0) == names.percent(None, 1.0) == ""
-
-
-# -------------------------------------------------------------------------- figures
-
-
-@pytest.mark.parametrize("count", [96, 97])
-def test_spectrum_of_a_cosine(count):
-    step = 3 / (150 * count)  # three whole periods of 150 Hz
-    time = step * np.arange(count)
-    signal = 5 + 2.5 * np.cos(2 * np.pi * 150 * time + 0.3) + 0.5 * np.sin(2 * np.pi * 300 * time)
-    frequency, amplitude = amplitude_spectrum(signal, step)
-    np.testing.assert_allclose(frequency, 50 * np.arange(1, len(frequency) + 1), rtol=1e-9)
-    expected = np.zeros_like(frequency)
-    expected[[2, 5]] = 2.5, 0.5
-    np.testing.assert_allclose(amplitude, expected, atol=1e-12)
-
-
-def test_force_panels_show_each_peak_on_a_common_time_axis():
-    long = _series(periods=128)
-    long.drive_force[100 * 64] = 500.0
-    _, axes = figure(6, 4, 2, 1, sharex=True)
-    responses = {"a": {"mean_force_N": 10.0, "peak_force_N": 500.0},
-                 "b": {"mean_force_N": 10.0, "peak_force_N": 30.0}}  # fmt: skip
-    plot_force(axes[:, 0], {"a": long, "b": _series()}, responses)
-    drawn = axes[0, 0].lines[0]
-    assert drawn.get_ydata().max() == 500
-    assert axes[0, 0].get_xlim() == pytest.approx((0, 20))
-    assert drawn.get_xdata()[-1] < 20
-
-
-def test_gap_panel_shows_the_least_gap():
-    """One revolution is drawn; a gap as wide as the rotors does not set the scale."""
-    series = _series(periods=6)
-    gap = 1e-4 * (1 + (np.arange(len(series.time)) % 64 == 32) * 600.0)
-    gap[5] = 8e-5
-    _, axes = figure(6, 2, 1, 1)
-    plot_gap(axes[:, 0], {"a": dataclasses.replace(series, depth=-gap)})
-    curve, least = axes[0, 0].lines
-    assert (least.get_ydata()[0], least.get_label()) == (pytest.approx(80), "least gap 80.00 µm")
-    assert axes[0, 0].get_ylim() == pytest.approx((0, 320))
-    assert (
-        np.ptp(series.rotation)
-        > 2 * np.pi
-        > 0.9 * np.ptp(series.rotation[: curve.get_xdata().size])
-    )
-
-
-def test_simulation_figures_without_a_series(tmp_path):
-    runs.simulation_figures(files.ResultFolder(tmp_path), _failed(), parse(CONFIG))
-    assert sorted(os.listdir(tmp_path / "figures")) == ["meshing.png", "profiles.png"]
-    assert "pyplot" not in vars(runs)

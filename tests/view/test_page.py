@@ -4,7 +4,6 @@ import dataclasses
 import queue
 import re
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -32,8 +31,7 @@ from tests.standins import evaluation_of
 from tests.view.test_server import serving
 
 pytest.importorskip("bokeh")
-ROOT = Path(__file__).parents[2]
-CIC = ROOT / "configs" / "cic_drawn.yaml"
+CIC = "cic_drawn"
 SPEED, TIP, LOAD = "scene.speed_rpm", "profile.tip_arc_angle_deg", "scene.load.torque_N_m"
 
 
@@ -240,7 +238,7 @@ def test_search_can_be_cancelled_and_its_design_is_taken(told, monkeypatch):
 
 
 def test_search_without_design_parameters_says_why():
-    made = Told(Engine(load(ROOT / "configs" / "ee.yaml"), optimize_design))
+    made = Told(Engine(load("ee"), optimize_design))
     made.engine.ready.set()
     made.optimize()
     assert "has no design parameter" in searched(made).words

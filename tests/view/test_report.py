@@ -8,7 +8,6 @@ import os
 import re
 import shlex
 import subprocess
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -28,8 +27,7 @@ from rootsopt.view.pages.gather import Run, glossary, linked
 from rootsopt.view.pages.html import report_text
 
 pytest.importorskip("bokeh")
-ROOT = Path(__file__).parents[2]
-CIC = str(ROOT / "configs" / "cic_drawn.yaml")
+CIC = "cic_drawn"
 HOSTILE = '</script><script>document.title = "taken"</script><b>&amp;'
 NOTE = "`rotor.helix_deg` is 1 °, which is unusual"
 SAMPLES, PITCHES = 240, 3

@@ -21,8 +21,7 @@ from rootsopt.view.pages.knobs import Engine
 from tests.commands.test_door import python
 
 pytest.importorskip("bokeh")
-ROOT = Path(__file__).parents[2]
-CIC = str(ROOT / "configs" / "cic_drawn.yaml")
+CIC = "cic_drawn"
 
 
 class Idle(Engine):
