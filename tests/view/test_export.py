@@ -6,8 +6,6 @@ import re
 from collections import Counter, defaultdict
 
 import ezdxf
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
@@ -308,28 +306,20 @@ def test_arrow_follows_the_force(few_frames):
 
 
 def test_bore_takes_mass_and_inertia():
-    """A bore removes π ρ L r² and π/2 ρ L r⁴; derivatives with respect to the design do not change.
+    """A bore removes π ρ L r² and π/2 ρ L r⁴ from any design.
 
     An optimisation keeps the root circle outside the bore."""
     plain, bored = (load("cic_drawn", sets) for sets in ([], ["rotor.bore_mm=20"]))
     one, other = Scene.from_config(plain), Scene.from_config(bored)
-    design = design_vector(plain)
-    shape = geometry(one.profile(design))
     cylinder = 7800.0 * 0.1 * np.pi * 0.01**2
-    assert float(one.mass(shape) - other.mass(shape)) == pytest.approx(cylinder, rel=1e-9)
-
-    def inertia(model):
-        """Return moment of inertia, and its derivative along a direction."""
-        turn = jnp.ones(3)
-        return jax.jvp(lambda x: model.inertia(geometry(model.profile(x))), (design,), (turn,))
-
-    (whole, slope), (less, same) = inertia(one), inertia(other)
-    assert float(whole - less) == pytest.approx(cylinder * 0.01**2 / 2, rel=1e-9)
-    assert float(same) == pytest.approx(float(slope), rel=1e-12)
-    assert abs(slope) > 0
     limits = {c.name: c for c in Space.of(bored, other).constraints}
-    room = float(shape.root_radius) * 1e3 - 10.0
-    assert float(limits["root radius"].slack(shape)) == pytest.approx(room, rel=1e-9)
+    for factor in (1.0, 1.01):
+        shape = geometry(one.profile(factor * design_vector(plain)))
+        lost = [float(one.mass(shape) - other.mass(shape))]
+        lost.append(float(one.inertia(shape) - other.inertia(shape)))
+        assert lost == pytest.approx([cylinder, cylinder * 0.01**2 / 2], rel=1e-9)
+        room = float(shape.root_radius) * 1e3 - 10.0
+        assert float(limits["root radius"].slack(shape)) == pytest.approx(room, rel=1e-9)
     assert "root radius" not in {c.name for c in Space.of(plain, one).constraints}
 
 
