@@ -118,19 +118,19 @@ def test_places_that_no_folder_can_take(tmp_path, monkeypatch, where, words):
     assert digest(tmp_path) == before
 
 
-def test_the_current_folder_is_not_overwritten(tmp_path, monkeypatch):
-    write_run(tmp_path / "here", "old")
-    monkeypatch.chdir(tmp_path / "here" / "figures")
+def test_runs_that_cannot_be_replaced_are_kept(tmp_path, monkeypatch):
+    """Neither a mount point nor the folder above the current one is overwritten."""
+    here = tmp_path / "here"
+    write_run(here, "old")
+    monkeypatch.setattr(runs, "_mount_points", lambda: {os.path.realpath(here)})
+    write_run(here / "simulate", "inside")
+    before = digest(here)
+    message = refusal(RunFolder, here, "simulate", overwrite=True)
+    assert re.search(r"mount point.*here/simulate", message)
+    monkeypatch.undo()
+    monkeypatch.chdir(here / "figures")
     assert "current folder" in refusal(RunFolder, "..", "simulate", overwrite=True)
-    assert digest(tmp_path / "here") == digest_of("old")
-
-
-def test_mount_points_are_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(runs, "_mount_points", lambda: {os.path.realpath(tmp_path / "mounted")})
-    (tmp_path / "mounted").mkdir()
-    message = refusal(RunFolder, tmp_path / "mounted", "simulate")
-    assert re.search(r"mount point.*mounted/simulate", message)
-    write_run(tmp_path / "mounted" / "simulate", "inside")
+    assert digest(here) == before
 
 
 def test_long_and_odd_names(tmp_path):
@@ -196,38 +196,28 @@ def test_without_locks_nothing_of_others_is_removed(tmp_path, monkeypatch):
     assert sorted(os.listdir(tmp_path)) == [stage.name, "run"]
 
 
-def _profile(folder, *more):
-    return main(["profile", "configs/cic_drawn.yaml", "-o", str(folder), "--no-figures", *more])
-
-
 def test_what_a_command_leaves_when_it_fails(tmp_path, capsys, monkeypatch):
-    """After bad input found late, or an interrupt, nothing is new and the earlier run is
-    unchanged."""
-    monkeypatch.chdir(ROOT)
-    target = tmp_path / "new" / "run"
-    assert _profile(target, "--export", "paper") == 2
+    """After bad input found late, or an interrupt, nothing is new and the earlier run is unchanged.
+
+    Each command has its own default folder, and the result names the command."""
+    monkeypatch.chdir(tmp_path)
+    command = ["profile", "cic_drawn", "--no-figures"]
+    assert main([*command, "--export", "paper"]) == 2
     assert os.listdir(tmp_path) == []
-    assert _profile(target, "--export", "none") == 0
-    before = digest(target)
+    assert main(command) == 0
+    place = tmp_path / "results" / "cic_drawn-profile"
+    record = json.loads((place / "result.json").read_text())
+    assert record["run"] == {"command": "profile", "files": sorted(os.listdir(place))}
+    before = digest(tmp_path)
 
     def interrupted(*_):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("rootsopt.commands.work.profile.write", interrupted)
     capsys.readouterr()
-    assert _profile(target) == 3
+    assert main(command) == 3
     assert capsys.readouterr().err == "rootsopt profile: stopped by the user\n"
-    assert digest(target) == before
-    assert os.listdir(tmp_path / "new") == ["run"]
-
-
-def test_each_command_has_a_folder_of_its_own(tmp_path, monkeypatch):
-    """Each command has its own default folder, and the result names the command."""
-    monkeypatch.chdir(tmp_path)
-    assert main(["profile", str(ROOT / "configs" / "cic_drawn.yaml"), "--no-figures"]) == 0
-    place = tmp_path / "results" / "cic_drawn-profile"
-    record = json.loads((place / "result.json").read_text())
-    assert record["run"] == {"command": "profile", "files": sorted(os.listdir(place))}
+    assert digest(tmp_path) == before
 
 
 AUDIT = """
