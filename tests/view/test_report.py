@@ -214,12 +214,9 @@ def test_header_marks_a_result_that_is_not_to_be_trusted(status, usable, mark, t
 
 @pytest.mark.parametrize(
     ("command", "source", "resumed"),
-    [
-        ("optimize", "cic -o run", "cic -o run --resume"),
-        ("sweep", "cic --resume", "cic --resume"),
-        ("pareto", "cic", "cic --resume"),
-    ],
-)
+    [("optimize", "cic -o run", "cic -o run --resume"), ("sweep", "cic --resume", "cic --resume"),
+     ("pareto", "cic", "cic --resume")],
+)  # fmt: skip
 def test_stopped_run_says_how_to_go_on(command, source, resumed, tmp_path):
     message = "The search was stopped after 2 designs. The best of them is reported."
     given = result_of(command, status="interrupted", message=message)
