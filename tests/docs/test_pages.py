@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import os
 import re
 import shlex
 
@@ -31,77 +32,57 @@ CELL = "{code-cell}"
 def test_code_is_executed_or_named_as_not_executed(name):
     known = {"run", "fails", "skip", "rotor.yaml"}
     for block in blocks_of(DOCS / f"{name}.md"):
-        if block.language.startswith("{"):  # A directive.
-            continue
-        assert block.language in ("sh", "python", "yaml"), block
-        assert block.words in known, f"{name}: say whether this block is run:\n{block.text}"
+        if not block.language.startswith("{"):  # A directive.
+            assert block.language in ("sh", "python", "yaml"), block
+            assert block.words in known, f"{name}: say whether this block is run:\n{block.text}"
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    return tmp_path_factory.mktemp("tutorial")
+def _ended(done, block, page):
+    """Assert that a block ended as the page says, with the message that it prints."""
+    fails = block.words == "fails"
+    assert done.returncode == (2 if fails else 0), f"{block.text}\n{done.stdout}\n{done.stderr}"
+    if fails:
+        assert done.stderr.strip().split(".yaml: ")[1] in " ".join(page.split())
 
 
-def _tutorial(folder, blocks):
-    """Write the files and run the commands and the Python of `blocks`."""
-    for block in blocks:
+@pytest.mark.parametrize("name", ["tutorial", "design"])
+def test_page_begins(name, tmp_path, capsys, monkeypatch):
+    """The steps that compile nothing: bad configs, a written or a new one, and its geometry."""
+    page = (DOCS / f"{name}.md").read_text()
+    (tmp_path / "rotor.yaml").touch()
+    for block in blocks_of(DOCS / f"{name}.md"):
         if block.language == "yaml":
-            (folder / block.words).write_text(block.text)
-        elif block.language == "python":
-            done = in_python(block.text, folder)
-            assert done.returncode == 0, done.stderr
-        elif block.words != "skip":
-            done = in_shell(block.text, folder)
-            wanted = 2 if block.words == "fails" else 0
-            assert done.returncode == wanted, f"{block.text}\n{done.stdout}\n{done.stderr}"
-            if wanted:
-                message = done.stderr.strip().split("rotor.yaml: ")[1]
-                assert message in (DOCS / "tutorial.md").read_text()
-
-
-def test_tutorial_begins(tmp_path, capsys, monkeypatch):
-    """The steps that compile nothing: the empty config, and the geometry of the written one."""
-    blocks = blocks_of(DOCS / "tutorial.md")
-    _tutorial(tmp_path, [b for b in blocks if b.language == "yaml" or b.words == "fails"])
-    (block,) = (b for b in blocks if "-o geometry" in b.text)
-    assert in_process(block.text, tmp_path, capsys, monkeypatch).returncode == 0
-    assert (tmp_path / "geometry" / "rotor.dxf").is_file()
-
-
-def test_design_page_begins(tmp_path, capsys, monkeypatch):
-    """The steps from the sheet to the geometry, and the answer that the page prints."""
-    text = (DOCS / "design.md").read_text()
-    for block in blocks_of(DOCS / "design.md"):
-        if block.words == "skip":
-            continue
-        done = in_process(block.text, tmp_path, capsys, monkeypatch)
-        assert done.returncode == (2 if block.words == "fails" else 0), done.stderr
-        if block.words == "fails":
-            assert done.stderr.strip().split("blower.yaml: ")[1] in " ".join(text.split())
-        elif "rootsopt new" in block.text:
-            assert "0.3 bar, which takes 15.6 kW without losses, 87% of the 18 kW" in done.stdout
-    assert (tmp_path / "geometry" / "profile_design.csv").is_file()
+            (tmp_path / block.words).write_text(block.text)
+        elif block.words == "fails" or re.search("rootsopt new|-o geometry", block.text):
+            done = in_process(block.text, tmp_path, capsys, monkeypatch)
+            _ended(done, block, page)
+            if "rootsopt new" in block.text:
+                told = "0.3 bar, which takes 15.6 kW without losses, 87% of the 18 kW"
+                assert told in done.stdout
+    assert {"profile_design.csv", "rotor.dxf"} <= {*os.listdir(tmp_path / "geometry")}
 
 
 @pytest.mark.long
-def test_tutorial(folder):
+def test_tutorial(tmp_path):
     """All steps, and the numbers that the page prints."""
-    _tutorial(folder, blocks_of(DOCS / "tutorial.md"))
-    result = json.loads((folder / "better" / "result.json").read_text())
-    rows = re.findall(
-        r"^\| (\w+) \| ([\d.]+) \| ([\d.]+) \|$", (DOCS / "tutorial.md").read_text(), re.M
-    )
+    page = (DOCS / "tutorial.md").read_text()
+    for block in blocks_of(DOCS / "tutorial.md"):
+        if block.language == "yaml":
+            (tmp_path / block.words).write_text(block.text)
+        elif block.words != "skip":
+            run = in_python if block.language == "python" else in_shell
+            _ended(run(block.text, tmp_path), block, page)
+    result = json.loads((tmp_path / "better" / "result.json").read_text())
+    rows = re.findall(r"^\| (\w+) \| ([\d.]+) \| ([\d.]+) \|$", page, re.M)
     assert len(rows) == 5
     for key, *told in rows:
         for text, name in zip(told, ("baseline", "optimized"), strict=True):
-            record = result[name]
-            value = {**record["design"], **record["response"]}[key]
+            value = (result[name]["design"] | result[name]["response"])[key]
             digit = 10.0 ** -len(text.partition(".")[2])
             assert float(text) == pytest.approx(value, abs=0.51 * digit), key
-    for file in ("rotor.dxf", "rotor.svg", "rotor_points.csv"):
-        assert (folder / "drawing" / file).is_file()
-    assert (folder / "geometry" / "profile_design.csv").is_file()
-    assert (folder / "speeds" / "sweep.nc").is_file()
+    for file in (*(f"drawing/rotor{end}" for end in (".dxf", ".svg", "_points.csv")),
+                 "geometry/profile_design.csv", "speeds/sweep.nc"):  # fmt: skip
+        assert (tmp_path / file).is_file()
 
 
 @pytest.mark.long
@@ -110,8 +91,7 @@ def test_identify_page(tmp_path):
     for block in blocks_of(DOCS / "identify.md"):
         if block.words == "run":
             run = in_python if block.language == "python" else in_shell
-            done = run(block.text, tmp_path)
-            assert done.returncode == 0, done.stderr
+            _ended(run(block.text, tmp_path), block, "")
     known = json.loads((tmp_path / "found" / "result.json").read_text())["parameters"]
     for key, true in (("backlash_mm", 0.14), ("damping_ratio", 0.3)):
         low, high = known[f"scene.timing_gear.{key}"]["interval_95"]
@@ -120,11 +100,10 @@ def test_identify_page(tmp_path):
 
 @pytest.mark.long
 def test_howto(tmp_path):
-    texts = [one.text for one in blocks_of(DOCS / "howto.md") if one.words == "run"]
-    assert texts
-    for text in texts:
-        done = in_python(text, tmp_path)
-        assert done.returncode == 0, done.stderr
+    blocks = [one for one in blocks_of(DOCS / "howto.md") if one.words == "run"]
+    assert blocks
+    for block in blocks:
+        _ended(in_python(block.text, tmp_path), block, "")
 
 
 @pytest.mark.long

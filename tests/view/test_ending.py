@@ -51,7 +51,7 @@ def facts_of(result, **more):
 
 
 def steps_of(result, place="run", source="cic", **more):
-    return [command for _, command in ending(result, Path(place), source, **more).steps]
+    return [*ending(result, Path(place), source, **more).steps]
 
 
 def test_optimum_in_other_scenes():
@@ -102,9 +102,8 @@ def test_optimum_in_three_sentences():
 
 
 def test_optimum_that_is_none_says_so():
-    doubted = {"converged": False, "message": "Raise optimizer.iterations."}
     given = optimum(status="not_converged", improvement={"objective": -0.05})
-    given["optimality"] = given["optimality"] | doubted
+    given["optimality"] |= {"converged": False, "message": "Raise optimizer.iterations."}
     given["robustness"] = {"fresh": {
         name: {"scenes": 9, "objective": {"mean": mean}, "failed_share": lost}
         for name, mean, lost in (("baseline", 1.0, 0.0), ("robust", 0.9, 0.125))
@@ -119,8 +118,7 @@ def test_optimum_that_is_none_says_so():
         "usable motion: baseline 0 % and robust 12.5 %. Raise optimizer.iterations."
     )
     same = record(geometry={"seal_width_mm": 6.0})
-    given = run_of("optimize", baseline=same, optimized=same, verification={})
-    assert facts_of(given) == {
+    assert facts_of(run_of("optimize", baseline=same, optimized=same, verification={})) == {
         "Gained": "No reported quantity is better.",
         "Costs": "No reported quantity is worse by 0.05 % or more.",
         "How sure": "The design has no certificate.",
@@ -145,19 +143,17 @@ def test_simulation_says_how_sure_it_is():
 @pytest.mark.parametrize("command", ["simulate", "optimize", "pareto", "attractors"])
 @pytest.mark.parametrize("status", [Status.CHAOTIC, Status.NOT_IMPROVED, Status.PASSED_THROUGH])
 def test_run_without_a_result_says_why_and_what_to_change(command, status):
-    window = {"kind": "transient", "window_mesh_periods": 300}
-    alone = record(steady_state=window) if command == "simulate" else {}
-    given = run_of(command, **alone) | {"status": status.label, "message": status.value}
-    first, rest = ending(given, Path("run"), "cic --set a=1"), status.value.partition(". ")[2]
-    assert first.facts[0] == (
-        "Status", f"{status.label.replace('_', ' ').capitalize()}: {status.meaning}"
-    )  # fmt: skip
-    assert [text for text, _ in first.steps] == [rest, "Then run it again"]
-    assert first.steps[1][1] == f"rootsopt {command} cic --set a=1"
+    alone = record(steady_state={"kind": "transient", "window_mesh_periods": 300})
+    given = run_of(command, **(alone if command == "simulate" else {}))
+    given |= {"status": status.label, "message": status.value}
+    name, rest = status.label.replace("_", " ").capitalize(), status.value.partition(". ")[2]
+    facts = facts_of(given)
+    assert [*facts.items()][:1] == [("Status", f"{name}: {status.meaning}")]
+    assert steps_of(given, source="cic --set a=1") == [
+        (rest, ""), ("Then run it again", f"rootsopt {command} cic --set a=1")
+    ]  # fmt: skip
     if command == "simulate":
-        assert dict(first.facts)["How sure"] == (
-            "The numbers are those of a window of 300 mesh periods."
-        )
+        assert facts["How sure"] == "The numbers are those of a window of 300 mesh periods."
 
 
 @pytest.mark.parametrize(("pump", "term"), [({}, "flow_ripple"), ({"volumetric_efficiency": 0.9},
@@ -176,16 +172,16 @@ def test_flanks_that_stay_apart_are_a_result(pump, term):
     assert facts_of(given)["How sure"].endswith(
         "Of 10000 machines within tolerances, 1.6 % touch; clearance costs most of the reserve."
     )
-    steps = dict(ending(given, Path("run"), "cic").steps)
-    assert f"{{{term}: 1}}" in steps["Optimise the design"]
-    assert all(term not in step for why, step in steps.items() if why != "Optimise the design")
+    steps = dict(steps_of(given))
+    assert f"{{{term}: 1}}" in steps.pop("Optimise the design")
+    assert all(term not in step for step in steps.values())
 
 
 def test_constraints_in_conflict_are_part_of_the_status():
     told, advice = "No design does. In conflict: width >= 25 mm.", "Relax one of these."
     given = run_of("optimize", status="infeasible", message=f"{told} {advice}")
     assert facts_of(given) == {"Status": f"Infeasible: {told}"}
-    assert ending(given, Path("run"), "cic").steps[0] == (advice, "")
+    assert steps_of(given)[0] == (advice, "")
 
 
 def test_the_reserve_is_part_of_what_was_gained():
@@ -197,95 +193,109 @@ def test_the_reserve_is_part_of_what_was_gained():
     assert "contact goes from 12.5 µm to 20 µm" in facts_of(given)["Gained"]
 
 
-def front():
-    aims = [{"name": "peak_force_N", "sense": "min"}, {"name": "area_efficiency", "sense": "max"}]
-    points = [
+FRONT = run_of(
+    "pareto",
+    terms=[
+        {"name": "peak_force_N", "sense": "min"}, {"name": "area_efficiency", "sense": "max"}
+    ],
+    points=[
         {"point": k, "terms": {"peak_force_N": 100.0 * k, "area_efficiency": 0.4 + 0.01 * k},
          "rates": {"area_efficiency": rate}, "design": DESIGN}
         for k, rate in ((1, None), (2, 2500.0), (3, None))
-    ]  # fmt: skip
-    return run_of("pareto", terms=aims, points=points, baseline=record(), message="Certified.")
-
-
-def sweep():
-    return [{"scene.speed_rpm": 1e3 * k, "peak_force_N": 50.0 + 10 * (k == 2) if k < 3 else None,
-               "status": "chaotic" if k == 3 else "periodic"} for k in (1, 2, 3)]  # fmt: skip
-
-
-def motions():
-    rows = [record(share=share, reached=share > 0.5) for share in (0.75, 0.2)]
-    return run_of("attractors", attractors=rows, lost={"chaotic": 0.05})
-
-
-def geometry():
-    sheet = {"displaced_volume_cm3": 555.0, "flow_ripple": 0.16}
-    shape = {"outer_radius_mm": 45.0, "area_efficiency": 0.4345}
-    return run_of("profile", design=DESIGN, geometry=shape, pump=sheet, status="geometry_only")
+    ],
+    baseline=record(),
+    message="Certified.",
+)  # fmt: skip
+SWEEP = [{"scene.speed_rpm": 1e3 * k, "peak_force_N": force, "status": status}
+         for k, force, status in ((1, 50.0, "periodic"), (2, 60.0, "periodic"),
+                                  (3, None, "chaotic"))]  # fmt: skip
+MOTIONS = run_of(
+    "attractors",
+    attractors=[record(share=share, reached=share > 0.5) for share in (0.75, 0.2)],
+    lost={"chaotic": 0.05},
+)
+GEOMETRY = run_of(
+    "profile",
+    design=DESIGN,
+    geometry={"outer_radius_mm": 45.0, "area_efficiency": 0.4345},
+    pump={"displaced_volume_cm3": 555.0, "flow_ripple": 0.16},
+    status="geometry_only",
+)
 
 
 def test_short_endings():
-    assert facts_of(front()) == {
+    assert facts_of(FRONT) == {
         "Best compromises": "3 points: peak force from 100 to 300 N and area efficiency from 0.41 "
         "to 0.43.",
         "Costs": "The peak force at point 2: +25 N for +0.01 of area efficiency.",
         "How sure": "Certified.",
     }
-    assert facts_of(run_of("sweep", status="chaotic"), rows=sweep()) == {
+    assert facts_of(run_of("sweep", status="chaotic"), rows=SWEEP) == {
         "Peak force": "It is lowest, 50 N, at speed 1000 rpm; highest, 60 N, at speed 2000 rpm.",
         "How sure": "2 of 3 scenes have a steady state. The others: 1 chaotic.",
     }
-    assert facts_of(motions()) == {
+    assert facts_of(MOTIONS) == {
         "Motions": "2 motions coexist; motion 1 (periodic): peak force 100 N, 75 % of the initial "
         "states, reached from rest; motion 2 (periodic): peak force 100 N, 20 % of the initial "
         "states.",
         "How sure": "5 % of the initial states lead to no reported motion.",
     }
-    assert facts_of(geometry()) == {
+    assert facts_of(GEOMETRY) == {
         "Rotor": "Outer radius 45 mm; 43.45 % of the circle of this radius pumps; displaced volume "
         "555 cm³; flow ripple 0.16.",
         "How sure": "Found.",
     }
 
 
-def test_every_command_parses():
+ODD = {"scene.load.torque_N_m": 4.8, "profile.family": "it's"}
+ROWS = [{"point": 0, **ODD, "peak_force_N": 9.0, "status": "periodic"}]
+
+
+@pytest.mark.parametrize(
+    ("result", "rows", "count"),
+    [
+        (optimum(), (), 3),
+        (run_of("simulate", **record()), (), 3),
+        (FRONT, (), 2),
+        (MOTIONS, (), 1),
+        (GEOMETRY, (), 2),
+        (run_of("sweep"), ROWS, 2),
+        (run_of("sweep"), SWEEP, 2),
+        (run_of("pareto", status="interrupted"), (), 1),
+    ],
+)
+def test_every_command_parses(result, rows, count):
     """Paths and values are quoted for a shell, files of `--import` come along."""
-    row = {"point": 0, "scene.load.torque_N_m": 4.8, "profile.family": "it's"}
-    rows = [row | {"peak_force_N": 9.0, "status": "periodic"}]
-    given = [optimum(), run_of("simulate", **record()), front(), motions(), geometry()]
-    runs = [(one, ()) for one in given] + [(run_of("sweep"), rows), (run_of("sweep"), sweep())]
-    runs.append((run_of("pareto", status="interrupted"), ()))
-    count, place = 0, "-my runs/{a}'é"
-    for result, table in runs:
-        source = shlex.join(["cic", "-o", place])
-        steps = steps_of(result, place, source, imports=["my file.py"], rows=table)
-        for program, name, *arguments in map(shlex.split, steps):
-            options = cli.parser(COMMANDS[name]).parse_args(arguments)
-            assert program == "rootsopt"
-            assert options.imports == ["my file.py"] or options.resume
-            assert str(options.config) == "cic" or options.config.parent.is_relative_to(place)
-            count += 1
-    assert count == 3 + 3 + 2 + 2 + 1 + 2 + 2 + 1
-    (first, _) = steps_of(run_of("sweep"), rows=rows)
+    place = "-my runs/{a}'é"
+    source = shlex.join(["cic", "-o", place])
+    steps = steps_of(result, place, source, imports=["my file.py"], rows=rows)
+    assert len(steps) == count
+    for _, step in steps:
+        program, name, *arguments = shlex.split(step)
+        options = cli.parser(COMMANDS[name]).parse_args(arguments)
+        assert program == "rootsopt"
+        assert options.imports == ["my file.py"] or options.resume
+        assert str(options.config) == "cic" or options.config.parent.is_relative_to(place)
+
+
+def test_commands_set_what_they_are_about():
+    (_, first), _ = steps_of(run_of("sweep"), rows=ROWS)
     assert shlex.split(first)[3:] == [
         "--set", "scene.load.torque_N_m=4.8", "--set", "profile.family=it's"
     ]  # fmt: skip
-    assert "--set scene.speed_rpm=2000" in steps_of(run_of("sweep"), rows=sweep())[0]
-    assert steps_of(motions())[0].endswith("config.yaml --set objective.motion=worst")
-
-
-def test_design_without_parameters_is_not_to_be_optimised():
-    given = run_of("simulate", **record(design={}))
-    assert not any("optimize" in one for one in steps_of(given))
+    assert "--set scene.speed_rpm=2000" in steps_of(run_of("sweep"), rows=SWEEP)[0][1]
+    assert steps_of(MOTIONS)[0][1].endswith("config.yaml --set objective.motion=worst")
+    assert "optimize" not in str(steps_of(run_of("simulate", **record(design={}))))
 
 
 def test_terminal_prints_commands_in_lines_of_their_own():
     out = Console(width=40, file=io.StringIO())
-    place = "a folder with a long name that no line of this width holds, é"
-    end = ending(optimum(), Path(place), "cic")
+    end = ending(
+        optimum(), Path("a folder with a long name that no line of this width holds, é"), "cic"
+    )
     terminal.show_ending(out, end)
-    lines = out.file.getvalue().splitlines()
-    for _, command in end.steps:
-        assert f"  {command}" in lines
-    told = " ".join(" ".join(lines).split())
+    text = out.file.getvalue()
+    assert {f"  {command}" for _, command in end.steps} <= {*text.splitlines()}
+    told = " ".join(text.split())
     for heading, sentences in end.facts:
         assert f"{heading}: {terminal.ascii_text(sentences)}" in told

@@ -3,13 +3,9 @@
 import io
 import itertools
 import re
-import sys
-from collections import Counter
-from pathlib import Path
+from collections import Counter, defaultdict
 
 import ezdxf
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
@@ -24,11 +20,9 @@ from rootsopt.scene import Scene, check_geometry, design_vector
 from rootsopt.scene.space import Space
 from rootsopt.view.figures import cad, chosen
 from rootsopt.view.figures.animation import meshing_gif, rolling_contacts
-from rootsopt.view.figures.cad import dxf_bytes
 from rootsopt.view.figures.drawing import Drawing, svg_text
-from rootsopt.view.figures.pieces import Arc, Spline, outline_pieces, polyline
+from rootsopt.view.figures.pieces import Arc, outline_pieces, polyline
 
-ROOT = Path(__file__).parents[2]
 R = 0.033
 LENGTH = 100.0
 
@@ -45,9 +39,8 @@ PROFILES = {
     "cic 3, textbook": textbook(3, 0.6358, 0.07),
     "cic 3, textbook, no land": textbook(3, 0.6358, 0.0),
     "ee 3": EE(3, R),
-    "ee 4": EE(4, R),
 }
-SOLIDS = ("cic 2, no land", "cic 3", "cic 3, textbook, no land", "ee 4")
+SOLIDS = ("cic 2, no land", "cic 3", "cic 3, textbook, no land")
 every_profile = pytest.mark.parametrize("shape", PROFILES.values(), ids=PROFILES)
 FREE = FreeForm(3, R, np.radians(2.0), np.array([0.7, 0.9, 0.95, 0.8, 0.4, 0.1, -0.3]))
 
@@ -87,22 +80,10 @@ def green(points):
 
 
 def read(document):
-    """Return (start, stop, fine points) of every entity on the layer OUTLINE, by ezdxf alone."""
+    """Yield fine points of every entity on the layer OUTLINE, by ezdxf alone."""
     for entity in document.modelspace().query('*[layer=="OUTLINE"]'):
-        assert entity.dxftype() in ("ARC", "SPLINE")
-        curve = entity.construction_tool()
-        if entity.dxftype() == "ARC":
-            first = np.radians(entity.dxf.start_angle)
-            sweep = np.radians((entity.dxf.end_angle - entity.dxf.start_angle) % 360)
-            turn = np.exp(1j * (first + sweep * np.linspace(0, 1, 2001)))
-            points = complex(*entity.dxf.center.vec2) + entity.dxf.radius * turn
-        else:
-            assert entity.dxf.degree == 3
-            ends = sorted(set(entity.knots))
-            fine = [np.linspace(a, b, 100, endpoint=False) for a, b in itertools.pairwise(ends)]
-            points = np.array([complex(p.x, p.y) for p in curve.points(np.concatenate(fine))])
-            points = np.append(points, complex(*entity.control_points[-1][:2]))
-        yield points
+        assert entity.dxftype() == "ARC" or entity.dxf.degree == 3
+        yield np.array([complex(p.x, p.y) for p in entity.construction_tool().flattening(1e-6)])
 
 
 def chained(parts):
@@ -130,11 +111,9 @@ def test_pieces_lie_on_the_flank(shape):
     pieces = outline_pieces(shape)
     fine = polyline(pieces, 0.01)
     true = np.asarray(outline(shape, 20))[:-1] * 1e3
-    polygon = np.stack([fine.real, fine.imag], -1)
-    distance = signed_distance(true, polygon, refine=False)
+    distance = signed_distance(true, np.stack([fine.real, fine.imag], -1), refine=False)
     # Sagitta of the polygon's chords of 0.01 mm on radii of 5 mm and more, and the tolerance.
-    away = np.abs(distance)
-    assert away.max() < 1e-5
+    assert np.max(np.abs(distance)) < 1e-5
     arcs = [piece for piece in pieces if isinstance(piece, Arc)]
     if isinstance(shape, EE):
         assert not arcs
@@ -153,29 +132,27 @@ def test_textbook_cic_has_arcs_about_the_pitch_circle():
     Halves of an arc on both sides of a lobe's axis are one piece."""
     pieces = outline_pieces(textbook(3, 0.6358, 0.0))
     arcs = [piece for piece in pieces if isinstance(piece, Arc)]
-    assert len(arcs) == 6
+    assert (len(arcs), len(pieces)) == (6, 18)
     np.testing.assert_allclose([abs(arc.center) for arc in arcs], 33.0, atol=1e-8)
     np.testing.assert_allclose([arc.radius for arc in arcs], arcs[0].radius, atol=1e-8)
     assert sorted(np.sign([arc.sweep for arc in arcs])) == [-1] * 3 + [1] * 3
-    assert len([piece for piece in pieces if isinstance(piece, Spline)]) == 12
 
 
 @pytest.mark.parametrize("shape", [*PROFILES.values(), FREE], ids=[*PROFILES, "free form"])
 def test_dxf_read_back(shape):
     """The DXF is in millimetres, has the layers, and is closed to 1e-9 mm; its area is right to
     1e-6."""
-    document = ezdxf.read(io.StringIO(dxf_bytes(drawing(shape, bore=12.0)).decode()))
+    document = ezdxf.read(io.StringIO(cad.dxf_bytes(drawing(shape, bore=12.0)).decode()))
     assert document.units == ezdxf.units.MM
-    assert not document.audit().has_errors
-    layers = Counter(entity.dxf.layer for entity in document.modelspace())
-    assert set(layers) == {
+    audit = document.audit()
+    assert (audit.errors, audit.fixes) == ([], [])
+    assert {entity.dxf.layer for entity in document.modelspace()} == {
         "OUTLINE", "BORE", "PITCH_CIRCLE", "CENTER_LINES", "TEXT",
         "CIRCLES", "DIMENSIONS", "TITLE_BLOCK", "TABLE",
     }  # fmt: skip
-    (bore,) = document.modelspace().query('CIRCLE[layer=="BORE"]')
-    assert bore.dxf.radius == 6.0
-    (pitch,) = document.modelspace().query('CIRCLE[layer=="PITCH_CIRCLE"]')
-    assert pitch.dxf.radius == 33.0
+    for layer, radius in (("BORE", 6.0), ("PITCH_CIRCLE", 33.0)):
+        (circle,) = document.modelspace().query(f'CIRCLE[layer=="{layer}"]')
+        assert circle.dxf.radius == radius
     run, gap = chained(list(read(document)))
     assert gap < 1e-9
     assert green(run) == pytest.approx(area_mm2(shape), rel=1e-6)
@@ -184,21 +161,19 @@ def test_dxf_read_back(shape):
     assert abs(np.angle(run[np.argmin(np.abs(run - tip))])) < 1e-3
 
 
-@pytest.mark.parametrize("name", ["cic 2, no land", "cic 3", "ee 4"])
+@pytest.mark.parametrize("name", ["cic 2, no land", "cic 3", "ee 3"])
 def test_svg_read_back(name):
     """The drawing has true size, and its own curves enclose the area to 1e-6."""
     svg = pytest.importorskip("svgpathtools")
     shape = PROFILES[name]
     text = svg_text(drawing(shape))
-    size, unit = re.search(r'<svg [^>]*width="([\d.]+)(\w+)"', text).groups()
-    assert unit == "mm"
-    assert re.search(r'viewBox="(\S+) (\S+) (\S+) (\S+)"', text).group(3) == size
+    size = re.search(r'viewBox="(\S+) (\S+) (\S+) (\S+)"', text).group(3)
+    assert re.search(rf'<svg [^>]*width="{size}mm"', text)
     assert "two &amp; &lt;three&gt;" in text
     path = svg.parse_path(re.search(r'class="outline" d="([^"]+)"', text).group(1))
     assert path.iscontinuous()
     assert path.isclosed()
-    share = np.linspace(0, 1, 1000, endpoint=False)
-    run = np.array([piece.point(x) for piece in path for x in share])
+    run = np.array([piece.point(x) for piece in path for x in np.arange(1000) / 1000])
     # Counter-clockwise with y up is clockwise with y down.
     assert -green(run) == pytest.approx(area_mm2(shape), rel=1e-6)
 
@@ -208,23 +183,23 @@ def test_step_read_back(name, tmp_path):
     """Volume over length, and area of the section, are right to 1e-6; arcs are cylinders.
 
     This also holds with bore and twist."""
-    build123d = pytest.importorskip("build123d")
+    pytest.importorskip("build123d")
     shape = PROFILES.get(name, FREE)
     pieces = outline_pieces(shape)
-    for bore, helix in ((None, 0.0), (10.0, -np.pi / 3)):
-        made = cad.rotor(pieces, LENGTH, bore, helix)
-        back = written(made, tmp_path)
+    for bore, helix in ((0.0, 0.0), (10.0, -np.pi / 3)):
+        back = written(cad.rotor(pieces, LENGTH, bore or None, helix), tmp_path)
         assert back.is_valid
-        exact = area_mm2(shape) - (0 if bore is None else np.pi * bore**2 / 4)
+        exact = area_mm2(shape) - np.pi * bore**2 / 4
         assert back.volume / LENGTH == pytest.approx(exact, rel=1e-6)
-        ends = [f for f in back.faces() if f.geom_type == build123d.GeomType.PLANE]
+        faces = defaultdict(list)
+        for face in back.faces():
+            faces[face.geom_type.name].append(face)
+        ends = sorted(faces["PLANE"], key=lambda end: end.center().Z)
         assert [end.area for end in ends] == pytest.approx([exact, exact], rel=1e-6)
-        assert sorted(end.center().Z for end in ends) == pytest.approx([0, LENGTH], abs=1e-9)
-        box = back.bounding_box()
-        assert pytest.approx(LENGTH, abs=1e-6) == box.max.Z - box.min.Z
-        rounds = [f for f in back.faces() if f.geom_type == build123d.GeomType.CYLINDER]
+        assert [end.center().Z for end in ends] == pytest.approx([0, LENGTH], abs=1e-9)
+        assert abs(back.bounding_box().size.Z - LENGTH) <= 1e-6
         arcs = sum(isinstance(piece, Arc) for piece in pieces)
-        assert len(rounds) == (arcs if bore is None else 1)
+        assert len(faces["CYLINDER"]) == (1 if bore else arcs)
 
 
 def test_pair_meshes_along_its_length(tmp_path):
@@ -242,41 +217,25 @@ def test_pair_meshes_along_its_length(tmp_path):
         for rotor, placed in zip(
             back.solids(), place_pair(points, 3, 66.0, turn, turn), strict=True
         ):
-            distances = [rotor.distance_to(build123d.Vertex(x, y, z)) for x, y in placed[::29]]
-            assert max(distances) < 1e-4
             middle = placed[:-1].mean(axis=0)
-            # And the points are on its surface, not inside.
-            outward = middle + (placed[::29] - middle) * (1 + 1e-4)
-            outside = [rotor.distance_to(build123d.Vertex(x, y, z)) for x, y in outward]
-            assert min(outside) > 1e-4
-    data = cad.stl_bytes(back.solids()[0])
+            # The points are on its surface, not inside: a little outwards, they leave it.
+            inner, outer = (
+                [
+                    rotor.distance_to(build123d.Vertex(x, y, z))
+                    for x, y in middle + (placed[::29] - middle) * factor
+                ]
+                for factor in (1.0, 1 + 1e-4)
+            )
+            assert max(inner) < 1e-4 < min(outer)
     kind = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("rest", "<u2")])
-    corners = np.frombuffer(data[84:], kind)["corners"].astype(float)
+    data = cad.stl_bytes(back.solids()[0])[84:]
+    corners = np.frombuffer(data, kind)["corners"].astype(float)
     volume = np.sum(np.linalg.det(corners)) / 6
     assert volume / LENGTH == pytest.approx(area_mm2(shape), rel=1e-3)
     names = {}
     faces = [[names.setdefault(tuple(c), len(names)) for c in face] for face in corners]
     edges = Counter((f[i], f[i - 1]) for f in faces for i in range(3))
     assert all(edges[b, a] == count for (a, b), count in edges.items())
-
-
-def test_solids_without_a_kernel(tmp_path, monkeypatch, capsys):
-    """Without a kernel, the exit code is 2, and one line says what to install; nothing is
-    written."""
-    monkeypatch.setitem(sys.modules, "build123d", None)
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    arguments = [
-        str(ROOT / "configs/cic_drawn.yaml"),
-        "-o",
-        str(tmp_path / "x"),
-        "--export",
-        "dxf,step",
-    ]
-    assert profile.main(arguments) == 2
-    message = capsys.readouterr().err
-    assert "rootsopt[cad]" in message
-    assert message.count("\n") == 1
-    assert not (tmp_path / "x").exists()
 
 
 @pytest.mark.parametrize("text", ["dwg", "dxf,png", "none,dxf"])
@@ -291,22 +250,23 @@ def few_frames(monkeypatch):
     monkeypatch.setattr("rootsopt.view.figures.animation._FRAMES", 8)
 
 
-def test_profile_writes_drawings_and_animation(tmp_path, few_frames):
-    """DXF and SVG are written by default; the GIF has one frame per step and moves."""
-    folder, config = tmp_path / "out", str(ROOT / "configs/cic_drawn.yaml")
-    assert profile.main([config, "-o", str(folder), "--no-figures"]) == 0
-    assert {"rotor.dxf", "rotor.svg"} <= {path.name for path in folder.iterdir()}
-    assert "outer radius 45.102855 mm" in (folder / "rotor.dxf").read_text()
-    arguments = ["--no-figures", "--export", "gif", "--set", "rotor.helix_deg=40"]
-    assert profile.main([config, "-o", str(folder), *arguments]) == 0
+def frames_of(file, numbers):
+    """Return the colours of the frames with these numbers of a GIF, which has eight."""
+    with Image.open(file) as picture:
+        assert picture.n_frames == 8
+        for number in numbers:
+            picture.seek(number)
+            yield np.asarray(picture.convert("RGB"), float)
+
+
+def test_profile_writes_an_animation(tmp_path, few_frames):
+    """The GIF has one frame per step and moves."""
+    folder = tmp_path / "out"
+    given = ["cic_drawn", "-o", str(folder), "--no-figures"]
+    assert profile.main([*given, "--export", "gif", "--set", "rotor.helix_deg=40"]) == 0
     gif = folder / "figures/meshing.gif"
     assert gif.stat().st_size < 2e6 / 5
-    with Image.open(gif) as picture:
-        assert picture.n_frames == 8
-        frames = []
-        for i in (0, 2, 4):
-            picture.seek(i)
-            frames.append(np.asarray(picture.convert("RGB"), float))
+    frames = frames_of(gif, (0, 2, 4))
     assert all(np.mean(np.abs(a - b)) > 3 for a, b in itertools.pairwise(frames))
 
 
@@ -324,8 +284,7 @@ def test_rolling_contacts_touch_both_rotors(shape):
         pair = place_pair(points, shape.lobes, 66.0, angle, angle)
         steps = flank.point[i] + np.array([[0.0], [0.05], [-0.05]]) * flank.normal[i]
         first, second = (signed_distance(steps, one) for one in pair)
-        assert abs(first[0]) < 2e-3
-        assert abs(second[0]) < 2e-3
+        assert max(abs(first[0]), abs(second[0])) < 2e-3
         assert first[2] < 0 < first[1]
         assert second[1] < 0 < second[2]
 
@@ -339,45 +298,32 @@ def test_arrow_follows_the_force(few_frames):
     force = np.where(np.arange(360) % 120 >= 60, 50.0, 0.0)
     series = Series(turn, turn, 0 * turn, 0 * turn, force, 0 * turn, 0 * turn)
     data = meshing_gif(drawing(shape), shape, series, 1)
-    with Image.open(io.BytesIO(data)) as picture:
-        assert picture.n_frames == 8
-        blue = []
-        for i in (2, 6):
-            picture.seek(i)
-            rgb = np.asarray(picture.convert("RGB"), float)[: picture.height // 2]
-            blue.append(np.sum(np.abs(rgb - [0, 114, 178]).sum(-1) < 40))
-    assert blue[0] < 0.2 * blue[1]
+    before, after = (
+        np.sum(np.abs(frame[: len(frame) // 2] - [0, 114, 178]).sum(-1) < 40)
+        for frame in frames_of(io.BytesIO(data), (2, 6))
+    )
+    assert before < 0.2 * after
 
 
 def test_bore_takes_mass_and_inertia():
-    """A bore removes π ρ L r² and π/2 ρ L r⁴; derivatives with respect to the design do not change.
+    """A bore removes π ρ L r² and π/2 ρ L r⁴ from any design.
 
     An optimisation keeps the root circle outside the bore."""
-    plain, bored = (
-        load(ROOT / "configs/cic_drawn.yaml", sets) for sets in ([], ["rotor.bore_mm=20"])
-    )
-    shape = geometry(Scene.from_config(plain).profile(design_vector(plain)))
+    plain, bored = (load("cic_drawn", sets) for sets in ([], ["rotor.bore_mm=20"]))
     one, other = Scene.from_config(plain), Scene.from_config(bored)
     cylinder = 7800.0 * 0.1 * np.pi * 0.01**2
-    assert float(one.mass(shape) - other.mass(shape)) == pytest.approx(cylinder, rel=1e-9)
-    lost = float(one.inertia(shape) - other.inertia(shape))
-    assert lost == pytest.approx(cylinder * 0.01**2 / 2, rel=1e-9)
-
-    def slope(model):
-        turn = jnp.ones(3)
-        inertia = lambda design: model.inertia(geometry(model.profile(design)))  # noqa: E731
-        return float(jax.jvp(inertia, (design_vector(plain),), (turn,))[1])
-
-    assert slope(other) == pytest.approx(slope(one), rel=1e-12)
-    assert abs(slope(one)) > 0
     limits = {c.name: c for c in Space.of(bored, other).constraints}
-    room = float(shape.root_radius) * 1e3 - 10.0
-    assert float(limits["root radius"].slack(shape)) == pytest.approx(room, rel=1e-9)
+    for factor in (1.0, 1.01):
+        shape = geometry(one.profile(factor * design_vector(plain)))
+        lost = [float(one.mass(shape) - other.mass(shape))]
+        lost.append(float(one.inertia(shape) - other.inertia(shape)))
+        assert lost == pytest.approx([cylinder, cylinder * 0.01**2 / 2], rel=1e-9)
+        room = float(shape.root_radius) * 1e3 - 10.0
+        assert float(limits["root radius"].slack(shape)) == pytest.approx(room, rel=1e-9)
     assert "root radius" not in {c.name for c in Space.of(plain, one).constraints}
 
 
 def test_bore_must_fit():
-    config = load(ROOT / "configs/ee.yaml", ["rotor.bore_mm=44.0"])
     with pytest.raises(InputError, match=r"`rotor.bore_mm` must be less than 44 .* but is 44"):
-        check_geometry(config)
-    check_geometry(load(ROOT / "configs/ee.yaml", ["rotor.bore_mm=43.9"]))
+        check_geometry(load("ee", ["rotor.bore_mm=44.0"]))
+    check_geometry(load("ee", ["rotor.bore_mm=43.9"]))

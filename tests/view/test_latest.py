@@ -41,11 +41,11 @@ def test_delayed_job_is_replaced_and_dropped(lane):
     lane.submit(lambda: ran.append("late"), delay=60)
     lane.submit(lambda: (ran.append("now"), end.set()))
     assert end.wait(20)
+    end.clear()
     lane.submit(lambda: ran.append("dropped"), delay=0.05)
     lane.clear()
-    done = threading.Event()
-    lane.submit(done.set, delay=0.1)
-    assert done.wait(20)
+    lane.submit(end.set, delay=0.1)
+    assert end.wait(20)
     assert ran == ["now"]
 
 

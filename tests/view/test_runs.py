@@ -36,58 +36,43 @@ def test_full_disk_or_death_at_every_file_operation():
 
 
 def test_an_earlier_run_is_moved_aside_or_replaced(tmp_path):
+    """It is replaced if asked, but files that are not the run's own are never deleted."""
     target = tmp_path / "run"
-    assert write_run(target, "first") == []
-    (note,) = write_run(target, "second")
-    assert note == f"the earlier run is now in {target}.1"
-    write_run(target, "third")
+    notes = [write_run(target, text) for text in ("first", "second", "third")]
+    assert notes == [[]] + [[f"the earlier run is now in {target}.{k}"] for k in (1, 2)]
     assert write_run(target, "fourth", overwrite=True) == []
     assert sorted(os.listdir(tmp_path)) == ["run", "run.1", "run.2"]
     found = [digest(tmp_path / name) for name in ("run", "run.1", "run.2")]
     assert found == [digest_of(text) for text in ("fourth", "first", "second")]
-
-
-def test_what_a_run_needs_no_more_goes_when_it_is_in_place(tmp_path):
-    spent, gone = tmp_path / "spent", tmp_path / "gone"
-    spent.touch()
-    with RunFolder(tmp_path / "run") as run:
-        run.remove_afterwards(spent)
-        run.remove_afterwards(gone)
-        run.write_json("result.json", {})
-    assert spent.exists()  # The run was given up.
-    with RunFolder(tmp_path / "run") as run:
-        run.remove_afterwards(spent)
-        run.remove_afterwards(gone)
-        run.write_json("result.json", {})
-        run.put_in_place()
-    assert os.listdir(tmp_path) == ["run"]
-
-
-def test_files_that_are_not_the_runs_own_are_never_deleted(tmp_path):
-    target = tmp_path / "run"
-    write_run(target, "old")
     (target / "figures" / "note.txt").write_text("mine")
     (note,) = write_run(target, "new", overwrite=True)
     assert "not its own" in note
-    assert (tmp_path / "run.1" / "figures" / "note.txt").read_text() == "mine"
+    assert (tmp_path / "run.3" / "figures" / "note.txt").read_text() == "mine"
     assert digest(target) == digest_of("new")
 
 
+def test_what_a_run_needs_no_more_goes_when_it_is_in_place(tmp_path):
+    (tmp_path / "spent").touch()
+    for given_up in (True, False):
+        with RunFolder(tmp_path / "run") as run:
+            run.remove_afterwards(tmp_path / "spent")
+            run.remove_afterwards(tmp_path / "gone")
+            run.write_json("result.json", {})
+            if not given_up:
+                run.put_in_place()
+        assert os.listdir(tmp_path) == ["spent" if given_up else "run"]
+
+
 @pytest.mark.parametrize("overwrite", [False, True])
-@pytest.mark.parametrize("name", ["thesis.doc", "result.json", ".hidden", "sub/"])
+@pytest.mark.parametrize("name", ["thesis.doc", "result.json", ".hidden", "sub/file"])
 def test_folders_of_others_are_refused(tmp_path, overwrite, name):
-    target = tmp_path / "run"
-    target.mkdir()
-    if name.endswith("/"):
-        (target / name).mkdir()
-    else:
-        (target / name).write_text("mine")
-    before = digest(target)
-    message = refusal(RunFolder, target, "simulate", overwrite)
-    assert "another folder" in message
-    assert name.strip("/") in message
-    assert digest(target) == before
-    assert os.listdir(tmp_path) == ["run"]
+    file = tmp_path / "run" / name
+    file.parent.mkdir(parents=True)
+    file.write_text("mine")
+    before = digest(tmp_path)
+    message = refusal(RunFolder, tmp_path / "run", "simulate", overwrite)
+    assert re.search(f"{name.partition('/')[0]}.*another folder", message)
+    assert digest(tmp_path) == before
 
 
 def test_a_folder_that_others_fill_meanwhile_is_left_to_them(tmp_path):
@@ -104,7 +89,7 @@ def test_a_folder_that_others_fill_meanwhile_is_left_to_them(tmp_path):
 
 
 def test_a_link_leads_to_the_folder_and_permissions_stay(tmp_path):
-    (tmp_path / "there").mkdir(mode=0o700)
+    (tmp_path / "there").mkdir()
     os.chmod(tmp_path / "there", 0o750)
     (tmp_path / "link").symlink_to("there")
     write_run(tmp_path / "link", "first")
@@ -115,38 +100,37 @@ def test_a_link_leads_to_the_folder_and_permissions_stay(tmp_path):
     assert (tmp_path / "there").stat().st_mode & 0o777 == 0o750
 
 
-@pytest.mark.parametrize("where", [".", "..", "sub/..", "file", "file/below", "pipe", "", "a\0b"])
-def test_places_that_no_folder_can_take(tmp_path, monkeypatch, where):
+@pytest.mark.parametrize(
+    ("where", "words"),
+    [(".", "current folder"), ("../here", "current folder"), ("sub/..", "current folder"),
+     ("..", "one above"), ("file", "not a folder"), ("file/below", ""), ("pipe", "not a folder"),
+     ("", "empty"), ("a\0b", "")],
+)  # fmt: skip
+def test_places_that_no_folder_can_take(tmp_path, monkeypatch, where, words):
+    """Another folder would replace the current one, under the user's shell, even if it is empty."""
     here = tmp_path / "parent" / "here"
     (here / "sub").mkdir(parents=True)
     monkeypatch.chdir(here)
     (here / "file").write_text("")
     os.mkfifo(here / "pipe")
     before = digest(tmp_path)
-    refusal(RunFolder, where, "simulate")
+    assert words in refusal(RunFolder, where, "simulate")
     assert digest(tmp_path) == before
 
 
-def test_the_current_folder_is_refused_even_if_empty(tmp_path, monkeypatch):
-    """The current folder is rejected: another folder would replace it, under the user's shell."""
+def test_runs_that_cannot_be_replaced_are_kept(tmp_path, monkeypatch):
+    """Neither a mount point nor the folder above the current one is overwritten."""
     here = tmp_path / "here"
-    here.mkdir()
-    monkeypatch.chdir(here)
-    for where in (".", str(here), "../here"):
-        assert "current folder" in refusal(RunFolder, where, "simulate")
-    monkeypatch.chdir(tmp_path)
     write_run(here, "old")
+    monkeypatch.setattr(runs, "_mount_points", lambda: {os.path.realpath(here)})
+    write_run(here / "simulate", "inside")
+    before = digest(here)
+    message = refusal(RunFolder, here, "simulate", overwrite=True)
+    assert re.search(r"mount point.*here/simulate", message)
+    monkeypatch.undo()
     monkeypatch.chdir(here / "figures")
     assert "current folder" in refusal(RunFolder, "..", "simulate", overwrite=True)
-    assert digest(here) == digest_of("old")
-
-
-def test_mount_points_are_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(runs, "_mount_points", lambda: {os.path.realpath(tmp_path / "mounted")})
-    (tmp_path / "mounted").mkdir()
-    message = refusal(RunFolder, tmp_path / "mounted", "simulate")
-    assert re.search(r"mount point.*mounted/simulate", message)
-    write_run(tmp_path / "mounted" / "simulate", "inside")
+    assert digest(here) == before
 
 
 def test_long_and_odd_names(tmp_path):
@@ -162,24 +146,22 @@ def test_a_second_process_is_kept_out(tmp_path):
     with RunFolder(target):
         assert f"process {os.getpid()} is writing" in refusal(RunFolder, target, overwrite=True)
         write_run(tmp_path / "other", "not concerned")
-        assert len(list(tmp_path.iterdir())) == 3  # two of the run that goes on
+        assert len(os.listdir(tmp_path)) == 3  # two of the run that goes on
     assert os.listdir(tmp_path) == ["other"]
     write_run(target, "free again")
 
 
 def test_a_lock_on_a_file_that_is_gone_is_none(tmp_path, monkeypatch):
     """A lock is void if the last holder removes the file between opening and locking."""
-    real, calls = files.fcntl.flock, []
+    real = files.fcntl.flock
 
     def late(*arguments):
-        calls.append(arguments)
-        if len(calls) == 1:
-            os.unlink(tmp_path / "lock")
+        monkeypatch.undo()
+        os.unlink(tmp_path / "lock")
         return real(*arguments)
 
     monkeypatch.setattr(files.fcntl, "flock", late)
     held = files.Lock(tmp_path / "lock")
-    assert len(calls) == 2
     with pytest.raises(files.TakenError):
         files.Lock(tmp_path / "lock")
     held.release()
@@ -194,7 +176,7 @@ def test_a_dead_process_keeps_nobody_out(tmp_path):
         "        RunFolder(name).write_text('config.yaml', 'x'); os.kill(os.getpid(), 9)\n"
         "    assert os.waitstatus_to_exitcode(os.wait()[1]) == -9\n"
     )
-    names = (str(tmp_path / name) for name in ("run", "never again"))
+    names = [str(tmp_path / name) for name in ("run", "never again")]
     subprocess.run([sys.executable, "-c", code, *names], cwd=ROOT, check=True)
     # A folder and a lock; the second process has removed those of the first.
     assert len(os.listdir(tmp_path)) == 2
@@ -214,40 +196,28 @@ def test_without_locks_nothing_of_others_is_removed(tmp_path, monkeypatch):
     assert sorted(os.listdir(tmp_path)) == [stage.name, "run"]
 
 
-def _profile(folder, *more):
-    return main(["profile", "configs/cic_drawn.yaml", "-o", str(folder), "--no-figures", *more])
-
-
 def test_what_a_command_leaves_when_it_fails(tmp_path, capsys, monkeypatch):
-    """After bad input found late, or an interrupt, nothing is new and the earlier run is
-    unchanged."""
-    monkeypatch.chdir(ROOT)
-    target = tmp_path / "new" / "run"
-    assert _profile(target, "--export", "paper") == 2
+    """After bad input found late, or an interrupt, nothing is new and the earlier run is unchanged.
+
+    Each command has its own default folder, and the result names the command."""
+    monkeypatch.chdir(tmp_path)
+    command = ["profile", "cic_drawn", "--no-figures"]
+    assert main([*command, "--export", "paper"]) == 2
     assert os.listdir(tmp_path) == []
-    assert _profile(target, "--export", "none") == 0
-    before = digest(target)
+    assert main(command) == 0
+    place = tmp_path / "results" / "cic_drawn-profile"
+    record = json.loads((place / "result.json").read_text())
+    assert record["run"] == {"command": "profile", "files": sorted(os.listdir(place))}
+    before = digest(tmp_path)
 
     def interrupted(*_):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("rootsopt.commands.work.profile.write", interrupted)
     capsys.readouterr()
-    assert _profile(target) == 3
+    assert main(command) == 3
     assert capsys.readouterr().err == "rootsopt profile: stopped by the user\n"
-    assert digest(target) == before
-    assert os.listdir(tmp_path / "new") == ["run"]
-
-
-def test_each_command_has_a_folder_of_its_own(tmp_path, monkeypatch):
-    """Each command has its own default folder, and the result names the command."""
-    config = str(ROOT / "configs" / "cic_drawn.yaml")
-    monkeypatch.chdir(tmp_path)
-    assert main(["profile", config, "--no-figures"]) == 0
-    record = json.loads((tmp_path / "results" / "cic_drawn-profile" / "result.json").read_text())
-    assert record["run"]["command"] == "profile"
-    written = {p.name for p in (tmp_path / "results" / "cic_drawn-profile").iterdir()}
-    assert set(record["run"]["files"]) == written
+    assert digest(tmp_path) == before
 
 
 AUDIT = """
@@ -280,19 +250,11 @@ def test_nothing_is_written_outside_of_the_runs_own_folder(tmp_path, formats):
     parent = tmp_path / "parent"
     parent.mkdir()
     others = {"MPLCONFIGDIR": matplotlib.get_cachedir(), "XDG_CACHE_HOME": str(tmp_path / "cache")}
-    arguments = [
-        "profile",
-        "configs/cic_drawn.yaml",
-        "-o",
-        str(parent / "run"),
-        "--export",
-        formats,
-    ]
+    run = ["profile", "configs/cic_drawn.yaml", "-o", str(parent / "run"), "--export", formats]
     done = subprocess.run(
-        [sys.executable, "-B", "-c", AUDIT, str(parent), *arguments],
+        [sys.executable, "-B", "-c", AUDIT, str(parent), *run],
         cwd=ROOT, env=os.environ | others, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    told = done.stdout.split(f"results in {parent / 'run'}\n")[1]
-    assert told.strip() == ""
+    assert done.stdout.split(f"results in {parent / 'run'}\n")[1].strip() == ""
     assert os.listdir(parent) == ["run"]
