@@ -12,6 +12,7 @@ from rootsopt.config.plausible import USUAL, notes_on_swept, usual_of
 from rootsopt.config.sources import shipped
 from rootsopt.config.units import _UNITS, unit_of
 from rootsopt.errors import InputError
+from tests.standins import refusal
 
 DOCS = Path(__file__).parents[2] / "docs"
 FULL = [
@@ -47,13 +48,12 @@ def test_shipped_configs_are_usual(name):
 
 def test_values_of_the_pages_are_usual():
     """`--set KEY=NUMBER` in the pages gives no note on the config of the paper's rotor."""
-    seen = 0
-    for page in sorted(DOCS.glob("*.md")):
-        for key, text in re.findall(r"--set '?([a-z_.]+)=([-\d.e]+)\b", page.read_text("utf-8")):
-            if usual_of(key) is not None and "outline" not in key:
-                seen += 1
-                assert notes_on_swept(load("cic_drawn"), {key: [float(text)]}) == (), (page, key)
-    assert seen > 10
+    pages = " ".join(page.read_text("utf-8") for page in DOCS.glob("*.md"))
+    given = re.findall(r"--set '?([a-z_.]+)=([-\d.e]+)\b", pages)
+    seen = {pair for pair in given if usual_of(pair[0]) is not None and "outline" not in pair[0]}
+    assert len(seen) > 10
+    for key, text in seen:
+        assert notes_on_swept(load("cic_drawn"), {key: [float(text)]}) == ()
 
 
 @pytest.mark.parametrize(
@@ -75,8 +75,7 @@ def test_values_of_the_pages_are_usual():
 def test_odd_value_has_a_note(override, words):
     (note,) = notes(load("cic_drawn", [override]))
     assert words in note
-    assert note.startswith("`")
-    assert "unusual" in note
+    assert re.match("`.*unusual", note)
 
 
 def test_values_in_another_unit_do_not_pass_in_silence():
@@ -122,14 +121,13 @@ def test_notes_on_swept_values_name_the_option():
     ],
 )
 def test_limits_that_no_force_can_meet_are_refused(terms, words):
-    with pytest.raises(InputError, match=words):
-        load("cic_drawn", [f"constraints.terms={terms}"])
+    assert re.search(words, refusal(load, "cic_drawn", [f"constraints.terms={terms}"]))
 
 
 @pytest.mark.parametrize(
     "friction", ["{kinetic: 0.3}", "{static: 0.05}", "{static: 0, kinetic: 1}"]
 )
 def test_static_friction_is_not_below_kinetic_friction(friction):
-    with pytest.raises(InputError, match=r"`contact\.friction\.static` must be at least `contact"):
-        load("pump", [f"contact.friction={friction}"])
+    message = refusal(load, "pump", [f"contact.friction={friction}"])
+    assert "`contact.friction.static` must be at least `contact" in message
     assert load("pump", ["contact.friction={static: 0.1, kinetic: 0.1}"]).contact.friction

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rootsopt.config import parse
-
+from rootsopt.errors import InputError
 from rootsopt.measured.estimates import Estimates, estimates, scatter, unit_of_size
 from rootsopt.measured.source import advice, outline_of
 from tests.fuzz import outlines
@@ -121,7 +121,8 @@ def test_unit_of_a_drawing_can_be_replaced(tmp_path):
 
     Scatter and centre of its polyline are estimated."""
     points, path = scattered(rotor() + 0.2, 5e-3) / 25.4, tmp_path / "points.dxf"
-    path.write_bytes(outlines.drawing(outlines.polyline(points)))
+    corners = np.stack([points.real, points.imag], axis=1)
+    path.write_bytes(outlines.drawing(lambda x: x.modelspace().add_lwpolyline(corners, close=True)))
     assert "`profile.outline_unit` = inch" in refusal(read, path)
     _, _, checks = read(path, unit="inch", center="fit", smoothing_mm=0.005)
     assert checks.record()["scatter_um"] == pytest.approx(5, rel=0.15)
@@ -140,8 +141,9 @@ def test_refused_points_are_said_to_be_scattered(tmp_path, size):
     The advised smoothing is accepted in the end."""
     path = write(tmp_path / "points.csv", scattered(rotor(), size * 1e-3, seed=2))
     for keys in ({}, {"smoothing_mm": 0.1e-3 * size}):
-        message = refusal(read, path, **keys)
-        (said,) = re.findall(r"the points are scattered by about ([0-9.]+) um", message)
+        with pytest.raises(InputError) as refused:
+            read(path, **keys)
+        (said,) = re.findall(r"points are scattered by about ([0-9.]+) um", str(refused.value))
         assert float(said) == pytest.approx(size, rel=0.15)
     smoothing = size * 1e-3
     if size == 20:

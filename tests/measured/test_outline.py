@@ -12,9 +12,7 @@ from experiments._common.polygons import pair_gap
 from rootsopt.commands.table import profile, simulate
 from rootsopt.config import load, parse
 from rootsopt.contact.closest import FlankPair
-
 from rootsopt.measured.conjugacy import conjugacy, inset_note
-
 from rootsopt.measured.fit import imported
 from rootsopt.measured.loop import Loop
 from rootsopt.measured.source import advice, outline_of
@@ -68,7 +66,9 @@ def approaches(pair, rolls, relatives):
 def contact_of(profile):
     rolls = jnp.linspace(1e-3, np.pi / 3 - 1e-3, 121)
     places = jnp.meshgrid(rolls, jnp.array([0.0, -1e-4, -1e-3, -3e-3]))
-    return approaches(FlankPair.of(profile, 2 * R, two_sided=True), *map(jnp.ravel, places))
+    return approaches(
+        FlankPair.of(profile, 2 * profile.pitch_radius, two_sided=True), *map(jnp.ravel, places)
+    )
 
 
 @every_profile
@@ -110,15 +110,13 @@ def test_a_wrong_outline_leaves_the_gap_that_its_points_leave(profile, by):
     assert worst == pytest.approx(-by * 1e-3, rel=1e-3)
     some = slice(7, None, 59)
     assert rolled.gap[some] == pytest.approx(gaps(rolled.roll[some], rolled.roll[some]), abs=1e-9)
-    pair = FlankPair.of(found, 2 * R, two_sided=True)
+    pair = FlankPair.of(found, 2 * found.pitch_radius, two_sided=True)
     x, e = np.array([0.3, 0.6, 0.9]), np.array([-1e-3, -2e-3, -5e-4])
     seen = gaps(-x - e / 2, -x + e / 2)
     assert np.asarray(approaches(pair, x, e).gap) == pytest.approx(seen, abs=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("by", "scatter"), [(0.5, 0.0), (0.02, 0.0), (-0.05, 0.0), (0.0, 0.0), (0.1, 2e-3), (0.0, 2e-3)]
-)
+@pytest.mark.parametrize(("by", "scatter"), [(0.02, 0.0), (-0.05, 0.0), (0.1, 2e-3), (0.0, 2e-3)])
 def test_an_inset_is_seen_in_the_mesh(by, scatter):
     """Half the gap in rolling, with its sign; within the scatter, there is none."""
     points = cut(points_of(CIC3, 240), by)
@@ -180,7 +178,6 @@ def test_lobes_and_flanks_that_differ_are_told():
     # The lobe's axis moves over with the flank and takes up part of it.
     assert 15 < checks.flank_deviation_um < 30
     assert "trailing flank" in advice(parse(CONFIG.format("x.csv")).profile, checks)[0]
-
 
 
 FAULTS = {

@@ -13,7 +13,6 @@ from ezdxf import units
 from hypothesis import given
 from hypothesis import strategies as st
 
-
 from rootsopt.measured.fit import imported
 from rootsopt.measured.loop import Loop, signed_area
 from rootsopt.measured.reading import Sought, read, untangled
@@ -538,7 +537,6 @@ def test_headers_that_state_units_or_polar_coordinates(tmp_path, header, comma):
     assert loop.points == pytest.approx(EE, abs=1e-8)
     assert bool(loop.notes) == bool(note)
     assert note is None or note in " ".join(loop.notes)
-
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,6 @@ def waves(function, *arguments):
     return sum(text.count(f" {name}(") for name in ("cosine", "sine"))
 
 
-
 def test_what_is_kept_does_not_change():
     """Integers, single numbers, infinite values and arrays of any nested batch pass unchanged."""
     tree = {"number": 3.0 * ANGLES[0], "count": jnp.arange(3), "far": jnp.full(40, jnp.inf)}

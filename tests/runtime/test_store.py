@@ -80,7 +80,10 @@ def test_only_plain_files_of_the_users_own_are_read(kept, monkeypatch, tmp_path)
         assert made.read("a", "for a") is None
     file.chmod(0o644)
     assert made.read("a", "for a") == DATA
-    for patched in ((os, "geteuid", lambda: os.getuid() + 1), (store, "MOST_BYTES", len(whole) - 1)):
+    for patched in (
+        (os, "geteuid", lambda: os.getuid() + 1),
+        (store, "MOST_BYTES", len(whole) - 1),
+    ):
         with monkeypatch.context() as patch:
             patch.setattr(*patched)
             assert made.read("a", "for a") is None
@@ -141,7 +144,11 @@ def test_a_folder_of_another_user_is_refused(folder, monkeypatch):
 def test_a_folder_that_cannot_be_used_is_an_os_error(tmp_path):
     (tmp_path / "file").write_text("")
     (tmp_path / "circle").symlink_to(tmp_path / "circle")
-    for name, said in (("file", "exists"), ("file/below", "directory"), ("circle", "circle")):
+    for name, said in (
+        ("file", "directory|exists"),
+        ("file/below", "directory"),
+        ("circle", "circle"),
+    ):
         with pytest.raises(OSError, match=said):
             Store(tmp_path / name)
 

@@ -133,7 +133,10 @@ def test_a_run_has_the_same_bits_on_1_2_and_16_cores(tmp_path, command):
         arguments += [part for text in RUNS[command] for part in ("--set", text)]
         own = {"NPROC": cores, "OPENBLAS_NUM_THREADS": cores, "OMP_NUM_THREADS": cores}
         faked = [sys.executable, "-c", FAKED, cores, *arguments]
-        assert subprocess.run(faked, cwd=ROOT, env=os.environ | own, check=False).returncode in (0, 3)
+        assert subprocess.run(faked, cwd=ROOT, env=os.environ | own, check=False).returncode in (
+            0,
+            3,
+        )
         found = {file.name: file.read_bytes() for file in out.glob("*.csv")}
         files.append((found, without_times(json.loads((out / "result.json").read_bytes()))))
     assert files[0][0]
