@@ -109,8 +109,6 @@ def test_profile_writes_one_record(tmp_path, command):
 
 
 def test_no_usable_result_exits_3(tmp_path, command):
-    """If the lobes pass through each other, the result has a status and no numbers; the exit code
-    is 3."""
     weak = "--set=scene.timing_gear.stiffness_N_m_per_rad=1", "--set=scene.load.torque_N_m=40"
     for module in ("simulate", "optimize"):
         done = command(module, CIC, "--no-figures", *weak, "-o", tmp_path / module)
@@ -133,8 +131,6 @@ def test_no_usable_result_exits_3(tmp_path, command):
     ],
 )
 def test_bad_input_exits_2_with_one_message(arguments, words, tmp_path, command):
-    """Bad input ends with exit code 2 and one line on stderr that names key and remedy. Nothing is
-    written."""
     done = command("simulate", *arguments, "-o", tmp_path / "out")
     assert (done.returncode, done.out) == (2, "")
     assert done.err.strip().count("\n") == 0
@@ -199,7 +195,6 @@ def test_simulate_in_an_odd_environment_with_the_programs_of_a_plain_one(tmp_pat
 
 
 def test_no_programs_are_kept_if_told_so(tmp_path, monkeypatch, capsys):
-    """With `--no-cache`, no programs are stored; without it, they are."""
     monkeypatch.setattr(programs, "_store", None)
     monkeypatch.setenv("ROOTSOPT_CACHE", str(tmp_path / "cache"))
     arguments = EE, "-o", str(tmp_path / "p"), "--no-figures", "--export", "none"

@@ -18,7 +18,6 @@ def bash():
 
 
 def completed(script, words):
-    """Return what bash offers for the last of `words`."""
     given = " ".join(f"'{word}'" for word in words)
     code = f"COMP_WORDS=({given}); COMP_CWORD={len(words) - 1}; _rootsopt 2>/dev/null; "
     code += 'printf "%s\\n" "${COMPREPLY[@]}"'

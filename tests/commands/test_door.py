@@ -18,7 +18,6 @@ CIC = str(ROOT / "configs" / "cic_drawn.yaml")
 
 
 def python(code, *arguments, **options):
-    """Return a process that runs `code`, with pipes as its streams."""
     options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True} | options
     # If the tests run in the background, Ctrl-C is ignored in their child processes too.
     options |= {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)}
@@ -90,8 +89,6 @@ def test_help_into_a_closed_pipe(arguments, code):
 
 @pytest.mark.parametrize("daemon", [True, False])
 def test_threads_that_go_on_do_not_keep_the_process(daemon):
-    """The process ends without waiting for threads, such as a compilation that is no longer
-    needed."""
     code = (
         f"go = lambda: threading.Thread(target=time.sleep, args=(60,), daemon={daemon}).start();"
         "door.leave(door.through('test', lambda: go() or print('said') or 3, own=True))"
@@ -165,7 +162,6 @@ def test_a_patient_run_ends_by_itself_or_at_a_second_signal(tmp_path, twice):
 
 
 def test_signals_that_are_ignored_stay_so():
-    """Signals stay ignored, as for a background job of a script."""
     code = (
         "signal.signal(signal.SIGINT, signal.SIG_IGN);"
         "kill = lambda: (os.kill(os.getpid(), signal.SIGINT), time.sleep(1));"
@@ -209,12 +205,10 @@ def test_called_from_python_nothing_global_changes(tmp_path, capsys, monkeypatch
 
 
 def loaded(code, names):
-    """Return which of the modules are imported by `code`, as a list in a line."""
     return python(f"{code}\nprint([n for n in {names} if n in sys.modules])").communicate()[0]
 
 
 def test_doors_load_little():
-    """No large module is imported before signals are handled."""
     code = "import sys, rootsopt.simulate, rootsopt.__main__, rootsopt.optimize.__main__"
     slow = "numpy", "yaml", "pydantic", "jax", "rich"
     assert loaded(code, slow) == "[]\n"
@@ -250,7 +244,6 @@ def test_wrong_arguments_take_one_line(capsys):
 
 
 def test_full_disks_elsewhere_take_one_line(capsys, monkeypatch):
-    """Any other failure of the operating system ends with one line."""
     full = OSError(28, "No space left on device", "/tmp/elsewhere")
     monkeypatch.setattr("rootsopt.commands.cli.load", mock.Mock(side_effect=full))
     assert main(["profile", CIC]) == 2

@@ -18,22 +18,18 @@ from rootsopt.view.files import design_file
 
 ROOT = Path(__file__).parents[2]
 CIC = str(ROOT / "configs" / "cic_drawn.yaml")
-RADIUS = ["--set", "pareto.terms=[outer_radius_mm, area_efficiency]"]
-FEW = [*RADIUS, "--set", "pareto.points=3", "--set", "optimizer.starts=1"]
+FEW = [
+    "--set=pareto.terms=[outer_radius_mm, area_efficiency]",
+    "--set=pareto.points=3",
+    "--set=optimizer.starts=1",
+]
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """Return the folder of a finished run without a simulation."""
-    place = tmp_path_factory.mktemp("front") / "run"
-    module = "rootsopt.optimize.tradeoffs.trace"
-    with mock.patch.multiple(module, _CHEAP_STARTS=2, _CHEAP_SCREENING=8):
-        assert pareto.main([CIC, "-o", str(place), *FEW]) == 0
-    return place
-
-
-def test_files_of_a_run_belong_together(folder):
+def test_files_of_a_run_belong_together(tmp_path):
     """Every file of the run is listed; table, result and configs contain the same points."""
+    folder, module = tmp_path / "run", "rootsopt.optimize.tradeoffs.trace"
+    with mock.patch.multiple(module, _CHEAP_STARTS=2, _CHEAP_SCREENING=8):
+        assert pareto.main([CIC, "-o", str(folder), *FEW]) == 0
     result = json.loads((folder / "result.json").read_text())
     files = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
     assert set(result["run"]["files"]) == files
@@ -45,20 +41,15 @@ def test_files_of_a_run_belong_together(folder):
         assert point["certificate"]["residual"] <= point["certificate"]["required_residual"]
         values = point["terms"] | point["design"]
         assert {name: row[name] for name in values} == pytest.approx(values, rel=1e-9)
-    assert [term["sense"] for term in result["terms"]] == ["min", "max"]
-    assert result["edges"] == [[1, 2], [2, 3]]
-    assert result["status"] == "geometry_only"
-
-
-def test_config_of_a_point_is_its_design(folder):
-    """The config of each point gives the terms of this point, computed in another way."""
-    result = json.loads((folder / "result.json").read_text())
-    for point in result["points"]:
+        # The config of the point gives its terms, computed in another way.
         config = load(folder / design_file(point["point"]))
         scene = Scene.from_config(config)
         found = geometry_record(scene, geometry(scene.profile(design_vector(config))))
         assert found == pytest.approx(point["geometry"], rel=1e-12)
         assert found == pytest.approx(found | point["terms"], rel=1e-12)
+    assert [term["sense"] for term in result["terms"]] == ["min", "max"]
+    assert result["edges"] == [[1, 2], [2, 3]]
+    assert result["status"] == "geometry_only"
 
 
 def test_contradicting_constraints_end_with_advice(tmp_path, capsys):

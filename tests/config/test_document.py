@@ -147,7 +147,6 @@ def test_size_of_what_is_read_is_bounded(text, words):
 )
 @pytest.mark.parametrize("key", ["scene.speed_rpm", "scene"])
 def test_odd_value_is_refused_in_one_line(key, value):
-    """The message for any odd value is one short line, both as an override and in the file."""
     refusal(MINIMAL, f"{key}={value}")
     if "." in key:
         section, name = key.split(".", 1)
@@ -266,7 +265,6 @@ def test_odd_path_is_refused(name, words):
     ids=range(9),
 )
 def test_bytes_that_are_no_config_are_refused(tmp_path, data, words):
-    """Other encodings are rejected, and so are files too long for a config."""
     path = tmp_path / "x.yaml"
     path.write_bytes(data)
     assert words in refused(load, path)
@@ -282,7 +280,6 @@ def test_byte_order_mark_of_utf8_is_taken(tmp_path):
 
 
 def test_words_are_bounded():
-    """Values, keys, paths and messages are shortened to one line, however long they are."""
     endless = [["x" * 10_000] * 1000] * 1000
     for value in (endless, {k: endless for k in range(1000)}, "x" * 10**6, 10**3999, "a\nb"):
         assert len(shown(value)) <= 160

@@ -6,10 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from rootsopt.config import Config, load, notes, parse
+from rootsopt.config import Config, load, notes
 from rootsopt.config.explain import keys_of
 from rootsopt.config.plausible import USUAL, notes_on_swept, usual_of
-from rootsopt.config.sources import shipped
 from rootsopt.config.units import _UNITS, unit_of
 from rootsopt.errors import InputError
 from tests.standins import refusal
@@ -37,13 +36,6 @@ def test_every_quantity_has_a_usual_range():
     keys = [key.name for key in keys_of(Config)]
     assert [key for key in keys if unit_of(key) and usual_of(key) is None] == []
     assert set(USUAL) <= set(keys)
-
-
-@pytest.mark.parametrize("name", shipped())
-def test_shipped_configs_are_usual(name):
-    config = load(name)
-    assert notes(config) == ()
-    assert notes(parse(config.to_yaml())) == ()
 
 
 def test_values_of_the_pages_are_usual():

@@ -9,8 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from rootsopt.config import load_config
+from rootsopt.config import load_config, notes, parse
 from rootsopt.config.sources import shipped
+from rootsopt.scene import check_geometry
 from tests.standins import refusal
 
 ROOT = Path(__file__).parents[2]
@@ -20,11 +21,14 @@ _NAMES = sorted(path.stem for path in (ROOT / "configs").glob("*.yaml"))
 
 @pytest.mark.parametrize("name", _NAMES)
 def test_a_shipped_config_is_found_by_its_name(name, monkeypatch, tmp_path):
-    """A shipped config is found from any folder, even if a folder has its name."""
+    """It is found from any folder, even if a folder has its name. Its values are usual, and its
+    profile can be made."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "cic").mkdir()
-    expected = load_config(ROOT / "configs" / f"{name}.yaml")
-    assert load_config(name) == load_config(f"{name}.yaml") == expected
+    config = load_config(ROOT / "configs" / f"{name}.yaml")
+    assert load_config(name) == load_config(f"{name}.yaml") == parse(config.to_yaml()) == config
+    assert notes(config) == ()
+    check_geometry(config)
 
 
 def test_a_file_comes_before_a_shipped_config(monkeypatch, tmp_path):
@@ -43,7 +47,6 @@ def test_other_names_are_refused_with_those_that_exist(path):
 
 
 def test_an_installed_package_has_its_configs_and_types(tmp_path):
-    """An unpacked wheel can be used from an empty folder."""
     builders = pytest.importorskip("hatchling.builders.wheel")
     (wheel,) = builders.WheelBuilder(str(ROOT)).build(
         directory=str(tmp_path), versions=["standard"]

@@ -42,7 +42,6 @@ def write(path, points):
 
 
 def found_in(folder, points, given=None):
-    """Return the rotor of a file with these points, with the default as answer to each question."""
     return found(write(folder / "rotor.csv", points), given or {}, lambda what, default: default)
 
 

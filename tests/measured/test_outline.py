@@ -53,7 +53,6 @@ def closed(points):
 
 
 def bulged(points, by):
-    """Return points with the addenda `by` mm too thick."""
     above = np.clip((np.abs(points) - 33) / (np.max(np.abs(points)) - 33), 0, 1)
     return cut(points, -by * np.sin(np.pi * above) ** 2)
 
@@ -187,14 +186,30 @@ FAULTS = {
     "folded": (lambda z: z * np.exp(2e-4j * (np.abs(z) - 33) ** 4), "fold back"),
     "unequal": (lambda z: np.where(np.abs(np.angle(z)) < 1, bulged(z, 1.5), z), "equal lobes"),
     "hollow": (lambda z: bulged(z, -4.0), "convex addendum|fold back|a flank turns by"),
+    "collinear": (lambda z: z.real + 0j, ""),
+    "two points": (lambda z: z[[0, len(z) // 2]], ""),
+    "six points": (lambda z: z[:: len(z) // 6], ""),
+    "axis among the points": (lambda z: np.where(np.arange(len(z)) == 5, 0, z), ""),
+    "spike": (lambda z: np.where(np.arange(len(z)) == 5, 3 * z, z), ""),
+    "twice around": (lambda z: np.concatenate([z, z]), ""),
+    "figure of eight": (
+        lambda z: np.concatenate([z.real + 60 + 1j * z.imag, -z.real - 60 - 1j * z.imag]),
+        "",
+    ),
+    "micrometres": (lambda z: z * 1e3, ""),
+    "metres": (lambda z: z * 1e-3, ""),
+    "in any order": (lambda z: np.random.default_rng(0).permutation(z), ""),
+    "lobes of other angles": (lambda z: np.abs(z) * np.exp(2j * np.angle(z) / 3), ""),
+    "circle": (lambda z: 33.0 * np.exp(2j * np.pi * np.arange(len(z)) / len(z)), ""),
 }
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_faults_are_named(tmp_path, fault):
+def test_faults_are_named(tmp_path, fault, capfd):
     change, message = FAULTS[fault]
-    path = write(tmp_path / "points.csv", change(points_of(CIC3, 240)))
+    path = write(tmp_path / "points.csv", change(points_of(CIC3, 60)))
     assert re.search(message, refusal(check_geometry, parse(CONFIG.format(path))))
+    assert capfd.readouterr().err == ""
 
 
 def test_config_keys(tmp_path):

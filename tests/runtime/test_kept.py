@@ -27,7 +27,6 @@ def results(cos, sin):
 
 
 def waves(function, *arguments):
-    """Return the number of cosines and sines that the compiled `function` contains."""
     text = function.lower(*arguments).compile().as_text()
     return sum(text.count(f" {name}(") for name in ("cosine", "sine"))
 
@@ -46,7 +45,6 @@ def test_what_is_kept_does_not_change():
 
 @jax.custom_jvp
 def values_kept(value):
-    """Keep a value, but not its derivatives."""
     return kept(value)
 
 

@@ -44,7 +44,6 @@ TRACED = []
 
 
 def scaled(factor, numbers, name):
-    """Stand in for a program: arrays and a static argument."""
     TRACED.append(name)
     return Answer({"sum": jnp.sum(factor.value * numbers**factor.power)}, name)
 
@@ -137,21 +136,17 @@ def test_kept_programs_are_found_without_tracing(tmp_path, traced):
 
 @pytest.fixture
 def folder(tmp_path):
-    """Return the folder in which programs are kept from now on."""
     programs.keep_in(tmp_path / "cache")
     return tmp_path / "cache"
 
 
-def test_a_damaged_or_unwritable_cache_is_no_error(folder, traced):
+def test_a_damaged_program_is_made_again(folder, traced):
     ask(CachedFunction(scaled))
     (file,) = folder.iterdir()
     file.write_bytes(file.read_bytes()[:100])
     for _ in range(2):
         ask(CachedFunction(scaled))
         assert len(traced) == 2
-    assert programs.keep_in(file / "below a file") is None
-    ask(CachedFunction(scaled))
-    assert len(traced) == 3
 
 
 @pytest.mark.skipif(os.name != "posix", reason="permissions of POSIX")
@@ -181,9 +176,7 @@ def test_a_cache_that_cannot_be_used_is_not_spoken_of(traced, monkeypatch, capsy
 
 
 def test_programs_called_from_python_are_kept_without_being_asked(traced, monkeypatch, tmp_path):
-    """Programs called from Python are kept in the commands' folder.
-
-    The environment may say otherwise."""
+    """They are kept in the commands' folder. The environment may say otherwise."""
     for choice, kept in ((str(tmp_path / "cache"), 1), ("off", 0)):
         monkeypatch.setattr(programs, "_chosen", False)
         monkeypatch.setenv("ROOTSOPT_CACHE", choice)
@@ -193,9 +186,7 @@ def test_programs_called_from_python_are_kept_without_being_asked(traced, monkey
 
 
 def test_programs_that_call_out_are_not_kept(folder):
-    """Programs that call library functions are not kept.
-
-    Loaded without being lowered, they would call functions that are not set up."""
+    """Loaded without being lowered, they would call functions that are not set up."""
     np.testing.assert_allclose(CachedFunction(solved)(jnp.eye(2) * 2), [1, 0])
     assert not list(folder.iterdir())
 
@@ -271,7 +262,6 @@ def test_a_program_is_another_after_a_change(what, folder, monkeypatch):
 
 @pytest.fixture
 def package(monkeypatch, tmp_path):
-    """Folder of a copy of this package, from which programs take their sources."""
     copy = tmp_path / "rootsopt"
     shutil.copytree(
         programs._PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__", "configs")
@@ -281,7 +271,7 @@ def package(monkeypatch, tmp_path):
 
 
 def test_a_program_follows_the_code_that_it_may_import(package):
-    """Not comments and docstrings, nor rooms that it does not import, such as a report."""
+    """Not rooms that it does not import, such as a report."""
 
     def replaced(name, old, new):
         text = (package / name).read_text()
@@ -293,9 +283,6 @@ def test_a_program_follows_the_code_that_it_may_import(package):
     first = replaced("status.py", "a", "a")
     assert replaced("view/pages/html.py", "def ", "x = 1\n\n\ndef ") == first
     assert replaced("commands/cli.py", "import", "import time  # or not\nimport") == first
-    for name in ("dynamics/pair.py", "contact/search.py", "profiles/cic.py", "runtime/programs.py"):
-        assert replaced(name, '"""', '"""Comparable to nothing.\n\n') == first
-        assert replaced(name, "\n\n\n", "\n\n\n# It's \"one\n\n\n") == first
     seen = [first]
     for name, old, new in (
         ("dynamics/window.py", "BLOCK = 4", "BLOCK = 8"),  # imported by what is imported
@@ -343,7 +330,7 @@ def test_only_words_for_people_change_nothing(tmp_path, before, after, same):
 
 
 def test_a_program_of_sources_elsewhere_follows_them(folder, monkeypatch, tmp_path):
-    """A changed function or scene part of the user is compiled again."""
+
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     answers = []

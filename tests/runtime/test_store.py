@@ -17,7 +17,6 @@ posix = pytest.mark.skipif(os.name != "posix", reason="owners and permissions of
 
 @pytest.fixture
 def kept(tmp_path):
-    """Return a store with one entry, and the file that holds it."""
     made = Store(tmp_path / "cache")
     made.write("a", "for a", DATA)
     (file,) = (tmp_path / "cache").iterdir()
@@ -60,7 +59,6 @@ def test_a_damaged_entry_is_none(kept, how):
 
 
 def test_an_exchanged_entry_is_none(kept):
-    """An entry under another name, or made for another purpose, is not returned."""
     made, file = kept
     made.write("b", "for b", DATA)
     assert made.read("b", "for a") is None
@@ -108,7 +106,6 @@ def refusal(folder):
 
 @pytest.fixture
 def folder(tmp_path):
-    """Return an empty folder."""
     (tmp_path / "folder").mkdir()
     return tmp_path / "folder"
 
@@ -124,7 +121,6 @@ def test_a_folder_others_may_write_to_is_refused(folder, mode):
 
 @posix
 def test_a_folder_others_may_exchange_is_refused(folder):
-    """A folder is refused if others can write to a folder above it without a sticky bit."""
     inner = folder / "between" / "cache"
     for mode in (0o777, 0o775):
         folder.chmod(mode)

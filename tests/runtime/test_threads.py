@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -25,7 +26,6 @@ ROOT = Path(__file__).parents[2]
 
 
 def counts():
-    """Return the numbers of threads of all libraries for dense algebra that are loaded."""
     return {one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"}
 
 
@@ -51,23 +51,21 @@ def test_work_is_divided_among_the_cores(monkeypatch):
 
 def test_overlapping_contexts_keep_one_thread_to_the_end():
     """A context that ends early does not return the threads that another one has set aside."""
-    inside, ending, seen = threading.Event(), threading.Event(), []
+    inside, ending = threading.Event(), threading.Event()
 
     @one_thread
     def other():
         inside.set()
         ending.wait(10)
-        seen.append(counts())
+        return counts()
 
-    with threadpool_limits(2):
-        thread = threading.Thread(target=other)
+    with threadpool_limits(2), ThreadPoolExecutor(1) as pool:
         with one_thread:
-            thread.start()
+            found = pool.submit(other)
             inside.wait(10)
         assert counts() == {1}
         ending.set()
-        thread.join(10)
-        assert seen == [{1}]
+        assert found.result(10) == {1}
     with threadpool_limits(2):
         with one_thread, one_thread:
             assert counts() == {1}
@@ -75,20 +73,17 @@ def test_overlapping_contexts_keep_one_thread_to_the_end():
 
 
 @pytest.mark.parametrize(
-    ("room", "search", "run"),
-    [
-        (design, "search_of", rootsopt.optimize_design),
-        (design, "Tracer", rootsopt.pareto_front),
-    ],
+    ("search", "run"),
+    [("search_of", rootsopt.optimize_design), ("Tracer", rootsopt.pareto_front)],
 )
-def test_searches_from_python_use_one_thread_and_restore_the_others(monkeypatch, room, search, run):
+def test_searches_from_python_use_one_thread_and_restore_the_others(monkeypatch, search, run):
     seen = []
 
     def made(*_, **__):
         seen.append(counts())
         raise InputError("enough")
 
-    monkeypatch.setattr(room, search, made)
+    monkeypatch.setattr(design, search, made)
     with threadpool_limits(2):
         assert refusal(run, load("cic_drawn")) == "enough"
         assert [*seen, counts()] == [{1}, {2}]
@@ -101,8 +96,10 @@ def test_commands_use_one_thread_whatever_the_user_has_set(monkeypatch):
     with threadpool_limits(2):
         own_process()
         assert counts() == {1}
-    script = "import scipy.linalg, threadpoolctl as t\n"
-    script += "print({x['num_threads'] for x in t.threadpool_info()})"
+    script = (
+        "import scipy.linalg, threadpoolctl as t; "
+        "print({x['num_threads'] for x in t.threadpool_info()})"
+    )
     assert subprocess.check_output([sys.executable, "-c", script], text=True) == "{1}\n"
 
 
