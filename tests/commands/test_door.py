@@ -24,6 +24,7 @@ def python(code, *arguments, **options):
     return subprocess.Popen([sys.executable, "-c", code, *arguments], cwd=ROOT, **options)
 
 
+MODULE = "import runpy, sys; runpy.run_module(sys.argv.pop(1), run_name='__main__', alter_sys=True)"
 DOOR = "import os, signal, sys, threading, time; from rootsopt.commands import door\n"
 WORK = f"""{DOOR}
 def work():
@@ -34,9 +35,9 @@ sys.exit(door.through("test", work, own=True))
 """
 
 
-def ended(code, **options):
+def ended(code, *arguments, **options):
     """Return exit code, stdout and stderr of a process that has run `code`."""
-    process = python(code, **options)
+    process = python(code, *arguments, **options)
     out, err = process.communicate()
     return process.returncode, out, err
 
@@ -79,12 +80,9 @@ def test_output_that_cannot_be_written_is_told(code):
 def test_help_into_a_closed_pipe(arguments, code):
     reading, writing = os.pipe()
     os.close(reading)
-    done = subprocess.run(
-        [sys.executable, "-m", "rootsopt", *arguments],
-        cwd=ROOT, stdout=writing, stderr=subprocess.PIPE, text=True, check=False, env=BUFFERED,
-    )  # fmt: skip
+    found = ended(MODULE, "rootsopt", *arguments, stdout=writing, env=BUFFERED)
     os.close(writing)
-    assert (done.returncode, done.stderr) == (code, "")
+    assert found == (code, None, "")
 
 
 @pytest.mark.parametrize("daemon", [True, False])
@@ -180,8 +178,7 @@ def test_an_interrupt_during_imports(tmp_path, command, module):
     (tmp_path / f"{module}.py").write_text(text)
     arguments = ["simulate", CIC] if command == "rootsopt" else [CIC]
     environment = os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"}
-    code = f"import runpy; runpy.run_module({command!r}, run_name='__main__', alter_sys=True)"
-    process = python(code, *arguments, "-o", str(tmp_path / "run"), env=environment)
+    process = python(MODULE, command, *arguments, "-o", str(tmp_path / "run"), env=environment)
     assert process.stdout.readline() == "here\n"
     process.send_signal(signal.SIGINT)
     _, told = process.communicate()

@@ -35,14 +35,13 @@ def file_of(folder, inset, unit=25.4):
     return str(folder / "rotor.csv")
 
 
-def improved(file, *options):
-    """Improve the rotor of a file: result, records of both rotors, and what was found.
+def improved(folder, file, *options):
+    """Return the result for the rotor of a file, the records of both, and what was found.
 
     The better one fits the housing and displaces as much."""
-    folder, quick = os.path.join(os.path.dirname(file), "run"), (f"--set={one}" for one in QUICK)
-    assert improve.main([file, "--no-figures", "-o", folder, *quick, *options]) == 0
-    with open(os.path.join(folder, "result.json")) as text:
-        result = json.load(text)
+    quick = [f"--set={one}" for one in QUICK]
+    assert improve.main([str(file), "--no-figures", "-o", str(folder), *quick, *options]) == 0
+    result = json.loads((folder / "result.json").read_text())
     before, after = result["baseline"], result["optimized"]
     assert after["geometry"]["outer_radius_mm"] <= before["geometry"]["outer_radius_mm"] + 1e-5
     assert after["pump"]["displaced_volume_cm3"] >= before["pump"]["displaced_volume_cm3"] - 1e-3
@@ -63,7 +62,7 @@ def test_a_better_rotor_takes_the_place_of_that_of_a_file(
     monkeypatch.setattr(*POSES)
     monkeypatch.setattr(work, "_COMMON", ("ee", "cic"))
     options = "--length-mm=100", "--set=scene.timing_gear.backlash_mm=0.3", f"--{aim}", *least
-    result, before, after, told = improved(file_of(tmp_path, 0.02), *options)
+    result, before, after, told = improved(tmp_path / "run", file_of(tmp_path, 0.02), *options)
     shown = capsys.readouterr().out
     assert "Your rotor against a better one" in shown
     assert "inset 0.02 mm" in shown
@@ -105,8 +104,8 @@ def test_a_gain_too_small_to_count_is_none(monkeypatch):
 @pytest.mark.long
 def test_a_rotor_without_parameters_is_improved_by_a_free_form(tmp_path):
     """EE has no seal and no parameters. The ripple of its flow needs no simulation."""
-    file = str(write(tmp_path / "ee.csv", cycloids(2, 40.0)))
-    result, before, after, told = improved(file, "--smoother", "--config", "cic")
+    file = write(tmp_path / "ee.csv", cycloids(2, 40.0))
+    result, before, after, told = improved(tmp_path / "run", file, "--smoother", "--config", "cic")
     assert (told["fit"]["family"], before["design"]) == ("ee", {})
     # EE of N lobes is the free form with all coefficients N / (N + 1).
     begun = [result["beginning"]["design"][f"coefficients_{k}"] for k in (1, 2, 3)]

@@ -56,6 +56,14 @@ def test_scatter_and_centre_are_those_put_in(name, size):
     assert found.middle == pytest.approx(33, abs=5 * size + 1e-6)
 
 
+@pytest.mark.parametrize("size", [5e-3, 20e-3])
+def test_scatter_of_points_closer_than_they_scatter(size):
+    """The points are a few micrometres apart, so that their order along the outline is lost."""
+    t = np.linspace(0, 2 * np.pi, 60_000, endpoint=False)
+    dense = (33 + 10 * np.cos(3 * t)) * np.exp(1j * t)
+    assert scatter(scattered(dense, size))[0] == pytest.approx(size, rel=0.15)
+
+
 @settings(max_examples=8, deadline=None)
 @given(
     turn=st.floats(-3.1, 3.1),
