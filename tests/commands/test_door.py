@@ -85,21 +85,35 @@ def test_help_into_a_closed_pipe(arguments, code):
     assert found == (code, None, "")
 
 
-@pytest.mark.parametrize("daemon", [True, False])
-def test_threads_that_go_on_do_not_keep_the_process(daemon):
-    code = (
-        f"go = lambda: threading.Thread(target=time.sleep, args=(60,), daemon={daemon}).start();"
-        "door.leave(door.through('test', lambda: go() or print('said') or 3, own=True))"
-    )
+THREAD = (
+    "go = lambda: threading.Thread(target=time.sleep, args=(60,), daemon={daemon}).start();"
+    "door.leave(door.through('test', lambda: go() or print('said') or 3, own=True))"
+)
+IGNORED = (
+    "signal.signal(signal.SIGINT, signal.SIG_IGN);"
+    "kill = lambda: (os.kill(os.getpid(), signal.SIGINT), time.sleep(1));"
+    "sys.exit(door.through('test', lambda: kill() and 0, own=True))"
+)
+LETTERS = "sys.exit(door.through('test', lambda: print('µm \\udcff') or 0, own=True))"
+ASCII = {"PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"}
+
+
+@pytest.mark.parametrize(
+    ("code", "variables", "found"),
+    [
+        # The process ends without waiting for a compilation that is no longer needed.
+        (THREAD.format(daemon=True), {}, (3, "said\n", "")),
+        (THREAD.format(daemon=False), {}, (3, "said\n", "")),
+        # As for a background job of a script.
+        (IGNORED, {}, (0, "", "")),
+        (LETTERS, ASCII, (0, "?m ?\n", "")),
+    ],
+    ids=["daemon", "thread", "signals that are ignored", "letters that the terminal lacks"],
+)
+def test_the_end_of_a_process(code, variables, found):
     began = time.monotonic()
-    assert ended(DOOR + code, env=BUFFERED) == (3, "said\n", "")
+    assert ended(DOOR + code, env=BUFFERED | variables) == found
     assert time.monotonic() - began < 30
-
-
-def test_letters_that_the_terminal_lacks():
-    code = "sys.exit(door.through('test', lambda: print('µm \\udcff') or 0, own=True))"
-    environment = os.environ | {"PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"}
-    assert ended(DOOR + code, env=environment) == (0, "?m ?\n", "")
 
 
 # ------------------------------------------------------------------------- signals
@@ -129,43 +143,33 @@ PATIENT = """
             while not stop.is_set() or "{twice}": time.sleep(0.01)"""
 
 
-@pytest.mark.parametrize(("wait", "number"), [(AT_ONCE, signal.SIGINT), (COMPILED, signal.SIGTERM)])
-def test_a_signal_stops_a_run_at_once(tmp_path, wait, number):
-    """A signal also stops compiled code, which Python cannot interrupt; nothing is left behind."""
+FINISHING = signal.SIGTERM, "SIGTERM: finishing (once more to stop at once)"
+BY_CTRL_C = signal.SIGINT, "stopped by Ctrl-C; {run} is unchanged"
+BY_SIGTERM = signal.SIGTERM, "stopped by SIGTERM; {run} is unchanged"
+
+
+@pytest.mark.parametrize(
+    ("wait", "signals", "left"),
+    [
+        (AT_ONCE, [BY_CTRL_C], set()),
+        (COMPILED, [BY_SIGTERM], set()),
+        (PATIENT.format(twice=""), [FINISHING], {"run", "config.yaml", "result.json"}),
+        (PATIENT.format(twice="yes"), [FINISHING, BY_CTRL_C], set()),
+    ],
+    ids=["at once", "in compiled code", "a patient run", "a patient run at the second signal"],
+)
+def test_a_signal_stops_a_run(tmp_path, wait, signals, left):
+    """A signal also stops compiled code, which Python cannot interrupt; nothing is left behind. A
+    patient run ends by itself, or at a second signal."""
     process = python(WAITING.format(wait=wait), str(tmp_path / "run"))
     assert process.stdout.readline() == "here\n"
     assert len(os.listdir(tmp_path)) == 2
-    process.send_signal(number)
-    _, told = process.communicate(timeout=20)
-    assert process.returncode == 3
-    name = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}[number]
-    assert told == f"rootsopt test: stopped by {name}; {tmp_path / 'run'} is unchanged\n"
-    assert os.listdir(tmp_path) == []
-
-
-@pytest.mark.parametrize("twice", ["", "yes"])
-def test_a_patient_run_ends_by_itself_or_at_a_second_signal(tmp_path, twice):
-    process = python(WAITING.format(wait=PATIENT.format(twice=twice)), str(tmp_path / "run"))
-    assert process.stdout.readline() == "here\n"
-    process.send_signal(signal.SIGTERM)
-    said = "rootsopt test: SIGTERM: finishing (once more to stop at once)\n"
-    assert process.stderr.readline() == said
-    if twice:
-        process.send_signal(signal.SIGINT)
-    _, told = process.communicate()
-    assert process.returncode == 3
-    assert ("stopped by Ctrl-C" in told) == bool(twice)
-    names = {path.name for path in tmp_path.rglob("*.*") if path.is_file()}
-    assert names == (set() if twice else {"config.yaml", "result.json"})
-
-
-def test_signals_that_are_ignored_stay_so():
-    code = (
-        "signal.signal(signal.SIGINT, signal.SIG_IGN);"
-        "kill = lambda: (os.kill(os.getpid(), signal.SIGINT), time.sleep(1));"
-        "sys.exit(door.through('test', lambda: kill() and 0, own=True))"
-    )
-    assert ended(DOOR + code) == (0, "", "")
+    for number, said in signals:
+        process.send_signal(number)
+        line = f"rootsopt test: {said.format(run=tmp_path / 'run')}\n"
+        assert process.stderr.readline() == line
+    assert (process.wait(20), process.stderr.read()) == (3, "")
+    assert {path.name for path in tmp_path.rglob("*")} == left
 
 
 @pytest.mark.parametrize(
