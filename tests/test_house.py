@@ -40,8 +40,10 @@ OPTIONAL = {
     "ezdxf",
     "jinja2",
     "markupsafe",
+    "netCDF4",
+    "shtab",
+    "xarray",
 }
-OPTIONAL |= {"netCDF4", "shtab", "xarray"}
 SLOW = {"PIL", "optax", "rich", "scipy"}
 LATE = {
     # The work of a command is loaded once its help or its config has asked for it.
@@ -98,8 +100,7 @@ FUNCTIONS = {
 
 
 def test_root_holds_the_face_and_the_doors():
-    files = {path.name for path in PACKAGE.iterdir() if path.is_file()}
-    assert files == FACE | DOORS
+    assert {path.name for path in PACKAGE.iterdir() if path.is_file()} == FACE | DOORS
     for name in DOORS - {"__main__.py"}:
         assert len((PACKAGE / name).read_text(encoding="utf-8").splitlines()) <= 15
 
@@ -121,8 +122,7 @@ def test_figures_loaded_in_the_background_exist():
     """A thread imports them, so that a wrong name would only print a traceback."""
     work = "".join(path.read_text(encoding="utf-8") for path in FILES if path.parent.name == "work")
     names = set(re.findall(r'load_figures\(options, "(\w+)"\)', work))
-    assert names
-    assert names <= {path.stem for path in (PACKAGE / "view" / "figures").glob("*.py")}
+    assert set() < names <= {path.stem for path in (PACKAGE / "view" / "figures").glob("*.py")}
 
 
 def test_long_functions_say_why():
@@ -144,9 +144,8 @@ def test_long_functions_say_why():
 
 
 def test_every_package_has_a_room_of_tests():
-    packages = {path.name for path in PACKAGE.iterdir() if (path / "__init__.py").is_file()}
-    rooms = {path.parent.name for path in (ROOT / "tests").glob("*/test_*.py")}
-    assert packages <= rooms
+    packages = {path.parent.name for path in PACKAGE.glob("*/__init__.py")}
+    assert packages <= {path.parent.name for path in (ROOT / "tests").glob("*/test_*.py")}
 
 
 def test_citation_names_this_version():

@@ -1,6 +1,5 @@
 """Tests of the commands from outside: files, exit codes, messages."""
 
-import csv
 import json
 import os
 import re
@@ -11,6 +10,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 import yaml
 
@@ -51,63 +51,41 @@ def command(capfd, monkeypatch):
     return run
 
 
-def columns(path):
-    with path.open() as file:
-        rows = list(csv.reader(file))
-    return rows[0], np.array(rows[1:], dtype=float)
-
-
-def profile_in(folder):
-    """Return the profile of the optimised config in a result folder."""
-    config = load(folder / "optimized.yaml")
-    return Scene.from_config(config).profile(design_vector(config))
-
-
 def test_optimize_writes_the_contract(tmp_path, command):
     """`optimize` writes every promised file, a table and the times of compiling and running.
 
     The exit code is 0 and stderr is empty."""
     done = command("optimize", CIC, "-o", tmp_path, *SMALL, "--export", "dxf")
-    assert done.returncode == 0, done.err
-    assert done.err == ""
-    for word in (
-        "baseline",
-        "optimised",
-        "pressure angle",
-        "mean force",
-        "periodic",
-        "compile",
-        "Pump sheet",
-    ):
-        assert word in done.out
+    assert (done.returncode, done.err) == (0, "")
+    words = "baseline", "optimised", "pressure angle", "mean force", "periodic", "compile"
+    assert [word for word in (*words, "Pump sheet") if word not in done.out] == []
     result = json.loads((tmp_path / "result.json").read_text())
-    for record in (result["baseline"], result["optimized"]):
-        assert record["status"] == "periodic"
-        assert set(record["design"]) == set(record["gradient"]["mean_force_N"])
-        assert record["steady_state"]["kind"] == "periodic"
-        assert record["steady_state"]["floquet_multiplier"] < 1
     assert {"improvement", "constraints", "versions"} <= set(result)
     for name in ("baseline", "optimized"):
-        header, outline = columns(tmp_path / f"profile_{name}.csv")
-        assert header == ["x_mm", "y_mm"]
-        np.testing.assert_array_equal(outline[0], outline[-1])
-        header, response = columns(tmp_path / f"response_{name}.csv")
-        assert header[0] == "time_s"
-        assert header[-1] == "contact_force_N"
-        force = response[:, -1]
-        assert force.mean() == pytest.approx(result[name]["response"]["mean_force_N"], rel=1e-3)
+        record = result[name]
+        assert record["status"] == record["steady_state"]["kind"] == "periodic"
+        assert set(record["design"]) == set(record["gradient"]["mean_force_N"])
+        assert record["steady_state"]["floquet_multiplier"] < 1
+        outline = pd.read_csv(tmp_path / f"profile_{name}.csv")
+        assert [*outline] == ["x_mm", "y_mm"]
+        np.testing.assert_array_equal(outline.iloc[0], outline.iloc[-1])
+        response = pd.read_csv(tmp_path / f"response_{name}.csv")
+        assert (response.columns[0], response.columns[-1]) == ("time_s", "contact_force_N")
+        force = response.contact_force_N.mean()
+        assert force == pytest.approx(record["response"]["mean_force_N"], rel=1e-3)
     assert yaml.safe_load((tmp_path / "config.yaml").read_text())["optimizer"]["screening"] == 2
     # Two iterations are too few for the first-order conditions.
     assert result["status"] in ("periodic", "not_converged")
     assert result["optimality"]["converged"] == (result["status"] == "periodic")
     assert len(result["optimality"]["starts"]) == 1
     assert all("multiplier" in row for row in result["constraints"])
+    names = "profiles", "meshing", "force", "spectrum", "history", "comparison"
     figures = {path.name for path in (tmp_path / "figures").iterdir()}
-    names = ("profiles", "meshing", "force", "spectrum", "history", "comparison")
     assert figures == {f"{name}.png" for name in names}
     assert (tmp_path / "history.csv").read_text().count("\n") >= 4
     # The optimised design, as a config and as a drawing, both read back.
-    best, drawn = result["optimized"]["geometry"], profiles.geometry(profile_in(tmp_path))
+    best, config = result["optimized"]["geometry"], load(tmp_path / "optimized.yaml")
+    drawn = profiles.geometry(Scene.from_config(config).profile(design_vector(config)))
     assert float(drawn.area) * 1e6 == pytest.approx(best["area_mm2"], rel=1e-9)
     loop = read(tmp_path / "rotor.dxf").points
     assert abs(signed_area(loop)) == pytest.approx(best["area_mm2"], rel=1e-3)
@@ -115,11 +93,11 @@ def test_optimize_writes_the_contract(tmp_path, command):
 
 def test_profile_writes_one_record(tmp_path, command):
     """`profile` simulates nothing, and tells what looks like another unit."""
-    odd = "--set", "scene.load.torque_N_m=4775"
-    done = command("profile", EE, "-o", tmp_path / "p", "--set", "profile.lobes=2", *odd)
+    odd = "--set=profile.lobes=2", "--set=scene.load.torque_N_m=4775"
+    done = command("profile", EE, "-o", tmp_path, *odd)
     assert done.returncode == 0, done.err
-    record = json.loads((tmp_path / "p" / "result.json").read_text())
-    assert f"\n  rootsopt simulate {tmp_path / 'p' / 'config.yaml'}\n" in done.out
+    record = json.loads((tmp_path / "result.json").read_text())
+    assert f"\n  rootsopt simulate {tmp_path / 'config.yaml'}\n" in done.out
     assert "rootsopt optimize" not in done.out  # EE has no design parameters.
     (note,) = record["notes"]  # A value that looks like another unit is told, not refused.
     assert done.err == f"rootsopt: {note}\n"
@@ -132,18 +110,14 @@ def test_profile_writes_one_record(tmp_path, command):
 
 
 def test_no_usable_result_exits_3(tmp_path, command):
-    """If the lobes pass through each other, the result has a status and no numbers; the exit code
-    is 3."""
-    weak = "scene.timing_gear.stiffness_N_m_per_rad=1", "scene.load.torque_N_m=40"
-    loose = [CIC, "--no-figures", *(f"--set={one}" for one in weak)]
+    weak = "--set=scene.timing_gear.stiffness_N_m_per_rad=1", "--set=scene.load.torque_N_m=40"
     for module in ("simulate", "optimize"):
-        done = command(module, *loose, "-o", tmp_path / module)
+        done = command(module, CIC, "--no-figures", *weak, "-o", tmp_path / module)
         assert done.returncode == 3, done.err
         assert "passed through" in done.out
         result = json.loads((tmp_path / module / "result.json").read_text())
         record = result if module == "simulate" else result["baseline"]
-        assert record["status"] == "passed_through"
-        assert record["response"] == {}
+        assert (record["status"], record["response"]) == ("passed_through", {})
 
 
 @pytest.mark.parametrize(
@@ -158,17 +132,11 @@ def test_no_usable_result_exits_3(tmp_path, command):
     ],
 )
 def test_bad_input_exits_2_with_one_message(arguments, words, tmp_path, command):
-    """Bad input ends with exit code 2 and one line on stderr that names key and remedy. Nothing is
-    written."""
-    out = tmp_path / "out"
-    done = command("simulate", *arguments, "-o", out)
-    assert done.returncode == 2
-    assert done.out == ""
+    done = command("simulate", *arguments, "-o", tmp_path / "out")
+    assert (done.returncode, done.out) == (2, "")
     assert done.err.strip().count("\n") == 0
-    assert "Traceback" not in done.err
-    for word in words:
-        assert word in done.err
-    assert not out.exists()
+    assert [word for word in words if word not in done.err] == []
+    assert not (tmp_path / "out").exists()
 
 
 def test_console_command(capsys):
@@ -187,9 +155,8 @@ def test_help_is_short_and_its_groups_have_every_key(command, capsys, monkeypatc
     monkeypatch.setenv("COLUMNS", "100")
 
     def printed(*group):
-        with pytest.raises(SystemExit) as end:
+        with pytest.raises(SystemExit, match="0"):
             COMMANDS[command].main(["--help", *group])
-        assert end.value.code == 0
         return capsys.readouterr().out
 
     short = printed()
@@ -229,7 +196,6 @@ def test_simulate_in_an_odd_environment_with_the_programs_of_a_plain_one(tmp_pat
 
 
 def test_no_programs_are_kept_if_told_so(tmp_path, monkeypatch, capsys):
-    """With `--no-cache`, no programs are stored; without it, they are."""
     monkeypatch.setattr(programs, "_store", None)
     monkeypatch.setenv("ROOTSOPT_CACHE", str(tmp_path / "cache"))
     arguments = EE, "-o", str(tmp_path / "p"), "--no-figures", "--export", "none"

@@ -18,25 +18,24 @@ def bash():
 
 
 def completed(script, words):
-    """Return what bash offers for the last of `words`."""
-    shell = shutil.which("bash")
-    if shell is None:
-        pytest.skip("bash is not installed")
     given = " ".join(f"'{word}'" for word in words)
     code = f"COMP_WORDS=({given}); COMP_CWORD={len(words) - 1}; _rootsopt 2>/dev/null; "
     code += 'printf "%s\\n" "${COMPREPLY[@]}"'
-    run = [shell, "--norc", "-c", f"{script}\n{code}"]
-    done = subprocess.run(run, capture_output=True, text=True, check=True)
-    return done.stdout.split()
+    return subprocess.check_output(["bash", "--norc", "-c", f"{script}\n{code}"], text=True).split()
 
 
-def test_commands_options_and_keys_are_completed(bash):
-    assert completed(bash, ["rootsopt", "si"]) == ["simulate"]
-    assert completed(bash, ["rootsopt", "optimize", "--res"]) == ["--resume"]
-    assert completed(bash, ["rootsopt", "simulate", "--set", "scene.timing_gear.b"]) == [
-        "scene.timing_gear.backlash_mm="
-    ]
-    assert completed(bash, ["rootsopt", "simulate", "ci"])[0] == "cic"
+@pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not installed")
+@pytest.mark.parametrize(
+    ("words", "first"),
+    [
+        (["si"], ["simulate"]),
+        (["optimize", "--res"], ["--resume"]),
+        (["simulate", "--set", "scene.timing_gear.b"], ["scene.timing_gear.backlash_mm="]),
+        (["simulate", "ci"], ["cic", "cic_drawn"]),
+    ],
+)
+def test_commands_options_and_keys_are_completed(bash, words, first):
+    assert completed(bash, ["rootsopt", *words]) == first
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -44,8 +43,8 @@ def test_every_option_of_the_help_is_in_the_script(command, bash, capsys):
     """The script has a command's own options, not only those that all commands share."""
     with pytest.raises(SystemExit, match="0"):
         main([command, "--help"])
-    told = capsys.readouterr().out
-    wanted = set(re.findall(r"^  (?:-\w[^,]*, )?(--[\w-]+)", told, re.M)) - {"--help"}
+    told = re.findall(r"^  (?:-\w[^,]*, )?(--[\w-]+)", capsys.readouterr().out, re.M)
+    wanted = set(told) - {"--help"}
     own = {"explore": {"--set", "--port"}, "new": {"--lobes"}}.get(command, {"--set", "--report"})
     assert own <= wanted
     (line,) = re.findall(rf"^_shtab_rootsopt_{command}_option_strings=\((.*?)\)$", bash, re.M)

@@ -7,10 +7,10 @@ import sys
 import threading
 import time
 from pathlib import Path
+from unittest import mock
 
 import pytest
 
-from rootsopt.commands import door
 from rootsopt.commands.console import COMMANDS, main
 
 ROOT = Path(__file__).parents[2]
@@ -18,22 +18,28 @@ CIC = str(ROOT / "configs" / "cic_drawn.yaml")
 
 
 def python(code, *arguments, **options):
-    """Return a process that runs `code`, with pipes as its streams."""
     options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True} | options
     # If the tests run in the background, Ctrl-C is ignored in their child processes too.
     options |= {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)}
     return subprocess.Popen([sys.executable, "-c", code, *arguments], cwd=ROOT, **options)
 
 
-WORK = """
-import os, sys, time
-from rootsopt.commands import door
+MODULE = "import runpy, sys; runpy.run_module(sys.argv.pop(1), run_name='__main__', alter_sys=True)"
+DOOR = "import os, signal, sys, threading, time; from rootsopt.commands import door\n"
+WORK = f"""{DOOR}
 def work():
     print("x" * int(sys.argv[2]), flush=True)
     print("said", file=sys.stderr, flush=True)
     return int(sys.argv[1])
 sys.exit(door.through("test", work, own=True))
 """
+
+
+def ended(code, *arguments, **options):
+    """Return exit code, stdout and stderr of a process that has run `code`."""
+    process = python(code, *arguments, **options)
+    out, err = process.communicate()
+    return process.returncode, out, err
 
 
 # Buffered output is written at the very end of the process.
@@ -57,20 +63,13 @@ def shell(redirection, code, size=10):
 )
 def test_the_exit_code_is_the_runs_own(redirection, code, size):
     """The exit code does not depend on who reads the output, or on whether it is still read."""
-    found, told = shell(redirection, code, size)
-    assert found == code
-    assert told in ("said\n", "")
+    assert shell(redirection, code, size) in ((code, "said\n"), (code, ""))
 
 
 @pytest.mark.parametrize("code", [0, 3])
 def test_output_that_cannot_be_written_is_told(code):
-    found, told = shell(">/dev/full", code)
-    assert found == 2
-    assert told.splitlines() == [
-        "said",
-        "rootsopt test: standard output cannot be written: no space left on device; redirect it "
-        "elsewhere",
-    ]
+    full = "standard output cannot be written: no space left on device; redirect it elsewhere"
+    assert shell(">/dev/full", code) == (2, f"said\nrootsopt test: {full}\n")
     assert shell("2>/dev/full", code) == (code, "")
 
 
@@ -81,48 +80,48 @@ def test_output_that_cannot_be_written_is_told(code):
 def test_help_into_a_closed_pipe(arguments, code):
     reading, writing = os.pipe()
     os.close(reading)
-    done = subprocess.run(
-        [sys.executable, "-m", "rootsopt", *arguments],
-        cwd=ROOT, stdout=writing, stderr=subprocess.PIPE, text=True, check=False, env=BUFFERED,
-    )  # fmt: skip
+    found = ended(MODULE, "rootsopt", *arguments, stdout=writing, env=BUFFERED)
     os.close(writing)
-    assert (done.returncode, done.stderr) == (code, "")
+    assert found == (code, None, "")
 
 
-@pytest.mark.parametrize("daemon", [True, False])
-def test_threads_that_go_on_do_not_keep_the_process(daemon):
-    """The process ends without waiting for threads, such as a compilation that is no longer
-    needed."""
-    code = (
-        "import threading, time; from rootsopt.commands import door;"
-        f"go = lambda: threading.Thread(target=time.sleep, args=(60,), daemon={daemon}).start();"
-        "door.leave(door.through('test', lambda: go() or print('said') or 3, own=True))"
-    )
+THREAD = (
+    "go = lambda: threading.Thread(target=time.sleep, args=(60,), daemon={daemon}).start();"
+    "door.leave(door.through('test', lambda: go() or print('said') or 3, own=True))"
+)
+IGNORED = (
+    "signal.signal(signal.SIGINT, signal.SIG_IGN);"
+    "kill = lambda: (os.kill(os.getpid(), signal.SIGINT), time.sleep(1));"
+    "sys.exit(door.through('test', lambda: kill() and 0, own=True))"
+)
+LETTERS = "sys.exit(door.through('test', lambda: print('µm \\udcff') or 0, own=True))"
+ASCII = {"PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"}
+
+
+@pytest.mark.parametrize(
+    ("code", "variables", "found"),
+    [
+        # The process ends without waiting for a compilation that is no longer needed.
+        (THREAD.format(daemon=True), {}, (3, "said\n", "")),
+        (THREAD.format(daemon=False), {}, (3, "said\n", "")),
+        # As for a background job of a script.
+        (IGNORED, {}, (0, "", "")),
+        (LETTERS, ASCII, (0, "?m ?\n", "")),
+    ],
+    ids=["daemon", "thread", "signals that are ignored", "letters that the terminal lacks"],
+)
+def test_the_end_of_a_process(code, variables, found):
     began = time.monotonic()
-    process = python(code, env=BUFFERED)
-    assert process.communicate() == ("said\n", "")
-    assert process.returncode == 3
+    assert ended(DOOR + code, env=BUFFERED | variables) == found
     assert time.monotonic() - began < 30
-
-
-def test_letters_that_the_terminal_lacks():
-    code = (
-        "import sys; from rootsopt.commands import door;"
-        "sys.exit(door.through('test', lambda: print('µm \\udcff') or 0, own=True))"
-    )
-    environment = os.environ | {"PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"}
-    process = python(code, env=environment)
-    assert process.communicate() == ("?m ?\n", "")
-    assert process.returncode == 0
 
 
 # ------------------------------------------------------------------------- signals
 
 
-WAITING = """
-import sys, time
-from pathlib import Path
-from rootsopt.commands import door
+WAITING = (
+    DOOR
+    + """
 from rootsopt.view.runs import RunFolder
 def work():
     with RunFolder(sys.argv[1]) as folder, door.leaving(folder.abandon):
@@ -133,6 +132,7 @@ def work():
     return 3
 door.leave(door.through("test", work, own=True))
 """
+)
 AT_ONCE = "print('here', flush=True); time.sleep(60)"
 # Unlike a sleep of the C library, this does not end at a signal.
 COMPILED = """print('here', flush=True)
@@ -143,49 +143,33 @@ PATIENT = """
             while not stop.is_set() or "{twice}": time.sleep(0.01)"""
 
 
-@pytest.mark.parametrize(("wait", "number"), [(AT_ONCE, signal.SIGINT), (COMPILED, signal.SIGTERM)])
-def test_a_signal_stops_a_run_at_once(tmp_path, wait, number):
-    """A signal also stops compiled code, which Python cannot interrupt; nothing is left behind."""
+FINISHING = signal.SIGTERM, "SIGTERM: finishing (once more to stop at once)"
+BY_CTRL_C = signal.SIGINT, "stopped by Ctrl-C; {run} is unchanged"
+BY_SIGTERM = signal.SIGTERM, "stopped by SIGTERM; {run} is unchanged"
+
+
+@pytest.mark.parametrize(
+    ("wait", "signals", "left"),
+    [
+        (AT_ONCE, [BY_CTRL_C], set()),
+        (COMPILED, [BY_SIGTERM], set()),
+        (PATIENT.format(twice=""), [FINISHING], {"run", "config.yaml", "result.json"}),
+        (PATIENT.format(twice="yes"), [FINISHING, BY_CTRL_C], set()),
+    ],
+    ids=["at once", "in compiled code", "a patient run", "a patient run at the second signal"],
+)
+def test_a_signal_stops_a_run(tmp_path, wait, signals, left):
+    """A signal also stops compiled code, which Python cannot interrupt; nothing is left behind. A
+    patient run ends by itself, or at a second signal."""
     process = python(WAITING.format(wait=wait), str(tmp_path / "run"))
     assert process.stdout.readline() == "here\n"
     assert len(os.listdir(tmp_path)) == 2
-    began = time.monotonic()
-    process.send_signal(number)
-    _, told = process.communicate()
-    assert time.monotonic() - began < 20
-    assert process.returncode == 3
-    name = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}[number]
-    assert told == f"rootsopt test: stopped by {name}; {tmp_path / 'run'} is unchanged\n"
-    assert os.listdir(tmp_path) == []
-
-
-@pytest.mark.parametrize("twice", ["", "yes"])
-def test_a_patient_run_ends_by_itself_or_at_a_second_signal(tmp_path, twice):
-    process = python(WAITING.format(wait=PATIENT.format(twice=twice)), str(tmp_path / "run"))
-    assert process.stdout.readline() == "here\n"
-    process.send_signal(signal.SIGTERM)
-    said = "rootsopt test: SIGTERM: finishing (once more to stop at once)\n"
-    assert process.stderr.readline() == said
-    if twice:
-        process.send_signal(signal.SIGINT)
-    _, told = process.communicate()
-    assert process.returncode == 3
-    assert ("stopped by Ctrl-C" in told) == bool(twice)
-    names = {path.name for path in tmp_path.rglob("*.*") if path.is_file()}
-    assert names == (set() if twice else {"config.yaml", "result.json"})
-
-
-def test_signals_that_are_ignored_stay_so():
-    """Signals stay ignored, as for a background job of a script."""
-    code = (
-        "import os, signal, sys, time; from rootsopt.commands import door;"
-        "signal.signal(signal.SIGINT, signal.SIG_IGN);"
-        "kill = lambda: (os.kill(os.getpid(), signal.SIGINT), time.sleep(1));"
-        "sys.exit(door.through('test', lambda: kill() and 0, own=True))"
-    )
-    process = python(code)
-    assert process.communicate() == ("", "")
-    assert process.returncode == 0
+    for number, said in signals:
+        process.send_signal(number)
+        line = f"rootsopt test: {said.format(run=tmp_path / 'run')}\n"
+        assert process.stderr.readline() == line
+    assert (process.wait(20), process.stderr.read()) == (3, "")
+    assert {path.name for path in tmp_path.rglob("*")} == left
 
 
 @pytest.mark.parametrize(
@@ -198,60 +182,46 @@ def test_an_interrupt_during_imports(tmp_path, command, module):
     (tmp_path / f"{module}.py").write_text(text)
     arguments = ["simulate", CIC] if command == "rootsopt" else [CIC]
     environment = os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"}
-    process = subprocess.Popen(
-        [sys.executable, "-m", command, *arguments, "-o", str(tmp_path / "run")],
-        cwd=tmp_path, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )  # fmt: skip
+    process = python(MODULE, command, *arguments, "-o", str(tmp_path / "run"), env=environment)
     assert process.stdout.readline() == "here\n"
     process.send_signal(signal.SIGINT)
     _, told = process.communicate()
-    assert process.returncode == 3
-    assert told.count("\n") == 1
+    assert (process.returncode, told.count("\n")) == (3, 1)
     assert "stopped by Ctrl-C" in told
 
 
 def test_called_from_python_nothing_global_changes(tmp_path, capsys, monkeypatch):
     """Signals, streams and file descriptors are unchanged."""
     monkeypatch.chdir(ROOT)
-    before = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
-    streams, threads = (sys.stdout, sys.stderr), threading.active_count()
-    assert main(["profile", "missing.yaml"]) == 2
-    assert main(["nonsense"]) == 2
-    assert before == [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
-    assert (sys.stdout, sys.stderr) == streams
-    assert threading.active_count() == threads
     monkeypatch.setattr(sys, "argv", ["rootsopt", "--version"])
-    assert main() == 0
-    assert before == [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
-    assert (sys.stdout, sys.stderr) == streams
+
+    def seen():
+        numbers = signal.SIGINT, signal.SIGTERM
+        return [*map(signal.getsignal, numbers), sys.stdout, sys.stderr, threading.active_count()]
+
+    before = seen()
+    for arguments, code in (["profile", "missing.yaml"], 2), (["nonsense"], 2), (None, 0):
+        assert main(arguments) == code
+        assert seen() == before
+
+
+def loaded(code, names):
+    return python(f"{code}\nprint([n for n in {names} if n in sys.modules])").communicate()[0]
 
 
 def test_doors_load_little():
-    """No large module is imported before signals are handled."""
-    code = "import sys, rootsopt.simulate, rootsopt.__main__, rootsopt.optimize.__main__;"
-    code += "print([n for n in ('numpy', 'yaml', 'pydantic', 'jax', 'rich') if n in sys.modules])"
-    process = python(code)
-    assert process.communicate()[0] == "[]\n"
+    code = "import sys, rootsopt.simulate, rootsopt.__main__, rootsopt.optimize.__main__"
+    slow = "numpy", "yaml", "pydantic", "jax", "rich"
+    assert loaded(code, slow) == "[]\n"
 
 
 def test_commands_import_late_what_a_run_may_not_need():
     """What is slow to import is imported where it is used; figures in the background."""
     names = "attractors", "optimize", "pareto", "simulate", "sweep"
     work = ", ".join(f"rootsopt.commands.work.{name}" for name in names)
-    slow = (
-        "matplotlib",
-        "optax",
-        "PIL",
-        "scipy",
-        "xarray",
-        "jinja2",
-        "bokeh",
-        "rootsopt.view.pages.html",
-    )
+    slow = "matplotlib", "optax", "PIL", "scipy", "xarray", "jinja2", "bokeh"
     code = "import sys; from rootsopt.commands import cli, table; cli.parser(table.profile)"
-    code += f"\nimport {work}; print([n for n in {slow} if n in sys.modules])"
-    assert python(code).communicate()[0] == "[]\n"
+    assert loaded(f"{code}\nimport {work}", (*slow, "rootsopt.view.pages.html")) == "[]\n"
 
 
 # ------------------------------------------------------------------- odd arguments
@@ -259,32 +229,24 @@ def test_commands_import_late_what_a_run_may_not_need():
 
 def test_an_empty_output_is_refused(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    reading = [name for name, one in COMMANDS.items() if one.takes == "CONFIG"]
-    for command in (name for name in reading if COMMANDS[name].writes):
+    for command in (x.name for x in COMMANDS.values() if x.takes == "CONFIG" and x.writes):
         for arguments in (["-o", ""], ["--output="]):
             assert main([command, CIC, *arguments]) == 2
-            told = capsys.readouterr().err
+            (told,) = capsys.readouterr().err.splitlines()
             assert "`--output` must name a folder" in told
-            assert told.count("\n") == 1
     assert os.listdir(tmp_path) == []
 
 
 def test_wrong_arguments_take_one_line(capsys):
     for arguments in ([], [CIC, "--nonsense"], [CIC, "-o"], [CIC, "two"]):
-        with pytest.raises(SystemExit) as caught:
+        with pytest.raises(SystemExit, match="2"):
             main(["profile", *arguments])
-        assert caught.value.code == 2
         assert capsys.readouterr().err.count("\n") == 1
 
 
 def test_full_disks_elsewhere_take_one_line(capsys, monkeypatch):
-    """Any other failure of the operating system ends with one line."""
-
-    def full(*_):
-        raise OSError(28, "No space left on device", "/tmp/elsewhere")
-
-    monkeypatch.setattr("rootsopt.commands.cli.load", full)
+    full = OSError(28, "No space left on device", "/tmp/elsewhere")
+    monkeypatch.setattr("rootsopt.commands.cli.load", mock.Mock(side_effect=full))
     assert main(["profile", CIC]) == 2
     expected = "rootsopt profile: /tmp/elsewhere: no space left on device\n"
     assert capsys.readouterr().err == expected
-    assert door.OK == 0

@@ -1,10 +1,11 @@
 """Tests of `pareto` from outside: files, exit codes, messages, and a whole run with forces."""
 
-import csv
 import json
+import re
 from pathlib import Path
 from unittest import mock
 
+import pandas as pd
 import pytest
 
 import rootsopt
@@ -17,58 +18,45 @@ from rootsopt.view.files import design_file
 
 ROOT = Path(__file__).parents[2]
 CIC = str(ROOT / "configs" / "cic_drawn.yaml")
-RADIUS = ["--set", "pareto.terms=[outer_radius_mm, area_efficiency]"]
-FEW = [*RADIUS, "--set", "pareto.points=3", "--set", "optimizer.starts=1"]
+FEW = [
+    "--set=pareto.terms=[outer_radius_mm, area_efficiency]",
+    "--set=pareto.points=3",
+    "--set=optimizer.starts=1",
+]
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """Return the folder of a finished run without a simulation."""
-    place = tmp_path_factory.mktemp("front") / "run"
-    module = "rootsopt.optimize.tradeoffs.trace"
-    with mock.patch.multiple(module, _CHEAP_STARTS=2, _CHEAP_SCREENING=8):
-        assert pareto.main([CIC, "-o", str(place), *FEW]) == 0
-    return place
-
-
-def test_files_of_a_run_belong_together(folder):
+def test_files_of_a_run_belong_together(tmp_path):
     """Every file of the run is listed; table, result and configs contain the same points."""
+    folder, module = tmp_path / "run", "rootsopt.optimize.tradeoffs.trace"
+    with mock.patch.multiple(module, _CHEAP_STARTS=2, _CHEAP_SCREENING=8):
+        assert pareto.main([CIC, "-o", str(folder), *FEW]) == 0
     result = json.loads((folder / "result.json").read_text())
     files = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
     assert set(result["run"]["files"]) == files
     assert {"config.yaml", "front.csv", "figures/front.png", design_file(3)} <= files
-    with (folder / "front.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert [int(row["point"]) for row in rows] == [1, 2, 3]
+    rows = pd.read_csv(folder / "front.csv").to_dict("records")
+    assert [row["point"] for row in rows] == [1, 2, 3]
     for row, point in zip(rows, result["points"], strict=True):
         assert row["status"] == point["status"] == "certified"
         assert point["certificate"]["residual"] <= point["certificate"]["required_residual"]
-        for name, value in (point["terms"] | point["design"]).items():
-            assert float(row[name]) == pytest.approx(value, rel=1e-9)
-    assert [term["sense"] for term in result["terms"]] == ["min", "max"]
-    assert result["edges"] == [[1, 2], [2, 3]]
-    assert result["status"] == "geometry_only"
-
-
-def test_config_of_a_point_is_its_design(folder):
-    """The config of each point gives the terms of this point, computed in another way."""
-    result = json.loads((folder / "result.json").read_text())
-    for point in result["points"]:
+        values = point["terms"] | point["design"]
+        assert {name: row[name] for name in values} == pytest.approx(values, rel=1e-9)
+        # The config of the point gives its terms, computed in another way.
         config = load(folder / design_file(point["point"]))
         scene = Scene.from_config(config)
         found = geometry_record(scene, geometry(scene.profile(design_vector(config))))
         assert found == pytest.approx(point["geometry"], rel=1e-12)
-        assert {name: found[name] for name in point["terms"]} == pytest.approx(
-            point["terms"], rel=1e-12
-        )
+        assert found == pytest.approx(found | point["terms"], rel=1e-12)
+    assert [term["sense"] for term in result["terms"]] == ["min", "max"]
+    assert result["edges"] == [[1, 2], [2, 3]]
+    assert result["status"] == "geometry_only"
 
 
 def test_contradicting_constraints_end_with_advice(tmp_path, capsys):
     limits = ["--set", "constraints={area_efficiency_min: 0.48, seal_width_min_mm: 25}"]
     assert pareto.main([CIC, "-o", str(tmp_path / "run"), *FEW, *limits]) == 3
     out = " ".join(capsys.readouterr().out.split())
-    assert "Infeasible: " in out
-    assert "seal width" in out
+    assert re.search("Infeasible: .*seal width", out)
     result = json.loads((tmp_path / "run" / "result.json").read_text())
     assert result["points"] == []
     assert {row["name"] for row in result["infeasible"]["conflicts"]} >= {"seal width"}
@@ -80,12 +68,9 @@ def test_front_with_forces(tmp_path):
 
     Its ends are the optima of `optimize`. Each point agrees with a simulation of its config. The
     rates are slopes of the front."""
-    assert (
-        pareto.main([CIC, "-o", str(tmp_path / "run"), "--no-figures", "--set", "pareto.points=5"])
-        == 0
-    )
-    result = json.loads((tmp_path / "run" / "result.json").read_text())
-    points = result["points"]
+    options = ["--no-figures", "--set", "pareto.points=5"]
+    assert pareto.main([CIC, "-o", str(tmp_path / "run"), *options]) == 0
+    points = json.loads((tmp_path / "run" / "result.json").read_text())["points"]
     assert [point["status"] for point in points] == ["certified"] * len(points)
     for point in points[1:3]:
         config = load(tmp_path / "run" / design_file(point["point"]))
@@ -93,13 +78,11 @@ def test_front_with_forces(tmp_path):
         assert force == pytest.approx(point["terms"]["peak_force_N"], rel=1e-6)
     overrides = ["objective.mean_weight=0", "constraints.area_efficiency_min=0"]
     alone = rootsopt.optimize_design(rootsopt.load_config(CIC, overrides)).optimized
-    assert alone is not None
     assert points[0]["end_of"] == "peak_force_N"
     assert points[0]["terms"]["peak_force_N"] == pytest.approx(
         alone.response["peak_force_N"], rel=1e-4
     )
-    for key, value in points[0]["design"].items():
-        assert value == pytest.approx(alone.design[key], rel=1e-2)
+    assert points[0]["design"] == pytest.approx(alone.design, rel=1e-2)
     forces = [point["terms"]["peak_force_N"] for point in points]
     shares = [point["terms"]["area_efficiency"] for point in points]
     assert forces == sorted(forces)

@@ -1,15 +1,14 @@
 """`rootsopt sweep`: files, exit codes, and going on after a kill."""
 
-import csv
 import json
 import os
-import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import xarray
 
@@ -21,16 +20,9 @@ WORKERS = ROOT / "tests" / "response" / "workers.py"
 SPEEDS, FAMILIES = "--over=scene.speed_rpm=1000:2000:2", "--over=profile.family=cic,arc"
 
 
-@pytest.fixture(scope="module")
-def run_once(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("sweep") / "run"
-    code = sweep.main(["cic", SPEEDS, FAMILIES, "-o", str(folder)])
-    return code, folder
-
-
-def test_files_of_a_sweep(run_once):
-    code, folder = run_once
-    assert code == 0
+def test_files_of_a_sweep(tmp_path):
+    folder = tmp_path / "run"
+    assert sweep.main(["cic", SPEEDS, FAMILIES, "-o", str(folder)]) == 0
     result = json.loads((folder / "result.json").read_text())
     assert result["statuses"] == {"periodic": 2, "invalid": 2}
     assert result["status"] == "periodic"
@@ -41,10 +33,9 @@ def test_files_of_a_sweep(run_once):
     assert found.mean_force_N.dims == ("scene.speed_rpm", "profile.family")
     assert found.status.values.tolist() == [["periodic", "invalid"]] * 2
     assert found.attrs["Conventions"] == "CF-1.11"
-    with open(folder / "sweep.csv", newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert [row["status"] for row in rows] == found.status.values.ravel().tolist()
-    assert float(rows[2]["mean_force_N"]) == pytest.approx(float(found.mean_force_N[1, 0]))
+    rows = pd.read_csv(folder / "sweep.csv")
+    assert [*rows.status] == found.status.values.ravel().tolist()
+    assert rows.mean_force_N[2] == pytest.approx(float(found.mean_force_N[1, 0]))
     assert not (folder.parent / ".run.checkpoint").exists()
 
 
@@ -94,9 +85,8 @@ def test_speeds_without_keys(tmp_path, monkeypatch):
 )
 def test_refused_in_one_sentence(options, words, tmp_path, capsys):
     assert sweep.main(["cic", *options, "-o", str(tmp_path / "run")]) == 2
-    told = capsys.readouterr().err
+    (told,) = capsys.readouterr().err.splitlines()
     assert words in told
-    assert told.count("\n") == 1
     assert not any(tmp_path.iterdir())
 
 
@@ -106,24 +96,19 @@ def arguments(folder):
     return ["cic", speeds, f"--import={WORKERS}", "--no-figures", "-o", str(folder)]
 
 
-def started(folder):
-    """The sweep in a process of its own."""
-    return subprocess.Popen(
+def test_killed_sweep_goes_on(tmp_path, capsys, monkeypatch):
+    """After kill -9, `--resume` ends with all points; another config is refused."""
+    folder, kept = tmp_path / "run", tmp_path / ".run.checkpoint"
+    process = subprocess.Popen(
         [sys.executable, "-m", "rootsopt.sweep", *arguments(folder)],
         cwd=ROOT,
         env=os.environ | {"TEST_SECONDS": "0.1", "PYTHONPATH": str(ROOT)},
         stdout=subprocess.DEVNULL,
     )
-
-
-def test_killed_sweep_goes_on(tmp_path, capsys, monkeypatch):
-    """After kill -9, `--resume` ends with all points; another config is refused."""
-    folder, kept = tmp_path / "run", tmp_path / ".run.checkpoint"
-    process = started(folder)
     while not (kept.exists() and kept.read_bytes().count(b"\n") > 4):
         assert process.poll() is None
         time.sleep(0.05)
-    process.send_signal(signal.SIGKILL)
+    process.kill()
     process.wait()
     before = kept.read_bytes()
     assert 4 < before.count(b"\n") < 31

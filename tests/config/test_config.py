@@ -2,6 +2,7 @@
 key."""
 
 import itertools
+import re
 import shlex
 from pathlib import Path
 from typing import Literal, get_args, get_origin
@@ -14,7 +15,6 @@ from rootsopt.config.explain import describe
 from rootsopt.config.families import families, family_of
 from rootsopt.config.section import Section
 from rootsopt.config.units import unit_of
-from rootsopt.errors import InputError
 from rootsopt.scene import check_geometry
 from tests.standins import refusal as refused
 
@@ -42,11 +42,9 @@ scene:
 EE_PROFILE = ("profile: {family: ee, lobes: 3, pitch_radius_mm: 33.0}\n") + MINIMAL[
     MINIMAL.index("rotor:") :
 ]
-SHIPPED = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
 
 
 def with_line(old, new):
-    """Return the minimal config with one piece of text replaced."""
     assert MINIMAL.count(old) == 1
     return MINIMAL.replace(old, new)
 
@@ -64,12 +62,6 @@ def test_units_of_names():
     assert {name: unit_of(name) for name in known} == known
 
 
-@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.name)
-def test_shipped_configs_load_and_mesh(path):
-    """Every config in configs/ is valid, and its profile can be made."""
-    check_geometry(load(path))
-
-
 def test_resolved_yaml_round_trips():
     """to_yaml() writes every default, and reading it again gives an equal config."""
     overrides = [
@@ -78,12 +70,11 @@ def test_resolved_yaml_round_trips():
         "solver.rtol=1e-9",
         "optimizer.bounds.involute_length_mm=[4, 9]",
     ]
-    for config in (parse(MINIMAL), parse(MINIMAL, overrides), parse(EE_PROFILE)):
-        text = config.to_yaml()
-        assert parse(text) == config
-        # A plain YAML reader must be able to read it too.
+    for config in (parse(MINIMAL, overrides), parse(EE_PROFILE)):
         assert Config.model_validate_json(config.model_dump_json()) == config
-        assert yaml.safe_load(text)["solver"]["method"] == config.solver.method
+        # A plain YAML reader must be able to read it too.
+        assert yaml.safe_load(config.to_yaml())["solver"]["method"] == config.solver.method
+        assert parse(config.to_yaml()) == config
     assert config.solver.orbit_tolerance == pytest.approx(1e-8)
 
 
@@ -146,39 +137,26 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("text", "override", "words"), REFUSED)
-def test_refusals_name_key_value_and_remedy(text, override, words):
-    message = refusal(text, *([] if override is None else [override]))
-    assert [word for word in words if word not in message] == []
-
-
-@pytest.mark.parametrize(
-    ("override", "answer"),
-    [
-        ("profile.center_distance_mm=125", "`profile.pitch_radius_mm: 62.5`?"),
-        ("profile.centre_distance_cm=12.5", "`profile.pitch_radius_mm: 62.5`?"),
-        ("profile.outer_diameter_mm=200", "`profile.outer_radius_mm: 100`? it belongs to"),
-        ("diameter_mm=200", "`profile.outer_radius_mm: 100`?"),
-        ("scene.rpm=1500", "`scene.speed_rpm`?"),
-        ("scene.speed=1500", "`scene.speed_rpm`?"),
-        ("scene.speed_Hz=50", "`scene.speed_rpm: 3000`?"),
-        ("scene.load.pressure_bar=0.3", "`scene.load.pressure_difference_Pa: 30000`?"),
-        ("scene.load.pressure_difference_kPa=40", "`scene.load.pressure_difference_Pa: 40000`?"),
-        ("pump.pressure_difference_mbar=300", "`pump.pressure_difference_Pa: 30000`?"),
-        ("rotor.length_m=0.3", "`rotor.length_mm: 300`?"),
-        ("rotor.density_g_cm3=7.2", "`rotor.density_kg_m3: 7200`?"),
-        ("rotor.length_m=long", "`rotor.length_mm`?"),
-        # 10 kW at the config's 3000 rpm is 31.83 N·m, half of it on rotor 2.
-        ("scene.power_kW=10", "`scene.load.torque_N_m: 15.92`? it is half of that power at 3000"),
-        ("scene.load.power_W=10000", "`scene.load.torque_N_m: 15.92`?"),
-        ("power=10", "`scene.load.torque_N_m`? it is half of the power over the speed"),
-    ],
-)
-def test_keys_of_catalogues_are_answered_with_the_right_key_and_value(override, answer):
-    message = refusal(MINIMAL, override)
-    assert message.startswith(f"config: `{override.split('=')[0]}` is not a known key; ")
-    assert f"did you mean {answer}" in message
-
+# Keys of catalogues, and the right key and value.
+CATALOGUE = [
+    ("profile.center_distance_mm=125", "`profile.pitch_radius_mm: 62.5`?"),
+    ("profile.centre_distance_cm=12.5", "`profile.pitch_radius_mm: 62.5`?"),
+    ("profile.outer_diameter_mm=200", "`profile.outer_radius_mm: 100`? it belongs to"),
+    ("diameter_mm=200", "`profile.outer_radius_mm: 100`?"),
+    ("scene.rpm=1500", "`scene.speed_rpm`?"),
+    ("scene.speed=1500", "`scene.speed_rpm`?"),
+    ("scene.speed_Hz=50", "`scene.speed_rpm: 3000`?"),
+    ("scene.load.pressure_bar=0.3", "`scene.load.pressure_difference_Pa: 30000`?"),
+    ("scene.load.pressure_difference_kPa=40", "`scene.load.pressure_difference_Pa: 40000`?"),
+    ("pump.pressure_difference_mbar=300", "`pump.pressure_difference_Pa: 30000`?"),
+    ("rotor.length_m=0.3", "`rotor.length_mm: 300`?"),
+    ("rotor.density_g_cm3=7.2", "`rotor.density_kg_m3: 7200`?"),
+    ("rotor.length_m=long", "`rotor.length_mm`?"),
+    # 10 kW at the config's 3000 rpm is 31.83 N·m, half of it on rotor 2.
+    ("scene.power_kW=10", "`scene.load.torque_N_m: 15.92`? it is half of that power at 3000"),
+    ("scene.load.power_W=10000", "`scene.load.torque_N_m: 15.92`?"),
+    ("power=10", "`scene.load.torque_N_m`? it is half of the power over the speed"),
+]
 
 PAIRS = [
     pair
@@ -190,58 +168,56 @@ PAIRS = [
 @pytest.mark.parametrize(("old", "new"), PAIRS)
 def test_change_of_family_is_answered_by_the_overrides_that_it_needs(old, new):
     """The message lists them all, in words that a shell takes."""
-    data = yaml.safe_load(MINIMAL)
-    example = {k: [*v] if isinstance(v, tuple) else v for k, v in family_of(old).example.items()}
-    data["profile"] = {"family": old, "lobes": 3, "pitch_radius_mm": 33.0, **example}
-    text, change = yaml.safe_dump(data), f"profile.family={new}"
-    if {*family_of(old).keys} == {*family_of(new).keys} and family_of(new).maker is not None:
+    before, after = {*family_of(old).keys}, {*family_of(new).keys}
+    if before == after and family_of(new).maker is not None:
         return
+    example = {k: [*v] if isinstance(v, tuple) else v for k, v in family_of(old).example.items()}
+    profile = {"family": old, "lobes": 3, "pitch_radius_mm": 33.0, **example}
+    text, change = (
+        yaml.safe_dump(yaml.safe_load(MINIMAL) | {"profile": profile}),
+        f"profile.family={new}",
+    )
     message = refusal(text, change)
     assert len(message) < 400
     words = shlex.split(message[message.index("--set") :])
     overrides = [word.replace("FILE", "rotor.csv") for word in words if word != "--set"]
-    foreign = {*family_of(old).keys} - {*family_of(new).keys}
-    assert {f"profile.{key}=null" for key in foreign} <= {*overrides}
+    assert {f"profile.{key}=null" for key in before - after} <= {*overrides}
     config = parse(text, [change, *overrides])
-    assert config.profile.family == new
-    assert config.profile.parameters.keys() == {*family_of(new).keys}
+    assert (config.profile.family, {*config.profile.parameters}) == (new, after)
 
 
 # Ranges, units, choices
 
 
-def leaves():
-    """Return dotted key and field of every key that has no keys below it."""
-    kinds: list[tuple[str, type[Section]]] = [("", Config)]
-    while kinds:
-        prefix, model = kinds.pop()
-        for name, field in model.model_fields.items():
-            inner = [
-                part
-                for part in (field.annotation, *getattr(field.annotation, "__args__", ()))
-                if isinstance(part, type) and issubclass(part, Section)
-            ]
-            if inner:
-                kinds.append((f"{prefix}{name}.", inner[0]))
-            else:
-                yield f"{prefix}{name}", field
-
-
 def numeric(annotation):
-    """Return whether an annotation stands for numbers."""
     if get_origin(annotation) is Literal:
         return False
     return annotation in (float, int) or any(numeric(part) for part in get_args(annotation))
 
 
-NUMERIC = [key for key, field in leaves() if numeric(field.annotation) and "bounds" not in key]
-PUMP = next(path for path in SHIPPED if path.name == "pump.yaml").read_text(encoding="utf-8")
-"""Text of a config with every part of a scene."""
+def numbers(model, prefix=""):
+    """Return the dotted key of every number below a section."""
+    for name, field in model.model_fields.items():
+        parts = field.annotation, *getattr(field.annotation, "__args__", ())
+        inner = [part for part in parts if isinstance(part, type) and issubclass(part, Section)]
+        if inner:
+            yield from numbers(inner[0], f"{prefix}{name}.")
+        elif numeric(field.annotation) and name != "bounds":
+            yield f"{prefix}{name}"
 
 
-@pytest.mark.parametrize("key", NUMERIC)
-def test_every_number_has_two_ends(key):
-    """Every number has a lower and an upper limit, and the help lists both."""
+# A config with every part of a scene.
+PUMP = (Path(__file__).parents[2] / "configs" / "pump.yaml").read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def lines():
+    return {line.split()[0]: line for line in describe(Config).splitlines()}
+
+
+@pytest.mark.parametrize("key", [*numbers(Config)])
+def test_every_number_has_two_ends(key, lines):
+    """The help lists both."""
     parts = "timing_gear", "motor", "supports", "load", "friction"
     text = PUMP if any(part in key for part in parts) else MINIMAL
     if key.startswith("tolerances."):
@@ -249,57 +225,51 @@ def test_every_number_has_two_ends(key):
     if key.startswith("pump."):
         own = "viscosity_mPa_s: 1.0, pressure_difference_Pa: 1.0e5, gas: {inlet_pressure_Pa: 1.0e5}"
         text += f"\npump: {{{own}}}\n"
-    for number in ("1.0e300", "-1.0e300", 10**390, ".inf", ".nan"):
-        assert f"`{key}" in refusal(text, f"{key}={number}")
-    for value in ("[1.0e300, 2.0e300]", "{1: 1.0e300, from: 1.0e300}"):
+    groups = "[1.0e300, 2.0e300]", "{1: 1.0e300, from: 1.0e300}"
+    for value in ("1.0e300", "-1.0e300", 10**390, ".inf", ".nan", *groups):
         assert f"`{key}" in refusal(text, f"{key}={value}")
-    line = next(line for line in describe(Config).splitlines() if line.split()[0] == key)
-    assert "from" in line or "above" in line
-    assert " to " in line or "below" in line
-
-
-def test_help_has_unit_default_range_and_choices():
-    """The help has one line for each key."""
-    lines = {line.split()[0]: line for line in describe(Config).splitlines()}
-    assert lines["profile.pitch_radius_mm"].endswith("[mm, from 1 to 5000, required]")
-    assert lines["scene.timing_gear.damping_ratio"].endswith("[from 0 to 100, default 0.0]")
-    assert lines["scene.drive"].endswith("[prescribed | torque, default prescribed]")
-    assert lines["profile.tip_arc_angle_deg"].endswith("[°, from 0 below 45]")
-    assert "N·m/rad" in lines["scene.timing_gear.stiffness_N_m_per_rad"]
-    assert "default: 25 to 45; from 1 to 80" in lines["profile.pressure_angle_deg"]
+    assert re.search(r"\b(from|above) .*\b(to|below)\b", lines[key])
 
 
 @pytest.mark.parametrize(
-    ("text", "override", "words"),
+    ("key", "words"),
     [
-        (MINIMAL, "profile.pitch_radius_mm=0.033", "metres? write 33"),
-        (MINIMAL, "profile.pitch_radius_mm=33000", "micrometres? write 33"),
-        (MINIMAL, "profile.pressure_angle_deg=0.63", "radians? write 36.1"),
-        (MINIMAL, "profile.involute_length_mm=0.0085", "metres? write 8.5"),
-        (MINIMAL, "rotor.length_mm=0.1", "metres? write 100"),
-        (MINIMAL, "rotor.bore_mm=0.012", "metres? write 12"),
-        (MINIMAL, "rotor.density_kg_m3=7.8", "g/cm³? write 7800"),
-        (MINIMAL, "rotor.density_kg_m3=7.8e-6", "kg/mm³? write 7800"),
-        (MINIMAL, "rotor.density_kg_m3=7.8e-9", "t/mm³? write 7800"),
-        (MINIMAL, "constraints.outer_radius_max_mm=0.045", "metres? write 45"),
-        (MINIMAL, "constraints.area_efficiency_min=42", "percentage? write 0.42"),
-        (MINIMAL, "optimizer.bounds.pressure_angle_deg=[0.45, 0.79]", "radians? write 25.78"),
-        (EE_PROFILE, "profile={family: arc, lobes: 3, pitch_radius_mm: 33, arc_center_mm: 0.0297}",
-         "metres? write 29.7"),
-        (EE_PROFILE, "profile={family: ellipse, lobes: 3, pitch_radius_mm: 33, "
-         "ellipse_center_mm: 27, ellipse_height_mm: 0.018}", "metres? write 18"),
-        (EE_PROFILE, "profile={family: circle_epicycloid, lobes: 3, pitch_radius_mm: 33, "
-         "rolling_radius_mm: 7, tip_arc_turn_deg: 0.52}", "radians? write 29.79"),
-        (EE_PROFILE, "profile={family: arcs_epicycloid, lobes: 3, pitch_radius_mm: 33, "
-         "arc_center_mm: 27, tip_arc_angle_deg: 8, edge_radius_mm: 0.001}", "metres? write 1"),
-        (MINIMAL, "scene.speed_rpm='3000,5'", "write 3000.5"),
+        ("profile.pitch_radius_mm", "[mm, from 1 to 5000, required]"),
+        ("scene.timing_gear.damping_ratio", "[from 0 to 100, default 0.0]"),
+        ("scene.drive", "[prescribed | torque, default prescribed]"),
+        ("profile.tip_arc_angle_deg", "[°, from 0 below 45]"),
+        ("scene.timing_gear.stiffness_N_m_per_rad", "N·m/rad"),
+        ("profile.pressure_angle_deg", "default: 25 to 45; from 1 to 80"),
     ],
-)  # fmt: skip
-def test_number_in_another_unit_is_recognised(text, override, words):
-    """If a value out of range would fit in a usual other unit, the message asks about this unit."""
-    message = refused(lambda: check_geometry(parse(text, [override])))
-    assert words in message
-    assert f"`{override.partition('=')[0]}" in message
+)
+def test_help_has_unit_default_range_and_choices(key, words, lines):
+    assert words in lines[key]
+
+
+# Values that would fit in another usual unit, about which the message asks.
+ANOTHER_UNIT = [
+    (MINIMAL, "profile.pitch_radius_mm=0.033", "metres? write 33"),
+    (MINIMAL, "profile.pitch_radius_mm=33000", "micrometres? write 33"),
+    (MINIMAL, "profile.pressure_angle_deg=0.63", "radians? write 36.1"),
+    (MINIMAL, "profile.involute_length_mm=0.0085", "metres? write 8.5"),
+    (MINIMAL, "rotor.length_mm=0.1", "metres? write 100"),
+    (MINIMAL, "rotor.bore_mm=0.012", "metres? write 12"),
+    (MINIMAL, "rotor.density_kg_m3=7.8", "g/cm³? write 7800"),
+    (MINIMAL, "rotor.density_kg_m3=7.8e-6", "kg/mm³? write 7800"),
+    (MINIMAL, "rotor.density_kg_m3=7.8e-9", "t/mm³? write 7800"),
+    (MINIMAL, "constraints.outer_radius_max_mm=0.045", "metres? write 45"),
+    (MINIMAL, "constraints.area_efficiency_min=42", "percentage? write 0.42"),
+    (MINIMAL, "optimizer.bounds.pressure_angle_deg=[0.45, 0.79]", "radians? write 25.78"),
+    (EE_PROFILE, "profile={family: arc, lobes: 3, pitch_radius_mm: 33, arc_center_mm: 0.0297}",
+     "metres? write 29.7"),
+    (EE_PROFILE, "profile={family: ellipse, lobes: 3, pitch_radius_mm: 33, "
+     "ellipse_center_mm: 27, ellipse_height_mm: 0.018}", "metres? write 18"),
+    (EE_PROFILE, "profile={family: circle_epicycloid, lobes: 3, pitch_radius_mm: 33, "
+     "rolling_radius_mm: 7, tip_arc_turn_deg: 0.52}", "radians? write 29.79"),
+    (EE_PROFILE, "profile={family: arcs_epicycloid, lobes: 3, pitch_radius_mm: 33, "
+     "arc_center_mm: 27, tip_arc_angle_deg: 8, edge_radius_mm: 0.001}", "metres? write 1"),
+    (MINIMAL, "scene.speed_rpm='3000,5'", "write 3000.5"),
+]  # fmt: skip
 
 
 CHOICES = [
@@ -336,10 +306,7 @@ def test_choices_are_taken_in_any_spelling(key, word, spellings):
     ],
 )
 def test_broken_yaml_is_refused_with_its_line(text, line):
-    """The message for a syntax error names its line."""
-    message = refusal(text)
-    assert "not valid YAML" in message
-    assert f"line {line}" in message or f"line {line + 1}" in message
+    assert re.search(f"not valid YAML.*line ({line}|{line + 1})", refusal(text))
 
 
 # Keys and values of former versions
@@ -370,10 +337,9 @@ def test_removed_keys_are_accepted_only_where_they_change_nothing():
     assert config == plain
     assert config.to_yaml() == plain.to_yaml()
     for key, (_, other) in FORMER.items():
-        message = refusal(MINIMAL, f"{key}={other}")
-        assert f"`{key}` must be left out, but is" in message
-        with pytest.raises(InputError, match=f"`{key}` must be left out"):
-            config.replaced({key: yaml.safe_load(other)})
+        assert f"`{key}` must be left out, but is" in refusal(MINIMAL, f"{key}={other}")
+        message = refused(config.replaced, {key: yaml.safe_load(other)})
+        assert f"`{key}` must be left out" in message
     assert "drawing.title_block" in refusal(MINIMAL, "drawing.revision=B")
     assert "--over scene.speed_rpm=" in refusal(MINIMAL, "sweep.speed_rpm={}")
 
@@ -382,7 +348,7 @@ def test_removed_keys_are_accepted_only_where_they_change_nothing():
 
 
 def test_overrides_replace_and_create_nested_keys():
-    """`--set` reaches any key and creates missing sections. The last override has precedence."""
+    """The last override has precedence."""
     config = parse(
         MINIMAL,
         [
@@ -394,49 +360,68 @@ def test_overrides_replace_and_create_nested_keys():
             "solver.method=dopri8",
         ],
     )
-    assert config.scene.timing_gear is not None
     assert config.scene.timing_gear.stiffness_N_m_per_rad == 2e4
-    assert config.scene.speed_rpm == 1500.0
+    assert (config.scene.speed_rpm, config.solver.method) == (1500.0, "dopri8")
     assert config.constraints.area_efficiency_min == 0.4
-    assert config.solver.method == "dopri8"
 
 
 # Geometry
 
 
+# Designs for which no profile can be made.
+IMPOSSIBLE = [
+    ({"involute_length_mm": 9.2}, ["`profile.involute_length_mm`", "8.893", "9.2"]),
+    (
+        {"pressure_angle_deg": 89.78, "tip_arc_angle_deg": 0.475, "involute_length_mm": 17.3},
+        ["`profile.involute_length_mm` must be less than 17", "no radius"],
+    ),
+    (
+        {"pressure_angle_deg": 25, "tip_arc_angle_deg": 0, "involute_length_mm": 7.2},
+        ["`profile.involute_length_mm`", "undercut", "7.2", "25"],
+    ),
+    (
+        {"pressure_angle_deg": 12, "involute_length_mm": 0.2},
+        ["`profile.involute_length_mm` must be at least 0.2395"],
+    ),
+    # A longer involute meets the pitch circle; its arc still undercuts the other rotor.
+    ({"pressure_angle_deg": 12, "involute_length_mm": 0.24}, ["undercut"]),
+    ({"tip_arc_angle_deg": 30}, ["`profile.tip_arc_angle_deg`", "less than 30", "but is 30"]),
+]
+
+
 @pytest.mark.parametrize(
-    ("design", "words"),
+    ("text", "overrides", "words"),
     [
-        ({"involute_length_mm": 9.2}, ["`profile.involute_length_mm`", "8.893", "9.2"]),
-        (
-            {"pressure_angle_deg": 89.78, "tip_arc_angle_deg": 0.475, "involute_length_mm": 17.3},
-            ["`profile.involute_length_mm` must be less than 17", "no radius"],
+        *((text, [override] if override else [], words) for text, override, words in REFUSED),
+        *(
+            (
+                MINIMAL,
+                [override],
+                [f"config: `{override.split('=')[0]}` is not a known", f"did you mean {answer}"],
+            )
+            for override, answer in CATALOGUE
         ),
-        (
-            {"pressure_angle_deg": 25, "tip_arc_angle_deg": 0, "involute_length_mm": 7.2},
-            ["`profile.involute_length_mm`", "undercut", "7.2", "25"],
+        *(
+            (text, [override], [f"`{override.split('=')[0]}", words])
+            for text, override, words in ANOTHER_UNIT
         ),
-        (
-            {"pressure_angle_deg": 12, "involute_length_mm": 0.2},
-            ["`profile.involute_length_mm` must be at least 0.2395"],
+        *(
+            (MINIMAL, [f"profile.{key}={value}" for key, value in design.items()], words)
+            for design, words in IMPOSSIBLE
         ),
-        # A longer involute meets the pitch circle; its arc still undercuts the other rotor.
-        ({"pressure_angle_deg": 12, "involute_length_mm": 0.24}, ["undercut"]),
-        ({"tip_arc_angle_deg": 30}, ["`profile.tip_arc_angle_deg`", "less than 30", "but is 30"]),
     ],
 )
-def test_geometry_that_cannot_be_made_is_refused(design, words):
-    config = parse(MINIMAL, [f"profile.{key}={value}" for key, value in design.items()])
-    message = refused(check_geometry, config)
+def test_refusals_name_key_value_and_remedy(text, overrides, words):
+    message = refused(lambda: check_geometry(parse(text, overrides)))
     assert [word for word in words if word not in message] == []
 
 
 def test_replaced_values_take_following_defaults_along():
     """A smoothing length that follows the load follows the new load; one that is given stays."""
-    key = {"scene.load.torque_N_m": 1e-3}
+    key, plain = {"scene.load.torque_N_m": 1e-3}, parse(MINIMAL)
     light = parse(MINIMAL, ["scene.load.torque_N_m=1e-3"])
-    assert light.contact.smoothing_mm != parse(MINIMAL).contact.smoothing_mm
-    assert parse(MINIMAL).replaced(key) == light
+    assert light.contact.smoothing_mm != plain.contact.smoothing_mm
+    assert plain.replaced(key) == light
     given = parse(MINIMAL, ["contact.smoothing_mm=3e-5"]).replaced(key)
     assert given.contact.smoothing_mm == 3e-5
 
@@ -453,33 +438,28 @@ def test_replaced_values_take_following_defaults_along():
     ],
 )
 def test_values_are_checked_by_themselves(values, words):
-    with pytest.raises(InputError, match=words):
-        parse(MINIMAL).check_values(values)
+    assert words in refused(parse(MINIMAL).check_values, values)
 
 
 def test_values_that_only_clash_with_others_pass_by_themselves():
     for values in ({"profile.family": "ee"}, {"scene.load.torque_N_m": None}):
         parse(MINIMAL).check_values(values)
-        with pytest.raises(InputError):
-            parse(MINIMAL).replaced(values)
+        assert refused(parse(MINIMAL).replaced, values)
 
 
 def test_entries_of_a_list_are_replaced_by_number():
     config = load("free")
     changed = config.replaced({"profile.coefficients_3": 0.5}).profile.coefficients
     assert changed == (*config.profile.coefficients[:2], 0.5, *config.profile.coefficients[3:])
-    with pytest.raises(InputError, match=r"`profile\.coefficients\.2` must be at most 1"):
-        config.check_values({"profile.coefficients_3": 9e9})
-    with pytest.raises(InputError, match="coefficients_99"):
-        config.check_values({"profile.coefficients_99": 0.5})
+    message = refused(config.check_values, {"profile.coefficients_3": 9e9})
+    assert "`profile.coefficients.2` must be at most 1" in message
+    assert "coefficients_99" in refused(config.check_values, {"profile.coefficients_99": 0.5})
 
 
 def test_tolerances_follow_from_accuracy():
     """Explicit tolerances override what follows from `solver.accuracy`."""
     coarse = parse(MINIMAL, ["solver.accuracy=1e-2"]).solver
-    assert coarse.orbit_tolerance == pytest.approx(1e-5)
-    assert coarse.transient_tolerance == pytest.approx(1e-4)
+    assert (coarse.orbit_tolerance, coarse.transient_tolerance) == pytest.approx((1e-5, 1e-4))
     given = parse(MINIMAL, ["solver.accuracy=1e-2", "solver.rtol=1e-9"]).solver
     assert (given.orbit_tolerance, given.transient_tolerance) == (1e-9, pytest.approx(1e-4))
-    with pytest.raises(InputError, match=r"solver\.accuracy"):
-        parse(MINIMAL, ["solver.accuracy=1e-10"])
+    assert "solver.accuracy" in refusal(MINIMAL, "solver.accuracy=1e-10")

@@ -3,6 +3,7 @@ configs."""
 
 import os
 import random
+import re
 import socket
 import time
 from pathlib import Path
@@ -14,7 +15,6 @@ from hypothesis import strategies as st
 from rootsopt.config import load, parse
 from rootsopt.config.document import MOST_BYTES, read_document
 from rootsopt.config.units import named, sentence, shown
-from rootsopt.errors import InputError
 from tests.config.test_config import MINIMAL
 from tests.fuzz import configs
 from tests.fuzz.verdict import LONGEST
@@ -54,7 +54,7 @@ def merges(levels):
             "32",
         ),
         ("[" * 10_000, "more than 32 nested levels"),
-        ("- " * 10_000, "more than 32 nested levels"),
+        ("- " * 3_000, "more than 32 nested levels"),
         ("\n".join(" " * k + "a:" for k in range(200)), "more than 32 nested levels"),
         ("[" + "1, " * 6000 + "]", "more than 5000 values"),
         ("x" * MOST_BYTES + "x", f"at most {MOST_BYTES} bytes"),
@@ -147,7 +147,6 @@ def test_size_of_what_is_read_is_bounded(text, words):
 )
 @pytest.mark.parametrize("key", ["scene.speed_rpm", "scene"])
 def test_odd_value_is_refused_in_one_line(key, value):
-    """The message for any odd value is one short line, both as an override and in the file."""
     refusal(MINIMAL, f"{key}={value}")
     if "." in key:
         section, name = key.split(".", 1)
@@ -167,26 +166,21 @@ def test_odd_value_is_refused_in_one_line(key, value):
     ids=lambda override: ascii(override[:24]),
 )
 def test_odd_override_is_refused_in_one_line(override):
-    """The same holds for any text after --set."""
     refusal(MINIMAL, override)
 
 
 def test_merge_keys_work():
     """`<<` accepts one section or a list of them. Own keys have precedence, then those merged
     first."""
-    text = MINIMAL.replace("rotor:\n", "rotor:\n  <<: [*one, *two]\n").replace(
-        "  length_mm: 100.0\n", ""
-    )
     head = "ensemble: &one {seed: 5}\nattractors: &two {rates: 7}\n"
-    with pytest.raises(InputError, match=r"`rotor.(seed|rates)` is not a known key"):
-        parse(head + text)
+    message = refusal(head + MINIMAL.replace("rotor:\n", "rotor:\n  <<: [*one, *two]\n"))
+    assert re.search("`rotor.(seed|rates)` is not a known key", message)
     data = read_document(
         "{one: &one {a: 1, b: 2}, two: &two {b: 3, c: 4}, x: {<<: [*one, *two], c: 5}, "
         "y: {a: 6, <<: *one}, z: *one}",
         "text",
     )
-    assert data["x"] == {"a": 1, "b": 2, "c": 5}
-    assert data["y"] == {"a": 6, "b": 2}
+    assert [data["x"], data["y"]] == [{"a": 1, "b": 2, "c": 5}, {"a": 6, "b": 2}]
     assert data["z"] == data["one"] == {"a": 1, "b": 2}
 
 
@@ -225,8 +219,7 @@ def test_merge_keys_work():
 def test_words_and_numbers_are_told_apart(written, value):
     """A time, a date or an octal is not a number, and a word is not a boolean."""
     found = read_document(written, "text")
-    assert found == value
-    assert type(found) is type(value)
+    assert (type(found), found) == (type(value), value)
 
 
 # Files
@@ -239,9 +232,7 @@ def test_what_is_no_regular_file_is_refused(tmp_path):
     with socket.socket(socket.AF_UNIX) as server:
         server.bind(str(bound))
         for path in (pipe, bound, Path("/dev/zero"), Path("/dev/null")):
-            message = refused(load, path)
-            assert str(path) in message
-            assert "regular file" in message
+            assert re.search(f"{path}.*regular file", refused(load, path))
 
 
 @pytest.mark.parametrize(
@@ -255,7 +246,6 @@ def test_what_is_no_regular_file_is_refused(tmp_path):
     ],
 )
 def test_odd_path_is_refused(name, words):
-    """A path that no file can have is rejected in one printable line."""
     assert words in refused(load, name)
 
 
@@ -275,14 +265,12 @@ def test_odd_path_is_refused(name, words):
     ids=range(9),
 )
 def test_bytes_that_are_no_config_are_refused(tmp_path, data, words):
-    """Other encodings are rejected, and so are files too long for a config."""
     path = tmp_path / "x.yaml"
     path.write_bytes(data)
     assert words in refused(load, path)
 
 
 def test_byte_order_mark_of_utf8_is_taken(tmp_path):
-    """A byte order mark is accepted, because some editors write one."""
     path = tmp_path / "x.yaml"
     path.write_bytes(MINIMAL.encode("utf-8-sig"))
     assert load(path) == parse(MINIMAL)
@@ -292,7 +280,6 @@ def test_byte_order_mark_of_utf8_is_taken(tmp_path):
 
 
 def test_words_are_bounded():
-    """Values, keys, paths and messages are shortened to one line, however long they are."""
     endless = [["x" * 10_000] * 1000] * 1000
     for value in (endless, {k: endless for k in range(1000)}, "x" * 10**6, 10**3999, "a\nb"):
         assert len(shown(value)) <= 160

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from rootsopt.config import Config, load, notes, parse
+from rootsopt.config import Config, load, notes
 from rootsopt.config.explain import keys_of
 from rootsopt.config.plausible import USUAL, notes_on_swept, usual_of
-from rootsopt.config.sources import shipped
 from rootsopt.config.units import _UNITS, unit_of
 from rootsopt.errors import InputError
+from tests.standins import refusal
 
 DOCS = Path(__file__).parents[2] / "docs"
 FULL = [
@@ -38,22 +38,14 @@ def test_every_quantity_has_a_usual_range():
     assert set(USUAL) <= set(keys)
 
 
-@pytest.mark.parametrize("name", shipped())
-def test_shipped_configs_are_usual(name):
-    config = load(name)
-    assert notes(config) == ()
-    assert notes(parse(config.to_yaml())) == ()
-
-
 def test_values_of_the_pages_are_usual():
     """`--set KEY=NUMBER` in the pages gives no note on the config of the paper's rotor."""
-    seen = 0
-    for page in sorted(DOCS.glob("*.md")):
-        for key, text in re.findall(r"--set '?([a-z_.]+)=([-\d.e]+)\b", page.read_text("utf-8")):
-            if usual_of(key) is not None and "outline" not in key:
-                seen += 1
-                assert notes_on_swept(load("cic_drawn"), {key: [float(text)]}) == (), (page, key)
-    assert seen > 10
+    pages = " ".join(page.read_text("utf-8") for page in DOCS.glob("*.md"))
+    given = re.findall(r"--set '?([a-z_.]+)=([-\d.e]+)\b", pages)
+    seen = {pair for pair in given if usual_of(pair[0]) is not None and "outline" not in pair[0]}
+    assert len(seen) > 10
+    for key, text in seen:
+        assert notes_on_swept(load("cic_drawn"), {key: [float(text)]}) == ()
 
 
 @pytest.mark.parametrize(
@@ -75,8 +67,7 @@ def test_values_of_the_pages_are_usual():
 def test_odd_value_has_a_note(override, words):
     (note,) = notes(load("cic_drawn", [override]))
     assert words in note
-    assert note.startswith("`")
-    assert "unusual" in note
+    assert re.match("`.*unusual", note)
 
 
 def test_values_in_another_unit_do_not_pass_in_silence():
@@ -108,28 +99,47 @@ def test_notes_on_swept_values_name_the_option():
 
 
 @pytest.mark.parametrize(
-    ("terms", "words"),
+    ("override", "words"),
     [
-        ("{peak_force_N: {max: -1}}", r"peak_force_N\.max` must be at least 0"),
-        ("{line_0.5_force_N: {max: -1}}", r"line_0\.5_force_N\.max` must be at least 0"),
-        ("{tilting_moment_max_N_m: {max: -1}}", "must be at least 0"),
-        ("{mean_force_N: {min: 21}, peak_force_N: {max: 20}}", r"mean_force_N\.min` .* at most 20"),
-        ("{rms_force_N: {min: 21, max: 30}, peak_force_N: {max: 20}}", r"rms_force_N\.min`"),
-        ("{line_1_force_N: {min: 21}, mean_force_N: {max: 10}}", "at most 20"),
-        ("{line_1_force_N: {min: 21}, peak_force_N: {max: 30}}", r"at most 19\.1"),
-        ("{line_1_force_N: {min: 21}, rms_force_N: {max: 18}}", r"at most 20\.78"),
-        ("{bearing_load_equivalent_N: {min: 9}, bearing_load_max_N: {max: 8}}", "at most 8"),
+        ("constraints.terms={peak_force_N: {max: -1}}", r"peak_force_N\.max` must be at least 0"),
+        (
+            "constraints.terms={line_0.5_force_N: {max: -1}}",
+            r"line_0\.5_force_N\.max` must be at least 0",
+        ),
+        ("constraints.terms={tilting_moment_max_N_m: {max: -1}}", "must be at least 0"),
+        (
+            "constraints.terms={mean_force_N: {min: 21}, peak_force_N: {max: 20}}",
+            r"mean_force_N\.min` .* at most 20",
+        ),
+        (
+            "constraints.terms={rms_force_N: {min: 21, max: 30}, peak_force_N: {max: 20}}",
+            r"rms_force_N\.min`",
+        ),
+        ("constraints.terms={line_1_force_N: {min: 21}, mean_force_N: {max: 10}}", "at most 20"),
+        (
+            "constraints.terms={line_1_force_N: {min: 21}, peak_force_N: {max: 30}}",
+            r"at most 19\.1",
+        ),
+        (
+            "constraints.terms={line_1_force_N: {min: 21}, rms_force_N: {max: 18}}",
+            r"at most 20\.78",
+        ),
+        (
+            "constraints.terms={bearing_load_equivalent_N: {min: 9}, bearing_load_max_N: {max: 8}}",
+            "at most 8",
+        ),
+        *(
+            (
+                f"contact.friction={friction}",
+                r"`contact\.friction\.static` must be at least `contact",
+            )
+            for friction in ("{kinetic: 0.3}", "{static: 0.05}", "{static: 0, kinetic: 1}")
+        ),
     ],
 )
-def test_limits_that_no_force_can_meet_are_refused(terms, words):
-    with pytest.raises(InputError, match=words):
-        load("cic_drawn", [f"constraints.terms={terms}"])
+def test_limits_and_friction_that_cannot_be_are_refused(override, words):
+    assert re.search(words, refusal(load, "cic_drawn", [override]))
 
 
-@pytest.mark.parametrize(
-    "friction", ["{kinetic: 0.3}", "{static: 0.05}", "{static: 0, kinetic: 1}"]
-)
-def test_static_friction_is_not_below_kinetic_friction(friction):
-    with pytest.raises(InputError, match=r"`contact\.friction\.static` must be at least `contact"):
-        load("pump", [f"contact.friction={friction}"])
+def test_static_friction_may_be_kinetic_friction():
     assert load("pump", ["contact.friction={static: 0.1, kinetic: 0.1}"]).contact.friction

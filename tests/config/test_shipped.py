@@ -9,22 +9,26 @@ from pathlib import Path
 
 import pytest
 
-from rootsopt.config import load_config
+from rootsopt.config import load_config, notes, parse
 from rootsopt.config.sources import shipped
+from rootsopt.scene import check_geometry
 from tests.standins import refusal
 
 ROOT = Path(__file__).parents[2]
-GLOSSARY = ROOT / "docs" / "glossary.md"
+PACKAGE = ROOT / "rootsopt"
 _NAMES = sorted(path.stem for path in (ROOT / "configs").glob("*.yaml"))
 
 
 @pytest.mark.parametrize("name", _NAMES)
 def test_a_shipped_config_is_found_by_its_name(name, monkeypatch, tmp_path):
-    """A shipped config is found from any folder, even if a folder has its name."""
+    """It is found from any folder, even if a folder has its name. Its values are usual, and its
+    profile can be made."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "cic").mkdir()
-    expected = load_config(ROOT / "configs" / f"{name}.yaml")
-    assert load_config(name) == load_config(f"{name}.yaml") == expected
+    config = load_config(ROOT / "configs" / f"{name}.yaml")
+    assert load_config(name) == load_config(f"{name}.yaml") == parse(config.to_yaml()) == config
+    assert notes(config) == ()
+    check_geometry(config)
 
 
 def test_a_file_comes_before_a_shipped_config(monkeypatch, tmp_path):
@@ -43,33 +47,27 @@ def test_other_names_are_refused_with_those_that_exist(path):
 
 
 def test_an_installed_package_has_its_configs_and_types(tmp_path):
-    """An unpacked wheel can be used from an empty folder."""
     builders = pytest.importorskip("hatchling.builders.wheel")
     (wheel,) = builders.WheelBuilder(str(ROOT)).build(
         directory=str(tmp_path), versions=["standard"]
     )
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(tmp_path / "site")
-    assert (tmp_path / "site" / "rootsopt" / "py.typed").exists()
-    pages = tmp_path / "site" / "rootsopt" / "view" / "pages"
-    for folder in ("report", "explore"):
-        own = ROOT / "rootsopt" / "view" / "pages" / folder
-        written = {file.name for file in (pages / folder).iterdir()}
-        assert written == {file.name for file in own.iterdir()}
-    assert (pages.parents[1] / "glossary.md").read_bytes() == GLOSSARY.read_bytes()
-    empty = tmp_path / "empty"
-    empty.mkdir()
+    site, pages = tmp_path / "site" / "rootsopt", Path("view", "pages")
+    assert (site / "py.typed").exists()
+    for folder in (pages / "report", pages / "explore"):
+        written, own = ({x.name for x in (at / folder).iterdir()} for at in (site, PACKAGE))
+        assert written == own
+    assert (site / "glossary.md").read_bytes() == (ROOT / "docs" / "glossary.md").read_bytes()
+    (tmp_path / "empty").mkdir()
     program = (
         "import rootsopt; print(rootsopt.__file__, rootsopt.load_config('cic_drawn').design_keys)"
     )
-    done = subprocess.run(
+    said = subprocess.check_output(
         [sys.executable, "-c", program],
-        cwd=empty,
+        cwd=tmp_path / "empty",
         env=os.environ | {"PYTHONPATH": str(tmp_path / "site")},
-        check=True,
-        capture_output=True,
         text=True,
     )
-    assert str(tmp_path / "site") in done.stdout
-    assert "pressure_angle_deg" in done.stdout
+    assert re.match(f"{site}.*pressure_angle_deg", said)
     assert sorted(shipped()) == _NAMES

@@ -4,9 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rootsopt.errors import InputError
 from rootsopt.measured.source import found
 from rootsopt.profiles import CIC, outline
+from tests.standins import refusal
 
 # Fewer roll angles at which the gap is measured, as `setattr` takes them.
 POSES = "rootsopt.measured.conjugacy._POSES", 91
@@ -23,17 +23,26 @@ def cycloids(lobes, radius, count=300):
     return (np.exp(2j * np.pi * np.arange(lobes)[:, None] / lobes) * pair).ravel()
 
 
+def cut(points, by):
+    """Return points of an outline that is `by` mm smaller along its normals."""
+    along = np.roll(points, -1) - np.roll(points, 1)
+    return points + 1j * along / np.abs(along) * by
+
+
 def cut_cic(inset):
     """Return points (mm) of a CIC rotor of pitch radius 33 mm, smaller by `inset` (mm)."""
     values = (0.033, np.radians(36.43), 0.0085, np.radians(4.0))
     points = np.asarray(outline(CIC(3, *map(jnp.asarray, values)), 300))[:-1] @ [1e3, 1e3j]
-    along = np.roll(points, -1) - np.roll(points, 1)
-    return points + 1j * along / np.abs(along) * inset
+    return cut(points, inset)
 
 
 def write(path, points):
     np.savetxt(path, np.stack([points.real, points.imag], axis=1), fmt="%.10g", delimiter=",")
     return path
+
+
+def found_in(folder, points, given=None):
+    return found(write(folder / "rotor.csv", points), given or {}, lambda what, default: default)
 
 
 ROTORS = {
@@ -51,8 +60,7 @@ ROTORS = {
 def test_unit_axis_lobes_distance_and_inset_are_found(name, tmp_path, monkeypatch):
     monkeypatch.setattr(*POSES)
     points, unit, lobes, distance, inset, axis = ROTORS[name]
-    file = write(tmp_path / "rotor.csv", points / LENGTHS[unit])
-    rotor = found(file, {}, lambda what, default: default)
+    rotor = found_in(tmp_path, points / LENGTHS[unit])
     assert rotor.lobes == lobes
     assert rotor.radius == pytest.approx(distance / 2, abs=2e-3)
     assert rotor.mesh.inset * 1e3 == pytest.approx(inset, abs=1e-3)
@@ -65,8 +73,8 @@ def test_scattered_and_dense_points_are_thinned_and_smoothed(tmp_path):
     noise = np.random.default_rng(0).normal(0, 0.004, (2, 20_000)).T @ [1, 1j]
     whole = cut_cic(0.1)
     place = np.arange(20_000) / 20_000 * len(whole)
-    points = np.interp(place, np.arange(len(whole) + 1), np.append(whole, whole[0])) + noise
-    rotor = found(write(tmp_path / "rotor.csv", points), {}, lambda what, default: default)
+    points = np.interp(place, np.arange(len(whole)), whole, period=len(whole))
+    rotor = found_in(tmp_path, points + noise)
     assert rotor.radius == pytest.approx(33, abs=5e-3)
     assert rotor.mesh.inset * 1e3 == pytest.approx(0.1, abs=5e-3)
     assert any("points is used" in fact for fact in rotor.facts)
@@ -86,5 +94,4 @@ REFUSED = {
 )
 def test_what_is_no_rotor_is_refused(name, tmp_path):
     points, given, message = REFUSED[name]
-    with pytest.raises(InputError, match=message):
-        found(write(tmp_path / "rotor.csv", points), given, lambda what, default: default)
+    assert message in refusal(found_in, tmp_path, points, given)

@@ -1,7 +1,7 @@
 """Tests of imported outlines: profile and deviations from files."""
 
-import importlib.util
 import json
+import re
 
 import jax
 import jax.numpy as jnp
@@ -12,9 +12,7 @@ from experiments._common.polygons import pair_gap
 from rootsopt.commands.table import profile, simulate
 from rootsopt.config import load, parse
 from rootsopt.contact.closest import FlankPair
-from rootsopt.errors import InputError
 from rootsopt.measured.conjugacy import conjugacy, inset_note
-from rootsopt.measured.curves import _jumps
 from rootsopt.measured.fit import imported
 from rootsopt.measured.loop import Loop
 from rootsopt.measured.source import advice, outline_of
@@ -22,7 +20,8 @@ from rootsopt.optimize.design import optimize_design, pareto_front
 from rootsopt.profiles import CIC, EE, geometry, outline
 from rootsopt.scene import check_geometry
 from rootsopt.scene.families import free_form_of
-from tests.measured.test_finding import POSES, write
+from tests.measured.test_finding import POSES, cut, write
+from tests.standins import refusal
 
 R = 0.033
 CIC3 = CIC(3, R, np.deg2rad(36.43), 8.5e-3, np.deg2rad(4.0))
@@ -54,16 +53,8 @@ def closed(points):
 
 
 def bulged(points, by):
-    """Return points with the addenda `by` mm too thick."""
-    along = np.roll(points, -1) - np.roll(points, 1)
     above = np.clip((np.abs(points) - 33) / (np.max(np.abs(points)) - 33), 0, 1)
-    return points - 1j * along / np.abs(along) * by * np.sin(np.pi * above) ** 2
-
-
-def cut(points, by):
-    """Return points of an outline that is `by` mm smaller along its normals."""
-    along = np.roll(points, -1) - np.roll(points, 1)
-    return points + 1j * along / np.abs(along) * by
+    return cut(points, -by * np.sin(np.pi * above) ** 2)
 
 
 @jax.jit
@@ -72,11 +63,11 @@ def approaches(pair, rolls, relatives):
 
 
 def contact_of(profile):
-    rolls, relatives = jnp.meshgrid(
-        jnp.linspace(1e-3, np.pi / 3 - 1e-3, 121), jnp.array([0.0, -1e-4, -1e-3, -3e-3])
+    rolls = jnp.linspace(1e-3, np.pi / 3 - 1e-3, 121)
+    places = jnp.meshgrid(rolls, jnp.array([0.0, -1e-4, -1e-3, -3e-3]))
+    return approaches(
+        FlankPair.of(profile, 2 * profile.pitch_radius, two_sided=True), *map(jnp.ravel, places)
     )
-    pair = FlankPair.of(profile, 2 * profile.pitch_radius, two_sided=True)
-    return approaches(pair, rolls.ravel(), relatives.ravel())
 
 
 @every_profile
@@ -99,8 +90,7 @@ def test_points_of_a_profile_give_its_contact_and_geometry(profile):
     assert float(shape.seal_width) == pytest.approx(float(exact.seal_width), rel=1e-3)
     assert np.isnan(shape.undercut_margin)
     assert max(checks.lobe_deviation_um, checks.flank_deviation_um) < 1e-3
-    rolled = conjugacy(found)
-    assert max(-rolled.least, rolled.most) < 1e-9
+    assert np.nanmax(np.abs(conjugacy(found).gap)) < 1e-9
 
 
 @every_profile
@@ -109,22 +99,23 @@ def test_a_wrong_outline_leaves_the_gap_that_its_points_leave(profile, by):
     """Addenda 20 µm too thick overlap by 20 µm, as node against segment finds."""
     points = bulged(points_of(profile), by)
     found, _ = profile_of(points)
+
+    def gaps(first, second):
+        pairs = zip(first, second, strict=True)
+        return [pair_gap(closed(points), 3, 2e3 * R, *pair) * 1e-3 for pair in pairs]
+
     rolled = conjugacy(found)
     worst = rolled.least if by > 0 else rolled.most
     assert worst == pytest.approx(-by * 1e-3, rel=1e-3)
-    for i in range(7, 361, 59):
-        seen = pair_gap(closed(points), 3, 2e3 * R, rolled.roll[i], rolled.roll[i]) * 1e-3
-        assert rolled.gap[i] == pytest.approx(seen, abs=1e-9)
+    some = slice(7, None, 59)
+    assert rolled.gap[some] == pytest.approx(gaps(rolled.roll[some], rolled.roll[some]), abs=1e-9)
     pair = FlankPair.of(found, 2 * found.pitch_radius, two_sided=True)
-    rolls, relatives = np.array([0.3, 0.6, 0.9]), np.array([-1e-3, -2e-3, -5e-4])
-    for x, e, gap in zip(rolls, relatives, approaches(pair, rolls, relatives).gap, strict=True):
-        seen = pair_gap(closed(points), 3, 2e3 * R, -x - e / 2, -x + e / 2) * 1e-3
-        assert float(gap) == pytest.approx(seen, abs=1e-9)
+    x, e = np.array([0.3, 0.6, 0.9]), np.array([-1e-3, -2e-3, -5e-4])
+    seen = gaps(-x - e / 2, -x + e / 2)
+    assert np.asarray(approaches(pair, x, e).gap) == pytest.approx(seen, abs=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("by", "scatter"), [(0.5, 0.0), (0.02, 0.0), (-0.05, 0.0), (0.0, 0.0), (0.1, 2e-3), (0.0, 2e-3)]
-)
+@pytest.mark.parametrize(("by", "scatter"), [(0.02, 0.0), (-0.05, 0.0), (0.1, 2e-3), (0.0, 2e-3)])
 def test_an_inset_is_seen_in_the_mesh(by, scatter):
     """Half the gap in rolling, with its sign; within the scatter, there is none."""
     points = cut(points_of(CIC3, 240), by)
@@ -158,15 +149,12 @@ def test_lobes_off_the_axis_are_refused_before_anything_is_compiled(tmp_path, mo
     monkeypatch.setattr("rootsopt.scene.families.check", looked.append)
     config = load(tmp_path / "scene.yaml")
     for work in (check_geometry, optimize_design, pareto_front):
-        with pytest.raises(InputError, match=r"outline_center` = fit .*\[0, 0\]"):
-            work(config)
+        assert re.search(r"outline_center` = fit .*\[0, 0\]", refusal(work, config))
     assert simulate.main([str(tmp_path / "scene.yaml"), "-o", str(tmp_path / "out")]) == 2
     assert "set `profile.outline_center` = fit" in capsys.readouterr().err
     assert not looked
-    for center, simulated in (([0, 0], True), ("fit", True), (None, False)):
-        given = config.model_copy(
-            update={"profile": config.profile.model_copy(update={"outline_center": center})}
-        )
+    for center, simulated in (("[0, 0]", True), ("fit", True), ("null", False)):
+        given = load(tmp_path / "scene.yaml", [f"profile.outline_center={center}"])
         check_geometry(given, simulated=simulated)
     assert len(looked) == 3
 
@@ -181,24 +169,14 @@ def test_turned_and_clockwise_outlines_are_put_right():
 
 def test_lobes_and_flanks_that_differ_are_told():
     points = points_of(CIC3, 240)
-    lobe = np.abs(np.angle(points)) < np.pi / 3
-    worse = np.where(lobe, bulged(points, 0.03), points)
-    _, checks = profile_of(worse)
+    worse, angle = bulged(points, 0.03), np.angle(points)
+    _, checks = profile_of(np.where(np.abs(angle) < np.pi / 3, worse, points))
     # The mean lobe has a third of it.
     assert checks.lobe_deviation_um == pytest.approx(20, rel=0.01)
-    leading = np.mod(np.angle(points), 2 * np.pi / 3) < np.pi / 3
-    _, checks = profile_of(np.where(leading, bulged(points, 0.03), points))
+    _, checks = profile_of(np.where(np.mod(angle, 2 * np.pi / 3) < np.pi / 3, worse, points))
     # The lobe's axis moves over with the flank and takes up part of it.
     assert 15 < checks.flank_deviation_um < 30
     assert "trailing flank" in advice(parse(CONFIG.format("x.csv")).profile, checks)[0]
-
-
-def test_joints_are_seen():
-    """Land, arc, involute and their mates give eight joints per lobe, without the pitch circle."""
-    points = points_of(CIC3, 240)
-    found = np.degrees(np.angle(points[np.roll(_jumps(np.roll(points, 77)), -77)]))
-    assert np.sum(np.abs(found) < 59) == 8
-    assert np.min(np.abs(found - 4)) < 1e-6
 
 
 FAULTS = {
@@ -208,34 +186,45 @@ FAULTS = {
     "folded": (lambda z: z * np.exp(2e-4j * (np.abs(z) - 33) ** 4), "fold back"),
     "unequal": (lambda z: np.where(np.abs(np.angle(z)) < 1, bulged(z, 1.5), z), "equal lobes"),
     "hollow": (lambda z: bulged(z, -4.0), "convex addendum|fold back|a flank turns by"),
+    "collinear": (lambda z: z.real + 0j, ""),
+    "two points": (lambda z: z[[0, len(z) // 2]], ""),
+    "six points": (lambda z: z[:: len(z) // 6], ""),
+    "axis among the points": (lambda z: np.where(np.arange(len(z)) == 5, 0, z), ""),
+    "spike": (lambda z: np.where(np.arange(len(z)) == 5, 3 * z, z), ""),
+    "twice around": (lambda z: np.concatenate([z, z]), ""),
+    "figure of eight": (
+        lambda z: np.concatenate([z.real + 60 + 1j * z.imag, -z.real - 60 - 1j * z.imag]),
+        "",
+    ),
+    "micrometres": (lambda z: z * 1e3, ""),
+    "metres": (lambda z: z * 1e-3, ""),
+    "in any order": (lambda z: np.random.default_rng(0).permutation(z), ""),
+    "lobes of other angles": (lambda z: np.abs(z) * np.exp(2j * np.angle(z) / 3), ""),
+    "circle": (lambda z: 33.0 * np.exp(2j * np.pi * np.arange(len(z)) / len(z)), ""),
 }
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_faults_are_named(tmp_path, fault):
+def test_faults_are_named(tmp_path, fault, capfd):
     change, message = FAULTS[fault]
-    path = write(tmp_path / "points.csv", change(points_of(CIC3, 240)))
-    with pytest.raises(InputError, match=message):
-        check_geometry(parse(CONFIG.format(path)))
+    path = write(tmp_path / "points.csv", change(points_of(CIC3, 60)))
+    assert re.search(message, refusal(check_geometry, parse(CONFIG.format(path))))
+    assert capfd.readouterr().err == ""
 
 
 def test_config_keys(tmp_path):
-    path = write(tmp_path / "points.csv", points_of(CIC3, 60))
-    (tmp_path / "scene.yaml").write_text(CONFIG.format("points.csv"))
-    config = load(tmp_path / "scene.yaml")
-    assert config.profile.outline_file == str(path)
+    scene = tmp_path / "scene.yaml"
+    scene.write_text(CONFIG.format("points.csv"))
+    config = load(scene)
+    assert config.profile.outline_file == str(tmp_path / "points.csv")
     for change, message in (
-        ("profile.outline_file=null", r"`profile.outline_file` is required"),
-        ("profile.family=ee", r"`profile.outline_file` does not belong to family ee"),
+        ("profile.outline_file=null", "`profile.outline_file` is required"),
+        ("profile.family=ee", "`profile.outline_file` does not belong to family ee"),
+        ("optimizer.family=ee", "`optimizer.family` must be one of"),
     ):
-        with pytest.raises(InputError, match=message):
-            load(tmp_path / "scene.yaml", [change])
-    with pytest.raises(InputError, match=r"must be a file that can be read"):
-        check_geometry(load(tmp_path / "scene.yaml", ["profile.outline_file=none.csv"]))
-    with pytest.raises(InputError, match=r"must not be read from a file for a projection"):
-        free_form_of(config.profile, 12)
-    with pytest.raises(InputError, match=r"`optimizer.family` must be one of"):
-        load(tmp_path / "scene.yaml", ["optimizer.family=ee"])
+        assert message in refusal(load, scene, [change])
+    assert "must be a file that can be read" in refusal(check_geometry, config)
+    assert "must not be read from a file for a" in refusal(free_form_of, config.profile, 12)
 
 
 def test_profile_command_reads_its_own_files(tmp_path, monkeypatch):
@@ -243,19 +232,16 @@ def test_profile_command_reads_its_own_files(tmp_path, monkeypatch):
     monkeypatch.setattr(*POSES)
     path = write(tmp_path / "points.csv", points_of(CIC3, 240))
     (tmp_path / "scene.yaml").write_text(CONFIG.format(path))
-    drawn = "dxf" if importlib.util.find_spec("ezdxf") else "none"
     first = tmp_path / "first"
-    arguments = [str(tmp_path / "scene.yaml"), "-o", str(first), "--no-figures", "--export", drawn]
-    assert profile.main(arguments) == 0
+    options = ["-o", str(first), "--no-figures", "--export", "dxf"]
+    assert profile.main([str(tmp_path / "scene.yaml"), *options]) == 0
     record = json.loads((first / "result.json").read_text())
     assert record["outline"]["interference_um"] < 1e-3
     assert record["geometry"]["undercut_margin_mm"] is None
     again = load(first / "config.yaml")
     assert again.profile.outline_file == str(first / "outline.csv")
-    sources = ["profile_design.csv"] + (["rotor.dxf"] if drawn == "dxf" else [])
-    for name in sources:
+    for name in ("profile_design.csv", "rotor.dxf"):
         other = again.profile.model_copy(update={"outline_file": str(first / name)})
         found, _ = outline_of(other)
-        area = float(found.area) * 1e6
-        assert area == pytest.approx(record["geometry"]["area_mm2"], rel=1e-7)
-        assert max(-conjugacy(found).least, conjugacy(found).most) < 5e-8
+        assert float(found.area) * 1e6 == pytest.approx(record["geometry"]["area_mm2"], rel=1e-7)
+        assert np.nanmax(np.abs(conjugacy(found).gap)) < 5e-8

@@ -13,7 +13,6 @@ from ezdxf import units
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rootsopt.errors import InputError
 from rootsopt.measured.fit import imported
 from rootsopt.measured.loop import Loop, signed_area
 from rootsopt.measured.reading import Sought, read, untangled
@@ -25,20 +24,17 @@ ROTOR = (40 + 8 * np.cos(3 * T)) * np.exp(1j * T)
 
 
 def drawn(path, draw, version="R2010", units=units.MM, fmt="asc", **how):
-    """Return the outline in a drawing with what `draw` adds to the model space."""
     document = ezdxf.new(version, units=units)
     draw(document.modelspace())
     document.saveas(path, fmt=fmt)
     return read(path, **how)
 
 
-def line(space, start, stop, **attributes):
-    ends = (start.real, start.imag), (stop.real, stop.imag)
-    space.add_line(*ends, dxfattribs=attributes)
+def line(space, start, stop):
+    space.add_line((start.real, start.imag), (stop.real, stop.imag))
 
 
 def lines(space, z, order=None):
-    """Draw loose lines along a polygon, every other one reversed."""
     for k in range(len(z)) if order is None else order:
         line(space, *(z[k], z[(k + 1) % len(z)])[:: 1 if k % 2 else -1])
 
@@ -48,14 +44,13 @@ def polyline(z, **how):
 
 
 def fault(path, data):
-    """Return the one-line message for a file with this content."""
     path.write_bytes(data if isinstance(data, bytes) else data.encode())
     return refusal(lambda: imported(read(path), 3, 33.0, 0.0))
 
 
 @given(seed=st.integers(0), smoothing=st.sampled_from([0.0, 1e-6, 1e-3, 10.0]))
 def test_damaged_files_are_answered(tmp_path_factory, seed, smoothing):
-    """Damaged files give a profile or a message of one line, and no other output."""
+    """They give a profile or a message of one line, and no other output."""
     data, ending = outlines.malformed(random.Random(seed))
     path = tmp_path_factory.getbasetemp() / f"damaged{ending}"
     path.write_bytes(data)
@@ -63,13 +58,11 @@ def test_damaged_files_are_answered(tmp_path_factory, seed, smoothing):
 
 
 def test_undamaged_files_are_read(tmp_path):
-    """The undamaged files are accepted, so that random ones test the damage."""
-    areas = {}
+    """They are accepted, so that random ones test the damage."""
     for name, data in outlines.good().items():
         (tmp_path / name).write_bytes(data)
-        areas[name] = abs(signed_area(read(tmp_path / name).points))
-    for name, area in areas.items():
-        assert area == pytest.approx(3960 if "ee" in name else 3900, rel=0.1), areas
+        area = abs(signed_area(read(tmp_path / name).points))
+        assert area == pytest.approx(3960 if "ee" in name else 3900, rel=0.1), name
 
 
 @pytest.mark.parametrize(
@@ -131,18 +124,13 @@ def test_malformed_tables(tmp_path, data, message):
         (";", False, "", "utf-8"),
         ("\t", False, "name", "utf-8"),
         (" ", False, "x_mm,y_mm", "utf-8"),
+        *((split, True, "", "utf-8") for split in ";\t "),
     ],
 )
 def test_tables_of_spreadsheets(tmp_path, split, comma, header, encoding):
-    data = outlines.table(ROTOR, split, comma, header).decode().replace("\n", "\r\n")
-    (tmp_path / "points.csv").write_bytes(data.encode(encoding))
+    data = outlines.table(ROTOR, split, comma, header).decode() + 2 * split
+    (tmp_path / "points.csv").write_bytes(data.replace("\n", "\r\n").encode(encoding))
     assert read(tmp_path / "points.csv").points == pytest.approx(ROTOR, abs=1e-8)
-
-
-def test_named_columns_are_taken_wherever_they_are(tmp_path):
-    rows = [f"{k};{z.imag:.9g};{z.real:.9g}" for k, z in enumerate(ROTOR)]
-    (tmp_path / "points.csv").write_text("\n".join(["nr;y (mm);x (mm)", *rows]))
-    assert read(tmp_path / "points.csv").points == pytest.approx(ROTOR, abs=1e-6)
 
 
 def test_what_is_no_file_is_refused_at_once(tmp_path):
@@ -151,17 +139,28 @@ def test_what_is_no_file_is_refused_at_once(tmp_path):
     (tmp_path / "device.csv").symlink_to("/dev/zero")
     signal.alarm(30)
     try:
-        for name, what in (("pipe", "a pipe"), ("folder", "a folder"), ("device", "a device")):
-            with pytest.raises(InputError, match=f"{name}.csv': is {what}; give .* an outline"):
-                read(tmp_path / f"{name}.csv")
+        for name in ("pipe", "folder", "device"):
+            message = refusal(read, tmp_path / f"{name}.csv")
+            assert re.search(f"{name}.csv': is a {name}; give .* an outline", message)
     finally:
         signal.alarm(0)
-    with pytest.raises(InputError, match="can be read"):
-        read(tmp_path / "a\0b.csv")
-    with open(tmp_path / "large.dxf", "wb") as file:
-        file.truncate(10**12)
-    with pytest.raises(InputError, match="at most 50 MB"):
-        read(tmp_path / "large.dxf")
+    assert "can be read" in refusal(read, tmp_path / "a\0b.csv")
+    (tmp_path / "large.dxf").touch()
+    os.truncate(tmp_path / "large.dxf", 10**12)
+    assert "at most 50 MB" in refusal(read, tmp_path / "large.dxf")
+
+
+def spline(**changes):
+    """Return a function that draws a valid spline, but for `changes`."""
+    points = [(0, 0), (1, 2), (3, 1), (4, 0)]
+    valid = {"control_points": points, "knots": [0.0] * 4 + [1.0] * 4}
+
+    def draw(space):
+        added = space.add_spline(degree=3)
+        for key, value in (valid | changes).items():
+            setattr(added, key, value)
+
+    return draw
 
 
 ENTITIES = {
@@ -188,6 +187,18 @@ ENTITIES = {
         lambda s: [s.add_circle((0, 0), 9), s.add_arc((0, 0), 9e8, 0, 360)],
         "measure 2.*e\\+09 mm",
     ),
+    "equal knots": (spline(knots=[1.0] * 8), "equal knots"),
+    "falling knots": (spline(knots=[0, 0, 0, 0, 1, 1, 1, 0.5]), "rising order"),
+    "few knots": (
+        spline(knots=[0, 0, 1, 1]),
+        "1 of 1 SPLINE are not valid .*knot value count: 4 < 8",
+    ),
+    "no weight": (spline(weights=[0.0] * 4), "weights above 0"),
+    "two weights": (spline(weights=[1.0, 1.0]), "are not valid .*weight count: 2 != 4"),
+    "few points": (
+        spline(control_points=[(0, 0), (1, 1)]),
+        "are not valid .*control point count: 2 < 4",
+    ),
 }
 
 
@@ -197,60 +208,29 @@ def test_senseless_entities(tmp_path, name):
     assert re.search(message, refusal(drawn, tmp_path / "drawing.dxf", draw))
 
 
-SPLINES = {
-    "equal knots": ({"knots": [1.0] * 8}, "equal knots"),
-    "falling knots": ({"knots": [0, 0, 0, 0, 1, 1, 1, 0.5]}, "rising order"),
-    "few knots": ({"knots": [0, 0, 1, 1]}, "1 of 1 SPLINE are not valid .*knot value count: 4 < 8"),
-    "no weight": ({"weights": [0.0] * 4}, "weights above 0"),
-    "two weights": ({"weights": [1.0, 1.0]}, "are not valid .*weight count: 2 != 4"),
-    "few points": (
-        {"control_points": [(0, 0), (1, 1)]},
-        "are not valid .*control point count: 2 < 4",
-    ),
-}
+@pytest.fixture
+def whole():
+    draw = polyline(ROTOR)
+    return outlines.drawing(lambda document: draw(document.modelspace()), "R2010").decode()
 
 
-@pytest.mark.parametrize("name", SPLINES)
-def test_senseless_splines(tmp_path, name):
-    changes, message = SPLINES[name]
-
-    def draw(space):
-        spline = space.add_spline(degree=3)
-        spline.control_points = [(0, 0), (1, 2), (3, 1), (4, 0)]
-        spline.knots = [0.0] * 4 + [1.0] * 4
-        for key, value in changes.items():
-            setattr(spline, key, value)
-
-    with pytest.raises(InputError, match=message):
-        drawn(tmp_path / "drawing.dxf", draw)
-
-
-def text_of(draw, version="R2010", units=units.MM):
-    return outlines.drawing(lambda x: draw(x.modelspace()), version, units).decode()
-
-
-def test_damaged_drawings_are_not_read_as_others(tmp_path, capfd):
+def test_damaged_drawings_are_not_read_as_others(whole, tmp_path, capfd):
     """A decimal comma, an unknown unit or a truncated file is rejected; the library would accept
     it."""
-    path, whole = tmp_path / "drawing.dxf", text_of(polyline(ROTOR))
-    assert "a number of LWPOLYLINE must be" in fault(path, whole.replace("48.0", "48,0"))
-    assert "end with the mark EOF" in fault(path, whole[: whole.rindex("ENDSEC")])
-    assert "is not a DXF file" in fault(path, "x,y\n1,2\n")
-    assert "is not a DXF file" in fault(path, b"AutoCAD Binary DXF\r\n\x1a\x00" + b"\xff" * 99)
     code = "$INSUNITS\n 70\n"
-    for unit in ("99", "-1", "17", "18"):
-        text = whole.replace(f"{code}4", f"{code}{unit}")
-        assert text != whole
-        assert (
-            f"$INSUNITS must be the code of a length unit (4: mm, 1: inch, 0: none), but is {unit}"
-            in fault(path, text)
-        )
+    units = "$INSUNITS must be the code of a length unit (4: mm, 1: inch, 0: none), but is"
+    for data, message in (
+        (whole.replace("48.0", "48,0"), "a number of LWPOLYLINE must be"),
+        (whole[: whole.rindex("ENDSEC")], "end with the mark EOF"),
+        ("x,y\n1,2\n", "is not a DXF file"),
+        (b"AutoCAD Binary DXF\r\n\x1a\x00" + b"\xff" * 99, "is not a DXF file"),
+        *((whole.replace(f"{code}4", code + x), f"{units} {x}") for x in ("99", "-1", "17", "18")),
+    ):
+        assert message in fault(tmp_path / "drawing.dxf", data)
     assert capfd.readouterr().err == ""
 
 
-def test_what_the_library_says_stays_inside(tmp_path, caplog):
-    """Log records of the library do not appear on stderr."""
-    whole = text_of(polyline(ROTOR))
+def test_what_the_library_says_stays_inside(whole, tmp_path, caplog):
     odd = whole.replace(" 90\n60\n", " 90\n60.0\n")
     assert odd != whole
     (tmp_path / "drawing.dxf").write_text(odd)
@@ -259,21 +239,25 @@ def test_what_the_library_says_stays_inside(tmp_path, caplog):
 
 
 @pytest.mark.parametrize(
-    ("code", "length"),
-    [(1, 25.4), (2, 304.8), (8, 2.54e-5), (9, 0.0254), (14, 100.0), (21, 304.8006)],
+    ("code", "length", "version", "fmt"),
+    [
+        (1, 25.4, "R2010", "asc"),
+        (2, 304.8, "R2010", "asc"),
+        (8, 2.54e-5, "R2010", "asc"),
+        (9, 0.0254, "R2010", "asc"),
+        (14, 100.0, "R2010", "asc"),
+        (21, 1.2e6 / 3937, "R2010", "asc"),
+        (0, 1.0, "R12", "asc"),
+        (0, 1.0, "R2000", "bin"),
+        (0, 1.0, "R2018", "bin"),
+    ],
 )
-def test_units(tmp_path, code, length):
-    loop = drawn(tmp_path / "drawing.dxf", polyline(ROTOR / length), units=code)
-    assert loop.points == pytest.approx(ROTOR, rel=1e-7)
-
-
-@pytest.mark.parametrize(("version", "fmt"), [("R12", "asc"), ("R2000", "bin"), ("R2018", "bin")])
-def test_versions_of_drawings(tmp_path, version, fmt):
+def test_units_and_versions_of_drawings(tmp_path, code, length, version, fmt):
     def draw(space):
         add = space.add_polyline2d if version == "R12" else space.add_lwpolyline
-        add([(z.real, z.imag) for z in ROTOR], close=True)
+        add([(z.real, z.imag) for z in ROTOR / length], close=True)
 
-    loop = drawn(tmp_path / "drawing.dxf", draw, version, units=0, fmt=fmt)
+    loop = drawn(tmp_path / "drawing.dxf", draw, version, units=code, fmt=fmt)
     assert loop.points == pytest.approx(ROTOR, abs=1e-9)
 
 
@@ -317,21 +301,19 @@ def test_splines_are_sampled_on_the_exact_curve(tmp_path):
 
 def test_blocks(tmp_path):
     """A turned outline in a block is read; entities drawn directly have precedence."""
-    document = ezdxf.new(units=units.MM)
+    document, path = ezdxf.new(units=units.MM), tmp_path / "block.dxf"
     inner, outer = document.blocks.new("ROTOR"), document.blocks.new("SHEET")
     polyline(ROTOR)(inner)
     outer.add_blockref("ROTOR", (0, 0), dxfattribs={"rotation": 90})
-    space = document.modelspace()
-    space.add_blockref("SHEET", (5, 0))
-    document.saveas(tmp_path / "block.dxf")
-    assert read(tmp_path / "block.dxf").points == pytest.approx(5 + 1j * ROTOR)
-    polyline(ROTOR / 2)(space)
-    document.saveas(tmp_path / "block.dxf")
-    assert read(tmp_path / "block.dxf").points == pytest.approx(ROTOR / 2)
+    document.modelspace().add_blockref("SHEET", (5, 0))
+    document.saveas(path)
+    assert read(path).points == pytest.approx(5 + 1j * ROTOR)
+    polyline(ROTOR / 2)(document.modelspace())
+    document.saveas(path)
+    assert read(path).points == pytest.approx(ROTOR / 2)
     inner.add_blockref("SHEET", (0, 0))
-    document.saveas(tmp_path / "block.dxf")
-    with pytest.raises(InputError, match="blocks must be inserted singly"):
-        read(tmp_path / "block.dxf")
+    document.saveas(path)
+    assert "blocks must be inserted singly" in refusal(read, path)
 
 
 def test_what_does_not_belong_to_the_outline(tmp_path):
@@ -348,8 +330,8 @@ def test_what_does_not_belong_to_the_outline(tmp_path):
 
     loop = drawn(tmp_path / "clean.dxf", clean)
     assert sorted(loop.points, key=np.angle) == pytest.approx(sorted(ROTOR, key=np.angle))
-    with pytest.raises(InputError, match=r"must not branch, but 3 ends meet at \("):
-        drawn(tmp_path / "chord.dxf", lambda s: [clean(s), line(s, ROTOR[6], ROTOR[0])])
+    chord = refusal(drawn, tmp_path / "chord.dxf", lambda s: [clean(s), line(s, *ROTOR[[6, 0]])])
+    assert "must not branch, but 3 ends meet at (" in chord
 
 
 def test_a_gap_is_not_answered_with_the_bore(tmp_path):
@@ -358,9 +340,8 @@ def test_a_gap_is_not_answered_with_the_bore(tmp_path):
         space.add_arc((0, 0), 5, 0, 180)
         space.add_arc((0, 0), 5, 180, 360)
 
-    gap = abs(ROTOR[59] - ROTOR[0])
-    with pytest.raises(InputError, match=f"enclose more than any .* a gap of {gap:.4g} mm at"):
-        drawn(tmp_path / "gap.dxf", draw)
+    gap = f"enclose more than any .* a gap of {abs(ROTOR[59] - ROTOR[0]):.4g} mm at"
+    assert re.search(gap, refusal(drawn, tmp_path / "gap.dxf", draw))
 
 
 def test_joints_of_a_clockwise_drawing():
@@ -377,49 +358,20 @@ def test_joints_of_a_clockwise_drawing():
     turned, others = imported(Loop(z[::-1], joints[::-1]), 3, 33.0, 0.0)
     assert (checks.reversed, others.reversed) == (False, True)
     for name in ("crown", "valley"):
-        one, other = getattr(found, name), getattr(turned, name)
         for part in ("node", "value", "slope"):
-            assert np.asarray(getattr(other, part)) == pytest.approx(
-                np.asarray(getattr(one, part)), abs=1e-12
-            )
+            one, other = (np.asarray(getattr(getattr(x, name), part)) for x in (found, turned))
+            assert other == pytest.approx(one, abs=1e-12)
 
 
 @pytest.mark.parametrize("smoothing", [1e-4, 10.0, 1e4])
 def test_smoothing_that_does_not_fit_the_scatter(smoothing, capfd):
     """Too little smoothing is rejected: fitting would take minutes, and the curve would follow the
     noise."""
-    random = np.random.default_rng(0)
     z = outlines.points("cic", 800)
-    z = z + random.normal(0, 1e-3, len(z)) + 1j * random.normal(0, 1e-3, len(z))
-    with pytest.raises(InputError, match=r"outline_smoothing_mm|outline_file") as raised:
-        imported(Loop(z, np.zeros(len(z), bool)), 3, 33.0, smoothing)
-    if smoothing < 1e-3:
-        assert "needs more than 500 knots" in str(raised.value)
-    assert capfd.readouterr().err == ""
-
-
-WRONG = {
-    "collinear": lambda z: z.real + 0j,
-    "two points": lambda z: z[[0, len(z) // 2]],
-    "six points": lambda z: z[:: len(z) // 6],
-    "axis among the points": lambda z: np.where(np.arange(len(z)) == 5, 0, z),
-    "spike": lambda z: np.where(np.arange(len(z)) == 5, 3 * z, z),
-    "twice around": lambda z: np.concatenate([z, z]),
-    "figure of eight": lambda z: np.concatenate(
-        [z.real + 60 + 1j * z.imag, -z.real - 60 - 1j * z.imag]
-    ),
-    "micrometres": lambda z: z * 1e3,
-    "metres": lambda z: z * 1e-3,
-    "in any order": lambda z: np.random.default_rng(0).permutation(z),
-    "two lobes": lambda z: np.abs(z) * np.exp(2j * np.angle(z) / 3),
-    "circle": lambda z: 33.0 * np.exp(2j * np.pi * np.arange(len(z)) / len(z)),
-}
-
-
-@pytest.mark.parametrize("name", WRONG)
-def test_wrong_outlines(tmp_path, name, capfd):
-    z = WRONG[name](outlines.points("cic", 60))
-    fault(tmp_path / "points.csv", outlines.table(z))
+    z = z + np.random.default_rng(0).normal(0, 1e-3, (len(z), 2)) @ [1, 1j]
+    message = refusal(imported, Loop(z, np.zeros(len(z), bool)), 3, 33.0, smoothing)
+    assert re.search("outline_smoothing_mm|outline_file", message)
+    assert smoothing > 1e-3 or "needs more than 500 knots" in message
     assert capfd.readouterr().err == ""
 
 
@@ -433,7 +385,6 @@ def rectangle(space, width, height):
 
 
 def title_block(space):
-    """Draw a frame and a table of loose lines that meet three and four at a point."""
     for x in (-90, 40, 65, 90):
         lines(space, np.array([x - 70j, x - 60j, x - 50j]), range(2))
     for y in (-70, -60, -50):
@@ -479,18 +430,18 @@ def test_one_of_several_rotors_is_chosen_by_its_centre(tmp_path):
             polyline(turned)(space)
 
     path = tmp_path / "pair.dxf"
-    with pytest.raises(InputError, match=r"holds 2 elsewhere, at .*`profile.outline_center` = \["):
-        drawn(path, pair, sought=SOUGHT)
+    message = refusal(drawn, path, pair, sought=SOUGHT)
+    assert re.search(r"holds 2 elsewhere, at .*`profile.outline_center` = \[", message)
     for center, points in ((-33.0, EE - 33), (33.0, 33 - EE)):
         chosen = dataclasses.replace(SOUGHT, center=(center, 0.0))
         assert read(path, sought=chosen).points == pytest.approx(points, abs=1e-9)
-    with pytest.raises(InputError, match=r"holds 2 at the axis, with outer radii of 43.996 and 43"):
-        drawn(path, lambda s: [polyline(EE * k)(s) for k in (1, 0.98)], sought=SOUGHT)
+    two = refusal(drawn, path, lambda s: [polyline(EE * k)(s) for k in (1, 0.98)], sought=SOUGHT)
+    assert "holds 2 at the axis, with outer radii of 43.996 and 43" in two
     rows = [f"{z.real:.9f},{z.imag:.9f}" for z in [*EE, EE[0], *(66 - EE), 66 - EE[0]]]
     (tmp_path / "pair.csv").write_text("\n".join(["x_mm,y_mm", *rows]))
-    both = {c: read(tmp_path / "pair.csv", sought=Sought(3, 33.0, c)) for c in (None, (66.0, 0.0))}
-    assert both[None].points == pytest.approx(EE, abs=1e-8)
-    assert both[66.0, 0.0].points == pytest.approx(66 - EE, abs=1e-8)
+    for center, points in ((None, EE), ((66.0, 0.0), 66 - EE)):
+        found = read(tmp_path / "pair.csv", sought=Sought(3, 33.0, center))
+        assert found.points == pytest.approx(points, abs=1e-8)
 
 
 @pytest.mark.parametrize("gap", [1e-5, 3e-4, 1.8e-3, 1e-2])
@@ -508,15 +459,10 @@ def test_ends_that_miss_are_joined_or_the_key_is_named(tmp_path, gap, framed):
 
     path, join = tmp_path / "gap.dxf", 1e-3
     if gap > join:
-        with pytest.raises(InputError, match="widest gap is") as refused:
-            drawn(path, draw, sought=SOUGHT)
-        said = re.search(
-            r"gap is ([\d.e-]+) mm, at \(.*`profile.outline_join_mm` = ([\d.e-]+),",
-            f"{refused.value}",
-        )
-        assert said
-        assert float(said[1]) < float(said[2]) < 1.1 * float(said[1])
-        join = float(said[2])
+        told = r"widest gap is ([\d.e-]+) mm, at \(.*`profile.outline_join_mm` = ([\d.e-]+),"
+        said = re.search(told, refusal(drawn, path, draw, sought=SOUGHT))
+        widest, join = map(float, said.groups())
+        assert widest < join < 1.1 * widest
     loop = drawn(path, draw, sought=SOUGHT, join=join)
     assert loop.gap[0] <= gap
     assert any("apart were joined" in note for note in loop.notes) == (gap > 1e-4)
@@ -527,6 +473,7 @@ def test_ends_that_miss_are_joined_or_the_key_is_named(tmp_path, gap, framed):
 
 
 HEADERS = {
+    "nr;y (mm);x (mm)": (1.0, None),
     "x_in,y_in": (25.4, "lengths are read in inch"),
     "X (inch);Y (inch)": (25.4, "lengths are read in inch"),
     "x [cm]\ty [cm]": (10.0, "lengths are read in cm"),
@@ -544,25 +491,18 @@ def test_headers_that_state_units_or_polar_coordinates(tmp_path, header, comma):
     length, note = HEADERS[header]
     split = next((c for c in ";\t," if c in header), " ")
     split = ";" if comma and split == "," else split
-    columns = np.stack([EE.real, EE.imag]) / length
+    columns = EE.real / length, EE.imag / length
     if note and "polar" in note:
-        turn = 1.0 if "rad)" in note else 180 / np.pi
-        columns = np.stack([np.abs(EE) / length, np.angle(EE) * turn])
-        columns = columns[::-1] if header.startswith("theta") else columns
-    rows = [split.join(f"{v:.12g}" for v in row) for row in columns.T]
+        columns = np.abs(EE) / length, np.angle(EE, deg="(deg)" in note)
+    columns = columns[:: -1 if header.startswith(("theta", "nr")) else 1]
+    columns = [range(len(EE)), *columns] if header.startswith("nr") else columns
+    rows = [split.join(f"{v:.12g}" for v in row) for row in zip(*columns, strict=True)]
     rows = [row.replace(".", ",") for row in rows] if comma else rows
     (tmp_path / "points.csv").write_text("\n".join([header.replace(",", split), *rows]))
     loop = read(tmp_path / "points.csv")
     assert loop.points == pytest.approx(EE, abs=1e-8)
     assert bool(loop.notes) == bool(note)
     assert note is None or note in " ".join(loop.notes)
-
-
-@pytest.mark.parametrize("split", [";", "\t", " "])
-def test_decimal_commas_without_a_header(tmp_path, split):
-    rows = [f"{z.real:.8f}{split}{z.imag:.8f}".replace(".", ",") for z in ROTOR]
-    (tmp_path / "points.txt").write_text("\n".join([*rows, split * 2]))
-    assert read(tmp_path / "points.txt").points == pytest.approx(ROTOR, abs=1e-7)
 
 
 @pytest.mark.parametrize(
@@ -584,15 +524,13 @@ def test_swallow_tails_of_an_offset_are_named_and_cut_off(tmp_path, lobes, inset
     off = (np.array(places) * lobes / 180) % 1 - 0.5  # Flanks cross in the middle of a half lobe.
     assert off == pytest.approx(0, abs=0.03)
     assert abs(signed_area(loop.points)) == pytest.approx(abs(signed_area(z)), rel=1e-6)
-    with pytest.raises(InputError) as refused:
-        imported(loop, lobes, 33.0, 0.0)
-    said = re.search(r"`profile.outline_smoothing_mm` = ([\d.e-]+), with which", f"{refused.value}")
-    assert said
+    message = refusal(imported, loop, lobes, 33.0, 0.0)
+    said = re.search(r"`profile.outline_smoothing_mm` = ([\d.e-]+), with which", message)
     found, _ = imported(loop, lobes, 33.0, float(said[1]))
     assert float(found.outer_radius) == pytest.approx(33e-3 * (1 + 1 / lobes) - 1e-3 * inset)
 
 
 def test_outlines_that_cross_themselves_widely_are_refused():
-    z = outlines.epicycloid(3, 33.0, 1500, 6.0)
-    with pytest.raises(InputError, match=r"does not cross itself, .* loops .* at \(.* deg, .* um"):
-        untangled(Loop(z, np.zeros(len(z), bool)), 3, 33.0)
+    loop = Loop(outlines.epicycloid(3, 33.0, 1500, 6.0), np.zeros(1500, bool))
+    message = refusal(untangled, loop, 3, 33.0)
+    assert re.search(r"does not cross itself, .* loops .* at \(.* deg, .* um", message)

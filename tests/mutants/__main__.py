@@ -66,13 +66,12 @@ def _failed(tests: tuple[str, ...], tree: Path) -> bool:
     # Programs that a mistake does not change are compiled only once, except in tests of the cache.
     cached = "tests/runtime/test_programs.py" not in tests[0]
     cache = {"JAX_COMPILATION_CACHE_DIR": f"{tree}.cache"} if cached else {}
-    limit = (_SECONDS, _SECONDS)
     return bool(
         subprocess.run(
             command,
             cwd=tree,
             env=os.environ | cache | {"PYTHONPATH": str(tree)},
-            preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CPU, limit),
+            preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CPU, (_SECONDS, _SECONDS)),
             stdout=subprocess.DEVNULL,
             check=False,
         ).returncode

@@ -21,8 +21,7 @@ def result_of(case: Case) -> dict[str, Any]:
     for nudge in _NUDGES if case.nudged else ():
         moved = differences(package.evaluate(case.config, case.overrides, nudge), found)
         rounding = {name: max(rounding.get(name, 0.0), off) for name, off in moved.items()}
-    how = {"config": case.config, "overrides": case.overrides}
-    return how | found | {"rounding": rounding}
+    return {"config": case.config, "overrides": case.overrides, **found, "rounding": rounding}
 
 
 def check(case: Case, results: dict[str, Any]) -> tuple[dict[str, float], dict[str, float]]:

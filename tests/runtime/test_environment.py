@@ -1,14 +1,15 @@
 """Environment variables and machines: what is ignored, refused, or works."""
 
 import ast
-import functools
 import json
 import os
+import re
 import subprocess
 import sys
 import types
 import warnings
 from pathlib import Path
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +19,7 @@ from hypothesis import strategies as st
 
 from rootsopt.errors import InputError
 from rootsopt.runtime import environment
+from tests.standins import refusal
 
 ROOT = Path(__file__).parents[2]
 EE = str(ROOT / "configs" / "ee.yaml")
@@ -55,9 +57,9 @@ HARMLESS = {
 }
 
 
-def command(name, output, **variables):
+def profiled(output, **variables):
     return subprocess.run(
-        [sys.executable, "-m", f"rootsopt.{name}", EE, "-o", str(output), "--no-figures"],
+        [sys.executable, "-m", "rootsopt.profile", EE, "-o", str(output), "--no-figures"],
         capture_output=True,
         encoding="utf-8",
         errors="replace",
@@ -119,39 +121,31 @@ def test_random_environments(tmp_path_factory, odd, wrong):
     """The geometry is the same to the last bit, or the exit code is 2, with one line."""
     variables = dict(pair for one in [*odd, wrong] for pair in one.items())
     out = tmp_path_factory.mktemp("run")
-    done = command("profile", out, **variables)
+    done = profiled(out, **variables)
     told = [line for line in done.stderr.splitlines() if line.startswith("rootsopt profile: ")]
     assert "Traceback" not in done.stderr
     assert (done.returncode, len(told)) == ((2, 1) if wrong else (0, 0)), done.stderr
     if not wrong:
-        assert geometry_in(out) == geometry_of_ee(out.parent)
-
-
-def geometry_in(folder):
-    return json.loads((folder / "result.json").read_text("utf-8"))["geometry"]
-
-
-@functools.cache
-def geometry_of_ee(parent):
-    assert command("profile", parent / "plain").returncode == 0
-    return geometry_in(parent / "plain")
+        plain = out.with_name("plain")
+        assert plain.exists() or profiled(plain).returncode == 0
+        found, wanted = (json.loads((x / "result.json").read_text("utf-8")) for x in (out, plain))
+        assert found["geometry"] == wanted["geometry"]
 
 
 @pytest.mark.parametrize(
-    ("variables", "words"),
+    ("name", "value"),
     [
-        ({"JAX_PLATFORMS": "nonsense"}, ["JAX_PLATFORMS", "nonsense", "unset"]),
-        ({"XLA_FLAGS": "--xla_nonsense=1"}, ["XLA_FLAGS", "--xla_nonsense=1", "unset"]),
-        ({"JAX_LOGGING_LEVEL": "junk"}, ["JAX_LOGGING_LEVEL", "junk", "unset"]),
+        ("JAX_PLATFORMS", "nonsense"),
+        ("XLA_FLAGS", "--xla_nonsense=1"),
+        ("JAX_LOGGING_LEVEL", "junk"),
     ],
 )
-def test_what_cannot_work_is_refused_in_one_line(tmp_path, variables, words):
-    done = command("profile", tmp_path / "out", **variables)
-    assert done.returncode == 2
+def test_what_cannot_work_is_refused_in_one_line(tmp_path, name, value):
+    done = profiled(tmp_path / "out", **{name: value})
+    assert (done.returncode, done.stdout) == (2, "")
     (line,) = done.stderr.splitlines()
     assert line.startswith("rootsopt profile: ")
-    assert all(word in line for word in words)
-    assert done.stdout == ""
+    assert [word for word in (name, value, "unset") if word not in line] == []
     assert not (tmp_path / "out" / "result.json").exists()
 
 
@@ -170,11 +164,8 @@ def test_what_cannot_work_is_refused_in_one_line(tmp_path, variables, words):
 def test_flags_of_xla_are_tried_in_a_process_of_their_own(monkeypatch, flags, word):
     monkeypatch.delenv(environment._CHECKED, raising=False)
     monkeypatch.setenv("XLA_FLAGS", flags)
-    with pytest.raises(InputError, match="XLA_FLAGS") as caught:
-        environment._check_flags(flags)
-    assert word in str(caught.value)
-    assert len(str(caught.value)) < 700
-    assert "\n" not in str(caught.value)
+    message = refusal(environment._check_flags, flags)
+    assert ("XLA_FLAGS" in message, word in message) == (True, True), message
 
 
 def test_flags_that_work_are_tried_once(monkeypatch):
@@ -189,9 +180,7 @@ def test_flags_that_work_are_tried_once(monkeypatch):
     environment.use_compiled_loops()
     assert environment._LOOPS in os.environ["XLA_FLAGS"]
 
-    def tried(*_, **__):
-        raise AssertionError
-
+    tried = mock.Mock(side_effect=AssertionError)
     monkeypatch.setattr(environment.subprocess, "run", tried)
     environment._check_flags(os.environ["XLA_FLAGS"])
     for before in ("", "  "):
@@ -214,16 +203,11 @@ print(found + [os.environ.get("XLA_FLAGS", "")])
 """
     variables = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
     for late in (False, True):
-        done = subprocess.run(
-            [sys.executable, "-c", script.format(late=late)],
-            env=variables,
-            capture_output=True,
-            text=True,
-            check=True,
+        said = subprocess.check_output(
+            [sys.executable, "-c", script.format(late=late)], env=variables, text=True
         )
-        before, after = ast.literal_eval(done.stdout)
-        assert before == ""
-        assert (environment._LOOPS in after) is not late
+        before, after = ast.literal_eval(said)
+        assert (before, environment._LOOPS in after) == ("", not late)
 
 
 def test_settings_of_a_python_session_are_put_right(monkeypatch, capsys):
@@ -236,11 +220,9 @@ def test_settings_of_a_python_session_are_put_right(monkeypatch, capsys):
     assert jnp.ones(1).dtype == float
     assert not jax.config.values["jax_debug_nans"]
     assert jax.config.values["jax_numpy_rank_promotion"] == "allow"
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "jax_debug_nans" in line
-    assert "jax_enable_x64" not in line
     environment.use_float64()
-    assert capsys.readouterr().err == ""
+    (line,) = capsys.readouterr().err.splitlines()
+    assert ("jax_debug_nans" in line, "jax_enable_x64" in line) == (True, False)
 
 
 class Machine:
@@ -263,13 +245,16 @@ class Machine:
 
 
 @pytest.mark.parametrize(
-    ("variable", "platform", "chosen"),
-    [(None, "cuda", "cpu"), ("cuda", "cuda", "cuda"), ("", "cuda", ""), ("cpu", "tpu", "cpu")],
+    ("variables", "platform", "chosen"),
+    [
+        ({}, "cuda", "cpu"),
+        ({"JAX_PLATFORMS": "cuda"}, "cuda", "cuda"),
+        ({"JAX_PLATFORMS": ""}, "cuda", ""),
+        ({"JAX_PLATFORMS": "cpu"}, "tpu", "cpu"),
+    ],
 )
-def test_a_platform_that_is_there_is_not_refused(monkeypatch, variable, platform, chosen):
-    monkeypatch.delenv("JAX_PLATFORMS", raising=False)
-    if variable is not None:
-        monkeypatch.setenv("JAX_PLATFORMS", variable)
+def test_a_platform_that_is_there_is_not_refused(monkeypatch, variables, platform, chosen):
+    monkeypatch.setattr(os, "environ", variables)
     machine = Machine(platform)
     environment._start_device(machine)
     assert machine.chosen == chosen
@@ -278,26 +263,22 @@ def test_a_platform_that_is_there_is_not_refused(monkeypatch, variable, platform
 def test_a_platform_that_is_not_there_is_refused(monkeypatch):
     for variable in ("cuda", "METAL", "CPU", "cuda,cpu", ",", "x" * 5000):
         monkeypatch.setenv("JAX_PLATFORMS", variable)
-        with pytest.raises(InputError, match="JAX_PLATFORMS") as caught:
-            environment._start_device(Machine("tpu"))
-        assert "unset" in str(caught.value)
-        assert "set X" not in str(caught.value)
-        assert len(str(caught.value)) < 700
+        message = refusal(environment._start_device, Machine("tpu"))
+        assert re.search("JAX_PLATFORMS.* unset", message)
+        assert "set X" not in message
 
 
 def test_a_device_without_double_precision_is_refused(monkeypatch):
     monkeypatch.setenv("JAX_PLATFORMS", "METAL")
     machine = Machine("METAL")
     machine.numpy = types.SimpleNamespace(ones=lambda *_: 1 / 0)
-    with pytest.raises(InputError, match="METAL"):
-        environment._start_device(machine)
+    assert "METAL" in refusal(environment._start_device, machine)
 
 
 def test_a_lack_of_memory_is_explained():
-    with pytest.raises(InputError, match="not enough memory"), environment.explained():
-        raise MemoryError
-    with pytest.raises(InputError, match="not enough memory"), environment.explained():
-        jnp.ones(2**46).block_until_ready()
+    for work in (mock.Mock(side_effect=MemoryError), lambda: jnp.ones(2**46).block_until_ready()):
+        with pytest.raises(InputError, match="not enough memory"), environment.explained():
+            work()
     with pytest.raises(ZeroDivisionError), environment.explained():
         _ = 1 / 0
 
@@ -326,10 +307,8 @@ def test_warnings_never_end_a_command(monkeypatch):
 
 
 def test_nothing_is_said_where_nobody_can_read_it(monkeypatch):
-    class Full:
-        def write(self, _):
-            raise OSError(28, "No space left on device")
-
+    full = mock.Mock(side_effect=OSError(28, "No space left on device"))
     monkeypatch.setattr(environment, "_noticed", set())
-    monkeypatch.setattr(sys, "stderr", Full())
+    monkeypatch.setattr(sys, "stderr", types.SimpleNamespace(write=full))
     environment.say("unread")
+    full.assert_called()

@@ -44,7 +44,6 @@ TRACED = []
 
 
 def scaled(factor, numbers, name):
-    """Stand in for a program: arrays and a static argument."""
     TRACED.append(name)
     return Answer({"sum": jnp.sum(factor.value * numbers**factor.power)}, name)
 
@@ -55,10 +54,8 @@ def solved(matrix):
 
 
 @pytest.fixture(autouse=True)
-def traced(monkeypatch, tmp_path):
-    """Return the list of traces of `scaled`, empty at first.
-
-    No programs are kept, and the key is the test's own."""
+def traced(monkeypatch):
+    """Return the list of traces of `scaled`, empty at first. No programs are kept."""
     monkeypatch.setattr(programs, "_store", None)
     TRACED.clear()
     return TRACED
@@ -66,26 +63,21 @@ def traced(monkeypatch, tmp_path):
 
 def ask(program, power=2, size=3, name="a"):
     answer = program(Factor(jnp.asarray(2.0), power), np.arange(size, dtype=float), name)
-    assert isinstance(answer, Answer)
-    assert answer.name == name
-    assert float(answer.total["sum"]) == 2 * sum(k**power for k in range(size))
-    return answer
+    total = 2 * sum(k**power for k in range(size))
+    assert (answer.name, float(answer.total["sum"])) == (name, total)
 
 
 def test_a_program_is_traced_once_for_each_kind_of_arguments(traced):
     program = CachedFunction(scaled)
-    ask(program)
-    ask(program)
-    assert len(traced) == 1
-    for other in ({"power": 3}, {"size": 4}, {"name": "b"}):
+    for other in ({}, {}, {"power": 3}, {"size": 4}, {"name": "b"}):
         ask(program, **other)
-    assert len(traced) == 4
+    assert traced == ["a", "a", "a", "b"]
 
 
 def test_prepared_programs_are_ready_when_called(traced):
     program = CachedFunction(scaled)
-    shape = jax.ShapeDtypeStruct((3,), float)
-    kind = Factor(jax.ShapeDtypeStruct((), float), 2), shape, "a"
+    number, row = (jax.ShapeDtypeStruct(shape, float) for shape in ((), (3,)))
+    kind = Factor(number, 2), row, "a"
     assert program.result_shape(*kind).total["sum"].shape == ()
     traced.clear()
     program.prepare(*kind)
@@ -133,11 +125,9 @@ def test_a_failure_is_raised_by_the_call_and_not_remembered():
 def test_kept_programs_are_found_without_tracing(tmp_path, traced):
     """Another process, here another `CachedFunction` of the same function, finds a kept program."""
     programs.keep_in(tmp_path / "new" / "folder")
-    first = ask(CachedFunction(scaled))
+    ask(CachedFunction(scaled))
     assert len(list((tmp_path / "new" / "folder").iterdir())) == 1
-    again = ask(CachedFunction(scaled))
-    assert traced == ["a"]
-    assert first.total["sum"] == again.total["sum"]
+    ask(CachedFunction(scaled))
     assert CachedFunction(scaled).result_shape(Factor(jnp.ones(()), 2), np.ones(3), "a").name == "a"
     assert traced == ["a"]
     ask(CachedFunction(scaled), power=3)
@@ -146,22 +136,17 @@ def test_kept_programs_are_found_without_tracing(tmp_path, traced):
 
 @pytest.fixture
 def folder(tmp_path):
-    """Return the folder in which programs are kept from now on."""
     programs.keep_in(tmp_path / "cache")
     return tmp_path / "cache"
 
 
-def test_a_damaged_or_unwritable_cache_is_no_error(folder, traced):
+def test_a_damaged_program_is_made_again(folder, traced):
     ask(CachedFunction(scaled))
     (file,) = folder.iterdir()
     file.write_bytes(file.read_bytes()[:100])
-    ask(CachedFunction(scaled))
-    assert len(traced) == 2
-    ask(CachedFunction(scaled))
-    assert len(traced) == 2
-    assert programs.keep_in(file / "below a file") is None
-    ask(CachedFunction(scaled))
-    assert len(traced) == 3
+    for _ in range(2):
+        ask(CachedFunction(scaled))
+        assert len(traced) == 2
 
 
 @pytest.mark.skipif(os.name != "posix", reason="permissions of POSIX")
@@ -175,8 +160,7 @@ def test_a_cache_others_may_write_to_is_said_once_and_not_used(folder, traced, m
         ask(CachedFunction(scaled))
     assert len(traced) == 3
     (line,) = capsys.readouterr().err.splitlines()
-    assert str(folder) in line
-    assert "chmod" in line
+    assert re.search(rf"{folder}.*chmod", line)
 
 
 def test_a_cache_that_cannot_be_used_is_not_spoken_of(traced, monkeypatch, capsys, tmp_path):
@@ -192,9 +176,7 @@ def test_a_cache_that_cannot_be_used_is_not_spoken_of(traced, monkeypatch, capsy
 
 
 def test_programs_called_from_python_are_kept_without_being_asked(traced, monkeypatch, tmp_path):
-    """Programs called from Python are kept in the commands' folder.
-
-    The environment may say otherwise."""
+    """They are kept in the commands' folder. The environment may say otherwise."""
     for choice, kept in ((str(tmp_path / "cache"), 1), ("off", 0)):
         monkeypatch.setattr(programs, "_chosen", False)
         monkeypatch.setenv("ROOTSOPT_CACHE", choice)
@@ -204,9 +186,7 @@ def test_programs_called_from_python_are_kept_without_being_asked(traced, monkey
 
 
 def test_programs_that_call_out_are_not_kept(folder):
-    """Programs that call library functions are not kept.
-
-    Loaded without being lowered, they would call functions that are not set up."""
+    """Loaded without being lowered, they would call functions that are not set up."""
     np.testing.assert_allclose(CachedFunction(solved)(jnp.eye(2) * 2), [1, 0])
     assert not list(folder.iterdir())
 
@@ -245,18 +225,9 @@ def processor(patch):
 
 
 def setting(name, value):
-    return lambda patch: patch.setitem(SETTINGS, name, value)
+    return lambda patch: patch.setattr(type(jax.config), name, value)
 
 
-class Settings(dict):
-    """Settings of JAX, as a dictionary that can be patched."""
-
-    def __setitem__(self, name, value):
-        super().__setitem__(name, value)
-        jax.config.update(name, value)
-
-
-SETTINGS = Settings(jax.config.values)
 CHANGES = {
     "flags of XLA": variable("XLA_FLAGS", " --xla_cpu_enable_fast_math=true"),
     "checks of equinox": variable("EQX_ON_ERROR", "nan"),
@@ -285,13 +256,12 @@ def test_a_program_is_another_after_a_change(what, folder, monkeypatch):
     assert place() == first
     with monkeypatch.context() as patch:
         CHANGES[what](patch)
-        assert all(one != other for one, other in zip(first, fresh(), strict=True))
+        assert not set(first) & set(fresh())
     assert fresh() == first
 
 
 @pytest.fixture
 def package(monkeypatch, tmp_path):
-    """Folder of a copy of this package, from which programs take their sources."""
     copy = tmp_path / "rootsopt"
     shutil.copytree(
         programs._PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__", "configs")
@@ -301,21 +271,18 @@ def package(monkeypatch, tmp_path):
 
 
 def test_a_program_follows_the_code_that_it_may_import(package):
-    """Not comments and docstrings, nor rooms that it does not import, such as a report."""
+    """Not rooms that it does not import, such as a report."""
 
     def replaced(name, old, new):
-        file = package / name
-        assert old in file.read_text()
-        file.write_text(file.read_text().replace(old, new, 1))
+        text = (package / name).read_text()
+        assert old in text
+        (package / name).write_text(text.replace(old, new, 1))
         programs._digest.cache_clear()
         return programs._sources({"rootsopt.response.evaluation"})
 
     first = replaced("status.py", "a", "a")
     assert replaced("view/pages/html.py", "def ", "x = 1\n\n\ndef ") == first
     assert replaced("commands/cli.py", "import", "import time  # or not\nimport") == first
-    for name in ("dynamics/pair.py", "contact/search.py", "profiles/cic.py", "runtime/programs.py"):
-        assert replaced(name, '"""', '"""Comparable to nothing.\n\n') == first
-        assert replaced(name, "\n\n\n", "\n\n\n# It's \"one\n\n\n") == first
     seen = [first]
     for name, old, new in (
         ("dynamics/window.py", "BLOCK = 4", "BLOCK = 8"),  # imported by what is imported
@@ -363,7 +330,7 @@ def test_only_words_for_people_change_nothing(tmp_path, before, after, same):
 
 
 def test_a_program_of_sources_elsewhere_follows_them(folder, monkeypatch, tmp_path):
-    """A changed function or scene part of the user is compiled again."""
+
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     answers = []
@@ -378,13 +345,9 @@ def test_a_program_of_sources_elsewhere_follows_them(folder, monkeypatch, tmp_pa
         monkeypatch.delitem(sys.modules, "own_room", raising=False)
         importlib.invalidate_caches()
         own = importlib.import_module("own_room")
-        answers.append(
-            (
-                float(CachedFunction(own.function)(jnp.ones(()))),
-                float(CachedFunction(grown)(own.Part(2.0), 1.0)),
-            )
-        )
-    assert answers == [(2.0, 3.0), (3.0, 5.0)]
+        answers += [float(CachedFunction(own.function)(jnp.ones(())))]
+        answers += [float(CachedFunction(grown)(own.Part(2.0), 1.0))]
+    assert answers == [2.0, 3.0, 3.0, 5.0]
     assert len(list(folder.iterdir())) == 4
     del own.__file__
     assert float(CachedFunction(own.function)(jnp.ones(2))[0]) == 3.0
@@ -437,8 +400,7 @@ def test_time_spent_compiling_side_by_side_counts_once():
     began = time.perf_counter()
     with CompileClock() as clock:
         program = CachedFunction(scaled)
-        for power in range(2, 8):
-            program.prepare(Factor(jnp.asarray(2.0), power), np.ones(3), "a")
-        for power in range(2, 8):
-            program(Factor(jnp.asarray(2.0), power), np.ones(3), "a")
+        for work in (program.prepare, program):
+            for power in range(2, 8):
+                work(Factor(jnp.asarray(2.0), power), np.ones(3), "a")
     assert 0 < clock.seconds <= time.perf_counter() - began

@@ -5,21 +5,18 @@ import stat
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import pytest
 
 from rootsopt.runtime import store
 from rootsopt.runtime.store import Store, UnsafeFolderError
 
-ROOT = Path(__file__).parents[2]
 DATA = b"program" * 1000
 posix = pytest.mark.skipif(os.name != "posix", reason="owners and permissions of POSIX")
 
 
 @pytest.fixture
 def kept(tmp_path):
-    """Return a store with one entry, and the file that holds it."""
     made = Store(tmp_path / "cache")
     made.write("a", "for a", DATA)
     (file,) = (tmp_path / "cache").iterdir()
@@ -28,10 +25,8 @@ def kept(tmp_path):
 
 def test_what_was_written_is_read(kept, tmp_path):
     made, file = kept
-    assert "a" in made
-    assert "b" not in made
-    assert made.read("a", "for a") == DATA
-    assert Store(tmp_path / "cache").read("a", "for a") == DATA
+    assert ("a" in made, "b" in made) == (True, False)
+    assert made.read("a", "for a") == Store(tmp_path / "cache").read("a", "for a") == DATA
     made.write("a", "for a", b"other")
     assert made.read("a", "for a") == b"other"
     assert [path.name for path in file.parent.iterdir()] == ["a.program"]
@@ -64,14 +59,11 @@ def test_a_damaged_entry_is_none(kept, how):
 
 
 def test_an_exchanged_entry_is_none(kept):
-    """An entry under another name, or made for another purpose, is not returned."""
     made, file = kept
     made.write("b", "for b", DATA)
-    other = file.with_name("b.program")
     assert made.read("b", "for a") is None
-    other.write_bytes(file.read_bytes())
-    assert made.read("b", "for b") is None
-    assert made.read("b", "for a") is None
+    file.with_name("b.program").write_bytes(file.read_bytes())
+    assert made.read("b", "for b") is made.read("b", "for a") is None
 
 
 @posix
@@ -86,12 +78,13 @@ def test_only_plain_files_of_the_users_own_are_read(kept, monkeypatch, tmp_path)
         assert made.read("a", "for a") is None
     file.chmod(0o644)
     assert made.read("a", "for a") == DATA
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "geteuid", lambda: os.getuid() + 1)
-        assert made.read("a", "for a") is None
-    with monkeypatch.context() as patch:
-        patch.setattr(store, "MOST_BYTES", len(whole) - 1)
-        assert made.read("a", "for a") is None
+    for patched in (
+        (os, "geteuid", lambda: os.getuid() + 1),
+        (store, "MOST_BYTES", len(whole) - 1),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr(*patched)
+            assert made.read("a", "for a") is None
     (tmp_path / "elsewhere").write_bytes(whole)
     for put in (lambda: file.symlink_to(tmp_path / "elsewhere"), lambda: os.mkfifo(file),
                 file.mkdir):  # fmt: skip
@@ -105,96 +98,84 @@ def test_only_plain_files_of_the_users_own_are_read(kept, monkeypatch, tmp_path)
 
 
 def refusal(folder):
-    with pytest.raises(UnsafeFolderError) as caught:
+    with pytest.raises(UnsafeFolderError, match="choose") as caught:
         Store(folder)
-    message = str(caught.value)
-    assert "\n" not in message
-    assert "choose" in message
-    return message
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "folder").mkdir()
+    return tmp_path / "folder"
 
 
 @posix
 @pytest.mark.parametrize("mode", [0o770, 0o707, 0o777, 0o1777, 0o720])
-def test_a_folder_others_may_write_to_is_refused(tmp_path, mode):
-    folder = tmp_path / "cache"
-    folder.mkdir()
+def test_a_folder_others_may_write_to_is_refused(folder, mode):
     folder.chmod(mode)
     assert "chmod go-w" in refusal(folder)
-    (tmp_path / "link").symlink_to(folder)
-    assert str(folder) in refusal(tmp_path / "link")
+    folder.with_name("link").symlink_to(folder)
+    assert str(folder) in refusal(folder.with_name("link"))
 
 
 @posix
-def test_a_folder_others_may_exchange_is_refused(tmp_path):
-    """A folder is refused if others can write to a folder above it without a sticky bit."""
-    above = tmp_path / "above"
-    above.mkdir()
-    folder = above / "between" / "cache"
+def test_a_folder_others_may_exchange_is_refused(folder):
+    inner = folder / "between" / "cache"
     for mode in (0o777, 0o775):
-        above.chmod(mode)
-        assert f"{str(above)!r}" in refusal(folder)
-    above.chmod(0o1777)
-    Store(folder).write("a", "for a", DATA)
-    assert (
-        stat.S_IMODE(folder.stat().st_mode) == stat.S_IMODE(folder.parent.stat().st_mode) == 0o700
-    )
-    assert stat.S_IMODE((folder / "a.program").stat().st_mode) == 0o600
+        folder.chmod(mode)
+        assert f"{str(folder)!r}" in refusal(inner)
+    folder.chmod(0o1777)
+    Store(inner).write("a", "for a", DATA)
+    modes = [stat.S_IMODE(x.stat().st_mode) for x in (inner.parent, inner, inner / "a.program")]
+    assert modes == [0o700, 0o700, 0o600]
 
 
 @posix
-def test_a_folder_of_another_user_is_refused(tmp_path, monkeypatch):
-    (tmp_path / "cache").mkdir()
+def test_a_folder_of_another_user_is_refused(folder, monkeypatch):
     monkeypatch.setattr(os, "geteuid", lambda: os.getuid() + 1)
-    assert "belongs to another user" in refusal(tmp_path / "cache")
+    assert "belongs to another user" in refusal(folder)
 
 
 def test_a_folder_that_cannot_be_used_is_an_os_error(tmp_path):
     (tmp_path / "file").write_text("")
-    for path in (tmp_path / "file", tmp_path / "file" / "below"):
-        with pytest.raises(OSError, match=r"directory|exists"):
-            Store(path)
     (tmp_path / "circle").symlink_to(tmp_path / "circle")
-    with pytest.raises(OSError, match="circle"):
-        Store(tmp_path / "circle")
+    for name, said in (
+        ("file", "directory|exists"),
+        ("file/below", "directory"),
+        ("circle", "circle"),
+    ):
+        with pytest.raises(OSError, match=said):
+            Store(tmp_path / name)
 
 
 def test_an_entry_written_by_many_is_whole(tmp_path):
-    made, gate = Store(tmp_path / "cache"), threading.Barrier(6)
+    gate, seen = threading.Barrier(6), set()
 
     def both(k):
         gate.wait()
         own = Store(tmp_path / "cache")
-        seen = set()
         for _ in range(20):
             own.write("a", "for a", bytes([k]) * 10_000)
             seen.add(own.read("a", "for a"))
-        return seen
 
     with ThreadPoolExecutor(6) as pool:
-        seen = set().union(*pool.map(both, range(6)))
-    assert None not in seen
-    assert all(len(data) == 10_000 and len(set(data)) == 1 for data in seen)
-    assert made.read("a", "for a") in seen
+        [*pool.map(both, range(6))]
+    assert seen <= {bytes([k]) * 10_000 for k in range(6)}
+    assert Store(tmp_path / "cache").read("a", "for a") in seen
     assert [path.name for path in (tmp_path / "cache").iterdir()] == ["a.program"]
 
 
-def make_older(folder):
+def test_unfinished_files_of_dead_processes_are_removed(folder):
+    """Unfinished files of the last minutes stay, and so do other files."""
+    for name in (".a.program.0123", ".program", ".a.txt"):
+        (folder / name).write_text("half a program, or the user's")
+    Store(folder)
+    assert len(list(folder.iterdir())) == 3
     for path in folder.iterdir():
         os.utime(path, (time.time() - 1000,) * 2)
-
-
-def test_unfinished_files_of_dead_processes_are_removed(tmp_path):
-    """Unfinished files of the last minutes stay, and so do other files."""
-    cache = tmp_path / "cache"
-    Store(cache)
-    (cache / ".a.program.0123").write_bytes(b"half")
-    (cache / ".program").write_text("the user's")
-    (cache / ".a.txt").write_text("the user's")
-    Store(cache)
-    assert len(list(cache.iterdir())) == 3
-    make_older(cache)
-    Store(cache)
-    assert {path.name for path in cache.iterdir()} == {".program", ".a.txt"}
+    Store(folder)
+    assert {path.name for path in folder.iterdir()} == {".program", ".a.txt"}
 
 
 def test_the_entries_unused_for_longest_give_way(kept, monkeypatch, tmp_path):
@@ -202,22 +183,19 @@ def test_the_entries_unused_for_longest_give_way(kept, monkeypatch, tmp_path):
 
     Other files in the folder, older and larger, are left alone."""
     made, file = kept
-    size = file.stat().st_size
+    size, now = file.stat().st_size, time.time()
     other = file.with_name("of the user")
     other.write_bytes(bytes(10 * size))
     os.utime(other, (0, 0))
-    folder = file.with_name("folder.program")
-    folder.mkdir()
-    now = time.time()
-    for age, name in enumerate("bcd", start=1):
-        made.write(name, "x", DATA)
-        os.utime(file.with_name(f"{name}.program"), (now - 100 * age, now - 100 * age))
-    os.utime(file, (now - 1000, now - 1000))
+    file.with_name("folder.program").mkdir()
+    for age, name in ((100, "b"), (200, "c"), (300, "d"), (1000, "a")):
+        made.write(name, f"for {name}", DATA)
+        os.utime(file.with_name(f"{name}.program"), (now - age, now - age))
     assert made.read("a", "for a") == DATA
     monkeypatch.setattr(store, "MOST_BYTES", 3.5 * size)
     made.write("e", "x", DATA)
-    names = {path.name for path in file.parent.iterdir()}
-    assert names == {"a.program", "b.program", "e.program", other.name, folder.name}
+    names = {path.name.removesuffix(".program") for path in file.parent.iterdir()}
+    assert names == {"a", "b", "e", "of the user", "folder"}
 
 
 def test_entries_may_disappear_while_others_are_counted(kept, monkeypatch):
@@ -225,8 +203,7 @@ def test_entries_may_disappear_while_others_are_counted(kept, monkeypatch):
     listed = os.listdir
     monkeypatch.setattr(os, "listdir", lambda path: [*listed(path), "gone.program", ".x.program.y"])
     made.write("b", "for b", DATA)
-    assert made.read("a", "for a") == DATA
-    assert made.read("b", "for b") == DATA
+    assert made.read("a", "for a") == made.read("b", "for b") == DATA
 
 
 def test_a_system_without_owners(tmp_path, monkeypatch):
