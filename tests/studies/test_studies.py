@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from experiments.__main__ import studies
+from experiments import __main__ as command
 
 ROOT = Path(__file__).parents[2]
 EXPERIMENTS = ROOT / "experiments"
-KNOWN = studies()
+KNOWN = command.studies()
 STUDIES = sorted(path.name for path in EXPERIMENTS.glob("[!_.]*") if path.is_dir())
 LONGEST = 400
 """Number of lines of study.py and its further modules up to which they are one file."""
