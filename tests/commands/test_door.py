@@ -193,16 +193,17 @@ def test_an_interrupt_during_imports(tmp_path, command, module):
 def test_called_from_python_nothing_global_changes(tmp_path, capsys, monkeypatch):
     """Signals, streams and file descriptors are unchanged."""
     monkeypatch.chdir(ROOT)
+    before = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
+    streams, threads = (sys.stdout, sys.stderr), threading.active_count()
+    assert main(["profile", "missing.yaml"]) == 2
+    assert main(["nonsense"]) == 2
+    assert before == [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
+    assert (sys.stdout, sys.stderr) == streams
+    assert threading.active_count() == threads
     monkeypatch.setattr(sys, "argv", ["rootsopt", "--version"])
-
-    def seen():
-        numbers = signal.SIGINT, signal.SIGTERM
-        return [*map(signal.getsignal, numbers), sys.stdout, sys.stderr, threading.active_count()]
-
-    before = seen()
-    for arguments, code in (["profile", "missing.yaml"], 2), (["nonsense"], 2), (None, 0):
-        assert main(arguments) == code
-        assert seen() == before
+    assert main() == 0
+    assert before == [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
+    assert (sys.stdout, sys.stderr) == streams
 
 
 def loaded(code, names):

@@ -18,6 +18,7 @@ PROFILES = {
     "paper": CIC(3, R, 36.43 * DEG, 9e-3, 4 * DEG),
     "short": CIC(3, R, 27.3 * DEG, 0.8e-3, 1.3 * DEG),
     "five lobes": CIC(5, R, 36 * DEG, 3e-3, 1 * DEG),
+    "two lobes, no land": CIC(2, R, 0.75, 8e-3, 0.0),
     "epicycloid": EE(3, R),
 }
 

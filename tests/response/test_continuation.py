@@ -238,7 +238,7 @@ def test_period_doubling_is_found(branch, below, monkeypatch):
     none = mock.Mock(side_effect=StoppedError(End.STEP_TOO_SMALL))
     monkeypatch.setattr(OrbitFamily, "from_integration", none)
     assert follow_doubled(found, doubling, points=6) is None
-    first, second = (call.args[1] for call in none.call_args_list)
+    first, second, *_ = (call.args[1] for call in none.call_args_list)
     assert np.linalg.norm(second) == pytest.approx(1)
     np.testing.assert_array_equal(second, -first)
     with pytest.raises(ValueError, match="period doubling"):
