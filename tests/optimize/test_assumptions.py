@@ -193,8 +193,11 @@ def test_a_baseline_that_hardly_strikes_is_no_unit(own, unit):
     config = load("cic_drawn")
     nominal, base, one = map(evaluation_of, (100.0, own, own + 4.0))
     space = Space.of(config, Scene.from_config(config))
-    problem = Problem(config, nominal, space).beside(base)
+    whole = Problem(config, nominal, space)
+    problem = whole.beside(base)
     assert [*map(problem.objective, (base, one))] == pytest.approx([1, 1 + 4 / unit])
+    # Constraints are evaluated once for all scenes.
+    assert problem.limits_at(np.full(3, 0.5))[0] is whole.limits_at(np.full(3, 0.5))[0]
 
 
 def test_scenes_are_named_and_seeded():
