@@ -118,9 +118,10 @@ class Problem:
         w. F_0 is the baseline's value there, F_n that of `self.baseline`. If F_0 is small or 0, a
         ratio to F_0 alone would mean nothing. Designs and constraints of the geometry are the
         same."""
-        found = Problem(self.config, _in_units(baseline, self.baseline), self.space, self.limits)
+        alone = Problem(self.config, _in_units(baseline, self.baseline), self.space, self.limits)
+        found = dataclasses.replace(alone, added=1 - alone.objective(baseline))
         found.__dict__["_look_at"] = self._look_at  # Expensive, independent of `baseline`.
-        return dataclasses.replace(found, added=1 - found.objective(baseline))
+        return found
 
     def objective(self, evaluation: Evaluation) -> float:
         """Return the objective of an `evaluation`, which is 1 for the baseline.
