@@ -14,8 +14,8 @@ from unittest import mock
 ROOT = Path(__file__).parents[1]
 MOST = {
     "statements of the package": 27_133,
-    "statements of the tests": 16_499,
-    "statements of the experiments": 4_489,
+    "statements of the tests": 14_545,
+    "statements of the experiments": 4_500,
     "packages": 13,
     "files of the package": 199,
     "lines of the longest file": 450,

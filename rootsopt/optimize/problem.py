@@ -173,12 +173,11 @@ class Problem:
         """Return the gradient (d,) of the objective with respect to the `point` (d,).
 
         `evaluation`: evaluation of the design at this point, with gradients."""
-        _, jacobian, _, _ = self.look(point)
         by_design = np.zeros(len(self.space.lower))
         for share, one, baseline in self._counted(evaluation):
             for key, weight in self._weights(baseline).items():
                 by_design += share * weight * np.array(list(one.gradient[key].values()))
-        return np.asarray(by_design @ np.asarray(jacobian))
+        return by_design @ self.look(point)[1]
 
     def local(self, evaluation: Evaluation, point) -> Linearization | None:
         """Return the objective and the constraints at a `point`, with gradients.
