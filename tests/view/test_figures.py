@@ -145,7 +145,7 @@ def test_gap_panel_shows_the_least_gap():
     )
 
 
-def test_simulation_figures_without_amade_up(tmp_path):
+def test_simulation_figures_without_a_series(tmp_path):
     runs.simulation_figures(ResultFolder(tmp_path), failed(), CIC)
     assert sorted(os.listdir(tmp_path / "figures")) == ["meshing.png", "profiles.png"]
     assert "pyplot" not in vars(runs)
