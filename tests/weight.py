@@ -14,7 +14,7 @@ from unittest import mock
 ROOT = Path(__file__).parents[1]
 MOST = {
     "statements of the package": 27_133,
-    "statements of the tests": 14_545,
+    "statements of the tests": 14_549,
     "statements of the experiments": 4_500,
     "packages": 13,
     "files of the package": 199,

@@ -12,8 +12,9 @@ from rootsopt.errors import InputError
 from rootsopt.optimize.design import search_of
 from rootsopt.optimize.local import Group, Linearization, certify
 from rootsopt.optimize.problem import Problem
-from rootsopt.optimize.robust import Scattered, compare
+from rootsopt.optimize.robust import Scattered, compare, without
 from rootsopt.optimize.robust_problem import RobustProblem
+from rootsopt.optimize.search import Search
 from rootsopt.optimize.sqp import Stops, descend
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.reducers import over_scenes
@@ -251,6 +252,12 @@ def test_a_parameter_that_the_family_of_the_search_lacks_cannot_scatter():
     config = config_of().replaced(found | {"tolerances.over": {key: {"normal": 1e-3}}})
     with pytest.raises(InputError, match=rf"must not name `{key}`"):
         search_of(config)
+
+
+def test_without_tolerances_the_search_is_the_plain_one():
+    config = without(config_of("assumptions.scenes=0"))
+    assert type(search_of(config)) is Search
+    assert "tolerances" not in config.to_yaml()
 
 
 def test_optimize_command(tmp_path, capsys, monkeypatch):

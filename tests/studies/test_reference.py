@@ -21,7 +21,7 @@ def _every():
         yield pytest.param(case, id=case.name, marks=marks)
 
 
-@pytest.mark.parametrize("case", _every())
+@pytest.mark.parametrize("case", [*_every()])
 def test_results_are_as_kept(case, results):
     if case.name not in results:
         pytest.skip("nothing is kept of it: python -m tests.reference --missing")
