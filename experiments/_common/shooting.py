@@ -36,25 +36,17 @@ _CUTS = 40
 
 
 class Shot(NamedTuple):
-    """An orbit: scaled `state` (n,) at φ1 = 0; mean, peak and RMS force (N); distance between start
-    and end (scaled); `monodromy` (n, n)."""
+    """An orbit: scaled `state` at φ1 = 0; mean, peak and RMS force (N); distance between start and
+    end (scaled); greatest modulus of the Floquet multipliers."""
 
     state: NDArray[np.float64]
     forces: NDArray[np.float64]
     miss: float
-    monodromy: NDArray[np.float64]
-
-    @property
-    def multiplier(self) -> float:
-        """Greatest modulus of the Floquet multipliers."""
-        return float(np.max(np.abs(np.linalg.eigvals(self.monodromy))))
+    multiplier: float
 
 
-def closed(pair: RotorPair, state: Any, period: int, near: Shot | None = None) -> Shot:
-    """Close the orbit of `period` mesh periods near the scaled `state` (n,).
-
-    `near`: orbit of an almost equal pair, whose monodromy matrix serves as long as Newton's steps
-    converge with it. The matrix takes most of the time."""
+def closed(pair: RotorPair, state: Any, period: int) -> Shot:
+    """Close the orbit of `period` mesh periods near the scaled `state` (n,)."""
     state = np.asarray(state, float)
 
     def fly(start: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -63,7 +55,7 @@ def closed(pair: RotorPair, state: Any, period: int, near: Shot | None = None) -
 
     unit = np.eye(len(state))
     end, forces = fly(state)
-    monodromy, before = (unit, 0.0) if near is None else (near.monodromy, np.inf)
+    monodromy, before = unit, 0.0
     for _ in range(_NEWTON):
         miss = np.max(np.abs(end - state))
         if miss > _SLOW * before:
@@ -74,7 +66,8 @@ def closed(pair: RotorPair, state: Any, period: int, near: Shot | None = None) -
             break
         state, before = state + np.linalg.solve(unit - monodromy, end - state), miss
         end, forces = fly(state)
-    return Shot(state, forces, float(np.max(np.abs(end - state))), monodromy)
+    multiplier = np.max(np.abs(np.linalg.eigvals(monodromy)))
+    return Shot(state, forces, float(np.max(np.abs(end - state))), float(multiplier))
 
 
 def differentiated(

@@ -128,11 +128,10 @@ def differences(evaluator: Evaluator, found: Evaluation) -> tuple[np.ndarray, np
     Both are NaN where an orbit does not close."""
     design = np.array(list(found.design.values()))
     period = int(found.steady_state["period"])
-    here = closed(evaluator.pair(design), found.state, period)
 
     def at(change: float) -> np.ndarray:
         moved = design * (1 + change * WAY[: len(design)])
-        shot = closed(evaluator.pair(moved), here.state, period, here)
+        shot = closed(evaluator.pair(moved), found.state, period)
         return shot.forces if shot.miss < 1e-9 else np.full(len(MEASURES), np.nan)
 
     return differentiated(at, STEP, LEVELS)

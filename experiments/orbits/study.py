@@ -182,8 +182,7 @@ def compared(config: Config, solve: Callable[..., Any] | None = None) -> Row:
     truth = closed(here, here.scaled(found.state), row["period"])
 
     def forces(change: float) -> np.ndarray:
-        moved = _pair(scene, design, jnp.asarray(change))
-        return closed(moved, truth.state, row["period"], truth).forces
+        return closed(_pair(scene, design, jnp.asarray(change)), truth.state, row["period"]).forces
 
     reference, noise = differentiated(forces, STEP)
     mine = np.array([found.mean, found.peak, found.rms])
