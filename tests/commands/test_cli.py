@@ -145,7 +145,7 @@ def test_console_command(capsys):
     A file after `-h` is not a group of keys."""
     assert console.main(["optimise"]) == 2
     assert "optimize" in capsys.readouterr().err
-    with pytest.raises(SystemExit, match="^0$"):
+    with pytest.raises(SystemExit, match=r"^0$"):
         console.main(["simulate", "-h", CIC])
     assert "backlash_mm" in capsys.readouterr().out
 
@@ -155,7 +155,7 @@ def test_help_is_short_and_its_groups_have_every_key(command, capsys, monkeypatc
     monkeypatch.setenv("COLUMNS", "100")
 
     def printed(*group):
-        with pytest.raises(SystemExit, match="^0$"):
+        with pytest.raises(SystemExit, match=r"^0$"):
             COMMANDS[command].main(["--help", *group])
         return capsys.readouterr().out
 

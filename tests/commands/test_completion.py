@@ -41,7 +41,7 @@ def test_commands_options_and_keys_are_completed(bash, words, first):
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_option_of_the_help_is_in_the_script(command, bash, capsys):
     """The script has a command's own options, not only those that all commands share."""
-    with pytest.raises(SystemExit, match="^0$"):
+    with pytest.raises(SystemExit, match=r"^0$"):
         main([command, "--help"])
     told = re.findall(r"^  (?:-\w[^,]*, )?(--[\w-]+)", capsys.readouterr().out, re.M)
     wanted = set(told) - {"--help"}

@@ -240,7 +240,7 @@ def test_an_empty_output_is_refused(tmp_path, capsys, monkeypatch):
 
 def test_wrong_arguments_take_one_line(capsys):
     for arguments in ([], [CIC, "--nonsense"], [CIC, "-o"], [CIC, "two"]):
-        with pytest.raises(SystemExit, match="^2$"):
+        with pytest.raises(SystemExit, match=r"^2$"):
             main(["profile", *arguments])
         assert capsys.readouterr().err.count("\n") == 1
 

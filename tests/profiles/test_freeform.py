@@ -159,7 +159,7 @@ def test_profile_command_projects(tmp_path, capsys):
     profile, distance = free_form_of(parse(SCENE).profile, 16)
     assert (found.profile, found.scene) == (profile, parse(SCENE).scene)
     assert distance < 4e-6
-    with pytest.raises(SystemExit, match="^2$"):
+    with pytest.raises(SystemExit, match=r"^2$"):
         command.main([*arguments, "--project", "2"])
     assert "--project" in capsys.readouterr().err
 
