@@ -1,6 +1,6 @@
 """Closes an orbit by shooting, to check the package, which closes orbits by collocation.
 
-The two share the equation of motion alone. diffrax integrates it at a tolerance of 1e-12 without
+The two share the equation of motion alone. diffrax integrates it at a tolerance of 1e-14 without
 knowing its events; the monodromy matrix and all derivatives are differences. It takes a hundred
 times as long."""
 
@@ -16,14 +16,19 @@ from numpy.typing import NDArray
 
 from rootsopt.dynamics.pair import RotorPair
 
-# Tolerance and longest step (mesh periods) of the integration.
-_TOLERANCE, _LONGEST = 1e-12, 1 / 256
+# Tolerance and longest step (mesh periods) of the integration. The states' rounding is not far
+# below, and is wanted: at 1e-12, corners of the force inside steps left errors of 1e-10, of which
+# differences show a hundred times as much.
+_TOLERANCE, _LONGEST = 1e-14, 1 / 256
 
 # Maximum number of steps of an integration.
 _STEPS = 2**16
 
 # Distance between start and end (scaled) of a closed orbit, and maximum number of Newton steps.
 _CLOSED, _NEWTON = 1e-11, 8
+
+# Distance above which an orbit does not count as closed in differences of forces.
+_NEAR = 1e-9
 
 # Change of a state (scaled) for the central differences that give the monodromy matrix, and
 # factor on the distance between start and end in one Newton step above which it is computed
@@ -37,16 +42,24 @@ _CUTS = 40
 
 class Shot(NamedTuple):
     """An orbit: scaled `state` at φ1 = 0; mean, peak and RMS force (N); distance between start and
-    end (scaled); greatest modulus of the Floquet multipliers."""
+    end (scaled); monodromy matrix (n, n) near the state."""
 
     state: NDArray[np.float64]
     forces: NDArray[np.float64]
     miss: float
-    multiplier: float
+    monodromy: NDArray[np.float64]
+
+    @property
+    def multiplier(self) -> float:
+        """Greatest modulus of the Floquet multipliers."""
+        return float(np.max(np.abs(np.linalg.eigvals(self.monodromy))))
 
 
-def closed(pair: RotorPair, state: Any, period: int) -> Shot:
-    """Close the orbit of `period` mesh periods near the scaled `state` (n,)."""
+def closed(pair: RotorPair, state: Any, period: int, monodromy: Any = None) -> Shot:
+    """Close the orbit of `period` mesh periods near the scaled `state` (n,).
+
+    `monodromy`: that of an orbit nearby, which saves computing it while Newton steps with it
+    converge."""
     state = np.asarray(state, float)
 
     def fly(start: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -55,19 +68,47 @@ def closed(pair: RotorPair, state: Any, period: int) -> Shot:
 
     unit = np.eye(len(state))
     end, forces = fly(state)
-    monodromy, before = unit, 0.0
+    before, fresh = np.inf, False
     for _ in range(_NEWTON):
         miss = np.max(np.abs(end - state))
-        if miss > _SLOW * before:
+        slow = miss > max(_SLOW * before, _CLOSED)
+        # Integrations are that exact: the corners of the force do not lie at ends of steps.
+        if slow and fresh and miss < _NEAR:
+            break
+        fresh = monodromy is None or slow
+        if fresh:
             sides = [[fly(state + sign * _AWAY * way)[0] for sign in (1, -1)] for way in unit]
             ahead, behind = np.moveaxis(np.array(sides), 1, 0)
             monodromy = (ahead - behind).T / (2 * _AWAY)
-        if miss < _CLOSED:
-            break
         state, before = state + np.linalg.solve(unit - monodromy, end - state), miss
         end, forces = fly(state)
-    multiplier = np.max(np.abs(np.linalg.eigvals(monodromy)))
-    return Shot(state, forces, float(np.max(np.abs(end - state))), float(multiplier))
+        # One step follows the first orbit that closes: else the differences between orbits would
+        # show how far each of them stopped from its end.
+        if miss < _CLOSED:
+            break
+    return Shot(state, forces, float(np.max(np.abs(end - state))), np.asarray(monodromy))
+
+
+def forces_near(
+    pair_of: Callable[[float], RotorPair], orbit: Shot, period: int
+) -> Callable[[float], NDArray[np.float64]]:
+    """Return the function change → forces (3,) in N of the orbit of `pair_of` that change.
+
+    `orbit`: that without change. Forces are NaN where no orbit closes. The function predicts each
+    orbit from the one before, so it is cheap where changes become smaller, as in
+    `differentiated`."""
+    slope = np.zeros_like(orbit.state)
+
+    def forces(change: float) -> NDArray[np.float64]:
+        nonlocal slope
+        start = orbit.state + change * slope
+        found = closed(pair_of(change), start, period, orbit.monodromy)
+        if not found.miss < _NEAR:
+            return np.full_like(found.forces, np.nan)
+        slope = (found.state - orbit.state) / change
+        return found.forces
+
+    return forces
 
 
 def differentiated(

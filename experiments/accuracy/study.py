@@ -36,7 +36,7 @@ REQUESTS = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7)
 SHARP, CHECKED = "solver.rtol=1e-12", 1e-7
 
 # Number of scenes of a full and of a reduced run, and number of timed evaluations.
-COUNT, QUICK_COUNT, REPEATS = 60, 1, 5
+COUNT, QUICK_COUNT, REPEATS = 60, 1, 3
 
 
 def scenes(seed: int) -> Iterator[tuple[str, list[str]]]:

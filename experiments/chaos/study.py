@@ -43,6 +43,7 @@ SCENE = (
 FULL = (
     "ensemble.members=16",
     "ensemble.settle_periods=32",
+    "ensemble.designs=16",
     "ensemble.spread=0.1",
     "optimizer.screening=8",
     "optimizer.starts=1",
@@ -67,8 +68,8 @@ QUICK = (
 # first more members, then more designs.
 SIZES = {
     False: SimpleNamespace(
-        line=25, members=32, window=128, pathwise=96, large=512, groups=(4, 8, 16, 32, 64),
-        slopes=((16, 4), (16, 8), (16, 16), (16, 32), (32, 4), (64, 4), (128, 4))),
+        line=17, members=32, window=128, pathwise=96, large=512, groups=(4, 8, 16, 32, 64),
+        slopes=((16, 4), (16, 8), (16, 16), (32, 4), (64, 4), (128, 4))),
     True: SimpleNamespace(
         line=3, members=4, window=8, pathwise=8, large=16, groups=(4, 8), slopes=((8, 4),)),
 }  # fmt: skip

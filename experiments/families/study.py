@@ -59,7 +59,7 @@ SCENES: dict[str, dict[str, Any]] = {
     "6000 rpm": {"speed_rpm": 6000.0},
     "20 N m": {"load": {"torque_N_m": 20.0}},
 }
-SEARCH = {"screening": 24, "starts": 4, "iterations": 40}
+SEARCH = {"screening": 12, "starts": 2, "iterations": 40}
 SEARCH_FREE = {"screening": 0, "starts": 1, "iterations": 100}
 
 # Families of a reduced run.

@@ -36,7 +36,7 @@ COEFFICIENTS = (3, 8, 24)
 QUICK = ("cic", "ee", "arc"), (2, 3)
 
 # Number of designs drawn per family and number of lobes: in a full and in a reduced run.
-DRAWS, QUICK_DRAWS = 2000, 50
+DRAWS, QUICK_DRAWS = 1000, 50
 _LEVELS = 4
 
 # Number of sides of the finest polygon: per interval of a curve, per knot span of a free form,

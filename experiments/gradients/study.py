@@ -5,7 +5,7 @@ A *pair* here is a random design (CIC with two and three lobes, arc, involute) i
 pairs that settle on a periodic orbit, most of them with periods above one and some above four. It
 evaluates each pair at rtol 1e-8, 1e-9 and 1e-10. The derivatives of mean, peak and RMS force along
 one direction of the design are compared with central differences of the forces of orbits closed
-with another method (dopri8) at 1e-12.
+with another method (dopri8) at 1e-14.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -17,11 +17,12 @@ from matplotlib.figure import Figure
 
 from experiments._common.driver import Run
 from experiments._common.scenes import CIC, FORCES, MEASURES
-from experiments._common.shooting import closed, differentiated
+from experiments._common.shooting import closed, differentiated, forces_near
 from experiments._common.simulation import evaluator_of
 from experiments._common.style import COLORS, sheet
 from experiments._common.tables import Row, show
 from rootsopt.config import load
+from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import agreement
 from rootsopt.response.evaluation import Evaluation, Evaluator
 
@@ -129,12 +130,11 @@ def differences(evaluator: Evaluator, found: Evaluation) -> tuple[np.ndarray, np
     design = np.array(list(found.design.values()))
     period = int(found.steady_state["period"])
 
-    def at(change: float) -> np.ndarray:
-        moved = design * (1 + change * WAY[: len(design)])
-        shot = closed(evaluator.pair(moved), found.state, period)
-        return shot.forces if shot.miss < 1e-9 else np.full(len(MEASURES), np.nan)
+    def pair(change: float) -> RotorPair:
+        return evaluator.pair(design * (1 + change * WAY[: len(design)]))
 
-    return differentiated(at, STEP, LEVELS)
+    orbit = closed(pair(0.0), found.state, period)
+    return differentiated(forces_near(pair, orbit, period), STEP, LEVELS)
 
 
 def evaluated(evaluator: Evaluator) -> Iterator[tuple[float, Evaluation]]:

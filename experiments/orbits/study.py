@@ -24,11 +24,12 @@ import numpy as np
 
 from experiments._common.driver import Run
 from experiments._common.scenes import CIC
-from experiments._common.shooting import closed, differentiated
+from experiments._common.shooting import closed, differentiated, forces_near
 from experiments._common.tables import Row, show
 from rootsopt import steady_response
 from rootsopt.config import Config, load
 from rootsopt.config.rotor import ProfileConfig
+from rootsopt.dynamics.pair import RotorPair
 from rootsopt.errors import InputError
 from rootsopt.scene import Scene, check_geometry, design_vector
 from rootsopt.scene.families import free_form_of
@@ -181,10 +182,10 @@ def compared(config: Config, solve: Callable[..., Any] | None = None) -> Row:
     here = _pair(scene, design, jnp.zeros(()))
     truth = closed(here, here.scaled(found.state), row["period"])
 
-    def forces(change: float) -> np.ndarray:
-        return closed(_pair(scene, design, jnp.asarray(change)), truth.state, row["period"]).forces
+    def pair(change: float) -> RotorPair:
+        return _pair(scene, design, jnp.asarray(change))
 
-    reference, noise = differentiated(forces, STEP)
+    reference, noise = differentiated(forces_near(pair, truth, row["period"]), STEP)
     mine = np.array([found.mean, found.peak, found.rms])
     for k, name in enumerate(FORCES):
         row[f"{name}_difference"] = abs(mine[k] / truth.forces[k] - 1)
