@@ -10,5 +10,4 @@ STUDY = Study(
     quick="one scene",
     published={"accuracy.png": "accuracy.png"},
     cache=False,
-    alone=True,
 )

@@ -22,5 +22,4 @@ STUDY = Study(
     },
     further=(("--speed",),),
     cache=False,
-    alone=True,
 )
