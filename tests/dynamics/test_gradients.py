@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments._common.shooting import closed, differentiated
+from experiments._common.shooting import closed, differentiated, forces_near
 from rootsopt.config import DESIGN_KEYS, load
 from rootsopt.contact.closest import FlankPair
 from rootsopt.profiles.epicycloid import EE
@@ -89,13 +89,14 @@ def test_ee(scene, lobes):
     # Rounding beside the cusp hides the error at the finest tolerance, but the orbit is closed.
     assert evaluator.at_tolerance(1e-12)(series=False).status is Status.PERIODIC
     gradient, columns = by_scene(evaluator, here).gradient, []
+    orbit = closed(evaluator.pair([]), here.state, 1)
     for key in OF_SCENE:
 
-        def shot(change, key=key):
+        def pair(change, key=key):
             moved = config.replaced({key: attrgetter(key)(config) * (1 + change)})
-            return closed(Evaluator.of(moved).pair([]), here.state, 1).forces
+            return Evaluator.of(moved).pair([])
 
-        columns.append(differentiated(shot, STEP)[0])
+        columns.append(differentiated(forces_near(pair, orbit, 1), STEP)[0])
     assert here.steady_state["period"] == 1
     for name, truth in zip(FORCES, np.stack(columns, axis=1), strict=True):
         slope = [gradient[name][key] * attrgetter(key)(config) for key in OF_SCENE]
@@ -195,11 +196,11 @@ def test_a_short_touch_is_an_event():
     design, way = np.array(list(near.design.values())), np.array([1.0, -0.7, 0.8])
     assert near.steady_state["period"] == 6
 
-    def forces(change):
-        pair = Evaluator.of(config).pair(design * (1 + change * way))
-        return closed(pair, near.state, 6).forces
+    def pair(change):
+        return Evaluator.of(config).pair(design * (1 + change * way))
 
-    truth, noise = differentiated(forces, 1e-3, 6)
+    orbit = closed(pair(0.0), near.state, 6)
+    truth, noise = differentiated(forces_near(pair, orbit, 6), 1e-3, 6)
     terms = slopes_of(near) * design * way
     off = np.maximum(np.abs(np.sum(terms, axis=1) - truth) - noise, 0.0)
     assert np.max(off / np.max(np.abs(terms), axis=1)) < 1e-5
