@@ -14,8 +14,8 @@ from unittest import mock
 ROOT = Path(__file__).parents[1]
 MOST = {
     "statements of the package": 27_133,
-    "statements of the tests": 14_549,
-    "statements of the experiments": 4_496,
+    "statements of the tests": 14_552,
+    "statements of the experiments": 4_499,
     "packages": 13,
     "files of the package": 199,
     "lines of the longest file": 450,

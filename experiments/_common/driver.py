@@ -36,8 +36,8 @@ class Study:
     result folder and its name in `docs/`; `options`: for each option of its own, the settings that
     `argparse` takes; `further`: options of further runs that `--all` makes; `cache`: whether
     compiled programs are kept between processes; `alone`: whether no other study may run beside
-    it, because it measures times by the clock or uses all cores. If `precision` is False, JAX is not started:
-    the study does that in its own processes.
+    it, because it measures times by the clock or uses all cores. If `precision` is False, JAX is
+    not started: the study does that in its own processes.
     """
 
     quick: str

@@ -101,12 +101,10 @@ def forces_near(
 
     def forces(change: float) -> NDArray[np.float64]:
         nonlocal slope
-        start = orbit.state + change * slope
-        found = closed(pair_of(change), start, period, orbit.monodromy)
-        if not found.miss < _NEAR:
-            return np.full_like(found.forces, np.nan)
-        slope = (found.state - orbit.state) / change
-        return found.forces
+        found = closed(pair_of(change), orbit.state + change * slope, period, orbit.monodromy)
+        near = found.miss < _NEAR
+        slope = (found.state - orbit.state) / change if near else slope
+        return found.forces if near else np.full_like(found.forces, np.nan)
 
     return forces
 

@@ -3,8 +3,8 @@
 Writes orbits.csv (updated after each pair). The exit code is 3 if the forces of an orbit
 differ by more than 1e-4.
 
-With `--speed`, times value and gradient from a neighbour's orbit instead, against the other ways,
-SciPy and Numba, on one core. Writes speed.csv.
+With `--speed`, times value and gradient from a neighbour's orbit and from rest instead, on one
+core. Writes speed.csv.
 
 With `--batches`, times value and gradient of batches of designs, on the device that JAX_PLATFORMS
 names ("cuda,cpu" for a GPU) or on the CPU. Writes batches.csv.

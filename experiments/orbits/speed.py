@@ -1,8 +1,8 @@
-"""Times value and gradient from a neighbour's orbit against other methods for the same numbers.
+"""Times value and gradient from a neighbour's orbit against those from rest.
 
-All tools run in one process, in turns, on one core. Times are processor times, which other
-processes on the machine hardly change. The neighbour is a design whose parameters differ by a small
-fraction."""
+All ways run in one process, in turns, on one core. Times are processor times, which other processes
+on the machine hardly change. The neighbour is a design whose parameters differ by a small fraction.
+The study `benchmark` compares with other tools."""
 
 import functools
 from collections.abc import Callable, Iterator
@@ -12,15 +12,12 @@ import numpy as np
 
 from experiments._common.batch import compiled, rest_of, solver_of
 from experiments._common.driver import NoResultError
-from experiments._common.engines import Scene as PlainScene
-from experiments._common.engines import best_steps, central_differences
-from experiments._common.engines.scipy_nodes import NODES_1E3, ScipyNodes
 from experiments._common.scenes import CIC
 from experiments._common.simulation import errors_of, numbers_of
 from experiments._common.tables import Row
 from experiments._common.timing import processor_time
 from rootsopt import Scene
-from rootsopt.config import Config, load
+from rootsopt.config import load
 from rootsopt.response.evaluation import Evaluator
 
 # Relative difference between the parameters of a design and those of its neighbour.
@@ -59,24 +56,3 @@ def rows_of(repeats: int, say: Callable[[str], None]) -> Iterator[Row]:
         call = functools.partial(own, design, start=start, series=False)
         seconds, found = processor_time(call, repeats)
         yield _row(f"evaluate, {tool}", seconds, numbers_of(found), truth)
-    yield from _competitors(config, design, truth, repeats, say)
-
-
-def _competitors(
-    config: Config, design: Any, truth: Any, repeats: int, say: Callable[[str], None]
-) -> Iterator[Row]:
-    """Measure SciPy and Numba with central differences."""
-    from experiments._common.engines import numba_pair as numba
-
-    scene = PlainScene.of(config)
-    tools = {
-        "SciPy, differences": ScipyNodes(scene, **NODES_1E3),
-        "Numba, differences": numba.NumbaPair(scene, **numba.SEARCH_1E3),
-        "Numba, gradient to 1e-3": numba.NumbaPair(scene, **numba.SEARCH_GRADIENT_1E3),
-    }
-    for name, tool in tools.items():
-        say(name)
-        steps, _ = best_steps(tool.forces, design, truth[1])
-        call = functools.partial(central_differences, tool.forces, design, steps)
-        count = max(1, repeats // 10) if "SciPy" in name else repeats
-        yield _row(name, *processor_time(call, count), truth)
