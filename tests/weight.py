@@ -13,8 +13,8 @@ from unittest import mock
 
 ROOT = Path(__file__).parents[1]
 MOST = {
-    "statements of the package": 27_133,
-    "statements of the tests": 14_552,
+    "statements of the package": 27_135,
+    "statements of the tests": 14_560,
     "statements of the experiments": 4_499,
     "packages": 13,
     "files of the package": 199,
@@ -24,7 +24,7 @@ MOST = {
     "config keys": 134,
     "lines of the longest help": 59,
     "pages of docs": 45,
-    "words of docs": 31_491,
+    "words of docs": 31_452,
 }
 """Greatest values that are accepted. Lower them when the project becomes lighter. Whoever raises
 one gives the reason in the changelog: what users can do now that is worth the weight."""

@@ -358,6 +358,18 @@ def test_the_check_bounds_the_error(scene, design):
         assert np.max(error) < {1e-8: 2e-7, 1e-10: 1e-7}[rtol]
 
 
+@pytest.mark.parametrize("speed", [450, 600])
+def test_many_bounces_in_a_mesh_period(speed):
+    """Some forty: with 160 elements, the error at 450 rpm was too large, and with 1.5 elements per
+    event, Newton's method failed at 600 rpm."""
+    scene = ["scene.timing_gear.damping_ratio=0.1", f"scene.speed_rpm={speed}"]
+    evaluator = Evaluator.of(load("configs/cic_drawn.yaml", scene)).surveying()
+    found = evaluator(series=False)
+    assert found.status is Status.PERIODIC
+    shot = closed(evaluator.pair([*found.design.values()]), found.state, 1)
+    assert [*found.response.values()][:3] == pytest.approx(shot.forces, rel=1e-6)
+
+
 def test_what_is_not_certain_has_no_derivatives():
     rtol, scales = jnp.asarray(1e-8), tuple(map(jnp.asarray, (1.5, 0.033, 100.0)))
     for share, certain in ((0.9, True), (1.1, False), (np.nan, False)):

@@ -60,8 +60,10 @@ from rootsopt.dynamics.orbit import Orbit, branch, choose
 from rootsopt.dynamics.pair import RotorPair
 
 # Size of the first mesh that is aligned with events: elements for each element of the mesh before
-# (more at a finer than the usual accuracy), and further elements per event.
-_SHARE, _EVENT = 0.5, 1
+# (more at a finer than the usual accuracy), and further elements per event; at least the third
+# number per event. With half of that, Newton's method failed where rotors bounce 40 times in a mesh
+# period; the other two numbers keep the mesh of a few events small.
+_SHARE, _EVENT, _BOUNCE = 0.5, 1, 3
 USUAL = 1e-7
 """Relative error of the forces (usual accuracy) for which `_SHARE` and `CORRECTED` hold."""
 # Order of the forces' error in the length of the elements.
@@ -325,6 +327,7 @@ class Closer(eqx.Module):
         events = branch(same, lambda: known_events(self.frozen_at(now), mesh), lambda: events)
         taken = mesh.used
         first = jnp.round(_SHARE * self.denser * taken).astype(int) + _EVENT * events.count
+        first = jnp.maximum(first, _BOUNCE * events.count)
         used = jnp.where(now.fits, jnp.where(finer, (_FINER * taken).astype(int), taken), first)
         most = self.most(now)
         used = jnp.maximum(snug(jnp.minimum(used, most)), events.count + 2)

@@ -27,8 +27,9 @@ _FLOOR = 0.15
 # period, four arcs up to 35. Other families have fewer, and more room would slow them down: with
 # room for 64 events in each of eight mesh periods, sorting events takes half of the time from rest.
 # Shorter orbits can use the room of longer ones, up to the third number per mesh period at the
-# usual accuracy.
-_MOST, _FINEST = (96, 48), 160
+# usual accuracy, or the fourth per event: at low speed, rotors bounce up to 50 times in a mesh
+# period, and four elements from one bounce to the next left errors of 1e-6.
+_MOST, _FINEST, _EACH = (96, 48), 160, 8
 # Number of events above which the search for the orbit fails, counted like elements.
 _TIMES = 64, 24
 # Greatest share of the elements that is left out to save the evaluation of a further block.
@@ -74,7 +75,8 @@ def most_elements(mesh: Mesh, denser: Float[Array, ""], slices: int) -> Int[Arra
     that needs more elements has an event that the equation does not know, and each further element
     costs time."""
     growth = 1 + _SLICES * (slices - 1)
-    wanted = jnp.round(growth * _FINEST * denser * mesh.period).astype(int)
+    least = jnp.maximum(growth * _FINEST * mesh.period, _EACH * jnp.sum(mesh.which >= 0))
+    wanted = jnp.round(denser * least).astype(int)
     return jnp.minimum(wanted, mesh.left.shape[0]) - 1
 
 
