@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from rootsopt.dynamics.pair import RotorPair
 
-# Tolerance and longest step (mesh periods) of the integration. The states' rounding is not far
-# below, and is wanted: at 1e-12, corners of the force inside steps left errors of 1e-10, of which
-# differences show a hundred times as much.
+# Tolerance and longest step (mesh periods) of the integration. The tolerance is close to rounding:
+# at 1e-12, corners of the force inside steps left errors of 1e-10 in the states, which differences
+# of forces show enlarged.
 _TOLERANCE, _LONGEST = 1e-14, 1 / 256
 
 # Maximum number of steps of an integration.
