@@ -14,7 +14,7 @@ import functools
 import itertools
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -22,15 +22,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments._common.driver import Run
+from experiments._common.batch import batches_of, compiled, rest_of, solver_of
+from experiments._common.driver import NoResultError, Run
 from experiments._common.scenes import CIC
 from experiments._common.shooting import closed, differentiated, forces_near
+from experiments._common.simulation import errors_of, numbers_of
 from experiments._common.tables import Row, show
+from experiments._common.timing import median_time, processor_time
 from rootsopt import steady_response
 from rootsopt.config import Config, load
 from rootsopt.config.rotor import ProfileConfig
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.errors import InputError
+from rootsopt.response.evaluation import Evaluator
 from rootsopt.scene import Scene, check_geometry, design_vector
 from rootsopt.scene.families import free_form_of
 from rootsopt.status import Status
@@ -246,13 +250,99 @@ def timed(job: Run) -> bool:
     one_core = job.options.speed
     if one_core and hasattr(os, "sched_setaffinity"):  # before JAX starts its threads
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
-    from experiments.orbits import batches, speed
-
-    sizes = batches.SIZES[: 1 if job.quick else None]
+    sizes = SIZES[: 1 if job.quick else None]
     repeats = 3 if job.quick else 20
     rows: list[Row] = []
-    for row in speed.rows_of(repeats, job.say) if one_core else batches.rows_of(sizes, job.say):
+    for row in speeds_of(repeats, job.say) if one_core else batch_rows(sizes, job.say):
         rows.append(row)
         job.csv("speed.csv" if one_core else "batches.csv", rows)
     show("Value and gradient", rows)
     return one_core or all(row["value_error"] <= AGREE for row in rows)
+
+
+# Relative difference between the parameters of a design and those of its neighbour.
+AWAY = 2e-3
+
+# Orbit tolerance of the reference.
+EXACT = 1e-10
+
+
+def _row(tool: str, seconds: float, found: Any, truth: Any) -> Row:
+    return {"tool": tool, "ms": 1e3 * seconds} | errors_of(found, truth)
+
+
+def speeds_of(repeats: int, say: Callable[[str], None]) -> Iterator[Row]:
+    """Measure all tools in the shipped scene; yield a row for each.
+
+    Raises `NoResultError` if a design has no orbit."""
+    config = load(CIC)
+    own = Evaluator.of(config)
+    base = np.asarray(config.design, float)
+    design = base * (1 + AWAY * np.random.default_rng(0).uniform(-1, 1, base.shape))
+    say("compiling")
+    neighbour = own(base, series=False)
+    exact = own.at_tolerance(EXACT)(design, series=False)
+    if not (neighbour.usable and exact.usable):
+        raise NoResultError(f"no orbit: {neighbour.status.label}, {exact.status.label}")
+    truth = numbers_of(exact)
+    machine = Scene.from_config(config)
+    solve, rest = compiled(solver_of(machine)), rest_of(machine, base)
+    for tool, start in (("neighbour", solve(base, rest)[3]), ("from rest", rest)):
+        call = functools.partial(solve, design, start)
+        seconds, found = processor_time(call, repeats)
+        yield _row(tool, seconds, found[:2], truth)
+    for tool, start in (("neighbour", neighbour.start), ("from rest", None)):
+        say(f"evaluate, {tool}")
+        call = functools.partial(own, design, start=start, series=False)
+        seconds, found = processor_time(call, repeats)
+        yield _row(f"evaluate, {tool}", seconds, numbers_of(found), truth)
+
+
+# Usual numbers of designs in a batch.
+SIZES = 256, 1024, 4096, 16384, 65536
+
+# Number of designs that are compared with single evaluations.
+_CHECKED = 8
+
+# Maximum number of timed calls, and time (s) after which no further call is made.
+_REPEATS, _SECONDS = 5, 10.0
+
+
+def batch_rows(sizes: Sequence[int], say: Callable[[str], None]) -> Iterator[Row]:
+    """Yield a row for each of `sizes` and each start."""
+    config = load(CIC, [])
+    machine, base = Scene.from_config(config), np.asarray(config.design, float)
+    changes = np.random.default_rng(0).uniform(-1, 1, (max(sizes), *base.shape))
+    designs = base * (1 + AWAY * changes)
+    solve = solver_of(machine)
+    say("compiling for single designs")
+    with jax.default_device(jax.devices("cpu")[0]):
+        single, rest = compiled(solve), rest_of(machine, base)
+        starts = {"neighbour": single(base, rest)[3], "rest": rest}
+        truth = {
+            name: [single(design, start)[:2] for design in designs[:_CHECKED]]
+            for name, start in starts.items()
+        }
+    device = jax.devices()[0]
+    starts = jax.device_put(starts, device)
+    for size in sizes:
+        say(f"{size} designs: compiling")
+        for call, row in batches_of(solve, designs[:size], starts["rest"]):
+            for name, start in starts.items():
+                say(f"{size} designs from {name}, {row['device']}")
+                call(start)
+                again = functools.partial(call, start)
+                seconds, found = median_time(again, _REPEATS, _SECONDS)
+                yield {
+                    **row,
+                    "start": name,
+                    "designs": size,
+                    "s": seconds,
+                    "designs_per_s": size / seconds,
+                    "periodic": float(np.mean(found[2] == Status.PERIODIC.code)),
+                    "peak_bytes": (device.memory_stats() or {}).get("peak_bytes_in_use"),
+                    **errors_of(
+                        [x[:_CHECKED] for x in found[:2]],
+                        [np.stack(x)[:size] for x in zip(*truth[name], strict=True)],
+                    ),
+                }
