@@ -75,8 +75,8 @@ def closed(pair: RotorPair, state: Any, period: int, monodromy: Any = None) -> S
         # Integrations are that exact: the corners of the force do not lie at ends of steps.
         if slow and fresh and miss < _NEAR:
             break
-        fresh = monodromy is None or slow
-        if fresh:
+        if monodromy is None or slow:
+            fresh = True
             sides = [[fly(state + sign * _AWAY * way)[0] for sign in (1, -1)] for way in unit]
             ahead, behind = np.moveaxis(np.array(sides), 1, 0)
             monodromy = (ahead - behind).T / (2 * _AWAY)
