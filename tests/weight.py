@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[1]
 MOST = {
     "statements of the package": 27_135,
     "statements of the tests": 14_560,
-    "statements of the experiments": 4_474,
+    "statements of the experiments": 4_473,
     "packages": 13,
     "files of the package": 199,
     "lines of the longest file": 450,
