@@ -2,8 +2,8 @@
 
 The scene is that of `configs/ee.yaml` with gas instead of a constant torque, and with bearings. All
 rotors have its pitch radius and length. The number of slices is fixed, so that all twists of one
-number of lobes share a compiled program; straight rotors are those with a twist of a millionth of a
-degree.
+number of lobes share a compiled program; straight rotors are those with a twist of a billionth
+of a degree, whose slices have their events at one instant.
 """
 
 import itertools
@@ -21,7 +21,7 @@ from rootsopt.response.evaluation import Evaluator
 from rootsopt.scene import Scene, design_vector
 
 LOBES = 2, 3, 4
-TWISTS = 1e-6, 10.0, 20.0, 30.0, 45.0, 60.0, 75.0, 90.0
+TWISTS = 1e-9, 10.0, 20.0, 30.0, 45.0, 60.0, 75.0, 90.0
 _SLICES = 6
 _FORCES = (
     "mean_force_N",
@@ -83,7 +83,7 @@ def run(job: Run) -> None:
     """Evaluate every number of lobes at every twist; write and print the table.
 
     A reduced run has three lobes, two twists and two slices."""
-    lobes, twists, slices = ((3,), (1e-6, 30.0), 2) if job.quick else (LOBES, TWISTS, _SLICES)
+    lobes, twists, slices = ((3,), (1e-9, 30.0), 2) if job.quick else (LOBES, TWISTS, _SLICES)
     rows: list[Row] = []
     for number, twist in itertools.product(lobes, twists):
         rows.append(evaluated(number, twist, slices))
