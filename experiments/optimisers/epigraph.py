@@ -43,7 +43,7 @@ class Epigraph:
         self.known: dict[bytes, Linearization | None] = {start.tobytes(): first}
         self.begin, self.first = start, first
         self.good = first
-        slots = [2 * len(group.values) + _SLOTS for group in (*first.groups, *first.walls)]
+        slots = [2 * len(group.values) + _SLOTS for group in (*first.groups, *first.caps)]
         self.slots = [np.full((count, 2), np.nan) for count in slots]
         self.used = [np.zeros(count) for count in slots]
 
@@ -84,11 +84,11 @@ class Epigraph:
         """Return the values (≥ 0 if satisfied) and gradients of all constraints at `z`.
 
         First come t - b_i for the branches b_i of each maximum t, then -w_i for those of each
-        wall, then the constraints of the problem."""
+        cap, then the constraints of the problem."""
         found = self.at(self.point(z)) or self.good
         values, rows = [], []
         tops = len(found.groups)
-        for k, group in enumerate((*found.groups, *found.walls)):
+        for k, group in enumerate((*found.groups, *found.caps)):
             branches, places = self._places(k, group)
             value, row = np.ones(len(self.slots[k])), np.zeros((len(self.slots[k]), len(z)))
             value[places] = -group.values[branches]

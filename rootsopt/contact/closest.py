@@ -39,7 +39,7 @@ from jaxtyping import Array, Bool, Float
 from rootsopt.contact.gap import DEEPEST, ClosestApproach, FlankNodes, bracket_of, root_in
 from rootsopt.profiles import base as trig
 from rootsopt.profiles.base import Profile
-from rootsopt.runtime.kept import kept
+from rootsopt.runtime.compute_once import compute_once
 
 # Least number of poses that are searched in groups (see `FlankPair.together`), and size of a group.
 _MANY = 32
@@ -132,7 +132,7 @@ class FlankPair(eqx.Module):
         distance = 2 * profile.pitch_radius if center_distance is None else center_distance
         dynamic, static = eqx.partition(frozen, eqx.is_inexact_array)
         # Otherwise, XLA would compute the sines of the nodes again at every pose.
-        dynamic, nodes = kept((dynamic, nodes))
+        dynamic, nodes = compute_once((dynamic, nodes))
         rolling = center_distance is None and profile.conjugate
         return cls(profile, eqx.combine(dynamic, static), nodes, distance, rolling)
 

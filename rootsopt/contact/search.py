@@ -10,7 +10,7 @@ from rootsopt.contact.closest import FlankPair, contact_begins
 from rootsopt.contact.gap import Approach, ClosestApproach, Contact, ContactPoint
 from rootsopt.profiles import base as trig
 from rootsopt.profiles.base import Profile
-from rootsopt.runtime.kept import kept_along
+from rootsopt.runtime.compute_once import compute_once_along
 
 
 def contact_point(
@@ -176,4 +176,4 @@ class NearContact(_FlankContact):
             normal1 + turned[2] * step,
             root + step,
         )
-        return ClosestApproach(*kept_along(numbers), found=present)
+        return ClosestApproach(*compute_once_along(numbers), found=present)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rootsopt.config.reading import Config
 from rootsopt.identification.model import OFFSET, REST, Point
 from rootsopt.identification.record import CHANNELS, Observed
-from rootsopt.identification.squares import TURN, Local, Problem
+from rootsopt.identification.squares import TURN, Fit, Problem
 from rootsopt.status import Status
 
 # Standard deviation of a combination (share of the range in which the search begins) above which
@@ -82,7 +82,7 @@ class Spread:
     chance: float
 
     @classmethod
-    def of(cls, problem: Problem, best: Local) -> "Spread":
+    def of(cls, problem: Problem, best: Fit) -> "Spread":
         """Return the spread of the `best` fit."""
         from scipy import stats  # Slow import (0.5 s).
 
@@ -124,7 +124,7 @@ class Spread:
 
 def parameters(
     problem: Problem,
-    best: Local,
+    best: Fit,
     spread: Spread,
     profiles: Mapping[str, Any],
     optima: Sequence[Mapping[str, Any]],
@@ -167,14 +167,14 @@ def combinations(problem: Problem, spread: Spread) -> list[dict[str, Any]]:
     return found
 
 
-def relative_misfit(problem: Problem, best: Local) -> float:
+def relative_misfit(problem: Problem, best: Fit) -> float:
     """Return the relative RMS difference between fit and record, without the greatest 5 %. It is a
     share of the record's variation, or of its averages."""
     away = np.sort(np.abs(best.residual * best.deviation / problem.rows.scale.to_numpy()))
     return float(np.sqrt(np.mean(away[: math.ceil(0.95 * len(away))] ** 2)))
 
 
-def structure(problem: Problem, best: Local) -> float:
+def structure(problem: Problem, best: Fit) -> float:
     """Return the correlation between residuals of neighbouring samples, in standard errors.
     Residuals are not independent if the scene lacks something or is the wrong one."""
     if relative_misfit(problem, best) < _NUMERICAL:
@@ -186,7 +186,7 @@ def structure(problem: Problem, best: Local) -> float:
     return float(total / math.sqrt(max(len(rows), 1)))
 
 
-def quality(problem: Problem, best: Local, spread: Spread) -> dict[str, Any]:
+def quality(problem: Problem, best: Fit, spread: Spread) -> dict[str, Any]:
     """Return the entry `fit` of the result file: how well the scene fits."""
     relative = (best.deviation / problem.rows.scale).groupby(problem.rows.column).median()
     gains = [", ".join(group) for group in problem.gains]
@@ -203,7 +203,7 @@ def quality(problem: Problem, best: Local, spread: Spread) -> dict[str, Any]:
     }
 
 
-def motions(problem: Problem, best: Local, others: Sequence[int | None]) -> list[dict[str, Any]]:
+def motions(problem: Problem, best: Fit, others: Sequence[int | None]) -> list[dict[str, Any]]:
     """Return the entry `motions` of the result file, empty for an ensemble. For each point, it
     states the motion that fits, whether it is reached from rest, and the number of `others`."""
     found = []
@@ -219,7 +219,7 @@ def motions(problem: Problem, best: Local, others: Sequence[int | None]) -> list
     return found
 
 
-def further(problem: Problem, best: Local, spread: Spread) -> list[dict[str, Any]]:
+def further(problem: Problem, best: Fit, spread: Spread) -> list[dict[str, Any]]:
     """Return the entry `further` of the result file: measurements that would help, best first.
 
     Each is a column over one turn, at one of several speeds, with the relative error of the
@@ -255,9 +255,7 @@ def further(problem: Problem, best: Local, spread: Spread) -> list[dict[str, Any
     return sorted(found, key=lambda one: one["least_certain_combination"])[:3]
 
 
-def profile(
-    problem: Problem, best: Local, spread: Spread, number: int, fine: bool
-) -> dict[str, Any]:
+def profile(problem: Problem, best: Fit, spread: Spread, number: int, fine: bool) -> dict[str, Any]:
     """Return the profile likelihood of quantity `number`, an entry `profiles` of the result file.
 
     At each of several values of the quantity, all others are fitted again. In the confidence
@@ -338,7 +336,7 @@ class Identification:
     profiles: dict[str, dict[str, Any]] = dataclasses.field(default_factory=dict)
     residuals: Mapping[str, Sequence[Any]] = dataclasses.field(default_factory=dict)
     covariance: NDArray[np.float64] = dataclasses.field(default_factory=lambda: np.zeros((0, 0)))
-    best: tuple[Problem, Local, Spread] | None = dataclasses.field(default=None, repr=False)
+    best: tuple[Problem, Fit, Spread] | None = dataclasses.field(default=None, repr=False)
 
     def increase(self, values: Mapping[str, float]) -> float:
         """Return the increase of twice the loss from its minimum to other `values` (by key).
@@ -371,7 +369,7 @@ class Identification:
         return found | end | {"statistics": self.statistics}
 
 
-def residuals(problem: Problem, best: Local) -> dict[str, Sequence[Any]]:
+def residuals(problem: Problem, best: Fit) -> dict[str, Sequence[Any]]:
     """Return the columns of residuals.csv: a row for each measured value."""
     rows = problem.rows.drop(columns=["given", "sampled", "scale", "place"]).assign(
         fitted=best.fit, standard_deviation=best.deviation, residual=best.residual
@@ -380,7 +378,7 @@ def residuals(problem: Problem, best: Local) -> dict[str, Sequence[Any]]:
     return {str(key): column.tolist() for key, column in rows.items()}
 
 
-def adopted(config: Config, problem: Problem, best: Local) -> Config:
+def adopted(config: Config, problem: Problem, best: Fit) -> Config:
     """Return a config with the fitted values."""
     values = named(problem, best.values)
     values.pop(OFFSET, None)

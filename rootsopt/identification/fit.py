@@ -15,7 +15,7 @@ from rootsopt.identification import answer
 from rootsopt.identification.answer import Identification, Spread, relative_misfit, structure
 from rootsopt.identification.model import OFFSET, Begin, Point, fitted
 from rootsopt.identification.record import observed
-from rootsopt.identification.squares import TURN, Local, Problem
+from rootsopt.identification.squares import TURN, Fit, Problem
 from rootsopt.response.attractors import closed, find
 from rootsopt.response.terms import reporting
 from rootsopt.runtime.environment import check_precision
@@ -208,12 +208,12 @@ class _Search:
         self.problem, self.starts, self.seed, self.progress = problem, starts, seed, progress
         self.deviation, known = problem.estimated(), problem.rows.given.notna().all()
         self.turn = TURN if known else 1.0
-        self.ends: list[Local] = []
+        self.ends: list[Fit] = []
         self.failed: list[Status] = []
         self.tried = 0
         self.others_at: list[tuple[NDArray[np.float64], list[int]]] = []
 
-    def run(self) -> Local | None:
+    def run(self) -> Fit | None:
         """Return the best fit; None if no scene has a usable motion at all points."""
         points, p, known = self.problem.points, len(self.problem.quantities), []
         count = int(np.clip(_MOST // len(points), 8, _TRIED * p))
@@ -243,7 +243,7 @@ class _Search:
         return next(iter(self._best), None)
 
     @property
-    def _best(self) -> list[Local]:
+    def _best(self) -> list[Fit]:
         """The ends of the fits, the best one first."""
         return sorted(self.ends, key=lambda one: one.cost)
 
@@ -256,17 +256,17 @@ class _Search:
             return random and (small or bool(self.problem.rows.sampled.any()))
         return False
 
-    def _at(self, place: NDArray[np.float64], begins: Sequence[Begin]) -> list[Local]:
+    def _at(self, place: NDArray[np.float64], begins: Sequence[Begin]) -> list[Fit]:
         found, lost = self.problem.at(place, begins, self.deviation, self.turn)
         self.failed += lost
         return [] if found is None else [found]
 
-    def _fit(self, one: Local) -> None:
+    def _fit(self, one: Fit) -> None:
         self.progress(f"fitting from the best scenes, {len(self.ends) + 1}")
         end = self.problem.fitted(one.place, one.begins, self.deviation, self.turn)
         self.ends += [] if end is None else [end]
 
-    def _fit_other_motions(self, one: Local) -> None:
+    def _fit_other_motions(self, one: Fit) -> None:
         """Repeat the fit `one` from its scene, with the other motions that coexist there."""
         named = zip(self.problem.quantities, one.values, strict=True)
         values = {q.key: float(x) for q, x in named if q.key != OFFSET}
@@ -283,7 +283,7 @@ class _Search:
                 if np.max(np.abs(other.fit - one.fit) / self.problem.rows.scale) > _EQUAL:
                     self._fit(other)
 
-    def coexisting(self, best: Local) -> Sequence[int | None]:
+    def coexisting(self, best: Fit) -> Sequence[int | None]:
         """Return how many other motions there are at each point of the `best` fit.
 
         They are counted at the nearest scene in which a search looked for them; None without such a
@@ -291,13 +291,13 @@ class _Search:
         near = sorted(self.others_at, key=lambda one: np.max(np.abs(one[0] - best.place)))
         return near[0][1] if near else [None] * len(best.begins)
 
-    def others(self, problem: Problem, best: Local, factor: float) -> list[dict[str, Any]]:
+    def others(self, problem: Problem, best: Fit, factor: float) -> list[dict[str, Any]]:
         """Return the entry `optima` of the result file: other scenes that fit nearly as well.
 
         `factor`: see `Spread`."""
         kept, misfit = [best], relative_misfit(problem, best)
 
-        def new(one: Local) -> bool:
+        def new(one: Fit) -> bool:
             return all(np.max(np.abs(one.place - other.place)) > _SAME for other in kept)
 
         for one in filter(new, self.ends):

@@ -35,7 +35,7 @@ _MANY = 30
 _FINEST = 1e-6
 
 
-class Local(NamedTuple):
+class Fit(NamedTuple):
     """A scene, and how well it fits.
 
     `place` (p,): on the scales of the quantities; `values` (p,): in their units; `cost`: sum of the
@@ -140,7 +140,7 @@ class Problem:
         begins: Sequence[Begin],
         deviation: NDArray[np.float64],
         turn: float = TURN,
-    ) -> tuple[Local | None, list[Status]]:
+    ) -> tuple[Fit | None, list[Status]]:
         """Return the fit at a `place` (p,), None if a motion is not usable, and the statuses of
         such motions.
 
@@ -177,7 +177,7 @@ class Problem:
         size = np.abs(residual)
         cost = np.sum(np.where(size <= turn, size**2 / 2, turn * (size - turn / 2)))
         begin = [one.begin for one in found]
-        return Local(place, values, float(cost), residual, slopes, fit, gains, begin, deviation), []
+        return Fit(place, values, float(cost), residual, slopes, fit, gains, begin, deviation), []
 
     def fitted(
         self,
@@ -186,7 +186,7 @@ class Problem:
         deviation: NDArray[np.float64],
         turn: float = TURN,
         held: Sequence[int] = (),
-    ) -> Local | None:
+    ) -> Fit | None:
         """Return the end of a local fit from a `place` (p,); None if no motion is usable there.
 
         `held`: indices of quantities that do not change; other arguments as in `at`."""
@@ -197,10 +197,10 @@ class Problem:
         # The search stays inside the bounds.
         room = 1e-9 * (high - low)
         place = np.clip(place, low + room, high - room)
-        known: dict[bytes, Local] = {}
+        known: dict[bytes, Fit] = {}
         nearest = [*begins]
 
-        def at(some: NDArray[np.float64]) -> Local | None:
+        def at(some: NDArray[np.float64]) -> Fit | None:
             if (name := some.tobytes()) not in known:
                 whole = place.copy()
                 whole[free] = some

@@ -234,7 +234,7 @@ class Bounding:
             return
         if local.violation <= FEASIBLE:
             self.best = min(self.best, local.objective)
-        rows = [local.minorants, *((wall.values, wall.slopes) for wall in local.walls)]
+        rows = [local.minorants, *((cap.values, cap.slopes) for cap in local.caps)]
         self.surfaces = self.surfaces or [Surface(self.size) for _ in rows]
         if any([one.add(point, row) for one, row in zip(self.surfaces, rows, strict=True)]):
             # Existing bounds rest on the old curvatures: compute them again.
@@ -372,9 +372,9 @@ class Bounding:
         places = np.vstack([np.zeros(self.size), self._corners * box.half])
         chosen = np.unique(np.argsort(-(values[:, None] + slopes @ places.T), axis=0)[:_ROWS])
         rows = [(slopes[chosen], -values[chosen], -1.0), (-tangents[1], tangents[0], 0.0)]
-        for wall in self.surfaces[1:]:
-            above, normals = wall.within(box)
-            rows.append((normals, wall.room(box) - above, 0.0))
+        for cap in self.surfaces[1:]:
+            above, normals = cap.within(box)
+            rows.append((normals, cap.room(box) - above, 0.0))
         from scipy.optimize import linprog  # Slow import (0.3 s).
 
         matrix = np.vstack([np.column_stack([a, np.full(len(a), c)]) for a, _, c in rows])

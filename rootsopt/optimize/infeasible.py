@@ -119,7 +119,7 @@ def explain(
     """Return why no design satisfies all constraints of a `problem`.
 
     `starts`: points (d,) of the unit box from which to search for the least violation. `look`:
-    function that returns constraints and walls at a point, from a simulation. By default, only the
+    function that returns constraints and caps at a point, from a simulation. By default, only the
     constraints of the geometry count."""
     limits = () if look is None else problem.limits
     stops = _STOPS if look is None else _SIMULATED
@@ -160,18 +160,18 @@ def _geometry(problem: "Problem", point: NDArray[np.float64]) -> Linearization |
 
 
 def _groups(local: Linearization) -> tuple[Group, ...]:
-    """Return all constraints and walls as groups of branches that must be at most 0.
+    """Return all constraints and caps as groups of branches that must be at most 0.
 
-    The index of a constraint or wall is the kind of its branches."""
+    The index of a constraint or cap is the kind of its branches."""
     found = [
         Group(np.array([[float(k), 0.0]]), np.array([-value]), -row[None, :])
         for k, (value, row) in enumerate(zip(local.slack, local.normals, strict=True))
     ]
-    for wall in local.walls:
+    for cap in local.caps:
         # Shift the phases, so that equal instants at different speeds or scenes stay distinct.
-        phases = (wall.tags[:, 1] + wall.tags[:, 0] * _GOLDEN) % 1.0
+        phases = (cap.tags[:, 1] + cap.tags[:, 0] * _GOLDEN) % 1.0
         kinds = np.full(len(phases), float(len(found)))
-        found.append(wall._replace(tags=np.stack([kinds, phases], axis=1)))
+        found.append(cap._replace(tags=np.stack([kinds, phases], axis=1)))
     return tuple(found)
 
 

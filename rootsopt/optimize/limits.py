@@ -296,7 +296,7 @@ def constraint_rows(
         slacks = [-float(one.excess(value)) for value in (before, after)]
         row = _row(one.name, before, after, one.limit, one.unit, slacks, one.sense)
         if certificate is not None:
-            per_unit = float(np.sum(certificate.walls[k])) / one.scale
+            per_unit = float(np.sum(certificate.caps[k])) / one.scale
             row |= _multiplier(problem, row, per_unit, optimized)
         rows.append(row)
     return rows + _range_rows(problem, optimized, certificate)

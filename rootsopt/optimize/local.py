@@ -6,7 +6,7 @@ The objective is a smooth function s plus a sum of maxima over groups g of smoot
 
 For example, the local maxima of the contact force over time are the branches of its peak. If only
 the worst of several speeds counts, the objectives at these speeds are branches. Each branch is
-smooth, even where the maximum has a corner. The same holds for the *walls* w_k: limits of a
+smooth, even where the maximum has a corner. The same holds for the *caps* w_k: limits of a
 quantity that is a maximum over branches.
 
 At a first-order optimum, the gradient of the Lagrangian is zero. The Lagrangian contains the active
@@ -76,14 +76,14 @@ class Linearization(NamedTuple):
 
     `smooth`: smooth part of the objective; `slope` (d,): its gradient; `groups`: the maxima that
     are added to it. `slack` (m,): values of the constraints c ≥ 0; `normals` (m, d): their
-    gradients. `walls`: limits of maxima over branches; each branch must be at most 0."""
+    gradients. `caps`: limits of maxima over branches; each branch must be at most 0."""
 
     smooth: float
     slope: NDArray[np.float64]
     groups: tuple[Group, ...]
     slack: NDArray[np.float64]
     normals: NDArray[np.float64]
-    walls: tuple[Group, ...] = ()
+    caps: tuple[Group, ...] = ()
 
     @property
     def objective(self) -> float:
@@ -92,8 +92,8 @@ class Linearization(NamedTuple):
 
     @property
     def violation(self) -> float:
-        """Greatest violation of a constraint or wall; 0 if all are satisfied."""
-        beyond = max((wall.top for wall in self.walls), default=0.0)
+        """Greatest violation of a constraint or cap; 0 if all are satisfied."""
+        beyond = max((cap.top for cap in self.caps), default=0.0)
         return max(0.0, -float(np.min(self.slack, initial=0.0)), beyond)
 
     @property
@@ -135,7 +135,7 @@ class Certificate(NamedTuple):
 
     `violation`: greatest scaled violation of a constraint. `multipliers` (m,): those of the
     constraints. `lower`, `upper` (d,): multipliers of the bounds. `shares`: one array (k,) for each
-    maximum over k branches, whose entries add up to 1. `walls`: one array (k,) for each wall, with
+    maximum over k branches, whose entries add up to 1. `caps`: one array (k,) for each cap, with
     a multiplier for each of its k branches."""
 
     residual: float
@@ -144,12 +144,12 @@ class Certificate(NamedTuple):
     lower: NDArray[np.float64]
     upper: NDArray[np.float64]
     shares: tuple[NDArray[np.float64], ...]
-    walls: tuple[NDArray[np.float64], ...] = ()
+    caps: tuple[NDArray[np.float64], ...] = ()
 
     @property
     def total(self) -> float:
-        """Sum of the multipliers of all constraints and walls."""
-        return float(np.sum(self.multipliers) + sum(map(np.sum, self.walls)))
+        """Sum of the multipliers of all constraints and caps."""
+        return float(np.sum(self.multipliers) + sum(map(np.sum, self.caps)))
 
     def holds(self, tolerance: float, feasibility: float) -> bool:
         """Return whether the conditions hold within tolerances.
@@ -179,9 +179,9 @@ def certify(local: Linearization, point: NDArray[np.float64], near: float = NEAR
         (point <= near, -np.eye(size), point),
         (1 - point <= near, np.eye(size), 1 - point),
     ]
-    for wall in local.walls:
-        steep = np.linalg.norm(wall.slopes, axis=1) > _NEGLIGIBLE
-        limits.append(((-wall.values <= near) & steep, wall.slopes, np.maximum(-wall.values, 0.0)))
+    for cap in local.caps:
+        steep = np.linalg.norm(cap.slopes, axis=1) > _NEGLIGIBLE
+        limits.append(((-cap.values <= near) & steep, cap.slopes, np.maximum(-cap.values, 0.0)))
     for active, normals, gap in limits:
         rows.append(normals[active])
         gaps.append(gap[active])
@@ -208,14 +208,14 @@ def certify(local: Linearization, point: NDArray[np.float64], near: float = NEAR
         values = np.zeros(len(active))
         values[active], found = found[:count], found[count:]
         numbers.append(values)
-    multipliers, lower, upper, *walls = numbers
+    multipliers, lower, upper, *caps = numbers
     left = local.combined(tuple(shares)) - multipliers @ local.normals - lower + upper
-    for wall, held in zip(local.walls, walls, strict=True):
-        left = left + held @ wall.slopes
+    for cap, held in zip(local.caps, caps, strict=True):
+        left = left + held @ cap.slopes
     apart = [s * (g.top - g.values) for s, g in zip(shares, local.groups, strict=True)]
     apart += [value * gap for value, (_, _, gap) in zip(numbers, limits, strict=True)]
     residual = float(np.linalg.norm(np.concatenate([left, *apart])))
-    held = multipliers, lower, upper, tuple(shares), tuple(walls)
+    held = multipliers, lower, upper, tuple(shares), tuple(caps)
     return Certificate(residual, local.violation, *held)
 
 
@@ -242,7 +242,7 @@ class Models:
     """Quadratic models of all functions of a problem near a point.
 
     The n functions are, in this order: the smooth part of the objective; the branches of each
-    maximum; the m constraints; the branches of each wall, with the opposite sign. `point` (d,):
+    maximum; the m constraints; the branches of each cap, with the opposite sign. `point` (d,):
     centre; `local`: the problem there, with the n values and gradients in `rows`; `hessians` (n, d,
     d): Hessians; `limits`: function for the constraints, which otherwise have models, too."""
 
@@ -255,7 +255,7 @@ class Models:
         sizes = [len(group.values) for group in local.groups]
         self.owner = np.repeat(np.arange(len(sizes)), sizes)
         self._begin = 1 + len(self.owner)
-        self._walls = self._begin + len(local.slack)
+        self._caps = self._begin + len(local.slack)
 
     def measure(self, at: Look) -> None:
         """Compute the Hessians from differences of gradients.
@@ -299,15 +299,15 @@ class Models:
         return value + slope @ step + bent @ step / 2, slope + bent
 
     def slacks(self, step: NDArray[np.float64]) -> Rows:
-        """Return slacks and their gradients after a `step` (d,): constraints, then walls."""
+        """Return slacks and their gradients after a `step` (d,): constraints, then caps."""
         value, slope = self.values(step)
-        walls = value[self._walls :], slope[self._walls :]
+        caps = value[self._caps :], slope[self._caps :]
         if self.limits is None:
             return value[self._begin :], slope[self._begin :]
         slack, normals = self.limits(self.point + step)
         if not (np.all(np.isfinite(slack)) and np.all(np.isfinite(normals))):
             slack, normals = np.full(len(slack), _ABSENT), self.local.normals
-        return np.concatenate([slack, walls[0]]), np.concatenate([normals, walls[1]])
+        return np.concatenate([slack, caps[0]]), np.concatenate([normals, caps[1]])
 
     def tops(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the greatest branch of each maximum, from the `values` (n,) of all functions."""
@@ -383,8 +383,8 @@ def _rows(local: Linearization) -> Rows:
     """Return the values (n,) and gradients (n, d) of the n functions listed in `Models`."""
     values = [np.array([local.smooth]), *(g.values for g in local.groups), local.slack]
     slopes = [local.slope[None], *(g.slopes for g in local.groups), local.normals]
-    values += [-wall.values for wall in local.walls]
-    slopes += [-wall.slopes for wall in local.walls]
+    values += [-cap.values for cap in local.caps]
+    slopes += [-cap.slopes for cap in local.caps]
     return np.concatenate(values), np.concatenate(slopes)
 
 
@@ -403,7 +403,7 @@ def _places(one: Linearization, other: Linearization) -> NDArray[np.int64]:
     add(one.groups, other.groups)
     places.append(start + np.arange(len(other.slack)))
     start += len(other.slack)
-    add(one.walls, other.walls)
+    add(one.caps, other.caps)
     return np.concatenate(places)
 
 

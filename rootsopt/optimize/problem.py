@@ -209,11 +209,11 @@ class Problem:
             together = [np.concatenate(arrays) for arrays in zip(*groups, strict=True)]
             groups = [Group(*together)]
         scaled = tuple(g._replace(slopes=g.slopes @ jacobian) for g in groups)
-        walls = self.walls(evaluation, jacobian)
-        return Linearization(smooth, slope @ jacobian, scaled, slack, normals, walls)
+        caps = self.caps(evaluation, jacobian)
+        return Linearization(smooth, slope @ jacobian, scaled, slack, normals, caps)
 
-    def walls(self, evaluation: Evaluation, jacobian: NDArray[np.float64]) -> tuple[Group, ...]:
-        """Return one wall for each of `limits`, with the amount by which an evaluated design
+    def caps(self, evaluation: Evaluation, jacobian: NDArray[np.float64]) -> tuple[Group, ...]:
+        """Return one cap for each of `limits`, with the amount by which an evaluated design
         exceeds it.
 
         `evaluation`: usable, with gradients; `jacobian` (d, d): that of the design with respect to
@@ -244,7 +244,7 @@ class Problem:
         """Return the worst value of a limited quantity: the one nearest to its `limit`, or farthest
         beyond it.
 
-        `evaluation`: usable. Speeds, motions and scenes are those of `walls`."""
+        `evaluation`: usable. Speeds, motions and scenes are those of `caps`."""
         values = [one.response[limit.key] for _, one in counting(evaluation)]
         return float(max(values, key=limit.excess))
 

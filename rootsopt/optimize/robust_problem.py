@@ -113,9 +113,9 @@ class RobustProblem(Problem):
             for one, e, add in self._each(evaluation)
             if (found := one.local(e, point)) is not None
         ]
-        walls = self.walls(evaluation, self.look(point)[1]) if self.limits else ()
+        caps = self.caps(evaluation, self.look(point)[1]) if self.limits else ()
         if self.config.tolerances.combine == "worst":
-            return self._worst(parts)._replace(walls=walls)
+            return self._worst(parts)._replace(caps=caps)
         value, weights = combine(self.config.tolerances, [part.objective for part in parts])
         shares = self.shares(weights) if shares is None else shares
         smooth, slope = value, np.zeros_like(parts[0].slope)
@@ -129,18 +129,18 @@ class RobustProblem(Problem):
                 slope = slope - share * one.slopes[np.argmax(one.values)]
                 groups.append(Group(one.tags, share * one.values, share * one.slopes))
         scaled = tuple(self._scaled(group) for group in groups)
-        limits = parts[0].slack, parts[0].normals, walls
+        limits = parts[0].slack, parts[0].normals, caps
         return Linearization(smooth / self.reference, slope / self.reference, scaled, *limits)
 
-    def walls(self, evaluation: Evaluation, jacobian: NDArray[np.float64]) -> tuple[Group, ...]:
-        """Return one wall for each of `limits`, as `Problem.walls` does.
+    def caps(self, evaluation: Evaluation, jacobian: NDArray[np.float64]) -> tuple[Group, ...]:
+        """Return one cap for each of `limits`, as `Problem.caps` does.
 
         If limits hold for the combination of the scenes, this combination is the only branch of a
-        wall. Its gradient is that of the greatest branch in each scene."""
+        cap. Its gradient is that of the greatest branch in each scene."""
         if not (evaluation.scenes and self._combines_limits):
-            return super().walls(evaluation, jacobian)
+            return super().caps(evaluation, jacobian)
         found = [
-            super(RobustProblem, self).walls(part.evaluation, jacobian)
+            super(RobustProblem, self).caps(part.evaluation, jacobian)
             for part in evaluation.samples
         ]
         return tuple(map(self._combined_wall, zip(*found, strict=True)))

@@ -23,7 +23,7 @@ distance of a point's tangent from that axis; a *land* is an arc centred on that
 
 Lengths are in metres, angles in radians. Everything is differentiable with respect to the design.
 
-Cosine and sine are computed once where this pays (`rootsopt.runtime.kept`)."""
+Cosine and sine are computed once where this pays (`rootsopt.runtime.compute_once`)."""
 
 import abc
 import contextlib
@@ -40,7 +40,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from rootsopt.profiles import base as trig
-from rootsopt.runtime.kept import kept
+from rootsopt.runtime.compute_once import compute_once
 
 _keeping = ContextVar("_keeping", default=False)
 
@@ -70,10 +70,10 @@ def sin(angle: Float[ArrayLike, "*n"]) -> Float[Array, "*n"]:
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _circle(keep, angle):
-    """Return cosine and sine of an `angle` (rad); `keep`: whether they are `kept`."""
+    """Return cosine and sine of an `angle` (rad); `keep`: whether to `compute_once`."""
     angle = jnp.asarray(angle)
     values = lax.cos(angle), lax.sin(angle)
-    return kept(values) if keep else values
+    return compute_once(values) if keep else values
 
 
 @_circle.defjvp

@@ -155,9 +155,9 @@ def test_a_limited_force_is_bounded_too():
     The least is at the corner of the box and the circle that the limit cuts out."""
 
     def local(point):
-        wall = Group(np.zeros((1, 2)), np.array([0.16 - point @ point]), -2 * point[None])
+        cap = Group(np.zeros((1, 2)), np.array([0.16 - point @ point]), -2 * point[None])
         one = Linearization(float(point.sum()), np.ones(2), (), np.ones(1), np.zeros((1, 2)))
-        return one._replace(walls=(wall,))
+        return one._replace(caps=(cap,))
 
     found = bounding.Bounding(lambda point: (np.ones(1), np.zeros((1, 2))), 2, 0.4)
     bound, _ = proven(found, local, [*np.array([[0.4, 0.0], [0.9, 0.9], [0.1, 0.6]])])

@@ -1,4 +1,4 @@
-"""Limits of any quantity: as constraints of the design space, and as walls of the search."""
+"""Limits of any quantity: as constraints of the design space, and as caps of the search."""
 
 import dataclasses
 
@@ -107,8 +107,8 @@ def test_prices_are_per_unit_of_the_limits(outside):
     )  # fmt: skip
     problem = dataclasses.replace(problem, baseline=base)
     held = np.full(len(problem.space.constraints), 2.0)
-    walls = np.zeros(1), np.array([0.25, 0.5])
-    proof = Certificate(0.0, 0.0, held, np.zeros(3), np.zeros(3), (), walls)
+    caps = np.zeros(1), np.array([0.25, 0.5])
+    proof = Certificate(0.0, 0.0, held, np.zeros(3), np.zeros(3), (), caps)
     rows = {row["name"]: row for row in constraint_rows(problem, found, proof)}
     # The objective, 0.8, rises with the least volume and falls with the greatest force.
     keys = "multiplier", "relaxed_by", "relaxed_objective_percent"
@@ -128,7 +128,7 @@ def test_forces_are_limited_at_every_speed_that_counts():
     shares = (2000.0, slow, 0.5), (3000.0, fast, 0.5), (4000.0, unused, 0.0)
     parts = tuple(Part({"speed_rpm": rpm}, one, share) for rpm, one, share in shares)
     whole = dataclasses.replace(slow, speeds=parts)
-    high, low = problem.walls(whole, np.diag([1.0, 2.0, 3.0]))
+    high, low = problem.caps(whole, np.diag([1.0, 2.0, 3.0]))
     np.testing.assert_allclose(high.values, np.array([10, 20, -30]) / 180)
     np.testing.assert_allclose(high.tags, [[0, 0.25], [0, 0.75], [1, 0]])
     np.testing.assert_allclose(high.slopes[0], np.array([1.0, 2.0, 3.0]) / 180)
@@ -233,12 +233,12 @@ def test_limits_of_forces_in_conflict_are_explained():
     def look(point):
         share = point[0]
         found = evaluation(100 * (2 - share), 100 * (1 + share))
-        walls = (
-            wall._replace(slopes=np.array([[row, 0.0, 0.0]]) / limit.scale)
-            for wall, limit, row in zip(problem.walls(found, np.eye(3)), problem.limits,
+        caps = (
+            cap._replace(slopes=np.array([[row, 0.0, 0.0]]) / limit.scale)
+            for cap, limit, row in zip(problem.caps(found, np.eye(3)), problem.limits,
                                         (100.0, -100.0), strict=True)
         )  # fmt: skip
-        return Linearization(0.0, np.zeros(3), (), *problem.look(point)[2:], tuple(walls))
+        return Linearization(0.0, np.zeros(3), (), *problem.look(point)[2:], tuple(caps))
 
     found = explain(problem, [problem.project(np.full(3, 0.5))], look)
     # 130 (1 + v) + 150 (1 + v) = 300, whatever the share.

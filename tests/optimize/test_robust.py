@@ -94,7 +94,7 @@ def test_objective_combines_the_scenes(spread):
 
 
 def test_limits_hold_in_every_scene_or_for_a_combination(spread, ends):
-    """Value and gradient of a limit's wall; mean plus k standard deviations by hand."""
+    """Value and gradient of a limit's cap; mean plus k standard deviations by hand."""
     evaluator, baseline, moved = spread
     limit = "constraints.terms={mean_force_N: {max: 60}, rms_force_N: {min: 70}}"
     every = problem_of(evaluator, baseline, limit)
@@ -106,12 +106,12 @@ def test_limits_hold_in_every_scene_or_for_a_combination(spread, ends):
         for key in ("mean_force_N", "rms_force_N")
     )
     values = np.mean(means) + 2 * np.std(means), np.mean(squares) - 2 * np.std(squares)
-    walls = combined.walls(moved, combined.look(POINT)[1])
-    for bound, value, wall in zip(combined.limits, values, walls, strict=True):
+    caps = combined.caps(moved, combined.look(POINT)[1])
+    for bound, value, cap in zip(combined.limits, values, caps, strict=True):
         assert combined.worst(moved, bound) == pytest.approx(value, rel=1e-12)
-        assert wall.values == pytest.approx([bound.excess(value)], abs=1e-12)
+        assert cap.values == pytest.approx([bound.excess(value)], abs=1e-12)
         upper, lower = (bound.excess(combined.worst(end, bound)) for end in ends)
-        slope = float(wall.slopes[0] @ DIRECTION)
+        slope = float(cap.slopes[0] @ DIRECTION)
         assert slope == pytest.approx((upper - lower) / (2 * STEP), rel=1e-4)
 
 

@@ -119,13 +119,13 @@ def beside(kind, gap):
         "lower bound": (gap, {}),
         "upper bound": (1 - gap, {"slope": -free.slope}),
         "constraint": (0.4, {"slack": np.array([gap]), "normals": -falls}),
-        "wall": (0.4, {"walls": (group([-gap], falls), far)}),
+        "cap": (0.4, {"caps": (group([-gap], falls), far)}),
         "branch": (0.4, {"slope": np.zeros(2), "groups": (both,)}),
     }[kind]
     return free._replace(**changes), np.array([place, 0.5])
 
 
-@pytest.mark.parametrize("kind", ["lower bound", "upper bound", "constraint", "wall", "branch"])
+@pytest.mark.parametrize("kind", ["lower bound", "upper bound", "constraint", "cap", "branch"])
 def test_residual_counts_what_a_step_onto_the_limit_would_gain(kind):
     """A multiplier makes the gradient vanish beside a limit, too: only on it is the optimum.
 
@@ -270,19 +270,19 @@ def walled(x, limit=0.35, lift=0.0):
     away = x - np.array([0.9, 0.8])
     values = np.array([x[0] ** 2 + x[1] + lift, x[0] + x[1] ** 2 + lift])
     slopes = np.array([[2 * x[0], 1.0], [1.0, 2 * x[1]]])
-    wall = group(values / limit - 1, slopes / limit)
-    return Linearization(away @ away, 2 * away, (), np.zeros(0), np.zeros((0, 2)), (wall,))
+    cap = group(values / limit - 1, slopes / limit)
+    return Linearization(away @ away, 2 * away, (), np.zeros(0), np.zeros((0, 2)), (cap,))
 
 
 @pytest.mark.parametrize("start", [[0.1, 0.1], [0.9, 0.8], [0.0, 1.0]])
 def test_walls_are_limits_of_maxima(start):
-    """The optimum lies on the corner of the wall, that of a grid by formulas, and the multiplier is
+    """The optimum lies on the corner of the cap, that of a grid by formulas, and the multiplier is
     the price of the limit, found by solving again."""
     found = descend(walled, np.array(start))
     assert found.converged
     assert found.evaluations < 40
-    (wall,), (held,) = found.local.walls, found.certificate.walls
-    np.testing.assert_allclose(wall.values, 0, atol=1e-7)
+    (cap,), (held,) = found.local.caps, found.certificate.caps
+    np.testing.assert_allclose(cap.values, 0, atol=1e-7)
     assert min(held) > 0.01
     x, y = np.meshgrid(*[np.linspace(0, 1, 1201)] * 2)
     inside = np.maximum(x**2 + y, x + y**2) <= 0.35

@@ -13,7 +13,7 @@ from rootsopt.contact.search import NearContact, SearchContact
 from rootsopt.dynamics.collocation.elements import greatest
 from rootsopt.dynamics.orbit import Measures
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.runtime.kept import kept
+from rootsopt.runtime.compute_once import compute_once
 
 
 class Points(NamedTuple):
@@ -130,7 +130,9 @@ class CollocatedEquation(eqx.Module):
 
         def derivatives(k, found):
             own = jax.tree.map(lambda x: x[k], (moved, units))
-            return found.at[k].set(jnp.stack(kept(jax.vmap(kept(linear))(*own)), axis=1))
+            return found.at[k].set(
+                jnp.stack(compute_once(jax.vmap(compute_once(linear))(*own)), axis=1)
+            )
 
         slopes = jnp.zeros((passes, size, len(values), place.shape[1]), place.dtype)
         slopes = lax.fori_loop(0, greatest(jnp.where(whole, passes, 1)), derivatives, slopes)

@@ -28,7 +28,7 @@ from rootsopt.dynamics.collocation.system import (
 from rootsopt.dynamics.linear import spectral_radius
 from rootsopt.dynamics.orbit import Orbit
 from rootsopt.dynamics.pair import RotorPair
-from rootsopt.runtime.kept import kept
+from rootsopt.runtime.compute_once import compute_once
 
 # Greatest fraction of an interval's length by which one step may shorten the interval.
 _ROOM = 0.7
@@ -102,7 +102,7 @@ def between(
 
     `neighbour` (m,): `numbers` of the neighbour."""
     own = numbers(pair)
-    return kept(jnp.where(way == 1, own, neighbour + way * (own - neighbour)))
+    return compute_once(jnp.where(way == 1, own, neighbour + way * (own - neighbour)))
 
 
 def numbers(pair: Any) -> Float[Array, " m"]:

@@ -342,7 +342,7 @@ class Scalar(NamedTuple):
                 smooth += RHO * float(values[0])
                 slope = slope + RHO * group.slopes[0] / width
         first = Group(*(np.concatenate(arrays) for arrays in zip(*together, strict=True)))
-        limits = sample.slack, sample.normals, sample.walls
+        limits = sample.slack, sample.normals, sample.caps
         return Linearization(smooth, slope, (first, *corners), *limits)
 
     def weights(self, sample: Sample, certificate: Certificate) -> NDArray[np.float64]:

@@ -151,7 +151,7 @@ class Sample:
     group of branches per term, with the sign that makes it a term to be minimised, and with
     gradients with respect to the point; `cornered`: for each term, whether it is a maximum over
     branches; `slack` (m,), `normals` (m, d),
-    `walls`: constraints, as in `rootsopt.optimize.local`."""
+    `caps`: constraints, as in `rootsopt.optimize.local`."""
 
     point: NDArray[np.float64]
     evaluation: Evaluation
@@ -159,12 +159,12 @@ class Sample:
     cornered: tuple[bool, ...]
     slack: NDArray[np.float64]
     normals: NDArray[np.float64]
-    walls: tuple[Group, ...] = ()
+    caps: tuple[Group, ...] = ()
 
     @property
     def feasible(self) -> bool:
         """Whether all constraints hold."""
-        beyond = max((wall.top for wall in self.walls), default=0.0)
+        beyond = max((cap.top for cap in self.caps), default=0.0)
         return max(-float(np.min(self.slack, initial=0.0)), beyond) <= FEASIBLE
 
     @property
@@ -276,8 +276,8 @@ class Study:
             slope = np.array([*evaluation.gradient[aim.name].values()])
             groups.append(_single(number, aim, evaluation.response[aim.name], slope @ jacobian))
         cornered = tuple(map(_is_cornered, self.aims))
-        walls = self.problem.walls(evaluation, jacobian)
-        limits = slack, normals, walls
+        caps = self.problem.caps(evaluation, jacobian)
+        limits = slack, normals, caps
         return _finite(Sample(np.array(point), evaluation, tuple(groups), cornered, *limits))
 
 
@@ -296,7 +296,7 @@ def _finite(sample: Sample) -> Sample | None:
     """Return `sample`, or `None` if a number in it is not finite."""
     arrays = [sample.slack, sample.normals]
     arrays += [
-        array for group in (*sample.terms, *sample.walls) for array in (group.values, group.slopes)
+        array for group in (*sample.terms, *sample.caps) for array in (group.values, group.slopes)
     ]
     return sample if all(np.all(np.isfinite(array)) for array in arrays) else None
 

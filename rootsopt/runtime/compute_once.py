@@ -20,7 +20,7 @@ T = TypeVar("T")
 _MANY = 32
 
 
-def kept(tree: T) -> T:
+def compute_once(tree: T) -> T:
     """Return `tree` unchanged, and have the values of its floating-point arrays computed once.
 
     The result cannot be differentiated. On a GPU, this function does nothing."""
@@ -28,29 +28,29 @@ def kept(tree: T) -> T:
     leaves, shape = jax.tree.flatten(values)
     if not leaves or jax.default_backend() != "cpu":
         return tree
-    return eqx.combine(jax.tree.unflatten(shape, _kept(leaves)), rest)
+    return eqx.combine(jax.tree.unflatten(shape, _compute_once(leaves)), rest)
 
 
-def kept_along(tree: T) -> T:
-    """Return `tree` unchanged, like `kept`, and have its derivatives along directions computed
-    once, too.
+def compute_once_along(tree: T) -> T:
+    """Return `tree` unchanged, like `compute_once`, and have its derivatives along directions
+    computed once, too.
 
     All leaves must be floating-point arrays. Reverse-mode differentiation is not possible."""
-    return _kept_along(tree)  # pyright: ignore[reportReturnType]
+    return _compute_once_along(tree)  # pyright: ignore[reportReturnType]
 
 
 @jax.custom_jvp
-def _kept_along(tree):
-    return kept(tree)
+def _compute_once_along(tree):
+    return compute_once(tree)
 
 
-@_kept_along.defjvp
+@_compute_once_along.defjvp
 def _(primals, tangents):
-    return kept(*primals), kept(*tangents)
+    return compute_once(*primals), compute_once(*tangents)
 
 
 @custom_vmap
-def _kept(leaves):
+def _compute_once(leaves):
     if sum(leaf.size for leaf in leaves) < _MANY:
         return leaves
     # The compiler cannot know that both branches return the same (for all but infinite values).
@@ -58,6 +58,6 @@ def _kept(leaves):
     return lax.cond(endless, lambda x: [1.0 * leaf for leaf in x], lambda x: x, leaves)
 
 
-@_kept.def_vmap
+@_compute_once.def_vmap
 def _(size, batched, leaves):
-    return _kept(leaves), batched[0]
+    return _compute_once(leaves), batched[0]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rootsopt.profiles import base as trig
-from rootsopt.runtime.kept import kept, kept_along
+from rootsopt.runtime.compute_once import compute_once, compute_once_along
 
 ANGLES = jnp.linspace(-3.0, 3.0, 64)
 
@@ -34,10 +34,12 @@ def waves(function, *arguments):
 def test_what_is_kept_does_not_change():
     """Integers, single numbers, infinite values and arrays of any nested batch pass unchanged."""
     tree = {"number": 3.0 * ANGLES[0], "count": jnp.arange(3), "far": jnp.full(40, jnp.inf)}
-    for found, given in zip(jax.tree.leaves(kept(tree)), jax.tree.leaves(tree), strict=True):
+    for found, given in zip(
+        jax.tree.leaves(compute_once(tree)), jax.tree.leaves(tree), strict=True
+    ):
         np.testing.assert_array_equal(found, given)
     square = ANGLES.reshape(8, 8)
-    row = jax.vmap(jax.vmap(lambda x: kept((x, jnp.arange(4.0)))))(square)
+    row = jax.vmap(jax.vmap(lambda x: compute_once((x, jnp.arange(4.0)))))(square)
     np.testing.assert_array_equal(row[0], square)
     assert row[1].shape == (8, 8, 4)
     assert float(jax.grad(lambda x: trig.sin(x) ** 2)(0.3)) == pytest.approx(np.sin(0.6))
@@ -45,12 +47,12 @@ def test_what_is_kept_does_not_change():
 
 @jax.custom_jvp
 def values_kept(value):
-    return kept(value)
+    return compute_once(value)
 
 
 @values_kept.defjvp
 def _(primals, tangents):
-    return kept(*primals), tangents[0]
+    return compute_once(*primals), tangents[0]
 
 
 def derivatives(through):
@@ -73,7 +75,7 @@ def derivatives(through):
     ("repeated", "once", "share"),
     [
         (results(jnp.cos, jnp.sin), results(trig.cos, trig.sin), 0.5),
-        (derivatives(values_kept), derivatives(kept_along), 1.0),
+        (derivatives(values_kept), derivatives(compute_once_along), 1.0),
     ],
     ids=["cosines of many angles", "derivatives along directions"],
 )
