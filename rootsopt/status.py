@@ -128,8 +128,8 @@ class Status(enum.Enum):
     @property
     def usable(self) -> bool:
         """Whether a result with this status is the requested one, with a gradient."""
-        found = Status.PERIODIC, Status.AVERAGED, Status.IDLE, Status.GEOMETRY_ONLY
-        return self in (*found, Status.IDENTIFIED)
+        evaluated = Status.PERIODIC, Status.AVERAGED, Status.IDLE, Status.GEOMETRY_ONLY
+        return self in (*evaluated, Status.IDENTIFIED)
 
     @property
     def label(self) -> str:

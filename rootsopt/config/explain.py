@@ -274,9 +274,9 @@ def _translated(
             torque = value * factor * 1e3 / (2 * speed * RPM)
             return f"`{key}: {torque:.4g}`? it is half of that power at {speed:g} rpm"
         shown_value = share * factor != 1.0 and _is_number(value) and end
-        found = f"`{key}: {value * factor * share:.6g}`" if shown_value else f"`{key}`"
+        entry = f"`{key}: {value * factor * share:.6g}`" if shown_value else f"`{key}`"
         other = "; in other families it follows from their keys, which `rootsopt new` finds"
-        return f"{found}?" + (f" it belongs to family five_arcs{other}" if key == _OUTER else "")
+        return f"{entry}?" + (f" it belongs to family five_arcs{other}" if key == _OUTER else "")
     return ""
 
 
@@ -284,12 +284,12 @@ def tree(model: type[Section], prefix: str = "") -> dict[str, FieldInfo]:
     """Return the fields of all sections and keys of a `model`, by dotted name.
 
     `prefix`: beginning of all names."""
-    found: dict[str, FieldInfo] = {}
+    fields: dict[str, FieldInfo] = {}
     for name, field in model.fields().items():
-        found[f"{prefix}{name}"] = field
+        fields[f"{prefix}{name}"] = field
         if inner := _section(field):
-            found |= tree(inner, f"{prefix}{name}.")
-    return found
+            fields |= tree(inner, f"{prefix}{name}.")
+    return fields
 
 
 def _section(field: FieldInfo) -> type[Section] | None:
@@ -428,5 +428,5 @@ def outline(model: type[Section]) -> str:
 
 def _group_of(key: str) -> str:
     """Return the group of a `key`."""
-    found = {start: group for group, starts in GROUPS.items() for start in starts}
-    return found[max((start for start in found if f"{key}.".startswith(f"{start}.")), key=len)]
+    groups = {start: group for group, starts in GROUPS.items() for start in starts}
+    return groups[max((start for start in groups if f"{key}.".startswith(f"{start}.")), key=len)]

@@ -240,12 +240,12 @@ class Family:
 
         `parameters`: values in SI units, under their keys without units. Raises `TypeError` for a
         family whose profiles are read from files."""
-        return _found(self.maker)(lobes, pitch_radius, **parameters)
+        return _resolved(self.maker)(lobes, pitch_radius, **parameters)
 
     def check(self, profile: "ProfileConfig") -> None:
         """Raise `InputError` if a profile violates a closed-form limit."""
         if self.limits is not None:
-            _found(self.limits)(profile)
+            _resolved(self.limits)(profile)
 
     def dependent(self, lobes: int, pitch_radius_mm: Any, **values: Any) -> Mapping[str, Any]:
         """Return {key: (low, high)} for the parameters whose range depends on the others.
@@ -254,7 +254,7 @@ class Family:
         in the units of the keys."""
         if self.ranges is None:
             return {}
-        return _found(self.ranges)(lobes, pitch_radius_mm, **values)
+        return _resolved(self.ranges)(lobes, pitch_radius_mm, **values)
 
 
 _families: dict[str, Family] = {}
@@ -302,8 +302,8 @@ def parameters() -> dict[str, Parameter]:
 
 def is_list(key: str) -> bool:
     """Return whether a key holds a list of design parameters rather than a single number."""
-    found = parameters().get(key)
-    return found is not None and found.count is not None
+    parameter = parameters().get(key)
+    return parameter is not None and parameter.count is not None
 
 
 def users_of(key: str) -> list[str]:
@@ -342,15 +342,15 @@ def outside_modules() -> set[str]:
 
 
 def _file(module: str) -> Path | None:
-    found = getattr(sys.modules.get(module), "__file__", None)
-    return Path(found) if found else None
+    file = getattr(sys.modules.get(module), "__file__", None)
+    return Path(file) if file else None
 
 
 def _installed(path: Path) -> bool:
     return not {"site-packages", "dist-packages"}.isdisjoint(path.parts)
 
 
-def _found(hook: Hook | None) -> Callable[..., Any]:
+def _resolved(hook: Hook | None) -> Callable[..., Any]:
     if isinstance(hook, str):
         module, _, name = hook.partition(":")
         return getattr(importlib.import_module(module), name)
@@ -377,7 +377,7 @@ def _check(family: Family) -> None:
     foreign = made and {*family.example} != {*keys}
     wanted = ", ".join(("lobes", "pitch_radius", *(one.argument for one in family.parameters)))
     unfit = _unfit(family)
-    for wrong, argument, must, found in (
+    for wrong, argument, must, actual in (
         (not _WORD.fullmatch(name), "name", "be lower-case letters, digits and _", name),
         (len(set(keys)) < len(keys), "parameters", "have every key once", listed),
         (any(lists[:-1]), "parameters", "have a list of numbers last", listed),
@@ -388,7 +388,7 @@ def _check(family: Family) -> None:
         (unfit, "maker", f"take the arguments {wanted}", f"a function with {unfit}"),
     ):
         if wrong:
-            raise ValueError(f"Argument `{argument}` of a family must {must}, but is {found}")
+            raise ValueError(f"Argument `{argument}` of a family must {must}, but is {actual}")
 
 
 def _beyond(family: Family) -> Iterator[tuple[str, Any]]:

@@ -162,14 +162,14 @@ def notes(config: "Config") -> tuple[str, ...]:
 
     Defaults have no note. Neither has 0, which is the same in every unit."""
     given = dict(_numbers(config))
-    found = [_note(config, key, key, value) for key, value in given.items()]
-    return tuple(filter(None, (*found, *_listed(config, given))))
+    texts = [_note(config, key, key, value) for key, value in given.items()]
+    return tuple(filter(None, (*texts, *_listed(config, given))))
 
 
 def notes_on_swept(config: "Config", values: Mapping[str, Any]) -> tuple[str, ...]:
     """Return notes on the greatest of the `values` of each dotted key of a sweep."""
-    found = (_note(config, key, f"--over {key}", _greatest(many)) for key, many in values.items())
-    return tuple(filter(None, found))
+    texts = (_note(config, key, f"--over {key}", _greatest(many)) for key, many in values.items())
+    return tuple(filter(None, texts))
 
 
 def _listed(config: "Config", given: Mapping[str, float]) -> Iterator[str]:

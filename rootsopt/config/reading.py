@@ -104,11 +104,11 @@ class Config(Section):
 
     def with_design(self, design: Sequence[float] | NDArray[np.float64]) -> "Config":
         """Return a copy of the config with another `design` (d,), without checking it."""
-        values, found = [float(value) for value in design], self
+        values, config = [float(value) for value in design], self
         if self.twist_free:
             *values, twist = values
-            found = _with(found, f"rotor.{TWIST}", twist)
-        return found.model_copy(update={"profile": found.profile.with_design(values)})
+            config = _with(config, f"rotor.{TWIST}", twist)
+        return config.model_copy(update={"profile": config.profile.with_design(values)})
 
     def replaced(self, values: Mapping[str, Any]) -> "Config":
         """Return a copy of the config in which some `values` are replaced.
@@ -155,17 +155,17 @@ class Config(Section):
         """Return `values` by dotted key, with single entries of lists joined to whole lists.
 
         `profile.coefficients_3` names the third entry of `profile.coefficients`."""
-        found: dict[str, Any] = {}
+        joined: dict[str, Any] = {}
         for key, value in values.items():
             name, _, number = key.rpartition("_")
             entry = key.removeprefix("profile.")
             if not is_list(name.removeprefix("profile.")) or entry not in self.profile.design_keys:
-                found[key] = value
+                joined[key] = value
                 continue
-            entries = [*found.get(name, self.value(name))]
+            entries = [*joined.get(name, self.value(name))]
             entries[int(number) - 1] = value
-            found[name] = tuple(entries)
-        return found
+            joined[name] = tuple(entries)
+        return joined
 
     def value(self, key: str) -> Any:
         """Return the value at a dotted `key`, `None` if the config has no such key or section."""

@@ -96,13 +96,13 @@ class Section(BaseModel):
     def _canonical(cls, data):
         if not isinstance(data, dict):
             return data
-        found = dict(data)
+        canonical = dict(data)
         for name, value in data.items():
             field = cls.model_fields.get(name)
             if field is not None and isinstance(value, str):
                 words = {bare(word): word for word in choices(field)}
-                found[name] = words.get(bare(value), value)
-        return found
+                canonical[name] = words.get(bare(value), value)
+        return canonical
 
 
 def choices(kind: Any) -> tuple[str, ...]:

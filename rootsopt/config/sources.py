@@ -99,8 +99,8 @@ _SUFFIX = ".yaml"
 def shipped() -> dict[str, Path]:
     """Return the paths of the shipped configs by name, such as "cic"."""
     for place in _PLACES:
-        if found := sorted(place.glob(f"*{_SUFFIX}")):
-            return {path.stem: path for path in found}
+        if paths := sorted(place.glob(f"*{_SUFFIX}")):
+            return {path.stem: path for path in paths}
     return {}
 
 
@@ -119,11 +119,11 @@ def place_files(data: dict, folder: Path) -> None:
     `folder`: folder to which the paths are relative."""
     for key in FILES:
         *sections, name = key.split(".")
-        found: Any = data
+        node: Any = data
         for section in sections:
-            found = found.get(section) if isinstance(found, dict) else None
-        if isinstance(found, dict) and isinstance(found.get(name), str):
-            found[name] = str((folder / found[name]).absolute())
+            node = node.get(section) if isinstance(node, dict) else None
+        if isinstance(node, dict) and isinstance(node.get(name), str):
+            node[name] = str((folder / node[name]).absolute())
 
 
 def advice(path: Path) -> str:

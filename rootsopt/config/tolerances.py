@@ -157,11 +157,11 @@ class TolerancesConfig(Section):
 
         `values`: the config's own value of each key. Raises ValueError for a relative distribution
         of a key whose value is 0."""
-        found = []
+        scatters = []
         for key in self.changed:
             nominal = values[key]
             half = max(abs(one.get(key, nominal) - nominal) for one in self.conditions.values())
-            found.append(Scatter(key, _LISTED, nominal, half, half))
+            scatters.append(Scatter(key, _LISTED, nominal, half, half))
         for key, given in self.over.items():
             ((name, width),) = given.items()
             kind = name.removeprefix(_RELATIVE)
@@ -173,8 +173,8 @@ class TolerancesConfig(Section):
                 )
             size = width * abs(nominal) if kind != name else width
             half = _CUT * size if kind == "normal" else size
-            found.append(Scatter(key, kind, nominal, size, half))
-        return tuple(found)
+            scatters.append(Scatter(key, kind, nominal, size, half))
+        return tuple(scatters)
 
     def extremes(self, values: Mapping[str, float]) -> Iterator[tuple[str, dict[str, float], str]]:
         """Yield scenes that must be valid, each as (requirement, its values by key, remedy).
@@ -196,7 +196,7 @@ def scatterable(config: Any, design: bool = True) -> dict[str, float]:
 
     They are the numerical values in its sections `rotor`, `contact` and `scene`, and with `design`
     its design parameters. An entry of a list is numbered from 1, as in `profile.coefficients_2`."""
-    found: dict[str, float] = {}
+    values: dict[str, float] = {}
 
     def walk(section: Section, prefix: str) -> None:
         for name in type(section).model_fields:
@@ -204,15 +204,15 @@ def scatterable(config: Any, design: bool = True) -> dict[str, float]:
             if isinstance(value, Section):
                 walk(value, f"{prefix}{name}.")
             elif isinstance(value, float) and prefix + name not in _NOT_PHYSICAL:
-                found[prefix + name] = value
+                values[prefix + name] = value
 
     for name in _SECTIONS:
         walk(getattr(config, name), f"{name}.")
     profile = config.profile
     if not design:
-        return found
+        return values
     designs = zip(profile.design_keys, profile.design, strict=True)
-    return found | {f"profile.{key}": float(value) for key, value in designs}
+    return values | {f"profile.{key}": float(value) for key, value in designs}
 
 
 def mounted(data: Any) -> Any:
@@ -256,8 +256,8 @@ def _near(word: str, words: Any) -> str:
     last = {one.split(".")[-1]: one for one in words}
     if word.split(".")[-1] in last and word not in words:
         return f"; did you mean `{last[word.split('.')[-1]]}`?"
-    found = difflib.get_close_matches(word[:80], [*words], n=1, cutoff=0.5)
-    return f"; did you mean `{found[0]}`?" if found else ""
+    matches = difflib.get_close_matches(word[:80], [*words], n=1, cutoff=0.5)
+    return f"; did you mean `{matches[0]}`?" if matches else ""
 
 
 def _dotted(data: dict, is_value: Callable[[dict], bool], prefix: str = "") -> dict[str, Any]:
@@ -265,12 +265,12 @@ def _dotted(data: dict, is_value: Callable[[dict], bool], prefix: str = "") -> d
 
     A later value replaces an earlier one of the same key. `is_value`: whether a dictionary is the
     value of a key rather than a section."""
-    found: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for key, value in data.items():
         nested = isinstance(value, dict) and not is_value(value)
         inner = _dotted(value, is_value, f"{prefix}{key}.") if nested else {f"{prefix}{key}": value}
-        found |= inner
-    return found
+        values |= inner
+    return values
 
 
 def entries(over: dict, kinds: Iterable[str]) -> dict[str, Any]:
@@ -360,7 +360,7 @@ class AssumptionsConfig(Section):
         half = max(_CLEARANCES[0], _CLEARANCES[1] * here)
         usual: dict[str, Any] = {key: {"factor": pair} for key, pair in _FACTORS.items()}
         usual |= {_CLEARANCE: {"range": (max(0.0, here - half), here + half)}}
-        found = []
+        spans = []
         for key, given in ((usual if every else {}) | self.over).items():
             if key not in values or given is None:
                 continue
@@ -368,5 +368,5 @@ class AssumptionsConfig(Section):
             size = values[key] if kind == "factor" else 1.0
             low, high = sorted(size * end for end in ends)
             if not math.isclose(low, high, abs_tol=1e-300):
-                found.append(Span(key, low, high))
-        return tuple(found)
+                spans.append(Span(key, low, high))
+        return tuple(spans)

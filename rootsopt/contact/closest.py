@@ -144,9 +144,9 @@ class FlankPair(eqx.Module):
         centre distance. The search itself is never differentiated.
         """
         folded, mirrored = self.folded(roll)
-        found = self._closest(folded, relative)
-        lever1, lever2 = found.lever1, found.lever2
-        return found._replace(
+        closest = self._closest(folded, relative)
+        lever1, lever2 = closest.lever1, closest.lever2
+        return closest._replace(
             lever1=jnp.where(mirrored, lever2, lever1), lever2=jnp.where(mirrored, lever1, lever2)
         )
 
@@ -165,15 +165,15 @@ class FlankPair(eqx.Module):
         profile = self.profile
         return profile.cusp or profile.forked or profile.wavy or not self.rolling
 
-    def _leap(self, found: ClosestApproach) -> Float[Array, ""]:
-        """Return a number that is positive if `found` is the minimum of the gap beyond the cusp.
+    def _leap(self, closest: ClosestApproach) -> Float[Array, ""]:
+        """Return a number that is positive if `closest` is the minimum of the gap beyond the cusp.
 
         That minimum lies beyond the cusp, or close before it (`_NEAR_CUSP`). Without a cusp, the
         number is 1: other flags then show that the contact may have jumped."""
         if not self.profile.cusp:
-            return jnp.ones_like(found.gap)
-        depth = jnp.maximum(-found.gap, 0.0) / self.frozen.pitch_radius
-        return found.normal2 - self.frozen.pitch_normal + _NEAR_CUSP * depth
+            return jnp.ones_like(closest.gap)
+        depth = jnp.maximum(-closest.gap, 0.0) / self.frozen.pitch_radius
+        return closest.normal2 - self.frozen.pitch_normal + _NEAR_CUSP * depth
 
     @property
     def edges(self) -> Float[Array, " k"]:
@@ -188,7 +188,10 @@ class FlankPair(eqx.Module):
         return jnp.stack([piece.stop for piece in pieces] or [jnp.zeros(())])
 
     def margins(
-        self, roll: Float[Array, ""], found: ClosestApproach, rival: Float[Array, ""] | None = None
+        self,
+        roll: Float[Array, ""],
+        closest: ClosestApproach,
+        rival: Float[Array, ""] | None = None,
     ) -> Float[Array, " s"]:
         """Return numbers (s,) that change their signs where the closest approach changes its piece.
 
@@ -197,17 +200,17 @@ class FlankPair(eqx.Module):
         and each rotor. The one for a common normal is 1 or -1, because it changes only where the
         flanks are apart.
 
-        `roll`: x (rad); `found`: closest approach at this pose; `rival`: gap (m) of the minimum to
-        which the contact jumps, if known. The number for the jump then passes smoothly through
+        `roll`: x (rad); `closest`: closest approach at this pose; `rival`: gap (m) of the minimum
+        to which the contact jumps, if known. The number for the jump then passes smoothly through
         zero."""
-        normals = jnp.stack([found.normal1, found.normal2])
+        normals = jnp.stack([closest.normal1, closest.normal2])
         beyond = (normals[:, None] - self.edges).ravel()
         half = self.profile.half_pitch
-        numbers = [jnp.where(found.found, 1.0, -1.0), trig.sin(jnp.pi / 2 * (roll - half) / half)]
+        numbers = [jnp.where(closest.found, 1.0, -1.0), trig.sin(jnp.pi / 2 * (roll - half) / half)]
         if self.jumps:
-            numbers.append(self._leap(found) if rival is None else rival - found.gap)
+            numbers.append(self._leap(closest) if rival is None else rival - closest.gap)
         if self.frozen.wavy:
-            numbers += [found.rank - 0.5 - number for number in range(RANKS)]
+            numbers += [closest.rank - 0.5 - number for number in range(RANKS)]
         return jnp.concatenate([jnp.stack(numbers), beyond])
 
     @eqx.filter_jit  # so that all its calls in one program are traced once
@@ -227,10 +230,10 @@ class FlankPair(eqx.Module):
 
         @closest.defjvp
         def _(primals, tangents):
-            found = closest(*primals)
+            approach = closest(*primals)
             dynamic, *pose = primals
             by_dynamic, *by_pose = tangents
-            here, normal2 = found.found, found.normal2
+            here, normal2 = approach.found, approach.normal2
             still, unit = jnp.zeros_like(normal2), jnp.ones_like(normal2)
 
             def mesh(dynamic, normal2, roll, relative):
@@ -244,7 +247,7 @@ class FlankPair(eqx.Module):
             normal1_dot, lever1_dot, lever2_dot = (
                 moved[i] + turned[i] * normal2_dot for i in (2, 3, 4)
             )
-            return found, ClosestApproach(
+            return approach, ClosestApproach(
                 gap=jnp.where(here, moved[1], still),
                 lever1=jnp.where(here, lever1_dot, still),
                 lever2=jnp.where(here, lever2_dot, still),
@@ -301,8 +304,8 @@ class FlankPair(eqx.Module):
             bracket, guess, present, single = lax.cond(
                 direct, lambda: rolling, lambda: bracket_of(self, attempt, roll, relative)
             )
-            found, converged = root_in(self, bracket, guess, ~direct, roll, relative)
-            gap, normal1, lever1, lever2, normal2 = found
+            root, converged = root_in(self, bracket, guess, ~direct, roll, relative)
+            gap, normal1, lever1, lever2, normal2 = root
             if self.frozen.wavy:  # A pair this deep belongs to the other flank of the lobe.
                 present &= gap > -DEEPEST * self.profile.pitch_radius
             rank = jnp.maximum(attempt - 1.0, 0.0) if self.frozen.wavy else nothing
@@ -365,8 +368,8 @@ class FlankPair(eqx.Module):
         def attempt(roll, relative):
             """Return the closest approach of attempt 1, and whether it is certain."""
             bracket, guess, present, single = bracket_of(self, 1, roll, relative)
-            found, _ = root_in(self, bracket, guess, jnp.ones((), bool), roll, relative)
-            gap, normal1, lever1, lever2, normal2 = found
+            closest, _ = root_in(self, bracket, guess, jnp.ones((), bool), roll, relative)
+            gap, normal1, lever1, lever2, normal2 = closest
             _, usual, absent = self._direct(roll, relative)
             absent &= usual
             present &= ~absent
@@ -374,16 +377,16 @@ class FlankPair(eqx.Module):
             new = jax.tree.map(lambda x, y: jnp.where(present, x, y), new, self._missing(roll))
             return new, single & present | absent
 
-        def one(k, found):
+        def one(k, closest):
             place = rest[k]
             new = self._search(roll[place], relative[place])[1]
-            return jax.tree.map(lambda x, y: x.at[place].set(y), found, new)
+            return jax.tree.map(lambda x, y: x.at[place].set(y), closest, new)
 
         poses = roll, relative
         with trig.computed_once():
-            found, certain = lax.map(lambda pose: attempt(*pose), poses, batch_size=_MANY)
+            closest, certain = lax.map(lambda pose: attempt(*pose), poses, batch_size=_MANY)
         (rest,) = jnp.nonzero(~certain, size=count, fill_value=0)
-        return lax.fori_loop(0, jnp.sum(~certain), one, found)
+        return lax.fori_loop(0, jnp.sum(~certain), one, closest)
 
 
 def _searched(pair: FlankPair, roll, relative):
@@ -402,10 +405,10 @@ def _searched(pair: FlankPair, roll, relative):
             return searcher._search(roll, relative)[1]
         poses = roll.ravel(), relative.ravel()
         if pair.together and searcher._trusted and roll.size >= _MANY:
-            found = searcher._search_all(*poses)
+            closest = searcher._search_all(*poses)
         else:
-            found = lax.map(lambda pose: searcher._search(*pose)[1], poses)
-        return jax.tree.map(lambda x: x.reshape(roll.shape), found)
+            closest = lax.map(lambda pose: searcher._search(*pose)[1], poses)
+        return jax.tree.map(lambda x: x.reshape(roll.shape), closest)
 
     if jax.default_backend() != "cpu":
         return search(dynamic, roll, relative)
@@ -415,14 +418,14 @@ def _searched(pair: FlankPair, roll, relative):
     def _(size, batched, dynamic, *pose):
         if any(jax.tree.leaves(batched[0])):
             axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, tuple(batched))
-            found = jax.vmap(sequential_vmap(poses), axes)(dynamic, *pose)
+            closest = jax.vmap(sequential_vmap(poses), axes)(dynamic, *pose)
         else:
             pose = (
                 x if is_batched else jnp.broadcast_to(x, (size, *x.shape))
                 for x, is_batched in zip(pose, batched[1:], strict=True)
             )
-            found = poses(dynamic, *pose)
-        return found, jax.tree.map(lambda _: True, found)
+            closest = poses(dynamic, *pose)
+        return closest, jax.tree.map(lambda _: True, closest)
 
     return poses(dynamic, roll, relative)
 

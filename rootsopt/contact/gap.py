@@ -395,8 +395,8 @@ def root_in(pair: "FlankPair", bracket, guess, guarded, roll, relative):
         return (count < limit) & (jnp.abs(step) >= _FINISHED)
 
     def newton(carry):
-        count, before, _, (low, high), found = carry
-        normal2 = found[-1]
+        count, before, _, (low, high), root = carry
+        normal2 = root[-1]
         (value, *here), (slope, *turned) = jax.jvp(
             lambda nu: pair._mesh(nu, roll, relative), (normal2,), (jnp.ones_like(normal2),)
         )
@@ -417,8 +417,8 @@ def root_in(pair: "FlankPair", bracket, guess, guarded, roll, relative):
         return count + 1, step, slope, (low, high), (*after, new)
 
     nothing = jnp.zeros_like(guess)
-    found = *[nothing] * 4, guess
-    start = 0, jnp.full_like(guess, jnp.inf), nothing, bracket, found
-    _, step, slope, (low, high), found = lax.while_loop(go_on, newton, start)
-    inside = (found[-1] > low) & (found[-1] < high) & (slope < 0)
-    return found, inside & (jnp.abs(step) < _CONVERGED)
+    root = *[nothing] * 4, guess
+    start = 0, jnp.full_like(guess, jnp.inf), nothing, bracket, root
+    _, step, slope, (low, high), root = lax.while_loop(go_on, newton, start)
+    inside = (root[-1] > low) & (root[-1] < high) & (slope < 0)
+    return root, inside & (jnp.abs(step) < _CONVERGED)

@@ -14,13 +14,15 @@ from rootsopt.runtime.compute_once import compute_once_along
 
 
 def contact_point(
-    pair: FlankPair, roll: Float[Array, ""], relative: Float[Array, ""], found: ClosestApproach
+    pair: FlankPair, roll: Float[Array, ""], relative: Float[Array, ""], closest: ClosestApproach
 ) -> ContactPoint:
-    """Return position and direction of a contact, given the closest approach `found`.
+    """Return position and direction of a contact, given the `closest` approach.
 
-    `pair`: the flanks; `roll`, `relative`: x and ε (rad) at which `found` was computed."""
+    `pair`: the flanks; `roll`, `relative`: x and ε (rad) at which `closest` was computed."""
     folded, mirrored = pair.folded(roll)
-    support1, support2, radial = pair.supports_along(found.normal1, found.normal2, folded, relative)
+    support1, support2, radial = pair.supports_along(
+        closest.normal1, closest.normal2, folded, relative
+    )
     return ContactPoint(
         support1=jnp.where(mirrored, support2, support1),
         support2=jnp.where(mirrored, support1, support2),
@@ -79,8 +81,8 @@ class SearchContact(_FlankContact):
         return self.sides == 2
 
     def approach(self, roll, relative) -> Approach:
-        found = self.pair(roll, relative)
-        return Approach(found.gap, found.lever1, found.lever2, found)
+        closest = self.pair(roll, relative)
+        return Approach(closest.gap, closest.lever1, closest.lever2, closest)
 
     def point(self, roll, relative, approach: Approach) -> ContactPoint:
         return contact_point(self.pair, roll, relative, approach.place)
@@ -130,17 +132,17 @@ class NearContact(_FlankContact):
         return eqx.tree_at(lambda contact: contact.roots, self, own)
 
     def approach(self, roll, relative) -> Approach:
-        found, rival = self._moved(0, roll, relative), None
+        closest, rival = self._moved(0, roll, relative), None
         if self.jumps:
             rival = self._moved(1, roll, relative)
-        return Approach(found.gap, found.lever1, found.lever2, (found, rival))
+        return Approach(closest.gap, closest.lever1, closest.lever2, (closest, rival))
 
     def point(self, roll, relative, approach: Approach) -> ContactPoint:
         return contact_point(self.pair, roll, relative, approach.place[0])
 
     def margins(self, roll, approach: Approach) -> Float[Array, " s"]:
-        found, rival = approach.place
-        return self.pair.margins(roll, found, None if rival is None else rival.gap)
+        closest, rival = approach.place
+        return self.pair.margins(roll, closest, None if rival is None else rival.gap)
 
     def _moved(self, which: int, roll, relative) -> ClosestApproach:
         """Return the closest approach after one Newton step from the root with index `which`.

@@ -68,10 +68,12 @@ class WornContact(WrappedContact):
     lobes: Float[Array, ""]
 
     def approach(self, roll, relative) -> Approach:
-        found = self.section.approach(roll, relative)
+        approach = self.section.approach(roll, relative)
         depth, rate = series_at(self.coefficients, self.lobes, roll)
-        return found._replace(
-            gap=found.gap + depth, lever1=found.lever1 + rate / 2, lever2=found.lever2 - rate / 2
+        return approach._replace(
+            gap=approach.gap + depth,
+            lever1=approach.lever1 + rate / 2,
+            lever2=approach.lever2 - rate / 2,
         )
 
 
@@ -151,9 +153,9 @@ def slices_needed(
     wanted = sliced_mean(torque, twist * (np.arange(_REFERENCE) + 0.5) / _REFERENCE, profile.lobes)
     for count in _COUNTS:
         places, weights = np.polynomial.legendre.leggauss(count)
-        found = sliced_mean(torque, twist * places / 2, profile.lobes, weights / 2)
+        mean = sliced_mean(torque, twist * places / 2, profile.lobes, weights / 2)
         # The reference covers 0 … Φ, the Gauss points -Φ/2 … Φ/2.
-        shifted = sliced_mean(found, np.array([twist / 2]), profile.lobes)
+        shifted = sliced_mean(mean, np.array([twist / 2]), profile.lobes)
         if np.mean(np.abs(shifted - wanted)) <= error * np.max(np.abs(wanted)):
             return count
     return MOST

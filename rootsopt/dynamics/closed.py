@@ -100,20 +100,20 @@ def closed_orbit(
     equation = CollocatedEquation(pair, measures, top, settings.variation)
     frozen, accuracy = lax.stop_gradient(pair), ACCURACY * tolerance
     closed = Closer(equation, frozen, tangents, known, neighbour, accuracy).run()
-    orbit, found, sound = closed.orbit, closed.known, closed.known.sound & known.sound
-    verified = sound & (found.error <= greatest_error(tolerance))
+    orbit, solution, sound = closed.orbit, closed.known, closed.known.sound & known.sound
+    verified = sound & (solution.error <= greatest_error(tolerance))
     # The transient may have mistaken several periods of the orbit for one.
     shorter = _repeats(pair, closed, settings.max_orbit, tolerance) * sound
     verified &= shorter == 0
     orbit = orbit._replace(
         residual=jnp.where(sound, orbit.residual, jnp.inf),
         newton_steps=closed.steps,
-        disagreement=found.drift,
+        disagreement=solution.drift,
     )
     if not pair.smooth:  # The force may jump where no element ends.
         unknown = jnp.nan * orbit.sensitivity, jnp.nan * orbit.moved
         orbit = orbit._replace(sensitivity=unknown[0], moved=unknown[1])
-    return Collocated(orbit, sound, shorter, verified, found._replace(sound=verified))
+    return Collocated(orbit, sound, shorter, verified, solution._replace(sound=verified))
 
 
 def _repeats(
@@ -194,7 +194,7 @@ def unknown(pair: RotorPair, longest: int) -> KnownOrbit:
 class _Loop(NamedTuple):
     """State of the loop over attempts.
 
-    `found`: result of the last attempt; `near`: whether the next attempt begins on the known orbit.
+    `motion`: that of the last attempt; `near`: whether the next attempt begins on the known orbit.
     Otherwise, it continues the transient from the scaled `state`, at the tolerance `coarse`, until
     the states repeat to within the scaled distance `within`. If `shorter` is not 0, the last orbit
     repeated after `shorter` mesh periods; the next attempt then closes an orbit of this period,
@@ -202,7 +202,7 @@ class _Loop(NamedTuple):
     loop has ended.
     """
 
-    found: Steady
+    motion: Steady
     near: Bool[Array, ""]
     shorter: Int[Array, ""]
     state: Float[Array, " n"]
@@ -226,7 +226,7 @@ class _Attempts(eqx.Module):
     def run(self) -> Steady:
         """Return the result of the search."""
         loop = lax.while_loop(lambda now: ~now.over, lambda now: self.step(now), self.begin())
-        return loop.found._replace(settled=loop.found.settled._replace(pieces=None))
+        return loop.motion._replace(settled=loop.motion.settled._replace(pieces=None))
 
     def begin(self) -> _Loop:
         """Return the initial state of the loop."""
@@ -240,7 +240,7 @@ class _Attempts(eqx.Module):
         known = unknown(pair, solver.max_orbit)
         still = unchanged(known.elements, directions) if solver.variation else None
         orbit = Orbit.empty(state, directions, solver.measures.count + 1, still)
-        found = Steady(
+        motion = Steady(
             status=jnp.where(unsound, Status.UNSOUND.code, Status.NOT_SETTLED.code),
             orbit=orbit,
             period=jnp.ones((), int),
@@ -256,7 +256,7 @@ class _Attempts(eqx.Module):
         coarse = jnp.maximum(solver.transient.rtol, _COARSE)
         within = settled_within(coarse).astype(dtype)
         near = self.start.known.sound
-        return _Loop(found, near, zero, state, coarse, within, zero, unsound)
+        return _Loop(motion, near, zero, state, coarse, within, zero, unsound)
 
     def step(self, now: _Loop) -> _Loop:
         """Make one attempt, and return the new state of the loop.
@@ -278,32 +278,32 @@ class _Attempts(eqx.Module):
         nothing = jnp.zeros_like(now.shorter)
         known = jnp.round(self.start.known.elements.mesh.period).astype(int)
         period = jnp.where(now.near, known, now.shorter)
-        settled = now.found.settled._replace(period=period, periods=nothing, steps=nothing)
+        settled = now.motion.settled._replace(period=period, periods=nothing, steps=nothing)
         return settled, nothing - 1
 
     def transient(self, now: _Loop) -> tuple[Transient, Int[Array, ""]]:
         """Return the transient of an attempt, and its status code, -1 if it has settled."""
         solver = self.solver
-        room = solver.max_periods - now.found.used
+        room = solver.max_periods - now.motion.used
         room = jnp.where(now.tries > 0, jnp.minimum(room, _LONGER), room).astype(int)
         integrator = dataclasses.replace(solver.transient, rtol=now.coarse)
-        found = settle(self.pair, now.state, integrator, now.within, room, solver.max_orbit, PIECES)
-        failure = transient_status(self.pair, found)
+        end = settle(self.pair, now.state, integrator, now.within, room, solver.max_orbit, PIECES)
+        failure = transient_status(self.pair, end)
         # The motion nearly repeats. The difference may be noise of the coarse steps: let Newton's
         # method decide.
-        nearly = (failure == Status.NOT_SETTLED.code) & (found.spread < _NEARLY)
-        period = jnp.where(nearly, found.nearest, found.period)
-        return found._replace(period=period), jnp.where(nearly, -1, failure)
+        nearly = (failure == Status.NOT_SETTLED.code) & (end.spread < _NEARLY)
+        period = jnp.where(nearly, end.nearest, end.period)
+        return end._replace(period=period), jnp.where(nearly, -1, failure)
 
     def lost(self, now: _Loop, settled: Transient, failure: Int[Array, ""]) -> _Loop:
         """Return the loop's state after a transient that has not settled."""
-        found = self.counted(now.found, settled)._replace(status=failure)
-        return now._replace(found=found, state=settled.state, over=jnp.ones((), bool))
+        motion = self.counted(now.motion, settled)._replace(status=failure)
+        return now._replace(motion=motion, state=settled.state, over=jnp.ones((), bool))
 
-    def counted(self, found: Steady, settled: Transient) -> Steady:
-        """Return `found` after a further transient: its end replaced, its effort added up."""
-        used, steps = found.used + settled.periods, found.steps + settled.steps
-        return found._replace(settled=settled, used=used, steps=steps)
+    def counted(self, motion: Steady, settled: Transient) -> Steady:
+        """Return `motion` after a further transient: its end replaced, its effort added up."""
+        used, steps = motion.used + settled.periods, motion.steps + settled.steps
+        return motion._replace(settled=settled, used=used, steps=steps)
 
     def attempt(self, now: _Loop, settled: Transient) -> _Loop:
         """Close an orbit, and return the loop's state."""
@@ -327,20 +327,20 @@ class _Attempts(eqx.Module):
         # event that the equation does not know. A further attempt would end the same way.
         vague = ~now.near & meets & made.sound & ~made.verified & (made.shorter == 0)
         made = made._replace(verified=made.verified & meets)
-        found = self.taken(self.counted(now.found, settled), made, place, period, within)
-        failed = found.status == Status.NOT_SETTLED.code
-        refused = now.near & (found.status != Status.PERIODIC.code)
+        motion = self.taken(self.counted(now.motion, settled), made, place, period, within)
+        failed = motion.status == Status.NOT_SETTLED.code
+        refused = now.near & (motion.status != Status.PERIODIC.code)
         shorter = jnp.where(now.near, 0, made.shorter)
         again = failed & ~now.near & ~vague & (now.tries + 1 < _ATTEMPTS)
-        again &= (shorter > 0) | (found.used < solver.max_periods)
+        again &= (shorter > 0) | (motion.used < solver.max_periods)
         # Chaos does not repeat at two tolerances: no window is needed to exclude it.
         repeats = (now.tries > 0) & (settled.spread < within) & ~again
         missed = failed & ~now.near & (vague | repeats)
-        status = jnp.where(missed, Status.NOT_CLOSED.code, found.status)
-        found = found._replace(status=status)
+        status = jnp.where(missed, Status.NOT_CLOSED.code, motion.status)
+        motion = motion._replace(status=status)
         finer = jnp.where(now.near | (shorter > 0), 1.0, 0.1)
         return _Loop(
-            found=found,
+            motion=motion,
             near=jnp.zeros((), bool),
             shorter=shorter,
             # A refused orbit does not change where the transient begins.
@@ -351,8 +351,8 @@ class _Attempts(eqx.Module):
             over=~(again | refused),
         )
 
-    def taken(self, found: Steady, made: Collocated, start, period, within) -> Steady:
-        """Return `found` with the closed orbit `made` and its status.
+    def taken(self, motion: Steady, made: Collocated, start, period, within) -> Steady:
+        """Return `motion` with the closed orbit `made` and its status.
 
         `start`: scaled state near which the orbit must lie; `period` of the orbit (mesh periods);
         `within`: scaled distance to which the transient's states repeated."""
@@ -364,14 +364,14 @@ class _Attempts(eqx.Module):
             # The flanks stay apart, but the gear rattles over several revolutions.
             unsure |= (status == Status.IDLE.code) & (made.shorter > 0)
         status = jnp.where(unsure | ~made.sound, Status.NOT_SETTLED.code, status)
-        found = found._replace(
+        motion = motion._replace(
             status=status,
             orbit=orbit,
             period=period,
             verdict=verdict,
             known=made.known,
         )
-        return final(self.pair, found, self.radius)
+        return final(self.pair, motion, self.radius)
 
 
 def steady_motion(
@@ -397,28 +397,28 @@ def steady_motion(
     return _Attempts(pair, tangents, start, numbers(start.pair), radius, solver).run()
 
 
-def examined(pair: RotorPair, found: Steady, solver: Solver) -> Steady:
-    """Return the motion `found` of `pair`; if it has no orbit, set its status by a window.
+def examined(pair: RotorPair, motion: Steady, solver: Solver) -> Steady:
+    """Return the `motion` of `pair`; if it has no orbit, set its status by a window.
 
     The window begins at the end of the transient, and distinguishes chaos from a long transient."""
-    state, integrator = found.settled.state, solver.transient
-    unsettled = among(found.status, OPEN) & (solver.probe_chaos > 0)
+    state, integrator = motion.settled.state, solver.transient
+    unsettled = among(motion.status, OPEN) & (solver.probe_chaos > 0)
     window = branch(
         unsettled,
         lambda: lyapunov(pair, state, PERIODS, integrator),
         lambda: Window.empty(state, PERIODS, integrator.tolerance),
     )
-    return seen(pair, found, window, unsettled)
+    return seen(pair, motion, window, unsettled)
 
 
 def seen(
-    pair: RotorPair, found: Steady, window: Window | None, whole: Bool[Array, ""] | bool = True
+    pair: RotorPair, motion: Steady, window: Window | None, whole: Bool[Array, ""] | bool = True
 ) -> Steady:
-    """Return a motion without an orbit, `found`, completed with a `window` of it.
+    """Return a `motion` without an orbit, completed with a `window` of it.
 
     The window determines the status if it was integrated (`whole`). A motion that repeats is
     NOT_CLOSED if the window shows neither chaos nor a failure."""
-    status, repeats = found.status, found.settled.period > 0
+    status, repeats = motion.status, motion.settled.period > 0
     if window is not None:
         judged = window_status(pair, window)
         # A motion that repeats at two tolerances is not chaotic.
@@ -426,4 +426,4 @@ def seen(
         status = jnp.where(among(status, OPEN) & whole & sure, judged, status)
     missed = (status == Status.NOT_SETTLED.code) & repeats
     status = jnp.where(missed, Status.NOT_CLOSED.code, status)
-    return found._replace(window=window, status=status)
+    return motion._replace(window=window, status=status)

@@ -129,9 +129,9 @@ def force_of(pair: "RotorPair", motion: Motion, touches: Any = None) -> FlankFor
     slices = pair.contact.slices
     if slices is None:
         return _section_force(pair, motion, *touches)
-    found = jax.vmap(functools.partial(_section_force, pair), (None, 0, 0))(motion, *touches)
-    whole = jax.tree.map(lambda x: jnp.tensordot(slices.weights, x, 1), found)
-    return whole._replace(depth=jnp.max(found.depth))
+    contacts = jax.vmap(functools.partial(_section_force, pair), (None, 0, 0))(motion, *touches)
+    whole = jax.tree.map(lambda x: jnp.tensordot(slices.weights, x, 1), contacts)
+    return whole._replace(depth=jnp.max(contacts.depth))
 
 
 def _section_force(pair: "RotorPair", motion: Motion, side: Float[Array, "*sides"], touch: Touch):
@@ -239,28 +239,28 @@ def kink_margins(pair: "RotorPair", motion: Motion, acting, touches: Any) -> Mar
     `acting`: list of (part, its own states in SI units); `touches`: result of `touches_of`."""
 
     def of_flank(contact, side, touch):
-        found = [
+        margins = [
             margins_of(pair.law, touch.depth, touch.closing),
             margins_of(contact.on_side(side), touch.roll, touch.approach),
         ]
         if touch.sliding is not None:
             speed = touch.sliding.speed
             rubbing = (part for part in pair.all_parts if part.rubs)
-            found += [margins_of(part, speed, flags="drag_switches") for part in rubbing]
-        values = jnp.concatenate(found)
+            margins += [margins_of(part, speed, flags="drag_switches") for part in rubbing]
+        values = jnp.concatenate(margins)
         return values, pair.law(touch.depth, touch.closing) > 0, touch.approach.place
 
     def of_section(section, motion, side, touch):
         del motion
         if pair.two_sided:
             return jax.vmap(functools.partial(of_flank, section.contact))(side, touch)
-        found = of_flank(section.contact, side, touch)
-        return jax.tree.map(lambda x: jnp.expand_dims(x, 0), found)
+        margins = of_flank(section.contact, side, touch)
+        return jax.tree.map(lambda x: jnp.expand_dims(x, 0), margins)
 
-    found = by_slice(pair, of_section, motion, *touches)
+    margins = by_slice(pair, of_section, motion, *touches)
     if pair.contact.slices is not None:
-        found = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), found)
-    values, pushes, places = found
+        margins = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), margins)
+    values, pushes, places = margins
     counts, values = jnp.repeat(pushes, values.shape[1]), [values.ravel()]
     if not pair.two_sided:
         values, counts = [*values, -motion.relative[None]], jnp.append(counts, jnp.any(pushes))
@@ -304,16 +304,16 @@ def pushes_of(pair: "RotorPair", motion: Motion) -> Pushes:
 
     def of_flank(side, motion):
         touch = touch_of(pair, side, motion, located=True)
-        found = _flank_force(pair, side, motion, touch)
+        forces = _flank_force(pair, side, motion, touch)
         sliding = touch.sliding
         assert sliding is not None
         assert sliding.normal is not None
-        assert found.push is not None
+        assert forces.push is not None
         x, y = sliding.normal
         aside = side * touch.approach.lever1 * jnp.stack([-y, x])
         place = sliding.point.support1 * sliding.normal - aside
         levers = jnp.stack([-touch.approach.lever1, touch.approach.lever2])
-        return Pushes(found.push, place, side * found.drive * levers)
+        return Pushes(forces.push, place, side * forces.drive * levers)
 
     def of_section(_, motion):
         sides = jnp.asarray([1.0, -1.0], pair.angle_scale.dtype)
@@ -321,11 +321,11 @@ def pushes_of(pair: "RotorPair", motion: Motion) -> Pushes:
             sides = jnp.where(motion.relative < 0, sides[:1], sides[1:])
         return jax.vmap(of_flank, (0, None))(sides, motion)
 
-    found, slices = by_slice(pair, of_section, motion), pair.contact.slices
+    forces, slices = by_slice(pair, of_section, motion), pair.contact.slices
     if slices is None:
-        return jax.tree.map(lambda x: x[None], found)
+        return jax.tree.map(lambda x: x[None], forces)
     weights = slices.weights[:, None, None]
-    return Pushes(weights * found.force, found.place, weights * found.torque)
+    return Pushes(weights * forces.force, forces.place, weights * forces.torque)
 
 
 def by_slice(pair: "RotorPair", of_section: Callable[..., Any], motion: Motion, *more: Any) -> Any:

@@ -137,11 +137,11 @@ class LandingControl(diffrax.AbstractAdaptiveStepSizeController):
         swing = _FIRST[1] * pair.timescales.swing / pair.mesh_period
         swing = jnp.minimum(_FIRST[0], swing)
         numbers = lax.stop_gradient((jnp.stack(edges), inside, swing))
-        found = cls(base, *(x.astype(dtype) for x in numbers))  # pyright: ignore
+        fixed = cls(base, *(x.astype(dtype) for x in numbers))  # pyright: ignore
         if pair.repeats == 1 or not own:
-            return found
+            return fixed
         zeros, frozen = jnp.zeros(len(own), dtype), lax.stop_gradient(pair)
-        return cls(found, zeros, jnp.full_like(play, jnp.inf), found.first, frozen)  # pyright: ignore
+        return cls(fixed, zeros, jnp.full_like(play, jnp.inf), fixed.first, frozen)  # pyright: ignore
 
     @property
     def rtol(self):  # pyright: ignore[reportIncompatibleVariableOverride]

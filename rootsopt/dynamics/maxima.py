@@ -93,8 +93,8 @@ def local_maxima(pair: RotorPair, tangents: RotorPair, orbit: VariedOrbit) -> Ma
     sides = np.concatenate([sides, [places[beside]] * 2], axis=1)
     room = ((0, 0), (0, MOST + _BESIDES - first.size))
     padded = np.pad(np.concatenate([first[None], sides]), room)
-    found = _located(pair, tangents, orbit, padded, np.asarray(first.size))
-    best, values, slopes = (np.asarray(x, np.float64)[: first.size] for x in found)
+    maxima = _located(pair, tangents, orbit, padded, np.asarray(first.size))
+    best, values, slopes = (np.asarray(x, np.float64)[: first.size] for x in maxima)
     order = np.argsort(-values, kind="stable")
     return Maxima(np.mod(best, period)[order], values[order], slopes[order])
 
@@ -130,9 +130,9 @@ def candidates(
         apart = all(_dip(forces, int(k), other) < (1 - _DIP) * forces[k] for other in kept)
         if apart and len(kept) < MOST:
             kept.append(int(k))
-    found = np.sort(np.asarray(kept, dtype=np.int64))
-    low, high = places[np.maximum(found - 1, 0)], places[np.minimum(found + 1, last)]
-    return found, np.stack([low, high])
+    indices = np.sort(np.asarray(kept, dtype=np.int64))
+    low, high = places[np.maximum(indices - 1, 0)], places[np.minimum(indices + 1, last)]
+    return indices, np.stack([low, high])
 
 
 def shoulders(places: NDArray[np.float64], forces: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -149,8 +149,8 @@ def shoulders(places: NDArray[np.float64], forces: NDArray[np.float64]) -> NDArr
     same = (np.sign(before) == np.sign(slope)) & (np.sign(after) == np.sign(slope))
     least = (steep <= np.abs(before)) & (steep < np.abs(after))
     high = forces > (1 - _SHOULDER) * np.max(forces)
-    found = np.flatnonzero(same & least & high)
-    return found[np.argsort(-forces[found], kind="stable")]
+    indices = np.flatnonzero(same & least & high)
+    return indices[np.argsort(-forces[indices], kind="stable")]
 
 
 def _dip(forces: NDArray[np.float64], one: int, other: int) -> float:
@@ -246,7 +246,7 @@ def located(
         values, slopes = jax.vmap(push, (0, 1, 0))(times, changes, still)
         return values[0], slopes[0], slopes[1:]
 
-    def one(k, found):
+    def one(k, maxima):
         start = places[0, k], -jnp.inf, places[1, k], places[2, k]
         best, top, *_ = lax.fori_loop(0, _ROUNDS, closer, start)
         values, (before, after), turned = jax.vmap(slopes)(best + _ASIDE * jnp.array([-1.0, 1.0]))
@@ -262,7 +262,7 @@ def located(
             there = turned[higher] + jnp.stack([before, after])[higher] * moves
             jumps = jnp.abs(values[1] - values[0]) > _JUMP * jnp.abs(top)
             slope = jnp.where(jumps, there, slope)
-        return tuple(x.at[k].set(y) for x, y in zip(found, (best, top, slope), strict=True))
+        return tuple(x.at[k].set(y) for x, y in zip(maxima, (best, top, slope), strict=True))
 
     nothing = jnp.zeros_like(places[0])
     rows = jnp.zeros((nothing.shape[0], orbit.variation.state.shape[-1]))

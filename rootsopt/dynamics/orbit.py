@@ -114,8 +114,8 @@ def branch(taken: Bool[Array, ""], then: Callable[[], Any], otherwise: Callable[
             nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(every))
             return lax.cond(jnp.any(takes), every, lambda: nothing)
 
-        found = jax.vmap(choose)(taken, computed(0, taken), computed(1, ~taken))
-        return found, jax.tree.map(lambda _: True, found)
+        results = jax.vmap(choose)(taken, computed(0, taken), computed(1, ~taken))
+        return results, jax.tree.map(lambda _: True, results)
 
     return chosen(taken, dynamic)
 
@@ -207,7 +207,7 @@ class Measures(eqx.Module):
         rows = np.asarray(response, np.float64)
         mean, square, peak, *others = rows
         rms = np.sqrt(max(square[0], 0.0))
-        found = {
+        forces = {
             "mean_force_N": (float(mean[0]), mean[1:]),
             "peak_force_N": (float(peak[0]), peak[1:]),
             "rms_force_N": (float(rms), square[1:] / (2 * max(rms, 1e-150))),
@@ -217,13 +217,13 @@ class Measures(eqx.Module):
             size = np.hypot(cos[0], sin[0])
             present = abs(order * period - round(order * period)) < 1e-6
             slope = 2 * (cos[0] * cos[1:] + sin[0] * sin[1:]) / max(size, 1e-150)
-            found[line_name(order)] = (
+            forces[line_name(order)] = (
                 (float(2 * size), slope) if present else (0.0, np.zeros_like(slope))
             )
         if self.norm is not None:
             norm = others[-1]
-            found[PEAK_NORM] = (float(norm[0]), norm[1:])
-        return found
+            forces[PEAK_NORM] = (float(norm[0]), norm[1:])
+        return forces
 
 
 PEAK_NORM = "peak_norm_force_N"

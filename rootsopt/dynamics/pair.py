@@ -206,7 +206,7 @@ class RotorPair(eqx.Module):
     def own_states(self, state: Float[Array, "*k n"]) -> list[Float[Array | np.ndarray, "*k _"]]:
         """Return a list of the parts' own states (SI units), in the order of `all_parts`, from the
         scaled `state` of the pair."""
-        found, place = [], 2 + self.free
+        states, place = [], 2 + self.free
         for part in self.all_parts:
             count = len(part.states)
             # A part without states adds nothing to the traced program: NumPy, not JAX.
@@ -215,9 +215,9 @@ class RotorPair(eqx.Module):
                 own = part.scales(self._units) * state[..., place : place + count]
                 start = part.start(self._units)
                 own = own if start is None else start + own
-            found.append(own)
+            states.append(own)
             place += count
-        return found
+        return states
 
     def motion(self, tau: Float[Array, "*k"], state: Float[Array, "*k n"]) -> Motion:
         """Return position and velocity (SI units) at rotation `tau` (mesh periods) and scaled
@@ -283,8 +283,8 @@ class RotorPair(eqx.Module):
         The flags describe the side of contact, the flank segment, the contact law and the parts, at
         rotation `tau` (mesh periods) and scaled `state`. The mask excludes flanks without a force.
         """
-        found = self.margins(tau, state)
-        return found.values > 0, found.counts
+        margins = self.margins(tau, state)
+        return margins.values > 0, margins.counts
 
     @eqx.filter_jit
     def margins(self, tau: Float[Array, ""], state: Float[Array, " n"]) -> Margins:

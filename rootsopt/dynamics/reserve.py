@@ -111,8 +111,8 @@ def apart(pair: RotorPair, tangents: RotorPair, orbit: VariedOrbit) -> Apart:
     """Return reserve and gear torque of a closed `orbit` of a pair with a timing gear.
 
     `tangents`: directions of the pair's parameters to which the variation of the orbit belongs."""
-    found = zip(reserve(pair, tangents, orbit), gear_torque(pair, tangents, orbit), strict=True)
-    return Apart(*map(jnp.concatenate, found))
+    fields = zip(reserve(pair, tangents, orbit), gear_torque(pair, tangents, orbit), strict=True)
+    return Apart(*map(jnp.concatenate, fields))
 
 
 def _aside(pair: RotorPair, tau, state: Float[Array, " n"]) -> tuple[Array, Array]:
@@ -189,8 +189,8 @@ def gaps(
         return jax.vmap(lambda side: touch_of(pair, side, motion).depth)(sides)
 
     def both(pair, tau, state):
-        found = by_slice(pair, of_section, pair.motion(tau, state))
-        return -jnp.max(found.reshape(-1, 2), axis=0)
+        depths = by_slice(pair, of_section, pair.motion(tau, state))
+        return -jnp.max(depths.reshape(-1, 2), axis=0)
 
     def at(tau):
         return orbit.pushed(both, tau, pair, tangents)
@@ -225,8 +225,8 @@ def gear_torque(
 
     begins, ends, _ = smooth_pieces(pair, orbit.elements, jnp.zeros(0), flags)
     nodes = begins[:, None] + (ends - begins)[:, None] * GAUSS.nodes
-    found = jax.vmap(jax.vmap(varied))(nodes)
-    total, slope = (jnp.tensordot(ends - begins, GAUSS.whole(x), 1) for x in found)
+    samples = jax.vmap(jax.vmap(varied))(nodes)
+    total, slope = (jnp.tensordot(ends - begins, GAUSS.whole(x), 1) for x in samples)
     mean, square = total[:2] / total[2]
     by_mean, by_square = (slope[:2] - jnp.stack([mean, square])[:, None] * slope[2]) / total[2]
     rms = jnp.sqrt(square)

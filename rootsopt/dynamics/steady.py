@@ -173,21 +173,21 @@ class Steady(NamedTuple):
         NaN."""
         closed = self.orbit.response
         unknown = jnp.full_like(closed, jnp.nan)
-        found = jnp.where(among(self.status, CLOSED), closed, unknown)
+        forces = jnp.where(among(self.status, CLOSED), closed, unknown)
         if self.window is not None:
             whole = self.window.done == self.window.growth.shape[0]
             window = among(self.status, OPEN) & whole
-            found = jnp.where(window, unknown.at[:3].set(self.window.forces), found)
-        return jnp.where(self.status == Status.IDLE.code, jnp.zeros_like(closed), found)
+            forces = jnp.where(window, unknown.at[:3].set(self.window.forces), forces)
+        return jnp.where(self.status == Status.IDLE.code, jnp.zeros_like(closed), forces)
 
     @property
     def sensitivity(self) -> Float[Array, "r d"]:
         """Derivatives of `forces` along the requested directions.
 
         They are 0 if the timing gear keeps the flanks apart, and NaN without a periodic orbit."""
-        found = self.orbit.sensitivity
-        found = jnp.where(self.status == Status.PERIODIC.code, found, jnp.nan)
-        return jnp.where(self.held, jnp.zeros_like(found), found)
+        sensitivity = self.orbit.sensitivity
+        sensitivity = jnp.where(self.status == Status.PERIODIC.code, sensitivity, jnp.nan)
+        return jnp.where(self.held, jnp.zeros_like(sensitivity), sensitivity)
 
     @property
     def held(self) -> Bool[Array, ""] | np.bool_:
@@ -223,34 +223,34 @@ def judged(
     orbit does not count as closed. The accuracy of the forces is checked later, by `final`."""
     rtols = solver.transient.tolerance, solver.orbit.tolerance
     scales = pair.law.exponent, radius, pair.force_scale
-    found = verdict(orbit, start, limits, rtols, scales)
+    checks = verdict(orbit, start, limits, rtols, scales)
     numbers = jnp.concatenate([orbit.response, orbit.state])
     # A pair that is not smooth never has derivatives. Their absence is not a failure.
     unknown = ~jnp.all(jnp.isfinite(orbit.sensitivity)) & pair.smooth
     status = _first(
-        (found.idle, Status.IDLE),
+        (checks.idle, Status.IDLE),
         (~jnp.all(jnp.isfinite(numbers)), Status.NON_FINITE),
         # Checked before the derivatives, which are unknown if the orbit amplifies errors.
-        (~found.steady, Status.NOT_SETTLED),
+        (~checks.steady, Status.NOT_SETTLED),
         (unknown, Status.NON_FINITE),
-        (~found.certain, Status.INACCURATE),
+        (~checks.certain, Status.INACCURATE),
         default=Status.PERIODIC.code,
     )
-    return found, status
+    return checks, status
 
 
-def final(pair: RotorPair, found: Steady, radius: Float[Array, ""]) -> Steady:
-    """Return `found`, with a different status if the forces of its orbit are not valid.
+def final(pair: RotorPair, motion: Steady, radius: Float[Array, ""]) -> Steady:
+    """Return `motion`, with a different status if the forces of its orbit are not valid.
 
     The status is then UNSOUND (no such rotors), TOO_DEEP (the flanks penetrate too deep) or
     UNRESOLVED (the numerical errors of the forces are too large). `radius`: pitch radius (m)."""
-    orbit, checks = found.orbit, found.verdict
-    closed = among(found.status, (Status.PERIODIC, Status.INACCURATE))
+    orbit, checks = motion.orbit, motion.verdict
+    closed = among(motion.status, (Status.PERIODIC, Status.INACCURATE))
     deep = orbit.depth > TOO_DEEP * radius
     vague = (checks.rounding > UNRESOLVED) | ~checks.consistent
-    status = jnp.where(closed & vague, Status.UNRESOLVED.code, found.status)
+    status = jnp.where(closed & vague, Status.UNRESOLVED.code, motion.status)
     status = jnp.where(closed & deep, Status.TOO_DEEP.code, status)
-    return found._replace(status=jnp.where(pair.sound, status, Status.UNSOUND.code))
+    return motion._replace(status=jnp.where(pair.sound, status, Status.UNSOUND.code))
 
 
 def transient_status(pair: RotorPair, settled: Transient) -> Int[Array, ""]:
@@ -331,9 +331,9 @@ class VariedOrbit(NamedTuple):
         return jax.vmap(push, (1, 0), (None, -1))(changes, moved)
 
 
-def varied(found: Steady) -> VariedOrbit:
+def varied(motion: Steady) -> VariedOrbit:
     """Return the closed orbit of a motion, with its variation.
 
     The motion must have been found with `Solver.variation`."""
-    assert found.orbit.variation is not None
-    return VariedOrbit(found.known.elements, found.orbit.variation)
+    assert motion.orbit.variation is not None
+    return VariedOrbit(motion.known.elements, motion.orbit.variation)

@@ -225,8 +225,8 @@ def integrated_difference(
     begun = state, jnp.zeros(3, state.dtype), jnp.ones((), bool)
     end, total, solved = lax.fori_loop(0, period, step, begun)
     sizes = jnp.stack([total[:2] / total[2], forces[:2]])
-    found, given = sizes.at[:, 1].set(jnp.sqrt(sizes[:, 1]))
-    apart = jnp.abs(found - given) / jnp.maximum(given, _FAINT * pair.force_scale)
+    integrated, given = sizes.at[:, 1].set(jnp.sqrt(sizes[:, 1]))
+    apart = jnp.abs(integrated - given) / jnp.maximum(given, _FAINT * pair.force_scale)
     largest = jnp.maximum(jnp.max(apart), jnp.max(jnp.abs(end - state)))
     return jnp.where(solved & jnp.isfinite(largest), largest, jnp.inf)
 

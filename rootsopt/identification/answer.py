@@ -133,12 +133,12 @@ def parameters(
 
     `profiles`: results of `profile` by key; `optima`: other scenes. The intervals include those
     that fit as well as the best."""
-    found, box = {}, zip(*problem.box, strict=True)
+    estimates, box = {}, zip(*problem.box, strict=True)
     near = [row for row in optima if row["increase"] < spread.width**2]
     for k, (one, (low, high)) in enumerate(zip(problem.quantities, box, strict=True)):
         ends = profiles[one.key]["interval_95"]
         sides = {"lower": best.place[k] - low, "upper": high - best.place[k]}
-        found[one.key] = {
+        estimates[one.key] = {
             "value": float(best.values[k]),
             "standard_error": float(spread.errors[k] * one.slope(best.values[k])),
             "interval_95": [
@@ -148,23 +148,23 @@ def parameters(
             "bounds": [one.low, one.high],
             "at_bound": next((side for side, room in sides.items() if room < _NEAR), None),
         }
-    return found
+    return estimates
 
 
 def combinations(problem: Problem, spread: Spread) -> list[dict[str, Any]]:
     """Return the entry `combinations` of the result file, undetermined ones first."""
-    found, names = [], {one.key: one.name for one in problem.quantities}
+    summaries, names = [], {one.key: one.name for one in problem.quantities}
     for row, deviation in zip(spread.combinations, spread.deviations, strict=True):
         row = row * np.sign(row[np.argmax(np.abs(row))])
         parts = {key: float(x) for key, x in zip(names, row, strict=True) if abs(x) > _PART}
         ups, downs = ([names[key] for key, x in parts.items() if x * side > 0] for side in (1, -1))
         words = " and ".join(ups) + (" together" if len(ups) > 1 else "")
         words += f", against {' and '.join(downs)}" if downs else ""
-        found.append({
+        summaries.append({
             "words": words, "parts": parts, "standard_error": float(deviation),
             "determined": not math.isinf(deviation),
         })  # fmt: skip
-    return found
+    return summaries
 
 
 def relative_misfit(problem: Problem, best: Fit) -> float:
@@ -206,7 +206,7 @@ def quality(problem: Problem, best: Fit, spread: Spread) -> dict[str, Any]:
 def motions(problem: Problem, best: Fit, others: Sequence[int | None]) -> list[dict[str, Any]]:
     """Return the entry `motions` of the result file, empty for an ensemble. For each point, it
     states the motion that fits, whether it is reached from rest, and the number of `others`."""
-    found = []
+    rows = []
     for point, begin, count in zip(problem.points, best.begins, others, strict=True):
         mine, rest = (point.predicted(problem.quantities, best.values, x) for x in (begin, REST))
         if mine.values is None or not mine.orbit:
@@ -215,8 +215,8 @@ def motions(problem: Problem, best: Fit, others: Sequence[int | None]) -> list[d
             rest.values, mine.values, rtol=0, atol=_SAME * np.max(np.abs(mine.values), axis=0)
         )
         where = {"at": point.seen.values, **mine.orbit}
-        found.append(where | {"reached_from_rest": bool(same), "other_motions": count})
-    return found
+        rows.append(where | {"reached_from_rest": bool(same), "other_motions": count})
+    return rows
 
 
 def further(problem: Problem, best: Fit, spread: Spread) -> list[dict[str, Any]]:
@@ -230,7 +230,7 @@ def further(problem: Problem, best: Fit, spread: Spread) -> list[dict[str, Any]]
     scales = [one.slope(x) for one, x in zip(problem.quantities, best.values, strict=True)]
     turned, config = np.arange(256) * 360 / 256, problem.points[0].config
     table = pandas.DataFrame({"rotation_deg": turned} | {name: 0.0 * turned for name in _FURTHER})
-    found = []
+    measurements = []
     for share in _SPEEDS if config.objective.motion != "ensemble" else ():
         speed = share * config.scene.speed_rpm
         point = Point(
@@ -247,12 +247,12 @@ def further(problem: Problem, best: Fit, spread: Spread) -> list[dict[str, Any]]
             after = known + more.T @ more
             errors = np.sqrt(np.diag(np.linalg.pinv(after, hermitian=True)))
             sure = max(float(np.linalg.eigvalsh(after)[0]), 1e-300)
-            found.append({
+            measurements.append({
                 "column": name, "scene.speed_rpm": speed,
                 "least_certain_combination": sure**-0.5,
                 "standard_errors": named(problem, errors * scales),
             })  # fmt: skip
-    return sorted(found, key=lambda one: one["least_certain_combination"])[:3]
+    return sorted(measurements, key=lambda one: one["least_certain_combination"])[:3]
 
 
 def profile(problem: Problem, best: Fit, spread: Spread, number: int, fine: bool) -> dict[str, Any]:
@@ -274,11 +274,11 @@ def profile(problem: Problem, best: Fit, spread: Spread, number: int, fine: bool
             return -spread.width
         place = best.place + away / error**2 * spread.covariance[:, number]
         place[number] = center + away
-        found = problem.fitted(place, best.begins, best.deviation, held=[number])
-        if found is None:  # Without a usable motion, the interval ends.
+        fit = problem.fitted(place, best.begins, best.deviation, held=[number])
+        if fit is None:  # Without a usable motion, the interval ends.
             return spread.width
-        rise = max(0.0, float(2 * (found.cost - best.cost) / factor))
-        rows.append({"increase": rise, "values": named(problem, found.values)})
+        rise = max(0.0, float(2 * (fit.cost - best.cost) / factor))
+        rows.append({"increase": rise, "values": named(problem, fit.values)})
         return math.sqrt(rise) - spread.width
 
     for side, room in ((-1, center - low), (1, high - center)):
@@ -318,8 +318,8 @@ class Identification:
     >>> config = rootsopt.load_config("cic_drawn")
     >>> record = {"scene.speed_rpm": [2000.0, 3000.0], "mean_force_N": [87.95, 76.25]}
     >>> key = "scene.load.torque_N_m"
-    >>> found = rootsopt.identify(config, record, {key: (3.0, 8.0)})
-    >>> found.status.label
+    >>> identification = rootsopt.identify(config, record, {key: (3.0, 8.0)})
+    >>> identification.status.label
     'identified'
     """
 
@@ -346,8 +346,8 @@ class Identification:
         assert self.best is not None
         problem, best, spread = self.best
         place = np.array([one.scaled(values[one.key]) for one in problem.quantities])
-        found, _ = problem.at(place, best.begins, best.deviation)
-        return math.inf if found is None else 2 * (found.cost - best.cost) / spread.factor
+        fit, _ = problem.at(place, best.begins, best.deviation)
+        return math.inf if fit is None else 2 * (fit.cost - best.cost) / spread.factor
 
     @property
     def correlation(self) -> NDArray[np.float64]:
@@ -363,10 +363,10 @@ class Identification:
             return {a: dict(zip(keys, row, strict=True))
                     for a, row in zip(keys, rows.tolist(), strict=True)}  # fmt: skip
 
-        found = {name: getattr(self, name) for name in ENTRIES}
-        found |= {"correlation": table(self.correlation), "covariance": table(self.covariance)}
+        entries = {name: getattr(self, name) for name in ENTRIES}
+        entries |= {"correlation": table(self.correlation), "covariance": table(self.covariance)}
         end = {"status": self.status.label, "message": self.message}
-        return found | end | {"statistics": self.statistics}
+        return entries | end | {"statistics": self.statistics}
 
 
 def residuals(problem: Problem, best: Fit) -> dict[str, Sequence[Any]]:

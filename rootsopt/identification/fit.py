@@ -85,8 +85,8 @@ def identify(  # Keywords of the public interface, each independent of the other
     >>> jax.config.update("jax_enable_x64", True)
     >>> config = rootsopt.load_config("cic_drawn")
     >>> record = {"scene.speed_rpm": [2000.0, 3000.0], "mean_force_N": [87.95, 76.25]}
-    >>> found = rootsopt.identify(config, record, {"scene.load.torque_N_m": (3.0, 8.0)})
-    >>> list(found.parameters["scene.load.torque_N_m"])[:3]
+    >>> identification = rootsopt.identify(config, record, {"scene.load.torque_N_m": (3.0, 8.0)})
+    >>> list(identification.parameters["scene.load.torque_N_m"])[:3]
     ['value', 'standard_error', 'interval_95']
     """
     check_precision()
@@ -257,9 +257,9 @@ class _Search:
         return False
 
     def _at(self, place: NDArray[np.float64], begins: Sequence[Begin]) -> list[Fit]:
-        found, lost = self.problem.at(place, begins, self.deviation, self.turn)
+        fit, lost = self.problem.at(place, begins, self.deviation, self.turn)
         self.failed += lost
-        return [] if found is None else [found]
+        return [] if fit is None else [fit]
 
     def _fit(self, one: Fit) -> None:
         self.progress(f"fitting from the best scenes, {len(self.ends) + 1}")
@@ -274,8 +274,8 @@ class _Search:
         for point, own in zip(self.problem.points, one.begins, strict=True):
             self.progress("trying other motions")
             config, evaluator = point.moved(values)
-            found = find(evaluator, jnp.asarray(config.design)).attractors
-            starts = [x.evaluation.start for x in found if closed(x.evaluation)]
+            attractors = find(evaluator, jnp.asarray(config.design)).attractors
+            starts = [x.evaluation.start for x in attractors if closed(x.evaluation)]
             each.append(starts or [own])
         self.others_at.append((one.place, [len(some) - 1 for some in each]))
         for k in range(max(map(len, each))):

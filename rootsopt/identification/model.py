@@ -71,10 +71,10 @@ class Fitted(NamedTuple):
     def value(self, place: float) -> float:
         """Return the value at a `place` on the scale, within the bounds."""
         if self.log:
-            found = self.begin * math.exp(place * math.log(self.end / self.begin))
+            value = self.begin * math.exp(place * math.log(self.end / self.begin))
         else:
-            found = self.begin + place * (self.end - self.begin)
-        return min(max(found, self.low), self.high)
+            value = self.begin + place * (self.end - self.begin)
+        return min(max(value, self.low), self.high)
 
     def slope(self, value: float) -> float:
         """Return the derivative of the value with respect to its place on the scale."""
@@ -111,11 +111,11 @@ def fitted(
             f"`{key}` must not be fitted, because the record has a column of its values; remove "
             "one of them"
         )
-    found = []
+    quantities = []
     for key, pair in wanted.items():
         config, one = _fitted(config, key, pair)
-        found.append(one)
-    return config, found
+        quantities.append(one)
+    return config, quantities
 
 
 def _bounds(key: str, text: str) -> Any:
@@ -218,8 +218,8 @@ class Point:
     @classmethod
     def of(cls, config: Config, seen: Observed) -> "Point":
         """Return the point. Raises `InputError` if its values do not fit the config."""
-        found = cls(configured(config, seen.values), seen)
-        check_geometry(found.config)
+        point = cls(configured(config, seen.values), seen)
+        check_geometry(point.config)
         gear = [name for name in seen.names if "gear" in name or "reserve" in name]
         if gear and config.scene.timing_gear is None:
             raise InputError(
@@ -232,7 +232,7 @@ class Point:
                 f"{seen.source}: must have columns among {', '.join(ERRORS)} only for "
                 "`objective.motion` ensemble; remove the others, or set it to reached"
             )
-        return found
+        return point
 
     @functools.cached_property
     def evaluator(self) -> Evaluator:
@@ -291,12 +291,12 @@ class Point:
         places = [CHANNELS.index(name) for name in self.seen.names]
         size = np.nansum(measured**2, axis=0)
         size = np.where(size > 0, size, np.inf)
-        found = {}
+        leads = {}
         for tried in range(0, int(motion.period), pair.repeats) if lead is None else [lead]:
             all_of = channels_at(pair, tangents, varied(motion), turned + tried)
-            found[tried] = [x[:, places] for x in all_of]
-        lead = min(found, key=lambda k: np.sum(np.nansum((found[k][0] - measured) ** 2, 0) / size))
-        return *found[lead], lead
+            leads[tried] = [x[:, places] for x in all_of]
+        lead = min(leads, key=lambda k: np.sum(np.nansum((leads[k][0] - measured) ** 2, 0) / size))
+        return *leads[lead], lead
 
     def _over_orbit(self, evaluator: Evaluator, pair, tangents, motion: Steady):
         """Return averages over an orbit (1, c), with their derivatives (1, c, d)."""
@@ -323,17 +323,17 @@ class Point:
             whole = dataclasses.replace(evaluator, motions=Ensemble(), survey=True)
             return whole.without_gradient()(config.design, states, series=False)
 
-        def rows(found: Any) -> list[float]:
-            return [found.response.get(name, np.nan) for name in self.seen.names]
+        def rows(averages: Any) -> list[float]:
+            return [averages.response.get(name, np.nan) for name in self.seen.names]
 
         here = averaged(values, begin)
         if here.status is not Status.AVERAGED:
             return Predicted(here.status)
         place = [one.scaled(x) for one, x in zip(quantities, values, strict=True)]
         around, steps = neighbours(np.clip(place, 0.0, 1.0), self.config.ensemble)
-        found = [rows(averaged(values_at(quantities, one), here.start)) for one in around]
+        averages = [rows(averaged(values_at(quantities, one), here.start)) for one in around]
         scales = [one.slope(x) for one, x in zip(quantities, values, strict=True)]
-        slopes = fitted_slope(np.array(found), steps)[0] / np.array(scales)
+        slopes = fitted_slope(np.array(averages), steps)[0] / np.array(scales)
         errors = np.array([[here.steady_state[ERRORS[name]] for name in self.seen.names]])
         return Predicted(here.status, np.array([rows(here)]), slopes[None], errors, here.start)
 

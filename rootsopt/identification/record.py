@@ -57,8 +57,8 @@ def channels_at(
     times = orbit.elements.mesh.times
     tau = np.mod(tau, pair.lobes * np.round(float(times[-1] - times[0])))
     padded = np.pad(tau, (0, -len(tau) % _TOGETHER))
-    found = [_channels(pair, tangents, orbit, some) for some in padded.reshape(-1, _TOGETHER)]
-    values, slopes = zip(*jax.device_get(found), strict=True)
+    chunks = [_channels(pair, tangents, orbit, some) for some in padded.reshape(-1, _TOGETHER)]
+    values, slopes = zip(*jax.device_get(chunks), strict=True)
     return np.concatenate(values)[: len(tau)], np.concatenate(slopes)[: len(tau)]
 
 
@@ -155,8 +155,8 @@ class Observed:
         k, c = np.nonzero(np.isfinite(measured))
         where = {"source": self.source, "line": self.table.index[k]} | self.values
         where |= {"rotation_deg": self.column()[k], "column": np.array(self.names)[c]}
-        found = {"measured": measured[k, c], "given": given[k, c], "sampled": self.sampled}
-        return pandas.DataFrame(where | found)
+        columns = {"measured": measured[k, c], "given": given[k, c], "sampled": self.sampled}
+        return pandas.DataFrame(where | columns)
 
     def state(
         self, lobes: int, turns: int, period: float, offset: float
@@ -188,12 +188,12 @@ def observed(config: Config, data: Any) -> list[Observed]:
     `data`: path of a CSV file, columns by name (a mapping or an `xarray.Dataset`), or a list of
     these. Raises `InputError` if a table cannot be read, or if a column or a value is wrong."""
     tables = data if isinstance(data, list | tuple) else [data]
-    found = []
+    measurements = []
     for number, one in enumerate(tables, 1):
-        found += _points(config, *_table(one, f"table {number} of the record"))
-    if not found:
+        measurements += _points(config, *_table(one, f"table {number} of the record"))
+    if not measurements:
         raise InputError("the record must hold measured values, but has none; add rows")
-    return found
+    return measurements
 
 
 def _table(data: Any, name: str) -> tuple[str, pandas.DataFrame]:
@@ -274,8 +274,8 @@ def _points(config: Config, name: str, cells: pandas.DataFrame) -> Iterator[Obse
 
 def _number(cell: str) -> float:
     """Return the number in a cell, NaN if it is empty, infinity for another text."""
-    found = measured_number(cell)
-    return np.inf if found is None else found
+    number = measured_number(cell)
+    return np.inf if number is None else number
 
 
 def _check(config: Config, name: str, title: str, sampled: bool) -> None:

@@ -120,10 +120,10 @@ class Problem:
         Those not given are estimated from the differences `away` (n,) between prediction and
         record. If `away` is `None`, they are set to `scale`. Columns of few values share one
         relative deviation."""
-        scale, found = self.rows.scale.to_numpy(), self.rows.given.to_numpy(copy=True)
-        unknown = np.isnan(found)
+        scale, deviations = self.rows.scale.to_numpy(), self.rows.given.to_numpy(copy=True)
+        unknown = np.isnan(deviations)
         if away is None:
-            return np.where(unknown, scale, found)
+            return np.where(unknown, scale, deviations)
         share, of = (away / scale) ** 2, self.rows.column[unknown]
         freed = np.sqrt(len(away) / max(len(away) - self.lost, 1))
         groups = of.where(of.groupby(of).transform("size") >= _MANY, "")
@@ -131,8 +131,8 @@ class Problem:
             size = np.mean(share[mine])
             for _ in range(_CLIPS):
                 size = np.mean(np.minimum(share[mine], TURN**2 * size))
-            found[mine] = max(np.sqrt(size) * freed, _FINEST) * scale[mine]
-        return found
+            deviations[mine] = max(np.sqrt(size) * freed, _FINEST) * scale[mine]
+        return deviations
 
     def at(
         self,
@@ -146,12 +146,12 @@ class Problem:
 
         `deviation` (n,): standard deviations; `turn`: residual at which the loss turns linear."""
         values, rows = values_at(self.quantities, place), self.rows
-        found = predict(self.points, self.quantities, values, begins)
-        if lost := [one.status for one in found if one.values is None]:
+        predictions = predict(self.points, self.quantities, values, begins)
+        if lost := [one.status for one in predictions if one.values is None]:
             return None, lost
         known = [np.isfinite(point.seen.measured) for point in self.points]
         fit, slopes, errors = (
-            np.concatenate([getattr(x, name)[k] for x, k in zip(found, known, strict=True)])
+            np.concatenate([getattr(x, name)[k] for x, k in zip(predictions, known, strict=True)])
             for name in ("values", "slopes", "errors")
         )
         if not (np.all(np.isfinite(fit)) and np.all(np.isfinite(slopes))):
@@ -176,7 +176,7 @@ class Problem:
         residual = (fit - rows.measured.to_numpy()) / deviation
         size = np.abs(residual)
         cost = np.sum(np.where(size <= turn, size**2 / 2, turn * (size - turn / 2)))
-        begin = [one.begin for one in found]
+        begin = [one.begin for one in predictions]
         return Fit(place, values, float(cost), residual, slopes, fit, gains, begin, deviation), []
 
     def fitted(
@@ -204,15 +204,15 @@ class Problem:
             if (name := some.tobytes()) not in known:
                 whole = place.copy()
                 whole[free] = some
-                found, _ = self.at(whole, nearest, deviation, turn)
-                if found is None:
+                fit, _ = self.at(whole, nearest, deviation, turn)
+                if fit is None:
                     return None
-                nearest[:], known[name] = found.begins, found
+                nearest[:], known[name] = fit.begins, fit
             return known[name]
 
         def residual(some: NDArray[np.float64]) -> NDArray[np.float64]:
-            found = at(some)
-            return np.full(len(self.rows), np.nan) if found is None else found.residual
+            fit = at(some)
+            return np.full(len(self.rows), np.nan) if fit is None else fit.residual
 
         def slopes(some: NDArray[np.float64]) -> NDArray[np.float64]:
             return known[some.tobytes()].slopes[:, free]

@@ -108,14 +108,14 @@ def conjugacy(profile: Profile, distance: float | None = None) -> Conjugacy:
     radius. Raises `InputError` if the flanks never face each other."""
     roll = float(profile.half_pitch) * (np.arange(_POSES) + 0.5) / _POSES
     apart = 2 * profile.pitch_radius if distance is None else jnp.asarray(distance)
-    gap, found = map(np.asarray, _gaps(profile, apart, jnp.asarray(roll)))
-    found = found & np.isfinite(gap)
-    if not np.any(found):
+    gap, facing = map(np.asarray, _gaps(profile, apart, jnp.asarray(roll)))
+    facing = facing & np.isfinite(gap)
+    if not np.any(facing):
         raise InputError(
             "`profile.pitch_radius_mm` must be half the centre distance at which the rotors mesh, "
             "but their flanks do not face each other there; check this key and the outline's units"
         )
-    return Conjugacy(roll, np.where(found, gap, np.nan))
+    return Conjugacy(roll, np.where(facing, gap, np.nan))
 
 
 @CachedFunction
@@ -127,9 +127,9 @@ def _gaps(profile, distance, roll):
     return jnp.min(gap, axis=0), jnp.any(contact.found.reshape(sides.shape), axis=0)
 
 
-def gaps_um(found: Conjugacy) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def gaps_um(mesh: Conjugacy) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return (roll angles (n,) in degrees, gaps (n,) in µm) of a `Conjugacy`, for a figure."""
-    return np.degrees(found.roll), found.gap / _MICRON
+    return np.degrees(mesh.roll), mesh.gap / _MICRON
 
 
 def record(config: Config) -> dict[str, Any]:
@@ -154,7 +154,7 @@ def notes(config: Config) -> list[str]:
     from rootsopt.measured.source import advice, outline_of  # Slow import, as in `record`.
 
     profile, checks = outline_of(config.profile)
-    found = advice(config.profile, checks)
+    texts = advice(config.profile, checks)
     if not checks.seen.off_center:
-        found += filter(None, [inset_note(conjugacy(profile).inset, config.contact.clearance_mm)])
-    return found
+        texts += filter(None, [inset_note(conjugacy(profile).inset, config.contact.clearance_mm)])
+    return texts

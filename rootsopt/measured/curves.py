@@ -73,10 +73,10 @@ class MeasuredCurve:
 
         Each value of `t` is evaluated on the piece that contains it. Lengths are in mm."""
         place = np.clip(np.searchsorted(self.ends, t, side="right") - 1, 0, len(self.pieces) - 1)
-        found = np.empty((4, len(t)), complex)
+        values = np.empty((4, len(t)), complex)
         for k in map(int, np.unique(place)):
-            found[:, place == k] = self.derivatives(t[place == k], k)
-        return found
+            values[:, place == k] = self.derivatives(t[place == k], k)
+        return values
 
     def between(self, start: float, stop: float) -> list[tuple[int, float, float]]:
         """Return (index, low, high) of each piece that overlaps the interval `start` ≤ t ≤ `stop`.
@@ -216,9 +216,9 @@ def _curvature(points: NDArray[np.complex128]) -> tuple[NDArray[np.float64], NDA
 
 def _jumps(points: NDArray[np.complex128]) -> NDArray[np.bool_]:
     """Return a mask (n,) of the points at which the polygon has a jump of curvature or a cusp."""
-    found = np.zeros(len(points), bool)
+    mask = np.zeros(len(points), bool)
     if len(points) < 2 * _AROUND:
-        return found
+        return mask
     # Entry i belongs to point i + 1.
     curvature, _ = _curvature(points)
     # Entry i belongs to point i + 3. Extrapolate the curvature to it from both sides.
@@ -237,8 +237,8 @@ def _jumps(points: NDArray[np.complex128]) -> NDArray[np.bool_]:
         before = jump[max(i - _AROUND, 0) : max(i - _BESIDE, 0)]
         around = np.append(before, jump[i + _BESIDE + 1 : i + _AROUND + 1])
         joint[i] = jump[i] > _ABOVE * np.median(around)
-    found[3:-3] = cusp | joint
-    return found
+    mask[3:-3] = cusp | joint
+    return mask
 
 
 def _beside(values: NDArray) -> NDArray:

@@ -193,16 +193,16 @@ def _chosen(document: Drawing, name: str) -> list[Any]:
         everything = list(document.modelspace())
         direct = [e for e in everything if e.dxftype() in _KINDS]
         inserts = [e for e in everything if e.dxftype() == "INSERT"]
-        found = on_layer(direct)
-        if not found:
+        group = on_layer(direct)
+        if not group:
             blocks = _exploded(inserts, name)
-            found = on_layer(blocks) or direct or blocks
-    if not found:
+            group = on_layer(blocks) or direct or blocks
+    if not group:
         raise InputError(
             f"{name}: must hold an outline of {', '.join(_KINDS)}, but "
             f"{'its blocks have' if inserts else 'has'} none of them; draw it with these"
         )
-    return found
+    return group
 
 
 def _exploded(inserts: list[Any], name: str) -> list[Any]:
@@ -218,7 +218,7 @@ def _exploded(inserts: list[Any], name: str) -> list[Any]:
                 "explode the blocks in the drawing"
             )
 
-    found, handled = [], 0
+    entities, handled = [], 0
     queue = [(insert, 1) for insert in inserts]
     for insert, depth in queue:  # Nested inserts join the queue.
         with guarded(name, "holds a block that cannot be read", "explode the blocks"):
@@ -233,6 +233,6 @@ def _exploded(inserts: list[Any], name: str) -> list[Any]:
                 f"most {_ENTITIES} entities in total, but these are not; explode the blocks in the "
                 "drawing"
             )
-        found += [e for e in own if e.dxftype() in _KINDS]
+        entities += [e for e in own if e.dxftype() in _KINDS]
         queue += [(e, depth + 1) for e in own if e.dxftype() == "INSERT"]
-    return found
+    return entities

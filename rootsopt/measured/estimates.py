@@ -297,24 +297,24 @@ def scatter(points: Complex128[np.ndarray, " n"]) -> tuple[float, float]:
     distance of the neighbours. The scatter is NaN if the deviations grow by `_GROWTH`; all of the
     deviation is then error of interpolation. Otherwise, the growth determines this error."""
     spacing = float(np.median(np.abs(np.diff(points))))
-    stride, found = 1, _across(points, 1)
-    while found > stride * spacing / _CLEAR and len(points) / (2 * stride) >= _FEWEST:
+    stride, deviation = 1, _across(points, 1)
+    while deviation > stride * spacing / _CLEAR and len(points) / (2 * stride) >= _FEWEST:
         stride *= 2
-        found = _across(points, stride)
+        deviation = _across(points, stride)
     wider = _across(points, 2 * stride)
-    if found < SEEN:
-        return found, found
-    if not wider < _GROWTH * found:
-        return math.nan, found
-    error = math.sqrt(max(wider**2 - found**2, 0.0) / (_GROWN**2 - 1))
-    return math.sqrt(found**2 - error**2), error
+    if deviation < SEEN:
+        return deviation, deviation
+    if not wider < _GROWTH * deviation:
+        return math.nan, deviation
+    error = math.sqrt(max(wider**2 - deviation**2, 0.0) / (_GROWN**2 - 1))
+    return math.sqrt(deviation**2 - error**2), error
 
 
 def _across(points: NDArray[np.complex128], stride: int) -> float:
     """Return the scatter of `points` as in `scatter`, with neighbours `stride` points apart.
 
     It includes the error of the polynomial. NaN if there are too few points."""
-    found = []
+    scatters = []
     for half in _NEIGHBOURS:
         if len(points) <= 2 * half * stride:
             break
@@ -330,8 +330,8 @@ def _across(points: NDArray[np.complex128], stride: int) -> float:
         ratio[:, range(len(steps)), range(len(steps))] = 1.0
         weight = np.prod(ratio, axis=2)
         deviation = np.sum(weight * y, axis=1) / np.sqrt(1 + np.sum(weight**2, axis=1))
-        found.append(float(_MEDIAN * np.median(np.abs(deviation))))
-    return min(found, default=math.nan)
+        scatters.append(float(_MEDIAN * np.median(np.abs(deviation))))
+    return min(scatters, default=math.nan)
 
 
 def center(points: Complex128[np.ndarray, " n"], lobes: int) -> tuple[complex, float]:
@@ -355,10 +355,10 @@ def center(points: Complex128[np.ndarray, " n"], lobes: int) -> tuple[complex, f
         by_move = away / radius * (1 - 1j * slope / radius)
         rows = np.column_stack([series, by_move.real, by_move.imag]) * across[:, None]
         inverse = np.linalg.pinv(rows.T @ rows, rcond=1e-12, hermitian=True)
-        found = inverse @ (rows.T @ (radius * across))
-        move = complex(*found[-2:])
+        solution = inverse @ (rows.T @ (radius * across))
+        move = complex(*solution[-2:])
         place += move
-        off = radius * across - rows @ found
+        off = radius * across - rows @ solution
         variance = np.sum(off**2) / max(1, len(chosen) - rows.shape[1])
         error = float(np.sqrt(variance * (inverse[-1, -1] + inverse[-2, -2]) / 2))
         if not abs(move) > _STILL * np.max(radius):

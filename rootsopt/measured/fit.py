@@ -146,8 +146,8 @@ def imported(
 
         advising = dataclasses.replace(seen, reads=reads) if tried else seen
         outline, checks = _imported(loop, lobes, pitch_radius_mm, smoothing_mm, advising)
-    found = [x for x in vars(checks).values() if isinstance(x, float)]
-    if not all(np.all(np.isfinite(x)) for x in (*jax.tree.leaves(outline), *found)):
+    deviations = [x for x in vars(checks).values() if isinstance(x, float)]
+    if not all(np.all(np.isfinite(x)) for x in (*jax.tree.leaves(outline), *deviations)):
         raise InputError(
             "`profile.outline_file` must hold a smooth outline, but the curve through its points "
             "is not finite; remove points that are much closer together than others"
@@ -281,8 +281,8 @@ def _flank(lobe, side, points, joints, lobes, radius, smoothing, seen) -> _Flank
                 f"{np.degrees(2 * np.pi * lobe / lobes):.4g} deg lacks its tip, root or pitch "
                 "crossing; add points"
             )
-        found = brentq(lambda t: function(curve(np.array([t]))[0])[0], *ends, xtol=1e-13)
-        return float(found)  # type: ignore[arg-type]
+        zero = brentq(lambda t: function(curve(np.array([t]))[0])[0], *ends, xtol=1e-13)
+        return float(zero)  # type: ignore[arg-type]
 
     tip = root(low, high, np.imag)
     end = root(low, high, lambda z: np.imag(z * np.exp(-1j * half)))

@@ -90,7 +90,7 @@ def tails(points: Complex128[np.ndarray, " n"], most: int) -> list[Tail]:
     gaps = np.diff(cusps, append=cusps[0] + count)
     begin = cusps[np.argmax(gaps)] + np.max(gaps) // 2
     reach = min(_BESIDE, count // 4)
-    found: list[Tail] = []
+    swallow_tails: list[Tail] = []
     free = 0  # First index that belongs to no tail yet.
     for i, j in itertools.pairwise(np.sort((cusps - begin) % count).tolist()):
         if i < free or j - i >= reach:
@@ -101,9 +101,9 @@ def tails(points: Complex128[np.ndarray, " n"], most: int) -> list[Tail]:
         back = np.all(np.real(run[1:] * np.conj(run[0])) < 0)
         direct = abs(np.sum(run[1:])) > _STRAIGHT * np.sum(np.abs(run[1:]))
         if back and direct:
-            found.append(_tail(points[index], index, reach, reach + j - i))
+            swallow_tails.append(_tail(points[index], index, reach, reach + j - i))
             free = j + 1
-    return found
+    return swallow_tails
 
 
 def _tail(z: NDArray[np.complex128], index: NDArray[np.intp], i: int, j: int) -> Tail:

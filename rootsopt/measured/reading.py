@@ -125,8 +125,8 @@ def _joined(chains: list[Loop], sought: Sought | None, name: str, join: float) -
     `sought`, `join`: as in `read`. Raises `InputError` if the chains form no loop, or form the
     rotor only if wider gaps are joined; the message states the value of the key."""
     loops, fault = joined(chains, name, join)
-    if found := _rotor(loops, sought, name):
-        return found
+    if rotor := _rotor(loops, sought, name):
+        return rotor
     for wider in (step for step in _JOINS if sought and step > join and len(chains) > 1):
         opened = None
         with contextlib.suppress(InputError):  # Too many ends meet, or there are several rotors.
@@ -151,20 +151,20 @@ def _rotor(loops: list[Loop], sought: Sought | None, name: str) -> Loop | None:
     if sought is None:
         return None
     radius = sought.pitch_radius_mm
-    found = [
+    rotors = [
         (loop, shape)
         for loop, shape in _lobed(loops, sought)
         if radius is None or abs(shape.middle / radius - 1) < SIZED
     ]
     axis = complex(*sought.center) if isinstance(sought.center, tuple) else 0j
-    near = [one for one in found if abs(one[1].center - axis) < (radius or one[1].middle) / 2]
+    near = [one for one in rotors if abs(one[1].center - axis) < (radius or one[1].middle) / 2]
     # The two rotors of a pair are equal, so that either will do.
-    same = radius is None and len({(s.lobes, round(s.most, 2)) for _, s in found}) == 1
-    if len(found) > 1 and len(near) != 1 and not same:
-        raise InputError(_several([shape for _, shape in near or found], bool(near), name))
-    if not found:
+    same = radius is None and len({(s.lobes, round(s.most, 2)) for _, s in rotors}) == 1
+    if len(rotors) > 1 and len(near) != 1 and not same:
+        raise InputError(_several([shape for _, shape in near or rotors], bool(near), name))
+    if not rotors:
         return None
-    loop, shape = (near or found)[0]
+    loop, shape = (near or rotors)[0]
     return _noted(loop, len(loops), f"the {shape.lobes}-lobed one at {written(shape.center)} mm")
 
 
@@ -311,23 +311,23 @@ def untangled(loop: Loop, lobes: int, pitch_radius_mm: float) -> Loop:
     An offset curve has them where the offset exceeds the radius of curvature, as at the pitch
     circle of EE. A cutter that follows the curve cuts them off, so that the trimmed loop is the
     rotor as cut. Raises `InputError` for swallow-tails that are not small."""
-    found = tails(loop.points, _CUSPS * lobes)
-    if not found:
+    tangles = tails(loop.points, _CUSPS * lobes)
+    if not tangles:
         return loop
     some = [
         f"{place(at)} ({np.degrees(np.angle(at)):.5g} deg, {size * 1e3:.3g} um long)"
-        for _, at, size in found[:_NAMED]
+        for _, at, size in tangles[:_NAMED]
     ]
-    more = f" and {len(found) - _NAMED} more" if len(found) > _NAMED else ""
-    where = f"{len(found)} small loops (swallow-tails of an offset) at {', '.join(some)}{more}"
-    if max(size for *_, size in found) > _TAIL * pitch_radius_mm:
+    more = f" and {len(tangles) - _NAMED} more" if len(tangles) > _NAMED else ""
+    where = f"{len(tangles)} small loops (swallow-tails of an offset) at {', '.join(some)}{more}"
+    if max(size for *_, size in tangles) > _TAIL * pitch_radius_mm:
         raise InputError(
             f"`profile.outline_file` must hold an outline that does not cross itself, but it has "
             f"{where}; cut them off in the drawing, or remove their points"
         )
     points, joints = loop.points.copy(), loop.joints.copy()
     kept = np.ones(len(points), bool)
-    for inner, at, _ in found:
+    for inner, at, _ in tangles:
         kept[inner[1:]] = False
         points[inner[0]], joints[inner[0]] = at, True
     notes = (*loop.notes, f"{where} are cut off where they cross")

@@ -45,8 +45,8 @@ def outline_of(config: "ProfileConfig") -> tuple[Outline, Checks]:
     the file does not contain the outline of a rotor that can be simulated."""
     path = Path(config.outline_file or "")
     try:
-        found = path.stat()
-        stamp = found.st_mtime_ns, found.st_size, found.st_ino
+        status = path.stat()
+        stamp = status.st_mtime_ns, status.st_size, status.st_ino
     except (OSError, ValueError):
         stamp = ()  # Ignore the error here: `read` reports it.
     smoothing = config.outline_smoothing_mm or 0.0
@@ -92,16 +92,16 @@ def advice(config: "ProfileConfig", checks: Checks) -> list[str]:
 
     `config`: the profile's config; `checks`: those of its outline. Flanks that differ by `_NOTABLE`
     or more need a note because the profile is made from one flank."""
-    seen, found = checks.seen, list(checks.notes)
+    seen, notes = checks.seen, list(checks.notes)
     if max(checks.lobe_deviation_um, checks.flank_deviation_um) >= _NOTABLE:
-        found.insert(
+        notes.insert(
             0,
             "the leading flank next to +x represents all flanks, but lobes differ by up to "
             f"{checks.lobe_deviation_um:.3g} um and the trailing flank differs from it by up to "
             f"{checks.flank_deviation_um:.3g} um",
         )
     if config.outline_center == "fit":
-        found.append(
+        notes.append(
             f"the axis is the fitted centre of symmetry, {written(checks.axis)} mm in the file, to "
             f"about {max(seen.center_error, 1e-6) * 1e3:.1g} um"
         )
@@ -111,8 +111,8 @@ def advice(config: "ProfileConfig", checks: Checks) -> list[str]:
         unsmooth = f"{seen.few}; add points if the forces must be more exact"
     else:
         unsmooth = ""
-    found += filter(None, (seen.centering(), unsmooth))
-    return [f"outline: {text}" for text in found]
+    notes += filter(None, (seen.centering(), unsmooth))
+    return [f"outline: {text}" for text in notes]
 
 
 # Usual range (mm) of a rotor's pitch radius. Outside it, the file's unit is assumed to be another
@@ -138,7 +138,7 @@ _UNEVEN = 2e-3
 _MM = 1e-3
 
 
-class Found(NamedTuple):
+class MeasuredRotor(NamedTuple):
     """A rotor from a file.
 
     `outline`, `checks`: profile and deviations of the outline; `mesh`: gap of two such rotors;
@@ -152,7 +152,9 @@ class Found(NamedTuple):
     facts: tuple[str, ...]
 
 
-def found(path: Path, given: Mapping[str, Any], ask: Callable[[str, Any], Any]) -> Found:
+def read_rotor(
+    path: Path, given: Mapping[str, Any], ask: Callable[[str, Any], Any]
+) -> MeasuredRotor:
     """Return the rotor in the file at `path`.
 
     `given`: what the user knows, by key of the section `profile`; `ask`: called with a question and
@@ -204,7 +206,7 @@ def found(path: Path, given: Mapping[str, Any], ask: Callable[[str, Any], Any]) 
     facts = [said, f"{lobes} lobes", f"centre distance {2 * radius:.7g} mm ({told})"]
     facts += [f"axis at {written(checks.axis)} mm in the file"] if center else []
     facts += [f"points scattered by {seen.scatter / _MM:.2g} um"] if seen.rough(0.0) else []
-    return Found(outline, checks, mesh, lobes, radius, (*facts, *loop.notes))
+    return MeasuredRotor(outline, checks, mesh, lobes, radius, (*facts, *loop.notes))
 
 
 def _first(call: Callable[..., Any], trials: Iterable[tuple[Any, ...]]) -> Any:
@@ -265,8 +267,8 @@ def _rolling(outline: Outline, radius: float) -> float:
     def uneven(distance: float) -> float:
         return _uneven(conjugacy(outline, distance * _MM))
 
-    found = minimize_scalar(uneven, bounds=(low, high), options={"xatol": 1e-8 * radius})
-    return round(float(found.x), 3) / 2
+    minimum = minimize_scalar(uneven, bounds=(low, high), options={"xatol": 1e-8 * radius})
+    return round(float(minimum.x), 3) / 2
 
 
 def _uneven(mesh: Conjugacy) -> float:

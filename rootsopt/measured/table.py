@@ -118,8 +118,8 @@ def named_columns(data: bytes, name: str, titles: tuple[str, str]) -> NDArray[np
             f"the line {','.join(titles)}"
         )
     places = first.index(titles[0]), first.index(titles[1])
-    found = [_values(row, places, what, f"{name}, line {number}") for number, row in rows.items()]
-    return np.array(found).reshape(-1, 2)
+    pairs = [_values(row, places, what, f"{name}, line {number}") for number, row in rows.items()]
+    return np.array(pairs).reshape(-1, 2)
 
 
 def titled(data: bytes, name: str, what: str) -> tuple[list[str], dict[int, list[str]]]:
@@ -178,10 +178,10 @@ def _columns(headers: list[list[str]], name: str) -> tuple[tuple[int, int], str 
     "deg", "rad", "" if it must be told from the numbers, or `None` for x and y. Raises `InputError`
     if a header states units that are not known or differ."""
     for header, axes in itertools.product(headers, (("x", "y"), ("r", "theta"))):
-        found = [_named(axis, header) for axis in axes]
-        if None in found:
+        columns = [_named(axis, header) for axis in axes]
+        if None in columns:
             continue
-        (first, one), (second, two) = (one for one in found if one)
+        (first, one), (second, two) = (one for one in columns if one)
         polar = axes[0] == "r"
         if one not in (None, *_LENGTHS) or two not in ((None, *_ANGLES) if polar else (one,)):
             stated = named(f"{header[first]}, {header[second]}")
@@ -202,13 +202,13 @@ def _named(axis: str, header: list[str]) -> tuple[int, str | None] | None:
     stated = rf"[\s_/]*(?:[(\[]\s*(?P<inside>.*?)\s*[)\]]|(?P<bare>{_UNIT}))|[\s_]+\w+"
     test = re.compile(f"(?:{_AXES[axis]})(?:{stated})?", re.IGNORECASE)
     cells = [(k, match) for k, cell in enumerate(header) if (match := test.fullmatch(cell.strip()))]
-    found = []
+    columns = []
     for k, match in cells:
         text, known = match["inside"] or match["bare"], (_LENGTHS | _ANGLES).items()
         units = (unit for unit, test in known if re.fullmatch(test, text or "", re.IGNORECASE))
-        found.append((k, next(units, "?") if text else None))
-    found = found if len(found) == 1 else [one for one in found if one[1] == "mm"]
-    return found[0] if len(found) == 1 else None
+        columns.append((k, next(units, "?") if text else None))
+    columns = columns if len(columns) == 1 else [one for one in columns if one[1] == "mm"]
+    return columns[0] if len(columns) == 1 else None
 
 
 def _counted(cells: list[str]) -> int:
@@ -221,13 +221,13 @@ def _values(row: list[str], places: tuple[int, int], what: str, where: str) -> l
 
     `what`: what they are, and `where`: file and line, for messages."""
     cells = [row[k] if k < len(row) else "" for k in places]
-    found = [value for cell in cells if (value := _number(cell)) is not None]
-    if len(found) < 2 or not all(map(math.isfinite, found)):
+    numbers = [value for cell in cells if (value := _number(cell)) is not None]
+    if len(numbers) < 2 or not all(map(math.isfinite, numbers)):
         raise InputError(
             f"{where}: must hold {what}, but is {named(', '.join(row))!r}; correct or remove the "
             "line"
         )
-    return found
+    return numbers
 
 
 def _angle(angles: NDArray[np.float64], name: str) -> str:
@@ -319,7 +319,7 @@ def transmission_error(path: Path) -> tuple[NDArray[np.float64], NDArray[np.floa
     steps = np.diff(turned, append=turned[:1] + 360)
     widest, most = (float(np.max(x, initial=0)) for x in (steps, np.abs(error)))
     fall = int(np.argmin(steps)) + 1 if len(steps) and np.min(steps) <= 0 else 0
-    for holds, wanted, found in (
+    for holds, wanted, actual in (
         (apart <= _SAME[1], "repeat its first error after 360°", f"differs by {apart:g} µm"),
         (len(turned) >= _FEWEST_ROWS, f"have at least {_FEWEST_ROWS} rows", f"has {len(turned)}"),
         (not fall, "go once round, with rising rotations", f"does not at row {fall}"),
@@ -327,7 +327,7 @@ def transmission_error(path: Path) -> tuple[NDArray[np.float64], NDArray[np.floa
         (most <= _MOST, f"have errors of at most {_MOST:g} µm", f"has one of {most:g} µm"),
     ):
         if not holds:
-            raise InputError(f"{path.name}: must {wanted}, but {found}; correct the table")
+            raise InputError(f"{path.name}: must {wanted}, but {actual}; correct the table")
     from scipy.interpolate import make_interp_spline  # Slow import.
 
     knots = turned * DEG

@@ -107,8 +107,8 @@ class _Comparison:
         where: dict[tuple[bool, str], Shift] = {}
         for kind, exact in self.exact.items():
             some = {one: scenes[one] for name, one in lacking if self._varied(name) == kind}
-            found = _shifts(exact.config, some)
-            where |= {(kind, one): shift for one, shift in zip(some, found, strict=True)}
+            moved = _shifts(exact.config, some)
+            where |= {(kind, one): shift for one, shift in zip(some, moved, strict=True)}
         before, expected = len(self._known), (2 + _RIVALS) * len(self.scenes)
 
         def points() -> Iterator[Point]:
@@ -121,10 +121,10 @@ class _Comparison:
         def progress(done: int) -> None:
             self.tick(before + done, max(expected, before + done))
 
-        found = evaluate_many(points(), self.runs, progress)
+        evaluations = evaluate_many(points(), self.runs, progress)
         if self.stop():
             raise _StoppedError
-        self._known |= dict(zip(lacking, found, strict=True))
+        self._known |= dict(zip(lacking, evaluations, strict=True))
         return [[self._known[name, one] for one in scenes] for name in names]
 
     def objectives(self, names: Iterable[str], scenes: Scenes) -> list[NDArray[np.float64]]:
@@ -132,15 +132,15 @@ class _Comparison:
 
         They are NaN unless both have a usable motion, and NaN where the flanks of both stay
         apart."""
-        bases, *found = self.evaluations([BASELINE, *names], scenes)
-        return [np.array([*map(self._relative, bases, row)]) for row in found]
+        bases, *rows = self.evaluations([BASELINE, *names], scenes)
+        return [np.array([*map(self._relative, bases, row)]) for row in rows]
 
     def _relative(self, base: Evaluation, one: Evaluation) -> float:
         if not base.usable:
             return math.nan
-        found = self.problem.beside(base).objective(one)
-        nothing = base.status is Status.IDLE and one is not base and found == 1
-        return math.nan if nothing else found
+        objective = self.problem.beside(base).objective(one)
+        nothing = base.status is Status.IDLE and one is not base and objective == 1
+        return math.nan if nothing else objective
 
     def pieces(self, span: Span, first: str, other: str) -> list[Piece]:
         """Return the parts of a range in which design `first` is worse than the `other` one.
@@ -155,7 +155,7 @@ class _Comparison:
             (one,), (two,) = self.objectives((first, other), scenes)
             return float(one - two) - (WINS if other != BASELINE else 0.0)
 
-        found: list[Piece] = []
+        pieces: list[Piece] = []
         middle = [own] if span.low < own < span.high else []
         for low, high in itertools.pairwise([span.low, *middle, span.high]):
             a, b = _known(lead, low, high), _known(lead, high, low)
@@ -166,22 +166,22 @@ class _Comparison:
             # No statement is made beyond the last value with a known motion.
             start = a if one > 0 else b if change is None else change
             stop = b if two > 0 else a if change is None else change
-            joined = bool(found) and found[-1][1] == start
-            found.append((found.pop()[0] if joined else start, stop))
-        return found
+            joined = bool(pieces) and pieces[-1][1] == start
+            pieces.append((pieces.pop()[0] if joined else start, stop))
+        return pieces
 
     def others(self) -> list[dict[str, float]]:
         """Return designs that may be better than the optimum in some of the scenes.
 
         They are the optimum of its worst scene, the nominal one, and those of other searches."""
-        (values,), found = self.objectives([OPTIMIZED], self.scenes), []
+        (values,), designs = self.objectives([OPTIMIZED], self.scenes), []
         if np.isfinite(values).any():
-            found += self._in_worst([*self.scenes][int(np.nanargmax(values))])
+            designs += self._in_worst([*self.scenes][int(np.nanargmax(values))])
         robustness, optimality = self.result.robustness, self.result.optimality
         if robustness is not None and robustness.nominal.optimized is not None:
-            found.append(robustness.nominal.optimized.design)
-        found += [one.design for one in (optimality.optima if optimality else ())]
-        return self._apart(found, _RIVALS, _NEAR)
+            designs.append(robustness.nominal.optimized.design)
+        designs += [one.design for one in (optimality.optima if optimality else ())]
+        return self._apart(designs, _RIVALS, _NEAR)
 
     def _apart(
         self, designs: Iterable[dict[str, float]], most: int, least: float
@@ -189,13 +189,13 @@ class _Comparison:
         """Return the first `most` of some `designs` that are far from each other.
 
         They are farther than `least` in the unit box, also from the optimum."""
-        kept, found = [self._point(self.designs[OPTIMIZED])], []
+        kept, chosen = [self._point(self.designs[OPTIMIZED])], []
         for one in designs:
             point = self._point(one)
-            if len(found) < most and all(np.linalg.norm(point - x) > least for x in kept):
+            if len(chosen) < most and all(np.linalg.norm(point - x) > least for x in kept):
                 kept.append(point)
-                found.append(one)
-        return found
+                chosen.append(one)
+        return chosen
 
     def _point(self, design: Mapping[str, float]) -> NDArray[np.float64]:
         return self.problem.point([*design.values()])
@@ -216,10 +216,10 @@ class _Comparison:
         starts: list[Any] = [None]
 
         def look(point: NDArray[np.float64]) -> Linearization | None:
-            found = evaluator(problem.design(point), starts[-1], series=False)
-            if found.usable:
-                starts.append(found.start)
-            return problem.local(found, point)
+            evaluation = evaluator(problem.design(point), starts[-1], series=False)
+            if evaluation.usable:
+                starts.append(evaluation.start)
+            return problem.local(evaluation, point)
 
         begins = [(local.objective, k) for k, x in enumerate(tried)
                   if (local := look(self._point(x))) is not None]  # fmt: skip
@@ -227,10 +227,10 @@ class _Comparison:
             return []
         best = self._point(tried[min(begins)[1]])
         stops = Stops(evaluations=self.config.optimizer.iterations + 1, asked=self.stop)
-        found = descend(look, best, stops, problem.limits_at)
-        if found.local is None or found.local.violation > FEASIBLE:
+        outcome = descend(look, best, stops, problem.limits_at)
+        if outcome.local is None or outcome.local.violation > FEASIBLE:
             return []
-        values = self.problem.look(found.point)[0].tolist()
+        values = self.problem.look(outcome.point)[0].tolist()
         return [dict(zip(keys, values, strict=True))]
 
 
@@ -296,7 +296,7 @@ def _compared(work: _Comparison) -> Assumed:
         better = np.any(objectives[OPTIMIZED] - values > WINS)
         if better and work.problem.excess(own) <= FEASIBLE:
             objectives[name] = values
-    found = work.evaluations(objectives, scenes)
+    evaluations = work.evaluations(objectives, scenes)
     return Assumed(
         spans=spans,
         scenes=scenes,
@@ -304,7 +304,7 @@ def _compared(work: _Comparison) -> Assumed:
         objectives=objectives,
         statuses={
             name: [one.status.label for one in row]
-            for name, row in zip(objectives, found, strict=True)
+            for name, row in zip(objectives, evaluations, strict=True)
         },
         worse={one.key: work.pieces(one, OPTIMIZED, BASELINE) for one in spans},
         wins={

@@ -176,8 +176,8 @@ class Surface:
         size = len(self.curved)
         least = _LEAST * np.max(2 * self.rises / np.sum(self.squares, axis=1))
         ends = [(least, None)] * size
-        found = linprog(np.ones(size), -0.5 * self.squares, -self.rises, bounds=ends)
-        self.curved = FACTOR * found.x
+        solution = linprog(np.ones(size), -0.5 * self.squares, -self.rises, bounds=ends)
+        self.curved = FACTOR * solution.x
 
     def within(self, box: Box) -> Rows:
         """Return affine minorants in a `box`, without the paraboloid that they have in common.
@@ -337,12 +337,12 @@ class Bounding:
                 if np.min(self._look(point)[0]) >= -FEASIBLE:
                     self._sample.append(point)
         taken = [*self.unusable, *self.surfaces[0].points]
-        found: list[NDArray[np.float64]] = []
+        points: list[NDArray[np.float64]] = []
         for _ in range(min(most, len(self._sample))):
-            away = [min(np.linalg.norm(x - y) for y in [*taken, *found]) for x in self._sample]
+            away = [min(np.linalg.norm(x - y) for y in [*taken, *points]) for x in self._sample]
             if max(away) > _CLOSE:
-                found.append(self._sample[int(np.argmax(away))])
-        return found
+                points.append(self._sample[int(np.argmax(away))])
+        return points
 
     def _bounded(self, box: Box) -> tuple[Box, NDArray[np.float64] | None]:
         """Return a `box` with its bound, and the point (d,) where its minorants are least.
@@ -380,12 +380,12 @@ class Bounding:
         matrix = np.vstack([np.column_stack([a, np.full(len(a), c)]) for a, _, c in rows])
         ends = [*zip(-box.half, box.half, strict=True), (None, None)]
         aim, tops = np.arange(self.size + 1) == self.size, np.concatenate([b for _, b, _ in rows])
-        found = linprog(aim, matrix, tops, bounds=ends)
-        if found.status == 2:  # infeasible
+        solution = linprog(aim, matrix, tops, bounds=ends)
+        if solution.status == 2:  # infeasible
             return nothing
-        if found.status:
+        if solution.status:
             return box._replace(bound=low), box.middle
-        step, value = found.x[:-1], found.x[-1]
+        step, value = solution.x[:-1], solution.x[-1]
         least = value - 0.5 * step**2 @ objective.curved
         return box._replace(bound=value - room), (
             box.middle + step if least < self.target else None

@@ -67,8 +67,8 @@ def optimize_design(
     >>> jax.config.update("jax_enable_x64", True)
     >>> quick = ["optimizer.starts=1", "optimizer.screening=0", "optimizer.iterations=2"]
     >>> quick += ["assumptions.scenes=0"]  # no comparison in other scenes
-    >>> found = rootsopt.optimize_design(rootsopt.load_config("cic", quick))
-    >>> found.improvement["objective"] > 0  # a few designs only: without `quick`, an optimum
+    >>> optimization = rootsopt.optimize_design(rootsopt.load_config("cic", quick))
+    >>> optimization.improvement["objective"] > 0  # a few designs only: without `quick`, an optimum
     True
     """
     check_geometry(config)

@@ -24,7 +24,7 @@ from rootsopt.config.units import MM
 from rootsopt.errors import InputError
 from rootsopt.optimize.limits import ForceLimit, settled
 from rootsopt.optimize.local import FEASIBLE, Group, Linearization, Look
-from rootsopt.optimize.sqp import Found, Stops, descend
+from rootsopt.optimize.sqp import Descent, Stops, descend
 from rootsopt.profiles import Outline, Profile
 from rootsopt.response.records import geometry_record
 from rootsopt.response.result import Evaluation
@@ -101,9 +101,9 @@ class Infeasible(NamedTuple):
                 " Limits of forces are searched for locally: optimizer.starts and "
                 "optimizer.screening look further."
             )
-        found = "was found that" if self.simulated else "within optimizer.bounds"
+        phrase = "was found that" if self.simulated else "within optimizer.bounds"
         return (
-            f"No design {found} satisfies all constraints. In conflict: "
+            f"No design {phrase} satisfies all constraints. In conflict: "
             f"{'; '.join(lines)}. {advice}"
         )
 
@@ -125,8 +125,8 @@ def explain(
     stops = _STOPS if look is None else _SIMULATED
 
     def parts(point: NDArray[np.float64]) -> tuple[Group, ...] | None:
-        found = _geometry(problem, point) if look is None else look(point)
-        return None if found is None else _groups(found)
+        local = _geometry(problem, point) if look is None else look(point)
+        return None if local is None else _groups(local)
 
     def greatest(point: NDArray[np.float64]) -> Linearization | None:
         groups = parts(point)
@@ -163,16 +163,16 @@ def _groups(local: Linearization) -> tuple[Group, ...]:
     """Return all constraints and caps as groups of branches that must be at most 0.
 
     The index of a constraint or cap is the kind of its branches."""
-    found = [
+    groups = [
         Group(np.array([[float(k), 0.0]]), np.array([-value]), -row[None, :])
         for k, (value, row) in enumerate(zip(local.slack, local.normals, strict=True))
     ]
     for cap in local.caps:
         # Shift the phases, so that equal instants at different speeds or scenes stay distinct.
         phases = (cap.tags[:, 1] + cap.tags[:, 0] * _GOLDEN) % 1.0
-        kinds = np.full(len(phases), float(len(found)))
-        found.append(cap._replace(tags=np.stack([kinds, phases], axis=1)))
-    return tuple(found)
+        kinds = np.full(len(phases), float(len(groups)))
+        groups.append(cap._replace(tags=np.stack([kinds, phases], axis=1)))
+    return tuple(groups)
 
 
 def _alone(
@@ -195,9 +195,9 @@ def _alone(
         nothing = np.zeros(0), np.zeros((0, len(point)))
         return Linearization(0.0, np.zeros(len(point)), (groups[k],), *nothing, others)
 
-    found = [descend(look, start, stops) for start in starts]
-    found = [one for one in found if one.local is not None and one.local.violation <= FEASIBLE]
-    best = _best(found)
+    minima = [descend(look, start, stops) for start in starts]
+    minima = [one for one in minima if one.local is not None and one.local.violation <= FEASIBLE]
+    best = _best(minima)
     return None if best is None or best.local is None else best.local.objective
 
 
@@ -213,8 +213,8 @@ def _conflict(one: Constraint | ForceLimit, excess: float, alone: float | None) 
     return Conflict(one.name, one.sense, limit, one.unit, limit + size * excess, nearest)
 
 
-def _best(found: Sequence[Found]) -> Found | None:
-    usable = [(one.local.objective, one) for one in found if one.local is not None]
+def _best(minima: Sequence[Descent]) -> Descent | None:
+    usable = [(one.local.objective, one) for one in minima if one.local is not None]
     return min(usable, key=lambda pair: pair[0], default=(0.0, None))[1]
 
 
@@ -297,8 +297,8 @@ def beginning(config: Config) -> Beginning | None:
             return None
         radius = jnp.asarray(own.pitch_radius_mm * MM)
         given = profile_of(own.family, own.lobes, radius, design_of(own))
-    found = _fits(given, wanted)
-    for one in found:
+    members = _fits(given, wanted)
+    for one in members:
         try:
             profile = one.config(config.profile)
         except (InputError, ValueError):
@@ -306,7 +306,7 @@ def beginning(config: Config) -> Beginning | None:
         other, oversize = _cut(config.model_copy(update={"profile": profile}), one.inset)
         other, keys = widened(other)
         file = Path(config.profile.outline_file or "").name
-        return Beginning(other, one, found, keys, file, oversize=oversize)
+        return Beginning(other, one, members, keys, file, oversize=oversize)
     valid = ", ".join([NEAREST, *(name for name, one in families().items() if one.fitted)])
     raise InputError(
         f"`optimizer.family` must be a family with a sound profile near the baseline, but is "
@@ -335,15 +335,15 @@ def _fits(given: Profile, family: str) -> list[Likeness]:
     `family`: name of a family, or `NEAREST` for all classical ones with parameters."""
     named = [name for name in classical() if family_of(name).fitted]
     if family == NEAREST:
-        found = [likeness(given, name) for name in named]
+        members = [likeness(given, name) for name in named]
     elif family in named:
-        found = [likeness(given, family)]
+        members = [likeness(given, family)]
     else:
         # Projections of smooth members are better starts than those of measured points.
         smooth = ("five_arcs", "cic") if isinstance(given, Outline) else ()
         near = [one for name in smooth if (one := likeness(given, name)) is not None]
         for count in _COUNTS:
-            found = [free_likeness(given, *near, count=count)]
-            if found[0] is not None and found[0].departure <= _EXACT:
+            members = [free_likeness(given, *near, count=count)]
+            if members[0] is not None and members[0].departure <= _EXACT:
                 break
-    return sorted((one for one in found if one is not None), key=lambda one: one.departure)
+    return sorted((one for one in members if one is not None), key=lambda one: one.departure)

@@ -61,7 +61,7 @@ class TermConstraint(Constraint):
 
     term: Term = eqx.field(kw_only=True)
 
-    def slack_of(self, space, design, profile, shape, found):
+    def slack_of(self, space, design, profile, shape, soundness):
         nothing = Forces(*[jnp.asarray(jnp.nan)] * 3)
         return self.scaled(self.term.value(space.scene.at(design), profile, shape, nothing))
 
@@ -125,21 +125,21 @@ def limited(config: Config) -> Config:
 
 
 def settled(
-    config: Config, geometry: Mapping[str, float], found: Sequence[Mapping[str, float]] = ()
+    config: Config, geometry: Mapping[str, float], responses: Sequence[Mapping[str, float]] = ()
 ) -> Config:
     """Return a copy of a `config` in which limits that are `baseline` are the baseline's values.
 
-    `geometry`: geometry of the baseline, with the keys of the result file; `found`: its responses,
-    one for each scene and speed; the worst one becomes the limit. Without responses, limits of
-    `constraints.terms` stay as they are."""
+    `geometry`: geometry of the baseline, with the keys of the result file; `responses`: its
+    responses, one for each scene and speed; the worst one becomes the limit. Without responses,
+    limits of `constraints.terms` stay as they are."""
     own = [key for key, limit in config.constraints if limit == BASELINE]
     values: dict[str, Any] = {key: geometry[quantity_of(key)] for key in own}
     terms: dict[str, dict[str, Any]] = {}
     for name, sides in config.constraints.terms.items():
         terms[name] = sides = {**sides}
         for side, worst in (("max", max), ("min", min)):
-            if sides.get(side) == BASELINE and found:
-                sides[side] = worst(one[name] for one in found)
+            if sides.get(side) == BASELINE and responses:
+                sides[side] = worst(one[name] for one in responses)
     limits = config.constraints.model_copy(update=values | {"terms": terms})
     return config.model_copy(update={"constraints": limits})
 
@@ -155,32 +155,32 @@ def quantity_of(key: str) -> str:
 
 def term_constraints(config: Config, scene: Scene) -> tuple[TermConstraint, ...]:
     """Return the constraints on those quantities of `constraints.terms` that read no forces."""
-    found = []
+    constraints = []
     for name, ceiling, limit in _sides(config):
         if depends_on_forces(config, scene, name, LIMITS):
             continue
         (term,) = terms_of([name], LIMITS)
         row = words(name), name, unit_of(name), jnp.asarray(limit), scale_of(limit), 1.0
-        found.append(TermConstraint(*row, ceiling=ceiling, term=term))
-    return tuple(found)
+        constraints.append(TermConstraint(*row, ceiling=ceiling, term=term))
+    return tuple(constraints)
 
 
 def force_limits(config: Config, scene: Scene) -> tuple[ForceLimit, ...]:
     """Return the limits on those quantities of `constraints.terms` that depend on forces.
 
     Raises `InputError` if such limits do not suit the objective or the method of the search."""
-    found = tuple(
+    limits = tuple(
         ForceLimit(name, ceiling, limit)
         for name, ceiling, limit in _sides(config)
         if depends_on_forces(config, scene, name, LIMITS)
     )
-    if found and config.objective.motion == "ensemble":
+    if limits and config.objective.motion == "ensemble":
         raise InputError(
             f"`{LIMITS}` must not limit forces for `objective.motion` ensemble, but limits "
-            f"{found[0].key}: averages have noise; give it a weight in `objective`, or choose "
+            f"{limits[0].key}: averages have noise; give it a weight in `objective`, or choose "
             "another motion"
         )
-    return found
+    return limits
 
 
 def _sides(config: Config):
@@ -222,20 +222,20 @@ def of_motions(config: Config) -> bool:
 def counting(evaluation: Evaluation) -> list[tuple[int, Evaluation]]:
     """Return (kind, evaluation) of each scene, speed and motion in which limits must hold."""
     scenes = [part.evaluation for part in evaluation.scenes] or [evaluation]
-    found = []
+    pairs = []
     for scene, whole in enumerate(scenes):
         for number, part in enumerate(whole.by_speed):
             if part.share <= 0:
                 continue
             kind = SCENE_KINDS * scene + number
-            found += [(kind, one) for one in (part.evaluation, *part.evaluation.rivals)]
-    return found
+            pairs += [(kind, one) for one in (part.evaluation, *part.evaluation.rivals)]
+    return pairs
 
 
 def settled_by(config: Config, baseline: Evaluation) -> Config:
     """Return a copy of a `config` in which limits that are `baseline` are its evaluated values."""
-    found = [one.response for _, one in counting(baseline)] if baseline.usable else []
-    return settled(config, baseline.geometry, found)
+    responses = [one.response for _, one in counting(baseline)] if baseline.usable else []
+    return settled(config, baseline.geometry, responses)
 
 
 def check_senses(config: Config) -> None:
@@ -307,11 +307,11 @@ def _always(problem: "Problem", optimized: Evaluation) -> NDArray[np.bool_]:
 
     Their slack is 0 at the config's own design and at the optimum, and does not depend on the
     design."""
-    found = np.ones(len(problem.space.constraints), bool)
+    always = np.ones(len(problem.space.constraints), bool)
     for design in (problem.config.design, list(optimized.design.values())):
         _, _, slack, normals = problem.look(problem.point(design))
-        found &= (np.abs(slack) < _SAME) & (np.linalg.norm(normals, axis=1) < _SAME)
-    return found
+        always &= (np.abs(slack) < _SAME) & (np.linalg.norm(normals, axis=1) < _SAME)
+    return always
 
 
 def _multiplier(problem: "Problem", row: dict, per_unit: float, optimized: Evaluation) -> dict:

@@ -194,10 +194,10 @@ def certify(local: Linearization, point: NDArray[np.float64], near: float = NEAR
         begin += count
     matrix = np.concatenate([every.T, np.diag(gap), sums])
     wanted = np.concatenate([-local.slope, np.zeros(len(gap)), np.full(len(counts), _WEIGHT)])
-    found = nnls(matrix, wanted)[0] if matrix.shape[1] else np.zeros(0)
+    solution = nnls(matrix, wanted)[0] if matrix.shape[1] else np.zeros(0)
     shares = []
     for mask, count in zip(chosen, counts, strict=True):
-        part, found = found[:count], found[count:]
+        part, solution = solution[:count], solution[count:]
         total = np.sum(part)
         share = np.zeros(len(mask))
         share[mask] = part / total if total > 0 else 1 / count
@@ -206,7 +206,7 @@ def certify(local: Linearization, point: NDArray[np.float64], near: float = NEAR
     for active, _, _ in limits:
         count = int(np.sum(active))
         values = np.zeros(len(active))
-        values[active], found = found[:count], found[count:]
+        values[active], solution = solution[:count], solution[count:]
         numbers.append(values)
     multipliers, lower, upper, *caps = numbers
     left = local.combined(tuple(shares)) - multipliers @ local.normals - lower + upper
@@ -266,10 +266,10 @@ class Models:
         for axis in range(size):
             step = np.zeros(size)
             step[axis] = _STEP if self.point[axis] < 0.5 else -_STEP
-            found = at(self.point + step)
-            if found is None:
+            local = at(self.point + step)
+            if local is None:
                 continue
-            slopes, known = _matched(self.local, found)
+            slopes, known = _matched(self.local, local)
             change = (slopes - self.rows[1]) / step[axis]
             columns[known, axis] = change[known]
         self.hessians = (columns + np.swapaxes(columns, 1, 2)) / 2
@@ -286,11 +286,11 @@ class Models:
             weight = float(left @ step)
             if abs(weight) > 1e-8 * np.linalg.norm(left) * np.linalg.norm(step):
                 self.hessians[k] += np.outer(left, left) / weight
-        found = Models(point, local, self.limits)
+        models = Models(point, local, self.limits)
         for k, place in enumerate(_places(self.local, local)):
             if place >= 0:
-                found.hessians[place] = self.hessians[k]
-        return found
+                models.hessians[place] = self.hessians[k]
+        return models
 
     def values(self, step: NDArray[np.float64]) -> Rows:
         """Return the models' values (n,) and gradients (n, d) after a `step` (d,)."""
@@ -311,9 +311,9 @@ class Models:
 
     def tops(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the greatest branch of each maximum, from the `values` (n,) of all functions."""
-        found = np.full(len(self.local.groups), -np.inf)
-        np.maximum.at(found, self.owner, values[1 : self._begin])
-        return found
+        tops = np.full(len(self.local.groups), -np.inf)
+        np.maximum.at(tops, self.owner, values[1 : self._begin])
+        return tops
 
     def merit(self, step: NDArray[np.float64], price: float) -> float:
         """Return the models' objective after a `step` (d,), plus `price` times the violation."""
@@ -367,7 +367,7 @@ class Models:
         start = np.clip(begin / reach, low, high)
         rises = (self.tops(self.values(reach * start)[0]) - self.tops(value)) / reach
         worst = max(0.0, -float(np.min(self.slacks(reach * start)[0], initial=0.0))) / reach
-        found = minimize(
+        solution = minimize(
             smooth,
             np.concatenate([start, rises, [worst]]),
             jac=True,
@@ -376,7 +376,7 @@ class Models:
             constraints={"type": "ineq", "fun": slack, "jac": normals},
             options={"maxiter": _ROUNDS, "ftol": 1e-10},
         )
-        return reach * np.clip(found.x[:size], low, high)
+        return reach * np.clip(solution.x[:size], low, high)
 
 
 def _rows(local: Linearization) -> Rows:
@@ -397,7 +397,7 @@ def _places(one: Linearization, other: Linearization) -> NDArray[np.int64]:
     def add(groups: Sequence[Group], others: Sequence[Group]) -> None:
         nonlocal start
         for group, new in zip(groups, others, strict=True):
-            places.append(np.where((found := _alike(group, new)) >= 0, found + start, -1))
+            places.append(np.where((index := _alike(group, new)) >= 0, index + start, -1))
             start += len(new.values)
 
     add(one.groups, other.groups)
@@ -427,8 +427,8 @@ def _alike(group: Group, other: Group) -> NDArray[np.int64]:
     apart = np.minimum(apart % 1.0, -apart % 1.0)
     differ = group.tags[:, None, 0] != other.tags[None, :, 0]
     cost = np.where(differ | ~(apart <= _SAME), 10.0, apart)
-    found = np.full(len(group.values), -1)
+    index = np.full(len(group.values), -1)
     for branch, place in zip(*linear_sum_assignment(cost), strict=True):
         if cost[branch, place] < 10.0:
-            found[branch] = place
-    return found
+            index[branch] = place
+    return index

@@ -148,8 +148,8 @@ def verify(problem: Problem, evaluator: Evaluator, trials: Sequence) -> Verifica
         evaluation = chooser(problem.design(point), series=False)
         tried.append((problem.objective(evaluation), searched, point))
     record["candidates"] = [
-        {"searched_objective": searched, "chosen_by_objective": found}
-        for found, searched, _ in tried
+        {"searched_objective": searched, "chosen_by_objective": objective}
+        for objective, searched, _ in tried
     ]
     tried = [one for one in tried if np.isfinite(one[0])]
     if not tried:
@@ -161,13 +161,13 @@ def verify(problem: Problem, evaluator: Evaluator, trials: Sequence) -> Verifica
     baseline = _with_gradient(baseline, problem.baseline)
     renewed = dataclasses.replace(problem, baseline=baseline)
     evaluation = judge(problem.design(point))
-    found = renewed.objective(evaluation)
+    objective = renewed.objective(evaluation)
     errors = [standard_error(renewed, one) for one in (baseline, evaluation)]
     combined = float(np.linalg.norm(errors))
-    holds = bool(1 - found > SIGNIFICANT * combined)
+    holds = bool(1 - objective > SIGNIFICANT * combined)
     record |= {
         "searched_objective": searched,
-        "verified_objective": found,
+        "verified_objective": objective,
         "combined_standard_error": combined,
         "status": evaluation.status.label,
         "holds_up": holds,
@@ -214,10 +214,10 @@ def candidates(problem: Problem, trials: Sequence) -> list[tuple[float, NDArray[
 
 def most_promising(problem: Problem, trials: Sequence) -> Any:
     """Return the trial at the best of the `candidates`, or `None` without candidates."""
-    found = candidates(problem, trials)
-    if not found:
+    designs = candidates(problem, trials)
+    if not designs:
         return None
-    _, point = found[0]
+    _, point = designs[0]
     return next(t for t in trials if t.candidate and np.array_equal(t.point, point))
 
 
@@ -231,17 +231,17 @@ def message(record: dict[str, Any]) -> str:
         "Raise ensemble.members or ensemble.periods (the standard error falls with the square "
         "root of either), or optimizer.iterations."
     )
-    found, error = record.get("verified_objective"), record.get("combined_standard_error")
-    if found is None:
+    objective, error = record.get("verified_objective"), record.get("combined_standard_error")
+    if objective is None:
         return f"The search found no design better than the baseline beyond the noise. {advice}"
-    if not np.isfinite(found):
+    if not np.isfinite(objective):
         return (
             f"Averaged over an independent ensemble, the best design has no usable response "
             f"({record['status']}). {advice}"
         )
     return (
         f"The difference from the baseline is within the noise: averaged over an independent "
-        f"ensemble, the best design has an objective of {found:.4g} against 1. The combined "
+        f"ensemble, the best design has an objective of {objective:.4g} against 1. The combined "
         f"standard error is {error:.2g}, and the difference must exceed "
         f"{record['required_standard_errors']:g} of these. {advice}"
     )

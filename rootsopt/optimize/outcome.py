@@ -93,8 +93,8 @@ class Optimization:
     >>> jax.config.update("jax_enable_x64", True)
     >>> quick = ["optimizer.starts=1", "optimizer.screening=0", "optimizer.iterations=2"]
     >>> quick += ["assumptions.scenes=0"]  # no comparison in other scenes
-    >>> found = rootsopt.optimize_design(rootsopt.load_config("cic", quick))
-    >>> sorted(found.improvement)
+    >>> optimization = rootsopt.optimize_design(rootsopt.load_config("cic", quick))
+    >>> sorted(optimization.improvement)
     ['mean_force_N', 'objective', 'peak_force_N', 'rms_force_N']
     """
 
@@ -138,8 +138,8 @@ class Optimization:
         """Evaluation of the family member fitted to a baseline from a file.
 
         `None` without such a baseline, or if the member has no usable steady state."""
-        found = None if self.beginning is None else self.beginning.evaluation
-        return found if found is not None and found.usable else None
+        evaluation = None if self.beginning is None else self.beginning.evaluation
+        return evaluation if evaluation is not None and evaluation.usable else None
 
     @property
     def improvement_over_nominal(self) -> dict[str, float]:
@@ -306,13 +306,13 @@ class Assumed:
 
     def columns(self) -> dict[str, list[Any]]:
         """Return one row per scene for a table file: its values, objectives and statuses."""
-        found: dict[str, list[Any]] = {"scene": [*self.scenes]}
+        table: dict[str, list[Any]] = {"scene": [*self.scenes]}
         for key, *_ in self.spans:
-            found[key] = [one.get(key, math.nan) for one in self.scenes.values()]
+            table[key] = [one.get(key, math.nan) for one in self.scenes.values()]
         for name, values in self.objectives.items():
-            found[f"objective_{name.replace(' ', '_')}"] = values.tolist()
-            found[f"status_{name.replace(' ', '_')}"] = self.statuses[name]
-        return found
+            table[f"objective_{name.replace(' ', '_')}"] = values.tolist()
+            table[f"status_{name.replace(' ', '_')}"] = self.statuses[name]
+        return table
 
     def record(self) -> dict[str, Any]:
         """Return the entry `assumptions` of the result file.

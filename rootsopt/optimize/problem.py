@@ -119,9 +119,9 @@ class Problem:
         ratio to F_0 alone would mean nothing. Designs and constraints of the geometry are the
         same."""
         alone = Problem(self.config, _in_units(baseline, self.baseline), self.space, self.limits)
-        found = dataclasses.replace(alone, added=1 - alone.objective(baseline))
-        found.__dict__["_look_at"] = self._look_at  # Expensive, independent of `baseline`.
-        return found
+        problem = dataclasses.replace(alone, added=1 - alone.objective(baseline))
+        problem.__dict__["_look_at"] = self._look_at  # Expensive, independent of `baseline`.
+        return problem
 
     def objective(self, evaluation: Evaluation) -> float:
         """Return the objective of an `evaluation`, which is 1 for the baseline.
@@ -220,7 +220,7 @@ class Problem:
         the point. Each speed that counts, each coexisting motion and each scene of a sample is a
         branch. If the peak force has a ceiling, each local maximum of the force is a branch, too.
         """
-        found = []
+        caps = []
         for limit in self.limits:
             tags, values, slopes = [], [], []
             for kind, one in counting(evaluation):
@@ -235,10 +235,10 @@ class Problem:
                 values += [*maxima.forces]
                 slopes += [*maxima.slopes]
             rows = limit.sign * np.array(slopes) / limit.scale
-            found.append(
+            caps.append(
                 Group(np.array(tags, float), limit.excess(np.array(values)), rows @ jacobian)
             )
-        return tuple(found)
+        return tuple(caps)
 
     def worst(self, evaluation: Evaluation, limit: ForceLimit) -> float:
         """Return the worst value of a limited quantity: the one nearest to its `limit`, or farthest
@@ -268,15 +268,15 @@ class Problem:
 
         They are those of the geometry, of its soundness, and of `constraints.terms`. For a rotor
         from a file, limits that need design parameters are left out."""
-        found = [
+        names = [
             one.name
             for k, one in enumerate(self.space.constraints)
             if scaled_slack(self, evaluation, k) < -FEASIBLE
         ]
         for one in self.limits:
             if evaluation.usable and one.excess(self.worst(evaluation, one)) > FEASIBLE:
-                found.append(one.name)
-        return found
+                names.append(one.name)
+        return names
 
     def along_scene(self, moved: Evaluation, certificate: Certificate) -> dict[str, float]:
         """Return the derivatives of the optimal objective with respect to scene quantities, by key.
@@ -374,14 +374,14 @@ class Problem:
         fails too, the result is the projection of `inside`. This helps where no profile exists at
         `point`. Families whose closed-form limits ensure a sound profile need only the first
         projection."""
-        found = self.project(point)
+        projected = self.project(point)
         if self.space.family.by_limits:
-            return found
+            return projected
         for share in (*0.5 ** np.arange(1, _DRAWN + 1), 0.0):
-            if self.feasible(found):
+            if self.feasible(projected):
                 break
-            found = self.project(inside + share * (np.asarray(point) - inside))
-        return found
+            projected = self.project(inside + share * (np.asarray(point) - inside))
+        return projected
 
     def held_by(self, evaluation: Evaluation, certificate: Certificate) -> list[Holder]:
         """Return the branches of the objective that are active at an evaluated optimum.
@@ -393,21 +393,21 @@ class Problem:
         for part, base in parts:
             if part.share <= 0:
                 continue
-            found: list[Holder] = []
+            holders: list[Holder] = []
             for one in (part.evaluation, *part.evaluation.rivals):
                 value = self._value(one, base.evaluation)
                 if one.maxima is None or not one.maxima.times.size:
-                    found.append(Holder(part.speed_rpm, math.nan, math.nan, value, 0.0))
+                    holders.append(Holder(part.speed_rpm, math.nan, math.nan, value, 0.0))
                     continue
                 weight = self._weights(base.evaluation).get(PEAK, 0.0)
                 turn = 360.0 / self.config.profile.lobes
                 for time, force, _ in zip(*one.maxima, strict=True):
                     height = value + weight * (force - one.response[PEAK])
-                    found.append(Holder(part.speed_rpm, turn * time, float(force), height, 0.0))
+                    holders.append(Holder(part.speed_rpm, turn * time, float(force), height, 0.0))
             if worst and labels:
-                labels[0] += found
+                labels[0] += holders
             else:
-                labels.append(found)
+                labels.append(holders)
         return [
             label._replace(share=float(share))
             for shares, group in zip(certificate.shares, labels, strict=False)

@@ -68,18 +68,18 @@ class Scattered:
 
         They are mean, its standard error, standard deviation, 95 % quantile and greatest value.
         All are NaN if no scene is usable."""
-        found = self.values[name][self.usable]
-        if not found.size:
+        values = self.values[name][self.usable]
+        if not values.size:
             return dict.fromkeys(
                 ("mean", "standard_error", "sigma", "quantile_95", "worst"), float("nan")
             )
-        sigma = float(np.std(found))
+        sigma = float(np.std(values))
         return {
-            "mean": float(np.mean(found)),
-            "standard_error": sigma / float(np.sqrt(len(found))),
+            "mean": float(np.mean(values)),
+            "standard_error": sigma / float(np.sqrt(len(values))),
             "sigma": sigma,
-            "quantile_95": float(np.quantile(found, _LEVEL)),
-            "worst": float(np.max(found)),
+            "quantile_95": float(np.quantile(values, _LEVEL)),
+            "worst": float(np.max(values)),
         }
 
     def record(self) -> dict[str, Any]:
@@ -159,11 +159,11 @@ class RobustStage(Stage):
 
         Without an optimum, return the baseline's `own` point. All are moved onto the feasible
         set."""
-        found = [] if self.nominal.optimized is None else [self.nominal.optimized.design]
-        found += [dict(one) for one in self.others]
+        designs = [] if self.nominal.optimized is None else [self.nominal.optimized.design]
+        designs += [dict(one) for one in self.others]
         if self.nominal.optimality is not None:
-            found += [one.design for one in self.nominal.optimality.optima]
-        points = [problem.point(list(design.values())) for design in found] or [own]
+            designs += [one.design for one in self.nominal.optimality.optima]
+        points = [problem.point(list(design.values())) for design in designs] or [own]
         return [problem.project(point) for point in points]
 
     def local(
@@ -222,16 +222,16 @@ class StagedSearch:
         If `stop` is set, no further comparison begins.
 
         Raises `InputError` if the objective is not defined for the baseline."""
-        found = self._optimum()
+        outcome = self._optimum()
         if not self.config.spans:
-            return found
-        before, best = len(found.history), 1 - found.improvement.get("objective", float("nan"))
+            return outcome
+        before, best = len(outcome.history), 1 - outcome.improvement.get("objective", float("nan"))
 
         def tick(done: int, expected: int) -> None:
             self.progress(before + done, before + expected, best)
 
-        spread = compared(self.config, found, self.runs, self.stop.is_set, tick)
-        return dataclasses.replace(found, assumptions=spread)
+        spread = compared(self.config, outcome, self.runs, self.stop.is_set, tick)
+        return dataclasses.replace(outcome, assumptions=spread)
 
     def _optimum(self) -> Optimization:
         """Run the stages, and compare their designs over fresh scenes."""
@@ -246,43 +246,43 @@ class StagedSearch:
         self._nominal = nominal
         how = self._report, self.stop, self.checkpoint, self.runs
         self._stage = stage = Search(second[0], *how, second[1])
-        found = stage.run()
-        if found.problem is None:
-            return found
-        return self._with(found, *self._compared(stage, found))
+        outcome = stage.run()
+        if outcome.problem is None:
+            return outcome
+        return self._with(outcome, *self._compared(stage, outcome))
 
     def _second(self, nominal: Optimization) -> tuple[Config, RobustStage] | None:
         """Return config and stage of the second search; `None` if there is nothing to search."""
         starts = self.config.optimizer.starts
         if self.config.tolerances is not None:
             return self.config, RobustStage(nominal, starts)
-        found = compared(self.config, nominal, self.runs, self.stop.is_set, self._tick)
-        if found is None:
+        spread = compared(self.config, nominal, self.runs, self.stop.is_set, self._tick)
+        if spread is None:
             return None
-        scenes, offsets = found.sample(self.config.assumptions.combine == "regret")
+        scenes, offsets = spread.sample(self.config.assumptions.combine == "regret")
         if not scenes:
             return None
         worst = self.config.assumptions.combine != "mean"
         rule = {"combine": "worst" if worst else "mean_plus_k_sigma", "k": 0.0}
         config = in_conditions(without(self.config), scenes, **rule)
-        others = [one for name, one in found.designs.items() if name.startswith(RIVAL)]
+        others = [one for name, one in spread.designs.items() if name.startswith(RIVAL)]
         return config, RobustStage(nominal, starts, others, offsets)
 
     def so_far(self) -> Optimization | None:
         """Return the results of the search so far, as `Search.so_far` does."""
-        found = self._stage.so_far()
-        if found is None:
+        outcome = self._stage.so_far()
+        if outcome is None:
             return self._nominal
-        return found if self._nominal is None else self._with(found, {}, {})
+        return outcome if self._nominal is None else self._with(outcome, {}, {})
 
-    def _with(self, found: Optimization, fresh, scenes) -> Optimization:
+    def _with(self, outcome: Optimization, fresh, scenes) -> Optimization:
         assert self._nominal is not None
         count = len(self._nominal.history)
-        rows = [row | {"evaluation": row["evaluation"] + count} for row in found.history]
+        rows = [row | {"evaluation": row["evaluation"] + count} for row in outcome.history]
         begun = next((row["objective"] for row in rows), float("nan"))
         robustness = Robustness(self._nominal, float(begun), fresh, scenes)
         history = [*self._nominal.history, *rows]
-        return dataclasses.replace(found, history=history, robustness=robustness)
+        return dataclasses.replace(outcome, history=history, robustness=robustness)
 
     def _report(self, done: int, expected: int, best: float) -> None:
         self.progress(self._done + done, self._expected + expected, best)
@@ -290,17 +290,17 @@ class StagedSearch:
     def _tick(self, done: int, expected: int) -> None:
         self._report(done, expected, float("nan"))
 
-    def _compared(self, stage: Search, found: Optimization) -> tuple[dict, dict]:
+    def _compared(self, stage: Search, outcome: Optimization) -> tuple[dict, dict]:
         """Return the fields `fresh` and `scenes` of `Robustness`."""
         tolerances = self.config.tolerances
         assert self._nominal is not None
-        assert isinstance(found.problem, RobustProblem)
+        assert isinstance(outcome.problem, RobustProblem)
         if tolerances is None or not tolerances.check_samples or self.stop.is_set():
             return {}, {}
         known = {
-            "baseline": found.baseline,
+            "baseline": outcome.baseline,
             "nominal": self._nominal.optimized,
-            "robust": found.optimized,
+            "robust": outcome.optimized,
         }
         designs = {
             name: (stage.source if name == "baseline" else stage.fast, one.nominal)
@@ -308,8 +308,8 @@ class StagedSearch:
             if one is not None
         }
         drawn = draw(self.config, tolerances.check_samples, fresh=True)
-        best = found.problem.objective(found.optimized) if found.optimized else float("nan")
-        before = self._done + len(found.history)
+        best = outcome.problem.objective(outcome.optimized) if outcome.optimized else float("nan")
+        before = self._done + len(outcome.history)
         per, total = 1 + tolerances.samples, len(drawn) * len(designs)
         expected, lock, ended = before + total // per, threading.Lock(), [0]
 
@@ -322,7 +322,7 @@ class StagedSearch:
                     self.progress(before + ended[0] // per, expected, best)
             return self.stop.is_set()
 
-        fresh = compare(found.problem, designs, drawn, tick, self.runs)
+        fresh = compare(outcome.problem, designs, drawn, tick, self.runs)
         if self.stop.is_set():
             return {}, {}
         keys = [one.key for one in self.config.scatters]
@@ -342,18 +342,18 @@ def compare(
     evaluation there, the baseline's first. Each motion starts at the design's orbit in the nominal
     scene. Equal designs are simulated only once. `tick`: function called before each simulation; if
     it returns True, no further one begins."""
-    found: dict[str, Scattered] = {}
+    scattered: dict[str, Scattered] = {}
     reference = 1.0
     for name, (evaluator, nominal) in designs.items():
-        twin = next((k for k in found if _same(problem, designs[k][1], nominal)), None)
+        twin = next((k for k in scattered if _same(problem, designs[k][1], nominal)), None)
         if twin is not None:
-            found[name] = found[twin]
+            scattered[name] = scattered[twin]
             continue
         one = _scattered(evaluator, problem, nominal, shifts(evaluator.config, drawn), tick, runs)
-        if not found:
+        if not scattered:
             reference = one.combined
-        found[name] = dataclasses.replace(one, combined=one.combined / reference)
-    return found
+        scattered[name] = dataclasses.replace(one, combined=one.combined / reference)
+    return scattered
 
 
 def _scattered(
@@ -368,10 +368,10 @@ def _scattered(
     design = np.array(list(nominal.design.values()))
 
     points = evaluator.in_scenes(scenes, design, itertools.repeat(nominal.start))
-    found = evaluate_many(itertools.takewhile(lambda _: not tick(), points), runs)
-    labels = [one.status.label for one in found]
-    rows = np.full((len(found), len(COMPARED)), np.nan)
-    for row, one in zip(rows, found, strict=True):
+    evaluations = evaluate_many(itertools.takewhile(lambda _: not tick(), points), runs)
+    labels = [one.status.label for one in evaluations]
+    rows = np.full((len(evaluations), len(COMPARED)), np.nan)
+    for row, one in zip(rows, evaluations, strict=True):
         if one.usable:
             row[:] = problem.objective(one), *(one.response.get(name, np.nan) for name in RESPONSES)
     columns = rows.T

@@ -52,8 +52,8 @@ class RobustProblem(Problem):
         problem = Problem.of(settled_by(config, baseline), scene, baseline.nominal)
         bases = tuple(part.evaluation for part in baseline.samples) if offsets else ()
         given = problem.config, problem.baseline, problem.space, problem.limits
-        found = cls(*given, offsets=offsets, bases=bases)
-        return dataclasses.replace(found, reference=found.combined(baseline).value)
+        robust = cls(*given, offsets=offsets, bases=bases)
+        return dataclasses.replace(robust, reference=robust.combined(baseline).value)
 
     def _each(self, evaluation: Evaluation) -> Iterator[tuple[Problem, Evaluation, float]]:
         """Yield (problem, evaluation, offset) of every scene of the sample."""
@@ -109,9 +109,9 @@ class RobustProblem(Problem):
             return None
         assert self.config.tolerances is not None
         parts = [
-            found._replace(smooth=found.smooth + add)
+            local._replace(smooth=local.smooth + add)
             for one, e, add in self._each(evaluation)
-            if (found := one.local(e, point)) is not None
+            if (local := one.local(e, point)) is not None
         ]
         caps = self.caps(evaluation, self.look(point)[1]) if self.limits else ()
         if self.config.tolerances.combine == "worst":
@@ -139,11 +139,11 @@ class RobustProblem(Problem):
         cap. Its gradient is that of the greatest branch in each scene."""
         if not (evaluation.scenes and self._combines_limits):
             return super().caps(evaluation, jacobian)
-        found = [
+        caps = [
             super(RobustProblem, self).caps(part.evaluation, jacobian)
             for part in evaluation.samples
         ]
-        return tuple(map(self._combined_wall, zip(*found, strict=True)))
+        return tuple(map(self._combined_wall, zip(*caps, strict=True)))
 
     def _combined_wall(self, groups: Sequence[Group]) -> Group:
         assert self.config.tolerances is not None

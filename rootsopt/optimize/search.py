@@ -40,7 +40,7 @@ from rootsopt.optimize.outcome import (
     ranked,
 )
 from rootsopt.optimize.robust_problem import Stage
-from rootsopt.optimize.sqp import Found, Stops, descend
+from rootsopt.optimize.sqp import Descent, Stops, descend
 from rootsopt.optimize.verification import Verification
 from rootsopt.optimize.vertices import AT_VERTEX, DRAWN, VertexOptimum, vertex_optimum
 from rootsopt.response.evaluation import Evaluator
@@ -126,7 +126,7 @@ class Search:
         self._lock, self._best = threading.Lock(), float("nan")
         self._trials: list[Trial] = []
         self._refuted: list[NDArray[np.float64]] = []
-        self._found: dict[int, Found] = {}
+        self._descents: dict[int, Descent] = {}
         self._baseline: Evaluation | None = None
         # A baseline that violates a limit may be better than every feasible design.
         self._bar = 1.0
@@ -187,14 +187,14 @@ class Search:
         bounding, further = self._bounded(trials, self.stage.first + len(starts))
         trials += further
         if self.stop.is_set():
-            if self.noisy and (found := self.so_far()) is not None:
-                return found
+            if self.noisy and (outcome := self.so_far()) is not None:
+                return outcome
             trials = self._in_order()
         rows = history_of(trials)
         if self.noisy:
             noise.add_errors(rows, trials, self.problem)
-            found = noise.verify(self.problem, self.exact, trials)
-            settled = found.problem, found.baseline, found.optimized, rows, found.record
+            outcome = noise.verify(self.problem, self.exact, trials)
+            settled = outcome.problem, outcome.baseline, outcome.optimized, rows, outcome.record
             return Optimization(*settled, self.stop.is_set())
         if self.problem.limits and not any(trial.candidate for trial in trials):
             reason = None if self.stop.is_set() else self._unmet(points)
@@ -242,19 +242,19 @@ class Search:
         bounding = Bounding(self.problem.limits_at, size, best, boxes)
         known, further, count = [], [], 0
 
-        def told(found: list[Trial]) -> None:
-            for one in found:
+        def told(batch: list[Trial]) -> None:
+            for one in batch:
                 bounding.tell(one.point, self.problem.local(one.evaluation, one.point))
-            known.extend(one for one in found if one.evaluation.usable)
+            known.extend(one for one in batch if one.evaluation.usable)
 
         told(trials)
         while count < most and (points := bounding.ask(TOGETHER)):
-            best, found = bounding.best, self._beside(known, points, count)
-            told(found)
+            best, batch = bounding.best, self._beside(known, points, count)
+            told(batch)
             count += len(points)
             if self.stop.is_set():
                 break
-            first = min(filter(candidate, found), key=objective, default=None)
+            first = min(filter(candidate, batch), key=objective, default=None)
             if first is not None and first.objective < best - BETTER * abs(best):
                 further += (again := self._side_by_side(self._solve, [(number, first.point)]))
                 told(again)
@@ -271,8 +271,8 @@ class Search:
         known = [one for one in trials if one.evaluation.usable]
 
         def simulated(points: list[NDArray[np.float64]]) -> list[float]:
-            found = self._beside(known, points, AT_VERTEX)
-            values = [x.objective if x.excess <= FEASIBLE else math.nan for x in found]
+            batch = self._beside(known, points, AT_VERTEX)
+            values = [x.objective if x.excess <= FEASIBLE else math.nan for x in batch]
             return values or [math.nan] * len(points)
 
         point = self.problem.point([*optimized.design.values()])
@@ -297,7 +297,7 @@ class Search:
 
     def _verification(self) -> Verification:
         tolerance, asked = self.config.solver.orbit_tolerance, self.stop.is_set
-        outcome = self.method, self._bar, asked, self._found, self._refuted
+        outcome = self.method, self._bar, asked, self._descents, self._refuted
         return Verification(self.problem, self.exact, tolerance, *outcome)
 
     def so_far(self) -> Optimization | None:
@@ -336,8 +336,8 @@ class Search:
     def _in_order(self) -> list[Trial]:
         """Return all trials so far: those of the screening, then those of each local search."""
         with self._lock:
-            found = [trial for trial in self._trials if trial.start > _BOUND]
-        return sorted(found, key=lambda trial: (trial.start, trial.iteration))
+            trials = [trial for trial in self._trials if trial.start > _BOUND]
+        return sorted(trials, key=lambda trial: (trial.start, trial.iteration))
 
     def _side_by_side(self, work: Callable[..., list[Trial]], tasks: Sequence) -> list[Trial]:
         """Run `work(*task)` for all tasks in parallel, and return all trials.
@@ -376,9 +376,9 @@ class Search:
                 starts.append(evaluation.start)
             return self.problem.local(evaluation, point)
 
-        usable = [found for found in self._found.values() if found.local is not None]
-        usable.sort(key=lambda found: found.local.violation if found.local else np.inf)
-        begins = [found.point for found in usable[: _SIMULATED - 1]] + points[:1]
+        usable = [outcome for outcome in self._descents.values() if outcome.local is not None]
+        usable.sort(key=lambda outcome: outcome.local.violation if outcome.local else np.inf)
+        begins = [outcome.point for outcome in usable[: _SIMULATED - 1]] + points[:1]
         return explain(self.problem, begins, look)
 
     def _solve(self, number: int, point: NDArray[np.float64]) -> list[Trial]:
@@ -400,10 +400,10 @@ class Search:
         for begin in (point, *self.problem.nearby(point, _BESIDE)):
             if self.stop.is_set():
                 break
-            found = descend(look, begin, stops, self.problem.limits_at)
+            outcome = descend(look, begin, stops, self.problem.limits_at)
             with self._lock:
-                self._found[number] = found
-            if found.local is not None:
+                self._descents[number] = outcome
+            if outcome.local is not None:
                 break
         return trials
 

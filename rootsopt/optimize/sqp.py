@@ -75,7 +75,7 @@ class Stops(NamedTuple):
     asked: Callable[[], bool] = lambda: False
 
 
-class Found(NamedTuple):
+class Descent(NamedTuple):
     """Outcome of a local search.
 
     `point` (d,): the best feasible point, or the least infeasible one. `local`: objective and
@@ -211,12 +211,12 @@ class _Descent:
         `decrease`: decrease that the models promise. The achieved share of it sets the trust
         region, unless rounding dominates."""
         point, length = np.clip(self.models.point + step, 0.0, 1.0), float(np.max(np.abs(step)))
-        found = self._at(point)
+        local = self._at(point)
         share, better = -np.inf, False
-        if found is not None:
-            gained, before = self._merit(self.models.local) - self._merit(found), self.certificate
-            share, moved = gained / decrease, self.models.moved(point, found)
-            flatter = certify(found, point).residual < before.residual
+        if local is not None:
+            gained, before = self._merit(self.models.local) - self._merit(local), self.certificate
+            share, moved = gained / decrease, self.models.moved(point, local)
+            flatter = certify(local, point).residual < before.residual
             better = bool(share > 0.05 or (decrease < _NOISE and gained > -_NOISE and flatter))
             self.models = moved if better else self.models
         if share < 0.25 and decrease >= _NOISE:
@@ -240,7 +240,7 @@ def descend(
     start: NDArray[np.float64],
     stops: Stops | None = None,
     limits: Limits | None = None,
-) -> Found:
+) -> Descent:
     """Search for a local minimum from `start` (d,) in the unit box.
 
     `look`: function that evaluates the problem at a point; `stops`: criteria for the end, by
@@ -249,7 +249,7 @@ def descend(
     start = np.clip(np.asarray(start, dtype=np.float64), 0.0, 1.0)
     first = look(start)
     if first is None:
-        return Found(start, None, None, "unusable", 1)
+        return Descent(start, None, None, "unusable", 1)
     search = _Descent(look, Models(start, first, limits), stops)
     try:
         reason = search.run()
@@ -257,4 +257,4 @@ def descend(
         reason = "interrupted" if stops.asked() else "evaluations"
     best = search.models
     ended = reason, search.evaluations, search.promised
-    return Found(best.point, best.local, search.certificate, *ended)
+    return Descent(best.point, best.local, search.certificate, *ended)

@@ -17,7 +17,7 @@ from rootsopt.optimize.local import FEASIBLE, RESIDUAL, Certificate, certify
 from rootsopt.optimize.optimality import Optimality, StartOutcome, judged
 from rootsopt.optimize.outcome import Optimization, Trial, candidate, near, objective
 from rootsopt.optimize.problem import Problem
-from rootsopt.optimize.sqp import Found
+from rootsopt.optimize.sqp import Descent
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.reducers import Point, evaluate_many
 from rootsopt.response.result import Evaluation
@@ -46,7 +46,7 @@ class Verification:
 
     `problem`: design problem; `exact`: evaluator from rest; `tolerance` of its orbits; `method` of
     the local searches; `bar`: objective that a design must be below; `asked`: whether the search
-    should end; `found`: what each local search by sequential quadratic programming has found;
+    should end; `descents`: what each local search by sequential quadratic programming has found;
     `refuted`: points that did not hold up, extended by the verification.
     """
 
@@ -56,14 +56,14 @@ class Verification:
     method: str
     bar: float
     asked: Callable[[], bool]
-    found: Mapping[int, Found]
+    descents: Mapping[int, Descent]
     refuted: list[NDArray[np.float64]]
 
     def confirmed(self, trials: list[Trial]) -> tuple[Evaluation | None, dict[str, Any]]:
         """Simulate the best designs again, from rest at a tight tolerance, until one is confirmed.
 
         Return (evaluation of this design, or `None`; record for the result file)."""
-        ends = {found.point.tobytes() for found in self.found.values()}
+        ends = {end.point.tobytes() for end in self.descents.values()}
         ranked = sorted(filter(candidate, trials), key=objective)
         # Try the results of the local searches first. Points next to them are hardly different.
         ranked.sort(key=lambda trial: trial.point.tobytes() not in ends)
@@ -101,8 +101,8 @@ class Verification:
             attempts.append((evaluation, record))
             if record["holds_up"] or self.asked():
                 break
-        found, record = attempts[-1 if attempts[-1][1]["holds_up"] else 0]
-        return found, record | {"attempts": [one["status"] for _, one in attempts]}
+        chosen, record = attempts[-1 if attempts[-1][1]["holds_up"] else 0]
+        return chosen, record | {"attempts": [one["status"] for _, one in attempts]}
 
     def _attempts(self, point: NDArray[np.float64]) -> Iterator[tuple[Evaluator, NDArray]]:
         """Yield (evaluator, point) of each attempt to confirm the design at a `point` (d,).
@@ -126,18 +126,18 @@ class Verification:
             # The gradients may be less accurate than the residual requires.
             sharper = self.exact.at_tolerance(_SHARPER * self.tolerance)
             again = sharper(self.problem.design(point), start=optimized.start, series=False)
-            found = self.problem.local(again, point)
-            if found is not None and (other := certify(found, point)).residual < RESIDUAL:
+            end = self.problem.local(again, point)
+            if end is not None and (other := certify(end, point)).residual < RESIDUAL:
                 certificate, optimized = other, again
-        ends = sorted(self.found.items())
+        ends = sorted(self.descents.items())
         reason, promised = "verification" if ends else "descent", float("nan")
-        beside = [found for _, found in ends if near(found.point, [point])]
+        beside = [end for _, end in ends if near(end.point, [point])]
         if beside:
-            found = min(beside, key=lambda one: float(np.linalg.norm(one.point - point)))
-            reason = judged(found.reason, certificate.holds(RESIDUAL, FEASIBLE))
-            promised = found.promised
+            end = min(beside, key=lambda one: float(np.linalg.norm(one.point - point)))
+            reason = judged(end.reason, certificate.holds(RESIDUAL, FEASIBLE))
+            promised = end.promised
         held = self.problem.held_by(optimized, certificate)
-        starts = [self._outcome(number, found) for number, found in ends]
+        starts = [self._outcome(number, end) for number, end in ends]
         starts = starts or self._ends(trials)
         rows = self._sensitivities(optimized, certificate)
         return Optimality(self.method, certificate, reason, promised, held, starts, rows)
@@ -165,12 +165,12 @@ class Verification:
             rows.append(row)
         return rows
 
-    def _outcome(self, number: int, found: Found) -> StartOutcome:
+    def _outcome(self, number: int, end: Descent) -> StartOutcome:
         """Return the outcome of a local search by sequential quadratic programming.
 
-        `number`: index of the search; `found`: what it found."""
-        certificate, local = found.certificate, found.local
-        reason = found.reason
+        `number`: index of the search; `end`: what it found at its end."""
+        certificate, local = end.certificate, end.local
+        reason = end.reason
         met = local is not None and local.violation <= FEASIBLE
         if local is not None and not met and reason != "interrupted":
             reason = "infeasible"
@@ -179,9 +179,9 @@ class Verification:
             objective=local.objective if local is not None and met else float("nan"),
             residual=float("nan") if certificate is None else certificate.residual,
             reason=reason,
-            evaluations=found.evaluations,
-            design=self._named(found.point),
-            point=found.point,
+            evaluations=end.evaluations,
+            design=self._named(end.point),
+            point=end.point,
         )
 
     def _ends(self, trials: list[Trial]) -> list[StartOutcome]:
@@ -190,12 +190,12 @@ class Verification:
         for trial in trials:
             if trial.start >= 0:
                 starts.setdefault(trial.start, []).append(trial)
-        found = []
+        outcomes = []
         for number, every in sorted(starts.items()):
             best = min(filter(candidate, every), key=objective, default=every[0])
             outcome = best.objective, best.residual, "descent", len(every)
-            found.append(StartOutcome(number, *outcome, self._named(best.point), best.point))
-        return found
+            outcomes.append(StartOutcome(number, *outcome, self._named(best.point), best.point))
+        return outcomes
 
     def _named(self, point) -> dict[str, float]:
         """Return the design at a `point` (d,), in config units by key."""
@@ -245,7 +245,7 @@ def surviving(result: Optimization, given: Config) -> list[dict[str, Any]]:
         return dataclasses.replace(evaluator, scene=evaluator.scene.renewed(config.moved(values)))
 
     both = [*zip(configs, evaluators, designs, strict=True)]
-    found = evaluate_many(
+    evaluations = evaluate_many(
         Point(moved(config, evaluator, *errors), design)
         for errors in _CASES.values()
         for config, evaluator, design in both
@@ -254,11 +254,11 @@ def surviving(result: Optimization, given: Config) -> list[dict[str, Any]]:
     closed = {Status.NOT_CLOSED: Status.PERIODIC}
     numbers = [
         problem.objective(dataclasses.replace(one, status=closed.get(one.status, one.status)))
-        for one in found
+        for one in evaluations
     ]
     pairs = [*zip(numbers[::2], numbers[1::2], strict=True)]
     gains = [1 - after / before for before, after in pairs]
-    states = [one.status.label for one in found]
+    states = [one.status.label for one in evaluations]
     return [
         {"case": name, "baseline": pair[0], "optimized": pair[1], "gain": gain,
          "share": gain / gains[0], "statuses": states[2 * k : 2 * k + 2]}

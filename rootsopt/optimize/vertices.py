@@ -128,17 +128,17 @@ class FeasibleSet:
 
     def vertices(self, first: Vertex, most: int) -> list[Vertex]:
         """Return up to `most` other vertices, those nearest to the `first` along edges first."""
-        found = [first]
-        for vertex in found:
+        vertices = [first]
+        for vertex in vertices:
             for number in vertex.held:
                 other = self._other_end(vertex, number)
                 if other is not None and all(
-                    np.linalg.norm(other.point - one.point) > NEAR for one in found
+                    np.linalg.norm(other.point - one.point) > NEAR for one in vertices
                 ):
-                    found.append(other)
-            if len(found) > most:
+                    vertices.append(other)
+            if len(vertices) > most:
                 break
-        return found[1 : most + 1]
+        return vertices[1 : most + 1]
 
     def plane(self, point: NDArray[np.float64], most: int) -> Plane | None:
         """Return the feasible part of a plane through a `point` (d,) along two coordinates.
@@ -156,8 +156,8 @@ class FeasibleSet:
             inside = np.flatnonzero(np.any(best.slacks >= 0, axis=axis))
             low, high = max(inside[0] - 1, 0), min(inside[-1] + 1, _COARSE - 1)
             around.append(np.linspace(ends[low], ends[high], _NODES))
-        found = self._plane(point, best.axes, *around)
-        return found if len(found.some(most)) >= _CORNERS else None
+        plane = self._plane(point, best.axes, *around)
+        return plane if len(plane.some(most)) >= _CORNERS else None
 
     def _plane(
         self,
@@ -166,11 +166,11 @@ class FeasibleSet:
         x: NDArray[np.float64],
         y: NDArray[np.float64],
     ) -> Plane:
-        found = Plane(axes, x, y, np.empty((len(y), len(x))))
-        for node in np.ndindex(found.slacks.shape):
-            slack, _ = self.limits(found.at(point, *node))
-            found.slacks[node] = np.min(slack, initial=np.inf)
-        return found
+        plane = Plane(axes, x, y, np.empty((len(y), len(x))))
+        for node in np.ndindex(plane.slacks.shape):
+            slack, _ = self.limits(plane.at(point, *node))
+            plane.slacks[node] = np.min(slack, initial=np.inf)
+        return plane
 
     def _other_end(self, vertex: Vertex, number: int) -> Vertex | None:
         """Return the other end of the edge on which limit `number` of a `vertex` is released.

@@ -80,16 +80,16 @@ class Arcs(Profile):
         half = jnp.pi / (2 * lobes)
         crossing = r * jnp.stack([jnp.cos(half), jnp.sin(half)])
         place = jnp.stack([jnp.asarray(0.0 if center is None else center), jnp.zeros_like(r)])
-        centers, found = [place], list(map(jnp.asarray, radii))
+        centers, all_radii = [place], list(map(jnp.asarray, radii))
         for k, joint in enumerate(joints):
             normal = jnp.stack([jnp.cos(joint), jnp.sin(joint)])
             if k + 1 == len(radii):
                 # The last arc: |X - C| = ρ at the crossing X, with C on the normal of the joint.
-                to = crossing - centers[-1] - found[-1] * normal
-                found.append(-jnp.dot(to, to) / (2 * jnp.dot(to, normal)))
-            centers.append(centers[-1] + (found[k] - found[k + 1]) * normal)
+                to = crossing - centers[-1] - all_radii[-1] * normal
+                all_radii.append(-jnp.dot(to, to) / (2 * jnp.dot(to, normal)))
+            centers.append(centers[-1] + (all_radii[k] - all_radii[k + 1]) * normal)
         if not radii:
-            found.append(jnp.linalg.norm(crossing - place))
+            all_radii.append(jnp.linalg.norm(crossing - place))
         x, y = crossing - centers[-1]
         stop = jnp.arctan2(y, x)
         return cls(
@@ -98,7 +98,7 @@ class Arcs(Profile):
             land=center is None,
             pitch_radius=r,
             center=jnp.stack(centers),
-            radius=jnp.stack(found),
+            radius=jnp.stack(all_radii),
             joints=jnp.stack([jnp.zeros_like(r), *map(jnp.asarray, joints), stop]),
         )
 

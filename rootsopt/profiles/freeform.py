@@ -221,9 +221,9 @@ def project(profile: Profile, count: int) -> FreeForm:
     rows, want = fall(share), (np.pi / 2 - psi) / length
     # The last row is the pitch crossing, at the end of the spline.
     rows[-1], want[-1] = rows[-1] * _FIRMLY, want[-1] * _FIRMLY
-    found = lsq_linear(rows, want, (-1.0, 1.0), method="bvls")
+    fit = lsq_linear(rows, want, (-1.0, 1.0), method="bvls")
     # BVLS may exceed a bound by a rounding error.
-    shares = jnp.asarray(np.clip(found.x, -1.0, 1.0))
+    shares = jnp.asarray(np.clip(fit.x, -1.0, 1.0))
     return FreeForm(profile.lobes, profile.pitch_radius, jnp.asarray(start), shares)
 
 

@@ -33,8 +33,8 @@ class Table(eqx.Module):
         width, t = width[..., None], t[..., None]
         first, last = self.slope[index] * width, self.slope[index + 1] * width
         bend = 3 * rise - 2 * first - last
-        found = before + t * (first + t * (bend + t * (first + last - 2 * rise)))
-        return tuple(jnp.moveaxis(found, -1, 0))
+        values = before + t * (first + t * (bend + t * (first + last - 2 * rise)))
+        return tuple(jnp.moveaxis(values, -1, 0))
 
 
 class Outline(Profile):

@@ -90,12 +90,12 @@ def soundness(
     profile, bore = lax.stop_gradient((profile, bore))
     free = jnp.full_like(profile.pitch_radius, jnp.inf)
     if isinstance(profile, Outline):
-        found = Soundness._make([*[free] * 8, profile.root_radius, free, free])
+        checks = Soundness._make([*[free] * 8, profile.root_radius, free, free])
     else:
-        found = margins(profile)
-    room = free if bore is None else found.root - bore
+        checks = margins(profile)
+    room = free if bore is None else checks.root - bore
     own = jnp.asarray(profile.limit_margin(), free.dtype)
-    return found._replace(**dict.fromkeys(inherent, free), limits=own, bore=room)
+    return checks._replace(**dict.fromkeys(inherent, free), limits=own, bore=room)
 
 
 def margins(profile: Profile) -> Soundness:

@@ -286,10 +286,10 @@ def leakage(scene: Scene, medium: Medium, profile: Profile, shape: Geometry) -> 
     if scene.wear is not None:
         series, lobes = wear_series(profile, scene.wear), jnp.asarray(float(profile.lobes))
         normal = normal + jax.vmap(lambda x: series_at(series, lobes, x)[0])(rolls(profile))
-    found = mesh_gap(profile, Allowances(normal, center, medium.radial_allowance))
-    mesh = _per_width(medium, found.least, found.length, 1)
+    gap = mesh_gap(profile, Allowances(normal, center, medium.radial_allowance))
+    mesh = _per_width(medium, gap.least, gap.length, 1)
     tips, ends = zero, zero
-    heights = [jnp.min(found.least)]
+    heights = [jnp.min(gap.least)]
     if medium.tip_clearance is not None:
         height = medium.tip_clearance + medium.radial_allowance + strain * shape.outer_radius
         length = tip_length(profile, shape, jnp.maximum(height, 1e-9))
@@ -308,7 +308,7 @@ def leakage(scene: Scene, medium: Medium, profile: Profile, shape: Geometry) -> 
         each = jnp.stack(heights)
         # Nothing flows through a closed gap.
         knudsen = path / jnp.min(jnp.where(each > 0, each, jnp.inf))
-    return Leakage(mesh, tips, ends, found, 1 - (mesh + tips + ends) / ideal, knudsen)
+    return Leakage(mesh, tips, ends, gap, 1 - (mesh + tips + ends) / ideal, knudsen)
 
 
 def _per_width(medium: Medium, height, length, series: int):

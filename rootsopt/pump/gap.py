@@ -146,8 +146,8 @@ def mesh_gap(profile: Profile, allowances: Allowances) -> MeshGap:
     nu, gap = profile.normal_at(roll), jnp.zeros_like(roll)
     if isinstance(profile, Outline):
         pair = FlankPair.of(profile, 2 * profile.pitch_radius, two_sided=True)
-        found = lax.map(lambda x: pair(x, jnp.zeros_like(x)), roll)
-        nu, gap = found.normal2, found.gap
+        points = lax.map(lambda x: pair(x, jnp.zeros_like(x)), roll)
+        nu, gap = points.normal2, points.gap
     r = profile.pitch_radius
     _, psi, s = profile.addendum(nu)
     shares = jnp.zeros_like(s)

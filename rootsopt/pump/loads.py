@@ -92,11 +92,11 @@ class BearingSet(eqx.Module):
         """Return the set of a `design` (d,) in config units; the scene must have `bearings`."""
         scene = scene.at(design)
         pair, shape = scene.pair_and_shape(design)
-        found, half = scene.bearings, scene.length / 2
-        assert found is not None
-        loads = scene.axis_loads(found, pair.load, pair.gear, scene.mass(shape))
-        ends = half + found.distance, half + found.gear_distance
-        return cls(pair, loads, scene.length, scene.helix, *ends, found.exponent)
+        bearings, half = scene.bearings, scene.length / 2
+        assert bearings is not None
+        loads = scene.axis_loads(bearings, pair.load, pair.gear, scene.mass(shape))
+        ends = half + bearings.distance, half + bearings.gear_distance
+        return cls(pair, loads, scene.length, scene.helix, *ends, bearings.exponent)
 
     def flags(self, orbit: VariedOrbit) -> Callable[[Any], Any]:
         """Return a function of time (mesh periods) whose result changes where the loads are not
@@ -221,13 +221,13 @@ def orbit_loads(scene: Scene, design: Float[Array, " d"], orbit: VariedOrbit) ->
 
         The integrands are the loads to the power of the exponent, and 1. Averages are over time:
         both are multiplied by the relative duration of a mesh period."""
-        found = bearings.at(tau, state)
-        size = found.sizes / unit
+        loads = bearings.at(tau, state)
+        size = loads.sizes / unit
         # The root of a load that vanishes has no derivative.
         pushed = size > 0
         powers = jnp.where(pushed, jnp.where(pushed, size, 1.0) ** bearings.exponent, 0.0)
         lapse = bearings.pair.lapse(state) * jnp.ones_like(unit)
-        return jnp.concatenate([lapse * powers, lapse[None], _channels(found, scene)])
+        return jnp.concatenate([lapse * powers, lapse[None], _channels(loads, scene)])
 
     def varied(tau):
         """Return the quantities, and their derivatives along the design, at constant time."""
@@ -328,22 +328,22 @@ def still_loads(scene: Scene, profile: Profile, shape: Geometry) -> tuple[Array,
     """Return the same as `static_loads` for the `profile` and `shape` of a design.
 
     JAX can differentiate it. The scene must have `bearings`."""
-    found, half = scene.bearings, scene.length / 2
-    assert found is not None
+    bearings, half = scene.bearings, scene.length / 2
+    assert bearings is not None
     load = scene.load(profile, shape)
-    loads = scene.axis_loads(found, load, scene.gear, scene.mass(shape))
+    loads = scene.axis_loads(bearings, load, scene.gear, scene.mass(shape))
 
     def size(phi):
         forces, first, _ = _from_gas(loads.gas, scene.length, scene.helix, phi)
         teeth = tooth_force(load.torque2(phi), loads.radius, loads.tooth_angle)
         teeth = jnp.stack([-teeth, teeth]) if scene.gear is not None else jnp.zeros((2, 2))
-        forces, first = forces + teeth, first + (half + found.gear_distance) * teeth
+        forces, first = forces + teeth, first + (half + bearings.gear_distance) * teeth
         if loads.weight is not None:
             forces = forces - loads.weight * np.array([[0.0, 1.0], [0.0, 1.0]])
-        share = first / (2 * (half + found.distance))
+        share = first / (2 * (half + bearings.distance))
         radial = jnp.stack([forces / 2 + share, forces / 2 - share], axis=1)
         return BearingLoads(radial, jnp.zeros(2), first).sizes
 
     phi = 2 * jnp.pi / scene.lobes * (jnp.arange(POSES) + 0.5) / POSES
     sizes = jax.vmap(size)(phi)
-    return equivalent_load(sizes.T, found.exponent), jnp.max(sizes, axis=0)
+    return equivalent_load(sizes.T, bearings.exponent), jnp.max(sizes, axis=0)

@@ -46,17 +46,17 @@ class SilentLimit(NamedTuple):
     depth: Float[Array, ""]
 
 
-def rattle_record(pair: RotorPair, found: Steady) -> dict[str, dict[str, float]]:
-    """Return the result file's entries for the rattle of the timing gear in the motion `found`.
+def rattle_record(pair: RotorPair, motion: Steady) -> dict[str, dict[str, float]]:
+    """Return the result file's entries for the rattle of the timing gear in the `motion`.
 
     They are the share of time without contact of its teeth, the number of impacts per turn, and the
     greatest torque (N·m) between the teeth. Without impacts, this torque is 0. There are no entries
     without a motion to report."""
-    status, window = Status.of(found.status), found.window
-    held = status in CLOSED or bool(found.held)
+    status, window = Status.of(motion.status), motion.window
+    held = status in CLOSED or bool(motion.held)
     if held:
-        elements = found.known.elements
-        used, turns = int(elements.mesh.used), int(found.period) / pair.lobes
+        elements = motion.known.elements
+        used, turns = int(elements.mesh.used), int(motion.period) / pair.lobes
         teeth = [np.asarray(x)[:used].ravel() for x in _of_orbit(pair, elements)]
     elif status in (*OPEN, Status.IDLE) and window is not None:
         done, states = int(window.done), window.states

@@ -49,49 +49,49 @@ def sheet(scene: Scene, design: Float[Array, " d"]) -> dict[str, Any]:
     With a section `pump`, the leakage follows: least and mean gap of the flanks over the mesh (µm),
     leakage through mesh, tips and end faces, and volumetric efficiency. For a gas, there is also
     the Knudsen number. Raises `InputError` if the rotors overlap somewhere."""
-    found = {key: value.tolist() for key, value in _flow(scene, design).items()}
+    rows = {key: value.tolist() for key, value in _flow(scene, design).items()}
     if scene.bearings is not None:
         equivalent, greatest = static_loads(scene, design)
-        found["static_bearing_load_max_N"] = float(jnp.max(greatest))
-        found["static_bearing_load_equivalent_N"] = float(jnp.max(equivalent))
+        rows["static_bearing_load_max_N"] = float(jnp.max(greatest))
+        rows["static_bearing_load_equivalent_N"] = float(jnp.max(equivalent))
     if _has_play(scene):
-        found |= {key: value.tolist() for key, value in _play(scene, design).items()}
-        if found["flank_interference_um"] * UM <= _ROUNDING:
-            del found["flank_interference_um"], found["flank_interference_at_deg"]
+        rows |= {key: value.tolist() for key, value in _play(scene, design).items()}
+        if rows["flank_interference_um"] * UM <= _ROUNDING:
+            del rows["flank_interference_um"], rows["flank_interference_at_deg"]
     if scene.medium is not None:
-        found |= _leaking(scene, scene.medium, design)
-    return {key: found[key] for key in KEYS if key in found}
+        rows |= _leaking(scene, scene.medium, design)
+    return {key: rows[key] for key in KEYS if key in rows}
 
 
 def warnings(rows: Mapping[str, Any]) -> list[str]:
     """Return caveats on the values of a sheet, as sentences.
 
     `rows`: the sheet."""
-    found = []
+    caveats = []
     if "flank_interference_um" in rows:
         overlap = rows["flank_interference_um"]
-        found.append(
+        caveats.append(
             f"The flanks overlap by {overlap:.3g} um in perfect rolling, most with rotor 1 at "
             f"{rows['flank_interference_at_deg']:.3g} deg: raise `contact.clearance_mm` by "
             f"{overlap / 1e3:.2g} to separate them, unless this is the scatter of measured points."
         )
     if rows.get("volumetric_efficiency", 1.0) <= 0:
-        found.append(
+        caveats.append(
             "More fluid leaks back than the rotors displace: the pump delivers nothing. Reduce the "
             "clearances or `pump.pressure_difference_Pa`, or raise `scene.speed_rpm`."
         )
     knudsen = rows.get("knudsen_number", 0.0)
     if knudsen > MOLECULAR:
-        found.append(
+        caveats.append(
             f"The flow through the gaps is molecular (Knudsen number {knudsen:.2g} > 1): the "
             "leakage and the volumetric efficiency above do not hold."
         )
     elif knudsen > CONTINUUM:
-        found.append(
+        caveats.append(
             f"Gas slips at the walls of the gaps (Knudsen number {knudsen:.2g} > 0.01): more leaks "
             "than reported."
         )
-    return found
+    return caveats
 
 
 def missing(rows: Mapping[str, Any]) -> str:
@@ -181,20 +181,20 @@ def _has_play(scene: Scene) -> bool:
 @CachedFunction
 def _play(scene: Scene, design: Float[Array, " d"]) -> dict[str, Array]:
     profile = scene.profile(design)
-    found = play_of(scene, profile)
+    play = play_of(scene, profile)
     return {
-        "angular_play_min_mrad": jnp.min(found.total) / MRAD,
-        "angular_play_max_mrad": jnp.max(found.total) / MRAD,
-        "gear_backlash_max_mm": found.gear_backlash / MM,
-        "flank_interference_um": found.overlap / UM,
-        "flank_interference_at_deg": found.overlap_at / DEG,
+        "angular_play_min_mrad": jnp.min(play.total) / MRAD,
+        "angular_play_max_mrad": jnp.max(play.total) / MRAD,
+        "gear_backlash_max_mm": play.gear_backlash / MM,
+        "flank_interference_um": play.overlap / UM,
+        "flank_interference_at_deg": play.overlap_at / DEG,
     }
 
 
 def _leaking(scene: Scene, medium: Medium, design: Float[Array, " d"]) -> dict[str, Any]:
     """Return the rows of leakage. Raises `InputError` as `sheet` does."""
-    found, rows = _leaks(scene, design)
-    least = float(found)
+    least_gap, rows = _leaks(scene, design)
+    least = float(least_gap)
     if least < -_ROUNDING:
         raise InputError(
             f"the flanks must not overlap in perfect rolling, but overlap by {-least / UM:.3g} um; "
@@ -215,14 +215,14 @@ def _leaks(scene: Scene, design: Float[Array, " d"]) -> tuple[Array, dict[str, A
     """Return (least gap of the flanks (m), rows of the sheet)."""
     assert scene.medium is not None
     profile = scene.profile(design)
-    found = flow.leakage(scene, scene.medium, profile, geometry(profile))
-    least = jnp.min(found.gap.least)
+    leakage = flow.leakage(scene, scene.medium, profile, geometry(profile))
+    least = jnp.min(leakage.gap.least)
     return least, {
         "flank_gap_min_um": least / UM,
-        "flank_gap_mean_um": jnp.mean(found.gap.least) / UM,
-        "mesh_leakage_l_min": found.mesh / L_MIN,
-        "tip_leakage_l_min": found.tips / L_MIN,
-        "end_leakage_l_min": found.ends / L_MIN,
-        "volumetric_efficiency": found.efficiency,
-        "knudsen_number": found.knudsen,
+        "flank_gap_mean_um": jnp.mean(leakage.gap.least) / UM,
+        "mesh_leakage_l_min": leakage.mesh / L_MIN,
+        "tip_leakage_l_min": leakage.tips / L_MIN,
+        "end_leakage_l_min": leakage.ends / L_MIN,
+        "volumetric_efficiency": leakage.efficiency,
+        "knudsen_number": leakage.knudsen,
     }

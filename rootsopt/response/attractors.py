@@ -150,22 +150,22 @@ def find(
     grid = pair.at_start(grid)
     starts = np.concatenate([grid, *(np.atleast_2d(state) for state in known)])
     ends, failures = _settled(evaluator, pair, starts)
-    found = _Sorter(evaluator, design, series)
-    found.add(rest, np.zeros(grid.shape[1]))
+    sorter = _Sorter(evaluator, design, series)
+    sorter.add(rest, np.zeros(grid.shape[1]))
     for k in range(len(starts)):
-        found.place(jax.tree.map(lambda x, k=k: x[k], ends), int(failures[k]))
-    numbers = np.asarray(found.numbers[: len(grid)])
-    shares = np.bincount(numbers[numbers >= 0], minlength=len(found.evaluations)) / len(grid)
-    order = sorted(range(len(shares)), key=lambda i: (not found.periodic(i), -shares[i]))
+        sorter.place(jax.tree.map(lambda x, k=k: x[k], ends), int(failures[k]))
+    numbers = np.asarray(sorter.numbers[: len(grid)])
+    shares = np.bincount(numbers[numbers >= 0], minlength=len(sorter.evaluations)) / len(grid)
+    order = sorted(range(len(shares)), key=lambda i: (not sorter.periodic(i), -shares[i]))
     attractors = tuple(
-        Attractor(found.evaluations[i], float(shares[i]), i == 0, found.cycles[i])
+        Attractor(sorter.evaluations[i], float(shares[i]), i == 0, sorter.cycles[i])
         for i in order
-        if found.evaluations[i].status not in _LOST
+        if sorter.evaluations[i].status not in _LOST
     )
     rank = np.full(len(shares) + 1, -1)
-    kept = [i for i in order if found.evaluations[i].status not in _LOST]
+    kept = [i for i in order if sorter.evaluations[i].status not in _LOST]
     rank[kept] = np.arange(len(kept))
-    lost = [label for label, number in zip(found.lost, numbers, strict=False) if number < 0]
+    lost = [label for label, number in zip(sorter.lost, numbers, strict=False) if number < 0]
     return Basins(
         relative=relative,
         rate=rate,
@@ -382,9 +382,9 @@ def _badness(evaluator: Evaluator, attractors: list[Attractor]) -> Callable[[Att
     (reference,) = evaluator.references or (greatest,)
 
     def badness(attractor: Attractor) -> float:
-        found = attractor.evaluation.response
+        response = attractor.evaluation.response
         # Skip a measure that is 0 in the reference. If the reference is the baseline's,
         # `Problem.of` has rejected it.
-        return sum(w * found[k] / reference[k] for k, w in weights.items() if reference[k] > 0)
+        return sum(w * response[k] / reference[k] for k, w in weights.items() if reference[k] > 0)
 
     return badness

@@ -164,11 +164,11 @@ def _report(
         response = dict(zip(RESPONSES, map(float, values[:, 0]), strict=True))
         errors = dict(zip(ERRORS.values(), map(float, values[:, 1]), strict=True))
         greatest = float(np.max(members.greatest))
-        found, series = _kind(evaluator, pair, members, with_series)
+        kind, series = _kind(evaluator, pair, members, with_series)
         if status is Status.IDLE:
-            found["kind"] = "idle"
+            kind["kind"] = "idle"
         drift, by_drift = mean_and_error(np.asarray(members.drift, np.float64))
-        steady = found | size | errors
+        steady = kind | size | errors
         steady |= {
             "mean_force_drift_N": float(drift),
             "mean_force_drift_standard_error_N": float(by_drift),
@@ -222,9 +222,9 @@ def _kind(evaluator: Evaluator, pair, members: Members, with_series):
         return kind, None
     typical = int(np.argmin(np.any(members.repeats, axis=1)))
     state = jnp.asarray(members.states[typical])
-    found = lyapunov_program(pair, state, PERIODS, evaluator.scene.solver.transient)
-    status = Status.of(int(unsettled_status(pair, found)))
-    steady, _, series = unsettled(pair, status, jax.device_get(found), with_series)
+    window = lyapunov_program(pair, state, PERIODS, evaluator.scene.solver.transient)
+    status = Status.of(int(unsettled_status(pair, window)))
+    steady, _, series = unsettled(pair, status, jax.device_get(window), with_series)
     del steady["window_mesh_periods"]
     return steady | (kind if every.any() else {}), series
 
@@ -247,8 +247,8 @@ def _slopes(
     if around.status is not Status.AVERAGED:
         return around.status, None
     values = np.stack([run.responses[:, 0] for run in around.runs])
-    found = per_config_unit(*fitted_slope(values, steps), np.asarray(jacobian))
-    return Status.AVERAGED, np.stack(found)
+    slopes = per_config_unit(*fitted_slope(values, steps), np.asarray(jacobian))
+    return Status.AVERAGED, np.stack(slopes)
 
 
 def _space(evaluator: Evaluator, design) -> Space:

@@ -118,17 +118,17 @@ class Evaluator:
         """Return the evaluator of a `config`, for the motions and speeds that its objective counts.
 
         Raises InputError as `of` does."""
-        found, motion = cls.of(config), config.objective.motion
+        evaluator, motion = cls.of(config), config.objective.motion
         if motion == "ensemble":
             from rootsopt.response.ensemble import Ensemble
 
-            found = dataclasses.replace(found, motions=Ensemble())
+            evaluator = dataclasses.replace(evaluator, motions=Ensemble())
         elif motion in ("worst", "weighted"):
             from rootsopt.response.attractors import Coexisting
 
-            found = dataclasses.replace(found, motions=Coexisting())
+            evaluator = dataclasses.replace(evaluator, motions=Coexisting())
         speeds = tuple(shares(config).items()) if config.objective.speeds_rpm else ()
-        return dataclasses.replace(found, speeds=speeds)
+        return dataclasses.replace(evaluator, speeds=speeds)
 
     @property
     def single(self) -> bool:
@@ -231,8 +231,8 @@ class Evaluator:
         head = self.nominal(design, begin, series)
         parts = [Part({}, head)]
         if head.usable:
-            found = evaluate_many(self.in_scenes(self.shifts, design, begins), self.runs)
-            parts += [Part(s.values, one) for s, one in zip(self.shifts, found, strict=True)]
+            evaluations = evaluate_many(self.in_scenes(self.shifts, design, begins), self.runs)
+            parts += [Part(s.values, one) for s, one in zip(self.shifts, evaluations, strict=True)]
         return over_scenes(parts)
 
     def in_scenes(
@@ -270,8 +270,8 @@ class Evaluator:
         `progress` is called with the number of speeds done. All parts have equal shares.
         """
         points = [Point(self.at_speed(speed), design) for speed in speeds_rpm]
-        found = evaluate_many(points, progress=progress)
-        return parts_at([(speed, 1 / len(speeds_rpm)) for speed in speeds_rpm], found)
+        evaluations = evaluate_many(points, progress=progress)
+        return parts_at([(speed, 1 / len(speeds_rpm)) for speed in speeds_rpm], evaluations)
 
     def reached(
         self,
@@ -286,12 +286,12 @@ class Evaluator:
         pair, tangents, shape = _build(self.scene, design)
         solver = self.solver
         begin = begun(pair, start, solver.max_orbit)
-        found = self.motion(pair, tangents, begin)
+        motion = self.motion(pair, tangents, begin)
         if series and self.confirm:
-            found = self._confirmed(pair, tangents, begin, found)
-        report = self._reported(design, (pair, tangents, shape), found, began, series)
+            motion = self._confirmed(pair, tangents, begin, motion)
+        report = self._reported(design, (pair, tangents, shape), motion, began, series)
         if self.maxima and report.usable:
-            maxima = local_maxima(pair, tangents, varied(found))
+            maxima = local_maxima(pair, tangents, varied(motion))
             report = dataclasses.replace(report, maxima=maxima)
         return report
 
@@ -304,45 +304,45 @@ class Evaluator:
         """Return the steady motion of `pair` to which `start` leads, in arrays of NumPy.
 
         It has derivatives along `tangents`; `start`: result of `starts.begun`."""
-        found = _motion(pair, tangents, start, self.scene.pitch_radius, self.solver)
-        found = jax.device_get(found)  # Fetching a hundred arrays one by one takes a millisecond.
-        return self._examined(pair, found)
+        motion = _motion(pair, tangents, start, self.scene.pitch_radius, self.solver)
+        motion = jax.device_get(motion)  # Fetching a hundred arrays one by one takes a millisecond.
+        return self._examined(pair, motion)
 
-    def _examined(self, pair: RotorPair, found: Steady) -> Steady:
-        """Return the motion `found`, with the status that `closed.examined` would give it.
+    def _examined(self, pair: RotorPair, motion: Steady) -> Steady:
+        """Return the `motion`, with the status that `closed.examined` would give it.
 
         The window has a separate program, which few motions need."""
-        if Status.of(found.status) not in OPEN:
-            return found
+        if Status.of(motion.status) not in OPEN:
+            return motion
         window = None
         if float(self.scene.solver.probe_chaos) > 0:
-            state, integrator = found.settled.state, self.scene.solver.transient
+            state, integrator = motion.settled.state, self.scene.solver.transient
             window = jax.device_get(lyapunov_program(pair, state, PERIODS, integrator))
-        return _seen(pair, found, window)
+        return _seen(pair, motion, window)
 
     def _confirmed(
-        self, pair: RotorPair, tangents: RotorPair, start: Start, found: Steady
+        self, pair: RotorPair, tangents: RotorPair, start: Start, motion: Steady
     ) -> Steady:
-        """Return the motion `found` from `start`, if an integration over its period confirms it.
+        """Return the `motion` from `start`, if an integration over its period confirms it.
 
         An orbit closed from a known one may lack a touch of the flanks. If so, search once more
         without the known orbit. An orbit that is still not confirmed is NOT_CLOSED."""
-        if Status.of(found.status) not in CLOSED:
-            return found
-        orbit, integrator = found.orbit, self.scene.solver.orbit
+        if Status.of(motion.status) not in CLOSED:
+            return motion
+        orbit, integrator = motion.orbit, self.scene.solver.orbit
         # A coarse integration would say nothing about the orbit.
         # NumPy's minimum: that of JAX, outside of a program, would be compiled.
         rtol = jax.device_put(np.minimum(integrator.rtol, _FINE))
         fine = dataclasses.replace(integrator, rtol=rtol)
-        apart = float(_integrated(pair, (orbit.state, orbit.response), found.period, fine))
+        apart = float(_integrated(pair, (orbit.state, orbit.response), motion.period, fine))
         least, tolerances = _APART
         if apart <= max(least, tolerances * float(integrator.rtol)):
-            return found
-        if start.known.sound and not int(found.used):
+            return motion
+        if start.known.sound and not int(motion.used):
             alone = dataclasses.replace(start, known=start.known._replace(sound=np.zeros((), bool)))
             return self._confirmed(pair, tangents, alone, self.motion(pair, tangents, alone))
         status = np.asarray(Status.NOT_CLOSED.code)
-        return self._examined(pair, found._replace(status=status))
+        return self._examined(pair, motion._replace(status=status))
 
     def pair(self, design: ArrayLike) -> RotorPair:
         """Return the rotor pair of `design` (config units)."""
@@ -365,23 +365,23 @@ class Evaluator:
         rest = jax.ShapeDtypeStruct((pair.states,), dtype)
         begin = eqx.filter_eval_shape(Start.at, pair, rest, solver.max_orbit)
 
-        def then(found: Steady) -> None:
-            orbit = varied(found)
+        def then(motion: Steady) -> None:
+            orbit = varied(motion)
             if loaded(self, series):
                 orbit_loads.prepare(self.scene, design, orbit)
             if geared(self, series):
                 apart_program.prepare(pair, tangents, orbit)
-            rows = np.zeros((found.orbit.response.shape[0], 1))
+            rows = np.zeros((motion.orbit.response.shape[0], 1))
             forces = solver.measures.named(rows, 1)
             added = [name for name in names_of(self) if name not in (*forces, *OF_MOTION)]
             if added:
                 values, slopes = (jax.ShapeDtypeStruct((3, *d), float) for d in ((), design.shape))
                 values_of.prepare(self.scene, terms_of(added), design, values, slopes)
             if series:
-                sampled.prepare(found.known.elements)
+                sampled.prepare(motion.known.elements)
             if series and self.confirm:
-                known = found.orbit.state, found.orbit.response
-                _integrated.prepare(pair, known, found.period, solver.orbit)
+                known = motion.orbit.state, motion.orbit.response
+                _integrated.prepare(pair, known, motion.period, solver.orbit)
             if maxima or self.maxima:
                 prepare_maxima(pair, tangents, orbit)
 
@@ -399,13 +399,13 @@ class Evaluator:
         return _build(self.scene, design_vector(self.config))
 
     def evaluation(
-        self, built: tuple[RotorPair, RotorPair, Geometry], found: Steady, began: float
+        self, built: tuple[RotorPair, RotorPair, Geometry], motion: Steady, began: float
     ) -> Evaluation:
         """Return the evaluation, without series, of the config's own design with a known motion.
 
-        `built`: result of `assembled`; `found`: its motion; `began`: time at the start (s,
+        `built`: result of `assembled`; `motion`: its steady motion; `began`: time at the start (s,
         `perf_counter`)."""
-        return self._reported(design_vector(self.config), built, found, began, False)
+        return self._reported(design_vector(self.config), built, motion, began, False)
 
     def _reported(self, design: Any, *known: Any) -> Evaluation:
         """Return the evaluation of a known motion; arguments as of `reported`."""
@@ -438,13 +438,13 @@ def evaluate(config: Config, design: ArrayLike | Sequence[float] | None = None) 
     >>> import rootsopt
     >>> jax.config.update("jax_enable_x64", True)
     >>> config = rootsopt.load_config("cic")
-    >>> found = rootsopt.evaluate(config)
-    >>> print(f"{found.response['mean_force_N']:.1f} N")
+    >>> evaluation = rootsopt.evaluate(config)
+    >>> print(f"{evaluation.response['mean_force_N']:.1f} N")
     26.8 N
     """
     check_precision()
     check_geometry(config, design)
-    found = Evaluator.of(config)(None if design is None else jnp.asarray(design, float))
-    if found.status is Status.UNSOUND:
-        raise InputError(found.message)
-    return found
+    evaluation = Evaluator.of(config)(None if design is None else jnp.asarray(design, float))
+    if evaluation.status is Status.UNSOUND:
+        raise InputError(evaluation.message)
+    return evaluation

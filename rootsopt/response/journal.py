@@ -130,11 +130,11 @@ class Journal:
                 f"{str(path)!r}; leave out `--resume`, or name that run's folder with --output"
             ) from None
         try:
-            found = _content(first, b"")
+            stored_header = _content(first, b"")
         except ValueError:
             self.dropped += bool(first)
         else:
-            _compare(found, _content(head[:-1], b""))
+            _compare(stored_header, _content(head[:-1], b""))
         kept = []
         for line in filter(None, others):
             try:
@@ -203,9 +203,9 @@ def _content(line: bytes, seal: bytes) -> Any:
     return json.loads(text)
 
 
-def _compare(found: Any, header: Any) -> None:
-    """Raise `InputError` if the header `found` in the file differs from `header`."""
-    old, new = _flat(found), _flat(header)
+def _compare(stored_header: Any, header: Any) -> None:
+    """Raise `InputError` if the `stored_header` of the file differs from `header`."""
+    old, new = _flat(stored_header), _flat(header)
     keys = [key for key in dict.fromkeys((*new, *old)) if old.get(key) != new.get(key)]
     if not keys:
         return
@@ -224,10 +224,10 @@ def _flat(tree: Any, name: str = "") -> dict[str, Any]:
     """Return the values in nested mappings as one mapping with names joined by `: `."""
     if not isinstance(tree, dict):
         return {name: tree}
-    found: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for key, value in tree.items():
-        found |= _flat(value, f"{name}: {key}" if name else key)
-    return found
+        values |= _flat(value, f"{name}: {key}" if name else key)
+    return values
 
 
 def _file_digest(path: str) -> str:
@@ -273,9 +273,9 @@ class Checkpoint(Journal):
         known = self.known(key, point)
         if known is not None:
             return known
-        found = run(asked)
-        self.keep(key, point, found)
-        return found
+        evaluation = run(asked)
+        self.keep(key, point, evaluation)
+        return evaluation
 
     def known(self, key: Any, point: NDArray[np.float64]) -> Evaluation | None:
         """Return the evaluation stored under `key`, or `None` unless it belongs to `point` (d,).
@@ -303,12 +303,12 @@ class Checkpoint(Journal):
 
 def plain_evaluation(evaluation: Evaluation) -> dict[str, Any]:
     """Return an evaluation as plain values for JSON, without its time series."""
-    found = {
+    values = {
         field.name: getattr(evaluation, field.name) for field in dataclasses.fields(Evaluation)
     }
-    speeds, scenes = found.pop("speeds"), found.pop("scenes")
+    speeds, scenes = values.pop("speeds"), values.pop("scenes")
     maxima = evaluation.maxima
-    found |= {
+    values |= {
         "series": None,
         "status": evaluation.status.name,
         "start": plain(evaluation.start),
@@ -316,17 +316,17 @@ def plain_evaluation(evaluation: Evaluation) -> dict[str, Any]:
         "rivals": [plain_evaluation(one) for one in evaluation.rivals],
     }
     if scenes:
-        found["scenes"] = [[part.values, plain_evaluation(part.evaluation)] for part in scenes]
+        values["scenes"] = [[part.values, plain_evaluation(part.evaluation)] for part in scenes]
     elif speeds:
-        found["parts"] = [[p.speed_rpm, p.share, plain_evaluation(p.evaluation)] for p in speeds]
-    return found
+        values["parts"] = [[p.speed_rpm, p.share, plain_evaluation(p.evaluation)] for p in speeds]
+    return values
 
 
-def read_evaluation(found: Mapping[str, Any]) -> Evaluation:
+def read_evaluation(plain_values: Mapping[str, Any]) -> Evaluation:
     """Return the evaluation from the plain values that `plain_evaluation` returned.
 
     Raises `ValueError`, `LookupError` or `TypeError` if they are not valid."""
-    values = dict(found)
+    values = dict(plain_values)
     parts, scenes = values.pop("parts", ()), values.pop("scenes", ())
     for name, kind in _KINDS.items():
         kind.validate_python(values[name], strict=True)

@@ -72,12 +72,12 @@ def series_of(pair: RotorPair, tau, states) -> Series:
     )
 
 
-def orbit_series(pair: RotorPair, found: Steady) -> Series:
+def orbit_series(pair: RotorPair, motion: Steady) -> Series:
     """Return the series of a closed orbit, repeated to cover at least one revolution of rotor 1."""
-    period = int(found.period)
+    period = int(motion.period)
     cycles = -(-pair.lobes // period)
     tau = period * np.arange(cycles * SAMPLES) / SAMPLES
-    return series_of(pair, tau, np.tile(np.asarray(sampled(found.known.elements)), (cycles, 1)))
+    return series_of(pair, tau, np.tile(np.asarray(sampled(motion.known.elements)), (cycles, 1)))
 
 
 def window_series(pair: RotorPair, window: Window) -> Series:
@@ -166,18 +166,18 @@ def floquet(monodromy) -> list[list[float]]:
     return [[float(z.real), float(z.imag)] for z in ordered]
 
 
-def orbit_statistics(found: Steady, solver: Solver) -> dict[str, int | float]:
+def orbit_statistics(motion: Steady, solver: Solver) -> dict[str, int | float]:
     """Return the result file's statistics of an orbit that `solver` closed: effort and accuracy."""
-    orbit = found.orbit
+    orbit = motion.orbit
     statistics: dict[str, int | float] = {
         "newton_steps": int(orbit.newton_steps),
         "orbit_rtol": float(solver.orbit.rtol),
-        "force_rounding": float(found.verdict.rounding),
-        "orbit_elements": int(found.known.elements.mesh.used),
+        "force_rounding": float(motion.verdict.rounding),
+        "orbit_elements": int(motion.known.elements.mesh.used),
     }
-    if not int(found.used):
+    if not int(motion.used):
         statistics["from_neighbour"] = 1
-    errors = {"force_error": found.known.error, "gradient_disagreement": orbit.disagreement}
+    errors = {"force_error": motion.known.error, "gradient_disagreement": orbit.disagreement}
     # Infinite: there was no room for a comparison.
     return statistics | {name: float(x) for name, x in errors.items() if np.isfinite(x)}
 
@@ -300,49 +300,53 @@ apart_program = CachedFunction(apart)
 
 
 def reported(
-    evaluator: "Evaluator", design, built, found: Steady, began: float, series: bool
+    evaluator: "Evaluator", design, built, steady_motion: Steady, began: float, series: bool
 ) -> Evaluation:
-    """Return the evaluation of the motion `found`.
+    """Return the evaluation of a `steady_motion`.
 
     `built`: rotor pair, its derivatives along the design, and geometry; `began`: time at the
     start of the evaluation (s, `perf_counter`); `series`: whether to compute the series."""
     seconds, design = time.perf_counter() - began, np.asarray(design, np.float64)
-    (pair, tangents, shape), status = built, Status.of(found.status)
+    (pair, tangents, shape), status = built, Status.of(steady_motion.status)
     statistics: dict[str, int | float] = {
-        "transient_mesh_periods": int(found.used),
-        "solver_steps": int(found.steps),
+        "transient_mesh_periods": int(steady_motion.used),
+        "solver_steps": int(steady_motion.steps),
     }
-    idle, held = status is Status.IDLE, bool(found.held)
+    idle, held = status is Status.IDLE, bool(steady_motion.held)
     known = (status is Status.PERIODIC and pair.smooth) or idle
-    named = _forces(evaluator, found) if status in CLOSED or idle else {}
+    named = _forces(evaluator, steady_motion) if status in CLOSED or idle else {}
     steady: dict[str, Any] = {"kind": "idle" if idle else "transient"}
     said, hint, motion, start = message_of(evaluator.config, status), "", None, None
     if status in CLOSED or held:
         steady = {"kind": "idle" if idle else "periodic"}
-        steady |= orbit_record(found.orbit, int(found.period))
-        statistics |= orbit_statistics(found, evaluator.solver)
-        motion, further = _along(evaluator, design, (pair, tangents), found, series)
-        named, start = named | further, Seed.of(found, pair)
+        steady |= orbit_record(steady_motion.orbit, int(steady_motion.period))
+        statistics |= orbit_statistics(steady_motion, evaluator.solver)
+        motion, further = _along(evaluator, design, (pair, tangents), steady_motion, series)
+        named, start = named | further, Seed.of(steady_motion, pair)
         hint = "" if pair.smooth else _NO_GRADIENT
         if status is Status.PERIODIC:
-            hint += fading_note(float(found.orbit.multiplier), int(found.period))
-    elif idle and found.window is not None:
-        steady |= window_record(found.window)
-        motion = window_series(pair, found.window) if series else None
+            hint += fading_note(float(steady_motion.orbit.multiplier), int(steady_motion.period))
+    elif idle and steady_motion.window is not None:
+        steady |= window_record(steady_motion.window)
+        motion = window_series(pair, steady_motion.window) if series else None
     response = {name: value for name, (value, _) in named.items()}
     gradient = _named(evaluator, {name: row for name, (_, row) in named.items()}) if known else {}
     if status is Status.UNSOUND and pair.soundness is not None:
         hint = f" Here, {fault_of(pair.soundness)}."
-    elif found.window is not None and not idle and status not in CLOSED:
-        steady, response, motion = unsettled(pair, status, found.window, series)
+    elif steady_motion.window is not None and not idle and status not in CLOSED:
+        steady, response, motion = unsettled(pair, status, steady_motion.window, series)
     elif status is Status.SOLVER_FAILED and pair.timescales is not None:
         swings = pair.mesh_period / (2 * np.pi * pair.timescales.swing)
         statistics["swings_per_mesh_period"] = float(swings)
     if idle:
-        depth = found.orbit.depth if found.window is None else found.window.depth
+        depth = (
+            steady_motion.orbit.depth
+            if steady_motion.window is None
+            else steady_motion.window.depth
+        )
         said = apart_message(evaluator.config, float(depth), response.get(RESERVES[1]))
     if pair.gear is not None and pair.gear.errors is not None:
-        steady |= rattle_record(pair, found)
+        steady |= rattle_record(pair, steady_motion)
         if series:
             limit = jax.device_get(silent_limit(evaluator.scene, jnp.asarray(design)))
             silent = silent_record(limit)
@@ -362,25 +366,25 @@ def reported(
     )
 
 
-def _forces(evaluator: "Evaluator", found: Steady) -> dict[str, tuple[float, Any]]:
+def _forces(evaluator: "Evaluator", motion: Steady) -> dict[str, tuple[float, Any]]:
     """Return the forces of an orbit and their derivatives (d,), by name; 0 without contact."""
-    rows = np.column_stack([found.orbit.response, found.orbit.sensitivity])
-    if Status.of(found.status) is Status.IDLE:
+    rows = np.column_stack([motion.orbit.response, motion.orbit.sensitivity])
+    if Status.of(motion.status) is Status.IDLE:
         rows = np.zeros_like(rows)
-    return evaluator.scene.solver.measures.named(rows, int(found.period))
+    return evaluator.scene.solver.measures.named(rows, int(motion.period))
 
 
 def _along(
-    evaluator: "Evaluator", design, built, found: Steady, series: bool
+    evaluator: "Evaluator", design, built, steady_motion: Steady, series: bool
 ) -> tuple[Series | None, dict[str, tuple[float, Any]]]:
     """Return the series of an orbit, and what else is computed along it: values and derivatives
     (d,) by name.
 
     `built`: rotor pair, and its derivatives along the `design`."""
     pair, further = built[0], {}
-    motion = orbit_series(pair, found) if series else None
+    motion = orbit_series(pair, steady_motion) if series else None
     if loaded(evaluator, series):
-        whole = varied(found)
+        whole = varied(steady_motion)
         loads = jax.device_get(orbit_loads(evaluator.scene, jnp.asarray(design), whole))
         further |= bearing_record(loads)
         if motion is not None:
@@ -388,8 +392,8 @@ def _along(
             each = np.tile(np.asarray(loads.series.sizes, np.float64), turns)
             motion = dataclasses.replace(motion, bearing_loads=each)
     # Without contact, the reserve is the result.
-    if geared(evaluator, series or Status.of(found.status) is Status.IDLE):
-        reserve = jax.device_get(apart_program(*built, varied(found)))
+    if geared(evaluator, series or Status.of(steady_motion.status) is Status.IDLE):
+        reserve = jax.device_get(apart_program(*built, varied(steady_motion)))
         further |= apart_record(reserve, float(evaluator.scene.pitch_radius))
     return motion, further
 

@@ -48,16 +48,16 @@ class Combined(NamedTuple):
 
 def combine(tolerances: TolerancesConfig, values: ArrayLike) -> Combined:
     """Return the combination of `values` (n,) that `tolerances.combine` selects."""
-    found = np.asarray(values, np.float64)
+    array = np.asarray(values, np.float64)
     if tolerances.combine == "worst":
-        weights = np.zeros(len(found))
-        weights[np.argmax(found)] = 1.0
+        weights = np.zeros(len(array))
+        weights[np.argmax(array)] = 1.0
     elif tolerances.combine == "quantile":
-        weights = np.empty(len(found))
-        weights[np.argsort(found, kind="stable")] = order_weights(len(found), tolerances.quantile)
+        weights = np.empty(len(array))
+        weights[np.argsort(array, kind="stable")] = order_weights(len(array), tolerances.quantile)
     else:
-        weights = _mean_and_deviation(found, tolerances.k)
-    return Combined(float(weights @ found), weights)
+        weights = _mean_and_deviation(array, tolerances.k)
+    return Combined(float(weights @ array), weights)
 
 
 def order_weights(count: int, quantile: float) -> NDArray[np.float64]:
@@ -83,16 +83,16 @@ def _mean_and_deviation(values: NDArray[np.float64], k: float) -> NDArray[np.flo
 def over_speeds(parts: Sequence[Part], own: float) -> Evaluation:
     """Return the evaluation over several speeds, reported at the speed `own` (rpm)."""
     (head,) = (part.evaluation for part in parts if part.speed_rpm == own)
-    found = _together(head, parts, {"speeds": len(parts)})
-    return dataclasses.replace(found, maxima=None, rivals=(), speeds=tuple(parts))
+    evaluation = _together(head, parts, {"speeds": len(parts)})
+    return dataclasses.replace(evaluation, maxima=None, rivals=(), speeds=tuple(parts))
 
 
 def over_scenes(parts: Sequence[Part]) -> Evaluation:
     """Return the evaluation over several scenes, reported in the nominal scene.
 
     `parts`: that of the nominal scene first."""
-    found = _together(parts[0].evaluation, parts, {"samples": len(parts) - 1})
-    return dataclasses.replace(found, scenes=tuple(parts))
+    evaluation = _together(parts[0].evaluation, parts, {"samples": len(parts) - 1})
+    return dataclasses.replace(evaluation, scenes=tuple(parts))
 
 
 def _together(head: Evaluation, parts: Sequence[Part], counts: dict[str, int]) -> Evaluation:
@@ -166,9 +166,9 @@ def shares(config: Config) -> dict[float, float]:
     objective = config.objective
     speeds = objective.speeds_rpm or (config.scene.speed_rpm,)
     weights = objective.speed_weights or (1.0,) * len(speeds)
-    found = {config.scene.speed_rpm: 0.0}
-    found |= {s: w / sum(weights) for s, w in zip(speeds, weights, strict=True)}
-    return dict(sorted(found.items()))
+    speed_shares = {config.scene.speed_rpm: 0.0}
+    speed_shares |= {s: w / sum(weights) for s, w in zip(speeds, weights, strict=True)}
+    return dict(sorted(speed_shares.items()))
 
 
 def counted(
@@ -193,15 +193,15 @@ def counted(
 
 
 def parts_at(
-    shares: Iterable[tuple[float, float]], found: Iterable[Evaluation]
+    shares: Iterable[tuple[float, float]], evaluations: Iterable[Evaluation]
 ) -> tuple[Part, ...]:
     """Return the parts of evaluations at several speeds; `shares`: (speed in rpm, share)."""
-    pairs = zip(shares, found, strict=True)
+    pairs = zip(shares, evaluations, strict=True)
     return tuple(Part({"speed_rpm": speed}, one, share) for (speed, share), one in pairs)
 
 
 Item = TypeVar("Item")
-Found = TypeVar("Found")
+Result = TypeVar("Result")
 
 
 class Point(NamedTuple):
@@ -257,16 +257,16 @@ def evaluate_many(
 
     `runs`: where they run; `progress` is called with the number of points done. Points are taken
     only when they can begin, so that a generator can end them early."""
-    found = {}
+    evaluations = {}
     for number, one in as_done(runs.evaluated, points, runs.slots):
-        found[number] = one
-        progress(len(found))
-    return [found[number] for number in sorted(found)]
+        evaluations[number] = one
+        progress(len(evaluations))
+    return [evaluations[number] for number in sorted(evaluations)]
 
 
 def as_done(
-    work: Callable[[Item], Found], items: Iterable[Item], slots: int
-) -> Iterator[tuple[int, Found]]:
+    work: Callable[[Item], Result], items: Iterable[Item], slots: int
+) -> Iterator[tuple[int, Result]]:
     """Yield (number, `work(item)`) of all items as they are done, `slots` of them at a time.
 
     Items are taken only when they can begin. After an error, no further item begins."""
@@ -274,8 +274,8 @@ def as_done(
     if slots == 1:
         yield from ((number, work(item)) for number, item in waiting)
         return
-    running: dict[Future[Found], int] = {}
-    done: list[tuple[int, Found]] = []
+    running: dict[Future[Result], int] = {}
+    done: list[tuple[int, Result]] = []
     with ThreadPoolExecutor(slots) as pool:
         while True:
             for number, item in islice(waiting, slots - len(running)):

@@ -40,14 +40,14 @@ class Seed(NamedTuple):
     orbit: tuple[NDArray[Any], ...] = ()
 
     @classmethod
-    def of(cls, found: Steady, pair: RotorPair) -> "Seed":
-        """Return a seed on the motion `found` of `pair`.
+    def of(cls, motion: Steady, pair: RotorPair) -> "Seed":
+        """Return a seed on the `motion` of `pair`.
 
         Only a periodic orbit is part of it."""
-        state = np.asarray(found.orbit.state, np.float64)
-        if Status.of(found.status) is not Status.PERIODIC:
+        state = np.asarray(motion.orbit.state, np.float64)
+        if Status.of(motion.status) is not Status.PERIODIC:
             return cls(state)
-        return cls(state, tuple(jax.tree.leaves((trimmed(found.known), _numbers(pair)))))
+        return cls(state, tuple(jax.tree.leaves((trimmed(motion.known), _numbers(pair)))))
 
 
 Seeds = Seed | NDArray[np.float64] | tuple[Any, ...] | None
@@ -74,8 +74,8 @@ def begun(pair: RotorPair, start: Seed | ArrayLike | None, longest: int) -> Star
     known, numbers = jax.tree.unflatten(kind, seed.orbit)
     if known.elements.mesh.used >= room[0]:
         return nothing
-    found = Start(given, padded(known, room), numbers)
-    return found if found.fits(nothing) else nothing
+    begin = Start(given, padded(known, room), numbers)
+    return begin if begin.fits(nothing) else nothing
 
 
 def plain(start: Seeds) -> Any:
@@ -186,9 +186,9 @@ class Evaluation:
     >>> import rootsopt
     >>> jax.config.update("jax_enable_x64", True)
     >>> config = rootsopt.load_config("cic")
-    >>> found = rootsopt.evaluate(config)
-    >>> slope = found.gradient["peak_force_N"]["pressure_angle_deg"]
-    >>> print(f"{found.status.label}, {slope:.2f} N per degree")
+    >>> evaluation = rootsopt.evaluate(config)
+    >>> slope = evaluation.gradient["peak_force_N"]["pressure_angle_deg"]
+    >>> print(f"{evaluation.status.label}, {slope:.2f} N per degree")
     periodic, -2.93 N per degree
     """
 
@@ -266,7 +266,7 @@ class Evaluation:
         if self.scenes:
             own = {"status": self.status.label, "message": self.message}
             return self.nominal.record() | own | {"samples": [one.row() for one in self.samples]}
-        found = {
+        record = {
             "design": self.design,
             "geometry": self.geometry,
             "response": self.response,
@@ -277,8 +277,8 @@ class Evaluation:
             "statistics": self.statistics,
         }
         if self.speeds:
-            found["speeds"] = [one.row(whole=True) | {"share": one.share} for one in self.speeds]
-        return found
+            record["speeds"] = [one.row(whole=True) | {"share": one.share} for one in self.speeds]
+        return record
 
 
 class Part(NamedTuple):

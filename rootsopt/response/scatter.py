@@ -84,7 +84,7 @@ def shifts(config: Config, samples: Float[np.ndarray, "n q"]) -> tuple[Shift, ..
     keys = [one.key for one in config.scatters]
     inner = [not key.startswith("profile.") for key in keys]
     here = Scene.from_config(config)
-    found = []
+    changes = []
     for row in np.asarray(samples):
         values = dict(zip(keys, map(float, row), strict=True))
         moved = config.moved(values)
@@ -92,8 +92,8 @@ def shifts(config: Config, samples: Float[np.ndarray, "n q"]) -> tuple[Shift, ..
         if any(inner):
             only = {key: value for key, value in values.items() if not key.startswith("profile.")}
             scene = _difference(here, here.renewed(config.moved(only)))
-        found.append(Shift(values, scene, moved.design - config.design))
-    return tuple(found)
+        changes.append(Shift(values, scene, moved.design - config.design))
+    return tuple(changes)
 
 
 def assumed(config: Config) -> dict[str, dict[str, float]]:
@@ -132,8 +132,8 @@ def _difference(before: Scene, after: Scene) -> Scene:
     """Return the change of a scene's arrays, as a `Scene` with None in all other fields."""
 
     def change(x: Any, y: Any) -> Any:
-        found = np.asarray(x) - np.asarray(y)
-        return found if found.any() else None
+        difference = np.asarray(x) - np.asarray(y)
+        return difference if difference.any() else None
 
     return jax.tree.map(change, *(eqx.filter(x, eqx.is_inexact_array) for x in (after, before)))
 

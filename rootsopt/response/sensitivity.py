@@ -62,16 +62,16 @@ def quantities(config: Config) -> list[Quantity]:
     The table states the effect of a change by 1 µm for clearance, backlash and centre distance
     error. For all other quantities, the change is 1 %. Quantities of parts that the scene does not
     have are left out. So are quantities that are 0, except the first three."""
-    found = []
+    entries = []
     for key, name in LENGTHS:
         value = config.value(key)
         if value is not None:
-            found.append(Quantity(key, name, "mm", value, MICROMETRE))
+            entries.append(Quantity(key, name, "mm", value, MICROMETRE))
     for key, name, unit in OTHERS:
         value = config.value(key)
         if value:
-            found.append(Quantity(key, name, unit, value, _PERCENT * value))
-    return found
+            entries.append(Quantity(key, name, unit, value, _PERCENT * value))
+    return entries
 
 
 def direction(
@@ -126,10 +126,10 @@ def motions_along(
         blank = [jax.tree.map(np.zeros_like, some[0])] * (size - len(some))
         stacked = jax.tree.map(lambda *x: np.stack(x), *some, *blank)
         pair, tangents = along_values(evaluator.scene, design, *stacked)
-        found = evaluator.motion(pair, tangents, begun(pair, start, longest))
-        yield len(some), pair, tangents, found
+        motion = evaluator.motion(pair, tangents, begun(pair, start, longest))
+        yield len(some), pair, tangents, motion
         if begin + size < len(directions):
-            start = Seed.of(found, pair)
+            start = Seed.of(motion, pair)
 
 
 def by_scene(evaluator: Evaluator, evaluation: Evaluation) -> Evaluation | None:
@@ -144,20 +144,20 @@ def by_scene(evaluator: Evaluator, evaluation: Evaluation) -> Evaluation | None:
     directions = [direction(config, evaluator.scene, one.key, one.value) for one in wanted]
     gradient: dict[str, dict[str, float]] = {}
     slopes, maxima, done = [], evaluation.maxima, 0
-    for count, pair, tangents, found in motions_along(
+    for count, pair, tangents, motion in motions_along(
         evaluator, design, directions, evaluation.start
     ):
-        if Status.of(found.status) is not Status.PERIODIC:
+        if Status.of(motion.status) is not Status.PERIODIC:
             return None
-        rows = np.column_stack([found.orbit.response, found.orbit.sensitivity])
-        named = measures.named(rows, int(found.period))
+        rows = np.column_stack([motion.orbit.response, motion.orbit.sensitivity])
+        named = measures.named(rows, int(motion.period))
         for name in evaluation.response.keys() & named.keys():
             slope = map(float, named[name][1][:count])
             row = gradient.setdefault(name, {})
             row |= {one.key: x for one, x in zip(wanted[done:], slope, strict=False)}
         done += count
         if maxima is not None:
-            again = local_maxima(pair, tangents, varied(found))
+            again = local_maxima(pair, tangents, varied(motion))
             if again.times.shape != maxima.times.shape:
                 return None
             slopes.append(again.slopes[:, :count])
@@ -255,10 +255,10 @@ class _Look:
         All are NaN if the motion is not known."""
         (shift,) = shifts(self.config, row[None])
         evaluator, design = self.evaluator.shifted(shift.scene), self.design + shift.design
-        count, found, values = len(self.directions), [], np.full(2 * INSTANTS, math.nan)
+        count, gradients, values = len(self.directions), [], np.full(2 * INSTANTS, math.nan)
         for _, pair, tangents, motion in motions_along(evaluator, design, self.directions):
             if not (Status.of(motion.status) is Status.PERIODIC or bool(motion.held)):
                 return values, np.full((len(values), count), math.nan)
             values, slopes = jax.device_get(_gaps(pair, tangents, varied(motion)))
-            found.append(slopes / UM)
-        return values / UM, np.concatenate(found, axis=1)[:, :count]
+            gradients.append(slopes / UM)
+        return values / UM, np.concatenate(gradients, axis=1)[:, :count]

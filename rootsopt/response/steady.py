@@ -198,13 +198,13 @@ _CONSTANT = "period", "multipliers", "residual", "status", "margins", "start"
 
 
 def _split(values, response: Response) -> dict[str, Any]:
-    found, place = {}, 0
+    fields, place = {}, 0
     for name, old in response._asdict().items():
         if name not in _CONSTANT:
             end = place + jnp.size(old) if old is not None else place
-            found[name] = None if old is None else values[place:end].reshape(jnp.shape(old))
+            fields[name] = None if old is None else values[place:end].reshape(jnp.shape(old))
             place = end
-    return found
+    return fields
 
 
 def _solved(scene: Scene, design, start, along: tuple[int, ...]) -> tuple[Response, Array]:
@@ -215,10 +215,10 @@ def _solved(scene: Scene, design, start, along: tuple[int, ...]) -> tuple[Respon
     arguments = scene, design, start, along
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arguments)):
         return _inline(*arguments)
-    found = _compiled(*arguments, False)
+    solution = _compiled(*arguments, False)
     # Rare: a window has a separate program, which is compiled only now.
-    status = Status.of(found[0].status)
-    return _compiled(*arguments, True) if status in OPEN else found
+    status = Status.of(solution[0].status)
+    return _compiled(*arguments, True) if status in OPEN else solution
 
 
 def _solve(
@@ -241,10 +241,10 @@ def _solve(
     pair, tangents, _ = along(build, chosen, _basis(chosen))
     start = _start_of(pair, start, scene.solver)
     radius, solver = scene.pitch_radius, scene.solver
-    found = steady_motion(pair, tangents, start, radius, solver)
+    motion = steady_motion(pair, tangents, start, radius, solver)
     if windowed:
-        found = examined(pair, found, solver)
-    return _named(scene.solver, pair, tangents, found)
+        motion = examined(pair, motion, solver)
+    return _named(scene.solver, pair, tangents, motion)
 
 
 def _start_of(pair: RotorPair, start: Any, solver: Solver) -> Start:
@@ -269,7 +269,7 @@ def _start_of(pair: RotorPair, start: Any, solver: Solver) -> Start:
     return start
 
 
-def _state(pair: RotorPair, tangents: RotorPair, found: Steady):
+def _state(pair: RotorPair, tangents: RotorPair, motion: Steady):
     """Return the state (n,) in SI units, and its derivatives (n, m) along the family of orbits.
 
     The state is on the orbit or, without an orbit, at the end of the transient."""
@@ -279,13 +279,13 @@ def _state(pair: RotorPair, tangents: RotorPair, found: Steady):
         return eqx.combine(dynamic, static).in_si(state)
 
     def along(tangent, moved):
-        return jax.jvp(in_si, (dynamic, found.orbit.state), (tangent, moved))[1]
+        return jax.jvp(in_si, (dynamic, motion.orbit.state), (tangent, moved))[1]
 
-    closed = among(found.status, (*CLOSED, Status.IDLE))
-    state = jnp.where(closed, found.orbit.state, found.settled.state)
+    closed = among(motion.status, (*CLOSED, Status.IDLE))
+    state = jnp.where(closed, motion.orbit.state, motion.settled.state)
     state = jnp.where(pair.sound, state, jnp.nan)
     directions = eqx.filter(tangents, eqx.is_inexact_array)
-    return pair.in_si(state), jax.vmap(along)(directions, found.orbit.moved.T).T
+    return pair.in_si(state), jax.vmap(along)(directions, motion.orbit.moved.T).T
 
 
 def _basis(leaves: list[Array]) -> list[Array]:
@@ -299,38 +299,40 @@ def _basis(leaves: list[Array]) -> list[Array]:
     return rows
 
 
-def _next_start(solver: Solver, pair: RotorPair, found: Steady, state: Float[Array, " n"]) -> Start:
+def _next_start(
+    solver: Solver, pair: RotorPair, motion: Steady, state: Float[Array, " n"]
+) -> Start:
     """Return `Response.start`. After a motion that fails, the next one begins at rest."""
     failed = (Status.UNSOUND, Status.PASSED_THROUGH, Status.STALLED, Status.NON_FINITE)
-    failed = among(found.status, (*failed, Status.SOLVER_FAILED))
+    failed = among(motion.status, (*failed, Status.SOLVER_FAILED))
     rest = pair.in_si(jnp.zeros_like(state))
-    closed = among(found.status, CLOSED) | found.held
-    known = found.known._replace(sound=found.known.sound & closed)
+    closed = among(motion.status, CLOSED) | motion.held
+    known = motion.known._replace(sound=motion.known.sound & closed)
     numbers = eqx.filter(pair, eqx.is_inexact_array)
     return Start(jnp.where(failed, rest, state), known, numbers)
 
 
-def _named(solver: Solver, pair: RotorPair, tangents: RotorPair, found: Steady):
+def _named(solver: Solver, pair: RotorPair, tangents: RotorPair, motion: Steady):
     measures = solver.measures
-    orbit, period = found.orbit, found.period
-    closed = among(found.status, CLOSED) | found.held
-    mean, square, peak, *others = found.forces
-    by_mean, by_square, by_peak, *by_others = found.sensitivity
+    orbit, period = motion.orbit, motion.period
+    closed = among(motion.status, CLOSED) | motion.held
+    mean, square, peak, *others = motion.forces
+    by_mean, by_square, by_peak, *by_others = motion.sensitivity
     rms = jnp.sqrt(jnp.maximum(square, 0.0))
     by_rms = by_square / (2 * jnp.maximum(rms, 1e-150))
     sizes, slopes = measures.amplitudes(others, by_others, period)
-    state, by_state = _state(pair, tangents, found)
+    state, by_state = _state(pair, tangents, motion)
     rows = [by_mean, by_peak, by_rms, *slopes]
     reserves: list[Any] = [None, None]
     by_reserves = jnp.zeros((0, by_mean.shape[0]))
     if solver.variation and pair.gear is not None:
-        known, by_reserves = reserve(pair, tangents, varied(found))
+        known, by_reserves = reserve(pair, tangents, varied(motion))
         reserves = [*jnp.where(closed, known, jnp.nan)]
     norm = None
     if measures.norm is not None:
         norm = others[-1]
         rows.append(by_others[-1])
-    periodic = (found.status == Status.PERIODIC.code) | found.held
+    periodic = (motion.status == Status.PERIODIC.code) | motion.held
     rows = jnp.concatenate([jnp.stack(rows), by_state, by_reserves])
     monodromy = jnp.where(closed, orbit.monodromy, jnp.nan)
     assert pair.soundness is not None
@@ -343,12 +345,12 @@ def _named(solver: Solver, pair: RotorPair, tangents: RotorPair, found: Steady):
         period=jnp.where(closed, period, 0),
         multipliers=eigenvalues(monodromy),
         residual=jnp.where(closed, orbit.residual, jnp.nan),
-        status=found.status,
+        status=motion.status,
         state=state,
         margins=pair.soundness,
         contact_reserve=reserves[0],
         backlash_reserve=reserves[1],
-        start=_next_start(solver, pair, found, state),
+        start=_next_start(solver, pair, motion, state),
     )
     # Without weak types: a start that has them would be compiled for once more.
     response, rows = jax.tree.map(

@@ -73,8 +73,8 @@ def needed_motion(config: Config) -> Evaluator:
 
     These are the objective and the limits of `constraints.terms`. Raises `InputError` as
     `Evaluator.of` does."""
-    found = Evaluator.of_objective(config)
+    evaluator = Evaluator.of_objective(config)
     names = {*objective_weights(config), *config.objective.terms, *config.constraints.terms}
-    if any(depends_on_forces(config, found.scene, name, "objective.terms") for name in names):
-        return found
-    return dataclasses.replace(found, motions=Still())
+    if any(depends_on_forces(config, evaluator.scene, name, "objective.terms") for name in names):
+        return evaluator
+    return dataclasses.replace(evaluator, motions=Still())

@@ -257,8 +257,8 @@ def values_of(
     def every(design, forces):
         here, profile = scene.at(design), scene.profile(design)
         shape = geometry(profile)
-        found = [term.value(here, profile, shape, Forces(*forces)) for term in terms]
-        return jnp.stack([jnp.asarray(one, float) for one in found])
+        term_values = [term.value(here, profile, shape, Forces(*forces)) for term in terms]
+        return jnp.stack([jnp.asarray(one, float) for one in term_values])
 
     def twice(*at):
         return (every(*at),) * 2
@@ -310,10 +310,10 @@ def is_force(config: Config, name: str, key: str) -> bool:
             f"`{key}` names {PEAK_NORM}, which needs `objective.peak_norm`; set it, or name "
             "peak_force_N"
         )
-    found = _LINE.fullmatch(name)
-    if found is None:
+    match = _LINE.fullmatch(name)
+    if match is None:
         return name in RESPONSES or name == PEAK_NORM
-    order = float(found[1])
+    order = float(match[1])
     if not 1e-2 <= order <= 1e3 or line_name(order) != name:
         raise InputError(
             f"`{key}` must name a line as line_ORDER_force_N with an order from 0.01 to "
@@ -322,26 +322,26 @@ def is_force(config: Config, name: str, key: str) -> bool:
     return True
 
 
-def with_terms(found: Evaluation, scene: Scene, design, names: Sequence[str]) -> Evaluation:
+def with_terms(evaluation: Evaluation, scene: Scene, design, names: Sequence[str]) -> Evaluation:
     """Return an evaluation of a `design` (d,) with the terms in `names` that it lacks.
 
     They have gradients if the forces have. Without an orbit, the evaluation stays as it is."""
-    names = [name for name in names if name not in found.response]
-    if not names or not (found.status in CLOSED or found.status is Status.IDLE):
-        return found
-    keys, known = [*found.design], RESPONSES[0] in found.gradient
-    forces = np.array([found.response[name] for name in RESPONSES])
+    names = [name for name in names if name not in evaluation.response]
+    if not names or not (evaluation.status in CLOSED or evaluation.status is Status.IDLE):
+        return evaluation
+    keys, known = [*evaluation.design], RESPONSES[0] in evaluation.gradient
+    forces = np.array([evaluation.response[name] for name in RESPONSES])
     slopes = np.zeros((len(RESPONSES), len(keys)))
     if known:
-        slopes[:] = [[*found.gradient[name].values()] for name in RESPONSES]
+        slopes[:] = [[*evaluation.gradient[name].values()] for name in RESPONSES]
     values, rows = map(np.asarray, values_of(scene, terms_of(names), design, forces, slopes))
-    response = found.response | dict(zip(names, map(float, values), strict=True))
+    response = evaluation.response | dict(zip(names, map(float, values), strict=True))
     further = {
         name: dict(zip(keys, map(float, row), strict=True))
         for name, row in zip(names, rows, strict=True)
     }
-    gradient = found.gradient | (further if known else {})
-    return dataclasses.replace(found, response=response, gradient=gradient)
+    gradient = evaluation.gradient | (further if known else {})
+    return dataclasses.replace(evaluation, response=response, gradient=gradient)
 
 
 def depends_on_forces(config: Config, scene: Scene, name: str, key: str) -> bool:
@@ -362,8 +362,8 @@ def reporting(config: Config, names: Sequence[str], key: str) -> Config:
     terms = dict(config.objective.terms)
     for name in names:
         forced = is_force(config, name, key)
-        if found := _LINE.fullmatch(name):
-            order = float(found[1])
+        if match := _LINE.fullmatch(name):
+            order = float(match[1])
             lines += [order] * (order not in lines)
         elif not forced:
             terms.setdefault(name, 0.0)

@@ -53,7 +53,7 @@ def evaluate_together(evaluators: Sequence[Evaluator]) -> list[Evaluation]:
         arrays, others = eqx.partition(arguments, eqx.is_array)
         inputs.append((arrays, others))
         groups.setdefault(_kind(arrays, others), []).append(number)
-    found: dict[int, Evaluation] = {}
+    evaluations: dict[int, Evaluation] = {}
     for members in groups.values():
         stacked = jax.tree.map(lambda *x: jnp.stack(x), *(inputs[k][0] for k in members))
         motions: Steady = jax.device_get(_motions(stacked, inputs[members[0]][1]))
@@ -61,8 +61,8 @@ def evaluate_together(evaluators: Sequence[Evaluator]) -> list[Evaluation]:
             motion = jax.tree.map(lambda x, row=row: x[row], motions)
             if not int(motion.window.done):
                 motion = motion._replace(window=None)
-            found[number] = evaluators[number].evaluation(built[number], motion, began)
-    return [found[number] for number in range(len(evaluators))]
+            evaluations[number] = evaluators[number].evaluation(built[number], motion, began)
+    return [evaluations[number] for number in range(len(evaluators))]
 
 
 def _kind(arrays: Any, others: Any) -> Hashable:
@@ -76,8 +76,8 @@ def _kind(arrays: Any, others: Any) -> Hashable:
 def _motions(arrays, others) -> Steady:
     def one(arrays):
         pair, tangents, start, radius, solver = eqx.combine(arrays, others)
-        found = motion_from(pair, tangents, start, radius, solver)
-        return examined(pair, found, solver)
+        motion = motion_from(pair, tangents, start, radius, solver)
+        return examined(pair, motion, solver)
 
     return jax.vmap(one)(arrays)
 

@@ -274,11 +274,11 @@ def _require(config) -> list[tuple[str, object]]:
     for name, needed in _REQUIRED.items():
         if name not in config.values:  # gone in this version of JAX
             continue
-        found = config.values[name]
-        if getattr(found, "value", found) != needed:
+        former = config.values[name]
+        if getattr(former, "value", former) != needed:
             config.update(name, needed)
             if name != "jax_enable_x64":  # its default
-                changed.append((name, found))
+                changed.append((name, former))
     return changed
 
 
@@ -376,5 +376,5 @@ _LIBRARIES = ("jax", "jaxlib", "diffrax", "optax", "equinox", "numpy")
 
 def versions() -> dict[str, str]:
     """Return the versions of Python, this package and the libraries that affect its results."""
-    found = {"python": platform.python_version(), "rootsopt": rootsopt.__version__}
-    return found | {name: importlib.metadata.version(name) for name in _LIBRARIES}
+    base = {"python": platform.python_version(), "rootsopt": rootsopt.__version__}
+    return base | {name: importlib.metadata.version(name) for name in _LIBRARIES}

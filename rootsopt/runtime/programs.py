@@ -114,15 +114,15 @@ def keep_in(folder: Path | None) -> str | None:
     reason. Otherwise return `None`. If the folder cannot be used for another reason, the cache is
     off as well."""
     global _store, _chosen
-    found, reason = None, None
+    store, reason = None, None
     if folder is not None:
         try:
-            found = Store(folder)
+            store = Store(folder)
         except UnsafeFolderError as error:
             reason = str(error)
         except OSError:
             pass
-    _store, _chosen = found, True
+    _store, _chosen = store, True
     return reason
 
 
@@ -159,8 +159,8 @@ class _Made(NamedTuple):
 
     def result(self, leaves: list) -> Any:
         """Return the result for the arrays among the arguments."""
-        found = iter(self.call(*leaves))
-        return jax.tree.map(lambda x: next(found) if _is_array(x) else x, self.result_shape)
+        arrays = iter(self.call(*leaves))
+        return jax.tree.map(lambda x: next(arrays) if _is_array(x) else x, self.result_shape)
 
 
 class CachedFunction:
@@ -378,14 +378,14 @@ def _loaded(place: _Place | None) -> _Made | None:
 
 def _modules(kind: _Kind) -> set[str]:
     """Return the names of the modules that define the types of the arguments of this `kind`."""
-    found = {of.__module__ for of, _ in kind.others}
+    modules = {of.__module__ for of, _ in kind.others}
     trees = [kind.tree]
     while trees:
         tree = trees.pop()
         if (data := tree.node_data()) is not None:
-            found.add(data[0].__module__)
+            modules.add(data[0].__module__)
         trees.extend(tree.children())
-    return found
+    return modules
 
 
 def _sources(modules: set[str]) -> list[str] | None:
@@ -417,12 +417,12 @@ def _digest(place: Path, *state: int) -> str:
     """Return a digest of a source file, or of all in a folder, without comments and docstrings.
 
     `state`: numbers that differ after a change of the file."""
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     for file in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
         text = _WORDS.sub(lambda match: match[1] or match[2] or b"", file.read_bytes())
-        found.update(file.name.encode() + b"\0")
-        found.update(re.sub(rb"\n(?:[ \t]*\n)+", b"\n", text).strip())
-    return found.hexdigest()
+        digest.update(file.name.encode() + b"\0")
+        digest.update(re.sub(rb"\n(?:[ \t]*\n)+", b"\n", text).strip())
+    return digest.hexdigest()
 
 
 @functools.cache

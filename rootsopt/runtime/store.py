@@ -52,9 +52,9 @@ class Store:
 
     def read(self, name: str, purpose: str) -> bytes | None:
         """Return the data of the entry `name`, or `None` if no valid entry has this `purpose`."""
-        found = _read(self._file(name), MOST_BYTES) or b""
-        data = found[len(_checksum(name, purpose, b"")) :]
-        return data if found and found == _checksum(name, purpose, data) + data else None
+        content = _read(self._file(name), MOST_BYTES) or b""
+        data = content[len(_checksum(name, purpose, b"")) :]
+        return data if content and content == _checksum(name, purpose, data) + data else None
 
     def write(self, name: str, purpose: str, data: bytes) -> None:
         """Write `data` as the entry `name` for this `purpose`, completely or not at all.
@@ -71,9 +71,9 @@ class Store:
             if name.endswith(SUFFIX) and not name.startswith("."):
                 file = self._folder / name
                 with contextlib.suppress(OSError):  # removed by another process
-                    found = file.lstat()
-                    if stat.S_ISREG(found.st_mode):
-                        kept.append((found.st_mtime_ns, found.st_size, file))
+                    status = file.lstat()
+                    if stat.S_ISREG(status.st_mode):
+                        kept.append((status.st_mtime_ns, status.st_size, file))
         total = 0
         for _, size, file in sorted(kept, reverse=True):
             total += size
@@ -94,10 +94,10 @@ def _read(file: Path, most: int) -> bytes | None:
     bytes. It is also returned if others may write to the file."""
     try:
         with open(os.open(file, os.O_RDONLY | _SAFELY), "rb") as stream:
-            found = os.fstat(stream.fileno())
-            if not stat.S_ISREG(found.st_mode) or found.st_size > most:
+            status = os.fstat(stream.fileno())
+            if not stat.S_ISREG(status.st_mode) or status.st_size > most:
                 return None
-            if _HAS_OWNERS and (found.st_uid != os.geteuid() or found.st_mode & _OTHERS_WRITE):
+            if _HAS_OWNERS and (status.st_uid != os.geteuid() or status.st_mode & _OTHERS_WRITE):
                 return None
             data = stream.read(most + 1)
         os.utime(file)
@@ -144,13 +144,13 @@ def _own_folder(path: Path) -> Path:
     os.listdir(path)  # An `OSError` unless it is a folder that can be read.
     if not _HAS_OWNERS:
         return path  # On such systems, folders below the user's home are the user's by default.
-    me, found = os.geteuid(), os.stat(path)
-    if found.st_uid != me:
+    me, status = os.geteuid(), os.stat(path)
+    if status.st_uid != me:
         raise UnsafeFolderError(
-            f"{os.fspath(path)!r} belongs to another user (number {found.st_uid}); choose a "
+            f"{os.fspath(path)!r} belongs to another user (number {status.st_uid}); choose a "
             "folder of your own"
         )
-    if found.st_mode & _OTHERS_WRITE:
+    if status.st_mode & _OTHERS_WRITE:
         raise UnsafeFolderError(
             f"others may write to {os.fspath(path)!r}; remove that permission with chmod go-w, or "
             "choose another folder"

@@ -123,7 +123,7 @@ class Scene(eqx.Module):
         file cannot be used."""
         check_precision()
         families.note_program(config.profile)
-        found = cls(
+        scene = cls(
             family=config.profile.family,
             lobes=config.profile.lobes,
             slices=config.solver.slices or 0,
@@ -138,17 +138,17 @@ class Scene(eqx.Module):
             **reading.physical_quantities(config),
             **reading.parts_of(config),
         )
-        if found.helix is None or found.slices:
-            return found
+        if scene.helix is None or scene.slices:
+            return scene
         count = slices_needed(
-            found.profile(reading.design_vector(config)),
-            found.law,
-            found.clearance,
-            jnp.asarray(found.static_depth),
+            scene.profile(reading.design_vector(config)),
+            scene.law,
+            scene.clearance,
+            jnp.asarray(scene.static_depth),
             greatest_twist(config) * DEG,
             _SLICE_ERROR,
         )
-        return dataclasses.replace(found, slices=count)
+        return dataclasses.replace(scene, slices=count)
 
     def renewed(self, config: Config) -> "Scene":
         """Return this scene with the physical quantities of another `config`.
@@ -250,11 +250,11 @@ class Scene(eqx.Module):
         if self.two_sided:
             error = self.center_distance_error
             distance = 2 * profile.pitch_radius + (0.0 if error is None else error)
-        found = SearchContact.of(profile, distance, self.two_sided)
+        contact = SearchContact.of(profile, distance, self.two_sided)
         if self.wear is None:
-            return found
+            return contact
         lobes = jnp.asarray(float(self.lobes))
-        return WornContact(found, wear_series(profile, self.wear), lobes)
+        return WornContact(contact, wear_series(profile, self.wear), lobes)
 
     def gear_of(self, inertia: Float[Array, ""]) -> TimingGear | None:
         """Return the timing gear between rotors of this `inertia` (kg·m²), with its damping."""

@@ -114,8 +114,8 @@ def sized(config: Config) -> Config | list[float]:
     radii = [radius(point) for point in sound]
     if min(radii) <= limit <= max(radii):
         sound.sort(key=lambda point: abs(radius(point) - limit))
-        found = [search(point, 0.0) for point in sound[:_STARTS]]
-        for point in sorted(found, key=lambda one: float(np.sum((one - home) ** 2))):
+        points = [search(point, 0.0) for point in sound[:_STARTS]]
+        for point in sorted(points, key=lambda one: float(np.sum((one - home) ** 2))):
             if (met := _met(config, at(*point)[0])) is not None:
                 return met
     return radii
@@ -177,8 +177,8 @@ def _searched(at, outer, room, home, start, side: float) -> NDArray[np.float64]:
         else (lambda x: -side * seen(x)[1][outer][0] / _FAR,
               lambda x: -side * seen(x)[2][outer][0] / _FAR)
     )  # fmt: skip
-    found = minimize(
+    minimum = minimize(
         goals[0], start, jac=goals[1], bounds=[(0, 1)] * len(home), method="SLSQP",
         constraints=rows[:1] if side else rows, options={"maxiter": 100, "ftol": 1e-13},
     )  # fmt: skip
-    return found.x
+    return minimum.x

@@ -35,12 +35,12 @@ def profile_of(
     """Return the profile of a `family` with a `design` (d,) in config units.
 
     `lobes`: number of lobes; `pitch_radius`: pitch radius (m)."""
-    found = family_of(family)
+    definition = family_of(family)
     values = {
         parameter.argument: value * parameter.unit
-        for parameter, value in zip(found.parameters, found.split(design), strict=True)
+        for parameter, value in zip(definition.parameters, definition.split(design), strict=True)
     }
-    return found.make(lobes, pitch_radius, **values)
+    return definition.make(lobes, pitch_radius, **values)
 
 
 def design_of(config: ProfileConfig) -> Float[Array, " d"]:
@@ -61,15 +61,15 @@ def free_form_of(config: ProfileConfig, count: int) -> tuple[ProfileConfig, floa
         )
     radius = jnp.asarray(config.pitch_radius_mm * MM)
     profile = profile_of(config.family, config.lobes, radius, design_of(config))
-    found = project(profile, count)
+    free_form = project(profile, count)
     # These decimals keep the outline within 0.01 µm.
     result = ProfileConfig.model_validate(
         {
             "family": "free_form",
             "lobes": config.lobes,
             "pitch_radius_mm": config.pitch_radius_mm,
-            "tip_arc_angle_deg": round(float(found.tip_arc_angle) / DEG, 9),
-            "coefficients": tuple(round(float(c), 6) for c in found.coefficients),
+            "tip_arc_angle_deg": round(float(free_form.tip_arc_angle) / DEG, 9),
+            "coefficients": tuple(round(float(c), 6) for c in free_form.coefficients),
         }
     )
     written = profile_of("free_form", config.lobes, radius, design_of(result))
@@ -106,8 +106,8 @@ def check(config: ProfileConfig) -> None:
     family = family_of(config.family)
     family.check(config)
     radius = np.asarray(config.pitch_radius_mm * MM)
-    found = _soundness(config.family, config.lobes, radius, design_of(config))
-    if fault := fault_of(found):
+    checks = _soundness(config.family, config.lobes, radius, design_of(config))
+    if fault := fault_of(checks):
         given = ", ".join(
             f"`profile.{key}` = {_written(value)}" for key, value in config.parameters.items()
         )
@@ -139,13 +139,13 @@ def note_program(config: ProfileConfig) -> None:
         )
 
 
-def fault_of(found: Soundness) -> str:
+def fault_of(checks: Soundness) -> str:
     """Return the first check of a design that fails, with its margin, or "" if it is sound."""
-    name = found.failed
+    name = checks.failed
     if not name:
         return ""
     unit, size = _UNITS.get(name, ("mm", MM))
-    value = float(getattr(found, name)) / size
+    value = float(getattr(checks, name)) / size
     margin = f"margin {value:.3g} {unit}".rstrip() if np.isfinite(value) else "no such curve"
     return f"{_FAULTS[name]} ({margin})"
 
@@ -158,9 +158,9 @@ def margins_of(config: ProfileConfig) -> dict[str, float]:
     if config.from_file:
         return {}
     radius = jnp.asarray(config.pitch_radius_mm * MM)
-    found = _margins(config.family, config.lobes, radius, design_of(config)).of_flank
+    flank_margins = _margins(config.family, config.lobes, radius, design_of(config)).of_flank
     record = {}
-    for name, value in found.items():
+    for name, value in flank_margins.items():
         unit, size = _UNITS.get(name, ("mm", MM))
         record["_".join(filter(None, (name, unit)))] = float(value) / size
     return record

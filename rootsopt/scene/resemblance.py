@@ -103,8 +103,8 @@ def likenesses(profile: Profile) -> list[Likeness]:
     the best members of a Sobol sample, and may therefore miss a nearer member. Families in which
     the search finds no sound member are left out.
     """
-    found = [likeness(profile, family) for family in classical()]
-    return sorted((one for one in found if one is not None), key=lambda one: one.departure)
+    members = [likeness(profile, family) for family in classical()]
+    return sorted((one for one in members if one is not None), key=lambda one: one.departure)
 
 
 def likeness(profile: Profile, family: str) -> Likeness | None:
@@ -119,13 +119,13 @@ def likeness(profile: Profile, family: str) -> Likeness | None:
     low, high = np.array([parameter.usually(*size) for parameter in parameters]).T
     sample = low + (high - low) * sobol(_SAMPLE, 0, len(keys))
     faults = np.array([look(look.start(one)).fault for one in sample])
-    found = [_fitted(look, sample[k], high - low) for k in np.argsort(faults)[:_STARTS]]
+    designs = [_fitted(look, sample[k], high - low) for k in np.argsort(faults)[:_STARTS]]
     if not family_of(family).by_limits:
-        return _best(look, profile, found)
+        return _best(look, profile, designs)
     # The closed-form limits also allow profiles with slightly negative margins.
     free = _Look(profile, family, limited=False)
-    again = (_fitted(free, one[:-1], high - low, one[-1]) for one in found)
-    return _best(free, profile, [*found, *again])
+    again = (_fitted(free, one[:-1], high - low, one[-1]) for one in designs)
+    return _best(free, profile, [*designs, *again])
 
 
 def free_likeness(profile: Profile, *near: Likeness, count: int = COEFFICIENTS) -> Likeness | None:
@@ -170,8 +170,8 @@ def _best(look: "_Look", profile: Profile, designs) -> Likeness | None:
         except (InputError, ValueError):
             continue
         member = profile_of(look.family, profile.lobes, profile.pitch_radius, jnp.asarray(design))
-        found = departures(profile, member, inset=inset)
-        return Likeness(look.family, named, found.greatest, found.rms, inset)
+        departure = departures(profile, member, inset=inset)
+        return Likeness(look.family, named, departure.greatest, departure.rms, inset)
     return None
 
 
@@ -252,8 +252,8 @@ class _Look:
     @functools.lru_cache(maxsize=1024)  # noqa: B019
     def _at(self, design: tuple[float, ...]) -> _Comparison:
         values = np.asarray(design, dtype=np.float64)
-        found = _member(self.family, self.lobes, self.radius, values)
-        line, line_slope, margin, margin_slope = map(np.asarray, found)
+        member = _member(self.family, self.lobes, self.radius, values)
+        line, line_slope, margin, margin_slope = map(np.asarray, member)
         if not self.limited:
             margin, margin_slope = 0 * margin, 0 * margin_slope
         if not np.all(np.isfinite(line)):
@@ -309,9 +309,9 @@ def _fitted(look: _Look, start, width, inset: float | None = None) -> NDArray[np
             break
         room = (low - design) / width, (high - design) / width
         new = np.clip(design + width * _promising(seen, width, size, room), low, high)
-        found = look(new).fault
-        if found < seen.fault:
-            if size <= 1e-4 and seen.fault - found < _GAIN * seen.fault:
+        fault = look(new).fault
+        if fault < seen.fault:
+            if size <= 1e-4 and seen.fault - fault < _GAIN * seen.fault:
                 return new
             design, size = new, min(2 * size, _LONGEST)
         else:
@@ -340,13 +340,13 @@ def _promising(seen: _Comparison, width, size: float, room) -> NDArray[np.float6
         (max(-size, min(low, 0.0)), min(size, max(high, 0.0)))
         for low, high in zip(*room, strict=True)
     ]
-    found = linprog(
+    solution = linprog(
         np.concatenate([np.zeros(count), [1.0, _UNSOUND_WEIGHT]]),
         A_ub=np.hstack([np.concatenate([rows, -seen.margin_slope * width]), bounds]),
         b_ub=np.concatenate([-value, seen.margin]),
         bounds=[*steps, (0, None), (0, None)],
     )
-    return np.zeros(count) if found.x is None else found.x[:count]
+    return np.zeros(count) if solution.x is None else solution.x[:count]
 
 
 @CachedFunction
@@ -361,10 +361,10 @@ def _member(family: str, lobes: int, radius: Float[Array, ""], design):
         profile = profile_of(family, lobes, radius, design)
         nu = profile.pitch_normal * jnp.linspace(0.0, 1.0, _NODES)
         upper, lower = (profile.position(f(nu)) for f in (profile.addendum, profile.dedendum))
-        found = margins(profile).of_flank
+        flank_margins = margins(profile).of_flank
         scaled = [
             value / (1.0 if name in PURE else radius)
-            for name, value in found.items()
+            for name, value in flank_margins.items()
             if name not in family_of(family).inherent
         ]
         values = jnp.concatenate([upper, lower[::-1]]) / radius, jnp.stack(scaled)

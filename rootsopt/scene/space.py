@@ -37,25 +37,25 @@ def bounds_of(config: Config) -> list[tuple[float, float]]:
     """Return the bounds (low, high) of each design parameter of a config, in config units.
 
     Raises `InputError` if a bound is impossible, such as a tip land wider than the lobe."""
-    found = []
+    bounds = []
     for parameter in family_of(config.profile.family).parameters:
         values = getattr(config.profile, parameter.key)
         count = len(values) if isinstance(values, tuple) else 1
-        found += [_pair(config, parameter)] * count
-    return [*found, config.optimizer.bounds[TWIST]] if config.twist_free else found
+        bounds += [_pair(config, parameter)] * count
+    return [*bounds, config.optimizer.bounds[TWIST]] if config.twist_free else bounds
 
 
 def floors_of(config: Config) -> tuple[float, ...]:
     """Return the default lower bound of each design parameter, as a fraction of its range's end.
 
     It is 0 for parameters that have bounds in the config, or whose range depends on no other."""
-    found: list[float] = []
+    floors: list[float] = []
     for parameter in family_of(config.profile.family).parameters:
         values = getattr(config.profile, parameter.key)
         count = len(values) if isinstance(values, tuple) else 1
         given = config.optimizer.bounds.get(parameter.key) is not None
-        found += [0.0 if given else parameter.floor] * count
-    return (*found, 0.0) if config.twist_free else tuple(found)
+        floors += [0.0 if given else parameter.floor] * count
+    return (*floors, 0.0) if config.twist_free else tuple(floors)
 
 
 def widened(config: Config) -> tuple[Config, tuple[str, ...]]:
@@ -161,12 +161,12 @@ class Constraint(eqx.Module):
         """The limit in the unit of reports."""
         return float(self.limit) / self.factor
 
-    def slack(self, shape: Geometry, found: Soundness | None = None) -> Float[Array, ""]:
+    def slack(self, shape: Geometry, soundness: Soundness | None = None) -> Float[Array, ""]:
         """Return the distance from the limit, divided by `scale`; ≥ 0 if the constraint holds.
 
-        `shape`, `found`: geometry and margins of the design. `found` is needed only if `margin` is
-        true."""
-        return self.scaled(getattr(found if self.margin else shape, self.quantity))
+        `shape`, `soundness`: geometry and margins of the design. The margins are needed only if
+        `margin` is true."""
+        return self.scaled(getattr(soundness if self.margin else shape, self.quantity))
 
     def scaled(self, value: Float[Array, ""] | float) -> Float[Array, ""]:
         """Return the slack of a `value` of the limited quantity."""
@@ -178,11 +178,11 @@ class Constraint(eqx.Module):
         design: Float[Array, " d"],
         profile: Profile,
         shape: Geometry,
-        found: Soundness | None,
+        soundness: Soundness | None,
     ) -> Float[Array, ""]:
         """Return the slack of a `design` (d,) of a `space`, given its `profile`; see `slack`."""
         del space, design, profile
-        return self.slack(shape, found)
+        return self.slack(shape, soundness)
 
 
 class RangeConstraint(Constraint):
@@ -190,8 +190,8 @@ class RangeConstraint(Constraint):
 
     The range depends on the other parameters; `quantity` is the parameter's key."""
 
-    def slack_of(self, space, design, profile, shape, found):
-        del profile, shape, found
+    def slack_of(self, space, design, profile, shape, soundness):
+        del profile, shape, soundness
         return self.scaled(_NARROW * space.ranges(design)[self.quantity][1] * self.factor)
 
 
@@ -304,8 +304,8 @@ class Space(eqx.Module):
         A slack is ≥ 0 where its constraint is satisfied."""
         profile = self.scene.profile(design)
         shape = geometry(profile)
-        found = margins(profile) if any(c.margin for c in self.constraints) else None
-        every = (c.slack_of(self, design, profile, shape, found) for c in self.constraints)
+        soundness = margins(profile) if any(c.margin for c in self.constraints) else None
+        every = (c.slack_of(self, design, profile, shape, soundness) for c in self.constraints)
         return jnp.stack([*every])
 
     def prepare(self) -> None:

@@ -37,14 +37,14 @@ _UNSURE = 0.5
 
 def assumption_tables(result: Mapping[str, Any]) -> Iterator[Table | None]:
     """Yield the objective at both ends of each range, and its statistics in random scenes."""
-    found = result.get("assumptions")
-    if not found:
+    comparison = result.get("assumptions")
+    if not comparison:
         return
     rows = [
         [label_of(row["key"]), value(row["low"]), value(row["high"]),
          *(_cell(row[f"objective_{end}"]) for end in ("low", "high")),
          value(row["rank_correlation"])]
-        for row in found["keys"]
+        for row in comparison["keys"]
     ]  # fmt: skip
     heads = "", "low", "high", "at low", "at high", "rank"
     note = (
@@ -52,13 +52,13 @@ def assumption_tables(result: Mapping[str, Any]) -> Iterator[Table | None]:
         "Rank: correlation of the objective with the quantity over the random scenes (Spearman)."
     )
     yield table("The optimum where the pump may run", heads, [("", rows)], note)
-    levels = found["objective_quantiles"]
+    levels = comparison["objective_quantiles"]
     spread = {f"objective, {name_and_unit(level)[0]}": x for level, x in levels.items()}
-    worst = found["worst"] or {}
+    worst = comparison["worst"] or {}
     spread |= {"objective, worst of all scenes": worst.get("objective")}
-    rows = [["better than the baseline", _share(found)]]
+    rows = [["better than the baseline", _share(comparison)]]
     rows += [[name, _cell(x)] for name, x in spread.items()]
-    title = f"The optimum in {found['compared']} random scenes"
+    title = f"The optimum in {comparison['compared']} random scenes"
     yield table(title, ("", "optimised"), [("", rows)])
 
 
@@ -75,50 +75,52 @@ def elsewhere(result: Mapping[str, Any]) -> Iterator[str]:
     """Yield sentences that compare the optimum with the baseline in other scenes.
 
     The scenes are those of `assumptions`. Yield nothing if the result has no such comparison."""
-    found = result.get("assumptions")
-    if not found:
+    comparison = result.get("assumptions")
+    if not comparison:
         return
-    compared, ends = found["compared"], found["ends_compared"]
+    compared, ends = comparison["compared"], comparison["ends_compared"]
     if not compared:
         yield "No random scene within the assumptions can be compared."
     else:
-        better = round(found["share_better"] * compared)
-        low, high = (found["objective_quantiles"][f"quantile_{k}"] for k in (5, 95))
+        better = round(comparison["share_better"] * compared)
+        low, high = (comparison["objective_quantiles"][f"quantile_{k}"] for k in (5, 95))
         yield (
             f"The optimum is better than the baseline in {better} of {compared} random scenes "
-            f"within the assumptions and at {found['ends_better']} of {ends} ends of their ranges: "
-            f"objective {brief(low, 3)} to {brief(high, 3)} (5 % to 95 % of the random scenes), at "
-            f"worst {brief(found['worst']['objective'], 3)}."
+            f"within the assumptions and at {comparison['ends_better']} of {ends} ends of their "
+            f"ranges: objective {brief(low, 3)} to {brief(high, 3)} (5 % to 95 % of the random "
+            f"scenes), at worst {brief(comparison['worst']['objective'], 3)}."
         )
     worse = [
-        _region(row | {"better": row["worse"]}, found) for row in found["keys"] if row["worse"]
+        _region(row | {"better": row["worse"]}, comparison)
+        for row in comparison["keys"]
+        if row["worse"]
     ]
     if worse:
         yield f"All else as given, it is worse {listed(worse)}."
-    elif compared and found["share_better"] < 1:
-        row = _row(found["decides"], found)
+    elif compared and comparison["share_better"] < 1:
+        row = _row(comparison["decides"], comparison)
         yield f"Its objective rises most with {_sense(row)}."
     known = (result.get("robustness") or {}).get("nominal") or {}
     nominal = (known.get("optimized") or {}).get("design")
-    for one in found["rivals"]:
+    for one in comparison["rivals"]:
         shape = ", ".join(
             f"{name_and_unit(k)[0]} {_stated(k, x)}" for k, x in one["design"].items()
         )
-        region = _region(one, found)
+        region = _region(one, comparison)
         where = f" and, all else as given, {region}" if region else f", mostly with {_sense(one)}"
         share = f"{_share(one)} of the random scenes"
         name = "The nominal optimum" if one["design"] == nominal else "Another design"
         yield f"{name} ({shape}) is better than the optimum in {share}{where}."
-    if found["not_compared"]:
+    if comparison["not_compared"]:
         rows = [[in_words(row[f"status_{who}"]) for who in ("baseline", "optimized")]
-                for row in found["not_compared"]]  # fmt: skip
+                for row in comparison["not_compared"]]  # fmt: skip
         counts = Counter(f"baseline {first}, optimum {last}" for first, last in rows)
         told = [f"{count} ({words})" for words, count in counts.items()]
         yield f"Scenes that cannot be compared: {listed(told)}."
 
 
-def _row(key: str, found: Mapping[str, Any]) -> Mapping[str, Any]:
-    return next(row for row in found["keys"] if row["key"] == key)
+def _row(key: str, comparison: Mapping[str, Any]) -> Mapping[str, Any]:
+    return next(row for row in comparison["keys"] if row["key"] == key)
 
 
 def _sense(row: Mapping[str, Any]) -> str:
@@ -128,9 +130,9 @@ def _sense(row: Mapping[str, Any]) -> str:
     return f"{word} {named(row['key'])} (rank correlation {brief(rank, 2)})"
 
 
-def _region(row: Mapping[str, Any], found: Mapping[str, Any]) -> str:
+def _region(row: Mapping[str, Any], comparison: Mapping[str, Any]) -> str:
     """Return where a design is better (`row`: key and parts of its range), in words."""
-    key, span = row["key"], _row(row["key"], found)
+    key, span = row["key"], _row(row["key"], comparison)
     parts = [_part(key, piece, span) for piece in row["better"]]
     return f"where the {named(key)} {' or '.join(parts)}" if parts else ""
 
@@ -138,14 +140,14 @@ def _region(row: Mapping[str, Any], found: Mapping[str, Any]) -> str:
 def _part(key: str, piece: Sequence[float], span: Mapping[str, Any]) -> str:
     start, stop = (_stated(key, x) for x in piece)
     below, above = piece[0] == span["low"], piece[1] == span["high"]
-    found = f"is between {start} and {stop}"
+    phrase = f"is between {start} and {stop}"
     if below and above:
-        found = "has any value"
+        phrase = "has any value"
     elif above or below:
-        found = f"is above {start}" if above else f"is below {stop}"
+        phrase = f"is above {start}" if above else f"is below {stop}"
     if start == stop:
-        found = f"is {start}"
-    return found
+        phrase = f"is {start}"
+    return phrase
 
 
 def _stated(key: str, given: float) -> str:
@@ -262,15 +264,15 @@ def identified(
     result: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]
 ) -> list[tuple[str, str]]:
     """Return facts on a fit to a record."""
-    found = []
+    fitted = []
     for key, one in (result.get("parameters") or {}).items():
         (name, unit), error = name_and_unit(key), one["standard_error"]
         if error is None:
-            found.append(f"{name} {quantity(one['value'], unit)} (not determined)")
+            fitted.append(f"{name} {quantity(one['value'], unit)} (not determined)")
         else:
-            found.append(f"{name} {brief(one['value'])} ± {brief(error, 2)} {unit}".strip())
+            fitted.append(f"{name} {brief(one['value'])} ± {brief(error, 2)} {unit}".strip())
     said = str(result["message"]).partition(". ")[2]
-    return [("Found", f"{listed(found)}."), ("How sure", said)] if found else []
+    return [("Found", f"{listed(fitted)}."), ("How sure", said)] if fitted else []
 
 
 def constraint_table(result: Record) -> Table | None:
@@ -290,8 +292,8 @@ def constraint_table(result: Record) -> Table | None:
         "Price: change of the objective if the limit is relaxed by the step, to first order. An "
         "empty price: the limit does not hold the optimum back."
     )
-    found = result.get("optimality") or {}
-    if found and not found.get("converged"):
+    optimality = result.get("optimality") or {}
+    if optimality and not optimality.get("converged"):
         note += " The design is no optimum, so prices are rough."
     return table("Constraints", heads, [("", rows)], note)
 
@@ -306,42 +308,43 @@ def price(row: Record) -> str:
 
 def certificate_tables(result: Record) -> Iterator[Table | None]:
     """Yield tables on the optimum: conditions, active branches, starts, sensitivities."""
-    found = result.get("optimality")
-    if not found:
+    optimality = result.get("optimality")
+    if not optimality:
         return
-    good = bool(found["converged"])
+    good = bool(optimality["converged"])
     conditions: list[Row] = [
         ["residual of the first-order conditions (of the unit box)",
-         Cell(value(found["residual"]), good), f"at most {value(found['required_residual'])}"],
-        ["better nearby, promised (relative)", value(found.get("promised_decrease"))],
-        ["violation of a constraint (scaled)", value(found["violation"]), "0"],
-        ["why the search stopped", Cell(in_words(found["reason"]), good)],
-        ["method", str(found["method"])],
+         Cell(value(optimality["residual"]), good),
+         f"at most {value(optimality['required_residual'])}"],
+        ["better nearby, promised (relative)", value(optimality.get("promised_decrease"))],
+        ["violation of a constraint (scaled)", value(optimality["violation"]), "0"],
+        ["why the search stopped", Cell(in_words(optimality["reason"]), good)],
+        ["method", str(optimality["method"])],
     ]  # fmt: skip
     heads = "", "value", "at an optimum"
-    yield table("First-order conditions", heads, [("", conditions)], found["message"])
-    held = [_held(one) for one in found.get("held_by") or ()]
+    yield table("First-order conditions", heads, [("", conditions)], optimality["message"])
+    held = [_held(one) for one in optimality.get("held_by") or ()]
     note = "Peaks, speeds or motions that are equal at the optimum: none falls alone."
     heads = "branch", "share", "its objective"
     yield table("What holds the optimum", heads, [("", held if len(held) > 1 else [])], note)
     starts: list[Row] = [
         [f"start {one['start']}", Cell(in_words(one["reason"]), one["reason"] == "converged"),
          str(one["evaluations"]), value(one["objective"])]
-        for one in found.get("starts") or ()
+        for one in optimality.get("starts") or ()
     ]  # fmt: skip
     optima: list[Row] = [
         [f"optimum {number}", f"found by {one['found']} of {len(starts)} starts", "",
          value(one["objective"])]
-        for number, one in enumerate(found.get("optima") or (), start=1)
+        for number, one in enumerate(optimality.get("optima") or (), start=1)
     ]  # fmt: skip
     heads = "", "why it ended", "designs", "objective"
     groups = [("starts", starts), ("distinct optima", optima)]
-    whole = found.get("global")
+    whole = optimality.get("global")
     proven = whole is not None and whole["proven"]
-    yield table("Local searches", heads, groups, "" if proven else _unseen(found))
+    yield table("Local searches", heads, groups, "" if proven else _unseen(optimality))
     yield _whole(whole) if whole else None
-    yield _vertices(result) if "vertex" in found else None
-    rows = [_sensitive(one) for one in found.get("sensitivities") or ()]
+    yield _vertices(result) if "vertex" in optimality else None
+    rows = [_sensitive(one) for one in optimality.get("sensitivities") or ()]
     heads = "", "mean force (N)", "peak force (N)", "objective (%)"
     note = "What a small change of the scene does to the optimised design."
     yield table("Sensitivity to the scene", heads, [("", rows)], note)
@@ -360,18 +363,18 @@ def _vertices(result: Record) -> Table | None:
     return table("Vertices of the limits", heads, [("", rows)], note)
 
 
-def _whole(found: Record) -> Table | None:
-    """Return the table on the lower bound `found` of all designs within the bounds."""
+def _whole(bound: Record) -> Table | None:
+    """Return the table on the lower `bound` of all designs within the bounds."""
     rows: list[Row] = [
-        ["lower bound of the objective", value(found["lower_bound"])],
-        ["distance of the optimum from it", Cell(value(found["gap"]), bool(found["proven"]))],
-        ["designs", str(found["evaluations"])],
-        ["designs without a usable motion", str(found["unusable"])],
-        ["jumps between motions", str(found["jumps"])],
-        ["regions left", str(found["regions_left"])],
-        ["their share of the bounds", f"{100 * found['volume_left']:.2g} %"],
+        ["lower bound of the objective", value(bound["lower_bound"])],
+        ["distance of the optimum from it", Cell(value(bound["gap"]), bool(bound["proven"]))],
+        ["designs", str(bound["evaluations"])],
+        ["designs without a usable motion", str(bound["unusable"])],
+        ["jumps between motions", str(bound["jumps"])],
+        ["regions left", str(bound["regions_left"])],
+        ["their share of the bounds", f"{100 * bound['volume_left']:.2g} %"],
     ]
-    return table("All designs within the bounds", ("", "value"), [("", rows)], found["assumption"])
+    return table("All designs within the bounds", ("", "value"), [("", rows)], bound["assumption"])
 
 
 def _held(one: Record) -> Row:
@@ -385,8 +388,8 @@ def _held(one: Record) -> Row:
     return [", ".join(parts) or "motion", f"{one['share']:.3f}", value(one["objective"])]
 
 
-def _unseen(found: Record) -> str:
-    share = (found.get("unseen") or {}).get("share_of_starts")
+def _unseen(optimality: Record) -> str:
+    share = (optimality.get("unseen") or {}).get("share_of_starts")
     if share is None:
         return "So few starts do not tell how many optima are left to find: raise optimizer.starts."
     more = ": raise optimizer.starts" if share > _UNSURE else ""

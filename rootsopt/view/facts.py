@@ -120,8 +120,8 @@ def _sense(key: str) -> str:
 
 def reserves(*records: Record) -> Iterator[str]:
     """Yield a phrase on the contact reserve, if any of the `records` holds it."""
-    found = [(one.get("response") or {}).get("contact_reserve_um") for one in records]
-    known = [quantity(x, "µm") for x in found if x is not None]
+    values = [(one.get("response") or {}).get("contact_reserve_um") for one in records]
+    known = [quantity(x, "µm") for x in values if x is not None]
     if known:
         verb = "is" if len(known) == 1 else "goes from"
         yield f"the reserve against contact {verb} {' to '.join(known)}"
@@ -129,10 +129,10 @@ def reserves(*records: Record) -> Iterator[str]:
 
 def _prices(result: Record) -> Iterator[str]:
     """Yield a phrase on the limits whose relaxation lowers the objective most."""
-    found = [row for row in result.get("constraints") or ()
+    limits = [row for row in result.get("constraints") or ()
              if (row.get("relaxed_objective_percent") or 0.0) < 0]  # fmt: skip
-    found.sort(key=lambda row: row["relaxed_objective_percent"])
-    shown = [f"{limit(row)} ({price(row)})" for row in found[:FEW]]
+    limits.sort(key=lambda row: row["relaxed_objective_percent"])
+    shown = [f"{limit(row)} ({price(row)})" for row in limits[:FEW]]
     if shown:
         rough = "" if (result.get("optimality") or {}).get("converged") else "rough "
         yield f"{rough}price of a limit, in objective: {listed(shown)}"
@@ -140,18 +140,18 @@ def _prices(result: Record) -> Iterator[str]:
 
 def _certified(result: Record) -> Iterator[str]:
     """Yield sentences on the certificate, on the simulation from rest, and on fresh scenes."""
-    found, check = result.get("optimality") or {}, result.get("verification") or {}
-    optima = found.get("optima") or ()
-    if found:
-        known = "a certified optimum" if found["converged"] else "not an optimum"
-        required = f"at most {brief(found['required_residual'])} required"
-        yield f"{known}: first-order residual {brief(found['residual'], 2)}, {required}"
+    optimality, check = result.get("optimality") or {}, result.get("verification") or {}
+    optima = optimality.get("optima") or ()
+    if optimality:
+        known = "a certified optimum" if optimality["converged"] else "not an optimum"
+        required = f"at most {brief(optimality['required_residual'])} required"
+        yield f"{known}: first-order residual {brief(optimality['residual'], 2)}, {required}"
     else:
         yield "the design has no certificate"
-    if found.get("converged") and optima and not check.get("rejected"):
-        yield f"{optima[0]['found']} of {len(found['starts'])} local searches found it"
-    yield from _at_vertex(found.get("vertex") or {})
-    yield from _bounded(found.get("global") or {})
+    if optimality.get("converged") and optima and not check.get("rejected"):
+        yield f"{optima[0]['found']} of {len(optimality['starts'])} local searches found it"
+    yield from _at_vertex(optimality.get("vertex") or {})
+    yield from _bounded(optimality.get("global") or {})
     searched, verified = (check.get(f"{name}_objective") for name in ("searched", "verified"))
     if verified is not None and "combined_standard_error" in check:
         error = brief(check["combined_standard_error"], 2)
@@ -201,9 +201,9 @@ def _bounded(known: Record) -> Iterator[str]:
 
 def _caveats(result: Record, after: Record) -> Iterator[str]:
     """Yield why a design is not an optimum, and further advice from the message of its motion."""
-    found = result.get("optimality") or {}
-    if found and not found["converged"]:
-        yield str(found["message"])
+    optimality = result.get("optimality") or {}
+    if optimality and not optimality["converged"]:
+        yield str(optimality["message"])
     yield from _advice_of(after)
 
 
@@ -235,13 +235,14 @@ def simulated(result: Record, rows: Sequence[Record]) -> Facts:
 
 def _touching(result: Record) -> list[str]:
     """Return a sentence on how many machines touch under tolerances, if this is known."""
-    found = result.get("touching")
-    if not found:
+    touching = result.get("touching")
+    if not touching:
         return []
-    worst = found["keys"][0]["key"]
+    worst = touching["keys"][0]["key"]
     return [
-        f"Of {found['machines']} machines within tolerances, {100 * found['touching_share']:.3g} % "
-        f"touch; {name_and_unit(worst)[0]} costs most of the reserve."
+        f"Of {touching['machines']} machines within tolerances, "
+        f"{100 * touching['touching_share']:.3g} % touch; "
+        f"{name_and_unit(worst)[0]} costs most of the reserve."
     ]
 
 
@@ -304,8 +305,8 @@ def ranked(rows: Sequence[Record]) -> tuple[str, list[Record]]:
 
     def known(key: str, falling: bool) -> list[Record]:
         given = [(row, row.get(key)) for row in rows]
-        found = [row for row, x in given if x is not None and math.isfinite(x)]
-        return sorted(found, key=lambda row: row[key], reverse=falling)
+        finite = [row for row, x in given if x is not None and math.isfinite(x)]
+        return sorted(finite, key=lambda row: row[key], reverse=falling)
 
     peaks, reserves = known(_PEAK, True), known(_RESERVE, False)
     if reserves and not (peaks and peaks[0][_PEAK]):
@@ -328,25 +329,25 @@ def swept(result: Record, rows: Sequence[Record]) -> Facts:
     rest = f" The others: {listed(sorted(others))}." if others else ""
     sure = f"{steady} of {len(rows)} scenes have a steady state.{rest}"
     name = name_and_unit(key)[0].capitalize()
-    found = [(name, f"It is {'; '.join(ends)}.")] if ends else []
-    return [*found, ("How sure", sure)] if rows else []
+    extremes = [(name, f"It is {'; '.join(ends)}.")] if ends else []
+    return [*extremes, ("How sure", sure)] if rows else []
 
 
 def coexisting(result: Record, rows: Sequence[Record]) -> Facts:
     """Return facts on coexisting motions."""
-    found, words = result.get("attractors") or [], []
-    for number, row in enumerate(found[:FEW], start=1):
+    motions, words = result.get("attractors") or [], []
+    for number, row in enumerate(motions[:FEW], start=1):
         peak = (row.get("response") or {}).get("peak_force_N")
         force = "no force known" if peak is None else f"peak force {brief(peak)} N"
         rest = ", reached from rest" if row.get("reached") else ""
         share = f"{100 * row['share']:.3g} % of the initial states"
         words.append(f"motion {number} ({in_words(row['status'])}): {force}, {share}{rest}")
-    count = "one motion was found" if len(found) == 1 else f"{len(found)} motions coexist"
+    count = "one motion was found" if len(motions) == 1 else f"{len(motions)} motions coexist"
     lost = sum((result.get("lost") or {}).values())
     sure = "Every initial state of the grid leads to a reported motion."
     if lost:
         sure = f"{100 * lost:.3g} % of the initial states lead to no reported motion."
-    return [("Motions", _sentence([count, *words])), ("How sure", sure)] if found else []
+    return [("Motions", _sentence([count, *words])), ("How sure", sure)] if motions else []
 
 
 def drawn(result: Record, rows: Sequence[Record]) -> Facts:

@@ -214,12 +214,12 @@ def table(
     """Return a table without its empty groups, or None if it has no rows.
 
     Arguments: fields of `Table`. Short rows are filled with empty cells."""
-    found = []
+    kept = []
     for heading, rows in groups:
         filled = ([*row, *[""] * (len(heads) - len(row))] for row in rows)
         cells = tuple(
             tuple(Cell(one) if isinstance(one, str) else one for one in row) for row in filled
         )
         if cells:
-            found.append((heading, cells))
-    return Table(title, tuple(heads), tuple(found), note) if found else None
+            kept.append((heading, cells))
+    return Table(title, tuple(heads), tuple(kept), note) if kept else None

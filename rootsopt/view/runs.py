@@ -148,18 +148,18 @@ class RunFolder(ResultFolder):
         A complete run of this target is moved to the target if the target does not exist. Complete
         runs of other targets are kept. All other folders of killed runs are removed."""
         for name in sorted(os.listdir(self.target.parent)):
-            found = _STAGE.fullmatch(name)
-            if found is None:
+            match = _STAGE.fullmatch(name)
+            if match is None:
                 continue
             left = self.target.parent / name
-            if found[1] == self._base.name:
+            if match[1] == self._base.name:
                 if _complete(left) and not os.path.lexists(self.target):
                     files.move(left, self.target)
                 else:
                     files.discard_tree(left)
                 continue
             with contextlib.suppress(InputError, OSError):  # belongs to a run in progress
-                other = Lock(self.target.parent / (found[1] + _SUFFIX))
+                other = Lock(self.target.parent / (match[1] + _SUFFIX))
                 if other.held and not _complete(left):
                     files.discard_tree(left)
                 other.release()
@@ -298,9 +298,9 @@ class RunFolder(ResultFolder):
     def _free(self) -> Path:
         """Return the first path of `NAME.1`, `NAME.2` … that does not exist."""
         number = 1
-        while os.path.lexists(found := self.target.with_name(f"{self.target.name}.{number}")):
+        while os.path.lexists(path := self.target.with_name(f"{self.target.name}.{number}")):
             number += 1
-        return found
+        return path
 
     @contextlib.contextmanager
     def _failing(self, name: str = ""):
@@ -350,13 +350,13 @@ def _base(name: str) -> str:
 
 def _files_in(folder: Path) -> set[str]:
     """Return the relative paths of all files, links and empty folders inside a folder."""
-    found: set[str] = set()
+    paths: set[str] = set()
     for place, folders, inner in os.walk(folder):
         inside = Path(place).relative_to(folder)
         names = inner if inner or folders else [""]
         names += [name for name in folders if os.path.islink(os.path.join(place, name))]
-        found |= {(inside / name).as_posix() for name in names}
-    return found
+        paths |= {(inside / name).as_posix() for name in names}
+    return paths
 
 
 def _listed(result: Path) -> set[str]:

@@ -73,7 +73,7 @@ def sections(
 
     `result`: content of the result file; `rows`: those of a sweep, if the result does not hold
     them; `most`: number of scenes above which their table is truncated."""
-    found = [
+    parts = [
         ("better", "A better rotor", [*better_tables(result)]),
         ("identified", "What the record tells", [*identified_tables(result)]),
         ("front", "Best compromises", front_tables(result)),
@@ -86,26 +86,26 @@ def sections(
         ("pump", "Pump sheet", [pump_table(result)]),
         ("likeness", "Resemblance", likeness_tables(result)),
     ]  # fmt: skip
-    kept = [(anchor, name, [one for one in tables if one]) for anchor, name, tables in found]
+    kept = [(anchor, name, [one for one in tables if one]) for anchor, name, tables in parts]
     return [section for section in kept if section[2]]
 
 
 def tables_of(result: Record, rows: Sequence[Record] = (), most: int = 200) -> list[Table]:
     """Return the tables of all `sections` in their order, with conflicts of constraints first."""
     parts = sections(result, rows, most)
-    found = [one for _, _, tables in parts for one in tables]
-    return [one for one in (conflict_table(result), *found) if one]
+    others = [one for _, _, tables in parts for one in tables]
+    return [one for one in (conflict_table(result), *others) if one]
 
 
 def records_of(result: Record) -> dict[str, Record]:
     """Return the records of all designs or motions of a result, by the names that views show."""
-    found: dict[str, Record] = {name: result.get(key) or {} for key, name in NAMES.items()}
-    found = {name: one for name, one in found.items() if isinstance(one.get("design"), Mapping)}
+    records: dict[str, Record] = {name: result.get(key) or {} for key, name in NAMES.items()}
+    records = {name: one for name, one in records.items() if isinstance(one.get("design"), Mapping)}
     motions = enumerate(result.get("attractors") or (), start=1)
-    found |= {f"motion {number}": record for number, record in motions}
-    found |= {f"point {record['point']}": record for record in result.get("points") or ()}
-    single = isinstance(result.get("design"), Mapping) and not found
-    return {"design": result} if single else found
+    records |= {f"motion {number}": record for number, record in motions}
+    records |= {f"point {record['point']}": record for record in result.get("points") or ()}
+    single = isinstance(result.get("design"), Mapping) and not records
+    return {"design": result} if single else records
 
 
 def numbers_table(result: Record) -> Table | None:
@@ -125,8 +125,8 @@ def numbers_table(result: Record) -> Table | None:
         return [name, *map(value, numbers), *further]
 
     def rows(part: str) -> list[Row]:
-        found = [one.get(part) or {} for one in records.values()]
-        given = [scalars({**one, **one.get("gear_rattle", {})}) for one in found]
+        parts = [one.get(part) or {} for one in records.values()]
+        given = [scalars({**one, **one.get("gear_rattle", {})}) for one in parts]
         keys = dict.fromkeys(key for one in given for key in one)
         changes = part != "steady_state"
         return [row(label(key), [one.get(key) for one in given], changes) for key in keys]
@@ -197,9 +197,9 @@ def scene_rows(result: Record, rows: Sequence[Record] = ()) -> dict[str, Sequenc
     """Return the rows of each design, one per scene; the name is empty if there is only one."""
     if rows:
         return {"": rows}
-    found = {name: record.get("speeds") for name, record in records_of(result).items()}
-    found = {name: speeds for name, speeds in found.items() if speeds}
-    return {"": found["design"]} if [*found] == ["design"] else found
+    designs = {name: record.get("speeds") for name, record in records_of(result).items()}
+    designs = {name: speeds for name, speeds in designs.items() if speeds}
+    return {"": designs["design"]} if [*designs] == ["design"] else designs
 
 
 def scene_tables(result: Record, rows: Sequence[Record], most: int) -> Iterator[Table | None]:
@@ -240,14 +240,16 @@ def _list_table(title: str, rows: Sequence[Record], note: str) -> Table | None:
     that are equal in all rows are listed below the table, except those of the first key."""
     rows = [scalars(row) for row in rows]
     order = dict.fromkeys([*[*rows[0]][:1], "status", *(key for row in rows for key in row)])
-    found = {key: [row.get(key) for row in rows] for key in order}
-    found = {key: values for key, values in found.items() if {*values} != {None}}
-    same = [key for key in [*found][1:] if len({*found[key]}) == 1 < len(rows) and key != "status"]
-    told = [stated(key, found.pop(key)[0], named=True) for key in same]
+    columns = {key: [row.get(key) for row in rows] for key in order}
+    columns = {key: values for key, values in columns.items() if {*values} != {None}}
+    same = [
+        key for key in [*columns][1:] if len({*columns[key]}) == 1 < len(rows) and key != "status"
+    ]
+    told = [stated(key, columns.pop(key)[0], named=True) for key in same]
     note = " ".join([note, *([f"In all rows: {', '.join(told)}."] if told else [])]).strip()
     cells = [[status_cell(str(x)) for x in values] if key == "status" else map(value, values)
-             for key, values in found.items()]  # fmt: skip
-    return table(title, [*map(label, found)], [("", [*zip(*cells, strict=True)])], note)
+             for key, values in columns.items()]  # fmt: skip
+    return table(title, [*map(label, columns)], [("", [*zip(*cells, strict=True)])], note)
 
 
 def conflict_table(result: Record) -> Table | None:
@@ -285,8 +287,8 @@ def tolerance_table(result: Record) -> Table | None:
 
 def touching_table(result: Record) -> Table | None:
     """Return how the reserve of the flanks scatters, and which tolerance costs most, or None."""
-    found = result.get("touching")
-    if not found:
+    touching = result.get("touching")
+    if not touching:
         return None
     lost = "reserve lost (µm)", "lost at most (µm)"
     rows = [
@@ -295,18 +297,19 @@ def touching_table(result: Record) -> Table | None:
             *(value(one[name]) for name in ("standard_deviation", "lost_um", "lost_at_most_um")),
             f"{100 * one['share_of_variance']:.3g} %",
         ]
-        for one in found["keys"]
+        for one in touching["keys"]
     ]
     first, second = (
-        f"{100 * found[f'touching_share{order}']:.3g} %" for order in ("_first_order", "")
+        f"{100 * touching[f'touching_share{order}']:.3g} %" for order in ("_first_order", "")
     )
     note = (
-        f"Contact reserve {brief(found['contact_reserve_um'], 4)} µm, standard deviation "
-        f"{brief(found['standard_deviation_um'], 3)} µm, worst case "
-        f"{brief(found['worst_case_um'], 4)} µm. Of {found['machines']} machines, {second} touch "
-        f"({first} to first order). Of {found['simulated']} simulated ones, "
-        f"{found['simulated_touching']} touch (model: {found['model_touching']}); their reserves "
-        f"differ from the model by at most {quantity(found['greatest_difference_um'], 'µm')}."
+        f"Contact reserve {brief(touching['contact_reserve_um'], 4)} µm, standard deviation "
+        f"{brief(touching['standard_deviation_um'], 3)} µm, worst case "
+        f"{brief(touching['worst_case_um'], 4)} µm. Of {touching['machines']} machines, {second} "
+        f"touch ({first} to first order). Of {touching['simulated']} simulated ones, "
+        f"{touching['simulated_touching']} touch (model: {touching['model_touching']}); their "
+        f"reserves differ from the model by at most "
+        f"{quantity(touching['greatest_difference_um'], 'µm')}."
     )
     heads = ["", "standard deviation", *lost, "share of variance"]
     return table("Reserve under tolerances", heads, [("", rows)], note)

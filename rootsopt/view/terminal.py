@@ -113,9 +113,9 @@ def _usable(command: str, status: str, result: Record, rows: Sequence[Record]) -
 
     A sweep, or a search for coexisting motions, has one if any of its motions has."""
     several = {"sweep": rows, "attractors": result.get("attractors")}
-    found = [row.get("status") for row in several.get(command) or ()]
+    statuses = [row.get("status") for row in several.get(command) or ()]
     explained = command == "optimize" and result.get("optimized")
-    return bool(explained) or not {status, *found}.isdisjoint(_SAID)
+    return bool(explained) or not {status, *statuses}.isdisjoint(_SAID)
 
 
 def _quoted(path: Path) -> str:
@@ -198,7 +198,7 @@ _STYLES = {True: "green", False: "bold red", None: ""}
 
 def ascii_text(text: str) -> str:
     """Return a text with the signs of print replaced: 5 µm becomes 5 um, and 4° becomes 4 deg."""
-    text = _POWER.sub(lambda found: f"e{int(found[1].translate(_PLAIN)):+03d}", text)
+    text = _POWER.sub(lambda match: f"e{int(match[1].translate(_PLAIN)):+03d}", text)
     text = re.sub(r"(?<=\d)°", " deg", text).replace("°", "deg").translate(_ASCII)
     return text.encode("ascii", "replace").decode()
 

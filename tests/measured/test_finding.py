@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rootsopt.measured.source import found
+from rootsopt.measured.source import read_rotor
 from rootsopt.profiles import CIC, outline
 from tests.standins import refusal
 
@@ -42,7 +42,9 @@ def write(path, points):
 
 
 def found_in(folder, points, given=None):
-    return found(write(folder / "rotor.csv", points), given or {}, lambda what, default: default)
+    return read_rotor(
+        write(folder / "rotor.csv", points), given or {}, lambda what, default: default
+    )
 
 
 ROTORS = {

@@ -51,7 +51,7 @@ def searching(truth=lambda point: 1.0, tight=None, **settings) -> Search:
     `tight`: what it finds at a tighter tolerance, by default the same."""
     search = object.__new__(Search)
     search.stop, search._refuted, search._trials = threading.Event(), [], []
-    search._found, search.checkpoint, search.noisy, search.runs = {}, None, True, HERE
+    search._descents, search.checkpoint, search.noisy, search.runs = {}, None, True, HERE
     config = load("configs/cic_drawn.yaml")
     given = {"screening": 0, "starts": 2} | settings
     search.settings = config.optimizer.model_copy(update=given)
@@ -189,7 +189,7 @@ def test_a_local_search_begins_beside_a_start_without_a_usable_motion(hole):
     trials = search._solve(0, start)
     tried = sum(trial.local is None for trial in trials)
     assert tried == {0.0: 0, 1e-6: 1, 5e-4: 3, 1.0: 5}[hole]
-    assert (search._found[0].local is None) == (hole == 1)
+    assert (search._descents[0].local is None) == (hole == 1)
 
 
 @dataclasses.dataclass(frozen=True)

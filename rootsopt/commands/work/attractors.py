@@ -22,34 +22,34 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     check_geometry(config)
     cli.load_figures(options, "sweep")
     with cli.waiting(Console(stderr=True), "compiling and simulating"):
-        found = find(Evaluator.of(config), series=True)
+        basins = find(Evaluator.of(config), series=True)
     files.write_config(folder, config)
     data = {
-        "attractors": found.records(),
-        "lost": found.lost,
-        "status": found.status.label,
-        "message": message_of(config, found.status),
+        "attractors": basins.records(),
+        "lost": basins.lost,
+        "status": basins.status.label,
+        "message": message_of(config, basins.status),
         "versions": files.versions(),
     }
     folder.write_json("result.json", data)
-    rows = [{"attractor": number} | row for number, row in enumerate(found.summary(), 1)]
+    rows = [{"attractor": number} | row for number, row in enumerate(basins.summary(), 1)]
     folder.write_csv("attractors.csv", files.row_columns(rows))
-    relative, rate = np.meshgrid(1e3 * found.relative, found.rate)
+    relative, rate = np.meshgrid(1e3 * basins.relative, basins.rate)
     columns = {
         "relative_rotation_mrad": relative.ravel(),
         "relative_speed_rad_s": rate.ravel(),
         # 0: the initial state leads to no reported motion.
-        "attractor": found.leads_to.ravel() + 1,
+        "attractor": basins.leads_to.ravel() + 1,
     }
     folder.write_csv("basins.csv", columns)
-    for number, one in enumerate(found.attractors, 1):
+    for number, one in enumerate(basins.attractors, 1):
         if one.evaluation.series is not None:
             response = files.response_columns(one.evaluation.series)
             folder.write_csv(f"response_{number}.csv", response)
     if not options.no_figures:
         from rootsopt.view.figures.sweep import basin_figures
 
-        basin_figures(folder, found, config)
+        basin_figures(folder, basins, config)
 
-    usable = any(one.evaluation.usable for one in found.attractors)
+    usable = any(one.evaluation.usable for one in basins.attractors)
     return cli.Outcome(cli.OK if usable else cli.NO_RESULT)

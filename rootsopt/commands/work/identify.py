@@ -24,20 +24,20 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
             raise InputError(f"`--{name}` is missing; add it, as in --{name} {example}")
     cli.load_figures(options, "force")
     with cli.waiting(Console(stderr=True), "compiling and simulating") as progress:
-        found = identify(
+        fit = identify(
             config, options.data, options.fit, gains=[text.split(",") for text in options.gain],
             constants=options.constant, profiles=options.profile, starts=options.starts,
             seed=options.seed, progress=progress,
         )  # fmt: skip
     files.write_config(folder, config)
-    data = found.record()
-    if found.parameters:
-        folder.write_text("identified.yaml", found.config.to_yaml())
-        folder.write_csv("residuals.csv", found.residuals)
+    data = fit.record()
+    if fit.parameters:
+        folder.write_text("identified.yaml", fit.config.to_yaml())
+        folder.write_csv("residuals.csv", fit.residuals)
     folder.write_json("result.json", data | {"versions": files.versions()})
-    if found.parameters and not options.no_figures:
+    if fit.parameters and not options.no_figures:
         from rootsopt.view.figures.force import identified_figure
 
-        identified_figure(folder, found)
+        identified_figure(folder, fit)
 
-    return cli.Outcome(cli.OK if found.status.usable else cli.NO_RESULT)
+    return cli.Outcome(cli.OK if fit.status.usable else cli.NO_RESULT)

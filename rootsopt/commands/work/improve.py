@@ -12,7 +12,7 @@ from rootsopt.config.document import read_document
 from rootsopt.config.families import FREE_FORM
 from rootsopt.config.reading import Config, load
 from rootsopt.errors import InputError
-from rootsopt.measured.source import Found, found
+from rootsopt.measured.source import MeasuredRotor, read_rotor
 from rootsopt.optimize.verification import survives, surviving
 from rootsopt.pump.sheet import record_of
 from rootsopt.runtime.environment import say
@@ -63,7 +63,7 @@ def config_of(options: argparse.Namespace) -> Config:
     base = load(scene or "cic_drawn", rest)
     if base.profile.from_file:
         given = base.profile.model_dump(exclude_none=True) | given
-    rotor = found(path, given, _asked)
+    rotor = read_rotor(path, given, _asked)
     one, radius = _fitted(rotor, path.name), rotor.radius
     size = {"lobes": rotor.lobes, "pitch_radius_mm": radius}
     profile = one.config(base.profile.model_copy(update=size))
@@ -139,7 +139,7 @@ def _asked(what: str, default: Any) -> Any:
     return default if answer is None else answer
 
 
-def _fitted(rotor: Found, name: str) -> Likeness:
+def _fitted(rotor: MeasuredRotor, name: str) -> Likeness:
     """Return the member of a family that is nearest to a rotor from the file `name`.
 
     Raises `InputError` if no member is near."""
@@ -169,10 +169,10 @@ def _typical(base: Config, radius: float, own: set[str]) -> dict[str, Any]:
     `base`: the config that is scaled; `own`: keys whose values the user gives. On a terminal, the
     user is asked for them."""
     size = radius / base.profile.pitch_radius_mm
-    found = {key: (base.value(key), power) for key, power in _SCALED.items() if key not in own}
+    values = {key: (base.value(key), power) for key, power in _SCALED.items() if key not in own}
     return {
         key: _asked(key, float(f"{value * size**power:.3g}"))
-        for key, (value, power) in found.items()
+        for key, (value, power) in values.items()
         if value is not None
     }
 

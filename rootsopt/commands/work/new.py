@@ -114,9 +114,9 @@ def _answer(key: Key) -> str:
 
 def _missing(given: dict[str, Any], keys: list[Key]) -> list[str]:
     """Return the names of the required options that are not `given`."""
-    found = [f"`{option(key.name)}`" for key in keys if key.required and key.name not in given]
+    names = [f"`{option(key.name)}`" for key in keys if key.required and key.name not in given]
     either = " or ".join(f"`{option(name)}`" for name in _POWERS)
-    return found if {*_POWERS} & {*given} else [*found, either]
+    return names if {*_POWERS} & {*given} else [*names, either]
 
 
 def _met(sheet: Sheet) -> Config:
@@ -133,10 +133,10 @@ def _met(sheet: Sheet) -> Config:
             text = sheet.text(sheet.first_profile(family_of(name)))
         except ValidationError:  # A parameter that its key cannot have at this size.
             continue
-        found = sized(parse(text, source="sheet"))
-        if isinstance(found, Config):
-            return found
-        radii += [(radius, name) for radius in found]
+        result = sized(parse(text, source="sheet"))
+        if isinstance(result, Config):
+            return result
+        radii += [(radius, name) for radius in result]
     who = f"family {sheet.family}" if sheet.family else "all families"
     where = f"{who} at {pair}"
     if not radii:

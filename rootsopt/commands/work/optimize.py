@@ -72,19 +72,19 @@ def searched_for(
     lines.append(
         f"compile {compiled:.1f} s, run {ran - compiled:.1f} s, reports {total - ran:.1f} s"
     )
-    found = result.optimized is not None and not result.interrupted
-    return cli.Outcome(cli.OK if found else cli.NO_RESULT, lines)
+    complete = result.optimized is not None and not result.interrupted
+    return cli.Outcome(cli.OK if complete else cli.NO_RESULT, lines)
 
 
 def _contradiction(config: Config, folder: RunFolder, result) -> cli.Outcome:
     """Write the files of a run that found no design because its constraints are in conflict.
 
     Return the `Outcome`, with exit code 3."""
-    found = result.infeasible
+    conflict = result.infeasible
     files.write_config(folder, config)
     data = {"baseline": result.baseline.record(), "optimized": None}
-    data |= {"status": result.status.label, "message": found.message}
-    data |= {"infeasible": found.record(), "versions": files.versions()}
+    data |= {"status": result.status.label, "message": conflict.message}
+    data |= {"infeasible": conflict.record(), "versions": files.versions()}
     if result.beginning is not None:
         data["beginning"] = result.beginning.record()
     folder.write_json("result.json", data)
@@ -100,8 +100,8 @@ def _alike(config: Config, result) -> dict:
         return {}
 
     design = list(result.optimized.design.values())
-    found = likenesses(Scene.from_config(config).profile(jnp.asarray(design)))
-    return {"resembles": [one.record() for one in found]}
+    nearest = likenesses(Scene.from_config(config).profile(jnp.asarray(design)))
+    return {"resembles": [one.record() for one in nearest]}
 
 
 def _sheets(config: Config, result) -> dict[str, dict]:

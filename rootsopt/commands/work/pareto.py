@@ -48,5 +48,5 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
         f"{front.searches} searches, {front.evaluations} designs, compile "
         f"{compiled:.1f} s, run {ran - compiled:.1f} s"
     )
-    found = front.certified > 0 and not front.interrupted
-    return cli.Outcome(cli.OK if found else cli.NO_RESULT, [line])
+    complete = front.certified > 0 and not front.interrupted
+    return cli.Outcome(cli.OK if complete else cli.NO_RESULT, [line])

@@ -24,21 +24,21 @@ from rootsopt.status import Status
 from rootsopt.view import files
 from rootsopt.view.runs import RunFolder
 
-Found = TypeVar("Found", covariant=True)
+Result = TypeVar("Result", covariant=True)
 PATIENCE = 5.0
 """Time (s) after an interrupt above which a command no longer waits for its search to end.
 
 In this time, the simulation in progress may end, and the best design may be simulated again."""
 
 
-class Searches(Protocol[Found]):
+class Searches(Protocol[Result]):
     """A search: `run` returns its outcome.
 
     `so_far` returns the results so far, or `None` before the baseline is known."""
 
-    def run(self) -> Found: ...
+    def run(self) -> Result: ...
 
-    def so_far(self) -> Found | None: ...
+    def so_far(self) -> Result | None: ...
 
 
 J = TypeVar("J", bound=Journal)
@@ -78,10 +78,10 @@ def opened(make: Callable[[Path, bool], J], options: argparse.Namespace, folder:
             f"when this run ends; to go on with the interrupted run, stop this one, move the file "
             f"back to {path.name!r}, and add `--resume`"
         )
-    found = make(path, options.resume)
-    if found.damage:
-        say(found.damage)
-    return found
+    journal = make(path, options.resume)
+    if journal.damage:
+        say(journal.damage)
+    return journal
 
 
 def searched(
@@ -89,16 +89,16 @@ def searched(
     config: Config,
     options: argparse.Namespace,
     folder: RunFolder,
-    make: Callable[..., Searches[Found]],
+    make: Callable[..., Searches[Result]],
     bar: Callable[[Console], contextlib.AbstractContextManager],
     kept: str,
-) -> tuple[Found | None, float]:
+) -> tuple[Result | None, float]:
     """Run the search of a `command`; return its outcome and the time (s) spent on compiling.
 
     `make`: makes the search, with the keywords `progress`, `stop`, `checkpoint` and `runs`; `bar`:
     returns the progress bar on a console; `kept`: what is kept if the user stops the search, in
     words. The outcome is `None` if the search was stopped before the baseline was known."""
-    made: list[Searches[Found]] = []
+    made: list[Searches[Result]] = []
     clock = CompileClock()
     with (
         clock,
@@ -114,11 +114,11 @@ def searched(
             )
             return made[0].run()
 
-        found = until_stopped(work, stop, PATIENCE)
-        found = made[0].so_far() if found is None and made else found
+        outcome = until_stopped(work, stop, PATIENCE)
+        outcome = made[0].so_far() if outcome is None and made else outcome
     if not stop.is_set():  # A stopped search can go on later.
         folder.remove_afterwards(folder.checkpoint)
-    return found, clock.seconds
+    return outcome, clock.seconds
 
 
 def nothing_known(

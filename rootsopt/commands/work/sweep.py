@@ -41,20 +41,20 @@ if TYPE_CHECKING:
 
 def rows_of(plan: Plan, records: Mapping[int, Row]) -> list[dict[str, Any]]:
     """Return one row per simulated point: its number, values, forces, kind of motion, status."""
-    found = []
+    rows = []
     for number in sorted(records):
         record, values = records[number], plan.at(number)
         plain = {key: v if is_numeric([v]) else written(v) for key, v in values.items()}
         steady = record["steady_state"]
         response = record["response"]
-        found.append(
+        rows.append(
             {"point": number}
             | plain
             | {name: response.get(name) for name in (*RESPONSES, *response)}
             | {name: steady.get(name) for name in ("kind", "period", "floquet_multiplier")}
             | {"status": record["status"]}
         )
-    return found
+    return rows
 
 
 def outcome(plan: Plan, records: Mapping[int, Row]) -> tuple[Status, str]:
@@ -112,10 +112,10 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     config, plan = _points(config, options)
     plan = checked(config, plan)
     columns = {key: values for one in plan.dimensions for key, values in one.columns.items()}
-    found = notes_on_swept(config, columns)
-    for note in found:
+    notes = notes_on_swept(config, columns)
+    for note in notes:
         say(note)
-    folder.add_notes(found)
+    folder.add_notes(notes)
     cache = not options.no_cache
     with (
         running(options.workers, options.scheduler, options.imports, cache) as runs,

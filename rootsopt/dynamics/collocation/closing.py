@@ -259,9 +259,9 @@ class Closer(eqx.Module):
         way = jnp.where(now.trusted & (now.tries == 0), _WAY, 1.0)
         pair = between(self.equation.pair, self.neighbour, way)
         points, along = evaluated(self.equation, pair, at, now.rivals, self.tangents, now.keeps)
-        found = lines(at, points)
-        columns = columns_of(at, found, along)
-        step = chained(at, found, columns, condensed(at, found, columns))
+        linearised = lines(at, points)
+        columns = columns_of(at, linearised, along)
+        step = chained(at, linearised, columns, condensed(at, linearised, columns))
         first = jnp.arange(columns.gap.shape[-1]) == 0
         # All changes are proportional to the right-hand sides.
         longer = jnp.where(first, 1 / way, 1.0)
@@ -358,8 +358,8 @@ class Closer(eqx.Module):
         peak = peak_of(at, now.rivals, *along)
 
         def kept() -> Loop:
-            found = forces_of(equation, at, peak, (points, direct), step, moved)
-            return self.keep(now._replace(line=line), found, moved)
+            orbit = forces_of(equation, at, peak, (points, direct), step, moved)
+            return self.keep(now._replace(line=line), orbit, moved)
 
         def goes_on() -> Loop:
             rivals = rivals_of(at, points, *along, now.rivals)
@@ -405,11 +405,11 @@ class Closer(eqx.Module):
         known_errors = known.error * growth, known.drift * growth
         return choose(known.aligned, known_errors, (force * rough, slope * rough))
 
-    def keep(self, now: Loop, found: Orbit, motion: Elements) -> Loop:
-        """Return the loop's state with the orbit `found`, its corrected `motion` and errors."""
+    def keep(self, now: Loop, new: Orbit, motion: Elements) -> Loop:
+        """Return the loop's state with the `new` orbit, its corrected `motion` and errors."""
         size = roughness(motion)
         first = now.meshes == 0
-        apart, turned = differences(now.orbit, found, self.equation.top)
+        apart, turned = differences(now.orbit, new, self.equation.top)
         force, slope = gained(now.known.elements.mesh.used, now.elements.mesh.used)
         compared = apart / force, turned / slope + _ROUGH
         error, drift = choose(first, self.uncompared(size), compared)
@@ -420,7 +420,7 @@ class Closer(eqx.Module):
         # Newton's method has converged, so the correction must be small. It is NaN where the time
         # derivative of a margin vanishes at its event. Derivatives are those before the correction:
         # if it is not yet negligible, they are computed once more.
-        correction = found.residual
+        correction = new.residual
         good = correction < corrected(self.tolerance)
         falls = correction < _STALLED * now.size
         failures = now.failures + ~good
@@ -429,7 +429,7 @@ class Closer(eqx.Module):
         least = jnp.where(first & self.known.aligned, self.known.roughness, 0.0)
         yes = jnp.ones((), bool)
         known = KnownOrbit(motion, jnp.maximum(size, least), error, drift, yes, yes)
-        orbit, known = choose(good & ~again, (found, known), (now.orbit, now.known))
+        orbit, known = choose(good & ~again, (new, known), (now.orbit, now.known))
         reached = ((error <= self.tolerance) & certain) | full
         return now._replace(
             orbit=orbit,

@@ -88,10 +88,10 @@ class Gauss(NamedTuple):
 def _polynomials(powers: NDArray[np.float64], share: Float[Array, "*m"]) -> Float[Array, "*m s"]:
     """Return s polynomials at σ = `share`; `powers` (p, s): coefficients, constants first."""
     share = share[..., None]
-    found = jnp.broadcast_to(jnp.asarray(powers[-1]), (*share.shape[:-1], powers.shape[1]))
+    values = jnp.broadcast_to(jnp.asarray(powers[-1]), (*share.shape[:-1], powers.shape[1]))
     for row in powers[-2::-1]:
-        found = found * share + row
-    return found
+        values = values * share + row
+    return values
 
 
 def summed(terms: Iterable[Array]) -> Array:
@@ -259,11 +259,11 @@ def in_blocks(function: Any, used: Int[Array, ""], *arrays: Any) -> Any:
     numbers, rest = eqx.partition(function, eqx.is_inexact_array)
     vector, back = ravel_pytree(numbers)
 
-    def block(number, found):
+    def block(number, results):
         begin = number * size
         new = eqx.combine(back(vector), rest)(*sliced(begin))
         return jax.tree.map(
-            lambda old, x: lax.dynamic_update_slice_in_dim(old, x, begin, 0), found, new
+            lambda old, x: lax.dynamic_update_slice_in_dim(old, x, begin, 0), results, new
         )
 
     return lax.fori_loop(0, greatest((used + size - 1) // size), block, nothing)

@@ -72,15 +72,15 @@ class CollocatedEquation(eqx.Module):
         (mesh periods); `state` (n,): scaled; `roots` (flanks, 2): `NearContact.roots`; `which`:
         index of the margin to evaluate. For the results, see `Points`."""
         near = self.near(dynamic, static, roots)
-        slope, contact, found = near.derivative_and_margins(tau, state)
+        slope, contact, margins = near.derivative_and_margins(tau, state)
         unit = jax.lax.stop_gradient(self.pair.force_scale)
         top = jax.lax.stop_gradient(self.top) / unit
         rates = self.measures.rates(tau, contact.total / unit, top)
         if near.free:
             rates = near.lapse(state) * jnp.append(rates, jnp.ones_like(unit))
-        values = [*slope, *rates, found.values[which]]
+        values = [*slope, *rates, margins.values[which]]
         if isinstance(innermost(near.contact), NearContact):
-            roots = _roots(found.places)
+            roots = _roots(margins.places)
         return values, (roots, contact.total, contact.depth)
 
     def along(
@@ -128,9 +128,9 @@ class CollocatedEquation(eqx.Module):
         unit = jnp.zeros((passes, *unit.shape), place.dtype).at[0].set(unit)
         units = jnp.broadcast_to(unit[..., None], (*unit.shape, place.shape[1]))
 
-        def derivatives(k, found):
+        def derivatives(k, partials):
             own = jax.tree.map(lambda x: x[k], (moved, units))
-            return found.at[k].set(
+            return partials.at[k].set(
                 jnp.stack(compute_once(jax.vmap(compute_once(linear))(*own)), axis=1)
             )
 

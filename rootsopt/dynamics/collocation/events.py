@@ -89,14 +89,14 @@ def flags_at(pair: RotorPair, tau, state):
     These are: whether each flag matters (f,); the normal angles ν2 (rad) of the closest approach
     (flanks,); whether the flanks transmit a force (flanks,). `tau`: time (mesh periods); `state`
     (n,): scaled."""
-    found = pair.margins(tau, state)
-    return found.values > 0, found.counts, _roots(pair, found), found.pushes
+    margins = pair.margins(tau, state)
+    return margins.values > 0, margins.counts, _roots(pair, margins), margins.pushes
 
 
-def _roots(pair: RotorPair, found: Margins) -> Float[Array, " flanks"]:
-    """Return the normal angles ν2 (rad) of the closest approaches `found`, 0 if not known."""
+def _roots(pair: RotorPair, margins: Margins) -> Float[Array, " flanks"]:
+    """Return the normal angles ν2 (rad) of the closest approaches in `margins`, 0 if not known."""
     searches = type(innermost(pair.contact)) is SearchContact
-    return found.places.normal2 if searches else jnp.zeros(pair.flanks)
+    return margins.places.normal2 if searches else jnp.zeros(pair.flanks)
 
 
 class Kinds(NamedTuple):
@@ -367,13 +367,13 @@ def _located(pair: RotorPair, elements: Elements, seen: FlagScan, compared: _Com
     number = jnp.sum(fresh)
     value, flank = seen.flags[place, flag], kind.flank[flag]
 
-    def locate(k, found):
+    def locate(k, events):
         def margin(tau):
             margins = pair.margins(tau, elements.motion(tau))
             return margins.values[flag[k]], _roots(pair, margins)[flank[k]]
 
         time, before, after = zero_of(margin, seen.tau[place[k]], later[place[k]], value[k])
-        return found[0].at[k].set(time), found[1].at[k].set(jnp.abs(after - before))
+        return events[0].at[k].set(time), events[1].at[k].set(jnp.abs(after - before))
 
     nothing = jnp.full(most, jnp.inf, seen.tau.dtype), jnp.zeros(most, seen.tau.dtype)
     located, change = lax.fori_loop(0, jnp.minimum(number, most), locate, nothing)

@@ -125,9 +125,9 @@ def shared(
     def share(step):
         goal = at[interval] + weight[interval] * step / size
         room = times[interval + 1] - times[interval]
-        found = (jnp.interp(goal, wanted, place) - times[interval]) / jnp.where(room > 0, room, 1)
-        found = jnp.where(step == 0, 0.0, jnp.where(step == size, 1.0, found))
-        return jnp.where(filled, found, 1.0)
+        ratio = (jnp.interp(goal, wanted, place) - times[interval]) / jnp.where(room > 0, room, 1)
+        ratio = jnp.where(step == 0, 0.0, jnp.where(step == size, 1.0, ratio))
+        return jnp.where(filled, ratio, 1.0)
 
     return Mesh(
         times=times,

@@ -81,13 +81,13 @@ def lines(elements: Elements, points: Points) -> Lines:
     )
 
 
-def columns_of(elements: Elements, found: Lines, direct: Float[Array, "e p r k"]) -> Columns:
+def columns_of(elements: Elements, linearised: Lines, direct: Float[Array, "e p r k"]) -> Columns:
     """Return the right-hand sides of Newton's step, followed by those of k further directions.
 
-    `found`: linearised equation; `direct`: derivatives of the equation's values along the
+    `linearised`: linearised equation; `direct`: derivatives of the equation's values along the
     directions, at constant motion."""
     count, inside = elements.state.shape[1], len(GAUSS.nodes)
-    own = own_column(elements, found)
+    own = own_column(elements, linearised)
     return Columns(
         slope=jnp.concatenate([own.slope, direct[:, :inside, :count]], axis=-1),
         gap=jnp.pad(own.gap, ((0, 0), (0, 0), (0, direct.shape[-1]))),
@@ -112,10 +112,10 @@ def numbers(pair: Any) -> Float[Array, " m"]:
     return ravel_pytree(eqx.filter(pair, eqx.is_inexact_array))[0]
 
 
-def with_numbers(equation: CollocatedEquation, found: Float[Array, " m"]) -> CollocatedEquation:
+def with_numbers(equation: CollocatedEquation, vector: Float[Array, " m"]) -> CollocatedEquation:
     """Return `equation` with a pair of the same kind, given by its `numbers`."""
     own, rest = eqx.partition(equation.pair, eqx.is_inexact_array)
-    pair = eqx.combine(ravel_pytree(own)[1](found), rest)
+    pair = eqx.combine(ravel_pytree(own)[1](vector), rest)
     return eqx.tree_at(lambda e: e.pair, equation, pair)
 
 

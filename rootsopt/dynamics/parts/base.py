@@ -326,5 +326,5 @@ class Timescales(eqx.Module):
             swing = swing if own is None else jnp.minimum(swing, own)
         # No lever is longer than the pitch radius.
         free = jnp.maximum(clearance, 0.0) / radius
-        found = cls(swing, jnp.where(flies, fall, jnp.inf), free)
-        return lax.stop_gradient(found)
+        timescales = cls(swing, jnp.where(flies, fall, jnp.inf), free)
+        return lax.stop_gradient(timescales)

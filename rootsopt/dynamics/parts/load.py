@@ -160,7 +160,7 @@ def over_segments(
     `addendum`: roll angle (rad) of this point. Where a whole segment touches within the roll angle
     `BRIEF`, the values at its ends are blended over that angle."""
     normal = profile.normal_at(addendum)
-    found = value(normal)
+    result = value(normal)
     for segment in profile.segments():
         if segment.land:
             continue
@@ -170,8 +170,8 @@ def over_segments(
         after = value(jnp.where(addendum > end, normal, segment.stop))
         spread = before + smooth_step(share) * (after - before)
         brief = (end - begin < BRIEF) & (share > 0) & (share < 1)
-        found = jnp.where(brief, spread, found)
-    return found
+        result = jnp.where(brief, spread, result)
+    return result
 
 
 class TwistedLoad(Load):

@@ -117,12 +117,12 @@ def among(pairs: Sequence[Pair], kept: Sequence[int], same: Sequence[int]) -> li
     """Return those `pairs` whose points are both in `kept`, each once.
 
     `same`: for each point, the index of the point that replaces it, or -1."""
-    found: dict[Pair, None] = {}
+    unique: dict[Pair, None] = {}
     for pair in pairs:
         i, j = sorted(same[k] if same[k] >= 0 else k for k in pair)
         if i != j and i in kept and j in kept:
-            found[i, j] = None
-    return [*found]
+            unique[i, j] = None
+    return [*unique]
 
 
 def divides(
@@ -206,10 +206,10 @@ class Selection(NamedTuple):
         `pairs`: indices of neighbouring nodes; used for three terms only. With two terms,
         neighbours are nodes that follow each other in `kept`."""
         if self.values.shape[1] == 2:
-            found = [(min(pair), max(pair)) for pair in along(self.kept)]
+            neighbours = [(min(pair), max(pair)) for pair in along(self.kept)]
         else:
-            found = among(pairs, self.kept, self.same)
-        return [measured(pair, self.values, self.points) for pair in found]
+            neighbours = among(pairs, self.kept, self.same)
+        return [measured(pair, self.values, self.points) for pair in neighbours]
 
 
 def selected(nodes: Sequence[Node], scale: Scale) -> Selection:
@@ -311,7 +311,7 @@ def _point(study: Study, node: Node, number: int, standing: Standing, scale: Sca
 
 
 def _limits(study: Study, certificate: Certificate) -> dict[str, float]:
-    found = {
+    limits = {
         constraint.name: float(multiplier)
         for constraint, multiplier in zip(
             study.problem.space.constraints, certificate.multipliers, strict=True
@@ -322,8 +322,8 @@ def _limits(study: Study, certificate: Certificate) -> dict[str, float]:
     for side, multipliers in (("lower", certificate.lower), ("upper", certificate.upper)):
         for key, multiplier in zip(keys, multipliers, strict=True):
             if multiplier > _HELD:
-                found[f"{side} bound of {words(key)}"] = float(multiplier)
-    return found
+                limits[f"{side} bound of {words(key)}"] = float(multiplier)
+    return limits
 
 
 def better(best: Node | None, other: Node | None) -> Node | None:
@@ -440,8 +440,8 @@ def sharpened(tracer: "Tracer", pair: Pair) -> Pair:
         best = tracer._solved(scalar, node.point, orbit, None, tracer._course)
         if best is None or tracer.stop.is_set():
             continue
-        found = tracer.scale.of(best.sample.values)
-        if found[lead] < start[lead] - BETTER and found[1 - lead] < limit[1 - lead]:
+        terms = tracer.scale.of(best.sample.values)
+        if terms[lead] < start[lead] - BETTER and terms[1 - lead] < limit[1 - lead]:
             with tracer._lock:
                 tracer._nodes[(len(tracer._nodes),)] = best
             moved = len(tracer._all()) - 1

@@ -228,7 +228,7 @@ class Front:
 
     def record(self) -> dict[str, Any]:
         """Return the entries of the result file."""
-        found: dict[str, Any] = {
+        entries: dict[str, Any] = {
             "terms": [
                 {"name": aim.name, "sense": aim.sense, "unit": aim.unit} for aim in self.aims
             ],
@@ -243,8 +243,8 @@ class Front:
             "statistics": {"searches": self.searches, "evaluations": self.evaluations},
         }
         if self.infeasible is not None:
-            found["infeasible"] = self.infeasible.record()
-        return found
+            entries["infeasible"] = self.infeasible.record()
+        return entries
 
 
 def dominated(values: NDArray[np.float64], equal: float = EQUAL) -> NDArray[np.bool_]:
@@ -266,17 +266,17 @@ def repeated(
 
     `values` (n, k): scaled terms; `points` (n, d): designs in the unit box. Two points are the same
     if no term differs by more than `near`, and no coordinate by more than 5 times `near`."""
-    found: list[int] = []
+    earlier: list[int] = []
     for k in range(len(values)):
         same = [
             j
             for j in range(k)
-            if found[j] < 0
+            if earlier[j] < 0
             and np.max(np.abs(values[j] - values[k])) <= near
             and np.max(np.abs(points[j] - points[k])) <= 5 * near
         ]
-        found.append(same[0] if same else -1)
-    return found
+        earlier.append(same[0] if same else -1)
+    return earlier
 
 
 def ordered(values: NDArray[np.float64]) -> Sequence[int]:
@@ -350,10 +350,10 @@ class Scalar(NamedTuple):
 
         `sample`, `certificate`: those of the optimum."""
         kinds = np.concatenate([sample.terms[k].tags[:, 0] for k in self.leading]).astype(int)
-        found = np.zeros(len(sample.terms))
-        np.add.at(found, kinds, certificate.shares[0])
-        found = found / self.steps
-        return found / np.sum(found)
+        weights = np.zeros(len(sample.terms))
+        np.add.at(weights, kinds, certificate.shares[0])
+        weights = weights / self.steps
+        return weights / np.sum(weights)
 
 
 def rates(
@@ -366,9 +366,9 @@ def rates(
     their scale. The rate is NaN if one of the two weights is below `least`. That term then does not
     influence the optimum, as at an end of the front or beside a gap."""
     held = np.where(weights >= least, weights / width, np.nan)
-    found = -held[None, :] / held[:, None]
-    np.fill_diagonal(found, np.nan)
-    return found
+    ratios = -held[None, :] / held[:, None]
+    np.fill_diagonal(ratios, np.nan)
+    return ratios
 
 
 def end_scale(baseline: NDArray[np.float64], screened: NDArray[np.float64]) -> Scale:
@@ -407,9 +407,9 @@ def directions(count: int) -> list[Key]:
     return [tuple((k == j) - (k == i) for k in range(count)) for i, j in pairs]
 
 
-def links(found: Sequence[Key]) -> list[tuple[int, int]]:
-    """Return the pairs of neighbours on the grid, as indices of the keys in `found`."""
-    place = {key: number for number, key in enumerate(found)}
+def links(grid: Sequence[Key]) -> list[tuple[int, int]]:
+    """Return the pairs of neighbours on the grid, as indices of the keys in `grid`."""
+    place = {key: number for number, key in enumerate(grid)}
     pairs = []
     for key, number in place.items():
         for step in directions(len(key)):

@@ -72,11 +72,11 @@ def aims_of(config: Config) -> tuple[Aim, ...]:
     """Return the terms of `config.pareto`.
 
     Raises `InputError` for a name that is neither a force nor a registered term."""
-    found = []
+    aims = []
     for name in config.pareto.terms:
         sense = "min" if is_force(config, name, _KEY) else terms_of([name], "pareto.terms")[0].sense
-        found.append(Aim(name, config.pareto.senses.get(name, sense)))
-    return tuple(found)
+        aims.append(Aim(name, config.pareto.senses.get(name, sense)))
+    return tuple(aims)
 
 
 def simulated(config: Config, scene: Scene) -> bool:
@@ -233,8 +233,8 @@ class Study:
         """Return an evaluation of a `point` (d,) for a screening.
 
         Return `None` if the design has no usable steady state."""
-        found = self._simulated("screening", self.fast.without_gradient(), point)
-        return found if found.usable else None
+        evaluation = self._simulated("screening", self.fast.without_gradient(), point)
+        return evaluation if evaluation.usable else None
 
     def sample(self, point: NDArray[np.float64], orbit: Seeds = None) -> Sample | None:
         """Return the terms at a `point` (d,) during a search.

@@ -103,7 +103,7 @@ class Tracer:
         checkpoint: Checkpoint | None = None,
     ):
         if not config.design_keys:
-            valid = ", ".join(family for family, found in FAMILY_KEYS.items() if found)
+            valid = ", ".join(family for family, parameters in FAMILY_KEYS.items() if parameters)
             raise InputError(
                 f"`profile.family` must be one of {valid} for a trade-off, but is "
                 f"{config.profile.family}: it has no design parameter; use `simulate` for it, "
@@ -161,13 +161,13 @@ class Tracer:
         return [point for point in self._sample if problem.feasible(point)]
 
     def _screen(self, points: Sequence[NDArray[np.float64]]) -> None:
-        found = self._side_by_side(self._screened, points)
+        evaluations = self._side_by_side(self._screened, points)
         signs = np.array([aim.sign for aim in self.study.aims])
         names = [aim.name for aim in self.study.aims]
         # Designs beyond a limit of a force serve as starts only if there are no others.
         inside: list[Seen] = []
         beyond: list[Seen] = []
-        for point, evaluation in zip(points, found, strict=True):
+        for point, evaluation in zip(points, evaluations, strict=True):
             if evaluation is not None:
                 values = signs * [evaluation.response[name] for name in names]
                 seen = Seen(point, values, evaluation.start)
@@ -198,11 +198,11 @@ class Tracer:
         self._expected = count * starts + 3 * (len(keys(count, self._divisions)) - count)
         scalars = [Scalar(self.scale, np.zeros(count), (number,)) for number in range(count)]
         begins = [starts_apart(self._course, scalar, starts, first) for scalar in scalars]
-        found = self._solved_from(
+        nodes = self._solved_from(
             [(number, one) for number in range(count) for one in begins[number]], scalars
         )
         for number, key in enumerate(corners(count, self._divisions)):
-            best = self._again(scalars[number], found[number], self._course)
+            best = self._again(scalars[number], nodes[number], self._course)
             if best is None:
                 return False
             with self._lock:
@@ -315,10 +315,10 @@ class Tracer:
             for one in course.seen
             if np.linalg.norm(one.point - best.point) > APART and scalar.value(one.values) < limit
         ]
-        found = min(others, key=lambda one: scalar.value(one.values), default=None)
-        if found is None:
+        seen = min(others, key=lambda one: scalar.value(one.values), default=None)
+        if seen is None:
             return best
-        return self._solved(scalar, found.point, found.orbit, best, course)
+        return self._solved(scalar, seen.point, seen.orbit, best, course)
 
     def _solved(
         self,
@@ -353,14 +353,14 @@ class Tracer:
         if self.study.sharp is None:
             limit = max(limit, _CHEAP_EVALUATIONS)
         stops = Stops(evaluations=limit, asked=self.stop.is_set)
-        found = descend(look, start, stops, self.study.problem.limits_at)
+        outcome = descend(look, start, stops, self.study.problem.limits_at)
         self._count(searches=1)
-        if found.local is None or found.certificate is None:
+        if outcome.local is None or outcome.certificate is None:
             return best
-        if found.local.violation > FEASIBLE:
+        if outcome.local.violation > FEASIBLE:
             return best
-        sample = samples[found.point.tobytes()]
-        node = Node(scalar, sample, found.certificate, found.reason)
+        sample = samples[outcome.point.tobytes()]
+        node = Node(scalar, sample, outcome.certificate, outcome.reason)
         return better(best, node)
 
     def _count(self, evaluations: int = 0, searches: int = 0) -> None:

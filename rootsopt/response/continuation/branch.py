@@ -313,7 +313,7 @@ class Branch:
         Each orbit is closed again at exactly this value, and left out if that fails. The branch's
         last point is returned unchanged. The list is empty if the branch does not pass the value.
         """
-        found = []
+        points = []
         for old, new in itertools.pairwise(self.spots):
             low, high = sorted((old.data.value, new.data.value))
             if not low <= value < high:
@@ -322,8 +322,8 @@ class Branch:
             guess = old.place + share * (new.place - old.place)
             fixed = np.eye(len(guess))[-1]
             with contextlib.suppress(StoppedError):
-                found.append(self.family(guess, fixed, old if share < 0.5 else new).data)
-        return found + [point for point in self.points[-1:] if point.value == value]
+                points.append(self.family(guess, fixed, old if share < 0.5 else new).data)
+        return points + [point for point in self.points[-1:] if point.value == value]
 
 
 def follow(config: Config, key: str, state: ArrayLike, period: int, limits: StepSizes) -> Branch:
@@ -398,10 +398,10 @@ def follow_doubled(branch: Branch, bifurcation: Bifurcation, points: int = 400) 
             continue
         if start.data.half_way <= 0.2 * size:
             continue
-        found = _branch(family, start.along(way * across))
-        if found.ends[1] is not End.HALVED or len(found.spots) >= _FEW:
-            return found
-        fallen = found
+        doubled = _branch(family, start.along(way * across))
+        if doubled.ends[1] is not End.HALVED or len(doubled.spots) >= _FEW:
+            return doubled
+        fallen = doubled
     return fallen
 
 

@@ -132,9 +132,9 @@ class DaskRunner:
         with self._lock:
             now = time.monotonic()
             if now - self._asked > _POLL:
-                found = sum(self._client.nthreads().values())
-                self._asked, self._count = now, max(1, found)
-                self._seen = now if found else self._seen
+                threads = sum(self._client.nthreads().values())
+                self._asked, self._count = now, max(1, threads)
+                self._seen = now if threads else self._seen
             return self._count
 
     def _check(self) -> None:
@@ -153,13 +153,13 @@ class DaskRunner:
 
         Raises `InputError` if the workers cannot be used; `ClosedError` after `close`."""
         task = point._replace(design=np.asarray(point.design, float))
-        found = self._run(self._closed, HERE.evaluated, task)
-        if found is None:
+        evaluation = self._run(self._closed, HERE.evaluated, task)
+        if evaluation is None:
             raise InputError(
                 "a design ended its process several times; it may need more memory: use fewer "
                 "workers, and run the same command with `--resume` if it has that option"
             )
-        return found
+        return evaluation
 
     def share(self, count: int) -> int:
         """Return the number of points in a chunk, for a sweep of `count` points."""
@@ -171,9 +171,9 @@ class DaskRunner:
         """Return (number, record) of `points`, as `points.at_once`.
 
         Raises `InputError` if the workers cannot be used; `ClosedError` once `stop` is set."""
-        found = self._run(stop, at_once, config, points)
-        if found is not None:
-            return found
+        rows = self._run(stop, at_once, config, points)
+        if rows is not None:
+            return rows
         if len(points) > 1:
             return [row for one in points for row in self.simulated(config, [one], stop)]
         why = "the process that simulated it ended, several times; it may need more memory"
@@ -267,9 +267,9 @@ def running(
         except (OSError, ValueError, TypeError, TimeoutError) as error:
             why = error or "it does not answer"
             raise InputError(f"{option} cannot be used: {why}; {advice}") from None
-        found = DaskRunner(distributed, client, settings)
-        stack.callback(found.close)
-        yield found
+        runner = DaskRunner(distributed, client, settings)
+        stack.callback(runner.close)
+        yield runner
 
 
 @contextlib.contextmanager

@@ -48,9 +48,9 @@ class Interval:
         """Return the values of the range, ascending or descending from `low` to `high`."""
         assert self.points is not None
         space = np.geomspace if self.log else np.linspace
-        found = space(self.low, self.high, self.points).tolist()
+        values = space(self.low, self.high, self.points).tolist()
         # Values between whole ends may not be whole; the config rejects these.
-        return [int(x) if self.whole and x.is_integer() else x for x in found]
+        return [int(x) if self.whole and x.is_integer() else x for x in values]
 
     def at(self, levels: NDArray[np.float64]) -> list[Any]:
         """Return the quantiles (n,) of the interval at `levels` (n,) from 0 to 1."""
@@ -113,21 +113,21 @@ def _values(key: str, given: Any) -> tuple[Any, ...]:
         raise _too_many(key)
     values: Any = given.range() if isinstance(given, Interval) else given
     values = values.tolist() if hasattr(values, "tolist") else values
-    found = _taken(key, values) if isinstance(values, Sequence | Iterator) else ()
-    if not found:
+    axis_values = _taken(key, values) if isinstance(values, Sequence | Iterator) else ()
+    if not axis_values:
         raise InputError(
             f"`{key}` must have at least one value, as a list or as text such as "
             f"'300:6000:39', but is {shown(given)}"
         )
-    return tuple(x.item() if hasattr(x, "item") else x for x in found)
+    return tuple(x.item() if hasattr(x, "item") else x for x in axis_values)
 
 
 def _taken(key: str, values: Iterable[Any]) -> tuple[Any, ...]:
     """Return the `values`, but take no more of them than an axis may have."""
-    found = tuple(itertools.islice(values, MOST + 1))
-    if len(found) > MOST:
+    first_values = tuple(itertools.islice(values, MOST + 1))
+    if len(first_values) > MOST:
         raise _too_many(key)
-    return found
+    return first_values
 
 
 def _too_many(key: str) -> InputError:
@@ -156,8 +156,8 @@ def _items(key: str, text: str) -> list[Any]:
     name = f"--over {shown(f'{key}={text}')}"
     if not text.strip():
         raise InputError(f"{name}: must name at least one value")
-    found = read_document(f"[{text}]", name)
-    return [_interval(key, item) if isinstance(item, str) else item for item in found]
+    items = read_document(f"[{text}]", name)
+    return [_interval(key, item) if isinstance(item, str) else item for item in items]
 
 
 def _interval(key: str, item: str) -> Any:
@@ -270,11 +270,11 @@ def plan_of(
     Raises `InputError` for axes that cannot be combined in this way."""
     if not axes:
         raise InputError("a sweep needs at least one key; give one with `--over KEY=VALUES`")
-    found = {
+    parsed_axes = {
         key: given if isinstance(given, Axis) else axis_of(key, given)
         for key, given in axes.items()
     }
-    _refuse_overlaps([*found])
+    _refuse_overlaps([*parsed_axes])
     if sample is not None and sobol is not None:
         raise InputError("`--sample` and `--sobol` exclude each other; remove one of them")
     count = sample if sample is not None else sobol
@@ -282,15 +282,15 @@ def plan_of(
         if zipped:
             raise InputError("`--zip` does not go with samples, which zip all keys; remove it")
         method = "random" if sample is not None else "sobol"
-        return Plan((_sampled(found, count, method, seed),), method, seed)
-    for key, axis in found.items():
+        return Plan((_sampled(parsed_axes, count, method, seed),), method, seed)
+    for key, axis in parsed_axes.items():
         if isinstance(axis.values, Interval):
             low, high = axis.values.low, axis.values.high
             raise InputError(
                 f"`{key}`: an interval needs a number of values, as in {low:g}:{high:g}:11, or "
                 "`--sample N` or `--sobol N`"
             )
-    plan = Plan(_dimensions(found, zipped))
+    plan = Plan(_dimensions(parsed_axes, zipped))
     if plan.count > MOST:
         raise InputError(
             f"a sweep must have at most {MOST} points, but the axes have {plan.count} "
@@ -333,13 +333,13 @@ def check_values(config: Config, plan: Plan) -> None:
 
 def _telling(values: Sequence[Any]) -> list[Any]:
     """Return the values to check in place of all: the extremes of the numbers, and all texts."""
-    found: list[Any] = []
+    selection: list[Any] = []
     for kind in (int, float):
         numbers = [value for value in values if type(value) is kind]
         odd = [value for value in numbers if value != value]
-        found += [min(numbers), max(numbers), *odd[:1]] if numbers else []
-        found += [value for value in numbers if not float(value).is_integer()][:1]
-    return found + [value for value in values if type(value) not in (int, float)]
+        selection += [min(numbers), max(numbers), *odd[:1]] if numbers else []
+        selection += [value for value in numbers if not float(value).is_integer()][:1]
+    return selection + [value for value in values if type(value) not in (int, float)]
 
 
 def _meant(key: str, message: str) -> str:
@@ -388,7 +388,7 @@ def _dimensions(
         if sum(key in group for group in groups) > 1:
             raise InputError(f"`{key}` is in two groups of zipped keys; name it once")
     names = ["point"] if len(groups) == 1 else [f"point_{k + 1}" for k in range(len(groups))]
-    found, used = [], set()
+    dimensions, used = [], set()
     for key in axes:
         if key in used:
             continue
@@ -401,8 +401,8 @@ def _dimensions(
             counts = ", ".join(f"`{one}` has {size}" for one, size in sizes.items())
             raise InputError(f"zipped keys must have equally many values, but {counts}")
         _refuse_repetitions(columns)
-        found.append(Dimension(key if number is None else names[number], columns))
-    return tuple(found)
+        dimensions.append(Dimension(key if number is None else names[number], columns))
+    return tuple(dimensions)
 
 
 def _refuse_repetitions(columns: Mapping[str, Sequence[Any]]) -> None:

@@ -127,8 +127,8 @@ def simulated_together(config: Config, points: Sequence[Mapping[str, Any]]) -> l
         if evaluator.single:
             batch[number] = evaluator
     try:
-        found = evaluate_together([*batch.values()])
-        rows |= {n: row_of(one) for n, one in zip(batch, found, strict=True)}
+        evaluations = evaluate_together([*batch.values()])
+        rows |= {n: row_of(one) for n, one in zip(batch, evaluations, strict=True)}
     except Exception:
         batch.clear()  # Memory may not suffice, for example. Simulate the points one by one.
     return [

@@ -67,24 +67,24 @@ def dataset_of(
     where a point without one has the status `not_simulated`; `attributes`: further attributes of
     the dataset."""
     missing = lost(Status.NOT_SIMULATED)
-    found = [rows.get(number, missing) for number in range(plan.count)]
+    records = [rows.get(number, missing) for number in range(plan.count)]
     grid = _Grid(plan)
     columns: dict[str, Any] = {}
-    names: list[str] = [*RESPONSES, *(name for row in found for name in row["response"])]
-    keys = _design_keys(config, found)
+    names: list[str] = [*RESPONSES, *(name for row in records for name in row["response"])]
+    keys = _design_keys(config, records)
     for name in dict.fromkeys(names):
         long = _LONG.get(name, name.replace("_", " "))
-        values = [row["response"].get(name) for row in found]
+        values = [row["response"].get(name) for row in records]
         columns[name] = grid.numbers(values, unit(name), long)
         if keys:
-            slopes = [[row["gradient"].get(name, {}).get(key) for key in keys] for row in found]
+            slopes = [[row["gradient"].get(name, {}).get(key) for key in keys] for row in records]
             columns[f"gradient_{name}"] = grid.numbers(
                 slopes,
                 f"{unit(name)} per unit of the key",
                 f"derivative of the {long} per unit of a design parameter",
                 "design_key",
             )
-    columns |= _statuses(grid, found) | _motions(grid, found) | _geometries(grid, found)
+    columns |= _statuses(grid, records) | _motions(grid, records) | _geometries(grid, records)
     coordinates = _coordinates(plan)
     if keys:
         coordinates["design_key"] = ("design_key", keys, {"long_name": "design parameter"})
@@ -123,8 +123,8 @@ class _Grid:
         return self.dims, np.array(values, dtype=object).reshape(self.shape), {"long_name": long}
 
 
-def _statuses(grid: _Grid, found: Sequence[Row]) -> dict[str, Any]:
-    labels = [row["status"] for row in found]
+def _statuses(grid: _Grid, rows: Sequence[Row]) -> dict[str, Any]:
+    labels = [row["status"] for row in rows]
     codes = np.array([Status[label.upper()].code for label in labels], np.int8)
     flags = {
         "long_name": "code of the status",
@@ -134,16 +134,16 @@ def _statuses(grid: _Grid, found: Sequence[Row]) -> dict[str, Any]:
     return {
         "status": grid.words(labels, "status"),
         "status_code": (grid.dims, codes.reshape(grid.shape), flags),
-        "message": grid.words([row["message"] for row in found], "meaning of the status, advice"),
+        "message": grid.words([row["message"] for row in rows], "meaning of the status, advice"),
     }
 
 
-def _motions(grid: _Grid, found: Sequence[Row]) -> dict[str, Any]:
-    steady = [row["steady_state"] for row in found]
+def _motions(grid: _Grid, rows: Sequence[Row]) -> dict[str, Any]:
+    steady = [row["steady_state"] for row in rows]
     columns: dict[str, Any] = {}
     for name, (units, long) in _SCALARS.items():
         columns[name] = grid.numbers([one.get(name) for one in steady], units, long)
-    usable = [Status[row["status"].upper()].usable for row in found]
+    usable = [Status[row["status"].upper()].usable for row in rows]
     periods = [one.get("period", 0) if ok else 0 for one, ok in zip(steady, usable, strict=True)]
     dims, _, attributes = columns["period"]
     columns["period"] = dims, np.array(periods, int).reshape(grid.shape), attributes
@@ -158,22 +158,22 @@ def _motions(grid: _Grid, found: Sequence[Row]) -> dict[str, Any]:
     return columns
 
 
-def _geometries(grid: _Grid, found: Sequence[Row]) -> dict[str, Any]:
-    names: dict[str, None] = dict.fromkeys(name for row in found for name in row["geometry"])
+def _geometries(grid: _Grid, rows: Sequence[Row]) -> dict[str, Any]:
+    names: dict[str, None] = dict.fromkeys(name for row in rows for name in row["geometry"])
     return {
         name: grid.numbers(
-            [row["geometry"].get(name) for row in found], unit(name), _LONG.get(name, name)
+            [row["geometry"].get(name) for row in rows], unit(name), _LONG.get(name, name)
         )
         for name in names
-        if not any(name in row["response"] for row in found)
+        if not any(name in row["response"] for row in rows)
     }
 
 
-def _design_keys(config: Config, found: Sequence[Row]) -> list[str]:
+def _design_keys(config: Config, rows: Sequence[Row]) -> list[str]:
     """Return the design parameters for which there are derivatives at some point.
 
     If no point has a gradient, these are the parameters of the config."""
-    slopes = (slope for row in found for slope in row["gradient"].values())
+    slopes = (slope for row in rows for slope in row["gradient"].values())
     return [*dict.fromkeys(key for slope in slopes for key in slope)] or [*config.design_keys]
 
 
@@ -181,19 +181,19 @@ def _coordinates(plan: Plan) -> dict[str, Any]:
     """Return the values of all keys along their dimensions.
 
     Values that are not all numbers become texts, as YAML writes them."""
-    found: dict[str, Any] = {}
+    coordinates: dict[str, Any] = {}
     for one in plan.dimensions:
         if one.name not in one.columns:
             numbers = {"long_name": f"number of the {one.name.partition('_')[0]}"}
-            found[one.name] = one.name, np.arange(one.size), numbers
+            coordinates[one.name] = one.name, np.arange(one.size), numbers
         for key, values in one.columns.items():
             field = tree(Config).get(key)
             long = field.description if field is not None and field.description else key
             attributes = {"units": unit(key), "long_name": long}
             if not is_numeric(values):
                 values, attributes = [*map(written, values)], {"long_name": long}
-            found[key] = one.name, np.array([*values]), attributes
-    return found
+            coordinates[key] = one.name, np.array([*values]), attributes
+    return coordinates
 
 
 def is_numeric(values: Sequence[Any]) -> bool:

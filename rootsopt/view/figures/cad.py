@@ -126,10 +126,10 @@ def add_table(space: Any, drawing: Drawing) -> None:
     """Add a table of points from the tip to the root, at the right of the rotor.
 
     The other flank is the mirror image. `space`: modelspace of ezdxf."""
-    found = coordinates(drawing.pieces, drawing.lobes, 2 * _ROWS - 1)
-    half = np.linspace(0.0, found.along[-1], _ROWS)
-    kept = [int(np.argmin(np.abs(found.along - place))) for place in half]
-    columns = [found.columns()[name][kept] for name in ("x_mm", "y_mm", "radius_mm", "normal_deg")]
+    points = coordinates(drawing.pieces, drawing.lobes, 2 * _ROWS - 1)
+    half = np.linspace(0.0, points.along[-1], _ROWS)
+    kept = [int(np.argmin(np.abs(points.along - place))) for place in half]
+    columns = [points.columns()[name][kept] for name in ("x_mm", "y_mm", "radius_mm", "normal_deg")]
     rows = [["no.", "x", "y", "radius", "normal, deg"]]
     for k, numbers in enumerate(zip(*columns, strict=True)):
         rows.append([str(k), *(f"{round(x, 4) + 0.0:.4f}" for x in numbers)])

@@ -55,7 +55,7 @@ def kinds(result: Mapping[str, Any]) -> dict[str, list[Mapping[str, Any]]]:
     sides = {gap[end] for gap in result.get("gaps") or () for end in ("first", "second")}
     sure = Standing.CERTIFIED.label
     dropped = result.get("dropped") or ()
-    found = {
+    groups = {
         "side of a gap": [one for one in points if one["point"] in sides],
         "certified": [one for one in points if one["status"] == sure],
         "not certified": [one for one in points if one["status"] != sure],
@@ -63,7 +63,7 @@ def kinds(result: Mapping[str, Any]) -> dict[str, list[Mapping[str, Any]]]:
         "dominated": [one for one in dropped if one["status"] == Standing.DOMINATED.label],
         "baseline": [base] if base.get("terms") else [],
     }
-    return {kind: group for kind, group in found.items() if group}
+    return {kind: group for kind, group in groups.items() if group}
 
 
 def plot_front(ax: Axes, front: "Front", x: str, y: str) -> Axes:

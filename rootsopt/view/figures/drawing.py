@@ -81,11 +81,11 @@ def widest(pieces: Sequence[DrawnPiece], lobes: int) -> complex:
 
     Its width is twice the point's y coordinate. If the lobe widens all the way down to the root,
     return the point on the pitch circle, at the angle π / (2 `lobes`)."""
-    found = []
+    maxima = []
     for piece in pieces:
         for share in _falls(lambda x, piece=piece: np.imag(piece.heading(x))):
-            found.append(complex(piece.at(share)))
-    inside = [point for point in found if 0 < np.angle(point) < np.pi / lobes - _SAME]
+            maxima.append(complex(piece.at(share)))
+    inside = [point for point in maxima if 0 < np.angle(point) < np.pi / lobes - _SAME]
     if inside:
         return max(inside, key=lambda point: point.real)
     number, share = _at_angle(pieces, np.pi / (2 * lobes))

@@ -202,11 +202,11 @@ def plot_orders(ax: Axes, turned: NDArray, measured: NDArray, fitted: NDArray) -
     return ax
 
 
-def plot_region(ax: Axes, found: "Identification", first: int, second: int) -> Axes:
+def plot_region(ax: Axes, fit: "Identification", first: int, second: int) -> Axes:
     """Draw the 95 % confidence region of two quantities. Return `ax`."""
-    keys, one = [*found.parameters], found.covariance[np.ix_([first, second], [first, second])]
+    keys, one = [*fit.parameters], fit.covariance[np.ix_([first, second], [first, second])]
     sizes, axes = np.linalg.eigh(one)
-    middle = [found.parameters[keys[k]]["value"] for k in (first, second)]
+    middle = [fit.parameters[keys[k]]["value"] for k in (first, second)]
     wide, tall = 2 * _INSIDE * np.sqrt(np.maximum(sizes, 0.0))
     turned = np.degrees(np.arctan2(axes[1, 0], axes[0, 0]))
     ax.add_patch(
@@ -220,12 +220,12 @@ def plot_region(ax: Axes, found: "Identification", first: int, second: int) -> A
     return ax
 
 
-def drawn(found: "Identification") -> Figure:
+def drawn(fit: "Identification") -> Figure:
     """Return the figure of a fit: columns of the record, orders of the first, and a region."""
-    table = {key: np.asarray(column) for key, column in found.residuals.items()}
+    table = {key: np.asarray(column) for key, column in fit.residuals.items()}
     turned = table["rotation_deg"].astype(float)
     names = [*dict.fromkeys(table["column"].tolist())][:_MOST]
-    count = len(names) + 1 + (len(found.parameters) > 1)
+    count = len(names) + 1 + (len(fit.parameters) > 1)
     made, axes = figure(4.2 * count, 4.2, 1, count)
     for ax, name in zip(axes[0], names, strict=False):
         mine = table["column"] == name
@@ -242,12 +242,12 @@ def drawn(found: "Identification") -> Figure:
             else:
                 beside.plot(table["line"], table["residual"], "o", color=GREY)
                 beside.set(xlabel="line of the record", title="difference / its error")
-    if len(found.parameters) > 1:
-        away = np.abs(np.triu(found.correlation, 1))
-        plot_region(axes[0, -1], found, *divmod(int(np.argmax(away)), len(away)))
+    if len(fit.parameters) > 1:
+        away = np.abs(np.triu(fit.correlation, 1))
+        plot_region(axes[0, -1], fit, *divmod(int(np.argmax(away)), len(away)))
     return made
 
 
-def identified_figure(folder: "ResultFolder", found: "Identification") -> None:
+def identified_figure(folder: "ResultFolder", fit: "Identification") -> None:
     """Write `figures/identified.png` into `folder`."""
-    write(folder, "identified", drawn(found), "Record and fit")
+    write(folder, "identified", drawn(fit), "Record and fit")

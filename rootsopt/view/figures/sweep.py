@@ -62,10 +62,10 @@ def plot_line(
         ax.plot(at[lost], low, MARKERS[status], transform=ax.get_xaxis_transform(), **style)
 
 
-def status_entries(found: Iterable[str], face: str = "black") -> list[Line2D]:
-    """Return legend entries for the markers of the statuses `found`; `face`: colour of faces."""
+def status_entries(statuses: Iterable[str], face: str = "black") -> list[Line2D]:
+    """Return legend entries for the markers of the `statuses`; `face`: colour of faces."""
     entries = []
-    for status in dict.fromkeys(found):
+    for status in dict.fromkeys(statuses):
         words = in_words(status)
         if status in ("chaotic", "not_settled"):
             words += ", average of a window"
@@ -93,14 +93,14 @@ def plot_speeds(ax: Axes, designs: Mapping[str, Sequence[Part]], force: str) -> 
 
 def legend_entries(designs: Mapping[str, Sequence[Part]]) -> list[Line2D]:
     """Return legend entries for the lines of the designs and for the markers of the statuses."""
-    found = [
+    statuses = [
         part.evaluation.status.label
         for parts in designs.values()
         for part in parts
         if len(parts) <= _DENSE or not part.evaluation.usable
     ]
     lines = [Line2D([], [], linewidth=1.5, **look) for look in looks(designs)]
-    return lines + (status_entries(found) if {*found} != {"periodic"} else [])
+    return lines + (status_entries(statuses) if {*statuses} != {"periodic"} else [])
 
 
 def speed_figure(folder: ResultFolder, designs: Mapping[str, Sequence[Part]], title: str) -> None:

@@ -43,8 +43,8 @@ def write(
     files: dict[str, bytes] = {}
     if "dxf" in formats:
         files["rotor.dxf"] = dxf_bytes(drawing)
-        found = coordinates(drawing.pieces, drawing.lobes, _COUNT)
-        folder.write_csv(POINTS, found.columns())
+        points = coordinates(drawing.pieces, drawing.lobes, _COUNT)
+        folder.write_csv(POINTS, points.columns())
     if "svg" in formats:
         files["rotor.svg"] = svg_text(drawing).encode()
     if set(formats) & set(SOLID):

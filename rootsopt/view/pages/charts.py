@@ -148,10 +148,10 @@ def _thinned(force: NDArray[np.float64], most: int = _MOST_SAMPLES) -> NDArray[n
     if count <= most:
         return np.arange(count)
     edges = np.linspace(0, count, most // 2 + 1).astype(int)
-    found = {0, count - 1}
+    indices = {0, count - 1}
     for a, b in itertools.pairwise(edges):
-        found |= {a + int(np.argmax(force[a:b])), a + int(np.argmin(force[a:b]))}
-    return np.array(sorted(found))
+        indices |= {a + int(np.argmax(force[a:b])), a + int(np.argmin(force[a:b]))}
+    return np.array(sorted(indices))
 
 
 def animations(cases: Sequence[Case]) -> dict[str, Any]:
@@ -168,8 +168,8 @@ def animations(cases: Sequence[Case]) -> dict[str, Any]:
         if key not in rotors:
             rotors[key] = rotor(case.config, np.asarray(outline(profile, points=240)) / MM)
         period = case.record.get("steady_state", {}).get("period")
-        found = {"name": case.name, "rotor": [*rotors].index(key)}
-        shown.append(found | motion(profile, case.series, period))
+        entry = {"name": case.name, "rotor": [*rotors].index(key)}
+        shown.append(entry | motion(profile, case.series, period))
     return {"rotors": [*rotors.values()], "cases": shown}
 
 
@@ -192,14 +192,14 @@ def motion(profile: Profile, series: Series | None = None, period: int | None = 
 
     `series`: the motion, None in perfect rolling; `period` (mesh periods), if it is known."""
     frames = frames_of(profile, series, period or profile.lobes)
-    found: dict[str, Any] = {
+    data: dict[str, Any] = {
         "rotation": _rounded(np.degrees(frames.rotation), 9),
         "contacts": [*map(_contacts, frames.flanks)],
         "forces": None,
     }
     if series is None or frames.forces is None:
-        return found
-    return found | {
+        return data
+    return data | {
         "relative": _rounded(1e3 * frames.relative, 6),
         "time": _rounded(1e3 * (frames.time - series.time[0]), 9),
         "forces": [_rounded(force, 4) for force in frames.forces],
@@ -209,10 +209,10 @@ def motion(profile: Profile, series: Series | None = None, period: int | None = 
 def _contacts(flank: Contacts) -> dict[str, list]:
     """Return contact points (mm), normals, and flags of contact in perfect rolling, of a flank."""
     parts = (*flank.point.T, *flank.normal.T)
-    found = {
+    columns = {
         name: _rounded(part, 5) for name, part in zip(("x", "y", "nx", "ny"), parts, strict=True)
     }
-    return found | {"present": flank.present.tolist()}
+    return columns | {"present": flank.present.tolist()}
 
 
 def _rounded(values: ArrayLike, places: int) -> list[float]:

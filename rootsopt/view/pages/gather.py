@@ -133,12 +133,12 @@ def _rows(file: Path) -> Iterator[dict[str, Any]]:
 def _read(text: str) -> Any:
     """Return the value of a cell: a number, None if it is empty or not finite, or its text."""
     try:
-        found = float(text)
+        number = float(text)
     except ValueError:
         return text or None
     if text.isdecimal():
         return int(text)
-    return found if math.isfinite(found) else None
+    return number if math.isfinite(number) else None
 
 
 def _series(place: Path, name: str) -> Series | None:
@@ -210,12 +210,12 @@ def _over(rows: Sequence[Mapping[str, Any]]) -> str:
     parts = []
     for key in varied(rows):
         name = name_and_unit(key)[0]
-        found: list[Any] = [*dict.fromkeys(row.get(key) for row in rows)]
-        shown = f"{len(found)} values"
-        if len(found) <= _FEW:
-            shown = listed([stated(key, x) for x in found])
-        elif all(isinstance(x, int | float) for x in found):
-            shown += f" from {brief(min(found))} to {stated(key, max(found))}"
+        values: list[Any] = [*dict.fromkeys(row.get(key) for row in rows)]
+        shown = f"{len(values)} values"
+        if len(values) <= _FEW:
+            shown = listed([stated(key, x) for x in values])
+        elif all(isinstance(x, int | float) for x in values):
+            shown += f" from {brief(min(values))} to {stated(key, max(values))}"
         parts.append(f"{name}: {shown}")
     return f"Between the scenes, these differ: {'; '.join(parts)}."
 
@@ -292,8 +292,8 @@ _MARGIN = " (margin)"
 def glossary() -> dict[str, str]:
     """Return the meaning of each word, in the order of the page."""
     page = next(path for path in _PLACES if path.exists()).read_text("utf-8")
-    found = re.findall(r"^(\S.*)\n((?:  .+\n)+)", page.partition("{glossary}\n")[2], re.M)
-    return {word: " ".join(meaning.split()) for word, meaning in found}
+    entries = re.findall(r"^(\S.*)\n((?:  .+\n)+)", page.partition("{glossary}\n")[2], re.M)
+    return {word: " ".join(meaning.split()) for word, meaning in entries}
 
 
 def anchor(word: str) -> str:
@@ -323,12 +323,12 @@ def linked(html: str) -> Markup:
     words = {word.lower(): word for word in glossary()}
     told = set()
 
-    def link(found: re.Match[str]) -> str:
-        key = f"{found[1]}{_MARGIN}".lower() if found[1] else (found[2] or "").lower()
+    def link(match: re.Match[str]) -> str:
+        key = f"{match[1]}{_MARGIN}".lower() if match[1] else (match[2] or "").lower()
         if key in told or key not in words:
-            return found[0]
+            return match[0]
         told.add(key)
         where, meaning = anchor(key), escape(glossary()[words[key]])
-        return f'<a class="term" href="#{where}" title="{meaning}">{found[0]}</a>'
+        return f'<a class="term" href="#{where}" title="{meaning}">{match[0]}</a>'
 
     return Markup(_pattern().sub(link, str(html)))

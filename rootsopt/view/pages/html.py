@@ -82,7 +82,7 @@ def _environment() -> jinja2.Environment:
 def _coded(text: str) -> Markup:
     """Return a sentence with `commands` set as code, and numbers beside their units."""
     text = _UNIT.sub("\N{NO-BREAK SPACE}", text)
-    return Markup(_CODE.sub(lambda found: _command(Markup(found[1])), str(escape(text))))
+    return Markup(_CODE.sub(lambda match: _command(Markup(match[1])), str(escape(text))))
 
 
 def _command(text: str) -> Markup:
@@ -163,15 +163,15 @@ def report_text(run: Run) -> str:
 def _charts(run: Run) -> list[tuple[str, str, Any]]:
     """Return (title, explanation, chart) of each interactive chart of a run."""
     hover = "Hover over a point to see its design."
-    found = [(title, hover, made) for title, made in charts.front_charts(run.result).items()]
+    entries = [(title, hover, made) for title, made in charts.front_charts(run.result).items()]
     force = (
         "Contact force over time",
         "Hover for values, drag to zoom; a button at the right zooms out. A click moves the rotors "
         "below to that time.",
         charts.force_chart(run.cases),
     )
-    found.append(force)
-    return [one for one in found if one[2] is not None]
+    entries.append(force)
+    return [one for one in entries if one[2] is not None]
 
 
 # The models of Bokeh accept more than their annotations say.
@@ -280,9 +280,9 @@ def numbers_table(now: Mapping[str, Any], first: Mapping[str, Any]) -> str:
 
     `now`, `first`: records as in the result file, perhaps without some entries: their numbers are
     dashes."""
-    found = tables.numbers_table({"baseline": _shown(first), "optimized": _shown(now)})
+    table = tables.numbers_table({"baseline": _shown(first), "optimized": _shown(now)})
     heads = "", "at start", "now", "change"
-    return table_html(found and dataclasses.replace(found, title="Numbers", heads=heads))
+    return table_html(table and dataclasses.replace(table, title="Numbers", heads=heads))
 
 
 def _shown(record: Mapping[str, Any]) -> dict[str, Any]:
@@ -320,7 +320,7 @@ def motion_line(motion: NewMotion, rest: FromRest | None) -> str:
     """Return the status of a motion, with whether it is the one that starts at rest.
 
     `rest`: the motion from rest; `None`: not known yet."""
-    found = motion.evaluation
+    evaluation = motion.evaluation
     if not motion.final:
         words = "Near the motion of the last values, no steady motion was found."
         return status_line("searching", "wait", words, "Simulating from rest …")
@@ -332,11 +332,11 @@ def motion_line(motion: NewMotion, rest: FromRest | None) -> str:
         note = "Reached from the motion of the last values; from rest, the motion is the same."
     else:
         note = f"From rest, another motion is reached: {_summary(rest.evaluation)}."
-    kind = "good" if found.usable else "bad"
-    words = found.message
-    if not found.usable and found.response and found.status is not Status.IDLE:
+    kind = "good" if evaluation.usable else "bad"
+    words = evaluation.message
+    if not evaluation.usable and evaluation.response and evaluation.status is not Status.IDLE:
         words += " The numbers below are those of this motion, without a gradient."
-    return status_line(in_words(found.status.label), kind, words, note)
+    return status_line(in_words(evaluation.status.label), kind, words, note)
 
 
 def _summary(evaluation: Evaluation) -> str:
@@ -360,32 +360,32 @@ def progress_line(progress: Progress | None, cancelled: bool) -> str:
 
 def searched_line(ended: Searched) -> str:
     """Return the outcome of a search: improvement and certificate."""
-    found = ended.found
-    if found is None:
+    outcome = ended.outcome
+    if outcome is None:
         return status_line("not optimised", "bad", ended.words)
-    word = in_words(found.status.label)
-    if found.optimized is None:
-        reason = found.status.value if found.infeasible is None else found.infeasible.message
+    word = in_words(outcome.status.label)
+    if outcome.optimized is None:
+        reason = outcome.status.value if outcome.infeasible is None else outcome.infeasible.message
         return status_line(word, "bad", reason)
-    if found.status is Status.PERIODIC:
+    if outcome.status is Status.PERIODIC:
         word = "optimum"
-    return status_line(word, "good", _improved(found), _certified(found))
+    return status_line(word, "good", _improved(outcome), _certified(outcome))
 
 
-def _improved(found: "Optimization") -> str:
+def _improved(outcome: "Optimization") -> str:
     """Return the improvement of the optimum over the design at which the search began."""
-    gains = found.improvement.items()
+    gains = outcome.improvement.items()
     changes = (f"{name_and_unit(key)[0]} {percent(1, 1 - gain)}" for key, gain in gains)
     return f"Against the start of the search: {', '.join(changes)}."
 
 
-def _certified(found: "Optimization") -> str:
+def _certified(outcome: "Optimization") -> str:
     """Return the certificate of an optimum: first-order conditions and active limits."""
-    if found.optimality is None:
+    if outcome.optimality is None:
         return "Without a certificate."
-    held = [in_words(row["name"]) for row in found.constraints if row.get("active")]
+    held = [in_words(row["name"]) for row in outcome.constraints if row.get("active")]
     limits = f" Limits that hold it: {', '.join(held)}." if held else ""
-    return found.optimality.record()["message"] + limits
+    return outcome.optimality.record()["message"] + limits
 
 
 def knob_label(knob: Knob) -> str:

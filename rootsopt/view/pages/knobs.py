@@ -99,7 +99,7 @@ def knobs_of(config: Config) -> list[Knob]:
 
     Design parameters span their bounds in an optimisation. Parts that the scene does not have, and
     keys that are not set, have no knobs."""
-    found = _design(config)
+    knobs = _design(config)
     parameters, fields = set(config.profile.parameters), tree(Config)
     for section in _SECTIONS:
         for key, field in fields.items():
@@ -112,14 +112,14 @@ def knobs_of(config: Config) -> list[Knob]:
                 continue
             value = config.value(key)
             if isinstance(value, int | float) and not isinstance(value, bool):
-                found.append(_scene(field, key, value))
-    order = [*_ORDER, *dict.fromkeys(knob.group for knob in found)]
-    return sorted(found, key=lambda knob: order.index(knob.group))
+                knobs.append(_scene(field, key, value))
+    order = [*_ORDER, *dict.fromkeys(knob.group for knob in knobs)]
+    return sorted(knobs, key=lambda knob: order.index(knob.group))
 
 
 def _design(config: Config) -> list[Knob]:
     """Return the knobs of the design parameters."""
-    found = []
+    knobs = []
     values = zip(config.design_keys, config.design, bounds_of(config), strict=True)
     owners = [
         parameter
@@ -135,13 +135,13 @@ def _design(config: Config) -> list[Knob]:
         name = words(owner.key)
         if key != owner.key:
             name = f"{name.removesuffix('s')} {key.rpartition('_')[2]}"
-        found.append(
+        knobs.append(
             Knob(
                 f"profile.{key}", name, unit_of(owner.key), owner.help, _DESIGN, float(value),
                 low, high, _step(high - low), least, most, False,
             ).with_value(float(value))
         )  # fmt: skip
-    return found
+    return knobs
 
 
 def _count(value: object) -> int:
@@ -258,9 +258,9 @@ class Engine:
         evaluator = Evaluator.of(config).unconfirmed()
         evaluator.prepare()
         self.shape(config)
-        found = evaluator()
-        if found.usable:
-            self.near(config, found.start)
+        evaluation = evaluator()
+        if evaluation.usable:
+            self.near(config, evaluation.start)
         self.ready.set()
 
 

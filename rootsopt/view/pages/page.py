@@ -302,15 +302,15 @@ class Page:
             return
         self.motion = motion
         self.rest = self.rest if self.rest and self.rest.number == motion.number else None
-        found = motion.evaluation
+        evaluation = motion.evaluation
         first = motion.final and "response" not in self.start
         if first:
-            self.start |= found.record()
+            self.start |= evaluation.record()
         self._tell_pair(motion=motion.frames)
-        if found.series is None:
+        if evaluation.series is None:
             self.force.clear("no motion to show")
         else:
-            self.force.draw(cut(found.series), found.response, first)
+            self.force.draw(cut(evaluation.series), evaluation.response, first)
         self._show_numbers()
         self.from_rest.disabled = True
         self.status.text = html.motion_line(motion, self.rest)

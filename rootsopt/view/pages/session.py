@@ -141,11 +141,11 @@ class Progress(Message):
 
 @dataclasses.dataclass(frozen=True)
 class Searched(Message):
-    """A search has ended. `found`: its outcome; `None`: an error, which `words` explains.
+    """A search has ended. `outcome`: that of the search; `None`: an error, which `words` explains.
 
     `values`: design parameters of the optimum by key; empty if there is none."""
 
-    found: "Optimization | None"
+    outcome: "Optimization | None"
     values: Mapping[str, float]
     words: str = ""
 
@@ -248,13 +248,13 @@ class Session:
         self.engine.ready.wait()
         start = self._start
         near = start is not None
-        found = self.engine.near(config, start) if near else self.engine.from_rest(config)
-        if found.usable:
-            self._start = found.start
-        final = found.usable or not near
-        self._present(NewMotion(number, found, frames(shape.profile, found), near, final))
+        evaluation = self.engine.near(config, start) if near else self.engine.from_rest(config)
+        if evaluation.usable:
+            self._start = evaluation.start
+        final = evaluation.usable or not near
+        self._present(NewMotion(number, evaluation, frames(shape.profile, evaluation), near, final))
         if near:
-            delay = self.idle if found.usable else 0.0
+            delay = self.idle if evaluation.usable else 0.0
             self._submit(self._rests, number, lambda: self._from_rest(number, False), delay)
 
     def _present(self, motion: NewMotion) -> None:
@@ -273,26 +273,30 @@ class Session:
         config = self.config()
         shape = self.engine.shape(config)  # refuses a profile that is not sound
         if known is not None and known.number == number:
-            found = known.evaluation
+            evaluation = known.evaluation
         else:
-            found = self.engine.from_rest(config)
+            evaluation = self.engine.from_rest(config)
         if number != self.number:
-            return found
-        same = shown is not None and shown.number == number and same_motion(shown.evaluation, found)
-        self._rest = FromRest(number, same, found)
+            return evaluation
+        same = (
+            shown is not None
+            and shown.number == number
+            and same_motion(shown.evaluation, evaluation)
+        )
+        self._rest = FromRest(number, same, evaluation)
         useless = shown is None or shown.number != number or not shown.final
         if useless or (forced and not same):
-            if found.usable:
-                self._start = found.start
-            self._present(NewMotion(number, found, frames(shape.profile, found), False))
+            if evaluation.usable:
+                self._start = evaluation.start
+            self._present(NewMotion(number, evaluation, frames(shape.profile, evaluation), False))
         else:
             self.show(self._rest)
-        return found
+        return evaluation
 
     def _save(self, number: int) -> None:
-        found = self._from_rest(number, True)
-        if found is not None:
-            self.show(Saved(number, self.config().to_yaml(), found))
+        evaluation = self._from_rest(number, True)
+        if evaluation is not None:
+            self.show(Saved(number, self.config().to_yaml(), evaluation))
 
     def _submit(
         self, lane: Latest, number: int, work: Callable[[], object], delay: float = 0.0
@@ -311,21 +315,21 @@ class Session:
         def progress(done: int, expected: int, best: float) -> None:
             self.show(Progress(number, done, expected, best))
 
-        found, values, words = None, {}, ""
+        outcome, values, words = None, {}, ""
         try:
             self.engine.ready.wait()
             config = self.config()
             if config.objective.over == "nominal":  # The page shows nothing of other scenes.
                 config = config.replaced({"assumptions.scenes": 0})
-            found = self.engine.optimize(config, progress, stop=stop)
-            if found.optimized is not None:
-                values = {f"profile.{key}": x for key, x in found.optimized.design.items()}
+            outcome = self.engine.optimize(config, progress, stop=stop)
+            if outcome.optimized is not None:
+                values = {f"profile.{key}": x for key, x in outcome.optimized.design.items()}
         except InputError as error:
             words = str(error)
         except Exception as error:
             words = _unexpected(error)
         self.searching.clear()
-        self.show(Searched(number, found, values, words))
+        self.show(Searched(number, outcome, values, words))
 
     def _failed(self, error: Exception) -> None:
         self.show(Problem(self.number, _unexpected(error)))
