@@ -13,7 +13,7 @@ from unittest import mock
 
 ROOT = Path(__file__).parents[1]
 MOST = {
-    "statements of the package": 27_135,
+    "statements of the package": 27_149,
     "statements of the tests": 14_560,
     "statements of the experiments": 4_473,
     "packages": 13,
