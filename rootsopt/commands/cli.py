@@ -6,6 +6,7 @@ the status says why.
 
 import argparse
 import contextlib
+import functools
 import importlib
 import os
 import shlex
@@ -13,13 +14,12 @@ import shutil
 import sys
 import textwrap
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 from rootsopt.commands import door
-from rootsopt.commands.door import BAD_INPUT, NO_RESULT
-from rootsopt.commands.door import OK as OK
+from rootsopt.commands.door import BAD_INPUT, NO_RESULT, OK
 from rootsopt.commands.table import Command
 from rootsopt.config import sources
 from rootsopt.config.explain import GROUPS, describe, outline
@@ -46,36 +46,24 @@ os.environ.setdefault("EQX_ON_ERROR", "off")
 
 
 class Outcome(NamedTuple):
-    """The result of a command.
+    """The result of a command that writes a folder.
 
-    `code`: exit code; `lines`, `head`: text on the terminal below and above the tables; `rows`:
-    rows of a sweep that the result file does not hold; `most`: number of them above which their
-    table is truncated; `tables`: tables for the terminal, by default all of the result."""
+    `usable`: whether the exit code is 0, not 3; `result`: content of the result file, without the
+    versions of the libraries; `lines`, `head`: text on the terminal below and above the tables;
+    `rows`: rows of a sweep that the result file does not hold; `most`: number of them above which
+    their table is truncated; `tables`: tables for the terminal, by default all of the result;
+    `config`: the config of the folder, by default that of the command; `notes` on the input that
+    those on its config lack."""
 
-    code: int
+    usable: bool
+    result: Mapping[str, Any]
     lines: Sequence[str] = ()
     rows: Sequence[dict[str, Any]] = ()
     most: int = 200
     tables: "Sequence[Table | None] | None" = None
     head: Sequence[str] = ()
-
-
-Body = Callable[[Config, argparse.Namespace, "RunFolder"], Outcome]
-"""Function that does a command's work and returns its `Outcome`.
-
-It takes the config, the options and the result folder, and writes the files."""
-
-
-class _Format(argparse.RawDescriptionHelpFormatter):
-    """Formats the help of most options in one line each."""
-
-    def __init__(self, prog: str):
-        super().__init__(prog, max_help_position=30, width=min(100, _columns()))
-
-
-def _columns() -> int:
-    """Return the width of the terminal, 100 in a pipe."""
-    return shutil.get_terminal_size((100, 24)).columns
+    config: Config | None = None
+    notes: Sequence[str] = ()
 
 
 class _Help(argparse.Action):
@@ -92,8 +80,7 @@ class _Help(argparse.Action):
 
 def _all_keys() -> str:
     """Return the text below the options of `--help all`."""
-    keys = (f" {group}\n{describe(Config, group)}" for group in GROUPS)
-    listed = "\n".join(keys)
+    listed = "\n".join(f" {group}\n{describe(Config, group)}" for group in GROUPS)
     curves = "\n".join(f"  {name:<18} {one.help}" for name, one in families().items())
     return (
         f"profile families (profile.family):\n{curves}\n\n"
@@ -120,11 +107,15 @@ class _Parser(argparse.ArgumentParser):
 
 def parser(command: Command) -> argparse.ArgumentParser:
     """Return the parser of a `command`: the arguments that every command takes, then its own."""
+    columns = shutil.get_terminal_size((100, 24)).columns
     result = _Parser(
         prog=f"rootsopt {command.name}",
         usage=f"rootsopt {command.name} {command.takes} [options]",
         description=command.purpose,
-        formatter_class=_Format,
+        # The help of most options takes one line each.
+        formatter_class=functools.partial(
+            argparse.RawDescriptionHelpFormatter, max_help_position=30, width=min(100, columns)
+        ),
         add_help=False,
     )
     result.add_argument(
@@ -215,22 +206,21 @@ def run(command: Command, argv: Sequence[str] | None) -> int:
     `argv`: arguments (`None`: those of the process).
 
     Parse the arguments, load the config and select double precision. Then call the function `body`
-    of the module `rootsopt.commands.work.COMMAND` with a new result folder, move the folder to its
-    final path and print the result. If the command writes nothing, its `body` takes no folder and
-    returns the exit code. If it also reads no config, its `body` takes only the options.
-    `InputError` and `OSError` give exit code 2."""
+    of the module `rootsopt.commands.work.COMMAND` with a new result folder, write config and result
+    into it, move it to its final path and print the result. If the command writes nothing, its
+    `body` takes no folder and returns the exit code. If it also reads no config, its `body` takes
+    only the options. `InputError` and `OSError` give exit code 2."""
     environment.own_process()
     try:
         _import_extensions(command.name, argv)
         options = parser(command).parse_args(argv)
-        options.given = [*(sys.argv[1:] if argv is None else argv)]
+        options.given = shlex.join(sys.argv[1:] if argv is None else argv)
         for name in options.imports:  # Only the whole parser knows abbreviated options.
             import_named(name)
         if command.writes and options.output is None:
             options.output = os.path.join("results", f"{options.config.stem}-{command.name}")
-        config = None
-        if command.takes == "CONFIG":
-            config = load(options.config, options.overrides)
+        own = command.takes == "CONFIG"
+        config = load(options.config, options.overrides) if own else None
         for note in notes(config) if config else ():
             environment.say(note)
         use_float64()
@@ -242,7 +232,7 @@ def run(command: Command, argv: Sequence[str] | None) -> int:
                 config = _work(command.name, "config_of")(options)
             if not command.writes:
                 return _work(command.name)(config, options)
-            return _in_folder(command.name, config, options)
+            return _in_folder(command, config, options)
     except InputError as error:
         message = " ".join(str(error).split())
         print(f"rootsopt {command.name}: {message}", file=sys.stderr)
@@ -261,18 +251,28 @@ def _work(command: str, name: str = "body") -> Callable[..., Any]:
     return getattr(importlib.import_module(f"rootsopt.commands.work.{command}"), name)
 
 
-def _in_folder(command: str, config: Config, options: argparse.Namespace) -> int:
-    from rootsopt.view.runs import RunFolder
+def _in_folder(command: Command, config: Config, options: argparse.Namespace) -> int:
+    """Run a command that writes a folder, with what all of these write; return its exit code."""
+    from rootsopt.view.files import write_config
+    from rootsopt.view.runs import RESULT, RunFolder
 
     if options.report:
         pages.require("`--report`")
-    body: Body = _work(command)
     with (
-        RunFolder(options.output, command, options.overwrite) as folder,
+        RunFolder(options.output, command.name, options.overwrite) as folder,
         door.leaving(folder.abandon),
     ):
-        folder.add_notes(notes(config))
-        outcome = body(config, options, folder)
+        body = _work(command.name)
+        if not options.no_figures:
+            # With matplotlib it takes 0.5 s. Meanwhile, programs are loaded or compiled, which does
+            # not hold Python's lock.
+            figures = f"rootsopt.view.figures.{command.figures}"
+            threading.Thread(target=importlib.import_module, args=(figures,)).start()
+        outcome: Outcome = body(config, options, folder)
+        write_config(folder, outcome.config or config)
+        data = {**outcome.result, "versions": environment.versions()}
+        told = [*notes(config), *outcome.notes]
+        folder.write_json(RESULT, data | ({"notes": told} if told else {}))
         if options.report:
             _report(folder, options, outcome)
         moved = folder.put_in_place()
@@ -285,13 +285,12 @@ def _in_folder(command: str, config: Config, options: argparse.Namespace) -> int
         out = Console()
         result, rows = folder.result, outcome.rows
         _say(out, outcome.head)
-        every = tables_of(result, rows, outcome.most)
-        out.print(shown(every if outcome.tables is None else outcome.tables))
+        tables = outcome.tables
+        out.print(shown(tables_of(result, rows, outcome.most) if tables is None else tables))
         _say(out, outcome.lines)
-        given = folder.path, shlex.join(options.given), options.imports, rows
-        show_ending(out, ending(result, *given))
+        show_ending(out, ending(result, folder.path, options.given, options.imports, rows))
         _say(out, [*moved, f"results in {folder.path}"])
-    return outcome.code
+    return OK if outcome.usable else NO_RESULT
 
 
 def _say(out: "Console", lines: Sequence[str]) -> None:
@@ -307,8 +306,7 @@ def _report(folder: "RunFolder", options: argparse.Namespace, outcome: Outcome) 
     from rootsopt.view.pages.html import report_text
 
     try:
-        given = shlex.join(options.given), outcome.code == door.OK, options.imports
-        run = Run.of(folder, folder.result, *given)
+        run = Run(folder, folder.result, options.given, outcome.usable, options.imports)
         text = report_text(run)
     except Exception as error:
         words = f"{type(error).__name__}: {error}"
@@ -317,21 +315,14 @@ def _report(folder: "RunFolder", options: argparse.Namespace, outcome: Outcome) 
     folder.write_text(REPORT, text)
 
 
-def load_figures(options: argparse.Namespace, module: str) -> None:
-    """Import a `module` of `view.figures` in the background, if the `options` want figures.
-
-    With matplotlib it takes 0.5 s. Meanwhile, programs are loaded or compiled, which does not hold
-    Python's lock."""
-    if not options.no_figures:
-        name = f"rootsopt.view.figures.{module}"
-        threading.Thread(target=importlib.import_module, args=(name,)).start()
-
-
 @contextlib.contextmanager
-def waiting(console: "Console", what: str) -> Iterator[Callable[[str], None]]:
-    """Show the text `what` during a `with` block, if `console` is a terminal.
+def waiting(what: str) -> Iterator[Callable[[str], None]]:
+    """Show the text `what` during a `with` block, if stderr is a terminal.
 
     Yield a function that shows another text."""
+    from rich.console import Console
+
+    console = Console(stderr=True)
     if not console.is_terminal:
         yield lambda other: None
         return

@@ -44,8 +44,17 @@ def script(shell: str) -> str:
         parent = cli.parser(command)
         _complete(parent, shtab.FILE, shtab.DIRECTORY)
         tree.add_parser(command.name, help=command.purpose, parents=[parent], add_help=False)
+    functions = f"""
+{_KEYS}() {{
+  compgen -W "{_keys()}" -- "$1"
+}}
+{_CONFIGS}() {{
+  compgen -W "{" ".join(shipped())}" -- "$1"
+  compgen -f -- "$1"
+}}
+"""
     # shtab takes a preamble per shell; its annotation names only text.
-    text = shtab.complete(whole, shell, preamble=_preamble())  # type: ignore[arg-type]
+    text = shtab.complete(whole, shell, preamble={"bash": functions})  # type: ignore[arg-type]
     return f"{text}\n{_NO_SPACE}" if shell == "bash" else text
 
 
@@ -68,18 +77,3 @@ def _complete(parser: argparse.ArgumentParser, file: Mapping, folder: Mapping) -
 
 def _keys() -> str:
     return " ".join(f"{key}=" for key in tree(Config))
-
-
-def _preamble() -> dict[str, str]:
-    """Return the functions of the bash script that list keys and configs."""
-    return {
-        "bash": f"""
-{_KEYS}() {{
-  compgen -W "{_keys()}" -- "$1"
-}}
-{_CONFIGS}() {{
-  compgen -W "{" ".join(shipped())}" -- "$1"
-  compgen -f -- "$1"
-}}
-"""
-    }

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from rootsopt.commands import door
 from rootsopt.commands.table import COMMANDS
 
-_COMPLETION = """
+_MORE = """\
+rootsopt COMMAND --help lists the options and the config keys used most.
 
 The Tab key completes commands, options and config keys after one of
   rootsopt --completion bash > ~/.local/share/bash-completion/completions/rootsopt
@@ -24,13 +25,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _called(arguments: list[str]) -> int:
-    usage = "usage: rootsopt COMMAND CONFIG [options]\n\n" + "\n".join(
-        f"  {name:<10} {command.brief}" for name, command in COMMANDS.items()
-    )
-    usage += "\n\nrootsopt COMMAND --help lists the options and the config keys used most."
-    usage += _COMPLETION
     if not arguments or arguments[0] in ("-h", "--help"):
-        print(usage)
+        listed = "\n".join(f"  {name:<10} {one.brief}" for name, one in COMMANDS.items())
+        print(f"usage: rootsopt COMMAND CONFIG [options]\n\n{listed}\n\n{_MORE}")
         return door.OK if arguments else door.BAD_INPUT
     name, *rest = arguments
     if name == "--version":

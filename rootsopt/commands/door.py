@@ -63,7 +63,8 @@ class Signals:
         waiting = threading.Thread(target=self._wait, args=(reading,), name=_WAITING, daemon=True)
         waiting.start()
         for number in self._before:
-            signal.signal(number, _nothing)
+            # Another thread responds to the signal.
+            signal.signal(number, lambda *_: None)
 
     def remove(self) -> None:
         """Restore the signal handlers that `install` replaced."""
@@ -93,15 +94,9 @@ class Signals:
     def say(self, text: str) -> None:
         """Write `text` as one line to stderr; ignore an `OSError`."""
         shown = f"rootsopt {self.command}".rstrip()
-        try:
+        with contextlib.suppress(OSError):
             start = f"\r{_SHOW_CURSOR}" if os.isatty(2) else ""
             os.write(2, f"{start}{shown}: {text}\n".encode(errors="replace"))
-        except OSError:
-            return
-
-
-def _nothing(number: int, frame: object) -> None:
-    """Ignore a signal in the main thread, because another thread responds to it."""
 
 
 _running: Signals | None = None

@@ -11,25 +11,23 @@ if TYPE_CHECKING:
     from argparse import ArgumentParser, _ArgumentGroup
 
 
-def _none(parser: "ArgumentParser") -> None:
-    """Add no options to a `parser`."""
-
-
 class Command(NamedTuple):
     """A command, with the work in the module of its name in `rootsopt.commands.work`.
 
     `name`; `brief`: what it does, for the list of commands; `purpose`: the same, for its help;
     `options`: adds its own options to a parser; `writes`: whether it writes a result folder;
     `reads`: whether it reads a config, rather than writing one;
-    `takes`: name of its argument in its help, CONFIG or what its work makes a config from."""
+    `takes`: name of its argument in its help, CONFIG or what its work makes a config from;
+    `figures`: module of `rootsopt.view.figures` that is loaded while it computes."""
 
     name: str
     brief: str
     purpose: str
-    options: "Callable[[ArgumentParser], None]" = _none
+    options: "Callable[[ArgumentParser], None]" = lambda parser: None
     writes: bool = True
     reads: bool = True
     takes: str = "CONFIG"
+    figures: str = ""
 
     def main(self, argv: Sequence[str] | None = None) -> int:
         """Run the command with the arguments `argv` (`None`: those of the process).
@@ -125,22 +123,14 @@ def _sweep(parser: "ArgumentParser") -> None:
         metavar="KEY,KEY...",
         help="advance these keys together; repeatable",
     )
-    group.add_argument("--sample", type=int, metavar="N", help="draw N pseudo-random points")
-    group.add_argument(
-        "--sobol",
-        type=int,
-        metavar="N",
-        help="draw N points of a Sobol sequence, best a power of 2",
-    )
-    group.add_argument(
-        "--tolerances",
-        type=int,
-        metavar="N",
-        help="simulate N fresh scenes of `tolerances`, instead of --over",
-    )
-    group.add_argument("--seed", type=int, metavar="N", help="seed of the samples (default: 0)")
-    group = parser.add_argument_group("how a sweep runs")
-    _shared(group)
+    for name, meaning in (
+        ("sample", "draw N pseudo-random points"),
+        ("sobol", "draw N points of a Sobol sequence, best a power of 2"),
+        ("tolerances", "simulate N fresh scenes of `tolerances`, instead of --over"),
+        ("seed", "seed of the samples (default: 0)"),
+    ):
+        group.add_argument(f"--{name}", type=int, metavar="N", help=meaning)
+    _shared(parser.add_argument_group("how a sweep runs"))
 
 
 def _identify(parser: "ArgumentParser") -> None:
@@ -228,6 +218,7 @@ optimize = Command(
     "optimise a design and compare it with the baseline",
     "Optimise the design parameters for low contact force and compare with the baseline.",
     _optimize,
+    figures="runs",
 )
 improve = Command(
     "improve",
@@ -236,41 +227,48 @@ improve = Command(
     "clearance.",
     _improve,
     takes="ROTOR",
+    figures="runs",
 )
 simulate = Command(
     "simulate",
     "simulate one design in one scene",
     "Simulate one design in one scene: steady state, contact force, its gradient.",
     _simulate,
+    figures="runs",
 )
 pareto = Command(
     "pareto",
     "trace the best compromises between two or three terms",
     "Trace the best compromises between two or three terms (pareto.terms).",
     _shared,
+    figures="comparisons",
 )
 sweep = Command(
     "sweep",
     "simulate one design at many speeds, or at values of any keys",
     "Simulate one config at many values of any of its keys (--over), or at many speeds.",
     _sweep,
+    figures="sweep",
 )
 attractors = Command(
     "attractors",
     "find the coexisting motions of one scene",
     "Find the coexisting motions of a scene and the initial states that lead to each.",
+    figures="sweep",
 )
 identify = Command(
     "identify",
     "fit quantities of a scene to a measured record",
     "Find the values of scene and design that fit a measured record best, and how sure they are.",
     _identify,
+    figures="force",
 )
 profile = Command(
     "profile",
     "compute the geometry of one design",
     "Compute the geometry of one design, and export drawings, solids or an animation.",
     _profile,
+    figures="runs",
 )
 explore = Command(
     "explore",

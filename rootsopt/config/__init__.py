@@ -6,17 +6,12 @@ value, and says what is allowed."""
 
 from rootsopt.config.families import FAMILY_KEYS
 from rootsopt.config.plausible import notes
-from rootsopt.config.reading import (
-    Config,
-    load,
-    parse,
-)
+from rootsopt.config.reading import Config, load, parse
+from rootsopt.config.reading import load as load_config
 from rootsopt.config.rotor import ProfileConfig
 from rootsopt.config.study import TWIST, EnsembleConfig, SolverConfig
 from rootsopt.config.units import hint
 
-load_config = load
-"""Alias of `load`, under the name that the package `rootsopt` exports."""
 DESIGN_KEYS = FAMILY_KEYS["cic"]
 """Config keys of the design parameters of a CIC rotor."""
 

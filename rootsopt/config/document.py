@@ -115,11 +115,21 @@ def _unshared(data: Any) -> Any:
     return data
 
 
+def _unknown(_, node):
+    tag = named(str(node.tag).replace(_TAG, "!!"))
+    raise _wrong(f"the tag {tag} is not known; write the value without it", node.start_mark)
+
+
 class _Loader(yaml.SafeLoader):
     """PyYAML's SafeLoader with messages for users of a config."""
 
     yaml_implicit_resolvers = {}  # noqa: RUF012
-    yaml_constructors = {}  # noqa: RUF012
+    yaml_constructors = {  # noqa: RUF012
+        _TAG + "str": yaml.SafeLoader.construct_yaml_str,
+        _TAG + "seq": yaml.SafeLoader.construct_yaml_seq,
+        _TAG + "map": yaml.SafeLoader.construct_yaml_map,
+        None: _unknown,
+    }
 
     def compose_scalar_node(self, anchor):
         node = super().compose_scalar_node(anchor)
@@ -200,10 +210,11 @@ def _real(text: str) -> float:
     return float(text.lower().replace("_", "").replace(".inf", "inf").replace(".nan", "nan"))
 
 
-def _scalar(kind: str, read: Callable[[str], Any]) -> None:
+def _scalar(kind: str, words: str, read: Callable[[str], Any]) -> None:
     """Register `read` as the function that converts scalars of a YAML type `kind`.
 
-    `read` must raise `ValueError`, `KeyError` or `OverflowError` for text that is not valid."""
+    `words`: what such a scalar must be, for messages. `read` must raise `ValueError`, `KeyError` or
+    `OverflowError` for text that is not valid."""
 
     def construct(loader, node):
         text = loader.construct_scalar(node)
@@ -212,30 +223,15 @@ def _scalar(kind: str, read: Callable[[str], Any]) -> None:
                 raise ValueError
             return read(text)
         except (ValueError, KeyError, OverflowError):
-            raise _wrong(f"{shown(text)} is not a {_KINDS[kind]}", node.start_mark) from None
+            raise _wrong(f"{shown(text)} is not a {words}", node.start_mark) from None
 
     _Loader.add_constructor(_TAG + kind, construct)
 
 
-def _unknown(_, node):
-    tag = named(str(node.tag).replace(_TAG, "!!"))
-    raise _wrong(f"the tag {tag} is not known; write the value without it", node.start_mark)
-
-
-_KINDS = {
-    "bool": "truth value (true or false)",
-    "null": "way to write an empty value (null or ~)",
-    "int": "whole number that can be read",
-    "float": "number that can be read",
-}
-_scalar("bool", _CONSTANTS["bool"].__getitem__)
-_scalar("null", _CONSTANTS["null"].__getitem__)
-_scalar("int", _whole)
-_scalar("float", _real)
-_Loader.add_constructor(_TAG + "str", yaml.SafeLoader.construct_yaml_str)
-_Loader.add_constructor(_TAG + "seq", yaml.SafeLoader.construct_yaml_seq)
-_Loader.add_constructor(_TAG + "map", yaml.SafeLoader.construct_yaml_map)
-_Loader.yaml_constructors[None] = _unknown
+_scalar("bool", "truth value (true or false)", _CONSTANTS["bool"].__getitem__)
+_scalar("null", "way to write an empty value (null or ~)", _CONSTANTS["null"].__getitem__)
+_scalar("int", "whole number that can be read", _whole)
+_scalar("float", "number that can be read", _real)
 for _kind, _pattern, _first in (
     ("bool", "|".join(_CONSTANTS["bool"]), "tTfF"),
     ("null", "|".join(_CONSTANTS["null"]), ["", "~", "n", "N"]),

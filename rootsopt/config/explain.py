@@ -1,6 +1,5 @@
 """Turns validation errors into one-sentence messages, and lists the config's keys for `--help`."""
 
-import difflib
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, get_args, get_origin
@@ -248,8 +247,8 @@ def _unknown(
         return f"{text}; did you mean {told}"
     names = [key.removeprefix(prefix) for key in known if key.startswith(prefix)]
     names = words or [name for name in names if "." not in name]
-    close = difflib.get_close_matches(last, names, n=1, cutoff=0.5)
-    if meant := same or "".join(f"{prefix}{name}" for name in close):
+    close = near(last, names, cutoff=0.5)
+    if meant := same or (close and prefix + close):
         return f"{text}; did you mean `{meant}`?"
     more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
     return f"{text}; valid here: {', '.join(names[:_MOST_NAMES])}{more}"

@@ -8,11 +8,8 @@ function that makes profiles may be named as "module:function" and is loaded whe
 
 import dataclasses
 import functools
-import importlib
-import importlib.machinery
-import importlib.metadata
-import importlib.util
 import inspect
+import pkgutil
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -21,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
 
-from rootsopt.config.section import Listed, bare, between
+from rootsopt.config.section import Listed, bare, between, require
 from rootsopt.config.units import si_unit
 
 if TYPE_CHECKING:
@@ -33,6 +30,9 @@ MARGINS = (
 """Names of the margins that are ≥ 0 in a sound profile (see `rootsopt.profiles.soundness`)."""
 FREE_FORM = "free_form"
 """Name of the family whose members can approximate any profile."""
+RESERVED: set[str] = set()
+"""Keys that cannot be parameters, because the config uses them otherwise: added where they are
+defined."""
 EXAMPLE_RADIUS = 33.0
 """Pitch radius (mm) of the rotors in `Family.example`."""
 
@@ -352,8 +352,7 @@ def _installed(path: Path) -> bool:
 
 def _resolved(hook: Hook | None) -> Callable[..., Any]:
     if isinstance(hook, str):
-        module, _, name = hook.partition(":")
-        return getattr(importlib.import_module(module), name)
+        return pkgutil.resolve_name(hook)
     if hook is None:
         raise TypeError("a family that reads its profiles from files cannot make one")
     return hook
@@ -413,26 +412,22 @@ def _unfit(family: Family) -> str:
 
 def _check_parameter(parameter: Parameter) -> None:
     key = parameter.key
-    if not _WORD.fullmatch(key):
-        raise ValueError(
-            "Argument `key` of a parameter must be lower-case letters, digits and _, but is "
-            f"{key!r}"
-        )
-    if key in _RESERVED:
-        raise ValueError(f"Argument `key` of a parameter must be a new one, but {key} is reserved")
-    if not parameter.lowest < parameter.highest:
-        raise ValueError(
-            f"Arguments `lowest` and `highest` of {key} must be increasing, but are "
-            f"{parameter.lowest:g} and {parameter.highest:g}"
-        )
-    if parameters().get(key, parameter) != parameter:
-        raise ValueError(
-            f"Argument `key` of a parameter must have one meaning, but {key} of "
-            f"{', '.join(users_of(key))} has another one; take that (`parameters()[{key!r}]`), or "
-            "choose another key"
-        )
-
-
-_RESERVED = (
-    *("family", "lobes", "pitch_radius_mm", "outline_file", "outline_smoothing_mm", "helix_deg"),
-)
+    require(
+        _WORD.fullmatch(key) is not None,
+        f"Argument `key` of a parameter must be lower-case letters, digits and _, but is {key!r}",
+    )
+    require(
+        key not in RESERVED,
+        f"Argument `key` of a parameter must be a new one, but {key} is reserved",
+    )
+    require(
+        parameter.lowest < parameter.highest,
+        f"Arguments `lowest` and `highest` of {key} must be increasing, but are "
+        f"{parameter.lowest:g} and {parameter.highest:g}",
+    )
+    require(
+        parameters().get(key, parameter) == parameter,
+        f"Argument `key` of a parameter must have one meaning, but {key} of "
+        f"{', '.join(users_of(key))} has another one; take that (`parameters()[{key!r}]`), or "
+        "choose another key",
+    )

@@ -230,31 +230,24 @@ class Config(Section):
 
     @model_validator(mode="after")
     def _smoothed(self):
-        contact, gear = self.contact, self.scene.timing_gear
+        contact, radius = self.contact, self.profile.pitch_radius_mm
         if contact.smoothing_mm is not None:
             return self
-        law = contact.stiffness_N_per_mm_e, contact.exponent, contact.full_damping_depth_mm
-        length = following_mm(
-            self.load_torque,
-            self.profile.pitch_radius_mm,
-            None if gear is None else gear.stiffness_N_m_per_rad,
-            law,
-        )
+        length = following_mm(contact, self.scene.timing_gear, self.load_torque, radius)
         return self.model_copy(update={"contact": _followed(contact, "smoothing_mm", length)})
 
     @model_validator(mode="after")
     def _pressed(self):
         pump, load = self.pump, self.scene.load
-        if pump is not None and pump.pressure_difference_Pa is None:
-            if load.pressure_difference_Pa is None:
-                raise ValueError(
-                    "`pump.pressure_difference_Pa` must be given if `scene.load` has no "
-                    "`pressure_difference_Pa`; add it, or remove the section `pump`"
-                )
-            across = load.pressure_difference_Pa
-            filled = _followed(pump, "pressure_difference_Pa", across)
-            return self.model_copy(update={"pump": filled})
-        return self
+        if pump is None or pump.pressure_difference_Pa is not None:
+            return self
+        require(
+            load.pressure_difference_Pa is not None,
+            "`pump.pressure_difference_Pa` must be given if `scene.load` has no "
+            "`pressure_difference_Pa`; add it, or remove the section `pump`",
+        )
+        filled = _followed(pump, "pressure_difference_Pa", load.pressure_difference_Pa)
+        return self.model_copy(update={"pump": filled})
 
     @model_validator(mode="after")
     def _fitting(self):

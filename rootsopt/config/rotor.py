@@ -13,6 +13,7 @@ from pydantic.fields import FieldInfo
 from rootsopt.config import catalogue as _catalogue  # noqa: F401  (fills the table)
 from rootsopt.config.families import (
     EXAMPLE_RADIUS,
+    RESERVED,
     Family,
     families,
     family_of,
@@ -188,6 +189,7 @@ class ProfileConfig(Section):
 
 
 _OUTLINE = tuple(key for key in ProfileConfig.model_fields if key.startswith("outline_"))
+RESERVED.update(ProfileConfig.model_fields)
 
 
 @functools.cache

@@ -48,11 +48,6 @@ class FrictionConfig(Section):
         return self
 
 
-def _none_for_auto(value: Any) -> Any:
-    """Return `None` for the word `auto`, and any other value unchanged."""
-    return None if value == "auto" else value
-
-
 class WearConfig(Section):
     """Material that the flanks have lost since they were drawn, or gained by a coating."""
 
@@ -83,7 +78,8 @@ class ContactConfig(Section):
         0.0, description="clearance, added to every flank gap"
     )
     smoothing_mm: Annotated[
-        Annotated[float, between(0, 1)] | None, BeforeValidator(_none_for_auto)
+        Annotated[float, between(0, 1)] | None,
+        BeforeValidator(lambda value: None if value == "auto" else value),
     ] = Field(
         None,
         description="length that rounds the corners of contact law and timing gear; 0: no "
@@ -358,10 +354,10 @@ class PumpConfig(Section):
 
     @model_validator(mode="after")
     def _driven(self):
-        if self.gas is not None and self.pressure_difference_Pa == 0:
-            raise ValueError(
-                "`pump.pressure_difference_Pa` must be greater than 0 with `pump.gas`, but is 0"
-            )
+        require(
+            self.gas is None or self.pressure_difference_Pa != 0,
+            "`pump.pressure_difference_Pa` must be greater than 0 with `pump.gas`, but is 0",
+        )
         return self
 
 
@@ -386,28 +382,27 @@ _LEAST_TORQUE = 1e-3
 
 
 def following_mm(
+    contact: ContactConfig,
+    gear: TimingGearConfig | None,
     load_torque: float,
     pitch_radius_mm: float,
-    gear_stiffness: float | None,
-    contact: tuple[float, float, float],
 ) -> float:
     """Return the default smoothing length (mm) of a scene, with two significant digits.
 
-    `load_torque`: torque on rotor 2 (N·m). `pitch_radius_mm`: pitch radius (mm). `gear_stiffness`:
-    stiffness of the timing gear (N·m/rad), `None` without a gear. `contact`: stiffness (N/mm^e),
-    exponent e and depth of full damping (mm) of the flanks.
+    `load_torque`: torque on rotor 2 (N·m). `pitch_radius_mm`: pitch radius (mm).
 
     This smoothing changes the forces by less than 1e-4 of their values."""
     torque = max(load_torque, _LEAST_TORQUE)
-    stiffness, exponent, full = contact
     force = torque / (pitch_radius_mm * 1e-3)
+    depth = (force / contact.stiffness_N_per_mm_e) ** (1 / contact.exponent)
     lengths = [
         _MOST_SMOOTHING,
-        _SMOOTHING_SHARES["depth"] * (force / stiffness) ** (1 / exponent),
-        _SMOOTHING_SHARES["damping"] * full,
+        _SMOOTHING_SHARES["depth"] * depth,
+        _SMOOTHING_SHARES["damping"] * contact.full_damping_depth_mm,
     ]
-    if gear_stiffness is not None:
-        lengths.append(_SMOOTHING_SHARES["twist"] * torque / gear_stiffness * pitch_radius_mm)
+    if gear is not None:
+        share = _SMOOTHING_SHARES["twist"] * torque / gear.stiffness_N_m_per_rad
+        lengths.append(share * pitch_radius_mm)
     shortest = max(min(lengths), _LEAST_SMOOTHING)
     # Two digits keep the written config readable.
     return float(f"{shortest:.1e}") if math.isfinite(shortest) else _MOST_SMOOTHING

@@ -130,11 +130,11 @@ class Sheet(Section):
         """Return the example of a `family` in the size of this sheet.
 
         Raises `ValueError` if a parameter is out of its range."""
-        scale = self.centre_distance_mm / 2 / EXAMPLE_RADIUS
-        size = {"family": family.name, "lobes": self.lobes}
-        size["pitch_radius_mm"] = self.centre_distance_mm / 2
-        values = ((k, v * scale if k.endswith("_mm") else v) for k, v in family.example.items())
-        return ProfileConfig.model_validate(size | dict(values))
+        radius = self.centre_distance_mm / 2
+        scale = radius / EXAMPLE_RADIUS
+        size = {"family": family.name, "lobes": self.lobes, "pitch_radius_mm": radius}
+        values = {k: v * scale if k.endswith("_mm") else v for k, v in family.example.items()}
+        return ProfileConfig.model_validate(size | values)
 
     def displaced(self, efficiency: float) -> float:
         """Return the displaced volume (m³ per turn) at an area `efficiency`."""

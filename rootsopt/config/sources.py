@@ -1,9 +1,7 @@
 """Files and modules that a config names, and the configs that come with the package."""
 
 import contextlib
-import difflib
 import functools
-import importlib
 import importlib.machinery
 import importlib.metadata
 import importlib.util
@@ -17,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from rootsopt.config.section import bare
-from rootsopt.config.units import placed, sentence
+from rootsopt.config.units import near, placed, sentence
 from rootsopt.errors import InputError
 
 FILES = {
@@ -66,24 +64,24 @@ def regular_file(path: str | os.PathLike, what: str) -> Path:
     return Path(path)
 
 
-def content(path: str | os.PathLike, key: str, most: int = MOST_BYTES) -> bytes:
+def content(path: str | os.PathLike, key: str) -> bytes:
     """Return the content of the file that a `key` of the config names.
 
-    `most`: size (bytes) above which it is refused. Raises `InputError` if it cannot be read."""
+    Raises `InputError` if it cannot be read, or is larger than `MOST_BYTES`."""
     file = regular_file(path, FILES[key][1])
     try:
         with file.open("rb") as stream:
-            data = stream.read(most + 1)
+            data = stream.read(MOST_BYTES + 1)
     except (OSError, ValueError) as error:
         raise InputError(
             f"`{key}` must be a file that can be read, but is {placed(path)!r}: {reason(error)}; a "
             "path in a config is relative to the config's folder, a path given with --set to the "
             "current folder"
         ) from None
-    if len(data) > most:
+    if len(data) > MOST_BYTES:
         raise InputError(
-            f"{placed(file.name)}: must have at most {most / 1e6:g} MB, but is larger; export what "
-            "is needed alone, with fewer points"
+            f"{placed(file.name)}: must have at most {MOST_BYTES / 1e6:g} MB, but is larger; "
+            "export what is needed alone, with fewer points"
         )
     return data
 
@@ -128,10 +126,9 @@ def place_files(data: dict, folder: Path) -> None:
 
 def advice(path: Path) -> str:
     """Return advice on a `path` that does not exist."""
-    near = difflib.get_close_matches(path.stem[:80], shipped(), n=1)
-    meant = f"; did you mean {near[0]!r}?" if near else ""
-    names = ", ".join(shipped())
-    return f"give the path of a config, or the name of a shipped one ({names}){meant}"
+    names, meant = ", ".join(shipped()), near(path.stem, shipped())
+    guess = f"; did you mean {meant!r}?" if meant else ""
+    return f"give the path of a config, or the name of a shipped one ({names}){guess}"
 
 
 def find_installed(name: str) -> None:

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from rootsopt.config.families import Parameter, families, parameters
+from rootsopt.config.families import RESERVED, Parameter, families, parameters
 from rootsopt.config.section import (
     Among,
     Listed,
@@ -356,6 +356,7 @@ class ConstraintsConfig(Section):
 
 TWIST = "helix_deg"
 """Key of the twist, in the section `rotor`, among the bounds and among the design parameters."""
+RESERVED.add(TWIST)
 
 
 def _searched() -> dict[str, Parameter]:

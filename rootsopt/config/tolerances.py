@@ -2,7 +2,6 @@
 
 The section `assumptions` gives the ranges of assumed values of a pump's operation."""
 
-import difflib
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Annotated, Any, Literal, NamedTuple, get_args
@@ -10,7 +9,7 @@ from typing import Annotated, Any, Literal, NamedTuple, get_args
 from pydantic import Field, model_validator
 
 from rootsopt.config.section import Increasing, Listed, Section, bare, between, require, such
-from rootsopt.config.units import named
+from rootsopt.config.units import named, near
 
 _RELATIVE = "relative_"
 _Kind = Literal[
@@ -166,11 +165,11 @@ class TolerancesConfig(Section):
             ((name, width),) = given.items()
             kind = name.removeprefix(_RELATIVE)
             nominal = values[key]
-            if kind != name and nominal == 0:
-                raise ValueError(
-                    f"`tolerances.over.{key}` must be {kind}, not {name}, because "
-                    f"`{key}` is 0; give the width in the key's unit"
-                )
+            require(
+                kind == name or nominal != 0,
+                f"`tolerances.over.{key}` must be {kind}, not {name}, because `{key}` is 0; give "
+                "the width in the key's unit",
+            )
             size = width * abs(nominal) if kind != name else width
             half = _CUT * size if kind == "normal" else size
             scatters.append(Scatter(key, kind, nominal, size, half))
@@ -256,8 +255,8 @@ def _near(word: str, words: Any) -> str:
     last = {one.split(".")[-1]: one for one in words}
     if word.split(".")[-1] in last and word not in words:
         return f"; did you mean `{last[word.split('.')[-1]]}`?"
-    matches = difflib.get_close_matches(word[:80], [*words], n=1, cutoff=0.5)
-    return f"; did you mean `{matches[0]}`?" if matches else ""
+    guess = near(word, words, cutoff=0.5)
+    return f"; did you mean `{guess}`?" if guess else ""
 
 
 def _dotted(data: dict, is_value: Callable[[dict], bool], prefix: str = "") -> dict[str, Any]:

@@ -6,7 +6,7 @@ which the contact forces depend."""
 import difflib
 import math
 import reprlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 MM = 1e-3
@@ -191,6 +191,21 @@ def sentence(text: str) -> str:
     return clipped(" ".join(text[: 100 * LONGEST].split()))
 
 
-def near(word: str, known: Sequence[str]) -> str:
-    """Return the one of the `known` words that is most similar to `word`, or "" without one."""
-    return next(iter(difflib.get_close_matches(word[:_NAME], known, n=1)), "")
+def near(word: str, known: Iterable[str], cutoff: float = 0.6) -> str:
+    """Return the one of the `known` words that is most similar to `word`, or "" without one.
+
+    `cutoff`: least similarity, 1 for the same word."""
+    return next(iter(difflib.get_close_matches(word[:_NAME], [*known], n=1, cutoff=cutoff)), "")
+
+
+COLUMNS = {
+    "rotation": ("rotation_deg", "deg", "rotation of rotor 1", 57.29577951308232),
+    "relative": ("relative_rotation_rad", "rad", "relative rotation of rotor 2", 1.0),
+    "rate": ("relative_speed_rad_s", "rad/s", "relative angular speed of rotor 2", 1.0),
+    "drive_force": ("drive_flank_force_N", "N", "normal force on the drive flank", 1.0),
+    "coast_force": ("coast_flank_force_N", "N", "normal force on the coast flank", 1.0),
+    "force": ("contact_force_N", "N", "contact force: sum of the normal forces", 1.0),
+    "depth": ("penetration_m", "m", "greatest penetration; negative: least gap", 1.0),
+}
+"""Columns of a simulated motion, keyed by the field of a `Series`: name, unit, long name, and
+factor from SI units to this unit. CSV files have all but the penetration."""

@@ -6,7 +6,7 @@ time may be spent on repetitions. XLA drops optimisation barriers on CPUs, but i
 code before and after a branch whose condition it does not know.
 """
 
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -31,20 +31,16 @@ def compute_once(tree: T) -> T:
     return eqx.combine(jax.tree.unflatten(shape, _compute_once(leaves)), rest)
 
 
-def compute_once_along(tree: T) -> T:
+@jax.custom_jvp
+def compute_once_along(tree: Any) -> Any:
     """Return `tree` unchanged, like `compute_once`, and have its derivatives along directions
     computed once, too.
 
     All leaves must be floating-point arrays. Reverse-mode differentiation is not possible."""
-    return _compute_once_along(tree)  # pyright: ignore[reportReturnType]
-
-
-@jax.custom_jvp
-def _compute_once_along(tree):
     return compute_once(tree)
 
 
-@_compute_once_along.defjvp
+@compute_once_along.defjvp
 def _(primals, tangents):
     return compute_once(*primals), compute_once(*tangents)
 

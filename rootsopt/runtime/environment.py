@@ -224,20 +224,14 @@ def explained() -> Iterator[None]:
     """Turn an out-of-memory error (Python or XLA) in the `with` block into an `InputError`."""
     try:
         yield
-    except MemoryError:
-        raise InputError(_NO_MEMORY) from None
     except Exception as error:
-        if type(error).__name__ in _XLA_ERRORS and _EXHAUSTED in str(error):
-            raise InputError(_NO_MEMORY) from error
+        of_xla = type(error).__name__ in ("XlaRuntimeError", "JaxRuntimeError")
+        if isinstance(error, MemoryError) or (of_xla and "RESOURCE_EXHAUSTED" in str(error)):
+            raise InputError(
+                "there is not enough memory for this run; free some, allow the process more, or "
+                "ask for less (fewer points, speeds or starts)"
+            ) from error
         raise
-
-
-_NO_MEMORY = (
-    "there is not enough memory for this run; free some, allow the process more, or ask for less "
-    "(fewer points, speeds or starts)"
-)
-_XLA_ERRORS = "XlaRuntimeError", "JaxRuntimeError"
-_EXHAUSTED = "RESOURCE_EXHAUSTED"
 
 
 def _set_aside(named: list[str]) -> None:

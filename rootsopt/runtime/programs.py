@@ -183,8 +183,7 @@ class CachedFunction:
         future, new = self._future(kind)
         if new:
             self._make(future, kind)
-        made = future.result()
-        return made.result(leaves)
+        return future.result().result(leaves)
 
     def prepare(self, *args: Any, then: Callable[[Any], None] | None = None) -> None:
         """Compile the function in the background for arguments of the same kind as `args`.
@@ -207,7 +206,7 @@ class CachedFunction:
         the function is only traced."""
         _, kind = _split(args)
         place = self._place(kind)
-        kept = place is not None and place.kept
+        kept = place is not None and place.name in place.store
         if kept:
             self.prepare(*args)
         future = self._made.get(kind)
@@ -274,8 +273,7 @@ class CachedFunction:
             return None
         if jax.config.jax_compilation_cache_dir:  # pyright: ignore[reportAttributeAccessIssue]
             return None  # A program loaded from JAX's own cache cannot be serialised again.
-        outside = outside_modules()
-        sources = _sources({self.function.__module__, *_modules(kind), *outside})
+        sources = _sources({self.function.__module__, *_modules(kind), *outside_modules()})
         if sources is None:
             return None
         name = f"{self.function.__module__}.{self.function.__qualname__}"
@@ -295,10 +293,6 @@ class _Place(NamedTuple):
     store: Store
     name: str
     purpose: str
-
-    @property
-    def kept(self) -> bool:
-        return self.name in self.store
 
 
 _ARRAYS = jax.Array, np.ndarray, np.generic, jax.ShapeDtypeStruct

@@ -52,7 +52,7 @@ class Store:
 
     def read(self, name: str, purpose: str) -> bytes | None:
         """Return the data of the entry `name`, or `None` if no valid entry has this `purpose`."""
-        content = _read(self._file(name), MOST_BYTES) or b""
+        content = _read(self._file(name)) or b""
         data = content[len(_checksum(name, purpose, b"")) :]
         return data if content and content == _checksum(name, purpose, data) + data else None
 
@@ -66,14 +66,12 @@ class Store:
     def _prune(self) -> None:
         """Remove the least recently used entries until the rest has at most `MOST_BYTES`."""
         kept = []
-        for name in os.listdir(self._folder):
-            # Only our own files: the folder may hold others.
-            if name.endswith(SUFFIX) and not name.startswith("."):
-                file = self._folder / name
-                with contextlib.suppress(OSError):  # removed by another process
-                    status = file.lstat()
-                    if stat.S_ISREG(status.st_mode):
-                        kept.append((status.st_mtime_ns, status.st_size, file))
+        # Only our own finished files: the folder may hold others.
+        for file in self._folder.glob(f"[!.]*{SUFFIX}"):
+            with contextlib.suppress(OSError):  # removed by another process
+                status = file.lstat()
+                if stat.S_ISREG(status.st_mode):
+                    kept.append((status.st_mtime_ns, status.st_size, file))
         total = 0
         for _, size, file in sorted(kept, reverse=True):
             total += size
@@ -87,23 +85,23 @@ def _checksum(name: str, purpose: str, data: bytes) -> bytes:
     return _HEADER + hashlib.sha256(b"".join(hashlib.sha256(x).digest() for x in parts)).digest()
 
 
-def _read(file: Path, most: int) -> bytes | None:
+def _read(file: Path) -> bytes | None:
     """Return the content of a regular file, or `None` if it cannot be trusted.
 
-    `None` is returned if the file does not exist, belongs to another user, or is larger than `most`
-    bytes. It is also returned if others may write to the file."""
+    `None` is returned if the file does not exist, belongs to another user, or is larger than
+    `MOST_BYTES`. It is also returned if others may write to the file."""
     try:
         with open(os.open(file, os.O_RDONLY | _SAFELY), "rb") as stream:
             status = os.fstat(stream.fileno())
-            if not stat.S_ISREG(status.st_mode) or status.st_size > most:
+            if not stat.S_ISREG(status.st_mode) or status.st_size > MOST_BYTES:
                 return None
             if _HAS_OWNERS and (status.st_uid != os.geteuid() or status.st_mode & _OTHERS_WRITE):
                 return None
-            data = stream.read(most + 1)
+            data = stream.read(MOST_BYTES + 1)
         os.utime(file)
     except OSError:
         return None
-    return data if len(data) <= most else None
+    return data if len(data) <= MOST_BYTES else None
 
 
 def _write(file: Path, data: bytes) -> None:

@@ -112,9 +112,11 @@ def elsewhere(result: Mapping[str, Any]) -> Iterator[str]:
         name = "The nominal optimum" if one["design"] == nominal else "Another design"
         yield f"{name} ({shape}) is better than the optimum in {share}{where}."
     if comparison["not_compared"]:
-        rows = [[in_words(row[f"status_{who}"]) for who in ("baseline", "optimized")]
-                for row in comparison["not_compared"]]  # fmt: skip
-        counts = Counter(f"baseline {first}, optimum {last}" for first, last in rows)
+        counts = Counter(
+            f"baseline {in_words(row['status_baseline'])}, "
+            f"optimum {in_words(row['status_optimized'])}"
+            for row in comparison["not_compared"]
+        )
         told = [f"{count} ({words})" for words, count in counts.items()]
         yield f"Scenes that cannot be compared: {listed(told)}."
 

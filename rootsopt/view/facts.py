@@ -304,9 +304,8 @@ def ranked(rows: Sequence[Record]) -> tuple[str, list[Record]]:
     It is the peak force or, if no flanks touch, the contact reserve."""
 
     def known(key: str, falling: bool) -> list[Record]:
-        given = [(row, row.get(key)) for row in rows]
-        finite = [row for row, x in given if x is not None and math.isfinite(x)]
-        return sorted(finite, key=lambda row: row[key], reverse=falling)
+        given = [row for row in rows if row.get(key) is not None and math.isfinite(row[key])]
+        return sorted(given, key=lambda row: row[key], reverse=falling)
 
     peaks, reserves = known(_PEAK, True), known(_RESERVE, False)
     if reserves and not (peaks and peaks[0][_PEAK]):

@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rootsopt.config import sources
+from rootsopt.config.units import COLUMNS
 from rootsopt.errors import InputError
-from rootsopt.runtime.environment import versions as versions
 
 if TYPE_CHECKING:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -41,12 +41,13 @@ DPI = 150
 class ResultFolder:
     """The folder `path` for result files, created with its parents if it does not exist.
 
-    Raises `InputError` if the folder cannot be created."""
+    `place`: folder into which files are written. Raises `InputError` if the folder cannot be
+    created."""
 
     def __init__(self, path: str | os.PathLike):
         if not str(path):
             raise InputError("the output folder must have a name, but is empty; give a path")
-        self.path = Path(path)
+        self.path = self.place = Path(path)
         try:
             self.path.mkdir(parents=True, exist_ok=True)
         except (OSError, ValueError) as error:
@@ -55,25 +56,25 @@ class ResultFolder:
                 "another folder or make this one writable"
             ) from None
 
-    @property
-    def place(self) -> Path:
-        """Folder into which files are written."""
-        return self.path
-
     def write_bytes(self, name: str, data: bytes) -> Path:
         """Write `data` to the file `name`, which may include a subfolder (`figures/force.png`).
 
         Return the file's path. Raises `InputError` if the file cannot be written."""
         target = self.path / name
-        try:
+        with self._failing(name):
             target.parent.mkdir(parents=True, exist_ok=True)
             target.write_bytes(data)
+        return target
+
+    @contextlib.contextmanager
+    def _failing(self, name: str = ""):
+        try:
+            yield
         except OSError as error:
             raise InputError(
-                f"{str(target)!r}: cannot be written: {sources.reason(error)}; make room there or "
-                "choose another output folder"
+                f"{str(self.path / name)!r}: cannot be written: {sources.reason(error)}; make room "
+                "there or choose another output folder"
             ) from None
-        return target
 
     def write_text(self, name: str, text: str) -> Path:
         """Write `text` as UTF-8 to the file `name`; return the file's path.
@@ -102,7 +103,17 @@ class ResultFolder:
         becomes an empty cell. A column may mix these with text. Raises `ValueError` if the columns
         differ in length or are not one-dimensional. Raises `InputError` if the file cannot be
         written."""
-        return self.write_text(name, _csv(columns))
+        arrays = {name: np.asarray(values) for name, values in columns.items()}
+        shapes = {name: array.shape for name, array in arrays.items()}
+        if any(len(shape) != 1 for shape in shapes.values()) or len(set(shapes.values())) > 1:
+            raise ValueError(
+                f"Argument `columns` must hold 1-D arrays of one length, but has {shapes}"
+            )
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(arrays)
+        writer.writerows(zip(*map(_cells, arrays.values()), strict=True))
+        return self.write_text(name, text.getvalue())
 
     def write_figure(self, name: str, figure: "Figure") -> Path:
         """Write a matplotlib figure as PNG to the file `name`; return the file's path.
@@ -139,18 +150,6 @@ def plain(data: Any) -> Any:
     return data
 
 
-def _csv(columns: Mapping[str, ArrayLike]) -> str:
-    arrays = {name: np.asarray(values) for name, values in columns.items()}
-    shapes = {name: array.shape for name, array in arrays.items()}
-    if any(len(shape) != 1 for shape in shapes.values()) or len(set(shapes.values())) > 1:
-        raise ValueError(f"Argument `columns` must hold 1-D arrays of one length, but has {shapes}")
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(arrays)
-    writer.writerows(zip(*(_cells(array) for array in arrays.values()), strict=True))
-    return text.getvalue()
-
-
 def _cells(array: NDArray) -> list[str]:
     if array.dtype.kind == "f":
         return [f"{value:.10g}" for value in (array + 0.0).tolist()]  # no "-0"
@@ -181,12 +180,11 @@ def write_config(folder: ResultFolder, config: "Config") -> None:
     folder.write_text("config.yaml", config.to_yaml())
 
 
-def profile_columns(outline_mm: ArrayLike) -> dict[str, NDArray[np.float64]]:
+def profile_columns(outline_mm: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
     """Return the columns `x_mm` and `y_mm` of `profile_*.csv`, each (n,).
 
     `outline_mm` (n, 2): points of the closed outline (mm)."""
-    outline = np.asarray(outline_mm)
-    return {"x_mm": outline[:, 0], "y_mm": outline[:, 1]}
+    return {"x_mm": outline_mm[:, 0], "y_mm": outline_mm[:, 1]}
 
 
 def response_columns(series: "Series") -> dict[str, NDArray[np.float64]]:
@@ -194,17 +192,11 @@ def response_columns(series: "Series") -> dict[str, NDArray[np.float64]]:
 
     `series`: time series of a motion, in SI units. Units of the columns are in their names. Loads
     on the bearings come last, if there are any."""
-    loads = series.bearing_loads
-    more = {} if loads is None else dict(zip(_BEARINGS, loads.T, strict=True))
-    return {
-        "time_s": series.time,
-        "rotation_deg": np.degrees(series.rotation),
-        "relative_rotation_rad": series.relative,
-        "relative_speed_rad_s": series.rate,
-        "drive_flank_force_N": series.drive_force,
-        "coast_flank_force_N": series.coast_force,
-        "contact_force_N": series.force,
-    } | more
+    loads, columns = series.bearing_loads, {"time_s": series.time}
+    for field, (name, *_, factor) in COLUMNS.items():
+        if field != "depth":
+            columns[name] = factor * getattr(series, field)
+    return columns | ({} if loads is None else dict(zip(_BEARINGS, loads.T, strict=True)))
 
 
 # Columns of the loads on the bearings.
@@ -313,22 +305,20 @@ def replace(source: Path, target: Path) -> None:
 
 
 def adopt_mode(path: Path, model: Path) -> None:
-    """Give the folder `path` the permissions of the folder `model`, if the system allows it."""
-    try:
+    """Give the folder `path` the permissions of the folder `model`.
+
+    Do nothing if there is no such folder, or if the system does not allow it."""
+    with contextlib.suppress(OSError):
         os.chmod(path, stat.S_IMODE(os.stat(model).st_mode))
-    except OSError:
-        return
 
 
 def discard(path: Path) -> None:
     """Remove a file or an empty folder if it exists and can be removed."""
-    try:
+    with contextlib.suppress(OSError):
         if path.is_dir() and not path.is_symlink():
             os.rmdir(path)
         else:
             os.unlink(path)
-    except OSError:
-        return
 
 
 def discard_tree(path: Path) -> None:
@@ -345,13 +335,7 @@ _TAKEN = (errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES)
 
 
 class TakenError(InputError):
-    """Raised if another process holds the lock.
-
-    `process`: ID of this process, `None` if unknown."""
-
-    def __init__(self, process: int | None):
-        super().__init__("the lock is held by another process")
-        self.process = process
+    """Raised if another process holds the lock; its message names that process."""
 
 
 class Lock:
@@ -365,9 +349,7 @@ class Lock:
         self.path = path
         self.held = False
         self._file = -1
-        if fcntl is None:
-            return
-        while self._file < 0:
+        while fcntl is not None and self._file < 0:
             self._try()
 
     def _try(self) -> None:
@@ -377,9 +359,9 @@ class Lock:
             self.held = True
         except OSError as error:
             if error.errno in _TAKEN:
-                process = _number(file)
+                holder = _holder(file)
                 os.close(file)
-                raise TakenError(process) from None
+                raise TakenError(holder) from None
         # The last holder may have removed the file between the two steps.
         if self.held and not self._same(file):
             os.close(file)
@@ -401,10 +383,9 @@ class Lock:
 
     def _same(self, file: int) -> bool:
         try:
-            there, here = os.stat(self.path), os.fstat(file)
+            return os.path.samestat(os.stat(self.path), os.fstat(file))
         except OSError:
             return False
-        return (there.st_dev, there.st_ino) == (here.st_dev, here.st_ino)
 
     def release(self) -> None:
         """Remove the file and release the lock; a second call does nothing."""
@@ -417,8 +398,8 @@ class Lock:
         os.close(file)
 
 
-def _number(file: int) -> int | None:
+def _holder(file: int) -> str:
     try:
-        return int(os.pread(file, 32, 0))
+        return f"process {int(os.pread(file, 32, 0))}"
     except (OSError, ValueError):
-        return None
+        return "another process"

@@ -46,17 +46,12 @@ Record = Mapping[str, Any]
 """The result file, or an entry of it."""
 
 
-def last_part(key: str) -> str:
-    """Return the last part of a dotted `key` of the config, and any other key unchanged."""
-    section, _, _ = key.partition(".")
-    return key.rpartition(".")[2] if section in Config.model_fields else key
-
-
 def name_and_unit(key: str) -> tuple[str, str]:
     """Return (name in words, unit) for a key of the result file, or for a dotted one of the config.
 
     Of a dotted key, the last part is named."""
-    key = last_part(key)
+    if key.partition(".")[0] in Config.model_fields:
+        key = key.rpartition(".")[2]
     if key in _NAMES:
         return _NAMES[key]
     line = re.fullmatch(r"line_(.*)_force_N", key)

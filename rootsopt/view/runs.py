@@ -23,7 +23,7 @@ import os
 import re
 import secrets
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -35,7 +35,6 @@ from rootsopt.view.files import Lock, ResultFolder, TakenError, plain
 
 RESULT = "result.json"
 """Name of the file that lists all files of a run and is written last."""
-_CONFIG = "config.yaml"
 _SUFFIX = ".rootsopt"
 _STAGE = re.compile(r"(\..+)\.\d+-[0-9a-f]{8}" + re.escape(_SUFFIX))
 
@@ -46,15 +45,15 @@ _LONGEST = 150
 # Time (s) after a request to stop above which the temporary folder is left behind. This happens
 # if a write is still in progress.
 _PATIENCE = 10.0
-_State = Literal["absent", "empty", "ours", "more", "foreign"]
 
 
 class RunFolder(ResultFolder):
     """A `ResultFolder` that appears at its final path only when it is complete.
 
-    `path`: the final path; `command`: name of the command, for the result file; `overwrite`:
-    whether to replace an earlier run. Use it as a context manager and call `put_in_place` at the
-    end; otherwise the folder is removed.
+    `path`: the final path; `place`: temporary folder into which files are written until the run is
+    complete; `command`: name of the command, for the result file; `overwrite`: whether to replace
+    an earlier run. Use it as a context manager and call `put_in_place` at the end; otherwise the
+    folder is removed.
 
     Raises `InputError` if the path cannot be used. Examples: another process is writing there, it
     contains files that belong to no run, it is not a folder, or its parent is not writable."""
@@ -70,8 +69,7 @@ class RunFolder(ResultFolder):
         self.placed = False
         self._written: set[str] = set()
         self._spent: list[Path] = []
-        self._result: Mapping[str, Any] | None = None
-        self._notes: list[str] = []
+        self._result: Mapping[str, Any] = {}
         self._made: list[Path] = []
         self._lock: Lock | None = None
         self._busy = threading.RLock()
@@ -80,24 +78,21 @@ class RunFolder(ResultFolder):
             self._refuse_places()
             files.make_folders(self.target.parent, self._made)
             self._base = self.target.parent / _base(self.target.name)
-            self.stage = self._temporary()
+            self.place = self._temporary()
             self._claim()
-            files.make_folder(self.stage)
+            files.make_folder(self.place)
         except InputError:
             self.close()
             raise
         except (OSError, ValueError) as error:
             self.close()
-            raise self._unusable(sources.reason(error)) from None
+            raise InputError(
+                f"{str(self.path)!r}: cannot be used as output folder: {sources.reason(error)}; "
+                "choose another folder or make its parent folder writable"
+            ) from None
         except BaseException:
             self.close()
             raise
-
-    def _unusable(self, why: str) -> InputError:
-        return InputError(
-            f"{str(self.path)!r}: cannot be used as output folder: {why}; choose another folder "
-            "or make its parent folder writable"
-        )
 
     def _refuse_places(self) -> None:
         """Raise `InputError` if a finished run could not replace the target.
@@ -127,10 +122,9 @@ class RunFolder(ResultFolder):
         try:
             self._lock = Lock(self._base.with_name(self._base.name + _SUFFIX))
         except TakenError as taken:
-            who = f"process {taken.process}" if taken.process else "another process"
             raise InputError(
-                f"{str(self.path)!r}: {who} is writing into this folder; wait for it, stop it, or "
-                "choose another folder with --output"
+                f"{str(self.path)!r}: {taken} is writing into this folder; wait for it, stop it, "
+                "or choose another folder with --output"
             ) from None
         if self._lock.held:
             self._clear()
@@ -152,19 +146,18 @@ class RunFolder(ResultFolder):
             if match is None:
                 continue
             left = self.target.parent / name
-            if match[1] == self._base.name:
-                if _complete(left) and not os.path.lexists(self.target):
-                    files.move(left, self.target)
-                else:
-                    files.discard_tree(left)
-                continue
-            with contextlib.suppress(InputError, OSError):  # belongs to a run in progress
-                other = Lock(self.target.parent / (match[1] + _SUFFIX))
-                if other.held and not _complete(left):
-                    files.discard_tree(left)
-                other.release()
+            if match[1] != self._base.name:
+                with contextlib.suppress(InputError, OSError):  # belongs to a run in progress
+                    other = Lock(self.target.parent / (match[1] + _SUFFIX))
+                    if other.held and not _complete(left):
+                        files.discard_tree(left)
+                    other.release()
+            elif _complete(left) and not os.path.lexists(self.target):
+                files.move(left, self.target)
+            else:
+                files.discard_tree(left)
 
-    def _state(self) -> _State:
+    def _state(self) -> Literal["absent", "empty", "ours", "more", "foreign"]:
         """Return what is at the target's path.
 
         `absent`: nothing; `empty`: an empty folder; `ours`: only an earlier run; `more`: an earlier
@@ -175,7 +168,7 @@ class RunFolder(ResultFolder):
             return "foreign"
         if not os.listdir(self.target):
             return "empty"
-        if not all((self.target / name).is_file() for name in (RESULT, _CONFIG)):
+        if not all((self.target / name).is_file() for name in (RESULT, "config.yaml")):
             return "foreign"
         return "ours" if _files_in(self.target) <= _listed(self.target / RESULT) else "more"
 
@@ -190,17 +183,12 @@ class RunFolder(ResultFolder):
         The file lies beside the result folder and is not part of the run."""
         return self._base.with_name(self._base.name + ".checkpoint")
 
-    @property
-    def place(self) -> Path:
-        """Temporary folder into which files are written until the run is complete."""
-        return self.stage
-
     def write_bytes(self, name: str, data: bytes) -> Path:
         """Write `data` to the file `name`, which may include a subfolder (`figures/force.png`).
 
         Return the final path of the file. Raises `InputError` if the file cannot be written."""
         with self._busy, self._failing(name):
-            file = self.stage / name
+            file = self.place / name
             files.make_folders(file.parent, [])
             if name in self._written:
                 files.discard(file)
@@ -221,15 +209,7 @@ class RunFolder(ResultFolder):
     @property
     def result(self) -> dict[str, Any]:
         """Content of the file `result.json` as it will be written, without the list of files."""
-        return plain({**self._entries, "run": {"command": self.command}})
-
-    @property
-    def _entries(self) -> dict[str, Any]:
-        return {**(self._result or {}), **({"notes": self._notes} if self._notes else {})}
-
-    def add_notes(self, notes: Sequence[str]) -> None:
-        """Add `notes` on the input to `result.json`. Without any, it has no entry `notes`."""
-        self._notes += notes
+        return plain({**self._result, "run": {"command": self.command}})
 
     def remove_afterwards(self, file: Path) -> None:
         """Remove `file`, which is not part of the run, as soon as the run is in place.
@@ -245,9 +225,9 @@ class RunFolder(ResultFolder):
         with self._busy:
             names = sorted(self._written | {RESULT})
             run = {"run": {"command": self.command, "files": names}}
-            super().write_json(RESULT, {**self._entries, **run})
+            super().write_json(RESULT, {**self._result, **run})
             with self._failing():
-                for folder in {(self.stage / name).parent for name in names} | {self.stage}:
+                for folder in {(self.place / name).parent for name in names} | {self.place}:
                     files.sync_folder(folder)
                 notes = self._take_place()
             self.placed = True
@@ -259,18 +239,15 @@ class RunFolder(ResultFolder):
 
     def _take_place(self) -> list[str]:
         state = self._state()
-        if state in ("absent", "empty"):
-            if state == "empty":
-                files.adopt_mode(self.stage, self.target)
-            files.move(self.stage, self.target)
-            return []
-        if (
-            state == "foreign"
-        ):  # The target was different at the start of the run. Do not throw away a long run.
+        if state == "foreign":
+            # The target was different at the start of the run. Do not throw away a long run.
             self.target = self.path = self._free()
-            files.move(self.stage, self.target)
+            files.move(self.place, self.target)
             return [f"the requested folder now holds other files; this run is in {self.path}"]
-        files.adopt_mode(self.stage, self.target)
+        files.adopt_mode(self.place, self.target)
+        if state in ("absent", "empty"):
+            files.move(self.place, self.target)
+            return []
         if self.overwrite and state == "ours":
             older = self._temporary()
             self._swap_by(older)
@@ -290,7 +267,7 @@ class RunFolder(ResultFolder):
         If the second step fails, undo the first."""
         files.move(self.target, older)
         try:
-            files.move(self.stage, self.target)
+            files.move(self.place, self.target)
         except BaseException:
             files.move(older, self.target)
             raise
@@ -302,23 +279,13 @@ class RunFolder(ResultFolder):
             number += 1
         return path
 
-    @contextlib.contextmanager
-    def _failing(self, name: str = ""):
-        try:
-            yield
-        except OSError as error:
-            raise InputError(
-                f"{str(self.path / name)!r}: cannot be written: {sources.reason(error)}; make room "
-                "there or choose another output folder"
-            ) from None
-
     def close(self) -> None:
         """Release the lock. Remove the temporary folder unless it has been moved to its final path.
 
         A second call does nothing."""
         with self._busy:
-            if not self.placed and hasattr(self, "stage"):
-                files.discard_tree(self.stage)
+            if not self.placed and hasattr(self, "place"):
+                files.discard_tree(self.place)
             if self._lock is not None:
                 self._lock.release()
             if not self.placed:

@@ -193,28 +193,20 @@ def gradient_tables(result: Record) -> Iterator[Table | None]:
         yield table(title, ["per unit of", *map(label, gradient)], [("", rows)], note)
 
 
-def scene_rows(result: Record, rows: Sequence[Record] = ()) -> dict[str, Sequence[Record]]:
-    """Return the rows of each design, one per scene; the name is empty if there is only one."""
-    if rows:
-        return {"": rows}
-    designs = {name: record.get("speeds") for name, record in records_of(result).items()}
-    designs = {name: speeds for name, speeds in designs.items() if speeds}
-    return {"": designs["design"]} if [*designs] == ["design"] else designs
-
-
 def scene_tables(result: Record, rows: Sequence[Record], most: int) -> Iterator[Table | None]:
     """Yield tables of the scenes of a sweep, or of the speeds of an objective.
 
     A sweep over any keys has tables of its statuses and of its greatest forces, too."""
-    groups = scene_rows(result, rows)
+    designs = {name: one["speeds"] for name, one in records_of(result).items() if one.get("speeds")}
     objectives = result.get("objective_by_speed") or ()
-    for name, given in groups.items():
+    for name, given in ({"design": rows} if rows else designs).items():
         if name == NAMES["optimized"] and objectives:
             given = [{"speed_rpm": x["speed_rpm"], "objective": x["objective"], **row}
                      for row, x in zip(given, objectives, strict=True)]  # fmt: skip
         title = "Contact force " + ("over speed" if "speed_rpm" in given[0] else "in each scene")
         note = f"The first {most} of {len(given)} rows." if len(given) > most else ""
-        yield _list_table(title + (f", {name}" if name else ""), given[:most], note)
+        title += "" if name == "design" else f", {name}"
+        yield _list_table(title, given[:most], note)
     if "sweep" not in result:
         return
     counts = [[status_cell(word), str(n)] for word, n in result["statuses"].items()]

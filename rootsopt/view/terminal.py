@@ -33,9 +33,6 @@ _FACTS = {
     "profile": facts.drawn,
 }
 
-# Commands whose runs end like those of another one.
-_ALIKE = {"improve": "optimize"}
-
 # Statuses of a run that need no explanation.
 _SAID = *facts.STEADY, Status.GEOMETRY_ONLY.label, Status.IDENTIFIED.label
 
@@ -88,7 +85,8 @@ def ending(
     quoted for a shell; `imports`: values of `--import`, which the next commands need, too; `rows`:
     rows of a sweep, if the result does not hold them."""
     command, status = str(result["run"]["command"]), str(result.get("status", ""))
-    again, command = f"rootsopt {command} {source}", _ALIKE.get(command, command)
+    again = f"rootsopt {command} {source}"
+    command = "optimize" if command == "improve" else command  # They end alike.
     told = _FACTS[command](result, rows)
     first, *advice = re.split(_SENTENCES, str(result.get("message") or ""))
     said = f"{in_words(status).capitalize()}: {first}"

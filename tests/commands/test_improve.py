@@ -91,14 +91,12 @@ def test_a_gain_too_small_to_count_is_none(monkeypatch):
     found = SimpleNamespace(improvement=gain, interrupted=False, optimized=evaluation_of())
 
     def searched(config, options, folder, further):
-        folder.result = {"improvement": gain} | further(found)
-        return SimpleNamespace(code=0)
+        return SimpleNamespace(usable=True, result={"improvement": gain} | further(found))
 
-    monkeypatch.setattr(work.optimize, "searched_for", searched)
-    folder, body = SimpleNamespace(), inspect.unwrap(work.body)
-    code = body(None, SimpleNamespace(known={"found": []}), folder).code
-    told = folder.result["status"], folder.result["message"]
-    assert (code, *told) == (3, "not_improved", NOTHING_BETTER)
+    monkeypatch.setattr(work.optimize, "body", searched)
+    outcome = inspect.unwrap(work.body)(None, SimpleNamespace(known={"found": []}), None)
+    told = outcome.result["status"], outcome.result["message"]
+    assert (outcome.usable, *told) == (False, "not_improved", NOTHING_BETTER)
 
 
 @pytest.mark.long

@@ -4,6 +4,7 @@ import io
 import itertools
 import re
 from collections import Counter, defaultdict
+from unittest import mock
 
 import ezdxf
 import numpy as np
@@ -18,10 +19,11 @@ from rootsopt.profiles import CIC, EE, FreeForm, geometry, outline, place_pair
 from rootsopt.response.result import Series
 from rootsopt.scene import Scene, check_geometry, design_vector
 from rootsopt.scene.space import Space
-from rootsopt.view.figures import cad, chosen
+from rootsopt.view.figures import cad, chosen, writing
 from rootsopt.view.figures.animation import meshing_gif, rolling_contacts
 from rootsopt.view.figures.drawing import Drawing, svg_text
 from rootsopt.view.figures.pieces import Arc, outline_pieces, polyline
+from rootsopt.view.files import ResultFolder
 
 R = 0.033
 LENGTH = 100.0
@@ -238,6 +240,13 @@ def test_pair_meshes_along_its_length(tmp_path):
     assert all(edges[b, a] == count for (a, b), count in edges.items())
 
 
+def test_drawings_have_the_twist_of_the_design(tmp_path):
+    config = load("ee", ["optimizer.bounds.helix_deg=[0, 90]", "rotor.helix_deg=20"])
+    with mock.patch.object(writing, "_solids", return_value={}) as solids:
+        writing.write(ResultFolder(tmp_path), config, ["stl"], {"helix_deg": 33.0})
+    assert solids.call_args.args[0].helix_deg == 33.0
+
+
 @pytest.mark.parametrize("text", ["dwg", "dxf,png", "none,dxf"])
 def test_formats_that_are_not_known(text):
     with pytest.raises(InputError, match="must be formats out of dxf, svg, step, stl, gif"):
@@ -319,7 +328,8 @@ def test_bore_takes_mass_and_inertia():
         lost.append(float(one.inertia(shape) - other.inertia(shape)))
         assert lost == pytest.approx([cylinder, cylinder * 0.01**2 / 2], rel=1e-9)
         room = float(shape.root_radius) * 1e3 - 10.0
-        assert float(limits["root radius"].slack(shape)) == pytest.approx(room, rel=1e-9)
+        slack = limits["root radius"].scaled(shape.root_radius)
+        assert float(slack) == pytest.approx(room, rel=1e-9)
     assert "root radius" not in {c.name for c in Space.of(plain, one).constraints}
 
 

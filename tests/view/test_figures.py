@@ -38,16 +38,15 @@ def test_departure_of_a_scaled_rotor_is_that_of_its_supporting_lines():
     """Scaling by 1.001 moves the tip by 45.1 µm outwards, and every point by 1/1000 of its
     support."""
     outline = outline_mm(CIC)
-    _, axes = figure(6, 4)
-    ax = plot_departure(axes[0, 0], outline, 1.001 * outline, 3, 33.0)
-    along, away = drawn(ax, 1).T
+    _, axes = figure(6, 4, 1, 2)
+    plot_departure(axes[0, 0], outline, 1.001 * outline, 3, 33.0)
+    along, away = drawn(axes[0, 0], 1).T
     radius = np.hypot(*outline.T)
     assert away[[0, -1]] == pytest.approx([radius.max(), radius.min()], rel=1e-3)
     assert along[-1] > np.ptp(radius)
-    assert "outwards" in ax.get_title()
-    _, axes = figure(6, 4)
-    same = plot_departure(axes[0, 0], outline, outline, 3, 33.0)
-    np.testing.assert_allclose(drawn(same, 1)[:, 1], 0.0, atol=1e-6)
+    assert "outwards" in axes[0, 0].get_title()
+    plot_departure(axes[0, 1], outline, outline, 3, 33.0)
+    np.testing.assert_allclose(drawn(axes[0, 1], 1)[:, 1], 0.0, atol=1e-6)
 
 
 def test_forces_begin_at_the_same_rotation():
@@ -58,8 +57,8 @@ def test_forces_begin_at_the_same_rotation():
         force, zero = 1 + np.sin(3 * rotation), 0 * rotation
         return Series(rotation / 314, rotation, zero, zero, force, zero, zero)
 
-    _, axes = figure(6, 4)
-    ax = plot_forces_together(axes[0, 0], {"a": run(0.0), "b": run(5.0)}, 2 * np.pi / 3)
+    ax = figure(6, 4)[1][0, 0]
+    plot_forces_together(ax, {"a": run(0.0), "b": run(5.0)}, 2 * np.pi / 3)
     first, second = (drawn(ax, k) for k in (0, 1))
     assert ax.get_xlim() == pytest.approx((0, 120))
     np.testing.assert_allclose(np.interp(second[:, 0], *first.T), second[:, 1], atol=1e-3)

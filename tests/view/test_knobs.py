@@ -8,20 +8,23 @@ import pytest
 
 from rootsopt.config import load, parse
 from rootsopt.config.families import families
-from rootsopt.view.pages.knobs import _step, knobs_of
+from rootsopt.view.pages.knobs import _step, dotted, knobs_of
 
 ROOT = Path(__file__).parents[2]
 CONFIGS = sorted(path.stem for path in (ROOT / "configs").glob("*.yaml"))
+FREE = "optimizer.bounds.helix_deg=[0, 90]", "rotor.helix_deg=20"
 
 
 def by_key(config):
     return {knob.key: knob for knob in knobs_of(config)}
 
 
-@pytest.mark.parametrize("name", CONFIGS)
-def test_every_knob_can_be_set(name):
+@pytest.mark.parametrize(
+    ("name", "changes"), [*((name, ()) for name in CONFIGS), ("cic_drawn", FREE), ("free", FREE)]
+)
+def test_every_knob_can_be_set(name, changes):
     """A knob's own value lies in its span, the span in its range, and the config accepts it."""
-    config = load(ROOT / "configs" / f"{name}.yaml")
+    config = load(ROOT / "configs" / f"{name}.yaml", changes)
     knobs = knobs_of(config)
     assert len({knob.key for knob in knobs}) == len(knobs)
     for knob in knobs:
@@ -33,19 +36,24 @@ def test_every_knob_can_be_set(name):
     config.check_values({knob.key: knob.low for knob in knobs if not knob.whole})
 
 
+@pytest.mark.parametrize("changes", [(), FREE])
 @pytest.mark.parametrize("family", [name for name, one in families().items() if one.maker])
-def test_every_family_has_a_knob_per_design_parameter(family):
-    """Design parameters come first, and span the bounds of an optimisation."""
+def test_every_family_has_a_knob_per_design_parameter(family, changes):
+    """Design parameters come first, and span the bounds of an optimisation.
+
+    A twist that is free is one of them, in the section of the rotor."""
     rows = "".join(f"\n  {key}: {list(x) if isinstance(x, tuple) else x}"
                    for key, x in families()[family].example.items())  # fmt: skip
     text = (ROOT / "configs" / "ee.yaml").read_text().replace("family: ee", f"family: {family}")
-    config = parse(text.replace("  lobes: 3", f"  lobes: 3{rows}"))
+    config = parse(text.replace("  lobes: 3", f"  lobes: 3{rows}"), changes)
     knobs = knobs_of(config)
     design = [knob for knob in knobs if knob.group == "Design"]
     assert [(knob.key, knob.value) for knob in design] == [
-        (f"profile.{key}", value)
-        for key, value in zip(config.design_keys, config.design, strict=True)
+        (dotted(key), value) for key, value in zip(config.design_keys, config.design, strict=True)
     ]
+    assert [(knob.key, knob.low, knob.high) for knob in design if "profile." not in knob.key] == [
+        ("rotor.helix_deg", 0, 90)
+    ] * bool(changes)
     assert knobs[: len(design)] == design
     assert all(math.isfinite(knob.low) and math.isfinite(knob.high) for knob in design)
 

@@ -73,7 +73,7 @@ class Stub(Engine):
     def __init__(self):
         super().__init__(load(CIC), optimize_design)
         self.status, self.calls = Status.PERIODIC, []
-        self._base = self.given
+        self.base = self.given
         self.ready.set()
 
     def shape(self, config):

@@ -50,7 +50,7 @@ def run_of(place, result, series=None, source="cic", usable=True):
     folder.write_text("config.yaml", load(CIC).to_yaml())
     if series is not None:
         folder.write_csv("response_design.csv", response_columns(series))
-    return Run.of(folder, result, source, usable)
+    return Run(folder, result, source, usable)
 
 
 def result_of(command="simulate", **more):
@@ -195,7 +195,7 @@ def test_names_that_are_no_text_are_shown(tmp_path):
     config = load(CIC, ["scene.timing_gear=null", "contact.friction={}"])
     folder = ResultFolder(tmp_path)
     folder.write_text("config.yaml", config.to_yaml())
-    text = words_of(report_text(Run.of(folder, result_of(), "caf\udce9.yaml", True)))
+    text = words_of(report_text(Run(folder, result_of(), "caf\udce9.yaml", True)))
     assert "caf?.yaml" in text
     assert "with friction between the flanks, without a timing gear" in text
 

@@ -3,7 +3,6 @@
 import argparse
 
 import numpy as np
-from rich.console import Console
 
 from rootsopt.commands import cli
 from rootsopt.config.reading import Config
@@ -20,18 +19,8 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
 
     Return the `Outcome`. Raises `InputError` if the config is invalid."""
     check_geometry(config)
-    cli.load_figures(options, "sweep")
-    with cli.waiting(Console(stderr=True), "compiling and simulating"):
+    with cli.waiting("compiling and simulating"):
         basins = find(Evaluator.of(config), series=True)
-    files.write_config(folder, config)
-    data = {
-        "attractors": basins.records(),
-        "lost": basins.lost,
-        "status": basins.status.label,
-        "message": message_of(config, basins.status),
-        "versions": files.versions(),
-    }
-    folder.write_json("result.json", data)
     rows = [{"attractor": number} | row for number, row in enumerate(basins.summary(), 1)]
     folder.write_csv("attractors.csv", files.row_columns(rows))
     relative, rate = np.meshgrid(1e3 * basins.relative, basins.rate)
@@ -51,5 +40,10 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
 
         basin_figures(folder, basins, config)
 
-    usable = any(one.evaluation.usable for one in basins.attractors)
-    return cli.Outcome(cli.OK if usable else cli.NO_RESULT)
+    data = {
+        "attractors": basins.records(),
+        "lost": basins.lost,
+        "status": basins.status.label,
+        "message": message_of(config, basins.status),
+    }
+    return cli.Outcome(any(one.evaluation.usable for one in basins.attractors), data)

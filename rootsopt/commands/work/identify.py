@@ -2,13 +2,10 @@
 
 import argparse
 
-from rich.console import Console
-
 from rootsopt.commands import cli
 from rootsopt.config.reading import Config
 from rootsopt.errors import InputError
 from rootsopt.identification.fit import identify
-from rootsopt.view import files
 from rootsopt.view.runs import RunFolder
 
 
@@ -22,22 +19,18 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     ):
         if not getattr(options, name):
             raise InputError(f"`--{name}` is missing; add it, as in --{name} {example}")
-    cli.load_figures(options, "force")
-    with cli.waiting(Console(stderr=True), "compiling and simulating") as progress:
+    with cli.waiting("compiling and simulating") as progress:
         fit = identify(
             config, options.data, options.fit, gains=[text.split(",") for text in options.gain],
             constants=options.constant, profiles=options.profile, starts=options.starts,
             seed=options.seed, progress=progress,
         )  # fmt: skip
-    files.write_config(folder, config)
-    data = fit.record()
     if fit.parameters:
         folder.write_text("identified.yaml", fit.config.to_yaml())
         folder.write_csv("residuals.csv", fit.residuals)
-    folder.write_json("result.json", data | {"versions": files.versions()})
     if fit.parameters and not options.no_figures:
         from rootsopt.view.figures.force import identified_figure
 
         identified_figure(folder, fit)
 
-    return cli.Outcome(cli.OK if fit.status.usable else cli.NO_RESULT)
+    return cli.Outcome(fit.status.usable, fit.record())

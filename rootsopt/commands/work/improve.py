@@ -23,6 +23,7 @@ from rootsopt.scene.space import widened
 from rootsopt.status import Status
 from rootsopt.view import pages
 from rootsopt.view.comparison import NOTHING_BETTER, WORTH, better_tables
+from rootsopt.view.files import plain
 from rootsopt.view.names import stated
 from rootsopt.view.runs import RunFolder
 
@@ -217,8 +218,8 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
         told = {} if worth or result.interrupted or result.optimized is None else lost
         return told | {"improve": options.known | {"cases": cases, "message": survives(cases)}}
 
-    outcome = optimize.searched_for(config, options, folder, further)
-    gain = (folder.result.get("improvement") or {}).get("objective", 0.0)
-    code = outcome.code if abs(gain) >= WORTH else cli.NO_RESULT
-    tables = [*better_tables(folder.result)]
-    return cli.Outcome(code, tables=tables, head=options.known["found"])
+    outcome = optimize.body(config, options, folder, further)
+    gain = (outcome.result.get("improvement") or {}).get("objective", 0.0)
+    tables, head = [*better_tables(plain(outcome.result))], options.known["found"]
+    usable = outcome.usable and abs(gain) >= WORTH
+    return cli.Outcome(usable, outcome.result, tables=tables, head=head)

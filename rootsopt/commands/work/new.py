@@ -9,7 +9,6 @@ import textwrap
 from typing import Any
 
 from pydantic import ValidationError
-from rich.console import Console
 
 from rootsopt.commands import cli
 from rootsopt.config.document import read_document
@@ -39,7 +38,7 @@ def body(options: argparse.Namespace) -> int:
             f"{placed(path)}: exists; give `--overwrite` to replace it, or another name"
         )
     sheet = Sheet.model_validate(_entries(options))
-    with cli.waiting(Console(stderr=True), "looking for a profile"):
+    with cli.waiting("looking for a profile"):
         config = _met(sheet)
         efficiency = float(shape_of(config).area_efficiency)
     given = shlex.join(word for one in options.overrides for word in ("--set", one))

@@ -3,7 +3,6 @@
 import argparse
 import time
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -17,6 +16,7 @@ from rootsopt.optimize import noise
 from rootsopt.optimize.design import search_of
 from rootsopt.optimize.outcome import Optimization
 from rootsopt.pump.sheet import check_clearances, record_of
+from rootsopt.response.result import Evaluation
 from rootsopt.response.sensitivity import touching
 from rootsopt.scene.build import Scene
 from rootsopt.scene.check import check_geometry, outline_mm
@@ -26,43 +26,33 @@ from rootsopt.view.figures import chosen
 from rootsopt.view.runs import RunFolder
 
 
-def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.Outcome:
-    """Run `rootsopt optimize`: search for the best design, and write files into `folder`.
-
-    Return the `Outcome`. Raises `InputError` if the config or an option is invalid."""
-    return searched_for(config, options, folder)
-
-
-def searched_for(
+def body(
     config: Config,
     options: argparse.Namespace,
     folder: RunFolder,
     further: Callable[[Optimization], dict[str, Any]] = lambda result: {},
 ) -> cli.Outcome:
-    """Search for the best design, and write the files of `rootsopt optimize` into `folder`.
+    """Run `rootsopt optimize`: search for the best design, and write files into `folder`.
 
-    `further`: returns further entries of the result file. For the rest, see `body`."""
+    `further`: returns further entries of the result file, for other commands that search. Return
+    the `Outcome`. Raises `InputError` if the config or an option is invalid."""
     began = time.perf_counter()
     formats = chosen(options.export)
-    cli.load_figures(options, "runs")
     check_geometry(config)
     check_clearances(config)
-    bar = partial(
-        progress_bar, first="baseline, compiling", then="optimising", counted="designs",
-        field="best objective",
-    )  # fmt: skip
-    given = "optimize", config, options, folder, search_of, bar, "the best design so far"
-    result, compiled = searched(*given)
+    bar = progress_bar("baseline, compiling", "optimising", "designs", "best objective")
+    result, compiled = searched(
+        "optimize", config, options, folder, search_of, bar, "the best design so far"
+    )
     if result is None:
         empty = {"baseline": None, "optimized": None}
-        return nothing_known(config, folder, "simulated", empty)
+        return nothing_known(folder, "simulated", empty)
     if result.infeasible is not None:
-        return _contradiction(config, folder, result)
+        return cli.Outcome(False, _contradiction(result))
     ran = time.perf_counter() - began
     alike = {} if result.interrupted else _alike(config, result)
-    sheets = _sheets(config, result)
     alike |= further(result)
-    _write(folder, config, options, result, alike, sheets, compiled, ran)
+    data = _write(folder, config, options, result, alike, compiled, ran)
     if result.optimized is not None and formats:
         from rootsopt.view.figures.writing import write_simulated
 
@@ -72,23 +62,19 @@ def searched_for(
     lines.append(
         f"compile {compiled:.1f} s, run {ran - compiled:.1f} s, reports {total - ran:.1f} s"
     )
-    complete = result.optimized is not None and not result.interrupted
-    return cli.Outcome(cli.OK if complete else cli.NO_RESULT, lines)
+    return cli.Outcome(result.optimized is not None and not result.interrupted, data, lines)
 
 
-def _contradiction(config: Config, folder: RunFolder, result) -> cli.Outcome:
-    """Write the files of a run that found no design because its constraints are in conflict.
-
-    Return the `Outcome`, with exit code 3."""
-    conflict = result.infeasible
-    files.write_config(folder, config)
-    data = {"baseline": result.baseline.record(), "optimized": None}
-    data |= {"status": result.status.label, "message": conflict.message}
-    data |= {"infeasible": conflict.record(), "versions": files.versions()}
-    if result.beginning is not None:
-        data["beginning"] = result.beginning.record()
-    folder.write_json("result.json", data)
-    return cli.Outcome(cli.NO_RESULT)
+def _contradiction(result) -> dict[str, Any]:
+    """Return the content of the result file if no design satisfies all constraints."""
+    conflict, begun = result.infeasible, result.beginning
+    return {
+        "baseline": result.baseline.record(),
+        "optimized": None,
+        "status": result.status.label,
+        "message": conflict.message,
+        "infeasible": conflict.record(),
+    } | ({} if begun is None else {"beginning": begun.record()})
 
 
 def _alike(config: Config, result) -> dict:
@@ -104,19 +90,15 @@ def _alike(config: Config, result) -> dict:
     return {"resembles": [one.record() for one in nearest]}
 
 
-def _sheets(config: Config, result) -> dict[str, dict]:
-    """Return the records of baseline and optimised design, with their pump sheets under `pump`.
+def _designs(config: Config, result) -> dict[str, tuple[Config, Evaluation]]:
+    """Return (config, evaluation) of the designs of a search by name.
 
-    Those of the nominal member of a measured baseline stand between them."""
-    designs = {"baseline": (config, result.baseline)}
-    if result.nominal is not None:
-        designs["nominal"] = _searching(config, result), result.nominal
-    if result.optimized is not None:
-        designs["optimized"] = _searching(config, result), result.optimized
-    return {
-        name: one.record() | {"pump": record_of(own, [*one.design.values()])}
-        for name, (own, one) in designs.items()
-    }
+    These are the baseline, the optimised design and the nominal member of a measured baseline, if
+    there are such."""
+    searching = _searching(config, result)
+    others = {"optimized": result.optimized, "nominal": result.nominal}
+    known = {name: (searching, one) for name, one in others.items() if one is not None}
+    return {"baseline": (config, result.baseline)} | known
 
 
 def _searching(config: Config, result) -> Config:
@@ -126,13 +108,8 @@ def _searching(config: Config, result) -> Config:
     return config if result.beginning is None else result.beginning.config
 
 
-def _advice(result) -> str:
-    """Return a result's message, preceded by the cost of limits that the baseline violates."""
-    return f"{result.cost} {_said(result)}".strip()
-
-
 def _said(result) -> str:
-
+    """Return a result's message, without the cost of limits that the baseline violates."""
     if result.interrupted:
         return _interrupted(result)
     if not result.baseline.usable:
@@ -167,27 +144,21 @@ def _interrupted(result) -> str:
     )
 
 
-def _write(folder, config, options, result, alike, sheets, compiled, ran) -> None:
-    """Write the files of a search."""
-    records = {"baseline": result.baseline, "optimized": result.optimized}
-    if result.nominal is not None:
-        records["nominal"] = result.nominal
+def _write(folder, config, options, result, alike, compiled, ran) -> dict[str, Any]:
+    """Write the files of a search; return the content of the result file."""
     searching = _searching(config, result)
-    configs = dict.fromkeys(records, searching) | {"baseline": config}
-    files.write_config(folder, config)
     if result.optimized is not None:
         folder.write_text("optimized.yaml", _designed(searching, result.optimized).to_yaml())
     if result.robustness is not None:
         _write_robustness(folder, config, options, result.robustness)
-    data: dict = {name: sheets.get(name) for name in records}
-    for name, evaluation in records.items():
-        if evaluation is None:
-            continue
-        design = list(evaluation.design.values())
-        points = outline_mm(configs[name], design)
+    data: dict = {"baseline": None, "optimized": None}
+    for name, (own, one) in _designs(config, result).items():
+        design = [*one.design.values()]
+        data[name] = one.record() | {"pump": record_of(own, design)}
+        points = outline_mm(own, design)
         folder.write_csv(f"profile_{name}.csv", files.profile_columns(points))
-        if evaluation.series is not None:
-            folder.write_csv(f"response_{name}.csv", files.response_columns(evaluation.series))
+        if one.series is not None:
+            folder.write_csv(f"response_{name}.csv", files.response_columns(one.series))
     rows = result.history
     if rows:
         folder.write_csv("history.csv", {key: [row[key] for row in rows] for key in rows[0]})
@@ -214,16 +185,16 @@ def _write(folder, config, options, result, alike, sheets, compiled, ran) -> Non
         folder.write_csv("assumptions.csv", result.assumptions.columns())
     data["verification"] = result.verification
     # Entries that `improve` adds, such as its own status, take precedence.
-    data = {"status": result.status.label, "message": _advice(result)} | data
+    message = f"{result.cost} {_said(result)}".strip()
+    data = {"status": result.status.label, "message": message} | data
     data["statistics"] = {
         "evaluations": len(rows),
         "compile_seconds": compiled,
         "run_seconds": ran - compiled,
     }
-    data["versions"] = files.versions()
-    folder.write_json("result.json", data)
     if not options.no_figures:
         _draw(folder, config, result, data)
+    return data
 
 
 def _draw(folder, config: Config, result, data: dict) -> None:

@@ -2,7 +2,6 @@
 
 import argparse
 import time
-from functools import partial
 
 from rootsopt.commands import cli
 from rootsopt.commands.work.searching import nothing_known, progress_bar, searched
@@ -19,25 +18,19 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     Return the `Outcome`. Raises `InputError` if the config is invalid."""
     began = time.perf_counter()
     check_geometry(config)
-    cli.load_figures(options, "comparisons")
-    bar = partial(
-        progress_bar, first="baseline and screening", then="tracing the front", counted="searches"
+    bar = progress_bar("baseline and screening", "tracing the front", "searches")
+    front, compiled = searched(
+        "pareto", config, options, folder, Tracer, bar, "the points found so far"
     )
-    given = "pareto", config, options, folder, Tracer, bar, "the points found so far"
-    front, compiled = searched(*given)
     if front is None:
-        return nothing_known(config, folder, "evaluated", {"points": []})
+        return nothing_known(folder, "evaluated", {"points": []})
     ran = time.perf_counter() - began
     record = front.record()
-    seconds = {"compile_seconds": compiled, "run_seconds": ran - compiled}
-    record["statistics"] |= seconds
-    files.write_config(folder, config)
+    record["statistics"] |= {"compile_seconds": compiled, "run_seconds": ran - compiled}
     if front.points:
         folder.write_csv("front.csv", files.row_columns([point.row() for point in front.points]))
     for point in front.points:
-        text = front.config_of(point).to_yaml()
-        folder.write_text(files.design_file(point.number), text)
-    folder.write_json("result.json", record | {"versions": files.versions()})
+        folder.write_text(files.design_file(point.number), front.config_of(point).to_yaml())
     if front.points and not options.no_figures:
         from rootsopt.view.figures.comparisons import front_figure
 
@@ -48,5 +41,4 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
         f"{front.searches} searches, {front.evaluations} designs, compile "
         f"{compiled:.1f} s, run {ran - compiled:.1f} s"
     )
-    complete = front.certified > 0 and not front.interrupted
-    return cli.Outcome(cli.OK if complete else cli.NO_RESULT, [line])
+    return cli.Outcome(front.certified > 0 and not front.interrupted, record, [line])

@@ -12,7 +12,7 @@ from rootsopt.response.records import geometry_record
 from rootsopt.scene.build import Scene
 from rootsopt.scene.check import check_geometry, outline_mm
 from rootsopt.scene.families import free_form_of, margins_of
-from rootsopt.scene.reading import design_keys, design_vector
+from rootsopt.scene.reading import design_vector
 from rootsopt.scene.resemblance import free_likeness, likenesses
 from rootsopt.status import Status
 from rootsopt.view import files
@@ -26,12 +26,11 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
 
     Return the `Outcome`. Raises `InputError` if the config or an option is invalid."""
     formats = chosen(options.export)
-    cli.load_figures(options, "runs")
     check_geometry(config, simulated=False)
     scene, design = Scene.from_config(config), design_vector(config)
     shape = geometry(scene.profile(design))
     record = {
-        "design": dict(zip(design_keys(config), map(float, design), strict=True)),
+        "design": dict(zip(config.design_keys, map(float, design), strict=True)),
         "geometry": geometry_record(scene, shape),
         "response": {},
         "gradient": {},
@@ -44,7 +43,6 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
         record["margins"] = margins
     record |= conjugacy.record(config)
     record["pump"] = sheet(scene, design)
-    files.write_config(folder, config)
     folder.write_csv("profile_design.csv", files.profile_columns(outline_mm(config)))
     write(folder, config, formats, record["design"])
     if not options.no_figures:
@@ -54,11 +52,10 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
     alike = resembles(scene.profile(design)) if options.resembles else []
     if alike:
         record["resembles"] = alike
-    folder.write_json("result.json", record | {"versions": files.versions()})
     lines = conjugacy.notes(config)
     if options.project is not None:
         lines.append(_projected(folder, config, options.project))
-    return cli.Outcome(cli.OK, lines)
+    return cli.Outcome(True, record, lines)
 
 
 def resembles(profile: Profile) -> list[dict[str, Any]]:

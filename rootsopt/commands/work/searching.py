@@ -21,7 +21,6 @@ from rootsopt.response.sweeps.cluster import running
 from rootsopt.runtime.environment import say
 from rootsopt.runtime.threads import until_stopped
 from rootsopt.status import Status
-from rootsopt.view import files
 from rootsopt.view.runs import RunFolder
 
 Result = TypeVar("Result", covariant=True)
@@ -52,16 +51,7 @@ def runs_of(options: argparse.Namespace) -> contextlib.AbstractContextManager[Ru
             f"each, and then are no faster than this process, which uses all {os.cpu_count() or 1} "
             "cores; leave it out unless a design may end its process"
         )
-    cache = not options.no_cache
-    return running(options.workers, options.scheduler, options.imports, cache)
-
-
-def checkpoint_of(
-    command: str, config: Config, options: argparse.Namespace, folder: RunFolder
-) -> Checkpoint:
-    """Return the checkpoint of a search, beside the result folder. Arguments: see `opened`."""
-    header = header_of(command, config, options.imports)
-    return opened(partial(Checkpoint, header), options, folder)
+    return running(options.workers, options.scheduler, options.imports, not options.no_cache)
 
 
 def opened(make: Callable[[Path, bool], J], options: argparse.Namespace, folder: RunFolder) -> J:
@@ -90,22 +80,22 @@ def searched(
     options: argparse.Namespace,
     folder: RunFolder,
     make: Callable[..., Searches[Result]],
-    bar: Callable[[Console], contextlib.AbstractContextManager],
+    bar: contextlib.AbstractContextManager,
     kept: str,
 ) -> tuple[Result | None, float]:
     """Run the search of a `command`; return its outcome and the time (s) spent on compiling.
 
     `make`: makes the search, with the keywords `progress`, `stop`, `checkpoint` and `runs`; `bar`:
-    returns the progress bar on a console; `kept`: what is kept if the user stops the search, in
-    words. The outcome is `None` if the search was stopped before the baseline was known."""
+    the progress bar; `kept`: what is kept if the user stops the search, in words. The
+    outcome is `None` if the search was stopped before the baseline was known."""
     made: list[Searches[Result]] = []
-    clock = CompileClock()
+    make_checkpoint = partial(Checkpoint, header_of(command, config, options.imports))
     with (
-        clock,
+        CompileClock() as clock,
         door.patience(f"keeping {kept} and writing the files") as stop,
         runs_of(options) as runs,
-        bar(Console(stderr=True)) as progress,
-        contextlib.closing(checkpoint_of(command, config, options, folder)) as checkpoint,
+        bar as progress,
+        contextlib.closing(opened(make_checkpoint, options, folder)) as checkpoint,
     ):
 
         def work():
@@ -121,33 +111,28 @@ def searched(
     return outcome, clock.seconds
 
 
-def nothing_known(
-    config: Config, folder: RunFolder, done: str, empty: Mapping[str, Any]
-) -> cli.Outcome:
-    """Write the files of a run that was stopped before the baseline was known.
+def nothing_known(folder: RunFolder, done: str, empty: Mapping[str, Any]) -> cli.Outcome:
+    """Return the outcome of a run into `folder` that was stopped before the baseline was known.
 
     `done`: past participle for the message, such as "simulated"; `empty`: entries of the result
-    file that have no value. Return the `Outcome`, with exit code 3."""
-    status = Status.INTERRUPTED
+    file that have no value."""
     message = f"The run was stopped before the baseline had been {done}: there is no result."
-    files.write_config(folder, config)
-    data = {**empty, "status": status.label, "message": message}
-    folder.write_json("result.json", data | {"versions": files.versions()})
     folder.overwrite = False  # An earlier result is more valuable than this one.
-    return cli.Outcome(cli.NO_RESULT)
+    return cli.Outcome(False, {**empty, "status": Status.INTERRUPTED.label, "message": message})
 
 
 @contextlib.contextmanager
 def progress_bar(
-    console: Console, first: str, then: str, counted: str, field: str = ""
+    first: str, then: str, counted: str, field: str = ""
 ) -> Iterator[Callable[..., None] | None]:
-    """Yield a function (done, expected, …) that updates a progress bar.
+    """Yield a function (done, expected, …) that updates a progress bar on stderr.
 
-    Yield `None` if the console is not a terminal, where no progress bar is shown. `first`: text
-    until the first update, `then`: text from there on; `counted`: what the bar counts; `field`:
-    name of the number that is the function's third argument ("": the function has none).
+    Yield `None` if stderr is not a terminal, where no progress bar is shown. `first`: text until
+    the first update, `then`: text from there on; `counted`: what the bar counts; `field`: name of
+    the number that is the function's third argument ("": the function has none).
 
     At the end, the bar is full and states the number counted."""
+    console = Console(stderr=True)
     if not console.is_terminal:
         yield None
         return

@@ -2,8 +2,6 @@
 
 import argparse
 
-from rich.console import Console
-
 from rootsopt.commands import cli
 from rootsopt.config.reading import Config
 from rootsopt.measured import conjugacy
@@ -22,12 +20,10 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
 
     Return the `Outcome`. Raises `InputError` if the config or an option is invalid."""
     formats = chosen(options.export)
-    cli.load_figures(options, "runs")
     check_geometry(config)
     check_clearances(config)
-    with cli.waiting(Console(stderr=True), "compiling and simulating"):
+    with cli.waiting("compiling and simulating"):
         evaluation = Evaluator.of_objective(alone(config))()
-    files.write_config(folder, config)
     folder.write_csv("profile_design.csv", files.profile_columns(outline_mm(config)))
     if evaluation.series is not None:
         folder.write_csv("response_design.csv", files.response_columns(evaluation.series))
@@ -36,7 +32,6 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
         data["pump"] = record_of(config, [*evaluation.design.values()])
     if config.tolerances is not None and (scattered := touching(config)) is not None:
         data["touching"] = scattered
-    folder.write_json("result.json", data | {"versions": files.versions()})
     if formats:
         from rootsopt.view.figures.writing import write_simulated
 
@@ -46,5 +41,4 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
 
         runs.simulation_figures(folder, evaluation, config)
     shown = [*tables.tables_of(data), tables.effort_table(data)]
-    code = cli.OK if evaluation.usable else cli.NO_RESULT
-    return cli.Outcome(code, conjugacy.notes(config), tables=shown)
+    return cli.Outcome(evaluation.usable, data, conjugacy.notes(config), tables=shown)

@@ -7,10 +7,9 @@ from collections import Counter
 from collections.abc import Mapping
 from contextlib import closing
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from rich.console import Console
 
 from rootsopt.commands import cli, door
 from rootsopt.commands.work.searching import opened, progress_bar
@@ -32,11 +31,7 @@ from rootsopt.response.sweeps.scenes import (
 from rootsopt.runtime.environment import say
 from rootsopt.status import Status
 from rootsopt.view import files
-from rootsopt.view.files import ResultFolder
 from rootsopt.view.runs import RunFolder
-
-if TYPE_CHECKING:
-    import xarray
 
 
 def rows_of(plan: Plan, records: Mapping[int, Row]) -> list[dict[str, Any]]:
@@ -88,19 +83,10 @@ def summary(plan: Plan, records: Mapping[int, Row]) -> dict[str, Any]:
     }
 
 
-def write_dataset(folder: ResultFolder, name: str, dataset: "xarray.Dataset") -> None:
-    """Write a dataset as netCDF into `folder`; raise `InputError` if that fails."""
-    data = io.BytesIO()
-    dataset.to_netcdf(data, engine="h5netcdf")
-    folder.write_bytes(name, data.getvalue())
-
-
 _DATA = "sweep.nc"
 
 # Number of points above which the terminal shows only the first.
 _FEW = 40
-_FIRST = "compiling and simulating"
-_PROMISE = "keeping the points that are done and writing the files"
 
 
 def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.Outcome:
@@ -108,34 +94,31 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
 
     Return the `Outcome`. Raises `InputError` if a key, a value or an option is not valid."""
     began = time.perf_counter()
-    cli.load_figures(options, "sweep")
     config, plan = _points(config, options)
     plan = checked(config, plan)
     columns = {key: values for one in plan.dimensions for key, values in one.columns.items()}
     notes = notes_on_swept(config, columns)
     for note in notes:
         say(note)
-    folder.add_notes(notes)
-    cache = not options.no_cache
     with (
-        running(options.workers, options.scheduler, options.imports, cache) as runs,
+        running(options.workers, options.scheduler, options.imports, not options.no_cache) as runs,
         closing(opened(partial(Points, config, plan, options.imports), options, folder)) as journal,
-        door.patience(_PROMISE) as stop,
-        progress_bar(Console(stderr=True), _FIRST, "simulating", "points") as progress,
+        door.patience("keeping the points that are done and writing the files") as stop,
+        progress_bar("compiling and simulating", "simulating", "points") as progress,
     ):
         known = len(journal.resumed)
-        records = complete(config, plan, runs, journal, progress or _silent, stop)
+        told = progress or (lambda done, expected: None)
+        records = complete(config, plan, runs, journal, told, stop)
     done = len(records) == plan.count
     seconds = time.perf_counter() - began
-    dataset = dataset_of(config, plan, records)
-    files.write_config(folder, config)
     rows = rows_of(plan, records)
     folder.write_csv("sweep.csv", files.row_columns(rows))
-    write_dataset(folder, _DATA, dataset)
-    statistics: dict[str, Any] = {"seconds": seconds, "resumed_points": known}
-    statistics["points_per_second"] = (len(records) - known) / seconds
+    dataset, data = dataset_of(config, plan, records), io.BytesIO()
+    dataset.to_netcdf(data, engine="h5netcdf")
+    folder.write_bytes(_DATA, data.getvalue())
+    rate = (len(records) - known) / seconds
+    statistics = {"seconds": seconds, "resumed_points": known, "points_per_second": rate}
     record = summary(plan, records) | {"data": _DATA, "statistics": statistics}
-    folder.write_json("result.json", record | {"versions": files.versions()})
     if not options.no_figures:
         from rootsopt.view.figures.sweep import sweep_figure
 
@@ -144,10 +127,9 @@ def body(config: Config, options: argparse.Namespace, folder: RunFolder) -> cli.
         folder.remove_afterwards(folder.checkpoint)
     else:
         folder.overwrite = False  # An earlier result is more valuable than this one.
-    rate = statistics["points_per_second"]
     line = f"{len(records) - known} points in {seconds:.1f} s, {rate:.3g} per second"
     usable = done and any(Status[row["status"].upper()].usable for row in rows)
-    return cli.Outcome(cli.OK if usable else cli.NO_RESULT, [line], rows, _FEW)
+    return cli.Outcome(usable, record, [line], rows, _FEW, config=config, notes=notes)
 
 
 def _points(config: Config, options: argparse.Namespace) -> tuple[Config, Plan]:
@@ -180,9 +162,4 @@ def _plan(config: Config, options: argparse.Namespace) -> Plan:
     seeded = options.sample is not None or options.sobol is not None
     if options.seed is not None and not seeded:
         raise InputError("`--seed` is for samples; add `--sample N` or `--sobol N`, or remove it")
-    seed = 0 if options.seed is None else options.seed
-    return plan_of(axes, options.zip or groups, options.sample, options.sobol, seed)
-
-
-def _silent(done: int, expected: int) -> None:
-    """Do nothing, in place of a progress bar."""
+    return plan_of(axes, options.zip or groups, options.sample, options.sobol, options.seed or 0)

@@ -168,9 +168,8 @@ def _force_panel(ax: Axes, series: Series, samples: int):
     """Draw the flank forces over the rotation on `ax`; return the line that marks a rotation.
 
     `samples`: number of samples of `series` that are drawn."""
-    shown = slice(0, samples)
-    degrees = np.degrees(series.rotation[shown] - series.rotation[0])
-    forces = series.drive_force[shown], series.coast_force[shown]
+    degrees = np.degrees(series.rotation[:samples] - series.rotation[0])
+    forces = series.drive_force[:samples], series.coast_force[:samples]
     for (name, color), force in zip(_FLANKS, forces, strict=True):
         plot_flank_force(ax, degrees, force, color, name)
     top = max(map(np.max, forces))
@@ -220,16 +219,20 @@ class _Scene:
         hole = 0.0 if drawing.bore is None else drawing.bore / 2
         self.rotors = []
         for name, color, x in (("rotor 1 ↺", SKY, 0.0), ("rotor 2 ↻", ORANGE, self.center)):
-            rotor = draw_rotor(ax, self.outline, color, x, drawing.pitch_radius)
-            self.rotors.append(rotor)
+            self.rotors.append(draw_rotor(ax, self.outline, color, x, drawing.pitch_radius))
             ax.add_patch(Circle((x, 0), hole, facecolor="white", edgecolor="black"))
             ax.annotate(name, (x, -hole), (0, -16), textcoords="offset points", ha="center")
         for name, color in _FLANKS:
             ax.plot([], [], "o", color=color, label=name)
         self.label = ax.text(0.01, 0.98, "", transform=ax.transAxes, va="top")
         reach = 1.06 * drawing.outer_radius
-        ax.set(xlim=(-reach, self.center + reach), ylim=(-reach, reach))
-        ax.set(xlabel="x (mm)", ylabel="y (mm)", aspect="equal")
+        ax.set(
+            xlim=(-reach, self.center + reach),
+            ylim=(-reach, reach),
+            xlabel="x (mm)",
+            ylabel="y (mm)",
+            aspect="equal",
+        )
         ax.legend(loc="lower left", fontsize="small", framealpha=0.9)
         self.arrows = [_Arrow(ax, color, _ARROW * drawing.pitch_radius) for _, color in _FLANKS]
 

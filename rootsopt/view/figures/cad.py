@@ -45,7 +45,6 @@ _STYLES = {
     TITLE: (7, "CONTINUOUS", 25),
     TABLE: (8, "CONTINUOUS", 13),
 }
-_MILLIMETRES = 4
 STYLE = "ROTOR"
 """Name of the dimension style."""
 
@@ -54,9 +53,6 @@ _ROWS = 19
 
 # Width of a letter as a fraction of its height, with room to spare.
 _LETTER = 0.9
-
-# Colour index of lines that have the colour of their layer.
-_BY_LAYER = 256
 
 
 def add_style(document: Any, drawing: Drawing) -> None:
@@ -155,7 +151,7 @@ def _add_texts(space: Any, layer: str, rows: Sequence[Sequence[str]], place: tup
     made.fg_layer_name = made.grid_layer_name = layer
     look = {"char_height": height, "margin_x": 0.5 * height}
     style = made.new_cell_style("text", align=MTextEntityAlignment.MIDDLE_LEFT, **look)
-    style.set_border_style(made.new_border_style(color=_BY_LAYER))
+    style.set_border_style(made.new_border_style())  # Its lines have the colour of the layer.
     for column, width in enumerate(widths):
         made.set_col_width(column, width)
         for row, texts in enumerate(rows):
@@ -191,30 +187,25 @@ def dxf_bytes(drawing: Drawing) -> bytes:
     logging.getLogger("ezdxf").setLevel(logging.WARNING)
     import ezdxf
 
-    document = ezdxf.new("R2010", setup=["linetypes"], units=_MILLIMETRES)  # type: ignore[attr-defined]
+    document = ezdxf.new("R2010", setup=["linetypes"], units=ezdxf.units.MM)  # type: ignore[attr-defined]
     document.header["$LTSCALE"] = drawing.outer_radius / 20
     for name, (color, linetype, width) in _STYLES.items():
         document.layers.add(name, color=color, linetype=linetype, lineweight=width)
     space = document.modelspace()
+    layer = {"layer": OUTLINE}
     for piece in drawing.pieces:
         if isinstance(piece, Arc):
-            # In DXF an arc runs counter-clockwise.
-            ends = sorted([piece.begin, piece.begin + piece.sweep])
-            first, last = np.degrees(ends)
-            center = piece.center.real, piece.center.imag
-            layer = {"layer": OUTLINE}
-            space.add_arc(center, piece.radius, float(first), float(last), dxfattribs=layer)
+            first, last = np.degrees([piece.begin, piece.begin + piece.sweep])
+            space.add_arc(_point(piece.center), piece.radius, first, last,
+                          is_counter_clockwise=piece.sweep > 0, dxfattribs=layer)  # fmt: skip
         else:
-            spline = space.add_spline(degree=3, dxfattribs={"layer": OUTLINE})
-            spline.control_points = [(z.real, z.imag, 0.0) for z in piece.controls]
-            spline.knots = list(map(float, piece.knots))
+            points, knots = map(_point, piece.controls), piece.knots.tolist()
+            space.add_open_spline(points, 3, knots, dxfattribs=layer)
     if drawing.bore is not None:
         space.add_circle((0, 0), drawing.bore / 2, dxfattribs={"layer": BORE})
     space.add_circle((0, 0), drawing.pitch_radius, dxfattribs={"layer": PITCH})
-    reach = drawing.reach
-    for end in ((reach, 0), (0, reach)):
-        start = -end[0], -end[1]
-        space.add_line(start, end, dxfattribs={"layer": CENTER})
+    for x, y in ((drawing.reach, 0), (0, drawing.reach)):
+        space.add_line((-x, -y), (x, y), dxfattribs={"layer": CENTER})
     add_style(document, drawing)
     add_dimensions(space, drawing)
     add_title_block(space, drawing)
@@ -230,8 +221,7 @@ def _add_notes(space: Any, drawing: Drawing) -> None:
     height, left = letter(drawing), edges(drawing)[0]
     for row, note in enumerate(drawing.notes):
         place = left + height, -1.3 * drawing.outer_radius - 1.9 * height * (row + 1)
-        text = space.add_text(plain(note), height=height, dxfattribs={"layer": TEXT})
-        text.set_placement(place)
+        space.add_text(plain(note), height=height, dxfattribs={"layer": TEXT}).set_placement(place)
 
 
 CHORD = 0.005
@@ -361,14 +351,9 @@ def _side(piece: DrawnPiece, length: float, helix: float) -> "Face":
     rate = 1j * helix
     ends = ([(1, rate)], [(1, rate * np.exp(rate))])
     rising = make_interp_spline(share, np.exp(rate * share), k=3, bc_type=ends)
-    heights = np.array([rising.t[i + 1 : i + 4].mean() for i in range(len(rising.c))])
-    return _surface(
-        (degree, 3),
-        (knots, rising.t),
-        controls[:, None] * rising.c,
-        np.broadcast_to(heights * length, (len(controls), len(heights))),
-        np.broadcast_to(weights[:, None], (len(controls), len(heights))),
-    )
+    heights = length * np.array([rising.t[i + 1 : i + 4].mean() for i in range(len(rising.c))])
+    points = controls[:, None] * rising.c
+    return _surface((degree, 3), (knots, rising.t), points, heights, weights)
 
 
 def _rational(piece: DrawnPiece):
@@ -397,8 +382,9 @@ def _quarters(piece: DrawnPiece) -> list[DrawnPiece]:
 def _surface(degrees, knots, points, heights, weights) -> "Face":
     """Return a face on a rational B-spline surface (mm).
 
-    `points`, `heights`, `weights` (n, m): x + iy, z and weight of each control point. `degrees`,
-    `knots`: pairs of values, the first along the outline and the second along the axis."""
+    `points` (n, m): x + iy of the control points; `heights` (m,): their z; `weights` (n,): their
+    weights. `degrees`, `knots`: pairs of values, the first along the outline and the second along
+    the axis."""
     from build123d import Face
     from OCP.BRepBuilderAPI import BRepBuilderAPI_MakeFace
     from OCP.collections import Array1_double, Array1_int, Array2_double, Array2_gp_Pnt
@@ -408,11 +394,9 @@ def _surface(degrees, knots, points, heights, weights) -> "Face":
     rows, columns = points.shape
     poles = Array2_gp_Pnt(1, rows, 1, columns)
     shares = Array2_double(1, rows, 1, columns)
-    for i in range(rows):
-        for j in range(columns):
-            x, y, _ = _point(points[i, j])
-            poles.SetValue(i + 1, j + 1, gp_Pnt(x, y, float(heights[i, j])))
-            shares.SetValue(i + 1, j + 1, float(weights[i, j]))
+    for (i, j), z in np.ndenumerate(points):
+        poles.SetValue(i + 1, j + 1, gp_Pnt(z.real, z.imag, heights[j]))
+        shares.SetValue(i + 1, j + 1, weights[i])
     vectors = []
     for values, counts in (np.unique(k, return_counts=True) for k in knots):
         places, multiplicities = Array1_double(1, len(values)), Array1_int(1, len(values))

@@ -18,21 +18,19 @@ from rootsopt.status import Standing
 from rootsopt.view.comparison import label_of, named
 from rootsopt.view.figures.style import (
     BLUE,
-    COLORS,
-    DASHES,
     GREEN,
     GREY,
     ORANGE,
     VERMILION,
     figure,
+    looks,
     write,
 )
 from rootsopt.view.files import ResultFolder
-from rootsopt.view.names import brief, name_and_unit
+from rootsopt.view.names import brief, in_words, label, name_and_unit
 
 if TYPE_CHECKING:
     from rootsopt.optimize.tradeoffs.front import Front
-    from rootsopt.view.files import ResultFolder
 
 
 # Colour and marker of each kind of point.
@@ -83,8 +81,9 @@ def plot_front(ax: Axes, front: "Front", x: str, y: str) -> Axes:
         ax.annotate(str(point.number), (point.terms[x], point.terms[y]), color="0.3", **text)
     third = next((aim for aim in front.aims if aim.name not in (x, y)), None)
     if third is not None:
-        places = ([point.terms[name] for point in front.points] for name in (x, y, third.name))
-        across, up, values = places
+        across, up, values = (
+            [point.terms[name] for point in front.points] for name in (x, y, third.name)
+        )
         colours = ax.scatter(across, up, c=values, cmap="viridis", s=40, zorder=3)
         ax.figure.colorbar(colours, ax=ax, location="top", label=third.label, shrink=0.8)
     ax.set(xlabel=_axis(aims[x]), ylabel=_axis(aims[y]))
@@ -110,30 +109,28 @@ def front_figure(folder: ResultFolder, front: "Front") -> None:
         made, axes = figure(14, 5.4, 1, len(pairs))
         for ax, (y, x) in zip(axes[0], pairs, strict=True):
             plot_front(ax, front, x, y)
-    words = [aim.words for aim in front.aims]
-    title = f"trade-off of {', '.join(words[:-1])} against {words[-1]}"
-    title = f"{front.config.profile.family.upper()}: {title}"
+    *others, last = [aim.words for aim in front.aims]
+    family = front.config.profile.family.upper()
+    title = f"{family}: trade-off of {', '.join(others)} against {last}"
     write(folder, "front", made, title, axes[0, 0].get_legend_handles_labels()[0], 6)
 
 
-def plot_designs(ax: Axes, front: "Front", x: str) -> Axes:
+def plot_designs(ax: Axes, front: "Front", x: str) -> None:
     """Draw the design parameters along a front over the term `x`, each in units of its bounds.
 
-    Lines are interrupted at gaps. Return `ax`."""
+    Lines are interrupted at gaps."""
     keys = [*front.points[0].design]
     points = np.array([point.point for point in front.points])
     aim = next(aim for aim in front.aims if aim.name == x)
-    for k, key in enumerate(keys[:12]):
-        color, dashes = COLORS[k % len(COLORS)], DASHES[k % len(DASHES)]
-        for one, other in front.edges:
-            ends = [front.points[n - 1].terms[x] for n in (one, other)]
-            ax.plot(ends, points[[one - 1, other - 1], k], color=color, linestyle=dashes)
-        at = [point.terms[x] for point in front.points]
-        ax.plot(at, points[:, k], "o", color=color, markersize=4)
-        ax.plot([], [], "o", color=color, linestyle=dashes, markersize=4, label=words(key))
+    at = np.array([point.terms[x] for point in front.points])
+    for k, look in enumerate(looks(map(words, keys[:12]))):
+        for edge in front.edges:
+            ends = np.array(edge) - 1
+            ax.plot(at[ends], points[ends, k], color=look["color"], linestyle=look["linestyle"])
+        ax.plot(at, points[:, k], "o", color=look["color"], markersize=4)
+        ax.plot([], [], "o", markersize=4, **look)
     ax.set(xlabel=_axis(aim), ylabel="design (0: lower, 1: upper bound)", ylim=(-0.05, 1.05))
     ax.legend(frameon=False, fontsize=8, ncols=math.ceil(len(keys[:12]) / 4))
-    return ax
 
 
 _OBJECTIVE = "objective (baseline in the same scene = 1)"
@@ -142,10 +139,10 @@ _OBJECTIVE = "objective (baseline in the same scene = 1)"
 _WIDE = 1.5
 
 
-def plot_ranges(ax: Axes, keys: Sequence[Mapping[str, Any]], own: float) -> Axes:
+def plot_ranges(ax: Axes, keys: Sequence[Mapping[str, Any]], own: float) -> None:
     """Draw the objective at both ends of the range of each quantity, one row per quantity.
 
-    `keys`: rows of the result file; `own`: objective in the config's own scene. Return `ax`."""
+    `keys`: rows of the result file; `own`: objective in the config's own scene."""
     for k, row in enumerate(keys):
         low, high = (np.nan if row[f"objective_{end}"] is None else row[f"objective_{end}"]
                      for end in ("low", "high"))  # fmt: skip
@@ -162,24 +159,22 @@ def plot_ranges(ax: Axes, keys: Sequence[Mapping[str, Any]], own: float) -> Axes
     ax.axvline(1, color="black", linewidth=0.8)
     ax.invert_yaxis()
     ax.set_xlabel(_OBJECTIVE)
-    return ax
 
 
-def plot_scenes(ax: Axes, key: str, columns: Mapping[str, Sequence[Any]]) -> Axes:
+def plot_scenes(ax: Axes, key: str, columns: Mapping[str, Sequence[Any]]) -> None:
     """Draw the objective of all designs in the random scenes over the quantity `key`.
 
-    `columns`: those of `assumptions.csv`. Return `ax`."""
-    names = [name for name in columns if name.startswith("objective_")]
+    `columns`: those of `assumptions.csv`."""
+    names = [
+        name for name in columns if name.startswith("objective_") and name != "objective_baseline"
+    ]
     values = np.array(columns[key], float)
     drawn = np.array([name.startswith("random") for name in columns["scene"]])
-    looks = {"objective_optimized": (BLUE, "o"), "objective_design_1": (VERMILION, "x")}
+    marks = {"objective_optimized": (BLUE, "o"), "objective_design_1": (VERMILION, "x")}
     for name in names:
-        color, mark = looks.get(name, (GREY, "+"))
-        if name != "objective_baseline":
-            word = name.removeprefix("objective_").replace("_", " ").replace("ized", "ised")
-            ax.plot(
-                values[drawn], np.array(columns[name], float)[drawn], mark, color=color, label=word
-            )
+        color, mark = marks.get(name, (GREY, "+"))
+        word = in_words(name.removeprefix("objective_")).replace("ized", "ised")
+        ax.plot(values[drawn], np.array(columns[name], float)[drawn], mark, color=color, label=word)
     ax.axhline(1, color="black", linewidth=0.8, label="baseline")
     places = np.concatenate([np.column_stack(line.get_data()) for line in ax.get_lines()[:-1]])
     places = places[np.isfinite(places).all(axis=1)].reshape(-1, 2)
@@ -192,7 +187,6 @@ def plot_scenes(ax: Axes, key: str, columns: Mapping[str, Sequence[Any]]) -> Axe
         at = {"transform": ax.get_xaxis_transform(), "clip_on": False, "label": "above the axis"}
         ax.plot(beyond[:, 0], np.full(len(beyond), 0.98), "^", color=GREY, **at)
     ax.set(xlabel=f"{label_of(key)}, all else random, too", ylabel=_OBJECTIVE)
-    return ax
 
 
 def spread_figure(
@@ -209,12 +203,11 @@ def spread_figure(
     write(folder, "assumptions", made, "The optimum where the pump may run", entries, 6)
 
 
-NAMES = {"baseline": "baseline", "nominal": "nominal optimum", "robust": "robust optimum"}
-"""Names of the designs in legends."""
-_STYLES = {
-    "baseline": (GREY, "-"),
-    "nominal": (BLUE, "-"),
-    "robust": (GREEN, (0, (4, 1.5))),
+# Look of each design in `distributions`.
+_STYLES: dict[str, dict[str, Any]] = {
+    "baseline": {"label": "baseline", "color": GREY},
+    "nominal": {"label": "nominal optimum", "color": BLUE},
+    "robust": {"label": "robust optimum", "color": GREEN, "linestyle": (0, (4, 1.5))},
 }
 
 # Maximum number of bins of a histogram.
@@ -222,42 +215,36 @@ _BINS = 50
 
 # Least average number of scenes per bin, if there are few scenes.
 _PER_BIN = 6
-PANELS = {"mean_force_N": "mean force (N)", "peak_force_N": "peak force (N)"}
-"""Forces that `distributions` draws, with the labels of their axes."""
 
 
-def plot_distribution(ax: Axes, designs: Mapping[str, ArrayLike], label: str) -> Axes:
+def plot_distribution(ax: Axes, designs: Mapping[str, ArrayLike], force: str) -> None:
     """Draw a histogram of each design's force, and a vertical line at its 95 % quantile.
 
-    `designs`: force in each scene (n,) by name of the design (keys of `NAMES`); scenes without a
-    usable motion are NaN and left out. `label`: that of the horizontal axis. Return `ax`.
+    `designs`: force in each scene (n,) by name of the design (keys of `_STYLES`); scenes without a
+    usable motion are NaN and left out. `force`: its key.
     """
     known = {name: np.asarray(values, float) for name, values in designs.items()}
-    known = {name: values[np.isfinite(values)] for name, values in known.items()}
-    known = {name: values for name, values in known.items() if values.size}
+    known = {name: x[np.isfinite(x)] for name, x in known.items() if np.isfinite(x).any()}
     every = np.concatenate([np.zeros(0), *known.values()])
     most = max((values.size for values in known.values()), default=0)
     bins = max(1, min(_BINS, most // _PER_BIN))
     edges = np.histogram_bin_edges(every, bins).tolist()
     for name, values in known.items():
-        color, dashes = _STYLES[name]
-        style = {"color": color, "linestyle": dashes}
-        weights = np.full(len(values), 100 / len(values))
-        ax.hist(values, edges, weights=weights, histtype="step", linewidth=1.6,
-                label=NAMES[name], **style)  # fmt: skip
-        ax.axvline(float(np.quantile(values, 0.95)), linewidth=1.0, alpha=0.8, **style)
-    ax.set(xlabel=label, ylabel="share of the scenes (%)")
-    return ax
+        style, weights = _STYLES[name], np.full(len(values), 100 / len(values))
+        ax.hist(values, edges, weights=weights, histtype="step", linewidth=1.6, **style)
+        line = style | {"label": None, "linewidth": 1.0, "alpha": 0.8}
+        ax.axvline(float(np.quantile(values, 0.95)), **line)
+    ax.set(xlabel=label(force), ylabel="share of the scenes (%)")
 
 
 def distributions(designs: Mapping[str, Mapping[str, ArrayLike]], title: str) -> Figure:
     """Return a figure of the distributions of mean and peak force, one panel each.
 
-    `designs`: by name of the design, its forces in each scene by key (`PANELS`)."""
-    made, axes = figure(11, 4.4, 1, len(PANELS))
-    for ax, (key, label) in zip(axes[0], PANELS.items(), strict=True):
-        plot_distribution(ax, {name: one[key] for name, one in designs.items()}, label)
-    lines, names = axes[0, 0].get_legend_handles_labels()
-    made.legend(lines, names, loc="outside lower center", ncols=3, frameon=False)
+    `designs`: by name of the design, its forces in each scene by key."""
+    made, axes = figure(11, 4.4, 1, 2)
+    for ax, force in zip(axes[0], ("mean_force_N", "peak_force_N"), strict=True):
+        plot_distribution(ax, {name: one[force] for name, one in designs.items()}, force)
+    entries = axes[0, 0].get_legend_handles_labels()
+    made.legend(*entries, loc="outside lower center", ncols=3, frameon=False)
     made.suptitle(f"{title}; vertical lines: 95 % quantiles")
     return made

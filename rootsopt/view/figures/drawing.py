@@ -181,7 +181,7 @@ class Drawing:
             length=rotor.length_mm,
             helix_deg=rotor.helix_deg,
             bore=rotor.bore_mm,
-            notes=tuple(note for note in notes if note),
+            notes=tuple(notes),
             root_radius=root,
             block=_block(config),
         )
@@ -223,12 +223,9 @@ def _block(config: Config) -> tuple[tuple[str, str], ...]:
 
 def _scene(config: Config) -> str:
     """Return a few words on the scene for which the rotor was designed."""
-    scene, load = config.scene, config.scene.load
-    words = [f"{scene.speed_rpm:g} rpm"]
-    if load.torque_N_m is not None:
-        words.append(f"{load.torque_N_m:g} N m")
-    else:
-        words.append(f"{load.pressure_difference_Pa:g} Pa")
+    scene, torque = config.scene, config.scene.load.torque_N_m
+    load = f"{scene.load.pressure_difference_Pa:g} Pa" if torque is None else f"{torque:g} N m"
+    words = [f"{scene.speed_rpm:g} rpm", load]
     if scene.timing_gear is not None:
         words.append(f"backlash {scene.timing_gear.backlash_mm:g} mm")
     words.append(f"clearance {config.contact.clearance_mm:g} mm")
@@ -248,12 +245,11 @@ def svg_text(drawing: Drawing) -> str:
 
     One user unit is 1 mm. The rotor's y axis points up on the page."""
     reach = drawing.reach + 1
-    size = _number(2 * reach)
-    corner = _number(-reach)
-    end = _number(drawing.reach)
-    path = outline_path(drawing.pieces)
+    size, corner, end = map(_number, (2 * reach, -reach, drawing.reach))
+    path = f"M{_point(drawing.pieces[0].start)}{''.join(map(_command, drawing.pieces))}Z"
     if drawing.bore is not None:
-        path += _circle_path(drawing.bore / 2)
+        r = _number(drawing.bore / 2)
+        path += f"M{r} 0A{r} {r} 0 1 0 -{r} 0A{r} {r} 0 1 0 {r} 0Z"
     return "\n".join(
         [
             '<?xml version="1.0" encoding="UTF-8"?>',
@@ -271,24 +267,13 @@ def svg_text(drawing: Drawing) -> str:
     )
 
 
-def outline_path(pieces: list[DrawnPiece]) -> str:
-    """Return the closed outline `pieces` as SVG path data, with splines as Bézier curves."""
-    return f"M{_point(pieces[0].start)}" + "".join(map(_command, pieces)) + "Z"
-
-
 def _command(piece: DrawnPiece) -> str:
+    """Return the SVG path data from the start of a piece to its end; splines are Bézier curves."""
     if not isinstance(piece, Arc):
-        rows = (" ".join(_point(z) for z in curve[1:]) for curve in piece.beziers())
-        return "".join(f"C{row}" for row in rows)
-    radius = _number(piece.radius)
-    large = int(abs(piece.sweep) > 3.141592653589793)
+        return "".join("C" + " ".join(map(_point, curve[1:])) for curve in piece.beziers())
+    radius, large = _number(piece.radius), int(abs(piece.sweep) > math.pi)
     # In SVG y points down, so a sweep flag of 1 looks clockwise.
     return f"A{radius} {radius} 0 {large} {int(piece.sweep < 0)} {_point(piece.stop)}"
-
-
-def _circle_path(radius: float) -> str:
-    r = _number(radius)
-    return f"M{r} 0A{r} {r} 0 1 0 -{r} 0A{r} {r} 0 1 0 {r} 0Z"
 
 
 def _point(z: complex) -> str:

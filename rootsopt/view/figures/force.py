@@ -29,14 +29,14 @@ def plot_force(
     axes: Sequence[Axes] | NDArray,
     series: Mapping[str, Series],
     responses: Mapping[str, Mapping[str, float]],
-) -> Sequence[Axes] | NDArray:
+) -> None:
     """Draw the contact force over time, one panel per design, all on one scale.
 
     `axes`: one for each design; `series`, `responses`: simulated motion and response of each
     design, keyed by its name. Mean and peak are taken from the response (`mean_force_N`,
     `peak_force_N`), which is more accurate than the samples. All panels cover the same number of
     revolutions, at most a few, and each includes the largest force of its design. Time is 0 at the
-    start of each panel. Return `axes`.
+    start of each panel.
     """
     turns = min(_MOST_TURNS, *(np.ptp(run.rotation) / (2 * np.pi) for run in series.values()))
     for ax, (name, run) in zip(axes, series.items(), strict=True):
@@ -58,16 +58,12 @@ def plot_force(
     for ax in axes:
         ax.set_ylim(0, 1.12 * top if top > 0 else 1)
     axes[-1].set_xlabel("time (ms)")
-    return axes
 
 
-def plot_gap(
-    axes: Sequence[Axes] | NDArray, series: Mapping[str, Series]
-) -> Sequence[Axes] | NDArray:
+def plot_gap(axes: Sequence[Axes] | NDArray, series: Mapping[str, Series]) -> None:
     """Draw the gap of flanks that never touch over one revolution, one panel per design.
 
-    `axes`: one for each design; `series`: simulated motion of each design, keyed by its name.
-    Return `axes`."""
+    `axes`: one for each design; `series`: simulated motion of each design, keyed by its name."""
     for ax, (name, run) in zip(axes, series.items(), strict=True):
         turn = run.rotation <= run.rotation[0] + 2 * np.pi
         time, gap = (run.time[turn] - run.time[0]) * 1e3, -1e6 * run.depth[turn]
@@ -80,7 +76,6 @@ def plot_gap(
         ax.set(title=name, ylabel="gap (µm)", xlim=(0, time[-1]), ylim=(0, high))
         beside(ax)
     axes[-1].set_xlabel("time (ms)")
-    return axes
 
 
 def plot_flank_force(ax: Axes, time: NDArray, force: NDArray, color: str, label: str) -> None:
@@ -102,8 +97,7 @@ def _around_peak(run: Series, turns: float) -> slice:
     Near an end of the run, the slice is shifted to lie within the run."""
     count = len(run.time)
     shown = min(count, round(count * turns * 2 * np.pi / np.ptp(run.rotation)))
-    start = 0 if shown == count else int(np.argmax(run.force)) - shown // 2
-    start = min(max(start, 0), count - shown)
+    start = int(np.clip(np.argmax(run.force) - shown // 2, 0, count - shown))
     return slice(start, start + shown)
 
 
@@ -129,12 +123,12 @@ def plot_spectrum(
     series: Mapping[str, Series],
     mesh_frequency_Hz: float,
     harmonics: int = 40,
-) -> Sequence[Axes] | NDArray:
+) -> None:
     """Draw the amplitude spectrum of the contact force, one panel per design, all on one scale.
 
     `axes`: one for each design; `series`: simulated motion of each design, keyed by its name;
     `mesh_frequency_Hz`: mesh frequency (Hz); `harmonics`: number of multiples of the mesh frequency
-    on the frequency axis. The mean (0 Hz) is omitted. Return `axes`.
+    on the frequency axis. The mean (0 Hz) is omitted.
     """
     limit = (harmonics + 0.5) * mesh_frequency_Hz
     top = 0.0
@@ -163,7 +157,6 @@ def plot_spectrum(
     )
     orders.set_xlabel(f"multiple of the mesh frequency, {mesh_frequency_Hz:.4g} Hz")
     axes[-1].set_xlabel("frequency (kHz)")
-    return axes
 
 
 # Maximum number of measured columns that are drawn.
@@ -180,30 +173,27 @@ _FLOOR = 1e-5
 _INSIDE = 2.448
 
 
-def plot_record(ax: Axes, place: NDArray, measured: NDArray, fitted: NDArray) -> Axes:
-    """Draw the measured and the fitted values over their `place`. Return `ax`."""
+def plot_record(ax: Axes, place: NDArray, measured: NDArray, fitted: NDArray) -> None:
+    """Draw the measured and the fitted values over their `place`."""
     order = np.argsort(place, kind="stable")
     ax.plot(place, measured, ".", color=GREY, markersize=3, label="record")
     ax.plot(place[order], fitted[order], color=BLUE, linewidth=1, label="fit")
-    return ax
 
 
-def plot_orders(ax: Axes, turned: NDArray, measured: NDArray, fitted: NDArray) -> Axes:
+def plot_orders(ax: Axes, turned: NDArray, measured: NDArray, fitted: NDArray) -> None:
     """Draw the amplitudes of samples at rotations `turned` (°) over their order, the number of
-    cycles in a turn. Return `ax`."""
+    cycles in a turn."""
     orders = np.arange(1, _ORDERS + 1)
     waves = np.exp(-1j * np.radians(turned) * orders[:, None])
     for values, color, mark in ((measured, GREY, "o"), (fitted, BLUE, "x")):
         sizes = 2 * np.abs(waves @ (values - np.mean(values))) / len(turned)
         ax.plot(orders, sizes, mark, color=color)
-    ax.set_yscale("log")
+    ax.set(yscale="log", xlabel="order (cycles per turn)")
     ax.set_ylim(bottom=_FLOOR * np.max(np.abs(measured)))
-    ax.set_xlabel("order (cycles per turn)")
-    return ax
 
 
-def plot_region(ax: Axes, fit: "Identification", first: int, second: int) -> Axes:
-    """Draw the 95 % confidence region of two quantities. Return `ax`."""
+def plot_region(ax: Axes, fit: "Identification", first: int, second: int) -> None:
+    """Draw the 95 % confidence region of two quantities."""
     keys, one = [*fit.parameters], fit.covariance[np.ix_([first, second], [first, second])]
     sizes, axes = np.linalg.eigh(one)
     middle = [fit.parameters[keys[k]]["value"] for k in (first, second)]
@@ -217,7 +207,6 @@ def plot_region(ax: Axes, fit: "Identification", first: int, second: int) -> Axe
     ax.locator_params(nbins=5, steps=[1, 2, 2.5, 5, 10])
     ax.ticklabel_format(useOffset=False, style="plain")
     ax.set(xlabel=label_of(keys[first]), ylabel=label_of(keys[second]), title="95 % region")
-    return ax
 
 
 def drawn(fit: "Identification") -> Figure:

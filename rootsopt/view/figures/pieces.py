@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex128, Float64
 from numpy.typing import NDArray
-from scipy.interpolate import BSpline, make_interp_spline
+from scipy.interpolate import BPoly, BSpline, make_interp_spline
 
 from rootsopt.errors import InputError
 from rootsopt.profiles import Profile
@@ -93,7 +93,7 @@ class Arc:
     def mirrored(self) -> "Arc":
         """Return the mirror image of the arc in the x axis, with its direction reversed."""
         begin = -(self.begin + self.sweep)
-        return dataclasses.replace(self, center=complex(np.conj(self.center)), begin=begin)
+        return dataclasses.replace(self, center=self.center.conjugate(), begin=begin)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,14 +111,13 @@ class Spline:
         """Return the points (mm) at fractions `share` of the parameter, from 0 (start) to 1 (end).
 
         The parameter is close to the arc length."""
-        first, last = self.knots[0], self.knots[-1]
-        return np.asarray(BSpline(self.knots, self.controls, 3)(first + share * (last - first)))
+        curve = BSpline(self.knots, self.controls, 3)
+        return np.asarray(curve(self.knots[0] + share * self.length))
 
     def heading(self, share: Float64[np.ndarray, "*n"] | float) -> Complex128[np.ndarray, "*n"]:
         """Return the unit tangents at fractions `share` of the parameter."""
-        first, last = self.knots[0], self.knots[-1]
         slope = BSpline(self.knots, self.controls, 3).derivative()
-        tangent = slope(first + np.asarray(share) * (last - first))
+        tangent = slope(self.knots[0] + share * self.length)
         return np.asarray(tangent / np.abs(tangent))
 
     @property
@@ -146,11 +145,9 @@ class Spline:
         """Return the same curve as k cubic Bézier curves, each a row of 4 control points (mm)."""
         curve = BSpline(self.knots, self.controls, 3)
         ends = np.unique(self.knots)
-        points, third = curve(ends), np.diff(ends) / 3
         # The derivative is continuous at every knot.
-        slopes = curve.derivative()(ends)
-        first, second = points[:-1] + slopes[:-1] * third, points[1:] - slopes[1:] * third
-        return np.stack([points[:-1], first, second, points[1:]], axis=-1)
+        both = np.stack([curve(ends), curve.derivative()(ends)], axis=-1)
+        return BPoly.from_derivatives(ends, both).c.T
 
 
 DrawnPiece = Arc | Spline
@@ -190,11 +187,10 @@ def polyline(pieces: list[DrawnPiece], chord: float) -> Complex128[np.ndarray, "
 def _flank(profile: Profile, inset: float) -> list[DrawnPiece]:
     """Return the pieces of one flank, from the centre of the tip to the centre of the root."""
     size = float(profile.pitch_radius) * _MM
-    segments = [(float(s.start), float(s.stop)) for s in profile.segments()]
+    segments = [(float(s.start), float(s.stop)) for s in profile.segments() if s.start != s.stop]
     stretches = [_Stretch(profile, start, stop, False, inset) for start, stop in segments]
     stretches += [_Stretch(profile, stop, start, True, inset) for start, stop in reversed(segments)]
-    whole = [stretch for stretch in stretches if stretch.start != stretch.stop]
-    pieces = [piece for stretch in whole for piece in stretch.pieces(size)]
+    pieces = [piece for stretch in stretches for piece in stretch.pieces(size)]
     # Leave out pieces without length, such as a tip land of zero width.
     return [piece for piece in pieces if piece.length > 1e-12 * size]
 

@@ -11,7 +11,6 @@ from rootsopt.config.reading import Config
 from rootsopt.measured.conjugacy import conjugacy, gaps_um
 from rootsopt.response.result import Evaluation
 from rootsopt.scene.check import outline_mm
-from rootsopt.scene.reading import design_keys
 from rootsopt.view.figures.designs import (
     plot_conjugacy,
     plot_departure,
@@ -95,7 +94,7 @@ def feasible_figure(
 
 
 def _outline(config, design):
-    return outline_mm(config, np.asarray([design[key] for key in design_keys(config)]))
+    return outline_mm(config, np.asarray([design[key] for key in config.design_keys]))
 
 
 def _profiles(folder, outlines, config):

@@ -132,10 +132,8 @@ class _Axis:
         self.label = label(key)
         positive = self.numeric and bool(np.all(self.at > 0)) and len({*values}) > 2
         steps = np.diff(np.sort(self.at))
-        self.log = positive and bool(steps.max() > 30 * steps.min() and self._ratio() > 30)
-
-    def _ratio(self) -> float:
-        return float(self.at.max() / self.at.min())
+        wide = positive and self.at.max() > 30 * self.at.min()
+        self.log = wide and steps.max() > 30 * steps.min()
 
     def words(self, value: Any) -> str:
         """Return a value as text for a legend."""
@@ -255,18 +253,17 @@ _UNSETTLED = "#B0B0B0"
 _PANELS = 6
 
 
-def plot_basins(ax: Axes, basins: Basins) -> Axes:
+def plot_basins(ax: Axes, basins: Basins) -> None:
     """Draw a map of the initial states, coloured by the motion to which each leads.
 
-    Points mark the state of each motion at the start of every mesh period. Return `ax`."""
+    Points mark the state of each motion at the start of every mesh period."""
     colors = [_LOST, *_colors(basins)]
     bounds = np.arange(len(colors) + 1) - 1.5
-    pale = [_pale(color) for color in colors]
     ax.pcolormesh(
         1e3 * basins.relative,
         basins.rate,
         basins.leads_to,
-        cmap=ListedColormap(pale),
+        cmap=ListedColormap([*map(_pale, colors)]),
         norm=BoundaryNorm(bounds, len(colors)),
         shading="nearest",
     )
@@ -283,7 +280,6 @@ def plot_basins(ax: Axes, basins: Basins) -> Axes:
         ylabel="initial relative speed (rad/s)",
         title="Where motions start and where they lead",
     )
-    return ax
 
 
 def plot_motions(axes: Sequence[Axes], attractors: Sequence[Attractor], colors, lobes: int) -> None:
@@ -313,19 +309,20 @@ def _entries(basins: Basins) -> list[Patch | Line2D]:
     for number, (one, color) in enumerate(zip(basins.attractors, _colors(basins), strict=True), 1):
         entries.append(Patch(facecolor=_pale(color), edgecolor=color, label=_label(number, one)))
     for name, share in basins.lost.items():
-        words = name.replace("_", " ")
-        entries.append(Patch(facecolor=_pale(_LOST), label=f"{words}, {share:.0%}"))
-    start = Line2D([], [], marker="+", color="black", linestyle="", markersize=11)
-    start.set_label("start at rest")
-    point = Line2D([], [], marker="o", color=GREY, linestyle="", markeredgecolor="white")
-    point.set_label("motion, once every mesh period")
-    return [*entries, point, start]
+        entries.append(Patch(facecolor=_pale(_LOST), label=f"{in_words(name)}, {share:.0%}"))
+    point: dict[str, Any] = {"marker": "o", "color": GREY, "markeredgecolor": "white"}
+    rest: dict[str, Any] = {"marker": "+", "color": "black", "markersize": 11}
+    return [
+        *entries,
+        Line2D([], [], linestyle="", label="motion, once every mesh period", **point),
+        Line2D([], [], linestyle="", label="start at rest", **rest),
+    ]
 
 
 def _label(number: int, one: Attractor) -> str:
     steady, response = one.evaluation.steady_state, one.evaluation.response
     period = steady.get("period")
-    kind = f"period {period}" if period else one.evaluation.status.label.replace("_", " ")
+    kind = f"period {period}" if period else in_words(one.evaluation.status.label)
     force = ""
     if response:
         force = f", mean {response['mean_force_N']:.4g} N, peak {response['peak_force_N']:.4g} N"

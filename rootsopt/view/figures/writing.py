@@ -14,10 +14,7 @@ from rootsopt.view.figures.cad import dxf_bytes
 from rootsopt.view.figures.drawing import Drawing, coordinates, svg_text
 from rootsopt.view.files import ResultFolder
 
-POINTS = "rotor_points.csv"
-"""Name of the table of coordinates, which is written beside the DXF drawing."""
-
-# Number of points over one lobe in this table, in addition to the ends of all pieces.
+# Number of points over one lobe in the table of coordinates, in addition to the ends of all pieces.
 _COUNT = 361
 
 
@@ -37,14 +34,15 @@ def write(
     """
     if not formats:
         return
-    values = jnp.asarray(np.array(list(design.values()), dtype=float))
-    profile = Scene.from_config(config).profile(values)
+    values = np.array(list(design.values()), dtype=float)
+    config = config.with_design(values)  # The twist may be a design parameter.
+    profile = Scene.from_config(config).profile(jnp.asarray(values))
     drawing = Drawing.of(config, profile, design)
     files: dict[str, bytes] = {}
     if "dxf" in formats:
         files["rotor.dxf"] = dxf_bytes(drawing)
         points = coordinates(drawing.pieces, drawing.lobes, _COUNT)
-        folder.write_csv(POINTS, points.columns())
+        folder.write_csv("rotor_points.csv", points.columns())
     if "svg" in formats:
         files["rotor.svg"] = svg_text(drawing).encode()
     if set(formats) & set(SOLID):

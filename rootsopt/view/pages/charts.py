@@ -72,8 +72,7 @@ def chart(across: str, up: str, height: int = 360, **options: Any) -> Any:
 
 def hover(made: Any, renderers: Sequence[Any], tips: Mapping[str, str], **options: Any) -> None:
     """Show `tips`, (name, field of the data), beside the pointer over some lines or points."""
-    tool = HoverTool(tooltips=[*tips.items()], renderers=[*renderers], **options)
-    made.add_tools(tool)
+    made.add_tools(HoverTool(tooltips=[*tips.items()], renderers=[*renderers], **options))
 
 
 def force_chart(cases: Sequence[Case]) -> Any | None:
@@ -81,7 +80,7 @@ def force_chart(cases: Sequence[Case]) -> Any | None:
 
     A single case shows the force on each flank. Several cases show the sum of both. A line marks
     the instant that the page's animation shows."""
-    moving = _moving(cases)
+    moving = [(case, case.series) for case in cases if case.series is not None]
     if not moving:
         return None
     longest = max(1e3 * float(np.ptp(series.time)) for _, series in moving)
@@ -111,11 +110,6 @@ def force_chart(cases: Sequence[Case]) -> Any | None:
     return made
 
 
-def _moving(cases: Sequence[Case]) -> list[tuple[Case, Series]]:
-    """Return the cases that have a motion, each with its series."""
-    return [(case, case.series) for case in cases if case.series is not None]
-
-
 def front_charts(result: Mapping[str, Any]) -> dict[str, Any]:
     """Return a chart of each pair of terms of a front, by title.
 
@@ -142,12 +136,12 @@ def front_charts(result: Mapping[str, Any]) -> dict[str, Any]:
     return charts
 
 
-def _thinned(force: NDArray[np.float64], most: int = _MOST_SAMPLES) -> NDArray[np.intp]:
+def _thinned(force: NDArray[np.float64]) -> NDArray[np.intp]:
     """Return the indices of the samples to draw: all, or the extremes of each short interval."""
     count = len(force)
-    if count <= most:
+    if count <= _MOST_SAMPLES:
         return np.arange(count)
-    edges = np.linspace(0, count, most // 2 + 1).astype(int)
+    edges = np.linspace(0, count, _MOST_SAMPLES // 2 + 1).astype(int)
     indices = {0, count - 1}
     for a, b in itertools.pairwise(edges):
         indices |= {a + int(np.argmax(force[a:b])), a + int(np.argmin(force[a:b]))}
@@ -173,9 +167,8 @@ def animations(cases: Sequence[Case]) -> dict[str, Any]:
     return {"rotors": [*rotors.values()], "cases": shown}
 
 
-def rotor(config: Config, points: ArrayLike) -> dict[str, Any]:
+def rotor(config: Config, points: NDArray[np.float64]) -> dict[str, Any]:
     """Return outline and sizes (mm) of a rotor; `points` (n, 2): its closed outline (mm)."""
-    points = np.asarray(points)
     error = config.scene.center_distance_error_mm or 0.0
     return {
         "outline": np.round(points, 4).tolist(),

@@ -16,21 +16,12 @@ from markupsafe import Markup, escape
 
 from rootsopt.config.families import family_of
 from rootsopt.config.reading import Config, load
+from rootsopt.config.units import COLUMNS
 from rootsopt.response.result import Series
 from rootsopt.view.files import ResultFolder, design_file
 from rootsopt.view.names import brief, in_words, listed, name_and_unit, quantity, stated, varied
 from rootsopt.view.tables import NAMES, records_of
 from rootsopt.view.terminal import Ending, ending
-
-# Columns of `response_*.csv`, by field of `Series`.
-_COLUMNS = {
-    "time": "time_s",
-    "rotation": "rotation_deg",
-    "relative": "relative_rotation_rad",
-    "rate": "relative_speed_rad_s",
-    "drive_force": "drive_flank_force_N",
-    "coast_force": "coast_flank_force_N",
-}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,62 +40,41 @@ class Case:
     series: Series | None
 
 
-@dataclasses.dataclass(frozen=True)
 class Run:
-    """A run as its files describe it.
+    """A run as the files in `folder` describe it.
 
-    `command`: name of the command; `source`: its arguments as the user gave them; `path`: final
-    path of the result folder; `config`: resolved config, with its YAML as `yaml`; `result`: content
-    of the result file; `cases`: designs and motions; `rows`: rows of a sweep's table;
-    `figures`: content of each PNG file by name; `usable`: whether the run ended with a usable
-    result (exit code 0); `imports`: files and modules of `--import`."""
+    `result`: content of the result file, which may not be written yet; `source`: arguments of the
+    command as the user gave them; `usable`: whether the run ended with a usable result (exit code
+    0); `imports`: files and modules of `--import`.
 
-    command: str
-    source: str
-    path: Path
-    config: Config
-    yaml: str
-    result: Mapping[str, Any]
-    cases: tuple[Case, ...]
-    rows: tuple[dict[str, Any], ...]
-    figures: Mapping[str, bytes]
-    usable: bool
-    imports: Sequence[str] = ()
+    `command`: name of the command; `path`: final path of the result folder; `config`: resolved
+    config, with its YAML as `yaml`; `cases`: designs and motions; `rows`: rows of a sweep's table;
+    `figures`: content of each PNG file by name.
 
-    @property
-    def end(self) -> Ending:
-        """Outcome and next commands, as on the terminal."""
-        return ending(self.result, self.path, self.source, self.imports, self.rows)
+    Raises `InputError` if a config in the folder cannot be read."""
 
-    @classmethod
-    def of(
-        cls,
+    def __init__(
+        self,
         folder: ResultFolder,
         result: Mapping[str, Any],
         source: str,
         usable: bool,
         imports: Sequence[str] = (),
-    ) -> "Run":
-        """Read the run whose files lie in `folder`.
-
-        `result`: content of the result file, which may not be written yet; `source`, `usable`,
-        `imports`: as in the class. Raises `InputError` if a config in the folder cannot be read."""
+    ):
         place = folder.place
-        config = load(place / "config.yaml")
         pictures = sorted((place / "figures").glob("*.png"))
-        return cls(
-            command=str(result.get("run", {}).get("command", "")),
-            source=source,
-            path=folder.path,
-            config=config,
-            yaml=(place / "config.yaml").read_text("utf-8"),
-            result=result,
-            cases=tuple(_cases(place, config, result)),
-            rows=tuple(_rows(place / "sweep.csv")),
-            figures={path.name: path.read_bytes() for path in pictures},
-            usable=usable,
-            imports=imports,
-        )
+        self.result, self.source, self.usable, self.imports = result, source, usable, imports
+        self.command, self.path = str(result.get("run", {}).get("command", "")), folder.path
+        self.config = load(place / "config.yaml")
+        self.yaml = (place / "config.yaml").read_text("utf-8")
+        self.cases = tuple(_cases(place, self.config, result))
+        self.rows = tuple(_rows(place / "sweep.csv"))
+        self.figures = {path.name: path.read_bytes() for path in pictures}
+
+    @property
+    def end(self) -> Ending:
+        """Outcome and next commands, as on the terminal."""
+        return ending(self.result, self.path, self.source, self.imports, self.rows)
 
 
 def _cases(place: Path, config: Config, result: Mapping[str, Any]) -> Iterator[Case]:
@@ -149,9 +119,11 @@ def _series(place: Path, name: str) -> Series | None:
     with file.open(encoding="utf-8") as lines:
         heads = lines.readline().strip().split(",")
         table = np.loadtxt(lines, delimiter=",", ndmin=2)
-    values = {field: table[:, heads.index(column)] for field, column in _COLUMNS.items()}
+    columns = dict(zip(heads, table.T, strict=True))
+    values = {field: columns[name] for field, (name, *_) in COLUMNS.items() if name in columns}
     values["rotation"] = np.radians(values["rotation"])
-    return Series(**values, depth=np.full(len(table), np.nan))
+    del values["force"]  # The sum of the forces on both flanks.
+    return Series(columns["time_s"], **values, depth=np.full(len(table), np.nan))
 
 
 _ASKED = {
@@ -175,14 +147,15 @@ _TITLES = {
     "profile": "Geometry of {pair}",
 }
 
+_SENSES = {"min": "as low as possible", "max": "as high as possible"}
+
 # Number of design parameters above which sentences do not list them.
 _FEW = 6
 
 
 def title(run: "Run") -> str:
     """Return the title of the report."""
-    pattern = _TITLES.get(run.command, "{pair}")
-    return pattern.format(pair=_pair(run.config)).strip()
+    return _TITLES.get(run.command, "{pair}").format(pair=_pair(run.config))
 
 
 def asked(run: "Run") -> list[str]:
@@ -200,7 +173,7 @@ def asked(run: "Run") -> list[str]:
         sentences.append(_over(run.rows))
     aims = run.result.get("terms")
     if run.command == "pareto" and aims:
-        words = [f"{name_and_unit(aim['name'])[0]} ({_sense(aim['sense'])})" for aim in aims]
+        words = [f"{name_and_unit(aim['name'])[0]} ({_SENSES[aim['sense']]})" for aim in aims]
         sentences.append(f"The quantities are {listed(words)}.")
     return sentences
 
@@ -223,7 +196,6 @@ def _over(rows: Sequence[Mapping[str, Any]]) -> str:
 def scene(config: Config) -> str:
     """Return one sentence that describes the scene of a config."""
     data = config.scene
-    speed = f"at {brief(data.speed_rpm)} rpm"
     load = data.load
     if load.torque_N_m is not None:
         under = f"under a load of {brief(load.torque_N_m)} N·m on rotor 2"
@@ -244,7 +216,7 @@ def scene(config: Config) -> str:
     present = [str(part) for part in parts if part]
     tail = f", with {listed(present)}" if present else ""
     tail += "" if gear is not None else ", without a timing gear"
-    return f"The scene is {_pair(config)}, {speed} {under}{tail}."
+    return f"The scene is {_pair(config)}, at {brief(data.speed_rpm)} rpm {under}{tail}."
 
 
 def _objective(config: Config) -> str:
@@ -258,10 +230,8 @@ def _objective(config: Config) -> str:
     shares |= {name_and_unit(name)[0]: x for name, x in weights.terms.items()}
     total = sum(shares.values()) or 1.0
     words = [f"{100 * x / total:.3g} % {name}" for name, x in shares.items() if x]
-    speeds = weights.speeds_rpm
-    over = ""
-    if speeds:
-        over = f", over the speeds {listed([*map(brief, speeds)])} rpm"
+    speeds = [*map(brief, weights.speeds_rpm)]
+    over = f", over the speeds {listed(speeds)} rpm" if speeds else ""
     return f"The objective is {listed(words)}, each relative to the baseline{over}."
 
 
@@ -273,10 +243,6 @@ def _pair(config: Config) -> str:
     radius = brief(profile.pitch_radius_mm)
     article = "an" if name[0] in "aeioAEIO" else "a"
     return f"{article} {name} rotor pair with {profile.lobes} lobes, pitch radius {radius} mm"
-
-
-def _sense(word: str) -> str:
-    return {"min": "as low as possible", "max": "as high as possible"}.get(word, word)
 
 
 _PACKAGE = Path(__file__).parents[2]

@@ -1,7 +1,7 @@
 """Makes the HTML of pages, and of pictures, texts and tables of the explorer.
 
-The report of a run and the page of a front open without a network: they are Jinja2 templates, and
-Bokeh's script is part of them. Everything that comes from a config or a result is escaped."""
+The report of a run opens without a network: it is a Jinja2 template, and Bokeh's script is part of
+it. Everything that comes from a config or a result is escaped."""
 
 import base64
 import dataclasses
@@ -103,36 +103,18 @@ def _part(*names: str) -> Markup:
     return Markup("\n".join((TEMPLATE / name).read_text("utf-8") for name in names))
 
 
-def _page(template: str, drawn: Iterable[Any], data: Mapping[str, Any], **facts: Any) -> str:
-    """Return a page with charts. Characters that UTF-8 lacks become `?`.
-
-    `drawn`: the charts; `data`: what the scripts of the page read; `facts`: what its template
-    reads."""
-    items = [json_item(one, f"chart-{k}", charts.THEME) for k, one in enumerate(drawn)]
-    name = template.partition(".")[0]
-    text = (
-        _environment()
-        .get_template(template)
-        .render(
-            data={"charts": items, **data},
-            style=_part("page.css", "pair.css"),
-            script=_part("charts.js", "pair.js", f"{name}.js"),
-            bokeh=Markup(Resources("inline", components=["bokeh"]).js_raw[0]) if items else "",
-            **facts,
-        )
-    )
-    return text.encode("utf-8", "replace").decode("utf-8")
-
-
 def report_text(run: Run) -> str:
-    """Return the HTML of the report of a `run`."""
+    """Return the HTML of the report of a `run`. Characters that UTF-8 lacks become `?`."""
     drawn = _charts(run)
+    items = [json_item(one, f"chart-{k}", charts.THEME) for k, (*_, one) in enumerate(drawn)]
     status = tables.status_cell(str(run.result.get("status", "")))
     animation = animations(run.cases)
-    return _page(
-        "page.html.j2",
-        [chart for *_, chart in drawn],
-        {"animation": animation},
+    page = _environment().get_template("page.html.j2")
+    text = page.render(
+        data={"charts": items, "animation": animation},
+        style=_part("page.css", "pair.css"),
+        script=_part("charts.js", "pair.js", "page.js"),
+        bokeh=Markup(Resources("inline", components=["bokeh"]).js_raw[0]) if items else "",
         title=gather.title(run),
         run=run,
         command_line=f"rootsopt {run.command} {run.source}",
@@ -158,19 +140,18 @@ def report_text(run: Run) -> str:
         effort=tables.effort_table(run.result),
         glossary=glossary(),
     )
+    return text.encode("utf-8", "replace").decode("utf-8")
 
 
 def _charts(run: Run) -> list[tuple[str, str, Any]]:
     """Return (title, explanation, chart) of each interactive chart of a run."""
     hover = "Hover over a point to see its design."
     entries = [(title, hover, made) for title, made in charts.front_charts(run.result).items()]
-    force = (
-        "Contact force over time",
+    note = (
         "Hover for values, drag to zoom; a button at the right zooms out. A click moves the rotors "
-        "below to that time.",
-        charts.force_chart(run.cases),
+        "below to that time."
     )
-    entries.append(force)
+    entries.append(("Contact force over time", note, charts.force_chart(run.cases)))
     return [one for one in entries if one[2] is not None]
 
 

@@ -4,6 +4,7 @@ A knob has a name, a unit, a span and an allowed range. An `Engine` computes the
 config, and its motion near a known one."""
 
 import dataclasses
+import functools
 import math
 import threading
 from collections.abc import Callable
@@ -16,6 +17,7 @@ from pydantic.fields import FieldInfo
 from rootsopt.config.explain import is_whole, limits_of, tree
 from rootsopt.config.families import family_of
 from rootsopt.config.reading import Config
+from rootsopt.config.study import TWIST
 from rootsopt.config.units import MM, unit_of, words
 from rootsopt.profiles import Geometry, Profile, geometry, outline
 from rootsopt.response.evaluation import Evaluator
@@ -54,9 +56,6 @@ _DESIGN = "Design"
 # Groups at the top of the page; the others follow in the order of the config.
 _ORDER = (_DESIGN, "Speed and mounting", "Load", "Motor", "Timing gear", "Contact")
 
-# Keys whose default follows other keys. They have a slider only if the config sets them.
-_FOLLOWS = ("contact.smoothing_mm",)
-
 # Span of a slider as multiples of the config's own value.
 _AROUND = 0.2, 2.0
 
@@ -89,10 +88,6 @@ class Knob(NamedTuple):
     most: float
     whole: bool
 
-    def with_value(self, value: float) -> "Knob":
-        """Return the knob with another `value`, which lies in its span."""
-        return self._replace(value=value, low=min(self.low, value), high=max(self.high, value))
-
 
 def knobs_of(config: Config) -> list[Knob]:
     """Return the knobs of all design parameters and scene parameters that a `config` has.
@@ -100,67 +95,68 @@ def knobs_of(config: Config) -> list[Knob]:
     Design parameters span their bounds in an optimisation. Parts that the scene does not have, and
     keys that are not set, have no knobs."""
     knobs = _design(config)
-    parameters, fields = set(config.profile.parameters), tree(Config)
-    for section in _SECTIONS:
-        for key, field in fields.items():
-            if key.partition(".")[0] != section or "." not in key:
-                continue
-            name = key.rpartition(".")[2]
-            if section == "profile" and name in parameters:
-                continue
-            if key in _FOLLOWS and name not in config.contact.model_fields_set:
-                continue
-            value = config.value(key)
-            if isinstance(value, int | float) and not isinstance(value, bool):
-                knobs.append(_scene(field, key, value))
+    known = {knob.key for knob in knobs}
+    for key, field in tree(Config).items():
+        section, name = key.partition(".")[0], key.rpartition(".")[2]
+        if section not in _SECTIONS or key in known:
+            continue
+        # Its default follows other keys, so it has a slider only if the config sets it.
+        if key == "contact.smoothing_mm" and name not in config.contact.model_fields_set:
+            continue
+        value = config.value(key)
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            knobs.append(_scene(field, key, float(value)))
     order = [*_ORDER, *dict.fromkeys(knob.group for knob in knobs)]
     return sorted(knobs, key=lambda knob: order.index(knob.group))
+
+
+def dotted(key: str) -> str:
+    """Return the dotted config key of a design parameter, one of `Config.design_keys`."""
+    return f"rotor.{key}" if key == TWIST else f"profile.{key}"
 
 
 def _design(config: Config) -> list[Knob]:
     """Return the knobs of the design parameters."""
     knobs = []
-    values = zip(config.design_keys, config.design, bounds_of(config), strict=True)
-    owners = [
-        parameter
-        for parameter in family_of(config.profile.family).parameters
-        for _ in range(_count(getattr(config.profile, parameter.key)))
-    ]
-    for (key, value, (low, high)), owner in zip(values, owners, strict=True):
+    known = {one.key: one for one in family_of(config.profile.family).parameters}
+    values = zip(config.design_keys, config.design.tolist(), bounds_of(config), strict=True)
+    for key, value, (low, high) in values:
+        if key == TWIST:
+            knob = _scene(tree(Config)[dotted(key)], dotted(key), value)
+            ends = {"low": min(low, value), "high": max(high, value), "step": _step(high - low)}
+            knobs.append(knob._replace(group=_DESIGN, **ends))
+            continue
+        owner = known.get(key) or known[key.rpartition("_")[0]]  # entries of a list are numbered
         sized = owner.limits(config.profile.pitch_radius_mm) or (owner.lowest, owner.highest)
         least, most = max(owner.lowest, sized[0]), min(owner.highest, sized[1])
         if not math.isfinite(high):
-            high = _AROUND[1] * float(value)
+            high = _AROUND[1] * value
         low, high = max(low, least), min(high, most)
         name = words(owner.key)
         if key != owner.key:
             name = f"{name.removesuffix('s')} {key.rpartition('_')[2]}"
         knobs.append(
             Knob(
-                f"profile.{key}", name, unit_of(owner.key), owner.help, _DESIGN, float(value),
-                low, high, _step(high - low), least, most, False,
-            ).with_value(float(value))
+                dotted(key), name, unit_of(owner.key), owner.help, _DESIGN, value,
+                min(low, value), max(high, value), _step(high - low), least, most, False,
+            )
         )  # fmt: skip
     return knobs
-
-
-def _count(value: object) -> int:
-    return len(value) if isinstance(value, tuple) else 1
 
 
 def _scene(field: FieldInfo, key: str, value: float) -> Knob:
     """Return the knob of any other number of the config."""
     (least, most), whole = limits_of(field).ends, is_whole(field)
-    low, high = _span(key, float(value), least < 0)
+    low, high = _span(key, value, least < 0)
     if whole:
         low, high = least, most
     low, high = max(low, least), min(high, most)
     section, _, name = key.rpartition(".")
     return Knob(
         key, words(name), unit_of(name), field.description or "",
-        _GROUPS.get(section, section), float(value), low, high,
+        _GROUPS.get(section, section), value, min(low, value), max(high, value),
         1.0 if whole else _step(high - low), least, most, whole,
-    ).with_value(float(value))  # fmt: skip
+    )  # fmt: skip
 
 
 def _span(key: str, value: float, signed: bool) -> tuple[float, float]:
@@ -218,17 +214,14 @@ class Engine:
     def __init__(self, given: Config, optimize: Callable[..., "Optimization"]):
         self.given, self.optimize = given, optimize
         self.ready = threading.Event()
-        self._base: Config | None = None
-        self._lock = threading.Lock()
 
-    @property
+    @functools.cached_property
     def base(self) -> Config:
-        """The config that the sliders change: `given` at the scene's own speed only."""
-        with self._lock:
-            if self._base is None:
-                check_geometry(self.given)
-                self._base = alone(self.given)
-            return self._base
+        """The config that the sliders change: `given` at the scene's own speed only.
+
+        Raises `InputError` if its profile is not sound."""
+        check_geometry(self.given)
+        return alone(self.given)
 
     def shape(self, config: Config) -> Shape:
         """Return the geometry of a `config`.
@@ -269,11 +262,6 @@ def _shape(scene: Scene, design) -> tuple[Profile, Geometry]:
     """Return profile and geometry of a design (d,) in config units."""
     profile = scene.profile(design)
     return profile, geometry(profile)
-
-
-def frames(profile: Profile, evaluation: Evaluation) -> dict[str, Any]:
-    """Return the frames of the motion of an `evaluation`; those of rolling if it has no series."""
-    return motion(profile, evaluation.series, evaluation.steady_state.get("period"))
 
 
 def cut(series: Series) -> Series:

@@ -13,7 +13,8 @@ from rootsopt.config.plausible import notes
 from rootsopt.config.reading import Config
 from rootsopt.errors import InputError
 from rootsopt.response.result import Evaluation
-from rootsopt.view.pages.knobs import Engine, Shape, frames, same_motion
+from rootsopt.view.pages.charts import motion
+from rootsopt.view.pages.knobs import Engine, Shape, dotted, same_motion
 
 if TYPE_CHECKING:
     from rootsopt.optimize.outcome import Optimization
@@ -152,10 +153,9 @@ class Searched(Message):
 
 @dataclasses.dataclass(frozen=True)
 class Saved(Message):
-    """The config of the values as YAML `text`. `evaluation`: its motion from rest."""
+    """The config of the values as YAML `text`."""
 
     text: str
-    evaluation: Evaluation
 
 
 class Session:
@@ -249,17 +249,21 @@ class Session:
         start = self._start
         near = start is not None
         evaluation = self.engine.near(config, start) if near else self.engine.from_rest(config)
-        if evaluation.usable:
-            self._start = evaluation.start
-        final = evaluation.usable or not near
-        self._present(NewMotion(number, evaluation, frames(shape.profile, evaluation), near, final))
+        self._present(number, shape, evaluation, near, final=evaluation.usable or not near)
         if near:
             delay = self.idle if evaluation.usable else 0.0
             self._submit(self._rests, number, lambda: self._from_rest(number, False), delay)
 
-    def _present(self, motion: NewMotion) -> None:
-        self._shown = motion
-        self.show(motion)
+    def _present(
+        self, number: int, shape: Shape, evaluation: Evaluation, near: bool, final: bool = True
+    ) -> None:
+        """Show a motion, from which others start if it is usable; arguments as in `NewMotion`."""
+        if evaluation.usable:
+            self._start = evaluation.start
+        period = evaluation.steady_state.get("period")
+        frames = motion(shape.profile, evaluation.series, period)
+        self._shown = NewMotion(number, evaluation, frames, near, final)
+        self.show(self._shown)
 
     def _from_rest(self, number: int, forced: bool) -> Evaluation | None:
         """Compute the motion from rest for the values with this `number`, and return it.
@@ -286,17 +290,14 @@ class Session:
         self._rest = FromRest(number, same, evaluation)
         useless = shown is None or shown.number != number or not shown.final
         if useless or (forced and not same):
-            if evaluation.usable:
-                self._start = evaluation.start
-            self._present(NewMotion(number, evaluation, frames(shape.profile, evaluation), False))
+            self._present(number, shape, evaluation, near=False)
         else:
             self.show(self._rest)
         return evaluation
 
     def _save(self, number: int) -> None:
-        evaluation = self._from_rest(number, True)
-        if evaluation is not None:
-            self.show(Saved(number, self.config().to_yaml(), evaluation))
+        if self._from_rest(number, True) is not None:
+            self.show(Saved(number, self.config().to_yaml()))
 
     def _submit(
         self, lane: Latest, number: int, work: Callable[[], object], delay: float = 0.0
@@ -312,18 +313,17 @@ class Session:
         lane.submit(refusing, delay)
 
     def _optimize(self, number: int, stop: threading.Event) -> None:
-        def progress(done: int, expected: int, best: float) -> None:
-            self.show(Progress(number, done, expected, best))
-
         outcome, values, words = None, {}, ""
         try:
             self.engine.ready.wait()
             config = self.config()
             if config.objective.over == "nominal":  # The page shows nothing of other scenes.
                 config = config.replaced({"assumptions.scenes": 0})
-            outcome = self.engine.optimize(config, progress, stop=stop)
+            outcome = self.engine.optimize(
+                config, lambda *told: self.show(Progress(number, *told)), stop=stop
+            )
             if outcome.optimized is not None:
-                values = {f"profile.{key}": x for key, x in outcome.optimized.design.items()}
+                values = {dotted(key): x for key, x in outcome.optimized.design.items()}
         except InputError as error:
             words = str(error)
         except Exception as error:
