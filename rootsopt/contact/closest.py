@@ -259,15 +259,6 @@ class FlankPair(eqx.Module):
 
         return closest(dynamic, roll, relative)
 
-    def supports_along(self, normal1, normal2, roll, relative):
-        """Return (support function at rotor 1's point (m), at rotor 2's point (m), cosine).
-
-        The cosine is the component of the common normal along the line of centres. `normal1`,
-        `normal2`: ν1 and ν2 (rad); `roll`: x (rad) from `folded`; `relative`: ε (rad)."""
-        mate = self.profile.mate(normal2)
-        direction = mate.facing + roll - relative / 2
-        return self.profile.support(normal1), mate.support, trig.cos(direction)
-
     def _mesh(self, normal2, roll, relative):
         """Return (T, G, ν1, q1, q2) at ν2 = `normal2`, as defined in the module's docstring.
 

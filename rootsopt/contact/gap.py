@@ -4,6 +4,7 @@ Also finds a root of the tangential offset T, which `rootsopt.contact.closest` d
 
 import abc
 import dataclasses
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
@@ -144,7 +145,6 @@ class Contact(eqx.Module):
     def in_slice(self, number: Int[Array, ""]) -> "Contact":
         """Return the contact in the slice with the index `number`; by default, this contact
         itself."""
-        del number
         return self
 
     @property
@@ -158,7 +158,6 @@ class Contact(eqx.Module):
         """Return the contact of the same flanks at another centre `distance` (m).
 
         Raises `InputError` if the contact supports only the nominal distance."""
-        del distance
         raise self._lacks("another centre distance", "displaced axes need")
 
     def approach(self, roll: Float[Array, ""], relative: Float[Array, ""]) -> Approach:
@@ -174,7 +173,6 @@ class Contact(eqx.Module):
 
         `roll`, `relative`: x and ε (rad). Raises `InputError` if the contact cannot compute the
         point."""
-        del roll, relative, approach
         raise self._lacks("the point of contact", "friction and supports need")
 
     def switches(self, roll: Float[Array, ""], approach: Approach) -> Bool[Array, " s"]:
@@ -182,7 +180,6 @@ class Contact(eqx.Module):
 
         `approach`: result of `approach` at the same pose. A flag changes wherever a derivative of
         the gap jumps."""
-        del roll, approach
         return jnp.zeros(0, bool)
 
     def margins(self, roll: Float[Array, ""], approach: Approach) -> Float[Array, " s"]:
@@ -196,7 +193,6 @@ class Contact(eqx.Module):
         """Return the contact for one side of the flanks; by default, this contact itself.
 
         `side`: 1 for the drive flanks, -1 for the coast flanks."""
-        del side
         return self
 
     def _lacks(self, what: str, why: str) -> InputError:
@@ -211,35 +207,18 @@ class WrappedContact(Contact):
 
     section: eqx.AbstractVar[Contact]
 
-    @property
-    def slices(self) -> Slices | None:
-        return self.section.slices
-
-    @property
-    def sections(self) -> int:
-        return self.section.sections
-
-    def in_slice(self, number: Int[Array, ""]):
-        return dataclasses.replace(self, section=self.section.in_slice(number))
-
-    @property
-    def smooth(self) -> bool:
-        return self.section.smooth
-
-    @property
-    def jumps(self) -> bool:
-        return self.section.jumps
-
-    @property
-    def two_sided(self) -> bool:
-        return self.section.two_sided
-
-    @property
-    def center_distance(self) -> Float[Array, ""]:
-        return self.section.center_distance
+    slices = property(attrgetter("section.slices"))
+    sections = property(attrgetter("section.sections"))
+    smooth = property(attrgetter("section.smooth"))
+    jumps = property(attrgetter("section.jumps"))
+    two_sided = property(attrgetter("section.two_sided"))
+    center_distance = property(attrgetter("section.center_distance"))
 
     def __call__(self, roll, relative):
         return self.approach(roll, relative)[:3]
+
+    def in_slice(self, number: Int[Array, ""]):
+        return dataclasses.replace(self, section=self.section.in_slice(number))
 
     def at_distance(self, distance: Float[Array, ""]):
         return dataclasses.replace(self, section=self.section.at_distance(distance))
@@ -265,13 +244,6 @@ def innermost(contact: Contact) -> Contact:
     while isinstance(contact, WrappedContact):
         contact = contact.section
     return contact
-
-
-def around(contact: Contact, inside: Contact) -> Contact:
-    """Return `contact` with the contact `inside` all of its wrappers."""
-    if not isinstance(contact, WrappedContact):
-        return inside
-    return dataclasses.replace(contact, section=around(contact.section, inside))
 
 
 class ClosestApproach(NamedTuple):
@@ -407,8 +379,7 @@ def root_in(pair: "FlankPair", bracket, guess, guarded, roll, relative):
         slow = (slope >= 0) | (jnp.abs(step) > 0.5 * jnp.abs(before))
         # The root may lie on an end of the bracket. A compiled program may round the step
         # differently for each result. All results must agree on whether to halve.
-        slack = _FINISHED
-        halve = guarded & (slow | (new < low - slack) | (new > high + slack))
+        halve = guarded & (slow | (new < low - _FINISHED) | (new > high + _FINISHED))
         new = jnp.where(halve, (low + high) / 2, jnp.clip(new, low, high))
         step = jnp.where(halve, (high - low) / 2, step)
         # The gap is stationary at the root: its mean slope is half of that before the step.

@@ -72,7 +72,6 @@ class ContactLaw(eqx.Module):
         `depth`, `rate`: as in `switches`. Each number passes smoothly through zero where its flag
         changes. By default, the only one is the penetration. Margins of a class that overrides only
         `switches` are not used (see `flanks.margins_of`)."""
-        del rate
         return jnp.stack([depth])
 
     def stiffness_at(self, depth: Float[Array, ""]) -> Float[Array, ""]:

@@ -20,13 +20,13 @@ def contact_point(
 
     `pair`: the flanks; `roll`, `relative`: x and ε (rad) at which `closest` was computed."""
     folded, mirrored = pair.folded(roll)
-    support1, support2, radial = pair.supports_along(
-        closest.normal1, closest.normal2, folded, relative
-    )
+    mate = pair.profile.mate(closest.normal2)
+    direction = mate.facing + folded - relative / 2
+    support = pair.profile.support(closest.normal1)
     return ContactPoint(
-        support1=jnp.where(mirrored, support2, support1),
-        support2=jnp.where(mirrored, support1, support2),
-        radial=radial,
+        support1=jnp.where(mirrored, mate.support, support),
+        support2=jnp.where(mirrored, support, mate.support),
+        radial=trig.cos(direction),
     )
 
 
@@ -57,12 +57,12 @@ class _FlankContact(Contact):
 class SearchContact(_FlankContact):
     """Gap and levers of a flank pair, from a search for the closest approach at every call.
 
-    `pair`: the flanks; `sides`: 1, or 2 if the search also covers flanks turned away from each
+    `pair`: the flanks; `two_sided`: whether the search also covers flanks turned away from each
     other.
     """
 
     pair: FlankPair
-    sides: int = eqx.field(static=True, default=1)
+    two_sided: bool = eqx.field(static=True, default=False)
 
     @classmethod
     def of(
@@ -74,11 +74,7 @@ class SearchContact(_FlankContact):
         """Return the contact of `profile`.
 
         `center_distance` (m), `two_sided`: as in `FlankPair.of`."""
-        return cls(FlankPair.of(profile, center_distance, two_sided), 1 + two_sided)
-
-    @property
-    def two_sided(self) -> bool:
-        return self.sides == 2
+        return cls(FlankPair.of(profile, center_distance, two_sided), two_sided)
 
     def approach(self, roll, relative) -> Approach:
         closest = self.pair(roll, relative)

@@ -96,8 +96,7 @@ def closed_orbit(
     known, neighbour = start
     integrator, measures = settings.orbit, settings.measures
     tolerance = integrator.tolerance
-    top = lax.stop_gradient(pair.force_scale)
-    equation = CollocatedEquation(pair, measures, top, settings.variation)
+    equation = CollocatedEquation(pair, measures, settings.variation)
     frozen, accuracy = lax.stop_gradient(pair), ACCURACY * tolerance
     closed = Closer(equation, frozen, tangents, known, neighbour, accuracy).run()
     orbit, solution, sound = closed.orbit, closed.known, closed.known.sound & known.sound
@@ -110,7 +109,7 @@ def closed_orbit(
         newton_steps=closed.steps,
         disagreement=solution.drift,
     )
-    if not pair.smooth:  # The force may jump where no element ends.
+    if not pair.contact.smooth:  # The force may jump where no element ends.
         unknown = jnp.nan * orbit.sensitivity, jnp.nan * orbit.moved
         orbit = orbit._replace(sensitivity=unknown[0], moved=unknown[1])
     return Collocated(orbit, sound, shorter, verified, solution._replace(sound=verified))
@@ -222,11 +221,6 @@ class _Attempts(eqx.Module):
     neighbour: Float[Array, " m"]
     radius: Float[Array, ""]
     solver: Solver
-
-    def run(self) -> Steady:
-        """Return the result of the search."""
-        loop = lax.while_loop(lambda now: ~now.over, lambda now: self.step(now), self.begin())
-        return loop.motion._replace(settled=loop.motion.settled._replace(pieces=None))
 
     def begin(self) -> _Loop:
         """Return the initial state of the loop."""
@@ -394,7 +388,9 @@ def steady_motion(
     to `examined`."""
     radius = jnp.asarray(radius, pair.angle_scale.dtype)
     start = lax.stop_gradient(start)
-    return _Attempts(pair, tangents, start, numbers(start.pair), radius, solver).run()
+    attempts = _Attempts(pair, tangents, start, numbers(start.pair), radius, solver)
+    loop = lax.while_loop(lambda now: ~now.over, lambda now: attempts.step(now), attempts.begin())
+    return loop.motion._replace(settled=loop.motion.settled._replace(pieces=None))
 
 
 def examined(pair: RotorPair, motion: Steady, solver: Solver) -> Steady:

@@ -168,16 +168,15 @@ def _flank_force(
     forward, sliding = side * force, touch.sliding
     torque1, torque2 = -lever1 * forward, lever2 * forward
     push = None
-    if sliding is not None and sliding.normal is not None:
-        push = force * sliding.normal
-    drag = None
     if sliding is not None:
+        if sliding.normal is not None:
+            push = force * sliding.normal
         drag = sum_of(part.drag(force, sliding.speed) for part in pair.all_parts if part.rubs)
-    if sliding is not None and drag is not None:
-        torque1 -= side * drag * sliding.point.support1
-        torque2 += side * drag * sliding.point.support2
-        if push is not None and sliding.tangent is not None:
-            push += drag * sliding.tangent
+        if drag is not None:
+            torque1 -= side * drag * sliding.point.support1
+            torque2 += side * drag * sliding.point.support2
+            if push is not None and sliding.tangent is not None:
+                push += drag * sliding.tangent
     return FlankForce(
         drive=force,
         coast=jnp.zeros_like(force),
@@ -251,7 +250,6 @@ def kink_margins(pair: "RotorPair", motion: Motion, acting, touches: Any) -> Mar
         return values, pair.law(touch.depth, touch.closing) > 0, touch.approach.place
 
     def of_section(section, motion, side, touch):
-        del motion
         if pair.two_sided:
             return jax.vmap(functools.partial(of_flank, section.contact))(side, touch)
         margins = of_flank(section.contact, side, touch)

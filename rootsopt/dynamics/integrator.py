@@ -134,26 +134,17 @@ class LandingControl(diffrax.AbstractAdaptiveStepSizeController):
         if pair.two_sided:
             inside = jnp.zeros_like(play)
         dtype = scale.dtype
-        swing = _FIRST[1] * pair.timescales.swing / pair.mesh_period
-        swing = jnp.minimum(_FIRST[0], swing)
-        numbers = lax.stop_gradient((jnp.stack(edges), inside, swing))
+        first = jnp.minimum(_FIRST[0], _FIRST[1] * pair.timescales.swing / pair.mesh_period)
+        numbers = lax.stop_gradient((jnp.stack(edges), inside, first))
         fixed = cls(base, *(x.astype(dtype) for x in numbers))  # pyright: ignore
         if pair.repeats == 1 or not own:
             return fixed
         zeros, frozen = jnp.zeros(len(own), dtype), lax.stop_gradient(pair)
         return cls(fixed, zeros, jnp.full_like(play, jnp.inf), fixed.first, frozen)  # pyright: ignore
 
-    @property
-    def rtol(self):  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.base.rtol
-
-    @property
-    def atol(self):  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.base.atol
-
-    @property
-    def norm(self):  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.base.norm
+    rtol = property(lambda self: self.base.rtol)  # pyright: ignore
+    atol = property(lambda self: self.base.atol)  # pyright: ignore
+    norm = property(lambda self: self.base.norm)  # pyright: ignore
 
     def wrap(self, direction):
         return self

@@ -253,7 +253,7 @@ def located(
         falls = before - after
         later = jnp.clip(before / jnp.where(falls > 0, falls, jnp.inf), 0.0, 1.0)
         slope = (1 - later) * turned[0] + later * turned[1]
-        if pair.jumps:
+        if pair.contact.jumps:
             # The higher side moves with the event.
             mesh = orbit.elements.mesh
             event = jnp.argmin(jnp.abs(mesh.times - orbit.elements.holding(best)[1]))

@@ -166,16 +166,6 @@ class RotorPair(eqx.Module):
         """Whether the design is sound, as far as it was checked."""
         return jnp.ones((), bool) if self.soundness is None else self.soundness.sound
 
-    @property
-    def smooth(self) -> bool:
-        """Whether the equation is smooth as long as no flag of `switches` changes."""
-        return self.contact.smooth
-
-    @property
-    def jumps(self) -> bool:
-        """Whether the contact force may jump (see `Contact.jumps`)."""
-        return self.contact.jumps
-
     def at_start(self, first: Float[np.ndarray, "*k 2"]) -> Float[np.ndarray, "*k n"]:
         """Return scaled states (…, n) for the start of a motion, from ε and dε/dt.
 

@@ -201,9 +201,7 @@ def gaps(
 
 def _torque(pair: RotorPair, tau, state) -> Float[Array, ""]:
     assert pair.gear is not None
-    torque = pair.gear.torque_on_1(pair.motion(tau, state), np.zeros(0))
-    assert torque is not None
-    return torque
+    return pair.gear.torque_on_1(pair.motion(tau, state), np.zeros(0))
 
 
 def gear_torque(

@@ -226,7 +226,7 @@ def judged(
     checks = verdict(orbit, start, limits, rtols, scales)
     numbers = jnp.concatenate([orbit.response, orbit.state])
     # A pair that is not smooth never has derivatives. Their absence is not a failure.
-    unknown = ~jnp.all(jnp.isfinite(orbit.sensitivity)) & pair.smooth
+    unknown = ~jnp.all(jnp.isfinite(orbit.sensitivity)) & pair.contact.smooth
     status = _first(
         (checks.idle, Status.IDLE),
         (~jnp.all(jnp.isfinite(numbers)), Status.NON_FINITE),
@@ -277,7 +277,7 @@ def window_status(pair: RotorPair, window: Window) -> Int[Array, ""]:
         (~finite, Status.NON_FINITE),
         (~window.solved, Status.SOLVER_FAILED),
         (jnp.max(window.response[:, 2]) <= least, Status.IDLE),
-        (jnp.asarray(window.chaotic), Status.CHAOTIC),
+        (window.chaotic, Status.CHAOTIC),
         default=Status.NOT_SETTLED.code,
     )
 

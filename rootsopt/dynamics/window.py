@@ -142,8 +142,7 @@ class Window(NamedTuple):
     @property
     def _rates(self) -> Float[_Arrays, "2 b"]:
         """Mean `growth` in each batch: row 0 at the far distance, row 1 at the near one."""
-        xp = _numpy_of(self.growth)
-        return xp.mean(self.growth.reshape(_BATCHES // 2, 2, -1), axis=2).T
+        return self.growth.reshape(_BATCHES // 2, 2, -1).mean(axis=2).T
 
     @property
     def exponent(self) -> Float[_Arrays, ""]:
@@ -158,17 +157,16 @@ class Window(NamedTuple):
         return xp.asarray(xp.sqrt(xp.mean(xp.var(self._rates, axis=1, ddof=1)) / _BATCHES))
 
     @property
-    def chaotic(self) -> Bool[_Arrays, ""]:
+    def chaotic(self) -> Bool[Array, ""]:
         """Whether motions diverge at both distances alike.
 
         The exponent must exceed three standard errors. The rate at each distance must exceed two
         standard errors of this rate, which are √2 times greater."""
-        xp = _numpy_of(self.growth)
-        far, near = xp.mean(self._rates, axis=1)
-        alike = xp.abs(near - far) < _ALIKE
+        far, near = jnp.mean(self._rates, axis=1)
+        alike = jnp.abs(near - far) < _ALIKE
         sure = self.exponent > 3 * self.error
-        each = xp.minimum(far, near) > 2 * 2**0.5 * self.error
-        return xp.asarray(sure & each & alike)
+        each = jnp.minimum(far, near) > 2 * 2**0.5 * self.error
+        return jnp.asarray(sure & each & alike)
 
     @property
     def forces(self) -> Float[_Arrays, " 3"]:

@@ -59,6 +59,8 @@ class Arcs(Profile):
     radius: Float[Array, " n"]
     joints: Float[Array, " n+1"]
 
+    cusp = False
+
     @classmethod
     def chain(
         cls,
@@ -161,10 +163,6 @@ class Arcs(Profile):
         away = jnp.sum(reach * side, axis=-1, keepdims=True) < 0
         x, y = jnp.moveaxis(jnp.where(away, -reach, reach), -1, 0)
         return jnp.arctan2(y, x)
-
-    @property
-    def cusp(self) -> bool:
-        return False
 
 
 class EdgedArcs(Arcs):

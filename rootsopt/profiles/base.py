@@ -30,7 +30,7 @@ import contextlib
 import functools
 from collections.abc import Iterator
 from contextvars import ContextVar
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -39,7 +39,6 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from rootsopt.profiles import base as trig
 from rootsopt.runtime.compute_once import compute_once
 
 _keeping = ContextVar("_keeping", default=False)
@@ -193,14 +192,11 @@ class Profile(eqx.Module):
         no segment is split."""
         return self.segments()
 
-    @property
-    def quadrature(self) -> Quadrature:
-        """Rule for integrals over each part in `stretches`.
+    quadrature: ClassVar[Quadrature] = Quadrature(64, True, 128)
+    """Rule for integrals over each part in `stretches`.
 
-        By default, nodes are denser near the ends. The rule integrates a square-root singularity of
-        ψ to rounding error, even if the singularity lies only 1e-4 of the part's length beyond an
-        end."""
-        return Quadrature(64, True, 128)
+    By default, nodes are denser near the ends. The rule integrates a square-root singularity of ψ
+    to rounding error, even if the singularity lies only 1e-4 of the part's length beyond an end."""
 
     def _cut(self, segment: Segment, place: Float[Array, ""]) -> tuple[Segment, Segment]:
         """Return the two parts of a segment split at the normal angle `place` (rad).
@@ -230,19 +226,45 @@ class Profile(eqx.Module):
         angle of the point nearest to the pitch crossing. The default is a numerical search with the
         derivatives of the implicit function; a closed form is faster.
         """
-        return _inverse(self, roll_angle)
+        # The safeguarded Newton steps are not differentiated. The plain Newton steps after them
+        # carry the derivatives with respect to roll angle and design. They also continue the flank
+        # analytically beyond its ends.
+        fixed, want = jax.tree.map(lax.stop_gradient, (self, roll_angle))
+
+        def rolled(profile, nu):
+            beta, rate = jax.jvp(profile.roll_angle, (nu,), (jnp.ones_like(nu),))
+            return beta, jnp.maximum(rate, _FLAT)
+
+        shares = jnp.arange(_BRACKETS) / _BRACKETS
+        nodes = [one.start + (one.stop - one.start) * shares for one in fixed.segments()]
+        nodes = jnp.append(jnp.concatenate(nodes), fixed.pitch_normal)
+        begun = fixed.roll_angle(nodes[:-1]) <= want[..., None]
+        last = jnp.max(jnp.where(begun, jnp.arange(len(nodes) - 1), 0), axis=-1)
+        low, high = nodes[last], nodes[last + 1]
+        nu = (low + high) / 2
+        for _ in range(_STEPS):
+            beta, rate = rolled(fixed, nu)
+            low, high = jnp.where(beta <= want, nu, low), jnp.where(beta > want, nu, high)
+            step = nu - (beta - want) / rate
+            inside = (step >= low - _SLACK) & (step <= high + _SLACK)
+            nu = jnp.where(inside, step, (low + high) / 2)
+        nu = lax.stop_gradient(nu)
+        for _ in range(_POLISH):
+            beta, rate = rolled(self, nu)
+            nu = nu - (beta - roll_angle) / rate
+        return nu
 
     def lever(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """Return the moment arm r cos ψ (m) of the contact normal about the rotor's axis.
 
         `nu`: normal angle (rad)."""
-        return self.pitch_radius * trig.sin(nu - self.roll_angle(nu))
+        return self.pitch_radius * sin(nu - self.roll_angle(nu))
 
     def support(self, nu: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """Return the support function P·n = r sin ψ + s (m) of the addendum at `nu` (rad).
 
         Its derivative with respect to ν is -lever."""
-        arm = self.pitch_radius * trig.cos(nu - self.roll_angle(nu))
+        arm = self.pitch_radius * cos(nu - self.roll_angle(nu))
         return arm + self.contact_distance(nu)
 
     def mate(self, nu: Float[Array, "*n"], support: bool = True) -> Mate:
@@ -272,32 +294,21 @@ class Profile(eqx.Module):
         It is negative beyond a limit, and inf (the default) without such limits."""
         return float("inf")
 
-    @property
-    def conjugate(self) -> bool:
-        """Whether the flanks are designed to touch throughout the mesh in perfect rolling."""
-        return True
+    conjugate: ClassVar[bool] = True
+    """Whether the flanks are designed to touch throughout the mesh in perfect rolling."""
+    search_nodes: ClassVar[int] = 32
+    """Number of nodes per segment on which the contact search brackets the closest approach.
 
-    @property
-    def search_nodes(self) -> int:
-        """Number of nodes per segment on which the contact search brackets the closest approach.
+    The nodes must be dense enough to separate the minima of the gap."""
+    turn_ratio: ClassVar[float] = 1.0
+    """Factor κ of the angle κν whose cosine and sine `lever_from` receives.
 
-        The nodes must be dense enough to separate the minima of the gap."""
-        return 32
+    The contact search computes this cosine and sine by the addition theorem, and thus evaluates no
+    trigonometric function at the nodes."""
+    cusp: ClassVar[bool] = True
+    """Whether the flank's radius of curvature vanishes at the pitch crossing (ψ = 0).
 
-    @property
-    def turn_ratio(self) -> float:
-        """Factor κ of the angle κν whose cosine and sine `lever_from` receives.
-
-        The contact search computes this cosine and sine by the addition theorem, and thus evaluates
-        no trigonometric function at the nodes."""
-        return 1.0
-
-    @property
-    def cusp(self) -> bool:
-        """Whether the flank's radius of curvature vanishes at the pitch crossing (ψ = 0).
-
-        Two minima of the gap may then be almost equally deep there."""
-        return True
+    Two minima of the gap may then be almost equally deep there."""
 
     @property
     def inflected(self) -> bool:
@@ -318,23 +329,18 @@ class Profile(eqx.Module):
             return False
         return sum(not one.land for one in self.segments()) > 1
 
-    @property
-    def single_turn(self) -> float:
-        """Relative rotation (rad) below which the gap is trusted to have no second, deeper minimum.
+    single_turn: ClassVar[float] = 1e-3
+    """Relative rotation (rad) below which the gap is trusted to have no second, deeper minimum.
 
-        The contact search accepts the minimum near the point of perfect rolling if Newton's method
-        converges to it. This holds down to ε = -`single_turn`, at the nominal centre distance.
-        Excluded are a fraction of the flank next to a cusp, about √|ε|, and one next to the joints
-        of a `forked` flank, proportional to ε. Tests confirm the value."""
-        return 1e-3
+    The contact search accepts the minimum near the point of perfect rolling if Newton's method
+    converges to it. This holds down to ε = -`single_turn`, at the nominal centre distance. Excluded
+    are a fraction of the flank next to a cusp, about √|ε|, and one next to the joints of a `forked`
+    flank, proportional to ε. Tests confirm the value."""
+    wavy: ClassVar[bool] = False
+    """Whether the gap may have any number of minima, because the curvature may rise and fall.
 
-    @property
-    def wavy(self) -> bool:
-        """Whether the gap may have any number of minima, because the curvature may rise and fall.
-
-        The contact search then compares all minima at every pose. Otherwise, it relies on at most
-        two: one near the point of perfect rolling, and one beside a cusp or a land."""
-        return False
+    The contact search then compares all minima at every pose. Otherwise, it relies on at most two:
+    one near the point of perfect rolling, and one beside a cusp or a land."""
 
     def lever_from(
         self, nu: Float[Array, "*n"], cos: Float[Array, "*n"], sin: Float[Array, "*n"]
@@ -342,7 +348,6 @@ class Profile(eqx.Module):
         """Return the lever (m) at the normal angle `nu` (rad), given two trigonometric functions.
 
         `cos`, `sin`: cosine and sine of κν, with the factor κ = `turn_ratio`."""
-        del cos, sin
         return self.lever(nu)
 
     @property
@@ -393,35 +398,3 @@ class Profile(eqx.Module):
         point, rate = self.addendum(nu), self.roll_rate(nu)
         sliding = self.pitch_radius * jnp.sin(point.psi)
         return point, sliding * rate + point.s, (sliding - 2 * point.s) * rate + point.s
-
-
-def _inverse(profile: Profile, roll_angle: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Return the greatest normal angle (rad) of `profile` at a `roll_angle` (rad), by a search.
-
-    The search uses safeguarded Newton steps and is not differentiated. The plain Newton steps after
-    it carry the derivatives with respect to roll angle and design. They also continue the flank
-    analytically beyond its ends."""
-    fixed, want = jax.tree.map(lax.stop_gradient, (profile, roll_angle))
-
-    def rolled(profile, nu):
-        beta, rate = jax.jvp(profile.roll_angle, (nu,), (jnp.ones_like(nu),))
-        return beta, jnp.maximum(rate, _FLAT)
-
-    shares = jnp.arange(_BRACKETS) / _BRACKETS
-    nodes = [one.start + (one.stop - one.start) * shares for one in fixed.segments()]
-    nodes = jnp.append(jnp.concatenate(nodes), fixed.pitch_normal)
-    begun = fixed.roll_angle(nodes[:-1]) <= want[..., None]
-    last = jnp.max(jnp.where(begun, jnp.arange(len(nodes) - 1), 0), axis=-1)
-    low, high = nodes[last], nodes[last + 1]
-    nu = (low + high) / 2
-    for _ in range(_STEPS):
-        beta, rate = rolled(fixed, nu)
-        low, high = jnp.where(beta <= want, nu, low), jnp.where(beta > want, nu, high)
-        step = nu - (beta - want) / rate
-        inside = (step >= low - _SLACK) & (step <= high + _SLACK)
-        nu = jnp.where(inside, step, (low + high) / 2)
-    nu = lax.stop_gradient(nu)
-    for _ in range(_POLISH):
-        beta, rate = rolled(profile, nu)
-        nu = nu - (beta - roll_angle) / rate
-    return nu

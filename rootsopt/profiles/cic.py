@@ -49,7 +49,6 @@ def ranges(
     pressure angle `pressure_angle_deg` and half the tip land's angle, `tip_arc_angle_deg`.
     `involute_length_mm` is not used. The longest involute is `CIC.longest_involute`, so that u ≤
     u_max holds by construction."""
-    del involute_length_mm
     half = jnp.pi / (2 * lobes)
     base = pitch_radius_mm * jnp.sin(pressure_angle_deg * DEG)
     longest = base * (half - tip_arc_angle_deg * DEG)
@@ -164,6 +163,9 @@ class CIC(Profile):
     involute_end: Float[Array, ""]
     tip_direction: Float[Array, "2"]
 
+    cusp = False
+    single_turn = 5e-3
+
     def __init__(self, lobes, pitch_radius, pressure_angle, involute_length, tip_arc_angle):
         """Build the rotor.
 
@@ -264,14 +266,6 @@ class CIC(Profile):
 
     @property
     def forked(self) -> bool:
-        return False
-
-    @property
-    def single_turn(self) -> float:
-        return 5e-3
-
-    @property
-    def cusp(self) -> bool:
         return False
 
     def lever_from(self, nu, cos, sin):

@@ -78,6 +78,9 @@ class Curve(Profile):
     value: Float[Array, " n"]
     ends: Float[Array, " m"]
 
+    # Between two nodes ψ is a quintic.
+    quadrature = Quadrature(6, False, 4)
+
     @classmethod
     def of(
         cls,
@@ -125,11 +128,6 @@ class Curve(Profile):
             for k in range(self.node.shape[0] - 1)
             if k % count < count - 1
         )
-
-    @property
-    def quadrature(self) -> Quadrature:
-        # Between two nodes ψ is a quintic.
-        return Quadrature(6, False, 4)
 
     def _place(self, nu):
         """Return (index of the last node before `nu`, distance of `nu` from this node in rad).

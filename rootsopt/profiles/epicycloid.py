@@ -13,17 +13,15 @@ class EE(Profile):
     """The EE rotor: rolling radius r/2N, ψ = N |π/2N - β|, s = (r/N) sin(N(π/2N - β)).
 
     These are the paper's Eqs. 7 and 8 with two misprints corrected: sine and cosine of Eq. 7 are
-    swapped, and the undefined τ of Eq. 8 is γ. Apart from the number of lobes, the pitch radius is
-    the only parameter.
+    swapped, and the undefined τ of Eq. 8 is γ.
+
+    `lobes`: number of lobes N; `pitch_radius`: r (m), the only parameter of the shape.
     """
 
     lobes: int = eqx.field(static=True)
-    pitch_radius: Float[Array, ""]
+    pitch_radius: Float[Array, ""] = eqx.field(converter=jnp.asarray)
 
-    def __init__(self, lobes, pitch_radius):
-        """Build the rotor with `lobes` N lobes and the scalar `pitch_radius` r (m)."""
-        self.lobes = lobes
-        self.pitch_radius = jnp.asarray(pitch_radius)
+    single_turn = 5e-3
 
     def segments(self) -> tuple[Segment, ...]:
         zero = jnp.zeros_like(self.pitch_radius)
@@ -39,10 +37,6 @@ class EE(Profile):
     def contact_distance(self, nu):
         beyond_pitch = self.lobes * (self.half_pitch - self.roll_angle(nu))
         return self.pitch_radius / self.lobes * trig.sin(beyond_pitch)
-
-    @property
-    def single_turn(self) -> float:
-        return 5e-3
 
     @property
     def turn_ratio(self) -> float:

@@ -73,6 +73,10 @@ class FreeForm(Profile):
     turn: Float[Array, "k 4"]
     beyond: Float[Array, " k"]
 
+    wavy = True
+    # ψ is a cubic inside a knot span.
+    quadrature = Quadrature(24, False, 128)
+
     def __init__(self, lobes, pitch_radius, tip_arc_angle, coefficients):
         """Build the rotor.
 
@@ -102,10 +106,6 @@ class FreeForm(Profile):
         return self.turn.shape[0]
 
     @property
-    def wavy(self) -> bool:
-        return True
-
-    @property
     def search_nodes(self) -> int:
         return max(32, _NODES_PER_SPAN * self._spans)
 
@@ -121,11 +121,6 @@ class FreeForm(Profile):
         ends = [free.start + k * self.width for k in range(self._spans)] + [free.stop]
         spans = itertools.pairwise(ends)
         return (land, *(Segment(free.name, start, stop, False) for start, stop in spans))
-
-    @property
-    def quadrature(self) -> Quadrature:
-        # ψ is a cubic inside a knot span.
-        return Quadrature(24, False, 128)
 
     def _place(self, nu):
         """Return (index of the knot span at `nu`, fraction of this span).
@@ -214,11 +209,10 @@ def project(profile: Profile, count: int) -> FreeForm:
     first, last = profile.segments()[0], profile.segments()[-1]
     start = float(first.stop) if first.land else 0.0
     length = float(last.stop) - start
-    fall = _integrals(count)
     spans = count - _DEGREE
     share = np.arange(1, _SAMPLES * spans + 1) / (_SAMPLES * spans)
     psi = np.asarray(_pressure_angles(profile, start + length * share))
-    rows, want = fall(share), (np.pi / 2 - psi) / length
+    rows, want = _integrals(count, share), (np.pi / 2 - psi) / length
     # The last row is the pitch crossing, at the end of the spline.
     rows[-1], want[-1] = rows[-1] * _FIRMLY, want[-1] * _FIRMLY
     fit = lsq_linear(rows, want, (-1.0, 1.0), method="bvls")
@@ -232,22 +226,16 @@ def _pressure_angles(profile: Profile, nu):
     return profile.addendum(nu).psi
 
 
-def _integrals(count: int):
-    """Return a function that integrates each of `count` B-splines from 0 to given fractions (n,).
-
-    The fractions are those of the whole spline's length. The function returns the integrals (n,
-    count), divided by this length."""
+def _integrals(count: int, share: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the integrals (n, count) of each of `count` B-splines from 0 to the fractions `share`
+    (n,) of the whole spline's length, divided by this length."""
     powers = _powers(count) / np.arange(1, 2 + _DEGREE)[:, None]
     spans = len(powers)
     before = np.cumsum(powers.sum(axis=1), axis=0) - powers.sum(axis=1)
-
-    def integrals(share):
-        x = share * spans
-        span = np.clip(np.floor(x).astype(int), 0, spans - 1)
-        inside = (x - span)[:, None] ** np.arange(1, 2 + _DEGREE)
-        return (before[span] + np.einsum("np,npc->nc", inside, powers[span])) / spans
-
-    return integrals
+    x = share * spans
+    span = np.clip(np.floor(x).astype(int), 0, spans - 1)
+    inside = (x - span)[:, None] ** np.arange(1, 2 + _DEGREE)
+    return (before[span] + np.einsum("np,npc->nc", inside, powers[span])) / spans
 
 
 @functools.cache

@@ -66,6 +66,10 @@ class Outline(Profile):
     root_radius: Float[Array, ""]
     seal_width: Float[Array, ""]
 
+    conjugate = False
+    search_nodes = 192
+    cusp = False
+
     def segments(self) -> tuple[Segment, ...]:
         stop = self.crown.node[-1]
         return (Segment("flank", jnp.zeros_like(stop), stop, False),)
@@ -92,25 +96,12 @@ class Outline(Profile):
         return Mate(*self.valley(jnp.clip(nu, self.valley.node[0], self.valley.node[-1])))
 
     def mate(self, nu, support=True):
-        del support
         pitch = self.pitch_normal
         beyond = nu > pitch
         reflected = jnp.where(beyond, 2 * pitch - nu, pitch)
         height, lever = self._crown(reflected)
         across = Mate(reflected - jnp.pi / self.lobes, lever, height)
         return jax.tree.map(lambda a, b: jnp.where(beyond, a, b), across, self._valley(nu))
-
-    @property
-    def conjugate(self) -> bool:
-        return False
-
-    @property
-    def search_nodes(self) -> int:
-        return 192
-
-    @property
-    def cusp(self) -> bool:
-        return False
 
     def _rolled(self, direction, mate):
         """Return the point of the outline whose outward normal has the given direction, as a

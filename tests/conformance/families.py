@@ -24,7 +24,7 @@ from rootsopt.errors import InputError
 from rootsopt.profiles import geometry
 from rootsopt.profiles.soundness import margins
 from rootsopt.scene import Scene
-from rootsopt.scene.families import check, design_of, profile_of
+from rootsopt.scene.families import arguments_of, check, profile_of
 from rootsopt.scene.space import Space, sobol
 
 R = 0.033
@@ -59,7 +59,7 @@ def maker(family):
 @functools.cache
 def made(family):
     """Return the profile of the example."""
-    return maker(family)(design_of(config_of(family)))
+    return maker(family)(arguments_of(config_of(family))[-1])
 
 
 @jax.jit
@@ -138,7 +138,7 @@ def what_margins_call_sound_is_one_curve(family):
     Support function and lever must be continuous, the law of gearing must hold, h′ = -lever, and
     the normal angle at a roll angle must have this roll angle. At least two members must be
     sound."""
-    row, designs = family_of(family), [design_of(config_of(family))]
+    row, designs = family_of(family), [arguments_of(config_of(family))[-1]]
     if row.classical and row.parameters:
         usual = np.array([one.usually(1e3 * R, LOBES) for one in row.parameters])
         ends = np.array([(one.lowest, one.highest) for one in row.parameters])
@@ -235,7 +235,7 @@ def slopes_of_geometry_are_those_of_differences(family):
 
         return jax.jvp(shape, (design,), (way,))
 
-    design = design_of(config_of(family))
+    design = arguments_of(config_of(family))[-1]
     for way in jnp.diag(design):
         value, slope = look(design, way)
         up, down = (look(design + step * way, way)[0] for step in (1e-5, -1e-5))
@@ -274,7 +274,7 @@ def config_is_read_and_written(family):
     check(config.profile)
     assert parse(config.to_yaml()) == config
     assert config.profile.parameters == {**family_of(family).example}
-    assert config.profile.with_design(design_of(config.profile).tolist()) == config.profile
+    assert config.profile.with_design(config.profile.design.tolist()) == config.profile
     assert made(family).lobes == LOBES
     for parameter in family_of(family).parameters:
         for value in (parameter.lowest - 1e6, parameter.highest + 1e6):

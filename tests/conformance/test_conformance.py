@@ -74,7 +74,7 @@ def rubbed(part, motion, own):
 
 
 def driven(part, motion, own):
-    return part.torque_at(motion.speed) * motion.speed
+    return part.torque_on_1(motion, own) * motion.speed
 
 
 def against(part, motion, own):

@@ -175,7 +175,10 @@ GOOD = {"name": "mine", "help": "mine", "maker": made, "parameters": (DEPTH,)} |
         ({"parameters": (DEPTH, DEPTH)}, "every key once"),
         ({"maker": lambda lobes, pitch_radius: None}, "lobes, pitch_radius, depth"),
         ({"parameters": (Parameter("arc_center_mm", "other", 0, 1),)}, "arc, arcs_epicycloid"),
-        ({"parameters": (Parameter("lobes", "other", 0, 1),)}, "reserved"),
+        *(
+            ({"parameters": (Parameter(key, "other", 0, 1),)}, f"{key} is reserved")
+            for key in ("lobes", "outline_join_mm", "helix_deg")
+        ),
         ({"parameters": (Parameter("depth_mm", "a depth", 9, 1),)}, "increasing"),
         ({"parameters": (parameters()["coefficients"], DEPTH)}, "list of numbers last"),
     ],

@@ -69,7 +69,7 @@ def test_margins_have_the_sign_of_the_flags(name):
         return searched, _near(pair, searched.places.normal2).margins(tau, state)
 
     jumps = set(kinds(pair).jump) - {-1}
-    assert len(jumps) == (pair.flanks if pair.jumps else 0)
+    assert len(jumps) == (pair.flanks if pair.contact.jumps else 0)
     seen = 0
     for tau, state in _states(pair, 60):
         searched, near = both(pair, tau, state)

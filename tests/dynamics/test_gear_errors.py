@@ -69,7 +69,7 @@ def test_orbit_is_closed_after_a_turn(lobes):
 
     `tests/pump/test_rattle.py` has two lobes in a quicker test."""
     pair = erring(lobes)
-    solver = Solver(HOW, HOW, Measures(), jnp.asarray(320.0), jnp.asarray(0.0), 8)
+    solver = Solver(HOW, HOW, Measures(np.zeros(0)), jnp.asarray(320.0), jnp.asarray(0.0), 8)
     numbers, rest = eqx.partition(pair, eqx.is_inexact_array)
     tangents = eqx.combine(jax.tree.map(lambda x: jnp.zeros((0, *x.shape)), numbers), rest)
     start = Start.at(pair, jnp.zeros(2), solver.max_orbit)

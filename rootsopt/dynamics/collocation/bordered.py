@@ -83,14 +83,6 @@ class Line(NamedTuple):
     tangent: Float[Array, " m"]
     motion: Step
 
-    @classmethod
-    def empty(cls, elements: Elements, share: Float[Array, ""]) -> "Line":
-        """Return a line with zeros, for motions like `elements`."""
-        count, motion = elements.state.shape[1], unchanged(elements, 1)
-        zeros = jnp.zeros
-        square, row, place = zeros((count, count)), zeros(count), zeros(count + 1)
-        return cls(share, jnp.asarray(jnp.inf), square, row, square, place, place, motion)
-
 
 class Followed(NamedTuple):
     """An orbit on a curve.
@@ -126,26 +118,27 @@ def moved_along(
 class _Follower(Closer):
     """The loop of `followed`.
 
-    `family`: pairs of the curve; `measures`: averages of the force; `plane`: see `Plane`; `rising`:
-    whether all events of the known orbit have kept their order (`moved_along`). The other fields
-    are those of `Closer`, for the parameter at the start."""
+    `family`: pairs of the curve; `plane`: see `Plane`; `rising`: whether all events of the known
+    orbit have kept their order (`moved_along`). The other fields are those of `Closer`, for the
+    parameter at the start."""
 
     family: Family = eqx.field(kw_only=True)
-    measures: Measures = eqx.field(kw_only=True)
     plane: Plane = eqx.field(kw_only=True)
     rising: Bool[Array, ""] = eqx.field(kw_only=True)
 
     def start(self) -> Loop:
-        begun = super().start()
-        line = Line.empty(begun.elements, self.plane.through[-1])
+        begun, share = super().start(), self.plane.through[-1]
+        count, motion = begun.elements.state.shape[1], unchanged(begun.elements, 1)
+        square, row, place = jnp.zeros((count, count)), jnp.zeros(count), jnp.zeros(count + 1)
+        line = Line(share, jnp.asarray(jnp.inf), square, row, square, place, place, motion)
         trusted = begun.trusted & self.rising
         return begun._replace(looks=~trusted, trusted=trusted, line=line)
 
     def frozen_at(self, now: Loop) -> RotorPair:
         return lax.stop_gradient(self.family(now.line.share)[0])
 
-    def limit(self, now: Loop) -> Float[Array, ""]:
-        del now
+    @property
+    def limit(self) -> Float[Array, ""]:
         return jnp.asarray(_SMALL)
 
     def judged(self, now: Loop, after: Loop, size: Float[Array, ""], found: Any) -> Loop:
@@ -156,15 +149,22 @@ class _Follower(Closer):
         size = jnp.maximum(size, jnp.abs(after.line.share - now.line.share))
         new = super().judged(now, after, size, found)
         lost = now.trusted & new.looks & ~new.solved
-        begun = self.start()._replace(looks=lost, trusted=~lost, orbit=new.orbit, known=new.known)
-        begun = begun._replace(turns=new.turns, steps=new.steps, failures=new.failures)
+        begun = self.start()._replace(
+            looks=lost,
+            trusted=~lost,
+            orbit=new.orbit,
+            known=new.known,
+            turns=new.turns,
+            steps=new.steps,
+            failures=new.failures,
+        )
         return choose(lost, begun, new)
 
     def step(self, now: Loop) -> tuple[CollocatedEquation, Points, Array, Step, Line]:
         """Solve the linearised equation together with that of the plane, as `Closer.step`."""
         at, line = now.elements, now.line
         pair, tangent = self.family(line.share)
-        equation = CollocatedEquation(pair, self.measures, pair.force_scale)
+        equation = CollocatedEquation(pair, self.equation.measures)
         count, yes = at.state.shape[1], jnp.ones((), bool)
         points, along = evaluated(equation, numbers(pair), at, now.rivals, tangent, yes)
         linearised = lines(at, points)
@@ -229,7 +229,7 @@ def followed(
     known, rising = moved_along(*start)
     pair, _ = family(plane.through[-1])
     frozen = lax.stop_gradient(pair)
-    equation = CollocatedEquation(pair, measures, pair.force_scale)
+    equation = CollocatedEquation(pair, measures)
     nothing = jax.tree.map(
         lambda x: jnp.zeros((0, *x.shape)), eqx.filter(pair, eqx.is_inexact_array)
     )
@@ -237,6 +237,6 @@ def followed(
     known = known._replace(elements=searched)
     loop = _Follower(
         equation, frozen, nothing, known, numbers(frozen), tolerance,
-        family=family, measures=measures, plane=plane, rising=rising,
+        family=family, plane=plane, rising=rising,
     ).run()  # fmt: skip
     return Followed(loop.orbit, loop.line, loop.known)

@@ -46,18 +46,18 @@ from rootsopt.dynamics.collocation.mesh import (
 )
 from rootsopt.dynamics.collocation.newton import (
     advanced,
-    between,
     columns_of,
     evaluated,
     forces_of,
-    has_stalled,
     lines,
+    numbers,
     with_numbers,
 )
 from rootsopt.dynamics.collocation.peak import Rivals, forces_along, is_settled, peak_of, rivals_of
 from rootsopt.dynamics.collocation.system import Step, chained, condensed, unchanged
 from rootsopt.dynamics.orbit import Orbit, branch, choose
 from rootsopt.dynamics.pair import RotorPair
+from rootsopt.runtime.compute_once import compute_once
 
 # Size of the first mesh that is aligned with events: elements for each element of the mesh before
 # (more at a finer than the usual accuracy), and further elements per event; at least the third
@@ -76,6 +76,9 @@ _UNCOMPARED = 1e-5, 1e-3, 0.1
 # second or later mesh is refined only if it grows by at least the other factor. A mesh of nearly
 # the same size would have nearly the same error, and say nothing about it.
 _FINER, _LAST = 1.4, 1.4**0.5
+# Step (scaled) below which Newton's method also stops if the step exceeds the second number times
+# the step before. The steps then only follow rounding.
+_ROUNDING = 1e-7, 0.5
 # Maximum number of evaluations of the flags, and of Newton steps after each of them.
 _TURNS, _STEPS = 24, 16
 # Fraction of the way to the new pair over which the predictor takes its difference.
@@ -192,9 +195,9 @@ class Closer(eqx.Module):
         """Return the initial state of the loop."""
         known, elements = self.known, self.known.elements
         infinite, zero, no = jnp.asarray(jnp.inf), jnp.zeros((), int), jnp.zeros((), bool)
-        equation, count = self.equation, self.directions
-        still = unchanged(elements, count) if equation.variation else None
-        orbit = Orbit.empty(elements.state[0], count, equation.measures.count + 1, still)
+        count = jax.tree.leaves(eqx.filter(self.tangents, eqx.is_inexact_array))[0].shape[0]
+        still = unchanged(elements, count) if self.equation.variation else None
+        orbit = Orbit.empty(elements.state[0], count, self.equation.measures.count + 1, still)
         unknown = KnownOrbit(elements, jnp.ones(()), infinite, infinite, no, ~no)
         return Loop(
             orbit=orbit,
@@ -216,11 +219,6 @@ class Closer(eqx.Module):
         )
 
     @property
-    def ease(self) -> Float[Array, ""]:
-        """Factor by which the requested errors exceed those at the usual accuracy, at least 1."""
-        return jnp.maximum(self.tolerance / USUAL, 1.0)
-
-    @property
     def denser(self) -> Float[Array, ""]:
         """Factor by which meshes are denser than at the usual accuracy, at least 1."""
         return jnp.maximum(USUAL / self.tolerance, 1.0) ** (1 / _ORDER)
@@ -229,19 +227,13 @@ class Closer(eqx.Module):
         """Return the number of elements above which the mesh is not refined."""
         return most_elements(now.elements.mesh, self.denser, self.frozen.contact.sections)
 
-    @property
-    def directions(self) -> int:
-        """Number of directions along which forces are differentiated."""
-        return jax.tree.leaves(eqx.filter(self.tangents, eqx.is_inexact_array))[0].shape[0]
-
     def frozen_at(self, now: Loop) -> RotorPair:
         """Return the pair whose flags are evaluated, treated as constant by JAX."""
-        del now
         return self.frozen
 
-    def limit(self, now: Loop) -> Float[Array, ""]:
-        """Return the size of a step (scaled) at which Newton's method stops."""
-        del now
+    @property
+    def limit(self) -> Float[Array, ""]:
+        """Size of a step (scaled) at which Newton's method stops."""
         return jnp.minimum(jnp.sqrt(self.tolerance), _LARGEST)
 
     def step(self, now: Loop) -> tuple[CollocatedEquation, Points, Array, Step, Any]:
@@ -257,7 +249,9 @@ class Closer(eqx.Module):
         this way."""
         at = now.elements
         way = jnp.where(now.trusted & (now.tries == 0), _WAY, 1.0)
-        pair = between(self.equation.pair, self.neighbour, way)
+        own = numbers(self.equation.pair)
+        toward = self.neighbour + way * (own - self.neighbour)
+        pair = compute_once(jnp.where(way == 1, own, toward))
         points, along = evaluated(self.equation, pair, at, now.rivals, self.tangents, now.keeps)
         linearised = lines(at, points)
         columns = columns_of(at, linearised, along)
@@ -300,24 +294,21 @@ class Closer(eqx.Module):
         come from the search, since those of Newton's method lag behind."""
         keeps = agree & now.solved & (apart(now.elements, seen) <= _FAR)
         motion = choose(agree, rooted(self.frozen, now.elements, seen), now.elements)
-        fresh = jnp.full_like(now.size, jnp.inf), jnp.zeros_like(now.tries)
         return now._replace(
             turns=now.turns + 1,
             elements=motion,
             rivals=now.rivals.rooted(now.elements, motion),
             looks=~agree,
             keeps=keeps,
-            size=fresh[0],
-            tries=fresh[1],
+            size=jnp.full_like(now.size, jnp.inf),
+            tries=jnp.zeros_like(now.tries),
         )
 
     def run(self) -> Loop:
         """Return the final state of the loop."""
-
-        def go_on(now: Loop) -> Bool[Array, ""]:
-            return ~now.over & (now.turns < _TURNS)
-
-        return lax.while_loop(go_on, lambda now: self.turn(now), self.start())
+        return lax.while_loop(
+            lambda now: ~now.over & (now.turns < _TURNS), lambda now: self.turn(now), self.start()
+        )
 
     def align(self, now: Loop, events: Events, finer: Bool[Array, ""]) -> Loop:
         """Return the loop's state with the motion on a mesh that ends at its `events`.
@@ -332,8 +323,7 @@ class Closer(eqx.Module):
         most = self.most(now)
         used = jnp.maximum(snug(jnp.minimum(used, most)), events.count + 2)
         used = jnp.minimum(used, now.elements.state.shape[0] - 1)
-        (place, wanted), (spot, number) = needed(now.elements), counted(now.elements)
-        density = jnp.where(now.fits, place, spot), jnp.where(now.fits, wanted, number)
+        density = choose(now.fits, needed(now.elements), counted(now.elements))
         new = aligned(now.elements, (events.times, events.which), density, used)
         yes = jnp.ones((), bool)
         return now._replace(
@@ -374,8 +364,8 @@ class Closer(eqx.Module):
 
         If the step is small enough and the peak is `found`, the motion is solved. Where rounding
         keeps steps above the limit, the method ends when they no longer shrink."""
-        limit, tries = self.limit(now), now.tries + 1
-        stalled = has_stalled(size, now.size)
+        limit, tries = self.limit, now.tries + 1
+        stalled = (size < _ROUNDING[0]) & (size > _ROUNDING[1] * now.size)
         # A size of NaN also ends the method.
         ends = ~(size > limit) | stalled
         ends = (ends & (found | ~jnp.isfinite(size))) | (tries >= _STEPS)
@@ -409,7 +399,7 @@ class Closer(eqx.Module):
         """Return the loop's state with the `new` orbit, its corrected `motion` and errors."""
         size = roughness(motion)
         first = now.meshes == 0
-        apart, turned = differences(now.orbit, new, self.equation.top)
+        apart, turned = differences(now.orbit, new, self.frozen.force_scale)
         force, slope = gained(now.known.elements.mesh.used, now.elements.mesh.used)
         compared = apart / force, turned / slope + _ROUGH
         error, drift = choose(first, self.uncompared(size), compared)
@@ -424,7 +414,8 @@ class Closer(eqx.Module):
         good = correction < corrected(self.tolerance)
         falls = correction < _STALLED * now.size
         failures = now.failures + ~good
-        again = jnp.isfinite(correction) & falls & (correction > _NEGLIGIBLE * self.ease)
+        negligible = _NEGLIGIBLE * jnp.maximum(self.tolerance / USUAL, 1.0)
+        again = jnp.isfinite(correction) & falls & (correction > negligible)
         again &= failures <= _FAILURES
         least = jnp.where(first & self.known.aligned, self.known.roughness, 0.0)
         yes = jnp.ones((), bool)

@@ -135,6 +135,11 @@ class Mesh(NamedTuple):
         return (self.right - self.left) * room
 
     @property
+    def filled(self) -> Bool[Array, " e"]:
+        """Whether each element is in use."""
+        return jnp.arange(self.interval.shape[0]) < self.used
+
+    @property
     def last(self) -> Bool[Array, " e"]:
         """Whether each element is the last of its interval."""
         following = jnp.append(self.interval[1:], -1)
@@ -197,9 +202,19 @@ class Elements(NamedTuple):
         mesh = self.mesh
         begin = mesh.ends[0]
         tau = mesh.times[0] + jnp.mod(tau - mesh.times[0], mesh.period)
-        used = jnp.arange(begin.shape[0]) < mesh.used
-        k = jnp.sum(used & (begin <= tau[..., None]), axis=-1) - 1
+        k = jnp.sum(mesh.filled & (begin <= tau[..., None]), axis=-1) - 1
         return jnp.maximum(k, 0), tau
+
+    def found(self, tau: Float[Array, "*m"]) -> tuple[Int[Array, "*m"], Float[Array, "*m"]]:
+        """Return the index of the element that contains each of the times `tau` (mesh periods),
+        and the times as fractions of it.
+
+        The search is a bisection; `holding` compares every time with all elements."""
+        mesh = self.mesh
+        tau = mesh.times[0] + jnp.mod(tau - mesh.times[0], mesh.period)
+        k = jnp.searchsorted(mesh.ends[0], tau, side="right") - 1
+        k = jnp.clip(k, 0, mesh.used - 1)
+        return k, self.share(k, tau)
 
     def share(self, k: Int[Array, "*m"], tau: Float[Array, "*m"]) -> Float[Array, "*m"]:
         """Return the times `tau` (mesh periods) as fractions of the elements `k`."""
@@ -230,7 +245,6 @@ def greatest(count: Int[Array, ""]) -> Int[Array, ""]:
 
 @greatest.def_vmap
 def _(size, batched, count):
-    del size, batched
     return jnp.max(count), False
 
 

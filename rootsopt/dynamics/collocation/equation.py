@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from rootsopt.contact.gap import around, innermost
+from rootsopt.contact.gap import innermost
 from rootsopt.contact.search import NearContact, SearchContact
 from rootsopt.dynamics.collocation.elements import greatest
 from rootsopt.dynamics.orbit import Measures
@@ -22,27 +22,25 @@ class Points(NamedTuple):
     `values` (e, p, r): derivatives of the n scaled states with respect to time (mesh periods), q
     integrands (see `CollocatedEquation`), and one margin (see `Margins`); `slopes` (e, p, r, 1 +
     n): derivatives of `values` with respect to time and state; `roots` (e, p, flanks, 2): improved
-    `NearContact.roots`; `force` (e, p): contact force (N); `depth` (e, p): penetration (m).
+    `NearContact.roots`; `depth` (e, p): penetration (m).
     """
 
     values: Float[Array, "e p r"]
     slopes: Float[Array, "e p r c"]
     roots: Float[Array, "e p flanks 2"]
-    force: Float[Array, "e p"]
     depth: Float[Array, "e p"]
 
 
 class CollocatedEquation(eqx.Module):
     """The equation of motion of a `pair`, together with the integrands of `measures`.
 
-    Forces in the integrands are in units of `pair.force_scale`. If rotor 1 is free, the integrands
-    are multiplied by `RotorPair.lapse`, which is also the last integrand. `top` (N): roughly the
-    greatest force. `variation`: whether a closed orbit has its `Orbit.variation`.
+    Forces in the integrands are in units of `pair.force_scale`, which is roughly the greatest
+    force. If rotor 1 is free, the integrands are multiplied by `RotorPair.lapse`, which is also the
+    last integrand. `variation`: whether a closed orbit has its `Orbit.variation`.
     """
 
     pair: RotorPair
     measures: Measures
-    top: Float[Array, ""]
     variation: bool = eqx.field(static=True, default=False)
 
     @property
@@ -61,12 +59,12 @@ class CollocatedEquation(eqx.Module):
             return pair
         if pair.contact.slices is not None:
             roots = roots.reshape(pair.contact.sections, -1, 2)
-        contact = NearContact(searched.pair, roots)
-        return eqx.tree_at(lambda p: p.contact, pair, around(pair.contact, contact))
+        return eqx.tree_at(
+            lambda pair: innermost(pair.contact), pair, NearContact(searched.pair, roots)
+        )
 
     def evaluated(self, dynamic, static, tau, state, roots, which):
-        """Return the equation at one instant: a list of values, and the tuple (roots, force,
-        depth).
+        """Return the equation at one instant: a list of values, and the tuple (roots, depth).
 
         `dynamic`, `static`: the pair's floating-point arrays, and the rest of the pair; `tau`: time
         (mesh periods); `state` (n,): scaled; `roots` (flanks, 2): `NearContact.roots`; `which`:
@@ -74,14 +72,13 @@ class CollocatedEquation(eqx.Module):
         near = self.near(dynamic, static, roots)
         slope, contact, margins = near.derivative_and_margins(tau, state)
         unit = jax.lax.stop_gradient(self.pair.force_scale)
-        top = jax.lax.stop_gradient(self.top) / unit
-        rates = self.measures.rates(tau, contact.total / unit, top)
+        rates = self.measures.rates(tau, contact.total / unit)
         if near.free:
             rates = near.lapse(state) * jnp.append(rates, jnp.ones_like(unit))
         values = [*slope, *rates, margins.values[which]]
         if isinstance(innermost(near.contact), NearContact):
             roots = _roots(margins.places)
-        return values, (roots, contact.total, contact.depth)
+        return values, (roots, contact.depth)
 
     def along(
         self,

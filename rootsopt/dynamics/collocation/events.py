@@ -19,9 +19,16 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.contact.closest import RANKS
-from rootsopt.contact.gap import WrappedContact, around, innermost
+from rootsopt.contact.gap import WrappedContact, innermost
 from rootsopt.contact.search import SearchContact
-from rootsopt.dynamics.collocation.elements import GAUSS, Elements, Mesh, in_blocks, zero_of
+from rootsopt.dynamics.collocation.elements import (
+    GAUSS,
+    POINTS,
+    Elements,
+    Mesh,
+    in_blocks,
+    zero_of,
+)
 from rootsopt.dynamics.flanks import Margins, has_margins, margins_of, touch_of
 from rootsopt.dynamics.orbit import branch
 from rootsopt.dynamics.pair import RotorPair
@@ -81,16 +88,6 @@ class Events(NamedTuple):
     new: Int[Array, ""]
     gone: Int[Array, ""]
     fits: Bool[Array, ""]
-
-
-def flags_at(pair: RotorPair, tau, state):
-    """Return the flags (f,) of the equation, and three further results.
-
-    These are: whether each flag matters (f,); the normal angles ν2 (rad) of the closest approach
-    (flanks,); whether the flanks transmit a force (flanks,). `tau`: time (mesh periods); `state`
-    (n,): scaled."""
-    margins = pair.margins(tau, state)
-    return margins.values > 0, margins.counts, _roots(pair, margins), margins.pushes
 
 
 def _roots(pair: RotorPair, margins: Margins) -> Float[Array, " flanks"]:
@@ -183,7 +180,7 @@ def look(pair: RotorPair, elements: Elements) -> FlagScan:
     if type(contact) is SearchContact:
         flanks = dataclasses.replace(contact.pair, together=True)
         grouped = dataclasses.replace(contact, pair=flanks)
-        pair = eqx.tree_at(lambda p: p.contact, pair, around(pair.contact, grouped))
+        pair = eqx.tree_at(lambda pair: innermost(pair.contact), pair, grouped)
     mesh = elements.mesh
     tau, state = elements.places
     number = jnp.arange(mesh.left.shape[0])
@@ -197,13 +194,17 @@ def look(pair: RotorPair, elements: Elements) -> FlagScan:
     inner = elements.inside(jnp.broadcast_to(number[:, None], more.shape), more)
     tau = jnp.concatenate([tau[:, :-1], end, more], axis=1)
     state = jnp.concatenate([state[:, :-1], ends, inner], axis=1)
-    each = jax.vmap(jax.vmap(lambda t, z: flags_at(pair, t, z)))
-    flags, counts, roots, pushes = in_blocks(each, mesh.used, tau, state)
-    width = flags.shape[-1]
+
+    def evaluated(tau, state):
+        margins = pair.margins(tau, state)
+        return margins.values > 0, margins.counts, _roots(pair, margins), margins.pushes
+
+    each = jax.vmap(jax.vmap(evaluated))
+    *rows, roots, pushes = in_blocks(each, mesh.used, tau, state)
     total = mesh.used * tau.shape[1]
     order = jnp.argsort(tau, axis=1)
-    flags, counts = (jnp.take_along_axis(x, order[..., None], 1) for x in (flags, counts))
-    flags, counts = flags.reshape(-1, width), counts.reshape(-1, width)
+    rows = (jnp.take_along_axis(x, order[..., None], 1) for x in rows)
+    flags, counts = (x.reshape(-1, x.shape[-1]) for x in rows)
     times = jnp.take_along_axis(tau, order, 1).ravel()
     kept = slice(-more.shape[1])
     return FlagScan(times, flags, counts, roots[:, kept], pushes[:, kept], total)
@@ -251,18 +252,17 @@ def rooted(pair: RotorPair, elements: Elements, seen: FlagScan) -> Elements:
     which the contact may jump, belongs to the instant after the end. Both are extrapolated to the
     end: otherwise derivatives of a peak at a corner of the force would have a relative error of
     about 5e-6."""
-    inside = len(GAUSS.nodes)
     mesh, number = elements.mesh, jnp.arange(elements.state.shape[0])
     following = jnp.where(number + 1 < mesh.used, number + 1, 0)
-    nodes = seen.roots[:, :inside]
+    nodes = seen.roots[:, :POINTS]
     # Slopes at both ends of each element, with respect to the fraction of its length.
     leaving, entering = jnp.einsum("ms,esk->mek", GAUSS.derivative(jnp.asarray(_ENDS)), nodes)
     length = jnp.where(mesh.lengths > 0, mesh.lengths, 1.0)[:, None]
     before, after = leaving / length, (entering / length)[following]
     end = mesh.ends[1][:, None, None]
     aside = seen.tau.reshape(*number.shape, -1)[:, -2:, None] - end
-    moved = seen.roots[:, inside:] - aside * jnp.stack([before, after], axis=1)
-    own = seen.pushes[:, inside] | ~seen.pushes[:, inside + 1]
+    moved = seen.roots[:, POINTS:] - aside * jnp.stack([before, after], axis=1)
+    own = seen.pushes[:, POINTS] | ~seen.pushes[:, POINTS + 1]
     jumps = np.unique(kinds(pair).jump)
     which = jnp.where(mesh.last, mesh.which[mesh.interval + 1], FIXED)
     for flank, jump in enumerate(jumps[jumps >= 0]):
@@ -277,28 +277,20 @@ def apart(elements: Elements, seen: FlagScan) -> Float[Array, ""]:
 
     Roots are normal angles of the closest approach. Gauss points at which the flanks do not push
     are ignored. `seen`: result of `look`."""
-    inside = len(GAUSS.nodes)
-    used = jnp.arange(elements.state.shape[0]) < elements.mesh.used
-    counts = seen.pushes[:, :inside] & used[:, None, None]
-    away = jnp.abs(elements.roots[:, :inside, :, 0] - seen.roots[:, :inside])
+    counts = seen.pushes[:, :POINTS] & elements.mesh.filled[:, None, None]
+    away = jnp.abs(elements.roots[:, :POINTS, :, 0] - seen.roots[:, :POINTS])
     return jnp.max(jnp.where(counts, away, 0.0))
 
 
-class _Compared(NamedTuple):
-    """Flags along a motion, compared with the events of its mesh.
+def _compared(
+    pair: RotorPair, elements: Elements, seen: FlagScan
+) -> tuple[Bool[Array, "p f"], Float[Array, " p"], Bool[Array, " m"], Int[Array, ""]]:
+    """Return the flags `seen` along a motion, compared with the events of its mesh.
 
-    `fresh` (p, f): whether a flag that matters changes after the instant, but not at an event of
-    the mesh; `later` (p,): next instant (mesh periods); `held` (m,): whether the time of the mesh
-    is an event at which its flag changes; `gone`: number of events of the mesh at which it does
-    not."""
-
-    fresh: Bool[Array, "p f"]
-    later: Float[Array, " p"]
-    held: Bool[Array, " m"]
-    gone: Int[Array, ""]
-
-
-def _compared(pair: RotorPair, elements: Elements, seen: FlagScan) -> _Compared:
+    The four results are `fresh` (p, f): whether a flag that matters changes after the instant, but
+    not at an event of the mesh; `later` (p,): next instant (mesh periods); `held` (m,): whether the
+    time of the mesh is an event at which its flag changes; `gone`: number of events of the mesh at
+    which it does not."""
     mesh = elements.mesh
     places = seen.tau.shape[0]
     per = places // elements.state.shape[0]
@@ -322,7 +314,7 @@ def _compared(pair: RotorPair, elements: Elements, seen: FlagScan) -> _Compared:
     kept = declared & ((which[:, 0] == FIXED) | jnp.any(differ & tells, axis=1))
     held = jnp.full(mesh.times.shape, False).at[jnp.where(kept, ends_at, 0)].set(True)
     gone = jnp.sum(declared & ~kept)
-    return _Compared(differ & ~kept[:, None], later, held.at[0].set(False), gone)
+    return differ & ~kept[:, None], later, held.at[0].set(False), gone
 
 
 def known_events(pair: RotorPair, mesh: Mesh) -> Events:
@@ -339,13 +331,12 @@ def found_events(pair: RotorPair, elements: Elements, seen: FlagScan) -> Events:
 
     If the flags change exactly at the events of the mesh, return a placeholder, to save the time of
     locating them: `known_events` returns these events."""
-    compared = _compared(pair, elements, seen)
-    changed = jnp.any(compared.fresh) | (compared.gone > 0)
+    fresh, later, held, gone = _compared(pair, elements, seen)
 
     def located():
-        return _located(pair, elements, seen, compared)
+        return _located(pair, elements, seen, fresh, later, held, gone)
 
-    return branch(changed, located, lambda: empty_like(located))
+    return branch(jnp.any(fresh) | (gone > 0), located, lambda: empty_like(located))
 
 
 def empty_like(function: Callable[[], Any]) -> Any:
@@ -353,10 +344,11 @@ def empty_like(function: Callable[[], Any]) -> Any:
     return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(function))
 
 
-def _located(pair: RotorPair, elements: Elements, seen: FlagScan, compared: _Compared) -> Events:
-    """Return the result of `found_events` if flags change elsewhere than at events of the mesh."""
+def _located(pair: RotorPair, elements: Elements, seen: FlagScan, fresh, later, held, gone):
+    """Return the result of `found_events` if flags change elsewhere than at events of the mesh.
+
+    `fresh`, `later`, `held`, `gone`: results of `_compared`."""
     mesh, kind = elements.mesh, jax.tree.map(jnp.asarray, kinds(pair))
-    fresh, later, held, gone = compared
     room = mesh.times.shape[0]
     most = _CHANGES * room
     # Choose the instants first: choosing among all flags of all instants takes ten times as long.

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rootsopt.contact.gap import innermost
 from rootsopt.contact.search import SearchContact
-from rootsopt.dynamics.collocation.elements import BLOCK, GAUSS, Elements, Mesh
+from rootsopt.dynamics.collocation.elements import BLOCK, GAUSS, POINTS, Elements, Mesh
 from rootsopt.dynamics.collocation.events import _SAME
 from rootsopt.dynamics.flow import Pieces
 from rootsopt.dynamics.orbit import Orbit, choose
@@ -160,7 +160,7 @@ def _highest(elements: Elements) -> Float[Array, " e"]:
     mesh = elements.mesh
     highest = jnp.sum(jnp.asarray(GAUSS.powers[-1])[:, None] * elements.slopes, axis=1)
     size = jnp.max(jnp.abs(highest), axis=1) * mesh.lengths
-    return jnp.where(jnp.arange(size.shape[0]) < mesh.used, size, 0.0)
+    return jnp.where(mesh.filled, size, 0.0)
 
 
 def ordered(mesh: Mesh) -> tuple[Mesh, Bool[Array, ""]]:
@@ -180,22 +180,12 @@ def moved(elements: Elements, mesh: Mesh) -> Elements:
 
     `Elements.roots` are only useful if both meshes have the same events; otherwise they must be
     renewed (see `events.rooted`)."""
-    old_begin = elements.mesh.ends[0]
     begin, end = mesh.ends
-    length, old_length = mesh.lengths, elements.mesh.lengths
-    last = elements.mesh.used - 1
-
-    def at(tau):
-        start = elements.mesh.times[0]
-        tau = start + jnp.mod(tau - start, elements.mesh.period)
-        k = jnp.clip(jnp.searchsorted(old_begin, tau, side="right") - 1, 0, last)
-        size = jnp.where(old_length[k] > 0, old_length[k], 1.0)
-        return k, (tau - old_begin[k]) / size
-
-    k, share = at(begin)
+    k, share = elements.found(begin)
     rise = jnp.sum(GAUSS.integrated(share)[..., None] * elements.slopes[k], axis=-2)
-    state = elements.state[k] + old_length[k][..., None] * rise
-    k, share = at(jnp.append(begin[:, None] + length[:, None] * GAUSS.nodes, end[:, None], axis=1))
+    state = elements.state[k] + elements.mesh.lengths[k][..., None] * rise
+    inside = begin[:, None] + mesh.lengths[:, None] * GAUSS.nodes
+    k, share = elements.found(jnp.append(inside, end[:, None], axis=1))
     weights = GAUSS.lagrange(share)
     slopes = jnp.einsum("eps,epsn->epn", weights[:, :-1], elements.slopes[k[:, :-1]])
     roots = jnp.einsum("eps,epsij->epij", weights, elements.roots[k][:, :, :-1])
@@ -267,8 +257,8 @@ def counted(elements: Elements) -> tuple[Float[Array, " p"], Float[Array, " p"]]
     time (p,)."""
     mesh = elements.mesh
     begin, end = mesh.ends
-    real = jnp.arange(begin.shape[0]) < mesh.used
-    return jnp.append(begin[:1], end), jnp.append(0.0, jnp.cumsum(jnp.where(real, 1.0, 0.0)))
+    number = jnp.cumsum(jnp.where(mesh.filled, 1.0, 0.0))
+    return jnp.append(begin[:1], end), jnp.append(0.0, number)
 
 
 class KnownOrbit(NamedTuple):
@@ -289,19 +279,12 @@ class KnownOrbit(NamedTuple):
     aligned: Bool[Array, ""]
 
     @classmethod
-    def unaligned(cls, elements: Elements) -> "KnownOrbit":
-        """Return the motion `elements`, whose mesh does not end at events yet, as a known orbit."""
-        infinite, yes = jnp.asarray(jnp.inf), jnp.ones((), bool)
-        return cls(elements, jnp.ones(()), infinite, infinite, yes, ~yes)
-
-    @classmethod
     def empty(cls, sizes: tuple[int, int], states: int, flanks: int) -> "KnownOrbit":
         """Return a placeholder for an orbit that is not known: arrays of its shapes, not `sound`.
 
         `sizes`: room for elements and for times of the mesh; `states`: number of states; `flanks`:
         number of flanks that can touch at once (`RotorPair.flanks`)."""
         elements, times = sizes
-        points = len(GAUSS.nodes)
 
         # NumPy's zeros: outside of a program, JAX would compile one for each shape.
         def zeros(*shape: int, dtype: Any = float) -> Any:
@@ -318,8 +301,8 @@ class KnownOrbit(NamedTuple):
         motion = Elements(
             mesh,
             zeros(elements, states),
-            zeros(elements, points, states),
-            zeros(elements, points + 1, flanks, 2),
+            zeros(elements, POINTS, states),
+            zeros(elements, POINTS + 1, flanks, 2),
         )
         no = zeros(dtype=bool)
         return cls(motion, zeros(), zeros(), zeros(), no, no)
@@ -384,9 +367,10 @@ def from_pieces(
         right=jnp.where(real, right, 1.0),
         used=used,
     )
-    roots = jnp.zeros((capacity, len(GAUSS.nodes) + 1, pair.flanks, 2), dtype)
-    states, slopes = pieces.states[row, column], pieces.slopes[row, column]
-    return KnownOrbit.unaligned(Elements(mesh, states, slopes, roots))
+    roots = jnp.zeros((capacity, POINTS + 1, pair.flanks, 2), dtype)
+    motion = Elements(mesh, pieces.states[row, column], pieces.slopes[row, column], roots)
+    infinite, yes = jnp.asarray(jnp.inf), jnp.ones((), bool)
+    return KnownOrbit(motion, jnp.ones(()), infinite, infinite, yes, ~yes)
 
 
 PIECES = 40, GAUSS.nodes

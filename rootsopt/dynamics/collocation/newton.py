@@ -14,29 +14,17 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
-from rootsopt.dynamics.collocation.elements import GAUSS, Elements, in_blocks, summed
+from rootsopt.dynamics.collocation.elements import GAUSS, POINTS, Elements, in_blocks, summed
 from rootsopt.dynamics.collocation.equation import CollocatedEquation, Points
 from rootsopt.dynamics.collocation.peak import Peak, Rivals
-from rootsopt.dynamics.collocation.system import (
-    Columns,
-    Lines,
-    Step,
-    moved_at,
-    moved_places,
-    own_column,
-)
+from rootsopt.dynamics.collocation.system import Columns, Lines, Step, moved_at, moved_places
 from rootsopt.dynamics.linear import spectral_radius
 from rootsopt.dynamics.orbit import Orbit
-from rootsopt.dynamics.pair import RotorPair
-from rootsopt.runtime.compute_once import compute_once
 
 # Greatest fraction of an interval's length by which one step may shorten the interval.
 _ROOM = 0.7
 # Change of a state (scaled) above which a Newton step is shortened.
 _LONGEST = 1.0
-# Step (scaled) below which Newton's method also stops if the step exceeds the second number times
-# the step before. The steps then only follow rounding.
-_STALLED = 1e-7, 0.5
 
 
 def evaluated(
@@ -72,12 +60,11 @@ def evaluated(
 def lines(elements: Elements, points: Points) -> Lines:
     """Return the linearised equation of `elements`; `points`: result of `evaluated`."""
     count = elements.state.shape[1]
-    inside = len(GAUSS.nodes)
     return Lines(
-        miss=points.values[:, :inside, :count] - elements.slopes,
-        slopes=points.slopes[:, :inside, :count],
-        margin=points.values[:, inside, -1],
-        bend=points.slopes[:, inside, -1],
+        miss=points.values[:, :POINTS, :count] - elements.slopes,
+        slopes=points.slopes[:, :POINTS, :count],
+        margin=points.values[:, POINTS, -1],
+        bend=points.slopes[:, POINTS, -1],
     )
 
 
@@ -86,23 +73,15 @@ def columns_of(elements: Elements, linearised: Lines, direct: Float[Array, "e p 
 
     `linearised`: linearised equation; `direct`: derivatives of the equation's values along the
     directions, at constant motion."""
-    count, inside = elements.state.shape[1], len(GAUSS.nodes)
-    own = own_column(elements, linearised)
+    count = elements.state.shape[1]
+    rise = GAUSS.whole(elements.slopes)
+    reached = elements.state + elements.mesh.lengths[:, None] * rise
+    gap = (reached - elements.following)[..., None]
     return Columns(
-        slope=jnp.concatenate([own.slope, direct[:, :inside, :count]], axis=-1),
-        gap=jnp.pad(own.gap, ((0, 0), (0, 0), (0, direct.shape[-1]))),
-        margin=jnp.concatenate([own.margin, direct[:, inside, -1]], axis=-1),
+        slope=jnp.concatenate([linearised.miss[..., None], direct[:, :POINTS, :count]], axis=-1),
+        gap=jnp.pad(gap, ((0, 0), (0, 0), (0, direct.shape[-1]))),
+        margin=jnp.concatenate([linearised.margin[:, None], direct[:, POINTS, -1]], axis=-1),
     )
-
-
-def between(
-    pair: RotorPair, neighbour: Float[Array, " m"], way: Float[Array, ""]
-) -> Float[Array, " m"]:
-    """Return the `numbers` of a pair between a neighbour (`way` = 0) and `pair` (1).
-
-    `neighbour` (m,): `numbers` of the neighbour."""
-    own = numbers(pair)
-    return compute_once(jnp.where(way == 1, own, neighbour + way * (own - neighbour)))
 
 
 def numbers(pair: Any) -> Float[Array, " m"]:
@@ -117,13 +96,6 @@ def with_numbers(equation: CollocatedEquation, vector: Float[Array, " m"]) -> Co
     own, rest = eqx.partition(equation.pair, eqx.is_inexact_array)
     pair = eqx.combine(ravel_pytree(own)[1](vector), rest)
     return eqx.tree_at(lambda e: e.pair, equation, pair)
-
-
-def has_stalled(size: Float[Array, ""], before: Float[Array, ""]) -> Bool[Array, ""]:
-    """Return whether Newton's steps only follow rounding.
-
-    `size`, `before`: size of the last step and of the one before (scaled)."""
-    return (size < _STALLED[0]) & (size > _STALLED[1] * before)
 
 
 def advanced(
@@ -172,8 +144,7 @@ def forces_of(
     change = _changes(elements, points, direct, step)
     raw, changes = _averages(equation, elements, points, change, step)
     unit = lax.stop_gradient(equation.pair.force_scale)
-    top = lax.stop_gradient(equation.top) / unit
-    averages, factors = equation.measures.values(raw, unit, top)
+    averages, factors = equation.measures.values(raw, unit)
     by_averages = changes * factors[:, None]
     by_height = unit * _by_height(equation, elements, peak, (points, direct, change), step)
     values = jnp.concatenate([averages[:2], unit * peak.force[None], averages[2:]])
@@ -183,7 +154,6 @@ def forces_of(
         columns = (x[..., 1:] for x in (step.state, step.slopes, step.times))
         variation = Step(*columns, monodromy=step.monodromy)
     first = origin(elements)
-    used = (jnp.arange(elements.state.shape[0]) < elements.mesh.used)[:, None]
     return Orbit(
         state=corrected.state[first],
         residual=jnp.max(jnp.abs(step.state[..., 0])),
@@ -192,7 +162,7 @@ def forces_of(
         response=values + slopes[:, 0],
         sensitivity=slopes[:, 1:],
         moved=step.state[first, :, 1:],
-        depth=jnp.max(jnp.where(used, points.depth, -jnp.inf)),
+        depth=jnp.max(jnp.where(elements.mesh.filled[:, None], points.depth, -jnp.inf)),
         newton_steps=jnp.zeros((), int),
         disagreement=jnp.asarray(jnp.inf),
         variation=variation,
@@ -202,12 +172,11 @@ def forces_of(
 def _changes(elements: Elements, points: Points, direct, step: Step) -> Float[Array, "e s r k"]:
     """Return the changes of the equation's values at the Gauss points, which move with the orbit,
     in all columns of `step`; `direct`: changes at constant motion."""
-    inside = len(GAUSS.nodes)
     times, states = moved_places(elements, step)
     moves = [times, *jnp.moveaxis(states, 2, 0)]
-    bend = points.slopes[:, :inside]
+    bend = points.slopes[:, :POINTS]
     change = summed(bend[..., k, None] * move[:, :, None] for k, move in enumerate(moves))
-    return change + direct[:, :inside]
+    return change + direct[:, :POINTS]
 
 
 def _averages(equation: CollocatedEquation, elements: Elements, points: Points, change, step: Step):
@@ -218,10 +187,10 @@ def _averages(equation: CollocatedEquation, elements: Elements, points: Points, 
     mesh = elements.mesh
     left, right = step.times[mesh.interval], step.times[mesh.interval + 1]
     longer = (mesh.right - mesh.left)[:, None] * (right - left)
-    count, inside = elements.state.shape[1], len(GAUSS.nodes)
+    count = elements.state.shape[1]
     rates = slice(count, count + equation.rates)
-    part, by_part = GAUSS.whole(points.values[:, :inside, rates]), GAUSS.whole(change[:, :, rates])
-    used = (jnp.arange(part.shape[0]) < mesh.used)[:, None]
+    part, by_part = GAUSS.whole(points.values[:, :POINTS, rates]), GAUSS.whole(change[:, :, rates])
+    used = mesh.filled[:, None]
     total = jnp.sum(jnp.where(used, mesh.lengths[:, None] * part, 0.0), axis=0)
     moved = mesh.lengths[:, None, None] * by_part + part[..., None] * longer[:, None]
     moved = jnp.sum(jnp.where(used[..., None], moved, 0.0), axis=0)
@@ -245,7 +214,7 @@ def _by_height(equation: CollocatedEquation, elements: Elements, peak: Peak, eva
     here = bend[:, :1] * time + bend[:, 1:] @ state + direct[peak.place]
     # The peak may lie slightly off the instant of the evaluation. The changes here and at the Gauss
     # points lie on one polynomial.
-    rows = change[k].reshape(len(GAUSS.nodes), -1)
+    rows = change[k].reshape(POINTS, -1)
     away = share - GAUSS.nodes
     bends = jnp.sum(away / (away**2 + _COINCIDE**2))
     beside = (here.ravel() - GAUSS.lagrange(share) @ rows) * bends
@@ -262,4 +231,4 @@ def origin(elements: Elements) -> Int[Array, ""]:
     mesh = elements.mesh
     begin = mesh.ends[0]
     away = jnp.abs(begin - mesh.period * jnp.round(begin / mesh.period))
-    return jnp.argmin(jnp.where(jnp.arange(begin.shape[0]) < mesh.used, away, jnp.inf))
+    return jnp.argmin(jnp.where(mesh.filled, away, jnp.inf))

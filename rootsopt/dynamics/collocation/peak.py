@@ -18,10 +18,10 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import NDArray
 
-from rootsopt.dynamics.collocation.elements import GAUSS, Elements
+from rootsopt.dynamics.collocation.elements import GAUSS, POINTS, Elements
 from rootsopt.dynamics.collocation.equation import CollocatedEquation, Points
 
-RIVALS = len(GAUSS.nodes) + 1
+RIVALS = POINTS + 1
 """Number of elements that may contain the peak: as many as an element has instants, so that the
 equation is evaluated in all of them on one additional element."""
 # Places in each element at which the polynomials of the force are compared.
@@ -67,13 +67,8 @@ class Rivals(NamedTuple):
 
     def moved(self, old: Elements, new: Elements) -> "Rivals":
         """Return the same instants in the elements of another mesh of the motion."""
-        begin, length = new.mesh.ends[0], new.mesh.lengths
-        time, start = self.places(old)[0], begin[0]
-        time = start + jnp.mod(time - start, new.mesh.period)
-        element = jnp.searchsorted(begin, time, side="right") - 1
-        element = jnp.minimum(element, new.mesh.used - 1)
-        size = jnp.where(length[element] > 0, length[element], 1.0)
-        share = jnp.clip((time - begin[element]) / size, _INSIDE, 1.0 - _INSIDE)
+        element, share = new.found(self.places(old)[0])
+        share = jnp.clip(share, _INSIDE, 1.0 - _INSIDE)
         return Rivals(element, share, _roots(new.roots, element, share))
 
     def rooted(self, before: Elements, after: Elements) -> "Rivals":
@@ -141,7 +136,7 @@ def rivals_of(
     `points`: equation along the motion, where the instants `before` follow the elements in use;
     `force`, `rate`: results of `forces_along` for it."""
     rows = _polynomials(elements, force, rate)
-    used = jnp.arange(rows.shape[0]) < elements.mesh.used
+    used = elements.mesh.filled
     heights = rows @ _powers(_PLACES, rows.shape[1])
     highest = jnp.where(used, jnp.max(heights, axis=1), -jnp.inf)
     element = lax.top_k(highest, RIVALS)[1].astype(int)
@@ -187,10 +182,10 @@ def peak_of(
     element, share, shift, height = element[top], share[top], shift[top], height[top]
     # Every end of an element is also an instant at which the equation is evaluated.
     before = jnp.where(element > 0, element, extra) - 1
-    ending, inside = jnp.where(share > 0, element, before), len(GAUSS.nodes)
-    at_end, here = jnp.abs(share - 0.5) == 0.5, force[ending, inside]
+    ending = jnp.where(share > 0, element, before)
+    at_end, here = jnp.abs(share - 0.5) == 0.5, force[ending, POINTS]
     joins = at_end & (jnp.abs(here - height) <= _JUMP * jnp.abs(height))
-    place = jnp.where(joins, ending, extra), jnp.where(joins, inside, top)
+    place = jnp.where(joins, ending, extra), jnp.where(joins, POINTS, top)
     return Peak(
         element=jnp.where(joins, ending, element),
         share=jnp.where(joins, 1.0, share),
@@ -218,7 +213,7 @@ def _roots(roots, element, share) -> Float[Array, "p flanks 2"]:
     """Return `NearContact.roots` in each `element` at `share`, by the polynomials through those at
     the Gauss points; `roots`: `Elements.roots`."""
     weights = GAUSS.lagrange(share)[..., None, None]
-    return jnp.sum(weights * roots[element, : len(GAUSS.nodes)], axis=1)
+    return jnp.sum(weights * roots[element, :POINTS], axis=1)
 
 
 def _to_vertex(slope: Float[Array, " p"], bend: Float[Array, " p"]) -> Float[Array, " p"]:
@@ -239,7 +234,7 @@ def _powers(share: NDArray[np.float64], count: int) -> NDArray[np.float64]:
 def _hermite() -> NDArray[np.float64]:
     """Return the matrix that converts values and slopes at the Gauss points to coefficients of
     powers of the distance from the middle of the element."""
-    count = 2 * len(GAUSS.nodes)
+    count = 2 * POINTS
     order = np.arange(count)
     values = _powers(GAUSS.nodes, count).T
     slopes = np.zeros_like(values)
@@ -250,7 +245,7 @@ def _hermite() -> NDArray[np.float64]:
 def _derived() -> NDArray[np.float64]:
     """Return the matrices (3, c, c) that convert the c coefficients of a polynomial to those of its
     value, first and second derivative."""
-    count = 2 * len(GAUSS.nodes)
+    count = 2 * POINTS
     once = np.diag(np.arange(1.0, count), -1)
     return np.stack([np.eye(count), once, once @ once])
 
@@ -260,9 +255,8 @@ _HERMITE, _DERIVED = _hermite(), _derived()
 
 def _polynomials(elements: Elements, force, rate) -> Float[Array, "e c"]:
     """Return the coefficients of the force in each element (see `_hermite`)."""
-    inside = len(GAUSS.nodes)
-    slopes = elements.mesh.lengths[:, None] * rate[:, :inside]
-    return jnp.concatenate([force[:, :inside], slopes], axis=1) @ _HERMITE.T
+    slopes = elements.mesh.lengths[:, None] * rate[:, :POINTS]
+    return jnp.concatenate([force[:, :POINTS], slopes], axis=1) @ _HERMITE.T
 
 
 def _derivatives(rows: Float[Array, "p c"], share: Float[Array, " p"]) -> Float[Array, "3 p"]:

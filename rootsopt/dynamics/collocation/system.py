@@ -86,14 +86,6 @@ class Condensed(NamedTuple):
     rise: Float[Array, "e n c"]
 
 
-def own_column(elements: Elements, lines: Lines) -> Columns:
-    """Return the right-hand side of Newton's step for the motion `elements`, as a single column."""
-    rise = GAUSS.whole(elements.slopes)
-    reached = elements.state + elements.mesh.lengths[:, None] * rise
-    gap = reached - elements.following
-    return Columns(lines.miss[..., None], gap[..., None], lines.margin[:, None])
-
-
 def condensed(elements: Elements, lines: Lines, columns: Columns) -> Condensed:
     """Return the linear equations of all `elements` after elimination of the slopes.
 
@@ -200,8 +192,7 @@ def opened(elements: Elements, lines: Lines, columns: Columns, parts: Condensed)
     interval. The event at the end of an interval then determines the shift of this end, and the
     maps from interval to interval are multiplied."""
     mesh = elements.mesh
-    count, states = elements.state.shape
-    used, ends = jnp.arange(count) < mesh.used, mesh.finals
+    states, used, ends = elements.state.shape[1], mesh.filled, mesh.finals
     first = jnp.append(True, mesh.last[:-1])
     # From the start of the interval to the end of each element. The columns are the change of the
     # state, the shifts of the interval's start and end, and the right-hand sides.

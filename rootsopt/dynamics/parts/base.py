@@ -2,7 +2,7 @@
 
 Timescales of a pair, which follow from its parts, set the solver's first and longest steps."""
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from typing import NamedTuple, TypeVar
 
 import equinox as eqx
@@ -134,7 +134,6 @@ class Part(eqx.Module):
         """Return the part, completed with values from the scene's `context`.
 
         Keep these values differentiable: store them as JAX arrays."""
-        del context
         return self
 
     # The part's own states: m numbers in SI units. A motion begins at `start`. The solver works
@@ -149,7 +148,6 @@ class Part(eqx.Module):
 
     def start(self, units: Units) -> Float[Array, " m"] | None:
         """Return the part's own states (m,) at the start of a motion, in SI units; None: zero."""
-        del units
         return None
 
     def rates(self, motion: Motion, own: Own, loads: Loads) -> Float[Array, " m"]:
@@ -173,7 +171,6 @@ class Part(eqx.Module):
     def lost(self, own: Own) -> Bool[Array, ""] | None:
         """Return whether the part's own states show that the pair no longer runs; None: they never
         do."""
-        del own
         return None
 
     # Loads from the part. None: no load.
@@ -184,7 +181,6 @@ class Part(eqx.Module):
         `motion`: position and velocity of the pair; `own` (m,): the part's own states (SI units).
         This method is called only if rotor 1 is `free`.
         """
-        del motion, own
         return None
 
     def torque_on_2(self, motion: Motion, own: Own) -> Float[Array, ""] | None:
@@ -192,7 +188,6 @@ class Part(eqx.Module):
 
         `motion`: position and velocity of the pair; `own` (m,): the part's own states (SI
         units)."""
-        del motion, own
         return None
 
     def force_on_axes(self, motion: Motion, own: Own) -> Float[Array, "2 2"] | None:
@@ -200,7 +195,6 @@ class Part(eqx.Module):
 
         `motion`: position and velocity of the pair; `own` (m,): the part's own states (SI units).
         This method is called only if a part `displaces` the axes."""
-        del motion, own
         return None
 
     def drag(self, force: Float[Array, ""], sliding: Float[Array, ""]) -> Float[Array, ""]:
@@ -234,13 +228,11 @@ class Part(eqx.Module):
     def margins(self, motion: Motion, own: Own) -> Float[Array, " s"]:
         """Return numbers (s,), each positive where the flag of `switches` with the same index is
         set."""
-        del motion, own
         return jnp.zeros(0)
 
     def drag_margins(self, sliding: Float[Array, ""]) -> Float[Array, " s"]:
         """Return numbers (s,), each positive where the flag of `drag_switches` with the same index
         is set."""
-        del sliding
         return jnp.zeros(0)
 
     # Data from which the solver chooses its steps.
@@ -260,7 +252,6 @@ class Part(eqx.Module):
 
     def edges_at(self, phi: Float[Array, ""]) -> tuple[Float[Array, ""], ...]:
         """Return the `edges` at φ1 = `phi` (rad), for a part of `whole_turns` whose edges move."""
-        del phi
         return self.edges
 
     @property
@@ -273,7 +264,6 @@ class Part(eqx.Module):
 
         `inertia` (kg·m²) of one rotor. The result is None if the part has no oscillation of its
         own."""
-        del inertia
         return None
 
 
@@ -295,7 +285,7 @@ class Timescales(eqx.Module):
     def of(
         cls,
         law: ContactLaw,
-        parts: Iterable[Part],
+        parts: Sequence[Part],
         inertia: Float[Array, ""],
         force: Float[Array, ""],
         radius: Float[Array, ""],
@@ -308,7 +298,6 @@ class Timescales(eqx.Module):
         contact stiffness is taken at the greater of two depths: the static penetration, and the
         penetration of an impact after free flight through the whole backlash. The energy of this
         impact is the work of the load."""
-        parts = tuple(parts)
         play = jnp.zeros_like(force)
         for part in parts:
             play = play if part.play is None else play + 2 * part.play
@@ -326,5 +315,4 @@ class Timescales(eqx.Module):
             swing = swing if own is None else jnp.minimum(swing, own)
         # No lever is longer than the pitch radius.
         free = jnp.maximum(clearance, 0.0) / radius
-        timescales = cls(swing, jnp.where(flies, fall, jnp.inf), free)
-        return lax.stop_gradient(timescales)
+        return lax.stop_gradient(cls(swing, jnp.where(flies, fall, jnp.inf), free))

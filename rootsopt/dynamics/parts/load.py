@@ -45,12 +45,10 @@ class Load(Part):
         """Mean torque (N·m) against both rotors together."""
 
     def torque_on_1(self, motion, own):
-        del own
         torque = self.torque1(motion.phi)
         return None if torque is None else -torque
 
     def torque_on_2(self, motion, own):
-        del own
         return -self.torque2(motion.phi)
 
 
@@ -60,11 +58,9 @@ class ConstantLoad(Load):
     torque: Float[Array, ""]
 
     def torque1(self, phi):
-        del phi
         return None
 
     def torque2(self, phi):
-        del phi
         return self.torque
 
     @property
@@ -131,7 +127,6 @@ class GasLoad(Load):
         return self.pressure_length / 2 * squares
 
     def margins(self, motion, own) -> Float[Array, " s"]:
-        del own
         phi, half = motion.phi, self.profile.half_pitch
         roll = self._roll(phi)
         addendum = half - jnp.abs(roll - half)
@@ -300,8 +295,7 @@ class GasResultant(eqx.Module):
         chord = contact - tip
         turned = jnp.stack([-chord[..., 1], chord[..., 0]], axis=-1)
         turned = turned * np.stack([np.ones(2), MIRROR])
-        weights = jnp.asarray(self.weights)
-        return self.pressure_length * weights[:, None, None] * turned
+        return self.pressure_length * jnp.asarray(self.weights)[:, None, None] * turned
 
     def openings(self) -> Float[Array, "2"]:
         """Return the angles φ1 (rad), each in one mesh period, at which a pocket opens."""
@@ -366,7 +360,6 @@ class AxisLoads(Part):
         return tooth_force(torque, self.radius, self.tooth_angle)
 
     def force_on_axes(self, motion, own) -> Float[Array, "2 2"]:
-        del own
         teeth = self.gear_force(motion)
         total = jnp.stack([-teeth, teeth])
         if self.gas is not None:
@@ -376,7 +369,6 @@ class AxisLoads(Part):
         return total
 
     def switches(self, motion, own) -> Bool[Array, " s"]:
-        del own
         flags = []
         if self.gear is not None:
             flags.append((self.gear.torque_on_1(motion, np.zeros(0)) > 0)[None])

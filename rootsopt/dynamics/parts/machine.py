@@ -48,12 +48,7 @@ class MotorDrive(Drive):
         return self.inertia
 
     def torque_on_1(self, motion, own):
-        del own
-        return self.torque_at(motion.speed)
-
-    def torque_at(self, speed: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Return the torque (N·m) at the angular `speed` (rad/s) of rotor 1."""
-        return self.torque - self.slope * (speed - self.speed)
+        return self.torque - self.slope * (motion.speed - self.speed)
 
 
 class Friction(Part):
@@ -119,8 +114,7 @@ class Supports(Part):
         return True
 
     def prepare(self, context: Context) -> "Supports":
-        new = context.mass, context.pitch_radius
-        return eqx.tree_at(lambda supports: (supports.mass, supports.radius), self, new)
+        return dataclasses.replace(self, mass=context.mass, radius=context.pitch_radius)
 
     def scales(self, units: Units) -> Float[Array, "8"]:
         length = units.angle * self.radius
@@ -135,25 +129,15 @@ class Supports(Part):
         return jnp.concatenate([own[4:], loads.axes.ravel() / self.mass])
 
     def force_on_axes(self, motion: Motion, own: Float[Array, "8"]) -> Float[Array, "2 2"]:
-        del own
         assert motion.shift is not None
         assert motion.drift is not None
-        return self.force(motion.shift, motion.drift)
+        return -self.stiffness * motion.shift - self.damping * motion.drift
 
     def lost(self, own: Float[Array, "8"]) -> Bool[Array, ""]:
         return jnp.any(jnp.abs(own[:4]) > _DISPLACED * 2 * self.radius)
 
     def quickest(self, inertia: Float[Array, ""]) -> Float[Array, ""]:
-        del inertia
         return jnp.sqrt(self.mass / self.stiffness)
-
-    def force(
-        self, displacement: Float[Array, "*n"], velocity: Float[Array, "*n"]
-    ) -> Float[Array, "*n"]:
-        """Return the bearing forces (N) on the rotors.
-
-        `displacement` (m), `velocity` (m/s): those of the axes. All arrays have the same shape."""
-        return -self.stiffness * displacement - self.damping * velocity
 
 
 class GearErrors(eqx.Module):
@@ -250,7 +234,6 @@ class TimingGear(Part):
         return spring + self.damping * engaged * rate
 
     def torque_on_1(self, motion: Motion, own) -> Float[Array, ""]:
-        del own
         gear, rate = self.meshing(motion)
         return gear(motion.relative, rate)
 
@@ -283,7 +266,6 @@ class TimingGear(Part):
 
     def margins(self, motion: Motion, own) -> Float[Array, "2"]:
         """Return numbers (2,): penetration of the teeth (rad), and its excess of the rounding."""
-        del own
         gear = self.meshing(motion)[0]
         excess = jnp.abs(gear._from_middle(motion.relative)) - gear.half_backlash
         return excess - jnp.stack([jnp.zeros_like(self.rounding), self.rounding])

@@ -138,7 +138,7 @@ def test_peak_is_located(place, corner):
     force, rate = (jnp.asarray(x) for x in _bump(np.asarray(elements.places[0]), place, corner))
     # The corner is an event: the element before it has the slope of its own side at its end.
     nothing = jnp.zeros((*force.shape, 1))
-    points = Points(nothing, nothing[..., None], jnp.zeros((*force.shape, 1, 2)), force, force)
+    points = Points(nothing, nothing[..., None], jnp.zeros((*force.shape, 1, 2)), force)
     rivals = Rivals.anywhere(elements)
     for _ in range(2):
         rivals = jax.jit(rivals_of)(elements, points, force, rate, rivals)
@@ -272,7 +272,8 @@ def test_a_mesh_is_refined_only_if_the_finer_one_says_something_new(used, meshes
         **{"orbit": orbit, "known": start._replace(elements=coarse)},
         **{"elements": motion, "meshes": jnp.asarray(meshes)},
     }
-    loop = _Crowded(SimpleNamespace(top=jnp.ones(())), None, None, start, None, jnp.asarray(1e-7))
+    pair = SimpleNamespace(force_scale=jnp.ones(()))
+    loop = _Crowded(None, pair, None, start, None, jnp.asarray(1e-7))
     assert bool(loop.keep(Loop(**now), finer, motion).over) is ends
 
 

@@ -18,7 +18,8 @@ from rootsopt.dynamics.collocation.elements import (
     zero_of,
 )
 from rootsopt.dynamics.collocation.mesh import aligned, counted, moved, needed, ordered
-from rootsopt.dynamics.collocation.system import Lines, chained, condensed, own_column
+from rootsopt.dynamics.collocation.newton import columns_of
+from rootsopt.dynamics.collocation.system import Lines, chained, condensed
 
 ROOM = 32
 EVENT = 0.3071
@@ -209,7 +210,8 @@ def test_newton_step_solves_the_dense_equations():
         margin=jax.vmap(_margin)(tau[:, -1], z[:, -1]),
         bend=bend(tau[:, -1], z[:, -1]),
     )
-    step = _stepped(elements, lines, own_column(elements, lines))
+    nothing = jnp.zeros((6, POINTS + 1, STATES + 1, 0))
+    step = _stepped(elements, lines, columns_of(elements, lines, nothing))
     unknown = jnp.concatenate([state[:USED].ravel(), slopes[:USED].ravel(), TIMES[1:2]])
     expected = np.linalg.solve(jax.jit(jax.jacfwd(_misses))(unknown), -jax.jit(_misses)(unknown))
     found = np.concatenate(
