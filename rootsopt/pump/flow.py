@@ -147,19 +147,10 @@ def _mean(shape: Geometry) -> Float[Array, ""]:
 
 def play_of(scene: Scene, profile: Profile) -> Play:
     """Return the play in a `scene`, with all its clearances."""
-    return play(profile, scene.clearance, center_distance(scene), radial=radial_allowance(scene))
-
-
-def radial_allowance(scene: Scene) -> Float[Array, ""]:
-    """Return the distance (m) by which each rotor's outline lies inside its profile, radially."""
-    medium = scene.medium
-    return jnp.zeros_like(scene.clearance) if medium is None else medium.radial_allowance
-
-
-def center_distance(scene: Scene) -> Float[Array, ""]:
-    """Return the distance between the rotors' axes (m)."""
-    error = scene.center_distance_error
-    return 2 * scene.pitch_radius + (0.0 if error is None else error)
+    error, medium = scene.center_distance_error, scene.medium
+    center_distance = 2 * scene.pitch_radius + (0.0 if error is None else error)
+    radial = jnp.zeros_like(scene.clearance) if medium is None else medium.radial_allowance
+    return play(profile, scene.clearance, center_distance, radial=radial)
 
 
 CONTINUUM = 0.01

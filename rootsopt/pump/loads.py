@@ -4,7 +4,7 @@ A rotor's bearings sit at z = ±(L/2 + a), the timing gear at z = L/2 + g. Force
 fixed frame: rotor 1 at the origin, rotor 2 at (2r, 0). Rotor 1 turns counter-clockwise.
 `docs/bearings.md` derives the formulas."""
 
-from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -98,15 +98,12 @@ class BearingSet(eqx.Module):
         ends = half + bearings.distance, half + bearings.gear_distance
         return cls(pair, loads, scene.length, scene.helix, *ends, bearings.exponent)
 
-    def flags(self, orbit: VariedOrbit) -> Callable[[Any], Any]:
-        """Return a function of time (mesh periods) whose result changes where the loads are not
-        smooth along an `orbit`."""
+    def flags(self, orbit: VariedOrbit, tau: Float[Array, ""]) -> Any:
+        """Return what changes where the loads are not smooth along an `orbit`.
 
-        def flags(tau):
-            motion = self.pair.motion(tau, orbit.elements.motion(tau))
-            return self.loads.switches(motion, np.zeros(0))
-
-        return flags
+        `tau`: time (mesh periods)."""
+        motion = self.pair.motion(tau, orbit.elements.motion(tau))
+        return self.loads.switches(motion, np.zeros(0))
 
     def at(self, tau: Float[Array, ""], state: Float[Array, " n"]) -> BearingLoads:
         """Return the loads at rotation `tau` (mesh periods) and scaled `state`.
@@ -207,8 +204,6 @@ def orbit_loads(scene: Scene, design: Float[Array, " d"], orbit: VariedOrbit) ->
         return BearingSet.of(scene, design), jnp.zeros(())
 
     bearings, tangents, _ = along(build, design, jnp.eye(design.shape[0]))
-    dynamic, static = eqx.partition(bearings, eqx.is_inexact_array)
-    moved = eqx.filter(tangents, eqx.is_inexact_array)
     unit, period = lax.stop_gradient(bearings.pair.force_scale), orbit.elements.mesh.period
     tau = period * jnp.arange(SAMPLES) / SAMPLES
     at_samples = tau, orbit.elements.motion(tau)
@@ -235,9 +230,9 @@ def orbit_loads(scene: Scene, design: Float[Array, " d"], orbit: VariedOrbit) ->
 
     # The loads have corners where the motion has none, for example where the gear's torque changes
     # sign.
-    corners, flags = loads_corners(bearings), bearings.flags(orbit)
+    corners, flags = loads_corners(bearings), partial(bearings.flags, orbit)
     begins, ends, count = smooth_pieces(bearings.pair, orbit.elements, corners, flags)
-    leaps, moves = _leaps(scene, orbit, (dynamic, static, moved))
+    leaps, moves = _leaps(scene, orbit, bearings, tangents)
     sides = leaps[:, None] + _ASIDE * np.array([-1.0, 1.0])
     # All instants in one array, so that the derivatives are compiled once.
     single = jnp.append(tau[latest], sides)
@@ -273,44 +268,45 @@ def orbit_loads(scene: Scene, design: Float[Array, " d"], orbit: VariedOrbit) ->
     return OrbitLoads(equivalent, factor[:, None] * slope, series, jnp.max(sizes, axis=0), rises)
 
 
-def _leaps(scene: Scene, orbit: VariedOrbit, bearings) -> tuple[Array, Array]:
+def _leaps(
+    scene: Scene, orbit: VariedOrbit, bearings: BearingSet, tangents: BearingSet
+) -> tuple[Array, Array]:
     """Return the times (m,) at which the loads jump (mesh periods), and how they move (m, d).
 
     These are the instants at which a pocket opens, and events of the orbit if levers may jump.
-    `bearings`: arrays of a `BearingSet`, the rest of it, and the derivatives of the arrays."""
+    `tangents`: derivatives of the `bearings` along the design."""
     mesh, variation = orbit.elements.mesh, orbit.variation
-    dynamic, static, moved = bearings
     times, moves = [jnp.zeros(0)], [jnp.zeros((0, variation.times.shape[1]))]
-    openings = _openings(dynamic, static, moved) if scene.twist_free else None
-    if openings is not None:
-        longest = eqx.combine(dynamic, static).pair.whole(LONGEST)
-        opened = (openings[0] + jnp.arange(longest)[:, None]).ravel()
+    if scene.twist_free and bearings.loads.gas is not None:
+        openings, slopes = _openings(bearings, tangents)
+        longest = bearings.pair.whole(LONGEST)
+        opened = (openings + jnp.arange(longest)[:, None]).ravel()
         times.append(opened)
-        moves.append((opened < mesh.period)[:, None] * jnp.tile(openings[1], (longest, 1)))
-    if eqx.combine(dynamic, static).pair.jumps:
+        moves.append((opened < mesh.period)[:, None] * jnp.tile(slopes, (longest, 1)))
+    if bearings.pair.contact.jumps:
         times.append(mesh.times)
         moves.append(variation.times)
     return jnp.concatenate(times), jnp.concatenate(moves)
 
 
-def _openings(dynamic, static, moved) -> tuple[Array, Array] | None:
-    """Return the times (2,) at which a pocket opens, and their derivatives (2, d) along `moved`.
+def _openings(bearings: BearingSet, tangents: BearingSet) -> tuple[Array, Array]:
+    """Return the times (2,) at which a pocket opens, and their derivatives (2, d) along `tangents`.
 
-    Times are in mesh periods, from 0 to 1. `None` without gas. `dynamic`, `static`: arrays
-    and rest of a `BearingSet`. The times move with the twist only."""
+    Times are in mesh periods, from 0 to 1. The `bearings` must have gas. The times move with the
+    twist only."""
+    dynamic, static = eqx.partition(bearings, eqx.is_inexact_array)
+    moved = eqx.filter(tangents, eqx.is_inexact_array)
 
     def times(dynamic):
         bearings = eqx.combine(dynamic, static)
         return bearings.loads.gas.openings() * bearings.pair.lobes / (2 * jnp.pi)
 
-    if eqx.combine(dynamic, static).loads.gas is None:
-        return None
     slopes = jax.vmap(lambda along: jax.jvp(times, (dynamic,), (along,))[1])(moved)
     return times(dynamic), slopes.T
 
 
 def _channels(loads: BearingLoads, scene: Scene) -> Float[Array, "*n k"]:
-    if scene.straight:
+    if scene.helix is None:
         return loads.sizes
     return jnp.concatenate([loads.sizes, loads.axial_sizes], axis=-1)
 

@@ -47,7 +47,7 @@ _LOST = (
     *(Status.UNSOUND, Status.PASSED_THROUGH, Status.STALLED),
     *(Status.SOLVER_FAILED, Status.NON_FINITE),
 )
-_GONE = tuple(status.code for status in _LOST)
+_GONE = {status.code: status.label for status in _LOST}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,21 +111,18 @@ class Basins:
 
     def summary(self) -> list[dict[str, Any]]:
         """Return one table row per attractor."""
-        rows = []
-        for one in self.attractors:
-            steady, response = one.evaluation.steady_state, one.evaluation.response
-            rows.append(
-                {
-                    "share": one.share,
-                    "reached": one.reached,
-                    "status": one.evaluation.status.label,
-                    "period": steady.get("period"),
-                    "floquet_multiplier": steady.get("floquet_multiplier"),
-                    "mean_force_N": response.get("mean_force_N"),
-                    "peak_force_N": response.get("peak_force_N"),
-                }
-            )
-        return rows
+        return [
+            {
+                "share": one.share,
+                "reached": one.reached,
+                "status": one.evaluation.status.label,
+                "period": one.evaluation.steady_state.get("period"),
+                "floquet_multiplier": one.evaluation.steady_state.get("floquet_multiplier"),
+                "mean_force_N": one.evaluation.response.get("mean_force_N"),
+                "peak_force_N": one.evaluation.response.get("peak_force_N"),
+            }
+            for one in self.attractors
+        ]
 
 
 def find(
@@ -156,14 +153,12 @@ def find(
         sorter.place(jax.tree.map(lambda x, k=k: x[k], ends), int(failures[k]))
     numbers = np.asarray(sorter.numbers[: len(grid)])
     shares = np.bincount(numbers[numbers >= 0], minlength=len(sorter.evaluations)) / len(grid)
-    order = sorted(range(len(shares)), key=lambda i: (not sorter.periodic(i), -shares[i]))
+    kept = [i for i, one in enumerate(sorter.evaluations) if one.status not in _LOST]
+    kept.sort(key=lambda i: (not sorter.periodic(i), -shares[i]))
     attractors = tuple(
-        Attractor(sorter.evaluations[i], float(shares[i]), i == 0, sorter.cycles[i])
-        for i in order
-        if sorter.evaluations[i].status not in _LOST
+        Attractor(sorter.evaluations[i], float(shares[i]), i == 0, sorter.cycles[i]) for i in kept
     )
     rank = np.full(len(shares) + 1, -1)
-    kept = [i for i in order if sorter.evaluations[i].status not in _LOST]
     rank[kept] = np.arange(len(kept))
     lost = [label for label, number in zip(sorter.lost, numbers, strict=False) if number < 0]
     return Basins(
@@ -222,11 +217,7 @@ class _Sorter:
 
     def place(self, end: Transient, failure: int) -> None:
         """Record the motion that a transient has led to; `failure`: its `transient_status`."""
-        number, label = -1, ""
-        if failure in _GONE:
-            label = Status.of(failure).label
-        else:
-            number, label = self._motion(end)
+        number, label = (-1, _GONE[failure]) if failure in _GONE else self._motion(end)
         self.numbers.append(number)
         self.lost.append(label)
 
@@ -259,10 +250,8 @@ class _Sorter:
 
     def _like(self, status: Status) -> int | None:
         """Return the number of the known non-periodic motion with this `status`, or None."""
-        for i, evaluation in enumerate(self.evaluations):
-            if evaluation.status is status and not self.periodic(i):
-                return i
-        return None
+        alike = (i for i, one in enumerate(self.evaluations) if one.status is status)
+        return next((i for i in alike if not self.periodic(i)), None)
 
 
 def _axes(config: Config, pair: RotorPair) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

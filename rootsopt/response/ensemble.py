@@ -29,7 +29,6 @@ from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import TOO_DEEP
 from rootsopt.dynamics.window import PERIODS
-from rootsopt.profiles import Geometry
 from rootsopt.response.evaluation import Evaluator, Motions, lyapunov_program, unsettled_status
 from rootsopt.response.records import apart_message, geometry_record, message_of, unsettled
 from rootsopt.response.result import ERRORS, RESPONSES, Evaluation
@@ -42,7 +41,7 @@ from rootsopt.response.together import (
 )
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene.build import Scene
-from rootsopt.scene.space import Space
+from rootsopt.scene.space import Space, sobol
 from rootsopt.status import Status
 
 # Finest tolerance at which the motions of an ensemble are integrated. The standard errors of an
@@ -88,8 +87,9 @@ class Ensemble(Motions):
         """Evaluate a design. `start` (members, n): scaled initial states; `series`: of a member.
 
         Raises ValueError if `start` has the wrong shape."""
-        began = time.perf_counter()
-        return _report(evaluator, design, _simulated(evaluator, design, start), began, series)
+        began, built = time.perf_counter(), _pair(evaluator.scene, design)
+        outcome = _run(evaluator, [built], *_beginning(evaluator, built[0], start))
+        return _report(evaluator, design, built, outcome, began, series)
 
     def prepare(self, evaluator: Evaluator, design: Any, series: bool, maxima: bool) -> None:
         """Compile the programs in the background. `series` and `maxima` have no effect."""
@@ -119,33 +119,42 @@ def independent(evaluator: Evaluator, number: int) -> Evaluator:
     return dataclasses.replace(evaluator, config=config, survey=False)
 
 
-def _simulated(evaluator: Evaluator, design, start) -> "_Outcome":
-    built, settings = _pair(evaluator.scene, design), evaluator.config.ensemble
-    pair, settle = built[0], settings.settle_periods
+def _beginning(evaluator: Evaluator, pair: RotorPair, start) -> tuple[NDArray[np.float64], int]:
+    """Return the initial states (members, n), and the number of mesh periods to settle."""
+    settings = evaluator.config.ensemble
     if start is None:
         states = initial_states(pair, settings.members, settings.seed)
-    else:
-        states, settle = np.asarray(start), -(-settle // _AGAIN)
-        if states.shape != (settings.members, pair.states):
-            raise ValueError(
-                f"Argument `start` must be the states (members, n) of an ensemble, but has "
-                f"shape {states.shape}; pass None to start from new states"
-            )
-    return _run(evaluator, [built], states, settle)
+        return states, settings.settle_periods
+    states = np.asarray(start)
+    if states.shape != (settings.members, pair.states):
+        raise ValueError(
+            f"Argument `start` must be the states (members, n) of an ensemble, but has shape "
+            f"{states.shape}; pass None to start from new states"
+        )
+    return states, -(-settings.settle_periods // _AGAIN)
 
 
-def _run(evaluator: Evaluator, built: Sequence, states, settle: int) -> "_Outcome":
-    """Simulate the ensembles of several designs; `built`: pair and geometry of each."""
-    pairs, shapes = zip(*built, strict=True)
+def _run(
+    evaluator: Evaluator, built: Sequence, states, settle: int
+) -> tuple[Status, list[Members]]:
+    """Simulate the ensembles of several designs; `built`: pair and geometry of each.
+
+    Return the status of the first design that has failed, or AVERAGED, and the `Members` of every
+    design."""
+    pairs, _ = zip(*built, strict=True)
     periods, how = evaluator.config.ensemble.periods, integrator(evaluator.scene)
-    return _Outcome(pairs[0], shapes[0], run_members(pairs, states, settle, periods, how))
+    runs = run_members(pairs, states, settle, periods, how)
+    if not bool(pairs[0].sound):
+        return Status.UNSOUND, runs
+    failed = (run.status for run in runs if run.status is not Status.AVERAGED)
+    return next(failed, Status.AVERAGED), runs
 
 
 def _report(
-    evaluator: Evaluator, design, outcome: "_Outcome", began: float, with_series: bool
+    evaluator: Evaluator, design, built, outcome, began: float, with_series: bool
 ) -> Evaluation:
-    pair, status = outcome.pair, outcome.status
-    (members,) = outcome.runs
+    """Return the evaluation; `built`: pair and geometry; `outcome`: result of `_run`."""
+    (pair, shape), (status, (members,)) = built, outcome
     settings = evaluator.config.ensemble
     size = {"members": settings.members, "window_mesh_periods": settings.periods}
     steady: dict[str, Any] = {"kind": "transient"}
@@ -192,7 +201,7 @@ def _report(
             response, steady, series, last = {}, {"kind": "transient"}, None, None
     return Evaluation(
         design=dict(zip(evaluator.keys, map(float, design), strict=True)),
-        geometry=geometry_record(evaluator.scene, outcome.shape),
+        geometry=geometry_record(evaluator.scene, shape),
         response=response,
         gradient=gradient,
         steady_state=steady,
@@ -243,10 +252,10 @@ def _slopes(
     settle = -(-settings.settle_periods // _AGAIN)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         built = list(pool.map(functools.partial(_pair, evaluator.scene), designs))
-    around = _run(evaluator, built, members.states, settle)
-    if around.status is not Status.AVERAGED:
-        return around.status, None
-    values = np.stack([run.responses[:, 0] for run in around.runs])
+    status, runs = _run(evaluator, built, members.states, settle)
+    if status is not Status.AVERAGED:
+        return status, None
+    values = np.stack([run.responses[:, 0] for run in runs])
     slopes = per_config_unit(*fitted_slope(values, steps), np.asarray(jacobian))
     return Status.AVERAGED, np.stack(slopes)
 
@@ -256,27 +265,6 @@ def _space(evaluator: Evaluator, design) -> Space:
     lower, upper = np.minimum(space.lower, design), np.maximum(space.upper, design)
     bounds = jnp.asarray(lower), jnp.asarray(upper)
     return eqx.tree_at(lambda s: (s.lower, s.upper), space, bounds)
-
-
-@dataclasses.dataclass(frozen=True)
-class _Outcome:
-    """Simulated ensembles of one or several designs.
-
-    `pair`, `shape`: rotor pair and geometry of the first design; `runs`: the `Members` of every
-    design.
-    """
-
-    pair: RotorPair
-    shape: Geometry
-    runs: list[Members]
-
-    @property
-    def status(self) -> Status:
-        """Status of the first design that has failed, or AVERAGED."""
-        if not bool(self.pair.sound):
-            return Status.UNSOUND
-        statuses = (run.status for run in self.runs)
-        return next((s for s in statuses if s is not Status.AVERAGED), Status.AVERAGED)
 
 
 def neighbours(
@@ -289,11 +277,10 @@ def neighbours(
     would leave the box. The centre is `point`, moved inside the box if it is less than one standard
     deviation from a bound. (A point at a bound has no opposite neighbours.)
     """
-    from scipy.stats import norm, qmc
+    from scipy.stats import norm
 
     pairs, spread = settings.designs // 2, settings.spread
-    sampler = qmc.Sobol(len(point), rng=np.random.default_rng(settings.seed))
-    share = sampler.random_base2(int(np.ceil(np.log2(pairs))))[:pairs]
+    share = sobol(pairs, settings.seed, len(point))
     steps = spread * norm.ppf(np.clip(share, 1e-6, 1 - 1e-6))
     middle = np.clip(point, spread, 1 - spread)
     room = np.minimum(middle, 1 - middle)

@@ -2,7 +2,7 @@
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rootsopt.config.reading import Config
+from rootsopt.config.units import RPM
 from rootsopt.dynamics.closed import Start, seen, steady_motion
 from rootsopt.dynamics.integrator import Solver
 from rootsopt.dynamics.maxima import local_maxima, prepare_maxima
@@ -26,7 +27,6 @@ from rootsopt.response.records import (
     contact_series,
     geared,
     loaded,
-    names_of,
     reported,
     sampled,
 )
@@ -42,13 +42,13 @@ from rootsopt.response.reducers import (
     shares,
 )
 from rootsopt.response.result import Evaluation, Part, Seed, Seeds, begun
-from rootsopt.response.scatter import Shift, at_speed, draw, shifts
+from rootsopt.response.scatter import Shift, draw, shifts
 from rootsopt.response.terms import OF_MOTION, terms_of, values_of, with_terms
 from rootsopt.runtime.environment import check_precision
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene.build import Scene
 from rootsopt.scene.check import check_geometry
-from rootsopt.scene.reading import design_keys, design_vector
+from rootsopt.scene.reading import design_vector
 from rootsopt.status import Status
 
 # Difference between an orbit closed by collocation and an integration over its period (see
@@ -177,7 +177,8 @@ class Evaluator:
 
     def at_speed(self, speed_rpm: float) -> "Evaluator":
         """Return another evaluator at the speed `speed_rpm` alone."""
-        scene = at_speed(self.scene, speed_rpm)
+        speed = jnp.asarray(speed_rpm * RPM)
+        scene = eqx.tree_at(lambda scene: scene.speed, self.scene, speed)
         return dataclasses.replace(self, scene=scene, speeds=())
 
     def shifted(self, shift: Scene | None) -> "Evaluator":
@@ -207,7 +208,7 @@ class Evaluator:
     @property
     def keys(self) -> tuple[str, ...]:
         """Names of the design parameters."""
-        return design_keys(self.config)
+        return self.config.design_keys
 
     def __call__(
         self, design: ArrayLike | None = None, start: Seeds = None, series: bool = True
@@ -258,38 +259,19 @@ class Evaluator:
         alone = self.at_speed(self.speeds[number][0])
         return dataclasses.replace(alone, references=references)
 
-    def swept(
-        self,
-        speeds_rpm: Sequence[float],
-        design: ArrayLike | None = None,
-        progress: Callable[[int], None] = lambda done: None,
-    ) -> tuple[Part, ...]:
-        """Evaluate `design` (config units; default: the config's own) at each of the speeds, from
-        rest.
-
-        `progress` is called with the number of speeds done. All parts have equal shares.
-        """
-        points = [Point(self.at_speed(speed), design) for speed in speeds_rpm]
-        evaluations = evaluate_many(points, progress=progress)
-        return parts_at([(speed, 1 / len(speeds_rpm)) for speed in speeds_rpm], evaluations)
-
     def reached(
-        self,
-        design: ArrayLike | None = None,
-        start: Seed | ArrayLike | None = None,
-        series: bool = True,
+        self, design: Any, start: Seed | ArrayLike | None = None, series: bool = True
     ) -> Evaluation:
-        """Evaluate the motion to which `start` leads, at the scene's speed. `design`: in config
-        units, by default the config's own. Arguments: see `__call__`."""
+        """Evaluate the motion to which `start` leads, at the scene's speed.
+
+        `design` (d,): in config units. For the other arguments, see `__call__`."""
         began = time.perf_counter()
-        design = design_vector(self.config) if design is None else jnp.asarray(design)
         pair, tangents, shape = _build(self.scene, design)
-        solver = self.solver
-        begin = begun(pair, start, solver.max_orbit)
+        begin = begun(pair, start, self.solver.max_orbit)
         motion = self.motion(pair, tangents, begin)
         if series and self.confirm:
             motion = self._confirmed(pair, tangents, begin, motion)
-        report = self._reported(design, (pair, tangents, shape), motion, began, series)
+        report = self.evaluation(design, (pair, tangents, shape), motion, began, series)
         if self.maxima and report.usable:
             maxima = local_maxima(pair, tangents, varied(motion))
             report = dataclasses.replace(report, maxima=maxima)
@@ -373,7 +355,9 @@ class Evaluator:
                 apart_program.prepare(pair, tangents, orbit)
             rows = np.zeros((motion.orbit.response.shape[0], 1))
             forces = solver.measures.named(rows, 1)
-            added = [name for name in names_of(self) if name not in (*forces, *OF_MOTION)]
+            added = [
+                name for name in self.config.objective.terms if name not in (*forces, *OF_MOTION)
+            ]
             if added:
                 values, slopes = (jax.ShapeDtypeStruct((3, *d), float) for d in ((), design.shape))
                 values_of.prepare(self.scene, terms_of(added), design, values, slopes)
@@ -398,18 +382,13 @@ class Evaluator:
         geometry."""
         return _build(self.scene, design_vector(self.config))
 
-    def evaluation(
-        self, built: tuple[RotorPair, RotorPair, Geometry], motion: Steady, began: float
-    ) -> Evaluation:
-        """Return the evaluation, without series, of the config's own design with a known motion.
+    def evaluation(self, design: Any, *known: Any) -> Evaluation:
+        """Return the evaluation of a `design` (config units) with a known motion.
 
-        `built`: result of `assembled`; `motion`: its steady motion; `began`: time at the start (s,
-        `perf_counter`)."""
-        return self._reported(design_vector(self.config), built, motion, began, False)
-
-    def _reported(self, design: Any, *known: Any) -> Evaluation:
-        """Return the evaluation of a known motion; arguments as of `reported`."""
-        return with_terms(reported(self, design, *known), self.scene, design, names_of(self))
+        `known`: the further arguments of `reported`."""
+        return with_terms(
+            reported(self, design, *known), self.scene, design, [*self.config.objective.terms]
+        )
 
 
 def motion_from(pair: RotorPair, tangents: RotorPair, start: Start, radius, solver) -> Steady:

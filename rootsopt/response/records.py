@@ -313,7 +313,7 @@ def reported(
         "solver_steps": int(steady_motion.steps),
     }
     idle, held = status is Status.IDLE, bool(steady_motion.held)
-    known = (status is Status.PERIODIC and pair.smooth) or idle
+    known = (status is Status.PERIODIC and pair.contact.smooth) or idle
     named = _forces(evaluator, steady_motion) if status in CLOSED or idle else {}
     steady: dict[str, Any] = {"kind": "idle" if idle else "transient"}
     said, hint, motion, start = message_of(evaluator.config, status), "", None, None
@@ -323,7 +323,7 @@ def reported(
         statistics |= orbit_statistics(steady_motion, evaluator.solver)
         motion, further = _along(evaluator, design, (pair, tangents), steady_motion, series)
         named, start = named | further, Seed.of(steady_motion, pair)
-        hint = "" if pair.smooth else _NO_GRADIENT
+        hint = "" if pair.contact.smooth else _NO_GRADIENT
         if status is Status.PERIODIC:
             hint += fading_note(float(steady_motion.orbit.multiplier), int(steady_motion.period))
     elif idle and steady_motion.window is not None:
@@ -401,7 +401,7 @@ def _along(
 def loaded(evaluator: "Evaluator", series: bool) -> bool:
     """Return whether an evaluation computes loads on bearings; `series`: with a series."""
     return evaluator.scene.bearings is not None and (
-        series or bool({*BEARING} & {*names_of(evaluator)})
+        series or bool({*BEARING} & {*evaluator.config.objective.terms})
     )
 
 
@@ -409,13 +409,8 @@ def geared(evaluator: "Evaluator", series: bool) -> bool:
     """Return whether an evaluation computes the reserve.
 
     `series`: whether it has a series, or no contact."""
-    wanted = bool({*RESERVES, *GEAR} & {*names_of(evaluator)})
+    wanted = bool({*RESERVES, *GEAR} & {*evaluator.config.objective.terms})
     return evaluator.scene.gear is not None and (series or wanted)
-
-
-def names_of(evaluator: "Evaluator") -> tuple[str, ...]:
-    """Return the names of the further terms of the objective."""
-    return tuple(evaluator.config.objective.terms)
 
 
 def _named(evaluator: "Evaluator", rows: dict[str, Any]) -> dict[str, dict[str, float]]:

@@ -13,6 +13,7 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rootsopt.config.units import COLUMNS
 from rootsopt.dynamics.closed import Start
 from rootsopt.dynamics.collocation.mesh import KnownOrbit, padded, room_for, trimmed
 from rootsopt.dynamics.maxima import Maxima
@@ -32,7 +33,7 @@ class Seed(NamedTuple):
     """Where an evaluation of a similar design or scene begins.
 
     `state` (n,): scaled, at φ1 = 0; `orbit`: the closed orbit through it, as the arrays of a
-    `KnownOrbit` (see `collocation.known.trimmed`), then those of its pair. It is empty if the orbit
+    `KnownOrbit` (see `collocation.mesh.trimmed`), then those of its pair. It is empty if the orbit
     is not known.
     """
 
@@ -154,19 +155,6 @@ class Series:
         return self.drive_force + self.coast_force
 
 
-# Columns of the dataset, keyed by the field of a `Series`. Each entry holds the name in CSV files,
-# the unit, a long name, and the factor from SI units to this unit.
-_COLUMNS = {
-    "rotation": ("rotation_deg", "deg", "rotation of rotor 1", 57.29577951308232),
-    "relative": ("relative_rotation_rad", "rad", "relative rotation of rotor 2", 1.0),
-    "rate": ("relative_speed_rad_s", "rad/s", "relative angular speed of rotor 2", 1.0),
-    "drive_force": ("drive_flank_force_N", "N", "normal force on the drive flank", 1.0),
-    "coast_force": ("coast_flank_force_N", "N", "normal force on the coast flank", 1.0),
-    "force": ("contact_force_N", "N", "contact force: sum of the normal forces", 1.0),
-    "depth": ("penetration_m", "m", "greatest penetration; negative: least gap", 1.0),
-}
-
-
 @dataclasses.dataclass(frozen=True)
 class Evaluation:
     """Everything known about one design in one scene.
@@ -243,7 +231,7 @@ class Evaluation:
 
         columns = {
             name: ("time_s", factor * getattr(series, field), {"units": unit, "long_name": long})
-            for field, (name, unit, long, factor) in _COLUMNS.items()
+            for field, (name, unit, long, factor) in COLUMNS.items()
         }
         time = ("time_s", series.time, {"units": "s", "long_name": "time"})
         attributes = {

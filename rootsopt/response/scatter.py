@@ -10,14 +10,12 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
 from rootsopt.config.reading import Config
 from rootsopt.config.tolerances import Scatter, TolerancesConfig
-from rootsopt.config.units import RPM
 from rootsopt.scene.build import Scene
 from rootsopt.scene.space import sobol
 
@@ -82,17 +80,15 @@ def draw(config: Config, count: int, fresh: bool = False) -> Float[np.ndarray, "
 def shifts(config: Config, samples: Float[np.ndarray, "n q"]) -> tuple[Shift, ...]:
     """Return the n samples (n, q) of `draw` as changes of scene and design."""
     keys = [one.key for one in config.scatters]
-    inner = [not key.startswith("profile.") for key in keys]
     here = Scene.from_config(config)
     changes = []
     for row in np.asarray(samples):
         values = dict(zip(keys, map(float, row), strict=True))
-        moved = config.moved(values)
+        of_scene = {key: x for key, x in values.items() if not key.startswith("profile.")}
         scene = None
-        if any(inner):
-            only = {key: value for key, value in values.items() if not key.startswith("profile.")}
-            scene = _difference(here, here.renewed(config.moved(only)))
-        changes.append(Shift(values, scene, moved.design - config.design))
+        if of_scene:
+            scene = _difference(here, here.renewed(config.moved(of_scene)))
+        changes.append(Shift(values, scene, config.moved(values).design - config.design))
     return tuple(changes)
 
 
@@ -136,9 +132,3 @@ def _difference(before: Scene, after: Scene) -> Scene:
         return difference if difference.any() else None
 
     return jax.tree.map(change, *(eqx.filter(x, eqx.is_inexact_array) for x in (after, before)))
-
-
-def at_speed(scene: Scene, speed_rpm: float) -> Scene:
-    """Return the `scene` at the speed `speed_rpm`."""
-    speed = jnp.asarray(speed_rpm * RPM)
-    return eqx.tree_at(lambda scene: scene.speed, scene, speed)

@@ -167,30 +167,20 @@ def _change(slopes: Array, moved: list[Array], without: list[Array]) -> Array:
 def _moved(scene: Any, design: Any) -> tuple[list[tuple[int, Array]], list[Array]]:
     """Return the tangents that are not None, in two lists. A tangent of None stands for zero.
 
-    The first list holds (index of the leaf in `_leaves`, tangent) for differentiable leaves. The
-    second list holds the tangents of a measured outline, for which there are no derivatives."""
+    The first list holds (number of the leaf, tangent) for differentiable leaves. The second list
+    holds the tangents of a measured outline, for which there are no derivatives."""
     numbers, leaves = [], []
-    for number, (path, leaf) in enumerate(_leaves((scene, design))):
-        if leaf is None:
-            continue
+    every = jax.tree_util.tree_leaves_with_path((scene, design), is_leaf=lambda x: x is None)
+    for number, (path, leaf) in enumerate(every):
         name = getattr(path[1], "name", "") if len(path) > 1 else ""
-        if name in _SETTINGS:
+        # The solver holds numerical settings, not physical quantities.
+        if leaf is None or name == "solver":
             continue
         if name == "outline":
             leaves.append(leaf)
         else:
             numbers.append((number, leaf))
     return numbers, leaves
-
-
-# Fields of a scene that are numerical settings, not physical quantities. Their tangents are
-# ignored.
-_SETTINGS = ("solver",)
-
-
-def _leaves(tree: Any) -> list[tuple[Any, Any]]:
-    """Return (path, leaf) for all leaves of `tree`, including leaves that are None."""
-    return jax.tree_util.tree_flatten_with_path(tree, is_leaf=lambda x: x is None)[0]
 
 
 # Fields of a response that are constant to JAX.
@@ -299,12 +289,10 @@ def _basis(leaves: list[Array]) -> list[Array]:
     return rows
 
 
-def _next_start(
-    solver: Solver, pair: RotorPair, motion: Steady, state: Float[Array, " n"]
-) -> Start:
+def _next_start(pair: RotorPair, motion: Steady, state: Float[Array, " n"]) -> Start:
     """Return `Response.start`. After a motion that fails, the next one begins at rest."""
-    failed = (Status.UNSOUND, Status.PASSED_THROUGH, Status.STALLED, Status.NON_FINITE)
-    failed = among(motion.status, (*failed, Status.SOLVER_FAILED))
+    lost = Status.UNSOUND, Status.PASSED_THROUGH, Status.STALLED
+    failed = among(motion.status, (*lost, Status.NON_FINITE, Status.SOLVER_FAILED))
     rest = pair.in_si(jnp.zeros_like(state))
     closed = among(motion.status, CLOSED) | motion.held
     known = motion.known._replace(sound=motion.known.sound & closed)
@@ -350,7 +338,7 @@ def _named(solver: Solver, pair: RotorPair, tangents: RotorPair, motion: Steady)
         margins=pair.soundness,
         contact_reserve=reserves[0],
         backlash_reserve=reserves[1],
-        start=_next_start(solver, pair, motion, state),
+        start=_next_start(pair, motion, state),
     )
     # Without weak types: a start that has them would be compiled for once more.
     response, rows = jax.tree.map(

@@ -135,7 +135,7 @@ def _still_loads(at: _At, name: str) -> tuple[Array, Array]:
 
 def _of_bearings(at: _At, name: str) -> Any:
     _need_bearings(at.scene, name)
-    if name in BEARING[2:] and at.scene.straight:
+    if name in BEARING[2:] and at.scene.helix is None:
         raise InputError(
             f"the term `{name}` needs twisted rotors, because it is 0 for straight ones; "
             "set `rotor.helix_deg`, or make the twist a design parameter with "

@@ -30,6 +30,8 @@ from rootsopt.dynamics.steady import Steady
 from rootsopt.response.evaluation import Evaluator, motion_from
 from rootsopt.response.result import Evaluation, begun
 from rootsopt.runtime.programs import CachedFunction
+from rootsopt.scene.reading import design_vector
+from rootsopt.scene.space import sobol
 from rootsopt.status import Status
 
 
@@ -61,7 +63,10 @@ def evaluate_together(evaluators: Sequence[Evaluator]) -> list[Evaluation]:
             motion = jax.tree.map(lambda x, row=row: x[row], motions)
             if not int(motion.window.done):
                 motion = motion._replace(window=None)
-            evaluations[number] = evaluators[number].evaluation(built[number], motion, began)
+            one = evaluators[number]
+            evaluations[number] = one.evaluation(
+                design_vector(one.config), built[number], motion, began, False
+            )
     return [evaluations[number] for number in range(len(evaluators))]
 
 
@@ -153,13 +158,9 @@ def initial_states(pair: RotorPair, members: int, seed: int) -> NDArray[np.float
     |dε/dt| ranges up to the speed that the load causes across the whole range of ε, or 1 (scaled)
     if that is greater. `seed`: seed of the sequence.
     """
-    from scipy.stats import qmc
-
     acceleration = float(pair.load.torque / pair.inertia * pair.mesh_period**2 / pair.angle_scale)
     fastest = max(2 * np.sqrt(acceleration), 1.0)
-    sampler = qmc.Sobol(2, rng=np.random.default_rng(seed))
-    power = int(np.ceil(np.log2(members)))
-    play = (2 * sampler.random_base2(power)[:members] - 1) * np.array([1.0, fastest])
+    play = (2 * sobol(members, seed, 2) - 1) * np.array([1.0, fastest])
     return pair.at_start(play)
 
 

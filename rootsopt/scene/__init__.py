@@ -4,9 +4,5 @@ from rootsopt.scene.build import Scene as Scene
 from rootsopt.scene.build import along as along
 from rootsopt.scene.check import check_geometry as check_geometry
 from rootsopt.scene.check import outline_mm as outline_mm
-from rootsopt.scene.families import fault_of as fault_of
-from rootsopt.scene.reading import design_keys as design_keys
 from rootsopt.scene.reading import design_vector as design_vector
 from rootsopt.scene.reading import integrators as integrators
-from rootsopt.scene.reading import measures as measures
-from rootsopt.scene.reading import solver_of as solver_of

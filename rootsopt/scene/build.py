@@ -52,7 +52,7 @@ from rootsopt.profiles import Geometry, Outline, Profile, geometry
 from rootsopt.profiles.soundness import Soundness, soundness
 from rootsopt.runtime.environment import check_precision
 from rootsopt.scene import families, reading
-from rootsopt.scene.reading import GRAVITY, Bearings, Medium, bearings_of, medium_of
+from rootsopt.scene.reading import GRAVITY, Bearings, Medium
 
 # Mean error of the contact torque of twisted rotors, relative to its maximum.
 _SLICE_ERROR = 1e-2
@@ -127,16 +127,11 @@ class Scene(eqx.Module):
             family=config.profile.family,
             lobes=config.profile.lobes,
             slices=config.solver.slices or 0,
-            design_size=len(reading.design_keys(config)),
+            design_size=len(config.design_keys),
             twist_free=config.twist_free,
             solver=reading.solver_of(config),
             outline=families.profile_from_file(config.profile),
-            medium=medium_of(config),
-            bearings=bearings_of(config),
-            law=reading.law_of(config),
-            gear=reading.gear_of(config),
             **reading.physical_quantities(config),
-            **reading.parts_of(config),
         )
         if scene.helix is None or scene.slices:
             return scene
@@ -155,15 +150,7 @@ class Scene(eqx.Module):
 
         The config must have the same parts as that of this scene. Profile and solver stay the
         same."""
-        return dataclasses.replace(
-            self,
-            medium=medium_of(config),
-            bearings=bearings_of(config),
-            law=reading.law_of(config),
-            gear=reading.gear_of(config),
-            **reading.physical_quantities(config),
-            **reading.parts_of(config),
-        )
+        return dataclasses.replace(self, **reading.physical_quantities(config))
 
     def profile(self, design: Float[Array, " d"]) -> Profile:
         """Return the profile of a design (d,) in config units."""
@@ -184,11 +171,6 @@ class Scene(eqx.Module):
     def soundness(self, profile: Profile) -> Soundness:
         """Return the margins of all checks of a design with this `profile`."""
         return soundness(profile, self.bore_radius, family_of(self.family).inherent)
-
-    @property
-    def straight(self) -> bool:
-        """Whether the rotors have no helix."""
-        return self.helix is None
 
     @property
     def static_depth(self) -> float:
@@ -323,7 +305,7 @@ class Scene(eqx.Module):
         does."""
         if directions is None:
             directions = jnp.eye(design.shape[0])
-        return along(lambda design: self.pair_and_shape(design), design, directions)
+        return along(self.pair_and_shape, design, directions)
 
     def pair_and_shape(self, design: Float[Array, " d"]) -> tuple[RotorPair, Geometry]:
         """Return (rotor pair, geometry of one rotor) for a design (d,) in config units.

@@ -19,7 +19,6 @@ from rootsopt.profiles import Geometry, geometry, outline
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene import families
 from rootsopt.scene.build import Scene
-from rootsopt.scene.families import check
 from rootsopt.scene.reading import design_vector
 from rootsopt.scene.space import Space, slacks_and_slopes, sobol
 
@@ -36,8 +35,10 @@ def check_geometry(config: Config, design: ArrayLike | None = None, simulated: b
     anything is compiled."""
     if design is not None:
         config = config.with_design(np.asarray(design, float))
-    if simulated:
-        families.check_axis(config.profile)
+    if simulated and config.profile.from_file:
+        from rootsopt.measured.source import check_center  # Slow import, for outlines only.
+
+        check_center(config.profile)
     families.check(config.profile)
     bore = config.rotor.bore_mm
     if bore is None:
@@ -126,7 +127,7 @@ def _met(config: Config, design) -> Config | None:
     # Ten digits keep the outer radius.
     config = config.with_design([float(f"{value:.10g}") for value in design])
     try:
-        check(config.profile)
+        families.check(config.profile)
     except InputError:
         return None
     limit = limits_of(None, config.constraints.outer_radius_max_mm)[1]

@@ -43,9 +43,12 @@ def profile_of(
     return definition.make(lobes, pitch_radius, **values)
 
 
-def design_of(config: ProfileConfig) -> Float[Array, " d"]:
-    """Return the design parameters (d,) of a config, in config units."""
-    return jnp.asarray(config.design)
+def arguments_of(
+    config: ProfileConfig,
+) -> tuple[str, int, Float[Array, ""], Float[Array, " d"]]:
+    """Return the arguments of `profile_of` for the profile of a config."""
+    size = jnp.asarray(config.pitch_radius_mm * MM)
+    return config.family, config.lobes, size, jnp.asarray(config.design)
 
 
 def free_form_of(config: ProfileConfig, count: int) -> tuple[ProfileConfig, float]:
@@ -59,8 +62,7 @@ def free_form_of(config: ProfileConfig, count: int) -> tuple[ProfileConfig, floa
             f"is {config.family}: unlike that of a free form, its dedendum need not be conjugate "
             "to its addendum; set the family by which the rotor was designed"
         )
-    radius = jnp.asarray(config.pitch_radius_mm * MM)
-    profile = profile_of(config.family, config.lobes, radius, design_of(config))
+    profile = profile_of(*arguments_of(config))
     free_form = project(profile, count)
     # These decimals keep the outline within 0.01 µm.
     result = ProfileConfig.model_validate(
@@ -72,8 +74,7 @@ def free_form_of(config: ProfileConfig, count: int) -> tuple[ProfileConfig, floa
             "coefficients": tuple(round(float(c), 6) for c in free_form.coefficients),
         }
     )
-    written = profile_of("free_form", config.lobes, radius, design_of(result))
-    return result, departure(profile, written)
+    return result, departure(profile, profile_of(*arguments_of(result)))
 
 
 def profile_from_file(config: ProfileConfig) -> Outline | None:
@@ -87,14 +88,6 @@ def profile_from_file(config: ProfileConfig) -> Outline | None:
     return outline_of(config)[0]
 
 
-def check_axis(config: ProfileConfig) -> None:
-    """Raise `InputError` if an outline from a file does not lie around its axis."""
-    if config.from_file:
-        from rootsopt.measured.source import check_center  # Slow import, for outlines only.
-
-        check_center(config)
-
-
 def check(config: ProfileConfig) -> None:
     """Raise `InputError` unless the profile is sound.
 
@@ -105,9 +98,7 @@ def check(config: ProfileConfig) -> None:
         return
     family = family_of(config.family)
     family.check(config)
-    radius = np.asarray(config.pitch_radius_mm * MM)
-    checks = _soundness(config.family, config.lobes, radius, design_of(config))
-    if fault := fault_of(checks):
+    if fault := fault_of(_soundness(*arguments_of(config))):
         given = ", ".join(
             f"`profile.{key}` = {_written(value)}" for key, value in config.parameters.items()
         )
@@ -123,9 +114,7 @@ def note_program(config: ProfileConfig) -> None:
     A simulation contains dozens of copies of the code that computes a point of a flank."""
     if is_shipped(config.family) or config.from_file:
         return
-    profile = profile_of(
-        config.family, config.lobes, jnp.asarray(config.pitch_radius_mm * MM), design_of(config)
-    )
+    profile = profile_of(*arguments_of(config))
     made = jax.make_jaxpr(
         lambda nu: [f(nu) for f in (profile.roll_angle, profile.lever, profile.support)]
     )
@@ -157,10 +146,8 @@ def margins_of(config: ProfileConfig) -> dict[str, float]:
     file, the result is {}."""
     if config.from_file:
         return {}
-    radius = jnp.asarray(config.pitch_radius_mm * MM)
-    flank_margins = _margins(config.family, config.lobes, radius, design_of(config)).of_flank
     record = {}
-    for name, value in flank_margins.items():
+    for name, value in _margins(*arguments_of(config)).of_flank.items():
         unit, size = _UNITS.get(name, ("mm", MM))
         record["_".join(filter(None, (name, unit)))] = float(value) / size
     return record

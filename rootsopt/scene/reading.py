@@ -26,13 +26,10 @@ def design_vector(config: Config) -> Float[Array, " d"]:
     return jnp.asarray(config.design)
 
 
-def design_keys(config: Config) -> tuple[str, ...]:
-    """Return the names of the design parameters, in the order of `design_vector`."""
-    return config.design_keys
+def physical_quantities(config: Config) -> dict[str, Any]:
+    """Return all physical quantities of a config in SI units, keyed by `Scene` field names.
 
-
-def physical_quantities(config: Config) -> dict[str, Float[Array, ""] | None]:
-    """Return the physical quantities of a config in SI units, keyed by `Scene` field names."""
+    They include the contact law and the parts, and what leakage and the bearings need."""
     rotor, scene, gear = config.rotor, config.scene, config.scene.timing_gear
     wear, heat, error = config.contact.wear, scene.heat, scene.center_distance_error_mm
     clearance = config.contact.clearance_mm
@@ -55,6 +52,11 @@ def physical_quantities(config: Config) -> dict[str, Float[Array, ""] | None]:
         "wear": None if wear is None else jnp.asarray(wear.depth_mm * MM),
         "pressure": _optional(scene.load.pressure_difference_Pa),
         "center_distance_error": _optional(error, MM),
+        "medium": medium_of(config),
+        "bearings": bearings_of(config),
+        "law": law_of(config),
+        "gear": gear_of(config),
+        **parts_of(config),
     }
 
 

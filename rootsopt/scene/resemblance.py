@@ -24,7 +24,7 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from rootsopt.config.families import FREE_FORM, Parameter, family_of
-from rootsopt.config.rotor import ProfileConfig
+from rootsopt.config.rotor import ProfileConfig, model_of
 from rootsopt.config.units import DEG, MM
 from rootsopt.errors import InputError
 from rootsopt.measured.conjugacy import conjugacy
@@ -89,11 +89,11 @@ class Likeness(NamedTuple):
         """Return the config of the member, with lobes and pitch radius of `profile`.
 
         Raises `InputError` or `ValueError` if the member is not a valid design."""
-        family, values = family_of(self.family), list(self.design.values())
-        parts = zip(family.parameters, family.split(values), strict=True)
-        named = {one.key: v if one.count is None else tuple(v) for one, v in parts}
-        size = {"lobes": profile.lobes, "pitch_radius_mm": profile.pitch_radius_mm}
-        return ProfileConfig.model_validate({"family": self.family} | size | named)
+        lobes, radius = profile.lobes, profile.pitch_radius_mm
+        member = _unset(self.family, lobes, radius).with_design([*self.design.values()])
+        return ProfileConfig.model_validate(
+            {"family": self.family, "lobes": lobes, "pitch_radius_mm": radius, **member.parameters}
+        )
 
 
 def likenesses(profile: Profile) -> list[Likeness]:
@@ -138,12 +138,12 @@ def free_likeness(profile: Profile, *near: Likeness, count: int = COEFFICIENTS) 
     size = float(radius) / MM, profile.lobes
     usual = [parameter.usually(*size) for parameter in parameters]
     width = np.array([high - low for low, high in [usual[0], *[usual[1]] * count]])
-    whole = [profile]
-    for one in near:
-        design = jnp.asarray(list(one.design.values()))
-        whole.append(profile_of(one.family, profile.lobes, radius, design))
+    members = (
+        profile_of(one.family, profile.lobes, radius, jnp.asarray([*one.design.values()]))
+        for one in near
+    )
     starts = []
-    for one in whole:
+    for one in (profile, *members):
         free = project(one, count)
         land = float(free.tip_arc_angle)
         if isinstance(one, Outline):
@@ -156,17 +156,15 @@ def _best(look: "_Look", profile: Profile, designs) -> Likeness | None:
     """Return the nearest sound member among those with the given `designs`, each with its inset.
 
     Return `None` if all of them are unsound."""
-    keys = family_of(look.family).keys
-    size = {"lobes": profile.lobes, "pitch_radius_mm": float(profile.pitch_radius) / MM}
-    blank = ProfileConfig.model_construct(**size)
+    unset = _unset(look.family, profile.lobes, float(profile.pitch_radius) / MM)
     for design in sorted(designs, key=lambda one: look(one).away):
         if not look(design).sound:
             break
         design, inset = design[:-1], float(design[-1] * profile.pitch_radius)
-        names = list(keys) if len(keys) == len(design) else _numbered(keys, len(design))
-        named = dict(zip(names, map(float, design), strict=True))
+        values = [*map(float, design)]
+        named = dict(zip(unset.with_design(values).design_keys, values, strict=True))
         try:
-            check(Likeness(look.family, named, 0.0, 0.0).config(blank))
+            check(Likeness(look.family, named, 0.0, 0.0).config(unset))
         except (InputError, ValueError):
             continue
         member = profile_of(look.family, profile.lobes, profile.pitch_radius, jnp.asarray(design))
@@ -175,10 +173,11 @@ def _best(look: "_Look", profile: Profile, designs) -> Likeness | None:
     return None
 
 
-def _numbered(keys: tuple[str, ...], count: int) -> list[str]:
-    """Return the names of `count` design parameters, of which the last ones are one list."""
-    alone = list(keys[:-1])
-    return [*alone, *(f"{keys[-1]}_{k}" for k in range(1, count - len(alone) + 1))]
+def _unset(family: str, lobes: int, pitch_radius_mm: float) -> ProfileConfig:
+    """Return the config of a profile of this size, without values of its design parameters."""
+    return model_of(family_of(family)).model_construct(
+        family=family, lobes=lobes, pitch_radius_mm=pitch_radius_mm
+    )
 
 
 class _Comparison(NamedTuple):

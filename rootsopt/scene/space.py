@@ -37,11 +37,7 @@ def bounds_of(config: Config) -> list[tuple[float, float]]:
     """Return the bounds (low, high) of each design parameter of a config, in config units.
 
     Raises `InputError` if a bound is impossible, such as a tip land wider than the lobe."""
-    bounds = []
-    for parameter in family_of(config.profile.family).parameters:
-        values = getattr(config.profile, parameter.key)
-        count = len(values) if isinstance(values, tuple) else 1
-        bounds += [_pair(config, parameter)] * count
+    bounds = [_pair(config, parameter) for parameter in _parameters(config)]
     return [*bounds, config.optimizer.bounds[TWIST]] if config.twist_free else bounds
 
 
@@ -49,13 +45,15 @@ def floors_of(config: Config) -> tuple[float, ...]:
     """Return the default lower bound of each design parameter, as a fraction of its range's end.
 
     It is 0 for parameters that have bounds in the config, or whose range depends on no other."""
-    floors: list[float] = []
-    for parameter in family_of(config.profile.family).parameters:
-        values = getattr(config.profile, parameter.key)
-        count = len(values) if isinstance(values, tuple) else 1
-        given = config.optimizer.bounds.get(parameter.key) is not None
-        floors += [0.0 if given else parameter.floor] * count
+    given = config.optimizer.bounds
+    floors = [one.floor if given.get(one.key) is None else 0.0 for one in _parameters(config)]
     return (*floors, 0.0) if config.twist_free else tuple(floors)
+
+
+def _parameters(config: Config) -> Iterator[Parameter]:
+    """Yield the parameter of each entry of a design, without the twist."""
+    for parameter in family_of(config.profile.family).parameters:
+        yield from [parameter] * np.size(getattr(config.profile, parameter.key))
 
 
 def widened(config: Config) -> tuple[Config, tuple[str, ...]]:
@@ -161,15 +159,10 @@ class Constraint(eqx.Module):
         """The limit in the unit of reports."""
         return float(self.limit) / self.factor
 
-    def slack(self, shape: Geometry, soundness: Soundness | None = None) -> Float[Array, ""]:
-        """Return the distance from the limit, divided by `scale`; ≥ 0 if the constraint holds.
-
-        `shape`, `soundness`: geometry and margins of the design. The margins are needed only if
-        `margin` is true."""
-        return self.scaled(getattr(soundness if self.margin else shape, self.quantity))
-
     def scaled(self, value: Float[Array, ""] | float) -> Float[Array, ""]:
-        """Return the slack of a `value` of the limited quantity."""
+        """Return the slack of a `value` of the limited quantity.
+
+        It is the distance from the limit, divided by `scale`; ≥ 0 if the constraint holds."""
         return self.sign * (value - self.limit) / self.scale
 
     def slack_of(
@@ -180,9 +173,11 @@ class Constraint(eqx.Module):
         shape: Geometry,
         soundness: Soundness | None,
     ) -> Float[Array, ""]:
-        """Return the slack of a `design` (d,) of a `space`, given its `profile`; see `slack`."""
-        del space, design, profile
-        return self.slack(shape, soundness)
+        """Return the slack of a `design` (d,) of a `space`, given its `profile`; see `scaled`.
+
+        `shape`, `soundness`: geometry and margins of the design. The margins are needed only if
+        `margin` is true."""
+        return self.scaled(getattr(soundness if self.margin else shape, self.quantity))
 
 
 class RangeConstraint(Constraint):
@@ -191,7 +186,6 @@ class RangeConstraint(Constraint):
     The range depends on the other parameters; `quantity` is the parameter's key."""
 
     def slack_of(self, space, design, profile, shape, soundness):
-        del profile, shape, soundness
         return self.scaled(_NARROW * space.ranges(design)[self.quantity][1] * self.factor)
 
 
@@ -223,9 +217,8 @@ class Space(eqx.Module):
         in first (`rootsopt.optimize.limits.settled`). Raises `InputError` if the config's bounds
         are impossible."""
         limits, family = config.constraints, family_of(config.profile.family)
-        rows = bounds_of(config)
         sound = not family.by_limits
-        constraints: tuple[Constraint, ...] = ()
+        constraints: list[Constraint] = []
         for key, name, quantity, unit, scale, factor in _LIMITED:
             limit = getattr(limits, key)
             if limit is None:
@@ -234,18 +227,17 @@ class Space(eqx.Module):
             margin = sound and quantity == "undercut_margin"
             row = name, "undercut" if margin else quantity, unit
             limit = 0.0 if limit == BASELINE else limit * factor
-            more = scale, factor, margin, key == "outer_radius_max_mm"
-            constraints += (_constraint(*row, limit, *more),)
+            ceiling = key == "outer_radius_max_mm"
+            constraints.append(_constraint(*row, limit, scale, factor, margin, ceiling))
         if scene.bore_radius is not None:
-            row = "root radius", "root_radius", "mm", scene.bore_radius
-            constraints += (_constraint(*row, MM, MM),)
-        if sound:
-            rows_of = [row for row in _SOUND if row[1] not in family.inherent]
-            constraints += tuple(_constraint(*row, margin=True) for row in rows_of)
-        lower, upper = np.array(rows, dtype=float).T
-        constraints += tuple(_reaching(config)) + further
-        bounds = jnp.asarray(lower), jnp.asarray(upper)
-        return cls(scene, *bounds, constraints, floors_of(config))
+            row = "root radius", "root_radius", "mm"
+            constraints.append(_constraint(*row, scene.bore_radius, MM, MM))
+        for row in _SOUND if sound else ():
+            if row[1] not in family.inherent:
+                constraints.append(_constraint(*row, margin=True))
+        constraints += [*_reaching(config), *further]
+        lower, upper = map(jnp.asarray, np.array(bounds_of(config), dtype=float).T)
+        return cls(scene, lower, upper, tuple(constraints), floors_of(config))
 
     @property
     def family(self) -> Family:
@@ -333,8 +325,7 @@ def slacks_and_slopes(space: Space, point):
 def _reaching(config: Config):
     """Yield a constraint for each lower bound in a `config` of a parameter in `Space.ranges`."""
     family, profile = family_of(config.profile.family), config.profile
-    values = [np.asarray(getattr(profile, key)) for key in family.keys]
-    named = dict(zip(family.keys, values, strict=True))
+    named = {key: np.asarray(value) for key, value in profile.parameters.items()}
     radius, ranges = np.asarray(profile.pitch_radius_mm), partial(family.dependent, profile.lobes)
     # Only the keys are needed: what computes the ranges would be compiled, one operation at a time.
     for key in jax.eval_shape(ranges, radius, **named):
@@ -359,8 +350,7 @@ def sobol(count: int, seed: int, dimension: int = 3) -> NDArray[np.float64]:
     from scipy.stats import qmc
 
     sampler = qmc.Sobol(dimension, rng=np.random.default_rng(seed))
-    power = max(0, int(np.ceil(np.log2(max(count, 1)))))
-    return sampler.random_base2(power)[:count]
+    return sampler.random_base2((count - 1).bit_length())[:count]
 
 
 def onto(

@@ -79,7 +79,7 @@ def test_points_agree_with_orbits_closed_for_themselves(branch):
     stable = [point for point in branch.points if point.stable]
     sizes = [np.max(np.abs(point.multipliers)) for point in stable]
     steady = 0
-    for number in range(0, len(stable), len(stable) // 6):
+    for number in range(0, len(stable), len(stable) // 3):
         point, near = stable[number], sizes[max(number - 1, 0) : number + 2]
         alone = Evaluator.of(config_at(point.value))(start=0.999 * point.state, series=False)
         assert alone.status is Status.PERIODIC
@@ -187,7 +187,10 @@ MOTOR = (
 def test_scenes_along_a_curve_are_those_of_the_configs(monkeypatch, name, changes, key, ends):
     """Scene and design at 30 % of the range are those of a config with this value."""
     pair = types.SimpleNamespace(
-        angle_scale=jnp.asarray(1e-3), smooth=True, repeats=1, whole=lambda periods: periods
+        angle_scale=jnp.asarray(1e-3),
+        contact=types.SimpleNamespace(smooth=True),
+        repeats=1,
+        whole=lambda periods: periods,
     )
     monkeypatch.setattr("rootsopt.response.continuation.branch._pair", lambda *scene: pair)
     config = load_config(f"configs/{name}.yaml", list(changes))

@@ -25,8 +25,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from rootsopt.config.reading import Config, parse
 from rootsopt.dynamics.closed import ACCURACY, greatest_error
-from rootsopt.dynamics.collocation.bordered import Followed, Line, Plane, followed
+from rootsopt.dynamics.collocation.bordered import Followed, Plane, followed
 from rootsopt.dynamics.collocation.mesh import PIECES, from_pieces
+from rootsopt.dynamics.collocation.system import unchanged
 from rootsopt.dynamics.flow import strobe
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import TOO_DEEP
@@ -137,7 +138,7 @@ class OrbitFamily:
                 "`scene.timing_gear.backlash_mm`, or that of a design parameter"
             )
         pair = _pair(scene, design_vector(config))
-        if not pair.smooth:
+        if not pair.contact.smooth:
             raise InputError(
                 f"Contact {type(pair.contact).__name__} must be `smooth` between events for orbits "
                 "to be followed, but is not; give its `switches`"
@@ -223,7 +224,7 @@ def _seed(over: _Range, guess: Float[Array, " m"], period: int):
     out = strobe(pair, SPAN * guess[:-1], period, over.low[0].solver.orbit, PIECES)
     assert out.pieces is not None
     known = from_pieces(pair, out.pieces, jnp.asarray(period), period)
-    return known, Line.empty(known.elements, guess[-1]).motion, jnp.zeros(())
+    return known, unchanged(known.elements, 1), jnp.zeros(())
 
 
 @CachedFunction

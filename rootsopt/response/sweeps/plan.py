@@ -64,55 +64,49 @@ class Interval:
         return (self.low + np.asarray(levels) * (self.high - self.low)).tolist()
 
 
-@dataclasses.dataclass(frozen=True)
-class Axis:
-    """A dotted `key` of the config and its `values`, or an interval to draw them from."""
+Axis = Interval | tuple[Any, ...]
+"""Values of a key, or the interval to draw them from."""
 
-    key: str
-    values: Interval | tuple[Any, ...]
 
-    def drawn(self, levels: NDArray[np.float64]) -> list[Any]:
-        """Return the values (n,) at `levels` (n,) from 0 to 1: of the interval, or of the list."""
-        if isinstance(self.values, Interval):
-            return self.values.at(levels)
-        count = len(self.values)
-        picked = np.minimum(np.floor(np.asarray(levels) * count).astype(int), count - 1)
-        return [self.values[k] for k in picked]
+def drawn(axis: Axis, levels: NDArray[np.float64]) -> list[Any]:
+    """Return the values (n,) of an axis at `levels` (n,) from 0 to 1."""
+    if isinstance(axis, Interval):
+        return axis.at(levels)
+    count = len(axis)
+    picked = np.minimum(np.floor(np.asarray(levels) * count).astype(int), count - 1)
+    return [axis[k] for k in picked]
 
 
 def axis_of(key: str, given: Any) -> Axis:
     """Return the axis of a `key`.
 
-    `given`: a sequence, an array or an iterator of values, or a text as after `--over KEY=`: values
-    separated by commas, and ranges `from:to:count`, with `:log` at the end for a logarithmic scale.
-    A text `from:to` is an interval to draw samples from.
+    `given`: an axis; a sequence, an array or an iterator of values; or a text as after `--over
+    KEY=`: values separated by commas, and ranges `from:to:count`, with `:log` at the end for a
+    logarithmic scale. A text `from:to` is an interval to draw samples from.
 
     Raises `InputError` if there are no values or more than `MOST`, or if a range is not valid."""
-    if isinstance(given, Interval) and given.points is None:
-        return Axis(key, given)
+    if isinstance(given, Interval):
+        return given
     if not isinstance(given, str):
-        return Axis(key, _values(key, given))
+        return _values(key, given)
     items = _items(key, given)
     spans = [item for item in items if isinstance(item, Interval) and item.points is None]
     if spans and len(items) == 1:
-        return Axis(key, spans[0])
+        return spans[0]
     if spans:
         raise InputError(
             f"`{key}`: an interval from:to cannot be mixed with other values, but the values are "
             f"{shown(given)}; write from:to:count for a range"
         )
     parts = (item.range() if isinstance(item, Interval) else [item] for item in items)
-    return Axis(key, _taken(key, itertools.chain.from_iterable(parts)))
+    return _taken(key, itertools.chain.from_iterable(parts))
 
 
 def _values(key: str, given: Any) -> tuple[Any, ...]:
-    """Return the values of a `key` that are `given` as a range, a sequence, an array or an
-    iterator."""
-    count = given.points if isinstance(given, Interval) else getattr(given, "size", None)
-    if (count or 0) > MOST:
+    """Return the values of a `key` that are `given` as a sequence, an array or an iterator."""
+    if (getattr(given, "size", None) or 0) > MOST:
         raise _too_many(key)
-    values: Any = given.range() if isinstance(given, Interval) else given
-    values = values.tolist() if hasattr(values, "tolist") else values
+    values: Any = given.tolist() if hasattr(given, "tolist") else given
     axis_values = _taken(key, values) if isinstance(values, Sequence | Iterator) else ()
     if not axis_values:
         raise InputError(
@@ -263,17 +257,14 @@ def plan_of(
 ) -> Plan:
     """Return the points of a sweep over `axes`.
 
-    `axes`: for each dotted key, its values, an `Axis`, or a text (see `axis_of`); `zipped`: `True`
-    to advance all keys together, or groups of keys that do so; `sample`, `sobol`: number of
+    `axes`: for each dotted key, its values or a text (see `axis_of`); `zipped`: `True` to
+    advance all keys together, or groups of keys that do so; `sample`, `sobol`: number of
     pseudo-random or Sobol samples instead of a grid; `seed` of the samples.
 
     Raises `InputError` for axes that cannot be combined in this way."""
     if not axes:
         raise InputError("a sweep needs at least one key; give one with `--over KEY=VALUES`")
-    parsed_axes = {
-        key: given if isinstance(given, Axis) else axis_of(key, given)
-        for key, given in axes.items()
-    }
+    parsed_axes = {key: axis_of(key, given) for key, given in axes.items()}
     _refuse_overlaps([*parsed_axes])
     if sample is not None and sobol is not None:
         raise InputError("`--sample` and `--sobol` exclude each other; remove one of them")
@@ -284,11 +275,10 @@ def plan_of(
         method = "random" if sample is not None else "sobol"
         return Plan((_sampled(parsed_axes, count, method, seed),), method, seed)
     for key, axis in parsed_axes.items():
-        if isinstance(axis.values, Interval):
-            low, high = axis.values.low, axis.values.high
+        if isinstance(axis, Interval):
             raise InputError(
-                f"`{key}`: an interval needs a number of values, as in {low:g}:{high:g}:11, or "
-                "`--sample N` or `--sobol N`"
+                f"`{key}`: an interval needs a number of values, as in {axis.low:g}:{axis.high:g}"
+                ":11, or `--sample N` or `--sobol N`"
             )
     plan = Plan(_dimensions(parsed_axes, zipped))
     if plan.count > MOST:
@@ -352,13 +342,12 @@ def _meant(key: str, message: str) -> str:
 
 
 def _refuse_overlaps(keys: Sequence[str]) -> None:
-    for one in keys:
-        for other in keys:
-            if one != other and f"{other}.".startswith(f"{one}."):
-                raise InputError(
-                    f"`{other}` is inside `{one}`, so that both cannot be swept; give `{one}` "
-                    "whole sections as values, or remove it"
-                )
+    for one, other in itertools.permutations(keys, 2):
+        if f"{other}.".startswith(f"{one}."):
+            raise InputError(
+                f"`{other}` is inside `{one}`, so that both cannot be swept; give `{one}` "
+                "whole sections as values, or remove it"
+            )
 
 
 def _sampled(axes: Mapping[str, Axis], count: int, method: str, seed: int) -> Dimension:
@@ -371,7 +360,7 @@ def _sampled(axes: Mapping[str, Axis], count: int, method: str, seed: int) -> Di
         levels = sobol_points(count, seed, len(axes))
     else:
         levels = np.random.default_rng(seed).random((count, len(axes)))
-    columns = {key: tuple(axis.drawn(levels[:, k])) for k, (key, axis) in enumerate(axes.items())}
+    columns = {key: tuple(drawn(axis, levels[:, k])) for k, (key, axis) in enumerate(axes.items())}
     return Dimension("sample", columns)
 
 
@@ -395,7 +384,7 @@ def _dimensions(
         number = next((k for k, group in enumerate(groups) if key in group), None)
         members = [key] if number is None else [one for one in axes if one in groups[number]]
         used |= {*members}
-        columns = {one: tuple(axes[one].values) for one in members}  # pyright: ignore
+        columns = {one: tuple(axes[one]) for one in members}  # pyright: ignore
         sizes = {one: len(values) for one, values in columns.items()}
         if len({*sizes.values()}) > 1:
             counts = ", ".join(f"`{one}` has {size}" for one, size in sizes.items())

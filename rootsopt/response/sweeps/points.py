@@ -6,6 +6,7 @@ are stepped together as arrays."""
 
 import threading
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -71,8 +72,10 @@ def simulated(config: Config, values: Mapping[str, Any]) -> Row:
     An invalid config or an error of the program becomes the point's status."""
     try:
         return row_of(_evaluator(config, values)(series=False))
+    except InputError as error:
+        return lost(Status.INVALID, str(error))
     except Exception as error:
-        return _lost_by(error)
+        return lost(Status.FAILED, f"{type(error).__name__}: {error}")
 
 
 def at_once(config: Config, points: Sequence[Numbered]) -> list[tuple[int, Row]]:
@@ -106,31 +109,20 @@ def _evaluator(config: Config, values: Mapping[str, Any]) -> Evaluator:
     return Evaluator.of_objective(one)
 
 
-def _lost_by(error: Exception) -> Row:
-    if isinstance(error, InputError):
-        return lost(Status.INVALID, str(error))
-    return lost(Status.FAILED, f"{type(error).__name__}: {error}")
-
-
 def simulated_together(config: Config, points: Sequence[Mapping[str, Any]]) -> list[Row]:
     """Return the records of several points, each given as values by dotted key.
 
-    Points of the same structure are simulated as one batch."""
+    Points of the same structure are simulated as one batch, and all others one by one."""
     rows: dict[int, Row] = {}
     batch: dict[int, Evaluator] = {}
     for number, values in enumerate(points):
-        try:
+        with suppress(Exception):  # `simulated` reports it.
             evaluator = _evaluator(config, values)
-        except Exception as error:
-            rows[number] = _lost_by(error)
-            continue
-        if evaluator.single:
-            batch[number] = evaluator
-    try:
+            if evaluator.single:
+                batch[number] = evaluator
+    with suppress(Exception):  # Memory may not suffice, for example.
         evaluations = evaluate_together([*batch.values()])
-        rows |= {n: row_of(one) for n, one in zip(batch, evaluations, strict=True)}
-    except Exception:
-        batch.clear()  # Memory may not suffice, for example. Simulate the points one by one.
+        rows = {n: row_of(one) for n, one in zip(batch, evaluations, strict=True)}
     return [
         rows[number] if number in rows else simulated(config, values)
         for number, values in enumerate(points)

@@ -8,27 +8,21 @@ from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rootsopt.config.reading import Config
-from rootsopt.config.sources import FILES
-from rootsopt.response.journal import Journal, header_of
-from rootsopt.response.reducers import HERE, as_done
-from rootsopt.response.sweeps.cluster import ClosedError, running
-from rootsopt.response.sweeps.plan import Plan, check_values, plan_of
-from rootsopt.response.sweeps.points import InProcess, Row, check_row, prepared
-from rootsopt.runtime.environment import check_precision
-
-if TYPE_CHECKING:
-    import xarray
-from typing import TYPE_CHECKING
-
 import numpy as np
 import yaml
 
 import rootsopt
 from rootsopt.config.explain import tree
+from rootsopt.config.reading import Config
+from rootsopt.config.sources import FILES
 from rootsopt.config.units import unit_of
+from rootsopt.response.journal import Journal, header_of
+from rootsopt.response.reducers import HERE, as_done
 from rootsopt.response.result import RESPONSES
-from rootsopt.response.sweeps.points import lost
+from rootsopt.response.sweeps.cluster import ClosedError, running
+from rootsopt.response.sweeps.plan import Plan, check_values, plan_of
+from rootsopt.response.sweeps.points import InProcess, Row, check_row, lost, prepared
+from rootsopt.runtime.environment import check_precision
 from rootsopt.status import Status
 
 if TYPE_CHECKING:
@@ -140,9 +134,10 @@ def _statuses(grid: _Grid, rows: Sequence[Row]) -> dict[str, Any]:
 
 def _motions(grid: _Grid, rows: Sequence[Row]) -> dict[str, Any]:
     steady = [row["steady_state"] for row in rows]
-    columns: dict[str, Any] = {}
-    for name, (units, long) in _SCALARS.items():
-        columns[name] = grid.numbers([one.get(name) for one in steady], units, long)
+    columns: dict[str, Any] = {
+        name: grid.numbers([one.get(name) for one in steady], units, long)
+        for name, (units, long) in _SCALARS.items()
+    }
     usable = [Status[row["status"].upper()].usable for row in rows]
     periods = [one.get("period", 0) if ok else 0 for one, ok in zip(steady, usable, strict=True)]
     dims, _, attributes = columns["period"]
