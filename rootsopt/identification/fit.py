@@ -150,33 +150,36 @@ def _caveats(problem: Problem, entries: Mapping[str, Any]) -> Iterator[str]:
     loose = [one["words"] for one in entries["combinations"] if not one["determined"]]
     away = [one for one in entries["motions"] if not one["reached_from_rest"]]
     yield f"It differs from the record by {100 * fit['relative_misfit']:.3g} % of its variation."
-    if away:
-        yield (
+    for holds, sentence in (
+        (
+            away,
             "The record shows a motion that is not reached from rest, of period "
             f"{' and '.join({str(one['period']): 1 for one in away})}: `rootsopt attractors` "
-            "finds it."
-        )
-    if averaged and doubtful:
-        yield (
+            "finds it.",
+        ),
+        (
+            averaged and doubtful,
             f"At {doubtful} of {points} operating points other motions coexist, and averages do "
             "not show well which was measured: the values may belong to another one (`rootsopt "
-            "attractors`). Samples of relative_rotation_rad would show it."
-        )
-    if averaged and fit["relative_misfit"] > _POOR:
-        yield (
+            "attractors`). Samples of relative_rotation_rad would show it.",
+        ),
+        (
+            averaged and fit["relative_misfit"] > _POOR,
             "No fit explains the averages to within "
             f"{100 * _POOR:g} %: the scene lacks something, or the motion that was measured was "
-            "missed. Do not trust the values; raise --starts, or give samples."
-        )
-    if fit["degrees_of_freedom"] <= 0:
-        yield (
+            "missed. Do not trust the values; raise --starts, or give samples.",
+        ),
+        (
+            fit["degrees_of_freedom"] <= 0,
             f"The record's number of values, {fit['measured_values']}, leaves nothing to estimate "
-            "errors from: fit fewer quantities, or give more values and their standard deviations."
-        )
-    if loose:
-        yield f"The record does not determine {'; '.join(loose)}."
-        for one in entries["further"][:1]:
-            yield f"Measure {one['column']} over a turn at {one['scene.speed_rpm']:g} rpm as well."
+            "errors from: fit fewer quantities, or give more values and their standard deviations.",
+        ),
+        (loose, f"The record does not determine {'; '.join(loose)}."),
+    ):
+        if holds:
+            yield sentence
+    for one in entries["further"][:1] if loose else ():
+        yield f"Measure {one['column']} over a turn at {one['scene.speed_rpm']:g} rpm as well."
     for one in problem.quantities:
         if not one.low <= one.own <= one.high:
             yield (
@@ -186,19 +189,25 @@ def _caveats(problem: Problem, entries: Mapping[str, Any]) -> Iterator[str]:
     for key, one in entries["parameters"].items():
         if one["at_bound"]:
             yield f"{key} lies at its {one['at_bound']} bound: widen it unless it is a limit."
-    if entries["optima"]:
-        count = len(entries["optima"])
-        yield f"Other scenes within the bounds fit nearly as well (optima): {count}."
-    if fit["structure"] > answer.STRUCTURED:
-        yield (
+    for holds, sentence in (
+        (
+            entries["optima"],
+            "Other scenes within the bounds fit nearly as well (optima): "
+            f"{len(entries['optima'])}.",
+        ),
+        (
+            fit["structure"] > answer.STRUCTURED,
             "Residuals of neighbouring samples are alike, so that the scene lacks something or is "
-            "not the best within the bounds: the errors are too small. Raise --starts."
-        )
-    if fit["probability"] is not None and fit["probability"] < answer.UNLIKELY:
-        yield (
+            "not the best within the bounds: the errors are too small. Raise --starts.",
+        ),
+        (
+            fit["probability"] is not None and fit["probability"] < answer.UNLIKELY,
             "The residuals are larger than the standard deviations allow, so that the scene lacks "
-            "something or these are too small: the errors are scaled up."
-        )
+            "something or these are too small: the errors are scaled up.",
+        ),
+    ):
+        if holds:
+            yield sentence
 
 
 class _Search:
@@ -230,10 +239,9 @@ class _Search:
                 # If possible, a fit begins at a place where no other fit has begun or ended.
                 self._fit(known[0])
                 begun = [known.pop(0).place, *(one.place for one in self.ends)]
-                near = [min(np.max(np.abs(one.place - x)) for x in begun) < _APART for one in known]
-                known = [
-                    one for _, one in sorted(zip(near, known, strict=True), key=lambda x: x[0])
-                ]
+                known.sort(
+                    key=lambda one: min(np.max(np.abs(one.place - x)) for x in begun) < _APART
+                )
         # Averages do not show which of several motions was measured.
         averaged = not self.problem.rows.sampled.any()
         if points[0].config.objective.motion != "ensemble":

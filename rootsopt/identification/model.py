@@ -120,7 +120,7 @@ def fitted(
 
 def _bounds(key: str, text: str) -> Any:
     """Return the bounds in a text, as in `0.02:0.4`."""
-    values = axis_of(key, text).values
+    values = axis_of(key, text)
     if not isinstance(values, Interval):
         raise InputError(
             f"`{key}` must have two bounds, as in {key}=0.1:0.5, but has {text!r}; correct them"

@@ -210,10 +210,9 @@ def _table(data: Any, name: str) -> tuple[str, pandas.DataFrame]:
     try:
         content = regular_file(path, "a table").read_bytes()
     except (OSError, ValueError) as error:
-        why = reason(error)
         raise InputError(
-            f"{named(str(path))}: must be a file that can be read: {why}; give the path of a CSV "
-            "file"
+            f"{named(str(path))}: must be a file that can be read: {reason(error)}; give the path "
+            "of a CSV file"
         ) from None
     titles, rows = titled(content, path.name, "of the record")
     if len({*titles}) < len(titles):
@@ -242,7 +241,7 @@ def _points(config: Config, name: str, cells: pandas.DataFrame) -> Iterator[Obse
     if not names:
         some = CHANNELS[0] if sampled else "mean_force_N"
         raise InputError(f"{name}: must have a measured column, such as {some}; add one")
-    table = cells.drop(columns=keys).map(_number).astype(float)
+    table = cells.drop(columns=keys).map(measured_number).astype(float)
     for title, column in table.items():
         wrong, what = column.abs() == np.inf, "a number"
         if str(title).endswith(_SPREAD):
@@ -270,12 +269,6 @@ def _points(config: Config, name: str, cells: pandas.DataFrame) -> Iterator[Obse
         if len(part):
             some = part.iloc[:: -(-len(part) // _MOST)]
             yield Observed(name, values, some, names, sampled)
-
-
-def _number(cell: str) -> float:
-    """Return the number in a cell, NaN if it is empty, infinity for another text."""
-    number = measured_number(cell)
-    return np.inf if number is None else number
 
 
 def _check(config: Config, name: str, title: str, sampled: bool) -> None:

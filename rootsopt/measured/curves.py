@@ -62,18 +62,18 @@ class MeasuredCurve:
     pieces: tuple[BSpline, ...]
 
     def derivatives(self, t: NDArray[np.float64], place: int) -> NDArray[np.complex128]:
-        """Return z, z′, z″, z‴ as an array (4, n) at the parameters `t` (n,).
+        """Return z, z′, z″ as an array (3, n) at the parameters `t` (n,).
 
         Derivatives are with respect to t; lengths are in mm. `place`: index of the piece that is
         evaluated."""
-        return np.stack([self.pieces[place](t, order) for order in range(4)])
+        return np.stack([self.pieces[place](t, order) for order in range(3)])
 
     def __call__(self, t: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """Return z, z′, z″, z‴ as an array (4, n) at the parameters `t` (n,).
+        """Return z, z′, z″ as an array (3, n) at the parameters `t` (n,).
 
         Each value of `t` is evaluated on the piece that contains it. Lengths are in mm."""
         place = np.clip(np.searchsorted(self.ends, t, side="right") - 1, 0, len(self.pieces) - 1)
-        values = np.empty((4, len(t)), complex)
+        values = np.empty((3, len(t)), complex)
         for k in map(int, np.unique(place)):
             values[:, place == k] = self.derivatives(t[place == k], k)
         return values
@@ -113,7 +113,7 @@ def stretch(
         ends = np.where(cusp, spared, [low, high])
         t = np.linspace(ends[0], ends[1], count - int(np.sum(cusp)))
         t = np.concatenate([[low][: int(cusp[0])], t, [high][: int(cusp[1])]])
-    z, first, second, _ = curve.derivatives(t, place)
+    z, first, second = curve.derivatives(t, place)
     speed = np.abs(first)
     turning = np.imag(np.conj(first) * second) / np.where(speed > 0, speed, 1.0) ** 2
     direction = np.angle(-1j * first)

@@ -87,7 +87,7 @@ class _Flank:
     off: float
 
     def at(self, share: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """Return z, z′, z″, z‴ as an array (4, n) at `share` (n,).
+        """Return z, z′, z″ as an array (3, n) at `share` (n,).
 
         A share is a fraction of the range of the curve's parameter: 0 at the tip, 1 at the root.
         Lengths are in mm, and derivatives are with respect to the parameter."""

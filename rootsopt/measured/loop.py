@@ -318,20 +318,13 @@ def _connected(parts: list[Loop]) -> Loop:
     gaps = np.array([b.points[0] - a.points[-1] for a, b in zip(parts, ahead, strict=True)])
     points, joints = [], []
     for k, part in enumerate(parts):
-        points.append(_shifted(part.points, -gaps[k - 1] / 2, gaps[k] / 2)[:-1])
+        way, first, last = lengths_along(part.points), -gaps[k - 1] / 2, gaps[k] / 2
+        points.append((part.points + first + (last - first) * way / way[-1])[:-1])
         joints.append(part.joints[:-1].copy())
         joints[-1][0] |= parts[k - 1].joints[-1]
     widest = int(np.argmax(np.abs(gaps)))
     gap = float(abs(gaps[widest])), complex(parts[widest].points[-1])
     return Loop(np.concatenate(points), np.concatenate(joints), parts[0].unit, gap)
-
-
-def _shifted(points: NDArray[np.complex128], first: complex, last: complex) -> NDArray:
-    """Return points along a chain, shifted by `first` at its start and by `last` at its end."""
-    if first == last == 0:
-        return points
-    way = lengths_along(points)
-    return points + first + (last - first) * way / way[-1]
 
 
 def _widest_gap(
@@ -355,8 +348,6 @@ def _widest_gap(
     return float(away[widest]), complex(places[widest])
 
 
-_LOGGER = "ezdxf"
-
 # Number of characters above which a library's own message is shortened.
 _REASON = 120
 
@@ -364,7 +355,7 @@ _REASON = 120
 @contextlib.contextmanager
 def silenced() -> Iterator[None]:
     """Suppress a library's log records and warnings in the `with` block, also those of NumPy."""
-    logger = logging.getLogger(_LOGGER)
+    logger = logging.getLogger("ezdxf")
     level = logger.level
     if level > logging.CRITICAL:  # Nested: entering again is slow for thousands of entities.
         yield

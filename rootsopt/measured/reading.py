@@ -106,7 +106,9 @@ def read(
             f"`profile.outline_file` must be a .csv, .txt or .dxf file, but is {name!r}; save "
             "the outline in one of these formats"
         )
-    data = _bytes(path, name)
+    data = content(path, "profile.outline_file")
+    if not data.strip():
+        raise InputError(f"{name}: must hold an outline, but is empty; export it again")
     if kind == ".dxf":
         from rootsopt.measured.dxf import from_dxf  # Imported for drawings only: it takes 0.25 s.
 
@@ -252,16 +254,6 @@ def _above(length: float) -> float:
     """Round a `length` up to two significant digits."""
     digit = 10.0 ** (math.floor(math.log10(length)) - 1)
     return math.ceil(length / digit * (1 + 1e-9)) * digit
-
-
-def _bytes(path: Path, name: str) -> bytes:
-    """Return the content of the file at `path`. `name`: name of the file in messages.
-
-    Raises `InputError` if it is not a regular file, unreadable, too large or empty."""
-    data = content(path, "profile.outline_file")
-    if not data.strip():
-        raise InputError(f"{name}: must hold an outline, but is empty; export it again")
-    return data
 
 
 def _closed(loop: Loop, name: str, unit: str | None, sought: Sought | None) -> Loop:

@@ -10,12 +10,13 @@ import functools
 import math
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 
 from rootsopt.config.plausible import USUAL
+from rootsopt.config.rotor import ProfileConfig
 from rootsopt.errors import InputError
 from rootsopt.measured.conjugacy import Conjugacy, conjugacy
 from rootsopt.measured.estimates import UNITS, Checks, Estimates, estimates, unit_of_size, written
@@ -23,9 +24,6 @@ from rootsopt.measured.fit import imported
 from rootsopt.measured.loop import JOIN, Loop
 from rootsopt.measured.reading import LOBES, Sought, lobes_of, read, untangled
 from rootsopt.profiles import Outline
-
-if TYPE_CHECKING:
-    from rootsopt.config.rotor import ProfileConfig
 
 # Deviation between flanks (µm) at or above which the user gets a note.
 _NOTABLE = 1.0
@@ -38,7 +36,7 @@ _ECCENTRIC = 1e-3
 _ROUGH = 5e-4
 
 
-def outline_of(config: "ProfileConfig") -> tuple[Outline, Checks]:
+def outline_of(config: ProfileConfig) -> tuple[Outline, Checks]:
     """Return (profile, deviations) of the outline file that a config names.
 
     Recent results are cached, so that an unchanged file is not read again. Raises `InputError` if
@@ -49,22 +47,22 @@ def outline_of(config: "ProfileConfig") -> tuple[Outline, Checks]:
         stamp = status.st_mtime_ns, status.st_size, status.st_ino
     except (OSError, ValueError):
         stamp = ()  # Ignore the error here: `read` reports it.
-    smoothing = config.outline_smoothing_mm or 0.0
-    sought = Sought(config.lobes, config.pitch_radius_mm, config.outline_center)
-    how = config.outline_unit, sought, config.outline_join_mm or JOIN
-    return _kept(path, stamp, how, smoothing)
+    smoothing, size = config.outline_smoothing_mm or 0.0, (config.lobes, config.pitch_radius_mm)
+    how = config.outline_unit, Sought(*size, config.outline_center), config.outline_join_mm or JOIN
+    return _kept(path, stamp, how, size, smoothing)
 
 
 @functools.lru_cache(maxsize=16)
-def _kept(path: Path, stamp, how: tuple[str | None, Sought, float], smoothing: float):
-    loop, sought = read(path, *how), how[1]
-    assert sought.lobes is not None
-    assert sought.pitch_radius_mm is not None
-    loop = untangled(loop, sought.lobes, sought.pitch_radius_mm)
+def _kept(
+    path: Path,
+    stamp,
+    how: tuple[str | None, Sought, float],
+    size: tuple[int, float],
+    smoothing: float,
+):
+    loop = untangled(read(path, *how), *size)
     try:
-        outline, checks = imported(
-            loop, sought.lobes, sought.pitch_radius_mm, smoothing, sought.center
-        )
+        outline, checks = imported(loop, *size, smoothing, how[1].center)
     except InputError as error:
         if not loop.notes:
             raise
@@ -72,12 +70,12 @@ def _kept(path: Path, stamp, how: tuple[str | None, Sought, float], smoothing: f
     return outline, dataclasses.replace(checks, notes=loop.notes)
 
 
-def check_center(config: "ProfileConfig") -> None:
+def check_center(config: ProfileConfig) -> None:
     """Raise `InputError` if lobes lie so far from the axis that a simulation is useless.
 
     Do not check a config that gives `outline_center`. Such a rotor has flanks that overlap or
     differ by about this distance; its motion takes minutes and means nothing."""
-    if not config.from_file or config.outline_center is not None:
+    if config.outline_center is not None:
         return
     seen = outline_of(config)[1].seen
     if (there := seen.centering()) and abs(seen.center) > _ECCENTRIC * config.pitch_radius_mm:
@@ -87,7 +85,7 @@ def check_center(config: "ProfileConfig") -> None:
         )
 
 
-def advice(config: "ProfileConfig", checks: Checks) -> list[str]:
+def advice(config: ProfileConfig, checks: Checks) -> list[str]:
     """Return notes on differing flanks, on how a file was read, and on ignored data.
 
     `config`: the profile's config; `checks`: those of its outline. Flanks that differ by `_NOTABLE`
@@ -141,12 +139,11 @@ _MM = 1e-3
 class MeasuredRotor(NamedTuple):
     """A rotor from a file.
 
-    `outline`, `checks`: profile and deviations of the outline; `mesh`: gap of two such rotors;
-    `lobes`; `radius`: pitch radius (mm); `facts`: what was found or assumed, in words."""
+    `outline`, `checks`: profile and deviations of the outline; `lobes`; `radius`: pitch radius
+    (mm); `facts`: what was found or assumed, in words."""
 
     outline: Outline
     checks: Checks
-    mesh: Conjugacy
     lobes: int
     radius: float
     facts: tuple[str, ...]
@@ -194,8 +191,7 @@ def read_rotor(
     if not known:
         radius = _rolling(outline, radius)
         outline, checks, _ = at(radius)
-    mesh = conjugacy(outline)
-    uneven = _uneven(mesh)
+    uneven = _uneven(conjugacy(outline))
     if uneven > _UNEVEN * radius * _MM:
         raise InputError(
             f"{path.name}: must hold a rotor that rolls on another one like it, but with centres "
@@ -206,7 +202,7 @@ def read_rotor(
     facts = [said, f"{lobes} lobes", f"centre distance {2 * radius:.7g} mm ({told})"]
     facts += [f"axis at {written(checks.axis)} mm in the file"] if center else []
     facts += [f"points scattered by {seen.scatter / _MM:.2g} um"] if seen.rough(0.0) else []
-    return MeasuredRotor(outline, checks, mesh, lobes, radius, (*facts, *loop.notes))
+    return MeasuredRotor(outline, checks, lobes, radius, (*facts, *loop.notes))
 
 
 def _first(call: Callable[..., Any], trials: Iterable[tuple[Any, ...]]) -> Any:

@@ -127,8 +127,8 @@ def titled(data: bytes, name: str, what: str) -> tuple[list[str], dict[int, list
 
     `data`: content of the file; `name`: name of the file, and `what`: names of its columns, for
     messages. Raises `InputError` if the table cannot be read."""
-    lines = [one for one in enumerate(_text(data, name).splitlines(), 1) if one[1].strip()]
-    lines = [(number, line) for number, line in lines if not _comment(line)]
+    numbered = enumerate(_text(data, name).splitlines(), 1)
+    lines = [(n, line) for n, line in numbered if line.strip() and not _comment(line)]
     split = next((c for c in ";\t," if lines and c in lines[0][1]), None)
     with guarded(name, "is not a table that can be read", f"save it with the columns {what}"):
         rows = {number: [cell.strip() for cell in _cells(line, split)] for number, line in lines}
@@ -136,13 +136,14 @@ def titled(data: bytes, name: str, what: str) -> tuple[list[str], dict[int, list
     return rows.pop(first, []), rows
 
 
-def measured_number(cell: str) -> float | None:
-    """Return the number in a cell;
+def measured_number(cell: str) -> float:
+    """Return the number in a cell.
 
-    NaN if it is empty or marks a missing number. Return `None` for any other text."""
+    NaN if the cell is empty or marks a missing number, infinity for any other text."""
     if not cell.strip() or _LACKING.fullmatch(cell.strip()):
         return math.nan
-    return _number(cell)
+    number = _number(cell)
+    return math.inf if number is None else number
 
 
 def _comment(line: str) -> bool:

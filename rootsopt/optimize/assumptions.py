@@ -29,6 +29,7 @@ from rootsopt.optimize.outcome import (
     Optimization,
     Piece,
     Scenes,
+    apart,
 )
 from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.sqp import Stops, descend
@@ -189,13 +190,7 @@ class _Comparison:
         """Return the first `most` of some `designs` that are far from each other.
 
         They are farther than `least` in the unit box, also from the optimum."""
-        kept, chosen = [self._point(self.designs[OPTIMIZED])], []
-        for one in designs:
-            point = self._point(one)
-            if len(chosen) < most and all(np.linalg.norm(point - x) > least for x in kept):
-                kept.append(point)
-                chosen.append(one)
-        return chosen
+        return apart(designs, least, most, self._point, [self._point(self.designs[OPTIMIZED])])
 
     def _point(self, design: Mapping[str, float]) -> NDArray[np.float64]:
         return self.problem.point([*design.values()])
@@ -230,8 +225,7 @@ class _Comparison:
         outcome = descend(look, best, stops, problem.limits_at)
         if outcome.local is None or outcome.local.violation > FEASIBLE:
             return []
-        values = self.problem.look(outcome.point)[0].tolist()
-        return [dict(zip(keys, values, strict=True))]
+        return [self.problem.named(outcome.point)]
 
 
 def _known(lead: Callable[[float], float], end: float, other: float) -> float:

@@ -13,7 +13,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,13 +29,16 @@ from rootsopt.response.records import geometry_record
 from rootsopt.response.result import Evaluation
 from rootsopt.scene.build import Scene
 from rootsopt.scene.check import shape_of
-from rootsopt.scene.families import classical, design_of, profile_from_file, profile_of
+from rootsopt.scene.families import arguments_of, classical, profile_from_file, profile_of
 from rootsopt.scene.resemblance import COEFFICIENTS, Likeness, free_likeness, likeness
 from rootsopt.scene.space import Constraint, widened
 
 if TYPE_CHECKING:
     from rootsopt.optimize.problem import Problem
 
+
+# Maximum number of points at which the search for the least violation of the constraints starts.
+_EXPLAINED = 8
 
 _STOPS = Stops(feasibility=1e-9, evaluations=300)
 
@@ -118,9 +120,10 @@ def explain(
 ) -> Infeasible:
     """Return why no design satisfies all constraints of a `problem`.
 
-    `starts`: points (d,) of the unit box from which to search for the least violation. `look`:
-    function that returns constraints and caps at a point, from a simulation. By default, only the
-    constraints of the geometry count."""
+    `starts`: points (d,) of the unit box, from the first of which (at most `_EXPLAINED`) to search
+    for the least violation. `look`: function that returns constraints and caps at a point, from a
+    simulation. By default, only the constraints of the geometry count."""
+    starts = starts[:_EXPLAINED]
     limits = () if look is None else problem.limits
     stops = _STOPS if look is None else _SIMULATED
 
@@ -146,8 +149,7 @@ def explain(
         excess = float(np.max(best.local.groups[0].values[kinds == k]))
         alone = _alone(parts, int(k), [best.point, *starts], stops)
         conflicts.append(_conflict((*problem.space.constraints, *limits)[k], excess, alone))
-    names = problem.config.design_keys
-    design = dict(zip(names, map(float, problem.design(best.point)), strict=True))
+    design = problem.named(best.point)
     return Infeasible(best.local.objective, tuple(conflicts), design, look is not None)
 
 
@@ -295,8 +297,7 @@ def beginning(config: Config) -> Beginning | None:
     if given is None:
         if wanted in (NEAREST, own.family):
             return None
-        radius = jnp.asarray(own.pitch_radius_mm * MM)
-        given = profile_of(own.family, own.lobes, radius, design_of(own))
+        given = profile_of(*arguments_of(own))
     members = _fits(given, wanted)
     for one in members:
         try:

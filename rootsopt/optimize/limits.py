@@ -98,7 +98,7 @@ class ForceLimit(NamedTuple):
     @property
     def scale(self) -> float:
         """Divisor for the distance from the limit: the limit's magnitude, or 1 if this is 0."""
-        return scale_of(self.limit)
+        return abs(self.limit) or 1.0
 
     @property
     def cornered(self) -> bool:
@@ -108,11 +108,6 @@ class ForceLimit(NamedTuple):
     def excess(self, value):
         """Return how far values exceed the limit, divided by `scale`; ≤ 0 if they satisfy it."""
         return self.sign * (value - self.limit) / self.scale
-
-
-def scale_of(limit: float) -> float:
-    """Return the magnitude of a `limit`, 1 if it is 0."""
-    return abs(limit) or 1.0
 
 
 def limited(config: Config) -> Config:
@@ -160,7 +155,7 @@ def term_constraints(config: Config, scene: Scene) -> tuple[TermConstraint, ...]
         if depends_on_forces(config, scene, name, LIMITS):
             continue
         (term,) = terms_of([name], LIMITS)
-        row = words(name), name, unit_of(name), jnp.asarray(limit), scale_of(limit), 1.0
+        row = words(name), name, unit_of(name), jnp.asarray(limit), abs(limit) or 1.0, 1.0
         constraints.append(TermConstraint(*row, ceiling=ceiling, term=term))
     return tuple(constraints)
 
@@ -208,15 +203,10 @@ _slacks_of = CachedFunction(Space.slacks_of)
 def needs_maxima(config: Config, limits: Sequence[ForceLimit]) -> bool:
     """Return whether evaluations need all local maxima of the force.
 
-    They do if the objective of `config` contains the peak force of single motions. They also do if
-    one of its `limits` is a ceiling of this force."""
+    They do if the objective of `config` contains the peak force of single motions, not an average
+    over many. They also do if one of its `limits` is a ceiling of this force."""
     cornered = PEAK in objective_weights(config) or any(one.cornered for one in limits)
-    return cornered and of_motions(config)
-
-
-def of_motions(config: Config) -> bool:
-    """Return whether the objective contains forces of single motions, not averages over many."""
-    return config.objective.motion in ("reached", "worst")
+    return cornered and config.objective.motion in ("reached", "worst")
 
 
 def counting(evaluation: Evaluation) -> list[tuple[int, Evaluation]]:
@@ -405,11 +395,6 @@ def _limited_value(problem: "Problem", evaluation: Evaluation, k: int) -> float:
         return evaluation.geometry.get(key, math.nan)
     if tuple(evaluation.design) != tuple(problem.config.design_keys):
         return math.nan
-    slack = float(_slacks(problem, evaluation)[k])
-    return (float(one.limit) + one.sign * slack * one.scale) / one.factor
-
-
-def _slacks(problem: "Problem", evaluation: Evaluation) -> NDArray[np.float64]:
-    """Return the scaled slacks (m,) of all constraints for an evaluated design."""
     design = np.asarray(list(evaluation.design.values()), dtype=np.float64)
-    return np.asarray(_slacks_of(problem.space, design))
+    slack = float(np.asarray(_slacks_of(problem.space, design))[k])
+    return (float(one.limit) + one.sign * slack * one.scale) / one.factor

@@ -158,11 +158,10 @@ class Certificate(NamedTuple):
         return self.residual <= tolerance and self.violation <= feasibility
 
 
-def certify(local: Linearization, point: NDArray[np.float64], near: float = NEAR) -> Certificate:
+def certify(local: Linearization, point: NDArray[np.float64]) -> Certificate:
     """Return the certificate of a `point` (d,) of the unit box.
 
-    `local`: objective and constraints at the point, with gradients. `near`: distance above which
-    limits and branches cannot be active, as in `NEAR`."""
+    `local`: objective and constraints at the point, with gradients."""
     from scipy.optimize import nnls  # Slow import (0.3 s).
 
     size, rows = len(point), []
@@ -170,18 +169,18 @@ def certify(local: Linearization, point: NDArray[np.float64], near: float = NEAR
     chosen: list[NDArray[np.bool_]] = []
     for group in local.groups:
         gap = group.top - group.values
-        chosen.append(gap <= near)
+        chosen.append(gap <= NEAR)
         rows.append(group.slopes[chosen[-1]])
         gaps.append(gap[chosen[-1]])
     long = np.linalg.norm(local.normals, axis=1) > _NEGLIGIBLE
     limits = [
-        ((local.slack <= near) & long, -local.normals, np.maximum(local.slack, 0.0)),
-        (point <= near, -np.eye(size), point),
-        (1 - point <= near, np.eye(size), 1 - point),
+        ((local.slack <= NEAR) & long, -local.normals, np.maximum(local.slack, 0.0)),
+        (point <= NEAR, -np.eye(size), point),
+        (1 - point <= NEAR, np.eye(size), 1 - point),
     ]
     for cap in local.caps:
         steep = np.linalg.norm(cap.slopes, axis=1) > _NEGLIGIBLE
-        limits.append(((-cap.values <= near) & steep, cap.slopes, np.maximum(-cap.values, 0.0)))
+        limits.append(((-cap.values <= NEAR) & steep, cap.slopes, np.maximum(-cap.values, 0.0)))
     for active, normals, gap in limits:
         rows.append(normals[active])
         gaps.append(gap[active])

@@ -10,15 +10,16 @@ accepted if its objective is lower than the baseline's by more than `SIGNIFICANT
 errors."""
 
 import dataclasses
+import operator
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
 from rootsopt.optimize.local import FEASIBLE
-from rootsopt.optimize.outcome import Trial
+from rootsopt.optimize.outcome import Optimization, Trial, apart
 from rootsopt.optimize.problem import Problem
 from rootsopt.response.ensemble import SIGNIFICANT, independent
 from rootsopt.response.evaluation import Evaluator
@@ -95,22 +96,6 @@ def _update(iterations, slope, state):
     return _rule(iterations).update(slope, state)
 
 
-class Verification(NamedTuple):
-    """Outcome of a verification.
-
-    `baseline`: evaluation of the baseline over the third ensemble, which decides. `problem`: the
-    design problem relative to this baseline. `optimized`: evaluation of the best candidate over the
-    same ensemble, or `None` if it was not accepted. `record`: entries for the result file.
-
-    If no candidate is usable, `problem` and `baseline` are those of the search. If only the new
-    evaluation of the baseline is not usable, `problem` is that of the search."""
-
-    problem: Problem
-    baseline: Evaluation
-    optimized: Evaluation | None
-    record: dict[str, Any]
-
-
 def standard_error(problem: Problem, evaluation: Evaluation) -> float:
     """Return the standard error of an evaluation's objective; NaN without a usable steady state.
 
@@ -130,11 +115,16 @@ def add_errors(rows: list[dict[str, Any]], trials: Sequence, problem: Problem) -
         row["objective_standard_error"] = standard_error(problem, trial.evaluation)
 
 
-def verify(problem: Problem, evaluator: Evaluator, trials: Sequence) -> Verification:
+def verify(problem: Problem, evaluator: Evaluator, trials: Sequence) -> Optimization:
     """Choose the best design with a second ensemble; compare it with the baseline in a third.
 
     `problem`, `evaluator`, `trials`: those of the search. The second and third ensembles are larger
-    than that of the search. Gradients come from ensembles of the search's size."""
+    than that of the search. Gradients come from ensembles of the search's size.
+
+    Return the outcome, without history. Its `baseline` is evaluated over the third ensemble, which
+    decides. Its `problem` is relative to this baseline. Its `optimized` design is evaluated over
+    the same ensemble. If no candidate is usable, `problem` and `baseline` are those of the search.
+    If only the new evaluation of the baseline is not usable, `problem` is that of the search."""
     chooser, judge = (independent(evaluator, k).without_gradient() for k in (1, 2))
     settings = judge.config.ensemble
     record: dict[str, Any] = {
@@ -153,11 +143,11 @@ def verify(problem: Problem, evaluator: Evaluator, trials: Sequence) -> Verifica
     ]
     tried = [one for one in tried if np.isfinite(one[0])]
     if not tried:
-        return Verification(problem, problem.baseline, None, record)
+        return Optimization(problem, problem.baseline, None, [], record)
     _, searched, point = min(tried, key=lambda one: one[0])
     baseline = judge(jnp.asarray(list(problem.baseline.design.values())))
     if not baseline.usable:
-        return Verification(problem, baseline, None, record)
+        return Optimization(problem, baseline, None, [], record)
     baseline = _with_gradient(baseline, problem.baseline)
     renewed = dataclasses.replace(problem, baseline=baseline)
     evaluation = judge(problem.design(point))
@@ -173,9 +163,9 @@ def verify(problem: Problem, evaluator: Evaluator, trials: Sequence) -> Verifica
         "holds_up": holds,
     }
     if not holds:
-        return Verification(renewed, baseline, None, record | {"design": evaluation.design})
+        return Optimization(renewed, baseline, None, [], record | {"design": evaluation.design})
     search = evaluator(problem.design(point), series=False)
-    return Verification(renewed, baseline, _with_gradient(evaluation, search), record)
+    return Optimization(renewed, baseline, _with_gradient(evaluation, search), [], record)
 
 
 def _with_gradient(evaluation: Evaluation, other: Evaluation) -> Evaluation:
@@ -204,12 +194,8 @@ def candidates(problem: Problem, trials: Sequence) -> list[tuple[float, NDArray[
         error = float(np.linalg.norm(errors[near])) / np.sum(near)
         ranked.append((mean + error, mean, point))
     ranked.sort(key=lambda entry: entry[0])
-    chosen: list[tuple[float, NDArray[np.float64]]] = []
-    for _, mean, point in ranked:
-        apart = all(np.linalg.norm(point - other) > _NEAR for _, other in chosen)
-        if apart and mean < 1 and len(chosen) < _CANDIDATES:
-            chosen.append((mean, point))
-    return chosen
+    better = [(mean, point) for _, mean, point in ranked if mean < 1]
+    return apart(better, _NEAR, _CANDIDATES, operator.itemgetter(1))
 
 
 def most_promising(problem: Problem, trials: Sequence) -> Any:
@@ -224,7 +210,8 @@ def most_promising(problem: Problem, trials: Sequence) -> Any:
 def message(record: dict[str, Any]) -> str:
     """Return a message for the user on why no design was confirmed over an ensemble.
 
-    `record`: `Verification.record`. Return "" for the record of a search without an ensemble."""
+    `record`: field `verification` of an `Optimization`. Return "" for that of a search without an
+    ensemble."""
     if "required_standard_errors" not in record:
         return ""
     advice = (

@@ -133,15 +133,13 @@ class Optimum(NamedTuple):
 class Optimality:
     """Facts about the optimum of a search.
 
-    `method`: method of the local searches. `certificate`: first-order conditions at the verified
-    design. `reason`: "converged", or a word for why the search had not. `promised`: relative
-    decrease of the objective that the search still expected nearby, NaN if not known. `holders`:
-    branches of the objective that are active there. `starts`: outcomes of the local searches.
-    `sensitivities`: one row per quantity of the scene, with its effect on the forces. `bound`:
-    lower bound over all designs, or `None`. `vertex`: other vertices of the limits if the optimum
-    is at one, else `None`."""
+    `certificate`: first-order conditions at the verified design. `reason`: "converged", or a word
+    for why the search had not. `promised`: relative decrease of the objective that the search still
+    expected nearby, NaN if not known. `holders`: branches of the objective that are active there.
+    `starts`: outcomes of the local searches. `sensitivities`: one row per quantity of the scene,
+    with its effect on the forces. `bound`: lower bound over all designs, or `None`. `vertex`: other
+    vertices of the limits if the optimum is at one, else `None`."""
 
-    method: str
     certificate: Certificate
     reason: str
     promised: float
@@ -175,7 +173,7 @@ class Optimality:
         if self.bound is None or not self.bound.proven:
             whole["unseen"] = unseen(sum(one.found for one in optima), len(optima))
         return whole | {
-            "method": self.method,
+            "method": "slsqp",
             "converged": self.converged,
             "reason": self.reason,
             "message": self.message,
@@ -240,8 +238,11 @@ def unseen(searches: int, optima: int) -> dict[str, float | None]:
     The formulas assume that the starts are drawn independently and that the number of optima is not
     known beforehand. Source: Boender and Rinnooy Kan, Bayesian stopping rules for multistart global
     optimization methods, Mathematical Programming 37 (1987) 59-80."""
-    count, n = optima, searches
-    expected = count * (n - 1) / (n - count - 2) if n > count + 2 else None
-    share = count * (count + 1) / (n * (n - 1)) if n > 1 else 1.0
-    share = share if share < 1.0 else None
-    return {"searches": n, "optima": count, "expected_optima": expected, "share_of_starts": share}
+    n, w = searches, optima
+    share = w * (w + 1) / (n * (n - 1)) if n > 1 else 1.0
+    return {
+        "searches": n,
+        "optima": w,
+        "expected_optima": w * (n - 1) / (n - w - 2) if n > w + 2 else None,
+        "share_of_starts": share if share < 1.0 else None,
+    }

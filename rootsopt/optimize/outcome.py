@@ -6,13 +6,12 @@ import dataclasses
 import itertools
 import math
 import operator
-from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.config.reading import Config
 from rootsopt.config.tolerances import Span
 from rootsopt.optimize.infeasible import Beginning, Infeasible
 from rootsopt.optimize.limits import constraint_rows
@@ -27,6 +26,7 @@ if TYPE_CHECKING:
     from rootsopt.optimize.problem import Problem
     from rootsopt.optimize.robust import Robustness
 
+Item = TypeVar("Item")
 Progress = Callable[[int, int, float], None]
 """Type of a progress callback, with arguments (evaluations done, evaluations expected, best
 objective)."""
@@ -229,11 +229,6 @@ def history_of(trials: list[Trial]) -> list[dict[str, Any]]:
     return rows
 
 
-def method_of(config: Config) -> str:
-    """Return the method of the local searches: Adam's rule for averages, which have noise."""
-    return "adam" if config.objective.motion == "ensemble" else "slsqp"
-
-
 def ranked(trials: list[Trial]) -> list[NDArray[np.float64]]:
     """Return the screened points at which a local search may begin, best first.
 
@@ -244,14 +239,22 @@ def ranked(trials: list[Trial]) -> list[NDArray[np.float64]]:
 
 
 def apart(
-    points: Sequence[NDArray[np.float64]], least: float, most: int
-) -> list[NDArray[np.float64]]:
-    """Return the first of the `points` (d,), at most `most`, that are more than `least` apart."""
-    chosen: list[NDArray[np.float64]] = []
-    for point in points:
-        far = all(np.linalg.norm(point - other) > least for other in chosen)
-        if far and len(chosen) < most:
-            chosen.append(point)
+    items: Iterable[Item],
+    least: float,
+    most: int,
+    point_of: Callable[[Any], NDArray[np.float64]] = lambda one: one,
+    others: Iterable[NDArray[np.float64]] = (),
+) -> list[Item]:
+    """Return the first of the `items`, at most `most`, whose points are more than `least` apart.
+
+    `point_of`: function that returns the point (d,) of an item, by default the item itself;
+    `others`: further points (d,) from which they are as far."""
+    chosen, points = [], [*others]
+    for one in items:
+        point = point_of(one)
+        if len(chosen) < most and all(np.linalg.norm(point - other) > least for other in points):
+            chosen.append(one)
+            points.append(point)
     return chosen
 
 

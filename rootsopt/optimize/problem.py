@@ -22,7 +22,6 @@ from rootsopt.optimize.limits import (
     counting,
     force_limits,
     needs_maxima,
-    of_motions,
     scaled_slack,
     settled_by,
     term_constraints,
@@ -48,11 +47,7 @@ _LEAST = 0.1
 # Maximum number of times that an infeasible point is moved halfway towards a feasible point.
 _DRAWN = 5
 
-
-@CachedFunction
-def _nearest(space: Space, design):
-    """Return the point (d,) of the unit box nearest to a `design` (d,) in config units."""
-    return space.point(design)
+_nearest = CachedFunction(Space.point)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -191,7 +186,7 @@ class Problem:
         _, jacobian, slack, normals = self.look(point)
         worst = self.config.objective.over_speeds == "worst"
         # The same groups at every point, even if one of them has a single branch.
-        cornered = self.cornered or self.config.objective.motion == "worst"
+        cornered = needs_maxima(self.config, ()) or self.config.objective.motion == "worst"
         parts = zip(evaluation.by_speed, self.baseline.by_speed, strict=True)
         smooth, slope = self.added, np.zeros(len(self.space.lower))
         groups: list[Group] = []
@@ -273,10 +268,9 @@ class Problem:
             for k, one in enumerate(self.space.constraints)
             if scaled_slack(self, evaluation, k) < -FEASIBLE
         ]
-        for one in self.limits:
-            if evaluation.usable and one.excess(self.worst(evaluation, one)) > FEASIBLE:
-                names.append(one.name)
-        return names
+        limits = self.limits if evaluation.usable else ()
+        beyond = [one for one in limits if one.excess(self.worst(evaluation, one)) > FEASIBLE]
+        return names + [one.name for one in beyond]
 
     def along_scene(self, moved: Evaluation, certificate: Certificate) -> dict[str, float]:
         """Return the derivatives of the optimal objective with respect to scene quantities, by key.
@@ -292,11 +286,6 @@ class Problem:
         shares = certificate.shares[0] if certificate.shares else np.ones(1)
         keys = next(iter(moved.gradient.values()))
         return dict(zip(keys, map(float, shares @ group.slopes), strict=True))
-
-    @property
-    def cornered(self) -> bool:
-        """Whether the objective contains the peak force of single motions, which has corners."""
-        return PEAK in objective_weights(self.config) and of_motions(self.config)
 
     def _branches(self, evaluation: Evaluation, baseline: Evaluation, number: int) -> Group:
         """Return the objective at one speed as branches, with gradients in config units.
@@ -348,6 +337,10 @@ class Problem:
     def design(self, point) -> Float[Array, " d"]:
         """Return the design (d,) in config units at a `point` (d,)."""
         return jnp.asarray(self.look(point)[0])
+
+    def named(self, point) -> dict[str, float]:
+        """Return the design at a `point` (d,), in config units by key."""
+        return dict(zip(self.config.design_keys, self.look(point)[0].tolist(), strict=True))
 
     def feasible(self, point) -> bool:
         """Return whether a `point` (d,) satisfies every constraint within `FEASIBLE`."""

@@ -17,7 +17,6 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from rootsopt.config.reading import Config
-from rootsopt.config.study import OptimizerConfig
 from rootsopt.config.tolerances import scatterable
 from rootsopt.errors import InputError
 from rootsopt.optimize.assumptions import compared
@@ -134,6 +133,7 @@ class RobustStage(Stage):
 
     apart = 0.03
     bounded = False
+    screens = False
 
     def __init__(
         self,
@@ -144,9 +144,6 @@ class RobustStage(Stage):
     ):
         self.nominal, self.first, self.others, self.offsets = nominal, first, others, offsets
         self._shares: dict[int, NDArray[np.float64]] = {}
-
-    def settings(self, given: OptimizerConfig) -> OptimizerConfig:
-        return given.model_copy(update={"screening": 0})
 
     def evaluator(self, exact: Evaluator, runs: Runs) -> Evaluator:
         return exact.scattered(runs)
@@ -172,11 +169,9 @@ class RobustStage(Stage):
         assert isinstance(problem, RobustProblem)
         if not evaluation.usable:
             return None
-        shares = self._shares.get(start)
-        if shares is None:
-            shares = problem.shares(problem.combined(evaluation).weights)
-            self._shares[start] = shares
-        return problem.local(evaluation, point, shares)
+        if start not in self._shares:
+            self._shares[start] = np.maximum(problem.combined(evaluation).weights, 0.0)
+        return problem.local(evaluation, point, self._shares[start])
 
 
 class StagedSearch:
@@ -374,13 +369,11 @@ def _scattered(
     for row, one in zip(rows, evaluations, strict=True):
         if one.usable:
             row[:] = problem.objective(one), *(one.response.get(name, np.nan) for name in RESPONSES)
-    columns = rows.T
-    values: dict[str, NDArray[np.float64]] = dict(zip(COMPARED, columns, strict=True))
+    values: dict[str, NDArray[np.float64]] = dict(zip(COMPARED, rows.T, strict=True))
     usable = np.isfinite(values[OBJECTIVE])
-    assert problem.config.tolerances is not None
     combined = float("nan")
     if usable.any():
-        combined = combine(problem.config.tolerances, values[OBJECTIVE][usable]).value
+        combined = combine(problem.rule, values[OBJECTIVE][usable]).value
     counts = {label: labels.count(label) for label in dict.fromkeys(labels)}
     return Scattered(values, counts, combined)
 

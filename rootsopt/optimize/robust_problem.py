@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from rootsopt.config.reading import Config
 from rootsopt.config.study import OptimizerConfig
-from rootsopt.optimize.limits import SCENE_KINDS, ForceLimit, settled_by
+from rootsopt.config.tolerances import TolerancesConfig
+from rootsopt.optimize.limits import HELD, SCENE_KINDS, ForceLimit, settled_by
 from rootsopt.optimize.local import Certificate, Group, Linearization
 from rootsopt.optimize.optimality import Holder
 from rootsopt.optimize.problem import Problem
@@ -22,9 +23,6 @@ from rootsopt.response.reducers import Combined, Runs, combine
 from rootsopt.response.result import Evaluation
 from rootsopt.scene.build import Scene
 from rootsopt.scene.space import sobol
-
-# Share of a scene below which the scene does not count as active at the optimum.
-_HELD = 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,6 +53,12 @@ class RobustProblem(Problem):
         robust = cls(*given, offsets=offsets, bases=bases)
         return dataclasses.replace(robust, reference=robust.combined(baseline).value)
 
+    @property
+    def rule(self) -> TolerancesConfig:
+        """How the scenes of the sample are combined."""
+        assert self.config.tolerances is not None
+        return self.config.tolerances
+
     def _each(self, evaluation: Evaluation) -> Iterator[tuple[Problem, Evaluation, float]]:
         """Yield (problem, evaluation, offset) of every scene of the sample."""
         for k, part in enumerate(evaluation.samples):
@@ -71,8 +75,7 @@ class RobustProblem(Problem):
         """Return the combination of the objectives in all scenes, with its weights.
 
         It is not yet divided by that of the baseline."""
-        assert self.config.tolerances is not None
-        return combine(self.config.tolerances, self.values(evaluation))
+        return combine(self.rule, self.values(evaluation))
 
     def objective(self, evaluation: Evaluation) -> float:
         """Return the robust objective of an `evaluation`, which is 1 for the baseline.
@@ -107,17 +110,16 @@ class RobustProblem(Problem):
             return super().local(evaluation, point)
         if not evaluation.usable:
             return None
-        assert self.config.tolerances is not None
         parts = [
             local._replace(smooth=local.smooth + add)
             for one, e, add in self._each(evaluation)
             if (local := one.local(e, point)) is not None
         ]
         caps = self.caps(evaluation, self.look(point)[1]) if self.limits else ()
-        if self.config.tolerances.combine == "worst":
+        if self.rule.combine == "worst":
             return self._worst(parts)._replace(caps=caps)
-        value, weights = combine(self.config.tolerances, [part.objective for part in parts])
-        shares = self.shares(weights) if shares is None else shares
+        value, weights = combine(self.rule, [part.objective for part in parts])
+        shares = np.maximum(weights, 0.0) if shares is None else shares
         smooth, slope = value, np.zeros_like(parts[0].slope)
         groups: list[Group] = []
         for part, weight, share in zip(parts, weights, shares, strict=True):
@@ -137,17 +139,16 @@ class RobustProblem(Problem):
 
         If limits hold for the combination of the scenes, this combination is the only branch of a
         cap. Its gradient is that of the greatest branch in each scene."""
-        if not (evaluation.scenes and self._combines_limits):
+        if not evaluation.scenes or self.rule.limits != "combined":
             return super().caps(evaluation, jacobian)
         caps = [
             super(RobustProblem, self).caps(part.evaluation, jacobian)
             for part in evaluation.samples
         ]
-        return tuple(map(self._combined_wall, zip(*caps, strict=True)))
+        return tuple(map(self._combined_cap, zip(*caps, strict=True)))
 
-    def _combined_wall(self, groups: Sequence[Group]) -> Group:
-        assert self.config.tolerances is not None
-        value, weights = combine(self.config.tolerances, [group.top for group in groups])
+    def _combined_cap(self, groups: Sequence[Group]) -> Group:
+        value, weights = combine(self.rule, [group.top for group in groups])
         slopes = np.array([group.slopes[np.argmax(group.values)] for group in groups])
         return Group(np.zeros((1, 2)), np.array([value]), (weights @ slopes)[None, :])
 
@@ -155,19 +156,10 @@ class RobustProblem(Problem):
         """Return the value of a limited quantity that must satisfy its `limit`.
 
         It is the worst of all scenes, or their combination. `evaluation`: usable."""
-        if not (evaluation.scenes and self._combines_limits):
+        if not evaluation.scenes or self.rule.limits != "combined":
             return super().worst(evaluation, limit)
-        assert self.config.tolerances is not None
         every = [super(RobustProblem, self).worst(p.evaluation, limit) for p in evaluation.samples]
-        return limit.sign * combine(self.config.tolerances, limit.sign * np.array(every)).value
-
-    @property
-    def _combines_limits(self) -> bool:
-        return self.config.tolerances is not None and self.config.tolerances.limits == "combined"
-
-    def shares(self, weights: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the shares (n,) with which the maxima of each scene become groups in `local`."""
-        return np.maximum(weights, 0.0)
+        return limit.sign * combine(self.rule, limit.sign * np.array(every)).value
 
     def _worst(self, parts: list[Linearization]) -> Linearization:
         branches = [self._scaled(_branches(part, SCENE_KINDS * k)) for k, part in enumerate(parts)]
@@ -186,8 +178,7 @@ class RobustProblem(Problem):
         `certificate`: those of the optimum."""
         if not evaluation.scenes:
             return super().held_by(evaluation, certificate)
-        assert self.config.tolerances is not None
-        if self.config.tolerances.combine != "worst" or not certificate.shares:
+        if self.rule.combine != "worst" or not certificate.shares:
             return []
         point = self.point(list(evaluation.design.values()))
         local = self.local(evaluation, point)
@@ -195,7 +186,7 @@ class RobustProblem(Problem):
         (group,), (shares,) = local.groups, certificate.shares
         scenes = (group.tags[:, 0] // SCENE_KINDS).astype(int)
         held = []
-        for scene in np.unique(scenes[shares > _HELD]):
+        for scene in np.unique(scenes[shares > HELD]):
             mine = scenes == scene
             top, share = float(np.max(group.values[mine])), float(np.sum(shares[mine]))
             nothing = float("nan")
@@ -209,15 +200,13 @@ class Stage:
     The base class is the usual search.
 
     `first`: index of the first local search; `apart`: distance between their starts in the unit
-    box; `bounded`: whether the stage may look for a lower bound."""
+    box; `bounded`: whether the stage may look for a lower bound; `screens`: whether designs are
+    screened."""
 
     first = 0
     apart = 0.15
     bounded = True
-
-    def settings(self, given: OptimizerConfig) -> OptimizerConfig:
-        """Return the settings of the stage; `given`: those of the config."""
-        return given
+    screens = True
 
     def evaluator(self, exact: Evaluator, runs: Runs) -> Evaluator:
         """Return the evaluator of the stage; `exact`: that of the config's objective."""

@@ -34,7 +34,6 @@ from rootsopt.optimize.outcome import (
     apart,
     candidate,
     history_of,
-    method_of,
     near,
     objective,
     ranked,
@@ -51,10 +50,8 @@ from rootsopt.response.still import Still, needed_motion
 from rootsopt.runtime.threads import POLL
 from rootsopt.scene.space import Space
 
-# Maximum number of points at which the search for the least violation of the constraints starts.
-_EXPLAINED = 8
-
-# Maximum number of these points if each must be simulated.
+# Maximum number of points at which the search for the least violation of the limits starts if each
+# point must be simulated.
 _SIMULATED = 3
 
 # Start of the trials of a lower bound, in place of the index of a local search.
@@ -113,9 +110,9 @@ class Search:
             config = config.replaced({"objective.motion": "reached"})
             self.given = self.given.replaced({"objective.motion": "reached"})
         self.config = config
-        self.settings = self.stage.settings(config.optimizer)
+        changes = {} if self.stage.screens else {"screening": 0}
+        self.settings = config.optimizer.model_copy(update=changes)
         self.progress = progress or (lambda done, expected, best: None)
-        self.method = method_of(config)
         self.expected = self.settings.screening + self.settings.starts * (
             self.settings.iterations + 1
         )
@@ -175,9 +172,10 @@ class Search:
         sample = self.stage.sample(self.problem, start, self.settings)
         points = [point for point in sample if self.problem.feasible(point)]
         if not points:
-            reason = explain(self.problem, sample[:_EXPLAINED])
-            nothing = None, [], {}, self.stop.is_set(), None, reason
-            return Optimization(self.problem, baseline, *nothing)
+            reason = explain(self.problem, sample)
+            return Optimization(
+                self.problem, baseline, None, [], {}, self.stop.is_set(), infeasible=reason
+            )
         trials: list[Trial] = []
         if self.settings.screening:
             trials = self._side_by_side(self._screen, list(enumerate(points)))
@@ -194,16 +192,14 @@ class Search:
         if self.noisy:
             noise.add_errors(rows, trials, self.problem)
             outcome = noise.verify(self.problem, self.exact, trials)
-            settled = outcome.problem, outcome.baseline, outcome.optimized, rows, outcome.record
-            return Optimization(*settled, self.stop.is_set())
+            return dataclasses.replace(outcome, history=rows, interrupted=self.stop.is_set())
         if self.problem.limits and not any(trial.candidate for trial in trials):
             reason = None if self.stop.is_set() else self._unmet(points)
             return Optimization(
-                self.problem, baseline, None, rows, {}, self.stop.is_set(), None, reason
+                self.problem, baseline, None, rows, {}, self.stop.is_set(), infeasible=reason
             )
         verification = self._verification()
         optimized, record = verification.confirmed(trials)
-        settled = self.problem, baseline, optimized, rows, record
         optimality = None if optimized is None else verification.optimality(optimized, trials)
         if optimality is not None and optimized is not None and bounding is not None:
             bound = bounding.bound(self.problem.objective(optimized))
@@ -211,7 +207,9 @@ class Search:
         if optimality is not None and optimized is not None and optimality.converged:
             vertex = self._vertex(optimized, trials)
             optimality = dataclasses.replace(optimality, vertex=vertex)
-        return Optimization(*settled, self.stop.is_set(), optimality)
+        return Optimization(
+            self.problem, baseline, optimized, rows, record, self.stop.is_set(), optimality
+        )
 
     def _starts(self, points: list[NDArray[np.float64]], trials: list[Trial]) -> list[NDArray]:
         """Return where the local searches begin, apart from each other.
@@ -296,9 +294,8 @@ class Search:
         return self._side_by_side(evaluated, tasks)
 
     def _verification(self) -> Verification:
-        tolerance, asked = self.config.solver.orbit_tolerance, self.stop.is_set
-        outcome = self.method, self._bar, asked, self._descents, self._refuted
-        return Verification(self.problem, self.exact, tolerance, *outcome)
+        outcome = self._bar, self.stop.is_set, self._descents, self._refuted
+        return Verification(self.problem, self.exact, *outcome)
 
     def so_far(self) -> Optimization | None:
         """Return the results of the search so far, without verification.
@@ -307,9 +304,6 @@ class Search:
         during the search."""
         if self._baseline is None:
             return None
-        return dataclasses.replace(self._so_far(self._baseline), beginning=self.beginning)
-
-    def _so_far(self, baseline: Evaluation) -> Optimization:
         trials = self._in_order()
         rows = history_of(trials)
         better = [
@@ -324,14 +318,17 @@ class Search:
             noise.add_errors(rows, trials, self.problem)
             best = noise.most_promising(self.problem, trials)
         verification: dict[str, Any] = {"holds_up": None, "rejected": []}
-        if best is None:
-            return Optimization(self.problem, baseline, None, rows, verification, True)
-        verification |= {
-            "searched_objective": best.objective,
-            "verified_objective": None,
-            "status": best.evaluation.status.label,
-        }
-        return Optimization(self.problem, baseline, best.evaluation, rows, verification, True)
+        if best is not None:
+            verification |= {
+                "searched_objective": best.objective,
+                "verified_objective": None,
+                "status": best.evaluation.status.label,
+            }
+        optimized = None if best is None else best.evaluation
+        return Optimization(
+            self.problem, self._baseline, optimized, rows, verification, True,
+            beginning=self.beginning,
+        )  # fmt: skip
 
     def _in_order(self) -> list[Trial]:
         """Return all trials so far: those of the screening, then those of each local search."""
@@ -427,15 +424,13 @@ class Search:
         checkpoint, by default (`start`, `iteration`)."""
         point = np.array(point, dtype=np.float64)
         key = (start, iteration) if key is None else key
-        kept = None if self.checkpoint is None else self.checkpoint.known(key, point)
-        if kept is None:
+        evaluation = None if self.checkpoint is None else self.checkpoint.known(key, point)
+        if evaluation is None:
             # A sample is distributed by its evaluator.
             runs = HERE if evaluator.shifts else self.runs
             evaluation = runs.evaluated(Point(evaluator, self.problem.design(point), orbit))
             if self.checkpoint is not None:
                 self.checkpoint.keep(key, point, evaluation)
-        else:
-            evaluation = kept
         objective = self.problem.objective(evaluation)
         feasible, excess = self.problem.feasible(point), self.problem.excess(evaluation)
         local = None

@@ -44,16 +44,14 @@ _MEETS = 1e-4
 class Verification:
     """Verifies the results of a search.
 
-    `problem`: design problem; `exact`: evaluator from rest; `tolerance` of its orbits; `method` of
-    the local searches; `bar`: objective that a design must be below; `asked`: whether the search
-    should end; `descents`: what each local search by sequential quadratic programming has found;
-    `refuted`: points that did not hold up, extended by the verification.
+    `problem`: design problem; `exact`: evaluator from rest; `bar`: objective that a design must be
+    below; `asked`: whether the search should end; `descents`: what each local search by sequential
+    quadratic programming has found; `refuted`: points that did not hold up, extended by the
+    verification.
     """
 
     problem: Problem
     exact: Evaluator
-    tolerance: float
-    method: str
     bar: float
     asked: Callable[[], bool]
     descents: Mapping[int, Descent]
@@ -109,7 +107,7 @@ class Verification:
 
         An orbit can fail a check of accuracy at a design although all its neighbours pass."""
         yield self.exact, point
-        yield self.exact.at_tolerance(_SHARPER * self.tolerance), point
+        yield self.exact.at_tolerance(_SHARPER * self.exact.config.solver.orbit_tolerance), point
         for beside in self.problem.nearby(point, _BESIDE):
             yield self.exact, beside
 
@@ -124,7 +122,7 @@ class Verification:
         certificate = certify(local, point)
         if not certificate.holds(RESIDUAL, FEASIBLE) and not self.asked():
             # The gradients may be less accurate than the residual requires.
-            sharper = self.exact.at_tolerance(_SHARPER * self.tolerance)
+            sharper = self.exact.at_tolerance(_SHARPER * self.exact.config.solver.orbit_tolerance)
             again = sharper(self.problem.design(point), start=optimized.start, series=False)
             end = self.problem.local(again, point)
             if end is not None and (other := certify(end, point)).residual < RESIDUAL:
@@ -140,7 +138,7 @@ class Verification:
         starts = [self._outcome(number, end) for number, end in ends]
         starts = starts or self._ends(trials)
         rows = self._sensitivities(optimized, certificate)
-        return Optimality(self.method, certificate, reason, promised, held, starts, rows)
+        return Optimality(certificate, reason, promised, held, starts, rows)
 
     def _sensitivities(self, optimized: Evaluation, certificate: Certificate) -> list[dict]:
         """Return one row per scene quantity, with its effect on forces and objective.
@@ -169,8 +167,7 @@ class Verification:
         """Return the outcome of a local search by sequential quadratic programming.
 
         `number`: index of the search; `end`: what it found at its end."""
-        certificate, local = end.certificate, end.local
-        reason = end.reason
+        certificate, local, reason = end.certificate, end.local, end.reason
         met = local is not None and local.violation <= FEASIBLE
         if local is not None and not met and reason != "interrupted":
             reason = "infeasible"
@@ -180,7 +177,7 @@ class Verification:
             residual=float("nan") if certificate is None else certificate.residual,
             reason=reason,
             evaluations=end.evaluations,
-            design=self._named(end.point),
+            design=self.problem.named(end.point),
             point=end.point,
         )
 
@@ -194,13 +191,9 @@ class Verification:
         for number, every in sorted(starts.items()):
             best = min(filter(candidate, every), key=objective, default=every[0])
             outcome = best.objective, best.residual, "descent", len(every)
-            outcomes.append(StartOutcome(number, *outcome, self._named(best.point), best.point))
+            design = self.problem.named(best.point)
+            outcomes.append(StartOutcome(number, *outcome, design, best.point))
         return outcomes
-
-    def _named(self, point) -> dict[str, float]:
-        """Return the design at a `point` (d,), in config units by key."""
-        values = self.problem.look(point)[0].tolist()
-        return dict(zip(self.problem.config.design_keys, values, strict=True))
 
 
 ERROR = 0.01

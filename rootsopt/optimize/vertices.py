@@ -241,7 +241,7 @@ def vertex_optimum(
     limits += [f"{side} bound of {words(key)}" for side in ("lower", "upper") for key in keys]
     others = [
         {
-            "design": dict(zip(keys, problem.look(one.point)[0].tolist(), strict=True)),
+            "design": problem.named(one.point),
             "limits": [limits[number] for number in one.held],
             "objective": None if np.isnan(objective) else objective,
         }

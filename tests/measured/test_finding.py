@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from rootsopt.measured.conjugacy import conjugacy
 from rootsopt.measured.source import read_rotor
 from rootsopt.profiles import CIC, outline
 from tests.standins import refusal
@@ -65,7 +66,7 @@ def test_unit_axis_lobes_distance_and_inset_are_found(name, tmp_path, monkeypatc
     rotor = found_in(tmp_path, points / LENGTHS[unit])
     assert rotor.lobes == lobes
     assert rotor.radius == pytest.approx(distance / 2, abs=2e-3)
-    assert rotor.mesh.inset * 1e3 == pytest.approx(inset, abs=1e-3)
+    assert conjugacy(rotor.outline).inset * 1e3 == pytest.approx(inset, abs=1e-3)
     assert abs(rotor.checks.axis - axis) < 1e-3
     assert f"unit {unit}" in rotor.facts[0]
 
@@ -78,7 +79,7 @@ def test_scattered_and_dense_points_are_thinned_and_smoothed(tmp_path):
     points = np.interp(place, np.arange(len(whole)), whole, period=len(whole))
     rotor = found_in(tmp_path, points + noise)
     assert rotor.radius == pytest.approx(33, abs=5e-3)
-    assert rotor.mesh.inset * 1e3 == pytest.approx(0.1, abs=5e-3)
+    assert conjugacy(rotor.outline).inset * 1e3 == pytest.approx(0.1, abs=5e-3)
     assert any("points is used" in fact for fact in rotor.facts)
 
 

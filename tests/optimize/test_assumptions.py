@@ -76,7 +76,7 @@ def test_scenes_agree_with_configs_one_by_one():
     assert [*found.scenes][:5] == [
         "as given", f"{LOAD}=2.865", f"{LOAD}=7.64", f"{CLEARANCE}=0", f"{CLEARANCE}=0.06"
     ]  # fmt: skip
-    for k, scene in enumerate([*found.scenes][:8]):
+    for k, scene in enumerate([*found.scenes][:6]):
         for name in (BASELINE, OPTIMIZED):
             assert found.statuses[name][k] == alone(scene, name).status.label
         # The length that smooths the contact follows load and stiffness in a config of its own.

@@ -89,7 +89,7 @@ def test_only_a_significant_difference_holds_up(problem, truth, accepted):
     verdict = noise.verify(problem, judge, [trial([0.5, 0.5, 0.5], 0.4)])
     # One choice, then baseline and choice over another ensemble; then the search's own again.
     assert judge.asked == [1, 2, 2] + [0] * accepted
-    record = verdict.record
+    record = verdict.verification
     assert (verdict.optimized is not None, record["holds_up"]) == (accepted, accepted)
     assert record["verified_objective"] == pytest.approx(truth)
     assert record["combined_standard_error"] == pytest.approx(0.02 * np.sqrt(2))
@@ -106,7 +106,7 @@ def test_a_candidate_without_an_average_is_passed_over(problem):
     lost, good = trial([0.9, 0.5, 0.5], 0.3), trial([0.1, 0.5, 0.5], 0.7)
     verdict = noise.verify(problem, judge, [lost, good])
     assert verdict.optimized is not None
-    assert verdict.record["searched_objective"] == 0.7
-    assert len(verdict.record["candidates"]) == 2
+    assert verdict.verification["searched_objective"] == 0.7
+    assert len(verdict.verification["candidates"]) == 2
     alone = noise.verify(problem, judge, [lost])
-    assert (alone.optimized, alone.record["holds_up"]) == (None, False)
+    assert (alone.optimized, alone.verification["holds_up"]) == (None, False)

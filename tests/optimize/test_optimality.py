@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from rootsopt import load_config
 from rootsopt.optimize.optimality import StartOutcome, distinct, unseen
-from rootsopt.optimize.outcome import method_of
 
 
 def outcome(number, objective, *point):
@@ -40,9 +38,3 @@ def test_unseen_optima_by_simulation():
             hidden += 1 - sizes[seen].sum()
     assert hits > 100
     assert hidden / hits == pytest.approx(unseen(10, 2)["share_of_starts"], rel=0.2)
-
-
-def test_method_follows_the_objective():
-    """Averages, whose gradients have noise, have a rule of their own."""
-    for method, overrides in (("slsqp", []), ("adam", ["objective.motion=ensemble"])):
-        assert method_of(load_config("configs/cic_drawn.yaml", overrides)) == method

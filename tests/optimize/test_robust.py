@@ -183,7 +183,7 @@ def test_local_search_finds_the_minimum_over_scenes_with_corners(name, monkeypat
     problem, evaluate = toy(monkeypatch, branches, *RULES[name])
     grid = np.linspace(0, 1, 801)
     values = [problem.objective(evaluate(x)) for x in grid]
-    shares = problem.shares(problem.combined(evaluate(0.2)).weights)
+    shares = np.maximum(problem.combined(evaluate(0.2)).weights, 0.0)
 
     def look(point):
         return problem.local(evaluate(float(point[0])), point, shares)

@@ -56,7 +56,6 @@ def searching(truth=lambda point: 1.0, tight=None, **settings) -> Search:
     given = {"screening": 0, "starts": 2} | settings
     search.settings = config.optimizer.model_copy(update=given)
     search.config = config.model_copy(update={"optimizer": search.settings})
-    search.method = "slsqp"
     search.stage = Stage()
     search._lock = threading.Lock()
     search._bar = search._best = 1.0

@@ -6,7 +6,6 @@ import functools
 import itertools
 import threading
 import types
-from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +19,7 @@ from rootsopt.errors import InputError
 from rootsopt.optimize.design import pareto_front
 from rootsopt.optimize.limits import check_senses
 from rootsopt.optimize.local import Group, certify
-from rootsopt.optimize.tradeoffs import assembly, trace
+from rootsopt.optimize.tradeoffs import assembly
 from rootsopt.optimize.tradeoffs.assembly import Node, points_of, selected
 from rootsopt.optimize.tradeoffs.front import RHO, Scalar, Scale, dominated, keys, links
 from rootsopt.optimize.tradeoffs.study import Aim, Sample, Study, aims_of, freed
@@ -69,13 +68,6 @@ def _two_wells(a, b):
 
     The term is continuous there, and the best design jumps."""
     return 3 - a + 40 * (b - 0.1) ** 2 * (b - 0.9) ** 2 + 0.4 * (a - 0.5) * (b - 0.5)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def few():
-    """Return fewer starts and screened designs than the defaults."""
-    with mock.patch.multiple(trace, _CHEAP_STARTS=2, _CHEAP_SCREENING=8):
-        yield
 
 
 def front_of(points, second, first=lambda a, b: a + 1.0 + 0.0 * b, starts=1):
@@ -306,10 +298,9 @@ def test_rates_have_the_signs_of_the_terms_themselves():
     scalar = Scalar(scale, np.zeros(3), (0, 1, 2))
     node = Node(scalar, sample, certify(scalar.local(sample), point), "converged")
     study = object.__new__(Study)
-    free = types.SimpleNamespace(space=types.SimpleNamespace(constraints=()))
-    vars(study).update(config=types.SimpleNamespace(design_keys=("b", "c")), aims=tuple(aims),
-                       problem=free, term_values=lambda found: {},
-                       completed=lambda found: found)  # fmt: skip
+    keys = types.SimpleNamespace(design_keys=("b", "c"))
+    free = types.SimpleNamespace(space=types.SimpleNamespace(constraints=()), config=keys)
+    vars(study).update(aims=tuple(aims), problem=free, term_values=lambda found: {})
     ((found,), dropped) = points_of(study, [node], selected([node], scale), scale)
     assert dropped == []
     assert found.rates == pytest.approx({"b": 0.5, "c": -2.0}, rel=0.02)

@@ -10,6 +10,7 @@ two neighbours. The *spacing* of terms is the distance between neighbouring refe
 
 import dataclasses
 import itertools
+import operator
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -18,7 +19,9 @@ from numpy.typing import NDArray
 
 from rootsopt.config.units import words
 from rootsopt.optimize.infeasible import Infeasible
+from rootsopt.optimize.limits import HELD
 from rootsopt.optimize.local import Certificate
+from rootsopt.optimize.outcome import apart
 from rootsopt.optimize.tradeoffs.front import (
     Front,
     FrontPoint,
@@ -94,10 +97,6 @@ class Spacing(NamedTuple):
         """Return "terms" if two neighbours are far apart in terms, otherwise "design"."""
         return "terms" if edge.distance > _WIDE_TERMS * self.terms else "design"
 
-    def close(self, edge: Edge) -> bool:
-        """Return whether two neighbours are too close in terms to be bisected."""
-        return edge.distance <= _CLOSE * self.terms
-
 
 def measured(pair: Pair, values: NDArray[np.float64], points: NDArray[np.float64]) -> Edge:
     """Return the `Edge` of a `pair` of points.
@@ -106,11 +105,6 @@ def measured(pair: Pair, values: NDArray[np.float64], points: NDArray[np.float64
     i, j = pair
     apart = float(np.linalg.norm(values[i] - values[j]))
     return Edge(pair, apart, float(np.max(np.abs(points[i] - points[j]))))
-
-
-def along(kept: Sequence[int]) -> list[Pair]:
-    """Return the pairs of neighbours on a front of two terms: successive indices in `kept`."""
-    return list(itertools.pairwise(kept))
 
 
 def among(pairs: Sequence[Pair], kept: Sequence[int], same: Sequence[int]) -> list[Pair]:
@@ -155,10 +149,6 @@ class Bisections:
             self.pairs.append(new)
         if pair in self.pairs:
             self.pairs.remove(pair)
-
-
-# Multiplier of a limit below which the limit counts as inactive.
-_HELD = 1e-6
 
 
 class Node(NamedTuple):
@@ -206,7 +196,7 @@ class Selection(NamedTuple):
         `pairs`: indices of neighbouring nodes; used for three terms only. With two terms,
         neighbours are nodes that follow each other in `kept`."""
         if self.values.shape[1] == 2:
-            neighbours = [(min(pair), max(pair)) for pair in along(self.kept)]
+            neighbours = [(min(pair), max(pair)) for pair in itertools.pairwise(self.kept)]
         else:
             neighbours = among(pairs, self.kept, self.same)
         return [measured(pair, self.values, self.points) for pair in neighbours]
@@ -316,12 +306,12 @@ def _limits(study: Study, certificate: Certificate) -> dict[str, float]:
         for constraint, multiplier in zip(
             study.problem.space.constraints, certificate.multipliers, strict=True
         )
-        if multiplier > _HELD
+        if multiplier > HELD
     }
-    keys = study.config.design_keys
+    keys = study.problem.config.design_keys
     for side, multipliers in (("lower", certificate.lower), ("upper", certificate.upper)):
         for key, multiplier in zip(keys, multipliers, strict=True):
-            if multiplier > _HELD:
+            if multiplier > HELD:
                 limits[f"{side} bound of {words(key)}"] = float(multiplier)
     return limits
 
@@ -367,7 +357,7 @@ def widest(edges: Sequence[Edge], spacing: Spacing, gaps: Bisections) -> Edge | 
     for edge in edges:
         if edge.pair in gaps.closed or spacing.excess(edge) <= 1:
             continue
-        if spacing.close(edge):
+        if edge.distance <= _CLOSE * spacing.terms:
             gaps.closed[edge.pair] = "design"
             continue
         open_ones.append(edge)
@@ -381,11 +371,8 @@ def starts_apart(
 
     They are in order of the objective `scalar`, the best first. Without such designs, return
     the point `first` (d,)."""
-    chosen: list[Seen] = []
-    for one in sorted(course.seen, key=lambda one: scalar.value(one.values)):
-        apart = all(np.linalg.norm(one.point - other.point) > APART for other in chosen)
-        if apart and len(chosen) < count:
-            chosen.append(one)
+    seen = sorted(course.seen, key=lambda one: scalar.value(one.values))
+    chosen = apart(seen, APART, count, operator.attrgetter("point"))
     return chosen or [Seen(first, np.zeros(0), None)]
 
 
@@ -393,8 +380,7 @@ def front_of(
     tracer: "Tracer", nodes: Sequence[Node], infeasible: Infeasible | None = None
 ) -> Front:
     """Return the front of the `nodes` of a `tracer`; `infeasible`: why there are none, if known."""
-    study, config = tracer.study, tracer.config
-    usable = study.usable
+    study, baseline = tracer.study, tracer.study.problem.baseline
     known: dict = {}
     if nodes:
         selection = selected(nodes, tracer.scale)
@@ -408,10 +394,10 @@ def front_of(
         known = {"points": tuple(points), "dropped": tuple(dropped)}
         known |= {"edges": tuple(edges), "gaps": tuple(gaps)}
     return Front(
-        config=config,
+        config=tracer.config,
         aims=study.aims,
-        baseline=study.problem.baseline,
-        baseline_terms=study.term_values(study.problem.baseline) if usable else {},
+        baseline=baseline,
+        baseline_terms=study.term_values(baseline) if baseline.usable else {},
         limits_dropped=study.limits_dropped,
         searches=tracer._searches,
         evaluations=tracer._evaluations,

@@ -247,14 +247,14 @@ class Front:
         return entries
 
 
-def dominated(values: NDArray[np.float64], equal: float = EQUAL) -> NDArray[np.bool_]:
+def dominated(values: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return a mask (n,) of the points that another point dominates.
 
     `values` (n, k): scaled terms, of which less is better. A point is dominated if another one is
-    no worse in any term and better in one, by more than `equal`."""
+    no worse in any term and better in one, by more than `EQUAL`."""
     worse = values[:, None, :] - values[None, :, :]
-    beaten = np.all(worse >= -equal, axis=2) & np.any(worse > equal, axis=2)
-    # Compare the sums as well: within `equal`, two points could otherwise dominate each other.
+    beaten = np.all(worse >= -EQUAL, axis=2) & np.any(worse > EQUAL, axis=2)
+    # Compare the sums as well: within `EQUAL`, two points could otherwise dominate each other.
     total = values.sum(axis=1)
     return np.any(beaten & (total[None, :] < total[:, None]), axis=1)
 

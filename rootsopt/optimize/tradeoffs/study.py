@@ -92,27 +92,21 @@ def simulated(config: Config, scene: Scene) -> bool:
     ]
     if not forced:
         return False
-    if config.objective.motion != "reached":
-        raise InputError(
-            f"`objective.motion` must be reached for `pareto.terms` with forces ({forced[0]}), but "
-            f"is {config.objective.motion}; set it to reached"
-        )
-    if config.objective.speeds_rpm:
-        raise InputError(
-            f"`objective.speeds_rpm` must be empty for `pareto.terms` with forces ({forced[0]}), "
-            f"but is {[*config.objective.speeds_rpm]}: a front is that of one speed; set it to [] "
-            "and `scene.speed_rpm` to that speed"
-        )
-    if config.objective.over != "nominal":
-        raise InputError(
-            f"`objective.over` must be nominal for `pareto.terms` with forces ({forced[0]}), but "
-            f"is {config.objective.over}: a front is that of the nominal scene; set it to nominal"
-        )
-    if config.tolerances is not None:
-        raise InputError(
-            f"`tolerances` must be absent for `pareto.terms` with forces ({forced[0]}): a front is "
-            "that of the nominal scene; remove them"
-        )
+    given, what = config.objective, f"for `pareto.terms` with forces ({forced[0]})"
+    conflicts = {
+        f"`objective.motion` must be reached {what}, but is {given.motion}; set it to "
+        "reached": given.motion != "reached",
+        f"`objective.speeds_rpm` must be empty {what}, but is {[*given.speeds_rpm]}: a front is "
+        "that of one speed; set it to [] and `scene.speed_rpm` to that "
+        "speed": bool(given.speeds_rpm),
+        f"`objective.over` must be nominal {what}, but is {given.over}: a front is that of the "
+        "nominal scene; set it to nominal": given.over != "nominal",
+        f"`tolerances` must be absent {what}: a front is that of the nominal scene; remove "
+        "them": config.tolerances is not None,
+    }
+    for message, met in conflicts.items():
+        if met:
+            raise InputError(message)
     return True
 
 
@@ -177,13 +171,12 @@ class Sample:
 class Study:
     """Everything that is needed to evaluate designs of one trade-off.
 
-    `config`: config of the study; `aims`: its k terms; `problem`: unit box and constraints, with
-    the evaluated baseline; `fast`, `sharp`, `exact`: evaluators for screening, search and report,
-    without a motion if no term depends on forces. `runs`: where they run; `checkpoint`: file
-    that stores every evaluation and supplies those of an interrupted search. `limits_dropped`:
-    quantities whose limits, the baseline's values, were dropped, because they are terms."""
+    `aims`: its k terms; `problem`: unit box and constraints, with the evaluated baseline; `fast`,
+    `sharp`, `exact`: evaluators for screening, search and report, without a motion if no term
+    depends on forces. `runs`: where they run; `checkpoint`: file that stores every evaluation and
+    supplies those of an interrupted search. `limits_dropped`: quantities whose limits, the
+    baseline's values, were dropped, because they are terms."""
 
-    config: Config
     aims: tuple[Aim, ...]
     problem: Problem
     fast: Evaluator
@@ -218,12 +211,7 @@ class Study:
         space = Space.of(config, exact.scene, term_constraints(config, exact.scene))
         problem = Problem(config, baseline, space, force_limits(config, exact.scene))
         work = fast, exact.surveying(), exact, runs, checkpoint
-        return cls(config, aims, problem, *work, dropped)
-
-    @property
-    def usable(self) -> bool:
-        """Whether all terms are known for the baseline."""
-        return self.problem.baseline.usable
+        return cls(aims, problem, *work, dropped)
 
     def term_values(self, evaluation: Evaluation) -> dict[str, float]:
         """Return the terms of an evaluated design by name, in their own units."""
@@ -273,8 +261,10 @@ class Study:
                 tags = np.stack([kinds, maxima.times / period], axis=1)
                 groups.append(Group(tags, maxima.forces, maxima.slopes @ jacobian))
                 continue
-            slope = np.array([*evaluation.gradient[aim.name].values()])
-            groups.append(_single(number, aim, evaluation.response[aim.name], slope @ jacobian))
+            value = np.array([evaluation.response[aim.name]])
+            slope = np.array([*evaluation.gradient[aim.name].values()]) @ jacobian
+            tags = np.array([[float(number), 0.0]])
+            groups.append(Group(tags, aim.sign * value, aim.sign * slope[None, :]))
         cornered = tuple(map(_is_cornered, self.aims))
         caps = self.problem.caps(evaluation, jacobian)
         limits = slack, normals, caps
@@ -284,12 +274,6 @@ class Study:
 def _is_cornered(aim: Aim) -> bool:
     """Return whether a term is a maximum over branches that is to be minimised."""
     return aim.name == PEAK and aim.sense == "min"
-
-
-def _single(number: int, aim: Aim, value: float, slope: NDArray[np.float64]) -> Group:
-    """Return term `number` as a group with one branch."""
-    tags = np.array([[float(number), 0.0]])
-    return Group(tags, aim.sign * np.array([value]), aim.sign * slope[None, :])
 
 
 def _finite(sample: Sample) -> Sample | None:

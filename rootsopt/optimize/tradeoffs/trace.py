@@ -68,11 +68,6 @@ from rootsopt.status import Standing
 # Excess over the best objective (fraction of a term's range) below which a design evaluated
 # earlier, far from the best one, starts another search.
 _PROMISING = 0.25
-# Minimum effort where no term needs a simulation: number of evaluations per search, of starts per
-# end, and of screened designs.
-_CHEAP_EVALUATIONS, _CHEAP_STARTS, _CHEAP_SCREENING = 300, 6, 64
-# Maximum number of points at which the search for the least violation of the constraints starts.
-_EXPLAINED = 8
 # Relative difference of a term between search and verification above which a point is dropped.
 _HOLDS_UP = 0.01
 # Range of a term over the ends (relative to its scale) below which the terms do not conflict.
@@ -121,19 +116,18 @@ class Tracer:
         self.scale = Scale(np.zeros(count), np.ones(count))  # Until designs are screened.
         self._course = Course()
         self._lock = threading.Lock()
-        self._searches = self._evaluations = 0
-        self._expected = 0
+        self._searches = self._evaluations = self._expected = 0
 
     def run(self) -> Front:
         """Find the ends, trace the front, and verify its points.
 
         Return the front. If `stop` is set, the front has the points found so far."""
         study = self.study
-        if not study.usable or self.stop.is_set():
+        if not study.problem.baseline.usable or self.stop.is_set():
             return front_of(self, [])
         points = self._feasible()
         if not points:
-            reason = explain(study.problem, self._sample[:_EXPLAINED])
+            reason = explain(study.problem, self._sample)
             return front_of(self, [], infeasible=reason)
         self._screen(points)
         if self._course.seen and self._ends(points[0]):
@@ -153,10 +147,7 @@ class Tracer:
         """Return the baseline's point and a Sobol sample, moved onto the feasible set."""
         settings, problem = self.config.optimizer, self.study.problem
         start = problem.project(problem.point([*problem.baseline.design.values()]))
-        count = settings.screening
-        if self.study.sharp is None:
-            count = max(count, _CHEAP_SCREENING)
-        sample = sobol(count, settings.seed, len(start))
+        sample = sobol(settings.screening, settings.seed, len(start))
         self._sample = [start, *(problem.toward(point, start) for point in sample)]
         return [point for point in self._sample if problem.feasible(point)]
 
@@ -193,8 +184,6 @@ class Tracer:
         all ends exist and are in conflict."""
         count = len(self.study.aims)
         starts = self.config.optimizer.starts
-        if self.study.sharp is None:
-            starts = max(starts, _CHEAP_STARTS)
         self._expected = count * starts + 3 * (len(keys(count, self._divisions)) - count)
         scalars = [Scalar(self.scale, np.zeros(count), (number,)) for number in range(count)]
         begins = [starts_apart(self._course, scalar, starts, first) for scalar in scalars]
@@ -240,10 +229,6 @@ class Tracer:
         wanted = self.config.pareto
         return wanted.points - 1 if len(wanted.terms) == 2 else wanted.divisions
 
-    def _reference(self, key: Key) -> NDArray[np.float64]:
-        ends = [self._nodes[one].sample.values for one in corners(len(key), self._divisions)]
-        return np.array(key) / self._divisions @ self.scale.of(np.array(ends))
-
     def _trace(self) -> None:
         inner = [k for k in keys(len(self.study.aims), self._divisions) if k not in self._nodes]
         ends = dict(self._nodes)
@@ -264,7 +249,9 @@ class Tracer:
         self._course.join(self._side_by_side(finish, inner))
 
     def _scalar(self, key: Key) -> Scalar:
-        return Scalar(self.scale, self._reference(key), tuple(range(len(key))))
+        ends = [self._nodes[one].sample.values for one in corners(len(key), self._divisions)]
+        reference = np.array(key) / self._divisions @ self.scale.of(np.array(ends))
+        return Scalar(self.scale, reference, tuple(range(len(key))))
 
     def _chain(
         self, inner: Sequence[Key], ends: Mapping[Key, Node], ahead: bool
@@ -349,10 +336,7 @@ class Tracer:
                 course.seen.append(Seen(sample.point, sample.values, sample.evaluation.start))
             return scalar.local(sample)
 
-        limit = self.config.optimizer.iterations + 1
-        if self.study.sharp is None:
-            limit = max(limit, _CHEAP_EVALUATIONS)
-        stops = Stops(evaluations=limit, asked=self.stop.is_set)
+        stops = Stops(evaluations=self.config.optimizer.iterations + 1, asked=self.stop.is_set)
         outcome = descend(look, start, stops, self.study.problem.limits_at)
         self._count(searches=1)
         if outcome.local is None or outcome.certificate is None:
