@@ -13,9 +13,9 @@ from unittest import mock
 
 ROOT = Path(__file__).parents[1]
 MOST = {
-    "statements of the package": 27_149,
-    "statements of the tests": 14_560,
-    "statements of the experiments": 4_473,
+    "statements of the package": 26_464,
+    "statements of the tests": 14_557,
+    "statements of the experiments": 4_479,
     "packages": 13,
     "files of the package": 199,
     "lines of the longest file": 450,

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rootsopt.commands.cli import use_cache
-from rootsopt.runtime.environment import use_float64
-from rootsopt.view.files import ResultFolder, row_columns, versions
+from rootsopt.runtime.environment import use_float64, versions
+from rootsopt.view.files import ResultFolder, row_columns
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

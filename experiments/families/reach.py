@@ -18,7 +18,7 @@ from rootsopt.config.study import limits_of
 from rootsopt.config.units import MM
 from rootsopt.optimize.problem import Problem
 from rootsopt.profiles import geometry
-from rootsopt.scene import Scene, design_keys
+from rootsopt.scene import Scene
 from rootsopt.scene.space import Space, sobol
 
 # Clearance (mm) between tip and bore above which a rotor does not fill the bore.
@@ -100,7 +100,7 @@ def reach(config: Config, sample: int = SAMPLE) -> Reach | None:
     search finds the maximum and minimum area efficiency. The result is `None` if the family does
     not fit into the housing.
     """
-    size = len(design_keys(config))
+    size = len(config.design_keys)
     if size == 0:
         return _only(config)
     problem = problem_of(config)

@@ -22,7 +22,7 @@ from rootsopt.config import Config, load
 from rootsopt.measured.conjugacy import conjugacy, gaps_um
 from rootsopt.measured.source import outline_of
 from rootsopt.profiles import Profile, outline
-from rootsopt.scene import check_geometry, design_keys
+from rootsopt.scene import check_geometry
 from rootsopt.view.figures.designs import plot_conjugacy
 
 # Form error of the addenda, differences between lobes, and RMS noise of the points (mm).
@@ -56,7 +56,7 @@ def measured(profile: Profile, seed: int = 0) -> np.ndarray:
 
 def imported(config: Config, path: Path) -> Config:
     """Return `config` with the outline in the file `path` as its profile."""
-    gone = dict.fromkeys(design_keys(config))
+    gone = dict.fromkeys(config.design_keys)
     found = {"family": "outline", "outline_file": str(path), "outline_smoothing_mm": NOISE}
     profile = config.profile.model_copy(update=gone | found)
     return config.model_copy(update={"profile": profile})

@@ -30,6 +30,8 @@ from experiments._common.tables import Row, print_record
 from rootsopt.config import Config
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.optimize.search import Search
+from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.reducers import Point, evaluate_many, parts_at
 from rootsopt.response.result import Evaluation, Part
 from rootsopt.response.terms import objective_weights
 from rootsopt.runtime.programs import CachedFunction
@@ -176,6 +178,14 @@ class Study:
         return np.array([objective(self.config, p.evaluation, b.evaluation) for p, b in pairs])
 
 
+def swept(evaluator: Evaluator, speeds: Sequence[float], design=None) -> tuple[Part, ...]:
+    """Evaluate a `design` (config units; default: the config's own) at each speed, from rest.
+
+    `speeds` (rpm): each with an equal share."""
+    points = [Point(evaluator.at_speed(speed), design) for speed in speeds]
+    return parts_at([(speed, 1 / len(speeds)) for speed in speeds], evaluate_many(points))
+
+
 def study(scene: str, speeds, listed, quick: bool) -> Study:
     """Sweep, optimise and linearise all pairs in one scene.
 
@@ -185,7 +195,7 @@ def study(scene: str, speeds, listed, quick: bool) -> Study:
     evaluators = {f: evaluator_of(shipped(f, *here)) for f in ("cic", "ee")}
     found = Study(evaluators["cic"].config, {}, {}, [])
     for family, evaluator in evaluators.items():
-        found.designs[family.upper()] = evaluator.swept(speeds)
+        found.designs[family.upper()] = swept(evaluator, speeds)
         found.linear[family.upper()] = linearised(evaluator.pair(evaluator.config.design))
     for name, keys in list(OPTIMISED.items())[slice(1, 2) if quick else slice(None)]:
         over = (f"objective.speeds_rpm={list(listed)}", *keys) if keys else ()
@@ -195,9 +205,9 @@ def study(scene: str, speeds, listed, quick: bool) -> Study:
             design = np.array(list(result.optimized.design.values()))
             label, cic = f"CIC, optimised {name}", evaluators["cic"]
             found.linear[label] = linearised(cic.pair(design))
-            found.designs[label] = cic.swept(speeds, design)
+            found.designs[label] = swept(cic, speeds, design)
             along = found.over(found.designs[label])
-            those = found.over(cic.swept(listed, design), cic.swept(listed))
+            those = found.over(swept(cic, listed, design), swept(cic, listed))
             outcome |= result.optimized.design | {
                 "own_objective": result.problem.objective(result.optimized),
                 "at_3000_rpm": along[int(np.argmin(np.abs(np.asarray(speeds) - 3000)))],
