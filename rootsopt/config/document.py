@@ -131,6 +131,12 @@ class _Loader(yaml.SafeLoader):
         None: _unknown,
     }
 
+    def fetch_flow_collection_start(self, TokenClass):
+        # PyYAML compares each bracket with all open ones: thousands would take seconds.
+        if self.flow_level > _DEEPEST:
+            raise _wrong(_TOO_DEEP, self.get_mark())
+        super().fetch_flow_collection_start(TokenClass)
+
     def compose_scalar_node(self, anchor):
         node = super().compose_scalar_node(anchor)
         if len(node.value) > _LONGEST_VALUE:
