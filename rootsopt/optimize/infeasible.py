@@ -120,8 +120,8 @@ def explain(
 ) -> Infeasible:
     """Return why no design satisfies all constraints of a `problem`.
 
-    `starts`: points (d,) of the unit box, from the first of which (at most `_EXPLAINED`) to search
-    for the least violation. `look`: function that returns constraints and caps at a point, from a
+    `starts`: points (d,) of the unit box at which searches for the least violation start; only the
+    first `_EXPLAINED` count. `look`: function that returns constraints and caps at a point, from a
     simulation. By default, only the constraints of the geometry count."""
     starts = starts[:_EXPLAINED]
     limits = () if look is None else problem.limits

@@ -67,14 +67,14 @@ def body(
 
 def _contradiction(result) -> dict[str, Any]:
     """Return the content of the result file if no design satisfies all constraints."""
-    conflict, begun = result.infeasible, result.beginning
+    conflict, beginning = result.infeasible, result.beginning
     return {
         "baseline": result.baseline.record(),
         "optimized": None,
         "status": result.status.label,
         "message": conflict.message,
         "infeasible": conflict.record(),
-    } | ({} if begun is None else {"beginning": begun.record()})
+    } | ({} if beginning is None else {"beginning": beginning.record()})
 
 
 def _alike(config: Config, result) -> dict:

@@ -127,12 +127,12 @@ class _Follower(Closer):
     rising: Bool[Array, ""] = eqx.field(kw_only=True)
 
     def start(self) -> Loop:
-        begun, share = super().start(), self.plane.through[-1]
-        count, motion = begun.elements.state.shape[1], unchanged(begun.elements, 1)
+        loop, share = super().start(), self.plane.through[-1]
+        count, motion = loop.elements.state.shape[1], unchanged(loop.elements, 1)
         square, row, place = jnp.zeros((count, count)), jnp.zeros(count), jnp.zeros(count + 1)
         line = Line(share, jnp.asarray(jnp.inf), square, row, square, place, place, motion)
-        trusted = begun.trusted & self.rising
-        return begun._replace(looks=~trusted, trusted=trusted, line=line)
+        trusted = loop.trusted & self.rising
+        return loop._replace(looks=~trusted, trusted=trusted, line=line)
 
     def frozen_at(self, now: Loop) -> RotorPair:
         return lax.stop_gradient(self.family(now.line.share)[0])
@@ -149,7 +149,7 @@ class _Follower(Closer):
         size = jnp.maximum(size, jnp.abs(after.line.share - now.line.share))
         new = super().judged(now, after, size, found)
         lost = now.trusted & new.looks & ~new.solved
-        begun = self.start()._replace(
+        restarted = self.start()._replace(
             looks=lost,
             trusted=~lost,
             orbit=new.orbit,
@@ -158,7 +158,7 @@ class _Follower(Closer):
             steps=new.steps,
             failures=new.failures,
         )
-        return choose(lost, begun, new)
+        return choose(lost, restarted, new)
 
     def step(self, now: Loop) -> tuple[CollocatedEquation, Points, Array, Step, Line]:
         """Solve the linearised equation together with that of the plane, as `Closer.step`."""

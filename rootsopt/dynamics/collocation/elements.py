@@ -205,7 +205,7 @@ class Elements(NamedTuple):
         k = jnp.sum(mesh.filled & (begin <= tau[..., None]), axis=-1) - 1
         return jnp.maximum(k, 0), tau
 
-    def found(self, tau: Float[Array, "*m"]) -> tuple[Int[Array, "*m"], Float[Array, "*m"]]:
+    def place_of(self, tau: Float[Array, "*m"]) -> tuple[Int[Array, "*m"], Float[Array, "*m"]]:
         """Return the index of the element that contains each of the times `tau` (mesh periods),
         and the times as fractions of it.
 

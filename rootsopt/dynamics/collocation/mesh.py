@@ -181,11 +181,11 @@ def moved(elements: Elements, mesh: Mesh) -> Elements:
     `Elements.roots` are only useful if both meshes have the same events; otherwise they must be
     renewed (see `events.rooted`)."""
     begin, end = mesh.ends
-    k, share = elements.found(begin)
+    k, share = elements.place_of(begin)
     rise = jnp.sum(GAUSS.integrated(share)[..., None] * elements.slopes[k], axis=-2)
     state = elements.state[k] + elements.mesh.lengths[k][..., None] * rise
     inside = begin[:, None] + mesh.lengths[:, None] * GAUSS.nodes
-    k, share = elements.found(jnp.append(inside, end[:, None], axis=1))
+    k, share = elements.place_of(jnp.append(inside, end[:, None], axis=1))
     weights = GAUSS.lagrange(share)
     slopes = jnp.einsum("eps,epsn->epn", weights[:, :-1], elements.slopes[k[:, :-1]])
     roots = jnp.einsum("eps,epsij->epij", weights, elements.roots[k][:, :, :-1])

@@ -67,7 +67,7 @@ class Rivals(NamedTuple):
 
     def moved(self, old: Elements, new: Elements) -> "Rivals":
         """Return the same instants in the elements of another mesh of the motion."""
-        element, share = new.found(self.places(old)[0])
+        element, share = new.place_of(self.places(old)[0])
         share = jnp.clip(share, _INSIDE, 1.0 - _INSIDE)
         return Rivals(element, share, _roots(new.roots, element, share))
 
