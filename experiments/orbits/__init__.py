@@ -15,7 +15,7 @@ from experiments._common.driver import Study
 STUDY = Study(
     quick="two pairs of one kind",
     options={
-        "--count": {"type": int, "default": 48, "help": "pairs (default: 48)"},
+        "--count": {"type": int, "default": 33, "help": "pairs (default: 33)"},
         "--seed": {"type": int, "default": 0, "help": "seed of the draw (default: 0)"},
         "--speed": {"action": "store_true", "help": "time an orbit from a neighbour instead"},
         "--batches": {"action": "store_true", "help": "time batches of designs instead"},
