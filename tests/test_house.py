@@ -76,7 +76,6 @@ LATE = {
     "commands/work/explore.py": {
         "rootsopt.optimize.design", "rootsopt.view.pages.knobs", "rootsopt.view.pages.server",
     },
-    "view/figures/__init__.py": {"rootsopt.view.figures.cad"},
     "view/figures/runs.py": {"rootsopt.measured.source"},
     "measured/reading.py": {"rootsopt.measured.dxf"},
     "measured/conjugacy.py": {"rootsopt.measured.source"},

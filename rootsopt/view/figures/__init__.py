@@ -4,6 +4,7 @@ Drawings and solids of a design are made from one outline of arcs and splines. T
 option `--export` of the commands."""
 
 import argparse
+import importlib.util
 
 from rootsopt.errors import InputError
 
@@ -32,18 +33,15 @@ def chosen(text: str) -> tuple[str, ...]:
     installed.
     """
     names = tuple(name.strip() for name in text.lower().split(",") if name.strip())
-    if names == ("none",):
-        return ()
-    if names == ("all",):
-        names = FORMATS
-    for name in names:
-        if name not in FORMATS:
-            raise InputError(
-                f"`--export` must be formats out of {', '.join(FORMATS)}, or all, or none, but "
-                f"has {name!r}; remove it"
-            )
-    if set(names) & set(SOLID):
-        from rootsopt.view.figures.cad import require_kernel
-
-        require_kernel()
+    names = {"none": (), "all": FORMATS}.get(",".join(names), names)
+    if unknown := [name for name in names if name not in FORMATS]:
+        raise InputError(
+            f"`--export` must be formats out of {', '.join(FORMATS)}, or all, or none, but "
+            f"has {unknown[0]!r}; remove it"
+        )
+    if set(names) & set(SOLID) and importlib.util.find_spec("build123d") is None:
+        raise InputError(
+            "`--export` step and stl need the CAD kernel build123d, which is not installed; "
+            "run: pip install 'rootsopt[cad]'"
+        )
     return tuple(name for name in FORMATS if name in names)

@@ -8,7 +8,6 @@ dependency. Lengths are in millimetres, angles in radians.
 # (The kernel is optional, and its bindings come without types.)
 
 import dataclasses
-import importlib.util
 import io
 import logging
 import tempfile
@@ -238,15 +237,6 @@ _STEP = np.pi / 48
 # more points with more spans. With one span, the computed volume has a relative error of 2e-4
 # next to a cusp, although the solid itself is exact to 1e-8.
 _SPANS = 8
-
-
-def require_kernel() -> None:
-    """Raise `InputError` if the CAD kernel is not installed."""
-    if importlib.util.find_spec("build123d") is None:
-        raise InputError(
-            "`--export` step and stl need the CAD kernel build123d, which is not installed; "
-            "run: pip install 'rootsopt[cad]'"
-        )
 
 
 def rotor(pieces: list[DrawnPiece], length: float, bore: float | None, helix: float) -> "Solid":
