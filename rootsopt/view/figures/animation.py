@@ -96,13 +96,6 @@ class Frames:
     forces: tuple[NDArray[np.float64], NDArray[np.float64]] | None
     samples: int
 
-    def shares(self) -> list[NDArray[np.float64]]:
-        """Return the length (n,) of each flank's arrow, as a fraction of the longest one."""
-        if self.forces is None:
-            return [flank.present.astype(float) for flank in self.flanks]
-        longest = max(1e-30, *map(np.max, self.forces))
-        return [force / longest for force in self.forces]
-
 
 def frames_of(profile: Profile, series: Series | None = None, periods: int = 1) -> Frames:
     """Return the frames of a motion over `periods` mesh periods, or of perfect rolling over one.
@@ -146,18 +139,22 @@ def meshing_gif(
     frames = frames_of(profile, series, periods)
     rows = 1 if series is None else 2
     made, axes = figure(9, 5.4 + 2 * (rows - 1), rows, 1, grid=False, height_ratios=[2.6, 1][:rows])
-    scene, cursor = _Scene(axes[0, 0], drawing), None
-    axes[0, 0].set_title("Perfect rolling: contact and direction of its force on rotor 2")
-    if series is not None:
-        axes[0, 0].set_title("Contact force on rotor 2; the arrow's length shows the force below")
-        cursor = _force_panel(axes[1, 0], series, frames.samples)
+    scene = _Scene(axes[0, 0], drawing)
+    axes[0, 0].set_title(
+        "Perfect rolling: contact and direction of its force on rotor 2"
+        if series is None
+        else "Contact force on rotor 2; the arrow's length shows the force below"
+    )
+    cursor = None if series is None else _force_panel(axes[1, 0], series, frames.samples)
     degrees = np.degrees(frames.rotation - frames.rotation[0])
-    shares = frames.shares()
+    # In perfect rolling, every contact has an arrow of the same length.
+    forces = frames.forces or [flank.present.astype(float) for flank in frames.flanks]
+    longest = max(1e-30, *map(np.max, forces))
 
     def draw(i: int) -> None:
         scene.turn(frames.rotation[i], frames.rotation[i] + frames.relative[i])
-        for arrow, flank, share in zip(scene.arrows, frames.flanks, shares, strict=True):
-            arrow.show(flank.point[i], flank.normal[i], float(share[i]))
+        for arrow, flank, force in zip(scene.arrows, frames.flanks, forces, strict=True):
+            arrow.show(flank.point[i], flank.normal[i], float(force[i] / longest))
         if cursor is not None:
             cursor.set_xdata([degrees[i], degrees[i]])
 
