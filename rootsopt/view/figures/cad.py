@@ -125,9 +125,11 @@ def add_table(space: Any, drawing: Drawing) -> None:
     half = np.linspace(0.0, points.along[-1], _ROWS)
     kept = [int(np.argmin(np.abs(points.along - place))) for place in half]
     columns = [points.columns()[name][kept] for name in ("x_mm", "y_mm", "radius_mm", "normal_deg")]
-    rows = [["no.", "x", "y", "radius", "normal, deg"]]
-    for k, numbers in enumerate(zip(*columns, strict=True)):
-        rows.append([str(k), *(f"{round(x, 4) + 0.0:.4f}" for x in numbers)])
+    heads = ["no.", "x", "y", "radius", "normal, deg"]
+    rows = [
+        [str(k), *(f"{round(x, 4) + 0.0:.4f}" for x in numbers)]
+        for k, numbers in enumerate(zip(*columns, strict=True))
+    ]
     height = 0.8 * letter(drawing)
     wide = 11 * _LETTER * height
     right, top = edges(drawing)[1:]
@@ -135,7 +137,7 @@ def add_table(space: Any, drawing: Drawing) -> None:
     title = "Half a lobe, tip to root (all points: rotor_points.csv)"
     text = space.add_text(title, height=height, dxfattribs={"layer": TABLE})
     text.set_placement((place[0], top - 1.6 * height))
-    _add_texts(space, TABLE, rows, place, [0.6 * wide, *4 * [wide]], height)
+    _add_texts(space, TABLE, [heads, *rows], place, [0.6 * wide, *4 * [wide]], height)
 
 
 def _add_texts(space: Any, layer: str, rows: Sequence[Sequence[str]], place: tuple[float, float],
@@ -365,8 +367,9 @@ def _quarters(piece: DrawnPiece) -> list[DrawnPiece]:
         return [piece]
     count = int(np.ceil(abs(piece.sweep) / (np.pi / 2) - 1e-9))
     sweep = piece.sweep / count
-    begins = (piece.begin + k * sweep for k in range(count))
-    return [dataclasses.replace(piece, begin=begin, sweep=sweep) for begin in begins]
+    return [
+        dataclasses.replace(piece, begin=piece.begin + k * sweep, sweep=sweep) for k in range(count)
+    ]
 
 
 def _surface(degrees, knots, points, heights, weights) -> "Face":

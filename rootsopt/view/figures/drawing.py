@@ -81,10 +81,11 @@ def widest(pieces: Sequence[DrawnPiece], lobes: int) -> complex:
 
     Its width is twice the point's y coordinate. If the lobe widens all the way down to the root,
     return the point on the pitch circle, at the angle π / (2 `lobes`)."""
-    maxima = []
-    for piece in pieces:
-        for share in _falls(lambda x, piece=piece: np.imag(piece.heading(x))):
-            maxima.append(complex(piece.at(share)))
+    maxima = [
+        complex(piece.at(share))
+        for piece in pieces
+        for share in _falls(lambda x, piece=piece: np.imag(piece.heading(x)))
+    ]
     inside = [point for point in maxima if 0 < np.angle(point) < np.pi / lobes - _SAME]
     if inside:
         return max(inside, key=lambda point: point.real)
@@ -93,13 +94,16 @@ def widest(pieces: Sequence[DrawnPiece], lobes: int) -> complex:
 
 
 def _at_angle(pieces: Sequence[DrawnPiece], angle: float) -> tuple[int, float]:
-    """Return number and share of the piece at which the outline crosses a polar angle (rad)."""
+    """Return number and share of the piece at which the outline crosses a polar angle (rad).
+
+    The outline is closed around the origin, so that there is such a piece."""
     turn = np.exp(-1j * angle)
-    for number, piece in enumerate(pieces):
-        for share in _falls(lambda x, piece=piece: -np.imag(piece.at(x) * turn)):
-            if np.real(piece.at(share) * turn) > 0:
-                return number, share
-    raise ValueError("Argument `pieces` must be a closed outline around the origin, but is not")
+    return next(
+        (number, share)
+        for number, piece in enumerate(pieces)
+        for share in _falls(lambda x, piece=piece: -np.imag(piece.at(x) * turn))
+        if np.real(piece.at(share) * turn) > 0
+    )
 
 
 def _falls(function: Callable[[Any], Any]) -> Iterator[float]:

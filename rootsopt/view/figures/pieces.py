@@ -177,10 +177,8 @@ def polyline(pieces: list[DrawnPiece], chord: float) -> Complex128[np.ndarray, "
 
     Successive corners are about `chord` (mm) apart or closer. The first corner is repeated at the
     end."""
-    parts = []
-    for piece in pieces:
-        count = max(2, int(np.ceil(piece.length / chord)))
-        parts.append(piece.at(np.arange(count) / count))
+    counts = (max(2, int(np.ceil(piece.length / chord))) for piece in pieces)
+    parts = [piece.at(np.arange(n) / n) for piece, n in zip(pieces, counts, strict=True)]
     return np.concatenate([*parts, parts[0][:1]])
 
 
