@@ -29,8 +29,6 @@ from rootsopt.view import tables
 from rootsopt.view.figures.style import BLUE, GREY, SKY, VERMILION
 from rootsopt.view.names import Table, brief, in_words, name_and_unit, percent
 from rootsopt.view.pages import charts, gather
-from rootsopt.view.pages.charts import animations, chart, hover
-from rootsopt.view.pages.gather import Run, anchor, glossary, linked
 from rootsopt.view.pages.knobs import Knob, Shape
 from rootsopt.view.pages.session import FromRest, NewMotion, Progress, Searched
 
@@ -38,8 +36,8 @@ if TYPE_CHECKING:
     from rootsopt.optimize.outcome import Optimization
 
 
-TEMPLATE = Path(__file__).with_name("report")
-"""Folder of the templates, styles and scripts."""
+# Folder with the templates, styles and scripts of the report and of the explorer.
+_FOLDER = Path(__file__).parent
 
 # Captions of the figures by file name; other figures are named after their file.
 _CAPTIONS = {
@@ -68,13 +66,15 @@ _UNIT = re.compile(r"(?<=\d) (?=(?:N·m|N|%|mm|µm|ms|rpm|bar|Pa|kPa|mrad|l/min)
 @functools.cache
 def _environment() -> jinja2.Environment:
     made = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(TEMPLATE),
+        loader=jinja2.FileSystemLoader(_FOLDER / "report"),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    made.filters |= {"anchor": anchor, "coded": _coded, "command": _command, "linked": linked}
+    made.filters |= {
+        "anchor": gather.anchor, "coded": _coded, "command": _command, "linked": gather.linked
+    }  # fmt: skip
     made.policies["json.dumps_kwargs"] = {}  # Bokeh reads its models in the order of writing.
     return made
 
@@ -98,22 +98,22 @@ def table_html(table: Table | None) -> str:
     return "" if table is None else str(made.table(table))
 
 
-def _part(*names: str) -> Markup:
-    """Return files of the template folder, one after the other, as they are."""
-    return Markup("\n".join((TEMPLATE / name).read_text("utf-8") for name in names))
+def part(*names: str) -> str:
+    """Return files of the folders `report` and `explore`, one after the other, as they are."""
+    return "\n".join((_FOLDER / name).read_text("utf-8") for name in names)
 
 
-def report_text(run: Run) -> str:
+def report_text(run: gather.Run) -> str:
     """Return the HTML of the report of a `run`. Characters that UTF-8 lacks become `?`."""
     drawn = _charts(run)
     items = [json_item(one, f"chart-{k}", charts.THEME) for k, (*_, one) in enumerate(drawn)]
     status = tables.status_cell(str(run.result.get("status", "")))
-    animation = animations(run.cases)
+    animation = charts.animations(run.cases)
     page = _environment().get_template("page.html.j2")
     text = page.render(
         data={"charts": items, "animation": animation},
-        style=_part("page.css", "pair.css"),
-        script=_part("charts.js", "pair.js", "page.js"),
+        style=Markup(part("report/page.css", "report/pair.css")),
+        script=Markup(part(*(f"report/{name}.js" for name in ("charts", "pair", "page")))),
         bokeh=Markup(Resources("inline", components=["bokeh"]).js_raw[0]) if items else "",
         title=gather.title(run),
         run=run,
@@ -128,7 +128,7 @@ def report_text(run: Run) -> str:
         sections=tables.sections(run.result, run.rows),
         charts=[(title, note) for title, note, _ in drawn],
         animation=animation,
-        pair=_part("pair.html"),
+        pair=Markup(part("report/pair.html")),
         figures=[
             {
                 "caption": _CAPTIONS.get(name, in_words(name.removesuffix(".png")).capitalize()),
@@ -138,12 +138,12 @@ def report_text(run: Run) -> str:
         ],
         statuses=tables.status_table(run.result, run.config),
         effort=tables.effort_table(run.result),
-        glossary=glossary(),
+        glossary=gather.glossary(),
     )
     return text.encode("utf-8", "replace").decode("utf-8")
 
 
-def _charts(run: Run) -> list[tuple[str, str, Any]]:
+def _charts(run: gather.Run) -> list[tuple[str, str, Any]]:
     """Return (title, explanation, chart) of each interactive chart of a run."""
     hover = "Hover over a point to see its design."
     entries = [(title, hover, made) for title, made in charts.front_charts(run.result).items()]
@@ -164,7 +164,7 @@ class ProfilePicture:
 
     def __init__(self) -> None:
         ranges = [DataRange1d(range_padding=0.03) for _ in range(2)]
-        self.figure = chart(
+        self.figure = charts.chart(
             "x (mm)", "y (mm)", 285, tools="", toolbar_location=None, match_aspect=True,
             x_range=ranges[0], y_range=ranges[1], title="Profile, start dashed",
         )  # fmt: skip
@@ -205,7 +205,7 @@ class ForcePicture:
     """The contact force over time, over that at the start."""
 
     def __init__(self) -> None:
-        self.figure = chart(
+        self.figure = charts.chart(
             "time (ms)", "contact force (N)", 265, tools="xpan,xwheel_zoom,reset",
             x_range=Range1d(0, 1), y_range=Range1d(0, 1), title="Contact force over time",
         )  # fmt: skip
@@ -218,7 +218,7 @@ class ForcePicture:
             if name == "drive":
                 fields = {"time": "@time{0.00} ms"}
                 fields |= {side: f"@{side}{{0.0}} N" for side in ("drive", "coast")}
-                hover(self.figure, [line], fields, mode="vline")
+                charts.hover(self.figure, [line], fields, mode="vline")
         style = {"line_color": GREY, "line_width": 1.2, "line_dash": [5, 3]}
         self.figure.line("time", "total", source=self.before, level="underlay",
                          legend_label="at start, both flanks", **style)  # fmt: skip

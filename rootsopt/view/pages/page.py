@@ -18,8 +18,6 @@ from bokeh.models.layouts import Column, LayoutDOM
 
 from rootsopt.view.pages import html
 from rootsopt.view.pages.charts import THEME
-from rootsopt.view.pages.html import TEMPLATE as PAGES
-from rootsopt.view.pages.html import ForcePicture, ProfilePicture
 from rootsopt.view.pages.knobs import Engine, Knob, cut, knobs_of
 from rootsopt.view.pages.session import (
     FromRest,
@@ -33,8 +31,6 @@ from rootsopt.view.pages.session import (
     Session,
 )
 
-_TEMPLATE = Path(__file__).with_name("explore")
-
 # Time (s) of a computation above which the page says how long it has been running.
 _SLOW = 1.0
 
@@ -47,20 +43,15 @@ _BUTTON = ".bk-btn { padding: 3px 9px; font-size: 13px; }"
 _DIGITS = 12
 
 
-def _file(name: str, folder: Path = _TEMPLATE) -> str:
-    """Return the text of a file of a template folder."""
-    return (folder / name).read_text("utf-8")
-
-
 def script(name: str, /, **arguments: Any) -> CustomJS:
-    """Return the script `name` of the template folder, as a callback with these `arguments`."""
-    return CustomJS(args=arguments, code=_file(f"{name}.js"))
+    """Return the script `name` of the page, as a callback with these `arguments`."""
+    return CustomJS(args=arguments, code=html.part(f"explore/{name}.js"))
 
 
 def text(content: str = "", name: str | None = None, **options: Any) -> Div:
     """Return an element that shows HTML, in the style of the page."""
     options = {"sizing_mode": "stretch_width", "margin": 0} | options
-    return Div(text=content, name=name, stylesheets=[_file("widgets.css")], **options)
+    return Div(text=content, name=name, stylesheets=[html.part("explore/widgets.css")], **options)
 
 
 def fade(models: Sequence[LayoutDOM], faded: bool) -> None:
@@ -119,7 +110,7 @@ class Page:
         self.facts: dict[str, Any] = {}  # what `pair` holds
         self.sliders: dict[str, Slider] = {}
         self.fields: dict[str, NumericInput] = {}
-        self.profile, self.force = ProfilePicture(), ForcePicture()
+        self.profile, self.force = html.ProfilePicture(), html.ForcePicture()
         stretch: dict[str, Any] = {"sizing_mode": "stretch_width", "margin": 0}
         hidden = (self.mark, self.file, self.pair)
         roots: dict[str, LayoutDOM] = {
@@ -143,12 +134,12 @@ class Page:
         self.file.js_on_change("tags", script("save", file=self.file, name=name))
         self.document.title = f"rootsopt explore {self.source}"
         self.document.theme = THEME
-        self.document.template = get_env().from_string(_file("page.html.j2"))
+        self.document.template = get_env().from_string(html.part("explore/page.html.j2"))
         self.document.template_variables.update(
             heading=self.document.title,
-            style=_file("page.css") + _file("pair.css", PAGES),
-            pair=_file("pair.html", PAGES),
-            script=_file("pair.js", PAGES),
+            style=html.part("explore/page.css", "report/pair.css"),
+            pair=html.part("report/pair.html"),
+            script=html.part("report/pair.js"),
         )
         self.status.text = html.status_line("preparing", "wait", "Computing the first profile …")
         self._show_numbers()
