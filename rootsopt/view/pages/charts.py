@@ -201,11 +201,8 @@ def motion(profile: Profile, series: Series | None = None, period: int | None = 
 
 def _contacts(flank: Contacts) -> dict[str, list]:
     """Return contact points (mm), normals, and flags of contact in perfect rolling, of a flank."""
-    parts = (*flank.point.T, *flank.normal.T)
-    columns = {
-        name: _rounded(part, 5) for name, part in zip(("x", "y", "nx", "ny"), parts, strict=True)
-    }
-    return columns | {"present": flank.present.tolist()}
+    parts = zip(("x", "y", "nx", "ny"), (*flank.point.T, *flank.normal.T), strict=True)
+    return {name: _rounded(part, 5) for name, part in parts} | {"present": flank.present.tolist()}
 
 
 def _rounded(values: ArrayLike, places: int) -> list[float]:

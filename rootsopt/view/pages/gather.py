@@ -197,10 +197,11 @@ def scene(config: Config) -> str:
     """Return one sentence that describes the scene of a config."""
     data = config.scene
     load = data.load
-    if load.torque_N_m is not None:
-        under = f"under a load of {brief(load.torque_N_m)} N·m on rotor 2"
-    else:
-        under = f"under a pressure difference of {quantity(load.pressure_difference_Pa, 'Pa')}"
+    under = (
+        f"under a pressure difference of {quantity(load.pressure_difference_Pa, 'Pa')}"
+        if load.torque_N_m is None
+        else f"under a load of {brief(load.torque_N_m)} N·m on rotor 2"
+    )
     gear, away = data.timing_gear, data.center_distance_error_mm
     parts = (
         gear and f"a timing gear with {brief(gear.backlash_mm)} mm backlash",

@@ -172,7 +172,7 @@ class ProfilePicture:
         self.now = ColumnDataSource(empty, name="outline_now")
         self.before, self.pitch = ColumnDataSource(empty), ColumnDataSource(empty)
         self.ends = ColumnDataSource({"x": [-1.0, 1.0], "y": [-1.0, 1.0]})
-        self._reach = self._radius = 0.0
+        self._reach = 0.0
         line = {"line_color": "#111111", "line_width": 1.5}
         self.figure.patch("x", "y", source=self.now, fill_color=SKY, fill_alpha=0.35, **line)
         dashes = {"line_dash": [5, 3], "line_width": 1.2}
@@ -191,10 +191,8 @@ class ProfilePicture:
         self.now.data = _points(shape.outline)
         if not len(self.before.data["x"]):
             self.before.data = _points(shape.outline)
-        if radius != self._radius:
-            self._radius = radius
-            turn = np.linspace(0, 2 * np.pi, 181)
-            self.pitch.data = _points(radius * np.stack([np.cos(turn), np.sin(turn)], -1))
+        turn = np.linspace(0, 2 * np.pi, 181)
+        self.pitch.data = _points(radius * np.stack([np.cos(turn), np.sin(turn)], -1))
 
 
 def _points(outline: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
@@ -278,18 +276,16 @@ def gradient_table(config: Config, evaluation: Evaluation | None) -> str:
         words = f"The family {html.escape(config.profile.family)} has no design parameters."
         return f'<p><b>Gradient</b></p><p class="note">{words}</p>'
     unknown = dict.fromkeys(config.design_keys)
-    gradient = {name: unknown for name in RESPONSES}
-    if evaluation is not None and evaluation.gradient:
-        gradient = evaluation.gradient
+    known = None if evaluation is None else evaluation.gradient
+    gradient = known or {name: unknown for name in RESPONSES}
     return table_html(next(tables.gradient_tables({"design": unknown, "gradient": gradient})))
 
 
 def status_line(word: str, kind: str, words: str, note: str = "") -> str:
     """Return the line with a status: its `word`, `kind` (good, bad, wait), advice and a note."""
     text = f'<span class="word {kind}">{html.escape(word)}</span><span>{html.escape(words)}</span>'
-    if note:
-        text += f'<span class="note">{html.escape(note)}</span>'
-    return f'<div class="status">{text}</div>'
+    more = f'<span class="note">{html.escape(note)}</span>' if note else ""
+    return f'<div class="status">{text}{more}</div>'
 
 
 def notes_lines(notes: Iterable[str]) -> str:
@@ -350,14 +346,10 @@ def searched_line(ended: Searched) -> str:
         return status_line(word, "bad", reason)
     if outcome.status is Status.PERIODIC:
         word = "optimum"
-    return status_line(word, "good", _improved(outcome), _certified(outcome))
-
-
-def _improved(outcome: "Optimization") -> str:
-    """Return the improvement of the optimum over the design at which the search began."""
     gains = outcome.improvement.items()
     changes = (f"{name_and_unit(key)[0]} {percent(1, 1 - gain)}" for key, gain in gains)
-    return f"Against the start of the search: {', '.join(changes)}."
+    words = f"Against the start of the search: {', '.join(changes)}."
+    return status_line(word, "good", words, _certified(outcome))
 
 
 def _certified(outcome: "Optimization") -> str:
