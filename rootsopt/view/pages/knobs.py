@@ -3,11 +3,10 @@
 A knob has a name, a unit, a span and an allowed range. An `Engine` computes the geometry of a
 config, and its motion near a known one."""
 
-import dataclasses
 import functools
 import math
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -59,9 +58,8 @@ _ORDER = (_DESIGN, "Speed and mounting", "Load", "Motor", "Timing gear", "Contac
 # Span of a slider as multiples of the config's own value.
 _AROUND = 0.2, 2.0
 
-# Half of the span of a slider, by unit, for a value of 0; `_ELSE` for other units.
+# Half of the span of a slider, by unit, for a value of 0; 1 for other units.
 _ZERO = {"mm": 0.2, "mrad": 1.0, "°": 60.0, "K": 60.0}
-_ELSE = 1.0
 
 # Least number of steps of a slider that is not whole.
 _STEPS = 200
@@ -94,7 +92,7 @@ def knobs_of(config: Config) -> list[Knob]:
 
     Design parameters span their bounds in an optimisation. Parts that the scene does not have, and
     keys that are not set, have no knobs."""
-    knobs = _design(config)
+    knobs = [*_design(config)]
     known = {knob.key for knob in knobs}
     for key, field in tree(Config).items():
         section, name = key.partition(".")[0], key.rpartition(".")[2]
@@ -115,16 +113,15 @@ def dotted(key: str) -> str:
     return f"rotor.{key}" if key == TWIST else f"profile.{key}"
 
 
-def _design(config: Config) -> list[Knob]:
-    """Return the knobs of the design parameters."""
-    knobs = []
+def _design(config: Config) -> Iterator[Knob]:
+    """Yield the knobs of the design parameters."""
     known = {one.key: one for one in family_of(config.profile.family).parameters}
     values = zip(config.design_keys, config.design.tolist(), bounds_of(config), strict=True)
     for key, value, (low, high) in values:
         if key == TWIST:
             knob = _scene(tree(Config)[dotted(key)], dotted(key), value)
             ends = {"low": min(low, value), "high": max(high, value), "step": _step(high - low)}
-            knobs.append(knob._replace(group=_DESIGN, **ends))
+            yield knob._replace(group=_DESIGN, **ends)
             continue
         owner = known.get(key) or known[key.rpartition("_")[0]]  # entries of a list are numbered
         sized = owner.limits(config.profile.pitch_radius_mm) or (owner.lowest, owner.highest)
@@ -135,21 +132,16 @@ def _design(config: Config) -> list[Knob]:
         name = words(owner.key)
         if key != owner.key:
             name = f"{name.removesuffix('s')} {key.rpartition('_')[2]}"
-        knobs.append(
-            Knob(
-                dotted(key), name, unit_of(owner.key), owner.help, _DESIGN, value,
-                min(low, value), max(high, value), _step(high - low), least, most, False,
-            )
+        yield Knob(
+            dotted(key), name, unit_of(owner.key), owner.help, _DESIGN, value,
+            min(low, value), max(high, value), _step(high - low), least, most, False,
         )  # fmt: skip
-    return knobs
 
 
 def _scene(field: FieldInfo, key: str, value: float) -> Knob:
     """Return the knob of any other number of the config."""
     (least, most), whole = limits_of(field).ends, is_whole(field)
-    low, high = _span(key, value, least < 0)
-    if whole:
-        low, high = least, most
+    low, high = (least, most) if whole else _span(key, value, least < 0)
     low, high = max(low, least), min(high, most)
     section, _, name = key.rpartition(".")
     return Knob(
@@ -163,12 +155,8 @@ def _span(key: str, value: float, signed: bool) -> tuple[float, float]:
     """Return the span of a slider around a `value`, before the key's limits are applied.
 
     `signed`: whether the key may be negative; its slider then reaches as far below 0 as above."""
-    reach = max(2 * abs(value), _ZERO.get(unit_of(key), _ELSE) * (signed or not value))
-    if signed:
-        return -reach, reach
-    if not value:
-        return 0.0, reach
-    return _AROUND[0] * value, _AROUND[1] * value
+    reach = max(_AROUND[1] * abs(value), _ZERO.get(unit_of(key), 1.0) * (signed or not value))
+    return -reach if signed else _AROUND[0] * value, reach
 
 
 def _step(width: float) -> float:
@@ -267,8 +255,7 @@ def _shape(scene: Scene, design) -> tuple[Profile, Geometry]:
 def cut(series: Series) -> Series:
     """Return the first revolutions of a long motion."""
     kept = series.rotation - series.rotation[0] < 2 * np.pi * _TURNS
-    given = ((one.name, getattr(series, one.name)) for one in dataclasses.fields(series))
-    values: dict[str, Any] = {name: None if x is None else x[kept] for name, x in given}
+    values: dict[str, Any] = {k: None if x is None else x[kept] for k, x in vars(series).items()}
     return Series(**values)
 
 

@@ -71,9 +71,7 @@ class Page:
     def __init__(self, document: Document, engine: Engine, source: str):
         self.document = document
         self.engine = engine
-        self.source = source
-        self.config = engine.given
-        self.knobs = knobs_of(self.config)
+        self.knobs = knobs_of(engine.given)
         self.start: dict[str, Any] = {}  # record of the first values
         self.shape: NewShape | None = None
         self.motion: NewMotion | None = None
@@ -82,9 +80,10 @@ class Page:
         self.progress: Progress | None = None
         self.cancelled = self.setting = self.closed = self.late = False
         self.before = -1  # number of the motion shown at the last tick
-        self._build()
+        self._build(source)
         self.session = Session(engine, self.post)
         document.add_periodic_callback(self._tick, _TICK)
+        document.on_session_destroyed(lambda _: self.close())
 
     def close(self) -> None:
         """End the session, when its tab has been closed."""
@@ -98,7 +97,7 @@ class Page:
 
     # The models of the page
 
-    def _build(self) -> None:
+    def _build(self, source: str) -> None:
         self.status, self.notes, self.numbers, self.gradient = (
             text(name=f"{name}_text") for name in ("status", "notes", "numbers", "gradient")
         )
@@ -130,9 +129,9 @@ class Page:
         self.document.js_on_event("document_ready", draw)
         self.force.figure.js_on_event("tap", CustomJS(code="rootsoptView.seek(cb_obj.x)"))
         self.mark.js_on_change("text", script("shown", mark=self.mark, latency=latency))
-        name = f"{Path(self.source).stem}-explored.yaml"
+        name = f"{Path(source).stem}-explored.yaml"
         self.file.js_on_change("tags", script("save", file=self.file, name=name))
-        self.document.title = f"rootsopt explore {self.source}"
+        self.document.title = f"rootsopt explore {source}"
         self.document.theme = THEME
         self.document.template = get_env().from_string(html.part("explore/page.html.j2"))
         self.document.template_variables.update(
@@ -150,7 +149,7 @@ class Page:
         self.save = Button(label="Save as YAML", name="save")
         self.from_rest = Button(label="Show from rest", disabled=True, name="from_rest")
         self.reset = Button(label="Back to start", name="reset")
-        self.optimize.disabled = not self.config.design_keys
+        self.optimize.disabled = not self.engine.given.design_keys
         for button, work in (
             (self.optimize, self._optimize),
             (self.cancel, self._cancel),
@@ -193,9 +192,8 @@ class Page:
     # What the user does
 
     def _moved(self, key: str, _: str, old: Any, new: Any) -> None:
-        if new is None or self.setting:
-            return
-        self.session.move({key: float(f"{new:.{_DIGITS}g}")})
+        if new is not None and not self.setting:
+            self.session.move({key: float(f"{new:.{_DIGITS}g}")})
 
     def _set(self, values: dict[str, float]) -> None:
         """Set sliders and fields to `values`, and compute once."""
@@ -319,7 +317,7 @@ class Page:
         record = {} if now is None else now.record()
         record |= {} if self.shape is None else {"geometry": self.shape.shape.record}
         self.numbers.text = html.numbers_table(record, self.start)
-        self.gradient.text = html.gradient_table(self.config, now)
+        self.gradient.text = html.gradient_table(self.engine.given, now)
         fade([self.numbers, self.gradient, self.force.figure], faded)
 
     def _tick(self) -> None:

@@ -10,7 +10,6 @@ from collections.abc import Callable
 
 from bokeh.application import Application
 from bokeh.application.handlers.function import FunctionHandler
-from bokeh.document import Document
 from bokeh.server.server import BaseServer
 from bokeh.server.tornado import BokehTornado
 from tornado.httpserver import HTTPServer
@@ -66,7 +65,6 @@ class PageServer:
     Raises `InputError` if the port cannot be used."""
 
     def __init__(self, engine: Engine, source: str, port: int = 0):
-        self.engine, self.source = engine, source
         _keep_quiet()
         prefix = f"/{secrets.token_urlsafe(_TOKEN)}"
         loop = IOLoop()
@@ -77,12 +75,12 @@ class PageServer:
                 f"`--port` must be a free port, but {port} cannot be used "
                 f"({error.strerror or error}); choose another one, or leave `--port` out"
             ) from error
-        self.port = sockets[0].getsockname()[1]
+        port = sockets[0].getsockname()[1]
         pages = BokehTornado(
-            {"/": Application(FunctionHandler(self._open))},
+            {"/": Application(FunctionHandler(lambda tab: Page(tab, engine, source)))},
             prefix=prefix,
             # Only the page's own scripts may connect.
-            extra_websocket_origins=[f"{name}:{self.port}" for name in (ADDRESS, "localhost")],
+            extra_websocket_origins=[f"{name}:{port}" for name in (ADDRESS, "localhost")],
             ico_path="none",
             unused_session_lifetime_milliseconds=_LIFETIME,
             check_unused_sessions_milliseconds=_LIFETIME // 3,
@@ -90,11 +88,7 @@ class PageServer:
         web = HTTPServer(pages)
         web.add_sockets(sockets)
         self.server = BaseServer(loop, pages, web)
-        self.url = f"http://{ADDRESS}:{self.port}{prefix}/"
-
-    def _open(self, document: Document) -> None:
-        page = Page(document, self.engine, self.source)
-        document.on_session_destroyed(lambda _: page.close())
+        self.url = f"http://{ADDRESS}:{port}{prefix}/"
 
     def run(self, stop: threading.Event, started: Callable[[str], None]) -> None:
         """Serve pages until `stop` is set. `started` is called with the address."""

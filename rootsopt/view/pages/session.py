@@ -84,10 +84,6 @@ class Latest:
             return None
 
 
-# Time (s) without a new value after which the motion is computed from rest.
-_IDLE = 0.4
-
-
 @dataclasses.dataclass(frozen=True)
 class Message:
     """A change for the values with this `number`; the first values have the number 0."""
@@ -165,7 +161,7 @@ class Session:
     called from several threads. `idle`: time (s) without a new value after which the motion is
     computed from rest."""
 
-    def __init__(self, engine: Engine, show: Callable[[Message], None], idle: float = _IDLE):
+    def __init__(self, engine: Engine, show: Callable[[Message], None], idle: float = 0.4):
         self.engine = engine
         self.show = show
         self.idle = idle
@@ -184,8 +180,7 @@ class Session:
         """Set new `values`, numbers by dotted config key; return their number."""
         with self._lock:
             self.values |= values
-            self.number += 1
-            number = self.number
+            self.number = number = self.number + 1
         self._ask(number)
         return number
 
@@ -276,10 +271,11 @@ class Session:
         shown, known = self._shown, self._rest
         config = self.config()
         shape = self.engine.shape(config)  # refuses a profile that is not sound
-        if known is not None and known.number == number:
-            evaluation = known.evaluation
-        else:
-            evaluation = self.engine.from_rest(config)
+        evaluation = (
+            known.evaluation
+            if known is not None and known.number == number
+            else self.engine.from_rest(config)
+        )
         if number != self.number:
             return evaluation
         same = (
