@@ -91,8 +91,7 @@ def plot_front(ax: Axes, front: "Front", x: str, y: str) -> Axes:
 
 
 def _axis(aim) -> str:
-    better = "less is better" if aim.sense == "min" else "more is better"
-    return f"{aim.label}, {better}"
+    return f"{aim.label}, {'less' if aim.sense == 'min' else 'more'} is better"
 
 
 def front_figure(folder: ResultFolder, front: "Front") -> None:

@@ -73,8 +73,8 @@ def _starts(starts: NDArray[np.int_]) -> Iterator[tuple[int, dict[str, Any]]]:
         else:
             color = COLORS[start % len(COLORS)]
             marker = _MARKERS[(start // len(COLORS) + start) % len(_MARKERS)]
-            style = {"color": color, "marker": marker, "linestyle": "-", "linewidth": 1}
-            style["label"] = f"start {start}" if i < 10 else None
+            style = {"color": color, "marker": marker, "linestyle": "-", "linewidth": 1,
+                     "label": f"start {start}" if i < 10 else None}  # fmt: skip
         yield start, style
 
 

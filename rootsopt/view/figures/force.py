@@ -47,11 +47,14 @@ def plot_force(
         plot_flank_force(ax, time, run.drive_force[shown], BLUE, "drive flank")
         plot_flank_force(ax, time, run.coast_force[shown], VERMILION, "coast flank")
         mean, peak = responses[name]["mean_force_N"], responses[name]["peak_force_N"]
-        label = f"mean {number(mean)} N"
-        ax.axhline(mean, color="black", linestyle="--", linewidth=1.1, label=label)
+        ax.axhline(
+            mean, color="black", linestyle="--", linewidth=1.1, label=f"mean {number(mean)} N"
+        )
         first = time[np.argmax(force >= 0.999 * np.max(force))]
-        label = f"peak {number(peak)} N"
-        ax.plot(first, peak, color="black", marker=CARETDOWN, ls="", markersize=9, label=label)
+        ax.plot(
+            first, peak, color="black", marker=CARETDOWN, ls="", markersize=9,
+            label=f"peak {number(peak)} N",
+        )  # fmt: skip
         ax.set(title=name, ylabel="contact force (N)", xlim=(0, len(force) * step))
         beside(ax)
     top = max(max(responses[k]["peak_force_N"], np.max(series[k].force)) for k in series)
@@ -69,8 +72,10 @@ def plot_gap(axes: Sequence[Axes] | NDArray, series: Mapping[str, Series]) -> No
         time, gap = (run.time[turn] - run.time[0]) * 1e3, -1e6 * run.depth[turn]
         ax.plot(time, gap, color=BLUE, linewidth=1.2, label="gap of the nearer flanks")
         least = float(np.min(gap))
-        label = f"least gap {number(least)} µm"
-        ax.axhline(least, color="black", linestyle="--", linewidth=1.1, label=label)
+        ax.axhline(
+            least, color="black", linestyle="--", linewidth=1.1,
+            label=f"least gap {number(least)} µm",
+        )  # fmt: skip
         # Between two lobes, the gap is as wide as the rotors. Only its narrow part is informative.
         high = min(1.12 * float(np.max(gap)), 4 * least)
         ax.set(title=name, ylabel="gap (µm)", xlim=(0, time[-1]), ylim=(0, high))

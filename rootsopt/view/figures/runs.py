@@ -31,7 +31,7 @@ def profile_figures(folder: ResultFolder, config: Config, record: Mapping[str, A
 
     `record`: the design's record in the result file. The figures are profiles.png, meshing.png and,
     for a profile read from a file, conjugacy.png."""
-    points = _outline(config, record.get("design", {}))
+    points = outline_mm(config, [*record["design"].values()])
     _profiles(folder, {config.profile.family.upper(): points}, config)
     _meshing(folder, points, config)
     if config.profile.from_file:
@@ -65,8 +65,8 @@ def optimization_figures(
     of the optimised design; `given`: that of the baseline, if its profile is of another family."""
     designs = {"baseline": baseline, "optimised": optimized}
     outlines = {
-        "baseline": _outline(given or config, baseline.design),
-        "optimised": _outline(config, optimized.design),
+        "baseline": outline_mm(given or config, [*baseline.design.values()]),
+        "optimised": outline_mm(config, [*optimized.design.values()]),
     }
     _profiles(folder, outlines, config)
     _meshing(folder, outlines["optimised"], config, "optimised rotors")
@@ -91,10 +91,6 @@ def feasible_figure(
     plot_feasible(axes[0, 0], columns, design, vertex["others"])
     entries = axes[0, 0].get_legend_handles_labels()[0]
     write(folder, "feasible", made, "Designs that satisfy all limits", entries, 3)
-
-
-def _outline(config, design):
-    return outline_mm(config, np.asarray([design[key] for key in config.design_keys]))
 
 
 def _profiles(folder, outlines, config):
@@ -125,8 +121,7 @@ def _meshing(folder, points, config, what="rotors"):
     plot_meshing(list(axes.ravel()), points, lobes, config.profile.pitch_radius_mm, angles)
     made.supxlabel("x (mm)")
     made.supylabel("y (mm)")
-    title = f"Meshing of the {what} over one lobe pitch ({360 / lobes:g}°)"
-    write(folder, "meshing", made, title)
+    write(folder, "meshing", made, f"Meshing of the {what} over one lobe pitch ({360 / lobes:g}°)")
 
 
 def _force_figures(folder, designs, config) -> None:

@@ -287,8 +287,7 @@ def plot_motions(axes: Sequence[Axes], attractors: Sequence[Attractor], colors, 
 
     All panels cover the same number of mesh periods. `axes`, `colors`: one for each motion;
     `lobes`: number of lobes of a rotor."""
-    longest = max(one.evaluation.steady_state.get("period", lobes) for one in attractors)
-    shown = max(longest, 2)
+    shown = max(2, *(one.evaluation.steady_state.get("period", lobes) for one in attractors))
     for ax, one, color in zip(axes, attractors, colors, strict=True):
         series = one.evaluation.series
         assert series is not None
@@ -305,15 +304,20 @@ def plot_motions(axes: Sequence[Axes], attractors: Sequence[Attractor], colors, 
 
 def _entries(basins: Basins) -> list[Patch | Line2D]:
     """Return legend entries for the colours of a map, and for its marks."""
-    entries: list[Patch | Line2D] = []
-    for number, (one, color) in enumerate(zip(basins.attractors, _colors(basins), strict=True), 1):
-        entries.append(Patch(facecolor=_pale(color), edgecolor=color, label=_label(number, one)))
-    for name, share in basins.lost.items():
-        entries.append(Patch(facecolor=_pale(_LOST), label=f"{in_words(name)}, {share:.0%}"))
+    pairs = enumerate(zip(basins.attractors, _colors(basins), strict=True), 1)
+    motions = [
+        Patch(facecolor=_pale(color), edgecolor=color, label=_label(number, one))
+        for number, (one, color) in pairs
+    ]
+    lost = [
+        Patch(facecolor=_pale(_LOST), label=f"{in_words(name)}, {share:.0%}")
+        for name, share in basins.lost.items()
+    ]
     point: dict[str, Any] = {"marker": "o", "color": GREY, "markeredgecolor": "white"}
     rest: dict[str, Any] = {"marker": "+", "color": "black", "markersize": 11}
     return [
-        *entries,
+        *motions,
+        *lost,
         Line2D([], [], linestyle="", label="motion, once every mesh period", **point),
         Line2D([], [], linestyle="", label="start at rest", **rest),
     ]
@@ -323,9 +327,11 @@ def _label(number: int, one: Attractor) -> str:
     steady, response = one.evaluation.steady_state, one.evaluation.response
     period = steady.get("period")
     kind = f"period {period}" if period else in_words(one.evaluation.status.label)
-    force = ""
-    if response:
-        force = f", mean {response['mean_force_N']:.4g} N, peak {response['peak_force_N']:.4g} N"
+    force = (
+        f", mean {response['mean_force_N']:.4g} N, peak {response['peak_force_N']:.4g} N"
+        if response
+        else ""
+    )
     return f"{number}: {kind}, {one.share:.1%} of the states{force}"
 
 

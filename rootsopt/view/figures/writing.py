@@ -38,21 +38,19 @@ def write(
     config = config.with_design(values)  # The twist may be a design parameter.
     profile = Scene.from_config(config).profile(jnp.asarray(values))
     drawing = Drawing.of(config, profile, design)
-    files: dict[str, bytes] = {}
     if "dxf" in formats:
-        files["rotor.dxf"] = dxf_bytes(drawing)
+        folder.write_bytes("rotor.dxf", dxf_bytes(drawing))
         points = coordinates(drawing.pieces, drawing.lobes, _COUNT)
         folder.write_csv("rotor_points.csv", points.columns())
     if "svg" in formats:
-        files["rotor.svg"] = svg_text(drawing).encode()
+        folder.write_text("rotor.svg", svg_text(drawing))
     if set(formats) & set(SOLID):
-        files |= _solids(drawing, formats, folder.place)
+        for name, data in _solids(drawing, formats, folder.place).items():
+            folder.write_bytes(name, data)
     if "gif" in formats:
         from rootsopt.view.figures.animation import meshing_gif
 
-        files["figures/meshing.gif"] = meshing_gif(drawing, profile, series, periods)
-    for name, data in files.items():
-        folder.write_bytes(name, data)
+        folder.write_bytes("figures/meshing.gif", meshing_gif(drawing, profile, series, periods))
 
 
 def write_simulated(
