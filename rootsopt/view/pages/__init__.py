@@ -19,6 +19,3 @@ def require(what: str, extra: str = "pages") -> None:
     """Raise `InputError` unless the libraries of pages are installed, which `what` needs."""
     if words := missing(extra):
         raise InputError(f"{what} needs {words}")
-
-
-__all__ = ["REPORT", "missing", "require"]

@@ -1,7 +1,7 @@
 """Interactive charts of a report, as figures that Bokeh's script draws in the browser."""
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -110,12 +110,11 @@ def force_chart(cases: Sequence[Case]) -> Any | None:
     return made
 
 
-def front_charts(result: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a chart of each pair of terms of a front, by title.
+def front_charts(result: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Yield (title, chart) of each pair of terms of a front.
 
     `result`: content of the result file."""
     points = result.get("points") or []
-    charts = {}
     names = [aim["name"] for aim in result.get("terms") or ()] if points else []
     for up, across in itertools.combinations(names, 2):
         made = chart(label(across), label(up), name=f"{across} {up}")
@@ -132,8 +131,7 @@ def front_charts(result: Mapping[str, Any]) -> dict[str, Any]:
             drawn = made.scatter(across, up, source=data, legend_label=name, **_LOOKS[name])
             hover(made, [drawn], {"point": "@what"}
                   | {label(key): f"@{{shown {key}}}" for key in tips})  # fmt: skip
-        charts[f"{label(up)} against {label(across)}"] = made
-    return charts
+        yield f"{label(up)} against {label(across)}", made
 
 
 def _thinned(force: NDArray[np.float64]) -> NDArray[np.intp]:
@@ -162,8 +160,10 @@ def animations(cases: Sequence[Case]) -> dict[str, Any]:
         if key not in rotors:
             rotors[key] = rotor(case.config, np.asarray(outline(profile, points=240)) / MM)
         period = case.record.get("steady_state", {}).get("period")
-        entry = {"name": case.name, "rotor": [*rotors].index(key)}
-        shown.append(entry | motion(profile, case.series, period))
+        shown.append(
+            {"name": case.name, "rotor": [*rotors].index(key)}
+            | motion(profile, case.series, period)
+        )
     return {"rotors": [*rotors.values()], "cases": shown}
 
 

@@ -21,7 +21,7 @@ from rootsopt.response.result import Series
 from rootsopt.view.files import ResultFolder, design_file
 from rootsopt.view.names import brief, in_words, listed, name_and_unit, quantity, stated, varied
 from rootsopt.view.tables import NAMES, records_of
-from rootsopt.view.terminal import Ending, ending
+from rootsopt.view.terminal import ending
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,7 +49,8 @@ class Run:
 
     `command`: name of the command; `path`: final path of the result folder; `config`: resolved
     config, with its YAML as `yaml`; `cases`: designs and motions; `rows`: rows of a sweep's table;
-    `figures`: content of each PNG file by name.
+    `figures`: content of each PNG file by name; `end`: outcome and next commands, as on the
+    terminal.
 
     Raises `InputError` if a config in the folder cannot be read."""
 
@@ -63,18 +64,14 @@ class Run:
     ):
         place = folder.place
         pictures = sorted((place / "figures").glob("*.png"))
-        self.result, self.source, self.usable, self.imports = result, source, usable, imports
-        self.command, self.path = str(result.get("run", {}).get("command", "")), folder.path
+        self.result, self.source, self.usable = result, source, usable
+        self.command, self.path = str(result["run"]["command"]), folder.path
         self.config = load(place / "config.yaml")
         self.yaml = (place / "config.yaml").read_text("utf-8")
         self.cases = tuple(_cases(place, self.config, result))
         self.rows = tuple(_rows(place / "sweep.csv"))
         self.figures = {path.name: path.read_bytes() for path in pictures}
-
-    @property
-    def end(self) -> Ending:
-        """Outcome and next commands, as on the terminal."""
-        return ending(self.result, self.path, self.source, self.imports, self.rows)
+        self.end = ending(result, self.path, source, imports, self.rows)
 
 
 def _cases(place: Path, config: Config, result: Mapping[str, Any]) -> Iterator[Case]:
@@ -126,25 +123,28 @@ def _series(place: Path, name: str) -> Series | None:
     return Series(columns["time_s"], **values, depth=np.full(len(table), np.nan))
 
 
-_ASKED = {
-    "optimize": "Find the design with the lowest objective, and compare it with the baseline.",
-    "improve": "Find a better rotor than that of a file, in its place.",
-    "simulate": "Simulate one design in one scene: steady state, contact force, gradient.",
-    "pareto": "Trace the best compromises between two or three quantities.",
-    "sweep": "Simulate one design in many scenes.",
-    "attractors": "Find the coexisting motions of a scene.",
-    "identify": "Fit quantities of a scene to a measured record.",
-    "profile": "Compute the geometry of one design.",
-}
-_TITLES = {
-    "optimize": "Optimisation of {pair}",
-    "improve": "A better rotor: {pair}",
-    "simulate": "Simulation of {pair}",
-    "pareto": "Best compromises for {pair}",
-    "sweep": "Sweep of {pair}",
-    "attractors": "Coexisting motions of {pair}",
-    "identify": "What a record tells of {pair}",
-    "profile": "Geometry of {pair}",
+# Title of the report and task of the run, by command.
+_TASKS = {
+    "optimize": (
+        "Optimisation of {pair}",
+        "Find the design with the lowest objective, and compare it with the baseline.",
+    ),
+    "improve": ("A better rotor: {pair}", "Find a better rotor than that of a file, in its place."),
+    "simulate": (
+        "Simulation of {pair}",
+        "Simulate one design in one scene: steady state, contact force, gradient.",
+    ),
+    "pareto": (
+        "Best compromises for {pair}",
+        "Trace the best compromises between two or three quantities.",
+    ),
+    "sweep": ("Sweep of {pair}", "Simulate one design in many scenes."),
+    "attractors": ("Coexisting motions of {pair}", "Find the coexisting motions of a scene."),
+    "identify": (
+        "What a record tells of {pair}",
+        "Fit quantities of a scene to a measured record.",
+    ),
+    "profile": ("Geometry of {pair}", "Compute the geometry of one design."),
 }
 
 _SENSES = {"min": "as low as possible", "max": "as high as possible"}
@@ -155,12 +155,12 @@ _FEW = 6
 
 def title(run: "Run") -> str:
     """Return the title of the report."""
-    return _TITLES.get(run.command, "{pair}").format(pair=_pair(run.config))
+    return _TASKS[run.command][0].format(pair=_pair(run.config))
 
 
 def asked(run: "Run") -> list[str]:
     """Return sentences on the task of the run."""
-    sentences = [_ASKED.get(run.command, f"Run the command {run.command}."), scene(run.config)]
+    sentences = [_TASKS[run.command][1], scene(run.config)]
     sentences += (run.result.get("improve") or {}).get("found", [])
     if run.command in ("optimize", "improve"):
         sentences.append(_objective(run.config))

@@ -146,7 +146,7 @@ def report_text(run: gather.Run) -> str:
 def _charts(run: gather.Run) -> list[tuple[str, str, Any]]:
     """Return (title, explanation, chart) of each interactive chart of a run."""
     hover = "Hover over a point to see its design."
-    entries = [(title, hover, made) for title, made in charts.front_charts(run.result).items()]
+    entries = [(title, hover, made) for title, made in charts.front_charts(run.result)]
     note = (
         "Hover for values, drag to zoom; a button at the right zooms out. A click moves the rotors "
         "below to that time."
@@ -324,10 +324,8 @@ def _summary(evaluation: Evaluation) -> str:
     return f"{word}, mean {brief(mean, 4)} N, peak {brief(peak, 4)} N"
 
 
-def progress_line(progress: Progress | None, cancelled: bool) -> str:
-    """Return the state of a search that is running."""
-    if cancelled:
-        return status_line("stopping", "wait", "Checking the best design found so far …")
+def progress_line(progress: Progress | None) -> str:
+    """Return the state of a search that is running; `None`: nothing is simulated yet."""
     if progress is None:
         return status_line("optimising", "wait", "Simulating the baseline …")
     best = f"; best objective {progress.best:.4f}" if progress.best == progress.best else ""

@@ -77,7 +77,6 @@ class Page:
         self.motion: NewMotion | None = None
         self.rest: FromRest | None = None
         self.problem: Problem | None = None
-        self.progress: Progress | None = None
         self.cancelled = self.setting = self.closed = self.late = False
         self.before = -1  # number of the motion shown at the last tick
         self._build(source)
@@ -207,15 +206,17 @@ class Page:
         self.session.move(values)
 
     def _optimize(self) -> None:
-        self.progress, self.cancelled = None, False
-        self.search.text = html.progress_line(None, False)
+        self.cancelled = False
+        self.search.text = html.progress_line(None)
         self.search.visible = True
         self._lock(True)
         self.session.optimize()
 
     def _cancel(self) -> None:
         self.cancelled = True
-        self.search.text = html.progress_line(self.progress, True)
+        self.search.text = html.status_line(
+            "stopping", "wait", "Checking the best design found so far …"
+        )
         self.session.cancel()
 
     def _lock(self, locked: bool) -> None:
@@ -240,9 +241,8 @@ class Page:
         refused = self.problem is not None and message.number < self.problem.number
         match message:
             case Progress():
-                self.progress = message
                 if not self.cancelled:
-                    self.search.text = html.progress_line(message, False)
+                    self.search.text = html.progress_line(message)
             case Searched():
                 self._lock(False)
                 self.search.text = html.searched_line(message)
