@@ -27,25 +27,22 @@ if TYPE_CHECKING:
     from build123d.topology import Shape
 
 
-OUTLINE, BORE, PITCH, CENTER, TEXT = "OUTLINE", "BORE", "PITCH_CIRCLE", "CENTER_LINES", "TEXT"
-"""Names of the DXF layers: outline, bore, pitch circle, centre lines and notes."""
-CIRCLES, DIMENSIONS, TITLE, TABLE = "CIRCLES", "DIMENSIONS", "TITLE_BLOCK", "TABLE"
-"""Names of the DXF layers: outer and root circle, dimensions, title block, coordinates."""
-
-# Colour index of AutoCAD (7 is black on white), line type, line width (1/100 mm) of each layer.
-_STYLES = {
-    OUTLINE: (7, "CONTINUOUS", 50),
-    BORE: (7, "CONTINUOUS", 50),
-    PITCH: (5, "DASHDOT", 18),
-    CENTER: (1, "CENTER", 18),
-    TEXT: (8, "CONTINUOUS", 18),
-    CIRCLES: (8, "PHANTOM", 13),
-    DIMENSIONS: (3, "CONTINUOUS", 18),
-    TITLE: (7, "CONTINUOUS", 25),
-    TABLE: (8, "CONTINUOUS", 13),
+# Layers of the DXF file: colour index of AutoCAD (7 is black on white), line type, line width
+# (1/100 mm).
+_LAYERS = {
+    "OUTLINE": (7, "CONTINUOUS", 50),
+    "BORE": (7, "CONTINUOUS", 50),
+    "PITCH_CIRCLE": (5, "DASHDOT", 18),
+    "CENTER_LINES": (1, "CENTER", 18),
+    "TEXT": (8, "CONTINUOUS", 18),  # notes
+    "CIRCLES": (8, "PHANTOM", 13),  # outer and root circle
+    "DIMENSIONS": (3, "CONTINUOUS", 18),
+    "TITLE_BLOCK": (7, "CONTINUOUS", 25),
+    "TABLE": (8, "CONTINUOUS", 13),  # coordinates
 }
-STYLE = "ROTOR"
-"""Name of the dimension style."""
+
+# Name of the dimension style.
+_STYLE = "ROTOR"
 
 # Number of points from tip to root in the table of the drawing.
 _ROWS = 19
@@ -60,7 +57,7 @@ def add_style(document: Any, drawing: Drawing) -> None:
     Dimensions are rounded to 0.001 mm."""
     height = letter(drawing)
     document.dimstyles.add(
-        STYLE,
+        _STYLE,
         dxfattribs={
             "dimtxt": height, "dimasz": 0.9 * height, "dimexo": 0.4 * height,
             "dimexe": 0.6 * height, "dimgap": 0.4 * height, "dimtad": 1, "dimdec": 3,
@@ -81,7 +78,7 @@ def add_dimensions(space: Any, drawing: Drawing) -> None:
     The circles are outer, pitch and root circle. `space`: modelspace of ezdxf."""
     outer = drawing.outer_radius
     for radius in (outer, drawing.root_radius):
-        space.add_circle((0, 0), radius, dxfattribs={"layer": CIRCLES})
+        space.add_circle((0, 0), radius, dxfattribs={"layer": "CIRCLES"})
     radii = {"outer": outer, "pitch": drawing.pitch_radius, "root": drawing.root_radius}
     if drawing.bore is not None:
         radii["bore"] = drawing.bore / 2
@@ -90,12 +87,12 @@ def add_dimensions(space: Any, drawing: Drawing) -> None:
         left = -1.3 * outer - 4.2 * letter(drawing) * row
         space.add_linear_dim(
             base=(left, 0), p1=(0, -radius), p2=(0, radius), angle=90, text=f"%%c<> {name}",
-            dimstyle=STYLE, dxfattribs={"layer": DIMENSIONS},
+            dimstyle=_STYLE, dxfattribs={"layer": "DIMENSIONS"},
         ).render()  # fmt: skip
     point = widest(drawing.pieces, drawing.lobes)
     space.add_linear_dim(
         base=(1.25 * outer, 0), p1=(point.real, -point.imag), p2=(point.real, point.imag),
-        angle=90, text="<> lobe", dimstyle=STYLE, dxfattribs={"layer": DIMENSIONS},
+        angle=90, text="<> lobe", dimstyle=_STYLE, dxfattribs={"layer": "DIMENSIONS"},
     ).render()  # fmt: skip
 
 
@@ -107,14 +104,14 @@ def add_title_block(space: Any, drawing: Drawing) -> None:
     left, right, top = edges(drawing)
     row, upper = 1.9 * height, -1.3 * drawing.outer_radius
     bottom = upper - row * max(len(drawing.block), len(drawing.notes) + 1)
-    frame = {"layer": TITLE}
+    frame = {"layer": "TITLE_BLOCK"}
     corners = [(left, bottom), (right, bottom), (right, top), (left, top)]
     space.add_lwpolyline(corners, close=True, dxfattribs=frame)
     space.add_line((left, upper), (right, upper), dxfattribs=frame)
     names = max(len(name) for name, _ in drawing.block) * _LETTER * height + height
     split = right - (_wide(drawing) + 1) * height
     widths = names, right - split - names
-    _add_texts(space, TITLE, drawing.block, (split, upper), widths, height)
+    _add_texts(space, "TITLE_BLOCK", drawing.block, (split, upper), widths, height)
 
 
 def add_table(space: Any, drawing: Drawing) -> None:
@@ -135,9 +132,9 @@ def add_table(space: Any, drawing: Drawing) -> None:
     right, top = edges(drawing)[1:]
     place = right - 4.6 * wide, top - 2.4 * height
     title = "Half a lobe, tip to root (all points: rotor_points.csv)"
-    text = space.add_text(title, height=height, dxfattribs={"layer": TABLE})
+    text = space.add_text(title, height=height, dxfattribs={"layer": "TABLE"})
     text.set_placement((place[0], top - 1.6 * height))
-    _add_texts(space, TABLE, [heads, *rows], place, [0.6 * wide, *4 * [wide]], height)
+    _add_texts(space, "TABLE", [heads, *rows], place, [0.6 * wide, *4 * [wide]], height)
 
 
 def _add_texts(space: Any, layer: str, rows: Sequence[Sequence[str]], place: tuple[float, float],
@@ -190,10 +187,10 @@ def dxf_bytes(drawing: Drawing) -> bytes:
 
     document = ezdxf.new("R2010", setup=["linetypes"], units=ezdxf.units.MM)  # type: ignore[attr-defined]
     document.header["$LTSCALE"] = drawing.outer_radius / 20
-    for name, (color, linetype, width) in _STYLES.items():
+    for name, (color, linetype, width) in _LAYERS.items():
         document.layers.add(name, color=color, linetype=linetype, lineweight=width)
     space = document.modelspace()
-    layer = {"layer": OUTLINE}
+    layer = {"layer": "OUTLINE"}
     for piece in drawing.pieces:
         if isinstance(piece, Arc):
             first, last = np.degrees([piece.begin, piece.begin + piece.sweep])
@@ -203,10 +200,10 @@ def dxf_bytes(drawing: Drawing) -> bytes:
             points, knots = map(_point, piece.controls), piece.knots.tolist()
             space.add_open_spline(points, 3, knots, dxfattribs=layer)
     if drawing.bore is not None:
-        space.add_circle((0, 0), drawing.bore / 2, dxfattribs={"layer": BORE})
-    space.add_circle((0, 0), drawing.pitch_radius, dxfattribs={"layer": PITCH})
+        space.add_circle((0, 0), drawing.bore / 2, dxfattribs={"layer": "BORE"})
+    space.add_circle((0, 0), drawing.pitch_radius, dxfattribs={"layer": "PITCH_CIRCLE"})
     for x, y in ((drawing.reach, 0), (0, drawing.reach)):
-        space.add_line((-x, -y), (x, y), dxfattribs={"layer": CENTER})
+        space.add_line((-x, -y), (x, y), dxfattribs={"layer": "CENTER_LINES"})
     add_style(document, drawing)
     add_dimensions(space, drawing)
     add_title_block(space, drawing)
@@ -222,13 +219,13 @@ def _add_notes(space: Any, drawing: Drawing) -> None:
     height, left = letter(drawing), edges(drawing)[0]
     for row, note in enumerate(drawing.notes):
         place = left + height, -1.3 * drawing.outer_radius - 1.9 * height * (row + 1)
-        space.add_text(plain(note), height=height, dxfattribs={"layer": TEXT}).set_placement(place)
+        text = space.add_text(plain(note), height=height, dxfattribs={"layer": "TEXT"})
+        text.set_placement(place)
 
 
-CHORD = 0.005
-"""Maximum distance (mm) between a facet of an STL file and the solid."""
-TURN = 0.05
-"""Maximum angle (rad) between neighbouring facets of a curved face of an STL file."""
+# Maximum distance (mm) between a facet of an STL file and the solid, and maximum angle (rad)
+# between neighbouring facets of a curved face.
+_CHORD, _TURN = 0.005, 0.05
 
 # Maximum twist (rad) between adjacent knots of a helical face. With this step, a cubic spline
 # deviates from the rotation by 5e-8 of the radius.
@@ -295,7 +292,7 @@ def step_bytes(shape: "Shape") -> bytes:
 
 
 def stl_bytes(shape: "Shape", place: Path | None = None) -> bytes:
-    """Return the content of a binary STL file (mm) within `CHORD` and `TURN` of the shape.
+    """Return the content of a binary STL file (mm) within 0.005 mm and 0.05 rad of the shape.
 
     The kernel writes a temporary file in the folder `place`. `None`: the system's folder for
     temporary files. Raises `InputError` if the kernel fails to make triangles.
@@ -304,7 +301,7 @@ def stl_bytes(shape: "Shape", place: Path | None = None) -> bytes:
 
     with tempfile.TemporaryDirectory(dir=place) as folder:
         file = Path(folder) / "shape.stl"
-        if not export_stl(shape, file, tolerance=CHORD, angular_tolerance=TURN):
+        if not export_stl(shape, file, tolerance=_CHORD, angular_tolerance=_TURN):
             raise InputError("the solid cannot be split into triangles; export step instead")
         return file.read_bytes()
 
