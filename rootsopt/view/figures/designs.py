@@ -156,8 +156,10 @@ def plot_feasible(
     ax.plot(*at.T, ".", color=GREY, markersize=3, label="simulated")
     ax.plot(design[one], design[two], "*", color=VERMILION, markersize=14, label="optimum")
     for place, row in enumerate(others):
-        name = None if place else "other vertices (projected)"
-        ax.plot(row["design"][one], row["design"][two], "s", mfc="none", color="black", label=name)
+        ax.plot(
+            row["design"][one], row["design"][two], "s", mfc="none", color="black",
+            label=None if place else "other vertices (projected)",
+        )  # fmt: skip
     rest = [f"{label(key)} = {brief(x)}" for key, x in design.items() if key not in (one, two)]
     ax.set(
         xlim=(np.min(x), np.max(x)),

@@ -186,8 +186,10 @@ def _flank(profile: Profile, inset: float) -> list[DrawnPiece]:
     """Return the pieces of one flank, from the centre of the tip to the centre of the root."""
     size = float(profile.pitch_radius) * _MM
     segments = [(float(s.start), float(s.stop)) for s in profile.segments() if s.start != s.stop]
-    stretches = [_Stretch(profile, start, stop, False, inset) for start, stop in segments]
-    stretches += [_Stretch(profile, stop, start, True, inset) for start, stop in reversed(segments)]
+    stretches = [
+        *(_Stretch(profile, start, stop, False, inset) for start, stop in segments),
+        *(_Stretch(profile, stop, start, True, inset) for start, stop in reversed(segments)),
+    ]
     pieces = [piece for stretch in stretches for piece in stretch.pieces(size)]
     # Leave out pieces without length, such as a tip land of zero width.
     return [piece for piece in pieces if piece.length > 1e-12 * size]

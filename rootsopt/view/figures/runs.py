@@ -87,7 +87,7 @@ def feasible_figure(
 
     `columns`: those of `feasible.csv`; `design`: the optimum; `vertex`: entry of the result
     file."""
-    made, axes = figure(7.5, 5, 1, 1)
+    made, axes = figure(7.5, 5)
     plot_feasible(axes[0, 0], columns, design, vertex["others"])
     entries = axes[0, 0].get_legend_handles_labels()[0]
     write(folder, "feasible", made, "Designs that satisfy all limits", entries, 3)

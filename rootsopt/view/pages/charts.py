@@ -62,10 +62,10 @@ _DASHES = "solid", "dashed", "dotted", "dashdot"
 
 def chart(across: str, up: str, height: int = 360, **options: Any) -> Any:
     """Return an empty figure with labels of its axes, and a legend above it that hides lines."""
-    if "tools" not in options:
-        options |= {"tools": "box_zoom,pan,wheel_zoom,reset,save", "active_drag": "box_zoom"}
-    options["sizing_mode"] = "stretch_width"
-    made = figure(height=height, x_axis_label=across, y_axis_label=up, **options)
+    usual = {"tools": "box_zoom,pan,wheel_zoom,reset,save", "active_drag": "box_zoom"}
+    options |= {} if "tools" in options else usual
+    made = figure(height=height, x_axis_label=across, y_axis_label=up,
+                  sizing_mode="stretch_width", **options)  # fmt: skip
     made.add_layout(Legend(orientation="horizontal", click_policy="hide"), "above")
     return made
 

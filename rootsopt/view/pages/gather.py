@@ -182,14 +182,13 @@ def _over(rows: Sequence[Mapping[str, Any]]) -> str:
     """Return a sentence on the values that differ between the scenes of a sweep."""
     parts = []
     for key in varied(rows):
-        name = name_and_unit(key)[0]
         values: list[Any] = [*dict.fromkeys(row.get(key) for row in rows)]
         shown = f"{len(values)} values"
         if len(values) <= _FEW:
             shown = listed([stated(key, x) for x in values])
         elif all(isinstance(x, int | float) for x in values):
             shown += f" from {brief(min(values))} to {stated(key, max(values))}"
-        parts.append(f"{name}: {shown}")
+        parts.append(f"{name_and_unit(key)[0]}: {shown}")
     return f"Between the scenes, these differ: {'; '.join(parts)}."
 
 

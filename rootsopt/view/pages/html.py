@@ -220,11 +220,11 @@ class ForcePicture:
         style = {"line_color": GREY, "line_width": 1.2, "line_dash": [5, 3]}
         self.figure.line("time", "total", source=self.before, level="underlay",
                          legend_label="at start, both flanks", **style)  # fmt: skip
-        self.mean = Span(location=0, dimension="width", line_color="#111111", line_dash=[2, 3])
+        self.mean = Span(location=0, dimension="width", line_color="#111111", line_dash=[2, 3],
+                         visible=False)  # fmt: skip
         self.cursor = Span(location=0, dimension="height", line_color="#8a9aa5", name="cursor",
-                           syncable=False)  # fmt: skip
+                           syncable=False, visible=False)  # fmt: skip
         for span in (self.mean, self.cursor):
-            span.visible = False
             self.figure.add_layout(span)
 
     def draw(self, series: Series, response: Mapping[str, float], start: bool) -> None:

@@ -281,9 +281,8 @@ class Page:
         self.start.setdefault("geometry", message.shape.record)
         fade([self.profile.figure], False)
         self.profile.draw(message.shape)
-        if self.motion is None:
-            self._tell_pair(**message.shape.pair)
-        self._tell_pair(rotor=message.shape.pair["rotor"], dim=False)
+        pair = message.shape.pair
+        self._tell_pair(dim=False, **(pair if self.motion is None else {"rotor": pair["rotor"]}))
         self._show_numbers(self.late)
 
     def _take_motion(self, motion: NewMotion) -> None:

@@ -186,13 +186,11 @@ class Session:
 
     def show_from_rest(self) -> None:
         """Show the motion that starts at rest, even if another one is known."""
-        number = self.number
-        self._submit(self._rests, number, lambda: self._from_rest(number, True))
+        self._submit(self._rests, self.number, lambda number: self._from_rest(number, True))
 
     def save(self) -> None:
         """Make the YAML of the values, and compute their motion from rest, as `simulate` does."""
-        number = self.number
-        self._submit(self._rests, number, lambda: self._save(number))
+        self._submit(self._rests, self.number, self._save)
 
     def optimize(self) -> None:
         """Search for the optimum from the present values, in a thread of its own."""
@@ -231,13 +229,13 @@ class Session:
         """Compute shape and motion of the values with this `number`."""
         self._motions.clear()
         self._rests.clear()
-        self._submit(self._shapes, number, lambda: self._compute_shape(number))
+        self._submit(self._shapes, number, self._compute_shape)
 
     def _compute_shape(self, number: int) -> None:
         config = self.config()
         shape = self.engine.shape(config)
         self.show(NewShape(number, shape, notes(config)))
-        self._submit(self._motions, number, lambda: self._compute_motion(number, config, shape))
+        self._submit(self._motions, number, lambda _: self._compute_motion(number, config, shape))
 
     def _compute_motion(self, number: int, config: Config, shape: Shape) -> None:
         self.engine.ready.wait()
@@ -247,7 +245,7 @@ class Session:
         self._present(number, shape, evaluation, near, final=evaluation.usable or not near)
         if near:
             delay = self.idle if evaluation.usable else 0.0
-            self._submit(self._rests, number, lambda: self._from_rest(number, False), delay)
+            self._submit(self._rests, number, lambda _: self._from_rest(number, False), delay)
 
     def _present(
         self, number: int, shape: Shape, evaluation: Evaluation, near: bool, final: bool = True
@@ -296,13 +294,15 @@ class Session:
             self.show(Saved(number, self.config().to_yaml()))
 
     def _submit(
-        self, lane: Latest, number: int, work: Callable[[], object], delay: float = 0.0
+        self, lane: Latest, number: int, work: Callable[[int], object], delay: float = 0.0
     ) -> None:
-        """Run `work` in a `lane` after a `delay` (s); if the values are rejected, show why."""
+        """Run `work` for the values with this `number` in a `lane` after a `delay` (s).
+
+        If the values are rejected, show why."""
 
         def refusing() -> None:
             try:
-                work()
+                work(number)
             except InputError as error:
                 self.show(Problem(number, str(error)))
 
