@@ -260,6 +260,8 @@ def _gif(made: Figure, draw, count: int) -> bytes:
     palette = Image.fromarray(some).quantize(_COLORS, Image.Quantize.MAXCOVERAGE)
     frames = [one.quantize(palette=palette, dither=Image.Dither.NONE) for one in pictures]
     file = io.BytesIO()
-    options = {"save_all": True, "append_images": frames[1:], "loop": 0, "optimize": True}
-    frames[0].save(file, format="GIF", duration=_MILLISECONDS, **options)
+    frames[0].save(
+        file, format="GIF", duration=_MILLISECONDS,
+        save_all=True, append_images=frames[1:], loop=0, optimize=True,
+    )  # fmt: skip
     return file.getvalue()

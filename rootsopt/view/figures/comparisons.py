@@ -52,13 +52,14 @@ def kinds(result: Mapping[str, Any]) -> dict[str, list[Mapping[str, Any]]]:
     points, base = result["points"], result.get("baseline") or {}
     sides = {gap[end] for gap in result.get("gaps") or () for end in ("first", "second")}
     sure = Standing.CERTIFIED.label
-    dropped = result.get("dropped") or ()
     groups = {
         "side of a gap": [one for one in points if one["point"] in sides],
         "certified": [one for one in points if one["status"] == sure],
         "not certified": [one for one in points if one["status"] != sure],
         "best in one term": [one for one in points if one.get("end_of")],
-        "dominated": [one for one in dropped if one["status"] == Standing.DOMINATED.label],
+        "dominated": [
+            one for one in result.get("dropped") or () if one["status"] == Standing.DOMINATED.label
+        ],
         "baseline": [base] if base.get("terms") else [],
     }
     return {kind: group for kind, group in groups.items() if group}

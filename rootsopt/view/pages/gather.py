@@ -63,13 +63,13 @@ class Run:
         imports: Sequence[str] = (),
     ):
         place = folder.place
-        pictures = sorted((place / "figures").glob("*.png"))
         self.result, self.source, self.usable = result, source, usable
         self.command, self.path = str(result["run"]["command"]), folder.path
         self.config = load(place / "config.yaml")
         self.yaml = (place / "config.yaml").read_text("utf-8")
         self.cases = tuple(_cases(place, self.config, result))
         self.rows = tuple(_rows(place / "sweep.csv"))
+        pictures = sorted((place / "figures").glob("*.png"))
         self.figures = {path.name: path.read_bytes() for path in pictures}
         self.end = ending(result, self.path, source, imports, self.rows)
 
@@ -117,9 +117,12 @@ def _series(place: Path, name: str) -> Series | None:
         heads = lines.readline().strip().split(",")
         table = np.loadtxt(lines, delimiter=",", ndmin=2)
     columns = dict(zip(heads, table.T, strict=True))
-    values = {field: columns[name] for field, (name, *_) in COLUMNS.items() if name in columns}
+    values = {
+        field: columns[name]
+        for field, (name, *_) in COLUMNS.items()
+        if name in columns and field != "force"  # The sum of the forces on both flanks.
+    }
     values["rotation"] = np.radians(values["rotation"])
-    del values["force"]  # The sum of the forces on both flanks.
     return Series(columns["time_s"], **values, depth=np.full(len(table), np.nan))
 
 
