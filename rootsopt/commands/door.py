@@ -51,17 +51,15 @@ class Signals:
         Outside the main thread, do nothing."""
         if threading.current_thread() is not threading.main_thread():
             return
-        for number in _NAMES:
-            before = signal.getsignal(number)
-            if before in (signal.SIG_DFL, signal.default_int_handler):
-                self._before[number] = before
+        found = {number: signal.getsignal(number) for number in _NAMES}
+        defaults = signal.SIG_DFL, signal.default_int_handler
+        self._before = {number: one for number, one in found.items() if one in defaults}
         if not self._before:
             return
         reading, writing = self._pipe = os.pipe()
         os.set_blocking(writing, False)
         self._wakeup = signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
-        waiting = threading.Thread(target=self._wait, args=(reading,), name=_WAITING, daemon=True)
-        waiting.start()
+        threading.Thread(target=self._wait, args=(reading,), name=_WAITING, daemon=True).start()
         for number in self._before:
             # Another thread responds to the signal.
             signal.signal(number, lambda *_: None)
@@ -108,10 +106,7 @@ def patience(promise: str) -> Iterator[threading.Event]:
 
     `promise`: message that tells the user what the run does after the signal. No signal sets the
     event unless the command runs as its own process."""
-    signals = _running
-    if signals is None:
-        yield threading.Event()
-        return
+    signals = _running or Signals("")  # The latter receives no signal.
     signals.promise, signals.patient = promise, True
     yield signals.stop  # Stay patient to the end: results that took long must be written.
 
@@ -122,10 +117,7 @@ def leaving(abandon: Callable[[], str]) -> Iterator[None]:
 
     `abandon`: function that cleans up and returns a message for the user. It is not called unless
     the command runs as its own process."""
-    signals = _running
-    if signals is None:
-        yield
-        return
+    signals = _running or Signals("")  # The latter receives no signal.
     signals.abandon = abandon
     try:
         yield
@@ -149,10 +141,6 @@ class _Stream:
         if not self.closed_early:
             self._guarded(lambda: self.stream.write(text))
         return len(text)
-
-    def writelines(self, lines) -> None:
-        for line in lines:
-            self.write(line)
 
     def flush(self) -> None:
         """Flush the stream, without raising an `OSError`."""
