@@ -26,12 +26,9 @@ from rootsopt.config.explain import GROUPS, describe, outline
 from rootsopt.config.families import families
 from rootsopt.config.plausible import notes
 from rootsopt.config.reading import Config, load
-from rootsopt.config.sources import import_named, shipped
 from rootsopt.errors import InputError
 from rootsopt.runtime import environment
-from rootsopt.runtime.environment import use_float64
 from rootsopt.view import pages
-from rootsopt.view.pages import REPORT
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -123,7 +120,7 @@ def parser(command: Command) -> argparse.ArgumentParser:
         type=Path,
         metavar=command.takes,
         help={
-            "CONFIG": f"YAML file or shipped: {', '.join(shipped())}",
+            "CONFIG": f"YAML file or shipped: {', '.join(sources.shipped())}",
             "ROTOR": "CSV or DXF file with the outline of a rotor",
         }.get(command.takes, "YAML file"),
     )
@@ -172,7 +169,7 @@ def _add_folder(result: argparse.ArgumentParser, command: str) -> None:
     result.add_argument(
         "--report",
         action="store_true",
-        help=f"write {REPORT}, the run on one page (needs rootsopt[pages])",
+        help=f"write {pages.REPORT}, the run on one page (needs rootsopt[pages])",
     )
 
 
@@ -195,9 +192,9 @@ def _import_extensions(command: str, argv: Sequence[str] | None) -> None:
     _add_import(early)
     names = early.parse_known_args(argv)[0].imports
     if names:
-        use_float64()
+        environment.use_float64()
     for name in names:
-        import_named(name)
+        sources.import_named(name)
 
 
 def run(command: Command, argv: Sequence[str] | None) -> int:
@@ -216,14 +213,14 @@ def run(command: Command, argv: Sequence[str] | None) -> int:
         options = parser(command).parse_args(argv)
         options.given = shlex.join(sys.argv[1:] if argv is None else argv)
         for name in options.imports:  # Only the whole parser knows abbreviated options.
-            import_named(name)
+            sources.import_named(name)
         if command.writes and options.output is None:
             options.output = os.path.join("results", f"{options.config.stem}-{command.name}")
         own = command.takes == "CONFIG"
         config = load(options.config, options.overrides) if own else None
         for note in notes(config) if config else ():
             environment.say(note)
-        use_float64()
+        environment.use_float64()
         use_cache(wanted=not options.no_cache)
         with environment.explained():
             if not command.reads:
@@ -234,16 +231,14 @@ def run(command: Command, argv: Sequence[str] | None) -> int:
                 return _work(command.name)(config, options)
             return _in_folder(command, config, options)
     except InputError as error:
-        message = " ".join(str(error).split())
-        print(f"rootsopt {command.name}: {message}", file=sys.stderr)
-        return BAD_INPUT
+        code, said = BAD_INPUT, " ".join(str(error).split())
     except OSError as error:
         where = f"{error.filename}: " if error.filename is not None else ""
-        print(f"rootsopt {command.name}: {where}{sources.reason(error)}", file=sys.stderr)
-        return BAD_INPUT
+        code, said = BAD_INPUT, f"{where}{sources.reason(error)}"
     except KeyboardInterrupt:
-        print(f"rootsopt {command.name}: stopped by the user", file=sys.stderr)
-        return NO_RESULT
+        code, said = NO_RESULT, "stopped by the user"
+    print(f"rootsopt {command.name}: {said}", file=sys.stderr)
+    return code
 
 
 def _work(command: str, name: str = "body") -> Callable[..., Any]:
@@ -310,9 +305,9 @@ def _report(folder: "RunFolder", options: argparse.Namespace, outcome: Outcome) 
         text = report_text(run)
     except Exception as error:
         words = f"{type(error).__name__}: {error}"
-        environment.say(f"{REPORT} is not written, because it could not be made: {words}")
+        environment.say(f"{pages.REPORT} is not written, because it could not be made: {words}")
         return
-    folder.write_text(REPORT, text)
+    folder.write_text(pages.REPORT, text)
 
 
 @contextlib.contextmanager
