@@ -1,4 +1,4 @@
-"""Shared parts of the commands: arguments, result folder, float64, exit codes.
+"""Shared parts of the commands: arguments and their completion, result folder, float64, exit codes.
 
 Exit code 0: success. 2: bad input, one message on stderr. 3: the run ended without a usable result;
 the status says why.
@@ -7,7 +7,7 @@ the status says why.
 import argparse
 import contextlib
 import functools
-import importlib
+import importlib.util
 import os
 import shlex
 import shutil
@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 from rootsopt.commands import door
 from rootsopt.commands.door import BAD_INPUT, NO_RESULT, OK
-from rootsopt.commands.table import Command
+from rootsopt.commands.table import COMMANDS, Command
 from rootsopt.config import sources
-from rootsopt.config.explain import GROUPS, describe, outline
+from rootsopt.config.explain import GROUPS, describe, outline, tree
 from rootsopt.config.families import families
 from rootsopt.config.plausible import notes
 from rootsopt.config.reading import Config, load
@@ -335,3 +335,73 @@ def use_cache(wanted: bool = True) -> None:
 
     if refused := programs.keep_by_default() if wanted else programs.keep_in(None):
         environment.say(f"compiled programs are not kept between runs: {refused}")
+
+
+SHELLS = "bash", "zsh"
+"""Shells for which there is a script."""
+_KEYS, _CONFIGS = "_rootsopt_keys", "_rootsopt_configs"
+
+# End of the bash script: no blank after a key, because its value follows.
+_NO_SPACE = """
+_rootsopt() {
+  _shtab_rootsopt "$@"
+  [[ ${COMPREPLY[0]} == *= ]] && compopt -o nospace 2>/dev/null
+  return 0
+}
+complete -o bashdefault -F _rootsopt rootsopt"""
+
+
+def completion(shell: str) -> str:
+    """Return the script that completes commands, options and config keys in a `shell`.
+
+    Raises `InputError` for an unknown shell, or if shtab is not installed."""
+    if shell not in SHELLS:
+        raise InputError(f"`--completion` must be {' or '.join(SHELLS)}, but is {shell!r}")
+    if importlib.util.find_spec("shtab") is None:
+        raise InputError(
+            "`--completion` needs shtab; install it with `pip install 'rootsopt[completion]'`"
+        )
+    import shtab
+
+    whole = argparse.ArgumentParser(prog="rootsopt")
+    whole.add_argument("--version", action="store_true", help="print the version")
+    parts = whole.add_subparsers()
+    for command in COMMANDS.values():
+        parent = parser(command)
+        _complete(parent, shtab.FILE, shtab.DIRECTORY)
+        parts.add_parser(command.name, help=command.purpose, parents=[parent], add_help=False)
+    functions = f"""
+{_KEYS}() {{
+  compgen -W "{_keys()}" -- "$1"
+}}
+{_CONFIGS}() {{
+  compgen -W "{" ".join(sources.shipped())}" -- "$1"
+  compgen -f -- "$1"
+}}
+"""
+    # shtab takes a preamble per shell; its annotation names only text.
+    text = shtab.complete(whole, shell, preamble={"bash": functions})  # type: ignore[arg-type]
+    return f"{text}\n{_NO_SPACE}" if shell == "bash" else text
+
+
+def _complete(parent: argparse.ArgumentParser, file: Mapping, folder: Mapping) -> None:
+    """Set how the shell completes the values of the arguments of the parser `parent`.
+
+    `file`, `folder`: shtab's functions for files and folders, by shell."""
+    ways = {
+        "config": {
+            "bash": _CONFIGS,
+            "zsh": f"_alternative 'c:config:({' '.join(sources.shipped())})' 'f:file:_files'",
+        },
+        "output": folder,
+        "imports": file,
+        "overrides": {"bash": _KEYS, "zsh": f"({_keys()})"},
+        "over": {"bash": _KEYS, "zsh": f"({_keys()})"},
+    }
+    for action in parent._actions:
+        if action.dest in ways:
+            action.complete = ways[action.dest]  # type: ignore[attr-defined]
+
+
+def _keys() -> str:
+    return " ".join(f"{key}=" for key in tree(Config))
