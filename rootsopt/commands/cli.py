@@ -28,7 +28,7 @@ from rootsopt.config.plausible import notes
 from rootsopt.config.reading import Config, load
 from rootsopt.errors import InputError
 from rootsopt.runtime import environment
-from rootsopt.view import pages
+from rootsopt.view import figures, pages
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -148,6 +148,8 @@ def parser(command: Command) -> argparse.ArgumentParser:
         action="store_true",
         help="compile again, and keep no compiled programs",
     )
+    if command.export:
+        figures.add_option(result, command.export)
     command.options(result)
     return result
 
@@ -261,8 +263,8 @@ def _in_folder(command: Command, config: Config, options: argparse.Namespace) ->
         if not options.no_figures:
             # With matplotlib it takes 0.5 s. Meanwhile, programs are loaded or compiled, which does
             # not hold Python's lock.
-            figures = f"rootsopt.view.figures.{command.figures}"
-            threading.Thread(target=importlib.import_module, args=(figures,)).start()
+            module = f"rootsopt.view.figures.{command.figures}"
+            threading.Thread(target=importlib.import_module, args=(module,)).start()
         outcome: Outcome = body(config, options, folder)
         write_config(folder, outcome.config or config)
         data = {**outcome.result, "versions": environment.versions()}
