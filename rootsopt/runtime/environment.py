@@ -133,8 +133,8 @@ def own_process() -> None:
     display. The runtime checks of equinox are off, and dense algebra uses one thread. `use_float64`
     handles the variables of JAX."""
     if any(option.lower().startswith("e") for option in sys.warnoptions):
-        for entry in [entry for entry in warnings.filters if entry[0] == "error"]:
-            warnings.filters.remove(entry)  # type: ignore[attr-defined]
+        kept = [entry for entry in warnings.filters if entry[0] != "error"]
+        warnings.filters[:] = kept  # type: ignore[index]
         warnings.simplefilter("default", append=True)
     columns = os.environ.get("COLUMNS", "")
     if not (columns.isdecimal() and int(columns) >= _NARROWEST):
@@ -182,13 +182,14 @@ def use_float64() -> None:
         raise InputError(f"JAX cannot be imported here: {_reason(error)}; {advice}") from error
     changed = _require(jax.config)
     known = jax.config.values
-    named = []
-    for name, value in aside.items():
-        if name.lower() not in known:
-            os.environ[name] = value  # not a variable of JAX
-        elif not _agrees(known[name.lower()], value):
-            named.append(f"{name}={shortened(value)}")
-    _set_aside(named + [f"{name} = {value!r}" for name, value in changed])
+    foreign = {name: value for name, value in aside.items() if name.lower() not in known}
+    os.environ.update(foreign)  # not variables of JAX
+    named = [
+        f"{name}={shortened(value)}"
+        for name, value in aside.items()
+        if name not in foreign and not _agrees(known[name.lower()], value)
+    ]
+    _set_aside(named + [f"{name} = {value!r}" for name, value in changed.items()])
     _start_device(jax)
 
 
@@ -260,20 +261,20 @@ def _agrees(setting: object, value: str) -> bool:
     return said == force or (isinstance(setting, bool) and words.get(said, said) == force)
 
 
-def _require(config) -> list[tuple[str, object]]:
+def _require(config) -> dict[str, object]:
     """Apply the settings in `_REQUIRED` to `config`, the configuration object of JAX.
 
-    Return (name, former value) of each setting that was changed, except double precision."""
-    changed = []
-    for name, needed in _REQUIRED.items():
-        if name not in config.values:  # gone in this version of JAX
-            continue
-        former = config.values[name]
-        if getattr(former, "value", former) != needed:
-            config.update(name, needed)
-            if name != "jax_enable_x64":  # its default
-                changed.append((name, former))
-    return changed
+    Return the former value of each setting that was changed, by name, except double precision."""
+    former = config.values  # lacks what is gone in this version of JAX
+    wrong = {
+        name: former[name]
+        for name, needed in _REQUIRED.items()
+        if name in former and getattr(former[name], "value", former[name]) != needed
+    }
+    for name in wrong:
+        config.update(name, _REQUIRED[name])
+    wrong.pop("jax_enable_x64", None)  # its default
+    return wrong
 
 
 def _start_device(jax) -> None:
@@ -323,11 +324,9 @@ def _check_flags(flags: str) -> None:
             f"{shown}: {unsound[1]} assumes that neither NaN nor infinity occurs, and results may "
             f"be wrong without notice; {advice}"
         )
-    if not sys.executable:
-        return
     try:
         done = subprocess.run(
-            [sys.executable, "-c", _TRIAL],
+            [sys.executable or "", "-c", _TRIAL],
             stdin=subprocess.DEVNULL,
             capture_output=True,
             timeout=_TRIAL_SECONDS,
@@ -370,5 +369,8 @@ _LIBRARIES = ("jax", "jaxlib", "diffrax", "optax", "equinox", "numpy")
 
 def versions() -> dict[str, str]:
     """Return the versions of Python, this package and the libraries that affect its results."""
-    base = {"python": platform.python_version(), "rootsopt": rootsopt.__version__}
-    return base | {name: importlib.metadata.version(name) for name in _LIBRARIES}
+    return {
+        "python": platform.python_version(),
+        "rootsopt": rootsopt.__version__,
+        **{name: importlib.metadata.version(name) for name in _LIBRARIES},
+    }
