@@ -112,7 +112,7 @@ class ResultFolder:
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow(arrays)
-        writer.writerows(zip(*map(_cells, arrays.values()), strict=True))
+        writer.writerows(zip(*(map(_cell, x.tolist()) for x in arrays.values()), strict=True))
         return self.write_text(name, text.getvalue())
 
     def write_figure(self, name: str, figure: "Figure") -> Path:
@@ -150,20 +150,12 @@ def plain(data: Any) -> Any:
     return data
 
 
-def _cells(array: NDArray) -> list[str]:
-    if array.dtype.kind == "f":
-        return [f"{value:.10g}" for value in (array + 0.0).tolist()]  # no "-0"
-    return [_cell(value) for value in array.tolist()]
-
-
 def _cell(value: Any) -> str:
-    if value is None:
-        return ""
-    if isinstance(value, bool | np.bool_):
-        return "true" if value else "false"
     if isinstance(value, float | np.floating):
-        return f"{value + 0.0:.10g}"
-    return str(value)
+        return f"{value + 0.0:.10g}"  # no "-0"
+    if isinstance(value, bool | np.bool_):
+        return str(value).lower()
+    return "" if value is None else str(value)
 
 
 def write_config(folder: ResultFolder, config: "Config") -> None:
@@ -192,11 +184,16 @@ def response_columns(series: "Series") -> dict[str, NDArray[np.float64]]:
 
     `series`: time series of a motion, in SI units. Units of the columns are in their names. Loads
     on the bearings come last, if there are any."""
-    loads, columns = series.bearing_loads, {"time_s": series.time}
-    for field, (name, *_, factor) in COLUMNS.items():
-        if field != "depth":
-            columns[name] = factor * getattr(series, field)
-    return columns | ({} if loads is None else dict(zip(_BEARINGS, loads.T, strict=True)))
+    loads = series.bearing_loads
+    return {
+        "time_s": series.time,
+        **{
+            name: factor * getattr(series, field)
+            for field, (name, *_, factor) in COLUMNS.items()
+            if field != "depth"
+        },
+        **({} if loads is None else dict(zip(_BEARINGS, loads.T, strict=True))),
+    }
 
 
 # Columns of the loads on the bearings.
@@ -247,11 +244,6 @@ def create(path: Path, data: bytes) -> None:
         raise
 
 
-def make_folder(path: Path) -> None:
-    """Create a folder, whose parent must exist. Raises `OSError` if this fails."""
-    os.mkdir(path)
-
-
 def make_folders(folder: Path, made: list[Path]) -> None:
     """Create a folder and its missing parents.
 
@@ -265,7 +257,7 @@ def make_folders(folder: Path, made: list[Path]) -> None:
         folder = folder.parent
     for new in reversed(missing):
         try:
-            make_folder(new)
+            os.mkdir(new)
         except FileExistsError:
             if not new.is_dir():  # otherwise another process was faster
                 raise
@@ -295,13 +287,6 @@ def move(source: Path, target: Path) -> None:
 
     If `target` is an empty folder, it is replaced. Raises `OSError` if renaming fails."""
     os.rename(source, target)
-
-
-def replace(source: Path, target: Path) -> None:
-    """Rename the file `source` to `target` in one step, replacing an existing file.
-
-    Raises `OSError` if renaming fails."""
-    os.replace(source, target)
 
 
 def adopt_mode(path: Path, model: Path) -> None:

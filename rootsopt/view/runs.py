@@ -80,7 +80,7 @@ class RunFolder(ResultFolder):
             self._base = self.target.parent / _base(self.target.name)
             self.place = self._temporary()
             self._claim()
-            files.make_folder(self.place)
+            files.make_folders(self.place, [])
         except InputError:
             self.close()
             raise
