@@ -316,8 +316,6 @@ try:
 except ImportError:  # this system has no such locks
     fcntl = None
 
-_TAKEN = (errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES)
-
 
 class TakenError(InputError):
     """Raised if another process holds the lock; its message names that process."""
@@ -342,11 +340,12 @@ class Lock:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # pyright: ignore
             self.held = True
-        except OSError as error:
-            if error.errno in _TAKEN:
-                holder = _holder(file)
-                os.close(file)
-                raise TakenError(holder) from None
+        except (BlockingIOError, PermissionError):
+            holder = _holder(file)
+            os.close(file)
+            raise TakenError(holder) from None
+        except OSError:
+            pass  # This file system has no such locks.
         # The last holder may have removed the file between the two steps.
         if self.held and not self._same(file):
             os.close(file)

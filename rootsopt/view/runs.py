@@ -47,7 +47,7 @@ _LONGEST = 150
 _PATIENCE = 10.0
 
 
-class RunFolder(ResultFolder):
+class RunFolder(ResultFolder, contextlib.AbstractContextManager["RunFolder"]):
     """A `ResultFolder` that appears at its final path only when it is complete.
 
     `path`: the final path; `place`: temporary folder into which files are written until the run is
@@ -81,18 +81,14 @@ class RunFolder(ResultFolder):
             self.place = self._temporary()
             self._claim()
             files.make_folders(self.place, [])
-        except InputError:
+        except BaseException as error:
             self.close()
-            raise
-        except (OSError, ValueError) as error:
-            self.close()
+            if isinstance(error, InputError) or not isinstance(error, OSError | ValueError):
+                raise
             raise InputError(
                 f"{str(self.path)!r}: cannot be used as output folder: {sources.reason(error)}; "
                 "choose another folder or make its parent folder writable"
             ) from None
-        except BaseException:
-            self.close()
-            raise
 
     def _refuse_places(self) -> None:
         """Raise `InputError` if a finished run could not replace the target.
@@ -300,9 +296,6 @@ class RunFolder(ResultFolder):
         if self._busy.acquire(timeout=_PATIENCE):
             self.close()
         return f"{self.path} is {'complete' if self.placed else 'unchanged'}"
-
-    def __enter__(self) -> "RunFolder":
-        return self
 
     def __exit__(self, *error: object) -> None:
         self.close()
