@@ -268,10 +268,10 @@ class CachedFunction:
         """Return the cache entry for a program of this `kind`, or `None` if it cannot be cached."""
         if not _chosen:
             keep_by_default()
-        if _store is None or jax.default_backend() != "cpu":
+        # A program loaded from JAX's own cache cannot be serialised again.
+        theirs = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+        if _store is None or theirs or jax.default_backend() != "cpu":
             return None
-        if jax.config.jax_compilation_cache_dir:  # pyright: ignore[reportAttributeAccessIssue]
-            return None  # A program loaded from JAX's own cache cannot be serialised again.
         sources = _sources({self.function.__module__, *_modules(kind), *outside_modules()})
         if sources is None:
             return None

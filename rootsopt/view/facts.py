@@ -60,16 +60,14 @@ def optimised(result: Record, rows: Sequence[Record]) -> Facts:
     costs = [f"no reported quantity is worse by {_SMALL} % or more"]
     if worse:
         costs = [listed([words for words, *_ in worse[:FEW]] + more)]
+    optimality = result.get("optimality") or {}
+    doubts = [] if optimality.get("converged", True) else [str(optimality["message"])]
+    sure = [_sentence([*_certified(result)]), *_touching(result), *doubts, *_advice_of(after)]
     spread = " ".join(elsewhere(result))
     return [
-        ("Gained", _sentence([*gained])),
+        ("Gained", _sentence(gained)),
         ("Costs", _sentence([*costs, *_prices(result)])),
-        (
-            "How sure",
-            " ".join(
-                [_sentence([*_certified(result)]), *_touching(result), *_caveats(result, after)]
-            ),
-        ),
+        ("How sure", " ".join(sure)),
         *([("Other scenes", spread)] if spread else []),
     ]
 
@@ -197,14 +195,6 @@ def _bounded(known: Record) -> Iterator[str]:
     else:
         left = f"{100 * known['volume_left']:.2g} %"
         yield f"not proven to be the best: {left} of the bounds may hold a design better by {gap}"
-
-
-def _caveats(result: Record, after: Record) -> Iterator[str]:
-    """Yield why a design is not an optimum, and further advice from the message of its motion."""
-    optimality = result.get("optimality") or {}
-    if optimality and not optimality["converged"]:
-        yield str(optimality["message"])
-    yield from _advice_of(after)
 
 
 def simulated(result: Record, rows: Sequence[Record]) -> Facts:

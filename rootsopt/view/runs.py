@@ -99,15 +99,15 @@ class RunFolder(ResultFolder, contextlib.AbstractContextManager["RunFolder"]):
         if os.path.lexists(target) and not target.is_dir():
             raise InputError(f"{str(self.path)!r}: is not a folder; choose another output folder")
         here = Path.cwd()
-        what = None
-        if target == here or target in here.parents:
-            what = "the current folder or one above it"
-        elif os.path.ismount(target) or str(target) in _mount_points():
-            what = "a mount point"
-        if what is not None:
+        kinds = {
+            "the current folder or one above it": target in (here, *here.parents),
+            "a mount point": os.path.ismount(target) or str(target) in _mount_points(),
+        }
+        met = [name for name, holds in kinds.items() if holds]
+        if met:
             inside = self.path / (self.command or "run")
             raise InputError(
-                f"{str(self.path)!r}: is {what}, which a finished run cannot replace; name a "
+                f"{str(self.path)!r}: is {met[0]}, which a finished run cannot replace; name a "
                 f"folder inside it, for example {str(inside)!r}"
             )
 
