@@ -339,8 +339,8 @@ def use_cache(wanted: bool = True) -> None:
         environment.say(f"compiled programs are not kept between runs: {refused}")
 
 
-SHELLS = "bash", "zsh"
-"""Shells for which there is a script."""
+# Shells for which there is a completion script.
+_SHELLS = "bash", "zsh"
 _KEYS, _CONFIGS = "_rootsopt_keys", "_rootsopt_configs"
 
 # End of the bash script: no blank after a key, because its value follows.
@@ -357,8 +357,8 @@ def completion(shell: str) -> str:
     """Return the script that completes commands, options and config keys in a `shell`.
 
     Raises `InputError` for an unknown shell, or if shtab is not installed."""
-    if shell not in SHELLS:
-        raise InputError(f"`--completion` must be {' or '.join(SHELLS)}, but is {shell!r}")
+    if shell not in _SHELLS:
+        raise InputError(f"`--completion` must be {' or '.join(_SHELLS)}, but is {shell!r}")
     if importlib.util.find_spec("shtab") is None:
         raise InputError(
             "`--completion` needs shtab; install it with `pip install 'rootsopt[completion]'`"

@@ -58,8 +58,6 @@ _REQUIRED = {
     "jax_no_execution": False,
 }
 
-_XLA_FLAGS = "XLA_FLAGS"
-
 # Name of the variable that tells child processes which value of XLA_FLAGS has been tested.
 _CHECKED = "ROOTSOPT_XLA_FLAGS_CHECKED"
 
@@ -110,11 +108,10 @@ _noticed: set[str] = set()
 
 def say(text: str) -> None:
     """Print `text` as one line on stderr, unless this process has already printed it."""
-    if text in _noticed:
-        return
-    _noticed.add(text)
-    with contextlib.suppress(OSError, ValueError):
-        print(f"rootsopt: {' '.join(text.split())}", file=sys.stderr)
+    if text not in _noticed:
+        _noticed.add(text)
+        with contextlib.suppress(OSError, ValueError):
+            print(f"rootsopt: {' '.join(text.split())}", file=sys.stderr)
 
 
 def shortened(value: str, longest: int = 80) -> str:
@@ -167,11 +164,11 @@ def use_float64() -> None:
 
     Raises `InputError` if the environment prevents JAX from starting."""
     aside = {} if "jax" in sys.modules else _without_settings()
-    flags = os.environ.get(_XLA_FLAGS, "").strip()
+    flags = os.environ.get("XLA_FLAGS", "").strip()
     if flags:
         _check_flags(flags)
     else:
-        os.environ.pop(_XLA_FLAGS, None)
+        os.environ.pop("XLA_FLAGS", None)
     use_compiled_loops()
     try:
         import jax
@@ -199,11 +196,11 @@ def use_compiled_loops() -> None:
     This adds an option to XLA_FLAGS, which XLA reads when JAX computes for the first time in a
     process. If JAX has computed already, or if XLA_FLAGS contains extra options for the backend,
     leave it unchanged. XLA does not accept the option for a single compilation."""
-    flags = os.environ.get(_XLA_FLAGS, "")
+    flags = os.environ.get("XLA_FLAGS", "")
     if "xla_backend_extra_options" not in flags and not _started():
         checked = flags.strip() in ("", os.environ.get(_CHECKED))
         flags = f"{flags} --xla_backend_extra_options={_LOOPS}=1000000000".strip()
-        os.environ[_XLA_FLAGS] = flags
+        os.environ["XLA_FLAGS"] = flags
         if checked:
             os.environ[_CHECKED] = flags
 

@@ -14,9 +14,9 @@ from pathlib import Path
 
 MOST_BYTES = 200 * 2**20
 """Total size (bytes) of all entries above which the least recently used entries are removed."""
-SUFFIX = ".program"
-"""Suffix of the file names of entries. It distinguishes them from other files in the folder."""
 
+# Suffix of the file names of entries. It distinguishes them from other files in the folder.
+_SUFFIX = ".program"
 _HEADER = b"rootsopt program 2\n"
 _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
@@ -42,13 +42,13 @@ class Store:
     def __init__(self, path: Path):
         self._folder = _own_folder(path)
         # Remove unfinished files that ended processes have left.
-        for file in self._folder.glob(f".*{SUFFIX}.*"):
+        for file in self._folder.glob(f".*{_SUFFIX}.*"):
             with contextlib.suppress(OSError):
                 if abs(time.time() - file.lstat().st_mtime) > _LEFT_SECONDS:
                     file.unlink()
 
     def _file(self, name: str) -> Path:
-        return self._folder / (name + SUFFIX)
+        return self._folder / (name + _SUFFIX)
 
     def __contains__(self, name: str) -> bool:
         file = self._file(name)
@@ -79,7 +79,7 @@ class Store:
         """Remove the least recently used entries until the rest has at most `MOST_BYTES`."""
         kept = []
         # Only our own finished files: the folder may hold others.
-        for file in self._folder.glob(f"[!.]*{SUFFIX}"):
+        for file in self._folder.glob(f"[!.]*{_SUFFIX}"):
             with contextlib.suppress(OSError):  # removed by another process
                 status = file.lstat()
                 if stat.S_ISREG(status.st_mode):

@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from rootsopt.response.result import Series
 
 
-DPI = 150
-"""Resolution (dots per inch) of the figures."""
+# Resolution (dots per inch) of the figures.
+_DPI = 150
 
 
 class ResultFolder:
@@ -124,12 +124,12 @@ class ResultFolder:
 
         file, canvas = io.BytesIO(), cast("FigureCanvasAgg", figure.canvas)
         # `savefig` would lay out and draw everything twice.
-        figure.set_dpi(DPI)
+        figure.set_dpi(_DPI)
         canvas.draw()
         picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
         # Without the opaque alpha, the lowest level gives files as small as matplotlib's default,
         # in half the time.
-        picture.save(file, "png", compress_level=1, dpi=(DPI, DPI))
+        picture.save(file, "png", compress_level=1, dpi=(_DPI, _DPI))
         return self.write_bytes(name, file.getvalue())
 
 
@@ -249,13 +249,7 @@ def make_folders(folder: Path, made: list[Path]) -> None:
 
     `made`: list to which each folder is appended as soon as it is created. Raises `OSError` if a
     folder cannot be created."""
-    missing = []
-    while not folder.is_dir():
-        missing.append(folder)
-        if folder.parent == folder:
-            break
-        folder = folder.parent
-    for new in reversed(missing):
+    for new in reversed([x for x in (folder, *folder.parents) if not x.is_dir()]):
         try:
             os.mkdir(new)
         except FileExistsError:
