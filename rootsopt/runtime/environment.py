@@ -252,8 +252,10 @@ def _without_settings() -> dict[str, str]:
 
 def _agrees(setting: object, value: str) -> bool:
     """Return whether the text `value` of a variable means the same as the current JAX `setting`."""
-    words = {"1": "true", "t": "true", "yes": "true", "y": "true", "on": "true"}
-    words |= {"0": "false", "f": "false", "no": "false", "n": "false", "off": "false", "": "false"}
+    words = {
+        **dict.fromkeys(("1", "t", "yes", "y", "on"), "true"),
+        **dict.fromkeys(("0", "f", "no", "n", "off", ""), "false"),
+    }
     said, force = value.strip().lower(), str(getattr(setting, "value", setting)).lower()
     return said == force or (isinstance(setting, bool) and words.get(said, said) == force)
 

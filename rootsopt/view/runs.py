@@ -244,18 +244,14 @@ class RunFolder(ResultFolder, contextlib.AbstractContextManager["RunFolder"]):
         if state in ("absent", "empty"):
             files.move(self.place, self.target)
             return []
-        if self.overwrite and state == "ours":
-            older = self._temporary()
-            self._swap_by(older)
+        replaced = self.overwrite and state == "ours"
+        older = self._temporary() if replaced else self._free()
+        self._swap_by(older)
+        if replaced:
             files.discard_tree(older)
             return []
-        aside = self._free()
-        self._swap_by(aside)
-        shown = self.path.with_name(aside.name)
-        note = f"the earlier run is now in {shown}"
-        if self.overwrite:
-            note += ", because it holds files that are not its own"
-        return [note]
+        why = ", because it holds files that are not its own" if self.overwrite else ""
+        return [f"the earlier run is now in {self.path.with_name(older.name)}{why}"]
 
     def _swap_by(self, older: Path) -> None:
         """Move the earlier run to `older`, then this run to the target's path.

@@ -282,7 +282,6 @@ def touching_table(result: Record) -> Table | None:
     touching = result.get("touching")
     if not touching:
         return None
-    lost = "reserve lost (µm)", "lost at most (µm)"
     rows = [
         [
             label(one["key"]),
@@ -303,7 +302,7 @@ def touching_table(result: Record) -> Table | None:
         f"reserves differ from the model by at most "
         f"{quantity(touching['greatest_difference_um'], 'µm')}."
     )
-    heads = ["", "standard deviation", *lost, "share of variance"]
+    heads = "", "standard deviation", "reserve lost (µm)", "lost at most (µm)", "share of variance"
     return table("Reserve under tolerances", heads, [("", rows)], note)
 
 
