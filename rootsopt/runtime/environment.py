@@ -163,7 +163,9 @@ def use_float64() -> None:
     """Import JAX in double precision, apply the required settings, and start the device.
 
     Raises `InputError` if the environment prevents JAX from starting."""
-    aside = {} if "jax" in sys.modules else _without_settings()
+    # Set aside the variables of JAX that are not respected; JAX reads them when it is imported.
+    names = [] if "jax" in sys.modules else [name for name in os.environ if name.startswith("JAX_")]
+    aside = {name: os.environ.pop(name) for name in names if not name.startswith(_RESPECTED)}
     flags = os.environ.get("XLA_FLAGS", "").strip()
     if flags:
         _check_flags(flags)
@@ -238,16 +240,6 @@ def _set_aside(named: list[str]) -> None:
             f"ignored: {', '.join(named)}; commands compute with JAX's own defaults in double "
             "precision (unset the variable to remove this line)"
         )
-
-
-def _without_settings() -> dict[str, str]:
-    """Remove the JAX variables from the environment, except those in `_RESPECTED`.
-
-    Return the removed variables as {name: value}."""
-    names = [
-        name for name in os.environ if name.startswith("JAX_") and not name.startswith(_RESPECTED)
-    ]
-    return {name: os.environ.pop(name) for name in names}
 
 
 def _agrees(setting: object, value: str) -> bool:
