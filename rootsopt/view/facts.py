@@ -73,9 +73,9 @@ def optimised(result: Record, rows: Sequence[Record]) -> Facts:
 
 
 def _sentence(parts: Sequence[str]) -> str:
-    """Join parts to one sentence, with semicolons between them."""
+    """Join parts to one sentence, with semicolons between them; "" without parts."""
     joined = "; ".join(parts)
-    return f"{joined[:1].upper()}{joined[1:]}."
+    return f"{joined[:1].upper()}{joined[1:]}." if parts else ""
 
 
 def _gains(result: Record) -> Iterator[str]:
@@ -212,15 +212,13 @@ def simulated(result: Record, rows: Sequence[Record]) -> Facts:
         count = steady["period"]
         words = "every mesh period" if count == 1 else f"every {count} mesh periods"
         force.append(f"the motion repeats {words}")
-    sure = [*_trust(steady, result)]
-    words = [_sentence(sure)] if sure else []
-    facts = [("Contact force", _sentence(force))] if force else []
-    if apart:
-        said = " ".join([str(result["message"]), *([_sentence(force)] if force else [])])
-        facts = [("Flanks", said)]
-    words += _touching(result)
-    told = " ".join([*words, *([] if apart else _advice_of(result))])
-    return [*facts, *([("How sure", told)] if told else [])]
+    said = [str(result["message"])] if apart else []
+    advice = [] if apart else _advice_of(result)
+    facts = {
+        "Flanks" if apart else "Contact force": [*said, _sentence(force)],
+        "How sure": [_sentence([*_trust(steady, result)]), *_touching(result), *advice],
+    }
+    return [(head, " ".join(filter(None, told))) for head, told in facts.items() if any(told)]
 
 
 def _touching(result: Record) -> list[str]:
