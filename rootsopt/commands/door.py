@@ -42,7 +42,7 @@ class Signals:
         self.promise = ""
         self.abandon: Callable[[], str] = str
         self._before: dict[int, Any] = {}
-        self._pipe: tuple[int, int] | None = None
+        self._writing = -1
         self._wakeup = -1
 
     def install(self) -> None:
@@ -56,9 +56,9 @@ class Signals:
         self._before = {number: one for number, one in found.items() if one in defaults}
         if not self._before:
             return
-        reading, writing = self._pipe = os.pipe()
-        os.set_blocking(writing, False)
-        self._wakeup = signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
+        reading, self._writing = os.pipe()
+        os.set_blocking(self._writing, False)
+        self._wakeup = signal.set_wakeup_fd(self._writing, warn_on_full_buffer=False)
         threading.Thread(target=self._wait, args=(reading,), name=_WAITING, daemon=True).start()
         for number in self._before:
             # Another thread responds to the signal.
@@ -66,14 +66,13 @@ class Signals:
 
     def remove(self) -> None:
         """Restore the signal handlers that `install` replaced."""
-        if self._pipe is None:
+        if self._writing < 0:
             return
         for number, before in self._before.items():
             signal.signal(number, before)
         signal.set_wakeup_fd(self._wakeup)
-        _, writing = self._pipe
-        self._pipe = None
-        os.close(writing)  # ends the thread, which closes the other end
+        os.close(self._writing)  # ends the thread, which closes the other end
+        self._writing = -1
 
     def _wait(self, reading: int) -> None:
         while numbers := os.read(reading, 1):

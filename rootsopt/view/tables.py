@@ -408,14 +408,13 @@ def effort_table(result: Record) -> Table | None:
     """Return effort and accuracy of the run, and the versions of its software."""
     records = {} if "points" in result else records_of(result)
     own = {} if "design" in records else {"run": result}
-    groups = [
-        (name if name == "run" or len(records) > 1 else "simulation", one.get("statistics") or {})
+    groups = {
+        name if name == "run" or len(records) > 1 else "simulation": one.get("statistics") or {}
         for name, one in (own | records).items()
-    ]
-    groups.append(("versions", result.get("versions") or {}))
+    } | {"versions": result.get("versions") or {}}
     shown = [
         (name, [[label(key), value(x)] for key, x in scalars(rows).items()])
-        for name, rows in groups
+        for name, rows in groups.items()
     ]
     return table("Effort, accuracy and versions", ["", "value"], shown)
 
