@@ -308,8 +308,8 @@ def _report(folder: "RunFolder", options: argparse.Namespace, outcome: Outcome) 
     except Exception as error:
         words = f"{type(error).__name__}: {error}"
         environment.say(f"{pages.REPORT} is not written, because it could not be made: {words}")
-        return
-    folder.write_text(pages.REPORT, text)
+    else:
+        folder.write_text(pages.REPORT, text)
 
 
 @contextlib.contextmanager
