@@ -43,35 +43,35 @@ if TYPE_CHECKING:
 
 __version__ = "0.2.0"
 
-# Public names, each with the "module:attribute" from which it is imported.
+# Public names, each with the module from which it is imported.
 _PUBLIC = {
-    "COMPILER_OPTIONS": "rootsopt.runtime.programs:COMPILER_OPTIONS",
-    "Config": "rootsopt.config:Config",
-    "Contact": "rootsopt.contact.gap:Contact",
-    "ContactLaw": "rootsopt.contact.law:ContactLaw",
-    "Evaluation": "rootsopt.response.result:Evaluation",
-    "Family": "rootsopt.config.families:Family",
-    "Front": "rootsopt.optimize.tradeoffs.front:Front",
-    "Identification": "rootsopt.identification.answer:Identification",
-    "InputError": "rootsopt.errors:InputError",
-    "Optimization": "rootsopt.optimize.outcome:Optimization",
-    "Parameter": "rootsopt.config.families:Parameter",
-    "Part": "rootsopt.dynamics.parts.base:Part",
-    "Profile": "rootsopt.profiles.base:Profile",
-    "Response": "rootsopt.response.steady:Response",
-    "Scene": "rootsopt.scene:Scene",
-    "Segment": "rootsopt.profiles.base:Segment",
-    "Status": "rootsopt.status:Status",
-    "Term": "rootsopt.response.terms:Term",
-    "evaluate": "rootsopt.response.evaluation:evaluate",
-    "identify": "rootsopt.identification.fit:identify",
-    "load_config": "rootsopt.config:load_config",
-    "optimize_design": "rootsopt.optimize.design:optimize_design",
-    "pareto_front": "rootsopt.optimize.design:pareto_front",
-    "register_family": "rootsopt.config.families:register_family",
-    "register_term": "rootsopt.response.terms:register_term",
-    "steady_response": "rootsopt.response.steady:steady_response",
-    "sweep_scenes": "rootsopt.response.sweeps.scenes:sweep_scenes",
+    "COMPILER_OPTIONS": "rootsopt.runtime.programs",
+    "Config": "rootsopt.config",
+    "Contact": "rootsopt.contact.gap",
+    "ContactLaw": "rootsopt.contact.law",
+    "Evaluation": "rootsopt.response.result",
+    "Family": "rootsopt.config.families",
+    "Front": "rootsopt.optimize.tradeoffs.front",
+    "Identification": "rootsopt.identification.answer",
+    "InputError": "rootsopt.errors",
+    "Optimization": "rootsopt.optimize.outcome",
+    "Parameter": "rootsopt.config.families",
+    "Part": "rootsopt.dynamics.parts.base",
+    "Profile": "rootsopt.profiles.base",
+    "Response": "rootsopt.response.steady",
+    "Scene": "rootsopt.scene",
+    "Segment": "rootsopt.profiles.base",
+    "Status": "rootsopt.status",
+    "Term": "rootsopt.response.terms",
+    "evaluate": "rootsopt.response.evaluation",
+    "identify": "rootsopt.identification.fit",
+    "load_config": "rootsopt.config",
+    "optimize_design": "rootsopt.optimize.design",
+    "pareto_front": "rootsopt.optimize.design",
+    "register_family": "rootsopt.config.families",
+    "register_term": "rootsopt.response.terms",
+    "steady_response": "rootsopt.response.steady",
+    "sweep_scenes": "rootsopt.response.sweeps.scenes",
 }
 __all__ = ["__version__", *_PUBLIC]  # pyright: ignore[reportUnsupportedDunderAll]
 
@@ -80,8 +80,7 @@ def __getattr__(name: str) -> Any:
     if name not in _PUBLIC:
         raise AttributeError(f"module 'rootsopt' has no attribute {name!r}")
     import_module("rootsopt.runtime.environment").use_compiled_loops()
-    module, _, attribute = _PUBLIC[name].partition(":")
-    return getattr(import_module(module), attribute)
+    return getattr(import_module(_PUBLIC[name]), name)
 
 
 def __dir__() -> list[str]:

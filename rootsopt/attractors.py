@@ -2,5 +2,4 @@
 
 from rootsopt.commands.table import attractors
 
-main = attractors.main
 attractors.begin(__name__)

@@ -2,5 +2,4 @@
 
 from rootsopt.commands.table import explore
 
-main = explore.main
 explore.begin(__name__)

@@ -5,7 +5,6 @@ import sys
 import rootsopt
 from rootsopt.commands.table import identify
 
-main = identify.main
 identify.begin(__name__)
 # This import, too, leaves `rootsopt.identify` the public function of that name.
 sys.modules[__name__] = rootsopt.__getattr__("identify")

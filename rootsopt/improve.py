@@ -2,5 +2,4 @@
 
 from rootsopt.commands.table import improve
 
-main = improve.main
 improve.begin(__name__)

@@ -2,5 +2,4 @@
 
 from rootsopt.commands.table import new
 
-main = new.main
 new.begin(__name__)

@@ -2,5 +2,4 @@
 
 from rootsopt.commands.table import pareto
 
-main = pareto.main
 pareto.begin(__name__)

@@ -2,5 +2,4 @@
 
 from rootsopt.commands.table import profile
 
-main = profile.main
 profile.begin(__name__)

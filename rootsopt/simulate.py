@@ -2,5 +2,4 @@
 
 from rootsopt.commands.table import simulate
 
-main = simulate.main
 simulate.begin(__name__)

@@ -2,5 +2,4 @@
 
 from rootsopt.commands.table import sweep
 
-main = sweep.main
 sweep.begin(__name__)

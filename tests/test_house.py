@@ -48,8 +48,7 @@ SLOW = {"PIL", "optax", "rich", "scipy"}
 LATE = {
     # The work of a command is loaded once its help or its config has asked for it.
     "commands/table.py": {
-        "rootsopt.commands", "rootsopt.view", "argparse", "rootsopt.config.explain",
-        "rootsopt.config.sheet",
+        "rootsopt.commands", "argparse", "rootsopt.config.explain", "rootsopt.config.sheet",
     },
     "commands/cli.py": {
         "rootsopt.view.terminal", "rootsopt.view.files", "rootsopt.view.runs",

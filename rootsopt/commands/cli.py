@@ -1,4 +1,4 @@
-"""Shared parts of the commands: arguments, result folder, float64, exit codes.
+"""Shared parts of the commands: arguments and their completion, result folder, float64, exit codes.
 
 Exit code 0: success. 2: bad input, one message on stderr. 3: the run ended without a usable result;
 the status says why.
@@ -7,7 +7,7 @@ the status says why.
 import argparse
 import contextlib
 import functools
-import importlib
+import importlib.util
 import os
 import shlex
 import shutil
@@ -20,18 +20,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 from rootsopt.commands import door
 from rootsopt.commands.door import BAD_INPUT, NO_RESULT, OK
-from rootsopt.commands.table import Command
+from rootsopt.commands.table import COMMANDS, Command
 from rootsopt.config import sources
-from rootsopt.config.explain import GROUPS, describe, outline
+from rootsopt.config.explain import GROUPS, describe, outline, tree
 from rootsopt.config.families import families
 from rootsopt.config.plausible import notes
 from rootsopt.config.reading import Config, load
-from rootsopt.config.sources import import_named, shipped
 from rootsopt.errors import InputError
 from rootsopt.runtime import environment
-from rootsopt.runtime.environment import use_float64
-from rootsopt.view import pages
-from rootsopt.view.pages import REPORT
+from rootsopt.view import figures, pages
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -123,7 +120,7 @@ def parser(command: Command) -> argparse.ArgumentParser:
         type=Path,
         metavar=command.takes,
         help={
-            "CONFIG": f"YAML file or shipped: {', '.join(shipped())}",
+            "CONFIG": f"YAML file or shipped: {', '.join(sources.shipped())}",
             "ROTOR": "CSV or DXF file with the outline of a rotor",
         }.get(command.takes, "YAML file"),
     )
@@ -151,6 +148,8 @@ def parser(command: Command) -> argparse.ArgumentParser:
         action="store_true",
         help="compile again, and keep no compiled programs",
     )
+    if command.export:
+        figures.add_option(result, command.export)
     command.options(result)
     return result
 
@@ -172,7 +171,7 @@ def _add_folder(result: argparse.ArgumentParser, command: str) -> None:
     result.add_argument(
         "--report",
         action="store_true",
-        help=f"write {REPORT}, the run on one page (needs rootsopt[pages])",
+        help=f"write {pages.REPORT}, the run on one page (needs rootsopt[pages])",
     )
 
 
@@ -195,9 +194,9 @@ def _import_extensions(command: str, argv: Sequence[str] | None) -> None:
     _add_import(early)
     names = early.parse_known_args(argv)[0].imports
     if names:
-        use_float64()
+        environment.use_float64()
     for name in names:
-        import_named(name)
+        sources.import_named(name)
 
 
 def run(command: Command, argv: Sequence[str] | None) -> int:
@@ -216,14 +215,14 @@ def run(command: Command, argv: Sequence[str] | None) -> int:
         options = parser(command).parse_args(argv)
         options.given = shlex.join(sys.argv[1:] if argv is None else argv)
         for name in options.imports:  # Only the whole parser knows abbreviated options.
-            import_named(name)
+            sources.import_named(name)
         if command.writes and options.output is None:
             options.output = os.path.join("results", f"{options.config.stem}-{command.name}")
         own = command.takes == "CONFIG"
         config = load(options.config, options.overrides) if own else None
         for note in notes(config) if config else ():
             environment.say(note)
-        use_float64()
+        environment.use_float64()
         use_cache(wanted=not options.no_cache)
         with environment.explained():
             if not command.reads:
@@ -234,16 +233,14 @@ def run(command: Command, argv: Sequence[str] | None) -> int:
                 return _work(command.name)(config, options)
             return _in_folder(command, config, options)
     except InputError as error:
-        message = " ".join(str(error).split())
-        print(f"rootsopt {command.name}: {message}", file=sys.stderr)
-        return BAD_INPUT
+        code, said = BAD_INPUT, " ".join(str(error).split())
     except OSError as error:
         where = f"{error.filename}: " if error.filename is not None else ""
-        print(f"rootsopt {command.name}: {where}{sources.reason(error)}", file=sys.stderr)
-        return BAD_INPUT
+        code, said = BAD_INPUT, f"{where}{sources.reason(error)}"
     except KeyboardInterrupt:
-        print(f"rootsopt {command.name}: stopped by the user", file=sys.stderr)
-        return NO_RESULT
+        code, said = NO_RESULT, "stopped by the user"
+    print(f"rootsopt {command.name}: {said}", file=sys.stderr)
+    return code
 
 
 def _work(command: str, name: str = "body") -> Callable[..., Any]:
@@ -266,8 +263,8 @@ def _in_folder(command: Command, config: Config, options: argparse.Namespace) ->
         if not options.no_figures:
             # With matplotlib it takes 0.5 s. Meanwhile, programs are loaded or compiled, which does
             # not hold Python's lock.
-            figures = f"rootsopt.view.figures.{command.figures}"
-            threading.Thread(target=importlib.import_module, args=(figures,)).start()
+            module = f"rootsopt.view.figures.{command.figures}"
+            threading.Thread(target=importlib.import_module, args=(module,)).start()
         outcome: Outcome = body(config, options, folder)
         write_config(folder, outcome.config or config)
         data = {**outcome.result, "versions": environment.versions()}
@@ -310,9 +307,9 @@ def _report(folder: "RunFolder", options: argparse.Namespace, outcome: Outcome) 
         text = report_text(run)
     except Exception as error:
         words = f"{type(error).__name__}: {error}"
-        environment.say(f"{REPORT} is not written, because it could not be made: {words}")
-        return
-    folder.write_text(REPORT, text)
+        environment.say(f"{pages.REPORT} is not written, because it could not be made: {words}")
+    else:
+        folder.write_text(pages.REPORT, text)
 
 
 @contextlib.contextmanager
@@ -340,3 +337,73 @@ def use_cache(wanted: bool = True) -> None:
 
     if refused := programs.keep_by_default() if wanted else programs.keep_in(None):
         environment.say(f"compiled programs are not kept between runs: {refused}")
+
+
+# Shells for which there is a completion script.
+_SHELLS = "bash", "zsh"
+_KEYS, _CONFIGS = "_rootsopt_keys", "_rootsopt_configs"
+
+# End of the bash script: no blank after a key, because its value follows.
+_NO_SPACE = """
+_rootsopt() {
+  _shtab_rootsopt "$@"
+  [[ ${COMPREPLY[0]} == *= ]] && compopt -o nospace 2>/dev/null
+  return 0
+}
+complete -o bashdefault -F _rootsopt rootsopt"""
+
+
+def completion(shell: str) -> str:
+    """Return the script that completes commands, options and config keys in a `shell`.
+
+    Raises `InputError` for an unknown shell, or if shtab is not installed."""
+    if shell not in _SHELLS:
+        raise InputError(f"`--completion` must be {' or '.join(_SHELLS)}, but is {shell!r}")
+    if importlib.util.find_spec("shtab") is None:
+        raise InputError(
+            "`--completion` needs shtab; install it with `pip install 'rootsopt[completion]'`"
+        )
+    import shtab
+
+    whole = argparse.ArgumentParser(prog="rootsopt")
+    whole.add_argument("--version", action="store_true", help="print the version")
+    parts = whole.add_subparsers()
+    for command in COMMANDS.values():
+        parent = parser(command)
+        _complete(parent, shtab.FILE, shtab.DIRECTORY)
+        parts.add_parser(command.name, help=command.purpose, parents=[parent], add_help=False)
+    functions = f"""
+{_KEYS}() {{
+  compgen -W "{_keys()}" -- "$1"
+}}
+{_CONFIGS}() {{
+  compgen -W "{" ".join(sources.shipped())}" -- "$1"
+  compgen -f -- "$1"
+}}
+"""
+    # shtab takes a preamble per shell; its annotation names only text.
+    text = shtab.complete(whole, shell, preamble={"bash": functions})  # type: ignore[arg-type]
+    return f"{text}\n{_NO_SPACE}" if shell == "bash" else text
+
+
+def _complete(parent: argparse.ArgumentParser, file: Mapping, folder: Mapping) -> None:
+    """Set how the shell completes the values of the arguments of the parser `parent`.
+
+    `file`, `folder`: shtab's functions for files and folders, by shell."""
+    ways = {
+        "config": {
+            "bash": _CONFIGS,
+            "zsh": f"_alternative 'c:config:({' '.join(sources.shipped())})' 'f:file:_files'",
+        },
+        "output": folder,
+        "imports": file,
+        "overrides": {"bash": _KEYS, "zsh": f"({_keys()})"},
+        "over": {"bash": _KEYS, "zsh": f"({_keys()})"},
+    }
+    for action in parent._actions:
+        if action.dest in ways:
+            action.complete = ways[action.dest]  # type: ignore[attr-defined]
+
+
+def _keys() -> str:
+    return " ".join(f"{key}=" for key in tree(Config))

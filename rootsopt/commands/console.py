@@ -47,11 +47,11 @@ def _called(arguments: list[str]) -> int:
 
 def _completed(arguments: list[str]) -> int:
     """Print the completion script for the shell that `arguments` name; return the exit code."""
-    from rootsopt.commands import completion
+    from rootsopt.commands import cli
     from rootsopt.errors import InputError
 
     try:
-        print(completion.script(arguments[0] if arguments else ""))
+        print(cli.completion(arguments[0] if arguments else ""))
     except InputError as error:
         print(f"rootsopt: {error}", file=sys.stderr)
         return door.BAD_INPUT

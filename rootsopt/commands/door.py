@@ -42,7 +42,7 @@ class Signals:
         self.promise = ""
         self.abandon: Callable[[], str] = str
         self._before: dict[int, Any] = {}
-        self._pipe: tuple[int, int] | None = None
+        self._writing = -1
         self._wakeup = -1
 
     def install(self) -> None:
@@ -51,31 +51,28 @@ class Signals:
         Outside the main thread, do nothing."""
         if threading.current_thread() is not threading.main_thread():
             return
-        for number in _NAMES:
-            before = signal.getsignal(number)
-            if before in (signal.SIG_DFL, signal.default_int_handler):
-                self._before[number] = before
+        found = {number: signal.getsignal(number) for number in _NAMES}
+        defaults = signal.SIG_DFL, signal.default_int_handler
+        self._before = {number: one for number, one in found.items() if one in defaults}
         if not self._before:
             return
-        reading, writing = self._pipe = os.pipe()
-        os.set_blocking(writing, False)
-        self._wakeup = signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
-        waiting = threading.Thread(target=self._wait, args=(reading,), name=_WAITING, daemon=True)
-        waiting.start()
+        reading, self._writing = os.pipe()
+        os.set_blocking(self._writing, False)
+        self._wakeup = signal.set_wakeup_fd(self._writing, warn_on_full_buffer=False)
+        threading.Thread(target=self._wait, args=(reading,), name=_WAITING, daemon=True).start()
         for number in self._before:
             # Another thread responds to the signal.
             signal.signal(number, lambda *_: None)
 
     def remove(self) -> None:
         """Restore the signal handlers that `install` replaced."""
-        if self._pipe is None:
+        if self._writing < 0:
             return
         for number, before in self._before.items():
             signal.signal(number, before)
         signal.set_wakeup_fd(self._wakeup)
-        _, writing = self._pipe
-        self._pipe = None
-        os.close(writing)  # ends the thread, which closes the other end
+        os.close(self._writing)  # ends the thread, which closes the other end
+        self._writing = -1
 
     def _wait(self, reading: int) -> None:
         while numbers := os.read(reading, 1):
@@ -108,10 +105,7 @@ def patience(promise: str) -> Iterator[threading.Event]:
 
     `promise`: message that tells the user what the run does after the signal. No signal sets the
     event unless the command runs as its own process."""
-    signals = _running
-    if signals is None:
-        yield threading.Event()
-        return
+    signals = _running or Signals("")  # The latter receives no signal.
     signals.promise, signals.patient = promise, True
     yield signals.stop  # Stay patient to the end: results that took long must be written.
 
@@ -122,10 +116,7 @@ def leaving(abandon: Callable[[], str]) -> Iterator[None]:
 
     `abandon`: function that cleans up and returns a message for the user. It is not called unless
     the command runs as its own process."""
-    signals = _running
-    if signals is None:
-        yield
-        return
+    signals = _running or Signals("")  # The latter receives no signal.
     signals.abandon = abandon
     try:
         yield
@@ -149,10 +140,6 @@ class _Stream:
         if not self.closed_early:
             self._guarded(lambda: self.stream.write(text))
         return len(text)
-
-    def writelines(self, lines) -> None:
-        for line in lines:
-            self.write(line)
 
     def flush(self) -> None:
         """Flush the stream, without raising an `OSError`."""

@@ -15,8 +15,9 @@ class Command(NamedTuple):
     """A command, with the work in the module of its name in `rootsopt.commands.work`.
 
     `name`; `brief`: what it does, for the list of commands; `purpose`: the same, for its help;
-    `options`: adds its own options to a parser; `writes`: whether it writes a result folder;
-    `reads`: whether it reads a config, rather than writing one;
+    `options`: adds its own options to a parser; `export`: default of its option `--export`, "" if
+    it has none; `writes`: whether it writes a result folder; `reads`: whether it reads a config,
+    rather than writing one;
     `takes`: name of its argument in its help, CONFIG or what its work makes a config from;
     `figures`: module of `rootsopt.view.figures` that is loaded while it computes."""
 
@@ -24,6 +25,7 @@ class Command(NamedTuple):
     brief: str
     purpose: str
     options: "Callable[[ArgumentParser], None]" = lambda parser: None
+    export: str = ""
     writes: bool = True
     reads: bool = True
     takes: str = "CONFIG"
@@ -46,15 +48,7 @@ class Command(NamedTuple):
         return cli.run(self, argv)
 
 
-def _optimize(parser: "ArgumentParser") -> None:
-    _simulate(parser)
-    _shared(parser)
-
-
 def _improve(parser: "ArgumentParser") -> None:
-    from rootsopt.view import figures
-
-    figures.add_option(parser, "dxf")
     parser.set_defaults(report=True)
     group = parser.add_argument_group("what is better, and what the file does not say")
     for aim, meaning in (
@@ -79,17 +73,7 @@ def _improve(parser: "ArgumentParser") -> None:
     _shared(parser)
 
 
-def _simulate(parser: "ArgumentParser") -> None:
-    from rootsopt.view import figures
-
-    figures.add_option(parser, "none")
-
-
 def _profile(parser: "ArgumentParser") -> None:
-    from rootsopt.view import figures
-
-    # Drawings take less than 1 s, a solid takes 10 s.
-    figures.add_option(parser, "dxf,svg")
     parser.add_argument(
         "--project",
         type=_whole(3, 64),
@@ -217,7 +201,8 @@ optimize = Command(
     "optimize",
     "optimise a design and compare it with the baseline",
     "Optimise the design parameters for low contact force and compare with the baseline.",
-    _optimize,
+    _shared,
+    export="none",
     figures="runs",
 )
 improve = Command(
@@ -226,6 +211,7 @@ improve = Command(
     "Find what rotor a file holds, and a better one of the same displacement, outer diameter and "
     "clearance.",
     _improve,
+    export="dxf",
     takes="ROTOR",
     figures="runs",
 )
@@ -233,7 +219,7 @@ simulate = Command(
     "simulate",
     "simulate one design in one scene",
     "Simulate one design in one scene: steady state, contact force, its gradient.",
-    _simulate,
+    export="none",
     figures="runs",
 )
 pareto = Command(
@@ -268,6 +254,8 @@ profile = Command(
     "compute the geometry of one design",
     "Compute the geometry of one design, and export drawings, solids or an animation.",
     _profile,
+    # Drawings take less than 1 s, a solid takes 10 s.
+    export="dxf,svg",
     figures="runs",
 )
 explore = Command(

@@ -58,8 +58,6 @@ _REQUIRED = {
     "jax_no_execution": False,
 }
 
-_XLA_FLAGS = "XLA_FLAGS"
-
 # Name of the variable that tells child processes which value of XLA_FLAGS has been tested.
 _CHECKED = "ROOTSOPT_XLA_FLAGS_CHECKED"
 
@@ -110,11 +108,10 @@ _noticed: set[str] = set()
 
 def say(text: str) -> None:
     """Print `text` as one line on stderr, unless this process has already printed it."""
-    if text in _noticed:
-        return
-    _noticed.add(text)
-    with contextlib.suppress(OSError, ValueError):
-        print(f"rootsopt: {' '.join(text.split())}", file=sys.stderr)
+    if text not in _noticed:
+        _noticed.add(text)
+        with contextlib.suppress(OSError, ValueError):
+            print(f"rootsopt: {' '.join(text.split())}", file=sys.stderr)
 
 
 def shortened(value: str, longest: int = 80) -> str:
@@ -133,8 +130,8 @@ def own_process() -> None:
     display. The runtime checks of equinox are off, and dense algebra uses one thread. `use_float64`
     handles the variables of JAX."""
     if any(option.lower().startswith("e") for option in sys.warnoptions):
-        for entry in [entry for entry in warnings.filters if entry[0] == "error"]:
-            warnings.filters.remove(entry)  # type: ignore[attr-defined]
+        kept = [entry for entry in warnings.filters if entry[0] != "error"]
+        warnings.filters[:] = kept  # type: ignore[index]
         warnings.simplefilter("default", append=True)
     columns = os.environ.get("COLUMNS", "")
     if not (columns.isdecimal() and int(columns) >= _NARROWEST):
@@ -166,12 +163,14 @@ def use_float64() -> None:
     """Import JAX in double precision, apply the required settings, and start the device.
 
     Raises `InputError` if the environment prevents JAX from starting."""
-    aside = {} if "jax" in sys.modules else _without_settings()
-    flags = os.environ.get(_XLA_FLAGS, "").strip()
+    # Set aside the variables of JAX that are not respected; JAX reads them when it is imported.
+    names = [] if "jax" in sys.modules else [name for name in os.environ if name.startswith("JAX_")]
+    aside = {name: os.environ.pop(name) for name in names if not name.startswith(_RESPECTED)}
+    flags = os.environ.get("XLA_FLAGS", "").strip()
     if flags:
         _check_flags(flags)
     else:
-        os.environ.pop(_XLA_FLAGS, None)
+        os.environ.pop("XLA_FLAGS", None)
     use_compiled_loops()
     try:
         import jax
@@ -182,13 +181,14 @@ def use_float64() -> None:
         raise InputError(f"JAX cannot be imported here: {_reason(error)}; {advice}") from error
     changed = _require(jax.config)
     known = jax.config.values
-    named = []
-    for name, value in aside.items():
-        if name.lower() not in known:
-            os.environ[name] = value  # not a variable of JAX
-        elif not _agrees(known[name.lower()], value):
-            named.append(f"{name}={shortened(value)}")
-    _set_aside(named + [f"{name} = {value!r}" for name, value in changed])
+    foreign = {name: value for name, value in aside.items() if name.lower() not in known}
+    os.environ.update(foreign)  # not variables of JAX
+    named = [
+        f"{name}={shortened(value)}"
+        for name, value in aside.items()
+        if name not in foreign and not _agrees(known[name.lower()], value)
+    ]
+    _set_aside(named + [f"{name} = {value!r}" for name, value in changed.items()])
     _start_device(jax)
 
 
@@ -198,11 +198,11 @@ def use_compiled_loops() -> None:
     This adds an option to XLA_FLAGS, which XLA reads when JAX computes for the first time in a
     process. If JAX has computed already, or if XLA_FLAGS contains extra options for the backend,
     leave it unchanged. XLA does not accept the option for a single compilation."""
-    flags = os.environ.get(_XLA_FLAGS, "")
+    flags = os.environ.get("XLA_FLAGS", "")
     if "xla_backend_extra_options" not in flags and not _started():
         checked = flags.strip() in ("", os.environ.get(_CHECKED))
         flags = f"{flags} --xla_backend_extra_options={_LOOPS}=1000000000".strip()
-        os.environ[_XLA_FLAGS] = flags
+        os.environ["XLA_FLAGS"] = flags
         if checked:
             os.environ[_CHECKED] = flags
 
@@ -242,38 +242,30 @@ def _set_aside(named: list[str]) -> None:
         )
 
 
-def _without_settings() -> dict[str, str]:
-    """Remove the JAX variables from the environment, except those in `_RESPECTED`.
-
-    Return the removed variables as {name: value}."""
-    names = [
-        name for name in os.environ if name.startswith("JAX_") and not name.startswith(_RESPECTED)
-    ]
-    return {name: os.environ.pop(name) for name in names}
-
-
 def _agrees(setting: object, value: str) -> bool:
     """Return whether the text `value` of a variable means the same as the current JAX `setting`."""
-    words = {"1": "true", "t": "true", "yes": "true", "y": "true", "on": "true"}
-    words |= {"0": "false", "f": "false", "no": "false", "n": "false", "off": "false", "": "false"}
+    words = {
+        **dict.fromkeys(("1", "t", "yes", "y", "on"), "true"),
+        **dict.fromkeys(("0", "f", "no", "n", "off", ""), "false"),
+    }
     said, force = value.strip().lower(), str(getattr(setting, "value", setting)).lower()
     return said == force or (isinstance(setting, bool) and words.get(said, said) == force)
 
 
-def _require(config) -> list[tuple[str, object]]:
+def _require(config) -> dict[str, object]:
     """Apply the settings in `_REQUIRED` to `config`, the configuration object of JAX.
 
-    Return (name, former value) of each setting that was changed, except double precision."""
-    changed = []
-    for name, needed in _REQUIRED.items():
-        if name not in config.values:  # gone in this version of JAX
-            continue
-        former = config.values[name]
-        if getattr(former, "value", former) != needed:
-            config.update(name, needed)
-            if name != "jax_enable_x64":  # its default
-                changed.append((name, former))
-    return changed
+    Return the former value of each setting that was changed, by name, except double precision."""
+    former = config.values  # lacks what is gone in this version of JAX
+    wrong = {
+        name: former[name]
+        for name, needed in _REQUIRED.items()
+        if name in former and getattr(former[name], "value", former[name]) != needed
+    }
+    for name in wrong:
+        config.update(name, _REQUIRED[name])
+    wrong.pop("jax_enable_x64", None)  # its default
+    return wrong
 
 
 def _start_device(jax) -> None:
@@ -323,11 +315,9 @@ def _check_flags(flags: str) -> None:
             f"{shown}: {unsound[1]} assumes that neither NaN nor infinity occurs, and results may "
             f"be wrong without notice; {advice}"
         )
-    if not sys.executable:
-        return
     try:
         done = subprocess.run(
-            [sys.executable, "-c", _TRIAL],
+            [sys.executable or "", "-c", _TRIAL],
             stdin=subprocess.DEVNULL,
             capture_output=True,
             timeout=_TRIAL_SECONDS,
@@ -370,5 +360,8 @@ _LIBRARIES = ("jax", "jaxlib", "diffrax", "optax", "equinox", "numpy")
 
 def versions() -> dict[str, str]:
     """Return the versions of Python, this package and the libraries that affect its results."""
-    base = {"python": platform.python_version(), "rootsopt": rootsopt.__version__}
-    return base | {name: importlib.metadata.version(name) for name in _LIBRARIES}
+    return {
+        "python": platform.python_version(),
+        "rootsopt": rootsopt.__version__,
+        **{name: importlib.metadata.version(name) for name in _LIBRARIES},
+    }

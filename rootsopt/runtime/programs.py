@@ -115,13 +115,12 @@ def keep_in(folder: Path | None) -> str | None:
     off as well."""
     global _store, _chosen
     store, reason = None, None
-    if folder is not None:
-        try:
-            store = Store(folder)
-        except UnsafeFolderError as error:
-            reason = str(error)
-        except OSError:
-            pass
+    try:
+        store = None if folder is None else Store(folder)
+    except UnsafeFolderError as error:
+        reason = str(error)
+    except OSError:
+        pass
     _store, _chosen = store, True
     return reason
 
@@ -231,11 +230,11 @@ class CachedFunction:
         try:
             place = self._place(kind)
             made = _loaded(place)
-            if made is not None:
+            if made is None:
+                future.set_result(self._compiled(kind, place, outlined))
+            else:
                 future.set_result(made)
                 outlined(made.result_shape)
-                return
-            future.set_result(self._compiled(kind, place, outlined))
         except BaseException as error:
             with self._lock:
                 del self._made[kind]
@@ -269,10 +268,10 @@ class CachedFunction:
         """Return the cache entry for a program of this `kind`, or `None` if it cannot be cached."""
         if not _chosen:
             keep_by_default()
-        if _store is None or jax.default_backend() != "cpu":
+        # A program loaded from JAX's own cache cannot be serialised again.
+        theirs = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+        if _store is None or theirs or jax.default_backend() != "cpu":
             return None
-        if jax.config.jax_compilation_cache_dir:  # pyright: ignore[reportAttributeAccessIssue]
-            return None  # A program loaded from JAX's own cache cannot be serialised again.
         sources = _sources({self.function.__module__, *_modules(kind), *outside_modules()})
         if sources is None:
             return None
@@ -344,30 +343,26 @@ def _joined(kind: _Kind, arrays: Iterator) -> tuple:
 def _save(place: _Place, made: _Made, number: int) -> None:
     """Write a program to the cache; `number`: how many arrays it takes."""
     # A program that calls out (LAPACK, Python) relies on addresses set up when it is lowered.
-    if "custom-call" in made.call.as_text():  # pyright: ignore[reportFunctionMemberAccess]
-        return
-    payload, _, _ = serialize_executable.serialize(made.call)  # pyright: ignore[reportArgumentType]
-    data = zlib.compress(pickle.dumps((payload, number, made.result_shape)), 1)
-    place.store.write(place.name, place.purpose, data)
+    if "custom-call" not in made.call.as_text():  # pyright: ignore[reportFunctionMemberAccess]
+        payload = serialize_executable.serialize(made.call)[0]  # pyright: ignore[reportArgumentType]
+        data = zlib.compress(pickle.dumps((payload, number, made.result_shape)), 1)
+        place.store.write(place.name, place.purpose, data)
 
 
 def _loaded(place: _Place | None) -> _Made | None:
     """Return the cached program at `place`, or `None` if no program can be loaded from it."""
-    if place is None:
-        return None
-    try:
-        data = place.store.read(place.name, place.purpose)
-        if data is None:
-            return None
-        payload, number, result_shape = pickle.loads(zlib.decompress(data))
-        results = sum(map(_is_array, jax.tree.leaves(result_shape)))
-        takes = jax.tree.structure(((0,) * number, {}))
-        call = serialize_executable.deserialize_and_load(
-            payload, takes, jax.tree.structure([0] * results)
-        )
-    except Exception:
-        return None
-    return _Made(call, result_shape)
+    if place is not None:
+        with contextlib.suppress(Exception):
+            # Without an entry there is nothing to decompress, which is an error, too.
+            data = place.store.read(place.name, place.purpose) or b""
+            payload, number, result_shape = pickle.loads(zlib.decompress(data))
+            results = sum(map(_is_array, jax.tree.leaves(result_shape)))
+            takes = jax.tree.structure(((0,) * number, {}))
+            call = serialize_executable.deserialize_and_load(
+                payload, takes, jax.tree.structure([0] * results)
+            )
+            return _Made(call, result_shape)
+    return None
 
 
 def _modules(kind: _Kind) -> set[str]:

@@ -14,9 +14,9 @@ from pathlib import Path
 
 MOST_BYTES = 200 * 2**20
 """Total size (bytes) of all entries above which the least recently used entries are removed."""
-SUFFIX = ".program"
-"""Suffix of the file names of entries. It distinguishes them from other files in the folder."""
 
+# Suffix of the file names of entries. It distinguishes them from other files in the folder.
+_SUFFIX = ".program"
 _HEADER = b"rootsopt program 2\n"
 _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
@@ -41,10 +41,14 @@ class Store:
 
     def __init__(self, path: Path):
         self._folder = _own_folder(path)
-        _sweep(self._folder)
+        # Remove unfinished files that ended processes have left.
+        for file in self._folder.glob(f".*{_SUFFIX}.*"):
+            with contextlib.suppress(OSError):
+                if abs(time.time() - file.lstat().st_mtime) > _LEFT_SECONDS:
+                    file.unlink()
 
     def _file(self, name: str) -> Path:
-        return self._folder / (name + SUFFIX)
+        return self._folder / (name + _SUFFIX)
 
     def __contains__(self, name: str) -> bool:
         file = self._file(name)
@@ -59,15 +63,23 @@ class Store:
     def write(self, name: str, purpose: str, data: bytes) -> None:
         """Write `data` as the entry `name` for this `purpose`, completely or not at all.
 
-        Raises `OSError` if writing fails."""
-        _write(self._file(name), _checksum(name, purpose, data) + data)
+        Only the user can access its file. Raises `OSError` if writing fails."""
+        file = self._file(name)
+        handle, unfinished = tempfile.mkstemp(prefix=f".{file.name}.", dir=file.parent)
+        try:
+            with open(handle, "wb") as stream:
+                stream.write(_checksum(name, purpose, data) + data)
+            os.replace(unfinished, file)
+        finally:
+            with contextlib.suppress(OSError):
+                os.unlink(unfinished)
         self._prune()
 
     def _prune(self) -> None:
         """Remove the least recently used entries until the rest has at most `MOST_BYTES`."""
         kept = []
         # Only our own finished files: the folder may hold others.
-        for file in self._folder.glob(f"[!.]*{SUFFIX}"):
+        for file in self._folder.glob(f"[!.]*{_SUFFIX}"):
             with contextlib.suppress(OSError):  # removed by another process
                 status = file.lstat()
                 if stat.S_ISREG(status.st_mode):
@@ -90,40 +102,13 @@ def _read(file: Path) -> bytes | None:
 
     `None` is returned if the file does not exist, belongs to another user, or is larger than
     `MOST_BYTES`. It is also returned if others may write to the file."""
-    try:
-        with open(os.open(file, os.O_RDONLY | _SAFELY), "rb") as stream:
-            status = os.fstat(stream.fileno())
-            if not stat.S_ISREG(status.st_mode) or status.st_size > MOST_BYTES:
-                return None
-            if _HAS_OWNERS and (status.st_uid != os.geteuid() or status.st_mode & _OTHERS_WRITE):
-                return None
-            data = stream.read(MOST_BYTES + 1)
-        os.utime(file)
-    except OSError:
-        return None
-    return data if len(data) <= MOST_BYTES else None
-
-
-def _write(file: Path, data: bytes) -> None:
-    """Write `data` to a file that only the user can access, completely or not at all.
-
-    Raises `OSError` if writing fails."""
-    handle, name = tempfile.mkstemp(prefix=f".{file.name}.", dir=file.parent)
-    try:
-        with open(handle, "wb") as stream:
-            stream.write(data)
-        os.replace(name, file)
-    finally:
-        with contextlib.suppress(OSError):
-            os.unlink(name)
-
-
-def _sweep(folder: Path) -> None:
-    """Remove unfinished files that ended processes have left."""
-    for file in folder.glob(f".*{SUFFIX}.*"):
-        with contextlib.suppress(OSError):
-            if abs(time.time() - file.lstat().st_mtime) > _LEFT_SECONDS:
-                file.unlink()
+    with contextlib.suppress(OSError), open(os.open(file, os.O_RDONLY | _SAFELY), "rb") as stream:
+        status = os.fstat(stream.fileno())
+        foreign = _HAS_OWNERS and (status.st_uid != os.geteuid() or status.st_mode & _OTHERS_WRITE)
+        if stat.S_ISREG(status.st_mode) and status.st_size <= MOST_BYTES and not foreign:
+            os.utime(file)
+            return stream.read(MOST_BYTES + 1)  # The checksum refuses a file that still grows.
+    return None
 
 
 def _own_folder(path: Path) -> Path:

@@ -142,14 +142,13 @@ def _region(row: Mapping[str, Any], comparison: Mapping[str, Any]) -> str:
 def _part(key: str, piece: Sequence[float], span: Mapping[str, Any]) -> str:
     start, stop = (_stated(key, x) for x in piece)
     below, above = piece[0] == span["low"], piece[1] == span["high"]
-    phrase = f"is between {start} and {stop}"
-    if below and above:
-        phrase = "has any value"
-    elif above or below:
-        phrase = f"is above {start}" if above else f"is below {stop}"
-    if start == stop:
-        phrase = f"is {start}"
-    return phrase
+    phrases = {
+        (True, True): "has any value",
+        (True, False): f"is below {stop}",
+        (False, True): f"is above {start}",
+        (False, False): f"is between {start} and {stop}",
+    }
+    return f"is {start}" if start == stop else phrases[below, above]
 
 
 def _stated(key: str, given: float) -> str:
@@ -380,14 +379,14 @@ def _whole(bound: Record) -> Table | None:
 
 
 def _held(one: Record) -> Row:
-    parts = []
-    if one.get("speed_rpm") is not None:
-        parts.append(stated("speed_rpm", one["speed_rpm"]))
-    if "scene" in one:
-        parts.append(f"scene {one['scene']} of the sample")
-    if one.get("rotation_deg") is not None:
-        parts.append(f"peak of {value(one['force_N'])} N at {one['rotation_deg']:.2f}°")
-    return [", ".join(parts) or "motion", f"{one['share']:.3f}", value(one["objective"])]
+    speed, rotation = one.get("speed_rpm"), one.get("rotation_deg")
+    parts = [
+        "" if speed is None else stated("speed_rpm", speed),
+        f"scene {one['scene']} of the sample" if "scene" in one else "",
+        "" if rotation is None else f"peak of {value(one['force_N'])} N at {rotation:.2f}°",
+    ]
+    name = ", ".join(filter(None, parts)) or "motion"
+    return [name, f"{one['share']:.3f}", value(one["objective"])]
 
 
 def _unseen(optimality: Record) -> str:

@@ -60,24 +60,22 @@ def optimised(result: Record, rows: Sequence[Record]) -> Facts:
     costs = [f"no reported quantity is worse by {_SMALL} % or more"]
     if worse:
         costs = [listed([words for words, *_ in worse[:FEW]] + more)]
+    optimality = result.get("optimality") or {}
+    doubts = [] if optimality.get("converged", True) else [str(optimality["message"])]
+    sure = [_sentence([*_certified(result)]), *_touching(result), *doubts, *_advice_of(after)]
     spread = " ".join(elsewhere(result))
     return [
-        ("Gained", _sentence([*gained])),
+        ("Gained", _sentence(gained)),
         ("Costs", _sentence([*costs, *_prices(result)])),
-        (
-            "How sure",
-            " ".join(
-                [_sentence([*_certified(result)]), *_touching(result), *_caveats(result, after)]
-            ),
-        ),
+        ("How sure", " ".join(sure)),
         *([("Other scenes", spread)] if spread else []),
     ]
 
 
 def _sentence(parts: Sequence[str]) -> str:
-    """Join parts to one sentence, with semicolons between them."""
+    """Join parts to one sentence, with semicolons between them; "" without parts."""
     joined = "; ".join(parts)
-    return f"{joined[:1].upper()}{joined[1:]}."
+    return f"{joined[:1].upper()}{joined[1:]}." if parts else ""
 
 
 def _gains(result: Record) -> Iterator[str]:
@@ -199,14 +197,6 @@ def _bounded(known: Record) -> Iterator[str]:
         yield f"not proven to be the best: {left} of the bounds may hold a design better by {gap}"
 
 
-def _caveats(result: Record, after: Record) -> Iterator[str]:
-    """Yield why a design is not an optimum, and further advice from the message of its motion."""
-    optimality = result.get("optimality") or {}
-    if optimality and not optimality["converged"]:
-        yield str(optimality["message"])
-    yield from _advice_of(after)
-
-
 def simulated(result: Record, rows: Sequence[Record]) -> Facts:
     """Return facts on one simulated design."""
     response, steady = result.get("response") or {}, result.get("steady_state") or {}
@@ -222,15 +212,13 @@ def simulated(result: Record, rows: Sequence[Record]) -> Facts:
         count = steady["period"]
         words = "every mesh period" if count == 1 else f"every {count} mesh periods"
         force.append(f"the motion repeats {words}")
-    sure = [*_trust(steady, result)]
-    words = [_sentence(sure)] if sure else []
-    facts = [("Contact force", _sentence(force))] if force else []
-    if apart:
-        said = " ".join([str(result["message"]), *([_sentence(force)] if force else [])])
-        facts = [("Flanks", said)]
-    words += _touching(result)
-    told = " ".join([*words, *([] if apart else _advice_of(result))])
-    return [*facts, *([("How sure", told)] if told else [])]
+    said = [str(result["message"])] if apart else []
+    advice = [] if apart else _advice_of(result)
+    facts = {
+        "Flanks" if apart else "Contact force": [*said, _sentence(force)],
+        "How sure": [_sentence([*_trust(steady, result)]), *_touching(result), *advice],
+    }
+    return [(head, " ".join(filter(None, told))) for head, told in facts.items() if any(told)]
 
 
 def _touching(result: Record) -> list[str]:

@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from rootsopt.response.result import Series
 
 
-DPI = 150
-"""Resolution (dots per inch) of the figures."""
+# Resolution (dots per inch) of the figures.
+_DPI = 150
 
 
 class ResultFolder:
@@ -112,7 +112,7 @@ class ResultFolder:
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow(arrays)
-        writer.writerows(zip(*map(_cells, arrays.values()), strict=True))
+        writer.writerows(zip(*(map(_cell, x.tolist()) for x in arrays.values()), strict=True))
         return self.write_text(name, text.getvalue())
 
     def write_figure(self, name: str, figure: "Figure") -> Path:
@@ -124,12 +124,12 @@ class ResultFolder:
 
         file, canvas = io.BytesIO(), cast("FigureCanvasAgg", figure.canvas)
         # `savefig` would lay out and draw everything twice.
-        figure.set_dpi(DPI)
+        figure.set_dpi(_DPI)
         canvas.draw()
         picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
         # Without the opaque alpha, the lowest level gives files as small as matplotlib's default,
         # in half the time.
-        picture.save(file, "png", compress_level=1, dpi=(DPI, DPI))
+        picture.save(file, "png", compress_level=1, dpi=(_DPI, _DPI))
         return self.write_bytes(name, file.getvalue())
 
 
@@ -150,20 +150,12 @@ def plain(data: Any) -> Any:
     return data
 
 
-def _cells(array: NDArray) -> list[str]:
-    if array.dtype.kind == "f":
-        return [f"{value:.10g}" for value in (array + 0.0).tolist()]  # no "-0"
-    return [_cell(value) for value in array.tolist()]
-
-
 def _cell(value: Any) -> str:
-    if value is None:
-        return ""
-    if isinstance(value, bool | np.bool_):
-        return "true" if value else "false"
     if isinstance(value, float | np.floating):
-        return f"{value + 0.0:.10g}"
-    return str(value)
+        return f"{value + 0.0:.10g}"  # no "-0"
+    if isinstance(value, bool | np.bool_):
+        return str(value).lower()
+    return "" if value is None else str(value)
 
 
 def write_config(folder: ResultFolder, config: "Config") -> None:
@@ -192,11 +184,16 @@ def response_columns(series: "Series") -> dict[str, NDArray[np.float64]]:
 
     `series`: time series of a motion, in SI units. Units of the columns are in their names. Loads
     on the bearings come last, if there are any."""
-    loads, columns = series.bearing_loads, {"time_s": series.time}
-    for field, (name, *_, factor) in COLUMNS.items():
-        if field != "depth":
-            columns[name] = factor * getattr(series, field)
-    return columns | ({} if loads is None else dict(zip(_BEARINGS, loads.T, strict=True)))
+    loads = series.bearing_loads
+    return {
+        "time_s": series.time,
+        **{
+            name: factor * getattr(series, field)
+            for field, (name, *_, factor) in COLUMNS.items()
+            if field != "depth"
+        },
+        **({} if loads is None else dict(zip(_BEARINGS, loads.T, strict=True))),
+    }
 
 
 # Columns of the loads on the bearings.
@@ -247,25 +244,14 @@ def create(path: Path, data: bytes) -> None:
         raise
 
 
-def make_folder(path: Path) -> None:
-    """Create a folder, whose parent must exist. Raises `OSError` if this fails."""
-    os.mkdir(path)
-
-
 def make_folders(folder: Path, made: list[Path]) -> None:
     """Create a folder and its missing parents.
 
     `made`: list to which each folder is appended as soon as it is created. Raises `OSError` if a
     folder cannot be created."""
-    missing = []
-    while not folder.is_dir():
-        missing.append(folder)
-        if folder.parent == folder:
-            break
-        folder = folder.parent
-    for new in reversed(missing):
+    for new in reversed([x for x in (folder, *folder.parents) if not x.is_dir()]):
         try:
-            make_folder(new)
+            os.mkdir(new)
         except FileExistsError:
             if not new.is_dir():  # otherwise another process was faster
                 raise
@@ -297,13 +283,6 @@ def move(source: Path, target: Path) -> None:
     os.rename(source, target)
 
 
-def replace(source: Path, target: Path) -> None:
-    """Rename the file `source` to `target` in one step, replacing an existing file.
-
-    Raises `OSError` if renaming fails."""
-    os.replace(source, target)
-
-
 def adopt_mode(path: Path, model: Path) -> None:
     """Give the folder `path` the permissions of the folder `model`.
 
@@ -331,8 +310,6 @@ try:
 except ImportError:  # this system has no such locks
     fcntl = None
 
-_TAKEN = (errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES)
-
 
 class TakenError(InputError):
     """Raised if another process holds the lock; its message names that process."""
@@ -357,11 +334,12 @@ class Lock:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # pyright: ignore
             self.held = True
-        except OSError as error:
-            if error.errno in _TAKEN:
-                holder = _holder(file)
-                os.close(file)
-                raise TakenError(holder) from None
+        except (BlockingIOError, PermissionError):
+            holder = _holder(file)
+            os.close(file)
+            raise TakenError(holder) from None
+        except OSError:
+            pass  # This file system has no such locks.
         # The last holder may have removed the file between the two steps.
         if self.held and not self._same(file):
             os.close(file)

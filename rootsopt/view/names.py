@@ -188,8 +188,10 @@ def statuses_in(data: Any) -> dict[str, None]:
 
 def status_cell(word: str) -> Cell:
     """Return the cell of a status: its label in words, marked favourable or not."""
-    known = {status.label: status.usable for status in Status}
-    known |= {one.label: one is Standing.CERTIFIED for one in Standing}
+    known = {
+        **{status.label: status.usable for status in Status},
+        **{one.label: one is Standing.CERTIFIED for one in Standing},
+    }
     return Cell(in_words(word), known.get(word))
 
 

@@ -47,7 +47,7 @@ _LONGEST = 150
 _PATIENCE = 10.0
 
 
-class RunFolder(ResultFolder):
+class RunFolder(ResultFolder, contextlib.AbstractContextManager["RunFolder"]):
     """A `ResultFolder` that appears at its final path only when it is complete.
 
     `path`: the final path; `place`: temporary folder into which files are written until the run is
@@ -80,19 +80,15 @@ class RunFolder(ResultFolder):
             self._base = self.target.parent / _base(self.target.name)
             self.place = self._temporary()
             self._claim()
-            files.make_folder(self.place)
-        except InputError:
+            files.make_folders(self.place, [])
+        except BaseException as error:
             self.close()
-            raise
-        except (OSError, ValueError) as error:
-            self.close()
+            if isinstance(error, InputError) or not isinstance(error, OSError | ValueError):
+                raise
             raise InputError(
                 f"{str(self.path)!r}: cannot be used as output folder: {sources.reason(error)}; "
                 "choose another folder or make its parent folder writable"
             ) from None
-        except BaseException:
-            self.close()
-            raise
 
     def _refuse_places(self) -> None:
         """Raise `InputError` if a finished run could not replace the target.
@@ -103,15 +99,15 @@ class RunFolder(ResultFolder):
         if os.path.lexists(target) and not target.is_dir():
             raise InputError(f"{str(self.path)!r}: is not a folder; choose another output folder")
         here = Path.cwd()
-        what = None
-        if target == here or target in here.parents:
-            what = "the current folder or one above it"
-        elif os.path.ismount(target) or str(target) in _mount_points():
-            what = "a mount point"
-        if what is not None:
+        kinds = {
+            "the current folder or one above it": target in (here, *here.parents),
+            "a mount point": os.path.ismount(target) or str(target) in _mount_points(),
+        }
+        met = [name for name, holds in kinds.items() if holds]
+        if met:
             inside = self.path / (self.command or "run")
             raise InputError(
-                f"{str(self.path)!r}: is {what}, which a finished run cannot replace; name a "
+                f"{str(self.path)!r}: is {met[0]}, which a finished run cannot replace; name a "
                 f"folder inside it, for example {str(inside)!r}"
             )
 
@@ -248,18 +244,14 @@ class RunFolder(ResultFolder):
         if state in ("absent", "empty"):
             files.move(self.place, self.target)
             return []
-        if self.overwrite and state == "ours":
-            older = self._temporary()
-            self._swap_by(older)
+        replaced = self.overwrite and state == "ours"
+        older = self._temporary() if replaced else self._free()
+        self._swap_by(older)
+        if replaced:
             files.discard_tree(older)
             return []
-        aside = self._free()
-        self._swap_by(aside)
-        shown = self.path.with_name(aside.name)
-        note = f"the earlier run is now in {shown}"
-        if self.overwrite:
-            note += ", because it holds files that are not its own"
-        return [note]
+        why = ", because it holds files that are not its own" if self.overwrite else ""
+        return [f"the earlier run is now in {self.path.with_name(older.name)}{why}"]
 
     def _swap_by(self, older: Path) -> None:
         """Move the earlier run to `older`, then this run to the target's path.
@@ -300,9 +292,6 @@ class RunFolder(ResultFolder):
         if self._busy.acquire(timeout=_PATIENCE):
             self.close()
         return f"{self.path} is {'complete' if self.placed else 'unchanged'}"
-
-    def __enter__(self) -> "RunFolder":
-        return self
 
     def __exit__(self, *error: object) -> None:
         self.close()

@@ -282,7 +282,6 @@ def touching_table(result: Record) -> Table | None:
     touching = result.get("touching")
     if not touching:
         return None
-    lost = "reserve lost (µm)", "lost at most (µm)"
     rows = [
         [
             label(one["key"]),
@@ -303,7 +302,7 @@ def touching_table(result: Record) -> Table | None:
         f"reserves differ from the model by at most "
         f"{quantity(touching['greatest_difference_um'], 'µm')}."
     )
-    heads = ["", "standard deviation", *lost, "share of variance"]
+    heads = "", "standard deviation", "reserve lost (µm)", "lost at most (µm)", "share of variance"
     return table("Reserve under tolerances", heads, [("", rows)], note)
 
 
@@ -409,14 +408,13 @@ def effort_table(result: Record) -> Table | None:
     """Return effort and accuracy of the run, and the versions of its software."""
     records = {} if "points" in result else records_of(result)
     own = {} if "design" in records else {"run": result}
-    groups = [
-        (name if name == "run" or len(records) > 1 else "simulation", one.get("statistics") or {})
+    groups = {
+        name if name == "run" or len(records) > 1 else "simulation": one.get("statistics") or {}
         for name, one in (own | records).items()
-    ]
-    groups.append(("versions", result.get("versions") or {}))
+    } | {"versions": result.get("versions") or {}}
     shown = [
         (name, [[label(key), value(x)] for key, x in scalars(rows).items()])
-        for name, rows in groups
+        for name, rows in groups.items()
     ]
     return table("Effort, accuracy and versions", ["", "value"], shown)
 

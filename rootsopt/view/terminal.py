@@ -174,8 +174,8 @@ def _steepest(record: Record) -> str:
     return f" ({stated(key, 1)} more of {name_and_unit(key)[0]} {much})"
 
 
-WIDTH = 80
-"""Width (characters) above which a table is split into several tables."""
+# Width (characters) above which a table is split into several tables.
+_WIDTH = 80
 
 # Length (characters) above which a text may be folded inside its column.
 _LONGEST = 20
@@ -209,10 +209,10 @@ def shown(tables: Iterable[Table | None]) -> Group:
 def show_ending(out: Console, end: Ending) -> None:
     """Print the end of a run. Commands stand in lines of their own, as they are to be pasted."""
     for heading, sentences in end.facts:
-        out.print(Text.assemble((f"{heading}: ", "bold"), ascii_text(sentences)), width=WIDTH)
+        out.print(Text.assemble((f"{heading}: ", "bold"), ascii_text(sentences)), width=_WIDTH)
     for purpose, command in end.steps:
         mark = ":" if command else ""
-        out.print(Text.assemble(("Next: ", "bold"), ascii_text(purpose), mark), width=WIDTH)
+        out.print(Text.assemble(("Next: ", "bold"), ascii_text(purpose), mark), width=_WIDTH)
         if command:
             out.print(f"  {command}", soft_wrap=True, markup=False, highlight=False)
 
@@ -237,7 +237,7 @@ def _split(table: Table) -> Iterator[dict[int, int]]:
     first, *others = least
     widths = {0: first}
     for column, width in enumerate(others, start=1):
-        if _total(widths) + width + _BETWEEN > WIDTH and len(widths) > 1:
+        if _total(widths) + width + _BETWEEN > _WIDTH and len(widths) > 1:
             yield _widened(widths, wanted)
             widths = {0: first}
         widths[column] = width
@@ -250,7 +250,7 @@ def _total(widths: Mapping[int, int]) -> int:
 
 def _widened(widths: dict[int, int], wanted: list[int]) -> dict[int, int]:
     """Return `widths` with the remaining space given to the columns that need most."""
-    spare = min(WIDTH - _total(widths), sum(wanted[k] - width for k, width in widths.items()))
+    spare = min(_WIDTH - _total(widths), sum(wanted[k] - width for k, width in widths.items()))
     for _ in range(spare):
         widths[max(widths, key=lambda k: wanted[k] - widths[k])] += 1
     return widths

@@ -6,7 +6,7 @@ import subprocess
 
 import pytest
 
-from rootsopt.commands import completion
+from rootsopt.commands import cli
 from rootsopt.commands.console import COMMANDS, main
 
 pytest.importorskip("shtab")
@@ -14,7 +14,7 @@ pytest.importorskip("shtab")
 
 @pytest.fixture(scope="module")
 def bash():
-    return completion.script("bash")
+    return cli.completion("bash")
 
 
 def completed(script, words):
@@ -52,7 +52,7 @@ def test_every_option_of_the_help_is_in_the_script(command, bash, capsys):
 
 
 def test_zsh_has_a_script():
-    text = completion.script("zsh")
+    text = cli.completion("zsh")
     assert text.startswith("#compdef rootsopt")
     assert "scene.timing_gear.backlash_mm=" in text
 
@@ -60,6 +60,6 @@ def test_zsh_has_a_script():
 def test_unknown_shell_and_missing_library(monkeypatch, capsys):
     assert main(["--completion", "tcsh"]) == 2
     assert "bash or zsh" in capsys.readouterr().err
-    monkeypatch.setattr(completion.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(cli.importlib.util, "find_spec", lambda name: None)
     assert main(["--completion", "bash"]) == 2
     assert "rootsopt[completion]" in capsys.readouterr().err

@@ -321,7 +321,7 @@ def example_of(name):
     value = getattr(rootsopt, name)
     text = rootsopt.__doc__ if name == "__version__" else inspect.getdoc(value)
     if isinstance(value, dict):
-        source = inspect.getsource(sys.modules[rootsopt._PUBLIC[name].partition(":")[0]])
+        source = inspect.getsource(sys.modules[rootsopt._PUBLIC[name]])
         (text,) = re.findall(rf'^{name}.*?^"""(.*?)"""', source, re.M | re.S)
     found = doctest.DocTestParser().get_doctest(text, {}, name, None, 0)
     assert "rootsopt" in "".join(one.source for one in found.examples), "no example"

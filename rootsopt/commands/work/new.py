@@ -54,7 +54,7 @@ def body(options: argparse.Namespace) -> int:
         )
     new = path.with_name(f".{path.name}.{os.getpid()}") if options.overwrite else path
     files.create(new, text.encode())
-    files.replace(new, path)
+    os.replace(new, path)
     named = zip(config.design_keys, config.design, strict=True)
     flow = sheet.displaced(efficiency)
     print(
