@@ -8,24 +8,6 @@ from rootsopt.config.families import FAMILY_KEYS
 from rootsopt.config.plausible import notes
 from rootsopt.config.reading import Config, load, parse
 from rootsopt.config.reading import load as load_config
-from rootsopt.config.rotor import ProfileConfig
-from rootsopt.config.study import TWIST, EnsembleConfig, SolverConfig
-from rootsopt.config.units import hint
+from rootsopt.config.study import EnsembleConfig
 
-DESIGN_KEYS = FAMILY_KEYS["cic"]
-"""Config keys of the design parameters of a CIC rotor."""
-
-__all__ = [
-    "DESIGN_KEYS",
-    "FAMILY_KEYS",
-    "TWIST",
-    "Config",
-    "EnsembleConfig",
-    "ProfileConfig",
-    "SolverConfig",
-    "hint",
-    "load",
-    "load_config",
-    "notes",
-    "parse",
-]
+__all__ = ["FAMILY_KEYS", "Config", "EnsembleConfig", "load", "load_config", "notes", "parse"]
