@@ -17,7 +17,7 @@ from rootsopt.dynamics.parts.machine import Friction, GearErrors, MotorDrive, Su
 from rootsopt.measured.table import transmission_error
 
 # Limit on the number of solver steps for a whole orbit, as a multiple of the number that the config
-# allows per mesh period.
+# allows per mesh period. An orbit has several mesh periods, and many short steps near its kinks.
 _ORBIT_STEPS = 4
 
 
@@ -143,26 +143,13 @@ def parts_of(config: Config) -> dict[str, Any]:
     return parts
 
 
-def integrators(config: Config) -> tuple[Integrator, Integrator]:
-    """Return (integrator of the transient, integrator of the orbit), with the config's settings.
-
-    An orbit is allowed more steps, because it has several mesh periods and many short steps near
-    its kinks."""
-    solver = config.solver
-    steps = solver.max_steps_per_period
-    return (
-        Integrator(solver.method, jnp.asarray(solver.transient_tolerance), steps),
-        Integrator(solver.method, jnp.asarray(solver.orbit_tolerance), _ORBIT_STEPS * steps),
-    )
-
-
 def solver_of(config: Config) -> Solver:
     """Return the solver for the steady motion, with the config's settings."""
     settings = config.solver
-    transient, orbit = integrators(config)
+    method, steps = settings.method, settings.max_steps_per_period
     return Solver(
-        transient=transient,
-        orbit=orbit,
+        transient=Integrator(method, jnp.asarray(settings.transient_tolerance), steps),
+        orbit=Integrator(method, jnp.asarray(settings.orbit_tolerance), _ORBIT_STEPS * steps),
         measures=measures(config),
         max_periods=jnp.asarray(float(settings.max_mesh_periods)),
         probe_chaos=jnp.asarray(1.0),
