@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rootsopt.config.families import parameters
+from rootsopt.config.section import is_number
 from rootsopt.config.study import TWIST
 from rootsopt.config.units import MM, RPM, hint, unit_of
 
@@ -216,5 +217,4 @@ def _greatest(value: Any) -> float:
     """Return the number of the greatest magnitude in a value, 0 without a number."""
     value = [*value.values()] if isinstance(value, dict) else value
     many = value if isinstance(value, list | tuple) else [value]
-    numbers = [one for one in many if isinstance(one, int | float) and not isinstance(one, bool)]
-    return max(numbers, key=abs, default=0.0)
+    return max(filter(is_number, many), key=abs, default=0.0)

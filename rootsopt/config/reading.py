@@ -16,7 +16,7 @@ from rootsopt.config.families import families, family_of, is_list
 from rootsopt.config.pareto import ParetoConfig
 from rootsopt.config.rotor import DrawingConfig, ProfileConfig, RotorConfig
 from rootsopt.config.scene import ContactConfig, PumpConfig, SceneConfig, following_mm
-from rootsopt.config.section import Section, bare, put, require
+from rootsopt.config.section import Section, bare, put, require, taken
 from rootsopt.config.sources import advice, find_installed, located, place_files, regular_file
 from rootsopt.config.study import (
     TWIST,
@@ -402,9 +402,7 @@ def _checked(data: dict, prefix: str = "") -> Config:
     try:
         return Config.model_validate(data)
     except ValidationError as error:
-        scene = data.get("scene")
-        speed = scene.get("speed_rpm") if isinstance(scene, dict) else None
-        message = explain(error, Config, speed_rpm=speed)
+        message = explain(error, Config, speed_rpm=taken(data, _SPEED))
         raise InputError(sentence(f"{prefix}{message}")) from None
 
 
@@ -412,8 +410,7 @@ def _find_family(data: dict) -> None:
     """Load the installed package that offers the config's family.
 
     `data`: the config as plain values. Do nothing if the family is already registered."""
-    profile = data.get("profile")
-    name = profile.get("family") if isinstance(profile, dict) else None
+    name = taken(data, "profile.family")
     if isinstance(name, str) and bare(name) not in map(bare, families()):
         find_installed(name)
 

@@ -27,6 +27,7 @@ from rootsopt.config.section import (
     Section,
     bare,
     between,
+    is_number,
     such,
 )
 from rootsopt.config.units import hint
@@ -47,8 +48,7 @@ def _is_center(value: Any) -> bool:
     """Return whether a value is the word `fit`, or two coordinates (mm)."""
     if not isinstance(value, list | tuple):
         return value == "fit"
-    numbers = [x for x in value if isinstance(x, int | float) and not isinstance(x, bool)]
-    return len(numbers) == len(value) == 2 and all(abs(x) <= _FARTHEST for x in numbers)
+    return len(value) == 2 and all(is_number(x) and abs(x) <= _FARTHEST for x in value)
 
 
 _Center = Annotated[

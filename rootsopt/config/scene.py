@@ -15,6 +15,7 @@ from rootsopt.config.section import (
     Speed,
     Torque,
     between,
+    is_number,
     require,
     such,
 )
@@ -197,8 +198,8 @@ def _each_gear(low: float, high: float) -> Any:
     def fits(value: Any) -> bool:
         listed = isinstance(value, list | tuple)
         values = value if listed else [value]
-        plain = all(isinstance(x, int | float) and not isinstance(x, bool) for x in values)
-        return plain and len(values) == 1 + listed and all(low <= x <= high for x in values)
+        within = all(is_number(x) and low <= x <= high for x in values)
+        return within and len(values) == 1 + listed
 
     return Annotated[
         Annotated[float, between(low, high)] | Annotated[tuple[float, float], Listed],

@@ -12,9 +12,8 @@ import sys
 import traceback
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
-from rootsopt.config.section import bare
+from rootsopt.config.section import bare, put, taken
 from rootsopt.config.units import near, placed, sentence
 from rootsopt.errors import InputError
 
@@ -116,12 +115,8 @@ def place_files(data: dict, folder: Path) -> None:
 
     `folder`: folder to which the paths are relative."""
     for key in FILES:
-        *sections, name = key.split(".")
-        node: Any = data
-        for section in sections:
-            node = node.get(section) if isinstance(node, dict) else None
-        if isinstance(node, dict) and isinstance(node.get(name), str):
-            node[name] = str((folder / node[name]).absolute())
+        if isinstance(path := taken(data, key), str):
+            put(data, key, str((folder / path).absolute()))
 
 
 def advice(path: Path) -> str:

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 from pydantic import Field, model_validator
 
-from rootsopt.config.section import Increasing, Listed, Section, bare, between, require, such
+from rootsopt.config.section import Increasing, Listed, Section, bare, between, require, such, taken
 from rootsopt.config.units import named, near
 
 _RELATIVE = "relative_"
@@ -219,13 +219,12 @@ def mounted(data: Any) -> Any:
 
     Return `data` unchanged if it does not have the form of a config, or if no such error scatters.
     """
-    parts = [data.get(key) for key in ("scene", "tolerances")] if isinstance(data, dict) else []
-    over = parts[1].get("over") if parts and isinstance(parts[1], dict) else None
-    if not isinstance(over, dict) or not isinstance(parts[0], dict):
+    scene, over = taken(data, "scene"), taken(data, "tolerances.over")
+    if not isinstance(over, dict) or not isinstance(scene, dict):
         return data
     scatter = [name for name in _MOUNTING if f"scene.{name}" in entries(over, DISTRIBUTIONS)]
-    absent = {name: 0.0 for name in scatter if parts[0].get(name) is None}
-    return data | {"scene": parts[0] | absent} if absent else data
+    absent = {name: 0.0 for name in scatter if scene.get(name) is None}
+    return data | {"scene": scene | absent} if absent else data
 
 
 def unknown_key(
