@@ -13,7 +13,6 @@ from pydantic import Field, SerializeAsAny, ValidationError, model_validator
 from rootsopt.config.document import MOST_BYTES, override_in, read_document
 from rootsopt.config.explain import explain, tree, without_removed
 from rootsopt.config.families import families, family_of, is_list
-from rootsopt.config.pareto import ParetoConfig
 from rootsopt.config.rotor import DrawingConfig, ProfileConfig, RotorConfig
 from rootsopt.config.scene import ContactConfig, PumpConfig, SceneConfig, following_mm
 from rootsopt.config.section import Section, bare, put, require, taken
@@ -30,6 +29,7 @@ from rootsopt.config.study import (
 )
 from rootsopt.config.tolerances import (
     AssumptionsConfig,
+    ParetoConfig,
     Scatter,
     Span,
     TolerancesConfig,

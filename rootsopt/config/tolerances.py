@@ -1,6 +1,7 @@
-"""Config section `tolerances`: scatter of values of scene and design in manufacture.
+"""Config sections for studies of several scenes, or of several terms of an objective.
 
-The section `assumptions` gives the ranges of assumed values of a pump's operation."""
+The section `tolerances` states how values of scene and design scatter in manufacture, `assumptions`
+the ranges of assumed values of a pump's operation, and `pareto` the terms of a trade-off."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -9,7 +10,7 @@ from typing import Annotated, Any, Literal, NamedTuple, get_args
 from pydantic import Field, model_validator
 
 from rootsopt.config.section import Increasing, Listed, Section, bare, between, require, such, taken
-from rootsopt.config.units import named, near
+from rootsopt.config.units import named, near, shown
 
 _RELATIVE = "relative_"
 _Kind = Literal[
@@ -368,3 +369,52 @@ class AssumptionsConfig(Section):
             if not math.isclose(low, high, abs_tol=1e-300):
                 spans.append(Span(key, low, high))
         return tuple(spans)
+
+
+class ParetoConfig(Section):
+    """The terms that `rootsopt pareto` trades against each other, and the number of points."""
+
+    terms: Annotated[
+        tuple[str, ...],
+        Listed,
+        such(
+            "two or three different terms, as [peak_force_N, area_efficiency]",
+            lambda terms: len(set(terms)) == len(terms) in (2, 3),
+        ),
+    ] = Field(
+        ("peak_force_N", "area_efficiency"),
+        description="two or three quantities: forces and lines as in `response`, geometry as in "
+        "`geometry`, displaced_volume_cm3, theoretical_flow_l_min, flow_ripple, "
+        "gear_backlash_max_mm, angular_play_min_mrad, leakage_fraction, delivered_flow_l_min, "
+        "flank_gap_min_um, flank_gap_mean_um, bearing_load_equivalent_N, bearing_load_max_N, "
+        "axial_force_max_N, tilting_moment_max_N_m, static_bearing_load_equivalent_N, "
+        "static_bearing_load_max_N, or registered terms",
+    )
+    senses: dict[str, Literal["min", "max"]] = Field(
+        default_factory=dict,
+        description="sense of a term, as {seal_width_mm: min}, where it should differ from the "
+        "term's own: max for area_efficiency, displaced_volume_cm3, theoretical_flow_l_min, "
+        "delivered_flow_l_min, gear_backlash_max_mm, flank_gap_min_um, flank_gap_mean_um, "
+        "seal_width_mm, root_radius_mm and undercut_margin_mm, min for all others",
+    )
+    points: Annotated[int, Field(ge=3, le=101)] = Field(
+        11, description="points along the front of two terms, its ends included"
+    )
+    divisions: Annotated[int, Field(ge=2, le=20)] = Field(
+        5,
+        description="steps between two ends of three terms: n steps give (n + 1) (n + 2) / 2 "
+        "points",
+    )
+    refinements: Annotated[int, Field(ge=0, le=100)] = Field(
+        12, description="greatest number of further points where neighbours lie far apart"
+    )
+
+    @model_validator(mode="after")
+    def _own(self):
+        for name in self.senses:
+            require(
+                name in self.terms,
+                f"`pareto.senses` must name terms of `pareto.terms` ({', '.join(self.terms)}), "
+                f"but names {shown(name)}; add the term, or remove its sense",
+            )
+        return self
