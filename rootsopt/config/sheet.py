@@ -41,10 +41,11 @@ MEDIA = {
     "water": (1.00, None, None, "5 to 80 °C: 1.52 to 0.35"),
     "oil": (40.0, None, None, "ISO VG 46 at 40 °C; VG 22 to VG 220: 19 to 190"),
 }
-TEETH, FACE, TOOTH_ANGLE, MESH = 50, 0.3, 20.0, 20.0
-"""A usual timing gear: teeth per gear, face width (pitch diameters), pressure angle (°), mesh
-stiffness (N/(mm·µm)). The stiffness is that of steel spur gears by ISO 6336-1, which gives 14 to 25
-for usual gears."""
+
+# A usual timing gear: teeth per gear, face width (pitch diameters), pressure angle (°), mesh
+# stiffness (N/(mm·µm)). The stiffness is that of steel spur gears by ISO 6336-1, which gives 14 to
+# 25 for usual gears.
+_TEETH, _FACE, _TOOTH_ANGLE, _MESH = 50, 0.3, 20.0, 20.0
 LINE = 10 / 9
 """Exponent of the force between two cylinders that touch along a line."""
 
@@ -54,8 +55,8 @@ def gear_stiffness(center_distance: float) -> float:
 
     `center_distance` in mm, equal to the pitch diameter of both gears. With the face width b and
     the base radius r_b, a torque turns one gear against the other by torque / (c b r_b²)."""
-    base = center_distance / 2 * math.cos(math.radians(TOOTH_ANGLE))
-    return MESH * FACE * center_distance * base**2
+    base = center_distance / 2 * math.cos(math.radians(_TOOTH_ANGLE))
+    return _MESH * _FACE * center_distance * base**2
 
 
 def gear_backlash(center_distance: float) -> float:
@@ -63,8 +64,8 @@ def gear_backlash(center_distance: float) -> float:
 
     ISO/TR 10064-2: 2/3 (0.06 + 0.0005 a + 0.03 m) along the normal, in mm, with the centre distance
     a, here `center_distance`, and the module m."""
-    normal = 2 / 3 * (0.06 + (0.0005 + 0.03 / TEETH) * center_distance)
-    return normal / math.cos(math.radians(TOOTH_ANGLE))
+    normal = 2 / 3 * (0.06 + (0.0005 + 0.03 / _TEETH) * center_distance)
+    return normal / math.cos(math.radians(_TOOTH_ANGLE))
 
 
 def line_stiffness(modulus: float, poisson: float, length: float) -> float:
@@ -252,12 +253,13 @@ class Sheet(Section):
             ),
             "scene.timing_gear.stiffness_N_m_per_rad": (
                 _short(gear_stiffness(across)),
-                f"ISO 6336-1: 20 N/(mm µm) (14 to 25), width {FACE:g} (0.2 to 0.5) pitch diameters",
+                f"ISO 6336-1: 20 N/(mm µm) (14 to 25), width {_FACE:g} (0.2 to 0.5) pitch "
+                "diameters",
             ),
             "scene.timing_gear.damping_ratio": (_RATIO, "usual: 0.03 to 0.17"),
             "scene.timing_gear.backlash_mm": (
                 _short(backlash),
-                f"{why}; module {across / TEETH:.3g}, {TEETH} teeth (35 to 80)",
+                f"{why}; module {across / _TEETH:.3g}, {_TEETH} teeth (35 to 80)",
             ),
         }
 

@@ -27,10 +27,9 @@ and the name of its content in messages."""
 MOST_BYTES = 50_000_000
 """Size (bytes) above which a file that a config names is refused."""
 
-ENTRY_POINTS = "rootsopt.families"
-"""Name of the entry-point group in which installed packages offer families.
-
-The name of each entry point is that of its family."""
+# Name of the entry-point group in which installed packages offer families. The name of each entry
+# point is that of its family.
+_ENTRY_POINTS = "rootsopt.families"
 
 
 def reason(error: Exception) -> str:
@@ -130,7 +129,7 @@ def find_installed(name: str) -> None:
     """Load the installed packages that offer a family with this `name`, if there are any.
 
     Raises `InputError` if loading fails."""
-    for point in importlib.metadata.entry_points(group=ENTRY_POINTS):
+    for point in importlib.metadata.entry_points(group=_ENTRY_POINTS):
         if bare(point.name) == bare(name):
             with _explained(f"profile family {point.name} of {point.value}"):
                 point.load()

@@ -16,8 +16,9 @@ _RELATIVE = "relative_"
 _Kind = Literal[
     "normal", "uniform", "triangular", "relative_normal", "relative_uniform", "relative_triangular"
 ]
-DISTRIBUTIONS = get_args(_Kind)
-"""Names of the distributions. The width of a `relative_` one is a fraction of the key's value."""
+
+# Names of the distributions. The width of a `relative_` one is a fraction of the key's value.
+_DISTRIBUTIONS = get_args(_Kind)
 _Distribution = Annotated[
     dict[_Kind, Annotated[float, Field(gt=0, le=1e9)]],
     such("one distribution, as in {normal: 0.002}", lambda given: len(given) == 1),
@@ -112,7 +113,7 @@ class TolerancesConfig(Section):
         if not isinstance(data, dict):
             return data
         if isinstance(over := data.get("over"), dict):
-            data = data | {"over": entries(over, DISTRIBUTIONS)}
+            data = data | {"over": entries(over, _DISTRIBUTIONS)}
         scenes = data.get("conditions")
         if not isinstance(scenes, dict) or not scenes:
             return data
@@ -223,7 +224,7 @@ def mounted(data: Any) -> Any:
     scene, over = taken(data, "scene"), taken(data, "tolerances.over")
     if not isinstance(over, dict) or not isinstance(scene, dict):
         return data
-    scatter = [name for name in _MOUNTING if f"scene.{name}" in entries(over, DISTRIBUTIONS)]
+    scatter = [name for name in _MOUNTING if f"scene.{name}" in entries(over, _DISTRIBUTIONS)]
     absent = {name: 0.0 for name in scatter if scene.get(name) is None}
     return data | {"scene": scene | absent} if absent else data
 

@@ -153,15 +153,6 @@ def play_of(scene: Scene, profile: Profile) -> Play:
     return play(profile, scene.clearance, center_distance, radial=radial)
 
 
-CONTINUUM = 0.01
-"""Knudsen number above which gas slips at the walls, so that it leaks more than the laminar formula
-states.
-"""
-MOLECULAR = 1.0
-"""Knudsen number above which molecules meet the walls more often than each other. The formulas of
-this module do not hold there."""
-
-
 def critical_ratio(heat_ratio: Float[Array, ""]) -> Float[Array, ""]:
     """Return the pressure ratio below which a nozzle is choked, (2 / (κ + 1))^(κ / (κ - 1)).
 
@@ -212,8 +203,8 @@ def mean_free_path(
     return viscosity / pressure * jnp.sqrt(jnp.pi / 2 * gas.gas_constant * gas.temperature)
 
 
-FACES = 4
-"""Number of end faces of the two rotors."""
+# Number of end faces of the two rotors.
+_FACES = 4
 _NODES, _WEIGHTS = (x / 2 for x in np.polynomial.legendre.leggauss(64))
 # Nodes and weights of the Gauss-Legendre rule on [0, 1], for the gap beside a tip.
 _SHARES = _NODES + 0.5
@@ -289,7 +280,7 @@ def leakage(scene: Scene, medium: Medium, profile: Profile, shape: Geometry) -> 
     if medium.end_clearance is not None:
         height = medium.end_clearance + strain * scene.length / 2
         width = 2 * shape.outer_radius
-        ends = FACES * width * _per_width(medium, height, width / end_shape(shape), 1)
+        ends = _FACES * width * _per_width(medium, height, width / end_shape(shape), 1)
         heights.append(height)
     mesh, tips = scene.length * mesh, scene.length * tips
     ideal = theoretical_flow(shape, scene.length, scene.speed)
