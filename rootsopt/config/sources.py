@@ -94,10 +94,8 @@ _SUFFIX = ".yaml"
 @functools.cache
 def shipped() -> dict[str, Path]:
     """Return the paths of the shipped configs by name, such as "cic"."""
-    for place in _PLACES:
-        if paths := sorted(place.glob(f"*{_SUFFIX}")):
-            return {path.stem: path for path in paths}
-    return {}
+    found = (sorted(place.glob(f"*{_SUFFIX}")) for place in _PLACES)
+    return {path.stem: path for path in next(filter(None, found), [])}
 
 
 def located(path: Path) -> Path:
