@@ -356,14 +356,9 @@ class Identification:
 
     def record(self) -> dict[str, Any]:
         """Return the record for the result file."""
-        keys = [*self.parameters]
-
-        def table(rows: NDArray[np.float64]) -> dict[str, dict[str, float]]:
-            return {a: dict(zip(keys, row, strict=True))
-                    for a, row in zip(keys, rows.tolist(), strict=True)}  # fmt: skip
-
-        entries = {name: getattr(self, name) for name in _ENTRIES}
-        entries |= {"correlation": table(self.correlation), "covariance": table(self.covariance)}
+        entries, keys = {name: getattr(self, name) for name in _ENTRIES}, [*self.parameters]
+        for name in ("correlation", "covariance"):
+            entries[name] = pandas.DataFrame(getattr(self, name), keys, keys).to_dict("index")
         end = {"status": self.status.label, "message": self.message}
         return entries | end | {"statistics": self.statistics}
 
@@ -379,6 +374,5 @@ def residuals(problem: Problem, best: Fit) -> dict[str, Sequence[Any]]:
 
 def adopted(config: Config, problem: Problem, best: Fit) -> Config:
     """Return a config with the fitted values."""
-    values = named(problem, best.values)
-    values.pop(OFFSET, None)
+    values = {key: x for key, x in named(problem, best.values).items() if key != OFFSET}
     return config.replaced(values) if values else config
