@@ -199,8 +199,8 @@ def _play(scene: Scene, design: Float[Array, " d"]) -> dict[str, Array]:
 
 def _leaking(scene: Scene, medium: Medium, design: Float[Array, " d"]) -> dict[str, Any]:
     """Return the rows of leakage. Raises `InputError` as `sheet` does."""
-    least_gap, rows = _leaks(scene, design)
-    least = float(least_gap)
+    rows = _leaks(scene, design)
+    least = float(rows["flank_gap_min_um"]) * UM
     if least < -_ROUNDING:
         raise InputError(
             f"the flanks must not overlap in perfect rolling, but overlap by {-least / UM:.3g} um; "
@@ -217,14 +217,13 @@ def _leaking(scene: Scene, medium: Medium, design: Float[Array, " d"]) -> dict[s
 
 
 @CachedFunction
-def _leaks(scene: Scene, design: Float[Array, " d"]) -> tuple[Array, dict[str, Array]]:
-    """Return (least gap of the flanks (m), rows of the sheet)."""
+def _leaks(scene: Scene, design: Float[Array, " d"]) -> dict[str, Array]:
+    """Return the rows of leakage, also of rotors that overlap."""
     assert scene.medium is not None
     profile = scene.profile(design)
     leakage = flow.leakage(scene, scene.medium, profile, geometry(profile))
-    least = jnp.min(leakage.gap.least)
-    return least, {
-        "flank_gap_min_um": least / UM,
+    return {
+        "flank_gap_min_um": jnp.min(leakage.gap.least) / UM,
         "flank_gap_mean_um": jnp.mean(leakage.gap.least) / UM,
         "mesh_leakage_l_min": leakage.mesh / L_MIN,
         "tip_leakage_l_min": leakage.tips / L_MIN,
