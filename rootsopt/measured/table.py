@@ -273,8 +273,8 @@ def _number(cell: str) -> float | None:
         return None
 
 
-KEY = "scene.timing_gear.transmission_error_file"
-"""Key that names the file."""
+# Key that names the file.
+_KEY = "scene.timing_gear.transmission_error_file"
 _COLUMNS = "rotation_deg", "error_um"
 
 # Least number of rows of a table, greatest step between them (°), greatest error (µm).
@@ -296,7 +296,7 @@ def transmission_error(path: Path) -> tuple[NDArray[np.float64], NDArray[np.floa
 
     Raises `InputError` if the file cannot be read, or the table is not that of one turn."""
     name, what = path.name, " and ".join(_COLUMNS)
-    first, rows = titled(content(path, KEY), name, what)
+    first, rows = titled(content(path, _KEY), name, what)
     if missing := [title for title in _COLUMNS if title not in first]:
         raise InputError(
             f"{name}: must name the columns {what} in its first line, but has no {missing[0]}; add "
