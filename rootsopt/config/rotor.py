@@ -23,7 +23,6 @@ from rootsopt.config.families import (
 from rootsopt.config.section import (
     Among,
     Listed,
-    Radius,
     Section,
     bare,
     between,
@@ -72,7 +71,9 @@ class ProfileConfig(Section):
         description="profile family; outline: read from a file"
     )
     lobes: Annotated[int, Field(ge=2, le=6)] = Field(description="number of lobes")
-    pitch_radius_mm: Radius = Field(description="pitch radius, half the centre distance")
+    pitch_radius_mm: Annotated[float, between(1, 5000)] = Field(
+        description="pitch radius, half the centre distance"
+    )
     outline_file: FilePath | None = Field(
         None, description="outline: CSV or DXF file, relative to the config's folder"
     )

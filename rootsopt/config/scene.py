@@ -13,12 +13,14 @@ from rootsopt.config.section import (
     Listed,
     Section,
     Speed,
-    Torque,
     between,
     is_number,
     require,
     such,
 )
+
+# Magnitude of a load or motor torque (N·m).
+_Torque = Annotated[float, between(0, 1e7)]
 
 
 class FrictionConfig(Section):
@@ -100,7 +102,7 @@ class ContactConfig(Section):
 class LoadConfig(Section):
     """The load: a constant torque on rotor 2, or gas pressure on both rotors."""
 
-    torque_N_m: Torque | None = Field(None, description="constant torque against rotor 2")
+    torque_N_m: _Torque | None = Field(None, description="constant torque against rotor 2")
     pressure_difference_Pa: Annotated[float, between(0, 1e8)] | None = Field(
         None, description="gas pressure across the pair, instead of a constant torque"
     )
@@ -118,7 +120,7 @@ class LoadConfig(Section):
 class MotorConfig(Section):
     """The motor on rotor 1 for `drive: torque`, with a linear torque-speed characteristic."""
 
-    torque_N_m: Torque | None = Field(
+    torque_N_m: _Torque | None = Field(
         None, description="torque at scene.speed_rpm; absent: equal to the load there"
     )
     slope_N_m_s_per_rad: Annotated[float, between(1e-6, 1e6)] = Field(

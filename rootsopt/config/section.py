@@ -63,20 +63,8 @@ class Among:
 
 Speed = Annotated[float, between(1e-2, 1e6)]
 """Speed of rotation (rpm)."""
-Radius = Annotated[float, between(1, 5000)]
-"""Radius of a rotor (mm)."""
-Weight = Annotated[float, between(0, 1e6)]
-"""Weight of a term in a sum; a weight of 0 leaves the term out."""
-Order = Annotated[float, between(1e-2, 1e3)]
-"""Order of a spectral line: its frequency as a multiple of the mesh frequency."""
-Torque = Annotated[float, between(0, 1e7)]
-"""Magnitude of a load or motor torque (N·m)."""
-Seed = Annotated[int, Field(ge=0, le=2**31 - 1)]
-"""Seed of random numbers."""
 Listed = Field(strict=False)
 """Marks a tuple that is given as a list, because YAML has no tuples."""
-Increasing = such("two increasing numbers", lambda pair: len(pair) == 2 and pair[0] < pair[1])
-"""Marks a pair (low, high)."""
 
 
 class Section(BaseModel):

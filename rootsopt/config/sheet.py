@@ -13,7 +13,7 @@ from pydantic import Field
 from rootsopt.config.document import override_in
 from rootsopt.config.families import EXAMPLE_RADIUS, Family, families, family_of
 from rootsopt.config.rotor import ProfileConfig
-from rootsopt.config.section import Among, Section, between, put
+from rootsopt.config.section import Among, Section, Speed, between, put
 from rootsopt.config.units import RPM
 
 MATERIALS = {
@@ -100,7 +100,7 @@ class Sheet(Section):
     outer_diameter_mm: _Length = Field(description="diameter of a rotor over its tips")
     length_mm: _Length = Field(description="length of a rotor")
     lobes: Annotated[int, Field(ge=2, le=6)] = Field(description="lobes of a rotor: 2 to 6")
-    speed_rpm: Annotated[float, between(1e-2, 1e6)] = Field(description="speed")
+    speed_rpm: Speed = Field(description="speed")
     power_kW: _Optional = Field(None, description="shaft power: half of it on each rotor")
     pressure_difference_bar: _Pressure | None = Field(
         None, description="discharge minus suction pressure; used if both are given"

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 from pydantic import Field, model_validator
 
-from rootsopt.config.section import Increasing, Listed, Section, bare, between, require, such, taken
+from rootsopt.config.section import Listed, Section, bare, between, require, such, taken
 from rootsopt.config.units import named, near, shown
 
 _RELATIVE = "relative_"
@@ -290,7 +290,11 @@ def entries(over: dict, kinds: Iterable[str]) -> dict[str, Any]:
     return {key: named_right(given) for key, given in _dotted(over, is_value).items()}
 
 
-_Pair = Annotated[tuple[Annotated[float, between(-1e9, 1e9)], ...], Listed, Increasing]
+_Pair = Annotated[
+    tuple[Annotated[float, between(-1e9, 1e9)], ...],
+    Listed,
+    such("two increasing numbers", lambda pair: len(pair) == 2 and pair[0] < pair[1]),
+]
 _Spread = Annotated[
     dict[Literal["factor", "range"], _Pair],
     such("one range, as in {factor: [0.8, 1.2]}", lambda given: len(given) == 1),
