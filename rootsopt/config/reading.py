@@ -16,7 +16,14 @@ from rootsopt.config.families import families, family_of, is_list
 from rootsopt.config.rotor import DrawingConfig, ProfileConfig, RotorConfig
 from rootsopt.config.scene import ContactConfig, PumpConfig, SceneConfig, following_mm
 from rootsopt.config.section import Section, bare, put, require, taken
-from rootsopt.config.sources import advice, find_installed, located, place_files, regular_file
+from rootsopt.config.sources import (
+    advice,
+    find_installed,
+    located,
+    place_files,
+    reason,
+    regular_file,
+)
 from rootsopt.config.study import (
     TWIST,
     AttractorsConfig,
@@ -424,8 +431,7 @@ def _read(path: Path) -> str:
     except FileNotFoundError:
         raise InputError(f"{name}: there is no such file; {advice(path)}") from None
     except OSError as error:
-        reason = error.strerror or type(error).__name__
-        raise InputError(f"{name}: cannot be read: {reason}") from None
+        raise InputError(f"{name}: cannot be read: {reason(error)}") from None
     except ValueError:  # A path with a null character.
         raise InputError(f"{name}: is not a path; give that of a config file") from None
     try:
