@@ -199,7 +199,7 @@ def _play(scene: Scene, design: Float[Array, " d"]) -> dict[str, Array]:
 
 def _leaking(scene: Scene, medium: Medium, design: Float[Array, " d"]) -> dict[str, Any]:
     """Return the rows of leakage. Raises `InputError` as `sheet` does."""
-    rows = _leaks(scene, design)
+    rows = _leaks(scene, medium, design)
     least = float(rows["flank_gap_min_um"]) * UM
     if least < -_ROUNDING:
         raise InputError(
@@ -217,11 +217,10 @@ def _leaking(scene: Scene, medium: Medium, design: Float[Array, " d"]) -> dict[s
 
 
 @CachedFunction
-def _leaks(scene: Scene, design: Float[Array, " d"]) -> dict[str, Array]:
+def _leaks(scene: Scene, medium: Medium, design: Float[Array, " d"]) -> dict[str, Array]:
     """Return the rows of leakage, also of rotors that overlap."""
-    assert scene.medium is not None
     profile = scene.profile(design)
-    leakage = flow.leakage(scene, scene.medium, profile, geometry(profile))
+    leakage = flow.leakage(scene, medium, profile, geometry(profile))
     return {
         "flank_gap_min_um": jnp.min(leakage.gap.least) / UM,
         "flank_gap_mean_um": jnp.mean(leakage.gap.least) / UM,
