@@ -327,6 +327,10 @@ class ConstraintsConfig(Section):
             "`constraints.outer_radius_min_mm` and `constraints.outer_radius_max_mm` must not both "
             "be baseline: no design meets both exactly; give one of them some room",
         )
+        return self
+
+    @model_validator(mode="after")
+    def _reachable(self):
         for name, sides in self.terms.items():
             key = f"`constraints.terms.{named(name)}"
             require(bool(sides), f"{key}` must have `min`, `max` or both, as in {{max: 200}}, but "
@@ -339,12 +343,6 @@ class ConstraintsConfig(Section):
                 f"{key}` must not have `min` and `max` both baseline: no design meets both "
                 "exactly; give one of them some room",
             )
-        return self
-
-    @model_validator(mode="after")
-    def _reachable(self):
-        for name, sides in self.terms.items():
-            low, high = limits_of(sides.get("min"), sides.get("max"))
             require(
                 high >= 0 or not (name in _SIZES or _LINE.fullmatch(name)),
                 f"`constraints.terms.{name}.max` must be at least 0, but is {high:g}: the "
