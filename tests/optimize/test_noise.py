@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from rootsopt.config import FAMILY_KEYS, load
+from rootsopt.config import family_of, load
 from rootsopt.optimize import noise
 from rootsopt.optimize.outcome import Trial
 from rootsopt.optimize.problem import Problem
@@ -23,7 +23,7 @@ def made_up(objective, error=0.02, design=INSIDE):
     error."""
     return dataclasses.replace(
         evaluation_of(100.0 * objective, Status.AVERAGED),
-        design=dict(zip(FAMILY_KEYS["cic"], map(float, design), strict=True)),
+        design=dict(zip(family_of("cic").keys, map(float, design), strict=True)),
         geometry={"area_efficiency": 0.43},
         steady_state={key: 100.0 * error for key in ERRORS.values()},
     )

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from rootsopt.config.families import FAMILY_KEYS, is_list
+from rootsopt.config.families import family_of, is_list
 from rootsopt.config.reading import Config
 from rootsopt.measured.conjugacy import conjugacy
 from rootsopt.response.result import Evaluation
@@ -73,7 +73,7 @@ def optimization_figures(
     _force_figures(folder, designs, config)
     _comparison(folder, designs, outlines, config)
     if history:
-        keys = FAMILY_KEYS[config.profile.family]
+        keys = family_of(config.profile.family).keys
         write(folder, "history", _history(history, keys), "Optimisation history")
 
 
