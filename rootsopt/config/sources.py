@@ -84,10 +84,8 @@ def content(path: str | os.PathLike, key: str) -> bytes:
     return data
 
 
-_PACKAGE = Path(__file__).parents[1]
-
 # Folders of the configs: in an installed package, and in the source tree.
-_PLACES = _PACKAGE / "configs", _PACKAGE.parent / "configs"
+_PLACES = [folder / "configs" for folder in Path(__file__).parents[1:3]]
 _SUFFIX = ".yaml"
 
 

@@ -163,19 +163,16 @@ def _searched(at, outer, room, home, start, side: float) -> NDArray[np.float64]:
     search begins."""
     from scipy.optimize import minimize
 
-    def seen(x):
-        return at(*x)
-
     rows = [
-        {"type": "ineq", "fun": lambda x: (seen(x)[1] - room)[~outer],
-         "jac": lambda x: seen(x)[2][~outer]},
-        {"type": "eq", "fun": lambda x: seen(x)[1][outer], "jac": lambda x: seen(x)[2][outer]},
+        {"type": "ineq", "fun": lambda x: (at(*x)[1] - room)[~outer],
+         "jac": lambda x: at(*x)[2][~outer]},
+        {"type": "eq", "fun": lambda x: at(*x)[1][outer], "jac": lambda x: at(*x)[2][outer]},
     ]  # fmt: skip
     goals = (
         (lambda x: np.sum((x - home) ** 2) / 2, lambda x: x - home)
         if not side
-        else (lambda x: -side * seen(x)[1][outer][0] / _FAR,
-              lambda x: -side * seen(x)[2][outer][0] / _FAR)
+        else (lambda x: -side * at(*x)[1][outer][0] / _FAR,
+              lambda x: -side * at(*x)[2][outer][0] / _FAR)
     )  # fmt: skip
     minimum = minimize(
         goals[0], start, jac=goals[1], bounds=[(0, 1)] * len(home), method="SLSQP",
