@@ -256,19 +256,12 @@ class RotorConfig(Section):
 
 # Length (characters) above which a text of the title block is rejected.
 _LONGEST = 60
-
-
-def _is_line(value: object) -> bool:
-    """Return whether a value is text that fits into one line of the title block."""
-    return isinstance(value, str) and 0 < len(value) <= _LONGEST and value.isprintable()
-
-
 _Text = Annotated[
     str,
     such(
         f"one line of at most {_LONGEST} characters that can be printed, in quotes if it is a "
         "number (\"'1.4301'\")",
-        _is_line,
+        lambda text: isinstance(text, str) and 0 < len(text) <= _LONGEST and text.isprintable(),
         before=True,
     ),
 ]

@@ -186,8 +186,7 @@ def _has_play(scene: Scene) -> bool:
 
 @CachedFunction
 def _play(scene: Scene, design: Float[Array, " d"]) -> dict[str, Array]:
-    profile = scene.profile(design)
-    play = play_of(scene, profile)
+    play = play_of(scene, scene.profile(design))
     return {
         "angular_play_min_mrad": jnp.min(play.total) / MRAD,
         "angular_play_max_mrad": jnp.max(play.total) / MRAD,

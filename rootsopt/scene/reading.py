@@ -30,10 +30,10 @@ def design_vector(config: Config) -> Float[Array, " d"]:
 def physical_quantities(config: Config) -> dict[str, Any]:
     """Return all physical quantities of a config in SI units, keyed by `Scene` field names.
 
-    They include the contact law and the parts, and what leakage and the bearings need."""
-    rotor, scene, gear = config.rotor, config.scene, config.scene.timing_gear
-    wear, heat, error = config.contact.wear, scene.heat, scene.center_distance_error_mm
-    clearance = config.contact.clearance_mm
+    They include the IMPACT contact law and the parts, and what leakage and the bearings need."""
+    rotor, scene, contact = config.rotor, config.scene, config.contact
+    gear, heat, wear = scene.timing_gear, scene.heat, contact.wear
+    clearance, error = contact.clearance_mm, scene.center_distance_error_mm
     if wear is not None:
         clearance += 2 * wear.offset_mm
     if heat is not None:
@@ -55,22 +55,16 @@ def physical_quantities(config: Config) -> dict[str, Any]:
         "center_distance_error": _optional(error, MM),
         "medium": medium_of(config),
         "bearings": bearings_of(config),
-        "law": law_of(config),
+        "law": ImpactLaw(
+            stiffness=jnp.asarray(contact.stiffness_N_per_mm_e / MM**contact.exponent),
+            exponent=jnp.asarray(contact.exponent),
+            damping=jnp.asarray(contact.max_damping_N_s_per_mm / MM),
+            full_damping_depth=jnp.asarray(contact.full_damping_depth_mm * MM),
+            smoothing=jnp.asarray(contact.rounding_mm * MM),
+        ),
         "gear": gear_of(config),
         **parts_of(config),
     }
-
-
-def law_of(config: Config) -> ImpactLaw:
-    """Return the IMPACT contact law of a config, in SI units."""
-    contact = config.contact
-    return ImpactLaw(
-        stiffness=jnp.asarray(contact.stiffness_N_per_mm_e / MM**contact.exponent),
-        exponent=jnp.asarray(contact.exponent),
-        damping=jnp.asarray(contact.max_damping_N_s_per_mm / MM),
-        full_damping_depth=jnp.asarray(contact.full_damping_depth_mm * MM),
-        smoothing=jnp.asarray(contact.rounding_mm * MM),
-    )
 
 
 def gear_of(config: Config) -> TimingGear | None:
