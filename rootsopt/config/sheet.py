@@ -46,8 +46,9 @@ MEDIA = {
 # stiffness (N/(mm·µm)). The stiffness is that of steel spur gears by ISO 6336-1, which gives 14 to
 # 25 for usual gears.
 _TEETH, _FACE, _TOOTH_ANGLE, _MESH = 50, 0.3, 20.0, 20.0
-LINE = 10 / 9
-"""Exponent of the force between two cylinders that touch along a line."""
+
+# Exponent of the force between two cylinders that touch along a line.
+_LINE = 10 / 9
 
 
 def gear_stiffness(center_distance: float) -> float:
@@ -69,12 +70,12 @@ def gear_backlash(center_distance: float) -> float:
 
 
 def line_stiffness(modulus: float, poisson: float, length: float) -> float:
-    """Return K (N/mm^e) of the force K δ^e of two flanks of a `length` (mm), e = `LINE`.
+    """Return K (N/mm^e) of the force K δ^e of two flanks of a `length` (mm), e = `_LINE`.
 
     `modulus` (GPa), `poisson`: Young's modulus E and Poisson's ratio ν. Lundberg (1939), as in
     Palmgren's bearing formulas: δ = 1.36 (η F)^0.9 / L^0.8, with η = 2 (1 - ν²) / E. For steel it
     is δ = 3.84e-5 F^0.9 / L^0.8."""
-    return (length**0.8 / 1.36) ** LINE * modulus * 1e3 / (2 * (1 - poisson**2))
+    return (length**0.8 / 1.36) ** _LINE * modulus * 1e3 / (2 * (1 - poisson**2))
 
 
 # One bar (Pa); penetration (mm) at which the damping of the flanks is full; damping ratio of
@@ -204,7 +205,7 @@ class Sheet(Section):
         stiffness = line_stiffness(modulus, poisson, self.length_mm)
         # Effective mass at the pitch circle of two solid cylinders that turn against each other.
         mass = density * math.pi * profile.pitch_radius_mm**2 * self.length_mm * 1e-9 / 4
-        damping = 2 * _RATIO * math.sqrt(stiffness * LINE * _DEPTH ** (LINE - 1) * 1e3 * mass)
+        damping = 2 * _RATIO * math.sqrt(stiffness * _LINE * _DEPTH ** (_LINE - 1) * 1e3 * mass)
         chosen = "--family" if self.family else "first of the table that meets the outer diameter"
         gap = "a thousandth of the outer diameter; usual: 0.0007 to 0.0015 of it"
         solved = f"solved for --outer-diameter-mm {self.outer_diameter_mm:g}"
@@ -222,7 +223,7 @@ class Sheet(Section):
                 _short(stiffness),
                 f"Lundberg's line contact, {name}: E = {modulus} GPa ({moduli}), ν = {poisson}",
             ),
-            "contact.exponent": (_short(LINE, 5), "10/9, line contact"),
+            "contact.exponent": (_short(_LINE, 5), "10/9, line contact"),
             "contact.max_damping_N_s_per_mm": (
                 _short(damping * 1e-3),
                 f"damping ratio {_RATIO:g}: 73 % of the speed returns; usual: 60 to 90 %",

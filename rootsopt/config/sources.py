@@ -24,8 +24,8 @@ FILES = {
 """Keys that hold the path of a file, each with two texts: the stem of its copy in a result folder,
 and the name of its content in messages."""
 
-MOST_BYTES = 50_000_000
-"""Size (bytes) above which a file that a config names is refused."""
+# Size (bytes) above which a file that a config names is refused.
+_MOST_BYTES = 50_000_000
 
 # Name of the entry-point group in which installed packages offer families. The name of each entry
 # point is that of its family.
@@ -65,20 +65,20 @@ def regular_file(path: str | os.PathLike, what: str) -> Path:
 def content(path: str | os.PathLike, key: str) -> bytes:
     """Return the content of the file that a `key` of the config names.
 
-    Raises `InputError` if it cannot be read, or is larger than `MOST_BYTES`."""
+    Raises `InputError` if it cannot be read, or is larger than `_MOST_BYTES`."""
     file = regular_file(path, FILES[key][1])
     try:
         with file.open("rb") as stream:
-            data = stream.read(MOST_BYTES + 1)
+            data = stream.read(_MOST_BYTES + 1)
     except (OSError, ValueError) as error:
         raise InputError(
             f"`{key}` must be a file that can be read, but is {placed(path)!r}: {reason(error)}; a "
             "path in a config is relative to the config's folder, a path given with --set to the "
             "current folder"
         ) from None
-    if len(data) > MOST_BYTES:
+    if len(data) > _MOST_BYTES:
         raise InputError(
-            f"{placed(file.name)}: must have at most {MOST_BYTES / 1e6:g} MB, but is larger; "
+            f"{placed(file.name)}: must have at most {_MOST_BYTES / 1e6:g} MB, but is larger; "
             "export what is needed alone, with fewer points"
         )
     return data

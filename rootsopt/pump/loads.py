@@ -40,8 +40,8 @@ def equivalent_load(force: Inexact[Array, "*k n"], exponent: float) -> Float[Arr
 _INTEGRANDS = 5
 # Distance (mesh periods) before and after a jump at which the integrands are evaluated.
 _ASIDE = 1e-9
-POSES = 720
-"""Number of angles of rotor 1, over a mesh period, for loads without a motion."""
+# Number of angles of rotor 1, over a mesh period, for loads without a motion.
+_POSES = 720
 
 
 class BearingLoads(NamedTuple):
@@ -340,6 +340,6 @@ def still_loads(scene: Scene, profile: Profile, shape: Geometry) -> tuple[Array,
         radial = jnp.stack([forces / 2 + share, forces / 2 - share], axis=1)
         return BearingLoads(radial, jnp.zeros(2), first).sizes
 
-    phi = 2 * jnp.pi / scene.lobes * (jnp.arange(POSES) + 0.5) / POSES
+    phi = 2 * jnp.pi / scene.lobes * (jnp.arange(_POSES) + 0.5) / _POSES
     sizes = jax.vmap(size)(phi)
     return equivalent_load(sizes.T, bearings.exponent), jnp.max(sizes, axis=0)
