@@ -248,14 +248,6 @@ def tip_length(profile: Profile, shape: Geometry, height: Float[Array, ""]) -> F
     return shape.seal_width + 2 * film
 
 
-def end_shape(shape: Geometry) -> Float[Array, ""]:
-    """Return the width over the length of the strip that represents an end face, 4 r_a² / A.
-
-    `shape`: geometry of the rotor. The strip is as wide as the rotor, 2 r_a, and as long as its
-    mean chord, A / 2r_a. By Jensen's inequality, parallel strips of unequal chords leak more."""
-    return 4 * shape.outer_radius**2 / shape.area
-
-
 def leakage(scene: Scene, medium: Medium, profile: Profile, shape: Geometry) -> Leakage:
     """Return the leakage of a pair.
 
@@ -279,8 +271,10 @@ def leakage(scene: Scene, medium: Medium, profile: Profile, shape: Geometry) -> 
         heights.append(height)
     if medium.end_clearance is not None:
         height = medium.end_clearance + strain * scene.length / 2
-        width = 2 * shape.outer_radius
-        ends = _FACES * width * _per_width(medium, height, width / end_shape(shape), 1)
+        # A strip represents an end face. It is as wide as the rotor, 2 r_a, and as long as its mean
+        # chord, A / 2r_a. By Jensen's inequality, parallel strips of unequal chords leak more.
+        width, ratio = 2 * shape.outer_radius, 4 * shape.outer_radius**2 / shape.area
+        ends = _FACES * width * _per_width(medium, height, width / ratio, 1)
         heights.append(height)
     mesh, tips = scene.length * mesh, scene.length * tips
     ideal = theoretical_flow(shape, scene.length, scene.speed)
@@ -302,7 +296,8 @@ def _per_width(medium: Medium, height, length, series: int):
     length = series * jnp.where(height > 0, length, 1.0)
     height = jnp.maximum(height, 0.0)
     if medium.gas is None:
-        return jnp.mean(slot_flow(height, length, across, medium.viscosity))
+        # A slot of height h and length L lets through h³ Δp / (12 μ L).
+        return jnp.mean(height**3 * across / (12 * medium.viscosity * length))
     down = medium.gas.inlet_pressure
     up = down + across
     slow = laminar_mass_flow(height, length, up, down, medium.viscosity, medium.gas)
@@ -328,15 +323,3 @@ def _lesser(slow, fast):
     # The first and the last angle stand for half a step each beyond them, too.
     ends = jnp.minimum(excess[0], 0.0) / 2 + jnp.minimum(excess[-1], 0.0) / 2
     return jnp.mean(fast) + (jnp.sum(between) + ends) / len(excess)
-
-
-def slot_flow(
-    height: Float[Array, "*n"],
-    length: Float[Array, "*n"],
-    pressure: Float[Array, ""],
-    viscosity: Float[Array, ""],
-) -> Float[Array, "*n"]:
-    """Return the flow (m²/s) per width through slots, h³ Δp / (12 μ L).
-
-    `height`: h (m); `length`: L (m) along the flow; `pressure`: Δp (Pa); `viscosity`: μ (Pa·s)."""
-    return height**3 * pressure / (12 * viscosity * length)
