@@ -112,7 +112,7 @@ def for_a_time():
         families._families.clear()
         families._families.update(before)
         for name in families._origins.keys() - before.keys():
-            del families._origins[name], families.FAMILY_KEYS[name]
+            del families._origins[name]
 
 
 def refusal(work, *arguments, **named) -> str:

@@ -17,8 +17,7 @@ from jax import lax
 
 from experiments._common.driver import Run
 from experiments._common.tables import Row, show
-from rootsopt.config import FAMILY_KEYS
-from rootsopt.config.families import family_of, parameters
+from rootsopt.config.families import families, family_of, parameters
 from rootsopt.config.units import DEG, MM
 from rootsopt.profiles import Curve, FreeForm, geometry
 from rootsopt.profiles.cic import CIC
@@ -27,7 +26,7 @@ from rootsopt.scene.families import profile_of
 
 RADIUS_MM = 33.0
 LOBES = (2, 3, 4, 5, 6)
-FAMILIES = tuple(family for family in FAMILY_KEYS if family != "outline")
+FAMILIES = tuple(family for family in families() if family != "outline")
 
 # Numbers of coefficients for which free forms are drawn.
 COEFFICIENTS = (3, 8, 24)
@@ -98,7 +97,7 @@ def draw(family: str, lobes: int, count: int, random: np.random.Generator, size:
     allows, with a concentration at its limits. `size`: number of coefficients of a free form.
     """
     usual, wide = [np.zeros((count, 0))], [np.zeros((count, 0))]
-    half, keys = 90.0 / lobes, FAMILY_KEYS[family]
+    half, keys = 90.0 / lobes, family_of(family).keys
     # Greatest value in a config, and least distance from the ends as a fraction of it.
     limits = {"tip_arc_angle_deg": (min(half, 45.0), 1e-4), "tip_arc_turn_deg": (180.0, 1e-3)}
     for key in keys:
@@ -187,7 +186,7 @@ def errors(family: str, lobes: int, count: int, random: np.random.Generator, siz
 
     The errors are those of `compared`; `size`: number of coefficients of a free form."""
     # A family without parameters has one design.
-    designs = draw(family, lobes, count if FAMILY_KEYS[family] else 1, random, size)
+    designs = draw(family, lobes, count if family_of(family).keys else 1, random, size)
     kept = designs[np.asarray(judged(family, lobes, designs))]
     if not len(kept):
         return kept, np.zeros((0, 3))

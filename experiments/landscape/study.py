@@ -68,7 +68,7 @@ def feasible_grid(problem: Problem, wanted: int) -> tuple[np.ndarray, NDArray[np
     constraints. It is refined until at least `wanted` points are feasible. Raises `NoResultError`
     if the constraints exclude nearly all designs.
     """
-    look = jax.jit(jax.vmap(problem.space.slacks))
+    look = jax.jit(jax.vmap(lambda x: problem.space.slacks_of(problem.space.design(x))))
     moved = feasible(problem, sobol(SAMPLE, 0, 3))
     for count in range(GRID, MOST if moved else 0):
         axes = np.linspace(np.min(moved, axis=0), np.max(moved, axis=0), count).T

@@ -19,7 +19,7 @@ from experiments._common.simulation import evaluate, profile_of
 from experiments._common.style import BLUE, GREY, sheet
 from experiments._common.tables import print_record
 from rootsopt.config import Config, load
-from rootsopt.measured.conjugacy import conjugacy, gaps_um
+from rootsopt.measured.conjugacy import conjugacy
 from rootsopt.measured.source import outline_of
 from rootsopt.profiles import Profile, outline
 from rootsopt.scene import check_geometry
@@ -85,7 +85,7 @@ def deviations(design: Profile, profile: Profile, points: np.ndarray, gaps: Any)
     )  # fmt: skip
     left.set(xlabel="radius (mm)", ylabel="deviation, outwards (µm)", title="From the design")
     left.legend(frameon=False, loc="upper left")
-    plot_conjugacy(right, {name: gaps_um(one) for name, one in gaps.items()})
+    plot_conjugacy(right, gaps)
     right.legend(frameon=False)
     return made
 

@@ -52,6 +52,7 @@ def _length(key: str, meaning: str, usual: Pair | None = None, radii: Pair = _SH
     return Parameter(key, meaning, least, _LONGEST, radii=radii, usual=usual)
 
 
+# Parameters that several families share.
 PRESSURE_ANGLE = Parameter(
     "pressure_angle_deg",
     "pressure angle of the involute",
@@ -77,33 +78,9 @@ TIP_ARC_ANGLE = _LandAngle(
     bounds_limits=(0.0, 44.0),
 )
 ARC_CENTER = _length("arc_center_mm", "distance of the arc's centre from the axis", (0.5, 0.999))
-# The family `arcs_epicycloid` sets its own floor for the edge radius.
-EDGE_RADIUS = _length(
-    "edge_radius_mm", "radius of the edge between tip land and arc", radii=_NO_FLOOR
-)
 TIP_ARC_RADIUS = _length("tip_arc_radius_mm", "radius of the tip arc", (0.05, 0.8))
 TIP_ARC_TURN = Parameter(
     "tip_arc_turn_deg", "normal angle where the tip arc ends", 1, 180, below=True, usual=(1.0, 90.0)
-)
-OUTER_RADIUS = _length("outer_radius_mm", "radius of the tip land", (1.1, 1.7))
-ROLLING_RADIUS = _length("rolling_radius_mm", "radius of the rolling circle")
-TROCHOID_RATIO = Parameter(
-    "trochoid_ratio",
-    "distance of the tracing point from the rolling circle's centre at the tip, in radii of that "
-    "circle",
-    *(1e-3, 10),
-)
-ELLIPSE_CENTER = _length(
-    "ellipse_center_mm", "distance of the ellipse's centre from the axis", (0.0, 0.99), _NO_FLOOR
-)
-ELLIPSE_HEIGHT = _length("ellipse_height_mm", "semi-axis along the lobe", (0.2, 1.5))
-COEFFICIENTS = Parameter(
-    "coefficients",
-    "decrease of the pressure angle per turn of the normal, from tip to pitch circle; 3 to 64 "
-    "numbers from -1 to 1 (0: involute, 1: arc about a pitch point)",
-    *(-1, 1),
-    usual=(-1.0, 1.0),
-    count=(3, 64),
 )
 
 # Margins that are negative with the longest involutes that `limits` tolerates.
@@ -138,7 +115,14 @@ _OWN = (
         name="arcs_epicycloid",
         help="a single arc cut off by a tip land, with a rounded edge between them",
         maker="rootsopt.profiles.arcs:arcs_epicycloid",
-        parameters=(ARC_CENTER, TIP_ARC_ANGLE, EDGE_RADIUS),
+        parameters=(
+            ARC_CENTER,
+            TIP_ARC_ANGLE,
+            # The family sets its own floor for the edge radius.
+            _length(
+                "edge_radius_mm", "radius of the edge between tip land and arc", radii=_NO_FLOOR
+            ),
+        ),
         example={"arc_center_mm": 27.0, "tip_arc_angle_deg": 8.0, "edge_radius_mm": 1.0},
         remedy="widen the land, move the arc's centre inwards, or round the edge more (its radius "
         "must be smaller than the arc's)",
@@ -169,7 +153,12 @@ _OWN = (
         name="five_arcs",
         help="tip land, tip arc and flank arc, tangent to each other",
         maker="rootsopt.profiles.arcs:five_arcs",
-        parameters=(OUTER_RADIUS, TIP_ARC_ANGLE, TIP_ARC_RADIUS, TIP_ARC_TURN),
+        parameters=(
+            _length("outer_radius_mm", "radius of the tip land", (1.1, 1.7)),
+            TIP_ARC_ANGLE,
+            TIP_ARC_RADIUS,
+            TIP_ARC_TURN,
+        ),
         example={
             "outer_radius_mm": 45.0,
             "tip_arc_angle_deg": 3.0,
@@ -182,7 +171,10 @@ _OWN = (
         name="circle_epicycloid",
         help="epicycloid with a circular tip",
         maker="rootsopt.profiles.epicycloid:circle_epicycloid",
-        parameters=(ROLLING_RADIUS, TIP_ARC_TURN),
+        parameters=(
+            _length("rolling_radius_mm", "radius of the rolling circle"),
+            TIP_ARC_TURN,
+        ),
         example={"rolling_radius_mm": 7.0, "tip_arc_turn_deg": 30.0},
         remedy="let the tip arc end further from the tip, or change the rolling radius",
     ),
@@ -198,7 +190,14 @@ _OWN = (
         name="extended_cycloid",
         help="epicycloid with a trochoid ratio that varies from tip to pitch crossing",
         maker="rootsopt.profiles.curve:extended_cycloid",
-        parameters=(TROCHOID_RATIO,),
+        parameters=(
+            Parameter(
+                "trochoid_ratio",
+                "distance of the tracing point from the rolling circle's centre at the tip, in "
+                "radii of that circle",
+                *(1e-3, 10),
+            ),
+        ),
         example={"trochoid_ratio": 1.3},
         remedy="bring the trochoid ratio closer to 1",
     ),
@@ -206,7 +205,15 @@ _OWN = (
         name="ellipse",
         help="an arc of an ellipse through both pitch crossings",
         maker="rootsopt.profiles.curve:ellipse",
-        parameters=(ELLIPSE_CENTER, ELLIPSE_HEIGHT),
+        parameters=(
+            _length(
+                "ellipse_center_mm",
+                "distance of the ellipse's centre from the axis",
+                (0.0, 0.99),
+                _NO_FLOOR,
+            ),
+            _length("ellipse_height_mm", "semi-axis along the lobe", (0.2, 1.5)),
+        ),
         example={"ellipse_center_mm": 27.0, "ellipse_height_mm": 18.0},
         remedy="move the centre, or change the height",
     ),
@@ -214,7 +221,17 @@ _OWN = (
         name="free_form",
         help="tip land and a B-spline with any number of coefficients",
         maker="rootsopt.profiles.freeform:FreeForm",
-        parameters=(TIP_ARC_ANGLE, COEFFICIENTS),
+        parameters=(
+            TIP_ARC_ANGLE,
+            Parameter(
+                "coefficients",
+                "decrease of the pressure angle per turn of the normal, from tip to pitch circle; "
+                "3 to 64 numbers from -1 to 1 (0: involute, 1: arc about a pitch point)",
+                *(-1, 1),
+                usual=(-1.0, 1.0),
+                count=(3, 64),
+            ),
+        ),
         example={"tip_arc_angle_deg": 4.0, "coefficients": (0.8, 0.7, 0.75)},
         remedy="change the coefficients, or start from `rootsopt profile --project`",
     ),

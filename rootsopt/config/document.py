@@ -13,7 +13,7 @@ import yaml
 from yaml.constructor import ConstructorError
 from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
-from rootsopt.config.section import put
+from rootsopt.config.section import is_number, put
 from rootsopt.config.units import clipped, named, sentence, shown
 from rootsopt.errors import InputError
 
@@ -168,7 +168,7 @@ class _Loader(yaml.SafeLoader):
 
     def _key(self, node: Node) -> str | float:
         key = self.construct_object(node) if isinstance(node, ScalarNode) else None
-        if isinstance(key, str) or (isinstance(key, int | float) and not isinstance(key, bool)):
+        if isinstance(key, str) or is_number(key):
             return key
         kinds = {MappingNode: "a section", SequenceNode: "a list"}
         what = kinds.get(type(node)) or shown(node.value) if node.value != "" else "empty"

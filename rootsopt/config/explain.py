@@ -8,7 +8,7 @@ from annotated_types import Ge, Gt, Le, Lt
 from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 
-from rootsopt.config.section import UNMET, Section, bare, choices, number, require
+from rootsopt.config.section import UNMET, Section, bare, choices, is_number, number, require
 from rootsopt.config.units import RPM, hint, named, near, readings, shown, unit_of, without_unit
 
 # Maximum number of valid keys that a message lists.
@@ -185,19 +185,15 @@ def _branch(first: Any, problems: Sequence[Any], size: int) -> Any:
     `first`: first of the `problems`; `size`: length of the key in its location. For a number
     that is not allowed, pydantic first reports that it is not one of the words. Return the problem
     with the number instead."""
-    if first["type"] != "literal_error" or not _is_number(first.get("input")):
+    if first["type"] != "literal_error" or not is_number(first.get("input")):
         return first
     same = [p for p in problems if p["loc"][:size] == first["loc"][:size] and len(p["loc"]) > size]
     return next((p for p in same if p["type"] != "literal_error"), first)
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
 def _wanted(kind: str, value: Any, context: dict, message: str, field: FieldInfo | None) -> str:
     """Return a description of the values that a key accepts."""
-    if kind in ("float_type", "int_type") and _is_number(value) and abs(value) > 2**53:
+    if kind in ("float_type", "int_type") and is_number(value) and abs(value) > 2**53:
         return "a number of ordinary size"
     if kind in _WANTED or kind == UNMET:
         return _WANTED.get(kind) or context["wanted"]
@@ -221,7 +217,7 @@ def _advice(place: str, kind: str, value: Any, field: FieldInfo | None) -> str:
     """Return a guess at the intended key, as the end of a message, or "" without a guess."""
     if field is None:
         return ""
-    if kind in ("greater_than_equal", "less_than_equal", "less_than") and _is_number(value):
+    if kind in ("greater_than_equal", "less_than_equal", "less_than") and is_number(value):
         return hint(place, value, *limits_of(field).ends)
     if kind == "literal_error" and isinstance(value, str):
         meant = near(value.casefold(), choices(field))
@@ -268,11 +264,11 @@ def _translated(
         if not key or not (key.endswith(end) or (stem, end) == ("power", "_kW")):
             continue
         if stem == "power":
-            if not (end and _is_number(value) and _is_number(speed) and speed > 0):
+            if not (end and is_number(value) and is_number(speed) and speed > 0):
                 return f"`{key}`? it is half of the power over the speed (rad/s)"
             torque = value * factor * 1e3 / (2 * speed * RPM)
             return f"`{key}: {torque:.4g}`? it is half of that power at {speed:g} rpm"
-        shown_value = share * factor != 1.0 and _is_number(value) and end
+        shown_value = share * factor != 1.0 and is_number(value) and end
         entry = f"`{key}: {value * factor * share:.6g}`" if shown_value else f"`{key}`"
         other = "; in other families it follows from their keys, which `rootsopt new` finds"
         return f"{entry}?" + (f" it belongs to family five_arcs{other}" if key == _OUTER else "")

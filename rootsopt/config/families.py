@@ -259,8 +259,6 @@ class Family:
 
 _families: dict[str, Family] = {}
 _origins: dict[str, str] = {}
-FAMILY_KEYS: dict[str, tuple[str, ...]] = {}
-"""Keys of the design parameters of each registered family; `register_family` updates it."""
 
 
 def register_family(family: Family) -> Family:
@@ -281,7 +279,6 @@ def register_family(family: Family) -> Family:
     _check(family)
     _families[family.name] = family
     _origins[family.name] = sys._getframe(1).f_globals.get("__name__", "")
-    FAMILY_KEYS[family.name] = family.keys
     return family
 
 

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rootsopt.config.families import parameters
+from rootsopt.config.section import is_number
 from rootsopt.config.study import TWIST
 from rootsopt.config.units import MM, RPM, hint, unit_of
 
@@ -66,9 +67,7 @@ _PRESSURE = Usual(300, 5e6)
 _TORQUE = Usual(1e-3, 50, "bar")
 _SPEED = Usual(0.2, 120, "rolling")
 _GAP = Usual(1e-5, 0.035, "radius")
-_LENGTH = Usual(5e-3, 2, "radius")
 _MARGIN = Usual(1e-3, 1, "radius")
-_ANGLE = Usual(0.2, 180)
 _TWIST = Usual(4, 360)
 _WARMING = Usual(0.5, 250)
 _EXPANSION = Usual(5e-7, 5e-5)
@@ -135,7 +134,7 @@ USUAL: dict[str, Usual] = {
 _DESIGN = {"pressure_angle_deg": Usual(5, 85), "tip_arc_turn_deg": Usual(3, 180), TWIST: _TWIST}
 
 # Usual range of a design parameter, by unit.
-_UNITS = {"mm": _LENGTH, "°": _ANGLE}
+_UNITS = {"mm": Usual(5e-3, 2, "radius"), "°": Usual(0.2, 180)}
 
 # Usual ranges of limited quantities, by the ends of their names.
 _TERMS = {
@@ -216,5 +215,4 @@ def _greatest(value: Any) -> float:
     """Return the number of the greatest magnitude in a value, 0 without a number."""
     value = [*value.values()] if isinstance(value, dict) else value
     many = value if isinstance(value, list | tuple) else [value]
-    numbers = [one for one in many if isinstance(one, int | float) and not isinstance(one, bool)]
-    return max(numbers, key=abs, default=0.0)
+    return max(filter(is_number, many), key=abs, default=0.0)

@@ -13,11 +13,17 @@ from pydantic import Field, SerializeAsAny, ValidationError, model_validator
 from rootsopt.config.document import MOST_BYTES, override_in, read_document
 from rootsopt.config.explain import explain, tree, without_removed
 from rootsopt.config.families import families, family_of, is_list
-from rootsopt.config.pareto import ParetoConfig
 from rootsopt.config.rotor import DrawingConfig, ProfileConfig, RotorConfig
 from rootsopt.config.scene import ContactConfig, PumpConfig, SceneConfig, following_mm
-from rootsopt.config.section import Section, bare, put, require
-from rootsopt.config.sources import advice, find_installed, located, place_files, regular_file
+from rootsopt.config.section import Section, bare, put, require, taken
+from rootsopt.config.sources import (
+    advice,
+    find_installed,
+    located,
+    place_files,
+    reason,
+    regular_file,
+)
 from rootsopt.config.study import (
     TWIST,
     AttractorsConfig,
@@ -30,6 +36,7 @@ from rootsopt.config.study import (
 )
 from rootsopt.config.tolerances import (
     AssumptionsConfig,
+    ParetoConfig,
     Scatter,
     Span,
     TolerancesConfig,
@@ -402,9 +409,7 @@ def _checked(data: dict, prefix: str = "") -> Config:
     try:
         return Config.model_validate(data)
     except ValidationError as error:
-        scene = data.get("scene")
-        speed = scene.get("speed_rpm") if isinstance(scene, dict) else None
-        message = explain(error, Config, speed_rpm=speed)
+        message = explain(error, Config, speed_rpm=taken(data, _SPEED))
         raise InputError(sentence(f"{prefix}{message}")) from None
 
 
@@ -412,8 +417,7 @@ def _find_family(data: dict) -> None:
     """Load the installed package that offers the config's family.
 
     `data`: the config as plain values. Do nothing if the family is already registered."""
-    profile = data.get("profile")
-    name = profile.get("family") if isinstance(profile, dict) else None
+    name = taken(data, "profile.family")
     if isinstance(name, str) and bare(name) not in map(bare, families()):
         find_installed(name)
 
@@ -427,8 +431,7 @@ def _read(path: Path) -> str:
     except FileNotFoundError:
         raise InputError(f"{name}: there is no such file; {advice(path)}") from None
     except OSError as error:
-        reason = error.strerror or type(error).__name__
-        raise InputError(f"{name}: cannot be read: {reason}") from None
+        raise InputError(f"{name}: cannot be read: {reason(error)}") from None
     except ValueError:  # A path with a null character.
         raise InputError(f"{name}: is not a path; give that of a config file") from None
     try:

@@ -23,10 +23,10 @@ from rootsopt.config.families import (
 from rootsopt.config.section import (
     Among,
     Listed,
-    Radius,
     Section,
     bare,
     between,
+    is_number,
     such,
 )
 from rootsopt.config.units import hint
@@ -47,8 +47,7 @@ def _is_center(value: Any) -> bool:
     """Return whether a value is the word `fit`, or two coordinates (mm)."""
     if not isinstance(value, list | tuple):
         return value == "fit"
-    numbers = [x for x in value if isinstance(x, int | float) and not isinstance(x, bool)]
-    return len(numbers) == len(value) == 2 and all(abs(x) <= _FARTHEST for x in numbers)
+    return len(value) == 2 and all(is_number(x) and abs(x) <= _FARTHEST for x in value)
 
 
 _Center = Annotated[
@@ -72,7 +71,9 @@ class ProfileConfig(Section):
         description="profile family; outline: read from a file"
     )
     lobes: Annotated[int, Field(ge=2, le=6)] = Field(description="number of lobes")
-    pitch_radius_mm: Radius = Field(description="pitch radius, half the centre distance")
+    pitch_radius_mm: Annotated[float, between(1, 5000)] = Field(
+        description="pitch radius, half the centre distance"
+    )
     outline_file: FilePath | None = Field(
         None, description="outline: CSV or DXF file, relative to the config's folder"
     )
@@ -255,19 +256,12 @@ class RotorConfig(Section):
 
 # Length (characters) above which a text of the title block is rejected.
 _LONGEST = 60
-
-
-def _is_line(value: object) -> bool:
-    """Return whether a value is text that fits into one line of the title block."""
-    return isinstance(value, str) and 0 < len(value) <= _LONGEST and value.isprintable()
-
-
 _Text = Annotated[
     str,
     such(
         f"one line of at most {_LONGEST} characters that can be printed, in quotes if it is a "
         "number (\"'1.4301'\")",
-        _is_line,
+        lambda text: isinstance(text, str) and 0 < len(text) <= _LONGEST and text.isprintable(),
         before=True,
     ),
 ]

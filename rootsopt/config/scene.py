@@ -13,11 +13,14 @@ from rootsopt.config.section import (
     Listed,
     Section,
     Speed,
-    Torque,
     between,
+    is_number,
     require,
     such,
 )
+
+# Magnitude of a load or motor torque (N·m).
+_Torque = Annotated[float, between(0, 1e7)]
 
 
 class FrictionConfig(Section):
@@ -99,7 +102,7 @@ class ContactConfig(Section):
 class LoadConfig(Section):
     """The load: a constant torque on rotor 2, or gas pressure on both rotors."""
 
-    torque_N_m: Torque | None = Field(None, description="constant torque against rotor 2")
+    torque_N_m: _Torque | None = Field(None, description="constant torque against rotor 2")
     pressure_difference_Pa: Annotated[float, between(0, 1e8)] | None = Field(
         None, description="gas pressure across the pair, instead of a constant torque"
     )
@@ -117,7 +120,7 @@ class LoadConfig(Section):
 class MotorConfig(Section):
     """The motor on rotor 1 for `drive: torque`, with a linear torque-speed characteristic."""
 
-    torque_N_m: Torque | None = Field(
+    torque_N_m: _Torque | None = Field(
         None, description="torque at scene.speed_rpm; absent: equal to the load there"
     )
     slope_N_m_s_per_rad: Annotated[float, between(1e-6, 1e6)] = Field(
@@ -197,8 +200,8 @@ def _each_gear(low: float, high: float) -> Any:
     def fits(value: Any) -> bool:
         listed = isinstance(value, list | tuple)
         values = value if listed else [value]
-        plain = all(isinstance(x, int | float) and not isinstance(x, bool) for x in values)
-        return plain and len(values) == 1 + listed and all(low <= x <= high for x in values)
+        within = all(is_number(x) and low <= x <= high for x in values)
+        return within and len(values) == 1 + listed
 
     return Annotated[
         Annotated[float, between(low, high)] | Annotated[tuple[float, float], Listed],

@@ -1,10 +1,11 @@
 """Base class of the config's sections, and types for their values."""
 
 import dataclasses
+import functools
 import re
 import types
 from collections.abc import Callable, Iterable, Mapping
-from typing import Annotated, Any, Literal, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeGuard, Union, get_args, get_origin
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 from pydantic.fields import FieldInfo
@@ -62,20 +63,8 @@ class Among:
 
 Speed = Annotated[float, between(1e-2, 1e6)]
 """Speed of rotation (rpm)."""
-Radius = Annotated[float, between(1, 5000)]
-"""Radius of a rotor (mm)."""
-Weight = Annotated[float, between(0, 1e6)]
-"""Weight of a term in a sum; a weight of 0 leaves the term out."""
-Order = Annotated[float, between(1e-2, 1e3)]
-"""Order of a spectral line: its frequency as a multiple of the mesh frequency."""
-Torque = Annotated[float, between(0, 1e7)]
-"""Magnitude of a load or motor torque (N·m)."""
-Seed = Annotated[int, Field(ge=0, le=2**31 - 1)]
-"""Seed of random numbers."""
 Listed = Field(strict=False)
 """Marks a tuple that is given as a list, because YAML has no tuples."""
-Increasing = such("two increasing numbers", lambda pair: len(pair) == 2 and pair[0] < pair[1])
-"""Marks a pair (low, high)."""
 
 
 class Section(BaseModel):
@@ -126,12 +115,24 @@ def bare(word: str) -> str:
     return re.sub(r"[-_\s]", "", word.casefold())
 
 
+def is_number(value: Any) -> TypeGuard[float]:
+    """Return whether a plain value is a number; true and false are not."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
 def number(key: Any) -> Any:
     """Convert a numeric string to float; return anything else unchanged."""
     try:
         return float(key) if isinstance(key, str) else key
     except ValueError:
         return key
+
+
+def taken(data: Any, key: str) -> Any:
+    """Return the value at a dotted `key` in plain `data`, `None` if it or a section is absent."""
+    return functools.reduce(
+        lambda at, part: at.get(part) if isinstance(at, dict) else None, key.split("."), data
+    )
 
 
 def put(data: dict, key: str, value: Any) -> None:

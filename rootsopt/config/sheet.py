@@ -13,7 +13,7 @@ from pydantic import Field
 from rootsopt.config.document import override_in
 from rootsopt.config.families import EXAMPLE_RADIUS, Family, families, family_of
 from rootsopt.config.rotor import ProfileConfig
-from rootsopt.config.section import Among, Section, between, put
+from rootsopt.config.section import Among, Section, Speed, between, put
 from rootsopt.config.units import RPM
 
 MATERIALS = {
@@ -41,12 +41,14 @@ MEDIA = {
     "water": (1.00, None, None, "5 to 80 °C: 1.52 to 0.35"),
     "oil": (40.0, None, None, "ISO VG 46 at 40 °C; VG 22 to VG 220: 19 to 190"),
 }
-TEETH, FACE, TOOTH_ANGLE, MESH = 50, 0.3, 20.0, 20.0
-"""A usual timing gear: teeth per gear, face width (pitch diameters), pressure angle (°), mesh
-stiffness (N/(mm·µm)). The stiffness is that of steel spur gears by ISO 6336-1, which gives 14 to 25
-for usual gears."""
-LINE = 10 / 9
-"""Exponent of the force between two cylinders that touch along a line."""
+
+# A usual timing gear: teeth per gear, face width (pitch diameters), pressure angle (°), mesh
+# stiffness (N/(mm·µm)). The stiffness is that of steel spur gears by ISO 6336-1, which gives 14 to
+# 25 for usual gears.
+_TEETH, _FACE, _TOOTH_ANGLE, _MESH = 50, 0.3, 20.0, 20.0
+
+# Exponent of the force between two cylinders that touch along a line.
+_LINE = 10 / 9
 
 
 def gear_stiffness(center_distance: float) -> float:
@@ -54,8 +56,8 @@ def gear_stiffness(center_distance: float) -> float:
 
     `center_distance` in mm, equal to the pitch diameter of both gears. With the face width b and
     the base radius r_b, a torque turns one gear against the other by torque / (c b r_b²)."""
-    base = center_distance / 2 * math.cos(math.radians(TOOTH_ANGLE))
-    return MESH * FACE * center_distance * base**2
+    base = center_distance / 2 * math.cos(math.radians(_TOOTH_ANGLE))
+    return _MESH * _FACE * center_distance * base**2
 
 
 def gear_backlash(center_distance: float) -> float:
@@ -63,17 +65,17 @@ def gear_backlash(center_distance: float) -> float:
 
     ISO/TR 10064-2: 2/3 (0.06 + 0.0005 a + 0.03 m) along the normal, in mm, with the centre distance
     a, here `center_distance`, and the module m."""
-    normal = 2 / 3 * (0.06 + (0.0005 + 0.03 / TEETH) * center_distance)
-    return normal / math.cos(math.radians(TOOTH_ANGLE))
+    normal = 2 / 3 * (0.06 + (0.0005 + 0.03 / _TEETH) * center_distance)
+    return normal / math.cos(math.radians(_TOOTH_ANGLE))
 
 
 def line_stiffness(modulus: float, poisson: float, length: float) -> float:
-    """Return K (N/mm^e) of the force K δ^e of two flanks of a `length` (mm), e = `LINE`.
+    """Return K (N/mm^e) of the force K δ^e of two flanks of a `length` (mm), e = `_LINE`.
 
     `modulus` (GPa), `poisson`: Young's modulus E and Poisson's ratio ν. Lundberg (1939), as in
     Palmgren's bearing formulas: δ = 1.36 (η F)^0.9 / L^0.8, with η = 2 (1 - ν²) / E. For steel it
     is δ = 3.84e-5 F^0.9 / L^0.8."""
-    return (length**0.8 / 1.36) ** LINE * modulus * 1e3 / (2 * (1 - poisson**2))
+    return (length**0.8 / 1.36) ** _LINE * modulus * 1e3 / (2 * (1 - poisson**2))
 
 
 # One bar (Pa); penetration (mm) at which the damping of the flanks is full; damping ratio of
@@ -99,7 +101,7 @@ class Sheet(Section):
     outer_diameter_mm: _Length = Field(description="diameter of a rotor over its tips")
     length_mm: _Length = Field(description="length of a rotor")
     lobes: Annotated[int, Field(ge=2, le=6)] = Field(description="lobes of a rotor: 2 to 6")
-    speed_rpm: Annotated[float, between(1e-2, 1e6)] = Field(description="speed")
+    speed_rpm: Speed = Field(description="speed")
     power_kW: _Optional = Field(None, description="shaft power: half of it on each rotor")
     pressure_difference_bar: _Pressure | None = Field(
         None, description="discharge minus suction pressure; used if both are given"
@@ -203,7 +205,7 @@ class Sheet(Section):
         stiffness = line_stiffness(modulus, poisson, self.length_mm)
         # Effective mass at the pitch circle of two solid cylinders that turn against each other.
         mass = density * math.pi * profile.pitch_radius_mm**2 * self.length_mm * 1e-9 / 4
-        damping = 2 * _RATIO * math.sqrt(stiffness * LINE * _DEPTH ** (LINE - 1) * 1e3 * mass)
+        damping = 2 * _RATIO * math.sqrt(stiffness * _LINE * _DEPTH ** (_LINE - 1) * 1e3 * mass)
         chosen = "--family" if self.family else "first of the table that meets the outer diameter"
         gap = "a thousandth of the outer diameter; usual: 0.0007 to 0.0015 of it"
         solved = f"solved for --outer-diameter-mm {self.outer_diameter_mm:g}"
@@ -221,7 +223,7 @@ class Sheet(Section):
                 _short(stiffness),
                 f"Lundberg's line contact, {name}: E = {modulus} GPa ({moduli}), ν = {poisson}",
             ),
-            "contact.exponent": (_short(LINE, 5), "10/9, line contact"),
+            "contact.exponent": (_short(_LINE, 5), "10/9, line contact"),
             "contact.max_damping_N_s_per_mm": (
                 _short(damping * 1e-3),
                 f"damping ratio {_RATIO:g}: 73 % of the speed returns; usual: 60 to 90 %",
@@ -252,12 +254,13 @@ class Sheet(Section):
             ),
             "scene.timing_gear.stiffness_N_m_per_rad": (
                 _short(gear_stiffness(across)),
-                f"ISO 6336-1: 20 N/(mm µm) (14 to 25), width {FACE:g} (0.2 to 0.5) pitch diameters",
+                f"ISO 6336-1: 20 N/(mm µm) (14 to 25), width {_FACE:g} (0.2 to 0.5) pitch "
+                "diameters",
             ),
             "scene.timing_gear.damping_ratio": (_RATIO, "usual: 0.03 to 0.17"),
             "scene.timing_gear.backlash_mm": (
                 _short(backlash),
-                f"{why}; module {across / TEETH:.3g}, {TEETH} teeth (35 to 80)",
+                f"{why}; module {across / _TEETH:.3g}, {_TEETH} teeth (35 to 80)",
             ),
         }
 

@@ -12,9 +12,8 @@ import sys
 import traceback
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
-from rootsopt.config.section import bare
+from rootsopt.config.section import bare, put, taken
 from rootsopt.config.units import near, placed, sentence
 from rootsopt.errors import InputError
 
@@ -25,13 +24,12 @@ FILES = {
 """Keys that hold the path of a file, each with two texts: the stem of its copy in a result folder,
 and the name of its content in messages."""
 
-MOST_BYTES = 50_000_000
-"""Size (bytes) above which a file that a config names is refused."""
+# Size (bytes) above which a file that a config names is refused.
+_MOST_BYTES = 50_000_000
 
-ENTRY_POINTS = "rootsopt.families"
-"""Name of the entry-point group in which installed packages offer families.
-
-The name of each entry point is that of its family."""
+# Name of the entry-point group in which installed packages offer families. The name of each entry
+# point is that of its family.
+_ENTRY_POINTS = "rootsopt.families"
 
 
 def reason(error: Exception) -> str:
@@ -67,39 +65,35 @@ def regular_file(path: str | os.PathLike, what: str) -> Path:
 def content(path: str | os.PathLike, key: str) -> bytes:
     """Return the content of the file that a `key` of the config names.
 
-    Raises `InputError` if it cannot be read, or is larger than `MOST_BYTES`."""
+    Raises `InputError` if it cannot be read, or is larger than `_MOST_BYTES`."""
     file = regular_file(path, FILES[key][1])
     try:
         with file.open("rb") as stream:
-            data = stream.read(MOST_BYTES + 1)
+            data = stream.read(_MOST_BYTES + 1)
     except (OSError, ValueError) as error:
         raise InputError(
             f"`{key}` must be a file that can be read, but is {placed(path)!r}: {reason(error)}; a "
             "path in a config is relative to the config's folder, a path given with --set to the "
             "current folder"
         ) from None
-    if len(data) > MOST_BYTES:
+    if len(data) > _MOST_BYTES:
         raise InputError(
-            f"{placed(file.name)}: must have at most {MOST_BYTES / 1e6:g} MB, but is larger; "
+            f"{placed(file.name)}: must have at most {_MOST_BYTES / 1e6:g} MB, but is larger; "
             "export what is needed alone, with fewer points"
         )
     return data
 
 
-_PACKAGE = Path(__file__).parents[1]
-
 # Folders of the configs: in an installed package, and in the source tree.
-_PLACES = _PACKAGE / "configs", _PACKAGE.parent / "configs"
+_PLACES = [folder / "configs" for folder in Path(__file__).parents[1:3]]
 _SUFFIX = ".yaml"
 
 
 @functools.cache
 def shipped() -> dict[str, Path]:
     """Return the paths of the shipped configs by name, such as "cic"."""
-    for place in _PLACES:
-        if paths := sorted(place.glob(f"*{_SUFFIX}")):
-            return {path.stem: path for path in paths}
-    return {}
+    found = (sorted(place.glob(f"*{_SUFFIX}")) for place in _PLACES)
+    return {path.stem: path for path in next(filter(None, found), [])}
 
 
 def located(path: Path) -> Path:
@@ -116,12 +110,8 @@ def place_files(data: dict, folder: Path) -> None:
 
     `folder`: folder to which the paths are relative."""
     for key in FILES:
-        *sections, name = key.split(".")
-        node: Any = data
-        for section in sections:
-            node = node.get(section) if isinstance(node, dict) else None
-        if isinstance(node, dict) and isinstance(node.get(name), str):
-            node[name] = str((folder / node[name]).absolute())
+        if isinstance(path := taken(data, key), str):
+            put(data, key, str((folder / path).absolute()))
 
 
 def advice(path: Path) -> str:
@@ -135,7 +125,7 @@ def find_installed(name: str) -> None:
     """Load the installed packages that offer a family with this `name`, if there are any.
 
     Raises `InputError` if loading fails."""
-    for point in importlib.metadata.entry_points(group=ENTRY_POINTS):
+    for point in importlib.metadata.entry_points(group=_ENTRY_POINTS):
         if bare(point.name) == bare(name):
             with _explained(f"profile family {point.name} of {point.value}"):
                 point.load()

@@ -10,11 +10,8 @@ from rootsopt.config.families import RESERVED, Parameter, families, parameters
 from rootsopt.config.section import (
     Among,
     Listed,
-    Order,
     Section,
-    Seed,
     Speed,
-    Weight,
     between,
     number,
     require,
@@ -30,6 +27,16 @@ _LEAST_WEIGHT = 1e-6
 
 # Number of spectral lines above which an objective is rejected.
 _MOST_LINES = 32
+
+
+# Weight of a term in a sum; a weight of 0 leaves the term out.
+_Weight = Annotated[float, between(0, 1e6)]
+
+# Order of a spectral line: its frequency as a multiple of the mesh frequency.
+_Order = Annotated[float, between(1e-2, 1e3)]
+
+# Seed of random numbers.
+_Seed = Annotated[int, Field(ge=0, le=2**31 - 1)]
 
 
 class SolverConfig(Section):
@@ -92,14 +99,14 @@ def _few(what: str) -> Any:
 class ObjectiveConfig(Section):
     """Weighted sum of measures of the contact force, each relative to the baseline."""
 
-    mean_weight: Weight = Field(0.5, description="weight of the mean contact force")
-    peak_weight: Weight = Field(0.5, description="weight of the peak contact force")
-    rms_weight: Weight = Field(0.0, description="weight of the RMS contact force")
-    line_weights: Annotated[dict[Order, Weight], _few("orders")] = Field(
+    mean_weight: _Weight = Field(0.5, description="weight of the mean contact force")
+    peak_weight: _Weight = Field(0.5, description="weight of the peak contact force")
+    rms_weight: _Weight = Field(0.0, description="weight of the RMS contact force")
+    line_weights: Annotated[dict[_Order, _Weight], _few("orders")] = Field(
         default_factory=dict,
         description="weights of spectral lines, {order: weight}, order in mesh frequencies",
     )
-    terms: dict[str, Weight] = Field(
+    terms: dict[str, _Weight] = Field(
         default_factory=dict,
         description="weights of further terms by name, as {outer_radius_mm: 0.2}: built-in or "
         "registered terms",
@@ -192,7 +199,7 @@ class ObjectiveConfig(Section):
 class ResponseConfig(Section):
     """Quantities reported in addition to the mean, peak and RMS of the contact force."""
 
-    lines: Annotated[tuple[Order, ...], Listed, _few("different orders")] = Field(
+    lines: Annotated[tuple[_Order, ...], Listed, _few("different orders")] = Field(
         (), description="spectral lines of the force, orders in mesh frequencies, as [1, 2]"
     )
     reserve: bool = Field(
@@ -232,7 +239,7 @@ class EnsembleConfig(Section):
         description="standard deviation of these designs, as a fraction of the bounds; designs "
         "stay within the bounds",
     )
-    seed: Seed = Field(0, description="seed of states and designs")
+    seed: _Seed = Field(0, description="seed of states and designs")
 
 
 BASELINE = "baseline"
@@ -320,6 +327,10 @@ class ConstraintsConfig(Section):
             "`constraints.outer_radius_min_mm` and `constraints.outer_radius_max_mm` must not both "
             "be baseline: no design meets both exactly; give one of them some room",
         )
+        return self
+
+    @model_validator(mode="after")
+    def _reachable(self):
         for name, sides in self.terms.items():
             key = f"`constraints.terms.{named(name)}"
             require(bool(sides), f"{key}` must have `min`, `max` or both, as in {{max: 200}}, but "
@@ -332,12 +343,6 @@ class ConstraintsConfig(Section):
                 f"{key}` must not have `min` and `max` both baseline: no design meets both "
                 "exactly; give one of them some room",
             )
-        return self
-
-    @model_validator(mode="after")
-    def _reachable(self):
-        for name, sides in self.terms.items():
-            low, high = limits_of(sides.get("min"), sides.get("max"))
             require(
                 high >= 0 or not (name in _SIZES or _LINE.fullmatch(name)),
                 f"`constraints.terms.{name}.max` must be at least 0, but is {high:g}: the "
@@ -390,7 +395,7 @@ class OptimizerConfig(Section):
     screening: Annotated[int, Field(ge=0, le=4096)] = Field(
         48, description="designs screened to place the starts; 0 starts at the baseline only"
     )
-    seed: Seed = Field(0, description="seed of all samples: designs and scenes")
+    seed: _Seed = Field(0, description="seed of all samples: designs and scenes")
     prove: Literal["auto"] | bool = Field(
         "auto",
         description="whether the objective of all designs is bounded from below, for up to 4 "

@@ -1,6 +1,7 @@
-"""Config section `tolerances`: scatter of values of scene and design in manufacture.
+"""Config sections for studies of several scenes, or of several terms of an objective.
 
-The section `assumptions` gives the ranges of assumed values of a pump's operation."""
+The section `tolerances` states how values of scene and design scatter in manufacture, `assumptions`
+the ranges of assumed values of a pump's operation, and `pareto` the terms of a trade-off."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -8,15 +9,16 @@ from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 from pydantic import Field, model_validator
 
-from rootsopt.config.section import Increasing, Listed, Section, bare, between, require, such
-from rootsopt.config.units import named, near
+from rootsopt.config.section import Listed, Section, bare, between, require, such, taken
+from rootsopt.config.units import named, near, shown
 
 _RELATIVE = "relative_"
 _Kind = Literal[
     "normal", "uniform", "triangular", "relative_normal", "relative_uniform", "relative_triangular"
 ]
-DISTRIBUTIONS = get_args(_Kind)
-"""Names of the distributions. The width of a `relative_` one is a fraction of the key's value."""
+
+# Names of the distributions. The width of a `relative_` one is a fraction of the key's value.
+_DISTRIBUTIONS = get_args(_Kind)
 _Distribution = Annotated[
     dict[_Kind, Annotated[float, Field(gt=0, le=1e9)]],
     such("one distribution, as in {normal: 0.002}", lambda given: len(given) == 1),
@@ -111,7 +113,7 @@ class TolerancesConfig(Section):
         if not isinstance(data, dict):
             return data
         if isinstance(over := data.get("over"), dict):
-            data = data | {"over": entries(over, DISTRIBUTIONS)}
+            data = data | {"over": entries(over, _DISTRIBUTIONS)}
         scenes = data.get("conditions")
         if not isinstance(scenes, dict) or not scenes:
             return data
@@ -219,13 +221,12 @@ def mounted(data: Any) -> Any:
 
     Return `data` unchanged if it does not have the form of a config, or if no such error scatters.
     """
-    parts = [data.get(key) for key in ("scene", "tolerances")] if isinstance(data, dict) else []
-    over = parts[1].get("over") if parts and isinstance(parts[1], dict) else None
-    if not isinstance(over, dict) or not isinstance(parts[0], dict):
+    scene, over = taken(data, "scene"), taken(data, "tolerances.over")
+    if not isinstance(over, dict) or not isinstance(scene, dict):
         return data
-    scatter = [name for name in _MOUNTING if f"scene.{name}" in entries(over, DISTRIBUTIONS)]
-    absent = {name: 0.0 for name in scatter if parts[0].get(name) is None}
-    return data | {"scene": parts[0] | absent} if absent else data
+    scatter = [name for name in _MOUNTING if f"scene.{name}" in entries(over, _DISTRIBUTIONS)]
+    absent = {name: 0.0 for name in scatter if scene.get(name) is None}
+    return data | {"scene": scene | absent} if absent else data
 
 
 def unknown_key(
@@ -289,7 +290,11 @@ def entries(over: dict, kinds: Iterable[str]) -> dict[str, Any]:
     return {key: named_right(given) for key, given in _dotted(over, is_value).items()}
 
 
-_Pair = Annotated[tuple[Annotated[float, between(-1e9, 1e9)], ...], Listed, Increasing]
+_Pair = Annotated[
+    tuple[Annotated[float, between(-1e9, 1e9)], ...],
+    Listed,
+    such("two increasing numbers", lambda pair: len(pair) == 2 and pair[0] < pair[1]),
+]
 _Spread = Annotated[
     dict[Literal["factor", "range"], _Pair],
     such("one range, as in {factor: [0.8, 1.2]}", lambda given: len(given) == 1),
@@ -369,3 +374,52 @@ class AssumptionsConfig(Section):
             if not math.isclose(low, high, abs_tol=1e-300):
                 spans.append(Span(key, low, high))
         return tuple(spans)
+
+
+class ParetoConfig(Section):
+    """The terms that `rootsopt pareto` trades against each other, and the number of points."""
+
+    terms: Annotated[
+        tuple[str, ...],
+        Listed,
+        such(
+            "two or three different terms, as [peak_force_N, area_efficiency]",
+            lambda terms: len(set(terms)) == len(terms) in (2, 3),
+        ),
+    ] = Field(
+        ("peak_force_N", "area_efficiency"),
+        description="two or three quantities: forces and lines as in `response`, geometry as in "
+        "`geometry`, displaced_volume_cm3, theoretical_flow_l_min, flow_ripple, "
+        "gear_backlash_max_mm, angular_play_min_mrad, leakage_fraction, delivered_flow_l_min, "
+        "flank_gap_min_um, flank_gap_mean_um, bearing_load_equivalent_N, bearing_load_max_N, "
+        "axial_force_max_N, tilting_moment_max_N_m, static_bearing_load_equivalent_N, "
+        "static_bearing_load_max_N, or registered terms",
+    )
+    senses: dict[str, Literal["min", "max"]] = Field(
+        default_factory=dict,
+        description="sense of a term, as {seal_width_mm: min}, where it should differ from the "
+        "term's own: max for area_efficiency, displaced_volume_cm3, theoretical_flow_l_min, "
+        "delivered_flow_l_min, gear_backlash_max_mm, flank_gap_min_um, flank_gap_mean_um, "
+        "seal_width_mm, root_radius_mm and undercut_margin_mm, min for all others",
+    )
+    points: Annotated[int, Field(ge=3, le=101)] = Field(
+        11, description="points along the front of two terms, its ends included"
+    )
+    divisions: Annotated[int, Field(ge=2, le=20)] = Field(
+        5,
+        description="steps between two ends of three terms: n steps give (n + 1) (n + 2) / 2 "
+        "points",
+    )
+    refinements: Annotated[int, Field(ge=0, le=100)] = Field(
+        12, description="greatest number of further points where neighbours lie far apart"
+    )
+
+    @model_validator(mode="after")
+    def _own(self):
+        for name in self.senses:
+            require(
+                name in self.terms,
+                f"`pareto.senses` must name terms of `pareto.terms` ({', '.join(self.terms)}), "
+                f"but names {shown(name)}; add the term, or remove its sense",
+            )
+        return self

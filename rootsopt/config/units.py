@@ -133,8 +133,8 @@ def hint(key: object, value: float, low: float, high: float) -> str:
     return ""
 
 
-LONGEST = 500
-"""Length (characters) above which a message about a config is shortened."""
+# Length (characters) above which a message about a config is shortened.
+_LONGEST = 500
 
 # Lengths (characters) of a string value, a key and a path above which a message shortens them.
 _VALUE, _NAME, _PATH = 80, 60, 160
@@ -178,7 +178,7 @@ def placed(path: Any) -> str:
     return text if text.isprintable() else ascii(text)[1:-1]
 
 
-def clipped(text: str, longest: int = LONGEST) -> str:
+def clipped(text: str, longest: int = _LONGEST) -> str:
     """Shorten a text to at most `longest` characters by omitting its middle."""
     if len(text) <= longest:
         return text
@@ -187,8 +187,8 @@ def clipped(text: str, longest: int = LONGEST) -> str:
 
 
 def sentence(text: str) -> str:
-    """Return a message as one line of at most `LONGEST` characters."""
-    return clipped(" ".join(text[: 100 * LONGEST].split()))
+    """Return a message as one line of at most `_LONGEST` characters."""
+    return clipped(" ".join(text[: 100 * _LONGEST].split()))
 
 
 def near(word: str, known: Iterable[str], cutoff: float = 0.6) -> str:

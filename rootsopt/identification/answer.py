@@ -28,8 +28,6 @@ _LOOSE, _PART = 0.3, 0.1
 
 # Distance from a bound (share of this range) below which a quantity counts as being at the bound.
 _NEAR = 1e-4
-STRUCTURED = 4.0
-"""Value of `structure` above which residuals are not independent."""
 
 # Relative error of a simulated orbit, the same in all samples. Relative misfit below which
 # residuals count as such errors.
@@ -54,8 +52,9 @@ _SAME = 1e-3
 # Speeds of further measurements, as multiples of the config's, and their relative error if the
 # record has none.
 _SPEEDS, _USUAL = (0.5, 1.0, 2.0), 0.01
-ENTRIES = "parameters", "combinations", "fit", "motions", "optima", "further", "profiles"
-"""Entries of the result file."""
+
+# Entries of the result file.
+_ENTRIES = "parameters", "combinations", "fit", "motions", "optima", "further", "profiles"
 
 # Columns of the samples that further measurements may record.
 _FURTHER = CHANNELS[0], CHANNELS[1], CHANNELS[4], *CHANNELS[6:]
@@ -357,14 +356,9 @@ class Identification:
 
     def record(self) -> dict[str, Any]:
         """Return the record for the result file."""
-        keys = [*self.parameters]
-
-        def table(rows: NDArray[np.float64]) -> dict[str, dict[str, float]]:
-            return {a: dict(zip(keys, row, strict=True))
-                    for a, row in zip(keys, rows.tolist(), strict=True)}  # fmt: skip
-
-        entries = {name: getattr(self, name) for name in ENTRIES}
-        entries |= {"correlation": table(self.correlation), "covariance": table(self.covariance)}
+        entries, keys = {name: getattr(self, name) for name in _ENTRIES}, [*self.parameters]
+        for name in ("correlation", "covariance"):
+            entries[name] = pandas.DataFrame(getattr(self, name), keys, keys).to_dict("index")
         end = {"status": self.status.label, "message": self.message}
         return entries | end | {"statistics": self.statistics}
 
@@ -380,6 +374,5 @@ def residuals(problem: Problem, best: Fit) -> dict[str, Sequence[Any]]:
 
 def adopted(config: Config, problem: Problem, best: Fit) -> Config:
     """Return a config with the fitted values."""
-    values = named(problem, best.values)
-    values.pop(OFFSET, None)
+    values = {key: x for key, x in named(problem, best.values).items() if key != OFFSET}
     return config.replaced(values) if values else config

@@ -41,6 +41,9 @@ _APART, _SAME = 0.15, 0.01
 _NEARLY, _EQUAL = 2.0, 1e-3
 _CHANCE = 1e-3
 
+# Value of `structure` above which residuals are not independent.
+_STRUCTURED = 4.0
+
 # Number of local fits in which standard deviations are estimated from the residuals.
 _PASSES = 3
 
@@ -196,7 +199,7 @@ def _caveats(problem: Problem, entries: Mapping[str, Any]) -> Iterator[str]:
             f"{len(entries['optima'])}.",
         ),
         (
-            fit["structure"] > answer.STRUCTURED,
+            fit["structure"] > _STRUCTURED,
             "Residuals of neighbouring samples are alike, so that the scene lacks something or is "
             "not the best within the bounds: the errors are too small. Raise --starts.",
         ),
@@ -259,7 +262,7 @@ class _Search:
     def _explained(self) -> bool:
         """Whether the residuals of the best fit look random (samples) or are small (averages)."""
         for one in self._best[:1]:
-            random = structure(self.problem, one) < answer.STRUCTURED
+            random = structure(self.problem, one) < _STRUCTURED
             small = relative_misfit(self.problem, one) < _POOR
             return random and (small or bool(self.problem.rows.sampled.any()))
         return False

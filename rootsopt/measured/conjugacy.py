@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Float64
-from numpy.typing import NDArray
 
 from rootsopt.config.reading import Config
 from rootsopt.contact.closest import FlankPair
@@ -125,11 +124,6 @@ def _gaps(profile, distance, roll):
     contact = lax.map(lambda x: pair(x, jnp.zeros_like(x)), sides.ravel())
     gap = jnp.where(contact.found, contact.gap, jnp.inf).reshape(sides.shape)
     return jnp.min(gap, axis=0), jnp.any(contact.found.reshape(sides.shape), axis=0)
-
-
-def gaps_um(mesh: Conjugacy) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return (roll angles (n,) in degrees, gaps (n,) in µm) of a `Conjugacy`, for a figure."""
-    return np.degrees(mesh.roll), mesh.gap / _MICRON
 
 
 def record(config: Config) -> dict[str, Any]:

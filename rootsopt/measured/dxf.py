@@ -8,7 +8,7 @@ import numpy as np
 
 from rootsopt.config.units import named
 from rootsopt.errors import InputError
-from rootsopt.measured.entities import chain, strokes
+from rootsopt.measured.entities import KINDS, chain, strokes
 from rootsopt.measured.estimates import UNITS
 from rootsopt.measured.loop import Loop, guarded, silenced
 
@@ -21,7 +21,6 @@ with silenced():  # Importing ezdxf writes to its log.
 # Approximate distance between points on arcs and splines, as a fraction of the drawing's size.
 _SPACING = 1 / 400
 _LAYER = "OUTLINE"
-_KINDS = ("LINE", "ARC", "SPLINE", "ELLIPSE", "LWPOLYLINE", "POLYLINE")
 _CURVES = ("LINE", "ARC", "SPLINE", "ELLIPSE")
 _PARTS = ("VERTEX", "INSERT")
 
@@ -108,7 +107,7 @@ def from_dxf(data: bytes, name: str, unit: str | None = None) -> list[Loop]:
     parts = [part for part in parts if part]
     if not parts:
         raise InputError(
-            f"{name}: must hold an outline of {', '.join(_KINDS)}, but those in it have no extent; "
+            f"{name}: must hold an outline of {', '.join(KINDS)}, but those in it have no extent; "
             "export it again"
         )
     rough = np.concatenate([stroke.rough for part in parts for stroke in part])
@@ -146,14 +145,14 @@ def _check_tags(data: bytes, binary: bool, name: str) -> Counter[str]:
             if code == 0:
                 kind = _raw(value).decode("latin-1").strip().upper()
                 counted[kind] += 1
-            elif kind in (*_KINDS, *_PARTS) and not _sound(code, _raw(value)):
+            elif kind in (*KINDS, *_PARTS) and not _sound(code, _raw(value)):
                 where = f"tag {number}" if binary else f"line {2 * number}"
                 raise InputError(
                     f"{name}, {where}: a number of {kind} must be finite and at most "
                     f"{_LARGEST:g}, but is {named(_raw(value).decode('latin-1'))!r}; repair or "
                     "remove the entity, or export the drawing again"
                 )
-    count = sum(counted[kind] for kind in (*_KINDS, *_PARTS))
+    count = sum(counted[kind] for kind in (*KINDS, *_PARTS))
     if count > _ENTITIES:
         raise InputError(
             f"{name}: must have at most {_ENTITIES} lines, arcs and vertices, but has {count}; "
@@ -191,7 +190,7 @@ def _chosen(document: Drawing, name: str) -> list[Any]:
 
     with guarded(name, _NOT, _AGAIN):
         everything = list(document.modelspace())
-        direct = [e for e in everything if e.dxftype() in _KINDS]
+        direct = [e for e in everything if e.dxftype() in KINDS]
         inserts = [e for e in everything if e.dxftype() == "INSERT"]
         group = on_layer(direct)
         if not group:
@@ -199,7 +198,7 @@ def _chosen(document: Drawing, name: str) -> list[Any]:
             group = on_layer(blocks) or direct or blocks
     if not group:
         raise InputError(
-            f"{name}: must hold an outline of {', '.join(_KINDS)}, but "
+            f"{name}: must hold an outline of {', '.join(KINDS)}, but "
             f"{'its blocks have' if inserts else 'has'} none of them; draw it with these"
         )
     return group
@@ -212,7 +211,7 @@ def _exploded(inserts: list[Any], name: str) -> list[Any]:
     `recursive_decompose` has no limit on depth or number, and leaves entities on layer 0 there."""
 
     def skipped(entity, reason):
-        if entity.dxftype() in _KINDS:
+        if entity.dxftype() in KINDS:
             raise InputError(
                 f"{name}: {entity.dxftype()} in a block cannot be placed: {named(reason)}; "
                 "explode the blocks in the drawing"
@@ -233,6 +232,6 @@ def _exploded(inserts: list[Any], name: str) -> list[Any]:
                 f"most {_ENTITIES} entities in total, but these are not; explode the blocks in the "
                 "drawing"
             )
-        entities += [e for e in own if e.dxftype() in _KINDS]
+        entities += [e for e in own if e.dxftype() in KINDS]
         queue += [(e, depth + 1) for e in own if e.dxftype() == "INSERT"]
     return entities

@@ -121,7 +121,7 @@ def strokes(entity: Any, scale: float, name: str) -> list[Stroke]:
         x, y, z = entity.dxf.get("extrusion", (0, 0, 1))
         if kind not in _SPATIAL and math.hypot(x, y) > _TILT * abs(z):
             raise fault("lie in the plane of x and y", "is in another")
-        made = _KINDS[kind](entity, scale, fault)
+        made = KINDS[kind](entity, scale, fault)
         if not all(np.all(np.isfinite(stroke.rough)) for stroke in made):
             raise fault("have a finite size", "has none")
     return made
@@ -242,11 +242,11 @@ def _polyline(entity: Any, scale: float, fault) -> list[Stroke]:
 
 # Function for each kind of entity that returns its strokes, from the library's object, the mm per
 # drawing unit, and a function that makes the error for an entity that is not valid.
-_KINDS = {
+KINDS = {
     "LINE": _line,
     "ARC": _arc,
-    "ELLIPSE": _ellipse,
     "SPLINE": _spline,
+    "ELLIPSE": _ellipse,
     "LWPOLYLINE": _polyline,
     "POLYLINE": _polyline,
 }

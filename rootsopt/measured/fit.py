@@ -16,12 +16,13 @@ from rootsopt.measured.loop import Loop, lengths_along, moment, signed_area
 from rootsopt.profiles.outline import Outline, Table
 
 _MM = 1e-3
-NODES = 1536
-"""Number of nodes in the table of the addendum, and in that of the dedendum. The number is fixed,
-so that one compiled program serves all outlines."""
+
+# Number of nodes in the table of the addendum, and in that of the dedendum. The number is fixed, so
+# that one compiled program serves all outlines.
+_NODES = 1536
 
 # Number of smooth pieces of an addendum or dedendum above which an outline is rejected.
-_PIECES = NODES // 4
+_PIECES = _NODES // 4
 
 # Polar angle (fraction of the angle from tip to root) by which the fitted points extend beyond a
 # flank's tip and root.
@@ -316,7 +317,7 @@ def _distances(flank: _Flank, own: _Flank) -> NDArray[np.float64]:
 def _stretch(flank: _Flank, start: float, stop: float) -> list[tuple[NDArray, ...]]:
     """Return the samples (see `stretch`) of each piece of a flank from `start` to `stop`.
 
-    The pieces have `NODES` parameters in total. The parameter of a joint occurs in both adjacent
+    The pieces have `_NODES` parameters in total. The parameter of a joint occurs in both adjacent
     pieces. Raises `InputError` if there are too many pieces."""
     parts = flank.curve.between(start, stop)
     if len(parts) > _PIECES:
@@ -326,8 +327,8 @@ def _stretch(flank: _Flank, start: float, stop: float) -> list[tuple[NDArray, ..
             "their scatter, otherwise draw the flank with longer arcs or one spline"
         )
     lengths = np.array([high - low for _, low, high in parts])
-    counts = 2 + np.floor((NODES - 2 * len(parts)) * lengths / lengths.sum()).astype(int)
-    counts[np.argmax(counts)] += NODES - counts.sum()
+    counts = 2 + np.floor((_NODES - 2 * len(parts)) * lengths / lengths.sum()).astype(int)
+    counts[np.argmax(counts)] += _NODES - counts.sum()
     return [
         stretch(flank.curve, *part, int(count)) for part, count in zip(parts, counts, strict=True)
     ]
@@ -349,9 +350,9 @@ def _outline(
     direction = _agreed(t, np.unwrap(direction))
     normal = np.exp(1j * direction)
     height, lever = np.real(z * np.conj(normal)), -np.imag(z * np.conj(normal))
-    nu = direction[:NODES]
-    curvature_radius = speed[:NODES] / np.where(turning > 0, turning, 1.0)[:NODES]
-    folds = ~(turning[:NODES] > 0) | np.append(np.diff(nu) < 0, not nu[-1] > max(0.0, nu[0]))
+    nu = direction[:_NODES]
+    curvature_radius = speed[:_NODES] / np.where(turning > 0, turning, 1.0)[:_NODES]
+    folds = ~(turning[:_NODES] > 0) | np.append(np.diff(nu) < 0, not nu[-1] > max(0.0, nu[0]))
     if np.any(folds):
         place = z[np.argmax(folds)]
         raise InputError(
@@ -360,15 +361,15 @@ def _outline(
             f"{seen.remedy(smoothing)}"
         )
     scale = nu[-1] / (flank.root - flank.pitch)
-    f, g, h, q = turning[NODES:], speed[NODES:], height[NODES:], lever[NODES:]
+    f, g, h, q = turning[_NODES:], speed[_NODES:], height[_NODES:], lever[_NODES:]
     crown = _table(
         nu,
-        np.stack([height[:NODES], lever[:NODES]], axis=1) * _MM,
-        np.stack([-lever[:NODES], height[:NODES] - curvature_radius], axis=1) * _MM,
+        np.stack([height[:_NODES], lever[:_NODES]], axis=1) * _MM,
+        np.stack([-lever[:_NODES], height[:_NODES] - curvature_radius], axis=1) * _MM,
     )
     valley = _table(
-        (flank.root - t[NODES:][::-1]) * scale,
-        np.stack([direction[NODES:] - np.pi / lobes, q * _MM, h * _MM], axis=1)[::-1],
+        (flank.root - t[_NODES:][::-1]) * scale,
+        np.stack([direction[_NODES:] - np.pi / lobes, q * _MM, h * _MM], axis=1)[::-1],
         np.stack([f, (h * f - g) * _MM, -q * f * _MM], axis=1)[::-1] / -scale,
     )
     star = float(np.min(height))
@@ -388,7 +389,7 @@ def _outline(
         polar_area_moment=jnp.asarray(moment * _MM**4),
         outer_radius=jnp.asarray(np.max(np.abs(z)) * _MM),
         root_radius=jnp.asarray(np.min(np.abs(z)) * _MM),
-        seal_width=jnp.asarray(_land(z[:NODES], radius, np.fmax(smoothing, seen.scatter)) * _MM),
+        seal_width=jnp.asarray(_land(z[:_NODES], radius, np.fmax(smoothing, seen.scatter)) * _MM),
     )
     return outline, star, float(np.min(curvature_radius))
 

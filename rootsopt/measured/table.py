@@ -105,23 +105,6 @@ def from_csv(data: bytes, name: str, unit: str | None = None) -> list[Loop]:
     ]
 
 
-def named_columns(data: bytes, name: str, titles: tuple[str, str]) -> NDArray[np.float64]:
-    """Return the numbers (n, 2) in the columns of a table that its first line calls `titles`.
-
-    `data`: content of the file; `name`: name of the file in messages. Raises `InputError` if the
-    table lacks a column, or a line a number."""
-    what = " and ".join(titles)
-    first, rows = titled(data, name, what)
-    if missing := [title for title in titles if title not in first]:
-        raise InputError(
-            f"{name}: must name the columns {what} in its first line, but has no {missing[0]}; add "
-            f"the line {','.join(titles)}"
-        )
-    places = first.index(titles[0]), first.index(titles[1])
-    pairs = [_values(row, places, what, f"{name}, line {number}") for number, row in rows.items()]
-    return np.array(pairs).reshape(-1, 2)
-
-
 def titled(data: bytes, name: str, what: str) -> tuple[list[str], dict[int, list[str]]]:
     """Return (titles in the first line of a table, cells of each further line by its number).
 
@@ -290,8 +273,8 @@ def _number(cell: str) -> float | None:
         return None
 
 
-KEY = "scene.timing_gear.transmission_error_file"
-"""Key that names the file."""
+# Key that names the file.
+_KEY = "scene.timing_gear.transmission_error_file"
 _COLUMNS = "rotation_deg", "error_um"
 
 # Least number of rows of a table, greatest step between them (°), greatest error (µm).
@@ -312,8 +295,16 @@ def transmission_error(path: Path) -> tuple[NDArray[np.float64], NDArray[np.floa
     coefficients (m/rad^k) of the polynomials that continue each knot, highest power first.
 
     Raises `InputError` if the file cannot be read, or the table is not that of one turn."""
-    data = content(path, KEY)
-    turned, error = named_columns(data, path.name, _COLUMNS).T
+    name, what = path.name, " and ".join(_COLUMNS)
+    first, rows = titled(content(path, _KEY), name, what)
+    if missing := [title for title in _COLUMNS if title not in first]:
+        raise InputError(
+            f"{name}: must name the columns {what} in its first line, but has no {missing[0]}; add "
+            f"the line {','.join(_COLUMNS)}"
+        )
+    places = first.index(_COLUMNS[0]), first.index(_COLUMNS[1])
+    pairs = [_values(row, places, what, f"{name}, line {number}") for number, row in rows.items()]
+    turned, error = np.array(pairs).reshape(-1, 2).T
     whole = len(turned) > 1 and abs(turned[-1] - turned[0] - 360) < _SAME[0]
     apart = float(abs(error[-1] - error[0])) if whole else 0.0
     turned, error = (x[: len(x) - whole] for x in (turned, error))
@@ -328,7 +319,7 @@ def transmission_error(path: Path) -> tuple[NDArray[np.float64], NDArray[np.floa
         (most <= _MOST, f"have errors of at most {_MOST:g} µm", f"has one of {most:g} µm"),
     ):
         if not holds:
-            raise InputError(f"{path.name}: must {wanted}, but {actual}; correct the table")
+            raise InputError(f"{name}: must {wanted}, but {actual}; correct the table")
     from scipy.interpolate import make_interp_spline  # Slow import.
 
     knots = turned * DEG

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.config.families import FAMILY_KEYS
+from rootsopt.config.families import families
 from rootsopt.config.reading import Config
 from rootsopt.errors import InputError
 from rootsopt.optimize import noise
@@ -93,7 +93,7 @@ class Search:
                     "has no design parameters; choose another motion"
                 )
         if not config.design_keys:
-            valid = ", ".join(family for family, keys in FAMILY_KEYS.items() if keys)
+            valid = ", ".join(name for name, family in families().items() if family.keys)
             raise InputError(
                 f"`profile.family` must be one of {valid} to be optimised, but is "
                 f"{config.profile.family}: it has no design parameter; use `simulate` for it, "

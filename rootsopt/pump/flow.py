@@ -153,15 +153,6 @@ def play_of(scene: Scene, profile: Profile) -> Play:
     return play(profile, scene.clearance, center_distance, radial=radial)
 
 
-CONTINUUM = 0.01
-"""Knudsen number above which gas slips at the walls, so that it leaks more than the laminar formula
-states.
-"""
-MOLECULAR = 1.0
-"""Knudsen number above which molecules meet the walls more often than each other. The formulas of
-this module do not hold there."""
-
-
 def critical_ratio(heat_ratio: Float[Array, ""]) -> Float[Array, ""]:
     """Return the pressure ratio below which a nozzle is choked, (2 / (κ + 1))^(κ / (κ - 1)).
 
@@ -212,8 +203,8 @@ def mean_free_path(
     return viscosity / pressure * jnp.sqrt(jnp.pi / 2 * gas.gas_constant * gas.temperature)
 
 
-FACES = 4
-"""Number of end faces of the two rotors."""
+# Number of end faces of the two rotors.
+_FACES = 4
 _NODES, _WEIGHTS = (x / 2 for x in np.polynomial.legendre.leggauss(64))
 # Nodes and weights of the Gauss-Legendre rule on [0, 1], for the gap beside a tip.
 _SHARES = _NODES + 0.5
@@ -257,14 +248,6 @@ def tip_length(profile: Profile, shape: Geometry, height: Float[Array, ""]) -> F
     return shape.seal_width + 2 * film
 
 
-def end_shape(shape: Geometry) -> Float[Array, ""]:
-    """Return the width over the length of the strip that represents an end face, 4 r_a² / A.
-
-    `shape`: geometry of the rotor. The strip is as wide as the rotor, 2 r_a, and as long as its
-    mean chord, A / 2r_a. By Jensen's inequality, parallel strips of unequal chords leak more."""
-    return 4 * shape.outer_radius**2 / shape.area
-
-
 def leakage(scene: Scene, medium: Medium, profile: Profile, shape: Geometry) -> Leakage:
     """Return the leakage of a pair.
 
@@ -288,8 +271,10 @@ def leakage(scene: Scene, medium: Medium, profile: Profile, shape: Geometry) -> 
         heights.append(height)
     if medium.end_clearance is not None:
         height = medium.end_clearance + strain * scene.length / 2
-        width = 2 * shape.outer_radius
-        ends = FACES * width * _per_width(medium, height, width / end_shape(shape), 1)
+        # A strip represents an end face. It is as wide as the rotor, 2 r_a, and as long as its mean
+        # chord, A / 2r_a. By Jensen's inequality, parallel strips of unequal chords leak more.
+        width, ratio = 2 * shape.outer_radius, 4 * shape.outer_radius**2 / shape.area
+        ends = _FACES * width * _per_width(medium, height, width / ratio, 1)
         heights.append(height)
     mesh, tips = scene.length * mesh, scene.length * tips
     ideal = theoretical_flow(shape, scene.length, scene.speed)
@@ -311,7 +296,8 @@ def _per_width(medium: Medium, height, length, series: int):
     length = series * jnp.where(height > 0, length, 1.0)
     height = jnp.maximum(height, 0.0)
     if medium.gas is None:
-        return jnp.mean(slot_flow(height, length, across, medium.viscosity))
+        # A slot of height h and length L lets through h³ Δp / (12 μ L).
+        return jnp.mean(height**3 * across / (12 * medium.viscosity * length))
     down = medium.gas.inlet_pressure
     up = down + across
     slow = laminar_mass_flow(height, length, up, down, medium.viscosity, medium.gas)
@@ -337,15 +323,3 @@ def _lesser(slow, fast):
     # The first and the last angle stand for half a step each beyond them, too.
     ends = jnp.minimum(excess[0], 0.0) / 2 + jnp.minimum(excess[-1], 0.0) / 2
     return jnp.mean(fast) + (jnp.sum(between) + ends) / len(excess)
-
-
-def slot_flow(
-    height: Float[Array, "*n"],
-    length: Float[Array, "*n"],
-    pressure: Float[Array, ""],
-    viscosity: Float[Array, ""],
-) -> Float[Array, "*n"]:
-    """Return the flow (m²/s) per width through slots, h³ Δp / (12 μ L).
-
-    `height`: h (m); `length`: L (m) along the flow; `pressure`: Δp (Pa); `viscosity`: μ (Pa·s)."""
-    return height**3 * pressure / (12 * viscosity * length)

@@ -82,9 +82,9 @@ def half_valley(flank: Flank, lobes: int, radius: Float[Array, "*n"]) -> Float[A
     return jnp.where(radius < away[0], (radius - away[0]) / away[0], free)
 
 
-POSES = 48
-"""Number of roll angles, evenly spaced over the quarter of the mesh in which one addendum touches.
-By symmetry, the other quarters have the same gap."""
+# Number of roll angles, evenly spaced over the quarter of the mesh in which one addendum touches.
+# By symmetry, the other quarters have the same gap.
+_POSES = 48
 # Number of points per segment of a flank at which the gap's width is computed.
 _POINTS = 400
 # Cosine of the angle between a flank's normal and that at the narrowest place: below the first, a
@@ -133,7 +133,7 @@ def relative_curvature(profile: Profile, nu: Float[Array, "*n"]) -> Float[Array,
 
 def rolls(profile: Profile) -> Float[Array, " n"]:
     """Return the roll angles (n,) in rad at which `mesh_gap` gives the gap."""
-    return profile.half_pitch * (jnp.arange(POSES) + 0.5) / POSES
+    return profile.half_pitch * (jnp.arange(_POSES) + 0.5) / _POSES
 
 
 def mesh_gap(profile: Profile, allowances: Allowances) -> MeshGap:
@@ -208,9 +208,9 @@ def _part(cosine):
     return share**2 * (3 - 2 * share)
 
 
-POINTS = 1000
-"""Number of points per segment of a flank. It makes the angles accurate to about 1e-6 rad, mostly
-1e-8 rad."""
+# Number of points per segment of a flank. It makes the angles accurate to about 1e-6 rad, mostly
+# 1e-8 rad.
+_PLAY_POINTS = 1000
 # Number of points that are looked at together. In most poses, most of these blocks are out of the
 # other rotor's reach, and the room or depth of a point takes ten times as long as its distance.
 _BLOCK = 256
@@ -219,9 +219,9 @@ _BLOCK = 256
 _STEP, _SHARE = 3e-8, 1e-2
 # Number of angles of rotor 1 over a quarter of a lobe pitch in the search for an overlap.
 _FINE = 361
-PLAY_POSES = 96
-"""Number of angles of rotor 1 over one lobe pitch. It is a multiple of 4, so that the poses in
-which the pitch crossings touch are included."""
+# Number of angles of rotor 1 over one lobe pitch. It is a multiple of 4, so that the poses in which
+# the pitch crossings touch are included.
+_PLAY_POSES = 96
 
 
 class Play(eqx.Module):
@@ -366,13 +366,13 @@ def play(
 
     `clearance` (m): distance added to every flank gap, along the normal. `center_distance` (m): by
     default that of perfect rolling, 2r. `phi` (n,): angles of rotor 1 (rad), by default
-    `PLAY_POSES` of them over one lobe pitch. `radial` (m): radius by which both rotors are smaller
+    `_PLAY_POSES` of them over one lobe pitch. `radial` (m): radius by which both rotors are smaller
     everywhere."""
     lobes, r = profile.lobes, profile.pitch_radius
     distance = 2 * r if center_distance is None else center_distance
     if phi is None:
-        phi = 2 * jnp.pi / lobes * jnp.arange(PLAY_POSES) / PLAY_POSES
-    flank = sampled_flank(profile, POINTS)
+        phi = 2 * jnp.pi / lobes * jnp.arange(_PLAY_POSES) / _PLAY_POSES
+    flank = sampled_flank(profile, _PLAY_POINTS)
     if radial is not None:
         flank = flank._replace(point=flank.point * (1 - radial / jnp.abs(flank.point)))
     pair = _Pair(flank, both_flanks(flank), clearance, distance, lobes)

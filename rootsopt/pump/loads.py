@@ -40,8 +40,8 @@ def equivalent_load(force: Inexact[Array, "*k n"], exponent: float) -> Float[Arr
 _INTEGRANDS = 5
 # Distance (mesh periods) before and after a jump at which the integrands are evaluated.
 _ASIDE = 1e-9
-POSES = 720
-"""Number of angles of rotor 1, over a mesh period, for loads without a motion."""
+# Number of angles of rotor 1, over a mesh period, for loads without a motion.
+_POSES = 720
 
 
 class BearingLoads(NamedTuple):
@@ -184,14 +184,6 @@ class OrbitLoads(NamedTuple):
     greatest_slopes: Float[Array, "k d"]
 
 
-def loads_corners(bearings: BearingSet) -> Float[Array, " k"]:
-    """Return the times (mesh periods, from 0 to 1) at which the gas forces are not smooth."""
-    gas = bearings.loads.gas
-    if gas is None:
-        return jnp.zeros(0)
-    return gas.corners() * bearings.pair.lobes / (2 * jnp.pi)
-
-
 @CachedFunction
 def orbit_loads(scene: Scene, design: Float[Array, " d"], orbit: VariedOrbit) -> OrbitLoads:
     """Return the bearing loads over a closed `orbit`.
@@ -229,8 +221,9 @@ def orbit_loads(scene: Scene, design: Float[Array, " d"], orbit: VariedOrbit) ->
         return orbit.pushed(quantities, tau, bearings, tangents)
 
     # The loads have corners where the motion has none, for example where the gear's torque changes
-    # sign.
-    corners, flags = loads_corners(bearings), partial(bearings.flags, orbit)
+    # sign. Those of the gas are known (mesh periods, from 0 to 1).
+    gas, flags = bearings.loads.gas, partial(bearings.flags, orbit)
+    corners = jnp.zeros(0) if gas is None else gas.corners() * bearings.pair.lobes / (2 * jnp.pi)
     begins, ends, count = smooth_pieces(bearings.pair, orbit.elements, corners, flags)
     leaps, moves = _leaps(scene, orbit, bearings, tangents)
     sides = leaps[:, None] + _ASIDE * np.array([-1.0, 1.0])
@@ -340,6 +333,6 @@ def still_loads(scene: Scene, profile: Profile, shape: Geometry) -> tuple[Array,
         radial = jnp.stack([forces / 2 + share, forces / 2 - share], axis=1)
         return BearingLoads(radial, jnp.zeros(2), first).sizes
 
-    phi = 2 * jnp.pi / scene.lobes * (jnp.arange(POSES) + 0.5) / POSES
+    phi = 2 * jnp.pi / scene.lobes * (jnp.arange(_POSES) + 0.5) / _POSES
     sizes = jax.vmap(size)(phi)
     return equivalent_load(sizes.T, bearings.exponent), jnp.max(sizes, axis=0)

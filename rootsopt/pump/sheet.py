@@ -12,7 +12,7 @@ from rootsopt.config.units import DEG, MM, UM
 from rootsopt.errors import InputError
 from rootsopt.profiles import geometry
 from rootsopt.pump import flow
-from rootsopt.pump.flow import CM3, CONTINUUM, L_MIN, MOLECULAR, MRAD, play_of, ripple_of
+from rootsopt.pump.flow import CM3, L_MIN, MRAD, play_of, ripple_of
 from rootsopt.pump.loads import static_loads
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene.build import Scene
@@ -20,8 +20,14 @@ from rootsopt.scene.reading import Medium, design_vector
 
 # Overlap (m) of the flanks below which it counts as rounding of an outline.
 _ROUNDING = 1e-8
-LINES = 4
-"""Number of lines of the flow in the sheet."""
+# Number of lines of the flow in the sheet.
+_LINES = 4
+# Knudsen number above which gas slips at the walls, so that it leaks more than the laminar formula
+# states.
+_CONTINUUM = 0.01
+# Knudsen number above which molecules meet the walls more often than each other. The formulas of
+# the leakage do not hold there.
+_MOLECULAR = 1.0
 NOTE = (
     "The flow ripple is (r_a - r_p)^2 / (eta r_a^2): with the outer radius r_a and the area "
     "efficiency eta given, no other shape of the flank changes it; a twist lowers it."
@@ -81,12 +87,12 @@ def warnings(rows: Mapping[str, Any]) -> list[str]:
             "clearances or `pump.pressure_difference_Pa`, or raise `scene.speed_rpm`."
         )
     knudsen = rows.get("knudsen_number", 0.0)
-    if knudsen > MOLECULAR:
+    if knudsen > _MOLECULAR:
         caveats.append(
             f"The flow through the gaps is molecular (Knudsen number {knudsen:.2g} > 1): the "
             "leakage and the volumetric efficiency above do not hold."
         )
-    elif knudsen > CONTINUUM:
+    elif knudsen > _CONTINUUM:
         caveats.append(
             f"Gas slips at the walls of the gaps (Knudsen number {knudsen:.2g} > 0.01): more leaks "
             "than reported."
@@ -159,7 +165,7 @@ KEYS = (
 def _flow(scene: Scene, design: Float[Array, " d"]) -> dict[str, Array]:
     scene, profile = scene.at(design), scene.profile(design)
     shape = geometry(profile)
-    lines = flow.flow_lines(profile, shape, LINES)
+    lines = flow.flow_lines(profile, shape, _LINES)
     if scene.helix is not None:
         lines = flow.twisted_lines(lines, scene.lobes, scene.helix)
     return {
@@ -180,8 +186,7 @@ def _has_play(scene: Scene) -> bool:
 
 @CachedFunction
 def _play(scene: Scene, design: Float[Array, " d"]) -> dict[str, Array]:
-    profile = scene.profile(design)
-    play = play_of(scene, profile)
+    play = play_of(scene, scene.profile(design))
     return {
         "angular_play_min_mrad": jnp.min(play.total) / MRAD,
         "angular_play_max_mrad": jnp.max(play.total) / MRAD,
@@ -193,8 +198,8 @@ def _play(scene: Scene, design: Float[Array, " d"]) -> dict[str, Array]:
 
 def _leaking(scene: Scene, medium: Medium, design: Float[Array, " d"]) -> dict[str, Any]:
     """Return the rows of leakage. Raises `InputError` as `sheet` does."""
-    least_gap, rows = _leaks(scene, design)
-    least = float(least_gap)
+    rows = _leaks(scene, medium, design)
+    least = float(rows["flank_gap_min_um"]) * UM
     if least < -_ROUNDING:
         raise InputError(
             f"the flanks must not overlap in perfect rolling, but overlap by {-least / UM:.3g} um; "
@@ -211,14 +216,12 @@ def _leaking(scene: Scene, medium: Medium, design: Float[Array, " d"]) -> dict[s
 
 
 @CachedFunction
-def _leaks(scene: Scene, design: Float[Array, " d"]) -> tuple[Array, dict[str, Array]]:
-    """Return (least gap of the flanks (m), rows of the sheet)."""
-    assert scene.medium is not None
+def _leaks(scene: Scene, medium: Medium, design: Float[Array, " d"]) -> dict[str, Array]:
+    """Return the rows of leakage, also of rotors that overlap."""
     profile = scene.profile(design)
-    leakage = flow.leakage(scene, scene.medium, profile, geometry(profile))
-    least = jnp.min(leakage.gap.least)
-    return least, {
-        "flank_gap_min_um": least / UM,
+    leakage = flow.leakage(scene, medium, profile, geometry(profile))
+    return {
+        "flank_gap_min_um": jnp.min(leakage.gap.least) / UM,
         "flank_gap_mean_um": jnp.mean(leakage.gap.least) / UM,
         "mesh_leakage_l_min": leakage.mesh / L_MIN,
         "tip_leakage_l_min": leakage.tips / L_MIN,

@@ -92,7 +92,7 @@ def sized(config: Config) -> Config | list[float]:
     limit = limits_of(None, config.constraints.outer_radius_max_mm)[1]
     if not family_of(config.profile.family).keys:
         own = float(shape_of(config).outer_radius) / MM
-        return _met(config, config.design) or [own]
+        return _met(config, config.design, limit) or [own]
     space = _space(config)
     outer = np.array([row.quantity == "outer_radius" for row in space.constraints])
     home = np.asarray(space.point(jnp.asarray(config.design)))
@@ -117,20 +117,19 @@ def sized(config: Config) -> Config | list[float]:
         sound.sort(key=lambda point: abs(radius(point) - limit))
         points = [search(point, 0.0) for point in sound[:_STARTS]]
         for point in sorted(points, key=lambda one: float(np.sum((one - home) ** 2))):
-            if (met := _met(config, at(*point)[0])) is not None:
+            if (met := _met(config, at(*point)[0], limit)) is not None:
                 return met
     return radii
 
 
-def _met(config: Config, design) -> Config | None:
-    """Return a config with a rounded design (d,); `None` unless it fills the housing."""
+def _met(config: Config, design, limit: float) -> Config | None:
+    """Return a config with a rounded design (d,), `None` unless its outer radius is `limit` mm."""
     # Ten digits keep the outer radius.
     config = config.with_design([float(f"{value:.10g}") for value in design])
     try:
         families.check(config.profile)
     except InputError:
         return None
-    limit = limits_of(None, config.constraints.outer_radius_max_mm)[1]
     return config if abs(float(shape_of(config).outer_radius) / MM - limit) <= _CLOSE else None
 
 
@@ -164,19 +163,16 @@ def _searched(at, outer, room, home, start, side: float) -> NDArray[np.float64]:
     search begins."""
     from scipy.optimize import minimize
 
-    def seen(x):
-        return at(*x)
-
     rows = [
-        {"type": "ineq", "fun": lambda x: (seen(x)[1] - room)[~outer],
-         "jac": lambda x: seen(x)[2][~outer]},
-        {"type": "eq", "fun": lambda x: seen(x)[1][outer], "jac": lambda x: seen(x)[2][outer]},
+        {"type": "ineq", "fun": lambda x: (at(*x)[1] - room)[~outer],
+         "jac": lambda x: at(*x)[2][~outer]},
+        {"type": "eq", "fun": lambda x: at(*x)[1][outer], "jac": lambda x: at(*x)[2][outer]},
     ]  # fmt: skip
     goals = (
         (lambda x: np.sum((x - home) ** 2) / 2, lambda x: x - home)
         if not side
-        else (lambda x: -side * seen(x)[1][outer][0] / _FAR,
-              lambda x: -side * seen(x)[2][outer][0] / _FAR)
+        else (lambda x: -side * at(*x)[1][outer][0] / _FAR,
+              lambda x: -side * at(*x)[2][outer][0] / _FAR)
     )  # fmt: skip
     minimum = minimize(
         goals[0], start, jac=goals[1], bounds=[(0, 1)] * len(home), method="SLSQP",

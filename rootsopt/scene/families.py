@@ -12,7 +12,7 @@ from rootsopt.errors import InputError
 from rootsopt.measured.conjugacy import conjugacy
 from rootsopt.profiles import Outline, Profile, project
 from rootsopt.profiles.geometry import departure
-from rootsopt.profiles.soundness import Soundness, margins, soundness
+from rootsopt.profiles.soundness import Soundness, soundness
 from rootsopt.runtime.environment import say
 from rootsopt.runtime.programs import CachedFunction
 
@@ -98,7 +98,8 @@ def check(config: ProfileConfig) -> None:
         return
     family = family_of(config.family)
     family.check(config)
-    if fault := fault_of(_soundness(*arguments_of(config))):
+    allowed = dict.fromkeys(family.inherent, jnp.asarray(jnp.inf))
+    if fault := fault_of(_soundness(*arguments_of(config))._replace(**allowed)):
         given = ", ".join(
             f"`profile.{key}` = {_written(value)}" for key, value in config.parameters.items()
         )
@@ -147,21 +148,15 @@ def margins_of(config: ProfileConfig) -> dict[str, float]:
     if config.from_file:
         return {}
     record = {}
-    for name, value in _margins(*arguments_of(config)).of_flank.items():
+    for name, value in _soundness(*arguments_of(config)).of_flank.items():
         unit, size = _UNITS.get(name, ("mm", MM))
         record["_".join(filter(None, (name, unit)))] = float(value) / size
     return record
 
 
 @CachedFunction
-def _margins(family, lobes, pitch_radius, design):
-    return margins(profile_of(family, lobes, pitch_radius, design))
-
-
-@CachedFunction
 def _soundness(family, lobes, pitch_radius, design):
-    profile = profile_of(family, lobes, pitch_radius, design)
-    return soundness(profile, None, family_of(family).inherent)
+    return soundness(profile_of(family, lobes, pitch_radius, design), None, frozenset())
 
 
 def _written(value: float | tuple[float, ...]) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rootsopt.config.reading import Config
+from rootsopt.config.scene import BearingsConfig, TimingGearConfig
 from rootsopt.config.units import DEG, MM, RPM, UM
 from rootsopt.contact.law import ImpactLaw
 from rootsopt.dynamics.integrator import Integrator, Solver
@@ -17,7 +18,7 @@ from rootsopt.dynamics.parts.machine import Friction, GearErrors, MotorDrive, Su
 from rootsopt.measured.table import transmission_error
 
 # Limit on the number of solver steps for a whole orbit, as a multiple of the number that the config
-# allows per mesh period.
+# allows per mesh period. An orbit has several mesh periods, and many short steps near its kinks.
 _ORBIT_STEPS = 4
 
 
@@ -29,10 +30,10 @@ def design_vector(config: Config) -> Float[Array, " d"]:
 def physical_quantities(config: Config) -> dict[str, Any]:
     """Return all physical quantities of a config in SI units, keyed by `Scene` field names.
 
-    They include the contact law and the parts, and what leakage and the bearings need."""
-    rotor, scene, gear = config.rotor, config.scene, config.scene.timing_gear
-    wear, heat, error = config.contact.wear, scene.heat, scene.center_distance_error_mm
-    clearance = config.contact.clearance_mm
+    They include the IMPACT contact law and the parts, and what leakage and the bearings need."""
+    rotor, scene, contact = config.rotor, config.scene, config.contact
+    gear, heat, wear = scene.timing_gear, scene.heat, contact.wear
+    clearance, error = contact.clearance_mm, scene.center_distance_error_mm
     if wear is not None:
         clearance += 2 * wear.offset_mm
     if heat is not None:
@@ -54,22 +55,16 @@ def physical_quantities(config: Config) -> dict[str, Any]:
         "center_distance_error": _optional(error, MM),
         "medium": medium_of(config),
         "bearings": bearings_of(config),
-        "law": law_of(config),
+        "law": ImpactLaw(
+            stiffness=jnp.asarray(contact.stiffness_N_per_mm_e / MM**contact.exponent),
+            exponent=jnp.asarray(contact.exponent),
+            damping=jnp.asarray(contact.max_damping_N_s_per_mm / MM),
+            full_damping_depth=jnp.asarray(contact.full_damping_depth_mm * MM),
+            smoothing=jnp.asarray(contact.rounding_mm * MM),
+        ),
         "gear": gear_of(config),
         **parts_of(config),
     }
-
-
-def law_of(config: Config) -> ImpactLaw:
-    """Return the IMPACT contact law of a config, in SI units."""
-    contact = config.contact
-    return ImpactLaw(
-        stiffness=jnp.asarray(contact.stiffness_N_per_mm_e / MM**contact.exponent),
-        exponent=jnp.asarray(contact.exponent),
-        damping=jnp.asarray(contact.max_damping_N_s_per_mm / MM),
-        full_damping_depth=jnp.asarray(contact.full_damping_depth_mm * MM),
-        smoothing=jnp.asarray(contact.rounding_mm * MM),
-    )
 
 
 def gear_of(config: Config) -> TimingGear | None:
@@ -86,17 +81,16 @@ def gear_of(config: Config) -> TimingGear | None:
         half_backlash=jnp.asarray(gear.backlash_mm * MM / (2 * radius)),
         rounding=jnp.asarray(config.contact.rounding_mm * MM / radius),
         offset=_optional(config.scene.phase_error_mrad, 1e-3),
-        errors=_errors_of(config) if gear.errs else None,
+        errors=_errors_of(gear, config.scene.bearings, radius) if gear.errs else None,
     )
 
 
-def _errors_of(config: Config) -> GearErrors:
-    """Return the errors of a config's timing gear.
+def _errors_of(
+    gear: TimingGearConfig, bearings: BearingsConfig | None, radius: float
+) -> GearErrors:
+    """Return the errors of a timing gear at the pitch `radius` (m).
 
     Raises `InputError` if the table of the transmission error cannot be used."""
-    gear, bearings = config.scene.timing_gear, config.scene.bearings
-    assert gear is not None
-    radius = config.profile.pitch_radius_mm * MM
     sizes, angles = gear.run_out
     knots = measured = None
     if gear.transmission_error_file is not None:
@@ -112,57 +106,49 @@ def _errors_of(config: Config) -> GearErrors:
 
 
 def parts_of(config: Config) -> dict[str, Any]:
-    """Return the motor, friction and supports that a config has, keyed by `Scene` field names.
+    """Return the motor, friction and supports of a config, keyed by `Scene` field names.
 
-    Numbers that `Scene` sets later, such as those that depend on the design, are NaN."""
+    A part that the config does not have is `None`. Numbers that `Scene` sets later, such as those
+    that depend on the design, are NaN."""
     scene, friction = config.scene, config.contact.friction
-    parts: dict[str, Any] = {}
     missing = jnp.asarray(float("nan"))
-    if scene.motor is not None:
-        torque = scene.motor.torque_N_m
-        parts["motor"] = MotorDrive(
+    return {
+        "motor": None
+        if scene.motor is None
+        else MotorDrive(
             speed=missing,
-            torque=missing if torque is None else jnp.asarray(torque),
+            torque=missing
+            if scene.motor.torque_N_m is None
+            else jnp.asarray(scene.motor.torque_N_m),
             slope=jnp.asarray(scene.motor.slope_N_m_s_per_rad),
             inertia=jnp.asarray(scene.motor.inertia_kg_m2),
-        )
-    if friction is not None:
-        parts["friction"] = Friction(
+        ),
+        "friction": None
+        if friction is None
+        else Friction(
             static=jnp.asarray(friction.static),
             kinetic=jnp.asarray(friction.kinetic),
             stiction_speed=jnp.asarray(friction.stiction_speed_mm_s * MM),
             friction_speed=jnp.asarray(friction.friction_speed_mm_s * MM),
-        )
-    if scene.supports is not None:
-        parts["supports"] = Supports(
+        ),
+        "supports": None
+        if scene.supports is None
+        else Supports(
             stiffness=jnp.asarray(scene.supports.stiffness_N_per_mm / MM),
             damping=jnp.asarray(scene.supports.damping_N_s_per_mm / MM),
             mass=missing,
             radius=missing,
-        )
-    return parts
-
-
-def integrators(config: Config) -> tuple[Integrator, Integrator]:
-    """Return (integrator of the transient, integrator of the orbit), with the config's settings.
-
-    An orbit is allowed more steps, because it has several mesh periods and many short steps near
-    its kinks."""
-    solver = config.solver
-    steps = solver.max_steps_per_period
-    return (
-        Integrator(solver.method, jnp.asarray(solver.transient_tolerance), steps),
-        Integrator(solver.method, jnp.asarray(solver.orbit_tolerance), _ORBIT_STEPS * steps),
-    )
+        ),
+    }
 
 
 def solver_of(config: Config) -> Solver:
     """Return the solver for the steady motion, with the config's settings."""
     settings = config.solver
-    transient, orbit = integrators(config)
+    method, steps = settings.method, settings.max_steps_per_period
     return Solver(
-        transient=transient,
-        orbit=orbit,
+        transient=Integrator(method, jnp.asarray(settings.transient_tolerance), steps),
+        orbit=Integrator(method, jnp.asarray(settings.orbit_tolerance), _ORBIT_STEPS * steps),
         measures=measures(config),
         max_periods=jnp.asarray(float(settings.max_mesh_periods)),
         probe_chaos=jnp.asarray(1.0),
@@ -222,14 +208,13 @@ def medium_of(config: Config) -> Medium | None:
     pump = config.pump
     if pump is None:
         return None
-    gas, across = pump.gas, pump.pressure_difference_Pa
-    wear, heat, tip = config.contact.wear, config.scene.heat, pump.tip_clearance_mm
+    gas, tip = pump.gas, pump.tip_clearance_mm
+    wear, heat = config.contact.wear, config.scene.heat
     if wear is not None and tip is not None:
         tip = tip + wear.offset_mm
-    assert across is not None
     return Medium(
         viscosity=jnp.asarray(pump.viscosity_mPa_s * _MPA_S),
-        pressure_difference=jnp.asarray(across),
+        pressure_difference=jnp.asarray(pump.pressure_difference_Pa),
         tip_clearance=_optional(tip, MM),
         end_clearance=_optional(pump.end_clearance_mm, MM),
         radial_allowance=jnp.asarray(pump.radial_allowance_mm * MM),

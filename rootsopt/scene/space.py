@@ -284,12 +284,6 @@ class Space(eqx.Module):
             least = jnp.minimum(jnp.maximum(self.lower[place], least), _NARROW * most)
             yield place, least, most
 
-    def slacks(self, point: Float[Array, " d"]) -> Float[Array, " m"]:
-        """Return the scaled slacks (m,) of the constraints at `point` of the unit box.
-
-        A slack is ≥ 0 where its constraint is satisfied."""
-        return self.slacks_of(self.design(point))
-
     def slacks_of(self, design: Float[Array, " d"]) -> Float[Array, " m"]:
         """Return the scaled slacks (m,) of the constraints at a design in config units.
 
@@ -315,7 +309,8 @@ def slacks_and_slopes(space: Space, point):
     unit box."""
 
     def both(point):
-        values = space.design(point), space.slacks(point)
+        design = space.design(point)
+        values = design, space.slacks_of(design)
         return values, values
 
     (design_slope, slack_slope), (design, slack) = jax.jacfwd(both, has_aux=True)(point)

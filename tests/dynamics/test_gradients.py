@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from experiments._common.shooting import closed, differentiated, forces_near
-from rootsopt.config import DESIGN_KEYS, load
+from rootsopt.config import family_of, load
 from rootsopt.contact.closest import FlankPair
 from rootsopt.profiles.epicycloid import EE
 from rootsopt.response.evaluation import Evaluator
@@ -69,7 +69,7 @@ def errors(config, levels=3):
 def test_cic(scene, design):
     """Derivatives of mean, peak, lines and p-norm with respect to the three design parameters are
     correct."""
-    changes = [f"profile.{k}={v}" for k, v in zip(DESIGN_KEYS, design, strict=True)]
+    changes = [f"profile.{k}={v}" for k, v in zip(family_of("cic").keys, design, strict=True)]
     found = errors(load("configs/cic_drawn.yaml", [*SHARP, *SCENES[scene], *changes]))
     assert max(found.values()) < 1e-6, found
 

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from rootsopt.config import DESIGN_KEYS, load
+from rootsopt.config import family_of, load
 from rootsopt.optimize import noise
 from rootsopt.optimize.outcome import Trial
 from rootsopt.optimize.problem import Problem
@@ -23,7 +23,7 @@ def made_up(objective, error=0.02, design=INSIDE):
     error."""
     return dataclasses.replace(
         evaluation_of(100.0 * objective, Status.AVERAGED),
-        design=dict(zip(DESIGN_KEYS, map(float, design), strict=True)),
+        design=dict(zip(family_of("cic").keys, map(float, design), strict=True)),
         geometry={"area_efficiency": 0.43},
         steady_state={key: 100.0 * error for key in ERRORS.values()},
     )
@@ -76,8 +76,8 @@ class Judge(Evaluator):
         self.asked.append(self.config.ensemble.seed)
         base = np.allclose(np.asarray(design), INSIDE)
         found = made_up(1.0 if base else self.truth, design=np.asarray(design))
-        lost = {"response": {}, "status": Status.PASSED_THROUGH}
-        return dataclasses.replace(found, **lost) if found.design[DESIGN_KEYS[0]] > 35 else found
+        lost, steep = {"response": {}, "status": Status.PASSED_THROUGH}, design[0] > 35
+        return dataclasses.replace(found, **lost) if steep else found
 
 
 @pytest.mark.parametrize(("truth", "accepted"), [(0.9, True), (0.93, False), (1.1, False)])

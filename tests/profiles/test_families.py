@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 
 from experiments.geometry import study
-from rootsopt.config import FAMILY_KEYS
 from rootsopt.config.families import families, family_of
 from rootsopt.errors import InputError
 from rootsopt.profiles import CIC, EE, arc, outline
@@ -393,4 +392,4 @@ def test_area_and_moment_are_those_of_the_outline(family):
 
 
 def test_every_family_is_looked_at():
-    assert set(HARD) == {*FAMILY_KEYS} - {"outline"}
+    assert set(HARD) == {*families()} - {"outline"}

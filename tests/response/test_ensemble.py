@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from rootsopt import Status, optimize
-from rootsopt.config import DESIGN_KEYS, EnsembleConfig, load
+from rootsopt.config import EnsembleConfig, family_of, load
 from rootsopt.response.ensemble import SIGNIFICANT, Ensemble, fitted_slope, independent, neighbours
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.result import ERRORS, RESPONSES
@@ -44,7 +44,7 @@ def numbers(evaluation):
 
 
 def rows(gradient):
-    return np.array([[gradient[name][key] for key in DESIGN_KEYS] for name in RESPONSES])
+    return np.array([[gradient[name][key] for key in family_of("cic").keys] for name in RESPONSES])
 
 
 # Where the motion is periodic

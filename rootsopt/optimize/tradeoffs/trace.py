@@ -24,7 +24,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from rootsopt.config.families import FAMILY_KEYS
+from rootsopt.config.families import families
 from rootsopt.config.reading import Config
 from rootsopt.errors import InputError
 from rootsopt.optimize.infeasible import explain
@@ -98,7 +98,7 @@ class Tracer:
         checkpoint: Checkpoint | None = None,
     ):
         if not config.design_keys:
-            valid = ", ".join(family for family, parameters in FAMILY_KEYS.items() if parameters)
+            valid = ", ".join(name for name, family in families().items() if family.keys)
             raise InputError(
                 f"`profile.family` must be one of {valid} for a trade-off, but is "
                 f"{config.profile.family}: it has no design parameter; use `simulate` for it, "

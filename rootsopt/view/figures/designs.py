@@ -13,6 +13,7 @@ from matplotlib.collections import PolyCollection
 from numpy.typing import NDArray
 
 from rootsopt.config.families import is_list
+from rootsopt.measured.conjugacy import Conjugacy
 from rootsopt.profiles import place_pair
 from rootsopt.profiles.geometry import beyond, feet
 from rootsopt.response.result import Series
@@ -248,13 +249,13 @@ def plot_meshing(
         ax.set(aspect="equal", title=f"rotor 1 at {angle:g}°")
 
 
-def plot_conjugacy(ax: Axes, gaps: Mapping[str, tuple[NDArray, NDArray]]) -> None:
+def plot_conjugacy(ax: Axes, gaps: Mapping[str, Conjugacy]) -> None:
     """Draw the gap of one or more pairs in perfect rolling over the angle of rotor 1.
 
-    `gaps`: (angles (n,) in degrees, gaps (n,) in µm) of each pair, keyed by its name. The angle is
-    0 when a tip of rotor 1 is on the line of centres."""
-    for (angle, gap), look in zip(gaps.values(), looks(gaps), strict=True):
-        ax.plot(angle, gap, linewidth=1.6, **look)
+    `gaps`: gap of each pair, keyed by its name. The angle is 0 when a tip of rotor 1 is on the line
+    of centres."""
+    for mesh, look in zip(gaps.values(), looks(gaps), strict=True):
+        ax.plot(np.degrees(mesh.roll), 1e6 * mesh.gap, linewidth=1.6, **look)
     ax.axhline(0, color="black", linewidth=0.8)
     low, high = ax.get_ylim()
     if low < 0:

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from rootsopt.config.families import FAMILY_KEYS, is_list
+from rootsopt.config.families import family_of, is_list
 from rootsopt.config.reading import Config
-from rootsopt.measured.conjugacy import conjugacy, gaps_um
+from rootsopt.measured.conjugacy import conjugacy
 from rootsopt.response.result import Evaluation
 from rootsopt.scene.check import outline_mm
 from rootsopt.view.figures.designs import (
@@ -38,8 +38,8 @@ def profile_figures(folder: ResultFolder, config: Config, record: Mapping[str, A
         from rootsopt.measured.source import outline_of  # For outlines only: it takes 0.5 s.
 
         made, axes = figure(8, 4.2)
-        gaps = gaps_um(conjugacy(outline_of(config.profile)[0]))
-        plot_conjugacy(axes[0, 0], {Path(config.profile.outline_file or "").name: gaps})
+        mesh = conjugacy(outline_of(config.profile)[0])
+        plot_conjugacy(axes[0, 0], {Path(config.profile.outline_file or "").name: mesh})
         axes[0, 0].legend(frameon=False)
         write(folder, "conjugacy", made, "")
 
@@ -73,7 +73,7 @@ def optimization_figures(
     _force_figures(folder, designs, config)
     _comparison(folder, designs, outlines, config)
     if history:
-        keys = FAMILY_KEYS[config.profile.family]
+        keys = family_of(config.profile.family).keys
         write(folder, "history", _history(history, keys), "Optimisation history")
 
 
