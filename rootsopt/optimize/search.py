@@ -118,7 +118,7 @@ class Search:
         )
         self.exact = self.stage.evaluator(evaluator, runs)
         self.noisy = config.objective.motion == "ensemble"
-        self.checkpoint = checkpoint
+        self.checkpoint = checkpoint or Checkpoint({}, None)
         self.stop = threading.Event() if stop is None else stop
         self._lock, self._best = threading.Lock(), float("nan")
         self._trials: list[Trial] = []
@@ -423,14 +423,11 @@ class Search:
         `start`, `iteration`: as in `Trial`; `orbit`: where the motion begins; `key`: key in the
         checkpoint, by default (`start`, `iteration`)."""
         point = np.array(point, dtype=np.float64)
-        key = (start, iteration) if key is None else key
-        evaluation = None if self.checkpoint is None else self.checkpoint.known(key, point)
-        if evaluation is None:
-            # A sample is distributed by its evaluator.
-            runs = HERE if evaluator.shifts else self.runs
-            evaluation = runs.evaluated(Point(evaluator, self.problem.design(point), orbit))
-            if self.checkpoint is not None:
-                self.checkpoint.keep(key, point, evaluation)
+        # A sample is distributed by its evaluator.
+        runs = HERE if evaluator.shifts else self.runs
+        asked = Point(evaluator, self.problem.design(point), orbit)
+        key = key or (start, iteration)
+        evaluation = self.checkpoint.evaluated(runs.evaluated, key, asked, point)
         objective = self.problem.objective(evaluation)
         feasible, excess = self.problem.feasible(point), self.problem.excess(evaluation)
         local = None

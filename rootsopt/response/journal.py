@@ -261,35 +261,20 @@ class Checkpoint(Journal):
     def evaluated(
         self,
         run: Callable[[Point], Evaluation],
-        stage: str,
+        key: Any,
         asked: Point,
         point: NDArray[np.float64],
     ) -> Evaluation:
-        """Return `run(asked)`, or the evaluation stored for the same arguments.
+        """Return `run(asked)` and keep it under `key`, or return what a resumed file holds there.
 
-        `stage`: name of the evaluator; `point` (d,): the design in the unit box."""
-        begun = json.dumps(plain(asked.start)).encode()
-        key = stage, hashlib.sha256(point.tobytes() + begun).hexdigest()[:16]
-        known = self.known(key, point)
-        if known is not None:
-            return known
-        evaluation = run(asked)
-        self.keep(key, point, evaluation)
-        return evaluation
-
-    def known(self, key: Any, point: NDArray[np.float64]) -> Evaluation | None:
-        """Return the evaluation stored under `key`, or `None` unless it belongs to `point` (d,).
-
-        Only evaluations that were read from a resumed file are found."""
+        `point` (d,): the design in the unit box, to which a stored evaluation must belong."""
         with self._lock:
-            if key not in self.resumed or self.rows[key][0] != point.tolist():
-                return None
-            self.reused += 1
-            return self.rows[key][1]
-
-    def keep(self, key: Any, point: NDArray[np.float64], evaluation: Evaluation) -> None:
-        """Add the `evaluation` of a `point` (d,)."""
+            if key in self.resumed and self.rows[key][0] == point.tolist():
+                self.reused += 1
+                return self.rows[key][1]
+        evaluation = run(asked)
         self.add([(key, (point.tolist(), evaluation))])
+        return evaluation
 
     def read(self, key: Any, value: Any) -> tuple[list[float], Evaluation]:
         point, evaluation = value

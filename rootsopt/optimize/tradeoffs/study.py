@@ -3,6 +3,8 @@
 Without a term that depends on forces, nothing is simulated."""
 
 import dataclasses
+import hashlib
+import json
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -27,7 +29,7 @@ from rootsopt.optimize.problem import Problem
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.journal import Checkpoint
 from rootsopt.response.reducers import HERE, Point, Runs
-from rootsopt.response.result import Evaluation, Seeds
+from rootsopt.response.result import Evaluation, Seeds, plain
 from rootsopt.response.still import Still
 from rootsopt.response.terms import depends_on_forces, is_force, reporting, terms_of
 from rootsopt.scene.build import Scene
@@ -182,8 +184,8 @@ class Study:
     fast: Evaluator
     sharp: Evaluator
     exact: Evaluator
-    runs: Runs = HERE
-    checkpoint: Checkpoint | None = None
+    runs: Runs
+    checkpoint: Checkpoint
     limits_dropped: tuple[str, ...] = ()
 
     @classmethod
@@ -210,7 +212,7 @@ class Study:
         config = settled_by(config, baseline)
         space = Space.of(config, exact.scene, term_constraints(config, exact.scene))
         problem = Problem(config, baseline, space, force_limits(config, exact.scene))
-        work = fast, exact.surveying(), exact, runs, checkpoint
+        work = fast, exact.surveying(), exact, runs, checkpoint or Checkpoint({}, None)
         return cls(aims, problem, *work, dropped)
 
     def term_values(self, evaluation: Evaluation) -> dict[str, float]:
@@ -244,9 +246,9 @@ class Study:
         orbit: Seeds = None,
     ) -> Evaluation:
         asked = Point(evaluator, self.problem.design(point), orbit)
-        if self.checkpoint is None:
-            return self.runs.evaluated(asked)
-        return self.checkpoint.evaluated(self.runs.evaluated, stage, asked, point)
+        begun = json.dumps(plain(orbit)).encode()
+        key = stage, hashlib.sha256(point.tobytes() + begun).hexdigest()[:16]
+        return self.checkpoint.evaluated(self.runs.evaluated, key, asked, point)
 
     def _moving(self, point: NDArray[np.float64], evaluation: Evaluation) -> Sample | None:
         if not evaluation.usable:
