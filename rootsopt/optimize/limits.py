@@ -18,7 +18,7 @@ from rootsopt.config.reading import Config
 from rootsopt.config.study import BASELINE
 from rootsopt.config.units import unit_of, words
 from rootsopt.errors import InputError
-from rootsopt.optimize.local import NEAR, Certificate
+from rootsopt.optimize.local import NEAR, Certificate, Group
 from rootsopt.response.result import Evaluation
 from rootsopt.response.terms import (
     Forces,
@@ -220,6 +220,21 @@ def counting(evaluation: Evaluation) -> list[tuple[int, Evaluation]]:
             kind = SCENE_KINDS * scene + number
             pairs += [(kind, one) for one in (part.evaluation, *part.evaluation.rivals)]
     return pairs
+
+
+def branches_of(evaluation: Evaluation, key: str, cornered: bool, kind: int) -> Group:
+    """Return the k branches of a quantity of a usable `evaluation`, with gradients in config units.
+
+    `key`: name of the quantity; `cornered`: whether it is the peak force, of which each known local
+    maximum is a branch; `kind` of the branches."""
+    maxima = evaluation.maxima if cornered else None
+    if maxima is None or not maxima.times.size:
+        slope = np.array([*evaluation.gradient[key].values()])
+        tags = np.array([[float(kind), 0.0]])
+        return Group(tags, np.array([evaluation.response[key]]), slope[None, :])
+    phases = maxima.times / evaluation.steady_state["period"]
+    tags = np.stack([np.full(len(phases), float(kind)), phases], axis=1)
+    return Group(tags, maxima.forces, maxima.slopes)
 
 
 def settled_by(config: Config, baseline: Evaluation) -> Config:

@@ -18,6 +18,7 @@ from rootsopt.optimize.limits import (
     HELD,
     PEAK,
     ForceLimit,
+    branches_of,
     check_senses,
     counting,
     force_limits,
@@ -217,22 +218,13 @@ class Problem:
         """
         caps = []
         for limit in self.limits:
-            tags, values, slopes = [], [], []
-            for kind, one in counting(evaluation):
-                maxima = one.maxima if limit.cornered else None
-                if maxima is None or not maxima.times.size:
-                    tags.append((kind, 0.0))
-                    values.append(one.response[limit.key])
-                    slopes.append(np.array(list(one.gradient[limit.key].values())))
-                    continue
-                period = one.steady_state["period"]
-                tags += [(kind, time / period) for time in maxima.times]
-                values += [*maxima.forces]
-                slopes += [*maxima.slopes]
-            rows = limit.sign * np.array(slopes) / limit.scale
-            caps.append(
-                Group(np.array(tags, float), limit.excess(np.array(values)), rows @ jacobian)
-            )
+            parts = [
+                branches_of(one, limit.key, limit.cornered, kind)
+                for kind, one in counting(evaluation)
+            ]
+            tags, values, slopes = map(np.concatenate, zip(*parts, strict=True))
+            rows = limit.sign * slopes / limit.scale
+            caps.append(Group(tags, limit.excess(values), rows @ jacobian))
         return tuple(caps)
 
     def worst(self, evaluation: Evaluation, limit: ForceLimit) -> float:

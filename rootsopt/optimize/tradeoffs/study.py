@@ -18,6 +18,7 @@ from rootsopt.errors import InputError
 from rootsopt.optimize.limits import (
     LIMITS,
     PEAK,
+    branches_of,
     force_limits,
     limited,
     quantity_of,
@@ -256,17 +257,9 @@ class Study:
         _, jacobian, slack, normals = self.problem.look(point)
         groups = []
         for number, aim in enumerate(self.aims):
-            maxima = evaluation.maxima if _is_cornered(aim) else None
-            if maxima is not None and maxima.times.size:
-                period = evaluation.steady_state["period"]
-                kinds = np.full(maxima.times.size, float(number))
-                tags = np.stack([kinds, maxima.times / period], axis=1)
-                groups.append(Group(tags, maxima.forces, maxima.slopes @ jacobian))
-                continue
-            value = np.array([evaluation.response[aim.name]])
-            slope = np.array([*evaluation.gradient[aim.name].values()]) @ jacobian
-            tags = np.array([[float(number), 0.0]])
-            groups.append(Group(tags, aim.sign * value, aim.sign * slope[None, :]))
+            one = branches_of(evaluation, aim.name, _is_cornered(aim), number)
+            slopes = aim.sign * (one.slopes @ jacobian)
+            groups.append(Group(one.tags, aim.sign * one.values, slopes))
         cornered = tuple(map(_is_cornered, self.aims))
         caps = self.problem.caps(evaluation, jacobian)
         limits = slack, normals, caps
