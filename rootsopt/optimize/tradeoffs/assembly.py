@@ -171,11 +171,6 @@ class Node(NamedTuple):
         """Value of the objective."""
         return self.scalar.value(self.sample.values)
 
-    @property
-    def point(self) -> NDArray[np.float64]:
-        """The design (d,) in the unit box."""
-        return self.sample.point
-
 
 class Selection(NamedTuple):
     """The nodes, out of n, that form the front.
@@ -308,12 +303,12 @@ def _limits(study: Study, certificate: Certificate) -> dict[str, float]:
         )
         if multiplier > HELD
     }
-    keys = study.problem.config.design_keys
-    for side, multipliers in (("lower", certificate.lower), ("upper", certificate.upper)):
-        for key, multiplier in zip(keys, multipliers, strict=True):
-            if multiplier > HELD:
-                limits[f"{side} bound of {words(key)}"] = float(multiplier)
-    return limits
+    return limits | {
+        f"{side} bound of {words(key)}": float(multiplier)
+        for side, multipliers in (("lower", certificate.lower), ("upper", certificate.upper))
+        for key, multiplier in zip(study.problem.config.design_keys, multipliers, strict=True)
+        if multiplier > HELD
+    }
 
 
 def better(best: Node | None, other: Node | None) -> Node | None:
@@ -340,12 +335,12 @@ def predictions(key: Key, ahead: bool, nodes: Mapping[Key, Node], course: Course
             continue
         far = nodes.get(tuple(a - 2 * b for a, b in zip(key, step, strict=True)))
         before = course.evaluations
-        if far is not None and np.max(np.abs(near.point - far.point)) < 2 * APART:
-            secant = np.clip(2 * near.point - far.point, 0.0, 1.0)
+        if far is not None and np.max(np.abs(near.sample.point - far.sample.point)) < 2 * APART:
+            secant = np.clip(2 * near.sample.point - far.sample.point, 0.0, 1.0)
             yield secant, near.sample.evaluation.start
             if course.evaluations > before + 1:  # The start had a steady state.
                 return
-        yield near.point, near.sample.evaluation.start
+        yield near.sample.point, near.sample.evaluation.start
         return
 
 
@@ -423,7 +418,7 @@ def sharpened(tracer: "Tracer", pair: Pair) -> Pair:
         node = tracer._all()[moving]
         scalar = Scalar(tracer.scale, reference, (0, 1), direction)
         orbit = node.sample.evaluation.start
-        best = tracer._solved(scalar, node.point, orbit, None, tracer._course)
+        best = tracer._solved(scalar, node.sample.point, orbit, None, tracer._course)
         if best is None or tracer.stop.is_set():
             continue
         terms = tracer.scale.of(best.sample.values)

@@ -25,7 +25,7 @@ from rootsopt.optimize.limits import (
     settled_by,
     term_constraints,
 )
-from rootsopt.optimize.local import FEASIBLE, Group
+from rootsopt.optimize.local import Group
 from rootsopt.optimize.problem import Problem
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.journal import Checkpoint
@@ -157,12 +157,6 @@ class Sample:
     slack: NDArray[np.float64]
     normals: NDArray[np.float64]
     caps: tuple[Group, ...] = ()
-
-    @property
-    def feasible(self) -> bool:
-        """Whether all constraints hold."""
-        beyond = max((cap.top for cap in self.caps), default=0.0)
-        return max(-float(np.min(self.slack, initial=0.0)), beyond) <= FEASIBLE
 
     @property
     def values(self) -> NDArray[np.float64]:
