@@ -87,14 +87,6 @@ class RobustProblem(Problem):
             return float("nan")
         return self.combined(evaluation).value / self.reference
 
-    def slope(self, evaluation: Evaluation, point) -> NDArray[np.float64]:
-        """Return the gradient (d,) of the robust objective with respect to the `point` (d,)."""
-        if not evaluation.scenes:
-            return super().slope(evaluation, point)
-        weights = self.combined(evaluation).weights
-        rows = [one.slope(e, point) for one, e, _ in self._each(evaluation)]
-        return np.asarray(weights @ np.array(rows) / self.reference)
-
     def local(
         self, evaluation: Evaluation, point, shares: NDArray[np.float64] | None = None
     ) -> Linearization | None:

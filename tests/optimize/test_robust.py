@@ -127,7 +127,9 @@ def test_gradient_agrees_with_central_differences(spread, ends):
     problems.append(RobustProblem.of(problems[-1].config, evaluator.scene, baseline, apart))
     for problem in problems:
         upper, lower = map(problem.objective, ends)
-        slopes.append(float(problem.slope(moved, POINT) @ DIRECTION))
+        rows = [one.slope(scene, POINT) for one, scene, _ in problem._each(moved)]
+        slope = problem.combined(moved).weights @ np.array(rows) / problem.reference
+        slopes.append(float(slope @ DIRECTION))
         assert slopes[-1] == pytest.approx((upper - lower) / (2 * STEP), rel=1e-4)
         local = problem.local(moved, POINT)
         # Two programs compute the peaks, from the orbit's elements and from steps along it.
