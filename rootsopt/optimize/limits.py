@@ -349,7 +349,10 @@ def _range_rows(
     for key, (end, least, most) in ranges.items():
         place = names.index(key)
         before, after, limit = problem.baseline.design.get(key), optimized.design[key], float(end)
-        own = _upper_end(problem, key)
+        own = math.nan
+        if before is not None:
+            given = np.asarray([*problem.baseline.design.values()], dtype=np.float64)
+            own = float(_ranges(problem.space, given)[key][0])
         slacks = [own - (math.nan if before is None else before), limit - after]
         row = _row(words(key), before, after, limit, unit_of(key), slacks, "<=")
         row["baseline_limit"] = None if math.isnan(own) else own
@@ -381,14 +384,6 @@ def _range_rows(
             row = _row(name, before, after, float(limit), unit, slacks, sense)
             rows.append(row | _multiplier(problem, row, multiplier / width, optimized))
     return rows
-
-
-def _upper_end(problem: "Problem", key: str) -> float:
-    """Return the upper end of a parameter's range for the baseline, NaN for one from a file."""
-    if key not in problem.baseline.design:
-        return math.nan
-    design = np.asarray([*problem.baseline.design.values()], dtype=np.float64)
-    return float(_ranges(problem.space, design)[key][0])
 
 
 def scaled_slack(problem: "Problem", evaluation: Evaluation, k: int) -> float:

@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -27,10 +27,10 @@ from rootsopt.optimize.limits import (
     settled_by,
     term_constraints,
 )
-from rootsopt.optimize.local import FEASIBLE, Certificate, Group, Linearization
+from rootsopt.optimize.local import FEASIBLE, Certificate, Group, Linearization, Look
 from rootsopt.optimize.optimality import Holder
 from rootsopt.response.reducers import counted
-from rootsopt.response.result import RESPONSES, Evaluation
+from rootsopt.response.result import RESPONSES, Evaluation, Seeds
 from rootsopt.response.terms import objective_weights
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene.build import Scene
@@ -174,6 +174,20 @@ class Problem:
             for key, weight in self._weights(baseline).items():
                 by_design += share * weight * np.array(list(one.gradient[key].values()))
         return by_design @ self.look(point)[1]
+
+    def looks(self, evaluate: Callable[..., Evaluation]) -> Look:
+        """Return a function for a search that evaluates the problem at a point.
+
+        `evaluate`: an `Evaluator`; each motion begins on the last usable one."""
+        starts: list[Seeds] = [None]
+
+        def look(point: NDArray[np.float64]) -> Linearization | None:
+            evaluation = evaluate(self.design(point), starts[-1], series=False)
+            if evaluation.usable:
+                starts.append(evaluation.start)
+            return self.local(evaluation, point)
+
+        return look
 
     def local(self, evaluation: Evaluation, point) -> Linearization | None:
         """Return the objective and the constraints at a `point`, with gradients.

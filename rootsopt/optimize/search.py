@@ -45,7 +45,7 @@ from rootsopt.optimize.vertices import AT_VERTEX, DRAWN, VertexOptimum, vertex_o
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.journal import Checkpoint
 from rootsopt.response.reducers import HERE, Point, Runs
-from rootsopt.response.result import Evaluation, Seeds
+from rootsopt.response.result import Evaluation
 from rootsopt.response.still import Still, needed_motion
 from rootsopt.runtime.threads import POLL
 from rootsopt.scene.space import Space
@@ -363,20 +363,13 @@ class Search:
         """Return why no design satisfies the limits of forces.
 
         `points`: feasible points (d,), used if the local searches found none."""
-        starts: list[Seeds] = [None]
-
-        def look(point: NDArray[np.float64]) -> Linearization | None:
-            if self.stop.is_set():
-                return None
-            evaluation = self.sharp(self.problem.design(point), start=starts[-1], series=False)
-            if evaluation.usable:
-                starts.append(evaluation.start)
-            return self.problem.local(evaluation, point)
-
+        look = self.problem.looks(self.sharp)
         usable = [outcome for outcome in self._descents.values() if outcome.local is not None]
         usable.sort(key=lambda outcome: outcome.local.violation if outcome.local else np.inf)
         begins = [outcome.point for outcome in usable[: _SIMULATED - 1]] + points[:1]
-        return explain(self.problem, begins, look)
+        return explain(
+            self.problem, begins, lambda point: None if self.stop.is_set() else look(point)
+        )
 
     def _solve(self, number: int, point: NDArray[np.float64]) -> list[Trial]:
         """Search from `point` (d,) by sequential quadratic programming, and return the trials.
