@@ -27,7 +27,7 @@ from rootsopt.dynamics.flow import one_period, strobe
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import Steady
-from rootsopt.response.evaluation import Evaluator, motion_from
+from rootsopt.response.evaluation import Evaluator, build, motion_from
 from rootsopt.response.result import Evaluation, begun
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene.reading import design_vector
@@ -45,7 +45,7 @@ def evaluate_together(evaluators: Sequence[Evaluator]) -> list[Evaluation]:
 
     Scenes of the same structure (parts, number of lobes, solver) are computed together."""
     began = time.perf_counter()
-    built = [one.assembled() for one in evaluators]
+    built = [build(one.scene, design_vector(one.config)) for one in evaluators]
     groups: dict[Hashable, list[int]] = {}
     inputs = []
     for number, (one, (pair, tangents, _)) in enumerate(zip(evaluators, built, strict=True)):
