@@ -150,14 +150,14 @@ def quantity_of(key: str) -> str:
 
 def term_constraints(config: Config, scene: Scene) -> tuple[TermConstraint, ...]:
     """Return the constraints on those quantities of `constraints.terms` that read no forces."""
-    constraints = []
-    for name, ceiling, limit in _sides(config):
-        if depends_on_forces(config, scene, name, LIMITS):
-            continue
-        (term,) = terms_of([name], LIMITS)
-        row = words(name), name, unit_of(name), jnp.asarray(limit), abs(limit) or 1.0, 1.0
-        constraints.append(TermConstraint(*row, ceiling=ceiling, term=term))
-    return tuple(constraints)
+    return tuple(
+        TermConstraint(
+            words(name), name, unit_of(name), jnp.asarray(limit), abs(limit) or 1.0, 1.0,
+            ceiling=ceiling, term=terms_of([name], LIMITS)[0],
+        )
+        for name, ceiling, limit in _sides(config)
+        if not depends_on_forces(config, scene, name, LIMITS)
+    )  # fmt: skip
 
 
 def force_limits(config: Config, scene: Scene) -> tuple[ForceLimit, ...]:
@@ -178,14 +178,16 @@ def force_limits(config: Config, scene: Scene) -> tuple[ForceLimit, ...]:
     return limits
 
 
-def _sides(config: Config):
-    """Yield (name, whether it is a ceiling, limit) for each floor and ceiling."""
-    for name, one in config.constraints.terms.items():
-        for side in ("max", "min"):
-            if side in one:
-                # The baseline's value is filled in before a search; the number has no effect.
-                limit = 0.0 if one[side] == BASELINE else float(one[side])
-                yield name, side == "max", limit
+def _sides(config: Config) -> list[tuple[str, bool, float]]:
+    """Return (name, whether it is a ceiling, limit) for each floor and ceiling.
+
+    The baseline's value is filled in before a search; until then it is 0, without effect."""
+    return [
+        (name, side == "max", 0.0 if one[side] == BASELINE else float(one[side]))
+        for name, one in config.constraints.terms.items()
+        for side in ("max", "min")
+        if side in one
+    ]
 
 
 @CachedFunction
@@ -212,14 +214,13 @@ def needs_maxima(config: Config, limits: Sequence[ForceLimit]) -> bool:
 def counting(evaluation: Evaluation) -> list[tuple[int, Evaluation]]:
     """Return (kind, evaluation) of each scene, speed and motion in which limits must hold."""
     scenes = [part.evaluation for part in evaluation.scenes] or [evaluation]
-    pairs = []
-    for scene, whole in enumerate(scenes):
-        for number, part in enumerate(whole.by_speed):
-            if part.share <= 0:
-                continue
-            kind = SCENE_KINDS * scene + number
-            pairs += [(kind, one) for one in (part.evaluation, *part.evaluation.rivals)]
-    return pairs
+    return [
+        (SCENE_KINDS * scene + number, one)
+        for scene, whole in enumerate(scenes)
+        for number, part in enumerate(whole.by_speed)
+        if part.share > 0
+        for one in (part.evaluation, *part.evaluation.rivals)
+    ]
 
 
 def branches_of(evaluation: Evaluation, key: str, cornered: bool, kind: int) -> Group:

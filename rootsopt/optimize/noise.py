@@ -133,10 +133,10 @@ def verify(problem: Problem, evaluator: Evaluator, trials: Sequence) -> Optimiza
         "seed": settings.seed,
         "required_standard_errors": SIGNIFICANT,
     }
-    tried = []
-    for searched, point in candidates(problem, trials):
-        evaluation = chooser(problem.design(point), series=False)
-        tried.append((problem.objective(evaluation), searched, point))
+    tried = [
+        (problem.objective(chooser(problem.design(point), series=False)), searched, point)
+        for searched, point in candidates(problem, trials)
+    ]
     record["candidates"] = [
         {"searched_objective": searched, "chosen_by_objective": objective}
         for objective, searched, _ in tried

@@ -410,10 +410,9 @@ def directions(count: int) -> list[Key]:
 def links(grid: Sequence[Key]) -> list[tuple[int, int]]:
     """Return the pairs of neighbours on the grid, as indices of the keys in `grid`."""
     place = {key: number for number, key in enumerate(grid)}
-    pairs = []
-    for key, number in place.items():
-        for step in directions(len(key)):
-            other = place.get(tuple(a + b for a, b in zip(key, step, strict=True)))
-            if other is not None:
-                pairs.append((number, other))
-    return pairs
+    return [
+        (number, place[other])
+        for key, number in place.items()
+        for step in directions(len(key))
+        if (other := tuple(a + b for a, b in zip(key, step, strict=True))) in place
+    ]

@@ -75,11 +75,12 @@ def aims_of(config: Config) -> tuple[Aim, ...]:
     """Return the terms of `config.pareto`.
 
     Raises `InputError` for a name that is neither a force nor a registered term."""
-    aims = []
-    for name in config.pareto.terms:
-        sense = "min" if is_force(config, name, _KEY) else terms_of([name], "pareto.terms")[0].sense
-        aims.append(Aim(name, config.pareto.senses.get(name, sense)))
-    return tuple(aims)
+
+    def sense(name: str) -> str:
+        return "min" if is_force(config, name, _KEY) else terms_of([name], _KEY)[0].sense
+
+    wanted = config.pareto
+    return tuple(Aim(name, wanted.senses.get(name, sense(name))) for name in wanted.terms)
 
 
 def simulated(config: Config, scene: Scene) -> bool:

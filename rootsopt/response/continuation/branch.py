@@ -412,13 +412,14 @@ def _branch(family: OrbitFamily, start: Spot) -> Branch:
     path = follow_curve(family, start, steps, _TESTS)
     halved = family.halves and path.spots[-1].data.half_way < _HALVED
     end = End.HALVED if halved and path.end is End.STEP_TOO_SMALL else path.end
-    bifurcations = []
-    for after, name, spot in path.crossings:
-        # Two real multipliers with product 1 are a neutral saddle, which is not a bifurcation.
-        real = np.all(np.abs(spot.data.multipliers.imag) < 1e-9)
-        if Kind[name] is not Kind.NEIMARK_SACKER or not real:
-            bifurcations.append(Bifurcation(Kind[name], spot, after))
-    return Branch(family, tuple(path.spots), tuple(bifurcations), (End.START, end))
+    # Two real multipliers with product 1 are a neutral saddle, which is not a bifurcation.
+    bifurcations = tuple(
+        Bifurcation(Kind[name], spot, after)
+        for after, name, spot in path.crossings
+        if Kind[name] is not Kind.NEIMARK_SACKER
+        or not np.all(np.abs(spot.data.multipliers.imag) < 1e-9)
+    )
+    return Branch(family, tuple(path.spots), bifurcations, (End.START, end))
 
 
 def _joined(falling: Branch, rising: Branch) -> Branch:
