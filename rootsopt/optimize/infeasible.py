@@ -124,8 +124,7 @@ def explain(
     first `_EXPLAINED` count. `look`: function that returns constraints and caps at a point, from a
     simulation. By default, only the constraints of the geometry count."""
     starts = starts[:_EXPLAINED]
-    limits = () if look is None else problem.limits
-    stops = _STOPS if look is None else _SIMULATED
+    limits, stops = ((), _STOPS) if look is None else (problem.limits, _SIMULATED)
 
     def parts(point: NDArray[np.float64]) -> tuple[Group, ...] | None:
         local = _geometry(problem, point) if look is None else look(point)

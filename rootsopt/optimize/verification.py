@@ -135,8 +135,7 @@ class Verification:
             reason = judged(end.reason, certificate.holds(RESIDUAL, FEASIBLE))
             promised = end.promised
         held = self.problem.held_by(optimized, certificate)
-        starts = [self._outcome(number, end) for number, end in ends]
-        starts = starts or self._ends(trials)
+        starts = [self._outcome(number, end) for number, end in ends] or self._ends(trials)
         rows = self._sensitivities(optimized, certificate)
         return Optimality(certificate, reason, promised, held, starts, rows)
 

@@ -204,7 +204,7 @@ def test_the_worst_scenes_hold_the_optimum(monkeypatch):
     branches = [[(1, 1, 0.25)], [(1, 1, 0.75)], [(0.1, 1, 0.5)]]
     problem, evaluate = toy(monkeypatch, branches, "tolerances.combine=worst")
     found = descend(lambda x: problem.local(evaluate(float(x[0])), x), np.array([0.1]))
-    assert found.converged
+    assert found.reason == "converged"
     assert found.point[0] == pytest.approx(0.5, abs=1e-6)
     held = problem.held_by(evaluate(0.5), found.certificate)
     assert [one.record()["scene"] for one in held] == [0, 1]
