@@ -69,7 +69,42 @@ class Motions:
 
     def prepare(self, evaluator: "Evaluator", design: Any, series: bool, maxima: bool) -> None:
         """Compile the programs in the background. Arguments: see `Evaluator.prepare`."""
-        evaluator.prepare_reached(design, series, maxima)
+        pair, tangents, _ = build.result_shape(evaluator.scene, design)
+        dtype, solver = pair.angle_scale.dtype, evaluator.solver
+        rest = jax.ShapeDtypeStruct((pair.states,), dtype)
+        begin = eqx.filter_eval_shape(Start.at, pair, rest, solver.max_orbit)
+
+        def then(motion: Steady) -> None:
+            orbit = varied(motion)
+            if loaded(evaluator, series):
+                orbit_loads.prepare(evaluator.scene, design, orbit)
+            if geared(evaluator, series):
+                apart_program.prepare(pair, tangents, orbit)
+            rows = np.zeros((motion.orbit.response.shape[0], 1))
+            forces = solver.measures.named(rows, 1)
+            added = [
+                name
+                for name in evaluator.config.objective.terms
+                if name not in (*forces, *OF_MOTION)
+            ]
+            if added:
+                values, slopes = (jax.ShapeDtypeStruct((3, *d), float) for d in ((), design.shape))
+                values_of.prepare(evaluator.scene, terms_of(added), design, values, slopes)
+            if series:
+                sampled.prepare(motion.known.elements)
+            if series and evaluator.confirm:
+                known = motion.orbit.state, motion.orbit.response
+                _integrated.prepare(pair, known, motion.period, solver.orbit)
+            if maxima or evaluator.maxima:
+                prepare_maxima(pair, tangents, orbit)
+
+        # The slowest compilation starts first.
+        _motion.prepare(pair, tangents, begin, evaluator.scene.pitch_radius, solver, then=then)
+        build.prepare(evaluator.scene, design)
+        if series:
+            count = pair.lobes * SAMPLES
+            times = jax.ShapeDtypeStruct((count,), float)
+            contact_series.prepare(pair, times, jax.ShapeDtypeStruct((count, pair.states), dtype))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -335,43 +370,6 @@ class Evaluator:
         `with_maxima` will follow."""
         design = design_vector(self.config) if design is None else jnp.asarray(design)
         self.motions.prepare(self, design, series, maxima)
-
-    def prepare_reached(self, design: Any, series: bool, maxima: bool) -> None:
-        """Compile the programs of `reached` in the background. Arguments: see `prepare`."""
-        pair, tangents, _ = build.result_shape(self.scene, design)
-        dtype, solver = pair.angle_scale.dtype, self.solver
-        rest = jax.ShapeDtypeStruct((pair.states,), dtype)
-        begin = eqx.filter_eval_shape(Start.at, pair, rest, solver.max_orbit)
-
-        def then(motion: Steady) -> None:
-            orbit = varied(motion)
-            if loaded(self, series):
-                orbit_loads.prepare(self.scene, design, orbit)
-            if geared(self, series):
-                apart_program.prepare(pair, tangents, orbit)
-            rows = np.zeros((motion.orbit.response.shape[0], 1))
-            forces = solver.measures.named(rows, 1)
-            added = [
-                name for name in self.config.objective.terms if name not in (*forces, *OF_MOTION)
-            ]
-            if added:
-                values, slopes = (jax.ShapeDtypeStruct((3, *d), float) for d in ((), design.shape))
-                values_of.prepare(self.scene, terms_of(added), design, values, slopes)
-            if series:
-                sampled.prepare(motion.known.elements)
-            if series and self.confirm:
-                known = motion.orbit.state, motion.orbit.response
-                _integrated.prepare(pair, known, motion.period, solver.orbit)
-            if maxima or self.maxima:
-                prepare_maxima(pair, tangents, orbit)
-
-        # The slowest compilation starts first.
-        _motion.prepare(pair, tangents, begin, self.scene.pitch_radius, solver, then=then)
-        build.prepare(self.scene, design)
-        if series:
-            count = pair.lobes * SAMPLES
-            times = jax.ShapeDtypeStruct((count,), float)
-            contact_series.prepare(pair, times, jax.ShapeDtypeStruct((count, pair.states), dtype))
 
     def evaluation(self, design: Any, *known: Any) -> Evaluation:
         """Return the evaluation of a `design` (config units) with a known motion.
