@@ -69,21 +69,14 @@ class TermConstraint(Constraint):
 class ForceLimit(NamedTuple):
     """A limit that depends on forces: value ≤ `limit` for a `ceiling`, else value ≥ `limit`.
 
-    `key`: name of the quantity in a response."""
+    `key`: name of the quantity in a response; `name`: in words; `unit`: empty if the key does not
+    tell it."""
 
     key: str
     ceiling: bool
     limit: float
-
-    @property
-    def name(self) -> str:
-        """Name of the quantity in words."""
-        return words(self.key)
-
-    @property
-    def unit(self) -> str:
-        """Unit of the quantity, empty if its name does not tell it."""
-        return unit_of(self.key)
+    name: str
+    unit: str
 
     @property
     def sense(self) -> str:
@@ -165,7 +158,7 @@ def force_limits(config: Config, scene: Scene) -> tuple[ForceLimit, ...]:
 
     Raises `InputError` if such limits do not suit the objective or the method of the search."""
     limits = tuple(
-        ForceLimit(name, ceiling, limit)
+        ForceLimit(name, ceiling, limit, words(name), unit_of(name))
         for name, ceiling, limit in _sides(config)
         if depends_on_forces(config, scene, name, LIMITS)
     )
