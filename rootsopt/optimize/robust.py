@@ -132,8 +132,7 @@ class RobustStage(Stage):
     designs from which searches begin; `offsets`: those of `RobustProblem`."""
 
     apart = 0.03
-    bounded = False
-    screens = False
+    broad = False
 
     def __init__(
         self,

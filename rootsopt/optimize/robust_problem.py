@@ -192,13 +192,12 @@ class Stage:
     The base class is the usual search.
 
     `first`: index of the first local search; `apart`: distance between their starts in the unit
-    box; `bounded`: whether the stage may look for a lower bound; `screens`: whether designs are
-    screened."""
+    box; `broad`: whether the stage searches the whole box: it screens designs, and may look for a
+    lower bound."""
 
     first = 0
     apart = 0.15
-    bounded = True
-    screens = True
+    broad = True
 
     def evaluator(self, exact: Evaluator, runs: Runs) -> Evaluator:
         """Return the evaluator of the stage; `exact`: that of the config's objective."""

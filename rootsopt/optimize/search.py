@@ -110,7 +110,7 @@ class Search:
             config = config.replaced({"objective.motion": "reached"})
             self.given = self.given.replaced({"objective.motion": "reached"})
         self.config = config
-        changes = {} if self.stage.screens else {"screening": 0}
+        changes = {} if self.stage.broad else {"screening": 0}
         self.settings = config.optimizer.model_copy(update=changes)
         self.progress = progress or (lambda done, expected, best: None)
         self.expected = self.settings.screening + self.settings.starts * (
@@ -231,7 +231,7 @@ class Search:
         size = len(trials[0].point) if trials else 0
         given = self.settings.prove
         quick = size <= QUICK and FIRST * (size + 1) <= len(trials)
-        asked = self.stage.bounded and not self.noisy and size <= PARAMETERS and given is not False
+        asked = self.stage.broad and not self.noisy and size <= PARAMETERS and given is not False
         if not (asked and candidates and (quick or given is True)):
             return None, []
         # By default the bound may cost about as much as the search.
@@ -264,7 +264,7 @@ class Search:
 
         Simulate at most as many designs as the search had `trials`. Return `None` also for an
         objective over a sample, and with more than `PARAMETERS` parameters."""
-        if not self.stage.bounded or len(optimized.design) > PARAMETERS:
+        if not self.stage.broad or len(optimized.design) > PARAMETERS:
             return None
         known = [one for one in trials if one.evaluation.usable]
 
