@@ -155,8 +155,8 @@ class Verification:
         rows = []
         for one in quantities(nominal.config):
             forces = {name: one.step * row[one.key] for name, row in moved.gradient.items()}
-            row = {"quantity": one.name, "key": one.key, "unit": one.unit, "value": one.value}
-            row |= {"step": one.step} | forces
+            row = {"quantity": one.name, "key": one.key, "unit": one.unit, "value": one.value,
+                   "step": one.step} | forces  # fmt: skip
             if slopes:
                 row["objective_percent"] = one.step * (100 * slopes[one.key] / level)
             rows.append(row)

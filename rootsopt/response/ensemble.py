@@ -172,17 +172,15 @@ def _report(
             gradient = {name: dict.fromkeys(evaluator.keys, 0.0) for name in RESPONSES}
         response = dict(zip(RESPONSES, map(float, values[:, 0]), strict=True))
         errors = dict(zip(ERRORS.values(), map(float, values[:, 1]), strict=True))
-        greatest = float(np.max(members.greatest))
         kind, series = _kind(evaluator, pair, members, with_series)
         if status is Status.IDLE:
             kind["kind"] = "idle"
         drift, by_drift = mean_and_error(np.asarray(members.drift, np.float64))
-        steady = kind | size | errors
-        steady |= {
+        steady = kind | size | errors | {
             "mean_force_drift_N": float(drift),
             "mean_force_drift_standard_error_N": float(by_drift),
-            "greatest_force_N": greatest,
-        }
+            "greatest_force_N": float(np.max(members.greatest)),
+        }  # fmt: skip
         last = np.asarray(members.states, np.float64)
         if float(np.max(members.depth)) > TOO_DEEP * float(evaluator.scene.pitch_radius):
             status = Status.TOO_DEEP
