@@ -270,12 +270,15 @@ class Beginning:
     def _inset(self) -> str:
         """Sentence on the clearance that gives the members the gap of the inset outline."""
         size, gap = self.likeness.inset * 1e3, self.config.contact.clearance_mm
-        text = f"The outline is cut, inset {size:.3g} mm: the members of the family have the same "
-        text += f"flank gap with `--set contact.clearance_mm={gap:.6g}`"
         if self.oversize:
-            text = f"The outline is oversize, inset {size:.3g} mm: its flanks overlap by "
-            text += f"{self.oversize:.3g} mm more than those of the members, whose clearance is 0"
-        return text
+            return (
+                f"The outline is oversize, inset {size:.3g} mm: its flanks overlap by "
+                f"{self.oversize:.3g} mm more than those of the members, whose clearance is 0"
+            )
+        return (
+            f"The outline is cut, inset {size:.3g} mm: the members of the family have the same "
+            f"flank gap with `--set contact.clearance_mm={gap:.6g}`"
+        )
 
     def record(self) -> dict[str, Any]:
         """Return the entry `beginning` of the result file."""

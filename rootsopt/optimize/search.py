@@ -176,9 +176,8 @@ class Search:
             return Optimization(
                 self.problem, baseline, None, [], {}, self.stop.is_set(), infeasible=reason
             )
-        trials: list[Trial] = []
-        if self.settings.screening:
-            trials = self._side_by_side(self._screen, list(enumerate(points)))
+        screens = bool(self.settings.screening)
+        trials = self._side_by_side(self._screen, [*enumerate(points)]) if screens else []
         starts = self._starts(points, trials) or points[:1]
         work = self._descend if self.noisy else self._solve
         trials += self._side_by_side(work, list(enumerate(starts, self.stage.first)))
@@ -423,9 +422,8 @@ class Search:
         evaluation = self.checkpoint.evaluated(runs.evaluated, key, asked, point)
         objective = self.problem.objective(evaluation)
         feasible, excess = self.problem.feasible(point), self.problem.excess(evaluation)
-        local = None
-        if start >= 0 and not self.noisy:
-            local = self.stage.local(self.problem, start, evaluation, point)
+        searched = start >= 0 and not self.noisy
+        local = self.stage.local(self.problem, start, evaluation, point) if searched else None
         trial = Trial(point, start, iteration, evaluation, objective, feasible, local, excess)
         with self._lock:
             self._trials.append(trial)

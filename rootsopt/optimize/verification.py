@@ -231,8 +231,8 @@ def surviving(result: Optimization, given: Config) -> list[dict[str, Any]]:
     def moved(config: Config, evaluator: Evaluator, full: float, away: float) -> Evaluator:
         # Both flanks of a gap move. The scene takes a negative clearance, which no config may have.
         tip = config.value("pump.tip_clearance_mm")
-        values = {"contact.clearance_mm": config.contact.clearance_mm - 2 * full}
-        values |= {"scene.center_distance_error_mm": own + away}
+        values = {"contact.clearance_mm": config.contact.clearance_mm - 2 * full,
+                  "scene.center_distance_error_mm": own + away}  # fmt: skip
         values |= {} if tip is None else {"pump.tip_clearance_mm": max(0.0, tip - full)}
         return dataclasses.replace(evaluator, scene=evaluator.scene.renewed(config.moved(values)))
 

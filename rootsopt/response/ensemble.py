@@ -222,9 +222,8 @@ def _kind(evaluator: Evaluator, pair, members: Members, with_series):
     one.
     """
     every = np.all(members.repeats, axis=0)
-    kind: dict[str, Any] = {"kind": "transient"}
-    if every.any():
-        kind = {"kind": "periodic", "period": (int(np.argmax(every)) + 1) * pair.repeats}
+    period = {"period": (int(np.argmax(every)) + 1) * pair.repeats}
+    kind: dict[str, Any] = {"kind": "periodic"} | period if every.any() else {"kind": "transient"}
     if evaluator.survey or (every.any() and not with_series):
         return kind, None
     typical = int(np.argmin(np.any(members.repeats, axis=1)))
@@ -323,9 +322,7 @@ def per_config_unit(
 _pair = CachedFunction(Scene.pair_and_shape)
 
 
-@CachedFunction
-def _point(space: Space, design):
-    return space.point(design)
+_point = CachedFunction(Space.point)
 
 
 @CachedFunction

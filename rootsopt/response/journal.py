@@ -160,8 +160,9 @@ def header_of(
     `imports`: names of the files and modules that were imported first; `others`: paths of files
     that replace the config's own; `more`: further entries. Raises `InputError` if a file cannot be
     read."""
-    files = {path for path in (*map(config.value, FILES), *others) if path is not None}
-    files |= {name for name in imports if os.path.isfile(name)}
+    files = {path for path in (*map(config.value, FILES), *others) if path is not None} | {
+        name for name in imports if os.path.isfile(name)
+    }
     return {
         "command": command,
         "config": config.model_dump(mode="json"),

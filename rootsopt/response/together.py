@@ -121,13 +121,13 @@ class Members(NamedTuple):
 
         Failures are checked in this order: the solver failed; the forces are not finite; the motor
         stalled; the lobes passed through each other."""
-        if not np.all(self.solved):
-            return Status.SOLVER_FAILED
-        if not np.all(np.isfinite(self.means)):
-            return Status.NON_FINITE
-        if np.any(self.stalled):
-            return Status.STALLED
-        return Status.PASSED_THROUGH if np.any(self.lost) else Status.AVERAGED
+        failures = {
+            Status.SOLVER_FAILED: not np.all(self.solved),
+            Status.NON_FINITE: not np.all(np.isfinite(self.means)),
+            Status.STALLED: np.any(self.stalled),
+            Status.PASSED_THROUGH: np.any(self.lost),
+        }
+        return next((status for status, met in failures.items() if met), Status.AVERAGED)
 
     @property
     def responses(self) -> NDArray[np.float64]:

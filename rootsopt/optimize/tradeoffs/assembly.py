@@ -386,8 +386,8 @@ def front_of(
         edges, gaps = gaps_of(selection, tracer._gaps, spacing)
         if tracer.stop.is_set():  # Neighbours may be far apart only because points are missing.
             gaps = [gap for gap in gaps if gap.confirmed]
-        known = {"points": tuple(points), "dropped": tuple(dropped)}
-        known |= {"edges": tuple(edges), "gaps": tuple(gaps)}
+        known = {"points": tuple(points), "dropped": tuple(dropped),
+                 "edges": tuple(edges), "gaps": tuple(gaps)}  # fmt: skip
     return Front(
         config=tracer.config,
         aims=study.aims,

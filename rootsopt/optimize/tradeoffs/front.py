@@ -108,8 +108,8 @@ class FrontPoint:
         first = next(iter(self.terms))
         rates = {f"{first}_per_{k}": None if math.isnan(v) else v for k, v in self.rates.items()}
         geometry = {k: v for k, v in self.evaluation.geometry.items() if k not in self.terms}
-        row = {"point": self.number, "status": self.standing.label, "end_of": self.end_of}
-        row |= self.terms | rates | self.design | geometry
+        own = {"point": self.number, "status": self.standing.label, "end_of": self.end_of}
+        row = own | self.terms | rates | self.design | geometry
         forces = {k: v for k, v in self.evaluation.response.items() if k not in row}
         return row | forces | {"residual": self.residual}
 

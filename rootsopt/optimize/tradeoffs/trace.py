@@ -340,13 +340,11 @@ class Tracer:
         stops = Stops(evaluations=self.config.optimizer.iterations + 1, asked=self.stop.is_set)
         outcome = descend(look, start, stops, self.study.problem.limits_at)
         self._count(searches=1)
-        if outcome.local is None or outcome.certificate is None:
-            return best
-        if outcome.local.violation > FEASIBLE:
+        local, certificate = outcome.local, outcome.certificate
+        if local is None or certificate is None or local.violation > FEASIBLE:
             return best
         sample = samples[outcome.point.tobytes()]
-        node = Node(scalar, sample, outcome.certificate, outcome.reason)
-        return better(best, node)
+        return better(best, Node(scalar, sample, certificate, outcome.reason))
 
     def _count(self, evaluations: int = 0, searches: int = 0) -> None:
         """Count designs and searches, of all courses together, and report progress."""
