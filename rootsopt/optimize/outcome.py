@@ -113,17 +113,16 @@ class Optimization:
     @property
     def status(self) -> Status:
         """Status of the search as a whole."""
-        if self.interrupted:
-            return Status.INTERRUPTED
-        if not self.baseline.usable:
-            return self.baseline.status
-        if self.infeasible is not None:
-            return Status.INFEASIBLE
-        if self.optimized is None:
-            return Status.NOT_IMPROVED
-        if self.optimality is not None and not self.optimality.converged:
-            return Status.NOT_CONVERGED
-        return self.optimized.status
+        optimized, optimality = self.optimized, self.optimality
+        failures = (
+            (Status.INTERRUPTED, self.interrupted),
+            (self.baseline.status, not self.baseline.usable),
+            (Status.INFEASIBLE, self.infeasible is not None),
+            (Status.NOT_IMPROVED, optimized is None),
+            (Status.NOT_CONVERGED, optimality is not None and not optimality.converged),
+        )
+        ended = self.baseline.status if optimized is None else optimized.status
+        return next((status for status, met in failures if met), ended)
 
     @property
     def improvement(self) -> dict[str, float]:

@@ -179,15 +179,13 @@ class Front:
     @property
     def status(self) -> Status:
         """Status of the front as a whole."""
-        if self.interrupted:
-            return Status.INTERRUPTED
-        if not self.baseline_terms:
-            return self.baseline.status
-        if self.infeasible is not None:
-            return Status.INFEASIBLE
-        if not self.certified:
-            return Status.NOT_CONVERGED
-        return self.baseline.status
+        failures = (
+            (Status.INTERRUPTED, self.interrupted),
+            (self.baseline.status, not self.baseline_terms),
+            (Status.INFEASIBLE, self.infeasible is not None),
+            (Status.NOT_CONVERGED, not self.certified),
+        )
+        return next((status for status, met in failures if met), self.baseline.status)
 
     @property
     def message(self) -> str:

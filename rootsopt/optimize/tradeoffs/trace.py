@@ -74,8 +74,6 @@ _HOLDS_UP = 0.01
 _SAME_ENDS = 1e-6
 
 Task, Done = TypeVar("Task"), TypeVar("Done")
-Progress = Callable[[int, int], None]
-"""Type of a progress callback, with arguments (searches done, searches expected)."""
 
 
 class Tracer:
@@ -92,7 +90,7 @@ class Tracer:
     def __init__(
         self,
         config: Config,
-        progress: Progress | None = None,
+        progress: Callable[[int, int], None] | None = None,
         stop: threading.Event | None = None,
         runs: Runs = HERE,
         checkpoint: Checkpoint | None = None,
