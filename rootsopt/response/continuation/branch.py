@@ -182,16 +182,17 @@ class OrbitFamily:
         made, checks = jax.device_get(_follow(self.range, start, guess, across))
         half_way, unit, lost, sound = checks
         scene, line, known = self.range.low[0], made.line, made.known
-        if not sound:
-            raise StoppedError(End.NO_GEOMETRY)
-        if not (known.sound and known.error <= greatest_error(scene.solver.orbit.rtol)):
-            raise StoppedError(End.STEP_TOO_SMALL)
-        if lost:
-            raise StoppedError(End.LOST_MESH)
-        if made.orbit.depth > TOO_DEEP * scene.pitch_radius:
-            raise StoppedError(End.TOO_DEEP)
-        if self.halves and half_way < _HALF_ALIKE:
-            raise StoppedError(End.HALVED)
+        close = known.sound and known.error <= greatest_error(scene.solver.orbit.rtol)
+        failures = {
+            End.NO_GEOMETRY: not sound,
+            End.STEP_TOO_SMALL: not close,
+            End.LOST_MESH: lost,
+            End.TOO_DEEP: made.orbit.depth > TOO_DEEP * scene.pitch_radius,
+            End.HALVED: self.halves and half_way < _HALF_ALIKE,
+        }
+        for end, met in failures.items():
+            if met:
+                raise StoppedError(end)
         state, monodromy = np.asarray(made.orbit.state), np.asarray(line.monodromy)
         mean, square, peak = map(float, made.orbit.response[:3])
         opened = np.column_stack([monodromy - np.eye(len(state)), line.by_share])
