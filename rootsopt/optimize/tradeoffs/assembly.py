@@ -98,27 +98,6 @@ class Spacing(NamedTuple):
         return "terms" if edge.distance > _WIDE_TERMS * self.terms else "design"
 
 
-def measured(pair: Pair, values: NDArray[np.float64], points: NDArray[np.float64]) -> Edge:
-    """Return the `Edge` of a `pair` of points.
-
-    `values` (n, k): scaled terms of all points; `points` (n, d): their designs in the unit box."""
-    i, j = pair
-    apart = float(np.linalg.norm(values[i] - values[j]))
-    return Edge(pair, apart, float(np.max(np.abs(points[i] - points[j]))))
-
-
-def among(pairs: Sequence[Pair], kept: Sequence[int], same: Sequence[int]) -> list[Pair]:
-    """Return those `pairs` whose points are both in `kept`, each once.
-
-    `same`: for each point, the index of the point that replaces it, or -1."""
-    unique: dict[Pair, None] = {}
-    for pair in pairs:
-        i, j = sorted(same[k] if same[k] >= 0 else k for k in pair)
-        if i != j and i in kept and j in kept:
-            unique[i, j] = None
-    return [*unique]
-
-
 def divides(
     edge: Edge, values: NDArray[np.float64], one: NDArray[np.float64], other: NDArray[np.float64]
 ) -> bool:
@@ -186,15 +165,24 @@ class Selection(NamedTuple):
     kept: list[int]
 
     def edges(self, pairs: Sequence[Pair]) -> list[Edge]:
-        """Return the pairs of neighbours on the front.
+        """Return the pairs of neighbours on the front, each once.
 
-        `pairs`: indices of neighbouring nodes; used for three terms only. With two terms,
-        neighbours are nodes that follow each other in `kept`."""
-        if self.values.shape[1] == 2:
-            neighbours = [(min(pair), max(pair)) for pair in itertools.pairwise(self.kept)]
-        else:
-            neighbours = among(pairs, self.kept, self.same)
-        return [measured(pair, self.values, self.points) for pair in neighbours]
+        `pairs`: indices of neighbouring nodes, where a repeated node stands for the one that it
+        repeats; used for three terms only. With two terms, neighbours are nodes that follow each
+        other in `kept`."""
+        known, values, points = {*self.kept}, self.values, self.points
+        kept = ([self.same[k] if self.same[k] >= 0 else k for k in pair] for pair in pairs)
+        nodes = itertools.pairwise(self.kept) if values.shape[1] == 2 else kept
+        neighbours = dict.fromkeys((min(pair), max(pair)) for pair in nodes)
+        return [
+            Edge(
+                (i, j),
+                float(np.linalg.norm(values[i] - values[j])),
+                float(np.max(np.abs(points[i] - points[j]))),
+            )
+            for i, j in neighbours
+            if i != j and known.issuperset((i, j))
+        ]
 
 
 def selected(nodes: Sequence[Node], scale: Scale) -> Selection:
