@@ -200,11 +200,8 @@ def candidates(problem: Problem, trials: Sequence) -> list[tuple[float, NDArray[
 
 def most_promising(problem: Problem, trials: Sequence) -> Any:
     """Return the trial at the best of the `candidates`, or `None` without candidates."""
-    designs = candidates(problem, trials)
-    if not designs:
-        return None
-    _, point = designs[0]
-    return next(t for t in trials if t.candidate and np.array_equal(t.point, point))
+    best = [point for _, point in candidates(problem, trials)[:1]]
+    return next((t for t in trials if t.candidate and np.array_equal([t.point], best)), None)
 
 
 def message(record: dict[str, Any]) -> str:

@@ -171,8 +171,8 @@ class Selection(NamedTuple):
         repeats; used for three terms only. With two terms, neighbours are nodes that follow each
         other in `kept`."""
         known, values, points = {*self.kept}, self.values, self.points
-        kept = ([self.same[k] if self.same[k] >= 0 else k for k in pair] for pair in pairs)
-        nodes = itertools.pairwise(self.kept) if values.shape[1] == 2 else kept
+        given = ([self.same[k] if self.same[k] >= 0 else k for k in pair] for pair in pairs)
+        nodes = itertools.pairwise(self.kept) if values.shape[1] == 2 else given
         neighbours = dict.fromkeys((min(pair), max(pair)) for pair in nodes)
         return [
             Edge(
