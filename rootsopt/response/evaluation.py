@@ -37,6 +37,7 @@ from rootsopt.response.reducers import (
     evaluate_many,
     over_scenes,
     over_speeds,
+    parts_at,
     shares,
 )
 from rootsopt.response.result import Evaluation, Part, Seed, Seeds, begun
@@ -286,9 +287,7 @@ class Evaluator:
             alone = dataclasses.replace(self.at_speed(speed), references=references)
             points.append(Point(alone, design, begin, series and speed == own))
         # Designs run side by side, so that their speeds need no threads.
-        evaluations = zip(self.speeds, evaluate_many(points, IN_TURN), strict=True)
-        parts = [Part({"speed_rpm": speed}, one, share) for (speed, share), one in evaluations]
-        return over_speeds(parts, own)
+        return over_speeds(parts_at(self.speeds, evaluate_many(points, IN_TURN)), own)
 
     def reached(
         self, design: Any, start: Seed | ArrayLike | None = None, series: bool = True

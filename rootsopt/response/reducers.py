@@ -191,6 +191,14 @@ def counted(
     return [(1.0, worst, base)]
 
 
+def parts_at(
+    shares: Iterable[tuple[float, float]], evaluations: Iterable[Evaluation]
+) -> tuple[Part, ...]:
+    """Return the parts of evaluations at several speeds; `shares`: (speed in rpm, share)."""
+    pairs = zip(shares, evaluations, strict=True)
+    return tuple(Part({"speed_rpm": speed}, one, share) for (speed, share), one in pairs)
+
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
