@@ -18,7 +18,7 @@ from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.parts import ConstantLoad, PrescribedDrive, TimingGear
 from rootsopt.errors import InputError
 from rootsopt.response import terms
-from rootsopt.response.evaluation import _build, _motion
+from rootsopt.response.evaluation import _motion, build
 from rootsopt.response.result import RESPONSES, Evaluation
 from rootsopt.response.terms import Term, register_term
 from rootsopt.status import Status
@@ -97,7 +97,7 @@ def registered(**formulas):
 
 def programs() -> int:
     """Return the number of programs that the evaluators have been compiled to."""
-    return sum(len(one._made) for one in (_build, _motion))
+    return sum(len(one._made) for one in (build, _motion))
 
 
 @contextlib.contextmanager

@@ -11,7 +11,6 @@ settle are left out, because one of them takes as long as a hundred others."""
 import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 from rootsopt.config.reading import Config
 from rootsopt.config.tolerances import Span
 from rootsopt.optimize.limits import limited
-from rootsopt.optimize.local import FEASIBLE, Linearization
+from rootsopt.optimize.local import FEASIBLE
 from rootsopt.optimize.outcome import (
     BASELINE,
     OPTIMIZED,
@@ -208,14 +207,7 @@ class _Comparison:
         (where,) = _shifts(self.config, one)
         exact = self.exact[True].shifted(where.scene)
         evaluator = (exact.with_maxima() if problem.with_maxima else exact).surveying()
-        starts: list[Any] = [None]
-
-        def look(point: NDArray[np.float64]) -> Linearization | None:
-            evaluation = evaluator(problem.design(point), starts[-1], series=False)
-            if evaluation.usable:
-                starts.append(evaluation.start)
-            return problem.local(evaluation, point)
-
+        look = problem.looks(evaluator)
         begins = [(local.objective, k) for k, x in enumerate(tried)
                   if (local := look(self._point(x))) is not None]  # fmt: skip
         if not begins:

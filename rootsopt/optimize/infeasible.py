@@ -124,8 +124,7 @@ def explain(
     first `_EXPLAINED` count. `look`: function that returns constraints and caps at a point, from a
     simulation. By default, only the constraints of the geometry count."""
     starts = starts[:_EXPLAINED]
-    limits = () if look is None else problem.limits
-    stops = _STOPS if look is None else _SIMULATED
+    limits, stops = ((), _STOPS) if look is None else (problem.limits, _SIMULATED)
 
     def parts(point: NDArray[np.float64]) -> tuple[Group, ...] | None:
         local = _geometry(problem, point) if look is None else look(point)
@@ -271,12 +270,15 @@ class Beginning:
     def _inset(self) -> str:
         """Sentence on the clearance that gives the members the gap of the inset outline."""
         size, gap = self.likeness.inset * 1e3, self.config.contact.clearance_mm
-        text = f"The outline is cut, inset {size:.3g} mm: the members of the family have the same "
-        text += f"flank gap with `--set contact.clearance_mm={gap:.6g}`"
         if self.oversize:
-            text = f"The outline is oversize, inset {size:.3g} mm: its flanks overlap by "
-            text += f"{self.oversize:.3g} mm more than those of the members, whose clearance is 0"
-        return text
+            return (
+                f"The outline is oversize, inset {size:.3g} mm: its flanks overlap by "
+                f"{self.oversize:.3g} mm more than those of the members, whose clearance is 0"
+            )
+        return (
+            f"The outline is cut, inset {size:.3g} mm: the members of the family have the same "
+            f"flank gap with `--set contact.clearance_mm={gap:.6g}`"
+        )
 
     def record(self) -> dict[str, Any]:
         """Return the entry `beginning` of the result file."""

@@ -18,7 +18,7 @@ from rootsopt.config.reading import Config
 from rootsopt.config.study import BASELINE
 from rootsopt.config.units import unit_of, words
 from rootsopt.errors import InputError
-from rootsopt.optimize.local import NEAR, Certificate
+from rootsopt.optimize.local import NEAR, Certificate, Group
 from rootsopt.response.result import Evaluation
 from rootsopt.response.terms import (
     Forces,
@@ -69,21 +69,14 @@ class TermConstraint(Constraint):
 class ForceLimit(NamedTuple):
     """A limit that depends on forces: value ≤ `limit` for a `ceiling`, else value ≥ `limit`.
 
-    `key`: name of the quantity in a response."""
+    `key`: name of the quantity in a response; `name`: in words; `unit`: empty if the key does not
+    tell it."""
 
     key: str
     ceiling: bool
     limit: float
-
-    @property
-    def name(self) -> str:
-        """Name of the quantity in words."""
-        return words(self.key)
-
-    @property
-    def unit(self) -> str:
-        """Unit of the quantity, empty if its name does not tell it."""
-        return unit_of(self.key)
+    name: str
+    unit: str
 
     @property
     def sense(self) -> str:
@@ -150,14 +143,14 @@ def quantity_of(key: str) -> str:
 
 def term_constraints(config: Config, scene: Scene) -> tuple[TermConstraint, ...]:
     """Return the constraints on those quantities of `constraints.terms` that read no forces."""
-    constraints = []
-    for name, ceiling, limit in _sides(config):
-        if depends_on_forces(config, scene, name, LIMITS):
-            continue
-        (term,) = terms_of([name], LIMITS)
-        row = words(name), name, unit_of(name), jnp.asarray(limit), abs(limit) or 1.0, 1.0
-        constraints.append(TermConstraint(*row, ceiling=ceiling, term=term))
-    return tuple(constraints)
+    return tuple(
+        TermConstraint(
+            words(name), name, unit_of(name), jnp.asarray(limit), abs(limit) or 1.0, 1.0,
+            ceiling=ceiling, term=terms_of([name], LIMITS)[0],
+        )
+        for name, ceiling, limit in _sides(config)
+        if not depends_on_forces(config, scene, name, LIMITS)
+    )  # fmt: skip
 
 
 def force_limits(config: Config, scene: Scene) -> tuple[ForceLimit, ...]:
@@ -165,7 +158,7 @@ def force_limits(config: Config, scene: Scene) -> tuple[ForceLimit, ...]:
 
     Raises `InputError` if such limits do not suit the objective or the method of the search."""
     limits = tuple(
-        ForceLimit(name, ceiling, limit)
+        ForceLimit(name, ceiling, limit, words(name), unit_of(name))
         for name, ceiling, limit in _sides(config)
         if depends_on_forces(config, scene, name, LIMITS)
     )
@@ -178,14 +171,16 @@ def force_limits(config: Config, scene: Scene) -> tuple[ForceLimit, ...]:
     return limits
 
 
-def _sides(config: Config):
-    """Yield (name, whether it is a ceiling, limit) for each floor and ceiling."""
-    for name, one in config.constraints.terms.items():
-        for side in ("max", "min"):
-            if side in one:
-                # The baseline's value is filled in before a search; the number has no effect.
-                limit = 0.0 if one[side] == BASELINE else float(one[side])
-                yield name, side == "max", limit
+def _sides(config: Config) -> list[tuple[str, bool, float]]:
+    """Return (name, whether it is a ceiling, limit) for each floor and ceiling.
+
+    The baseline's value is filled in before a search; until then it is 0, without effect."""
+    return [
+        (name, side == "max", 0.0 if one[side] == BASELINE else float(one[side]))
+        for name, one in config.constraints.terms.items()
+        for side in ("max", "min")
+        if side in one
+    ]
 
 
 @CachedFunction
@@ -212,14 +207,28 @@ def needs_maxima(config: Config, limits: Sequence[ForceLimit]) -> bool:
 def counting(evaluation: Evaluation) -> list[tuple[int, Evaluation]]:
     """Return (kind, evaluation) of each scene, speed and motion in which limits must hold."""
     scenes = [part.evaluation for part in evaluation.scenes] or [evaluation]
-    pairs = []
-    for scene, whole in enumerate(scenes):
-        for number, part in enumerate(whole.by_speed):
-            if part.share <= 0:
-                continue
-            kind = SCENE_KINDS * scene + number
-            pairs += [(kind, one) for one in (part.evaluation, *part.evaluation.rivals)]
-    return pairs
+    return [
+        (SCENE_KINDS * scene + number, one)
+        for scene, whole in enumerate(scenes)
+        for number, part in enumerate(whole.by_speed)
+        if part.share > 0
+        for one in (part.evaluation, *part.evaluation.rivals)
+    ]
+
+
+def branches_of(evaluation: Evaluation, key: str, cornered: bool, kind: int) -> Group:
+    """Return the k branches of a quantity of a usable `evaluation`, with gradients in config units.
+
+    `key`: name of the quantity; `cornered`: whether it is the peak force, of which each known local
+    maximum is a branch; `kind` of the branches."""
+    maxima = evaluation.maxima if cornered else None
+    if maxima is None or not maxima.times.size:
+        slope = np.array([*evaluation.gradient[key].values()])
+        tags = np.array([[float(kind), 0.0]])
+        return Group(tags, np.array([evaluation.response[key]]), slope[None, :])
+    phases = maxima.times / evaluation.steady_state["period"]
+    tags = np.stack([np.full(len(phases), float(kind)), phases], axis=1)
+    return Group(tags, maxima.forces, maxima.slopes)
 
 
 def settled_by(config: Config, baseline: Evaluation) -> Config:
@@ -334,7 +343,10 @@ def _range_rows(
     for key, (end, least, most) in ranges.items():
         place = names.index(key)
         before, after, limit = problem.baseline.design.get(key), optimized.design[key], float(end)
-        own = _upper_end(problem, key)
+        own = math.nan
+        if before is not None:
+            given = np.asarray([*problem.baseline.design.values()], dtype=np.float64)
+            own = float(_ranges(problem.space, given)[key][0])
         slacks = [own - (math.nan if before is None else before), limit - after]
         row = _row(words(key), before, after, limit, unit_of(key), slacks, "<=")
         row["baseline_limit"] = None if math.isnan(own) else own
@@ -366,14 +378,6 @@ def _range_rows(
             row = _row(name, before, after, float(limit), unit, slacks, sense)
             rows.append(row | _multiplier(problem, row, multiplier / width, optimized))
     return rows
-
-
-def _upper_end(problem: "Problem", key: str) -> float:
-    """Return the upper end of a parameter's range for the baseline, NaN for one from a file."""
-    if key not in problem.baseline.design:
-        return math.nan
-    design = np.asarray([*problem.baseline.design.values()], dtype=np.float64)
-    return float(_ranges(problem.space, design)[key][0])
 
 
 def scaled_slack(problem: "Problem", evaluation: Evaluation, k: int) -> float:

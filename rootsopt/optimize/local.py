@@ -164,14 +164,8 @@ def certify(local: Linearization, point: NDArray[np.float64]) -> Certificate:
     `local`: objective and constraints at the point, with gradients."""
     from scipy.optimize import nnls  # Slow import (0.3 s).
 
-    size, rows = len(point), []
-    gaps: list[NDArray[np.float64]] = []
-    chosen: list[NDArray[np.bool_]] = []
-    for group in local.groups:
-        gap = group.top - group.values
-        chosen.append(gap <= NEAR)
-        rows.append(group.slopes[chosen[-1]])
-        gaps.append(gap[chosen[-1]])
+    size, apart = len(point), [group.top - group.values for group in local.groups]
+    branches = [(gap <= NEAR, g.slopes, gap) for gap, g in zip(apart, local.groups, strict=True)]
     long = np.linalg.norm(local.normals, axis=1) > _NEGLIGIBLE
     limits = [
         ((local.slack <= NEAR) & long, -local.normals, np.maximum(local.slack, 0.0)),
@@ -181,38 +175,32 @@ def certify(local: Linearization, point: NDArray[np.float64]) -> Certificate:
     for cap in local.caps:
         steep = np.linalg.norm(cap.slopes, axis=1) > _NEGLIGIBLE
         limits.append(((-cap.values <= NEAR) & steep, cap.slopes, np.maximum(-cap.values, 0.0)))
-    for active, normals, gap in limits:
-        rows.append(normals[active])
-        gaps.append(gap[active])
-    every, gap = np.concatenate(rows), np.concatenate(gaps)
-    counts = [int(np.sum(one)) for one in chosen]
-    sums = np.zeros((len(counts), len(every)))
-    begin = 0
-    for k, count in enumerate(counts):
-        sums[k, begin : begin + count] = _WEIGHT
-        begin += count
-    matrix = np.concatenate([every.T, np.diag(gap), sums])
+    every = [*branches, *limits]
+    rows = np.concatenate([slopes[active] for active, slopes, _ in every])
+    gap = np.concatenate([away[active] for active, _, away in every])
+    counts = [int(np.sum(active)) for active, _, _ in branches]
+    sums = np.zeros((len(counts), len(rows)))
+    sums[np.repeat(np.arange(len(counts)), counts), np.arange(sum(counts))] = _WEIGHT
+    matrix = np.concatenate([rows.T, np.diag(gap), sums])
     wanted = np.concatenate([-local.slope, np.zeros(len(gap)), np.full(len(counts), _WEIGHT)])
     solution = nnls(matrix, wanted)[0] if matrix.shape[1] else np.zeros(0)
     shares = []
-    for mask, count in zip(chosen, counts, strict=True):
+    for active, count in zip((active for active, _, _ in branches), counts, strict=True):
         part, solution = solution[:count], solution[count:]
-        total = np.sum(part)
-        share = np.zeros(len(mask))
-        share[mask] = part / total if total > 0 else 1 / count
+        total, share = np.sum(part), np.zeros(len(active))
+        share[active] = part / total if total > 0 else 1 / count
         shares.append(share)
     numbers = []
     for active, _, _ in limits:
-        count = int(np.sum(active))
-        values = np.zeros(len(active))
+        count, values = int(np.sum(active)), np.zeros(len(active))
         values[active], solution = solution[:count], solution[count:]
         numbers.append(values)
     multipliers, lower, upper, *caps = numbers
     left = local.combined(tuple(shares)) - multipliers @ local.normals - lower + upper
     for cap, held in zip(local.caps, caps, strict=True):
         left = left + held @ cap.slopes
-    apart = [s * (g.top - g.values) for s, g in zip(shares, local.groups, strict=True)]
-    apart += [value * gap for value, (_, _, gap) in zip(numbers, limits, strict=True)]
+    pairs = zip([*shares, *numbers], every, strict=True)
+    apart = [value * away for value, (_, _, away) in pairs]
     residual = float(np.linalg.norm(np.concatenate([left, *apart])))
     held = multipliers, lower, upper, tuple(shares), tuple(caps)
     return Certificate(residual, local.violation, *held)

@@ -133,10 +133,10 @@ def verify(problem: Problem, evaluator: Evaluator, trials: Sequence) -> Optimiza
         "seed": settings.seed,
         "required_standard_errors": SIGNIFICANT,
     }
-    tried = []
-    for searched, point in candidates(problem, trials):
-        evaluation = chooser(problem.design(point), series=False)
-        tried.append((problem.objective(evaluation), searched, point))
+    tried = [
+        (problem.objective(chooser(problem.design(point), series=False)), searched, point)
+        for searched, point in candidates(problem, trials)
+    ]
     record["candidates"] = [
         {"searched_objective": searched, "chosen_by_objective": objective}
         for objective, searched, _ in tried
@@ -200,11 +200,8 @@ def candidates(problem: Problem, trials: Sequence) -> list[tuple[float, NDArray[
 
 def most_promising(problem: Problem, trials: Sequence) -> Any:
     """Return the trial at the best of the `candidates`, or `None` without candidates."""
-    designs = candidates(problem, trials)
-    if not designs:
-        return None
-    _, point = designs[0]
-    return next(t for t in trials if t.candidate and np.array_equal(t.point, point))
+    best = [point for _, point in candidates(problem, trials)[:1]]
+    return next((t for t in trials if t.candidate and np.array_equal([t.point], best)), None)
 
 
 def message(record: dict[str, Any]) -> str:

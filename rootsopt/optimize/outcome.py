@@ -113,17 +113,16 @@ class Optimization:
     @property
     def status(self) -> Status:
         """Status of the search as a whole."""
-        if self.interrupted:
-            return Status.INTERRUPTED
-        if not self.baseline.usable:
-            return self.baseline.status
-        if self.infeasible is not None:
-            return Status.INFEASIBLE
-        if self.optimized is None:
-            return Status.NOT_IMPROVED
-        if self.optimality is not None and not self.optimality.converged:
-            return Status.NOT_CONVERGED
-        return self.optimized.status
+        optimized, optimality = self.optimized, self.optimality
+        failures = (
+            (Status.INTERRUPTED, self.interrupted),
+            (self.baseline.status, not self.baseline.usable),
+            (Status.INFEASIBLE, self.infeasible is not None),
+            (Status.NOT_IMPROVED, optimized is None),
+            (Status.NOT_CONVERGED, optimality is not None and not optimality.converged),
+        )
+        ended = self.baseline.status if optimized is None else optimized.status
+        return next((status for status, met in failures if met), ended)
 
     @property
     def improvement(self) -> dict[str, float]:
@@ -325,13 +324,13 @@ class Assumed:
         known = np.isfinite(values)
         some, ends = values[drawn & known], [x for x in values[~drawn][1:] if math.isfinite(x)]
         worst = int(np.nanargmax(values)) if known.any() else None
-        rows = []
-        for k, span in enumerate(self.spans):
-            low, high = self._ends(values, k)
-            rows.append({
-                **span._asdict(), "objective_low": low, "objective_high": high,
-                "worse": self.worse[span.key], "rank_correlation": self._rank(values, span.key),
-            })  # fmt: skip
+        ends_of = "objective_low", "objective_high"
+        rows = [
+            span._asdict()
+            | dict(zip(ends_of, self._ends(values, k), strict=True))
+            | {"worse": self.worse[span.key], "rank_correlation": self._rank(values, span.key)}
+            for k, span in enumerate(self.spans)
+        ]
         return {
             "scenes": int(np.sum(drawn)),
             "compared": int(some.size),

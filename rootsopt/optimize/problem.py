@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +18,7 @@ from rootsopt.optimize.limits import (
     HELD,
     PEAK,
     ForceLimit,
+    branches_of,
     check_senses,
     counting,
     force_limits,
@@ -26,10 +27,10 @@ from rootsopt.optimize.limits import (
     settled_by,
     term_constraints,
 )
-from rootsopt.optimize.local import FEASIBLE, Certificate, Group, Linearization
+from rootsopt.optimize.local import FEASIBLE, Certificate, Group, Linearization, Look
 from rootsopt.optimize.optimality import Holder
 from rootsopt.response.reducers import counted
-from rootsopt.response.result import RESPONSES, Evaluation
+from rootsopt.response.result import RESPONSES, Evaluation, Seeds
 from rootsopt.response.terms import objective_weights
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene.build import Scene
@@ -174,6 +175,20 @@ class Problem:
                 by_design += share * weight * np.array(list(one.gradient[key].values()))
         return by_design @ self.look(point)[1]
 
+    def looks(self, evaluate: Callable[..., Evaluation]) -> Look:
+        """Return a function for a search that evaluates the problem at a point.
+
+        `evaluate`: an `Evaluator`; each motion begins on the last usable one."""
+        starts: list[Seeds] = [None]
+
+        def look(point: NDArray[np.float64]) -> Linearization | None:
+            evaluation = evaluate(self.design(point), starts[-1], series=False)
+            if evaluation.usable:
+                starts.append(evaluation.start)
+            return self.local(evaluation, point)
+
+        return look
+
     def local(self, evaluation: Evaluation, point) -> Linearization | None:
         """Return the objective and the constraints at a `point`, with gradients.
 
@@ -217,22 +232,13 @@ class Problem:
         """
         caps = []
         for limit in self.limits:
-            tags, values, slopes = [], [], []
-            for kind, one in counting(evaluation):
-                maxima = one.maxima if limit.cornered else None
-                if maxima is None or not maxima.times.size:
-                    tags.append((kind, 0.0))
-                    values.append(one.response[limit.key])
-                    slopes.append(np.array(list(one.gradient[limit.key].values())))
-                    continue
-                period = one.steady_state["period"]
-                tags += [(kind, time / period) for time in maxima.times]
-                values += [*maxima.forces]
-                slopes += [*maxima.slopes]
-            rows = limit.sign * np.array(slopes) / limit.scale
-            caps.append(
-                Group(np.array(tags, float), limit.excess(np.array(values)), rows @ jacobian)
-            )
+            parts = [
+                branches_of(one, limit.key, limit.cornered, kind)
+                for kind, one in counting(evaluation)
+            ]
+            tags, values, slopes = map(np.concatenate, zip(*parts, strict=True))
+            rows = limit.sign * slopes / limit.scale
+            caps.append(Group(tags, limit.excess(values), rows @ jacobian))
         return tuple(caps)
 
     def worst(self, evaluation: Evaluation, limit: ForceLimit) -> float:

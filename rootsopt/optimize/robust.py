@@ -132,8 +132,7 @@ class RobustStage(Stage):
     designs from which searches begin; `offsets`: those of `RobustProblem`."""
 
     apart = 0.03
-    bounded = False
-    screens = False
+    broad = False
 
     def __init__(
         self,
@@ -242,16 +241,19 @@ class StagedSearch:
         how = self._report, self.stop, self.checkpoint, self.runs
         self._stage = stage = Search(second[0], *how, second[1])
         outcome = stage.run()
-        if outcome.problem is None:
+        if not isinstance(outcome.problem, RobustProblem):
             return outcome
-        return self._with(outcome, *self._compared(stage, outcome))
+        return _joined(nominal, outcome, *self._compared(stage, outcome.problem, nominal, outcome))
 
     def _second(self, nominal: Optimization) -> tuple[Config, RobustStage] | None:
         """Return config and stage of the second search; `None` if there is nothing to search."""
         starts = self.config.optimizer.starts
         if self.config.tolerances is not None:
             return self.config, RobustStage(nominal, starts)
-        spread = compared(self.config, nominal, self.runs, self.stop.is_set, self._tick)
+        spread = compared(
+            self.config, nominal, self.runs, self.stop.is_set,
+            lambda done, expected: self._report(done, expected, float("nan")),
+        )  # fmt: skip
         if spread is None:
             return None
         scenes, offsets = spread.sample(self.config.assumptions.combine == "regret")
@@ -268,33 +270,21 @@ class StagedSearch:
         outcome = self._stage.so_far()
         if outcome is None:
             return self._nominal
-        return outcome if self._nominal is None else self._with(outcome, {}, {})
-
-    def _with(self, outcome: Optimization, fresh, scenes) -> Optimization:
-        assert self._nominal is not None
-        count = len(self._nominal.history)
-        rows = [row | {"evaluation": row["evaluation"] + count} for row in outcome.history]
-        begun = next((row["objective"] for row in rows), float("nan"))
-        robustness = Robustness(self._nominal, float(begun), fresh, scenes)
-        history = [*self._nominal.history, *rows]
-        return dataclasses.replace(outcome, history=history, robustness=robustness)
+        return outcome if self._nominal is None else _joined(self._nominal, outcome, {}, {})
 
     def _report(self, done: int, expected: int, best: float) -> None:
         self.progress(self._done + done, self._expected + expected, best)
 
-    def _tick(self, done: int, expected: int) -> None:
-        self._report(done, expected, float("nan"))
-
-    def _compared(self, stage: Search, outcome: Optimization) -> tuple[dict, dict]:
+    def _compared(
+        self, stage: Search, problem: RobustProblem, nominal: Optimization, outcome: Optimization
+    ) -> tuple[dict, dict]:
         """Return the fields `fresh` and `scenes` of `Robustness`."""
         tolerances = self.config.tolerances
-        assert self._nominal is not None
-        assert isinstance(outcome.problem, RobustProblem)
         if tolerances is None or not tolerances.check_samples or self.stop.is_set():
             return {}, {}
         known = {
             "baseline": outcome.baseline,
-            "nominal": self._nominal.optimized,
+            "nominal": nominal.optimized,
             "robust": outcome.optimized,
         }
         designs = {
@@ -303,7 +293,7 @@ class StagedSearch:
             if one is not None
         }
         drawn = draw(self.config, tolerances.check_samples, fresh=True)
-        best = outcome.problem.objective(outcome.optimized) if outcome.optimized else float("nan")
+        best = problem.objective(outcome.optimized) if outcome.optimized else float("nan")
         before = self._done + len(outcome.history)
         per, total = 1 + tolerances.samples, len(drawn) * len(designs)
         expected, lock, ended = before + total // per, threading.Lock(), [0]
@@ -317,11 +307,22 @@ class StagedSearch:
                     self.progress(before + ended[0] // per, expected, best)
             return self.stop.is_set()
 
-        fresh = compare(outcome.problem, designs, drawn, tick, self.runs)
+        fresh = compare(problem, designs, drawn, tick, self.runs)
         if self.stop.is_set():
             return {}, {}
         keys = [one.key for one in self.config.scatters]
         return fresh, dict(zip(keys, drawn.T, strict=True))
+
+
+def _joined(nominal: Optimization, outcome: Optimization, fresh, scenes) -> Optimization:
+    """Return the `outcome` of the second stage with the history of both stages.
+
+    `nominal`: outcome of the first stage; `fresh`, `scenes`: fields of `Robustness`."""
+    count = len(nominal.history)
+    rows = [row | {"evaluation": row["evaluation"] + count} for row in outcome.history]
+    begun = next((row["objective"] for row in rows), float("nan"))
+    robustness, history = Robustness(nominal, float(begun), fresh, scenes), nominal.history + rows
+    return dataclasses.replace(outcome, history=history, robustness=robustness)
 
 
 def compare(
@@ -370,10 +371,8 @@ def _scattered(
         if one.usable:
             row[:] = problem.objective(one), *(one.response.get(name, np.nan) for name in RESPONSES)
     values: dict[str, NDArray[np.float64]] = dict(zip(COMPARED, rows.T, strict=True))
-    usable = np.isfinite(values[OBJECTIVE])
-    combined = float("nan")
-    if usable.any():
-        combined = combine(problem.rule, values[OBJECTIVE][usable]).value
+    known = values[OBJECTIVE][np.isfinite(values[OBJECTIVE])]
+    combined = combine(problem.rule, known).value if known.size else float("nan")
     counts = {label: labels.count(label) for label in dict.fromkeys(labels)}
     return Scattered(values, counts, combined)
 

@@ -87,14 +87,6 @@ class RobustProblem(Problem):
             return float("nan")
         return self.combined(evaluation).value / self.reference
 
-    def slope(self, evaluation: Evaluation, point) -> NDArray[np.float64]:
-        """Return the gradient (d,) of the robust objective with respect to the `point` (d,)."""
-        if not evaluation.scenes:
-            return super().slope(evaluation, point)
-        weights = self.combined(evaluation).weights
-        rows = [one.slope(e, point) for one, e, _ in self._each(evaluation)]
-        return np.asarray(weights @ np.array(rows) / self.reference)
-
     def local(
         self, evaluation: Evaluation, point, shares: NDArray[np.float64] | None = None
     ) -> Linearization | None:
@@ -200,13 +192,12 @@ class Stage:
     The base class is the usual search.
 
     `first`: index of the first local search; `apart`: distance between their starts in the unit
-    box; `bounded`: whether the stage may look for a lower bound; `screens`: whether designs are
-    screened."""
+    box; `broad`: whether the stage searches the whole box: it screens designs, and may look for a
+    lower bound."""
 
     first = 0
     apart = 0.15
-    bounded = True
-    screens = True
+    broad = True
 
     def evaluator(self, exact: Evaluator, runs: Runs) -> Evaluator:
         """Return the evaluator of the stage; `exact`: that of the config's objective."""

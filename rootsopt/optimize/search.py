@@ -45,7 +45,7 @@ from rootsopt.optimize.vertices import AT_VERTEX, DRAWN, VertexOptimum, vertex_o
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.journal import Checkpoint
 from rootsopt.response.reducers import HERE, Point, Runs
-from rootsopt.response.result import Evaluation, Seeds
+from rootsopt.response.result import Evaluation
 from rootsopt.response.still import Still, needed_motion
 from rootsopt.runtime.threads import POLL
 from rootsopt.scene.space import Space
@@ -110,7 +110,7 @@ class Search:
             config = config.replaced({"objective.motion": "reached"})
             self.given = self.given.replaced({"objective.motion": "reached"})
         self.config = config
-        changes = {} if self.stage.screens else {"screening": 0}
+        changes = {} if self.stage.broad else {"screening": 0}
         self.settings = config.optimizer.model_copy(update=changes)
         self.progress = progress or (lambda done, expected, best: None)
         self.expected = self.settings.screening + self.settings.starts * (
@@ -118,7 +118,7 @@ class Search:
         )
         self.exact = self.stage.evaluator(evaluator, runs)
         self.noisy = config.objective.motion == "ensemble"
-        self.checkpoint = checkpoint
+        self.checkpoint = checkpoint or Checkpoint({}, None)
         self.stop = threading.Event() if stop is None else stop
         self._lock, self._best = threading.Lock(), float("nan")
         self._trials: list[Trial] = []
@@ -176,9 +176,8 @@ class Search:
             return Optimization(
                 self.problem, baseline, None, [], {}, self.stop.is_set(), infeasible=reason
             )
-        trials: list[Trial] = []
-        if self.settings.screening:
-            trials = self._side_by_side(self._screen, list(enumerate(points)))
+        screens = bool(self.settings.screening)
+        trials = self._side_by_side(self._screen, [*enumerate(points)]) if screens else []
         starts = self._starts(points, trials) or points[:1]
         work = self._descend if self.noisy else self._solve
         trials += self._side_by_side(work, list(enumerate(starts, self.stage.first)))
@@ -231,7 +230,7 @@ class Search:
         size = len(trials[0].point) if trials else 0
         given = self.settings.prove
         quick = size <= QUICK and FIRST * (size + 1) <= len(trials)
-        asked = self.stage.bounded and not self.noisy and size <= PARAMETERS and given is not False
+        asked = self.stage.broad and not self.noisy and size <= PARAMETERS and given is not False
         if not (asked and candidates and (quick or given is True)):
             return None, []
         # By default the bound may cost about as much as the search.
@@ -264,7 +263,7 @@ class Search:
 
         Simulate at most as many designs as the search had `trials`. Return `None` also for an
         objective over a sample, and with more than `PARAMETERS` parameters."""
-        if not self.stage.bounded or len(optimized.design) > PARAMETERS:
+        if not self.stage.broad or len(optimized.design) > PARAMETERS:
             return None
         known = [one for one in trials if one.evaluation.usable]
 
@@ -363,20 +362,13 @@ class Search:
         """Return why no design satisfies the limits of forces.
 
         `points`: feasible points (d,), used if the local searches found none."""
-        starts: list[Seeds] = [None]
-
-        def look(point: NDArray[np.float64]) -> Linearization | None:
-            if self.stop.is_set():
-                return None
-            evaluation = self.sharp(self.problem.design(point), start=starts[-1], series=False)
-            if evaluation.usable:
-                starts.append(evaluation.start)
-            return self.problem.local(evaluation, point)
-
+        look = self.problem.looks(self.sharp)
         usable = [outcome for outcome in self._descents.values() if outcome.local is not None]
         usable.sort(key=lambda outcome: outcome.local.violation if outcome.local else np.inf)
         begins = [outcome.point for outcome in usable[: _SIMULATED - 1]] + points[:1]
-        return explain(self.problem, begins, look)
+        return explain(
+            self.problem, begins, lambda point: None if self.stop.is_set() else look(point)
+        )
 
     def _solve(self, number: int, point: NDArray[np.float64]) -> list[Trial]:
         """Search from `point` (d,) by sequential quadratic programming, and return the trials.
@@ -423,19 +415,15 @@ class Search:
         `start`, `iteration`: as in `Trial`; `orbit`: where the motion begins; `key`: key in the
         checkpoint, by default (`start`, `iteration`)."""
         point = np.array(point, dtype=np.float64)
-        key = (start, iteration) if key is None else key
-        evaluation = None if self.checkpoint is None else self.checkpoint.known(key, point)
-        if evaluation is None:
-            # A sample is distributed by its evaluator.
-            runs = HERE if evaluator.shifts else self.runs
-            evaluation = runs.evaluated(Point(evaluator, self.problem.design(point), orbit))
-            if self.checkpoint is not None:
-                self.checkpoint.keep(key, point, evaluation)
+        # A sample is distributed by its evaluator.
+        runs = HERE if evaluator.shifts else self.runs
+        asked = Point(evaluator, self.problem.design(point), orbit)
+        key = key or (start, iteration)
+        evaluation = self.checkpoint.evaluated(runs.evaluated, key, asked, point)
         objective = self.problem.objective(evaluation)
         feasible, excess = self.problem.feasible(point), self.problem.excess(evaluation)
-        local = None
-        if start >= 0 and not self.noisy:
-            local = self.stage.local(self.problem, start, evaluation, point)
+        searched = start >= 0 and not self.noisy
+        local = self.stage.local(self.problem, start, evaluation, point) if searched else None
         trial = Trial(point, start, iteration, evaluation, objective, feasible, local, excess)
         with self._lock:
             self._trials.append(trial)

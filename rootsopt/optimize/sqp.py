@@ -90,11 +90,6 @@ class Descent(NamedTuple):
     evaluations: int
     promised: float = float("nan")
 
-    @property
-    def converged(self) -> bool:
-        """Whether no design nearby is better."""
-        return self.reason == "converged"
-
 
 REASONS = {
     "converged": "No design nearby is better, and the first-order conditions hold.",

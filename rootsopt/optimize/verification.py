@@ -135,8 +135,7 @@ class Verification:
             reason = judged(end.reason, certificate.holds(RESIDUAL, FEASIBLE))
             promised = end.promised
         held = self.problem.held_by(optimized, certificate)
-        starts = [self._outcome(number, end) for number, end in ends]
-        starts = starts or self._ends(trials)
+        starts = [self._outcome(number, end) for number, end in ends] or self._ends(trials)
         rows = self._sensitivities(optimized, certificate)
         return Optimality(certificate, reason, promised, held, starts, rows)
 
@@ -156,8 +155,8 @@ class Verification:
         rows = []
         for one in quantities(nominal.config):
             forces = {name: one.step * row[one.key] for name, row in moved.gradient.items()}
-            row = {"quantity": one.name, "key": one.key, "unit": one.unit, "value": one.value}
-            row |= {"step": one.step} | forces
+            row = {"quantity": one.name, "key": one.key, "unit": one.unit, "value": one.value,
+                   "step": one.step} | forces  # fmt: skip
             if slopes:
                 row["objective_percent"] = one.step * (100 * slopes[one.key] / level)
             rows.append(row)
@@ -232,8 +231,8 @@ def surviving(result: Optimization, given: Config) -> list[dict[str, Any]]:
     def moved(config: Config, evaluator: Evaluator, full: float, away: float) -> Evaluator:
         # Both flanks of a gap move. The scene takes a negative clearance, which no config may have.
         tip = config.value("pump.tip_clearance_mm")
-        values = {"contact.clearance_mm": config.contact.clearance_mm - 2 * full}
-        values |= {"scene.center_distance_error_mm": own + away}
+        values = {"contact.clearance_mm": config.contact.clearance_mm - 2 * full,
+                  "scene.center_distance_error_mm": own + away}  # fmt: skip
         values |= {} if tip is None else {"pump.tip_clearance_mm": max(0.0, tip - full)}
         return dataclasses.replace(evaluator, scene=evaluator.scene.renewed(config.moved(values)))
 

@@ -265,6 +265,7 @@ def vertex_optimum(
 
 
 def _independent(normals: NDArray[np.float64]) -> bool:
-    if not np.all(np.isfinite(normals)):
-        return False
-    return not len(normals) or float(np.linalg.svd(normals, compute_uv=False)[-1]) > _FLAT
+    finite = bool(np.all(np.isfinite(normals)))
+    return finite and (
+        not len(normals) or float(np.linalg.svd(normals, compute_uv=False)[-1]) > _FLAT
+    )

@@ -90,17 +90,12 @@ class Basins:
     def status(self) -> Status:
         """PERIODIC if every initial state leads to a stable periodic motion, IDLE if no flank
         touches in any of these motions. Otherwise, the status of a motion that is neither."""
-        for status in _LOST:
-            if self.lost.get(status.label):
-                return status
         motions = [attractor.evaluation for attractor in self.attractors]
-        for one in motions:
-            if not closed(one):
-                return one.status
-        if any(self.lost.values()):
-            return Status.NOT_SETTLED
+        failures = [status for status in _LOST if self.lost.get(status.label)]
+        failures += [one.status for one in motions if not closed(one)]
+        failures += [Status.NOT_SETTLED] if any(self.lost.values()) else []
         apart = all(one.status is Status.IDLE for one in motions)
-        return Status.IDLE if apart and motions else Status.PERIODIC
+        return [*failures, Status.IDLE if apart and motions else Status.PERIODIC][0]
 
     def records(self) -> list[dict[str, Any]]:
         """Return one record per attractor for the result file."""

@@ -172,17 +172,15 @@ def _report(
             gradient = {name: dict.fromkeys(evaluator.keys, 0.0) for name in RESPONSES}
         response = dict(zip(RESPONSES, map(float, values[:, 0]), strict=True))
         errors = dict(zip(ERRORS.values(), map(float, values[:, 1]), strict=True))
-        greatest = float(np.max(members.greatest))
         kind, series = _kind(evaluator, pair, members, with_series)
         if status is Status.IDLE:
             kind["kind"] = "idle"
         drift, by_drift = mean_and_error(np.asarray(members.drift, np.float64))
-        steady = kind | size | errors
-        steady |= {
+        steady = kind | size | errors | {
             "mean_force_drift_N": float(drift),
             "mean_force_drift_standard_error_N": float(by_drift),
-            "greatest_force_N": greatest,
-        }
+            "greatest_force_N": float(np.max(members.greatest)),
+        }  # fmt: skip
         last = np.asarray(members.states, np.float64)
         if float(np.max(members.depth)) > TOO_DEEP * float(evaluator.scene.pitch_radius):
             status = Status.TOO_DEEP
@@ -224,9 +222,8 @@ def _kind(evaluator: Evaluator, pair, members: Members, with_series):
     one.
     """
     every = np.all(members.repeats, axis=0)
-    kind: dict[str, Any] = {"kind": "transient"}
-    if every.any():
-        kind = {"kind": "periodic", "period": (int(np.argmax(every)) + 1) * pair.repeats}
+    period = {"period": (int(np.argmax(every)) + 1) * pair.repeats}
+    kind: dict[str, Any] = {"kind": "periodic"} | period if every.any() else {"kind": "transient"}
     if evaluator.survey or (every.any() and not with_series):
         return kind, None
     typical = int(np.argmin(np.any(members.repeats, axis=1)))
@@ -325,9 +322,7 @@ def per_config_unit(
 _pair = CachedFunction(Scene.pair_and_shape)
 
 
-@CachedFunction
-def _point(space: Space, design):
-    return space.point(design)
+_point = CachedFunction(Space.point)
 
 
 @CachedFunction

@@ -20,7 +20,6 @@ from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import CLOSED, OPEN, SAMPLES, Steady, varied, window_status
 from rootsopt.dynamics.window import BLOCK, PERIODS, integrated_difference, lyapunov
 from rootsopt.errors import InputError
-from rootsopt.profiles import Geometry
 from rootsopt.pump.loads import orbit_loads
 from rootsopt.response.records import (
     apart_program,
@@ -71,7 +70,42 @@ class Motions:
 
     def prepare(self, evaluator: "Evaluator", design: Any, series: bool, maxima: bool) -> None:
         """Compile the programs in the background. Arguments: see `Evaluator.prepare`."""
-        evaluator.prepare_reached(design, series, maxima)
+        pair, tangents, _ = build.result_shape(evaluator.scene, design)
+        dtype, solver = pair.angle_scale.dtype, evaluator.solver
+        rest = jax.ShapeDtypeStruct((pair.states,), dtype)
+        begin = eqx.filter_eval_shape(Start.at, pair, rest, solver.max_orbit)
+
+        def then(motion: Steady) -> None:
+            orbit = varied(motion)
+            if loaded(evaluator, series):
+                orbit_loads.prepare(evaluator.scene, design, orbit)
+            if geared(evaluator, series):
+                apart_program.prepare(pair, tangents, orbit)
+            rows = np.zeros((motion.orbit.response.shape[0], 1))
+            forces = solver.measures.named(rows, 1)
+            added = [
+                name
+                for name in evaluator.config.objective.terms
+                if name not in (*forces, *OF_MOTION)
+            ]
+            if added:
+                values, slopes = (jax.ShapeDtypeStruct((3, *d), float) for d in ((), design.shape))
+                values_of.prepare(evaluator.scene, terms_of(added), design, values, slopes)
+            if series:
+                sampled.prepare(motion.known.elements)
+            if series and evaluator.confirm:
+                known = motion.orbit.state, motion.orbit.response
+                _integrated.prepare(pair, known, motion.period, solver.orbit)
+            if maxima or evaluator.maxima:
+                prepare_maxima(pair, tangents, orbit)
+
+        # The slowest compilation starts first.
+        _motion.prepare(pair, tangents, begin, evaluator.scene.pitch_radius, solver, then=then)
+        build.prepare(evaluator.scene, design)
+        if series:
+            count = pair.lobes * SAMPLES
+            times = jax.ShapeDtypeStruct((count,), float)
+            contact_series.prepare(pair, times, jax.ShapeDtypeStruct((count, pair.states), dtype))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -247,17 +281,13 @@ class Evaluator:
 
     def _over_speeds(self, design: Any, start: Any, series: bool) -> Evaluation:
         own, begins = self.config.scene.speed_rpm, start or (None,) * len(self.speeds)
-        points = [
-            Point(self._at(number), design, begin, series and self.speeds[number][0] == own)
-            for number, begin in enumerate(begins)
-        ]
+        points = []
+        for number, ((speed, _), begin) in enumerate(zip(self.speeds, begins, strict=True)):
+            references = self.references[number : number + 1]
+            alone = dataclasses.replace(self.at_speed(speed), references=references)
+            points.append(Point(alone, design, begin, series and speed == own))
         # Designs run side by side, so that their speeds need no threads.
         return over_speeds(parts_at(self.speeds, evaluate_many(points, IN_TURN)), own)
-
-    def _at(self, number: int) -> "Evaluator":
-        references = self.references[number : number + 1]
-        alone = self.at_speed(self.speeds[number][0])
-        return dataclasses.replace(alone, references=references)
 
     def reached(
         self, design: Any, start: Seed | ArrayLike | None = None, series: bool = True
@@ -266,7 +296,7 @@ class Evaluator:
 
         `design` (d,): in config units. For the other arguments, see `__call__`."""
         began = time.perf_counter()
-        pair, tangents, shape = _build(self.scene, design)
+        pair, tangents, shape = build(self.scene, design)
         begin = begun(pair, start, self.solver.max_orbit)
         motion = self.motion(pair, tangents, begin)
         if series and self.confirm:
@@ -328,7 +358,7 @@ class Evaluator:
 
     def pair(self, design: ArrayLike) -> RotorPair:
         """Return the rotor pair of `design` (config units)."""
-        return _build(self.scene, jnp.asarray(design))[0]
+        return build(self.scene, jnp.asarray(design))[0]
 
     def prepare(
         self, design: ArrayLike | None = None, series: bool = True, maxima: bool = False
@@ -339,48 +369,6 @@ class Evaluator:
         `with_maxima` will follow."""
         design = design_vector(self.config) if design is None else jnp.asarray(design)
         self.motions.prepare(self, design, series, maxima)
-
-    def prepare_reached(self, design: Any, series: bool, maxima: bool) -> None:
-        """Compile the programs of `reached` in the background. Arguments: see `prepare`."""
-        pair, tangents, _ = _build.result_shape(self.scene, design)
-        dtype, solver = pair.angle_scale.dtype, self.solver
-        rest = jax.ShapeDtypeStruct((pair.states,), dtype)
-        begin = eqx.filter_eval_shape(Start.at, pair, rest, solver.max_orbit)
-
-        def then(motion: Steady) -> None:
-            orbit = varied(motion)
-            if loaded(self, series):
-                orbit_loads.prepare(self.scene, design, orbit)
-            if geared(self, series):
-                apart_program.prepare(pair, tangents, orbit)
-            rows = np.zeros((motion.orbit.response.shape[0], 1))
-            forces = solver.measures.named(rows, 1)
-            added = [
-                name for name in self.config.objective.terms if name not in (*forces, *OF_MOTION)
-            ]
-            if added:
-                values, slopes = (jax.ShapeDtypeStruct((3, *d), float) for d in ((), design.shape))
-                values_of.prepare(self.scene, terms_of(added), design, values, slopes)
-            if series:
-                sampled.prepare(motion.known.elements)
-            if series and self.confirm:
-                known = motion.orbit.state, motion.orbit.response
-                _integrated.prepare(pair, known, motion.period, solver.orbit)
-            if maxima or self.maxima:
-                prepare_maxima(pair, tangents, orbit)
-
-        # The slowest compilation starts first.
-        _motion.prepare(pair, tangents, begin, self.scene.pitch_radius, solver, then=then)
-        _build.prepare(self.scene, design)
-        if series:
-            count = pair.lobes * SAMPLES
-            times = jax.ShapeDtypeStruct((count,), float)
-            contact_series.prepare(pair, times, jax.ShapeDtypeStruct((count, pair.states), dtype))
-
-    def assembled(self) -> tuple[RotorPair, RotorPair, Geometry]:
-        """Return the pair of the config's own design, its derivatives along the design, and its
-        geometry."""
-        return _build(self.scene, design_vector(self.config))
 
     def evaluation(self, design: Any, *known: Any) -> Evaluation:
         """Return the evaluation of a `design` (config units) with a known motion.
@@ -397,7 +385,7 @@ def motion_from(pair: RotorPair, tangents: RotorPair, start: Start, radius, solv
     return steady_motion(pair, tangents, start, radius, solver)
 
 
-_build = CachedFunction(Scene.pair_and_tangents)
+build = CachedFunction(Scene.pair_and_tangents)
 _motion = CachedFunction(motion_from)
 _integrated = CachedFunction(integrated_difference)
 lyapunov_program = CachedFunction(lyapunov)

@@ -160,8 +160,9 @@ def header_of(
     `imports`: names of the files and modules that were imported first; `others`: paths of files
     that replace the config's own; `more`: further entries. Raises `InputError` if a file cannot be
     read."""
-    files = {path for path in (*map(config.value, FILES), *others) if path is not None}
-    files |= {name for name in imports if os.path.isfile(name)}
+    files = {path for path in (*map(config.value, FILES), *others) if path is not None} | {
+        name for name in imports if os.path.isfile(name)
+    }
     return {
         "command": command,
         "config": config.model_dump(mode="json"),
@@ -261,35 +262,20 @@ class Checkpoint(Journal):
     def evaluated(
         self,
         run: Callable[[Point], Evaluation],
-        stage: str,
+        key: Any,
         asked: Point,
         point: NDArray[np.float64],
     ) -> Evaluation:
-        """Return `run(asked)`, or the evaluation stored for the same arguments.
+        """Return `run(asked)` and keep it under `key`, or return what a resumed file holds there.
 
-        `stage`: name of the evaluator; `point` (d,): the design in the unit box."""
-        begun = json.dumps(plain(asked.start)).encode()
-        key = stage, hashlib.sha256(point.tobytes() + begun).hexdigest()[:16]
-        known = self.known(key, point)
-        if known is not None:
-            return known
-        evaluation = run(asked)
-        self.keep(key, point, evaluation)
-        return evaluation
-
-    def known(self, key: Any, point: NDArray[np.float64]) -> Evaluation | None:
-        """Return the evaluation stored under `key`, or `None` unless it belongs to `point` (d,).
-
-        Only evaluations that were read from a resumed file are found."""
+        `point` (d,): the design in the unit box, to which a stored evaluation must belong."""
         with self._lock:
-            if key not in self.resumed or self.rows[key][0] != point.tolist():
-                return None
-            self.reused += 1
-            return self.rows[key][1]
-
-    def keep(self, key: Any, point: NDArray[np.float64], evaluation: Evaluation) -> None:
-        """Add the `evaluation` of a `point` (d,)."""
+            if key in self.resumed and self.rows[key][0] == point.tolist():
+                self.reused += 1
+                return self.rows[key][1]
+        evaluation = run(asked)
         self.add([(key, (point.tolist(), evaluation))])
+        return evaluation
 
     def read(self, key: Any, value: Any) -> tuple[list[float], Evaluation]:
         point, evaluation = value

@@ -280,9 +280,8 @@ def apart_message(config: Config, depth: float, backlash: float | None = None) -
     of the timing gear may grow, `None` if it is not known. Without it, the message names the
     clearance, because the motion does not depend on the clearance as long as nothing touches."""
     geared = config.scene.timing_gear is not None
-    said = Status.IDLE.value
-    if geared:
-        said = "The timing gear keeps the flanks apart: the contact force is zero."
+    kept = "The timing gear keeps the flanks apart: the contact force is zero."
+    said = kept if geared else Status.IDLE.value
     gap, clearance = -depth / MM, config.contact.clearance_mm
     if not (np.isfinite(gap) and 0 < gap < 0.9 * config.profile.pitch_radius_mm):
         return said
@@ -318,8 +317,9 @@ def reported(
     steady: dict[str, Any] = {"kind": "idle" if idle else "transient"}
     said, hint, motion, start = message_of(evaluator.config, status), "", None, None
     if status in CLOSED or held:
-        steady = {"kind": "idle" if idle else "periodic"}
-        steady |= orbit_record(steady_motion.orbit, int(steady_motion.period))
+        steady = {"kind": "idle" if idle else "periodic"} | orbit_record(
+            steady_motion.orbit, int(steady_motion.period)
+        )
         statistics |= orbit_statistics(steady_motion, evaluator.solver)
         motion, further = _along(evaluator, design, (pair, tangents), steady_motion, series)
         named, start = named | further, Seed.of(steady_motion, pair)

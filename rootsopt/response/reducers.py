@@ -166,9 +166,8 @@ def shares(config: Config) -> dict[float, float]:
     objective = config.objective
     speeds = objective.speeds_rpm or (config.scene.speed_rpm,)
     weights = objective.speed_weights or (1.0,) * len(speeds)
-    speed_shares = {config.scene.speed_rpm: 0.0}
-    speed_shares |= {s: w / sum(weights) for s, w in zip(speeds, weights, strict=True)}
-    return dict(sorted(speed_shares.items()))
+    given = {s: w / sum(weights) for s, w in zip(speeds, weights, strict=True)}
+    return dict(sorted(({config.scene.speed_rpm: 0.0} | given).items()))
 
 
 def counted(

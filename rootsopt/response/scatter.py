@@ -85,9 +85,7 @@ def shifts(config: Config, samples: Float[np.ndarray, "n q"]) -> tuple[Shift, ..
     for row in np.asarray(samples):
         values = dict(zip(keys, map(float, row), strict=True))
         of_scene = {key: x for key, x in values.items() if not key.startswith("profile.")}
-        scene = None
-        if of_scene:
-            scene = _difference(here, here.renewed(config.moved(of_scene)))
+        scene = _difference(here, here.renewed(config.moved(of_scene))) if of_scene else None
         changes.append(Shift(values, scene, config.moved(values).design - config.design))
     return tuple(changes)
 

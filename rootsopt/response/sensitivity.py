@@ -62,16 +62,16 @@ def quantities(config: Config) -> list[Quantity]:
     The table states the effect of a change by 1 µm for clearance, backlash and centre distance
     error. For all other quantities, the change is 1 %. Quantities of parts that the scene does not
     have are left out. So are quantities that are 0, except the first three."""
-    entries = []
-    for key, name in LENGTHS:
-        value = config.value(key)
-        if value is not None:
-            entries.append(Quantity(key, name, "mm", value, MICROMETRE))
-    for key, name, unit in OTHERS:
-        value = config.value(key)
-        if value:
-            entries.append(Quantity(key, name, unit, value, _PERCENT * value))
-    return entries
+    lengths = [
+        Quantity(key, name, "mm", value, MICROMETRE)
+        for key, name in LENGTHS
+        if (value := config.value(key)) is not None
+    ]
+    return lengths + [
+        Quantity(key, name, unit, value, _PERCENT * value)
+        for key, name, unit in OTHERS
+        if (value := config.value(key))
+    ]
 
 
 def direction(

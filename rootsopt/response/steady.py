@@ -281,12 +281,11 @@ def _state(pair: RotorPair, tangents: RotorPair, motion: Steady):
 def _basis(leaves: list[Array]) -> list[Array]:
     """Return the unit directions of all entries of the `leaves`, stacked along a leading axis."""
     sizes = [leaf.size for leaf in leaves]
-    unit, begin, rows = np.eye(sum(sizes)), 0, []
-    for leaf, size in zip(leaves, sizes, strict=True):
-        part = unit[:, begin : begin + size].reshape(len(unit), *leaf.shape)
-        rows.append(jnp.asarray(part, leaf.dtype))
-        begin += size
-    return rows
+    unit, ends = np.eye(sum(sizes)), np.cumsum(sizes, dtype=int)
+    return [
+        jnp.asarray(unit[:, end - leaf.size : end].reshape(len(unit), *leaf.shape), leaf.dtype)
+        for leaf, end in zip(leaves, ends, strict=True)
+    ]
 
 
 def _next_start(pair: RotorPair, motion: Steady, state: Float[Array, " n"]) -> Start:

@@ -115,10 +115,6 @@ def _leakage(at: _At, name: str) -> flow.Leakage:
     return flow.leakage(at.scene, at.scene.medium, at.profile, at.shape)
 
 
-def _gaps(at: _At, name: str) -> Float[Array, " n"]:
-    return _leakage(at, name).gap.least
-
-
 def _silent(at: _At) -> Float[Array, ""]:
     if at.scene.gear is None or at.scene.gear.errors is None:
         raise InputError(
@@ -194,8 +190,8 @@ _MORE: dict[str, Callable[[_At], Any]] = {
     # Greatest backlash at which a timing gear keeps the flanks apart; negative where the rotors
     # overlap.
     "gear_backlash_max_mm": lambda at: play_of(at.scene, at.profile).gear_backlash / MM,
-    "flank_gap_min_um": lambda at: jnp.min(_gaps(at, "flank_gap_min_um")) / UM,
-    "flank_gap_mean_um": lambda at: jnp.mean(_gaps(at, "flank_gap_mean_um")) / UM,
+    "flank_gap_min_um": lambda at: jnp.min(_leakage(at, "flank_gap_min_um").gap.least) / UM,
+    "flank_gap_mean_um": lambda at: jnp.mean(_leakage(at, "flank_gap_mean_um").gap.least) / UM,
     SILENT: _silent,
     **{name: partial(_of_gear, name=name) for name in RESERVES},
 }
@@ -274,14 +270,10 @@ class _UsedError(Exception):
 class _NoForces:
     """Substitute for `Forces` that raises an error when a term reads a force."""
 
-    def __getattr__(self, name: str) -> Any:
-        raise _UsedError(name)
+    def __getattr__(self, *asked: Any) -> Any:
+        raise _UsedError
 
-    def __iter__(self) -> Any:
-        raise _UsedError("all")
-
-    def __getitem__(self, place: Any) -> Any:
-        raise _UsedError(str(place))
+    __iter__ = __getitem__ = __getattr__
 
 
 def needs_forces(scene: Scene, term: Term, design: Float[Array, " d"]) -> bool:

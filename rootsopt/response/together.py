@@ -27,7 +27,7 @@ from rootsopt.dynamics.flow import one_period, strobe
 from rootsopt.dynamics.integrator import Integrator
 from rootsopt.dynamics.pair import RotorPair
 from rootsopt.dynamics.steady import Steady
-from rootsopt.response.evaluation import Evaluator, motion_from
+from rootsopt.response.evaluation import Evaluator, build, motion_from
 from rootsopt.response.result import Evaluation, begun
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.scene.reading import design_vector
@@ -45,7 +45,7 @@ def evaluate_together(evaluators: Sequence[Evaluator]) -> list[Evaluation]:
 
     Scenes of the same structure (parts, number of lobes, solver) are computed together."""
     began = time.perf_counter()
-    built = [one.assembled() for one in evaluators]
+    built = [build(one.scene, design_vector(one.config)) for one in evaluators]
     groups: dict[Hashable, list[int]] = {}
     inputs = []
     for number, (one, (pair, tangents, _)) in enumerate(zip(evaluators, built, strict=True)):
@@ -121,13 +121,13 @@ class Members(NamedTuple):
 
         Failures are checked in this order: the solver failed; the forces are not finite; the motor
         stalled; the lobes passed through each other."""
-        if not np.all(self.solved):
-            return Status.SOLVER_FAILED
-        if not np.all(np.isfinite(self.means)):
-            return Status.NON_FINITE
-        if np.any(self.stalled):
-            return Status.STALLED
-        return Status.PASSED_THROUGH if np.any(self.lost) else Status.AVERAGED
+        failures = {
+            Status.SOLVER_FAILED: not np.all(self.solved),
+            Status.NON_FINITE: not np.all(np.isfinite(self.means)),
+            Status.STALLED: np.any(self.stalled),
+            Status.PASSED_THROUGH: np.any(self.lost),
+        }
+        return next((status for status, met in failures.items() if met), Status.AVERAGED)
 
     @property
     def responses(self) -> NDArray[np.float64]:

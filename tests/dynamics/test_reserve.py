@@ -162,7 +162,7 @@ def test_a_search_without_forces_simulates_nothing(monkeypatch):
     def moved(*arguments, **named):
         raise AssertionError("nothing may move")
 
-    for name in ("_motion", "_build", "apart_program"):
+    for name in ("_motion", "build", "apart_program"):
         monkeypatch.setattr(evaluation, name, moved)
     found = rootsopt.optimize_design(load("cic_drawn", [*QUICK, "optimizer.iterations=8"]))
     assert found.optimized.status is Status.GEOMETRY_ONLY

@@ -42,7 +42,7 @@ def test_the_command_keeps_its_checkpoint_until_the_run_is_in_place(tmp_path, mo
     kept.write_text("of an earlier run")
 
     def search_of(config, progress, stop, checkpoint, runs):
-        checkpoint.keep((0, 0), np.zeros(1), evaluation(0.1))
+        checkpoint.add([((0, 0), ([0.0], evaluation(0.1)))])
         return types.SimpleNamespace(run=lambda: None, so_far=lambda: None)
 
     def given_up(self):

@@ -16,6 +16,7 @@ from rootsopt.optimize.problem import Problem
 from rootsopt.optimize.robust_problem import Stage
 from rootsopt.optimize.search import Search
 from rootsopt.response.evaluation import Evaluator
+from rootsopt.response.journal import Checkpoint
 from rootsopt.response.reducers import HERE
 from rootsopt.scene.space import sobol
 from rootsopt.status import Status
@@ -51,7 +52,8 @@ def searching(truth=lambda point: 1.0, tight=None, **settings) -> Search:
     `tight`: what it finds at a tighter tolerance, by default the same."""
     search = object.__new__(Search)
     search.stop, search._refuted, search._trials = threading.Event(), [], []
-    search._descents, search.checkpoint, search.noisy, search.runs = {}, None, True, HERE
+    search._descents, search.checkpoint = {}, Checkpoint({}, None)
+    search.noisy, search.runs = True, HERE
     config = load("configs/cic_drawn.yaml")
     given = {"screening": 0, "starts": 2} | settings
     search.settings = config.optimizer.model_copy(update=given)

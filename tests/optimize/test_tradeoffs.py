@@ -378,7 +378,8 @@ def test_a_point_holds_up_only_if_all_its_terms_do(off, reason, standing):
 def test_a_point_divides_neighbours_if_it_lies_between_them():
     """It does not at an end, or farther from one of them than they are apart."""
     one, other = np.array([0.0, 1.0]), np.array([1.0, 0.0])
-    edge = assembly.measured((0, 1), np.stack([one, other]), np.zeros((2, 3)))
+    both = np.stack([one, other]), np.zeros((2, 3))
+    (edge,) = assembly.Selection(*both, [], [-1, -1], [0, 1]).edges([])
     assert edge.distance == pytest.approx(2**0.5)
     places = [0.5, 0.5], [0.2, 0.7], one, other, [0.001, 0.999], [1.5, -0.5], [2.0, 2.0]
     between = [assembly.divides(edge, np.array(place), one, other) for place in places]

@@ -98,27 +98,6 @@ class Spacing(NamedTuple):
         return "terms" if edge.distance > _WIDE_TERMS * self.terms else "design"
 
 
-def measured(pair: Pair, values: NDArray[np.float64], points: NDArray[np.float64]) -> Edge:
-    """Return the `Edge` of a `pair` of points.
-
-    `values` (n, k): scaled terms of all points; `points` (n, d): their designs in the unit box."""
-    i, j = pair
-    apart = float(np.linalg.norm(values[i] - values[j]))
-    return Edge(pair, apart, float(np.max(np.abs(points[i] - points[j]))))
-
-
-def among(pairs: Sequence[Pair], kept: Sequence[int], same: Sequence[int]) -> list[Pair]:
-    """Return those `pairs` whose points are both in `kept`, each once.
-
-    `same`: for each point, the index of the point that replaces it, or -1."""
-    unique: dict[Pair, None] = {}
-    for pair in pairs:
-        i, j = sorted(same[k] if same[k] >= 0 else k for k in pair)
-        if i != j and i in kept and j in kept:
-            unique[i, j] = None
-    return [*unique]
-
-
 def divides(
     edge: Edge, values: NDArray[np.float64], one: NDArray[np.float64], other: NDArray[np.float64]
 ) -> bool:
@@ -171,11 +150,6 @@ class Node(NamedTuple):
         """Value of the objective."""
         return self.scalar.value(self.sample.values)
 
-    @property
-    def point(self) -> NDArray[np.float64]:
-        """The design (d,) in the unit box."""
-        return self.sample.point
-
 
 class Selection(NamedTuple):
     """The nodes, out of n, that form the front.
@@ -191,15 +165,24 @@ class Selection(NamedTuple):
     kept: list[int]
 
     def edges(self, pairs: Sequence[Pair]) -> list[Edge]:
-        """Return the pairs of neighbours on the front.
+        """Return the pairs of neighbours on the front, each once.
 
-        `pairs`: indices of neighbouring nodes; used for three terms only. With two terms,
-        neighbours are nodes that follow each other in `kept`."""
-        if self.values.shape[1] == 2:
-            neighbours = [(min(pair), max(pair)) for pair in itertools.pairwise(self.kept)]
-        else:
-            neighbours = among(pairs, self.kept, self.same)
-        return [measured(pair, self.values, self.points) for pair in neighbours]
+        `pairs`: indices of neighbouring nodes, where a repeated node stands for the one that it
+        repeats; used for three terms only. With two terms, neighbours are nodes that follow each
+        other in `kept`."""
+        known, values, points = {*self.kept}, self.values, self.points
+        given = ([self.same[k] if self.same[k] >= 0 else k for k in pair] for pair in pairs)
+        nodes = itertools.pairwise(self.kept) if values.shape[1] == 2 else given
+        neighbours = dict.fromkeys((min(pair), max(pair)) for pair in nodes)
+        return [
+            Edge(
+                (i, j),
+                float(np.linalg.norm(values[i] - values[j])),
+                float(np.max(np.abs(points[i] - points[j]))),
+            )
+            for i, j in neighbours
+            if i != j and known.issuperset((i, j))
+        ]
 
 
 def selected(nodes: Sequence[Node], scale: Scale) -> Selection:
@@ -308,12 +291,12 @@ def _limits(study: Study, certificate: Certificate) -> dict[str, float]:
         )
         if multiplier > HELD
     }
-    keys = study.problem.config.design_keys
-    for side, multipliers in (("lower", certificate.lower), ("upper", certificate.upper)):
-        for key, multiplier in zip(keys, multipliers, strict=True):
-            if multiplier > HELD:
-                limits[f"{side} bound of {words(key)}"] = float(multiplier)
-    return limits
+    return limits | {
+        f"{side} bound of {words(key)}": float(multiplier)
+        for side, multipliers in (("lower", certificate.lower), ("upper", certificate.upper))
+        for key, multiplier in zip(study.problem.config.design_keys, multipliers, strict=True)
+        if multiplier > HELD
+    }
 
 
 def better(best: Node | None, other: Node | None) -> Node | None:
@@ -340,12 +323,12 @@ def predictions(key: Key, ahead: bool, nodes: Mapping[Key, Node], course: Course
             continue
         far = nodes.get(tuple(a - 2 * b for a, b in zip(key, step, strict=True)))
         before = course.evaluations
-        if far is not None and np.max(np.abs(near.point - far.point)) < 2 * APART:
-            secant = np.clip(2 * near.point - far.point, 0.0, 1.0)
+        if far is not None and np.max(np.abs(near.sample.point - far.sample.point)) < 2 * APART:
+            secant = np.clip(2 * near.sample.point - far.sample.point, 0.0, 1.0)
             yield secant, near.sample.evaluation.start
             if course.evaluations > before + 1:  # The start had a steady state.
                 return
-        yield near.point, near.sample.evaluation.start
+        yield near.sample.point, near.sample.evaluation.start
         return
 
 
@@ -391,8 +374,8 @@ def front_of(
         edges, gaps = gaps_of(selection, tracer._gaps, spacing)
         if tracer.stop.is_set():  # Neighbours may be far apart only because points are missing.
             gaps = [gap for gap in gaps if gap.confirmed]
-        known = {"points": tuple(points), "dropped": tuple(dropped)}
-        known |= {"edges": tuple(edges), "gaps": tuple(gaps)}
+        known = {"points": tuple(points), "dropped": tuple(dropped),
+                 "edges": tuple(edges), "gaps": tuple(gaps)}  # fmt: skip
     return Front(
         config=tracer.config,
         aims=study.aims,
@@ -423,7 +406,7 @@ def sharpened(tracer: "Tracer", pair: Pair) -> Pair:
         node = tracer._all()[moving]
         scalar = Scalar(tracer.scale, reference, (0, 1), direction)
         orbit = node.sample.evaluation.start
-        best = tracer._solved(scalar, node.point, orbit, None, tracer._course)
+        best = tracer._solved(scalar, node.sample.point, orbit, None, tracer._course)
         if best is None or tracer.stop.is_set():
             continue
         terms = tracer.scale.of(best.sample.values)

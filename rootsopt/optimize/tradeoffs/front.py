@@ -108,8 +108,8 @@ class FrontPoint:
         first = next(iter(self.terms))
         rates = {f"{first}_per_{k}": None if math.isnan(v) else v for k, v in self.rates.items()}
         geometry = {k: v for k, v in self.evaluation.geometry.items() if k not in self.terms}
-        row = {"point": self.number, "status": self.standing.label, "end_of": self.end_of}
-        row |= self.terms | rates | self.design | geometry
+        own = {"point": self.number, "status": self.standing.label, "end_of": self.end_of}
+        row = own | self.terms | rates | self.design | geometry
         forces = {k: v for k, v in self.evaluation.response.items() if k not in row}
         return row | forces | {"residual": self.residual}
 
@@ -179,15 +179,13 @@ class Front:
     @property
     def status(self) -> Status:
         """Status of the front as a whole."""
-        if self.interrupted:
-            return Status.INTERRUPTED
-        if not self.baseline_terms:
-            return self.baseline.status
-        if self.infeasible is not None:
-            return Status.INFEASIBLE
-        if not self.certified:
-            return Status.NOT_CONVERGED
-        return self.baseline.status
+        failures = (
+            (Status.INTERRUPTED, self.interrupted),
+            (self.baseline.status, not self.baseline_terms),
+            (Status.INFEASIBLE, self.infeasible is not None),
+            (Status.NOT_CONVERGED, not self.certified),
+        )
+        return next((status for status, met in failures if met), self.baseline.status)
 
     @property
     def message(self) -> str:
@@ -410,10 +408,9 @@ def directions(count: int) -> list[Key]:
 def links(grid: Sequence[Key]) -> list[tuple[int, int]]:
     """Return the pairs of neighbours on the grid, as indices of the keys in `grid`."""
     place = {key: number for number, key in enumerate(grid)}
-    pairs = []
-    for key, number in place.items():
-        for step in directions(len(key)):
-            other = place.get(tuple(a + b for a, b in zip(key, step, strict=True)))
-            if other is not None:
-                pairs.append((number, other))
-    return pairs
+    return [
+        (number, place[other])
+        for key, number in place.items()
+        for step in directions(len(key))
+        if (other := tuple(a + b for a, b in zip(key, step, strict=True))) in place
+    ]

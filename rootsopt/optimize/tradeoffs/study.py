@@ -3,6 +3,8 @@
 Without a term that depends on forces, nothing is simulated."""
 
 import dataclasses
+import hashlib
+import json
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -16,18 +18,19 @@ from rootsopt.errors import InputError
 from rootsopt.optimize.limits import (
     LIMITS,
     PEAK,
+    branches_of,
     force_limits,
     limited,
     quantity_of,
     settled_by,
     term_constraints,
 )
-from rootsopt.optimize.local import FEASIBLE, Group
+from rootsopt.optimize.local import Group
 from rootsopt.optimize.problem import Problem
 from rootsopt.response.evaluation import Evaluator
 from rootsopt.response.journal import Checkpoint
 from rootsopt.response.reducers import HERE, Point, Runs
-from rootsopt.response.result import Evaluation, Seeds
+from rootsopt.response.result import Evaluation, Seeds, plain
 from rootsopt.response.still import Still
 from rootsopt.response.terms import depends_on_forces, is_force, reporting, terms_of
 from rootsopt.scene.build import Scene
@@ -72,11 +75,12 @@ def aims_of(config: Config) -> tuple[Aim, ...]:
     """Return the terms of `config.pareto`.
 
     Raises `InputError` for a name that is neither a force nor a registered term."""
-    aims = []
-    for name in config.pareto.terms:
-        sense = "min" if is_force(config, name, _KEY) else terms_of([name], "pareto.terms")[0].sense
-        aims.append(Aim(name, config.pareto.senses.get(name, sense)))
-    return tuple(aims)
+
+    def sense(name: str) -> str:
+        return "min" if is_force(config, name, _KEY) else terms_of([name], _KEY)[0].sense
+
+    wanted = config.pareto
+    return tuple(Aim(name, wanted.senses.get(name, sense(name))) for name in wanted.terms)
 
 
 def simulated(config: Config, scene: Scene) -> bool:
@@ -156,12 +160,6 @@ class Sample:
     caps: tuple[Group, ...] = ()
 
     @property
-    def feasible(self) -> bool:
-        """Whether all constraints hold."""
-        beyond = max((cap.top for cap in self.caps), default=0.0)
-        return max(-float(np.min(self.slack, initial=0.0)), beyond) <= FEASIBLE
-
-    @property
     def values(self) -> NDArray[np.float64]:
         """Values (k,) of the terms, each with the sign that makes it a term to be minimised."""
         return np.array([group.top for group in self.terms])
@@ -182,8 +180,8 @@ class Study:
     fast: Evaluator
     sharp: Evaluator
     exact: Evaluator
-    runs: Runs = HERE
-    checkpoint: Checkpoint | None = None
+    runs: Runs
+    checkpoint: Checkpoint
     limits_dropped: tuple[str, ...] = ()
 
     @classmethod
@@ -210,7 +208,7 @@ class Study:
         config = settled_by(config, baseline)
         space = Space.of(config, exact.scene, term_constraints(config, exact.scene))
         problem = Problem(config, baseline, space, force_limits(config, exact.scene))
-        work = fast, exact.surveying(), exact, runs, checkpoint
+        work = fast, exact.surveying(), exact, runs, checkpoint or Checkpoint({}, None)
         return cls(aims, problem, *work, dropped)
 
     def term_values(self, evaluation: Evaluation) -> dict[str, float]:
@@ -244,9 +242,9 @@ class Study:
         orbit: Seeds = None,
     ) -> Evaluation:
         asked = Point(evaluator, self.problem.design(point), orbit)
-        if self.checkpoint is None:
-            return self.runs.evaluated(asked)
-        return self.checkpoint.evaluated(self.runs.evaluated, stage, asked, point)
+        begun = json.dumps(plain(orbit)).encode()
+        key = stage, hashlib.sha256(point.tobytes() + begun).hexdigest()[:16]
+        return self.checkpoint.evaluated(self.runs.evaluated, key, asked, point)
 
     def _moving(self, point: NDArray[np.float64], evaluation: Evaluation) -> Sample | None:
         if not evaluation.usable:
@@ -254,17 +252,9 @@ class Study:
         _, jacobian, slack, normals = self.problem.look(point)
         groups = []
         for number, aim in enumerate(self.aims):
-            maxima = evaluation.maxima if _is_cornered(aim) else None
-            if maxima is not None and maxima.times.size:
-                period = evaluation.steady_state["period"]
-                kinds = np.full(maxima.times.size, float(number))
-                tags = np.stack([kinds, maxima.times / period], axis=1)
-                groups.append(Group(tags, maxima.forces, maxima.slopes @ jacobian))
-                continue
-            value = np.array([evaluation.response[aim.name]])
-            slope = np.array([*evaluation.gradient[aim.name].values()]) @ jacobian
-            tags = np.array([[float(number), 0.0]])
-            groups.append(Group(tags, aim.sign * value, aim.sign * slope[None, :]))
+            one = branches_of(evaluation, aim.name, _is_cornered(aim), number)
+            slopes = aim.sign * (one.slopes @ jacobian)
+            groups.append(Group(one.tags, aim.sign * one.values, slopes))
         cornered = tuple(map(_is_cornered, self.aims))
         caps = self.problem.caps(evaluation, jacobian)
         limits = slack, normals, caps

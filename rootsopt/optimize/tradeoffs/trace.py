@@ -74,8 +74,6 @@ _HOLDS_UP = 0.01
 _SAME_ENDS = 1e-6
 
 Task, Done = TypeVar("Task"), TypeVar("Done")
-Progress = Callable[[int, int], None]
-"""Type of a progress callback, with arguments (searches done, searches expected)."""
 
 
 class Tracer:
@@ -92,7 +90,7 @@ class Tracer:
     def __init__(
         self,
         config: Config,
-        progress: Progress | None = None,
+        progress: Callable[[int, int], None] | None = None,
         stop: threading.Event | None = None,
         runs: Runs = HERE,
         checkpoint: Checkpoint | None = None,
@@ -152,7 +150,9 @@ class Tracer:
         return [point for point in self._sample if problem.feasible(point)]
 
     def _screen(self, points: Sequence[NDArray[np.float64]]) -> None:
-        evaluations = self._side_by_side(self._screened, points)
+        evaluations = self._side_by_side(
+            lambda point: None if self.stop.is_set() else self.study.screened(point), points
+        )
         signs = np.array([aim.sign for aim in self.study.aims])
         names = [aim.name for aim in self.study.aims]
         # Designs beyond a limit of a force serve as starts only if there are no others.
@@ -173,9 +173,6 @@ class Tracer:
     def _side_by_side(self, work: Callable[[Task], Done], tasks: Iterable[Task]) -> list[Done]:
         """Return `work(task)` for all tasks, in their order; they run side by side."""
         return [done for _, done in sorted(as_done(work, tasks, self.runs.slots))]
-
-    def _screened(self, point: NDArray[np.float64]):
-        return None if self.stop.is_set() else self.study.screened(point)
 
     def _ends(self, first: NDArray[np.float64]) -> bool:
         """Find the end of each term, and set the final scale.
@@ -300,7 +297,8 @@ class Tracer:
         others = [
             one
             for one in course.seen
-            if np.linalg.norm(one.point - best.point) > APART and scalar.value(one.values) < limit
+            if np.linalg.norm(one.point - best.sample.point) > APART
+            and scalar.value(one.values) < limit
         ]
         seen = min(others, key=lambda one: scalar.value(one.values), default=None)
         if seen is None:
@@ -332,20 +330,19 @@ class Tracer:
                 return None
             last[0] = sample.evaluation.start
             samples[point.tobytes()] = sample
-            if sample.feasible:
+            local = scalar.local(sample)
+            if local.violation <= FEASIBLE:
                 course.seen.append(Seen(sample.point, sample.values, sample.evaluation.start))
-            return scalar.local(sample)
+            return local
 
         stops = Stops(evaluations=self.config.optimizer.iterations + 1, asked=self.stop.is_set)
         outcome = descend(look, start, stops, self.study.problem.limits_at)
         self._count(searches=1)
-        if outcome.local is None or outcome.certificate is None:
-            return best
-        if outcome.local.violation > FEASIBLE:
+        local, certificate = outcome.local, outcome.certificate
+        if local is None or certificate is None or local.violation > FEASIBLE:
             return best
         sample = samples[outcome.point.tobytes()]
-        node = Node(scalar, sample, outcome.certificate, outcome.reason)
-        return better(best, node)
+        return better(best, Node(scalar, sample, certificate, outcome.reason))
 
     def _count(self, evaluations: int = 0, searches: int = 0) -> None:
         """Count designs and searches, of all courses together, and report progress."""

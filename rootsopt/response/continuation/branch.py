@@ -182,16 +182,17 @@ class OrbitFamily:
         made, checks = jax.device_get(_follow(self.range, start, guess, across))
         half_way, unit, lost, sound = checks
         scene, line, known = self.range.low[0], made.line, made.known
-        if not sound:
-            raise StoppedError(End.NO_GEOMETRY)
-        if not (known.sound and known.error <= greatest_error(scene.solver.orbit.rtol)):
-            raise StoppedError(End.STEP_TOO_SMALL)
-        if lost:
-            raise StoppedError(End.LOST_MESH)
-        if made.orbit.depth > TOO_DEEP * scene.pitch_radius:
-            raise StoppedError(End.TOO_DEEP)
-        if self.halves and half_way < _HALF_ALIKE:
-            raise StoppedError(End.HALVED)
+        close = known.sound and known.error <= greatest_error(scene.solver.orbit.rtol)
+        failures = {
+            End.NO_GEOMETRY: not sound,
+            End.STEP_TOO_SMALL: not close,
+            End.LOST_MESH: lost,
+            End.TOO_DEEP: made.orbit.depth > TOO_DEEP * scene.pitch_radius,
+            End.HALVED: self.halves and half_way < _HALF_ALIKE,
+        }
+        for end, met in failures.items():
+            if met:
+                raise StoppedError(end)
         state, monodromy = np.asarray(made.orbit.state), np.asarray(line.monodromy)
         mean, square, peak = map(float, made.orbit.response[:3])
         opened = np.column_stack([monodromy - np.eye(len(state)), line.by_share])
@@ -412,13 +413,14 @@ def _branch(family: OrbitFamily, start: Spot) -> Branch:
     path = follow_curve(family, start, steps, _TESTS)
     halved = family.halves and path.spots[-1].data.half_way < _HALVED
     end = End.HALVED if halved and path.end is End.STEP_TOO_SMALL else path.end
-    bifurcations = []
-    for after, name, spot in path.crossings:
-        # Two real multipliers with product 1 are a neutral saddle, which is not a bifurcation.
-        real = np.all(np.abs(spot.data.multipliers.imag) < 1e-9)
-        if Kind[name] is not Kind.NEIMARK_SACKER or not real:
-            bifurcations.append(Bifurcation(Kind[name], spot, after))
-    return Branch(family, tuple(path.spots), tuple(bifurcations), (End.START, end))
+    # Two real multipliers with product 1 are a neutral saddle, which is not a bifurcation.
+    bifurcations = tuple(
+        Bifurcation(Kind[name], spot, after)
+        for after, name, spot in path.crossings
+        if Kind[name] is not Kind.NEIMARK_SACKER
+        or not np.all(np.abs(spot.data.multipliers.imag) < 1e-9)
+    )
+    return Branch(family, tuple(path.spots), bifurcations, (End.START, end))
 
 
 def _joined(falling: Branch, rising: Branch) -> Branch:
