@@ -14,7 +14,7 @@ import yaml
 
 from rootsopt.config import Config, load, parse
 from rootsopt.config.explain import tree
-from tests.fuzz.verdict import fault_of, guarded
+from tests.standins import fault_of, guarded
 
 SECONDS = 2.0
 """CPU time (s) above which loading a config counts as a failure."""

@@ -17,7 +17,7 @@ from rootsopt.measured.fit import imported
 from rootsopt.measured.loop import Loop, signed_area
 from rootsopt.measured.reading import Sought, read, untangled
 from tests.fuzz import outlines
-from tests.standins import refusal
+from tests.standins import fault_of, refusal
 
 T = np.linspace(0, 2 * np.pi, 60, endpoint=False)
 ROTOR = (40 + 8 * np.cos(3 * T)) * np.exp(1j * T)
@@ -54,7 +54,7 @@ def test_damaged_files_are_answered(tmp_path_factory, seed, smoothing):
     data, ending = outlines.malformed(random.Random(seed))
     path = tmp_path_factory.getbasetemp() / f"damaged{ending}"
     path.write_bytes(data)
-    assert outlines.tried(path, smoothing, roll=False) is None
+    assert fault_of(lambda: imported(read(path), 3, 33.0, smoothing)) is None
 
 
 def test_undamaged_files_are_read(tmp_path):
