@@ -6,14 +6,13 @@ import subprocess
 import sys
 import threading
 import time
-from pathlib import Path
 from unittest import mock
 
 import pytest
 
 from rootsopt.commands.console import COMMANDS, main
+from tests.weight import ROOT
 
-ROOT = Path(__file__).parents[2]
 CIC = str(ROOT / "configs" / "cic_drawn.yaml")
 
 

@@ -2,7 +2,6 @@
 
 import functools
 import re
-from pathlib import Path
 
 import pytest
 
@@ -11,9 +10,8 @@ from rootsopt.config.explain import keys_of
 from rootsopt.config.plausible import USUAL, notes_on_swept, usual_of
 from rootsopt.config.units import _UNITS, unit_of
 from rootsopt.errors import InputError
-from tests.standins import refusal
+from tests.standins import ROOT, refusal
 
-DOCS = Path(__file__).parents[2] / "docs"
 FULL = [
     "contact.clearance_mm=0.05",
     "contact.friction={}",
@@ -40,7 +38,7 @@ def test_every_quantity_has_a_usual_range():
 
 def test_values_of_the_pages_are_usual():
     """`--set KEY=NUMBER` in the pages gives no note on the config of the paper's rotor."""
-    pages = " ".join(page.read_text("utf-8") for page in DOCS.glob("*.md"))
+    pages = " ".join(page.read_text("utf-8") for page in (ROOT / "docs").glob("*.md"))
     given = re.findall(r"--set '?([a-z_.]+)=([-\d.e]+)\b", pages)
     seen = {pair for pair in given if usual_of(pair[0]) is not None and "outline" not in pair[0]}
     assert len(seen) > 10

@@ -3,13 +3,12 @@
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
 from experiments import __main__ as command
+from tests.weight import ROOT
 
-ROOT = Path(__file__).parents[2]
 EXPERIMENTS = ROOT / "experiments"
 KNOWN = command.studies()
 STUDIES = sorted(path.name for path in EXPERIMENTS.glob("[!_.]*") if path.is_dir())

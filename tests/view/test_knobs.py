@@ -2,16 +2,14 @@
 
 import math
 import re
-from pathlib import Path
 
 import pytest
 
 from rootsopt.config import load, parse
 from rootsopt.config.families import families
+from rootsopt.config.sources import shipped
 from rootsopt.view.pages.knobs import _step, dotted, knobs_of
 
-ROOT = Path(__file__).parents[2]
-CONFIGS = sorted(path.stem for path in (ROOT / "configs").glob("*.yaml"))
 FREE = "optimizer.bounds.helix_deg=[0, 90]", "rotor.helix_deg=20"
 
 
@@ -20,11 +18,11 @@ def by_key(config):
 
 
 @pytest.mark.parametrize(
-    ("name", "changes"), [*((name, ()) for name in CONFIGS), ("cic_drawn", FREE), ("free", FREE)]
+    ("name", "changes"), [*((name, ()) for name in shipped()), ("cic_drawn", FREE), ("free", FREE)]
 )
 def test_every_knob_can_be_set(name, changes):
     """A knob's own value lies in its span, the span in its range, and the config accepts it."""
-    config = load(ROOT / "configs" / f"{name}.yaml", changes)
+    config = load(name, changes)
     knobs = knobs_of(config)
     assert len({knob.key for knob in knobs}) == len(knobs)
     for knob in knobs:
@@ -44,7 +42,7 @@ def test_every_family_has_a_knob_per_design_parameter(family, changes):
     A twist that is free is one of them, in the section of the rotor."""
     rows = "".join(f"\n  {key}: {list(x) if isinstance(x, tuple) else x}"
                    for key, x in families()[family].example.items())  # fmt: skip
-    text = (ROOT / "configs" / "ee.yaml").read_text().replace("family: ee", f"family: {family}")
+    text = shipped()["ee"].read_text().replace("family: ee", f"family: {family}")
     config = parse(text.replace("  lobes: 3", f"  lobes: 3{rows}"), changes)
     knobs = knobs_of(config)
     design = [knob for knob in knobs if knob.group == "Design"]

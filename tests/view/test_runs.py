@@ -5,7 +5,6 @@ import os
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import matplotlib
 import pytest
@@ -14,9 +13,7 @@ from rootsopt.commands.console import main
 from rootsopt.view import files, runs
 from rootsopt.view.runs import RunFolder
 from tests.deaths import digest, digest_of, write_run
-from tests.standins import refusal
-
-ROOT = Path(__file__).parents[2]
+from tests.standins import ROOT, refusal
 
 
 def test_full_disk_or_death_at_every_file_operation():
