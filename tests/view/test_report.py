@@ -25,6 +25,7 @@ from rootsopt.view.pages import charts
 from rootsopt.view.pages.charts import animations
 from rootsopt.view.pages.gather import Run, glossary, linked
 from rootsopt.view.pages.html import report_text
+from tests.commands.test_pareto import FEW
 
 pytest.importorskip("bokeh")
 CIC = "cic_drawn"
@@ -310,13 +311,15 @@ def test_sweep_over_two_quantities(tmp_path):
     assert "these differ: speed: 1000 rpm, 3000 rpm and 2000 rpm; backlash: 0.1 mm and 0.2" in text
 
 
-def test_command_writes_a_report_of_a_run_without_a_result(tmp_path):
-    """An infeasible front: exit code 3, with a report."""
+def test_command_writes_a_report_of_a_run_without_a_result(tmp_path, capsys):
+    """An infeasible front: exit code 3, with advice on the terminal, and with a report."""
     place = tmp_path / "run"
-    given = ["--set", "pareto.terms=[outer_radius_mm, area_efficiency]", "--set", "pareto.points=3"]
-    given += ["--set", "constraints={area_efficiency_min: 0.48, seal_width_min_mm: 25}"]
-    assert pareto.main([CIC, "-o", str(place), "--report", *given]) == 3
-    assert pages.REPORT in json.loads((place / "result.json").read_text())["run"]["files"]
+    limits = "--set=constraints={area_efficiency_min: 0.48, seal_width_min_mm: 25}"
+    assert pareto.main([CIC, "-o", str(place), "--report", *FEW, limits]) == 3
+    assert re.search("Infeasible: .*seal width", " ".join(capsys.readouterr().out.split()))
+    result = json.loads((place / "result.json").read_text())
+    assert (result["points"], pages.REPORT in result["run"]["files"]) == ([], True)
+    assert {row["name"] for row in result["infeasible"]["conflicts"]} >= {"seal width"}
     text = words_of((place / pages.REPORT).read_text("utf-8"))
     for words in ("Infeasible: ", "Constraints in conflict", "seal width ≥ 25 mm"):
         assert words in text
