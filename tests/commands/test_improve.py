@@ -27,12 +27,10 @@ QUICK = (
 )
 
 
-def file_of(folder, inset, unit=25.4):
+def file_of(folder, inset):
     """Write a CIC rotor that is smaller by `inset` (mm), in inches, turned and off its axis."""
     points = cut_cic(inset) * np.exp(0.4j) + 5 - 3j
-    rows = np.stack([points.real, points.imag], axis=1)[::-1] / unit
-    np.savetxt(folder / "rotor.csv", rows, fmt="%.10g", delimiter=",", header="x,y", comments="")
-    return str(folder / "rotor.csv")
+    return str(write(folder / "rotor.csv", points[::-1] / 25.4))
 
 
 def improved(folder, file, *options):
