@@ -1,8 +1,9 @@
-"""Config section `assumptions`: usual and own ranges, refusals."""
+"""Ranges: of design parameters by default, of the config section `assumptions`, refusals."""
 
 import pytest
 
 from rootsopt.config import load, parse
+from rootsopt.config.families import Parameter, parameters
 from tests.standins import refusal
 
 CLEARANCE, SPEED = "contact.clearance_mm", "scene.speed_rpm"
@@ -11,6 +12,27 @@ OVER = "assumptions.over"
 
 def ranges(*overrides, name="cic_drawn"):
     return {one.key: one.ends for one in load(name, overrides).spans}
+
+
+def test_ranges_of_parameters_that_a_config_leaves_open():
+    """Lengths scale with the pitch radius and the tip land with the lobe pitch.
+
+    Every other parameter has the range of its kind; no length is negative."""
+    other = Parameter("some_other_angle_deg", "an angle", 0, 180)
+    expected = {
+        "arc_center_mm": (15.0, 29.97),
+        "rolling_radius_mm": (0.3, 45.0),
+        "edge_radius_mm": (0.3, 45.0),
+        "tip_arc_angle_deg": (0.0, 15.0),
+        "tip_arc_turn_deg": (1.0, 90.0),
+        "pressure_angle_deg": (15.0, 60.0),
+        "trochoid_ratio": (0.0, 2.0),
+        "coefficients": (-1.0, 1.0),
+        "some_other_angle_deg": (0.0, 90.0),
+    }
+    for key, pair in expected.items():
+        found = (parameters() | {other.key: other})[key].usually(30.0, 3)
+        assert found == pytest.approx(pair), key
 
 
 def test_usual_ranges_follow_the_scene():
