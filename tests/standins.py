@@ -7,6 +7,7 @@ import contextlib
 import signal
 from collections.abc import Callable
 from pathlib import Path
+from unittest import mock
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -92,11 +93,10 @@ class Own(Term):
 @contextlib.contextmanager
 def registered(**formulas):
     """Register a term for each of the formulas in a `with` block."""
-    for name, formula in formulas.items():
-        register_term(name, Own(formula))
-    yield
-    for name in formulas:
-        del terms._terms[name]
+    with mock.patch.dict(terms._terms):
+        for name, formula in formulas.items():
+            register_term(name, Own(formula))
+        yield
 
 
 def programs() -> int:
@@ -109,14 +109,12 @@ def for_a_time():
     """Remove the families that are registered in a `with` block at its end.
 
     Compiled programs stay in memory, so that names of families must not be used again."""
-    before = dict(families._families)
-    try:
+    with (
+        mock.patch.dict(families._families),
+        mock.patch.dict(families._origins),
+        mock.patch.dict(families.FAMILY_KEYS),
+    ):
         yield
-    finally:
-        families._families.clear()
-        families._families.update(before)
-        for name in families._origins.keys() - before.keys():
-            del families._origins[name], families.FAMILY_KEYS[name]
 
 
 def refusal(work, *arguments, **named) -> str:
