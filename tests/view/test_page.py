@@ -1,5 +1,6 @@
 """The explorer's session, and its page in a real browser."""
 
+import contextlib
 import dataclasses
 import queue
 import re
@@ -59,10 +60,9 @@ class Told(Session):
 
 @pytest.fixture
 def session(engine):
-    made = Told(engine)
-    assert made.next(NewMotion, 0).evaluation.status is Status.PERIODIC
-    yield made
-    made.close()
+    with contextlib.closing(Told(engine)) as made:
+        assert made.next(NewMotion, 0).evaluation.status is Status.PERIODIC
+        yield made
 
 
 class Stub(Engine):
@@ -91,10 +91,9 @@ class Stub(Engine):
 @pytest.fixture
 def told():
     """Return a session in which nothing is computed, after its first motion."""
-    made = Told(Stub(), idle=0.3)
-    made.next(NewMotion, 0)
-    yield made
-    made.close()
+    with contextlib.closing(Told(Stub(), idle=0.3)) as made:
+        made.next(NewMotion, 0)
+        yield made
 
 
 def test_rest_waits_until_the_slider_rests(told):
@@ -238,11 +237,10 @@ def test_search_can_be_cancelled_and_its_design_is_taken(told, monkeypatch):
 
 
 def test_search_without_design_parameters_says_why():
-    made = Told(Engine(load("ee"), optimize_design))
-    made.engine.ready.set()
-    made.optimize()
-    assert "has no design parameter" in searched(made).words
-    made.close()
+    with contextlib.closing(Told(Engine(load("ee"), optimize_design))) as made:
+        made.engine.ready.set()
+        made.optimize()
+        assert "has no design parameter" in searched(made).words
 
 
 @pytest.fixture(scope="module")
@@ -254,13 +252,10 @@ def address(engine):
 @pytest.fixture
 def page(address, tmp_path):
     """Return a browser that shows the page, once its numbers are there."""
-    made = Browser(tmp_path)
-    try:
+    with contextlib.closing(Browser(tmp_path)) as made:
         made.open(address)
         shown(made, "motion 0")
         yield made
-    finally:
-        made.close()
 
 
 MODEL = "const model = name => Bokeh.documents[0].get_model_by_name(name); "
