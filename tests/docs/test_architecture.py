@@ -11,15 +11,11 @@ from tests.docs.blocks import DOCS, ROOT
 
 PAGE = (DOCS / "architecture.md").read_text(encoding="utf-8")
 PACKAGE = ROOT / "rootsopt"
-TABLES = {
-    heading: [
-        [cell.strip() for cell in line.strip("|").split("|")]
-        for line in text.splitlines()
-        if line.startswith("|") and not set(line) <= set("|- ")
-    ][1:]
-    for heading, text in re.findall(r"^## (.*?)\n(.*?)(?=^## |\Z)", PAGE, re.M | re.S)
-}
-PACKAGES = TABLES["The packages"]
+PACKAGES = [
+    [cell.strip() for cell in line.strip("|").split("|")]
+    for line in PAGE.partition("\n## The packages\n")[2].partition("\n## ")[0].splitlines()
+    if line.startswith("|") and not set(line) <= set("|- ")
+][1:]
 
 
 def code_in(text):
