@@ -358,9 +358,11 @@ def browsed(file, *options):
     """Return (standard output, console messages) of Chromium that shows a file.
 
     It runs headless with scripts, without a network and without a display."""
-    flags = [*FLAGS, f"--user-data-dir={file.parent / 'profile'}", "--enable-logging=stderr"]
-    flags += ["--virtual-time-budget=8000", "--window-size=1280,900", *options]
-    command = [chromium(), *flags, file.as_uri()]
+    command = [
+        *(chromium(), *FLAGS, f"--user-data-dir={file.parent / 'profile'}"),
+        *("--enable-logging=stderr", "--virtual-time-budget=8000", "--window-size=1280,900"),
+        *(*options, file.as_uri()),
+    ]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
     told = [line for line in done.stderr.splitlines() if "CONSOLE" in line]
     return done.stdout, [line for line in told if "[bokeh" not in line]  # Bokeh's own work
