@@ -24,9 +24,8 @@ ROTOR = (40 + 8 * np.cos(3 * T)) * np.exp(1j * T)
 
 
 def drawn(path, draw, version="R2010", units=units.MM, fmt="asc", **how):
-    document = ezdxf.new(version, units=units)
-    draw(document.modelspace())
-    document.saveas(path, fmt=fmt)
+    file = outlines.drawing(lambda document: draw(document.modelspace()), version, units, fmt)
+    path.write_bytes(file)
     return read(path, **how)
 
 
@@ -39,8 +38,8 @@ def lines(space, z, order=None):
         line(space, *(z[k], z[(k + 1) % len(z)])[:: 1 if k % 2 else -1])
 
 
-def polyline(z, **how):
-    return lambda space: space.add_lwpolyline([(p.real, p.imag) for p in z], close=True, **how)
+def polyline(z):
+    return lambda space: space.add_lwpolyline([(p.real, p.imag) for p in z], close=True)
 
 
 def fault(path, data):
