@@ -125,6 +125,3 @@ class Browser:
         )
         with urllib.request.urlopen(request, timeout=120) as answer:
             return json.load(answer)["value"]
-
-
-__all__ = ["FLAGS", "Browser", "chromium"]
