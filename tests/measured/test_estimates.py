@@ -30,8 +30,8 @@ def scattered(points, size, seed=0):
 def read(path, **keys):
     """Return config, profile and checks of an outline file, with further `keys` of the profile."""
     more = "".join(f", outline_{key}: {value}" for key, value in keys.items())
-    rotor = f"family: outline, lobes: 3, pitch_radius_mm: 33.0, outline_file: '{path}'{more}"
-    config = load("cic_drawn", [f"profile={{{rotor}}}"]).profile
+    given = f"family: outline, lobes: 3, pitch_radius_mm: 33.0, outline_file: '{path}'{more}"
+    config = load("cic_drawn", [f"profile={{{given}}}"]).profile
     return config, *outline_of(config)
 
 
