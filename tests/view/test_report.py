@@ -126,11 +126,10 @@ def test_page_says_what_came_out_and_what_every_status_means(page, simulated):
         "the motion repeats every mesh period.",
         "timing gear with 0.1 mm backlash",
         "backlash_mm: 0.1",
+        *(f"{one}: {other}" for one, other in (*simulated.end.facts, *simulated.end.steps)),
+        *(status.label.replace("_", " ") for status in Status),
+        *(message_of(load(CIC), status).replace("`", "") for status in Status),
     ]
-    told += [f"{one}: {other}" for one, other in (*simulated.end.facts, *simulated.end.steps)]
-    for status in Status:
-        told.append(status.label.replace("_", " "))
-        told.append(message_of(load(CIC), status).replace("`", ""))
     assert [words for words in told if words not in text] == []
 
 
