@@ -9,8 +9,6 @@ import pytest
 from rootsopt.commands import completion
 from rootsopt.commands.console import COMMANDS, main
 
-pytest.importorskip("shtab")
-
 
 @pytest.fixture(scope="module")
 def bash():

@@ -39,8 +39,6 @@ def test_help_and_reference_have_one_source():
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
     """Folder of the site, built strictly, without running the notebooks."""
-    pytest.importorskip("sphinx")
-    pytest.importorskip("myst_nb")
     folder = tmp_path_factory.mktemp("site")
     build = [
         *(sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-b", "html"),

@@ -14,8 +14,6 @@ from experiments._common import engines
 from experiments._common.engines.scipy_nodes import ScipyNodes
 from rootsopt.config import load
 
-pytest.importorskip("numba")
-
 PNG = b"\x89PNG"
 KNOWN = studies()
 

@@ -32,7 +32,6 @@ from rootsopt.view.pages.session import (
 from tests.standins import evaluation_of
 from tests.view.test_server import serving
 
-pytest.importorskip("bokeh")
 CIC = "cic_drawn"
 SPEED, TIP, LOAD = "scene.speed_rpm", "profile.tip_arc_angle_deg", "scene.load.torque_N_m"
 

@@ -27,7 +27,6 @@ from rootsopt.view.pages.gather import Run, glossary, linked
 from rootsopt.view.pages.html import report_text
 from tests.commands.test_pareto import FEW
 
-pytest.importorskip("bokeh")
 CIC = "cic_drawn"
 HOSTILE = '</script><script>document.title = "taken"</script><b>&amp;'
 NOTE = "`rotor.helix_deg` is 1 °, which is unusual"

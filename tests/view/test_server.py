@@ -21,7 +21,6 @@ from rootsopt.optimize.design import optimize_design
 from rootsopt.view.pages.knobs import Engine
 from tests.commands.test_door import python
 
-pytest.importorskip("bokeh")
 CIC = "cic_drawn"
 
 
