@@ -14,7 +14,7 @@ import pytest
 from rootsopt.commands.table import improve
 from rootsopt.commands.work import improve as work
 from rootsopt.view.comparison import NOTHING_BETTER, WORTH
-from tests.measured.test_finding import POSES, cut_cic, cycloids, write
+from tests.measured.test_outline import POSES, cut_cic, cycloids, write
 from tests.standins import evaluation_of
 
 DESIGN = {"pressure_angle_deg": 36.43, "involute_length_mm": 8.5, "tip_arc_angle_deg": 4.0}

@@ -15,7 +15,7 @@ from rootsopt.errors import InputError
 from rootsopt.measured.estimates import Estimates, estimates, scatter, unit_of_size
 from rootsopt.measured.source import advice, outline_of
 from tests.fuzz import outlines
-from tests.measured.test_finding import write
+from tests.measured.test_outline import write
 from tests.standins import refusal
 
 rotor = functools.partial(outlines.points, "cic", 240)
