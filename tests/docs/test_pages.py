@@ -1,4 +1,6 @@
-"""The pages teach what works: the code of tutorial and notebooks runs."""
+"""The pages teach what works: the code of tutorial and notebooks runs.
+
+Every link of the README, of the pages and of the studies leads to a file and a heading."""
 
 import itertools
 import json
@@ -11,7 +13,7 @@ import pytest
 import rootsopt
 from rootsopt.config import load
 from rootsopt.scene import check_geometry
-from tests.docs.blocks import DOCS, blocks_of, in_process, in_python, in_shell
+from tests.docs.blocks import DOCS, ROOT, blocks_of, in_process, in_python, in_shell
 
 PAGES = [
     "index",
@@ -128,3 +130,48 @@ def test_commands_of_the_howto_page_have_valid_overrides():
         name, *words = shlex.split(one)[2:]
         sets = [value for flag, value in itertools.pairwise(words) if flag == "--set"]
         check_geometry(load("cic_drawn" if name == "CONFIG" else name, sets))
+
+
+LINKING = [
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")),
+    ROOT / "experiments" / "README.md",
+    *sorted(DOCS.rglob("*.md")),
+]
+FENCE = re.compile(r"^(```|~~~).*?^\1$", re.M | re.S)
+LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
+INCLUDE = re.compile(r"^```\{include\} (\S+)$", re.M)
+
+
+def _anchors(page):
+    """Anchors of the headings of a page, as GitHub and MyST make them."""
+    text = page.read_text()
+    for file in INCLUDE.findall(text):
+        text += (page.parent / file).read_text()
+    heads = re.findall(r"^#+ +(.+?)\s*$", FENCE.sub("", text), re.M)
+    return {re.sub(r"[^\w\- ]", "", head.lower()).replace(" ", "-") for head in heads}
+
+
+@pytest.mark.parametrize("page", LINKING, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_somewhere(page):
+    for link in LINK.findall(FENCE.sub("", page.read_text())):
+        if re.match(r"[a-z]+:", link):  # Another site.
+            continue
+        name, _, anchor = link.partition("#")
+        file = (page.parent / name).resolve() if name else page
+        assert file.exists(), f"{link} leads nowhere"
+        assert file.is_relative_to(ROOT), f"{link} leads out of the project"
+        if anchor:
+            assert anchor in _anchors(file), f"{link}: {name or page.name} has no such heading"
+
+
+def test_every_figure_is_in_the_gallery_with_command_and_version():
+    text = (DOCS / "gallery.md").read_text()
+    entries = re.findall(
+        r"^!\[.+\]\((\S+)\)\n\n\*.+\*, version \d+\.\d+\.\d+, \[.+\]\(.+\):\n`(.+)`$", text, re.M
+    )
+    figures = {file.name for kind in ("*.png", "*.gif") for file in DOCS.rglob(kind)}
+    assert {name for name, _ in entries} == figures
+    for _, command in entries:
+        assert command.startswith(("rootsopt ", "python -m experiments "))
+        if command.startswith("python"):
+            assert (ROOT / "experiments" / command.split()[3] / "study.py").is_file(), command
