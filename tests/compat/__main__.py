@@ -30,7 +30,6 @@ TESTS = (
     "tests/config",
     "tests/contact/test_closed_forms.py",
     "tests/view/test_knobs.py",
-    "tests/view/test_latest.py",
     "tests/view/test_server.py",
     "tests/view/test_drawing.py",
     "tests/optimize/test_sqp.py",
