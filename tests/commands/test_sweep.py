@@ -70,7 +70,6 @@ def test_speeds_without_keys(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--resume"], "there is no"),
         (["--sobol=4", "--zip"], "does not go with samples"),
         (["--over=scene.sped_rpm=1,2"], "did you mean `scene.speed_rpm`"),
         ([SPEEDS, "--over=scene.speed_rpm=3"], "given twice"),
