@@ -36,28 +36,24 @@ def chromium() -> str:
 class Browser:
     """A running Chromium that chromedriver controls, by the WebDriver protocol.
 
-    `folder`: new profile of the browser, and place of its downloads; `size`: of the window in
-    pixels. The test is skipped if chromedriver or a browser is not installed."""
+    `folder`: new profile of the browser, and place of its downloads. The test is skipped if
+    chromedriver or a browser is not installed."""
 
-    def __init__(self, folder: Path, size: tuple[int, int] = (1400, 900)):
+    def __init__(self, folder: Path):
         driver = shutil.which("chromedriver")
         if driver is None:
             pytest.skip("no chromedriver is installed")
-        width, height = size
         options = {
             "binary": chromium(),
             "args": [*FLAGS, f"--user-data-dir={folder / 'profile'}",
-                     f"--window-size={width},{height}"],
+                     "--window-size=1400,900"],
             "prefs": {"download.default_directory": str(folder)},
         }  # fmt: skip
         self._process = subprocess.Popen(
             [driver, "--port=0"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
         )
-        assert self._process.stdout is not None
-        for line in self._process.stdout:
-            if "successfully on port" in line:
-                self._base = f"http://127.0.0.1:{line.split()[-1].rstrip('.')}"
-                break
+        started = next(line for line in self._process.stdout if "successfully on port" in line)
+        self._base = f"http://127.0.0.1:{started.split()[-1].rstrip('.')}"
         wanted = {"goog:chromeOptions": options, "goog:loggingPrefs": {"browser": "ALL"}}
         made = self._call("POST", "/session", {"capabilities": {"alwaysMatch": wanted}})
         self._base += f"/session/{made['sessionId']}"
@@ -104,12 +100,15 @@ class Browser:
 
     def drag(self, x: float, y: float, dx: float) -> None:
         """Press the mouse at (x, y), move it by `dx` pixels in steps, and let go."""
-        steps = [{"type": "pointerMove", "x": round(x), "y": round(y), "duration": 0},
-                 {"type": "pointerDown", "button": 0}]  # fmt: skip
-        for k in range(1, 6):
-            to = round(x + k * dx / 5)
-            steps.append({"type": "pointerMove", "x": to, "y": round(y), "duration": 30})
-        steps.append({"type": "pointerUp", "button": 0})
+        steps = [
+            {"type": "pointerMove", "x": round(x), "y": round(y), "duration": 0},
+            {"type": "pointerDown", "button": 0},
+            *(
+                {"type": "pointerMove", "x": round(x + k * dx / 5), "y": round(y), "duration": 30}
+                for k in range(1, 6)
+            ),
+            {"type": "pointerUp", "button": 0},
+        ]
         pointer = {"type": "pointer", "id": "mouse", "actions": steps}
         self._call("POST", "/actions", {"actions": [pointer]})
 
@@ -125,6 +124,3 @@ class Browser:
         )
         with urllib.request.urlopen(request, timeout=120) as answer:
             return json.load(answer)["value"]
-
-
-__all__ = ["FLAGS", "Browser", "chromium"]

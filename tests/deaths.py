@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest import mock
 
 from rootsopt.errors import InputError
 from rootsopt.view import files
@@ -41,15 +42,13 @@ def faulty(operations: tuple[str, ...], at: int, fail: Callable[[], Any]) -> Ite
 
         return call
 
-    before = files.os, files.shutil
     changed = {name: counted(real) for name, real in vars(os).items() if name in operations}
-    files.os = SimpleNamespace(**vars(os) | changed)  # type: ignore[assignment]
-    if "rmtree" in operations:
-        files.shutil = SimpleNamespace(rmtree=counted(shutil.rmtree))  # type: ignore[assignment]
-    try:
+    rmtree = counted(shutil.rmtree) if "rmtree" in operations else shutil.rmtree
+    with (
+        mock.patch.object(files, "os", SimpleNamespace(**vars(os) | changed)),
+        mock.patch.object(files, "shutil", SimpleNamespace(rmtree=rmtree)),
+    ):
         yield calls
-    finally:
-        files.os, files.shutil = before
 
 
 def full_disk() -> None:

@@ -88,27 +88,28 @@ Touch = namedtuple("Touch", "first second normal gap")
 
 
 class Planar:
-    """The equations of motion of a config's scene; `inertia` (kg·m²), `mass` (kg) of a rotor."""
+    """The equations of motion of a config's scene, which has all parts.
 
-    def __init__(self, config, inertia, mass=None, load=None):
+    `inertia` (kg·m²) and `mass` (kg) are those of a rotor, `load` a function from φ1 to the torques
+    against the rotors."""
+
+    def __init__(self, config, inertia, mass, load):
         scene, law = config.scene, config.contact
         self.flank = Flank(config.profile)
         self.radius, self.lobes = self.flank.radius, config.profile.lobes
         self.inertia, self.mass = inertia, mass
-        self.distance = 2 * self.radius + 1e-3 * (scene.center_distance_error_mm or 0.0)
+        self.distance = 2 * self.radius + 1e-3 * scene.center_distance_error_mm
         self.law = law
         self.rounding = law.smoothing_mm * 1e-3
         self.clearance = law.clearance_mm * 1e-3
         self.speed = scene.speed_rpm * 2 * np.pi / 60
-        # Torques against the rotors at φ1.
-        self.load = load or (lambda phi: (0.0, scene.load.torque_N_m))
+        self.load = load
         self.motor, self.supports = scene.motor, scene.supports
         self.gear = scene.timing_gear
-        if self.gear is not None:
-            self.play = 1e-3 * self.gear.backlash_mm / (2 * self.radius)
-            stiffness = self.gear.stiffness_N_m_per_rad
-            self.gear_damping = 2 * self.gear.damping_ratio * np.sqrt(stiffness * inertia / 2)
-            self.middle = 1e-3 * (scene.phase_error_mrad or 0.0)
+        self.play = 1e-3 * self.gear.backlash_mm / (2 * self.radius)
+        stiffness = self.gear.stiffness_N_m_per_rad
+        self.gear_damping = 2 * self.gear.damping_ratio * np.sqrt(stiffness * inertia / 2)
+        self.middle = 1e-3 * scene.phase_error_mrad
 
     def ramp(self, x, width):
         """Return max(0, x), rounded over `width`."""
@@ -128,8 +129,6 @@ class Planar:
 
     def coefficient(self, sliding):
         law = self.law.friction
-        if law is None:
-            return 0.0
         low, high = 1e-3 * law.stiction_speed_mm_s, 1e-3 * law.friction_speed_mm_s
 
         def step(x, x0, h0, x1, h1):
@@ -140,14 +139,8 @@ class Planar:
             return step(sliding, -low, -law.static, low, law.static)
         return np.sign(sliding) * step(abs(sliding), low, law.static, high, law.kinetic)
 
-    def touches(self, angles, axes):
-        """Return the closest approach of the drive flanks and of the coast flanks, where they
-        exist."""
-        found = [self.touch(side, angles, axes) for side in (1, -1)]
-        return [touch for touch in found if touch is not None]
-
     def touch(self, side, angles, axes):
-        """Return the closest approach of the flanks nearest to the pitch point.
+        """Return the closest approach of the flanks nearest to the pitch point, or None.
 
         They are the leading flanks of rotor 1 (`side` 1) and the trailing ones of rotor 2, or the
         other way round."""
@@ -212,14 +205,15 @@ class Planar:
         return min(found, key=lambda touch: touch.gap, default=None)
 
     def forces(self, state):
-        """Return torques on the rotors, forces on their axes, contact force and greatest depth."""
+        """Return torques on the rotors, forces on their axes and contact force."""
         (phi1, phi2), shifts = state[:2], state[2:6]
         (speed1, speed2), drifts = state[6:8], state[8:12]
         axes = np.array([0, self.distance]) + shifts[::2] + 1j * shifts[1::2]
         moving = drifts[::2] + 1j * drifts[1::2]
         torques, pushes = np.zeros(2), np.zeros(2, complex)
-        total, deepest = 0.0, -np.inf
-        for touch in self.touches((phi1, phi2), axes):
+        total = 0.0
+        # Of the drive flanks and of the coast flanks, where they exist.
+        for touch in filter(None, [self.touch(side, (phi1, phi2), axes) for side in (1, -1)]):
             arm1, arm2 = touch.first - axes[0], touch.second - axes[1]
             slip = moving[0] + 1j * speed1 * arm1 - moving[1] + 1j * speed2 * arm2
             depth = -touch.gap - self.clearance
@@ -228,36 +222,30 @@ class Planar:
             force = normal * (touch.normal + self.coefficient(dot(along, slip)) * along)
             torques += cross(arm1, -force), -cross(arm2, force)
             pushes += [-force, force]
-            total, deepest = total + normal, max(deepest, depth)
-        return torques, pushes, total, deepest
+            total += normal
+        return torques, pushes, total
 
     def __call__(self, time, state):
         """Return d(state)/dt."""
-        torques, pushes, _, _ = self.forces(state)
+        torques, pushes, _ = self.forces(state)
         torques = torques - np.array(self.load(state[0]))
-        if self.gear is not None:
-            aside = state[1] - state[0] - self.middle
-            excess = abs(aside) - self.play
-            width = self.rounding / self.radius
-            t = np.clip(excess / width, 0, 1)
-            # Cubic roundings, and as much of t² (1 - t)² as restores the integral.
-            bump = t**2 * (1 - t) ** 2
-            taken_up = self.ramp(excess, width) + 2.5 * width * bump
-            hold = self.gear.stiffness_N_m_per_rad * np.sign(aside) * taken_up
-            engaged = t**2 * (3 - 2 * t) + 15 * bump
-            hold += self.gear_damping * engaged * (state[7] - state[6])
-            torques += hold, -hold
+        aside = state[1] - state[0] - self.middle
+        excess = abs(aside) - self.play
+        width = self.rounding / self.radius
+        t = np.clip(excess / width, 0, 1)
+        # Cubic roundings, and as much of t² (1 - t)² as restores the integral.
+        bump = t**2 * (1 - t) ** 2
+        taken_up = self.ramp(excess, width) + 2.5 * width * bump
+        hold = self.gear.stiffness_N_m_per_rad * np.sign(aside) * taken_up
+        engaged = t**2 * (3 - 2 * t) + 15 * bump
+        hold += self.gear_damping * engaged * (state[7] - state[6])
+        torques += hold, -hold
         accelerations = torques / self.inertia
-        if self.motor is None:
-            accelerations[0] = 0.0
-        else:
-            motor = self.motor.torque_N_m
-            motor -= self.motor.slope_N_m_s_per_rad * (state[6] - self.speed)
-            accelerations[0] = (torques[0] + motor) / (self.inertia + self.motor.inertia_kg_m2)
-        along = np.zeros(4)
-        if self.supports is not None:
-            along = np.stack([pushes.real, pushes.imag], axis=1).ravel()
-            along -= 1e3 * self.supports.stiffness_N_per_mm * state[2:6]
-            along -= 1e3 * self.supports.damping_N_s_per_mm * state[8:12]
-            along /= self.mass
+        motor = self.motor.torque_N_m
+        motor -= self.motor.slope_N_m_s_per_rad * (state[6] - self.speed)
+        accelerations[0] = (torques[0] + motor) / (self.inertia + self.motor.inertia_kg_m2)
+        along = np.stack([pushes.real, pushes.imag], axis=1).ravel()
+        along -= 1e3 * self.supports.stiffness_N_per_mm * state[2:6]
+        along -= 1e3 * self.supports.damping_N_s_per_mm * state[8:12]
+        along /= self.mass
         return np.concatenate([state[6:], accelerations, along])

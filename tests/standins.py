@@ -1,10 +1,13 @@
-"""Stand-ins for a pair and an evaluation, with numbers made up for a test, and
-the message of a refusal.
+"""Stand-ins for a pair and an evaluation, with numbers made up for a test, and what counts as a
+failure of the package on odd input.
 
 A pair whose flanks never touch is a damped oscillator."""
 
 import contextlib
+import signal
 from collections.abc import Callable
+from pathlib import Path
+from unittest import mock
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -22,10 +25,12 @@ from rootsopt.response.evaluation import _motion, build
 from rootsopt.response.result import RESPONSES, Evaluation
 from rootsopt.response.terms import Term, register_term
 from rootsopt.status import Status
-from tests.fuzz.verdict import wrong_message
 
+ROOT = Path(__file__).parents[1]
 LOBES, SPEED, INERTIA, STIFFNESS, DAMPING, LOAD = 3, 300.0, 2e-3, 2e3, 1.5, 0.4
 HALF_BACKLASH, SCALE = 1e-3, 5e-3
+LONGEST = 500
+"""Length (characters) of a message above which it counts as a failure."""
 
 
 class Far(Contact):
@@ -88,11 +93,10 @@ class Own(Term):
 @contextlib.contextmanager
 def registered(**formulas):
     """Register a term for each of the formulas in a `with` block."""
-    for name, formula in formulas.items():
-        register_term(name, Own(formula))
-    yield
-    for name in formulas:
-        del terms._terms[name]
+    with mock.patch.dict(terms._terms):
+        for name, formula in formulas.items():
+            register_term(name, Own(formula))
+        yield
 
 
 def programs() -> int:
@@ -105,14 +109,8 @@ def for_a_time():
     """Remove the families that are registered in a `with` block at its end.
 
     Compiled programs stay in memory, so that names of families must not be used again."""
-    before = dict(families._families)
-    try:
+    with mock.patch.dict(families._families), mock.patch.dict(families._origins):
         yield
-    finally:
-        families._families.clear()
-        families._families.update(before)
-        for name in families._origins.keys() - before.keys():
-            del families._origins[name]
 
 
 def refusal(work, *arguments, **named) -> str:
@@ -121,3 +119,52 @@ def refusal(work, *arguments, **named) -> str:
         work(*arguments, **named)
     assert wrong_message(str(caught.value)) is None
     return str(caught.value)
+
+
+class LateError(BaseException):
+    """Raised if something takes too long; code that catches `Exception` does not stop it."""
+
+
+@contextlib.contextmanager
+def guarded(seconds: float):
+    """Raise `LateError` in code that takes more CPU time than this (s)."""
+
+    def late(*_):
+        raise LateError
+
+    before = signal.signal(signal.SIGPROF, late)
+    # Raise it repeatedly, because an exception inside a destructor is lost.
+    signal.setitimer(signal.ITIMER_PROF, seconds, 0.1)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        signal.signal(signal.SIGPROF, before)
+
+
+def fault_of(action: Callable[[], object], seconds: float = 20.0) -> str | None:
+    """Return what is wrong with an action that may end with an `InputError` and no other, or
+    None."""
+    try:
+        with guarded(seconds):
+            action()
+    except InputError as error:
+        return wrong_message(str(error))
+    except LateError:
+        return f"takes longer than {seconds} s"
+    except Exception as error:
+        return f"{type(error).__name__}: {str(error)[:200]!r}"
+    return None
+
+
+def wrong_message(message: str) -> str | None:
+    """Return what is wrong with the message of an `InputError`, or None."""
+    faults = {
+        "empty": not message.strip(),
+        "long": len(message) > LONGEST,
+        "of several lines": len(message.splitlines()) > 1,
+        "not printable": not message.isprintable(),
+        "a traceback": "Traceback" in message,
+    }
+    found = [fault for fault, is_so in faults.items() if is_so]
+    return f"message is {', '.join(found)}: {message[:200]!r}" if found else None

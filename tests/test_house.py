@@ -1,7 +1,6 @@
 """The house is in order: what lies in the package's root, late imports, long functions, rooms."""
 
 import ast
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,9 +10,8 @@ from jaxtyping import TypeCheckError
 import rootsopt
 from rootsopt.commands.table import COMMANDS
 from rootsopt.profiles.geometry import feet
-from tests.weight import MOST, measured
+from tests.weight import MOST, ROOT, measured
 
-ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "rootsopt"
 FILES = sorted(PACKAGE.rglob("*.py"))
 FACE = {"__init__.py", "continuation.py", "errors.py", "status.py", "py.typed"}

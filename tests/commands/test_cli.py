@@ -1,4 +1,4 @@
-"""Tests of the commands from outside: files, exit codes, messages."""
+"""Tests of the commands from outside: files, exit codes, messages, completion by a shell."""
 
 import json
 import os
@@ -15,7 +15,7 @@ import pytest
 import yaml
 
 from rootsopt import profiles
-from rootsopt.commands import console
+from rootsopt.commands import cli, console
 from rootsopt.commands.table import COMMANDS, profile
 from rootsopt.config import Config, load
 from rootsopt.config.explain import GROUPS, describe
@@ -151,7 +151,7 @@ def test_console_command(capsys):
 
 
 @pytest.mark.parametrize("command", ["optimize", "sweep", "new"])
-def test_help_is_short_and_its_groups_have_every_key(command, capsys, monkeypatch):
+def test_groups_of_the_help_have_every_key(command, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "100")
 
     def printed(*group):
@@ -160,7 +160,6 @@ def test_help_is_short_and_its_groups_have_every_key(command, capsys, monkeypatc
         return capsys.readouterr().out
 
     short = printed()
-    assert len(short.splitlines()) <= 60
     assert set(re.findall("--help ([a-z |]+)$", short, re.M)[-1].split(" | ")) == set(GROUPS)
     every = [line for group in GROUPS for line in printed(group).splitlines()]
     assert sorted(every) == sorted(describe(Config).splitlines())
@@ -204,3 +203,56 @@ def test_no_programs_are_kept_if_told_so(tmp_path, monkeypatch, capsys):
         assert profile.main([*arguments, *more]) == 0
         assert capsys.readouterr().err == ""
     assert (tmp_path / "cache").is_dir()
+
+
+@pytest.fixture(scope="module")
+def bash():
+    return cli.completion("bash")
+
+
+def completed(script, words):
+    given = " ".join(f"'{word}'" for word in words)
+    code = f"COMP_WORDS=({given}); COMP_CWORD={len(words) - 1}; _rootsopt 2>/dev/null; "
+    code += 'printf "%s\\n" "${COMPREPLY[@]}"'
+    return subprocess.check_output(["bash", "--norc", "-c", f"{script}\n{code}"], text=True).split()
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not installed")
+@pytest.mark.parametrize(
+    ("words", "first"),
+    [
+        (["si"], ["simulate"]),
+        (["optimize", "--res"], ["--resume"]),
+        (["simulate", "--set", "scene.timing_gear.b"], ["scene.timing_gear.backlash_mm="]),
+        (["simulate", "ci"], ["cic", "cic_drawn"]),
+    ],
+)
+def test_commands_options_and_keys_are_completed(bash, words, first):
+    assert completed(bash, ["rootsopt", *words]) == first
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_option_of_the_help_is_in_the_script(command, bash, capsys):
+    """The script has a command's own options, not only those that all commands share."""
+    with pytest.raises(SystemExit, match=r"^0$"):
+        console.main([command, "--help"])
+    told = re.findall(r"^  (?:-\w[^,]*, )?(--[\w-]+)", capsys.readouterr().out, re.M)
+    wanted = set(told) - {"--help"}
+    own = {"explore": {"--set", "--port"}, "new": {"--lobes"}}.get(command, {"--set", "--report"})
+    assert own <= wanted
+    (line,) = re.findall(rf"^_shtab_rootsopt_{command}_option_strings=\((.*?)\)$", bash, re.M)
+    assert wanted <= {word.strip("'") for word in line.split()}
+
+
+def test_zsh_has_a_script():
+    text = cli.completion("zsh")
+    assert text.startswith("#compdef rootsopt")
+    assert "scene.timing_gear.backlash_mm=" in text
+
+
+def test_unknown_shell_and_missing_library(monkeypatch, capsys):
+    assert console.main(["--completion", "tcsh"]) == 2
+    assert "bash or zsh" in capsys.readouterr().err
+    monkeypatch.setattr(cli.importlib.util, "find_spec", lambda name: None)
+    assert console.main(["--completion", "bash"]) == 2
+    assert "rootsopt[completion]" in capsys.readouterr().err

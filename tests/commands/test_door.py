@@ -6,14 +6,13 @@ import subprocess
 import sys
 import threading
 import time
-from pathlib import Path
 from unittest import mock
 
 import pytest
 
 from rootsopt.commands.console import COMMANDS, main
+from tests.weight import ROOT
 
-ROOT = Path(__file__).parents[2]
 CIC = str(ROOT / "configs" / "cic_drawn.yaml")
 
 
@@ -206,23 +205,31 @@ def test_called_from_python_nothing_global_changes(tmp_path, capsys, monkeypatch
     assert (sys.stdout, sys.stderr) == streams
 
 
-def loaded(code, names):
-    return python(f"{code}\nprint([n for n in {names} if n in sys.modules])").communicate()[0]
+WORKS = ", ".join(
+    f"rootsopt.commands.work.{name}"
+    for name in ("attractors", "optimize", "pareto", "simulate", "sweep")
+)
 
 
-def test_doors_load_little():
-    code = "import sys, rootsopt.simulate, rootsopt.__main__, rootsopt.optimize.__main__"
-    slow = "numpy", "yaml", "pydantic", "jax", "rich"
-    assert loaded(code, slow) == "[]\n"
-
-
-def test_commands_import_late_what_a_run_may_not_need():
-    """What is slow to import is imported where it is used; figures in the background."""
-    names = "attractors", "optimize", "pareto", "simulate", "sweep"
-    work = ", ".join(f"rootsopt.commands.work.{name}" for name in names)
-    slow = "matplotlib", "optax", "PIL", "scipy", "xarray", "jinja2", "bokeh"
-    code = "import sys; from rootsopt.commands import cli, table; cli.parser(table.profile)"
-    assert loaded(f"{code}\nimport {work}", (*slow, "rootsopt.view.pages.html")) == "[]\n"
+@pytest.mark.parametrize(
+    ("code", "slow"),
+    [
+        (
+            "import rootsopt.simulate, rootsopt.__main__, rootsopt.optimize.__main__",
+            ["numpy", "yaml", "pydantic", "jax", "rich"],
+        ),
+        (
+            f"from rootsopt.commands import cli, table; cli.parser(table.profile)\nimport {WORKS}",
+            ["matplotlib", "optax", "PIL", "scipy", "xarray", "jinja2", "bokeh",
+             "rootsopt.view.pages.html"],
+        ),
+    ],
+    ids=["doors", "commands"],
+)  # fmt: skip
+def test_what_is_slow_is_imported_where_it_is_used(code, slow):
+    """Doors load little, and commands not what a run may not need; figures in the background."""
+    code = f"import sys\n{code}\nprint([n for n in {slow} if n in sys.modules])"
+    assert ended(code)[1] == "[]\n"
 
 
 # ------------------------------------------------------------------- odd arguments

@@ -14,7 +14,7 @@ import pytest
 from rootsopt.commands.table import improve
 from rootsopt.commands.work import improve as work
 from rootsopt.view.comparison import NOTHING_BETTER, WORTH
-from tests.measured.test_finding import POSES, cut_cic, cycloids, write
+from tests.measured.test_outline import POSES, cut_cic, cycloids, write
 from tests.standins import evaluation_of
 
 DESIGN = {"pressure_angle_deg": 36.43, "involute_length_mm": 8.5, "tip_arc_angle_deg": 4.0}
@@ -27,12 +27,10 @@ QUICK = (
 )
 
 
-def file_of(folder, inset, unit=25.4):
+def file_of(folder, inset):
     """Write a CIC rotor that is smaller by `inset` (mm), in inches, turned and off its axis."""
     points = cut_cic(inset) * np.exp(0.4j) + 5 - 3j
-    rows = np.stack([points.real, points.imag], axis=1)[::-1] / unit
-    np.savetxt(folder / "rotor.csv", rows, fmt="%.10g", delimiter=",", header="x,y", comments="")
-    return str(folder / "rotor.csv")
+    return str(write(folder / "rotor.csv", points[::-1] / 25.4))
 
 
 def improved(folder, file, *options):

@@ -5,7 +5,6 @@ import os
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -14,8 +13,8 @@ import xarray
 
 from rootsopt.commands.table import sweep
 from rootsopt.response.sweeps import points
+from tests.weight import ROOT
 
-ROOT = Path(__file__).parents[2]
 WORKERS = ROOT / "tests" / "response" / "workers.py"
 SPEEDS, FAMILIES = "--over=scene.speed_rpm=1000:2000:2", "--over=profile.family=cic,arc"
 
@@ -71,7 +70,6 @@ def test_speeds_without_keys(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--resume"], "there is no"),
         (["--sobol=4", "--zip"], "does not go with samples"),
         (["--over=scene.sped_rpm=1,2"], "did you mean `scene.speed_rpm`"),
         ([SPEEDS, "--over=scene.speed_rpm=3"], "given twice"),

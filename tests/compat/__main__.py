@@ -29,9 +29,7 @@ COPIED = "tests", "configs", "experiments", "docs", "pyproject.toml", "README.md
 TESTS = (
     "tests/config",
     "tests/contact/test_closed_forms.py",
-    "tests/scene/test_bounds.py",
     "tests/view/test_knobs.py",
-    "tests/view/test_latest.py",
     "tests/view/test_server.py",
     "tests/view/test_drawing.py",
     "tests/optimize/test_sqp.py",

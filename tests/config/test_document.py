@@ -17,7 +17,7 @@ from rootsopt.config.document import MOST_BYTES, read_document
 from rootsopt.config.units import named, sentence, shown
 from tests.config.test_config import MINIMAL
 from tests.fuzz import configs
-from tests.fuzz.verdict import LONGEST
+from tests.standins import LONGEST
 from tests.standins import refusal as refused
 
 

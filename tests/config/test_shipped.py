@@ -12,9 +12,8 @@ import pytest
 from rootsopt.config import load_config, notes, parse
 from rootsopt.config.sources import shipped
 from rootsopt.scene import check_geometry
-from tests.standins import refusal
+from tests.standins import ROOT, refusal
 
-ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "rootsopt"
 _NAMES = sorted(path.stem for path in (ROOT / "configs").glob("*.yaml"))
 

@@ -1,17 +1,23 @@
-"""The pages teach what works: the code of tutorial and notebooks runs."""
+"""The pages teach what works: the code of tutorial and notebooks runs.
 
+Every link of the README, of the pages and of the studies leads to a file and a heading. What
+docs/architecture.md names exists, and its table has the order of the layers."""
+
+import ast
+import functools
 import itertools
 import json
 import os
 import re
 import shlex
+import tomllib
 
 import pytest
 
 import rootsopt
 from rootsopt.config import load
 from rootsopt.scene import check_geometry
-from tests.docs.blocks import DOCS, blocks_of, in_process, in_python, in_shell
+from tests.docs.blocks import DOCS, ROOT, blocks_of, in_process, in_python, in_shell
 
 PAGES = [
     "index",
@@ -128,3 +134,105 @@ def test_commands_of_the_howto_page_have_valid_overrides():
         name, *words = shlex.split(one)[2:]
         sets = [value for flag, value in itertools.pairwise(words) if flag == "--set"]
         check_geometry(load("cic_drawn" if name == "CONFIG" else name, sets))
+
+
+LINKING = [
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")),
+    ROOT / "experiments" / "README.md",
+    *sorted(DOCS.rglob("*.md")),
+]
+FENCE = re.compile(r"^(```|~~~).*?^\1$", re.M | re.S)
+LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
+INCLUDE = re.compile(r"^```\{include\} (\S+)$", re.M)
+
+
+def _anchors(page):
+    """Anchors of the headings of a page, as GitHub and MyST make them."""
+    text = page.read_text()
+    for file in INCLUDE.findall(text):
+        text += (page.parent / file).read_text()
+    heads = re.findall(r"^#+ +(.+?)\s*$", FENCE.sub("", text), re.M)
+    return {re.sub(r"[^\w\- ]", "", head.lower()).replace(" ", "-") for head in heads}
+
+
+@pytest.mark.parametrize("page", LINKING, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_somewhere(page):
+    for link in LINK.findall(FENCE.sub("", page.read_text())):
+        if re.match(r"[a-z]+:", link):  # Another site.
+            continue
+        name, _, anchor = link.partition("#")
+        file = (page.parent / name).resolve() if name else page
+        assert file.exists(), f"{link} leads nowhere"
+        assert file.is_relative_to(ROOT), f"{link} leads out of the project"
+        if anchor:
+            assert anchor in _anchors(file), f"{link}: {name or page.name} has no such heading"
+
+
+def test_every_figure_is_in_the_gallery_with_command_and_version():
+    text = (DOCS / "gallery.md").read_text()
+    entries = re.findall(
+        r"^!\[.+\]\((\S+)\)\n\n\*.+\*, version \d+\.\d+\.\d+, \[.+\]\(.+\):\n`(.+)`$", text, re.M
+    )
+    figures = {file.name for kind in ("*.png", "*.gif") for file in DOCS.rglob(kind)}
+    assert {name for name, _ in entries} == figures
+    for _, command in entries:
+        assert command.startswith(("rootsopt ", "python -m experiments "))
+        if command.startswith("python"):
+            assert (ROOT / "experiments" / command.split()[3] / "study.py").is_file(), command
+
+
+ARCHITECTURE = (DOCS / "architecture.md").read_text(encoding="utf-8")
+PACKAGE = ROOT / "rootsopt"
+PACKAGES = [
+    [cell.strip() for cell in line.strip("|").split("|")]
+    for line in ARCHITECTURE.partition("\n## The packages\n")[2].partition("\n## ")[0].splitlines()
+    if line.startswith("|") and not set(line) <= set("|- ")
+][1:]
+
+
+def code_in(text):
+    """Return the code spans of a text."""
+    return re.findall(r"`([^`]*)`", text)
+
+
+@functools.cache
+def names_of(package):
+    """Return all names of classes, functions, methods and fields that a package defines."""
+    nodes = [
+        node
+        for path in package.rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+    ]
+    fields = [node.target for node in nodes if isinstance(node, ast.AnnAssign)]
+    return {node.name for node in nodes if isinstance(node, ast.ClassDef | ast.FunctionDef)} | {
+        field.id for field in fields if isinstance(field, ast.Name)
+    }
+
+
+def is_module(path):
+    return path.with_suffix(".py").is_file() or (path / "__init__.py").is_file()
+
+
+def test_every_folder_has_a_row_in_the_order_of_the_layers():
+    rows = [name for cells in PACKAGES for name in code_in(cells[0])]
+    folders = {path.name for path in PACKAGE.iterdir() if (path / "__init__.py").is_file()}
+    assert folders <= set(rows)
+    assert all(is_module(PACKAGE / name) for name in rows)
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    contract, _ = settings["tool"]["importlinter"]["contracts"]
+    layers = [re.findall(r"rootsopt\.(\w+)\b(?!\.__main__)", layer) for layer in contract["layers"]]
+    first = {name: k for k, layer in reversed([*enumerate(layers)]) for name in layer}
+    places = [first[name] for name in rows if name in folders]
+    assert places == sorted(places)
+
+
+@pytest.mark.parametrize("row", PACKAGES[1:], ids=lambda cells: cells[0].strip("`"))
+def test_modules_of_a_row_exist(row):
+    """A name in a package's row is a module there, or something that a module there defines."""
+    (package,) = code_in(row[0])
+    folder = PACKAGE / package
+    for name in code_in(row[1]):
+        if name.startswith("--") or name in ("constraints.terms", "tolerances"):
+            continue  # An option, or a config key.
+        below = any(is_module(path / name) for path in [folder, *folder.iterdir()])
+        assert below or name in names_of(folder), f"rootsopt/{package} has no {name}"

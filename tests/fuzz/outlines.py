@@ -1,7 +1,6 @@
-"""Malformed outline files for reader, fit and roll check.
+"""Malformed outline files for reader and fit.
 
-Good files of this program are damaged: bytes, headers, cells, encodings, and the outline itself. A
-file passes if it gives a profile or an `InputError` of one line."""
+Good files of this program are damaged: bytes, headers, cells, encodings, and the outline itself."""
 
 import functools
 import io
@@ -12,17 +11,11 @@ import ezdxf
 import numpy as np
 
 from rootsopt.config import load
-from rootsopt.measured.conjugacy import conjugacy
-from rootsopt.measured.fit import imported
-from rootsopt.measured.reading import read
 from rootsopt.profiles import CIC, EE, outline
 from rootsopt.scene import Scene, design_vector
 from rootsopt.view.figures.cad import dxf_bytes
 from rootsopt.view.figures.drawing import Drawing
-from tests.fuzz.verdict import fault_of
 
-SECONDS = 20.0
-"""Limit of processor time for a file (s)."""
 _R = 33.0
 NUMBERS = """nan NaN -nan inf -inf 1e308 -1e308 1e-308 1e400 0 -0 -1 1 2 3 99 255 1e9 1e12 -1e9
 2147483648 -9223372036854775809 123456789012345678901234567890 1,5 1.5.2 1_0 0x10 1e"""
@@ -243,15 +236,3 @@ def malformed(chance: random.Random) -> tuple[bytes, str]:
     name = chance.choice(list(good()))
     kinds = [damaged_bytes] if name.endswith(".dxf") else [damaged_bytes, damaged_cells]
     return chance.choice(kinds)(good()[name], chance), Path(name).suffix
-
-
-def tried(path: Path, smoothing: float, roll: bool = True) -> str | None:
-    """Read, fit and roll the outline in a file, as `rootsopt profile` does; return the failure, if
-    any."""
-
-    def read_and_rolled():
-        found, _ = imported(read(path), 3, _R, smoothing)
-        if roll:
-            conjugacy(found)
-
-    return fault_of(read_and_rolled, SECONDS)

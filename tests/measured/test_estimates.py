@@ -10,22 +10,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rootsopt.config import parse
+from rootsopt.config import load
 from rootsopt.errors import InputError
 from rootsopt.measured.estimates import Estimates, estimates, scatter, unit_of_size
 from rootsopt.measured.source import advice, outline_of
 from tests.fuzz import outlines
-from tests.measured.test_finding import write
+from tests.measured.test_outline import write
 from tests.standins import refusal
 
 rotor = functools.partial(outlines.points, "cic", 240)
-CONFIG = """
-profile: {{family: outline, lobes: 3, pitch_radius_mm: 33.0, outline_file: "{}"{}}}
-rotor: {{length_mm: 100.0, density_kg_m3: 7800.0}}
-contact: {{stiffness_N_per_mm_e: 2.0e5, exponent: 2.2, max_damping_N_s_per_mm: 0.25,
-  full_damping_depth_mm: 0.01}}
-scene: {{speed_rpm: 3000.0, load: {{torque_N_m: 4.775}}}}
-"""
 
 
 def scattered(points, size, seed=0):
@@ -37,7 +30,8 @@ def scattered(points, size, seed=0):
 def read(path, **keys):
     """Return config, profile and checks of an outline file, with further `keys` of the profile."""
     more = "".join(f", outline_{key}: {value}" for key, value in keys.items())
-    config = parse(CONFIG.format(path, more)).profile
+    given = f"family: outline, lobes: 3, pitch_radius_mm: 33.0, outline_file: '{path}'{more}"
+    config = load("cic_drawn", [f"profile={{{given}}}"]).profile
     return config, *outline_of(config)
 
 

@@ -17,16 +17,15 @@ from rootsopt.measured.fit import imported
 from rootsopt.measured.loop import Loop, signed_area
 from rootsopt.measured.reading import Sought, read, untangled
 from tests.fuzz import outlines
-from tests.standins import refusal
+from tests.standins import fault_of, refusal
 
 T = np.linspace(0, 2 * np.pi, 60, endpoint=False)
 ROTOR = (40 + 8 * np.cos(3 * T)) * np.exp(1j * T)
 
 
 def drawn(path, draw, version="R2010", units=units.MM, fmt="asc", **how):
-    document = ezdxf.new(version, units=units)
-    draw(document.modelspace())
-    document.saveas(path, fmt=fmt)
+    file = outlines.drawing(lambda document: draw(document.modelspace()), version, units, fmt)
+    path.write_bytes(file)
     return read(path, **how)
 
 
@@ -39,8 +38,8 @@ def lines(space, z, order=None):
         line(space, *(z[k], z[(k + 1) % len(z)])[:: 1 if k % 2 else -1])
 
 
-def polyline(z, **how):
-    return lambda space: space.add_lwpolyline([(p.real, p.imag) for p in z], close=True, **how)
+def polyline(z):
+    return lambda space: space.add_lwpolyline([(p.real, p.imag) for p in z], close=True)
 
 
 def fault(path, data):
@@ -54,7 +53,7 @@ def test_damaged_files_are_answered(tmp_path_factory, seed, smoothing):
     data, ending = outlines.malformed(random.Random(seed))
     path = tmp_path_factory.getbasetemp() / f"damaged{ending}"
     path.write_bytes(data)
-    assert outlines.tried(path, smoothing, roll=False) is None
+    assert fault_of(lambda: imported(read(path), 3, 33.0, smoothing)) is None
 
 
 def test_undamaged_files_are_read(tmp_path):

@@ -38,7 +38,7 @@ _OF = {
     "dynamics/parts/load": "load scene stepping bearings loads",
     "config/families": "extending families config",
     "scene/resemblance": "resemblance",
-    "scene/space": "search optimize freeform bounds families beginning",
+    "scene/space": "search optimize freeform plausible families beginning",
     "identification/answer": "squares identify",
     "identification/fit": "identify",
     "identification/model": "identify record",

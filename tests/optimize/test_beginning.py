@@ -18,8 +18,7 @@ from rootsopt.scene import outline_mm
 from rootsopt.scene.check import shape_of
 from rootsopt.scene.resemblance import Likeness
 from rootsopt.scene.space import bounds_of, widened
-from tests.measured.test_finding import write
-from tests.measured.test_outline import cut
+from tests.measured.test_outline import cut, write
 from tests.standins import evaluation_of
 
 CIC = "configs/cic_drawn.yaml"

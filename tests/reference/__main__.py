@@ -3,15 +3,34 @@
 `pytest tests/studies/test_reference.py` compares the present results with those stored."""
 
 import argparse
+import json
 import sys
+from pathlib import Path
 from typing import Any
 
-from tests.reference import kept, package
+from tests.reference import package
 from tests.reference.cases import CASES, Case
 from tests.reference.compare import ChangedError, differences, limits
 
+FILE = Path(__file__).with_name("reference.json")
+"""The file of stored results."""
 _NUDGES = (1e-13, -1e-13, 3e-13, -3e-13)
 """Relative changes of the speed that represent rounding."""
+
+
+def read() -> dict[str, dict[str, Any]]:
+    """Return the stored results by name of the case."""
+    return json.loads(FILE.read_text())["results"] if FILE.exists() else {}
+
+
+def write(results: dict[str, dict[str, Any]]) -> None:
+    """Store results: numbers with all their digits, a line for each case."""
+    head = {"call": package.CALL, "versions": package.versions()}
+    lines = [f"{json.dumps(name)}: {json.dumps(result)}" for name, result in results.items()]
+    body = ",\n".join(lines)
+    text = f'{json.dumps(head)[:-1]},\n"results": {{\n{body}\n}}}}\n'
+    json.loads(text)
+    FILE.write_text(text)
 
 
 def result_of(case: Case) -> dict[str, Any]:
@@ -41,7 +60,7 @@ def main() -> int:
     parser.add_argument("--missing", action="store_true", help="only cases without a stored result")
     options = parser.parse_args()
     package.start()
-    results, failed = kept.read(), 0
+    results, failed = read(), 0
     for case in CASES:
         known = options.missing and case.name in results
         if known or not case.name.startswith(tuple(options.names) or ""):
@@ -53,7 +72,7 @@ def main() -> int:
             failed += 1
             continue
         print(f"{case.name}: {found['status']}, by rounding {found['rounding']}", flush=True)
-        kept.write({one.name: results[one.name] for one in CASES if one.name in results})
+        write({one.name: results[one.name] for one in CASES if one.name in results})
     return int(failed > 0)
 
 

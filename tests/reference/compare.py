@@ -1,5 +1,6 @@
 """Differences between two results of one config, quantity by quantity."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -49,10 +50,15 @@ def differences(found: dict[str, Any], kept: dict[str, Any]) -> dict[str, float]
     for key in ("design", "geometry", "response", "gradient"):
         _same(f"the names in {key}", list(found[key]), list(kept[key]))
     averaged = kept["status"] == "averaged"
+    # The rotor's size is the scale of small lengths, the greatest force that of small forces.
+    length = _SMALL * kept["geometry"]["outer_radius_mm"]
+    force = _SMALL * _greatest(kept["response"])
     result = {
-        "geometry": _worst(found["geometry"], kept["geometry"], _lengths(kept["geometry"])),
+        "geometry": _worst(
+            found["geometry"], kept["geometry"], lambda key: length * key.endswith("_mm")
+        ),
         "average" if averaged else "response": _worst(
-            found["response"], kept["response"], _forces(kept["response"])
+            found["response"], kept["response"], lambda _: force
         ),
     }
     if not is_loose(kept):
@@ -89,24 +95,17 @@ def _same(what: str, found: Any, kept: Any) -> None:
         raise ChangedError(f"{what}: {found} instead of {kept}")
 
 
-def _worst(found: dict[str, float], kept: dict[str, float], scales: dict[str, float]) -> float:
+def _greatest(numbers: dict[str, float]) -> float:
+    return max(map(abs, numbers.values()), default=0.0)
+
+
+def _worst(found: dict[str, float], kept: dict[str, float], least: Callable[[str], float]) -> float:
+    """Return the greatest difference relative to the number itself, or to `least` of its name."""
+    scales = {key: max(abs(value), least(key), 1e-300) for key, value in kept.items()}
     return max((abs(found[key] - kept[key]) / scales[key] for key in kept), default=0.0)
-
-
-def _lengths(kept: dict[str, float]) -> dict[str, float]:
-    """Return scales of a geometry: each number itself, or the rotor's size for small lengths."""
-    least = _SMALL * kept["outer_radius_mm"]
-    return {k: max(abs(v), least if k.endswith("_mm") else 1e-300) for k, v in kept.items()}
-
-
-def _forces(kept: dict[str, float]) -> dict[str, float]:
-    """Return scales of a response: each force itself, or the greatest force for small ones."""
-    least = max(_SMALL * max(map(abs, kept.values()), default=0.0), 1e-300)
-    return {key: max(abs(value), least) for key, value in kept.items()}
 
 
 def _row(found: dict[str, float], kept: dict[str, float]) -> float:
     """Return the difference of a gradient relative to its greatest entry."""
     _same("the parameters of a gradient", list(found), list(kept))
-    size = max(map(abs, kept.values()), default=0.0)
-    return max((abs(found[k] - kept[k]) / max(size, 1e-300) for k in kept), default=0.0)
+    return _worst(found, kept, lambda _: _greatest(kept))

@@ -8,7 +8,6 @@ import subprocess
 import sys
 import types
 import warnings
-from pathlib import Path
 from unittest import mock
 
 import jax
@@ -19,9 +18,8 @@ from hypothesis import strategies as st
 
 from rootsopt.errors import InputError
 from rootsopt.runtime import environment
-from tests.standins import refusal
+from tests.standins import ROOT, refusal
 
-ROOT = Path(__file__).parents[2]
 EE = str(ROOT / "configs" / "ee.yaml")
 SET_ASIDE = {
     "JAX_DEBUG_NANS": "1",

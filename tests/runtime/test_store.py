@@ -199,10 +199,13 @@ def test_the_entries_unused_for_longest_give_way(kept, monkeypatch, tmp_path):
 
 
 def test_entries_may_disappear_while_others_are_counted(kept, monkeypatch):
-    made, _ = kept
-    listed = os.listdir
-    monkeypatch.setattr(os, "listdir", lambda path: [*listed(path), "gone.program", ".x.program.y"])
+    made, file = kept
+    listed, gone = type(file).glob, ("gone.program", ".x.program.y")
+    monkeypatch.setattr(
+        type(file), "glob", lambda *where: [*listed(*where), *map(file.with_name, gone)]
+    )
     made.write("b", "for b", DATA)
+    Store(file.parent)
     assert made.read("a", "for a") == made.read("b", "for b") == DATA
 
 

@@ -6,7 +6,6 @@ import subprocess
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,9 +19,7 @@ from rootsopt.optimize import design
 from rootsopt.runtime.environment import own_process
 from rootsopt.runtime.programs import CachedFunction
 from rootsopt.runtime.threads import on_all_cores, one_thread
-from tests.standins import refusal
-
-ROOT = Path(__file__).parents[2]
+from tests.standins import ROOT, refusal
 
 
 def counts():

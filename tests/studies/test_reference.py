@@ -4,14 +4,13 @@ import json
 
 import pytest
 
-from tests.reference import kept
-from tests.reference.__main__ import check
+from tests.reference.__main__ import FILE, check, read
 from tests.reference.cases import CASES, SHORT
 
 
 @pytest.fixture(scope="module")
 def results():
-    return kept.read()
+    return read()
 
 
 def _every():
@@ -35,6 +34,6 @@ def test_results_are_kept_with_their_configs(results):
     assert len({case.name for case in CASES}) == len(CASES)
     found = {name: [one["config"], one["overrides"]] for name, one in results.items()}
     assert [*found.items()] == [*kept_of.items()]
-    text = kept.FILE.read_text()
-    json.loads(text, parse_constant=lambda word: pytest.fail(f"{word} in {kept.FILE.name}"))
-    assert str(kept.FILE.parent) not in text
+    text = FILE.read_text()
+    json.loads(text, parse_constant=lambda word: pytest.fail(f"{word} in {FILE.name}"))
+    assert str(FILE.parent) not in text

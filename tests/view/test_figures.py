@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import os
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -165,17 +166,11 @@ def made(axes, **options):
     return plan, rows, dataset_of(CIC, plan, rows)
 
 
-@pytest.fixture
-def figure_of(tmp_path, monkeypatch):
-    """Return a function (plan, data) → the figure of a sweep, or None."""
-    kept = [None]
-    monkeypatch.setattr(ResultFolder, "write_figure", lambda _, name, figure: kept.append(figure))
-
-    def draw(plan, data):
-        sweep_figure(ResultFolder(tmp_path), plan, data)
-        return kept[-1]
-
-    return draw
+def figure_of(folder, plan, data):
+    """Return the figure of a sweep, or None."""
+    with mock.patch.object(ResultFolder, "write_figure") as written:
+        sweep_figure(ResultFolder(folder), plan, data)
+    return written.call_args and written.call_args.args[1]
 
 
 @pytest.mark.parametrize(
@@ -191,9 +186,9 @@ def figure_of(tmp_path, monkeypatch):
         ({SPEED: "1,2,3", PLAY: "1,2,3"}, {"zipped": True}, 4),
     ],
 )
-def test_statuses_are_in_every_figure(axes, options, panels, figure_of):
+def test_statuses_are_in_every_figure(axes, options, panels, tmp_path):
     plan, _, data = made(axes, **options)
-    figure = figure_of(plan, data)
+    figure = figure_of(tmp_path, plan, data)
     assert len(figure.axes) == panels
     assert overlaps(figure) == []
     found = {str(label).replace("_", " ") for label in data.status.values.ravel()}
@@ -212,7 +207,7 @@ def test_statuses_are_in_every_figure(axes, options, panels, figure_of):
     ],
 )  # fmt: skip
 def test_flanks_that_stay_apart_have_their_reserve_on_the_axes(
-    force, shown, heading, words, figure_of
+    force, shown, heading, words, tmp_path
 ):
     """Without any contact, a sweep shows the reserve and the gear's force, and tells its ends."""
     plan, rows = plan_of({"contact.clearance_mm": "0.1:0.2:3"}), {}
@@ -221,7 +216,7 @@ def test_flanks_that_stay_apart_have_their_reserve_on_the_axes(
         response = {"mean_force_N": peak / 2, "peak_force_N": peak, "gear_force_N": 200.0,
                     "contact_reserve_um": 10.0 * number + 1}  # fmt: skip
         rows[number] = lost(Status.IDLE) | {"response": response}
-    figure = figure_of(plan, dataset_of(CIC, plan, rows))
+    figure = figure_of(tmp_path, plan, dataset_of(CIC, plan, rows))
     assert [ax.get_ylabel() for ax in figure.axes] == shown
     assert figure.axes[1].get_xlabel() == "clearance (mm)"
     first, sure = swept({}, rows_of(plan, rows))
@@ -232,9 +227,9 @@ def test_every_status_has_a_marker_of_its_own():
     assert [*map(len, (MARKERS, {*MARKERS.values()}))] == [len(Status)] * 2
 
 
-def test_no_figure_over_three_keys(figure_of):
+def test_no_figure_over_three_keys(tmp_path):
     plan, _, data = made({SPEED: "1,2", PLAY: "1,2", "rotor.length_mm": "1,2"})
-    assert figure_of(plan, data) is None
+    assert figure_of(tmp_path, plan, data) is None
 
 
 def test_rows_and_outcome():

@@ -1,6 +1,7 @@
 """Tests of result files and tables, from made-up evaluations."""
 
 import dataclasses
+import functools
 import json
 import os
 
@@ -280,15 +281,13 @@ def test_wide_tables_are_divided_on_the_terminal():
         (names.label, "flank_gap_min_um", "flank gap min (µm)"),
         (names.label, "area_efficiency", "area efficiency"),
         (names.label, "tilting_moment_max_N_m", "tilting moment max (N·m)"),
+        (functools.partial(names.percent, -2.0), -1.0, "+50.00 %"),
+        (functools.partial(names.percent, 1.0), 1.0 - 1e-9, "0.00 %"),
+        (functools.partial(names.percent, 0.001), 3.0, "+3 × 10⁵ %"),
+        (functools.partial(names.percent, 0.0), 1.0, ""),
+        (functools.partial(names.percent, None), 1.0, ""),
     ],
 )
 def test_signs_values_and_names(work, given, shown):
-    """The terminal replaces the signs of print; values and names are words."""
+    """The terminal replaces the signs of print; values, names and changes are words."""
     assert work(given) == shown
-
-
-def test_changes():
-    assert names.percent(-2.0, -1.0) == "+50.00 %"
-    assert names.percent(1.0, 1.0 - 1e-9) == "0.00 %"
-    assert names.percent(0.001, 3.0) == "+3 × 10⁵ %"
-    assert names.percent(0.0, 1.0) == names.percent(None, 1.0) == ""

@@ -1,17 +1,20 @@
-"""The sliders of a config: which keys have one, their spans, steps and ranges."""
+"""Sliders and jobs of the explorer.
+
+Which keys have a slider, with which span, step and range. The newest job wins, at most one runs,
+errors are reported."""
 
 import math
 import re
-from pathlib import Path
+import threading
 
 import pytest
 
 from rootsopt.config import load, parse
 from rootsopt.config.families import families
+from rootsopt.config.sources import shipped
 from rootsopt.view.pages.knobs import _step, dotted, knobs_of
+from rootsopt.view.pages.session import Latest
 
-ROOT = Path(__file__).parents[2]
-CONFIGS = sorted(path.stem for path in (ROOT / "configs").glob("*.yaml"))
 FREE = "optimizer.bounds.helix_deg=[0, 90]", "rotor.helix_deg=20"
 
 
@@ -20,11 +23,11 @@ def by_key(config):
 
 
 @pytest.mark.parametrize(
-    ("name", "changes"), [*((name, ()) for name in CONFIGS), ("cic_drawn", FREE), ("free", FREE)]
+    ("name", "changes"), [*((name, ()) for name in shipped()), ("cic_drawn", FREE), ("free", FREE)]
 )
 def test_every_knob_can_be_set(name, changes):
     """A knob's own value lies in its span, the span in its range, and the config accepts it."""
-    config = load(ROOT / "configs" / f"{name}.yaml", changes)
+    config = load(name, changes)
     knobs = knobs_of(config)
     assert len({knob.key for knob in knobs}) == len(knobs)
     for knob in knobs:
@@ -44,7 +47,7 @@ def test_every_family_has_a_knob_per_design_parameter(family, changes):
     A twist that is free is one of them, in the section of the rotor."""
     rows = "".join(f"\n  {key}: {list(x) if isinstance(x, tuple) else x}"
                    for key, x in families()[family].example.items())  # fmt: skip
-    text = (ROOT / "configs" / "ee.yaml").read_text().replace("family: ee", f"family: {family}")
+    text = shipped()["ee"].read_text().replace("family: ee", f"family: {family}")
     config = parse(text.replace("  lobes: 3", f"  lobes: 3{rows}"), changes)
     knobs = knobs_of(config)
     design = [knob for knob in knobs if knob.group == "Design"]
@@ -94,3 +97,59 @@ def test_steps_are_round_and_many(width):
     assert 200 <= width / step * (1 + 1e-9) < 500
     lead = step / 10 ** math.floor(math.log10(step) + 1e-9)
     assert lead == pytest.approx(round(lead))
+
+
+@pytest.fixture
+def lane():
+    errors = []
+    made = Latest(errors.append)
+    made.errors = errors
+    yield made
+    made.close()
+
+
+def test_newest_job_replaces_those_that_wait(lane):
+    """While the first job runs, a hundred others arrive: only the last of them runs."""
+    begun, go, end = (threading.Event() for _ in range(3))
+    ran: list[int] = []
+
+    def first():
+        begun.set()
+        go.wait(20)
+        ran.append(-1)
+
+    lane.submit(first)
+    assert begun.wait(20)
+    for k in range(100):
+        lane.submit(lambda k=k: (ran.append(k), k == 99 and end.set()))
+    assert lane.seconds > 0
+    go.set()
+    assert end.wait(20)
+    assert ran == [-1, 99]
+
+
+def test_delayed_job_is_replaced_and_dropped(lane):
+    ran, end = [], threading.Event()
+    lane.submit(lambda: ran.append("late"), delay=60)
+    lane.submit(lambda: (ran.append("now"), end.set()))
+    assert end.wait(20)
+    end.clear()
+    lane.submit(lambda: ran.append("dropped"), delay=0.05)
+    lane.clear()
+    lane.submit(end.set, delay=0.1)
+    assert end.wait(20)
+    assert ran == ["now"]
+
+
+def test_error_is_reported_and_the_next_job_runs(lane):
+    end = threading.Event()
+
+    def fail():
+        raise ValueError("no idea")
+
+    lane.submit(fail)
+    while not lane.errors:
+        pass
+    lane.submit(end.set)
+    assert end.wait(20)
+    assert str(lane.errors[0]) == "no idea"

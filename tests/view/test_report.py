@@ -25,8 +25,8 @@ from rootsopt.view.pages import charts
 from rootsopt.view.pages.charts import animations
 from rootsopt.view.pages.gather import Run, glossary, linked
 from rootsopt.view.pages.html import report_text
+from tests.commands.test_pareto import FEW
 
-pytest.importorskip("bokeh")
 CIC = "cic_drawn"
 HOSTILE = '</script><script>document.title = "taken"</script><b>&amp;'
 NOTE = "`rotor.helix_deg` is 1 °, which is unusual"
@@ -125,11 +125,10 @@ def test_page_says_what_came_out_and_what_every_status_means(page, simulated):
         "the motion repeats every mesh period.",
         "timing gear with 0.1 mm backlash",
         "backlash_mm: 0.1",
+        *(f"{one}: {other}" for one, other in (*simulated.end.facts, *simulated.end.steps)),
+        *(status.label.replace("_", " ") for status in Status),
+        *(message_of(load(CIC), status).replace("`", "") for status in Status),
     ]
-    told += [f"{one}: {other}" for one, other in (*simulated.end.facts, *simulated.end.steps)]
-    for status in Status:
-        told.append(status.label.replace("_", " "))
-        told.append(message_of(load(CIC), status).replace("`", ""))
     assert [words for words in told if words not in text] == []
 
 
@@ -310,13 +309,15 @@ def test_sweep_over_two_quantities(tmp_path):
     assert "these differ: speed: 1000 rpm, 3000 rpm and 2000 rpm; backlash: 0.1 mm and 0.2" in text
 
 
-def test_command_writes_a_report_of_a_run_without_a_result(tmp_path):
-    """An infeasible front: exit code 3, with a report."""
+def test_command_writes_a_report_of_a_run_without_a_result(tmp_path, capsys):
+    """An infeasible front: exit code 3, with advice on the terminal, and with a report."""
     place = tmp_path / "run"
-    given = ["--set", "pareto.terms=[outer_radius_mm, area_efficiency]", "--set", "pareto.points=3"]
-    given += ["--set", "constraints={area_efficiency_min: 0.48, seal_width_min_mm: 25}"]
-    assert pareto.main([CIC, "-o", str(place), "--report", *given]) == 3
-    assert pages.REPORT in json.loads((place / "result.json").read_text())["run"]["files"]
+    limits = "--set=constraints={area_efficiency_min: 0.48, seal_width_min_mm: 25}"
+    assert pareto.main([CIC, "-o", str(place), "--report", *FEW, limits]) == 3
+    assert re.search("Infeasible: .*seal width", " ".join(capsys.readouterr().out.split()))
+    result = json.loads((place / "result.json").read_text())
+    assert (result["points"], pages.REPORT in result["run"]["files"]) == ([], True)
+    assert {row["name"] for row in result["infeasible"]["conflicts"]} >= {"seal width"}
     text = words_of((place / pages.REPORT).read_text("utf-8"))
     for words in ("Infeasible: ", "Constraints in conflict", "seal width ≥ 25 mm"):
         assert words in text
@@ -355,9 +356,11 @@ def browsed(file, *options):
     """Return (standard output, console messages) of Chromium that shows a file.
 
     It runs headless with scripts, without a network and without a display."""
-    flags = [*FLAGS, f"--user-data-dir={file.parent / 'profile'}", "--enable-logging=stderr"]
-    flags += ["--virtual-time-budget=8000", "--window-size=1280,900", *options]
-    command = [chromium(), *flags, file.as_uri()]
+    command = [
+        *(chromium(), *FLAGS, f"--user-data-dir={file.parent / 'profile'}"),
+        *("--enable-logging=stderr", "--virtual-time-budget=8000", "--window-size=1280,900"),
+        *(*options, file.as_uri()),
+    ]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
     told = [line for line in done.stderr.splitlines() if "CONSOLE" in line]
     return done.stdout, [line for line in told if "[bokeh" not in line]  # Bokeh's own work

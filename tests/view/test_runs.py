@@ -5,7 +5,7 @@ import os
 import re
 import subprocess
 import sys
-from pathlib import Path
+from unittest import mock
 
 import matplotlib
 import pytest
@@ -14,9 +14,7 @@ from rootsopt.commands.console import main
 from rootsopt.view import files, runs
 from rootsopt.view.runs import RunFolder
 from tests.deaths import digest, digest_of, write_run
-from tests.standins import refusal
-
-ROOT = Path(__file__).parents[2]
+from tests.standins import ROOT, refusal
 
 
 def test_full_disk_or_death_at_every_file_operation():
@@ -187,11 +185,8 @@ def test_a_dead_process_keeps_nobody_out(tmp_path):
 def test_without_locks_nothing_of_others_is_removed(tmp_path, monkeypatch):
     stage = tmp_path / ".run.1-00000000.rootsopt"
     stage.mkdir()
-
-    def refuse(*_):
-        raise OSError(37, "No locks available")
-
-    monkeypatch.setattr(files.fcntl, "flock", refuse)
+    lacking = mock.Mock(side_effect=OSError(37, "No locks available"))
+    monkeypatch.setattr(files.fcntl, "flock", lacking)
     write_run(tmp_path / "run", "new")
     assert sorted(os.listdir(tmp_path)) == [stage.name, "run"]
 
@@ -209,10 +204,7 @@ def test_what_a_command_leaves_when_it_fails(tmp_path, capsys, monkeypatch):
     record = json.loads((place / "result.json").read_text())
     assert record["run"] == {"command": "profile", "files": sorted(os.listdir(place))}
     before = digest(tmp_path)
-
-    def interrupted(*_):
-        raise KeyboardInterrupt
-
+    interrupted = mock.Mock(side_effect=KeyboardInterrupt)
     monkeypatch.setattr("rootsopt.commands.work.profile.write", interrupted)
     capsys.readouterr()
     assert main(command) == 3
@@ -251,10 +243,7 @@ def test_nothing_is_written_outside_of_the_runs_own_folder(tmp_path, formats):
     parent.mkdir()
     others = {"MPLCONFIGDIR": matplotlib.get_cachedir(), "XDG_CACHE_HOME": str(tmp_path / "cache")}
     run = ["profile", "configs/cic_drawn.yaml", "-o", str(parent / "run"), "--export", formats]
-    done = subprocess.run(
-        [sys.executable, "-B", "-c", AUDIT, str(parent), *run],
-        cwd=ROOT, env=os.environ | others, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.split(f"results in {parent / 'run'}\n")[1].strip() == ""
+    command = [sys.executable, "-B", "-c", AUDIT, str(parent), *run]
+    said = subprocess.check_output(command, cwd=ROOT, env=os.environ | others, text=True)
+    assert said.split(f"results in {parent / 'run'}\n")[1].strip() == ""
     assert os.listdir(parent) == ["run"]

@@ -2,6 +2,7 @@
 
 import contextlib
 import http.client
+import queue
 import re
 import signal
 import socket
@@ -20,7 +21,6 @@ from rootsopt.optimize.design import optimize_design
 from rootsopt.view.pages.knobs import Engine
 from tests.commands.test_door import python
 
-pytest.importorskip("bokeh")
 CIC = "cic_drawn"
 
 
@@ -36,15 +36,10 @@ def serving(engine):
     """Serve the page of an engine, and yield its address."""
     from rootsopt.view.pages.server import PageServer
 
-    found, up, stop = [], threading.Event(), threading.Event()
-
-    def serve():
-        PageServer(engine, "cic").run(stop, lambda url: (found.append(url), up.set()))
-
-    thread = threading.Thread(target=serve)
+    found, stop = queue.SimpleQueue(), threading.Event()
+    thread = threading.Thread(target=lambda: PageServer(engine, "cic").run(stop, found.put))
     thread.start()
-    assert up.wait(60)
-    yield found[0]
+    yield found.get(timeout=60)
     stop.set()
     thread.join(30)
     assert not thread.is_alive()

@@ -1,1 +1,0 @@
-"""Mistakes in a copy of the package, each of which a test should notice; run by `make mutants`."""
