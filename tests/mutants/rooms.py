@@ -75,7 +75,7 @@ _OF = {
     "pump/rattle": "rattle",
     "pump/sheet": "pump_flow play leakage",
     "response/ensemble": "members ensemble",
-    "response/reducers": "risk reserve speeds tolerances many evaluations",
+    "response/reducers": "risk reserve speeds tolerances cluster",
     "response/result": "journal speeds tolerances start",
     "response/scatter": "tolerances",
     "response/sensitivity": "robust",
@@ -85,7 +85,7 @@ _OF = {
     "response/sweeps/plan": "plan axes",
     "response/sweeps/scenes": "scenes",
     "optimize/tradeoffs/assembly": "tradeoffs",
-    "optimize/tradeoffs/front": "tradeoffs evaluations",
+    "optimize/tradeoffs/front": "tradeoffs cluster",
     "optimize/tradeoffs/study": "tradeoffs",
     "optimize/tradeoffs/trace": "tradeoffs",
 }

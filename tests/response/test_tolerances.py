@@ -1,6 +1,7 @@
 """Scatter of scene and design: config, samples, scenes, evaluator."""
 
 import dataclasses
+import pickle
 from unittest import mock
 
 import jax
@@ -213,18 +214,38 @@ def test_a_scene_without_steady_state_is_a_status():
     assert (found.status, found.samples) == (Status.NOT_SETTLED, ())
 
 
+class Away:
+    """Runs points as if in another process: what a point refers to must travel."""
+
+    slots = 2
+
+    def __init__(self):
+        self.asked = []
+
+    def evaluated(self, point):
+        self.asked.append(point)
+        evaluator, *rest = pickle.loads(pickle.dumps(point))
+        return evaluator(*rest)
+
+
 def test_scatter_over_several_speeds():
-    """Each scene is evaluated at every speed.
+    """Each scene is evaluated at every speed, where `runs` says, and as in this process.
 
     Methods that return another evaluator keep the sample."""
     narrow = "tolerances.over.contact.clearance_mm.uniform=0.001"
     evaluator = told(narrow, "objective.speeds_rpm=[2000, 3000]", "tolerances.samples=2")
-    found = evaluator()
+    runs = Away()
+    found = evaluator.surveying().scattered(runs)()
+    assert [point.series for point in runs.asked] == [False, False]
+    rows = [[part.evaluation.response for part in one.scenes] for one in (found, evaluator())]
+    assert rows[0] == rows[1]
     assert [len(start) for start in found.start] == [2, 2, 2]
     for part in found.samples:
         assert [p.speed_rpm for p in part.evaluation.speeds] == [2000, 3000]
         forces = [p.evaluation.response["mean_force_N"] for p in part.evaluation.speeds]
         assert forces == pytest.approx([1e3 * part.values["contact.clearance_mm"]] * 2, rel=1e-12)
+        speeds = [p.evaluation.start[1] for p in part.evaluation.speeds]
+        np.testing.assert_allclose(speeds, [200 * np.pi / 3, 100 * np.pi])
     again = read_evaluation(plain_evaluation(found))
     assert again.samples[1].evaluation.speeds[0].speed_rpm == 2000
     lone = evaluator.at_speed(2500.0)
