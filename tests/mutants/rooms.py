@@ -81,7 +81,7 @@ _OF = {
     "response/sensitivity": "robust",
     "response/steady": "steady gradients",
     "response/terms": "terms loads leakage free_twist",
-    "response/together": "together members ensemble",
+    "response/together": "scenes members ensemble",
     "response/sweeps/plan": "plan axes",
     "response/sweeps/scenes": "scenes",
     "optimize/tradeoffs/assembly": "tradeoffs",
